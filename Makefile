@@ -1,0 +1,59 @@
+# Everything is run from a virtual environment that `make` makes by itself in .venv. It needs Python
+# 3.11-3.13 with pip and venv, and a package index that pip can reach; nothing else.
+
+PYTHON ?= python3
+PYTEST_ARGS ?=
+LOCK_ARGS ?=
+
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+UV := .venv-lock/bin/uv
+UV_VERSION := 0.13.8
+
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+.PHONY: help demo test test-all lint format lock clean
+
+help: ## List the targets
+	@awk 'BEGIN { FS = ":.*## " } /^[a-z-]+:.*## / { printf "  %-10s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
+
+demo: $(STAMP) ## Compare the gradient estimators on the pusher, into results/pusher
+	$(BIN)/mjx-study compare pusher --output results/pusher
+
+test: $(STAMP) ## Run the tests, less the slow ones (PYTEST_ARGS='-n 2 -k name' adds options)
+	$(BIN)/python -m pytest $(PYTEST_ARGS)
+
+test-all: $(STAMP) ## Run all the tests, the slow ones too
+	$(BIN)/python -m pytest -m '' $(PYTEST_ARGS)
+
+lint: $(STAMP) ## Check style, formatting and types
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/basedpyright
+
+format: $(STAMP) ## Put imports and formatting right
+	$(BIN)/ruff check --fix-only .
+	$(BIN)/ruff format .
+
+lock: $(UV) ## Bring requirements.lock up to pyproject.toml (LOCK_ARGS=--upgrade also renews the pins)
+	$(UV) pip compile --universal --python-version 3.11 --fork-strategy fewest --extra dev \
+		--generate-hashes --no-emit-index-url --no-emit-find-links \
+		--custom-compile-command 'make lock' --quiet $(LOCK_ARGS) pyproject.toml -o requirements.lock
+
+clean: ## Remove the environment, the caches and what was built; results/ stays
+	rm -rf $(VENV) .venv-lock build dist *.egg-info .pytest_cache .ruff_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# Every file that pip installs here is pinned by its hash: the build backend comes from the lock as well.
+$(STAMP): requirements.lock pyproject.toml
+	$(PYTHON) -c 'import sys; v = sys.version_info[:2]; (3, 11) <= v <= (3, 13) or sys.exit("mjx-study needs Python 3.11-3.13, this is %d.%d: set PYTHON" % v)'
+	test -x $(BIN)/pip || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements.lock
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
+	touch $@
+
+# Apart from .venv, which is made from the lock: a lock that does not install can still be renewed.
+$(UV):
+	$(PYTHON) -m venv .venv-lock
+	.venv-lock/bin/python -m pip install --quiet --disable-pip-version-check uv==$(UV_VERSION)
