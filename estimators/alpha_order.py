@@ -1,0 +1,164 @@
+"""Interpolation between a zeroth- and a first-order estimate, and the choice of its weight."""
+
+from dataclasses import replace
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from estimators.statistics import finite_rows
+from estimators.types import AlphaChoice, GradientEstimate
+
+Scalar = Float[Array, ""]
+
+
+def inverse_variance_alpha(variance_zeroth: Scalar, variance_first: Scalar) -> Scalar:
+    """The weight of least variance: alpha = sigmahat_0^2 / (sigmahat_0^2 + sigmahat_1^2).
+
+    Where the variances do not decide (both zero, both infinite, either one undefined) it is 0: a first-order
+    batch is trusted on evidence only.
+
+    Args:
+        variance_zeroth: sigmahat_0^2 >= 0, [cost^2/param^2].
+        variance_first: sigmahat_1^2 >= 0, [cost^2/param^2].
+
+    Returns:
+        alpha in [0, 1].
+
+    Reference: Suh et al. 2022, lemma on the closed form, gamma = infinity.
+    """
+    ratio = variance_first / jnp.where(variance_zeroth == 0, 1.0, variance_zeroth)  # not a sum, which can overflow
+    alpha = jnp.where(variance_zeroth == 0, 0.0, 1.0 / (1.0 + ratio))
+    return jnp.where(jnp.isnan(alpha) | jnp.isnan(variance_first), 0.0, alpha)
+
+
+def constrained_alpha(
+    variance_zeroth: Scalar,
+    variance_first: Scalar,
+    discrepancy: Scalar,
+    epsilon: float | Scalar,
+    gamma: float | Scalar,
+) -> Scalar:
+    """The weight of least variance among those that promise an error of at most gamma.
+
+        min_alpha  alpha^2 sigmahat_1^2 + (1 - alpha)^2 sigmahat_0^2   s.t.  epsilon + alpha B <= gamma
+
+    is solved by the smaller of the inverse-variance weight and (gamma - epsilon)/B. If epsilon > gamma
+    nothing is feasible, and alpha = 0. B = 0 never binds. gamma = infinity is inverse-variance weighting
+    whatever epsilon and B are; otherwise an epsilon or B that is undefined gives 0.
+
+    Args:
+        variance_zeroth: sigmahat_0^2 >= 0, [cost^2/param^2].
+        variance_first: sigmahat_1^2 >= 0, [cost^2/param^2].
+        discrepancy: B = ||gbar_1 - gbar_0||, [cost/param].
+        epsilon: Confidence radius of the zeroth-order mean, [cost/param].
+        gamma: Largest error to accept, [cost/param].
+
+    Returns:
+        alpha in [0, 1].
+
+    Reference: Suh et al. 2022, eq. of the robust interpolation and lemma on its closed form. The stationarity
+    condition in that proof must read 2 alpha sigmahat_1^2 - 2 (1 - alpha) sigmahat_0^2 + lambda B = 0
+    (printed with a plus).
+    """
+    dtype = variance_zeroth.dtype
+    epsilon, gamma = jnp.asarray(epsilon, dtype), jnp.asarray(gamma, dtype)
+    unconstrained = inverse_variance_alpha(variance_zeroth, variance_first)
+    touches = discrepancy == 0
+    largest = jnp.where(touches, 1.0, (gamma - epsilon) / jnp.where(touches, 1.0, discrepancy))
+    alpha = jnp.where(epsilon <= gamma, jnp.minimum(unconstrained, largest), 0.0)
+    alpha = jnp.where(jnp.isnan(alpha), 0.0, alpha)
+    return jnp.where(gamma == jnp.inf, unconstrained, alpha)
+
+
+def interpolate(zeroth: GradientEstimate, first: GradientEstimate, alpha: float | Scalar) -> GradientEstimate:
+    """Alpha-order batched gradient for a given weight.
+
+        gbar = alpha gbar_1 + (1 - alpha) gbar_0
+        sigmahat^2 = alpha^2 sigmahat_1^2 + (1 - alpha)^2 sigmahat_0^2,  and so for each squared standard
+        error
+
+    Assumes that the two batches are independent. Sample i pairs row i of one with row i of the other, an
+    arbitrary pairing that independence allows; the empirical variance of the pairs differs from sigmahat^2 by
+    the batches' chance correlation. A batch of weight 0 is left out altogether, NaN included. For a fixed
+    alpha the bias is alpha times that of the first-order batch.
+
+    Args:
+        zeroth: Zeroth-order estimate.
+        first: First-order estimate from the same number of independent samples.
+        alpha: Weight of `first`, in [0, 1].
+
+    Returns:
+        The estimate; its `alpha` is None.
+
+    Raises:
+        ValueError: The batches differ in shape.
+
+    Reference: Suh et al. 2022, def. of the AoBG and lemmas on its bias and variance (the last line of the
+    latter swaps the two variances).
+    """
+    if zeroth.per_sample.shape != first.per_sample.shape:
+        raise ValueError(
+            "the two batches must have the same shape (samples, params); "
+            f"got {zeroth.per_sample.shape} zeroth-order and {first.per_sample.shape} first-order; "
+            "draw the same number of samples for both"
+        )
+    alpha = jnp.asarray(alpha, zeroth.per_sample.dtype)
+
+    linear, squared = (1.0 - alpha, alpha), ((1.0 - alpha) ** 2, alpha**2)
+    per_sample = _weigh(linear, zeroth.per_sample, first.per_sample)
+    return GradientEstimate(
+        per_sample=per_sample,
+        mean=_weigh(linear, zeroth.mean, first.mean),
+        variance=_weigh(squared, zeroth.variance, first.variance),
+        standard_error=jnp.sqrt(_weigh(squared, zeroth.standard_error**2, first.standard_error**2)),
+        num_finite=jnp.sum(finite_rows(per_sample)),
+    )
+
+
+def alpha_order(
+    zeroth: GradientEstimate,
+    first: GradientEstimate,
+    *,
+    gamma: float | Scalar,
+    epsilon: float | Scalar,
+) -> GradientEstimate:
+    """Alpha-order batched gradient (AoBG) with the weight of `constrained_alpha`.
+
+    Assumes independent batches of the same size. The weight is chosen from the very samples that it weighs,
+    and the variance and standard errors take it as given.
+
+    Args:
+        zeroth: Zeroth-order estimate.
+        first: First-order estimate from the same number of independent samples.
+        gamma: Largest error to accept, [cost/param]; infinity for inverse-variance weighting.
+        epsilon: Confidence radius of the zeroth-order mean, [cost/param]; see `bernstein_epsilon`.
+
+    Returns:
+        The estimate, its `alpha` filled in.
+
+    Raises:
+        ValueError: The batches differ in shape.
+
+    Reference: Suh et al. 2022, sec. "alpha-order gradient estimator".
+    """
+    dtype = zeroth.per_sample.dtype
+    discrepancy = jnp.linalg.norm(first.mean - zeroth.mean)
+    alpha = constrained_alpha(zeroth.variance, first.variance, discrepancy, epsilon, gamma)
+    choice = AlphaChoice(
+        alpha=alpha,
+        epsilon=jnp.asarray(epsilon, dtype),
+        discrepancy=discrepancy,
+        variance_zeroth=zeroth.variance,
+        variance_first=first.variance,
+    )
+    return replace(interpolate(zeroth, first, alpha), alpha=choice)
+
+
+def _weigh(
+    weights: tuple[Scalar, Scalar], zeroth: Float[Array, "*shape"], first: Float[Array, "*shape"]
+) -> Float[Array, "*shape"]:
+    """Weighted sum in which nothing times NaN is nothing."""
+    weight_zeroth, weight_first = weights
+    return jnp.where(weight_zeroth == 0, 0.0, weight_zeroth * zeroth) + jnp.where(
+        weight_first == 0, 0.0, weight_first * first
+    )

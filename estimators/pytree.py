@@ -1,0 +1,42 @@
+"""Frozen dataclasses as pytrees whose shapes are checked when built, never when rebuilt."""
+
+from collections.abc import Iterable
+from dataclasses import fields
+from typing import Any, TypeVar
+
+import jax
+from jax.tree_util import GetAttrKey
+
+DataclassT = TypeVar("DataclassT")
+
+
+def register_pytree(dataclass_type: type[DataclassT]) -> type[DataclassT]:
+    """Register a dataclass as a pytree, every field a child.
+
+    `jax.tree_util.register_dataclass` rebuilds through `__init__`. JAX rebuilds trees around placeholders and
+    around arrays with a batch axis in front (`vmap`, `eval_shape`), and with shape annotations checked at run
+    time that `__init__` would refuse them. Here rebuilding sets the fields and nothing else, so that a
+    constructor in somebody's code is checked and a transformation is not.
+
+    Args:
+        dataclass_type: A dataclass, frozen or not. All its fields become leaves or subtrees.
+
+    Returns:
+        The same class.
+    """
+    names = tuple(field.name for field in fields(dataclass_type))  # pyright: ignore[reportArgumentType]
+
+    def flatten(tree: DataclassT) -> tuple[tuple[Any, ...], None]:
+        return tuple(getattr(tree, name) for name in names), None
+
+    def flatten_with_keys(tree: DataclassT) -> tuple[tuple[tuple[Any, Any], ...], None]:
+        return tuple((GetAttrKey(name), getattr(tree, name)) for name in names), None
+
+    def unflatten(_: None, children: Iterable[Any]) -> DataclassT:
+        tree = object.__new__(dataclass_type)
+        for name, child in zip(names, children, strict=True):
+            object.__setattr__(tree, name, child)
+        return tree
+
+    jax.tree_util.register_pytree_with_keys(dataclass_type, flatten_with_keys, unflatten, flatten)
+    return dataclass_type

@@ -1,0 +1,65 @@
+"""Zeroth-order estimates: from values and scores, never from a derivative of the dynamics."""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from estimators.baselines import BASELINES
+from estimators.statistics import summarise
+from estimators.types import Evaluation, GradientEstimate
+
+
+def zeroth_order(evaluation: Evaluation, baseline: str) -> GradientEstimate:
+    """Zeroth-order batched gradient (ZoBG), also known as REINFORCE or the score-function gradient.
+
+        g_i = (f_i - b_i) s_i
+
+    Unbiased for every f of polynomial growth, continuous or not. Its variance is at most B_V^2 B_pi^2 H m /
+    (N sigma^2) for |f - b| <= B_V, ||D pi|| <= B_pi and m noise dimensions at each of H steps.
+
+    Args:
+        evaluation: The batch.
+        baseline: A name in `BASELINES`.
+
+    Returns:
+        The estimate, one row per sample.
+
+    Raises:
+        ValueError: No baseline has that name.
+
+    Reference: Suh et al. 2022, def. of the ZoBG and lemma on its variance (which prints H n for the noise
+    dimensions).
+    """
+    if baseline not in BASELINES:
+        raise ValueError(f"baseline must be one of {', '.join(BASELINES)}; got {baseline!r}")
+    advantage = evaluation.value - BASELINES[baseline](evaluation)
+    return summarise(advantage[:, None] * evaluation.score)
+
+
+def delta_control_variate(
+    evaluation: Evaluation,
+    gradient: Float[Array, " params"],
+    sigma: float | Float[Array, ""],
+) -> GradientEstimate:
+    """Zeroth-order estimate of what a linear model of f leaves over, added to the model's gradient.
+
+        g_i = g + (f_i - f_i(0) - sigma^2 s_i . g) s_i
+
+    With f_i(0) the zero-noise value. Unbiased for *any* g that does not depend on the batch, provided that
+    E[s s^T] = I / sigma^2, which holds where the noise is added to the parameters themselves (an open loop,
+    one step) and not for a feedback policy. The closer g is to the gradient of f, the less variance: for
+    linear f and its own gradient, none. A wrong g costs variance only, so references are made this way even
+    where first-order gradients are biased.
+
+    Args:
+        evaluation: The batch, open loop.
+        gradient: g, such as a first-order mean from other samples, [cost/param].
+        sigma: Standard deviation of the noise, [param].
+
+    Returns:
+        The estimate, one row per sample.
+    """
+    scale = jnp.asarray(sigma, evaluation.score.dtype)
+    # A sum, since a matrix product of float32 may be rounded to fewer digits on an accelerator.
+    linear = scale**2 * jnp.sum(evaluation.score * gradient[None, :], axis=1)
+    remainder = evaluation.value - evaluation.baseline - linear
+    return summarise(gradient[None, :] + remainder[:, None] * evaluation.score)

@@ -1,0 +1,223 @@
+"""Running estimators by name: oracles, keys, sharing, precision, transformations and refusals."""
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import Array
+
+import estimators
+from estimators import (
+    ESTIMATORS,
+    Differentiation,
+    Estimator,
+    EstimatorOptions,
+    Evaluation,
+    GradientEstimate,
+    estimate,
+    zeroth_order,
+)
+from tests.estimators import objectives
+
+# Compiled whole: a fraction of the time of compiling operation by operation.
+combine = jax.jit(estimators.combine, static_argnums=(0, 3))
+leave_one_out = jax.jit(estimators.leave_one_out)
+
+HESSIAN = np.array([[1.0, 0.4], [0.4, 0.5]])
+OBJECTIVE = objectives.quadratic(HESSIAN, 0.5)
+THETA = np.array([1.5, -2.0])
+OPTIONS = EstimatorOptions(gamma=50.0, failure_probability=0.1, variance_proxy="variance", radius="max_deviation")
+
+
+@dataclass
+class Spy:
+    """Records the keys that each oracle is given."""
+
+    num_params: int = 2
+    evaluated: list[Array] = field(default_factory=list)
+    differentiated: list[Array] = field(default_factory=list)
+
+    def evaluate(self, theta: Array, keys: Array) -> Evaluation:
+        self.evaluated.append(jax.random.key_data(jax.random.clone(keys)))
+        return OBJECTIVE.evaluate(theta, keys)
+
+    def differentiate(self, theta: Array, keys: Array) -> Differentiation:
+        self.differentiated.append(jax.random.key_data(jax.random.clone(keys)))
+        return OBJECTIVE.differentiate(theta, keys)
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_every_estimator_calls_the_oracles_that_it_names_with_keys_used_once(name: str):
+    spy = Spy()
+    estimate(name, spy, jnp.asarray(THETA), jax.random.key(0), 20, options=OPTIONS)
+    orders = ESTIMATORS[name].order_of_oracle
+    assert (len(spy.evaluated), len(spy.differentiated)) == (int(0 in orders), int(1 in orders))
+    keys = np.concatenate([np.asarray(batch) for batch in spy.evaluated + spy.differentiated])
+    assert len(np.unique(keys, axis=0)) == len(keys) == 20 * len(orders)
+
+
+def test_the_table_is_keyed_by_name():
+    assert list(ESTIMATORS) == ["zobg", "fobg", "aobg", "ivw"]
+    for name, entry in ESTIMATORS.items():
+        assert isinstance(entry, Estimator) and entry.name == name and entry.description
+
+
+def test_sample_i_depends_on_key_i_alone():
+    keys = jax.random.split(jax.random.key(1), 10)
+    whole = OBJECTIVE.evaluate(jnp.asarray(THETA), jax.random.clone(keys))
+    part = OBJECTIVE.evaluate(jnp.asarray(THETA), keys[3:5])
+    np.testing.assert_array_equal(whole.value[3:5], part.value)
+
+
+def draw(name: str, options: EstimatorOptions) -> GradientEstimate:
+    return jax.jit(lambda theta: estimate(name, OBJECTIVE, theta, jax.random.key(2), 200, options=options))(
+        jnp.asarray(THETA)
+    )
+
+
+def shared() -> dict[str, GradientEstimate]:
+    return {name: draw(name, OPTIONS) for name in ESTIMATORS}
+
+
+def test_estimators_share_batches_given_the_same_key():
+    estimates = shared()
+    zeroth, first = estimates["zobg"], estimates["fobg"]
+    for name in ("aobg", "ivw"):
+        choice = estimates[name].alpha
+        assert choice is not None and 0.0 < choice.alpha < 1.0
+        expected = choice.alpha * first.mean + (1.0 - choice.alpha) * zeroth.mean
+        np.testing.assert_allclose(estimates[name].mean, expected, rtol=1e-14)
+    assert zeroth.alpha is None and first.alpha is None
+
+
+def test_ivw_is_aobg_without_a_limit():
+    options = replace(OPTIONS, gamma=float("inf"))
+    unlimited = draw("aobg", options)
+    strict = replace(OPTIONS, gamma=1e-9)
+    ivw = draw("ivw", strict)
+    np.testing.assert_array_equal(unlimited.mean, ivw.mean)
+    assert unlimited.alpha is not None and unlimited.alpha.alpha > 0.5
+    zeroth = draw("aobg", strict)
+    np.testing.assert_array_equal(zeroth.mean, shared()["zobg"].mean)
+
+
+@pytest.mark.parametrize(
+    ("name", "baseline"),
+    [("zobg", "none"), ("zobg", "leave_one_out"), ("fobg", "none"), ("aobg", "zero_noise"), ("ivw", "none")],
+)
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_precision_is_the_callers_under_jit(name: str, baseline: str, dtype: type):
+    options = replace(OPTIONS, baseline=baseline)
+
+    def run(theta: Array, key: Array) -> GradientEstimate:
+        return estimate(name, OBJECTIVE, theta, key, 50, options=options)
+
+    compiled = jax.jit(run)(jnp.asarray(THETA, dtype), jax.random.key(3))
+    for leaf in jax.tree.leaves(compiled):
+        assert leaf.dtype == dtype or jnp.issubdtype(leaf.dtype, jnp.integer)
+        assert np.all(np.isfinite(leaf))
+
+
+def test_estimates_can_be_mapped_over_parameters():
+    thetas = jnp.asarray(np.stack([THETA, -THETA, 2 * THETA]))
+    keys = jax.random.split(jax.random.key(4), 3)
+
+    def run(theta: Array, key: Array) -> GradientEstimate:
+        return estimate("aobg", OBJECTIVE, theta, key, 30, options=OPTIONS)
+
+    mapped = jax.jit(jax.vmap(run))(thetas, jax.random.clone(keys))
+    assert mapped.per_sample.shape == (3, 30, 2)
+    np.testing.assert_array_equal(mapped.num_nonfinite, [0, 0, 0])
+    np.testing.assert_allclose(mapped.mean[1], run(thetas[1], keys[1]).mean, rtol=1e-12)
+    shapes = jax.eval_shape(run, thetas[0], jax.random.key(0))
+    assert shapes.mean.shape == (2,)
+    assert jax.tree.map(lambda leaf: None, mapped).alpha.alpha is None
+
+
+def test_options_are_static_arguments():
+    @jax.jit
+    def through_closure(theta: Array) -> Array:
+        return estimate("aobg", OBJECTIVE, theta, jax.random.key(5), 10, options=OPTIONS).mean
+
+    def through_argument(theta: Array, options: EstimatorOptions) -> Array:
+        return estimate("aobg", OBJECTIVE, theta, jax.random.key(5), 10, options=options).mean
+
+    theta = jnp.asarray(THETA)
+    static = jax.jit(through_argument, static_argnums=1)(theta, OPTIONS)
+    np.testing.assert_array_equal(through_closure(theta), static)
+
+
+@jax.jit
+def lossy_batches() -> tuple[Evaluation, Differentiation]:
+    """100 samples each; three values lost, and one gradient of a finite value."""
+    theta = jnp.asarray(THETA)
+    first_keys, zeroth_keys = jax.random.split(jax.random.key(6), (2, 100))
+    zeroth, first = OBJECTIVE.evaluate(theta, zeroth_keys), OBJECTIVE.differentiate(theta, first_keys)
+    lost = jnp.array([5, 6, 90])
+    return (
+        replace(zeroth, value=zeroth.value.at[lost].set(jnp.nan)),
+        replace(first, value=first.value.at[lost].set(jnp.inf), gradient=first.gradient.at[7, 0].set(jnp.nan)),
+    )
+
+
+@pytest.mark.parametrize(("name", "lost"), [("zobg", 3), ("fobg", 4), ("aobg", 4)])
+@pytest.mark.parametrize("baseline", ["zero_noise", "leave_one_out"])
+def test_lost_samples_are_counted_and_do_not_spoil_the_rest(name: str, lost: int, baseline: str):
+    zeroth, first = lossy_batches()
+    result = combine(name, zeroth, first, replace(OPTIONS, baseline=baseline))
+    assert result.num_nonfinite == lost
+    for leaf in (result.mean, result.variance, result.standard_error):
+        assert np.all(np.isfinite(leaf))
+
+
+def test_leave_one_out_is_the_mean_of_the_other_finite_values():
+    zeroth, _ = lossy_batches()
+    value = np.asarray(zeroth.value)
+    baseline = np.asarray(leave_one_out(zeroth))
+    for sample in (0, 5, 50):
+        np.testing.assert_allclose(baseline[sample], np.nanmean(np.delete(value, sample)), rtol=1e-13)
+    alone = Evaluation(jnp.array([2.0, jnp.nan]), jnp.ones((2, 1)), jnp.zeros(2))
+    np.testing.assert_array_equal(leave_one_out(alone), [0.0, 2.0])
+
+
+def test_unknown_names_are_refused_with_the_choices():
+    zeroth, first = lossy_batches()
+    with pytest.raises(ValueError, match="one of zobg, fobg, aobg, ivw; got 'zo'"):
+        combine("zo", zeroth, first, OPTIONS)
+    with pytest.raises(ValueError, match="one of zobg, fobg, aobg, ivw; got 'zo'"):
+        estimate("zo", OBJECTIVE, jnp.asarray(THETA), jax.random.key(0), 10, options=OPTIONS)
+    with pytest.raises(ValueError, match="one of none, zero_noise, leave_one_out; got 'mean'"):
+        zeroth_order(zeroth, "mean")
+
+
+def test_missing_batches_and_impossible_sizes_are_refused():
+    zeroth, first = lossy_batches()
+    for name in ("zobg", "aobg", "ivw"):
+        with pytest.raises(ValueError, match=f"'{name}' needs a zeroth-order batch"):
+            combine(name, None, first, OPTIONS)
+    for name in ("fobg", "aobg", "ivw"):
+        with pytest.raises(ValueError, match=f"'{name}' needs a first-order batch"):
+            combine(name, zeroth, None, OPTIONS)
+    with pytest.raises(ValueError, match="at least 1, .* got 0"):
+        estimate("zobg", OBJECTIVE, jnp.asarray(THETA), jax.random.key(0), 0, options=OPTIONS)
+    with pytest.raises(ValueError, match=r"shape \(2,\), the objective's; got \(3,\)"):
+        estimate("zobg", OBJECTIVE, jnp.ones(3), jax.random.key(0), 10, options=OPTIONS)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"baseline": "mean"}, "one of none, zero_noise, leave_one_out; got 'mean'"),
+        ({"gamma": 0.0}, "gamma must be positive; got 0.0"),
+        ({"gamma": float("nan")}, "gamma must be positive; got nan"),
+        ({"failure_probability": 1.5}, "strictly between 0 and 1; got 1.5"),
+        ({"variance_proxy": "sum"}, "one of variance, second_moment; got 'sum'"),
+        ({"radius": -0.1}, "not negative; got -0.1"),
+    ],
+)
+def test_options_out_of_range_are_refused(change: dict[str, Any], message: str):
+    with pytest.raises(ValueError, match=message):
+        replace(OPTIONS, **change)

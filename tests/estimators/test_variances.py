@@ -1,0 +1,183 @@
+"""Variances against closed forms."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import Array
+from scipy.stats import norm
+
+from estimators import (
+    Differentiation,
+    Evaluation,
+    delta_control_variate,
+    first_order,
+    interpolate,
+    summarise,
+    zeroth_order,
+)
+from tests.estimators import objectives
+from tests.estimators.statistics_helpers import assert_mean_is, assert_variance_is
+
+SAMPLES = 200_000
+RNG = np.random.default_rng(1)
+SLOPE = RNG.normal(size=5)
+HESSIAN = (lambda root: root + root.T)(RNG.normal(size=(3, 3)))
+THETA = np.array([0.5, -0.4, 0.3])
+SIGMA = 0.7
+
+
+def keys(seed: int, num_samples: int = SAMPLES) -> Array:
+    return jax.random.split(jax.random.key(seed), num_samples)
+
+
+def zeroth_variance_of_quadratic(baseline_gap: float = 0.0) -> float:
+    """(d+1)||G||^2 + (sigma^2/4)(d+4)(tr(H)^2 + 2 tr(H^2)) with a zero-noise baseline, by Isserlis.
+
+    A baseline off by c adds E||(c + w^T H w/2) s||^2 - E||(w^T H w/2) s||^2 = c^2 d/sigma^2 + c (d+2) tr(H).
+    """
+    dimension, trace = len(THETA), np.trace(HESSIAN)
+    slope = np.sum((HESSIAN @ THETA) ** 2)
+    curvature = SIGMA**2 / 4 * (dimension + 4) * (trace**2 + 2 * np.sum(HESSIAN**2))
+    gap = baseline_gap**2 * dimension / SIGMA**2 + baseline_gap * (dimension + 2) * trace
+    return float((dimension + 1) * slope + curvature + gap)
+
+
+def test_linear_first_order_has_no_variance():
+    estimate = first_order(objectives.linear(SLOPE, 0.3).differentiate(jnp.ones(5), keys(0, 1000)))
+    assert estimate.variance == 0.0
+    np.testing.assert_array_equal(estimate.mean, SLOPE)
+
+
+@pytest.mark.parametrize("baseline", ["zero_noise", "none"])
+def test_linear_zeroth_order_variance(baseline: str):
+    sigma, theta, dimension = 0.3, jnp.linspace(0.0, 1.0, 5), 5
+    estimate = zeroth_order(objectives.linear(SLOPE, sigma).evaluate(theta, keys(1)), baseline)
+    exact = (dimension + 1) * np.sum(SLOPE**2)
+    if baseline == "none":
+        exact += float(SLOPE @ theta) ** 2 * dimension / sigma**2
+    assert_variance_is(estimate, SLOPE, exact)
+
+
+def test_linear_control_variate_variance_is_that_of_the_wrong_part_of_the_gradient():
+    batch = objectives.linear(SLOPE, 0.3).evaluate(jnp.ones(5), keys(2))
+    wrong = SLOPE + np.array([1.0, -2.0, 0.0, 0.5, 0.0])
+    estimate = delta_control_variate(batch, jnp.asarray(wrong), 0.3)
+    assert_variance_is(estimate, SLOPE, 6 * np.sum((wrong - SLOPE) ** 2))
+    exact_model = delta_control_variate(batch, jnp.asarray(SLOPE), 0.3)
+    # f - f(0) - w.g cancels to rounding, of relative size 1e-16 before the division by sigma^2
+    assert exact_model.variance < 1e-24
+
+
+def test_quadratic_variances():
+    objective, theta = objectives.quadratic(HESSIAN, SIGMA), jnp.asarray(THETA)
+    gradient = HESSIAN @ THETA
+    assert_variance_is(first_order(objective.differentiate(theta, keys(3))), gradient, SIGMA**2 * np.sum(HESSIAN**2))
+    batch = objective.evaluate(theta, keys(4))
+    assert_variance_is(zeroth_order(batch, "zero_noise"), gradient, zeroth_variance_of_quadratic())
+    gap = float(THETA @ HESSIAN @ THETA) / 2
+    assert_variance_is(zeroth_order(batch, "none"), gradient, zeroth_variance_of_quadratic(gap))
+
+
+def test_heaviside_second_moment():
+    """E[1[theta + w >= 0] w^2] / sigma^4 = (Phi(t) - t phi(t)) / sigma^2 with t = theta / sigma."""
+    sigma, theta = 0.6, 0.3
+    estimate = zeroth_order(objectives.heaviside(sigma).evaluate(jnp.array([theta]), keys(5)), "none")
+    ratio = theta / sigma
+    exact = (norm.cdf(ratio) - ratio * norm.pdf(ratio)) / sigma**2
+    assert_mean_is(np.asarray(estimate.per_sample) ** 2, [exact])
+
+
+@pytest.mark.parametrize("width", [0.4, 0.1, 0.025])
+def test_relaxed_heaviside_first_order_variance_grows_as_one_over_width(width: float):
+    sigma, theta = 0.6, jnp.array([0.3])
+    gradient = np.asarray(objectives.relaxed_heaviside_gradient(theta, sigma, width))
+    hit = width * float(gradient[0])
+    exact = hit * (1 - hit) / width**2
+    estimate = first_order(objectives.relaxed_heaviside(sigma, width).differentiate(theta, keys(6)))
+    assert_variance_is(estimate, gradient, exact, resolution=0.1)
+    assert set(np.unique(estimate.per_sample)) == {0.0, 1 / width}
+    limit = float(objectives.heaviside_gradient(theta, sigma)[0])
+    # width * variance -> grad F: the gap is the hit probability; grad F itself changes by width^2
+    np.testing.assert_allclose(exact * width, limit, rtol=hit + width**2 / sigma**2)
+
+
+@pytest.mark.parametrize("probability", [0.5, 0.02])
+def test_empirical_bias_example(probability: float):
+    """z = 1/beta with probability beta: mean 1, variance 1/beta - 1."""
+    hits = jax.vmap(lambda key: jax.random.bernoulli(key, probability))(keys(7))
+    rows = jnp.where(hits, 1 / probability, 0.0)[:, None]
+    estimate = first_order(Differentiation(value=jnp.zeros(SAMPLES), gradient=rows))
+    assert_mean_is(rows, [1.0], resolution=0.1)
+    assert_variance_is(estimate, [1.0], 1 / probability - 1, resolution=0.1)
+
+
+def test_variance_from_empirical_bias_bounds_every_population():
+    """Var z >= Delta_0^2/beta and (1-beta) Delta^2/beta, over populations of 12 equally likely vectors."""
+    rng = np.random.default_rng(2)
+    rows = rng.normal(size=(500, 12, 2)) * 10 ** rng.uniform(-2, 2, size=(500, 12, 1))
+    estimates = jax.vmap(summarise)(jnp.asarray(rows))
+    variances = np.asarray(estimates.variance) * 11 / 12  # of the population
+    tightest = 0.0
+    for population, variance in zip(rows, variances, strict=True):
+        for outside in range(1, 12):
+            beta, mean = outside / 12, population.mean(0)
+            gap = np.linalg.norm(population[outside:].mean(0) - mean)
+            reduced = max(0.0, (1 - beta) * gap - beta * np.linalg.norm(mean))
+            assert variance >= reduced**2 / beta * (1 - 1e-12)
+            assert variance >= (1 - beta) * gap**2 / beta * (1 - 1e-12)
+            tightest = max(tightest, (1 - beta) * gap**2 / beta / variance)
+    assert tightest > 0.9  # a variance too small by a tenth would have been seen
+
+
+def test_zeroth_order_variance_bound_is_attained_by_a_constant_value():
+    """B_V^2 B_pi^2 H m / sigma^2 with noise dimension m; H n, for one state, would be too small."""
+    horizon, controls, bound, sigma = 4, 3, 2.0, 0.5
+    noise = sigma * jax.vmap(lambda key: jax.random.normal(key, (horizon * controls,)))(keys(8))
+    batch = Evaluation(jnp.full(SAMPLES, bound), noise / sigma**2, jnp.zeros(SAMPLES))
+    estimate = zeroth_order(batch, "none")
+    assert_variance_is(estimate, np.zeros(horizon * controls), bound**2 * horizon * controls / sigma**2)
+
+
+@pytest.mark.parametrize("theta", [-1.0, 0.0, 0.4, 2.0])
+def test_zeroth_order_variance_bound_holds(theta: float):
+    sigma = 0.6
+    estimate = zeroth_order(objectives.heaviside(sigma).evaluate(jnp.array([theta]), keys(9)), "none")
+    assert estimate.variance <= 1 / sigma**2
+    assert 0.0 < estimate.variance
+
+
+@pytest.mark.parametrize("num_samples", [2, 8, 32])
+def test_variance_of_the_mean_is_the_sample_variance_over_n(num_samples: int):
+    objective, theta, batches = objectives.quadratic(HESSIAN, SIGMA), jnp.asarray(THETA), 40_000
+    grid = jax.random.split(jax.random.key(10), (batches, num_samples))
+    estimates = jax.jit(jax.vmap(lambda row: zeroth_order(objective.evaluate(theta, row), "zero_noise")))(grid)
+    exact = zeroth_variance_of_quadratic()
+    squares = np.sum((np.asarray(estimates.mean) - HESSIAN @ THETA) ** 2, axis=1)
+    assert_mean_is(squares[:, None], [exact / num_samples], resolution=0.1)
+    assert_mean_is(np.asarray(estimates.variance)[:, None], [exact], resolution=0.1)
+    assert_mean_is(
+        np.sum(np.asarray(estimates.standard_error) ** 2, axis=1)[:, None],
+        [exact / num_samples],
+        resolution=0.1,
+    )
+
+
+@pytest.mark.parametrize("alpha", [0.25, 0.9])
+def test_interpolated_variance(alpha: float):
+    """alpha^2 sigma_1^2 + (1-alpha)^2 sigma_0^2, each with its own batch; the erratum swaps them."""
+    objective, theta, num_samples = objectives.quadratic(HESSIAN, SIGMA), jnp.asarray(THETA), 6
+    grid = jax.random.split(jax.random.key(11), (20_000, 2, num_samples))
+
+    def one(pair: Array):
+        zeroth = zeroth_order(objective.evaluate(theta, pair[0]), "zero_noise")
+        return interpolate(zeroth, first_order(objective.differentiate(theta, pair[1])), alpha)
+
+    estimates = jax.jit(jax.vmap(one))(grid)
+    first, zeroth = SIGMA**2 * np.sum(HESSIAN**2), zeroth_variance_of_quadratic()
+    exact = alpha**2 * first + (1 - alpha) ** 2 * zeroth
+    assert_mean_is(np.asarray(estimates.variance)[:, None], [exact], resolution=0.1)
+    squares = np.sum((np.asarray(estimates.mean) - HESSIAN @ THETA) ** 2, axis=1)
+    assert_mean_is(squares[:, None], [exact / num_samples], resolution=0.1)
+    se_squares = np.sum(np.asarray(estimates.standard_error) ** 2, axis=1)
+    np.testing.assert_allclose(se_squares, np.asarray(estimates.variance) / num_samples, rtol=1e-10)
