@@ -1,0 +1,19 @@
+"""Imports `mujoco.mjx` without the lines it prints about NVIDIA Warp.
+
+MJX announces on standard output that its optional Warp backend is missing, which would corrupt JSON output.
+Those lines are dropped; anything else that the import prints goes to standard error.
+"""
+
+import contextlib
+import io
+import sys
+
+_printed = io.StringIO()
+with contextlib.redirect_stdout(_printed):
+    from mujoco import mjx
+
+for _line in _printed.getvalue().splitlines():
+    if not _line.startswith(("Failed to import warp", "Failed to import mujoco_warp")):
+        print(_line, file=sys.stderr)
+
+__all__ = ["mjx"]

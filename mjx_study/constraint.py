@@ -1,0 +1,158 @@
+r"""The constraint solve as a differentiable root.
+
+MuJoCo's constrained acceleration is the minimum of a convex function, that is the root `a` of
+
+    G(a) = M a - qfrc_smooth - J^T f(J a - aref) = 0,
+
+with `f` the force law of each constraint row. MJX finds it with a `while_loop`, which has no reverse mode, so
+`mjx.step` differentiates only one solver iteration and gets both the step and its gradient wrong. Here MJX's own
+loop runs to convergence and the derivative comes from the implicit function theorem: one symmetric positive
+definite system in `dG/da = M + J^T f' J`, whatever the solver and its budget. The derivative is as good as the
+solve has converged, so `residual` measures that and every result carries it.
+
+MJX's constraint rows are private (`Data._impl.efc_*`); their content is read here only.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jaxtyping import Array, Float
+
+from mjx_study._mjx import mjx
+from mjx_study.scene import num_constraint_rows
+
+_ELLIPTIC = mujoco.mjtCone.mjCONE_ELLIPTIC
+
+
+def row_force(model: mjx.Model, data: mjx.Data, slack: Float[Array, " rows"]) -> Float[Array, " rows"]:
+    """Force of each constraint row at the slack `J a - aref`, MuJoCo's force law f.
+
+    With D the inverse regularisation of a row and x its slack: equality -D x; friction loss -D x clipped to
+    +- frictionloss; limit, frictionless and pyramidal contact -D x where x < 0, else 0; elliptic contact by zone of
+    the cone (`_elliptic_force`).
+
+    Args:
+        model: the model on the device.
+        data: a state with its constraint rows, after `mjx.make_constraint`.
+        slack: J a - aref [m/s^2 or rad/s^2].
+
+    Returns:
+        Force of each row [N or N m].
+
+    Reference: MuJoCo documentation, Computation, "Constraint model".
+    """
+    rows: Any = data._impl
+    linear = -rows.efc_D * slack
+    unilateral = jnp.where(slack < 0, linear, 0.0)
+
+    loss = rows.efc_frictionloss
+    friction = jnp.where(loss > 0, jnp.clip(linear, -loss, loss), linear)
+
+    kind = np.zeros(slack.shape[0], dtype=int)
+    kind[: rows.ne] = 2
+    kind[rows.ne : rows.ne + rows.nf] = 1
+    force = jnp.where(kind == 2, linear, jnp.where(kind == 1, friction, unilateral))
+    if model.opt.cone == _ELLIPTIC:
+        force = _elliptic_force(model, rows, slack, linear, force)
+    return force
+
+
+def _elliptic_force(
+    model: mjx.Model,
+    rows: Any,
+    slack: Float[Array, " rows"],
+    linear: Float[Array, " rows"],
+    force: Float[Array, " rows"],
+) -> Float[Array, " rows"]:
+    """Replace the rows of elliptic contacts in `force`.
+
+    In the scaled slack u = (mu x_n, friction * x_t), N = u_n, T = |u_t|: separated (N >= mu T) no force; sticking
+    (mu N + T <= 0) linear; sliding in between, on the cone, with force -dm mu (N - mu T) along (1, -u_t / T).
+    The branch that is not taken is evaluated at a safe T, so T = 0 has a finite derivative.
+    """
+    contact = rows.contact
+    for index, (condim, address) in enumerate(zip(contact.dim, contact.efc_address, strict=True)):
+        if condim == 1:
+            continue
+        span = slice(int(address), int(address) + int(condim))
+        friction = contact.friction[index, : condim - 1]
+        mu = friction[0] / jnp.sqrt(model.opt.impratio)
+        normal = mu * slack[span][0]
+        tangent = friction * slack[span][1:]
+
+        square = jnp.sum(tangent**2)
+        moving = square > 0
+        length = jnp.where(moving, jnp.sqrt(jnp.where(moving, square, 1.0)), 0.0)
+        safe_length = jnp.where(moving, length, 1.0)
+        sticking = jnp.where(moving, mu * normal + length <= 0, normal < 0)
+        sliding = moving & (normal < mu * length) & (mu * normal + length > 0)
+
+        stiffness = rows.efc_D[span][0] / jnp.maximum(mu * mu * (1 + mu * mu), mujoco.mjMINVAL)
+        magnitude = -stiffness * mu * (normal - mu * length)
+        on_cone = jnp.concatenate([magnitude[None], -magnitude * friction * tangent / safe_length])
+        force = force.at[span].set(jnp.where(sticking, linear[span], jnp.where(sliding, on_cone, 0.0)))
+    return force
+
+
+def constraint_force(model: mjx.Model, data: mjx.Data, qacc: Float[Array, " nv"]) -> Float[Array, " nv"]:
+    """Joint-space constraint force J^T f(J a - aref) [N or N m] at the acceleration `qacc`."""
+    rows: Any = data._impl
+    return rows.efc_J.T @ row_force(model, data, rows.efc_J @ qacc - rows.efc_aref)
+
+
+def imbalance(model: mjx.Model, data: mjx.Data, qacc: Float[Array, " nv"]) -> Float[Array, " nv"]:
+    """The equation that the solver solves, G(a) = M a - qfrc_smooth - J^T f(J a - aref) [N or N m].
+
+    `data` needs its position, velocity and smooth-force stages and its constraint rows.
+    """
+    return mjx.mul_m(model, data, qacc) - data.qfrc_smooth - constraint_force(model, data, qacc)
+
+
+def residual(model: mjx.Model, data: mjx.Data, qacc: Float[Array, " nv"]) -> Float[Array, ""]:
+    """Relative imbalance |G(a)| / (|M a| + |qfrc_smooth| + |J^T f|), 0 where all are 0; no unit."""
+    inertial = mjx.mul_m(model, data, qacc)
+    constraint = constraint_force(model, data, qacc)
+    scale = sum(jnp.sum(jnp.abs(term)) for term in (inertial, data.qfrc_smooth, constraint))
+    gap = jnp.sum(jnp.abs(inertial - data.qfrc_smooth - constraint))
+    return jnp.where(scale > 0, gap / jnp.where(scale > 0, scale, 1.0), 0.0)
+
+
+def run_solver(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]:
+    """MJX's own converged solve; the constrained acceleration [m/s^2 or rad/s^2], without a reverse mode."""
+    if num_constraint_rows(data) == 0:
+        return data.qacc_smooth
+    return mjx.solve(model, data).qacc
+
+
+def solve(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]:
+    """The constrained acceleration with its implicit derivative, exact in forward and reverse mode.
+
+    Args:
+        model: the model on the device; its array leaves may be traced and differentiated.
+        data: a state after `mjx.fwd_acceleration`; `qacc_warmstart` starts the loop and has no derivative.
+
+    Returns:
+        qacc [m/s^2 or rad/s^2].
+    """
+    if num_constraint_rows(data) == 0:
+        return data.qacc_smooth
+
+    def tangent_solve(linear_map, right_side):
+        return solve_positive_definite(jax.vmap(linear_map)(jnp.eye(model.nv)), right_side)
+
+    return jax.lax.custom_root(
+        f=lambda qacc: imbalance(model, data, qacc),
+        initial_guess=data.qacc_warmstart,
+        solve=lambda _, __: jax.lax.stop_gradient(run_solver(model, data)),
+        tangent_solve=tangent_solve,
+    )
+
+
+def solve_positive_definite(
+    matrix: Float[Array, "nv nv"], right_side: Float[Array, "nv ..."]
+) -> Float[Array, "nv ..."]:
+    """Solve with a symmetric positive definite matrix by Cholesky."""
+    return jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(matrix), right_side)

@@ -1,0 +1,61 @@
+"""Position integration with the true derivative of free and ball joints at rest.
+
+MJX normalises the angular velocity and branches at zero, so that its derivative of the orientation with respect to
+an angular velocity of zero is silently zero; it is half a timestep per component. Here the quaternion is a smooth
+function of the squared angle, with a series where the angle is small. Values agree with MJX to rounding.
+"""
+
+import jax.numpy as jnp
+import mujoco
+from jaxtyping import Array, Float
+
+_FREE, _BALL = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL)
+_SMALL = 1e-4  # [rad^2]; the series' first omitted term is below 1e-16 of the result
+
+
+def integrate_position(
+    host: mujoco.MjModel,
+    qpos: Float[Array, " nq"],
+    qvel: Float[Array, " nv"],
+    timestep: Float[Array, ""] | float,
+) -> Float[Array, " nq"]:
+    """Positions after moving with `qvel` for one timestep.
+
+    Args:
+        host: the model, for its joints.
+        qpos: positions [m or rad; unit quaternions].
+        qvel: velocities [m/s or rad/s], angular ones in the body's frame as MuJoCo has them.
+        timestep: [s].
+    """
+    parts = []
+    for kind, start, velocity in zip(host.jnt_type, host.jnt_qposadr, host.jnt_dofadr, strict=True):
+        if kind == _FREE:
+            parts.append(qpos[start : start + 3] + timestep * qvel[velocity : velocity + 3])
+            start, velocity = start + 3, velocity + 3
+        if kind in (_FREE, _BALL):
+            rotation = timestep * qvel[velocity : velocity + 3]
+            parts.append(rotate_quaternion(qpos[start : start + 4], rotation))
+        else:
+            parts.append(qpos[start : start + 1] + timestep * qvel[velocity : velocity + 1])
+    return jnp.concatenate(parts) if parts else qpos
+
+
+def rotate_quaternion(quaternion: Float[Array, " 4"], rotation: Float[Array, " 3"]) -> Float[Array, " 4"]:
+    """The unit quaternion after a rotation vector [rad] in the body's frame: q exp(rotation / 2), normalised."""
+    square = jnp.sum(rotation**2)
+    small = square < _SMALL
+    angle = jnp.sqrt(jnp.where(small, 1.0, square))
+    # sin(angle / 2) / angle and cos(angle / 2), in powers of angle^2
+    sine = jnp.where(small, 0.5 - square / 48 + square**2 / 3840, jnp.sin(angle / 2) / angle)
+    cosine = jnp.where(small, 1 - square / 8 + square**2 / 384 - square**3 / 46080, jnp.cos(angle / 2))
+    w, x, y, z = quaternion
+    a, b, c = sine * rotation
+    product = jnp.stack(
+        [
+            w * cosine - x * a - y * b - z * c,
+            w * a + x * cosine + y * c - z * b,
+            w * b - x * c + y * cosine + z * a,
+            w * c + x * b - y * a + z * cosine,
+        ]
+    )
+    return product / jnp.sqrt(jnp.sum(product**2))

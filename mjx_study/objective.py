@@ -1,0 +1,191 @@
+"""(Task, ContactModel) -> the Objective that estimators see.
+
+Batching, chunks and devices live here and nowhere else. A `Simulator` holds the two compiled programs of a task, one
+that evaluates and one that differentiates; contact parameters, theta, sigma and keys are arguments, so a sweep over
+them compiles nothing new. Samples are spread over the devices with `jax.shard_map`, where each device leaves the
+solver's loop on its own, in chunks of fixed size that bound memory.
+"""
+
+import dataclasses
+import math
+from typing import Any, Final
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, PartitionSpec
+from jaxtyping import Array, Float, Key
+
+from estimators import Differentiation, Evaluation
+from mjx_study.contact import ContactModel, apply_contact
+from mjx_study.dynamics import State, rollout
+from mjx_study.noise import split_sample_key, standard_noise
+from mjx_study.policy import OpenLoop
+from mjx_study.task import Task, check_sigma
+
+MAX_CHUNK: Final = 512
+"""Most samples per device in one call: on a CPU larger batches gain no speed, and this bounds memory."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Simulator:
+    """The compiled programs of a task.
+
+    Attributes:
+        task: what is simulated; its scene's contact parameters are replaced by those of each call.
+        chunk_size: samples per device and call.
+        devices: where samples are spread; by default all local devices.
+    """
+
+    task: Task
+    chunk_size: int = MAX_CHUNK
+    devices: tuple[Any, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.chunk_size < 1:
+            raise ValueError(f"chunk_size must be at least 1 sample, got {self.chunk_size}")
+        devices = tuple(self.devices) or tuple(jax.local_devices())
+        object.__setattr__(self, "devices", devices)
+        for name, program in (("_values", self._sample_value), ("_gradients", self._sample_gradient)):
+            object.__setattr__(self, name, self._compile(program, devices))
+
+    def objective(self, contact: ContactModel, sigma: float | None = None) -> "MjxObjective":
+        """Bind a contact model, and a noise level other than the task's."""
+        return MjxObjective(self, contact, self.task.sigma if sigma is None else sigma)
+
+    @property
+    def num_compilations(self) -> int:
+        """How many programs this simulator has compiled so far."""
+        return sum(program._cache_size() for program in (self._values, self._gradients))  # type: ignore[attr-defined]
+
+    def _compile(self, program, devices: tuple[Any, ...]):
+        mesh = Mesh(np.array(devices), ("samples",))
+        shared, split = PartitionSpec(), PartitionSpec("samples")
+        batched = jax.vmap(program, in_axes=(None, None, None, 0, 0))
+        return jax.jit(
+            jax.shard_map(
+                batched,
+                mesh=mesh,
+                in_specs=(shared, shared, shared, split, split),
+                out_specs=split,
+                check_vma=False,
+            )
+        )
+
+    def _cost(self, theta, contact, sigma, key_data, noise_scale) -> tuple[Array, tuple[State, Array, Array]]:
+        """Cost of one rollout, and its states, noise and largest solver residual."""
+        task = self.task
+        start_key, noise_key = split_sample_key(jax.random.wrap_key_data(key_data))
+        dtype = task.scene.template.qpos.dtype
+        noise = noise_scale * sigma * standard_noise(noise_key, task.horizon, task.scene.host.nu, dtype)
+        feedforward = task.policy.feedforward(theta) + noise
+
+        def control_law(index, state):
+            feedback = task.policy.feedback(theta, state)
+            return feedforward[index] if feedback is None else feedforward[index] + feedback
+
+        model = apply_contact(task.scene.model, contact)
+        states, controls, residuals = rollout(task.scene, model, task.draw_start(start_key), control_law, task.horizon)
+        before = jax.tree.map(lambda leaf: leaf[:-1], states)
+        last = jax.tree.map(lambda leaf: leaf[-1], states)
+        cost = jnp.sum(jax.vmap(task.running_cost)(before, controls)) + task.final_cost(last)
+        return cost, (before, noise, jnp.max(residuals))
+
+    def _sample_value(self, theta, contact, sigma, key_data, noise_scale):
+        value, (states, noise, residual) = self._cost(theta, contact, sigma, key_data, noise_scale)
+        return value, self.task.policy.score(theta, states, noise / sigma**2), residual
+
+    def _sample_gradient(self, theta, contact, sigma, key_data, noise_scale):
+        (value, (_, _, residual)), gradient = jax.value_and_grad(self._cost, has_aux=True)(
+            theta, contact, sigma, key_data, noise_scale
+        )
+        return value, gradient, residual
+
+    def _run(self, program, theta, contact, sigma, keys, noise_scale):
+        """Call a program chunk by chunk; the last chunk is padded by repeating its last sample."""
+        check_sigma(sigma)
+        dtype = self.task.scene.template.qpos.dtype
+        samples, capacity = len(noise_scale), self.chunk_size * len(self.devices)
+        padded = np.minimum(np.arange(math.ceil(samples / capacity) * capacity), samples - 1)
+        outputs = [
+            program(theta, contact, np.asarray(sigma, dtype), keys[part], noise_scale[part])
+            for part in padded.reshape(-1, capacity)
+        ]
+        host = jax.device_get(outputs)
+        return [np.concatenate(leaves)[:samples] for leaves in zip(*host, strict=True)]
+
+    def run_values(self, theta, contact, sigma, keys, noise_scale):
+        """Values, scores and residuals of the samples that the keys name, their noise multiplied by `noise_scale`."""
+        keys = np.asarray(jax.random.key_data(keys))
+        return self._run(self._values, theta, contact, sigma, keys, noise_scale)  # type: ignore[attr-defined]
+
+    def run_gradients(self, theta, contact, sigma, keys):
+        """Values, gradients and residuals of the samples that the keys name, as NumPy arrays."""
+        keys = np.asarray(jax.random.key_data(keys))
+        scale = np.ones(len(keys), self.task.scene.template.qpos.dtype)
+        return self._run(self._gradients, theta, contact, sigma, keys, scale)  # type: ignore[attr-defined]
+
+
+@dataclasses.dataclass(frozen=True)
+class MjxObjective:
+    """F(theta) = E V_1 of a task under one contact model; implements `estimators.Objective`.
+
+    Attributes:
+        simulator: the compiled programs, shared by all contact models of a sweep.
+        contact: the contact model.
+        sigma: standard deviation of the noise, in the control's unit.
+    """
+
+    simulator: Simulator
+    contact: ContactModel
+    sigma: float
+
+    @property
+    def num_params(self) -> int:
+        """Length of theta."""
+        return self.simulator.task.policy.num_params
+
+    def evaluate(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> Evaluation:
+        """Values and scores by rollouts alone; the dynamics are not differentiated.
+
+        The baseline, the zero-noise rollout from the same start, rides along as samples whose noise is scaled by 0: one
+        for all where the start is fixed, otherwise one each.
+        """
+        samples = len(keys)
+        silent = keys if self.simulator.task.random_start else keys[:1]
+        scale = np.concatenate([np.ones(samples), np.zeros(len(silent))])
+        values, scores, residuals = self._values(theta, jnp.concatenate([keys, silent]), scale)
+        baseline = np.broadcast_to(values[samples:], samples)
+        return Evaluation(*map(jnp.asarray, (values[:samples], scores[:samples], baseline, residuals[:samples])))
+
+    def evaluate_odd(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> Evaluation:
+        """The part of the objective that is odd in the noise, (f(w) - f(-w)) / 2, by two rollouts per sample.
+
+        Only the odd part correlates with an open loop's score, so it has the same gradient; the even part, most of the
+        variance of a zeroth-order sample, is gone.
+
+        Raises:
+            ValueError: the policy has feedback; then the score is not odd in the noise.
+        """
+        if not isinstance(self.simulator.task.policy, OpenLoop):
+            raise ValueError("the odd part of an objective needs an open-loop policy")
+        samples = len(keys)
+        scale = np.repeat([1.0, -1.0], samples)
+        values, scores, residuals = self._values(theta, jnp.concatenate([keys, keys]), scale)
+        odd = (values[:samples] - values[samples:]) / 2
+        residual = np.maximum(residuals[:samples], residuals[samples:])
+        return Evaluation(*map(jnp.asarray, (odd, scores[:samples], np.zeros_like(odd), residual)))
+
+    def differentiate(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> Differentiation:
+        """Values and exact gradients of each sample's cost with respect to theta."""
+        return Differentiation(*map(jnp.asarray, self.simulator.run_gradients(theta, self.contact, self.sigma, keys)))
+
+    def _values(self, theta, keys, noise_scale):
+        scale = noise_scale.astype(self.simulator.task.scene.template.qpos.dtype)
+        return self.simulator.run_values(theta, self.contact, self.sigma, keys, scale)
+
+
+def chunk_for(samples: int, devices: int, most: int = MAX_CHUNK) -> int:
+    """The chunk size that runs `samples` and their baseline in the fewest, evenly filled calls."""
+    per_device = math.ceil((samples + 1) / devices)
+    return math.ceil(per_device / math.ceil(per_device / most))

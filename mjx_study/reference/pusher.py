@@ -1,0 +1,83 @@
+r"""The pusher in closed form: two point masses and a one-sided spring, semi-implicit Euler.
+
+    f = K max(0, distance - (x_2 - x_1)),   v' = damping v + (h / m) (u - f, f),   x' = x + h v'
+
+Reference: Suh et al. 2022, "Pushing with stiff contact", with its published example's numbers.
+"""
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Float
+
+
+@dataclasses.dataclass(frozen=True)
+class Pusher:
+    """State (x1, x2, v1, v2) [m, m/s], control: the force on the first mass [N].
+
+    Attributes:
+        stiffness: K of the contact spring [N/m].
+        timestep: h [s].
+        mass: of each body [kg].
+        damping: factor on the velocities per step.
+        distance: of the centres at first touch [m].
+        goal: state that the cost pulls to.
+        state_weight: diagonal of Q.
+        control_weight: R [1/N^2].
+    """
+
+    stiffness: float
+    timestep: float = 0.005
+    mass: float = 0.1
+    damping: float = 0.99
+    distance: float = 1.0
+    goal: tuple[float, ...] = (1.0, 2.0, 0.0, 0.0)
+    state_weight: tuple[float, ...] = (0.1, 10.0, 0.1, 0.1)
+    control_weight: float = 1.0
+    num_states: int = 4
+    num_controls: int = 1
+
+    def step(
+        self, state: Float[np.ndarray, "*batch 4"], control: Float[np.ndarray, "*batch 1"]
+    ) -> Float[np.ndarray, "*batch 4"]:
+        """The state after one timestep."""
+        position, velocity = state[..., :2], state[..., 2:]
+        penetration = self.distance - (position[..., 1] - position[..., 0])
+        spring = self.stiffness * np.maximum(penetration, 0.0)
+        force = np.stack([control[..., 0] - spring, spring], axis=-1)
+        velocity = self.damping * velocity + self.timestep / self.mass * force
+        return np.concatenate([position + self.timestep * velocity, velocity], axis=-1)
+
+    def jacobians(
+        self, state: Float[np.ndarray, "*batch 4"], control: Float[np.ndarray, "*batch 1"]
+    ) -> tuple[Float[np.ndarray, "*batch 4 4"], Float[np.ndarray, "*batch 4 1"]]:
+        """Derivatives of `step`; at first touch the spring counts as slack."""
+        h, gain = self.timestep, self.timestep / self.mass
+        touching = (state[..., 1] - state[..., 0]) < self.distance
+        spring = gain * self.stiffness * np.array([[-1.0, 1.0], [1.0, -1.0]]) * touching[..., None, None]
+        over_velocity = np.broadcast_to(self.damping * np.eye(2), spring.shape)
+        velocity_rows = np.concatenate([spring, over_velocity], axis=-1)
+        identity = np.broadcast_to(np.eye(2, 4), velocity_rows.shape)
+        over_state = np.concatenate([identity + h * velocity_rows, velocity_rows], axis=-2)
+        over_control = np.array([h * gain, 0.0, gain, 0.0])[:, None]
+        return over_state, np.broadcast_to(over_control, (*state.shape, 1))
+
+    def cost(
+        self, state: Float[np.ndarray, "*batch 4"], control: Float[np.ndarray, "*batch 1"]
+    ) -> Float[np.ndarray, "*batch"]:
+        """e^T Q e + R u^2 with e = x - goal."""
+        return self.final_cost(state) + self.control_weight * np.sum(control**2, axis=-1)
+
+    def cost_gradients(
+        self, state: Float[np.ndarray, "*batch 4"], control: Float[np.ndarray, "*batch 1"]
+    ) -> tuple[Float[np.ndarray, "*batch 4"], Float[np.ndarray, "*batch 1"]]:
+        """2 Q e and 2 R u."""
+        return self.final_gradient(state), 2 * self.control_weight * control
+
+    def final_cost(self, state: Float[np.ndarray, "*batch 4"]) -> Float[np.ndarray, "*batch"]:
+        """e^T Q e."""
+        return np.sum(np.array(self.state_weight) * (state - np.array(self.goal)) ** 2, axis=-1)
+
+    def final_gradient(self, state: Float[np.ndarray, "*batch 4"]) -> Float[np.ndarray, "*batch 4"]:
+        """2 Q e."""
+        return 2 * np.array(self.state_weight) * (state - np.array(self.goal))

@@ -1,0 +1,46 @@
+"""What an analytic system must provide: a step, a cost, and their derivatives by hand."""
+
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float
+
+
+@runtime_checkable
+class System(Protocol):
+    """x' = step(x, u) with cost c(x, u) per step and a final cost; leading axes are a batch."""
+
+    num_states: int
+    num_controls: int
+
+    def step(
+        self, state: Float[np.ndarray, "*batch states"], control: Float[np.ndarray, "*batch controls"]
+    ) -> Float[np.ndarray, "*batch states"]:
+        """The state after one timestep."""
+        ...
+
+    def jacobians(
+        self, state: Float[np.ndarray, "*batch states"], control: Float[np.ndarray, "*batch controls"]
+    ) -> tuple[Float[np.ndarray, "*batch states states"], Float[np.ndarray, "*batch states controls"]]:
+        """Derivatives of `step` with respect to state and control."""
+        ...
+
+    def cost(
+        self, state: Float[np.ndarray, "*batch states"], control: Float[np.ndarray, "*batch controls"]
+    ) -> Float[np.ndarray, "*batch"]:
+        """Running cost."""
+        ...
+
+    def cost_gradients(
+        self, state: Float[np.ndarray, "*batch states"], control: Float[np.ndarray, "*batch controls"]
+    ) -> tuple[Float[np.ndarray, "*batch states"], Float[np.ndarray, "*batch controls"]]:
+        """Derivatives of `cost` with respect to state and control."""
+        ...
+
+    def final_cost(self, state: Float[np.ndarray, "*batch states"]) -> Float[np.ndarray, "*batch"]:
+        """Cost of the last state."""
+        ...
+
+    def final_gradient(self, state: Float[np.ndarray, "*batch states"]) -> Float[np.ndarray, "*batch states"]:
+        """Derivative of `final_cost`."""
+        ...

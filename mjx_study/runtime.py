@@ -1,0 +1,81 @@
+"""Settings of the process: precision, devices, compilation cache. Called explicitly, never at import."""
+
+import hashlib
+import os
+import platform
+from collections.abc import Sequence
+from importlib import metadata
+from pathlib import Path
+from typing import Final
+
+import jax
+
+PRECISIONS: Final = ("float64", "float32")
+
+
+def configure(*, precision: str = "float64", cpu_devices: int | None = None, cache: str | Path | None = None) -> None:
+    """Set JAX up for a study; call it before the first array is made.
+
+    Args:
+        precision: float64 or float32. Stiff contact needs float64: two equal float32 programs of one stiff rollout
+            differ in the second digit.
+        cpu_devices: CPU devices that JAX shows, so that samples use as many cores; None for one per core.
+        cache: folder of compiled programs that are kept between runs; None for `default_cache()`.
+
+    Raises:
+        ValueError: unknown precision, or fewer than one device.
+    """
+    if precision not in PRECISIONS:
+        raise ValueError(f"unknown precision {precision!r}; choose from {', '.join(PRECISIONS)}")
+    devices = available_cores() if cpu_devices is None else cpu_devices
+    if devices < 1:
+        raise ValueError(f"cpu_devices must be at least 1, got {devices}")
+    jax.config.update("jax_enable_x64", precision == "float64")
+    jax.config.update("jax_num_cpu_devices", devices)
+    jax.config.update("jax_compilation_cache_dir", str(default_cache() if cache is None else cache))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
+
+
+def available_cores() -> int:
+    """Cores this process may run on."""
+    affinity = getattr(os, "sched_getaffinity", None)
+    return len(affinity(0)) if affinity else os.cpu_count() or 1
+
+
+def default_cache() -> Path:
+    """Compiled programs of this kind of machine: `$XDG_CACHE_HOME/mjx-study/<processor>`.
+
+    A program compiled for one processor may use instructions that another lacks, so each has its own folder.
+    """
+    root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    return root / "mjx-study" / hashlib.sha256(_processor().encode()).hexdigest()[:12]
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor() or platform.machine()
+    kept = {line for line in lines if line.startswith(("model name", "flags", "Features", "CPU part"))}
+    return "\n".join(sorted(kept)) + platform.machine()
+
+
+def processor_name() -> str:
+    """The processor's name as the operating system gives it."""
+    names = [line.split(":", 1)[1].strip() for line in _processor().splitlines() if line.startswith("model name")]
+    return names[0] if names else platform.machine()
+
+
+def environment() -> dict[str, str | int | Sequence[str]]:
+    """What a result depends on besides its configuration: versions, machine, devices, precision."""
+    names = ("mjx-study", "mujoco", "mujoco-mjx", "jax", "jaxlib", "numpy")
+    return {
+        "versions": {name: metadata.version(name) for name in names},  # type: ignore[dict-item]
+        "python": platform.python_version(),
+        "processor": processor_name(),
+        "cores": available_cores(),
+        "devices": [str(device) for device in jax.local_devices()],
+        "backend": jax.default_backend(),
+        "precision": "float64" if jax.config.read("jax_enable_x64") else "float32",
+    }

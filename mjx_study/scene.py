@@ -1,0 +1,159 @@
+"""A scene: one MJCF, compiled by MuJoCo and put on the device for MJX."""
+
+import dataclasses
+from collections.abc import Mapping
+from importlib import resources
+from pathlib import Path
+from typing import Any, Final
+
+import jax
+import mujoco
+import numpy as np
+
+from mjx_study._mjx import mjx
+
+CONES: Final = {"pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL, "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC}
+SOLVERS: Final = {"newton": mujoco.mjtSolver.mjSOL_NEWTON, "cg": mujoco.mjtSolver.mjSOL_CG}
+INTEGRATORS: Final = {
+    "euler": mujoco.mjtIntegrator.mjINT_EULER,
+    "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
+    "rk4": mujoco.mjtIntegrator.mjINT_RK4,
+}
+_ENUMERATED: Final = {"cone": CONES, "solver": SOLVERS, "integrator": INTEGRATORS}
+_POSITIVE: Final = ("timestep", "iterations", "ls_iterations", "tolerance")
+
+
+class SceneError(ValueError):
+    """An MJCF that cannot be found, compiled, or run by MJX."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Scene:
+    """A compiled model on the host and on the device, with an empty `mjx.Data` as template for each step.
+
+    What is static in MJX (cone, solver, integrator, budgets) is fixed here; contact parameters are array leaves
+    of `model` and are swept without recompiling (see `mjx_study.contact`).
+    """
+
+    name: str
+    host: mujoco.MjModel
+    model: mjx.Model
+    template: mjx.Data
+
+    @property
+    def timestep(self) -> float:
+        """Time per step [s]."""
+        return float(self.host.opt.timestep)
+
+    @property
+    def has_constraints(self) -> bool:
+        """Whether MJX allocates any constraint row (contact, limit, equality or friction loss)."""
+        return num_constraint_rows(self.template) > 0
+
+    def geom(self, name: str) -> int:
+        """Index of a geom by name. Raises SceneError, listing the choices, for an unknown name."""
+        return self._index(mujoco.mjtObj.mjOBJ_GEOM, "geom", name, self.host.ngeom)
+
+    def joint(self, name: str) -> int:
+        """Index of a joint by name. Raises SceneError, listing the choices, for an unknown name."""
+        return self._index(mujoco.mjtObj.mjOBJ_JOINT, "joint", name, self.host.njnt)
+
+    def _index(self, kind: mujoco.mjtObj, noun: str, name: str, count: int) -> int:
+        index = mujoco.mj_name2id(self.host, kind, name)
+        if index < 0:
+            names = [mujoco.mj_id2name(self.host, kind, i) for i in range(count)]
+            raise SceneError(f"{self.name} has no {noun} {name!r}; it has {', '.join(map(str, names)) or 'none'}")
+        return index
+
+
+def num_constraint_rows(data: mjx.Data) -> int:
+    """Constraint rows that MJX allocates, active or not; static."""
+    rows: Any = data._impl
+    return rows.efc_J.shape[0]
+
+
+def models_folder() -> Path:
+    """Folder of the MJCF files that ship with the package (beside it in a checkout)."""
+    package = Path(str(resources.files("mjx_study")))
+    packaged = package / "models"
+    return packaged if packaged.is_dir() else package.parent / "models"
+
+
+def model_names() -> list[str]:
+    """Names of the MJCF files that ship with the package."""
+    return sorted(path.stem for path in models_folder().glob("*.xml"))
+
+
+def load_scene(source: str | Path, **options: str | float) -> Scene:
+    """Compile an MJCF and put it on the device.
+
+    Args:
+        source: the name of a shipped model (`"pusher"`) or the path of an MJCF file.
+        **options: replace what the file says: `cone` (pyramidal, elliptic), `solver` (newton, cg), `integrator`
+            (euler, implicitfast, rk4), `timestep` [s], `iterations`, `ls_iterations`, `tolerance`.
+
+    Raises:
+        SceneError: the file is missing or does not parse, an option is unknown or out of range, or MJX cannot
+            run the model; the message says which.
+    """
+    path = _find(source)
+    try:
+        host = mujoco.MjModel.from_xml_path(str(path))
+    except ValueError as error:
+        raise SceneError(f"{path} is not a valid MJCF: {' '.join(str(error).split())}") from error
+    _set_options(host, options)
+    return put_scene(host, path.stem)
+
+
+def put_scene(host: mujoco.MjModel, name: str) -> Scene:
+    """Put a compiled model on the device; raises SceneError where MJX cannot run it."""
+    _refuse_unsupported(host, name)
+    try:
+        model = mjx.put_model(host)
+        template = mjx.make_data(host)
+    except (NotImplementedError, ValueError, AssertionError) as error:
+        reason = str(error) or type(error).__name__
+        raise SceneError(f"MJX cannot run {name}: {reason}") from error
+    # `make_data` on a shared host leaves weakly typed leaves; fix their types once so that loops carry them.
+    template = jax.tree.map(lambda leaf: leaf if isinstance(leaf, np.ndarray) else jax.numpy.asarray(leaf), template)
+    scene = Scene(name, host, model, template)
+    if host.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4 and scene.has_constraints:
+        raise SceneError(
+            f"{name} combines RK4 with contacts, limits, equalities or friction loss: RK4's stages would solve the "
+            "constraints four times per step without an order to gain; use euler or implicitfast"
+        )
+    return scene
+
+
+def _find(source: str | Path) -> Path:
+    path = Path(source)
+    if path.suffix.lower() == ".xml":
+        if not path.is_file():
+            raise SceneError(f"no MJCF file at {path}")
+        return path
+    shipped = models_folder() / f"{source}.xml"
+    if not shipped.is_file():
+        raise SceneError(f"no model named {source!r}; there are {', '.join(model_names())}, or give a path to an .xml")
+    return shipped
+
+
+def _set_options(host: mujoco.MjModel, options: Mapping[str, str | float]) -> None:
+    for name, value in options.items():
+        if name in _ENUMERATED:
+            choices = _ENUMERATED[name]
+            if value not in choices:
+                raise SceneError(f"unknown {name} {value!r}; choose from {', '.join(choices)}")
+            setattr(host.opt, name, choices[str(value)])
+        elif name in _POSITIVE:
+            if not float(value) > 0:
+                raise SceneError(f"{name} must be positive, got {value}")
+            setattr(host.opt, name, type(getattr(host.opt, name))(value))
+        else:
+            raise SceneError(f"unknown option {name!r}; choose from {', '.join([*_ENUMERATED, *_POSITIVE])}")
+
+
+def _refuse_unsupported(host: mujoco.MjModel, name: str) -> None:
+    for option, choices in _ENUMERATED.items():
+        value = int(getattr(host.opt, option))
+        if value not in {int(choice) for choice in choices.values()}:
+            raise SceneError(f"{name} asks for a {option} that MJX lacks; use one of {', '.join(choices)}")

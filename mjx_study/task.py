@@ -1,0 +1,76 @@
+"""A task: a scene, where it starts, a policy, its noise, and a cost."""
+
+import dataclasses
+from collections.abc import Callable
+
+import jax
+from jaxtyping import Array, Float, Key
+
+from mjx_study.contact import effective_mass
+from mjx_study.dynamics import State
+from mjx_study.policy import Policy
+from mjx_study.scene import Scene
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Task:
+    """Everything that defines F(theta) = E V_1 except the contact model.
+
+    Attributes:
+        name: as the command line takes it.
+        description: one line.
+        scene: the compiled model.
+        horizon: number of steps H.
+        policy: maps theta and state to the control.
+        theta: where gradients are taken unless told otherwise, (params,).
+        sigma: standard deviation of the Gaussian noise on each control, in the control's unit.
+        start: the start state, or a distribution over start states as a function of a key.
+        running_cost: c(state, control) of each step before it is taken.
+        final_cost: c(state) after the last step.
+        contact_pair: names of the two geoms whose contact is swept.
+        gamma: AoBG's accuracy bound, in the unit of the gradient.
+    """
+
+    name: str
+    description: str
+    scene: Scene
+    horizon: int
+    policy: Policy
+    theta: Float[Array, " params"]
+    sigma: float
+    start: State | Callable[[Key[Array, ""]], State]
+    running_cost: Callable[[State, Float[Array, " nu"]], Float[Array, ""]]
+    final_cost: Callable[[State], Float[Array, ""]]
+    contact_pair: tuple[str, str]
+    gamma: float
+
+    def __post_init__(self) -> None:
+        if self.horizon < 1:
+            raise ValueError(f"horizon must be at least 1 step, got {self.horizon}")
+        check_sigma(self.sigma)
+        if self.theta.shape != (self.policy.num_params,):
+            raise ValueError(f"theta has shape {self.theta.shape}, the policy needs ({self.policy.num_params},)")
+
+    @property
+    def random_start(self) -> bool:
+        """Whether the start is drawn per sample."""
+        return not isinstance(self.start, State)
+
+    @property
+    def effective_mass(self) -> float:
+        """Of the swept contact along its normal [kg]."""
+        return effective_mass(self.scene, *self.contact_pair)
+
+    def draw_start(self, key: Key[Array, ""]) -> State:
+        """The start state of one sample."""
+        return self.start if isinstance(self.start, State) else self.start(key)
+
+    def replace(self, **changes) -> "Task":
+        """A copy with some attributes changed."""
+        return dataclasses.replace(self, **changes)
+
+
+def check_sigma(sigma: float) -> None:
+    """Raises ValueError unless sigma is positive and finite."""
+    if not (sigma > 0 and jax.numpy.isfinite(sigma)):
+        raise ValueError(f"sigma must be positive and finite, in the unit of the control; got {sigma}")

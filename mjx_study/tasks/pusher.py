@@ -1,0 +1,63 @@
+"""Pushing through stiff contact: an open-loop force on the first of two bodies that touch.
+
+The numbers are those of Suh et al. 2022 and its published example: two bodies of 0.1 kg, 5 ms, velocity factor 0.99
+per step, 200 forces; only the contact model varies. At K = 10 N/m first-order gradients win, from about 1000 N/m on
+they lose.
+"""
+
+from pathlib import Path
+from typing import Final
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from mjx_study.dynamics import State, initial_state
+from mjx_study.policy import OpenLoop
+from mjx_study.scene import load_scene
+from mjx_study.task import Task
+
+HORIZON: Final = 200
+START: Final = (0.0, 1.0)  # positions [m]: touching, at rest
+GOAL: Final = (1.0, 2.0, 0.0, 0.0)  # positions [m], velocities [m/s]
+STATE_WEIGHT: Final = (0.1, 10.0, 0.1, 0.1)
+CONTROL_WEIGHT: Final = 1.0  # [1/N^2]
+FORCE: Final = 0.1  # [N] at every step
+SIGMA: Final = 0.1  # [N]
+GAMMA: Final = 1e8
+
+
+def pusher(*, horizon: int = HORIZON, model: str | Path = "pusher", **scene_options: str | float) -> Task:
+    """sum_h e_h^T Q e_h + R u_h^2 + e_{H+1}^T Q e_{H+1}, e the state minus the goal.
+
+    Args:
+        horizon: number of 5 ms steps.
+        model: another MJCF in its place, with two slide joints and the geoms `pusher` and `slider`.
+        **scene_options: see `load_scene`.
+    """
+    scene = load_scene(model, **scene_options)
+    for joint in ("pusher", "slider"):
+        scene.joint(joint)
+    weight, goal = np.array(STATE_WEIGHT), np.array(GOAL)
+
+    def state_cost(state: State) -> Float[Array, ""]:
+        error = jnp.concatenate([state.qpos, state.qvel]) - goal.astype(state.qpos.dtype)
+        return jnp.sum(weight.astype(error.dtype) * error**2)
+
+    def running_cost(state: State, control: Float[Array, " nu"]) -> Float[Array, ""]:
+        return state_cost(state) + CONTROL_WEIGHT * jnp.sum(control**2)
+
+    return Task(
+        name="pusher",
+        description="push a body through stiff contact; 200 open-loop forces",
+        scene=scene,
+        horizon=horizon,
+        policy=OpenLoop(horizon, scene.host.nu),
+        theta=jnp.full(horizon * scene.host.nu, FORCE, scene.template.qpos.dtype),
+        sigma=SIGMA,
+        start=initial_state(scene, qpos=jnp.array(START)),
+        running_cost=running_cost,
+        final_cost=state_cost,
+        contact_pair=("pusher", "slider"),
+        gamma=GAMMA,
+    )
