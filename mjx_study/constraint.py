@@ -13,7 +13,7 @@ solve has converged, so `residual` measures that and every result carries it.
 MJX's constraint rows are private (`Data._impl.efc_*`); their content is read here only.
 """
 
-from typing import Any
+from typing import Any, Final
 
 import jax
 import jax.numpy as jnp
@@ -25,6 +25,10 @@ from mjx_study._mjx import mjx
 from mjx_study.scene import num_constraint_rows
 
 _ELLIPTIC = mujoco.mjtCone.mjCONE_ELLIPTIC
+
+SMALL: Final = 6
+"""Most degrees of freedom for which linear systems are unrolled and the solver's warm start is improved."""
+PREDICTOR_STEPS: Final = 2
 
 
 def row_force(model: mjx.Model, data: mjx.Data, slack: Float[Array, " rows"]) -> Float[Array, " rows"]:
@@ -121,10 +125,22 @@ def residual(model: mjx.Model, data: mjx.Data, qacc: Float[Array, " nv"]) -> Flo
 
 
 def run_solver(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]:
-    """MJX's own converged solve; the constrained acceleration [m/s^2 or rad/s^2], without a reverse mode."""
+    """MJX's own converged solve; the constrained acceleration [m/s^2 or rad/s^2], without a reverse mode.
+
+    Where Newton steps are cheap, `PREDICTOR_STEPS` of them improve the warm start. MJX keeps it only if its cost is
+    below that of the unconstrained start, and its loop then does what is left, mostly nothing: twice the speed.
+    """
     if num_constraint_rows(data) == 0:
         return data.qacc_smooth
+    if model.nv <= SMALL:
+        for _ in range(PREDICTOR_STEPS):
+            data = data.replace(qacc_warmstart=_newton_step(model, data, data.qacc_warmstart))
     return mjx.solve(model, data).qacc
+
+
+def _newton_step(model: mjx.Model, data: mjx.Data, qacc: Float[Array, " nv"]) -> Float[Array, " nv"]:
+    gap, linear_map = jax.linearize(lambda x: imbalance(model, data, x), qacc)
+    return qacc - solve_positive_definite(jax.vmap(linear_map)(jnp.eye(model.nv, dtype=qacc.dtype)), gap)
 
 
 def solve(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]:
@@ -141,7 +157,7 @@ def solve(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]:
         return data.qacc_smooth
 
     def tangent_solve(linear_map, right_side):
-        return solve_positive_definite(jax.vmap(linear_map)(jnp.eye(model.nv)), right_side)
+        return solve_positive_definite(jax.vmap(linear_map)(jnp.eye(model.nv, dtype=right_side.dtype)), right_side)
 
     return jax.lax.custom_root(
         f=lambda qacc: imbalance(model, data, qacc),
@@ -154,5 +170,21 @@ def solve(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]:
 def solve_positive_definite(
     matrix: Float[Array, "nv nv"], right_side: Float[Array, "nv ..."]
 ) -> Float[Array, "nv ..."]:
-    """Solve with a symmetric positive definite matrix by Cholesky."""
-    return jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(matrix), right_side)
+    """Solve with a symmetric positive definite matrix by Cholesky.
+
+    Small systems are unrolled: under `vmap` their entries are whole batches, which a library would take one by one.
+    """
+    size = matrix.shape[0]
+    if size > SMALL:
+        return jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(matrix), right_side)
+    lower: dict[tuple[int, int], Array] = {}
+    for j in range(size):
+        lower[j, j] = jnp.sqrt(matrix[j, j] - sum(lower[j, k] ** 2 for k in range(j)))
+        for i in range(j + 1, size):
+            lower[i, j] = (matrix[i, j] - sum(lower[i, k] * lower[j, k] for k in range(j))) / lower[j, j]
+    solution = list(right_side)
+    for i in range(size):
+        solution[i] = (solution[i] - sum(lower[i, k] * solution[k] for k in range(i))) / lower[i, i]
+    for i in reversed(range(size)):
+        solution[i] = (solution[i] - sum(lower[k, i] * solution[k] for k in range(i + 1, size))) / lower[i, i]
+    return jnp.stack(solution)

@@ -290,7 +290,7 @@ def apply_contact(model: mjx.Model, contact: ContactModel) -> mjx.Model:
         pair = jnp.stack([sliding, sliding, torsional, rolling, rolling])
         changes["pair_friction"] = fill(model.pair_friction, pair)
     if contact.margin is not None:
-        changes["geom_margin"] = fill(model.geom_margin, contact.margin)
+        changes["geom_margin"] = fill(model.geom_margin, contact.margin / 2)  # MuJoCo adds the margins of two geoms
         changes["pair_margin"] = fill(model.pair_margin, contact.margin)
     return model.replace(**changes)
 

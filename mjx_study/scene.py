@@ -1,6 +1,7 @@
 """A scene: one MJCF, compiled by MuJoCo and put on the device for MJX."""
 
 import dataclasses
+import math
 from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
@@ -84,7 +85,7 @@ def model_names() -> list[str]:
     return sorted(path.stem for path in models_folder().glob("*.xml"))
 
 
-def load_scene(source: str | Path, **options: str | float) -> Scene:
+def load_scene(source: str | Path, **options: str | float | int) -> Scene:
     """Compile an MJCF and put it on the device.
 
     Args:
@@ -137,7 +138,7 @@ def _find(source: str | Path) -> Path:
     return shipped
 
 
-def _set_options(host: mujoco.MjModel, options: Mapping[str, str | float]) -> None:
+def _set_options(host: mujoco.MjModel, options: Mapping[str, str | float | int]) -> None:
     for name, value in options.items():
         if name in _ENUMERATED:
             choices = _ENUMERATED[name]
@@ -145,9 +146,11 @@ def _set_options(host: mujoco.MjModel, options: Mapping[str, str | float]) -> No
                 raise SceneError(f"unknown {name} {value!r}; choose from {', '.join(choices)}")
             setattr(host.opt, name, choices[str(value)])
         elif name in _POSITIVE:
-            if not float(value) > 0:
-                raise SceneError(f"{name} must be positive, got {value}")
-            setattr(host.opt, name, type(getattr(host.opt, name))(value))
+            number_type = type(getattr(host.opt, name))
+            if isinstance(value, str) or not (0 < value < math.inf and number_type(value) == value):
+                whole = "whole " if number_type is int else ""
+                raise SceneError(f"{name} must be a positive {whole}number, got {value!r}")
+            setattr(host.opt, name, number_type(value))
         else:
             raise SceneError(f"unknown option {name!r}; choose from {', '.join([*_ENUMERATED, *_POSITIVE])}")
 
@@ -156,4 +159,4 @@ def _refuse_unsupported(host: mujoco.MjModel, name: str) -> None:
     for option, choices in _ENUMERATED.items():
         value = int(getattr(host.opt, option))
         if value not in {int(choice) for choice in choices.values()}:
-            raise SceneError(f"{name} asks for a {option} that MJX lacks; use one of {', '.join(choices)}")
+            raise SceneError(f"MJX lacks the {option} that {name} asks for; use one of {', '.join(choices)}")
