@@ -8,6 +8,7 @@ solver's loop on its own, in chunks of fixed size that bound memory.
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from typing import Any, Final
 
 import jax
@@ -23,8 +24,35 @@ from mjx_study.noise import split_sample_key, standard_noise
 from mjx_study.policy import OpenLoop
 from mjx_study.task import Task, check_sigma
 
-MAX_CHUNK: Final = 512
-"""Most samples per device in one call: on a CPU larger batches gain no speed, and this bounds memory."""
+MAX_CHUNK: Final = {"cpu": 512, "gpu": 32768, "tpu": 32768}
+"""Most samples per device in one call, by backend: a CPU gains nothing from larger batches, an accelerator needs them;
+and this bounds memory (about 40 kB for each gradient of 200 steps of a two-joint model)."""
+
+
+def rollout_cost(
+    task: Task,
+    theta: Float[Array, " params"],
+    contact: ContactModel,
+    start: State,
+    noise: Float[Array, "horizon nu"],
+) -> tuple[Float[Array, ""], tuple[State, Float[Array, "horizon nu"], Float[Array, ""]]]:
+    """Total cost V_1 of one rollout, a pure function of everything that may be traced or differentiated.
+
+    Returns:
+        The cost; and the states before each step, the controls, and the largest relative solver residual.
+    """
+    feedforward = task.policy.feedforward(theta) + noise
+
+    def control_law(index, state):
+        feedback = task.policy.feedback(theta, state)
+        return feedforward[index] if feedback is None else feedforward[index] + feedback
+
+    model = apply_contact(task.scene.model, contact)
+    states, controls, residuals = rollout(task.scene, model, start, control_law, task.horizon)
+    before = jax.tree.map(lambda leaf: leaf[:-1], states)
+    last = jax.tree.map(lambda leaf: leaf[-1], states)
+    cost = jnp.sum(jax.vmap(task.running_cost)(before, controls)) + task.final_cost(last)
+    return cost, (before, controls, jnp.max(residuals))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -33,12 +61,12 @@ class Simulator:
 
     Attributes:
         task: what is simulated; its scene's contact parameters are replaced by those of each call.
-        chunk_size: samples per device and call.
+        chunk_size: samples per device and call; `chunk_for` chooses one.
         devices: where samples are spread; by default all local devices.
     """
 
     task: Task
-    chunk_size: int = MAX_CHUNK
+    chunk_size: int
     devices: tuple[Any, ...] = ()
 
     def __post_init__(self) -> None:
@@ -57,6 +85,15 @@ class Simulator:
     def num_compilations(self) -> int:
         """How many programs this simulator has compiled so far."""
         return sum(program._cache_size() for program in (self._values, self._gradients))  # type: ignore[attr-defined]
+
+    def gradient_memory(self, contact: ContactModel, samples: int) -> int:
+        """Temporary memory of the gradients of a batch, all chunks at once on all devices [bytes], as XLA plans it."""
+        capacity = self.chunk_size * len(self.devices)
+        dtype = self.task.scene.template.qpos.dtype
+        keys = np.asarray(jax.random.key_data(jax.random.split(jax.random.key(0), capacity)))
+        arguments = (self.task.theta, contact, np.asarray(1.0, dtype), keys, np.ones(capacity, dtype))
+        plan = self._gradients.lower(*arguments).compile().memory_analysis()  # type: ignore[attr-defined]
+        return plan.temp_size_in_bytes * len(self.devices) * samples // capacity
 
     def _compile(self, program, devices: tuple[Any, ...]):
         mesh = Mesh(np.array(devices), ("samples",))
@@ -78,18 +115,8 @@ class Simulator:
         start_key, noise_key = split_sample_key(jax.random.wrap_key_data(key_data))
         dtype = task.scene.template.qpos.dtype
         noise = noise_scale * sigma * standard_noise(noise_key, task.horizon, task.scene.host.nu, dtype)
-        feedforward = task.policy.feedforward(theta) + noise
-
-        def control_law(index, state):
-            feedback = task.policy.feedback(theta, state)
-            return feedforward[index] if feedback is None else feedforward[index] + feedback
-
-        model = apply_contact(task.scene.model, contact)
-        states, controls, residuals = rollout(task.scene, model, task.draw_start(start_key), control_law, task.horizon)
-        before = jax.tree.map(lambda leaf: leaf[:-1], states)
-        last = jax.tree.map(lambda leaf: leaf[-1], states)
-        cost = jnp.sum(jax.vmap(task.running_cost)(before, controls)) + task.final_cost(last)
-        return cost, (before, noise, jnp.max(residuals))
+        cost, (states, _, residual) = rollout_cost(task, theta, contact, task.draw_start(start_key), noise)
+        return cost, (states, noise, residual)
 
     def _sample_value(self, theta, contact, sigma, key_data, noise_scale):
         value, (states, noise, residual) = self._cost(theta, contact, sigma, key_data, noise_scale)
@@ -104,6 +131,10 @@ class Simulator:
     def _run(self, program, theta, contact, sigma, keys, noise_scale):
         """Call a program chunk by chunk; the last chunk is padded by repeating its last sample."""
         check_sigma(sigma)
+        if theta.shape != (self.task.policy.num_params,):
+            raise ValueError(f"theta has shape {theta.shape}, the policy needs ({self.task.policy.num_params},)")
+        if len(noise_scale) == 0:
+            raise ValueError("there is no sample to run: give at least one key")
         dtype = self.task.scene.template.qpos.dtype
         samples, capacity = len(noise_scale), self.chunk_size * len(self.devices)
         padded = np.minimum(np.arange(math.ceil(samples / capacity) * capacity), samples - 1)
@@ -114,16 +145,14 @@ class Simulator:
         host = jax.device_get(outputs)
         return [np.concatenate(leaves)[:samples] for leaves in zip(*host, strict=True)]
 
-    def run_values(self, theta, contact, sigma, keys, noise_scale):
-        """Values, scores and residuals of the samples that the keys name, their noise multiplied by `noise_scale`."""
-        keys = np.asarray(jax.random.key_data(keys))
-        return self._run(self._values, theta, contact, sigma, keys, noise_scale)  # type: ignore[attr-defined]
+    def run_values(self, theta, contact, sigma, key_data, noise_scale):
+        """Values, scores and residuals of samples, each with its key's data and a factor on its noise; NumPy arrays."""
+        return self._run(self._values, theta, contact, sigma, key_data, noise_scale)  # type: ignore[attr-defined]
 
-    def run_gradients(self, theta, contact, sigma, keys):
-        """Values, gradients and residuals of the samples that the keys name, as NumPy arrays."""
-        keys = np.asarray(jax.random.key_data(keys))
-        scale = np.ones(len(keys), self.task.scene.template.qpos.dtype)
-        return self._run(self._gradients, theta, contact, sigma, keys, scale)  # type: ignore[attr-defined]
+    def run_gradients(self, theta, contact, sigma, key_data):
+        """Values, gradients and residuals of samples, each with its key's data; NumPy arrays."""
+        scale = np.ones(len(key_data), self.task.scene.template.qpos.dtype)
+        return self._run(self._gradients, theta, contact, sigma, key_data, scale)  # type: ignore[attr-defined]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -152,9 +181,9 @@ class MjxObjective:
         for all where the start is fixed, otherwise one each.
         """
         samples = len(keys)
-        silent = keys if self.simulator.task.random_start else keys[:1]
+        silent = np.arange(samples if self.simulator.task.random_start else min(samples, 1))
         scale = np.concatenate([np.ones(samples), np.zeros(len(silent))])
-        values, scores, residuals = self._values(theta, jnp.concatenate([keys, silent]), scale)
+        values, scores, residuals = self._values(theta, keys, np.append(np.arange(samples), silent), scale)
         baseline = np.broadcast_to(values[samples:], samples)
         return Evaluation(*map(jnp.asarray, (values[:samples], scores[:samples], baseline, residuals[:samples])))
 
@@ -171,21 +200,25 @@ class MjxObjective:
             raise ValueError("the odd part of an objective needs an open-loop policy")
         samples = len(keys)
         scale = np.repeat([1.0, -1.0], samples)
-        values, scores, residuals = self._values(theta, jnp.concatenate([keys, keys]), scale)
+        values, scores, residuals = self._values(theta, keys, np.tile(np.arange(samples), 2), scale)
         odd = (values[:samples] - values[samples:]) / 2
         residual = np.maximum(residuals[:samples], residuals[samples:])
         return Evaluation(*map(jnp.asarray, (odd, scores[:samples], np.zeros_like(odd), residual)))
 
     def differentiate(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> Differentiation:
         """Values and exact gradients of each sample's cost with respect to theta."""
-        return Differentiation(*map(jnp.asarray, self.simulator.run_gradients(theta, self.contact, self.sigma, keys)))
+        key_data = np.asarray(jax.random.key_data(keys))
+        outputs = self.simulator.run_gradients(theta, self.contact, self.sigma, key_data)
+        return Differentiation(*map(jnp.asarray, outputs))
 
-    def _values(self, theta, keys, noise_scale):
+    def _values(self, theta, keys, rows, noise_scale):
+        # Rows of the bare key data: one noise is drawn on purpose for several rollouts, which is no reuse of a key.
+        key_data = np.asarray(jax.random.key_data(keys))[rows]
         scale = noise_scale.astype(self.simulator.task.scene.template.qpos.dtype)
-        return self.simulator.run_values(theta, self.contact, self.sigma, keys, scale)
+        return self.simulator.run_values(theta, self.contact, self.sigma, key_data, scale)
 
 
-def chunk_for(samples: int, devices: int, most: int = MAX_CHUNK) -> int:
-    """The chunk size that runs `samples` and their baseline in the fewest, evenly filled calls."""
-    per_device = math.ceil((samples + 1) / devices)
+def chunk_for(samples: int, devices: Sequence[Any]) -> int:
+    """The chunk size that runs `samples` and their baseline in the fewest, evenly filled calls on these devices."""
+    per_device, most = math.ceil((samples + 1) / len(devices)), MAX_CHUNK[devices[0].platform]
     return math.ceil(per_device / math.ceil(per_device / most))

@@ -3,18 +3,19 @@
 import hashlib
 import os
 import platform
-from collections.abc import Sequence
+import sys
 from importlib import metadata
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import jax
+import mujoco
 
 PRECISIONS: Final = ("float64", "float32")
 
 
 def configure(*, precision: str = "float64", cpu_devices: int | None = None, cache: str | Path | None = None) -> None:
-    """Set JAX up for a study; call it before the first array is made.
+    """Set JAX up for a study, and have MuJoCo's warnings on standard error; call it before the first array is made.
 
     Args:
         precision: float64 or float32. Stiff contact needs float64: two equal float32 programs of one stiff rollout
@@ -30,6 +31,7 @@ def configure(*, precision: str = "float64", cpu_devices: int | None = None, cac
     devices = available_cores() if cpu_devices is None else cpu_devices
     if devices < 1:
         raise ValueError(f"cpu_devices must be at least 1, got {devices}")
+    mujoco.set_mju_user_warning(lambda message: print(f"MuJoCo: {message}", file=sys.stderr))  # not a file in the cwd
     jax.config.update("jax_enable_x64", precision == "float64")
     jax.config.update("jax_num_cpu_devices", devices)
     jax.config.update("jax_compilation_cache_dir", str(default_cache() if cache is None else cache))
@@ -58,7 +60,7 @@ def _processor() -> str:
     except OSError:
         return platform.processor() or platform.machine()
     kept = {line for line in lines if line.startswith(("model name", "flags", "Features", "CPU part"))}
-    return "\n".join(sorted(kept)) + platform.machine()
+    return "\n".join([*sorted(kept), platform.machine()])
 
 
 def processor_name() -> str:
@@ -67,11 +69,11 @@ def processor_name() -> str:
     return names[0] if names else platform.machine()
 
 
-def environment() -> dict[str, str | int | Sequence[str]]:
+def environment() -> dict[str, Any]:
     """What a result depends on besides its configuration: versions, machine, devices, precision."""
     names = ("mjx-study", "mujoco", "mujoco-mjx", "jax", "jaxlib", "numpy")
     return {
-        "versions": {name: metadata.version(name) for name in names},  # type: ignore[dict-item]
+        "versions": {name: metadata.version(name) for name in names},
         "python": platform.python_version(),
         "processor": processor_name(),
         "cores": available_cores(),

@@ -9,6 +9,7 @@ from jaxtyping import Array, Float, Key
 from mjx_study.contact import effective_mass
 from mjx_study.dynamics import State
 from mjx_study.policy import Policy
+from mjx_study.reference import ReferenceObjective
 from mjx_study.scene import Scene
 
 
@@ -29,6 +30,8 @@ class Task:
         final_cost: c(state) after the last step.
         contact_pair: names of the two geoms whose contact is swept.
         gamma: AoBG's accuracy bound, in the unit of the gradient.
+        reference: the analytic system in place of the penalty family, as a function of the stiffness [N/m]; None where
+            there is none.
     """
 
     name: str
@@ -43,6 +46,7 @@ class Task:
     final_cost: Callable[[State], Float[Array, ""]]
     contact_pair: tuple[str, str]
     gamma: float
+    reference: Callable[[float], ReferenceObjective] | None = None
 
     def __post_init__(self) -> None:
         if self.horizon < 1:

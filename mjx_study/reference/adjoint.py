@@ -33,7 +33,7 @@ def roll_out(
         value = value + system.cost(state, controls[..., step, :])
         state = system.step(state, controls[..., step, :])
         states.append(state)
-    return Rollout(np.stack(states), value + system.final_cost(state))
+    return Rollout(np.stack(states), np.asarray(value + system.final_cost(state)))
 
 
 def value_and_gradient(

@@ -66,7 +66,7 @@ class Pusher:
         self, state: Float[np.ndarray, "*batch 4"], control: Float[np.ndarray, "*batch 1"]
     ) -> Float[np.ndarray, "*batch"]:
         """e^T Q e + R u^2 with e = x - goal."""
-        return self.final_cost(state) + self.control_weight * np.sum(control**2, axis=-1)
+        return np.asarray(self.final_cost(state) + self.control_weight * np.sum(control**2, axis=-1))
 
     def cost_gradients(
         self, state: Float[np.ndarray, "*batch 4"], control: Float[np.ndarray, "*batch 1"]
@@ -76,7 +76,7 @@ class Pusher:
 
     def final_cost(self, state: Float[np.ndarray, "*batch 4"]) -> Float[np.ndarray, "*batch"]:
         """e^T Q e."""
-        return np.sum(np.array(self.state_weight) * (state - np.array(self.goal)) ** 2, axis=-1)
+        return np.asarray(np.sum(np.array(self.state_weight) * (state - np.array(self.goal)) ** 2, axis=-1))
 
     def final_gradient(self, state: Float[np.ndarray, "*batch 4"]) -> Float[np.ndarray, "*batch 4"]:
         """2 Q e."""

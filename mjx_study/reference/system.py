@@ -10,8 +10,15 @@ from jaxtyping import Float
 class System(Protocol):
     """x' = step(x, u) with cost c(x, u) per step and a final cost; leading axes are a batch."""
 
-    num_states: int
-    num_controls: int
+    @property
+    def num_states(self) -> int:
+        """Length of the state."""
+        ...
+
+    @property
+    def num_controls(self) -> int:
+        """Length of the control."""
+        ...
 
     def step(
         self, state: Float[np.ndarray, "*batch states"], control: Float[np.ndarray, "*batch controls"]

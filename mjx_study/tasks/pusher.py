@@ -14,7 +14,8 @@ from jaxtyping import Array, Float
 
 from mjx_study.dynamics import State, initial_state
 from mjx_study.policy import OpenLoop
-from mjx_study.scene import load_scene
+from mjx_study.reference import Pusher, ReferenceObjective
+from mjx_study.scene import SceneError, load_scene
 from mjx_study.task import Task
 
 HORIZON: Final = 200
@@ -38,6 +39,9 @@ def pusher(*, horizon: int = HORIZON, model: str | Path = "pusher", **scene_opti
     scene = load_scene(model, **scene_options)
     for joint in ("pusher", "slider"):
         scene.joint(joint)
+    sizes = (scene.host.nq, scene.host.nv, scene.host.nu)
+    if sizes != (2, 2, 1):
+        raise SceneError(f"{scene.name} has nq, nv, nu = {sizes}; the pusher task needs two slide joints and one motor")
     weight, goal = np.array(STATE_WEIGHT), np.array(GOAL)
 
     def state_cost(state: State) -> Float[Array, ""]:
@@ -60,4 +64,7 @@ def pusher(*, horizon: int = HORIZON, model: str | Path = "pusher", **scene_opti
         final_cost=state_cost,
         contact_pair=("pusher", "slider"),
         gamma=GAMMA,
+        reference=lambda stiffness: ReferenceObjective(
+            Pusher(stiffness, timestep=scene.timestep), (*START, 0.0, 0.0), horizon, SIGMA
+        ),
     )

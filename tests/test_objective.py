@@ -1,0 +1,475 @@
+"""From a task and a contact model to an objective: batching, devices, scores, baselines, failures, memory.
+
+What does not depend on contact runs on a cart, a mass on a slide, which compiles in a third of the pusher's time.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from estimators import Differentiation, EstimatorOptions, Evaluation, Objective, estimate, first_order, zeroth_order
+from mjx_study import constraint, dynamics
+from mjx_study.contact import ContactModel, contact_model, family_model
+from mjx_study.dynamics import State, initial_state
+from mjx_study.objective import MAX_CHUNK, Simulator, chunk_for
+from mjx_study.policy import OpenLoop, Policy
+from mjx_study.scene import put_scene
+from mjx_study.task import Task
+from mjx_study.tasks import make_task
+from tests.estimators.statistics_helpers import assert_mean_is
+from tests.pusher_fixtures import (
+    HORIZON,
+    NO_NOISE,
+    SIGMA,
+    cost,
+    penalty,
+    pusher_simulator,
+    pusher_task,
+    sample_keys,
+)
+
+CART = """<mujoco model="cart">
+  <option timestep="0.01" integrator="Euler"><flag eulerdamp="disable"/></option>
+  <worldbody><body>
+    <joint name="x" type="slide" axis="1 0 0" damping="0.1"/><geom name="cart" size="0.1" mass="1"/>
+  </body></worldbody>
+  <actuator><motor joint="x"/></actuator>
+</mujoco>"""
+ANY_CONTACT = ContactModel(jnp.array([-1.0, -1.0]), jnp.array([0.9, 0.9, 0.001, 0.5, 2.0]))
+LIMIT = 0.25  # [N]; controls beyond it have no cost in the task that breaks
+
+
+def cart(running_cost=lambda state, control: jnp.sum(state.qpos**2) + jnp.sum(control**2), horizon: int = 5) -> Task:
+    scene = put_scene(mujoco.MjModel.from_xml_string(CART), "cart")
+    return Task(
+        name="cart",
+        description="a mass on a slide",
+        scene=scene,
+        horizon=horizon,
+        policy=OpenLoop(horizon, 1),
+        theta=jnp.linspace(0.0, 0.2, horizon),
+        sigma=0.1,
+        start=initial_state(scene, qpos=jnp.array([1.0])),
+        running_cost=running_cost,
+        final_cost=lambda state: jnp.sum(state.qvel**2),
+        contact_pair=("cart", "cart"),
+        gamma=1.0,
+    )
+
+
+@pytest.fixture
+def simulator() -> Simulator:
+    return pusher_simulator()
+
+
+@pytest.fixture(scope="module")
+def large() -> Simulator:
+    """Both devices together hold 1000 samples."""
+    return Simulator(pusher_task(), chunk_size=500)
+
+
+# Compilation, chunks, devices
+
+
+def test_a_sweep_compiles_each_program_once(simulator):
+    """13 stiffnesses, 2 families, and other theta and sigma."""
+    task, compiled = pusher_task(), []
+    for family in ("penalty", "impedance"):
+        for stiffness in np.geomspace(1.0, 4000.0, 13):
+            contact = family_model(family, task.scene, stiffness=float(stiffness), effective_mass=task.effective_mass)
+            objective = simulator.objective(contact, sigma=float(0.01 * stiffness))
+            values = objective.evaluate(task.theta * stiffness, sample_keys(2)).value
+            gradients = objective.differentiate(task.theta * stiffness, sample_keys(2)).gradient
+            compiled.append(simulator.num_compilations)
+            assert np.all(np.isfinite(values)) and np.all(np.isfinite(gradients))
+    assert set(compiled) == {2}
+
+
+def test_chunk_size_does_not_matter_in_contact(simulator, large):
+    """Other samples share a solver loop; at K = 10 rounding is not amplified."""
+    contact, theta = penalty(10.0), pusher_task().theta
+    small, big = (one.objective(contact).differentiate(theta, sample_keys(130)) for one in (simulator, large))
+    np.testing.assert_allclose(small.value, big.value, rtol=1e-12)
+    np.testing.assert_allclose(small.gradient, big.gradient, rtol=1e-12, atol=1e-12 * np.abs(big.gradient).max())
+
+
+@pytest.fixture(scope="module")
+def cart_evaluations() -> dict[tuple[int, int], Evaluation]:
+    """The same 7 samples by (chunk size, devices); 7 fits none of the chunks."""
+    task, results = cart(), {}
+    for chunk, devices in ((2, 2), (3, 2), (100, 2), (3, 1)):
+        simulator = Simulator(task, chunk, tuple(jax.local_devices()[:devices]))
+        results[chunk, devices] = simulator.objective(ANY_CONTACT).evaluate(task.theta, sample_keys(7))
+    return results
+
+
+def test_neither_chunks_nor_devices_matter(cart_evaluations):
+    assert len(jax.local_devices()) == 2
+    first, *others = cart_evaluations.values()
+    assert first.value.shape == (7,) and len(np.unique(first.value)) == 7
+    for other in others:
+        for field in ("value", "score", "baseline"):
+            np.testing.assert_allclose(getattr(other, field), getattr(first, field), rtol=1e-12)
+
+
+def test_cart_in_closed_form(cart_evaluations):
+    """Semi-implicit Euler by hand, with the noise that the scores hold."""
+    evaluation = cart_evaluations[3, 2]
+    for value, score in zip(evaluation.value, evaluation.score, strict=True):
+        position, velocity, total = 1.0, 0.0, 0.0
+        for control in np.linspace(0.0, 0.2, 5) + 0.1**2 * np.asarray(score):
+            total += position**2 + control**2
+            velocity += 0.01 * (control - 0.1 * velocity)
+            position += 0.01 * velocity
+        assert value == pytest.approx(total + velocity**2, rel=1e-13)
+
+
+def test_a_sample_depends_on_its_own_key_alone(simulator):
+    objective, theta = simulator.objective(penalty(10.0)), pusher_task().theta
+    order = np.random.default_rng(0).permutation(70)
+    straight = objective.evaluate(theta, sample_keys(70)), objective.differentiate(theta, sample_keys(70))
+    mixed = (
+        objective.evaluate(theta, sample_keys(70)[order]),
+        objective.differentiate(theta, sample_keys(70)[order]),
+    )
+    for one, other in zip(straight, mixed, strict=True):
+        np.testing.assert_allclose(other.value, one.value[order], rtol=1e-12)
+    np.testing.assert_array_equal(mixed[0].score, straight[0].score[order])
+    scale = np.abs(straight[1].gradient).max()
+    np.testing.assert_allclose(mixed[1].gradient, straight[1].gradient[order], rtol=1e-12, atol=1e-12 * scale)
+    alone = objective.evaluate(theta, sample_keys(70)[4:5])
+    np.testing.assert_allclose(alone.value[0], straight[0].value[4], rtol=1e-12)
+
+
+@pytest.mark.parametrize(("samples", "devices"), [(1, 2), (7, 2), (1000, 2), (1023, 1), (5000, 3)])
+def test_chunk_for_wastes_less_than_a_call_per_device(samples, devices):
+    chunk = chunk_for(samples, jax.local_devices()[:1] * devices)
+    calls = -(-(samples + 1) // (chunk * devices))
+    most = MAX_CHUNK[jax.default_backend()]
+    assert 1 <= chunk <= most
+    assert calls == -(-(samples + 1) // (most * devices))  # no more calls than the largest chunk would take
+    assert (chunk - calls) * calls * devices < samples + 1  # smaller chunks of that number would not hold them
+
+
+# Orders of the oracle
+
+
+def test_evaluating_never_differentiates_the_dynamics(monkeypatch):
+    def forbidden(*arguments):
+        raise RuntimeError("differentiated")
+
+    simulator = Simulator(pusher_task(), chunk_size=3, devices=tuple(jax.local_devices()[:1]))
+    monkeypatch.setattr(dynamics, "step_jacobian", forbidden)
+    objective, theta = simulator.objective(penalty(10.0)), pusher_task().theta
+    alone = objective.evaluate(theta, sample_keys(7))
+    with pytest.raises(RuntimeError, match="differentiated"):
+        objective.differentiate(theta, sample_keys(7))
+    monkeypatch.undo()
+    # One device against two, in contact.
+    both = pusher_simulator().objective(penalty(10.0)).evaluate(theta, sample_keys(7))
+    np.testing.assert_allclose(alone.value, both.value, rtol=1e-12)
+    np.testing.assert_array_equal(alone.score, both.score)
+
+
+@dataclasses.dataclass
+class Recorded:
+    """An objective that remembers its batches."""
+
+    inner: Objective
+    evaluated: list[tuple[np.ndarray, Evaluation]] = dataclasses.field(default_factory=list)
+    differentiated: list[tuple[np.ndarray, Differentiation]] = dataclasses.field(default_factory=list)
+
+    @property
+    def num_params(self) -> int:
+        return self.inner.num_params
+
+    def evaluate(self, theta, keys) -> Evaluation:
+        self.evaluated.append((np.asarray(jax.random.key_data(keys)), self.inner.evaluate(theta, keys)))
+        return self.evaluated[-1][1]
+
+    def differentiate(self, theta, keys) -> Differentiation:
+        self.differentiated.append((np.asarray(jax.random.key_data(keys)), self.inner.differentiate(theta, keys)))
+        return self.differentiated[-1][1]
+
+
+def test_batches_of_an_interpolated_estimate_are_independent(simulator):
+    """Noise of the zeroth-order batch against that of the first-order batch: 50 x 200 pairs, correlation 0 +- 1e-2."""
+    task, recorded = pusher_task(), Recorded(simulator.objective(penalty(10.0)))
+    options = EstimatorOptions(
+        gamma=task.gamma, failure_probability=0.05, variance_proxy="variance", radius="max_deviation"
+    )
+    estimate("aobg", recorded, task.theta, jax.random.key(0), 50, options=options)
+    ((zeroth_keys, zeroth),), ((first_keys, first),) = recorded.evaluated, recorded.differentiated
+    assert not {tuple(key) for key in zeroth_keys} & {tuple(key) for key in first_keys}
+    replayed = recorded.inner.evaluate(task.theta, jax.random.wrap_key_data(jnp.asarray(first_keys)))
+    np.testing.assert_array_equal(replayed.value, first.value)  # so its scores hold the first-order batch's noise
+    correlation = np.corrcoef(np.ravel(zeroth.score), np.ravel(replayed.score))[0, 1]
+    assert abs(correlation) < 4 / np.sqrt(50 * HORIZON)
+    # Nor is any sample of one the same as any sample of the other.
+    assert not np.intersect1d(np.ravel(zeroth.score), np.ravel(replayed.score)).size
+
+
+# Scores and baselines
+
+
+def test_score_is_the_noise_over_its_variance(simulator):
+    """The cost of theta + sigma^2 score without noise is the sample's; scores scale as 1 / sigma."""
+    objective, theta = simulator.objective(penalty(10.0)), pusher_task().theta
+    evaluation = objective.evaluate(theta, sample_keys(3))
+    for value, score in zip(evaluation.value, evaluation.score, strict=True):
+        explicit = cost(simulator, penalty(10.0), np.asarray(theta + SIGMA**2 * score))
+        assert value == pytest.approx(explicit, rel=1e-12)
+    wider = simulator.objective(penalty(10.0), 3 * SIGMA).evaluate(theta, sample_keys(3))
+    np.testing.assert_allclose(wider.score, evaluation.score / 3, rtol=1e-13)
+    assert np.all(wider.value != evaluation.value)
+
+
+def test_score_has_mean_zero_and_the_fisher_information(simulator):
+    """E s = 0 and E s^2 = 1 / sigma^2 per entry: 300 x 200 normal numbers, whose squares have variance 2."""
+    score = simulator.objective(penalty(10.0)).evaluate(pusher_task().theta, sample_keys(300)).score
+    noise = np.asarray(score).ravel()[:, None] * SIGMA
+    assert_mean_is(noise, [0.0])  # resolves 0.05 standard deviations
+    assert_mean_is(noise**2, [1.0])
+
+
+def test_baseline_is_the_cost_without_noise(simulator):
+    objective, theta = simulator.objective(penalty(100.0)), pusher_task().theta
+    evaluation = objective.evaluate(theta, sample_keys(3))
+    silent = simulator.objective(penalty(100.0), NO_NOISE).differentiate(theta, sample_keys(3))
+    np.testing.assert_array_equal(evaluation.baseline, np.broadcast_to(evaluation.baseline[0], 3))
+    np.testing.assert_allclose(evaluation.baseline, silent.value, rtol=1e-14)
+    assert np.all(np.abs(evaluation.value / evaluation.baseline - 1) > 1e-6)
+
+
+def test_odd_part_is_half_the_difference_of_mirrored_noise(simulator):
+    objective, theta = simulator.objective(penalty(100.0)), pusher_task().theta
+    odd = objective.evaluate_odd(theta, sample_keys(5))
+    plain = objective.evaluate(theta, sample_keys(5))
+    np.testing.assert_array_equal(odd.score, plain.score)
+    np.testing.assert_array_equal(odd.baseline, np.zeros(5))
+    assert odd.residual is not None and odd.residual.shape == (5,)
+    for value, ahead, score in zip(odd.value, plain.value, odd.score, strict=True):
+        behind = cost(simulator, penalty(100.0), np.asarray(theta - SIGMA**2 * score))
+        # Rounding of two costs of 1.8e3, in a difference of about 10.
+        assert value == pytest.approx((float(ahead) - behind) / 2, abs=1e-12 * behind)
+
+
+# Feedback and random starts: one variant of the pusher
+
+
+@dataclasses.dataclass(frozen=True)
+class Feedback:
+    """A constant push and a linear feedback of both positions and velocities: theta = (push, 4 gains)."""
+
+    horizon: int
+    num_params: int = 5
+
+    def feedforward(self, theta):
+        return jnp.full((self.horizon, 1), theta[0])
+
+    def feedback(self, theta, state: State):
+        return jnp.sum(theta[1:] * jnp.concatenate([state.qpos, state.qvel]))[None]
+
+    def score(self, theta, states: State, noise_gradient):
+        def controls(theta):
+            return self.feedforward(theta) + jax.vmap(lambda state: self.feedback(theta, state))(states)
+
+        return jax.vjp(controls, theta)[1](noise_gradient)[0]
+
+
+STEPS = 20
+GAINS = jnp.array([0.3, -0.1, 0.05, -0.2, 0.1])
+
+
+@pytest.fixture(scope="module")
+def closed_loop() -> Simulator:
+    task = make_task("pusher", horizon=STEPS)
+
+    def start(key):
+        """Apart by up to 1 mm and moving together: all samples touch soon."""
+        gap = 1e-3 * jax.random.uniform(key)
+        return initial_state(task.scene, qpos=jnp.stack([0.0 * gap, 1.0 + gap]), qvel=jnp.array([0.1, 0.0]))
+
+    return Simulator(task.replace(policy=Feedback(STEPS), theta=GAINS, start=start), chunk_size=16)
+
+
+def test_a_feedback_policy_is_a_policy():
+    assert isinstance(Feedback(STEPS), Policy) and isinstance(OpenLoop(3, 2), Policy)
+
+
+def test_baseline_of_a_random_start_is_each_samples_own(closed_loop):
+    assert closed_loop.task.random_start and not pusher_task().random_start
+    noisy = closed_loop.objective(penalty(100.0)).evaluate(GAINS, sample_keys(5))
+    silent = closed_loop.objective(penalty(100.0), NO_NOISE).differentiate(GAINS, sample_keys(5))
+    np.testing.assert_allclose(noisy.baseline, silent.value, rtol=1e-14)
+    assert len(np.unique(noisy.baseline)) == 5
+
+
+def test_gradient_through_feedback_against_differences(closed_loop):
+    """Common random numbers; the cost is a polynomial of the gains between events: truncation is step^2."""
+    objective = closed_loop.objective(penalty(100.0))
+    gradient = np.asarray(objective.differentiate(GAINS, sample_keys(16)).gradient)
+    for index in range(5):
+        shift = 1e-4 * jnp.eye(5)[index]
+        ahead, behind = (objective.evaluate(GAINS + sign * shift, sample_keys(16)).value for sign in (1, -1))
+        # 3 of 16 samples may straddle an onset, where the force jumps by 1e-4 of the approach's acceleration.
+        errors = np.abs((ahead - behind) / 2e-4 - gradient[:, index]) / np.linalg.norm(gradient, axis=1)
+        assert np.sum(errors < 1e-6) >= 13, errors
+
+
+def test_feedback_gives_both_orders_one_mean(closed_loop):
+    """A score that forgot the states, or a gradient that forgot the feedback, would move one of them."""
+    objective = closed_loop.objective(penalty(10.0), sigma=0.3)
+    zeroth = zeroth_order(objective.evaluate(GAINS, sample_keys(3000, 1)), "zero_noise")
+    first = first_order(objective.differentiate(GAINS, sample_keys(1000, 2)))
+    spread = np.hypot(zeroth.standard_error, first.standard_error)
+    assert np.all(np.abs(zeroth.mean - first.mean) < 4 * spread)
+    assert 4 * np.linalg.norm(spread) < 0.25 * np.linalg.norm(first.mean), "no power"
+
+
+def test_odd_part_refuses_feedback(closed_loop):
+    with pytest.raises(ValueError, match="needs an open-loop policy"):
+        closed_loop.objective(penalty(10.0)).evaluate_odd(GAINS, sample_keys(2))
+
+
+# What can fail
+
+
+def test_a_sample_that_is_not_finite_is_counted_and_left_out():
+    def breaks(state, control):
+        return jnp.where(control[0] > LIMIT, jnp.nan, jnp.sum(state.qpos**2) + jnp.sum(control**2))
+
+    task = cart(breaks)
+    objective = Simulator(task, chunk_size=20).objective(ANY_CONTACT)
+    evaluation, differentiation = (
+        objective.evaluate(task.theta, sample_keys(40)),
+        objective.differentiate(task.theta, sample_keys(40)),
+    )
+    over = np.any(np.asarray(task.theta + 0.1**2 * evaluation.score) > LIMIT, axis=1)
+    assert 5 < over.sum() < 35
+    for value in (evaluation.value, differentiation.value):
+        np.testing.assert_array_equal(np.isnan(value), over)
+    zeroth, first = zeroth_order(evaluation, "zero_noise"), first_order(differentiation)
+    rows = np.asarray((evaluation.value - evaluation.baseline)[:, None] * evaluation.score)
+    assert zeroth.num_nonfinite == first.num_nonfinite == over.sum()
+    np.testing.assert_allclose(zeroth.mean, rows[~over].mean(0), rtol=1e-12)
+    np.testing.assert_allclose(first.mean, np.asarray(differentiation.gradient)[~over].mean(0), rtol=1e-12)
+
+
+def test_theta_that_is_not_a_number_ends_and_is_counted(simulator):
+    """The solver's loop meets NaN in every sample and must leave."""
+    theta = pusher_task().theta.at[100].set(jnp.nan)
+    objective = simulator.objective(penalty(10.0))
+    assert zeroth_order(objective.evaluate(theta, sample_keys(3)), "zero_noise").num_finite == 0
+    assert first_order(objective.differentiate(theta, sample_keys(3))).num_finite == 0
+
+
+def test_residual_of_the_shipped_budget_is_rounding(simulator):
+    for stiffness in np.geomspace(1.0, 3e4, 13):
+        objective = simulator.objective(penalty(float(stiffness)))
+        for batch in (
+            objective.evaluate(pusher_task().theta, sample_keys(16)),
+            objective.differentiate(pusher_task().theta, sample_keys(16)),
+        ):
+            assert batch.residual is not None and float(batch.residual.max()) < 1e-8
+
+
+BALL = """<mujoco model="ball">
+  <option timestep="0.005" cone="elliptic" iterations="{0}" ls_iterations="{0}"/>
+  <worldbody>
+    <geom name="floor" type="plane" size="5 5 0.1"/>
+    <body pos="0 0 0.0995">
+      <joint name="x" type="slide" axis="1 0 0"/><joint name="z" type="slide" axis="0 0 1"/>
+      <joint name="spin" type="hinge" axis="0 1 0"/><geom name="ball" size="0.1" mass="1"/>
+    </body>
+  </worldbody>
+  <actuator><motor joint="x"/></actuator>
+</mujoco>"""
+
+
+def test_a_starved_solver_shows_in_the_residual(monkeypatch):
+    """A ball that slides and spins: the elliptic cone couples the rows, and one iteration does not solve it.
+
+    The pusher cannot show this: its one frictionless contact is a quadratic, which one Newton step solves. Nor can a
+    small scene with the predictor, which solves this ball by itself.
+    """
+    monkeypatch.setattr(constraint, "PREDICTOR_STEPS", 0)
+    residuals = {}
+    for iterations in (1, 50):
+        scene = put_scene(mujoco.MjModel.from_xml_string(BALL.format(iterations)), "ball")
+        task = dataclasses.replace(
+            cart(horizon=2),
+            scene=scene,
+            theta=jnp.full(2, 8.0),
+            start=initial_state(scene, qvel=jnp.array([0.5, -0.1, 0.3])),
+            running_cost=lambda state, control: jnp.sum(state.qvel**2),
+        )
+        contact = contact_model((0.02, 1.0), scene=scene)
+        residual = Simulator(task, chunk_size=2).objective(contact).evaluate(task.theta, sample_keys(3)).residual
+        assert residual is not None
+        residuals[iterations] = float(np.max(residual))
+    assert residuals[1] > 1e-3
+    assert residuals[50] < 1e-8
+
+
+# Memory
+
+
+def test_memory_of_a_thousand_gradients(large):
+    """1000 samples of 200 steps at once: 24 numbers per step, among them the 2 x 5 Jacobian, make 36.6 MiB."""
+    task = pusher_task()
+    keys = np.asarray(jax.random.key_data(sample_keys(1000)))
+    arguments = (task.theta, penalty(10.0), np.asarray(SIGMA), keys, np.ones(1000))
+    plan = large._gradients.lower(*arguments).compile().memory_analysis()
+    temporary = plan.temp_size_in_bytes * len(large.devices)  # the plan is one device's
+    output = plan.output_size_in_bytes * len(large.devices)
+    assert 1000 * HORIZON * 8 <= output <= 1000 * (HORIZON + 10) * 8  # gradients, values, residuals
+    assert output <= temporary <= 40 * 2**20
+
+
+# Refusals
+
+
+@pytest.mark.parametrize("sigma", [0.0, -1.0, float("nan"), float("inf")])
+def test_refuses_a_noise_level(simulator, sigma):
+    with pytest.raises(ValueError, match="sigma must be positive and finite"):
+        pusher_task().replace(sigma=sigma)
+    objective = simulator.objective(penalty(10.0), sigma)
+    for run in (objective.evaluate, objective.differentiate, objective.evaluate_odd):
+        with pytest.raises(ValueError, match="sigma must be positive and finite"):
+            run(pusher_task().theta, sample_keys(2))
+
+
+def test_refuses_an_empty_chunk():
+    with pytest.raises(ValueError, match="chunk_size must be at least 1 sample, got 0"):
+        Simulator(pusher_task(), chunk_size=0)
+
+
+def test_refuses_an_unknown_task():
+    with pytest.raises(ValueError, match=r"unknown task 'pushr'; choose from .*pusher"):
+        make_task("pushr")
+
+
+def test_refuses_a_horizon_without_steps():
+    with pytest.raises(ValueError, match="horizon must be at least 1 step, got 0"):
+        make_task("pusher", horizon=0)
+
+
+def test_refuses_theta_of_another_length(simulator):
+    with pytest.raises(ValueError, match=r"theta has shape \(199,\), the policy needs \(200,\)"):
+        pusher_task().replace(theta=jnp.zeros(199))
+    objective = simulator.objective(penalty(10.0))
+    for run in (objective.evaluate, objective.differentiate, objective.evaluate_odd):
+        with pytest.raises(ValueError, match=r"theta has shape \(199,\), the policy needs \(200,\)"):
+            run(jnp.zeros(199), sample_keys(2))
+
+
+def test_refuses_no_samples(simulator):
+    objective = simulator.objective(penalty(10.0))
+    for run in (objective.evaluate, objective.differentiate, objective.evaluate_odd):
+        with pytest.raises(ValueError, match="at least one key"):
+            run(pusher_task().theta, sample_keys(1)[:0])
