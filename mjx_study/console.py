@@ -1,0 +1,143 @@
+"""What the command line prints: tables, numbers with their intervals, progress."""
+
+import math
+import shutil
+from collections.abc import Callable, Generator, Sequence
+from contextlib import contextmanager
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+from mjx_study.contact import FAMILIES
+from mjx_study.plots import STYLE
+from mjx_study.study import CompareResult, Row, findings
+from mjx_study.table import format_table
+
+Column = tuple[str, Callable[[Row], str]]
+
+
+def number(value: float | None, digits: int = 3) -> str:
+    """A number in few characters; `-` for none, `nan` and `inf` as they are."""
+    if value is None:
+        return "-"
+    if value == 0 or not math.isfinite(value):
+        return f"{value:g}"
+    if 1e-3 <= abs(value) < 1e4:
+        rounded = float(f"{value:.{digits}g}")
+        return f"{rounded:.0f}" if abs(rounded) >= 10 ** (digits - 1) else f"{rounded:.{digits}g}"
+    mantissa, exponent = f"{value:.1e}".split("e")
+    return f"{mantissa}e{int(exponent)}"
+
+
+def _interval(row: Row) -> str:
+    return f"{number(row.variance)} ({number(row.variance_lower, 2)} to {number(row.variance_upper, 2)})"
+
+
+def _with_error(value: float, error: float) -> str:
+    if not (math.isfinite(value) and math.isfinite(error)):
+        return number(value)
+    if value >= 1000:
+        return f"{number(value, 2)} ± {number(error, 2)}"
+    return f"{value:.3f} ± {error:.3f}"
+
+
+def columns(confidence: float) -> list[list[Column]]:
+    """The comparison's table in two halves, each narrow enough for 80 characters."""
+    identity: list[Column] = [
+        ("K [N/m]", lambda row: number(row.stiffness)),
+        ("estimator", lambda row: STYLE[row.estimator][0]),
+    ]
+    values: list[Column] = [
+        ("|gradient|", lambda row: number(row.gradient_norm)),
+        (f"variance ({confidence:.0%} interval)", _interval),
+        ("relative error", lambda row: _with_error(row.relative_error, row.relative_error_se)),
+        ("cosine", lambda row: _with_error(row.cosine, row.cosine_se)),
+    ]
+    details: list[Column] = [
+        ("alpha", lambda row: "-" if row.alpha is None else f"{row.alpha:.3f}"),
+        ("epsilon", lambda row: number(row.epsilon)),
+        ("B", lambda row: number(row.discrepancy)),
+        ("ms/sample", lambda row: f"{1e3 * row.seconds_per_sample:.2f}"),
+        ("residual", lambda row: number(row.residual, 2)),
+        ("not finite", lambda row: str(row.nonfinite)),
+    ]
+    return [identity + values, identity + details]
+
+
+def print_comparison(result: CompareResult, print_line: Callable[[str], None] = print) -> None:
+    """The whole result as text: configuration, a table for each contact family, what it says, what to beware of."""
+    config = result.config
+    print_line(
+        f"{config.task}: {config.samples} samples in each batch, sigma {config.sigma:g}, {config.horizon} steps, "
+        f"{config.cone} cone, seed {config.seed}, {result.environment['precision']}"
+    )
+    halves = columns(config.confidence)
+    whole = halves[0] + halves[1][2:]
+    for family in config.contact:
+        rows = [row for row in result.rows if row.contact == family]
+        print_line("")
+        print_line(f"{family}: {FAMILIES[family].description}")
+        text = _table(rows, whole)
+        if max(map(len, text)) <= shutil.get_terminal_size((140, 24)).columns:
+            blocks = [text]
+        else:
+            blocks = [_table(rows, half) for half in halves]
+        for block in blocks:
+            for line in block:
+                print_line(line)
+    print_line("")
+    uncertainty = [row.reference_uncertainty for row in result.rows if math.isfinite(row.reference_uncertainty)]
+    if uncertainty:
+        print_line(
+            f"Errors and cosines are against an unbiased zeroth-order reference, {config.reference_samples} pairs of "
+            f"rollouts with a control variate;\nits own relative uncertainty is {number(min(uncertainty), 2)} to "
+            f"{number(max(uncertainty), 2)}, and smaller errors cannot be told from zero."
+        )
+    for sentence in findings(result):
+        print_line(sentence + ".")
+    for warning in alarms(result):
+        print_line(f"warning: {warning}")
+
+
+def alarms(result: CompareResult) -> list[str]:
+    """What a reader must not overlook: samples left out, solves that did not converge, contact models at their edge."""
+    messages = []
+    for row in result.rows:
+        where = f"{row.contact}, K = {number(row.stiffness)} N/m, {STYLE[row.estimator][0]}"
+        if row.nonfinite:
+            messages.append(f"{where}: {row.nonfinite} of {row.samples} samples are not finite and were left out")
+        if row.unconverged:
+            messages.append(
+                f"{where}: {row.unconverged} samples have an unconverged solve (residual {row.residual:.1e})"
+            )
+    return messages + list(result.warnings)
+
+
+def _table(rows: Sequence[Row], table: Sequence[Column]) -> list[str]:
+    cells = [[show(row) for _, show in table] for row in rows]
+    for previous, current in reversed(list(zip(range(len(rows)), range(1, len(rows)), strict=False))):
+        if rows[previous].stiffness == rows[current].stiffness:
+            cells[current][0] = ""
+    return format_table(cells, [heading for heading, _ in table])
+
+
+@contextmanager
+def progress_bar() -> Generator[Callable[[int, int, str], None]]:
+    """A progress bar on standard error, shown only on a terminal and gone when the work is done."""
+    console = Console(stderr=True)
+    bar = Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        console=console,
+        transient=True,
+        disable=not console.is_terminal,
+    )
+    with bar:
+        task = bar.add_task("starting", total=None)
+
+        def report(done: int, total: int, what: str) -> None:
+            bar.update(task, completed=done, total=total, description=what)
+
+        yield report

@@ -1,0 +1,251 @@
+"""The command line as a user meets it: figures that are true, one line for what is wrong, nothing written then."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import jax.numpy as jnp
+import pytest
+
+from mjx_study import cli, study
+
+SMALL = ["--horizon", "4", "--samples", "8", "--reference-samples", "8"]
+MJCF = """<mujoco><worldbody>
+  <body name="a"><joint name="{joint}" type="slide" axis="1 0 0"/>
+    <geom name="pusher" type="{geom}" size="0.5 0.5 0.5" mass="0.1"/></body>
+  <body name="b" pos="1 0 0"><joint name="slider" type="slide" axis="1 0 0" ref="1"/>
+    <geom name="slider" type="box" size="0.5 0.5 0.5" mass="0.1"/></body>
+</worldbody><actuator><motor joint="{joint}"/></actuator></mujoco>"""
+
+
+@pytest.fixture(autouse=True)
+def configured(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The tests' own settings stand: JAX takes its devices once per process."""
+    monkeypatch.setattr(cli, "configure", lambda **_: None)
+
+
+def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    """Run, expect exit code 2 and one line on standard error, and return that line."""
+    assert cli.main(arguments) == 2
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert printed.err.count("\n") == 1, printed.err
+    assert "Traceback" not in printed.err
+    return printed.err
+
+
+@pytest.fixture(scope="module")
+def small_run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """One small comparison with an output folder, and what it printed."""
+    folder = tmp_path_factory.mktemp("out") / "results"
+    environment = os.environ | {"XDG_CACHE_HOME": str(tmp_path_factory.mktemp("cache"))}
+    command = [sys.executable, "-m", "mjx_study", "compare", "pusher", *SMALL, "--output", str(folder)]
+    command += ["--stiffness", "10,1000", "--contact", "penalty,mujoco_default", "--estimators", "zobg,fobg,aobg,ivw"]
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=300)
+    assert done.returncode == 0, done.stderr
+    assert "Warp" not in done.stdout and "warp" not in done.stdout
+    return folder, done.stdout
+
+
+def test_compare_reports_every_column_for_every_cell(small_run: tuple[Path, str]) -> None:
+    folder, printed = small_run
+    document = json.loads((folder / "results.json").read_text())
+    cells = [(row["contact"], row["stiffness"], row["estimator"]) for row in document["rows"]]
+    names = ["zobg", "fobg", "aobg", "ivw"]
+    swept = [("penalty", stiffness, name) for stiffness in (10.0, 1000.0) for name in names]
+    assert cells == swept + [("mujoco_default", pytest.approx(125.0), name) for name in names]
+    for row in document["rows"]:
+        assert row["variance_lower"] <= row["variance"] <= row["variance_upper"]
+        assert row["seconds_per_sample"] > 0 and row["residual"] < 1e-6 and row["nonfinite"] == 0
+        assert (row["alpha"] is None) == (row["estimator"] in ("zobg", "fobg"))
+    for heading in ("|gradient|", "variance", "relative error", "cosine", "alpha", "epsilon", "B", "ms/sample"):
+        assert heading in printed
+    assert "residual" in printed and "not finite" in printed
+
+
+def test_a_result_holds_its_whole_configuration(small_run: tuple[Path, str]) -> None:
+    document = json.loads((small_run[0] / "results.json").read_text())
+    config = document["config"]
+    assert None not in [value for name, value in config.items() if name not in ("damping", "model")]
+    assert (
+        config["horizon"] == 4 and config["sigma"] == 0.1 and config["gamma"] == 1e8 and config["cone"] == "pyramidal"
+    )
+    assert document["environment"]["versions"]["mujoco"].startswith("3.17")
+    assert document["environment"]["precision"] == "float64"
+
+
+def test_figures_are_written_whole(small_run: tuple[Path, str]) -> None:
+    folder, printed = small_run
+    assert sorted(path.name for path in folder.iterdir()) == [
+        "comparison.pdf",
+        "comparison.png",
+        "gradients.npz",
+        "results.json",
+    ]
+    assert (folder / "comparison.png").read_bytes().startswith(b"\x89PNG")
+    assert (folder / "comparison.pdf").read_bytes().rstrip().endswith(b"%%EOF")
+    assert "comparison.png" in printed
+
+
+def test_compare_prints_json_and_nothing_else(capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["compare", "pusher", *SMALL, "--stiffness", "10", "--contact", "penalty", "--gamma", "inf", "--json"]
+    assert cli.main(arguments) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["config"]["gamma"] == "inf"
+    assert [row["estimator"] for row in document["rows"]] == ["zobg", "fobg", "aobg"]
+
+
+def test_warnings_about_the_contact_reach_the_reader(capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["compare", "pusher", *SMALL, "--stiffness", "1e4", "--contact", "penalty", "--estimators", "zobg"]
+    assert cli.main(arguments) == 0
+    assert "warning: penalty, K = 10000 N/m: h^2 k" in capsys.readouterr().out
+
+
+def test_one_nan_sample_does_not_poison_the_table(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def with_a_nan(config: study.CompareConfig) -> study.ComparePlan:
+        plan = planned(config)
+        cost = plan.task.final_cost
+        # A cost that is undefined for about one rollout in four.
+        threshold = float(plan.task.theta[0]) * 0.75e-5
+
+        def final_cost(state):
+            return jnp.where(state.qpos[0] > threshold, cost(state), jnp.nan)
+
+        return study.ComparePlan(
+            plan.config, plan.task.replace(final_cost=final_cost), plan.cells, plan.options, plan.warnings
+        )
+
+    planned = study.plan_compare
+    monkeypatch.setattr(cli, "plan_compare", with_a_nan)
+    arguments = ["compare", "pusher", *SMALL, "--samples", "32", "--stiffness", "10", "--contact", "penalty"]
+    assert cli.main(arguments) == 0
+    printed = capsys.readouterr().out
+    assert "of 32 samples are not finite and were left out" in printed
+    row = next(line for line in printed.splitlines() if "ZoBG" in line)
+    assert "nan" not in row
+
+
+def test_help_teaches(capsys: pytest.CaptureFixture[str]) -> None:
+    for command in ([], ["compare"], ["gradcheck"], ["bench"], ["tasks"]):
+        with pytest.raises(SystemExit) as stop:
+            cli.main([*command, "--help"])
+        assert stop.value.code == 0
+    text = capsys.readouterr().out
+    for taught in ("mjx-study compare pusher", "penalty", "zobg", "N/m", "epsilon", "residual"):
+        assert taught in text
+
+
+def test_version(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        cli.main(["--version"])
+    assert stop.value.code == 0
+    assert capsys.readouterr().out.startswith("mjx-study 0.")
+
+
+def test_tasks(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["tasks"]) == 0
+    assert "pusher" in capsys.readouterr().out
+    assert cli.main(["tasks", "--json"]) == 0
+    (task,) = json.loads(capsys.readouterr().out)["tasks"]
+    assert task["params"] == 200 and task["effective_mass"] == pytest.approx(0.05)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["compare", "puhser"], "unknown task 'puhser'; choose from pusher"),
+        (["compare", "pusher", "--estimators", "zobg,gobg"], "unknown estimator 'gobg'; choose from zobg, fobg"),
+        (["compare", "pusher", "--estimators", ""], "no estimator given"),
+        (["compare", "pusher", "--contact", "spring"], "unknown contact family 'spring'; choose from penalty"),
+        (["compare", "pusher", "--samples", "-5"], "samples must be at least 3"),
+        (["compare", "pusher", "--samples", "0"], "samples must be at least 3"),
+        (["compare", "pusher", "--samples", "many"], "invalid int value"),
+        (["compare", "pusher", "--reference-samples", "0"], "reference_samples must be at least 3"),
+        (["compare", "pusher", "--sigma", "0"], "sigma must be positive"),
+        (["compare", "pusher", "--sigma", "-0.1"], "sigma must be positive"),
+        (["compare", "pusher", "--sigma", "nan"], "sigma must be positive"),
+        (["compare", "pusher", "--stiffness", "10,-5"], "stiffness must be positive"),
+        (["compare", "pusher", "--stiffness", "0"], "stiffness must be positive"),
+        (["compare", "pusher", "--stiffness", "ten"], "not a list of numbers"),
+        (["compare", "pusher", "--stiffness", ""], "need at least one stiffness"),
+        (["compare", "pusher", "--damping", "-1"], "damping must be >= 0"),
+        (["compare", "pusher", "--gamma", "0"], "gamma must be positive"),
+        (["compare", "pusher", "--gamma", "big"], "neither a number nor inf"),
+        (["compare", "pusher", "--radius", "huge"], "radius"),
+        (["compare", "pusher", "--variance-proxy", "range"], "variance_proxy"),
+        (["compare", "pusher", "--failure-probability", "2"], "failure_probability"),
+        (["compare", "pusher", "--confidence", "95"], "confidence must lie strictly between 0 and 1"),
+        (["compare", "pusher", "--seed", "-1"], "seed must not be negative"),
+        (["compare", "pusher", "--horizon", "0"], "horizon must be at least 1"),
+        (["compare", "pusher", "--chunk-size", "0"], "chunk_size must be at least 1"),
+        (["compare", "pusher", "--cone", "square"], "invalid choice: 'square'"),
+        (["compare", "pusher", "--precision", "float16"], "invalid choice: 'float16'"),
+        (["compare", "pusher", "--model", "nowhere.xml"], "no MJCF file at nowhere.xml"),
+        (["compare", "pusher", "--model", "tennis_racket"], "no model named 'tennis_racket'; there are pusher"),
+        (["compare", "pusher", "--no-such-option"], "unrecognized arguments"),
+        (["compare"], "TASK"),
+        (["explain", "pusher"], "invalid choice: 'explain'"),
+        ([], "COMMAND"),
+        (["gradcheck", "puhser"], "unknown task"),
+        (["gradcheck", "pusher", "--contact", ""], "no contact model to check"),
+        (["bench", "pusher", "--samples", "0"], "samples must be at least 1"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+)
+def test_bad_options_get_one_line(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, arguments: list[str], says: str
+) -> None:
+    untouched = tmp_path / "out"
+    extra = ["--output", str(untouched)] if arguments[:1] == ["compare"] and len(arguments) > 1 else []
+    assert says in refused(capsys, *arguments, *extra)
+    assert not untouched.exists()
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        ("<mujoco><worldbody>", "is not a valid MJCF"),
+        (MJCF.format(joint="push", geom="sphere"), "no joint 'pusher'; it has push, slider"),
+        (MJCF.format(joint="pusher", geom="cylinder"), "MJX cannot run"),
+    ],
+    ids=["does not parse", "no such joint", "not for MJX"],
+)
+def test_bad_models_get_one_line(capsys: pytest.CaptureFixture[str], tmp_path: Path, content: str, says: str) -> None:
+    path, untouched = tmp_path / "mine.xml", tmp_path / "out"
+    path.write_text(content)
+    assert says in refused(capsys, "compare", "pusher", *SMALL, "--model", str(path), "--output", str(untouched))
+    assert not untouched.exists()
+
+
+def test_an_output_folder_that_is_a_file(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    path = tmp_path / "taken"
+    path.write_text("mine")
+    assert "cannot write to the output folder" in refused(capsys, "compare", "pusher", "--output", str(path))
+    assert path.read_text() == "mine"
+
+
+def test_an_output_folder_that_cannot_be_written(capsys: pytest.CaptureFixture[str]) -> None:
+    assert "cannot write to the output folder" in refused(capsys, "compare", "pusher", "--output", "/proc/results")
+
+
+def test_interruption_leaves_nothing_behind(tmp_path: Path) -> None:
+    folder = tmp_path / "out"
+    command = [sys.executable, "-m", "mjx_study", "compare", "pusher", "--output", str(folder)]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    deadline = time.monotonic() + 60
+    while not folder.exists():  # made once the options are checked, before computing
+        assert time.monotonic() < deadline and process.poll() is None
+        time.sleep(0.05)
+    time.sleep(1)
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=120)
+    assert process.returncode == 130
+    assert err.strip().splitlines()[-1] == "mjx-study: interrupted; nothing was written"
+    assert out == "" and "Traceback" not in err
+    assert list(folder.iterdir()) == []
