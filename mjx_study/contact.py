@@ -251,7 +251,8 @@ def effective_mass(scene: Scene, geom1: str, geom2: str) -> float:
 
         m_eff = 2 (condim - 1) impratio / (2 mu^2 (1 + mu^2) (w_1 + w_2))
 
-    in the penalty limit.
+    in the penalty limit. It is that of the MJCF's friction, larger of the two; explicit pairs and priorities are not
+    looked at.
 
     Raises:
         SceneError: unknown geom name.

@@ -1,7 +1,7 @@
 r"""One simulation step and whole rollouts, differentiable through contact.
 
-A step is MJX's own pipeline with the solve of `mjx_study.constraint` in its middle: it agrees with `mjx.step` to
-rounding, while its derivative is that of the converged step. Two programs compute the derivative:
+A step is MJX's own pipeline with the solve of `mjx_study.constraint` in its middle: it agrees with `mjx.step` to what
+either leaves unconverged, while its derivative is that of the converged step. Two programs compute the derivative:
 
 - the *Jacobian* program, for models of few coordinates: the Jacobian of the velocity update over state and control
   by the implicit function theorem, once per step, and nothing else stored. Reverse mode then keeps nv (nq + nv + nu)
@@ -129,13 +129,18 @@ def uses_jacobian(scene: Scene) -> bool:
     return not explicit and host.nq + host.nv + host.na + host.nu <= JACOBIAN_COLUMNS
 
 
-# The stages of a step. A Jacobian over qvel, act or ctrl enters after the position stage, so it costs little.
+# The stages of a step. A Jacobian over qvel, act or ctrl enters after the position stage, so it costs little. Each is
+# jitted so that JAX traces MJX's many operations once and not for every direction; XLA inlines them again.
 
 
 def _position_stage(scene: Scene, model: mjx.Model, qpos: Float[Array, " nq"]) -> mjx.Data:
-    return mjx.fwd_position(model, scene.template.replace(qpos=qpos))
+    return _fwd_position(model, scene.template.replace(qpos=qpos))
 
 
+_fwd_position = jax.jit(mjx.fwd_position)
+
+
+@jax.jit
 def _force_stage(
     model: mjx.Model,
     data: mjx.Data,
@@ -150,6 +155,7 @@ def _force_stage(
     return mjx.fwd_acceleration(model, data)
 
 
+@jax.jit
 def _finish(
     model: mjx.Model, data: mjx.Data, qacc: Float[Array, " nv"]
 ) -> tuple[Float[Array, " nv"], Float[Array, " na"]]:
@@ -160,6 +166,13 @@ def _finish(
     return data.qvel, data.act
 
 
+@jax.jit
+def _constrained_update(model: mjx.Model, data: mjx.Data, qvel: Array, act: Array, control: Array, warmstart: Array):
+    data = _force_stage(model, _fwd_position(model, data), qvel, act, control)
+    qacc = checkpoint_name(constraint.solve(model, data.replace(qacc_warmstart=warmstart)), "qacc")
+    return *_finish(model, data, qacc), qacc, constraint.residual(model, data, qacc)
+
+
 def _update(scene: Scene):
     """The velocity update (model, qpos, qvel, act, control, warmstart) -> (qvel, act, qacc, residual).
 
@@ -168,9 +181,7 @@ def _update(scene: Scene):
     """
 
     def tape(model, qpos, qvel, act, control, warmstart):
-        data = _force_stage(model, _position_stage(scene, model, qpos), qvel, act, control)
-        qacc = checkpoint_name(constraint.solve(model, data.replace(qacc_warmstart=warmstart)), "qacc")
-        return *_finish(model, data, qacc), qacc, constraint.residual(model, data, qacc)
+        return _constrained_update(model, scene.template.replace(qpos=qpos), qvel, act, control, warmstart)
 
     if not uses_jacobian(scene):
         return tape
@@ -186,10 +197,12 @@ def _update(scene: Scene):
             return jax.jvp(tape, primals, zeros)
         value = update(*primals)
         inputs = [_instantiate(*pair) for pair in zip(primals[1:5], inputs, strict=True)]
-        jacobian = step_jacobian(scene, model, qpos, qvel, act, control, value[2])
-        out = jacobian @ jnp.concatenate(inputs)
+        over_step, over_qacc = step_jacobian(scene, model, qpos, qvel, act, control, value[2])
+        direction = jnp.concatenate(inputs)
+        out, qacc_out = over_step @ direction, over_qacc @ direction
         nv = qvel.shape[0]
-        return value, (out[:nv], out[nv:], jnp.zeros_like(value[2]), jnp.zeros_like(value[3]))
+        # The tangent of qacc is for derivatives of this derivative: the Jacobian is a function of qacc.
+        return value, (out[:nv], out[nv:], qacc_out, jnp.zeros_like(value[3]))
 
     return update
 
@@ -206,12 +219,12 @@ def step_jacobian(
     act: Float[Array, " na"],
     control: Float[Array, " nu"],
     qacc: Float[Array, " nv"],
-) -> Float[Array, "nv_na inputs"]:
-    r"""Jacobian of (qvel', act') with respect to (qpos, qvel, act, control), columns in that order.
+) -> tuple[Float[Array, "nv_na inputs"], Float[Array, "nv inputs"]]:
+    r"""Jacobians of (qvel', act') and of qacc with respect to (qpos, qvel, act, control), columns in that order.
 
     With S the step at a given acceleration a and G(x, a) = 0 the solver's equation,
 
-        dS/dx = S_x - S_a G_a^{-1} G_x.
+        da/dx = -G_a^{-1} G_x,   dS/dx = S_x + S_a da/dx.
 
     Args:
         scene: gives what is static.
@@ -219,7 +232,13 @@ def step_jacobian(
         qpos, qvel, act, control: where to linearise.
         qacc: the constrained acceleration there, converged.
     """
-    positioned = _position_stage(scene, model, qpos)
+    return _jacobian(model, scene.template, qpos, qvel, act, control, qacc)
+
+
+@jax.jit
+def _jacobian(model: mjx.Model, template: mjx.Data, qpos: Array, qvel: Array, act: Array, control: Array, qacc: Array):
+    def position_stage(qpos):
+        return _fwd_position(model, template.replace(qpos=qpos))
 
     def equations(data, qvel, act, control, qacc):
         data = _force_stage(model, data, qvel, act, control)
@@ -229,17 +248,18 @@ def step_jacobian(
         push = lambda direction: jax.jvp(function, (point,), (direction,))[1]  # noqa: E731
         return jax.vmap(push, out_axes=-1)(jnp.eye(point.shape[0], dtype=point.dtype))
 
-    inputs = [
-        columns(lambda x: equations(_position_stage(scene, model, x), qvel, act, control, qacc), qpos),
-        columns(lambda x: equations(positioned, x, act, control, qacc), qvel),
-        columns(lambda x: equations(positioned, qvel, x, control, qacc), act),
-        columns(lambda x: equations(positioned, qvel, act, x, qacc), control),
+    positioned = position_stage(qpos)
+    blocks = [
+        (lambda x: equations(position_stage(x), qvel, act, control, qacc), qpos),
+        (lambda x: equations(positioned, x, act, control, qacc), qvel),
+        (lambda x: equations(positioned, qvel, x, control, qacc), act),
+        (lambda x: equations(positioned, qvel, act, x, qacc), control),
     ]
-    over_inputs = jnp.concatenate(inputs, axis=1)
+    over_inputs = jnp.concatenate([columns(*block) for block in blocks if block[1].size], axis=1)
     over_qacc = columns(lambda x: equations(positioned, qvel, act, control, x), qacc)
     nv = qvel.shape[0]
-    response = constraint.solve_positive_definite(over_qacc[:nv], over_inputs[:nv])
-    return over_inputs[nv:] - over_qacc[nv:] @ response
+    response = -constraint.solve_positive_definite(over_qacc[:nv], over_inputs[:nv])
+    return over_inputs[nv:] + over_qacc[nv:] @ response, response
 
 
 def _runge_kutta(scene: Scene, model: mjx.Model, state: State, control: Float[Array, " nu"]) -> State:

@@ -180,7 +180,7 @@ class _Programs:
 
         def jacobian(state: State, control, contact):
             model = apply_contact(task.scene.model, contact)
-            return step_jacobian(task.scene, model, state.qpos, state.qvel, state.act, control, state.warmstart)
+            return step_jacobian(task.scene, model, state.qpos, state.qvel, state.act, control, state.warmstart)[0]
 
         self.costs = jax.jit(jax.vmap(lambda theta, contact: cost(theta, contact)[0], in_axes=(0, None)))
         self.gradient = jax.jit(jax.grad(cost, has_aux=True))

@@ -1,0 +1,165 @@
+"""Our law of the constraint rows against MJX's solver, and the residual that it gives."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from mujoco.mjx._src import solver
+
+from mjx_study import constraint, dynamics
+from tests.scenes import (
+    CASES,
+    compiled,
+    condims,
+    floor_scene,
+    option,
+    plain_warm_start,
+    scene_of,
+    slider,
+    split,
+    start_point,
+    step_flat,
+)
+
+SOURCES = {
+    "pyramidal condim 1, 3, 4, 6": condims("pyramidal", (1, 3, 4, 6)),
+    "elliptic condim 3, 4, 6": condims("elliptic", (3, 4, 6)),
+    "mechanism": CASES["mechanism"].source,
+    "chain elliptic CG": CASES["chain elliptic CG"].source,
+}
+
+
+@pytest.fixture(scope="module", params=SOURCES, ids=lambda name: name.replace(" ", "-"))
+def laws(request):
+    """The slack, our forces and imbalance, and MJX's at a given acceleration."""
+    scene = scene_of(SOURCES[request.param])
+    if request.param in CASES:
+        point = start_point(CASES[request.param], scene)
+    else:
+        speeds = np.random.default_rng(1).normal(size=scene.host.nv) / 5
+        point = np.concatenate([np.asarray(scene.template.qpos), speeds])
+
+    def evaluate(qacc):
+        qpos, qvel, act, control = split(scene, jnp.asarray(point))
+        positioned = dynamics._position_stage(scene, scene.model, qpos)
+        data = dynamics._force_stage(scene.model, positioned, qvel, act, control)
+        context = solver.Context.create(scene.model, data.replace(qacc=qacc))
+        rows: Any = data._impl
+        slack = rows.efc_J @ qacc - rows.efc_aref
+        forces = constraint.row_force(scene.model, data, slack)
+        imbalance = constraint.imbalance(scene.model, data, qacc)
+        span = slice(rows.ne, rows.ne + rows.nf or None)  # the rows whose linear zone is narrow, if there are any
+        nearest = jnp.linalg.lstsq(rows.efc_J[span], rows.efc_aref[span])[0]
+        return slack, rows.efc_D, forces, context.efc_force, imbalance, context.grad, nearest
+
+    run = compiled(evaluate, jnp.zeros(scene.host.nv))
+    return request.param, scene, run
+
+
+def random_accelerations(run, nv: int, number: int = 200) -> np.ndarray:
+    """Around the acceleration of least slack, at distances from 1e-5 to 1e3, so that every zone is seen."""
+    rng = np.random.default_rng(2)
+    return np.asarray(run(np.zeros(nv))[-1]) + rng.normal(size=(number, nv)) * 10 ** rng.uniform(-5, 3, (number, 1))
+
+
+def test_forces_and_imbalance_are_those_of_mjx(laws) -> None:
+    name, scene, run = laws
+    seen, forces = [], []
+    for qacc in random_accelerations(run, scene.host.nv):
+        slack, inverse_regularisation, ours, theirs, imbalance, gradient, _ = map(np.asarray, run(qacc))
+        scale = np.abs(inverse_regularisation * slack).max()
+        np.testing.assert_allclose(ours, theirs, atol=1e-14 * scale)
+        np.testing.assert_allclose(imbalance, gradient, atol=1e-13 * max(scale, np.abs(gradient).max()))
+        forces.append(ours)
+        linear = np.isclose(ours, -inverse_regularisation * slack, rtol=1e-9, atol=0)
+        seen.append(np.where(ours == 0, 0, np.where(linear, 1, 2)))
+    seen, forces = np.array(seen), np.array(forces)
+    zones = {zone: set(np.flatnonzero((seen == zone).any(axis=0))) for zone in (0, 1, 2)}
+    rows: Any = scene.template._impl
+    one_sided = set(range(rows.ne + rows.nf, rows.nefc))
+    if "condim" in name:  # each contact is seen separated and sticking (and on the cone's side below)
+        assert one_sided <= zones[0] and one_sided <= zones[1]
+    if "elliptic condim" in name:
+        assert one_sided <= zones[2], "not every contact was seen sliding"
+    if name == "mechanism":
+        assert rows.ne == 1 and rows.nf == 3 and rows.nl == 3
+        assert zones[1] >= set(range(rows.ne + rows.nf)), "equality and friction loss were not seen linear"
+        assert zones[2] >= set(range(rows.ne, rows.ne + rows.nf)), "friction loss was not seen saturated"
+        saturated = np.abs(forces[:, rows.ne : rows.ne + rows.nf]).max(axis=0)
+        np.testing.assert_allclose(saturated, [0.1, 0.02, 0.2], rtol=1e-15)  # of two joints, then of the tendon
+
+
+@pytest.fixture(scope="module")
+def resting():
+    """A ball that presses on the plane, and the residual over acceleration and height."""
+    scene = scene_of(floor_scene(slider(3), option(extra='cone="elliptic"')))
+
+    def evaluate(height, qacc):
+        data = dynamics._position_stage(scene, scene.model, jnp.zeros(3).at[2].set(height))
+        data = dynamics._force_stage(scene.model, data, jnp.asarray([0.3, 0.0, -0.1]), jnp.zeros(0), jnp.zeros(0))
+        solved = constraint.solve(scene.model, data)
+        return solved, constraint.residual(scene.model, data, solved), constraint.residual(scene.model, data, qacc)
+
+    return scene, compiled(evaluate, jnp.asarray(0.0), jnp.zeros(3))
+
+
+def test_the_residual_measures_the_distance_from_the_solution(resting) -> None:
+    _, run = resting
+    height = jnp.asarray(-0.0005)
+    solution, converged, _ = run(height, jnp.zeros(3))
+    # MJX stops where its cost no longer falls; the cost is quadratic, so that this is the square root of rounding
+    assert float(converged) < 1e-7
+    away = np.array([1.0, -0.5, 2.0])
+    far, near = (float(run(height, solution + distance * away)[2]) for distance in (1e-2, 1e-3))
+    assert far > 1e-4
+    assert far / near == pytest.approx(10, rel=0.05)  # linear in the distance
+
+
+def test_a_short_budget_shows_in_the_residual() -> None:
+    case, residuals = CASES["mechanism"], []
+    for iterations in (1, 100):
+        scene = scene_of(case.source.replace('iterations="100" ls', f'solver="CG" iterations="{iterations}" ls'))
+        point = start_point(case, scene)
+        with plain_warm_start():
+            step = compiled(lambda x, scene=scene: step_flat(scene, scene.model, x, jnp.zeros(scene.host.nv))[2], point)
+        residuals.append(float(step(point)))
+    assert residuals[0] > 1e-3
+    assert residuals[1] < 1e-6  # where conjugate gradients no longer lower the cost
+
+
+def test_the_residual_of_nothing_is_zero() -> None:
+    scene = scene_of(floor_scene(slider(1, height=0.5), option(extra='gravity="0 0 0"'), 'condim="1"'))
+
+    def residual(qpos):
+        data = dynamics._position_stage(scene, scene.model, qpos)
+        data = dynamics._force_stage(scene.model, data, jnp.zeros(3), jnp.zeros(0), jnp.zeros(0))
+        return constraint.residual(scene.model, data, jnp.zeros(3))
+
+    assert float(jax.jit(residual)(jnp.zeros(3))) == 0.0
+
+
+def test_the_improved_warm_start_converges_to_rounding() -> None:
+    """Where conjugate gradients stop because their cost no longer falls, two steps of Newton's go on."""
+    case = CASES["mechanism"]
+    scene = scene_of(case.source.replace('iterations="100" ls', 'solver="CG" iterations="100" ls'))
+    assert scene.host.nv <= constraint.SMALL
+    point, warmstart = start_point(case, scene), jnp.zeros(scene.host.nv)
+    step = compiled(lambda *args: step_flat(scene, scene.model, *args), point, warmstart)
+    _, warmstart, _ = step(point, warmstart)
+    assert float(step(point, warmstart)[2]) < 1e-12  # from nearby, where Newton's method is quadratic
+
+
+@pytest.mark.parametrize("size", [1, 2, constraint.SMALL, constraint.SMALL + 1])
+def test_solve_positive_definite(size: int) -> None:
+    """Unrolled and by a library."""
+    rng = np.random.default_rng(size)
+    root = rng.normal(size=(size, size))
+    matrix = root @ root.T + np.eye(size)
+    for right_side in (rng.normal(size=size), rng.normal(size=(size, 3))):
+        solution = constraint.solve_positive_definite(jnp.asarray(matrix), jnp.asarray(right_side))
+        assert solution.shape == right_side.shape
+        # backward stable: |A x - b| is some roundings of |A| |x|
+        scale = np.linalg.norm(matrix, 2) * np.abs(solution).max()
+        np.testing.assert_allclose(matrix @ solution, right_side, rtol=0, atol=10 * size * np.finfo(float).eps * scale)

@@ -1,0 +1,365 @@
+"""Contact models: units, the force that MJX makes of them, validation and warnings."""
+
+import math
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from mjx_study import constraint
+from mjx_study._mjx import mjx
+from mjx_study.contact import (
+    DEFAULT_SOLIMP,
+    DEFAULT_SOLREF,
+    FAMILIES,
+    MIN_IMPEDANCE,
+    ContactModel,
+    ContactWarning,
+    apply_contact,
+    contact_model,
+    effective_mass,
+    family_model,
+    solref_from_stiffness,
+    stiffness_from_solref,
+)
+from mjx_study.scene import SceneError, load_scene, put_scene
+from tests.scenes import compiled, floor_scene, option, scene_of, slider, step_flat
+
+PENETRATION = 0.002  # [m], beyond every width, so that the impedance is d_width
+MASS = 2.0
+
+
+def constant(impedance: float) -> tuple[float, float, float, float, float]:
+    return (impedance, impedance, 0.001, 0.5, 2.0)
+
+
+# A sphere over a plane; the excess g of its edges' weight over the normal's own, by the cone.
+KINDS = {
+    "frictionless": (1, "pyramidal", 0.5),
+    "elliptic": (3, "elliptic", 0.5),
+    "pyramidal mu 0.5": (3, "pyramidal", 0.5),
+    "pyramidal mu 1": (3, "pyramidal", 1.0),
+    "pyramidal condim 4": (4, "pyramidal", 0.5),
+}
+
+
+def edges_gain(kind: str) -> float:
+    """g = 2 (condim - 1) / (2 mu^2 (1 + mu^2)) for a pyramid, else 1: m_eff = g m."""
+    condim, cone, mu = KINDS[kind]
+    if condim == 1 or cone == "elliptic":
+        return 1.0
+    return 2 * (condim - 1) / (2 * mu**2 * (1 + mu**2))
+
+
+def ball_scene(condim: int, cone: str, mu: float):
+    ball = slider(condim, mu, MASS).replace("<geom", '<geom gap="0"', 1)
+    text = floor_scene(ball, option(extra=f'cone="{cone}" gravity="0 0 0"'), f'condim="{condim}" friction="{mu} .01 0"')
+    return scene_of(text)
+
+
+@pytest.fixture(scope="module", params=KINDS)
+def normal_acceleration(request):
+    """The kind, its scene, and (contact, normal velocity, force per mass) -> normal acceleration, in MJX."""
+    scene = ball_scene(*KINDS[request.param])
+    lowered = jnp.asarray([0.0, 0.0, -PENETRATION])
+
+    def acceleration(contact: ContactModel, velocity, free):
+        model = apply_contact(scene.model, contact)
+        data = scene.template.replace(
+            qpos=lowered, qvel=jnp.zeros(3).at[2].set(velocity), qfrc_applied=jnp.zeros(3).at[2].set(MASS * free)
+        )
+        return mjx.forward(model, data).qacc[2]
+
+    example = contact_model(DEFAULT_SOLREF, scene=scene)
+    run = compiled(acceleration, example, jnp.asarray(0.0), jnp.asarray(0.0))
+    return request.param, scene, lambda contact, v, a: float(run(contact, jnp.asarray(v), jnp.asarray(a)))
+
+
+STIFFNESS, DAMPING, SPEED = 5e3, 30.0, -0.04  # N/m, N s/m, m/s
+
+
+def in_units(scene, impedance: float) -> ContactModel:
+    mass = effective_mass(scene, "floor", "ball")
+    solref = solref_from_stiffness(STIFFNESS, DAMPING, effective_mass=mass)
+    return contact_model(solref, constant(impedance), scene=scene)
+
+
+def test_the_penalty_limit_is_a_spring_and_a_damper(normal_acceleration) -> None:
+    """MJX's force is K penetration - B velocity, up to 1 + (g - 1) d of the cone's edges: 5.4e-4 at mu = 0.5."""
+    kind, scene, acceleration = normal_acceleration
+    force = STIFFNESS * PENETRATION - DAMPING * SPEED
+    for impedance in (MIN_IMPEDANCE, 1e-3, 1e-2, 0.5):
+        measured = MASS * acceleration(in_units(scene, impedance), SPEED, 0.0)
+        exact = force / (1 + (edges_gain(kind) - 1) * impedance)
+        assert measured == pytest.approx(exact, rel=1e-10)
+        if impedance == MIN_IMPEDANCE:
+            assert measured == pytest.approx(force, rel=1e-3)
+
+
+def test_the_penalty_adds_to_other_forces_as_the_impedance_falls(normal_acceleration) -> None:
+    """a_1 - (a_0 + F / m) falls linearly with the impedance: tenfold per decade."""
+    _, scene, acceleration = normal_acceleration
+    spring = STIFFNESS * PENETRATION / MASS
+    free = -9.0
+    gaps = [acceleration(in_units(scene, d), 0.0, free) - (free + spring) for d in (1e-2, 1e-3, 1e-4)]
+    # the next order of the expansion is g d: 10 percent at most in the first decade, 1 percent in the second
+    assert gaps[0] / gaps[1] == pytest.approx(10, rel=0.1)
+    assert gaps[1] / gaps[2] == pytest.approx(10, rel=0.01)
+    assert gaps[2] == pytest.approx(0, abs=1e-4 * 12 * (spring - free))
+
+
+@pytest.mark.parametrize("impedance", [1e-3, 0.5, 0.9])
+def test_the_law_of_contact(normal_acceleration, impedance: float) -> None:
+    """a_1 = (1 - d) a_0 - b v - k r, exact for a single normal row; with its gain for a pyramid."""
+    kind, scene, acceleration = normal_acceleration
+    k, b, free, gain = 3e3, 20.0, -7.0, edges_gain(kind)
+    measured = acceleration(contact_model((-k, -b), constant(impedance), scene=scene), SPEED, free)
+    law = (1 - impedance) * free - b * SPEED + k * PENETRATION
+    # a pyramid's edges together weigh g rows: share g d / (1 - d + g d) of the way from a_0 to the reference
+    share = gain * impedance / (1 - impedance + gain * impedance)
+    weighed = free + share * ((-b * SPEED + k * PENETRATION) / impedance - free)
+    assert measured == pytest.approx(weighed, rel=1e-10)
+    assert gain != 1 or measured == pytest.approx(law, rel=1e-12)
+
+
+def test_a_positive_solref_is_its_spring_and_damper(normal_acceleration) -> None:
+    _, scene, acceleration = normal_acceleration
+    positive = (0.025, 0.7)
+    k, b = stiffness_from_solref(positive, effective_mass=1.0)
+    models = [contact_model(solref, constant(0.8), scene=scene) for solref in (positive, (-k, -b))]
+    by_time, direct = (acceleration(model, SPEED, -3.0) for model in models)
+    assert by_time == pytest.approx(direct, rel=1e-12)
+
+
+def test_refsafe_clips_at_two_timesteps(normal_acceleration) -> None:
+    _, scene, acceleration = normal_acceleration
+    limit = 2 * scene.timestep
+    with pytest.warns(ContactWarning, match=r"refsafe clips the time constant 0.003 s at two timesteps, 0.004 s"):
+        clipped = contact_model((0.75 * limit, 4.0), constant(0.8), scene=scene)
+    safe = contact_model((limit, 4.0), constant(0.8), scene=scene)
+    assert acceleration(clipped, SPEED, 0.0) == acceleration(safe, SPEED, 0.0)
+
+
+def test_refsafe_off_does_not_clip() -> None:
+    contact_model((0.009, 1.0), scene=load_scene("pusher"))  # less than two of its timesteps; warnings are errors here
+
+
+@pytest.mark.parametrize(("stiffness", "damping"), [(1e3, 0.0), (2.5, 7.0), (1e7, 1e3)])
+def test_units_round_trip(stiffness: float, damping: float) -> None:
+    solref = solref_from_stiffness(stiffness, damping, effective_mass=0.05)
+    assert solref == (-stiffness / 0.05, -damping / 0.05)
+    assert stiffness_from_solref(solref, effective_mass=0.05) == pytest.approx((stiffness, damping), rel=1e-15)
+    if damping:
+        k, b = -solref[0], -solref[1]
+        positive = (2 / b, b / (2 * math.sqrt(k)))
+        assert stiffness_from_solref(positive, effective_mass=0.05) == pytest.approx((stiffness, damping), rel=1e-14)
+
+
+def test_a_damping_ratio_of_one_is_critical() -> None:
+    k, b = (-value for value in solref_from_stiffness(300.0, effective_mass=2.0, dampratio=1.0))
+    assert b**2 == pytest.approx(4 * k, rel=1e-15)  # r'' + b r' + k r = 0 has a double root
+    assert solref_from_stiffness(300.0, effective_mass=2.0) == (-150.0, -0.0)
+
+
+def test_effective_masses() -> None:
+    """Two masses m in series act like m / 2; a fixed one does not move; a pyramid has its edges' gain."""
+    assert effective_mass(load_scene("pusher"), "pusher", "slider") == pytest.approx(0.05, rel=1e-12)
+    for kind, parts in KINDS.items():
+        assert effective_mass(ball_scene(*parts), "ball", "floor") == pytest.approx(edges_gain(kind) * MASS, rel=1e-12)
+
+
+def test_effective_mass_errors() -> None:
+    host = mujoco.MjModel.from_xml_string(floor_scene('<geom name="wall" size=".1"/>' + slider()))
+    scene = put_scene(host, "here")
+    with pytest.raises(ValueError, match="'floor' and 'wall' are both fixed"):
+        effective_mass(scene, "floor", "wall")
+    with pytest.raises(SceneError, match="here has no geom 'roof'; it has floor, wall, ball"):
+        effective_mass(scene, "roof", "ball")
+
+
+PAIRED = f"""<mujoco>{option()}<worldbody><geom name="floor" type="plane" size="1 1 1" priority="1"/>
+  {slider().replace("ball", "one")}{slider().replace("ball", "two").replace('"0 0 0.1"', '"1 0 .1"')}</worldbody>
+<contact><pair geom1="floor" geom2="one" condim="4"/></contact></mujoco>"""
+
+
+def test_contact_parameters_reach_every_contact() -> None:
+    """Geoms and explicit pairs alike, whatever the MJCF says of mixing; the margin counts once."""
+    scene = scene_of(PAIRED)
+    solimp, friction, margin = (0.3, 0.6, 0.002, 0.4, 3.0), (0.8, 0.02, 0.003), 0.0015
+    contact = contact_model((-900.0, -3.0), solimp, friction, margin, scene=scene)
+    data = jax.jit(lambda contact: mjx.fwd_position(apply_contact(scene.model, contact), scene.template))(contact)
+    rows = data._impl.contact
+    assert len(rows.dim) >= 3  # floor with each ball, and the balls
+    for index in range(len(rows.dim)):
+        np.testing.assert_array_equal(rows.solref[index], [-900.0, -3.0])
+        np.testing.assert_array_equal(rows.solimp[index], solimp)
+        np.testing.assert_array_equal(rows.friction[index], [0.8, 0.8, 0.02, 0.003, 0.003])
+        assert rows.includemargin[index] == margin
+
+
+def test_what_is_not_given_stays_the_mjcfs() -> None:
+    scene = scene_of(PAIRED)
+    model = apply_contact(scene.model, contact_model(DEFAULT_SOLREF, scene=scene))
+    for name in ("geom_friction", "geom_margin", "pair_friction", "pair_margin"):
+        assert getattr(model, name) is getattr(scene.model, name)
+
+
+def test_contact_models_stack_under_vmap() -> None:
+    scene = scene_of(PAIRED)
+    models = [contact_model((-k, -1.0), margin=m, scene=scene) for k, m in ((100.0, 0.0), (300.0, 0.001))]
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *models)
+    applied = jax.jit(jax.vmap(lambda contact: apply_contact(scene.model, contact), axis_size=2))(stacked)
+    for index, contact in enumerate(models):
+        alone = apply_contact(scene.model, contact)
+        for name in ("geom_solref", "pair_solref", "geom_solimp", "pair_solimp", "geom_margin", "pair_margin"):
+            np.testing.assert_array_equal(getattr(applied, name)[index], getattr(alone, name))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"solref": (-1.0, 1.0)}, "mixes signs and MuJoCo would fall back"),
+        ({"solref": (1.0, -1.0)}, "mixes signs"),
+        ({"solref": (0.02, 0.0)}, "mixes signs"),
+        ({"solref": (1.0,)}, "solref must be two finite numbers"),
+        ({"solref": (math.inf, 1.0)}, "solref must be two finite numbers"),
+        ({"solimp": (0.9, 0.95)}, "solimp must be five finite numbers"),
+        ({"solimp": (0.9, 0.95, math.nan, 0.5, 2.0)}, "solimp must be five finite numbers"),
+        ({"solimp": (0.0, 0.95, 0.001, 0.5, 2.0)}, "solimp's d_0 is 0.0, and MuJoCo would clip it"),
+        ({"solimp": (0.9, 1.0, 0.001, 0.5, 2.0)}, "solimp's d_width is 1.0"),
+        ({"solimp": (0.9, 0.95, 0.001, 0.0, 2.0)}, "solimp's midpoint is 0.0"),
+        ({"solimp": (0.9, 0.95, 0.0, 0.5, 2.0)}, "solimp's width must be positive, in m; got 0.0"),
+        ({"solimp": (0.9, 0.95, 0.001, 0.5, 0.5)}, "solimp's power must be at least 1, got 0.5"),
+        ({"friction": (0.5, 0.1)}, "friction must be three numbers >= 0"),
+        ({"friction": (0.5, -0.1, 0.0)}, "friction must be three numbers >= 0"),
+        ({"friction": (math.nan, 0.1, 0.0)}, "friction must be three numbers >= 0"),
+        ({"margin": -0.1}, "margin must be >= 0 m, got -0.1"),
+        ({"margin": math.nan}, "margin must be >= 0 m, got nan"),
+    ],
+)
+def test_bad_contact_models_are_refused(change, message: str) -> None:
+    arguments = {"solref": DEFAULT_SOLREF, **change}
+    with pytest.raises(ValueError, match=message):
+        contact_model(**arguments, scene=load_scene("pusher"))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"stiffness": 0.0}, "stiffness must be positive and finite, in N/m; got 0.0"),
+        ({"stiffness": math.inf}, "stiffness must be positive and finite"),
+        ({"stiffness": math.nan}, "stiffness must be positive and finite"),
+        ({"effective_mass": 0.0}, "effective mass must be positive and finite, in kg; got 0.0"),
+        ({"effective_mass": math.inf}, "effective mass must be positive and finite"),
+        ({"damping": -1.0}, "damping must be >= 0 and finite, in N s/m; got -1.0"),
+        ({"damping": math.inf}, "damping must be >= 0 and finite"),
+        ({"dampratio": -1.0}, "damping ratio must be >= 0 and finite; got -1.0"),
+        ({"dampratio": math.nan}, "damping ratio must be >= 0 and finite"),
+        ({"damping": 1.0, "dampratio": 1.0}, "give damping in N s/m or a damping ratio, not both"),
+    ],
+)
+def test_bad_units_are_refused(arguments, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        solref_from_stiffness(**{"stiffness": 1.0, "effective_mass": 1.0, **arguments})
+
+
+def test_mixed_signs_have_no_stiffness() -> None:
+    with pytest.raises(ValueError, match="mixes signs"):
+        stiffness_from_solref((-1.0, 1.0), effective_mass=1.0)
+
+
+@pytest.mark.parametrize("name", FAMILIES)
+def test_every_family_builds(name: str) -> None:
+    scene, family = load_scene("pusher"), FAMILIES[name]
+    mass = effective_mass(scene, "pusher", "slider")
+    if not family.swept:
+        contact = family_model(name, scene, effective_mass=mass)
+        np.testing.assert_array_equal(contact.solref, family.solref)
+        for given in ({"stiffness": 1.0}, {"damping": 1.0}):
+            with pytest.raises(ValueError, match="is a single point and takes no stiffness or damping"):
+                family_model(name, scene, effective_mass=mass, **given)
+        return
+    contact = family_model(name, scene, stiffness=100.0, effective_mass=mass)
+    stiffness, damping = stiffness_from_solref(np.asarray(contact.solref).tolist(), effective_mass=mass)
+    assert stiffness == pytest.approx(100.0, rel=1e-15)
+    assert damping == pytest.approx(2 * family.dampratio * math.sqrt(100.0 * mass), abs=1e-12)
+    np.testing.assert_array_equal(contact.solimp, family.solimp)
+    damped = family_model(name, scene, stiffness=100.0, damping=0.3, effective_mass=mass)
+    assert float(damped.solref[1]) == pytest.approx(-0.3 / mass, rel=1e-15)
+    with pytest.raises(ValueError, match=f"contact family '{name}' needs a stiffness in N/m"):
+        family_model(name, scene, effective_mass=mass)
+
+
+def test_an_unknown_family_is_refused() -> None:
+    with pytest.raises(ValueError, match="unknown contact family 'rubber'; choose from penalty, impedance, mujoco"):
+        family_model("rubber", load_scene("pusher"), stiffness=1.0, effective_mass=1.0)
+
+
+def test_mujocos_own_defaults_are_the_constants() -> None:
+    host = mujoco.MjModel.from_xml_string(floor_scene(slider()))
+    assert tuple(host.geom_solref[0]) == DEFAULT_SOLREF
+    assert tuple(host.geom_solimp[0]) == DEFAULT_SOLIMP
+
+
+@pytest.fixture(scope="module")
+def pressed():
+    """A frictionless ball under gravity, stepped under any contact model."""
+    scene = scene_of(floor_scene(slider(1), option(extra='gravity="0 0 -10"'), 'condim="1"'))
+
+    def advance(contact, point, warmstart):
+        return step_flat(scene, apply_contact(scene.model, contact), point, warmstart)[:2]
+
+    contact = contact_model(DEFAULT_SOLREF, scene=scene)
+    return scene, compiled(advance, contact, jnp.zeros(6), jnp.zeros(3))
+
+
+@pytest.mark.parametrize("relative_damping", [0.0, 0.5, 1.3])
+def test_the_stability_limit(pressed, relative_damping: float) -> None:
+    """h^2 k = 4 - 2 h b is where a pressed contact starts to make energy, and where the warning starts."""
+    scene, advance = pressed
+    timestep, impedance = scene.timestep, 0.5
+    b = relative_damping / timestep
+    limit = (4 - 2 * timestep * b) / timestep**2
+
+    def growth(k: float) -> float:
+        contact = contact_model((-k, -b), constant(impedance), scene=scene)
+        rest = -(1 - impedance) * 10 / k  # where the spring carries its share of gravity
+        point, warmstart, offset = np.array([0, 0, 0.9999 * rest, 0, 0, 0]), np.zeros(3), []
+        for _ in range(25):
+            point, warmstart = (np.asarray(part) for part in advance(contact, point, warmstart))
+            offset.append(abs(point[2] / rest - 1))
+        return max(offset[-2:]) / 1e-4
+
+    # The linear map's root nearest -1 is 4 % of the distance over 1 + det away from it on either side; over 25 steps
+    # that is at least a factor of two, and without damping a bounded beat below the limit.
+    below = growth(0.96 * limit)
+    with pytest.warns(ContactWarning, match=r"is not below 4 - 2 h b .*makes energy"):
+        above = growth(1.04 * limit)
+    roots = [
+        max(abs(np.roots([1, -(2 - timestep * b - s * timestep**2 * limit), 1 - timestep * b]))) for s in (0.96, 1.04)
+    ]
+    assert roots[0] <= 1 + 1e-12 < roots[1]
+    assert below < 6  # 1 / sqrt(1 - 0.96) = 5: the largest transient of the undamped map
+    assert above > 0.3 * roots[1] ** 24
+    assert above > below
+
+
+def test_zero_damping_keeps_the_derivative_finite() -> None:
+    """The damping that stands in for zero changes a velocity by 1e-12 h v, less than its rounding."""
+    contact = contact_model((-1000.0, 0.0), scene=load_scene("pusher"))
+    assert -1e-11 < float(contact.solref[1]) < 0
+
+
+def test_rows_exist_where_contact_begins() -> None:
+    """A ball 1 mm above the plane is in contact under a margin of 1.1 mm and not under one of 0.9 mm."""
+    scene = scene_of(floor_scene(slider(1, height=0.101), None, 'condim="1"'))
+
+    def force(contact):
+        data = mjx.forward(apply_contact(scene.model, contact), scene.template)
+        return constraint.constraint_force(scene.model, data, data.qacc)[2]
+
+    run = jax.jit(force)
+    near, far = (contact_model((-1000.0, 0.0), margin=m, scene=scene) for m in (0.0011, 0.0009))
+    assert float(run(near)) > 0 == float(run(far))

@@ -1,0 +1,461 @@
+"""The step against `mjx.step`, and its derivatives against central differences, over a table of scenes."""
+
+import dataclasses
+from collections.abc import Callable
+from functools import cache
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from mjx_study import constraint, dynamics
+from mjx_study._mjx import mjx
+from mjx_study.contact import ContactModel, apply_contact, contact_model
+from mjx_study.integration import integrate_position
+from mjx_study.scene import Scene
+from tests.scenes import (
+    CASES,
+    assert_close_by_rows,
+    central_jacobian,
+    compiled,
+    floor_scene,
+    option,
+    plain_warm_start,
+    scene_of,
+    sizes,
+    slider,
+    split,
+    start_point,
+    step_flat,
+    stock_step_flat,
+)
+
+# Where the other cases already cover what a case's derivatives would show, they are left to `make test-all`.
+SLOW = ("box-plane pyramidal", "chain elliptic CG")
+MARKED = [pytest.param(name, marks=[pytest.mark.slow] if name in SLOW else []) for name in CASES]
+STEPPED = [pytest.param(name, marks=[pytest.mark.slow] if name == SLOW[1] else []) for name in CASES]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Prepared:
+    """A scene in generic contact and its compiled step."""
+
+    scene: Scene
+    step: Callable[..., Any]
+    point: np.ndarray
+    warmstart: np.ndarray
+
+    def run(self, point: Any) -> np.ndarray:
+        """State after one step."""
+        return np.asarray(self.step(self.scene.model, jnp.asarray(point), self.warmstart)[0])
+
+
+@cache
+def prepare(name: str) -> Prepared:
+    """A case, two steps after its start."""
+    case = CASES[name]
+    scene = scene_of(case.source)
+    point, warmstart = start_point(case, scene), np.zeros(scene.host.nv)
+    step = compiled(lambda *args: step_flat(scene, *args), scene.model, point, warmstart)
+    for _ in range(2):
+        after, warmstart, _ = step(scene.model, point, warmstart)
+        point = np.concatenate([after, case.control])
+    return Prepared(scene, step, point, np.asarray(warmstart))
+
+
+@cache
+def jacobian(name: str) -> np.ndarray:
+    """The Jacobian program's, in reverse mode."""
+    case = prepare(name)
+    assert dynamics.uses_jacobian(case.scene)
+
+    def after(model, point):
+        return step_flat(case.scene, model, point, jnp.asarray(case.warmstart))[0]
+
+    program = compiled(jax.jacrev(after, 1), case.scene.model, case.point)
+    return np.asarray(program(case.scene.model, case.point))
+
+
+def polished_step(scene: Scene, model, point: jax.Array) -> jax.Array:
+    """A step whose acceleration solves the constraints to rounding.
+
+    MJX stops where its cost no longer falls, which with cones or conjugate gradients leaves an acceleration 1e-8 off:
+    harmless, but not to differences of 3e-6. Newton's method on the equation itself has no such floor.
+    """
+    qpos, qvel, act, control = split(scene, point)
+    data = dynamics._force_stage(model, dynamics._position_stage(scene, model, qpos), qvel, act, control)
+
+    def newton(qacc, _):
+        gap = lambda qacc: constraint.imbalance(model, data, qacc)  # noqa: E731
+        return qacc - jnp.linalg.solve(jax.jacfwd(gap)(qacc), gap(qacc)), None
+
+    qacc, _ = jax.lax.scan(newton, constraint.run_solver(model, data), length=3)
+    qvel, act = dynamics._finish(model, data, qacc)
+    return jnp.concatenate([integrate_position(scene.host, qpos, qvel, model.opt.timestep), qvel, act])
+
+
+@cache
+def numeric_jacobian(name: str) -> np.ndarray:
+    """By central differences of a step converged to rounding.
+
+    The shortest length is the 1 mm over which the impedance rises; 3e-6 of differences leave (3e-3)^4 of curvature
+    and 1e-16 / 3e-6 of rounding.
+    """
+    case = prepare(name)
+    program = compiled(lambda point: polished_step(case.scene, case.scene.model, point), case.point)
+    np.testing.assert_allclose(program(case.point), case.run(case.point), atol=1e-7)
+    return central_jacobian(program, case.point, 3e-6)
+
+
+@pytest.mark.parametrize("name", STEPPED)
+def test_the_step_is_mjxs(name: str) -> None:
+    """Over 25 steps, each from the same state, so that each step is compared and not how errors grow.
+
+    From the same warm start the step is MJX's to rounding. With the improved one, ours may lie nearer the solution
+    than MJX's: the solver's cost is as convex as M, so two accelerations are at most |G| apart each, in the norms of M.
+    """
+    case = prepare(name)
+    scene, (nq, nv, na, _) = case.scene, sizes(case.scene)
+
+    def compare(model, point, warmstart, qacc):
+        qpos, qvel, act, control = split(scene, point)
+        data = dynamics._force_stage(model, dynamics._position_stage(scene, model, qpos), qvel, act, control)
+
+        inertia = mjx.full_m(model, data)
+
+        def distance(qacc):
+            gap = constraint.imbalance(model, data, qacc)
+            return jnp.sqrt(gap @ jnp.linalg.solve(inertia, gap))
+
+        stock, stock_qacc = stock_step_flat(scene, model, point, warmstart)
+        plain, plain_qacc, _ = step_flat(scene, model, point, warmstart)
+        apart = qacc - stock_qacc
+        apart = jnp.sqrt(apart @ inertia @ apart)
+        return stock, plain, stock_qacc - plain_qacc, apart, distance(qacc) + distance(stock_qacc)
+
+    point, warmstart = start_point(CASES[name], scene), np.zeros(nv)
+    with plain_warm_start():
+        program = compiled(compare, scene.model, point, warmstart, warmstart)
+    for _ in range(25):
+        after, qacc, residual = case.step(scene.model, point, warmstart)
+        stock, plain, gap, apart, allowed = program(scene.model, point, warmstart, qacc)
+        np.testing.assert_allclose(plain, stock, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(scene.timestep * gap, 0, atol=1e-12)
+        assert float(apart) <= float(allowed) + 1e-12 * np.abs(qacc).max()
+        assert float(residual) < 1e-6
+        point, warmstart = np.concatenate([after, CASES[name].control]), qacc
+    assert after.shape == (nq + nv + na,)
+
+
+@pytest.mark.parametrize("name", STEPPED)
+def test_the_state_is_in_contact(name: str) -> None:
+    """Without its constraints the step would end elsewhere; the tests below are of contact."""
+    case = prepare(name)
+    host = case.scene.host
+    free = case.scene.model.replace(
+        geom_margin=case.scene.model.geom_margin - 10.0, jnt_margin=case.scene.model.jnt_margin - 10.0
+    )
+    nq, nv = host.nq, host.nv
+    without = np.asarray(case.step(free, case.point, case.warmstart)[0])
+    assert np.abs(case.run(case.point) - without)[nq : nq + nv].max() > 1e-3
+
+
+@pytest.mark.parametrize("name", MARKED)
+def test_reverse_mode_is_the_central_difference(name: str) -> None:
+    # the derivative is taken where MJX's solver stopped, 1e-8 from the solution; with cones it differs there by as much
+    assert_close_by_rows(jacobian(name), numeric_jacobian(name), 1e-6)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=[] if name in ("sphere-sphere condim 1", "mechanism") else [pytest.mark.slow])
+        for name in CASES
+    ],
+)
+def test_both_programs_and_both_modes_agree(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The tape, forwards and backwards, equals the Jacobian program."""
+    case, expected = prepare(name), jacobian(name)
+    monkeypatch.setattr(dynamics, "JACOBIAN_COLUMNS", 0)
+    assert not dynamics.uses_jacobian(case.scene)
+
+    def both(model, point):
+        after, push = jax.linearize(lambda x: step_flat(case.scene, model, x, jnp.asarray(case.warmstart))[0], point)
+        pull = jax.linear_transpose(push, point)
+        forward = jax.vmap(push, out_axes=-1)(jnp.eye(point.shape[0]))
+        return forward, jax.vmap(lambda row: pull(row)[0])(jnp.eye(after.shape[0]))
+
+    forward, reverse = compiled(both, case.scene.model, case.point)(case.scene.model, case.point)
+    assert_close_by_rows(forward, expected, 1e-10)
+    assert_close_by_rows(reverse, expected, 1e-10)
+
+
+# A sphere that slides on the plane: cheap enough for what needs several programs.
+
+SPEED = np.array([0.3, 0.2, -0.1])
+
+
+def sliding(extra: str = "", options: str | None = None) -> Scene:
+    return scene_of(floor_scene(slider(3), options or option(extra=extra)))
+
+
+def at(height: float, qvel: np.ndarray = SPEED) -> np.ndarray:
+    return np.concatenate([[0.01, -0.02, height], qvel])
+
+
+def state_jacobian(scene: Scene) -> Callable[[np.ndarray], np.ndarray]:
+    def after(point):
+        return step_flat(scene, scene.model, point, jnp.zeros(3))[0]
+
+    program = compiled(jax.jacfwd(after), jnp.zeros(6))
+    return lambda point: np.asarray(program(jnp.asarray(point)))
+
+
+@cache
+def sliding_jacobian(extra: str) -> Callable[[np.ndarray], np.ndarray]:
+    return state_jacobian(sliding(extra))
+
+
+@cache
+def sliding_step(extra: str) -> Callable[[np.ndarray], np.ndarray]:
+    scene = sliding(extra)
+    program = compiled(lambda point: step_flat(scene, scene.model, point, jnp.zeros(3))[0], jnp.zeros(6))
+    return lambda point: np.asarray(program(jnp.asarray(point)))
+
+
+@pytest.mark.parametrize("cone", [pytest.param("pyramidal", marks=pytest.mark.slow), "elliptic"])
+def test_conjugate_gradients_have_newtons_derivative(cone: str) -> None:
+    newton = sliding_jacobian(f'cone="{cone}" solver="Newton"')
+    with plain_warm_start():  # two steps of Newton's would leave little to the gradients
+        gradients = state_jacobian(sliding(f'cone="{cone}" solver="CG"'))
+    for height in (-0.0004, -0.003):
+        # both loops stop where the cost no longer falls: 1e-8 in the acceleration, on a smooth piece of the law
+        assert_close_by_rows(gradients(at(height)), newton(at(height)), 1e-6)
+
+
+def test_the_derivative_does_not_depend_on_the_budget() -> None:
+    """Unlike an unrolled solver's: with enough iterations more of them change nothing."""
+    expected = sliding_jacobian('cone="elliptic" solver="Newton"')(at(-0.0004))
+    with plain_warm_start():
+        options = '<option cone="elliptic" iterations="15" ls_iterations="15" tolerance="1e-30"/>'
+        enough = state_jacobian(sliding(options=options))
+    assert_close_by_rows(enough(at(-0.0004)), expected, 1e-6)
+
+
+def test_elliptic_contact_without_tangential_velocity() -> None:
+    """The cone's axis, where a norm has no derivative; friction sticks there and the step is smooth."""
+    derivative = sliding_jacobian('cone="elliptic" solver="Newton"')
+    step = sliding_step('cone="elliptic" solver="Newton"')
+    for qvel in (np.array([0.0, 0.0, -0.1]), np.zeros(3)):
+        point = at(-0.0004, qvel)
+        assert_close_by_rows(derivative(point), central_jacobian(step, point, 3e-6), 1e-6)
+        # the tangential velocity is braked, at the rate of its own row
+        assert 0 < derivative(point)[3, 3] < 1
+
+
+def test_without_contact_the_derivative_is_free_fall() -> None:
+    scene = sliding()
+    expected = np.block([[np.eye(3), scene.timestep * np.eye(3)], [np.zeros((3, 3)), np.eye(3)]])
+    free_fall = sliding_jacobian('cone="elliptic" solver="Newton"')(at(0.1))
+    np.testing.assert_allclose(free_fall, expected, atol=1e-15)
+
+
+# Derivatives with respect to contact parameters.
+
+PARAMETERS = ("stiffness", "damping", "d_0", "d_width", "width", "midpoint", "power", "sliding", "torsional", "rolling")
+POWER = PARAMETERS.index("power")
+
+
+@cache
+def over_parameters(cone: str) -> Callable[..., Any]:
+    """(parameters, point) -> (velocity after a step, its Jacobian over the parameters, reverse mode)."""
+    scene = sliding(f'cone="{cone}"', None)
+
+    def velocity(parameters, point):
+        contact = ContactModel(parameters[:2], parameters[2:7], parameters[7:])
+        return step_flat(scene, apply_contact(scene.model, contact), point, jnp.zeros(3))[0][3:]
+
+    def both(parameters, point):
+        return velocity(parameters, point), jax.jacrev(velocity)(parameters, point)
+
+    program = compiled(both, jnp.zeros(10), jnp.zeros(6))
+    return lambda parameters, point: tuple(map(np.asarray, program(jnp.asarray(parameters), jnp.asarray(point))))
+
+
+def parameters(solref: tuple[float, float], power: float = 2.0) -> np.ndarray:
+    return np.array([*solref, 0.3, 0.9, 0.001, 0.4, power, 0.5, 0.02, 0.003])
+
+
+@pytest.mark.parametrize("cone", ["pyramidal", "elliptic"])
+@pytest.mark.parametrize("solref", [(-3000.0, -40.0), (0.03, 0.8)], ids=["direct", "time"])
+@pytest.mark.parametrize("height", [-0.0002, -0.0007, -0.003], ids=["below-midpoint", "above-midpoint", "beyond-width"])
+def test_derivatives_over_contact_parameters(cone: str, solref: tuple[float, float], height: float) -> None:
+    program, values = over_parameters(cone), parameters(solref)
+    _, derivative = program(values, at(height))
+    # per relative change of a parameter, so that all have the unit of the velocity
+    numeric = central_jacobian(lambda log: program(values * np.exp(log), at(height))[0], np.zeros(10), 1e-3)
+    scaled = derivative * values
+    if height == -0.003:
+        # MJX raises 1 - |r| / width, negative here, to the power in a branch that it does not take
+        assert np.isnan(scaled[:, POWER]).all(), "MJX now has this derivative: say so where its fault is described"
+        np.testing.assert_allclose(numeric[:, POWER], 0, atol=1e-12)
+        scaled, numeric = np.delete(scaled, POWER, 1), np.delete(numeric, POWER, 1)
+    assert np.abs(numeric[:, :4]).max() > 1e-4
+    # Richardson at 1e-3: (1e-3)^4 of a few derivatives; rounding and the solver's 1e-8 of a velocity change over 1e-3
+    np.testing.assert_allclose(scaled, numeric, rtol=1e-6, atol=1e-8 if cone == "elliptic" else 1e-10)
+
+
+def test_derivative_over_stiffness_without_damping() -> None:
+    """Exactly zero damping is NaN in MJX; what `contact_model` puts in its place is finite and right."""
+    program, scene = over_parameters("pyramidal"), sliding()
+    values, point = parameters((-3000.0, 0.0)), at(-0.0004)
+    assert np.isnan(program(values, point)[1]).any(), "MJX now has this derivative: say so where its fault is described"
+    values[:2] = contact_model((-3000.0, 0.0), scene=scene).solref
+    derivative = program(values, point)[1]
+    assert np.isfinite(derivative).all()
+
+    def by_stiffness(shift):
+        return program(values + np.array([shift[0], *np.zeros(9)]), point)[0]
+
+    numeric = central_jacobian(by_stiffness, np.zeros(1), 1.0)
+    np.testing.assert_allclose(derivative[:, 0], numeric[:, 0], rtol=1e-8, atol=1e-14)
+
+
+@pytest.mark.slow
+def test_a_power_that_is_no_whole_number(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Beyond the width MJX raises a negative number to it in a branch that it does not take.
+
+    The Jacobian program, of forward modes, is unharmed; on the tape reverse mode is NaN, out of contact too.
+    """
+    scene = sliding()
+    model = apply_contact(scene.model, contact_model((-3000.0, -40.0), (0.3, 0.9, 0.001, 0.4, 1.5), scene=scene))
+    points = [at(height) for height in (-0.003, 0.05)]
+
+    def program():
+        return compiled(jax.jacrev(lambda point: step_flat(scene, model, point, jnp.zeros(3))[0]), jnp.zeros(6))
+
+    step = compiled(lambda point: step_flat(scene, model, point, jnp.zeros(3))[0], jnp.zeros(6))
+    derivative = program()
+    for point in points:
+        assert_close_by_rows(derivative(point), central_jacobian(step, point, 3e-6), 1e-6)
+    monkeypatch.setattr(dynamics, "JACOBIAN_COLUMNS", 0)
+    on_the_tape = program()
+    for point in points:
+        assert np.isnan(on_the_tape(point)).any(), "MJX now has this derivative: say so where its fault is described"
+
+
+# States and rollouts.
+
+
+def test_a_rollout_is_its_steps() -> None:
+    case = prepare("sphere-sphere condim 1")
+    scene, horizon = case.scene, 6
+    start = dynamics.initial_state(scene, qvel=jnp.asarray([0.5, 0.0]))
+
+    def law(index, state):
+        return jnp.asarray([0.1]) * index - 0.3 * state.qvel[:1]
+
+    states, controls, residuals = jax.jit(lambda s: dynamics.rollout(scene, scene.model, s, law, horizon))(start)
+    assert states.qpos.shape == (horizon + 1, 2) and controls.shape == (horizon, 1) and residuals.shape == (horizon,)
+    point, warmstart = np.array([0.0, 1.0, 0.5, 0.0]), np.zeros(2)
+    for index in range(horizon):
+        np.testing.assert_allclose(np.concatenate([states.qpos[index], states.qvel[index]]), point, atol=1e-14)
+        control = 0.1 * index - 0.3 * point[2]
+        assert float(controls[index, 0]) == pytest.approx(control, abs=1e-14)
+        point, warmstart, _ = map(np.asarray, case.step(scene.model, np.concatenate([point, [control]]), warmstart))
+
+
+@pytest.mark.parametrize("horizon", [0, -1])
+def test_an_empty_rollout_is_refused(horizon: int) -> None:
+    scene = prepare("sphere-sphere condim 1").scene
+    with pytest.raises(ValueError, match=f"horizon must be at least 1 step, got {horizon}"):
+        dynamics.rollout(scene, scene.model, dynamics.initial_state(scene), lambda _, __: jnp.zeros(1), horizon)
+
+
+# Runge-Kutta.
+
+PENDULUM = """
+<mujoco><option timestep="0.02" integrator="RK4"/><worldbody><body><joint name="axle" axis="0 1 0" damping=".1"/>
+  <geom type="capsule" fromto="0 0 0 0 0 -.5" size=".03" mass="1" contype="0" conaffinity="0"/></body>
+</worldbody><actuator><general joint="axle" dyntype="filter" dynprm=".1" gainprm="2"/></actuator></mujoco>"""
+
+
+@pytest.fixture(scope="module")
+def pendulum():
+    """A pendulum with an activated motor: our step and MJX's at any timestep."""
+    scene = scene_of(PENDULUM)
+    assert not scene.has_constraints and not dynamics.uses_jacobian(scene)
+
+    def with_timestep(timestep):
+        return scene.model.replace(opt=scene.model.opt.replace(timestep=timestep))
+
+    def both(timestep, point):
+        model = with_timestep(timestep)
+        return step_flat(scene, model, point, jnp.zeros(1))[0], stock_step_flat(scene, model, point, jnp.zeros(1))[0]
+
+    start = np.array([0.9, 2.5, 0.3, 0.7])
+    program = compiled(both, jnp.asarray(0.02), start)
+    return scene, start, lambda timestep, point: tuple(map(np.asarray, program(jnp.asarray(timestep), point)))
+
+
+def test_runge_kutta_is_mjxs(pendulum) -> None:
+    _, start, run = pendulum
+    point = start
+    for _ in range(20):
+        ours, stock = run(0.02, point)
+        np.testing.assert_allclose(ours, stock, rtol=0, atol=1e-13)
+        point = np.concatenate([ours, start[-1:]])
+
+
+def test_runge_kutta_converges_with_order_four(pendulum) -> None:
+    _, start, run = pendulum
+
+    def after_a_while(steps: int) -> np.ndarray:
+        point = start
+        for _ in range(steps):
+            point = np.concatenate([run(0.32 / steps, point)[0], start[-1:]])
+        return point
+
+    exact = after_a_while(512)
+    errors = [np.abs(after_a_while(steps) - exact).max() for steps in (16, 32, 64)]
+    orders = np.log2(np.array(errors[:-1]) / errors[1:])
+    np.testing.assert_allclose(orders, 4, atol=0.15)  # the next order's share, which halves with the timestep
+
+
+def test_derivative_of_runge_kutta(pendulum) -> None:
+    scene, start, run = pendulum
+    program = compiled(jax.jacrev(lambda x: step_flat(scene, scene.model, x, jnp.zeros(1))[0]), start)
+    numeric = central_jacobian(lambda point: run(0.02, point)[0], start, 1e-3)
+    # Richardson at 1e-3 and rounding 1e-16 / 1e-3
+    assert_close_by_rows(program(start), numeric, 1e-10)
+
+
+def test_initial_state_defaults() -> None:
+    scene = prepare("mechanism").scene
+    state = dynamics.initial_state(scene)
+    host = mujoco.MjData(scene.host)
+    np.testing.assert_array_equal(state.qpos, host.qpos)
+    assert state.act.shape == (2,) and not np.any(state.qvel) and not np.any(state.warmstart)
+
+
+def test_second_derivatives_see_the_acceleration(monkeypatch):
+    """The step's Jacobian depends on qacc; its own derivative must follow that, as the tape's does by itself."""
+    scene = scene_of(floor_scene(slider(), option(extra='cone="elliptic"')))
+
+    def speed(height):
+        qpos = scene.template.qpos.at[2].set(height)
+        state = dynamics.initial_state(scene, qpos, jnp.array([0.5, -0.2, -0.1]))
+        following, _ = dynamics.step(scene, scene.model, state, jnp.zeros(0))
+        return following.qvel[0]
+
+    def second():
+        return float(jax.grad(jax.grad(lambda height: speed(height)))(-5e-4))
+
+    jacobian_program = second()
+    monkeypatch.setattr(dynamics, "JACOBIAN_COLUMNS", 0)
+    tape = second()
+    assert abs(tape) > 1
+    assert jacobian_program == pytest.approx(tape, rel=1e-8)

@@ -1,0 +1,146 @@
+"""Imports only point down the layers, and importing has no effect on the process."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+# From the bottom up; a module may import from its own layer and from those above it in this list.
+LAYERS = [
+    "estimators",
+    "mjx_study._mjx",
+    "mjx_study.runtime",
+    "mjx_study.noise",
+    "mjx_study.table",
+    "mjx_study.reference",
+    "mjx_study.scene",
+    "mjx_study.contact",
+    "mjx_study.integration",
+    "mjx_study.constraint",
+    "mjx_study.dynamics",
+    "mjx_study.policy",
+    "mjx_study.task",
+    "mjx_study.tasks",
+    "mjx_study.objective",
+    "mjx_study.reference_gradient",
+    "mjx_study.study",
+    "mjx_study.gradcheck",
+    "mjx_study.bench",
+    "mjx_study.results",
+    "mjx_study.plots",
+    "mjx_study.console",
+    "mjx_study.cli",
+    "mjx_study.__main__",
+    "mjx_study",  # the package itself re-exports, so that nothing may import from it
+]
+PACKAGES = ("estimators", "mjx_study")
+# The analytic systems are NumPy alone, and share with the simulator only how noise is drawn.
+REFERENCE_MAY_IMPORT = ("estimators", "mjx_study.noise", "mjx_study.reference")
+FILES = sorted(path for package in PACKAGES for path in (ROOT / package).glob("**/*.py"))
+
+
+def module_of(path: Path) -> str:
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def layer_of(module: str) -> int:
+    """Index of the layer; an error for a module of ours that is in none."""
+    for index, name in enumerate(LAYERS):
+        if module == name or (name != "mjx_study" and module.startswith(name + ".")):
+            return index
+    raise LookupError(f"{module} is in no layer: add it to LAYERS where it belongs")
+
+
+def imports_of(source: str, module: str, *, is_package: bool) -> set[str]:
+    """Modules of ours that a source imports, wherever the import statement stands."""
+    parts = module.split(".")
+    package = parts if is_package else parts[:-1]
+    found: set[str] = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            base = package[: len(package) - node.level + 1] if node.level else []
+            stem = ".".join([*base, *([node.module] if node.module else [])])
+            submodules = {f"{stem}.{alias.name}" for alias in node.names if is_module(f"{stem}.{alias.name}")}
+            found |= submodules or {stem}
+            if submodules and len(submodules) < len(node.names):
+                found.add(stem)
+    return {name for name in found if name.split(".")[0] in PACKAGES}
+
+
+def is_module(name: str) -> bool:
+    path = ROOT.joinpath(*name.split("."))
+    return path.with_suffix(".py").is_file() or (path / "__init__.py").is_file()
+
+
+def read(path: Path) -> set[str]:
+    return imports_of(path.read_text(), module_of(path), is_package=path.name == "__init__.py")
+
+
+def refused(module: str, imported: set[str]) -> set[str]:
+    """Which of a module's imports are not allowed."""
+    here = layer_of(module)
+    wrong = {name for name in imported if layer_of(name) > here}
+    if module.startswith("mjx_study.reference.") or module == "mjx_study.reference":
+        wrong |= {n for n in imported if not any(n == p or n.startswith(p + ".") for p in REFERENCE_MAY_IMPORT)}
+    return wrong
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_imports_point_down(path: Path) -> None:
+    wrong = refused(module_of(path), read(path))
+    assert not wrong, f"{module_of(path)} imports {sorted(wrong)}, of a later layer"
+
+
+def test_every_layer_is_used_once_and_files_are_found() -> None:
+    assert len(set(LAYERS)) == len(LAYERS)
+    assert {layer_of(module_of(path)) for path in FILES} >= {LAYERS.index(n) for n in ("estimators", "mjx_study.scene")}
+
+
+@pytest.mark.parametrize(
+    ("module", "source", "wrong"),
+    [
+        ("estimators.types", "import mjx_study.noise", {"mjx_study.noise"}),
+        ("mjx_study.scene", "def f():\n    from mjx_study.dynamics import step", {"mjx_study.dynamics"}),
+        ("mjx_study.scene", "from .contact import ContactModel", {"mjx_study.contact"}),
+        ("mjx_study.scene", "from mjx_study import contact", {"mjx_study.contact"}),
+        ("mjx_study.contact", "from mjx_study import ContactModel", {"mjx_study"}),
+        ("mjx_study.reference.system", "from mjx_study.scene import Scene", {"mjx_study.scene"}),
+        ("mjx_study.contact", "from mjx_study.scene import Scene\nimport jax", set()),
+    ],
+)
+def test_the_walk_sees(module: str, source: str, wrong: set[str]) -> None:
+    assert refused(module, imports_of(source, module, is_package=False)) == wrong
+
+
+def test_a_module_in_no_layer_fails() -> None:
+    with pytest.raises(LookupError, match="mjx_study.surprise is in no layer"):
+        layer_of("mjx_study.surprise")
+
+
+IMPORT_ALL = """
+import os, sys, warnings
+import jax
+before = dict(jax.config.values)
+environment, filters = dict(os.environ), list(warnings.filters)
+for name in sys.argv[1:]:
+    __import__(name)
+changed = {key: (old, jax.config.values[key]) for key, old in before.items() if jax.config.values[key] != old}
+assert not changed, f"JAX configuration changed: {changed}"
+added = {key for key in os.environ if os.environ[key] != environment.get(key)}
+assert not added, f"environment changed: {added}"
+assert not jax._src.xla_bridge.backends_are_initialized(), "a backend was started"
+"""
+
+
+def test_import_has_no_global_effect() -> None:
+    """In a fresh process: no change of JAX's configuration or of the environment, nothing printed."""
+    modules = [module_of(path) for path in FILES if path.name != "__main__.py"]
+    done = subprocess.run([sys.executable, "-c", IMPORT_ALL, *modules], capture_output=True, text=True, cwd=ROOT)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == ""
