@@ -51,7 +51,8 @@ columns of the table:
   alpha           weight of the first-order batch in AoBG
   epsilon, B      confidence radius of the zeroth-order mean; distance between the two means
   residual        largest relative imbalance left by MuJoCo's constraint solver
-  not finite      samples that overflowed or became NaN; they are left out, and a warning says so
+  ms              computing time of one sample in milliseconds, compilation excluded
+  lost            samples that overflowed or became NaN; they are left out, and a warning says so
 """,
     "gradcheck": """\
 Compares, at each contact model: reverse mode with forward mode and with central differences of the whole cost over
@@ -249,7 +250,7 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument("--estimators", type=_names, metavar="NAME[,NAME]", help="default: zobg,fobg,aobg")
     command.add_argument("--samples", type=int, metavar="N", help="samples in each batch (default: 400)")
     command.add_argument(
-        "--reference-samples", type=int, metavar="N", help="pairs of rollouts behind each reference (default: 800)"
+        "--reference-samples", type=int, metavar="N", help="pairs of rollouts behind each reference (default: 600)"
     )
     command.add_argument(
         "--damping", type=float, metavar="B", help="contact damping in N s/m, in place of the family's"

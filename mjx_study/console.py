@@ -51,15 +51,15 @@ def columns(confidence: float) -> list[list[Column]]:
         ("|gradient|", lambda row: number(row.gradient_norm)),
         (f"variance ({confidence:.0%} interval)", _interval),
         ("relative error", lambda row: _with_error(row.relative_error, row.relative_error_se)),
-        ("cosine", lambda row: _with_error(row.cosine, row.cosine_se)),
     ]
     details: list[Column] = [
+        ("cosine", lambda row: _with_error(row.cosine, row.cosine_se)),
         ("alpha", lambda row: "-" if row.alpha is None else f"{row.alpha:.3f}"),
         ("epsilon", lambda row: number(row.epsilon)),
         ("B", lambda row: number(row.discrepancy)),
-        ("ms/sample", lambda row: f"{1e3 * row.seconds_per_sample:.2f}"),
+        ("ms", lambda row: f"{1e3 * row.seconds_per_sample:.2f}"),
         ("residual", lambda row: number(row.residual, 2)),
-        ("not finite", lambda row: str(row.nonfinite)),
+        ("lost", lambda row: str(row.nonfinite)),
     ]
     return [identity + values, identity + details]
 

@@ -64,7 +64,7 @@ class CompareConfig:
     contact: tuple[str, ...] = ("penalty", "mujoco", "mujoco_stiff")
     estimators: tuple[str, ...] = ("zobg", "fobg", "aobg")
     samples: int = 400
-    reference_samples: int = 800
+    reference_samples: int = 600
     sigma: float | None = None
     seed: int = 0
     baseline: str = "zero_noise"
@@ -417,25 +417,41 @@ def _row(
 
 
 def findings(result: CompareResult) -> list[str]:
-    """What the intervals say about the variance of FoBG and ZoBG, a sentence for each contact family."""
-    sentences = []
-    for family in result.config.contact:
-        table = {(row.stiffness, row.estimator): row for row in result.rows if row.contact == family}
-        stiffnesses = sorted({stiffness for stiffness, _ in table})
-        if not all((stiffness, name) in table for stiffness in stiffnesses for name in ("zobg", "fobg")):
-            continue
-        less, more = [], []
-        for stiffness in stiffnesses:
-            zeroth, first = table[stiffness, "zobg"], table[stiffness, "fobg"]
-            if first.variance_upper < zeroth.variance_lower:
-                less.append(stiffness)
-            elif first.variance_lower > zeroth.variance_upper:
-                more.append(stiffness)
-        undecided = [stiffness for stiffness in stiffnesses if stiffness not in less + more]
-        parts = [
-            f"{verb} at K = {', '.join(f'{stiffness:g}' for stiffness in group)} N/m"
-            for verb, group in (("below ZoBG's", less), ("above it", more), ("not told apart", undecided))
-            if group
-        ]
-        sentences.append(f"{family}: FoBG's variance is {'; '.join(parts)} ({result.config.confidence:.0%} intervals)")
-    return sentences
+    """What the intervals say, in sentences: where FoBG's variance is above ZoBG's, and where its mean is biased."""
+    return [
+        sentence
+        for family in result.config.contact
+        for sentence in (*_variance_finding(result, family), *_bias_finding(result, family))
+    ]
+
+
+def _variance_finding(result: CompareResult, family: str) -> list[str]:
+    table = {(row.stiffness, row.estimator): row for row in result.rows if row.contact == family}
+    groups: dict[str, list[float]] = {"below ZoBG's": [], "above it": [], "not told apart": []}
+    for stiffness in sorted({stiffness for stiffness, _ in table}):
+        if (stiffness, "zobg") not in table or (stiffness, "fobg") not in table:
+            return []
+        zeroth, first = table[stiffness, "zobg"], table[stiffness, "fobg"]
+        below, above = first.variance_upper < zeroth.variance_lower, first.variance_lower > zeroth.variance_upper
+        groups["below ZoBG's" if below else "above it" if above else "not told apart"].append(stiffness)
+    parts = [f"{verdict} at K = {_list(group)} N/m" for verdict, group in groups.items() if group]
+    return [f"{family}: FoBG's variance is {'; '.join(parts)} ({result.config.confidence:.0%} intervals)"]
+
+
+def _bias_finding(result: CompareResult, family: str) -> list[str]:
+    """Where the error of FoBG's mean is more than three times what its own noise and the reference's explain."""
+    biased = []
+    for row in result.rows:
+        if row.contact == family and row.estimator == "fobg":
+            noise = math.hypot(math.sqrt(row.variance / row.samples) / row.reference_norm, row.reference_uncertainty)
+            if row.relative_error > 3 * noise:
+                biased.append(row)
+    return [
+        f"{family}: FoBG's mean is biased by {row.relative_error:.1%} at K = {row.stiffness:g} N/m "
+        "(its error is over three times what noise explains)"
+        for row in biased
+    ]
+
+
+def _list(values: Sequence[float]) -> str:
+    return ", ".join(f"{value:g}" for value in values)

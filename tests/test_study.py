@@ -1,0 +1,217 @@
+"""Comparisons: what is shared, what is compiled, what the findings say, what a plan refuses."""
+
+import dataclasses
+import math
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mjx_study import console, plots, results, study
+from mjx_study.objective import MjxObjective, Simulator
+from mjx_study.study import CompareConfig, CompareResult, Row
+
+SMALL: dict[str, Any] = {"horizon": 4, "samples": 8, "reference_samples": 8}
+
+
+def config(**changes: Any) -> CompareConfig:
+    return CompareConfig(task="pusher", **(SMALL | changes))
+
+
+def row(estimator: str, stiffness: float, variance: float, **changes: Any) -> Row:
+    """A row of a made-up result, with an interval of a factor of two either way."""
+    variance, stiffness = float(variance), float(stiffness)
+    values: dict[str, Any] = {name.name: 0.0 for name in dataclasses.fields(Row)}
+    values |= {"contact": "penalty", "estimator": estimator, "stiffness": stiffness, "samples": 100, "residual": 1e-15}
+    values |= {"variance": variance, "variance_lower": variance / 2, "variance_upper": 2 * variance}
+    values |= {"solref": (-stiffness / 0.05, 0.0), "solimp": (1e-4, 1e-4, 1e-3, 0.5, 2.0), "unconverged": 0}
+    values |= {"alpha": None, "epsilon": None, "discrepancy": None, "nonfinite": 0, "reference_norm": 10.0}
+    values |= {"reference_uncertainty": 0.01, "relative_error": 0.01, "cosine": 1.0, "gradient_norm": 10.0}
+    return Row(**(values | changes))
+
+
+def result(*rows: Row, **changes: Any) -> CompareResult:
+    resolved = config(contact=("penalty",), sigma=0.1, gamma=1e8, cone="pyramidal", chunk_size=4, **changes)
+    gradients = np.zeros((len(rows), 4))
+    return CompareResult(resolved, {"precision": "float64"}, rows, (), gradients, gradients)
+
+
+@pytest.fixture(scope="module")
+def spied() -> tuple[CompareResult, int, dict[str, list[np.ndarray]]]:
+    """A sweep over 13 stiffness values in two families: its result, compilations, and the keys of each batch."""
+    keys: dict[str, list[np.ndarray]] = {"evaluate": [], "differentiate": []}
+    simulators: list[Simulator] = []
+
+    def spy(name: str):
+        method = getattr(MjxObjective, name)
+
+        def recorded(self, theta, batch):
+            keys[name].append(np.asarray(jax.random.key_data(batch)))
+            if self.simulator not in simulators:
+                simulators.append(self.simulator)
+            return method(self, theta, batch)
+
+        return recorded
+
+    with pytest.MonkeyPatch.context() as patch:
+        for name in keys:
+            patch.setattr(MjxObjective, name, spy(name))
+        plan = study.plan_compare(
+            config(stiffness=tuple(np.geomspace(10, 1000, 13)), contact=("penalty", "mujoco"), chunk_size=4)
+        )
+        found = study.compare(plan)
+    (simulator,) = simulators
+    return found, simulator.num_compilations, keys
+
+
+def test_a_sweep_compiles_each_program_once(spied) -> None:
+    found, compilations, _ = spied
+    assert compilations == 2
+    assert len(found.rows) == 13 * 2 * 3
+
+
+def test_batches_are_independent_and_the_same_in_every_cell(spied) -> None:
+    _, _, keys = spied
+    zeroth, first = keys["evaluate"][1:], keys["differentiate"][1:]  # the first call of each only compiles
+    assert len(zeroth) == 26 and len(first) == 52  # a cell differentiates for FoBG and for the control variate
+    for batch in zeroth:
+        np.testing.assert_array_equal(batch, zeroth[0])
+    pools = [{tuple(key) for key in batch} for batch in (zeroth[0], first[0], first[1])]
+    assert all(len(pool) == len(batch) for pool, batch in zip(pools, (zeroth[0], first[0], first[1]), strict=True))
+    assert not (pools[0] & pools[1] or pools[0] & pools[2] or pools[1] & pools[2])
+
+
+def test_an_alpha_order_row_follows_from_the_other_two(spied) -> None:
+    found, _, _ = spied
+    table = {(row.contact, row.stiffness, row.estimator): row for row in found.rows}
+    means = {
+        (row.contact, row.stiffness, row.estimator): mean for row, mean in zip(found.rows, found.gradients, strict=True)
+    }
+    for family, stiffness, name in table:
+        if name != "aobg":
+            continue
+        zeroth, first, both = (table[family, stiffness, which] for which in ("zobg", "fobg", "aobg"))
+        assert both.alpha == pytest.approx(zeroth.variance / (zeroth.variance + first.variance), rel=1e-9)
+        mixed = both.alpha**2 * first.variance + (1 - both.alpha) ** 2 * zeroth.variance
+        assert both.variance == pytest.approx(mixed, rel=1e-9)
+        expected = both.alpha * means[family, stiffness, "fobg"] + (1 - both.alpha) * means[family, stiffness, "zobg"]
+        np.testing.assert_allclose(means[family, stiffness, "aobg"], expected, rtol=1e-9, atol=1e-12)
+        assert both.seconds_per_sample == pytest.approx(zeroth.seconds_per_sample + first.seconds_per_sample)
+
+
+def test_results_do_not_depend_on_the_chunk_size() -> None:
+    chosen = [study.compare(study.plan_compare(config(stiffness=(100.0,), contact=("mujoco",), chunk_size=chunk)))
+              for chunk in (2, 9)]  # fmt: skip
+    np.testing.assert_allclose(chosen[0].gradients, chosen[1].gradients, rtol=1e-12)
+    np.testing.assert_allclose(chosen[0].references, chosen[1].references, rtol=1e-12)
+
+
+def test_a_second_run_gives_the_same_numbers(spied) -> None:
+    found, _, _ = spied
+    again = study.compare(study.plan_compare(config(stiffness=(10.0,), contact=("penalty",), chunk_size=4)))
+    np.testing.assert_array_equal(again.gradients, found.gradients[:3])
+    other = study.compare(study.plan_compare(config(stiffness=(10.0,), contact=("penalty",), chunk_size=4, seed=1)))
+    assert np.all(other.gradients != found.gradients[:3])
+
+
+def test_zeroth_order_alone_does_not_differentiate_for_itself() -> None:
+    plan = study.plan_compare(config(stiffness=(10.0,), contact=("penalty",), estimators=("zobg",)))
+    found = study.compare(plan)
+    assert [row.estimator for row in found.rows] == ["zobg"]
+    assert found.rows[0].alpha is None
+
+
+def test_findings_follow_the_intervals() -> None:
+    rows = (row("zobg", 10, 100), row("fobg", 10, 1), row("zobg", 100, 100), row("fobg", 100, 150))
+    rows += (row("zobg", 1000, 100), row("fobg", 1000, 1e6))
+    (sentence,) = study.findings(result(*rows))
+    assert sentence == (
+        "penalty: FoBG's variance is below ZoBG's at K = 10 N/m; above it at K = 1000 N/m; not told apart at "
+        "K = 100 N/m (95% intervals)"
+    )
+
+
+def test_bias_is_reported_only_beyond_what_noise_explains() -> None:
+    noise = math.hypot(math.sqrt(1 / 100) / 10, 0.01)
+    quiet = row("fobg", 10, 1, relative_error=2.9 * noise)
+    loud = row("fobg", 10, 1, relative_error=3.1 * noise)
+    assert study.findings(result(quiet)) == []
+    (sentence,) = study.findings(result(loud))
+    assert "FoBG's mean is biased by 4.4% at K = 10 N/m" in sentence
+
+
+def test_alarms_name_what_must_not_be_overlooked() -> None:
+    messages = console.alarms(result(row("fobg", 10, 1, nonfinite=7), row("zobg", 10, 1, unconverged=3, residual=0.2)))
+    assert messages == [
+        "penalty, K = 10 N/m, FoBG: 7 of 100 samples are not finite and were left out",
+        "penalty, K = 10 N/m, ZoBG: 3 samples have an unconverged solve (residual 2.0e-01)",
+    ]
+
+
+def test_an_unconverged_solve_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(study.UNCONVERGED, "float64", 1e-30)
+    found = study.compare(study.plan_compare(config(stiffness=(10.0,), contact=("penalty",))))
+    assert all(row.unconverged > 0 for row in found.rows)
+    assert any("unconverged solve" in alarm for alarm in console.alarms(found))
+
+
+def test_numbers_that_are_not_finite_become_null_in_json() -> None:
+    document = results.as_json(result(row("fobg", 10, math.inf, cosine=math.nan)))
+    assert document["rows"][0]["variance"] is None and document["rows"][0]["cosine"] is None
+
+
+def test_figures_survive_what_cannot_be_drawn(tmp_path) -> None:
+    made_up = result(row("zobg", 10, math.nan), row("fobg", 10, 0.0), row("zobg", 20, 1.0), row("fobg", 20, math.inf))
+    made_up = dataclasses.replace(made_up, config=dataclasses.replace(made_up.config, estimators=("zobg", "fobg")))
+    for path in plots.save_figure(plots.plot_comparison(made_up), tmp_path, "figure"):
+        assert path.stat().st_size > 1000
+
+
+def test_a_file_is_whole_or_absent(tmp_path) -> None:
+    target = tmp_path / "results.json"
+    target.write_text("before")
+
+    def fail(file):
+        file.write(b"half")
+        raise RuntimeError("disk full")
+
+    with pytest.raises(RuntimeError, match="disk full"):
+        results.write_whole(target, fail)
+    assert target.read_text() == "before" and list(tmp_path.iterdir()) == [target]
+
+
+@pytest.mark.parametrize(
+    ("value", "digits", "shown"),
+    [
+        (None, 3, "-"),
+        (0.0, 3, "0"),
+        (math.nan, 3, "nan"),
+        (176.07, 3, "176"),
+        (8.545, 3, "8.54"),
+        (4585.0, 2, "4600"),
+        (6.83e6, 3, "6.8e6"),
+        (3.3e-16, 2, "3.3e-16"),
+        (-1.5, 3, "-1.5"),
+    ],
+)
+def test_numbers_are_short(value: float | None, digits: int, shown: str) -> None:
+    assert console.number(value, digits) == shown
+
+
+@pytest.mark.parametrize(("columns", "tables"), [(200, 1), (80, 2)])
+def test_the_table_fits_the_terminal(monkeypatch: pytest.MonkeyPatch, columns: int, tables: int) -> None:
+    monkeypatch.setenv("COLUMNS", str(columns))
+    lines: list[str] = []
+    full = row("aobg", 1000, 6.4e20, alpha=0.5, epsilon=641.0, discrepancy=1.2e11, relative_error=4.1e9)
+    console.print_comparison(result(full), lines.append)
+    table = [line for line in lines if "K [N/m]" in line or "AoBG" in line]
+    assert sum("K [N/m]" in line for line in table) == tables
+    assert max(map(len, table)) <= columns
+
+
+def test_theta_and_sigma_reach_the_plan() -> None:
+    plan = study.plan_compare(config(sigma=0.3, gamma=5.0))
+    assert (plan.task.sigma, plan.options.gamma, plan.config.cone) == (0.3, 5.0, "pyramidal")
+    assert jnp.all(plan.task.theta == 0.1)
