@@ -2,7 +2,7 @@
 # 3.11-3.13 with pip and venv, and a package index that pip can reach; nothing else.
 
 PYTHON ?= python3
-PYTEST_ARGS ?=
+PYTEST_ARGS ?= -n 2 --dist loadfile
 LOCK_ARGS ?=
 
 VENV := .venv
@@ -21,7 +21,7 @@ help: ## List the targets
 demo: $(STAMP) ## Compare the gradient estimators on the pusher, into results/pusher
 	$(BIN)/mjx-study compare pusher --output results/pusher
 
-test: $(STAMP) ## Run the tests, less the slow ones (PYTEST_ARGS='-n 2 -k name' adds options)
+test: $(STAMP) ## Run the tests, less the slow ones (PYTEST_ARGS='-k name' in place of two workers)
 	$(BIN)/python -m pytest $(PYTEST_ARGS)
 
 test-all: $(STAMP) ## Run all the tests, the slow ones too

@@ -8,6 +8,7 @@ The rivals get the same batch, devices and precision:
   number of devices, as if threads cost nothing.
 """
 
+import copy
 import dataclasses
 import statistics
 import time
@@ -198,12 +199,17 @@ def _stock_gradients(task: Task, contact: Any, samples: int, devices: Any) -> Ca
     return lambda: gradients(thetas, contact)
 
 
-def _engine_gradient(task: Task, contact: Any) -> np.ndarray:
-    """One gradient by the C engine: centred differences of each step, one adjoint sweep."""
-    host = task.scene.host
+def _engine_start(task: Task, contact: Any) -> tuple[mujoco.MjModel, mujoco.MjData]:
+    host = copy.copy(task.scene.host)
     apply_to_host(host, contact)
     data, start = mujoco.MjData(host), task.draw_start(jax.random.key(0))
     data.qpos[:], data.qvel[:] = np.asarray(start.qpos), np.asarray(start.qvel)
+    return host, data
+
+
+def _engine_gradient(task: Task, contact: Any) -> np.ndarray:
+    """Gradient of the sum of the last state by the C engine: centred differences of each step, one adjoint sweep."""
+    host, data = _engine_start(task, contact)
     controls = np.asarray(task.policy.feedforward(task.theta), float)
     size = 2 * host.nv + host.na
     over_state = np.zeros((task.horizon, size, size))
