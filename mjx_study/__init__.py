@@ -4,6 +4,7 @@ A study of gradient estimators through MuJoCo MJX: scenes, contact models in phy
 tasks as objectives, and comparisons of estimators over them. Call `configure` first for float64 and all cores.
 """
 
+from mjx_study.comparison import CompareConfig, CompareResult
 from mjx_study.contact import (
     FAMILIES,
     ContactModel,
@@ -20,7 +21,7 @@ from mjx_study.objective import MjxObjective, Simulator
 from mjx_study.policy import OpenLoop, Policy
 from mjx_study.runtime import configure
 from mjx_study.scene import Scene, SceneError, load_scene, put_scene
-from mjx_study.study import CompareConfig, CompareResult, compare, plan_compare
+from mjx_study.study import compare, plan_compare
 from mjx_study.task import Task
 from mjx_study.tasks import TASKS, make_task
 

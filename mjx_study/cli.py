@@ -16,13 +16,14 @@ from typing import Any, NoReturn
 from estimators import BASELINES, ESTIMATORS
 from mjx_study import bench as benchmark
 from mjx_study import gradcheck as check
+from mjx_study.comparison import CompareConfig
 from mjx_study.console import alarms, print_comparison, progress_bar
 from mjx_study.contact import FAMILIES
 from mjx_study.plots import plot_comparison, save_figure
 from mjx_study.results import as_json, prepare_folder, save
 from mjx_study.runtime import PRECISIONS, configure
 from mjx_study.scene import CONES
-from mjx_study.study import CompareConfig, compare, plan_compare
+from mjx_study.study import compare, plan_compare
 from mjx_study.tasks import TASKS, make_task
 
 EXAMPLES = {

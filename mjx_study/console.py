@@ -8,9 +8,10 @@ from contextlib import contextmanager
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
+from mjx_study.comparison import CompareResult, Row
 from mjx_study.contact import FAMILIES
+from mjx_study.findings import findings
 from mjx_study.plots import STYLE
-from mjx_study.study import CompareResult, Row, findings
 from mjx_study.table import format_table
 
 Column = tuple[str, Callable[[Row], str]]

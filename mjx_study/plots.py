@@ -10,9 +10,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from estimators import ESTIMATORS
+from mjx_study.comparison import CompareResult, Row
 from mjx_study.contact import DEFAULT_SOLREF, FAMILIES
 from mjx_study.results import write_whole
-from mjx_study.study import CompareResult, Row
 
 # Okabe and Ito's colours, told apart in print and by colour-blind eyes; markers repeat the distinction.
 STYLE: Final = {

@@ -11,7 +11,8 @@ from typing import IO, Any
 
 import numpy as np
 
-from mjx_study.study import CompareResult, findings
+from mjx_study.comparison import CompareResult
+from mjx_study.findings import findings
 
 
 def prepare_folder(folder: str | Path) -> Path:

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from mjx_study import console, plots, results, study
+from mjx_study.comparison import CompareConfig, CompareResult, Row
+from mjx_study.findings import findings
 from mjx_study.objective import MjxObjective, Simulator
-from mjx_study.study import CompareConfig, CompareResult, Row
 
 SMALL: dict[str, Any] = {"horizon": 4, "samples": 8, "reference_samples": 8}
 
@@ -126,7 +127,7 @@ def test_zeroth_order_alone_does_not_differentiate_for_itself() -> None:
 def test_findings_follow_the_intervals() -> None:
     rows = (row("zobg", 10, 100), row("fobg", 10, 1), row("zobg", 100, 100), row("fobg", 100, 150))
     rows += (row("zobg", 1000, 100), row("fobg", 1000, 1e6))
-    (sentence,) = study.findings(result(*rows))
+    (sentence,) = findings(result(*rows))
     assert sentence == (
         "penalty: FoBG's variance is below ZoBG's at K = 10 N/m; above it at K = 1000 N/m; not told apart at "
         "K = 100 N/m (95% intervals)"
@@ -137,8 +138,8 @@ def test_bias_is_reported_only_beyond_what_noise_explains() -> None:
     noise = math.hypot(math.sqrt(1 / 100) / 10, 0.01)
     quiet = row("fobg", 10, 1, relative_error=2.9 * noise)
     loud = row("fobg", 10, 1, relative_error=3.1 * noise)
-    assert study.findings(result(quiet)) == []
-    (sentence,) = study.findings(result(loud))
+    assert findings(result(quiet)) == []
+    (sentence,) = findings(result(loud))
     assert "FoBG's mean is biased by 4.4% at K = 10 N/m" in sentence
 
 

@@ -1,0 +1,155 @@
+"""What a comparison is asked for, and what it answers: plain data, with every field explained."""
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from estimators import ESTIMATORS
+from mjx_study.contact import FAMILIES
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class CompareConfig:
+    """Everything that decides the result of a comparison.
+
+    Attributes:
+        task: name of a task.
+        stiffness: contact stiffnesses [N/m], for the families that take one.
+        contact: names of contact families.
+        estimators: names of estimators.
+        samples: in each batch; an alpha-order estimate uses two batches.
+        reference_samples: pairs of rollouts behind each reference gradient.
+        sigma: standard deviation of the noise, in the control's unit; None for the task's.
+        seed: of all randomness.
+        baseline: of zeroth-order estimates: zero_noise, leave_one_out or none.
+        gamma: accuracy that the alpha-order estimate must keep, in the unit of the gradient; None for the task's.
+        failure_probability: of the confidence radius epsilon.
+        variance_proxy: in epsilon: variance or second_moment.
+        radius: R in epsilon: max_deviation, or a bound in the unit of the gradient.
+        confidence: of the intervals that are reported.
+        damping: of the contact [N s/m]; None for each family's damping ratio.
+        cone: pyramidal or elliptic; None for the MJCF's.
+        horizon: steps; None for the task's.
+        model: an MJCF in place of the task's own; None for that.
+        chunk_size: samples per device and call; None to choose by the number of samples.
+    """
+
+    task: str
+    stiffness: tuple[float, ...] = (10.0, 30.0, 100.0, 300.0, 1000.0, 3000.0)
+    contact: tuple[str, ...] = ("penalty", "mujoco", "mujoco_stiff")
+    estimators: tuple[str, ...] = ("zobg", "fobg", "aobg")
+    samples: int = 400
+    reference_samples: int = 600
+    sigma: float | None = None
+    seed: int = 0
+    baseline: str = "zero_noise"
+    gamma: float | None = None
+    failure_probability: float = 0.05
+    variance_proxy: str = "variance"
+    radius: str | float = "max_deviation"
+    confidence: float = 0.95
+    damping: float | None = None
+    cone: str | None = None
+    horizon: int | None = None
+    model: str | None = None
+    chunk_size: int | None = None
+
+    def __post_init__(self) -> None:
+        for label, names, choices in (
+            ("contact family", self.contact, FAMILIES),
+            ("estimator", self.estimators, ESTIMATORS),
+        ):
+            if not names:
+                raise ValueError(f"no {label} given; choose from {', '.join(choices)}")
+            for name in names:
+                if name not in choices:
+                    raise ValueError(f"unknown {label} {name!r}; choose from {', '.join(choices)}")
+        if any(FAMILIES[name].swept for name in self.contact) and not self.stiffness:
+            raise ValueError(f"the contact families {', '.join(self.contact)} need at least one stiffness in N/m")
+        for label, count, least in (("samples", self.samples, 3), ("reference_samples", self.reference_samples, 3)):
+            if count < least:
+                raise ValueError(f"{label} must be at least {least}, so that a variance has an interval; got {count}")
+        if self.chunk_size is not None and self.chunk_size < 1:
+            raise ValueError(f"chunk_size must be at least 1 sample, got {self.chunk_size}")
+        if not 0 < self.confidence < 1:
+            raise ValueError(f"confidence must lie strictly between 0 and 1, got {self.confidence}")
+        if self.seed < 0:
+            raise ValueError(f"seed must not be negative, got {self.seed}")
+
+
+@dataclasses.dataclass(frozen=True)
+class Row:
+    """One estimator at one contact model. Gradients are in cost per unit of theta.
+
+    Attributes:
+        contact: contact family.
+        stiffness: K of the contact's spring, at full penetration [N/m].
+        solref, solimp: MuJoCo's parameters of this contact.
+        estimator: name.
+        samples: in each batch.
+        gradient_norm: of the mean gradient.
+        variance: empirical variance of one sample, the trace of the covariance.
+        variance_lower, variance_upper: its confidence interval.
+        norm_median, norm_90, norm_max: quantiles of the norms of single samples; heavy tails show here.
+        relative_error, relative_error_se: distance to the reference gradient over its norm, with standard error.
+        cosine, cosine_se: of the angle to the reference gradient, with standard error.
+        reference_norm: of the reference gradient.
+        reference_uncertainty: its relative standard error; errors below it cannot be told from zero.
+        alpha: weight of the first-order batch; None for an estimator of one batch.
+        epsilon: confidence radius of the zeroth-order mean; None likewise.
+        discrepancy: B, the distance between the two means; None likewise.
+        seconds_per_sample: of computing, compilation excluded.
+        residual: largest relative solver residual in the batches.
+        unconverged: samples whose residual is above the threshold.
+        nonfinite: samples left out because they were not finite.
+    """
+
+    contact: str
+    stiffness: float
+    solref: tuple[float, ...]
+    solimp: tuple[float, ...]
+    estimator: str
+    samples: int
+    gradient_norm: float
+    variance: float
+    variance_lower: float
+    variance_upper: float
+    norm_median: float
+    norm_90: float
+    norm_max: float
+    relative_error: float
+    relative_error_se: float
+    cosine: float
+    cosine_se: float
+    reference_norm: float
+    reference_uncertainty: float
+    alpha: float | None
+    epsilon: float | None
+    discrepancy: float | None
+    seconds_per_sample: float
+    residual: float
+    unconverged: int
+    nonfinite: int
+
+
+@dataclasses.dataclass(frozen=True)
+class CompareResult:
+    """What a comparison found, with what it depended on.
+
+    Attributes:
+        config: as resolved: no value is left to a default.
+        environment: versions, machine, devices, precision.
+        rows: one per cell and estimator, in the order of the configuration.
+        warnings: what MuJoCo would alter or the integrator cannot resolve, each with its cell.
+        gradients: mean gradients, (rows, params).
+        references: reference gradients, (rows, params).
+    """
+
+    config: CompareConfig
+    environment: dict[str, Any]
+    rows: tuple[Row, ...]
+    warnings: tuple[str, ...]
+    gradients: Float[np.ndarray, "rows params"]
+    references: Float[np.ndarray, "rows params"]

@@ -1,0 +1,47 @@
+"""What a comparison says, in sentences, each backed by intervals."""
+
+import math
+from collections.abc import Sequence
+
+from mjx_study.comparison import CompareResult
+
+
+def findings(result: CompareResult) -> list[str]:
+    """What the intervals say, in sentences: where FoBG's variance is above ZoBG's, and where its mean is biased."""
+    return [
+        sentence
+        for family in result.config.contact
+        for sentence in (*_variance_finding(result, family), *_bias_finding(result, family))
+    ]
+
+
+def _variance_finding(result: CompareResult, family: str) -> list[str]:
+    table = {(row.stiffness, row.estimator): row for row in result.rows if row.contact == family}
+    groups: dict[str, list[float]] = {"below ZoBG's": [], "above it": [], "not told apart": []}
+    for stiffness in sorted({stiffness for stiffness, _ in table}):
+        if (stiffness, "zobg") not in table or (stiffness, "fobg") not in table:
+            return []
+        zeroth, first = table[stiffness, "zobg"], table[stiffness, "fobg"]
+        below, above = first.variance_upper < zeroth.variance_lower, first.variance_lower > zeroth.variance_upper
+        groups["below ZoBG's" if below else "above it" if above else "not told apart"].append(stiffness)
+    parts = [f"{verdict} at K = {_list(group)} N/m" for verdict, group in groups.items() if group]
+    return [f"{family}: FoBG's variance is {'; '.join(parts)} ({result.config.confidence:.0%} intervals)"]
+
+
+def _bias_finding(result: CompareResult, family: str) -> list[str]:
+    """Where the error of FoBG's mean is more than three times what its own noise and the reference's explain."""
+    biased = []
+    for row in result.rows:
+        if row.contact == family and row.estimator == "fobg":
+            noise = math.hypot(math.sqrt(row.variance / row.samples) / row.reference_norm, row.reference_uncertainty)
+            if row.relative_error > 3 * noise:
+                biased.append(row)
+    return [
+        f"{family}: FoBG's mean is biased by {row.relative_error:.1%} at K = {row.stiffness:g} N/m "
+        "(its error is over three times what noise explains)"
+        for row in biased
+    ]
+
+
+def _list(values: Sequence[float]) -> str:
+    return ", ".join(f"{value:g}" for value in values)
