@@ -29,7 +29,7 @@ from mjx_study.tasks import TASKS, make_task
 EXAMPLES = {
     "main": """\
 start here:
-  mjx-study compare pusher                       which estimator, at which contact stiffness? about 20 s
+  mjx-study compare pusher                       which estimator, at which contact stiffness? 20 s once compiled
   mjx-study compare pusher --output out          the same, with a figure and the numbers on disk
   mjx-study gradcheck pusher                     are the derivatives right? exit code 1 if not
   mjx-study bench pusher                         what does a gradient cost on this machine?
@@ -290,7 +290,12 @@ def _parser() -> argparse.ArgumentParser:
 def _add_task_options(command: argparse.ArgumentParser, *, contact: bool = True) -> None:
     command.add_argument("task", metavar="TASK", help=f"one of: {', '.join(TASKS)}")
     if contact:
-        command.add_argument("--stiffness", type=_numbers, metavar="K[,K]", help="contact stiffnesses in N/m")
+        command.add_argument(
+            "--stiffness",
+            type=_numbers,
+            metavar="K[,K]",
+            help="contact stiffnesses in N/m (default: a sweep)",
+        )
         command.add_argument("--contact", type=_names, metavar="FAMILY[,FAMILY]", help=f"of: {', '.join(FAMILIES)}")
     command.add_argument("--sigma", type=float, metavar="S", help="noise on each control (default: the task's)")
     command.add_argument("--seed", type=int, default=0, metavar="N", help="of all randomness (default: 0)")
@@ -298,4 +303,6 @@ def _add_task_options(command: argparse.ArgumentParser, *, contact: bool = True)
     command.add_argument("--cone", choices=list(CONES), help="friction cone (default: the MJCF's)")
     command.add_argument("--horizon", type=int, metavar="H", help="steps (default: the task's)")
     command.add_argument("--model", metavar="FILE.xml", help="an MJCF in place of the task's own")
-    command.add_argument("--devices", type=int, metavar="N", help="CPU devices to use (default: one per core)")
+    command.add_argument(
+        "--devices", type=int, metavar="N", help="CPU devices (default: one per core; with JAX 0.11 one)"
+    )

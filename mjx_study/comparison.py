@@ -1,6 +1,7 @@
 """What a comparison is asked for, and what it answers: plain data, with every field explained."""
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -37,7 +38,7 @@ class CompareConfig:
     """
 
     task: str
-    stiffness: tuple[float, ...] = (10.0, 30.0, 100.0, 300.0, 1000.0, 3000.0)
+    stiffness: tuple[float, ...] = (10.0, 100.0, 300.0, 550.0, 1000.0, 1200.0)
     contact: tuple[str, ...] = ("penalty", "mujoco", "mujoco_stiff")
     estimators: tuple[str, ...] = ("zobg", "fobg", "aobg")
     samples: int = 400
@@ -63,11 +64,13 @@ class CompareConfig:
         ):
             if not names:
                 raise ValueError(f"no {label} given; choose from {', '.join(choices)}")
+            _refuse_repeats(label, names)
             for name in names:
                 if name not in choices:
                     raise ValueError(f"unknown {label} {name!r}; choose from {', '.join(choices)}")
         if any(FAMILIES[name].swept for name in self.contact) and not self.stiffness:
             raise ValueError(f"the contact families {', '.join(self.contact)} need at least one stiffness in N/m")
+        _refuse_repeats("stiffness", self.stiffness)
         for label, count, least in (("samples", self.samples, 3), ("reference_samples", self.reference_samples, 3)):
             if count < least:
                 raise ValueError(f"{label} must be at least {least}, so that a variance has an interval; got {count}")
@@ -77,6 +80,12 @@ class CompareConfig:
             raise ValueError(f"confidence must lie strictly between 0 and 1, got {self.confidence}")
         if self.seed < 0:
             raise ValueError(f"seed must not be negative, got {self.seed}")
+
+
+def _refuse_repeats(label: str, values: Sequence[object]) -> None:
+    repeated = {str(value) for value in values if values.count(value) > 1}
+    if repeated:
+        raise ValueError(f"{label} given twice: {', '.join(sorted(repeated))}")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -89,10 +89,12 @@ def print_comparison(result: CompareResult, print_line: Callable[[str], None] = 
     print_line("")
     uncertainty = [row.reference_uncertainty for row in result.rows if math.isfinite(row.reference_uncertainty)]
     if uncertainty:
+        low, high = number(min(uncertainty), 2), number(max(uncertainty), 2)
+        spread = low if low == high else f"{low} to {high}"
         print_line(
             f"Errors and cosines are against an unbiased zeroth-order reference, {config.reference_samples} pairs of "
-            f"rollouts with a control variate;\nits own relative uncertainty is {number(min(uncertainty), 2)} to "
-            f"{number(max(uncertainty), 2)}, and smaller errors cannot be told from zero."
+            f"rollouts with a control variate;\nits own relative uncertainty is {spread}, and smaller errors "
+            "cannot be told from zero."
         )
     for sentence in findings(result):
         print_line(sentence + ".")

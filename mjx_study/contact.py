@@ -334,12 +334,15 @@ def _warn_if_clipped(solref: Sequence[float], scene: Scene) -> None:
 
 
 def _warn_if_unstable(solref: Sequence[float], timestep: float) -> None:
+    """Semi-implicit Euler with a spring k and a damper b is stable while h^2 k < 4 - 2 h b."""
     k, b = stiffness_from_solref(solref, effective_mass=1.0)
     limit = 4 - 2 * timestep * b
     if timestep**2 * k >= limit:
+        dampratio = b / (2 * math.sqrt(k)) if k > 0 else 0.0
+        stable = (2 * (math.sqrt(dampratio**2 + 1) - dampratio)) ** 2 / (timestep**2 * k) if k > 0 else 0.0
         warnings.warn(
-            f"h^2 k = {timestep**2 * k:.3g} is not below 4 - 2 h b = {limit:.3g}: the semi-implicit step makes energy "
-            f"while in contact; lower the stiffness, or the timestep h = {timestep:g} s",
+            f"h^2 k = {timestep**2 * k:.3g} is not below 4 - 2 h b = {limit:.3g}: the step makes energy while in "
+            f"contact; it is stable up to {stable:.0%} of this stiffness at h = {timestep:g} s",
             ContactWarning,
             stacklevel=3,
         )

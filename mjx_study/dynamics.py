@@ -5,7 +5,7 @@ either leaves unconverged, while its derivative is that of the converged step. T
 
 - the *Jacobian* program, for models of few coordinates: the Jacobian of the velocity update over state and control
   by the implicit function theorem, once per step, and nothing else stored. Reverse mode then keeps nv (nq + nv + nu)
-  numbers per step and replays neither the solver nor the kinematics.
+  numbers per step for it and replays neither the solver nor the kinematics.
 - the *tape* program, for larger models and for derivatives with respect to model parameters: ordinary automatic
   differentiation around the implicit solve, each step recomputed in the backward pass (`jax.checkpoint`) with the
   solver's result saved, so that the recomputation has no solver in it.
@@ -193,8 +193,7 @@ def _update(scene: Scene):
         model, qpos, qvel, act, control, _ = primals
         model_tangents, *inputs, _ = tangents
         if any(not isinstance(leaf, SymbolicZero) for leaf in jax.tree.leaves(model_tangents)):
-            zeros = jax.tree.map(_instantiate, primals, tangents)
-            return jax.jvp(tape, primals, zeros)
+            return jax.jvp(tape, primals, jax.tree.map(_instantiate, primals, tangents))
         value = update(*primals)
         inputs = [_instantiate(*pair) for pair in zip(primals[1:5], inputs, strict=True)]
         over_step, over_qacc = step_jacobian(scene, model, qpos, qvel, act, control, value[2])

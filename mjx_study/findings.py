@@ -17,13 +17,18 @@ def findings(result: CompareResult) -> list[str]:
 
 def _variance_finding(result: CompareResult, family: str) -> list[str]:
     table = {(row.stiffness, row.estimator): row for row in result.rows if row.contact == family}
-    groups: dict[str, list[float]] = {"below ZoBG's": [], "above it": [], "not told apart": []}
+    groups: dict[str, list[float]] = {
+        "below ZoBG's": [],
+        "above ZoBG's": [],
+        "not told apart from ZoBG's": [],
+    }
     for stiffness in sorted({stiffness for stiffness, _ in table}):
         if (stiffness, "zobg") not in table or (stiffness, "fobg") not in table:
             return []
         zeroth, first = table[stiffness, "zobg"], table[stiffness, "fobg"]
         below, above = first.variance_upper < zeroth.variance_lower, first.variance_lower > zeroth.variance_upper
-        groups["below ZoBG's" if below else "above it" if above else "not told apart"].append(stiffness)
+        verdict = "below ZoBG's" if below else "above ZoBG's" if above else "not told apart from ZoBG's"
+        groups[verdict].append(stiffness)
     parts = [f"{verdict} at K = {_list(group)} N/m" for verdict, group in groups.items() if group]
     return [f"{family}: FoBG's variance is {'; '.join(parts)} ({result.config.confidence:.0%} intervals)"]
 

@@ -7,8 +7,7 @@ disagree, and no derivative can match both. The report tells the two apart.
 import copy
 import dataclasses
 import math
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Sequence
 from typing import Any, Final
 
 import jax
@@ -155,11 +154,9 @@ def plan_gradcheck(task: Task, families: Sequence[str], stiffnesses: Sequence[fl
 def gradcheck(plan: GradcheckPlan, progress: Progress = lambda done, total, what: None) -> GradcheckReport:
     """Check every contact model of a plan."""
     programs = _Programs(plan.task)
-    total = len(plan.cells) + 1
-    progress(0, total, "compiling")
-    programs.compile(plan.cells[0].contact)
+    total = len(plan.cells)
     findings = []
-    for done, cell in enumerate(plan.cells, start=1):
+    for done, cell in enumerate(plan.cells):
         progress(done, total, f"{cell.family}, K = {cell.stiffness:g} N/m")
         findings.append(_check(plan, programs, cell))
     progress(total, total, "done")
@@ -192,19 +189,6 @@ class _Programs:
         """Unit directions to look along."""
         directions = np.random.default_rng(seed).normal(size=(DIRECTIONS, len(self.task.theta)))
         return directions / np.linalg.norm(directions, axis=1, keepdims=True)
-
-    def compile(self, contact: ContactModel) -> None:
-        """Compile the large programs side by side."""
-        theta, directions = self.task.theta, self.batch(0)
-        steps = np.zeros((2 * DIRECTIONS * len(STEP_SIZES) + 1, len(theta)))
-        calls: list[Callable[[], Any]] = [
-            lambda: self.gradient(theta, contact),
-            lambda: self.slopes(theta, directions, contact),
-            lambda: self.costs(theta + steps, contact),
-        ]
-        with ThreadPoolExecutor(2) as pool:
-            for future in [pool.submit(call) for call in calls]:
-                jax.block_until_ready(future.result())
 
 
 def _check(plan: GradcheckPlan, programs: _Programs, cell: Cell) -> Finding:

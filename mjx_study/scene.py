@@ -128,6 +128,8 @@ def put_scene(host: mujoco.MjModel, name: str) -> Scene:
 
 def _find(source: str | Path) -> Path:
     path = Path(source)
+    if path.is_dir():
+        raise SceneError(f"{path} is a folder, not an MJCF file")
     if path.suffix.lower() == ".xml":
         if not path.is_file():
             raise SceneError(f"no MJCF file at {path}")

@@ -10,7 +10,6 @@ import math
 import time
 import warnings
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
@@ -161,12 +160,11 @@ class _Keys:
 
 
 def _compile(simulator: Simulator, cell: Cell) -> None:
-    """Compile both programs at once: XLA compiles outside of Python's lock."""
+    """Compile both programs, so that no cell's time holds it; in turn, since tracing in two threads can crash JAX."""
     objective, theta = simulator.objective(cell.contact), simulator.task.theta
     keys = jax.random.split(jax.random.key(0), 1)
-    with ThreadPoolExecutor(2) as pool:
-        for future in [pool.submit(method, theta, keys) for method in (objective.evaluate, objective.differentiate)]:
-            future.result()
+    objective.evaluate(theta, keys)
+    objective.differentiate(theta, keys)
 
 
 def _timed(method: Callable[..., Any], *arguments: Any) -> tuple[Any, float]:

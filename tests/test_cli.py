@@ -174,6 +174,8 @@ def test_tasks(capsys: pytest.CaptureFixture[str]) -> None:
         (["compare", "pusher", "--stiffness", "0"], "stiffness must be positive"),
         (["compare", "pusher", "--stiffness", "ten"], "not a list of numbers"),
         (["compare", "pusher", "--stiffness", ""], "need at least one stiffness"),
+        (["compare", "pusher", "--stiffness", "100,100"], "stiffness given twice: 100.0"),
+        (["compare", "pusher", "--estimators", "zobg,zobg"], "estimator given twice: zobg"),
         (["compare", "pusher", "--damping", "-1"], "damping must be >= 0"),
         (["compare", "pusher", "--gamma", "0"], "gamma must be positive"),
         (["compare", "pusher", "--gamma", "big"], "neither a number nor inf"),

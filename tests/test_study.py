@@ -129,8 +129,8 @@ def test_findings_follow_the_intervals() -> None:
     rows += (row("zobg", 1000, 100), row("fobg", 1000, 1e6))
     (sentence,) = findings(result(*rows))
     assert sentence == (
-        "penalty: FoBG's variance is below ZoBG's at K = 10 N/m; above it at K = 1000 N/m; not told apart at "
-        "K = 100 N/m (95% intervals)"
+        "penalty: FoBG's variance is below ZoBG's at K = 10 N/m; above ZoBG's at K = 1000 N/m; not told apart from "
+        "ZoBG's at K = 100 N/m (95% intervals)"
     )
 
 
