@@ -240,7 +240,14 @@ def test_an_output_folder_that_cannot_be_written(capsys: pytest.CaptureFixture[s
 def test_interruption_leaves_nothing_behind(tmp_path: Path) -> None:
     folder = tmp_path / "out"
     command = [sys.executable, "-m", "mjx_study", "compare", "pusher", "--output", str(folder)]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    process = subprocess.Popen(
+        command,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        # A shell's background job ignores the interrupt, and so would its children.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    )
     deadline = time.monotonic() + 60
     while not folder.exists():  # made once the options are checked, before computing
         assert time.monotonic() < deadline and process.poll() is None
