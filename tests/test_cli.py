@@ -237,6 +237,7 @@ def test_an_output_folder_that_cannot_be_written(capsys: pytest.CaptureFixture[s
     assert "cannot write to the output folder" in refused(capsys, "compare", "pusher", "--output", "/proc/results")
 
 
+@pytest.mark.slow  # when the interrupt falls into a callback inside JAX, it is swallowed
 def test_interruption_leaves_nothing_behind(tmp_path: Path) -> None:
     folder = tmp_path / "out"
     command = [sys.executable, "-m", "mjx_study", "compare", "pusher", "--output", str(folder)]
