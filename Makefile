@@ -13,13 +13,19 @@ UV_VERSION := 0.13.8
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test test-all lint format lock clean
+.PHONY: help demo figures test test-all lint format lock clean
 
 help: ## List the targets
 	@awk 'BEGIN { FS = ":.*## " } /^[a-z-]+:.*## / { printf "  %-10s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
 
 demo: $(STAMP) ## Compare the gradient estimators on the pusher, into results/pusher
 	$(BIN)/mjx-study compare pusher --output results/pusher
+
+figures: $(STAMP) ## Make the figures of docs/ again
+	$(BIN)/mjx-study compare pusher --output results/pusher && cp results/pusher/comparison.png docs/pusher.png
+	$(BIN)/mjx-study landscape momentum_transfer --contact penalty,mujoco_default,smooth_onset --output results/onset
+	cp results/onset/landscape.png docs/onset.png
+	$(BIN)/python docs/make_figures.py
 
 test: $(STAMP) ## Run the tests, less the slow ones (PYTEST_ARGS='-k name' in place of two workers)
 	$(BIN)/python -m pytest $(PYTEST_ARGS)

@@ -17,8 +17,8 @@ from mjx_study.contact import (
     stiffness_from_solref,
 )
 from mjx_study.dynamics import State, initial_state, rollout, step, step_jacobian
-from mjx_study.objective import MjxObjective, Simulator
-from mjx_study.policy import OpenLoop, Policy
+from mjx_study.objective import MjxObjective, Simulator, simulate
+from mjx_study.policy import Launch, LinearFeedback, OpenLoop, Policy
 from mjx_study.runtime import configure
 from mjx_study.scene import Scene, SceneError, load_scene, put_scene
 from mjx_study.study import compare, plan_compare
@@ -33,6 +33,8 @@ __all__ = [
     "ContactModel",
     "ContactWarning",
     "MjxObjective",
+    "Launch",
+    "LinearFeedback",
     "OpenLoop",
     "Policy",
     "Scene",
@@ -52,6 +54,7 @@ __all__ = [
     "plan_compare",
     "put_scene",
     "rollout",
+    "simulate",
     "solref_from_stiffness",
     "step",
     "step_jacobian",

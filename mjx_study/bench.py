@@ -1,14 +1,13 @@
 """What rollouts and gradients cost, against what one would use otherwise; rates and ratios of one run.
 
-The rivals get the same batch, devices and precision:
+The rivals get the same policy, starts, noise, devices and precision:
 
 - stock MJX: `jax.grad` through `mjx.step` with the one solver iteration that reverse mode allows (its gradient is then
-  not that of the converged step);
+  not that of the converged step), in batches that its memory allows;
 - the C engine: centred `mjd_transitionFD` at every step and an adjoint sweep, one thread measured and multiplied by the
-  number of devices, as if threads cost nothing.
+  number of devices, as if threads cost nothing; not with quaternions, nor with RK4, which it does not differentiate.
 """
 
-import copy
 import dataclasses
 import statistics
 import time
@@ -22,18 +21,19 @@ import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
 from mjx_study._mjx import mjx
-from mjx_study.contact import apply_contact, family_model
+from mjx_study.contact import ContactModel, apply_contact
 from mjx_study.dynamics import State
-from mjx_study.gradcheck import apply_to_host
-from mjx_study.objective import Simulator, chunk_for
-from mjx_study.policy import OpenLoop
+from mjx_study.engine import engine_model
+from mjx_study.noise import split_sample_key, standard_noise
+from mjx_study.objective import Simulator, chunk_for, simulate
 from mjx_study.runtime import environment
-from mjx_study.study import Progress
+from mjx_study.study import Progress, plan_cells
 from mjx_study.task import Task
 
 REPEATS: Final = 5
-ENGINE_SAMPLES: Final = 8
-STIFFNESS: Final = 100.0  # [N/m]; speed hardly depends on it
+ENGINE_SAMPLES: Final = 5
+STOCK_BATCH: Final = {"cpu": 125, "gpu": 32768, "tpu": 32768}
+"""Most samples per device that stock MJX gets at once: its gradients keep every intermediate of every step."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,10 +42,13 @@ class BenchReport:
 
     Attributes:
         task, samples, horizon: what was run.
+        contact: family and stiffness of the contact.
         value_seconds: a zeroth-order sample, one rollout [s].
         gradient_seconds: a first-order sample, one rollout and its gradient [s].
+        stock_value_seconds: a rollout through stock MJX with the same solver budget [s].
         stock_gradient_seconds: a gradient through stock MJX with one solver iteration [s].
-        engine_gradient_seconds: a gradient by the C engine's differences on as many threads [s].
+        engine_gradient_seconds: a gradient by the C engine's differences on as many threads [s]; None where it has
+            none.
         gradient_memory: temporary memory of all samples' gradients at once [MiB].
         environment: versions and machine.
     """
@@ -53,21 +56,26 @@ class BenchReport:
     task: str
     samples: int
     horizon: int
+    contact: str
     value_seconds: float
     gradient_seconds: float
+    stock_value_seconds: float
     stock_gradient_seconds: float
-    engine_gradient_seconds: float
+    engine_gradient_seconds: float | None
     gradient_memory: float
     environment: dict[str, Any]
 
     @property
     def ratios(self) -> dict[str, float]:
         """The figures that can be compared between machines."""
-        return {
+        ratios = {
             "gradient_per_value": self.gradient_seconds / self.value_seconds,
+            "values_over_stock": self.stock_value_seconds / self.value_seconds,
             "speedup_over_stock": self.stock_gradient_seconds / self.gradient_seconds,
-            "speedup_over_engine": self.engine_gradient_seconds / self.gradient_seconds,
         }
+        if self.engine_gradient_seconds is not None:
+            ratios["speedup_over_engine"] = self.engine_gradient_seconds / self.gradient_seconds
+        return ratios
 
     def as_json(self) -> dict[str, Any]:
         """The report as plain data."""
@@ -75,24 +83,28 @@ class BenchReport:
 
     def lines(self) -> list[str]:
         """The report as text."""
-        ratios = self.ratios
-        devices = self.environment["devices"]
+        ratios, devices = self.ratios, self.environment["devices"]
 
-        def rate(label: str, seconds: float) -> str:
-            return f"  {label:<46} {1e3 * seconds:8.3f} ms  {self.horizon / seconds / 1e6:8.3f} million steps/s"
+        def rate(label: str, seconds: float | None) -> list[str]:
+            if seconds is None:
+                return []
+            return [f"  {label:<46} {1e3 * seconds:8.3f} ms  {self.horizon / seconds / 1e6:8.3f} million steps/s"]
 
+        engine = f", {ratios['speedup_over_engine']:.2f} x the C engine" if "speedup_over_engine" in ratios else ""
         return [
-            f"{self.task}: {self.samples} samples of {self.horizon} steps, {self.environment['precision']}, "
-            f"{len(devices)} x {self.environment['backend']} ({self.environment['processor']})",
+            f"{self.task}: {self.samples} samples of {self.horizon} steps, {self.contact}, "
+            f"{self.environment['precision']}, {len(devices)} x {self.environment['backend']} "
+            f"({self.environment['processor']})",
             "per sample:",
-            rate("zeroth order (one rollout)", self.value_seconds),
-            rate("first order (rollout and gradient)", self.gradient_seconds),
-            rate("jax.grad through mjx.step, one iteration", self.stock_gradient_seconds),
-            rate("C engine, mjd_transitionFD and adjoint", self.engine_gradient_seconds),
+            *rate("zeroth order (one rollout)", self.value_seconds),
+            *rate("first order (rollout and gradient)", self.gradient_seconds),
+            *rate("a rollout through mjx.step", self.stock_value_seconds),
+            *rate("jax.grad through mjx.step, one iteration", self.stock_gradient_seconds),
+            *rate("C engine, mjd_transitionFD and adjoint", self.engine_gradient_seconds),
             "ratios of this run:",
             f"  a first-order sample costs {ratios['gradient_per_value']:.2f} zeroth-order samples",
-            f"  gradients per second: {ratios['speedup_over_stock']:.2f} x stock mjx.step, "
-            f"{ratios['speedup_over_engine']:.2f} x the C engine",
+            f"  rollouts per second: {ratios['values_over_stock']:.2f} x stock mjx.step",
+            f"  gradients per second: {ratios['speedup_over_stock']:.2f} x stock mjx.step{engine}",
             f"  memory of {self.samples} gradients at once: {self.gradient_memory:.1f} MiB",
         ]
 
@@ -109,51 +121,49 @@ def plan_bench(task: Task, samples: int) -> BenchPlan:
     """Check what is to be measured.
 
     Raises:
-        ValueError: fewer than one sample, or a task whose policy or coordinates the rivals cannot run.
+        ValueError: fewer than one sample.
     """
     if samples < 1:
         raise ValueError(f"samples must be at least 1, got {samples}")
-    if not isinstance(task.policy, OpenLoop) or task.random_start or task.scene.host.nq != task.scene.host.nv:
-        raise ValueError(f"bench compares open loops from a fixed start without quaternions, and {task.name} is none")
     return BenchPlan(task, samples)
 
 
 def bench(plan: BenchPlan, progress: Progress = lambda done, total, what: None) -> BenchReport:
-    """Measure everything once, ours and the rivals' interleaved."""
+    """Measure everything, ours and the rivals' interleaved; medians of repeats."""
     task, samples = plan.task, plan.samples
     devices = jax.local_devices()
-    contact = family_model("mujoco", task.scene, stiffness=STIFFNESS, effective_mass=task.effective_mass)
+    family = "mujoco" if task.contact_pair else "mjcf"
+    (cell,), _ = plan_cells(task, [family], [task.stiffnesses[1]])
     keys = jax.random.split(jax.random.key(0), samples)
     simulator = Simulator(task, chunk_size=chunk_for(samples, devices))
-    objective = simulator.objective(contact)
-
-    progress(0, 4, "compiling")
-    stock = _stock_gradients(task, contact, samples, devices)
-    contenders: dict[str, Callable[[], Any]] = {
-        "value": lambda: objective.evaluate(task.theta, keys),
-        "gradient": lambda: objective.differentiate(task.theta, keys),
-        "stock": stock,
+    objective = simulator.objective(cell.contact)
+    stock_samples = min(samples, STOCK_BATCH[devices[0].platform] * len(devices))
+    stock_value, stock_gradient = _stock_programs(task, cell.contact, keys[:stock_samples], devices)
+    contenders: dict[str, tuple[int, Callable[[], Any]]] = {
+        "value": (samples, lambda: objective.evaluate(task.theta, keys)),
+        "gradient": (samples, lambda: objective.differentiate(task.theta, keys)),
+        "stock_value": (stock_samples, stock_value),
+        "stock_gradient": (stock_samples, stock_gradient),
     }
-    for done, contender in enumerate(contenders.values()):
-        progress(done, 4, "compiling")
-        jax.block_until_ready(contender())
+    total = 2 * len(contenders)
+    for done, (name, (_, call)) in enumerate(contenders.items()):
+        progress(done, total, f"{task.name}: compiling {name.replace('_', ' ')}")
+        jax.block_until_ready(call())
     times: dict[str, list[float]] = {name: [] for name in contenders}
-    progress(3, 4, "measuring")
-    for _ in range(REPEATS):
-        for name, contender in contenders.items():
-            times[name].append(_seconds(contender))
-    engine = statistics.median(_seconds(lambda: _engine_gradient(task, contact)) for _ in range(ENGINE_SAMPLES))
-    medians = {name: statistics.median(values) / samples for name, values in times.items()}
-    progress(4, 4, "done")
+    for repeat in range(REPEATS):
+        progress(len(contenders) + min(repeat, len(contenders) - 1), total, f"{task.name}: measuring")
+        for name, (count, call) in contenders.items():
+            times[name].append(_seconds(call) / count)
+    engine = _engine_seconds(task, cell.contact)
+    progress(total, total, "done")
     return BenchReport(
         task=task.name,
         samples=samples,
         horizon=task.horizon,
-        value_seconds=medians["value"],
-        gradient_seconds=medians["gradient"],
-        stock_gradient_seconds=medians["stock"],
-        engine_gradient_seconds=engine / len(devices),
-        gradient_memory=simulator.gradient_memory(contact, samples) / 2**20,
+        contact=cell.label,
+        **{f"{name}_seconds": statistics.median(values) for name, values in times.items()},
+        engine_gradient_seconds=None if engine is None else engine / len(devices),
+        gradient_memory=simulator.gradient_memory(cell.contact, samples) / 2**20,
         environment=environment(),
     )
 
@@ -164,62 +174,77 @@ def _seconds(call: Callable[[], Any]) -> float:
     return time.perf_counter() - start
 
 
-def _stock_gradients(task: Task, contact: Any, samples: int, devices: Any) -> Callable[[], Any]:
-    """Gradients of the whole cost through `mjx.step`, sharded like ours."""
-    scene = task.scene
-    one = scene.model.replace(opt=scene.model.opt.replace(iterations=1))
-    start = task.draw_start(jax.random.key(0))
-    first = scene.template.replace(qpos=start.qpos, qvel=start.qvel)
+def _stock_programs(task: Task, contact: ContactModel | None, keys: Any, devices: Any) -> tuple[Callable[[], Any], ...]:
+    """Costs and gradients of the same samples through `mjx.step`, sharded like ours."""
+    scene, policy = task.scene, task.policy
+    dtype = scene.template.qpos.dtype
 
-    def cost(theta, contact):
-        model = apply_contact(one, contact)
+    def cost(theta, contact, key_data, iterations: int):
+        model = scene.model.replace(opt=scene.model.opt.replace(iterations=iterations))
+        model = apply_contact(model, contact)
+        start_key, noise_key = split_sample_key(jax.random.wrap_key_data(key_data))
+        noise = task.sigma * standard_noise(noise_key, policy.noise_shape, dtype)
+        start = policy.place(theta, noise, task.draw_start(start_key))
 
-        def advance(data, control):
+        def advance(data, feedforward):
             state = State(data.qpos, data.qvel, data.act, data.qacc_warmstart)
-            value = task.running_cost(state, control)
-            return mjx.step(model, data.replace(ctrl=control)), value
+            feedback = policy.feedback(theta, state)
+            control = feedforward if feedback is None else feedforward + feedback
+            return mjx.step(model, data.replace(ctrl=control)), task.running_cost(state, control)
 
-        last, values = jax.lax.scan(advance, first, task.policy.feedforward(theta))
+        first = scene.template.replace(qpos=start.qpos, qvel=start.qvel, act=start.act)
+        last, values = jax.lax.scan(advance, first, policy.feedforward(theta, noise))
         return jnp.sum(values) + task.final_cost(State(last.qpos, last.qvel, last.act, last.qacc_warmstart))
 
     mesh = Mesh(np.array(devices), ("samples",))
     shared, split = PartitionSpec(), PartitionSpec("samples")
-    gradients = jax.jit(
-        jax.shard_map(
-            jax.vmap(jax.grad(cost), in_axes=(0, None)),
-            mesh=mesh,
-            in_specs=(split, shared),
-            out_specs=split,
-            check_vma=False,
-        )
-    )
-    padded = -(-samples // len(devices)) * len(devices)
-    noise = np.random.default_rng(0).normal(scale=task.sigma, size=(padded, len(task.theta)))
-    thetas = jnp.asarray(np.asarray(task.theta) + noise.astype(task.theta.dtype))
-    return lambda: gradients(thetas, contact)
+
+    def program(function):
+        batched = jax.vmap(function, in_axes=(None, None, 0))
+        specs = {"mesh": mesh, "in_specs": (shared, shared, split), "out_specs": split}
+        return jax.jit(jax.shard_map(batched, **specs, check_vma=False))
+
+    budget = int(scene.host.opt.iterations)
+    values = program(lambda theta, contact, key: cost(theta, contact, key, budget))
+    gradients = program(jax.grad(lambda theta, contact, key: cost(theta, contact, key, 1)))
+    rows = np.minimum(np.arange(-(-len(keys) // len(devices)) * len(devices)), len(keys) - 1)
+    key_data = np.asarray(jax.random.key_data(keys))[rows]
+    return tuple((lambda run=run: run(task.theta, contact, key_data)) for run in (values, gradients))
 
 
-def _engine_start(task: Task, contact: Any) -> tuple[mujoco.MjModel, mujoco.MjData]:
-    host = copy.copy(task.scene.host)
-    apply_to_host(host, contact)
-    data, start = mujoco.MjData(host), task.draw_start(jax.random.key(0))
-    data.qpos[:], data.qvel[:] = np.asarray(start.qpos), np.asarray(start.qvel)
-    return host, data
+def _engine_seconds(task: Task, contact: ContactModel | None) -> float | None:
+    """Median time of a gradient by the C engine [s]; None where its differences do not apply."""
+    host = task.scene.host
+    if host.nq != host.nv or host.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
+        return None
+    key = jax.random.key(0)
+    states, controls, *_ = jax.jit(lambda theta, contact: simulate(task, theta, contact, key, 1.0))(task.theta, contact)
+    start = (np.asarray(states.qpos[0], float), np.asarray(states.qvel[0], float))
+    played = np.asarray(controls, float)
+    times = [_seconds(lambda: engine_gradient(task, contact, start, played)) for _ in range(ENGINE_SAMPLES)]
+    return statistics.median(times)
 
 
-def _engine_gradient(task: Task, contact: Any) -> np.ndarray:
-    """Gradient of the sum of the last state by the C engine: centred differences of each step, one adjoint sweep."""
-    host, data = _engine_start(task, contact)
-    controls = np.asarray(task.policy.feedforward(task.theta), float)
+def engine_gradient(
+    task: Task, contact: ContactModel | None, start: tuple[np.ndarray, np.ndarray], controls: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Gradient of the sum of the last state with respect to start state and controls.
+
+    By the C engine: centred differences of each step, and one adjoint sweep.
+    """
+    host = engine_model(task.scene, contact)
+    data = mujoco.MjData(host)
+    data.qpos[:], data.qvel[:] = start
     size = 2 * host.nv + host.na
-    over_state = np.zeros((task.horizon, size, size))
-    over_control = np.zeros((task.horizon, size, host.nu))
+    over_state = np.zeros((len(controls), size, size))
+    over_control = np.zeros((len(controls), size, host.nu))
     for index, control in enumerate(controls):
         data.ctrl[:] = control
-        mujoco.mjd_transitionFD(host, data, 1e-6, True, over_state[index], over_control[index], None, None)
+        over = over_control[index] if host.nu else None
+        mujoco.mjd_transitionFD(host, data, 1e-6, True, over_state[index], over, None, None)
         mujoco.mj_step(host, data)
     adjoint, gradient = np.ones(size), np.empty(controls.shape)
-    for index in reversed(range(task.horizon)):
+    for index in reversed(range(len(controls))):
         gradient[index] = adjoint @ over_control[index]
         adjoint = adjoint @ over_state[index]
-    return gradient
+    return adjoint, gradient

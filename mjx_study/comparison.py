@@ -17,12 +17,12 @@ class CompareConfig:
 
     Attributes:
         task: name of a task.
-        stiffness: contact stiffnesses [N/m], for the families that take one.
-        contact: names of contact families.
+        stiffness: contact stiffnesses [N/m], for the families that take one; None for the task's.
+        contact: names of contact families; None for the task's.
         estimators: names of estimators.
         samples: in each batch; an alpha-order estimate uses two batches.
         reference_samples: pairs of rollouts behind each reference gradient.
-        sigma: standard deviation of the noise, in the control's unit; None for the task's.
+        sigma: standard deviation of the noise, in the unit of what it is added to; None for the task's.
         seed: of all randomness.
         baseline: of zeroth-order estimates: zero_noise, leave_one_out or none.
         gamma: accuracy that the alpha-order estimate must keep, in the unit of the gradient; None for the task's.
@@ -38,8 +38,8 @@ class CompareConfig:
     """
 
     task: str
-    stiffness: tuple[float, ...] = (10.0, 100.0, 300.0, 550.0, 1000.0, 1200.0)
-    contact: tuple[str, ...] = ("penalty", "mujoco", "mujoco_stiff")
+    stiffness: tuple[float, ...] | None = None
+    contact: tuple[str, ...] | None = None
     estimators: tuple[str, ...] = ("zobg", "fobg", "aobg")
     samples: int = 400
     reference_samples: int = 600
@@ -62,15 +62,20 @@ class CompareConfig:
             ("contact family", self.contact, FAMILIES),
             ("estimator", self.estimators, ESTIMATORS),
         ):
+            if names is None:
+                continue
             if not names:
                 raise ValueError(f"no {label} given; choose from {', '.join(choices)}")
             _refuse_repeats(label, names)
             for name in names:
                 if name not in choices:
                     raise ValueError(f"unknown {label} {name!r}; choose from {', '.join(choices)}")
-        if any(FAMILIES[name].swept for name in self.contact) and not self.stiffness:
-            raise ValueError(f"the contact families {', '.join(self.contact)} need at least one stiffness in N/m")
-        _refuse_repeats("stiffness", self.stiffness)
+        if self.stiffness is not None:
+            if not self.stiffness:
+                raise ValueError("no stiffness given: give at least one, in N/m")
+            _refuse_repeats("stiffness", self.stiffness)
+            if self.contact is not None and not any(FAMILIES[name].swept for name in self.contact):
+                raise ValueError(f"contact {', '.join(self.contact)} takes no stiffness; leave --stiffness out")
         for label, count, least in (("samples", self.samples, 3), ("reference_samples", self.reference_samples, 3)):
             if count < least:
                 raise ValueError(f"{label} must be at least {least}, so that a variance has an interval; got {count}")
@@ -94,8 +99,8 @@ class Row:
 
     Attributes:
         contact: contact family.
-        stiffness: K of the contact's spring, at full penetration [N/m].
-        solref, solimp: MuJoCo's parameters of this contact.
+        stiffness: K of the contact's spring, at full penetration [N/m]; 0 where there is no contact.
+        solref, solimp: MuJoCo's parameters of this contact; empty where each contact has the MJCF's own.
         estimator: name.
         samples: in each batch.
         gradient_norm: of the mean gradient.
@@ -162,3 +167,8 @@ class CompareResult:
     warnings: tuple[str, ...]
     gradients: Float[np.ndarray, "rows params"]
     references: Float[np.ndarray, "rows params"]
+
+    @property
+    def families(self) -> tuple[str, ...]:
+        """Contact families, in the order of the rows."""
+        return tuple(dict.fromkeys(row.contact for row in self.rows))

@@ -2,6 +2,7 @@
 
 import math
 import shutil
+import sys
 from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
 
@@ -45,7 +46,7 @@ def _with_error(value: float, error: float) -> str:
 def columns(confidence: float) -> list[list[Column]]:
     """The comparison's table in two halves, each narrow enough for 80 characters."""
     identity: list[Column] = [
-        ("K [N/m]", lambda row: number(row.stiffness)),
+        ("K [N/m]", lambda row: number(row.stiffness or None)),
         ("estimator", lambda row: STYLE[row.estimator][0]),
     ]
     values: list[Column] = [
@@ -74,7 +75,7 @@ def print_comparison(result: CompareResult, print_line: Callable[[str], None] = 
     )
     halves = columns(config.confidence)
     whole = halves[0] + halves[1][2:]
-    for family in config.contact:
+    for family in result.families:
         rows = [row for row in result.rows if row.contact == family]
         print_line("")
         print_line(f"{family}: {FAMILIES[family].description}")
@@ -106,7 +107,8 @@ def alarms(result: CompareResult) -> list[str]:
     """What a reader must not overlook: samples left out, solves that did not converge, contact models at their edge."""
     messages = []
     for row in result.rows:
-        where = f"{row.contact}, K = {number(row.stiffness)} N/m, {STYLE[row.estimator][0]}"
+        stiffness = f"K = {number(row.stiffness)} N/m, " if row.stiffness else ""
+        where = f"{row.contact}, {stiffness}{STYLE[row.estimator][0]}"
         if row.nonfinite:
             messages.append(f"{where}: {row.nonfinite} of {row.samples} samples are not finite and were left out")
         if row.unconverged:
@@ -144,3 +146,9 @@ def progress_bar() -> Generator[Callable[[int, int, str], None]]:
             bar.update(task, completed=done, total=total, description=what)
 
         yield report
+
+
+def show_cursor() -> None:
+    """Bring back the cursor that a progress bar hides, where standard error is a terminal."""
+    if sys.stderr.isatty():
+        sys.stderr.write("\n\x1b[?25h")

@@ -39,11 +39,6 @@ DEFAULT_SOLREF: Final = (0.02, 1.0)
 DEFAULT_SOLIMP: Final = (0.9, 0.95, 0.001, 0.5, 2.0)
 STIFF_SOLIMP: Final = (0.99, 0.9999, 0.001, 0.5, 2.0)
 
-# A direct solref of exactly zero damping makes MJX differentiate 1 / dampratio^2 in the branch it does not take, and
-# the derivative with respect to stiffness NaN. This much damping [1/s] changes no result (5e-15 of a velocity per
-# step at 5 ms) and keeps that branch finite.
-_LEAST_DAMPING: Final = 1e-12
-
 
 class ContactWarning(UserWarning):
     """A contact model that MuJoCo would alter, or that the integrator cannot resolve."""
@@ -99,8 +94,6 @@ def contact_model(
         raise ValueError(f"margin must be >= 0 m, got {margin}")
     _warn_if_clipped(solref, scene)
     _warn_if_unstable(solref, scene.timestep)
-    if solref[0] <= 0:
-        solref = (solref[0], min(solref[1], -_LEAST_DAMPING))
     as_array = partial(jnp.asarray, dtype=scene.template.qpos.dtype)
     return ContactModel(
         as_array(solref),
@@ -117,21 +110,21 @@ class Family:
     Attributes:
         name: as the command line takes it.
         description: one line for tables and help.
-        solimp: the impedance of all its members.
+        solimp: the impedance of all its members; None for what the MJCF says.
         dampratio: damping ratio that goes with a stiffness, where no damping is given.
-        solref: the fixed reference of a single point; None for a line over stiffness.
+        solref: the fixed reference of a single point; None for a line over stiffness, or for what the MJCF says.
     """
 
     name: str
     description: str
-    solimp: tuple[float, float, float, float, float]
+    solimp: tuple[float, float, float, float, float] | None
     dampratio: float = 0.0
     solref: tuple[float, float] | None = None
 
     @property
     def swept(self) -> bool:
         """Whether the family takes a stiffness."""
-        return self.solref is None
+        return self.solref is None and self.solimp is not None
 
 
 def _constant(impedance: float) -> tuple[float, float, float, float, float]:
@@ -160,6 +153,7 @@ FAMILIES: Final = {
             1.0,
         ),
         Family("mujoco_default", "MuJoCo's defaults: solref (0.02, 1)", DEFAULT_SOLIMP, 1.0, DEFAULT_SOLREF),
+        Family("mjcf", "each contact as the MJCF has it", None),
     )
 }
 
@@ -175,21 +169,24 @@ def family_model(
     """The member of a family at a physical stiffness.
 
     Args:
-        name: one of `FAMILIES`.
+        name: one of `FAMILIES`, but "mjcf".
         scene: the scene that it is meant for.
         stiffness: K [N/m], positive; None for a family that is a single point.
         damping: B [N s/m], not negative; None for the family's damping ratio.
         effective_mass: of the contact along its normal [kg]; see `effective_mass`.
 
     Raises:
-        ValueError: unknown name, a stiffness that is missing or not wanted, or a value out of range.
+        ValueError: unknown name, a stiffness that is missing or not wanted, a value out of range, or the family "mjcf",
+            which stands for no contact model at all.
     """
     if name not in FAMILIES:
         raise ValueError(f"unknown contact family {name!r}; choose from {', '.join(FAMILIES)}")
     family = FAMILIES[name]
+    if not family.swept and (stiffness is not None or damping is not None):
+        raise ValueError(f"contact family {name!r} is a single point and takes no stiffness or damping")
+    if family.solimp is None:
+        raise ValueError(f"contact family {name!r} leaves the model as it is: use None in place of a contact model")
     if family.solref is not None:
-        if stiffness is not None or damping is not None:
-            raise ValueError(f"contact family {name!r} is a single point and takes no stiffness or damping")
         return contact_model(family.solref, family.solimp, scene=scene)
     if stiffness is None:
         raise ValueError(f"contact family {name!r} needs a stiffness in N/m")
@@ -270,11 +267,14 @@ def effective_mass(scene: Scene, geom1: str, geom2: str) -> float:
     return 2 * (condim - 1) * float(host.opt.impratio) / (2 * mu**2 * (1 + mu**2) * weight)
 
 
-def apply_contact(model: mjx.Model, contact: ContactModel) -> mjx.Model:
+def apply_contact(model: mjx.Model, contact: ContactModel | None) -> mjx.Model:
     """The model with every geom and explicit pair set to the contact model; pure, for traced values too.
 
-    Both geoms of a pair are set, so MuJoCo's mixing by `solmix` and `priority` has nothing to mix.
+    Both geoms of a pair are set, so MuJoCo's mixing by `solmix` and `priority` has nothing to mix. None leaves the
+    model as the MJCF has it.
     """
+    if contact is None:
+        return model
 
     def fill(leaf, value):
         return jnp.broadcast_to(value, leaf.shape).astype(jnp.result_type(leaf))

@@ -28,6 +28,7 @@ from estimators.pytree import register_pytree
 from mjx_study import constraint
 from mjx_study._mjx import mjx
 from mjx_study.integration import integrate_position
+from mjx_study.repairs import has_tendon_springs, repaired, tendon_spring_gap
 from mjx_study.scene import Scene
 
 JACOBIAN_COLUMNS = 32
@@ -86,6 +87,27 @@ def step(scene: Scene, model: mjx.Model, state: State, control: Float[Array, " n
     return State(qpos, qvel, act, jax.lax.stop_gradient(qacc)), jax.lax.stop_gradient(residual)
 
 
+def exact_step(
+    scene: Scene, model: mjx.Model, state: State, control: Float[Array, " nu"]
+) -> tuple[State, Float[Array, ""]]:
+    """`step` with its constraints solved to rounding whatever the budgets; slow, and for values only.
+
+    What differences of the step are taken of: those of `step` itself would show where its solver stopped.
+    """
+    if scene.host.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
+        return step(scene, model, state, control)
+    data = smooth_stages(scene, model, state, control).replace(qacc_warmstart=state.warmstart)
+    qacc = constraint.solve_to_rounding(model, data)
+    qvel, act = _finish(model, data, qacc)
+    qpos = integrate_position(scene.host, state.qpos, qvel, model.opt.timestep)
+    return State(qpos, qvel, act, qacc), constraint.residual(model, data, qacc)
+
+
+def smooth_stages(scene: Scene, model: mjx.Model, state: State, control: Float[Array, " nu"]) -> mjx.Data:
+    """All of a step that comes before the constraint solve: kinematics, contacts, forces, constraint rows."""
+    return _force_stage(model, _position_stage(scene, model, state.qpos), state.qvel, state.act, control)
+
+
 ControlLaw = Callable[[Int[Array, ""], State], Float[Array, " nu"]]
 
 
@@ -137,7 +159,10 @@ def _position_stage(scene: Scene, model: mjx.Model, qpos: Float[Array, " nq"]) -
     return _fwd_position(model, scene.template.replace(qpos=qpos))
 
 
-_fwd_position = jax.jit(mjx.fwd_position)
+@jax.jit
+def _fwd_position(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    with repaired():
+        return mjx.fwd_position(model, data)
 
 
 @jax.jit
@@ -149,10 +174,13 @@ def _force_stage(
     control: Float[Array, " nu"],
 ) -> mjx.Data:
     data = data.replace(qvel=qvel, act=act, ctrl=control)
-    data = mjx.make_constraint(model, data)  # again: aref depends on qvel
-    data = mjx.fwd_velocity(model, data)
-    data = mjx.fwd_actuation(model, data)
-    return mjx.fwd_acceleration(model, data)
+    with repaired():
+        data = mjx.make_constraint(model, data)  # again: aref depends on qvel
+        data = mjx.fwd_velocity(model, data)
+        if has_tendon_springs(model):
+            data = data.replace(qfrc_passive=data.qfrc_passive + tendon_spring_gap(model, data))
+        data = mjx.fwd_actuation(model, data)
+        return mjx.fwd_acceleration(model, data)
 
 
 @jax.jit
@@ -280,6 +308,8 @@ def _runge_kutta(scene: Scene, model: mjx.Model, state: State, control: Float[Ar
     fourth = slopes(*moved(1.0, third))
     mean = jax.tree.map(lambda a, b, c, d: (a + 2 * b + 2 * c + d) / 6, first, second, third, fourth)
     qpos, qvel, _ = moved(1.0, mean)
+    if state.act.size == 0:
+        return State(qpos, qvel, state.act, state.warmstart)
     # MJX's own advance of the activation, with its clamping
     data = _force_stage(model, _position_stage(scene, model, state.qpos), state.qvel, state.act, control)
     act = mjx.euler(model, data.replace(act_dot=mean[2], qacc=data.qacc_smooth)).act

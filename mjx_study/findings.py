@@ -10,7 +10,7 @@ def findings(result: CompareResult) -> list[str]:
     """What the intervals say, in sentences: where FoBG's variance is above ZoBG's, and where its mean is biased."""
     return [
         sentence
-        for family in result.config.contact
+        for family in result.families
         for sentence in (*_variance_finding(result, family), *_bias_finding(result, family))
     ]
 
@@ -29,7 +29,7 @@ def _variance_finding(result: CompareResult, family: str) -> list[str]:
         below, above = first.variance_upper < zeroth.variance_lower, first.variance_lower > zeroth.variance_upper
         verdict = "below ZoBG's" if below else "above ZoBG's" if above else "not told apart from ZoBG's"
         groups[verdict].append(stiffness)
-    parts = [f"{verdict} at K = {_list(group)} N/m" for verdict, group in groups.items() if group]
+    parts = [f"{verdict}{_at(group)}" for verdict, group in groups.items() if group]
     return [f"{family}: FoBG's variance is {'; '.join(parts)} ({result.config.confidence:.0%} intervals)"]
 
 
@@ -42,11 +42,12 @@ def _bias_finding(result: CompareResult, family: str) -> list[str]:
             if row.relative_error > 3 * noise:
                 biased.append(row)
     return [
-        f"{family}: FoBG's mean is biased by {row.relative_error:.1%} at K = {row.stiffness:g} N/m "
+        f"{family}: FoBG's mean is biased by {row.relative_error:.1%}{_at([row.stiffness])} "
         "(its error is over three times what noise explains)"
         for row in biased
     ]
 
 
-def _list(values: Sequence[float]) -> str:
-    return ", ".join(f"{value:g}" for value in values)
+def _at(stiffnesses: Sequence[float]) -> str:
+    """Where, unless there is no contact."""
+    return f" at K = {', '.join(f'{value:g}' for value in stiffnesses)} N/m" if any(stiffnesses) else ""

@@ -40,6 +40,45 @@ def integrate_position(
     return jnp.concatenate(parts) if parts else qpos
 
 
+def difference_position(
+    host: mujoco.MjModel, start: Float[Array, " nq"], end: Float[Array, " nq"]
+) -> Float[Array, " nv"]:
+    """The velocity that moves from `start` to `end` in unit time, the inverse of `integrate_position`.
+
+    Args:
+        host: the model, for its joints.
+        start, end: positions [m or rad; quaternions of any length].
+    """
+    parts = []
+    for kind, first in zip(host.jnt_type, host.jnt_qposadr, strict=True):
+        if kind == _FREE:
+            parts.append(end[first : first + 3] - start[first : first + 3])
+            first = first + 3
+        if kind in (_FREE, _BALL):
+            parts.append(rotation_between(start[first : first + 4], end[first : first + 4]))
+        else:
+            parts.append(end[first : first + 1] - start[first : first + 1])
+    return jnp.concatenate(parts) if parts else end
+
+
+def rotation_between(start: Float[Array, " 4"], end: Float[Array, " 4"]) -> Float[Array, " 3"]:
+    """The rotation vector [rad], in the body's frame, that `rotate_quaternion` takes from `start` to `end`.
+
+    With (w, u) = start^-1 end of sign w >= 0 it is 2 atan2(|u|, w) u / |u|, a smooth function of u / w below pi.
+    """
+    a, b = start, end
+    real = jnp.sum(a * b)
+    axis = a[0] * b[1:] - b[0] * a[1:] - jnp.cross(a[1:], b[1:])
+    real, axis = jnp.where(real < 0, -real, real), jnp.where(real < 0, -axis, axis)
+    ratio = jnp.sum(axis**2) / real**2
+    small = ratio < _SMALL / 4
+    square = jnp.where(small, 1.0, jnp.sum(axis**2))
+    length = jnp.sqrt(square)
+    # 2 atan(t) / t, in powers of t^2, with t = |u| / w
+    series = (2 - ratio * (2 / 3) + ratio**2 * (2 / 5) - ratio**3 * (2 / 7)) / real
+    return axis * jnp.where(small, series, 2 * jnp.arctan2(length, real) / length)
+
+
 def rotate_quaternion(quaternion: Float[Array, " 4"], rotation: Float[Array, " 3"]) -> Float[Array, " 4"]:
     """The unit quaternion after a rotation vector [rad] in the body's frame: q exp(rotation / 2), normalised."""
     square = jnp.sum(rotation**2)

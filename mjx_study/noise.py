@@ -1,4 +1,4 @@
-"""How one sample's key becomes its start and its noise; the same for MJX and for the reference systems."""
+"""How a sample's key becomes its start and its noise; the same for MJX and for the reference systems."""
 
 import jax
 from jaxtyping import Array, Float, Key
@@ -10,6 +10,6 @@ def split_sample_key(key: Key[Array, ""]) -> tuple[Key[Array, ""], Key[Array, ""
     return start_key, noise_key
 
 
-def standard_noise(noise_key: Key[Array, ""], horizon: int, controls: int, dtype) -> Float[Array, "horizon nu"]:
-    """Standard normal noise of a whole rollout; times sigma it is added to the controls."""
-    return jax.random.normal(noise_key, (horizon, controls), dtype)
+def standard_noise(noise_key: Key[Array, ""], shape: tuple[int, int], dtype) -> Float[Array, "steps dimensions"]:
+    """Standard normal noise of a whole rollout, (steps, dimensions); times sigma it is what a policy adds."""
+    return jax.random.normal(noise_key, shape, dtype)

@@ -21,7 +21,6 @@ from estimators import Differentiation, Evaluation
 from mjx_study.contact import ContactModel, apply_contact
 from mjx_study.dynamics import State, rollout
 from mjx_study.noise import split_sample_key, standard_noise
-from mjx_study.policy import OpenLoop
 from mjx_study.task import Task, check_sigma
 
 MAX_CHUNK: Final = {"cpu": 512, "gpu": 32768, "tpu": 32768}
@@ -32,27 +31,61 @@ and this bounds memory (about 40 kB for each gradient of 200 steps of a two-join
 def rollout_cost(
     task: Task,
     theta: Float[Array, " params"],
-    contact: ContactModel,
+    contact: ContactModel | None,
     start: State,
-    noise: Float[Array, "horizon nu"],
+    noise: Float[Array, "steps dimensions"],
 ) -> tuple[Float[Array, ""], tuple[State, Float[Array, "horizon nu"], Float[Array, ""]]]:
     """Total cost V_1 of one rollout, a pure function of everything that may be traced or differentiated.
 
+    Args:
+        task: what is simulated.
+        theta: parameters of its policy.
+        contact: the contact model; None for the MJCF's own.
+        start: the start state, before the policy acts on it.
+        noise: of the policy's `noise_shape`.
+
     Returns:
-        The cost; and the states before each step, the controls, and the largest relative solver residual.
+        The cost; and the states `(horizon + 1, ...)` with the start first, the controls, and the largest relative
+        solver residual.
     """
-    feedforward = task.policy.feedforward(theta) + noise
+    feedforward = task.policy.feedforward(theta, noise)
 
     def control_law(index, state):
         feedback = task.policy.feedback(theta, state)
         return feedforward[index] if feedback is None else feedforward[index] + feedback
 
     model = apply_contact(task.scene.model, contact)
-    states, controls, residuals = rollout(task.scene, model, start, control_law, task.horizon)
-    before = jax.tree.map(lambda leaf: leaf[:-1], states)
+    first = task.policy.place(theta, noise, start)
+    states, controls, residuals = rollout(task.scene, model, first, control_law, task.horizon)
     last = jax.tree.map(lambda leaf: leaf[-1], states)
-    cost = jnp.sum(jax.vmap(task.running_cost)(before, controls)) + task.final_cost(last)
-    return cost, (before, controls, jnp.max(residuals))
+    cost = jnp.sum(jax.vmap(task.running_cost)(_before_each_step(states), controls)) + task.final_cost(last)
+    return cost, (states, controls, jnp.max(residuals))
+
+
+def simulate(
+    task: Task,
+    theta: Float[Array, " params"],
+    contact: ContactModel | None,
+    key: Key[Array, ""],
+    noise_scale: float | Float[Array, ""],
+) -> tuple[State, Float[Array, "horizon nu"], Float[Array, ""], Float[Array, ""]]:
+    """One sample's rollout: its states with the start first, controls, cost and largest solver residual.
+
+    Args:
+        task: what is simulated.
+        theta: parameters of its policy.
+        contact: the contact model; None for the MJCF's own.
+        key: of the sample; draws start and noise as in a batch.
+        noise_scale: factor on the noise; 0 for a rollout without.
+    """
+    start_key, noise_key = split_sample_key(key)
+    noise = noise_scale * task.sigma * standard_noise(noise_key, task.policy.noise_shape, theta.dtype)
+    cost, (states, controls, residual) = rollout_cost(task, theta, contact, task.draw_start(start_key), noise)
+    return states, controls, cost, residual
+
+
+def _before_each_step(states: State) -> State:
+    return jax.tree.map(lambda leaf: leaf[:-1], states)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -77,7 +110,7 @@ class Simulator:
         for name, program in (("_values", self._sample_value), ("_gradients", self._sample_gradient)):
             object.__setattr__(self, name, self._compile(program, devices))
 
-    def objective(self, contact: ContactModel, sigma: float | None = None) -> "MjxObjective":
+    def objective(self, contact: ContactModel | None, sigma: float | None = None) -> "MjxObjective":
         """Bind a contact model, and a noise level other than the task's."""
         return MjxObjective(self, contact, self.task.sigma if sigma is None else sigma)
 
@@ -86,7 +119,7 @@ class Simulator:
         """How many programs this simulator has compiled so far."""
         return sum(program._cache_size() for program in (self._values, self._gradients))  # type: ignore[attr-defined]
 
-    def gradient_memory(self, contact: ContactModel, samples: int) -> int:
+    def gradient_memory(self, contact: ContactModel | None, samples: int) -> int:
         """Temporary memory of the gradients of a batch, all chunks at once on all devices [bytes], as XLA plans it."""
         capacity = self.chunk_size * len(self.devices)
         dtype = self.task.scene.template.qpos.dtype
@@ -114,13 +147,14 @@ class Simulator:
         task = self.task
         start_key, noise_key = split_sample_key(jax.random.wrap_key_data(key_data))
         dtype = task.scene.template.qpos.dtype
-        noise = noise_scale * sigma * standard_noise(noise_key, task.horizon, task.scene.host.nu, dtype)
+        noise = noise_scale * sigma * standard_noise(noise_key, task.policy.noise_shape, dtype)
         cost, (states, _, residual) = rollout_cost(task, theta, contact, task.draw_start(start_key), noise)
         return cost, (states, noise, residual)
 
     def _sample_value(self, theta, contact, sigma, key_data, noise_scale):
         value, (states, noise, residual) = self._cost(theta, contact, sigma, key_data, noise_scale)
-        return value, self.task.policy.score(theta, states, noise / sigma**2), residual
+        score = self.task.policy.score(theta, _before_each_step(states), noise / sigma**2)
+        return value, score, residual
 
     def _sample_gradient(self, theta, contact, sigma, key_data, noise_scale):
         (value, (_, _, residual)), gradient = jax.value_and_grad(self._cost, has_aux=True)(
@@ -161,12 +195,12 @@ class MjxObjective:
 
     Attributes:
         simulator: the compiled programs, shared by all contact models of a sweep.
-        contact: the contact model.
-        sigma: standard deviation of the noise, in the control's unit.
+        contact: the contact model; None for the MJCF's own.
+        sigma: standard deviation of the noise, in the unit of what it is added to.
     """
 
     simulator: Simulator
-    contact: ContactModel
+    contact: ContactModel | None
     sigma: float
 
     @property
@@ -190,20 +224,35 @@ class MjxObjective:
     def evaluate_odd(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> Evaluation:
         """The part of the objective that is odd in the noise, (f(w) - f(-w)) / 2, by two rollouts per sample.
 
-        Only the odd part correlates with an open loop's score, so it has the same gradient; the even part, most of the
-        variance of a zeroth-order sample, is gone.
+        Only the odd part correlates with the score of noise that is added to theta, so it has the same gradient; the
+        even part, most of the variance of a zeroth-order sample, is gone.
 
         Raises:
             ValueError: the policy has feedback; then the score is not odd in the noise.
         """
-        if not isinstance(self.simulator.task.policy, OpenLoop):
-            raise ValueError("the odd part of an objective needs an open-loop policy")
+        if not self.simulator.task.policy.additive:
+            raise ValueError("the odd part of an objective needs a policy whose noise is added to theta")
         samples = len(keys)
         scale = np.repeat([1.0, -1.0], samples)
         values, scores, residuals = self._values(theta, keys, np.tile(np.arange(samples), 2), scale)
         odd = (values[:samples] - values[samples:]) / 2
         residual = np.maximum(residuals[:samples], residuals[samples:])
         return Evaluation(*map(jnp.asarray, (odd, scores[:samples], np.zeros_like(odd), residual)))
+
+    def evaluate_pair(
+        self, theta: Float[Array, " params"], keys: Key[Array, " samples"]
+    ) -> tuple[Evaluation, Evaluation]:
+        """Two evaluations whose noises are opposite, sample by sample, from the same starts; three rollouts each."""
+        samples = len(keys)
+        scale = np.repeat([1.0, -1.0, 0.0], samples)
+        values, scores, residuals = self._values(theta, keys, np.tile(np.arange(samples), 3), scale)
+        above, below = slice(samples), slice(samples, 2 * samples)
+        silent = jnp.asarray(values[2 * samples :])
+        plus, minus = (
+            Evaluation(*map(jnp.asarray, (values[part], scores[part], silent, residuals[part])))
+            for part in (above, below)
+        )
+        return plus, minus
 
     def differentiate(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> Differentiation:
         """Values and exact gradients of each sample's cost with respect to theta."""

@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from estimators import ESTIMATORS
 from mjx_study.comparison import CompareResult, Row
 from mjx_study.contact import DEFAULT_SOLREF, FAMILIES
+from mjx_study.landscape import Curve, Landscape
 from mjx_study.results import write_whole
 
 # Okabe and Ito's colours, told apart in print and by colour-blind eyes; markers repeat the distinction.
@@ -21,6 +22,8 @@ STYLE: Final = {
     "aobg": ("AoBG", "#009E73", "D"),
     "ivw": ("IVW", "#CC79A7", "^"),
 }
+NO_CONTACT: Final = 1.0
+"""Place on a stiffness axis of a task without contact."""
 TITLES: Final = {
     "penalty": "penalty (impedance 1e-4)",
     "impedance": "impedance 0.5",
@@ -28,13 +31,14 @@ TITLES: Final = {
     "mujoco_stiff": "MuJoCo, impedance 0.99 to 0.9999",
     "smooth_onset": "smooth onset",
     "mujoco_default": "MuJoCo default",
+    "mjcf": "as in the MJCF",
 }
 assert set(STYLE) >= set(ESTIMATORS) and set(TITLES) >= set(FAMILIES)
 
 
 def plot_comparison(result: CompareResult) -> Figure:
     """Variance and relative error against stiffness: a column for each contact family, a line for each estimator."""
-    families = result.config.contact
+    families = result.families
     figure = Figure(figsize=(1.2 + 3.4 * len(families), 6.2), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots(2, len(families), sharex=True, sharey="row", squeeze=False)
@@ -44,6 +48,10 @@ def plot_comparison(result: CompareResult) -> Figure:
         _error_panel(column[1], rows, result.config.estimators)
         column[0].set_title(TITLES[family])
         column[1].set_xlabel("contact stiffness K [N/m]")
+        if not any(row.stiffness for row in rows):
+            column[1].set_xlabel("")
+            column[1].set_xticks([NO_CONTACT], ["no contact"])
+            column[1].set_xticks([], minor=True)
         _mark_default(column[0], family, rows)
     axes[0, 0].set_ylabel("variance of one sample")
     axes[1, 0].set_ylabel(f"relative error of the mean\nof {result.config.samples} samples")
@@ -56,6 +64,64 @@ def plot_comparison(result: CompareResult) -> Figure:
         fontsize="medium",
     )
     return figure
+
+
+def plot_landscape(result: Landscape) -> Figure:
+    """Cost and smoothed cost above, the slopes that ZoBG and FoBG see below; a column for each contact model."""
+    figure = Figure(figsize=(1.2 + 2.9 * len(result.curves), 5.6), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(2, len(result.curves), sharex=True, sharey="row", squeeze=False)
+    t = result.position
+    for (above, below), curve in zip(axes.T, result.curves, strict=True):
+        above.plot(t, curve.cost, color="0.55", linewidth=1.2, label="cost without noise")
+        _mean_with_band(above, t, curve.smoothed, curve.smoothed_se, "black", "mean cost with noise")
+        for name, mean, error in (
+            ("zobg", curve.zeroth, curve.zeroth_se),
+            ("fobg", curve.first, curve.first_se),
+        ):
+            label, colour, _ = STYLE[name]
+            _mean_with_band(below, t, mean, error, colour, f"mean of {label}")
+        if curve.exact is not None:
+            style = {"color": "black", "linestyle": ":", "linewidth": 1.2}
+            below.plot(t, curve.exact.slope, **style, label="slope of the mean cost, exact")
+            below.plot(t, curve.exact.first, **style | {"color": STYLE["fobg"][1]}, label="mean of FoBG, exact")
+        above.set_title(_curve_title(curve), fontsize="medium")
+        below.axhline(0, color="0.7", linewidth=0.8)
+        below.set_xlabel("theta" if len(result.direction) == 1 else f"t along direction {result.config.direction}")
+        for panel in (above, below):
+            panel.grid(alpha=0.25)
+    low, high = _robust_limits([array for curve in result.curves for array in (curve.zeroth, curve.first)])
+    axes[1, 0].set_ylim(low, high)
+    axes[0, 0].set_ylabel("cost")
+    axes[1, 0].set_ylabel("slope")
+    axes[0, 0].legend(frameon=False, fontsize="small")
+    axes[1, 0].legend(frameon=False, fontsize="small")
+    config = result.config
+    figure.suptitle(
+        f"{config.task}: sigma = {config.sigma:g}, {config.samples} samples at each point (bands: 95 %)",
+        fontsize="medium",
+    )
+    return figure
+
+
+def _curve_title(curve: Curve) -> str:
+    if curve.family == "reference":
+        return "analytic reference"
+    return f"{TITLES[curve.family]}\nK = {curve.stiffness:g} N/m" if curve.stiffness else TITLES[curve.family]
+
+
+def _mean_with_band(axes: Axes, x, mean, error, color: str, label: str) -> None:
+    axes.plot(x, mean, color=color, linewidth=1.6, label=label)
+    axes.fill_between(x, mean - 1.96 * error, mean + 1.96 * error, color=color, alpha=0.2, linewidth=0)
+
+
+def _robust_limits(curves: Sequence[np.ndarray]) -> tuple[float, float]:
+    """Limits that hold all but the wildest hundredth of the values."""
+    values = np.concatenate(curves)
+    values = values[np.isfinite(values)]
+    low, high = np.quantile(values, [0.005, 0.995]) if len(values) else (-1.0, 1.0)
+    room = 0.08 * (high - low) or 1.0
+    return float(low - room), float(high + room)
 
 
 def save_figure(figure: Figure, folder: Path, name: str) -> list[Path]:
@@ -103,7 +169,10 @@ def _columns(rows: Sequence[Row], *names: str) -> list[np.ndarray]:
     """Columns of a table sorted by stiffness; what is not positive and finite cannot be on a logarithmic axis."""
     ordered = sorted(rows, key=lambda row: row.stiffness)
     table = np.array([[getattr(row, name) for name in names] for row in ordered], float).reshape(-1, len(names))
-    return list(np.where(np.isfinite(table) & (table > 0), table, np.nan).T)
+    columns = list(np.where(np.isfinite(table) & (table > 0), table, np.nan).T)
+    if names[0] == "stiffness":
+        columns[0] = np.nan_to_num(columns[0], nan=NO_CONTACT)
+    return columns
 
 
 def _mark_default(axes: Axes, family: str, rows: Sequence[Row]) -> None:

@@ -86,7 +86,16 @@ def model_names() -> list[str]:
 
 
 def load_scene(source: str | Path, **options: str | float | int) -> Scene:
-    """Compile an MJCF and put it on the device.
+    """Compile an MJCF and put it on the device; see `load_model` for the arguments.
+
+    Raises:
+        SceneError: as `load_model`, or MJX cannot run the model; the message says why.
+    """
+    return put_scene(load_model(source, **options), Path(source).stem)
+
+
+def load_model(source: str | Path, **options: str | float | int) -> mujoco.MjModel:
+    """Compile an MJCF.
 
     Args:
         source: the name of a shipped model (`"pusher"`) or the path of an MJCF file.
@@ -94,8 +103,7 @@ def load_scene(source: str | Path, **options: str | float | int) -> Scene:
             (euler, implicitfast, rk4), `timestep` [s], `iterations`, `ls_iterations`, `tolerance`.
 
     Raises:
-        SceneError: the file is missing or does not parse, an option is unknown or out of range, or MJX cannot
-            run the model; the message says which.
+        SceneError: the file is missing or does not parse, or an option is unknown or out of range.
     """
     path = _find(source)
     try:
@@ -103,7 +111,7 @@ def load_scene(source: str | Path, **options: str | float | int) -> Scene:
     except ValueError as error:
         raise SceneError(f"{path} is not a valid MJCF: {' '.join(str(error).split())}") from error
     _set_options(host, options)
-    return put_scene(host, path.stem)
+    return host
 
 
 def put_scene(host: mujoco.MjModel, name: str) -> Scene:
@@ -138,6 +146,26 @@ def _find(source: str | Path) -> Path:
     if not shipped.is_file():
         raise SceneError(f"no model named {source!r}; there are {', '.join(model_names())}, or give a path to an .xml")
     return shipped
+
+
+def require(scene: Scene, *, joints: tuple[str, ...], geoms: tuple[str, ...], sizes: tuple[int, int, int]) -> None:
+    """Refuse a model that a task cannot use.
+
+    Args:
+        scene: the model.
+        joints, geoms: names that it must have.
+        sizes: its nq, nv and nu.
+
+    Raises:
+        SceneError: a name is missing, or a size is another.
+    """
+    for name in joints:
+        scene.joint(name)
+    for name in geoms:
+        scene.geom(name)
+    found = (scene.host.nq, scene.host.nv, scene.host.nu)
+    if found != sizes:
+        raise SceneError(f"{scene.name} has nq, nv, nu = {found}; the task needs {sizes}")
 
 
 def _set_options(host: mujoco.MjModel, options: Mapping[str, str | float | int]) -> None:

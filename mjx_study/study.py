@@ -24,7 +24,7 @@ from estimators import ESTIMATORS, Differentiation, EstimatorOptions, Evaluation
 from mjx_study.comparison import CompareConfig, CompareResult, Row
 from mjx_study.contact import FAMILIES, ContactModel, ContactWarning, family_model, stiffness_from_solref
 from mjx_study.objective import MjxObjective, Simulator, chunk_for
-from mjx_study.reference_gradient import reference_gradient
+from mjx_study.reference_gradient import antithetic_gradient, reference_gradient
 from mjx_study.runtime import environment
 from mjx_study.task import Task
 from mjx_study.tasks import make_task
@@ -39,7 +39,12 @@ class Cell:
 
     family: str
     stiffness: float
-    contact: ContactModel
+    contact: ContactModel | None
+
+    @property
+    def label(self) -> str:
+        """As messages name it."""
+        return f"{self.family}, K = {self.stiffness:g} N/m" if self.stiffness else self.family
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,8 +81,11 @@ def plan_compare(config: CompareConfig) -> ComparePlan:
     )
     chunk = chunk_for(config.samples, jax.local_devices()) if config.chunk_size is None else config.chunk_size
     cells, messages = plan_cells(task, config.contact, config.stiffness, config.damping)
+    families = tuple(dict.fromkeys(cell.family for cell in cells))
     resolved = dataclasses.replace(
         config,
+        contact=families,
+        stiffness=config.stiffness or (task.stiffnesses if any(FAMILIES[name].swept for name in families) else None),
         sigma=task.sigma,
         gamma=options.gamma,
         horizon=task.horizon,
@@ -89,31 +97,50 @@ def plan_compare(config: CompareConfig) -> ComparePlan:
 
 
 def plan_cells(
-    task: Task, families: Sequence[str], stiffnesses: Sequence[float], damping: float | None = None
+    task: Task,
+    families: Sequence[str] | None = None,
+    stiffnesses: Sequence[float] | None = None,
+    damping: float | None = None,
 ) -> tuple[tuple[Cell, ...], tuple[str, ...]]:
-    """The contact models of a sweep, family by family from soft to stiff, and what there is to warn about.
+    """The contact models of a sweep, family by family, and what there is to warn about.
+
+    Args:
+        task: gives what is None, and the effective mass.
+        families: names of contact families.
+        stiffnesses: for families that take one [N/m].
+        damping: in place of each family's [N s/m].
 
     Raises:
         ValueError: a family is unknown, or a stiffness or damping is out of range.
     """
-    cells, messages, mass = [], [], task.effective_mass
-    for family in families:
+    cells, messages = [], []
+    for family in task.families if families is None else families:
         swept = family not in FAMILIES or FAMILIES[family].swept
-        for stiffness in stiffnesses if swept else (None,):
+        undamped = swept and family in FAMILIES and FAMILIES[family].dampratio == 0
+        own = damping if damping is not None else task.damping if undamped else None
+        for stiffness in (task.stiffnesses if stiffnesses is None else stiffnesses) if swept else (None,):
             with warnings.catch_warnings(record=True) as caught:
                 warnings.simplefilter("always", ContactWarning)
-                contact = family_model(
-                    family,
-                    task.scene,
-                    stiffness=stiffness,
-                    damping=damping if swept else None,
-                    effective_mass=mass,
-                )
-            solref = np.asarray(contact.solref).tolist()
-            cell = Cell(family, stiffness or stiffness_from_solref(solref, effective_mass=mass)[0], contact)
+                contact = None if family == "mjcf" else _contact(task, family, stiffness, own if swept else None)
+            cell = Cell(family, stiffness or _stiffness(task, contact), contact)
             cells.append(cell)
-            messages += [f"{family}, K = {cell.stiffness:g} N/m: {warning.message}" for warning in caught]
+            messages += [f"{cell.label}: {warning.message}" for warning in caught]
     return tuple(cells), tuple(messages)
+
+
+def _contact(task: Task, family: str, stiffness: float | None, damping: float | None) -> ContactModel:
+    return family_model(family, task.scene, stiffness=stiffness, damping=damping, effective_mass=task.effective_mass)
+
+
+def _stiffness(task: Task, contact: ContactModel | None) -> float:
+    """Spring K [N/m] of a contact model that was not made from one; 0 where there is no contact."""
+    if task.contact_pair is None:
+        return 0.0
+    if contact is None:
+        solref = task.scene.host.geom_solref[task.scene.geom(task.contact_pair[0])]
+    else:
+        solref = np.asarray(contact.solref)
+    return stiffness_from_solref(solref.tolist(), effective_mass=task.effective_mass)[0]
 
 
 def compare(plan: ComparePlan, progress: Progress = lambda done, total, what: None) -> CompareResult:
@@ -126,12 +153,13 @@ def compare(plan: ComparePlan, progress: Progress = lambda done, total, what: No
 
     total = len(plan.cells) + 1
     progress(0, total, "compiling")
-    _compile(simulator, plan.cells[0])
+    for cell in {cell.contact is None: cell for cell in plan.cells}.values():
+        _compile(simulator, cell)
 
     rows: list[Row] = []
     gradients, references, candidates = [], [], []
     for done, cell in enumerate(plan.cells, start=1):
-        progress(done, total, f"{cell.family}, K = {cell.stiffness:g} N/m")
+        progress(done, total, cell.label)
         objective = simulator.objective(cell.contact)
         zeroth, zeroth_seconds = _timed(objective.evaluate, task.theta, keys.zeroth)
         first = first_seconds = None
@@ -178,11 +206,16 @@ def _reference(
 ) -> GradientEstimate:
     """The reference gradient of a cell; adds this cell's control variate to the candidates of those to come."""
     theta = objective.simulator.task.theta
+    if not objective.simulator.task.policy.additive:
+        return _antithetic_gradient(*objective.evaluate_pair(theta, keys.odd))
     gradients = objective.differentiate(theta, keys.candidate).gradient
     candidates.append(jnp.median(gradients, axis=0))
     newest = jnp.stack((candidates[-1:] + candidates[-2::-1])[:8])
     padded = jnp.concatenate([newest, jnp.zeros((8 - len(newest), len(theta)), newest.dtype)])
     return _reference_gradient(objective.evaluate_odd(theta, keys.odd), pilot, padded, objective.sigma)
+
+
+_antithetic_gradient = jax.jit(antithetic_gradient)
 
 
 @partial(jax.jit, static_argnames="sigma")
@@ -258,8 +291,8 @@ def _row(
     return Row(
         contact=cell.family,
         stiffness=cell.stiffness,
-        solref=tuple(np.asarray(cell.contact.solref).tolist()),
-        solimp=tuple(np.asarray(cell.contact.solimp).tolist()),
+        solref=() if cell.contact is None else tuple(np.asarray(cell.contact.solref).tolist()),
+        solimp=() if cell.contact is None else tuple(np.asarray(cell.contact.solimp).tolist()),
         estimator=name,
         samples=samples,
         seconds_per_sample=seconds / samples,

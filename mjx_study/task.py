@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
+from typing import Final
 
 import jax
 from jaxtyping import Array, Float, Key
@@ -9,8 +10,11 @@ from jaxtyping import Array, Float, Key
 from mjx_study.contact import effective_mass
 from mjx_study.dynamics import State
 from mjx_study.policy import Policy
-from mjx_study.reference import ReferenceObjective
+from mjx_study.reference import Reference
 from mjx_study.scene import Scene
+
+STIFFNESSES: Final = (10.0, 100.0, 300.0, 550.0, 1000.0, 1200.0)
+FAMILIES: Final = ("penalty", "mujoco", "mujoco_stiff")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -22,16 +26,21 @@ class Task:
         description: one line.
         scene: the compiled model.
         horizon: number of steps H.
-        policy: maps theta and state to the control.
+        policy: maps theta, noise and state to start and controls.
         theta: where gradients are taken unless told otherwise, (params,).
-        sigma: standard deviation of the Gaussian noise on each control, in the control's unit.
+        sigma: standard deviation of the Gaussian noise, in the unit of what it is added to.
         start: the start state, or a distribution over start states as a function of a key.
         running_cost: c(state, control) of each step before it is taken.
         final_cost: c(state) after the last step.
-        contact_pair: names of the two geoms whose contact is swept.
+        contact_pair: names of the two geoms whose contact is swept; None where there is no contact.
         gamma: AoBG's accuracy bound, in the unit of the gradient.
         reference: the analytic system in place of the penalty family, as a function of the stiffness [N/m]; None where
             there is none.
+        damping: of the contact in families without a damping ratio of their own [N s/m], or None; friction needs some,
+            since it is the resistance to slip.
+        stiffnesses: that a sweep takes unless told otherwise [N/m].
+        families: contact families that a sweep takes unless told otherwise.
+        span: range of a decision of one number that a landscape shows; None for a range about theta.
     """
 
     name: str
@@ -44,9 +53,13 @@ class Task:
     start: State | Callable[[Key[Array, ""]], State]
     running_cost: Callable[[State, Float[Array, " nu"]], Float[Array, ""]]
     final_cost: Callable[[State], Float[Array, ""]]
-    contact_pair: tuple[str, str]
+    contact_pair: tuple[str, str] | None
     gamma: float
-    reference: Callable[[float], ReferenceObjective] | None = None
+    reference: Callable[[float], Reference] | None = None
+    damping: float | None = None
+    stiffnesses: tuple[float, ...] = STIFFNESSES
+    families: tuple[str, ...] = FAMILIES
+    span: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         if self.horizon < 1:
@@ -62,7 +75,13 @@ class Task:
 
     @property
     def effective_mass(self) -> float:
-        """Of the swept contact along its normal [kg]."""
+        """Of the swept contact along its normal [kg].
+
+        Raises:
+            ValueError: the task has no contact.
+        """
+        if self.contact_pair is None:
+            raise ValueError(f"{self.name} has no contact whose stiffness could be set; use the contact family mjcf")
         return effective_mass(self.scene, *self.contact_pair)
 
     def draw_start(self, key: Key[Array, ""]) -> State:
@@ -77,4 +96,4 @@ class Task:
 def check_sigma(sigma: float) -> None:
     """Raises ValueError unless sigma is positive and finite."""
     if not (sigma > 0 and jax.numpy.isfinite(sigma)):
-        raise ValueError(f"sigma must be positive and finite, in the unit of the control; got {sigma}")
+        raise ValueError(f"sigma must be positive and finite, in the unit of what it is added to; got {sigma}")

@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjx_study import constraint, dynamics
+from mjx_study import constraint, dynamics, repairs
 from mjx_study._mjx import mjx
 from mjx_study.scene import Scene, load_scene, put_scene
 
@@ -157,9 +157,13 @@ def compiled(function: Callable[..., Any], *examples: Any) -> Callable[..., Any]
 
 @contextlib.contextmanager
 def plain_warm_start() -> Generator[None]:
-    """What is traced inside starts MJX's solver where MJX does, without improving the start."""
+    """What is traced inside is MJX's own: its solver starts where MJX does, without improving the start.
+
+    Its terms are MJX's, too, not those that round otherwise and have derivatives.
+    """
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(constraint, "PREDICTOR_STEPS", 0)
+        patch.setattr(repairs, "_REPLACED", {})
         jax.clear_caches()  # a trace from before would be used again
         yield
     jax.clear_caches()

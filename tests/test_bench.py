@@ -2,54 +2,81 @@
 
 import json
 
+import jax
 import mujoco
 import numpy as np
 import pytest
 
 from mjx_study import bench, cli
-from mjx_study.contact import family_model
+from mjx_study.cli import options
+from mjx_study.engine import engine_model
+from mjx_study.objective import Simulator
+from mjx_study.study import plan_cells
 from mjx_study.tasks import make_task
 
 
 @pytest.fixture(autouse=True)
 def configured(monkeypatch: pytest.MonkeyPatch) -> None:
     """The tests' own settings stand: JAX takes its devices once per process."""
-    monkeypatch.setattr(cli, "configure", lambda **_: None)
+    monkeypatch.setattr(options, "configure", lambda **_: None)
 
 
-def test_bench_prints_its_ratios_and_the_machine(capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["bench", "pusher", "--horizon", "3", "--samples", "6", "--json"]) == 0
+RATIOS = {"gradient_per_value", "values_over_stock", "speedup_over_stock"}
+
+
+@pytest.mark.parametrize(
+    ("task", "engine"),
+    [
+        ("pusher", True),
+        pytest.param("tennis", True, marks=pytest.mark.slow),
+        pytest.param("double_pendulum", False, marks=pytest.mark.slow),
+    ],
+)
+def test_bench_prints_its_ratios_and_the_machine(capsys: pytest.CaptureFixture[str], task: str, engine: bool) -> None:
+    """Open loop, feedback from random starts, and a launch without contact by Runge-Kutta."""
+    assert cli.main(["bench", task, "--horizon", "3", "--samples", "6", "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
-    assert set(document["ratios"]) == {"gradient_per_value", "speedup_over_stock", "speedup_over_engine"}
+    assert set(document["ratios"]) == RATIOS | ({"speedup_over_engine"} if engine else set())
     assert all(ratio > 0 for ratio in document["ratios"].values())
     assert document["environment"]["processor"] and document["gradient_memory"] > 0
 
 
-def test_the_engines_rival_computes_a_gradient() -> None:
-    """Of the sum of the last state, by differences: the same as perturbing one control by hand."""
-    task = make_task("pusher", horizon=20)
-    contact = family_model("mujoco", task.scene, stiffness=100.0, effective_mass=task.effective_mass)
-    gradient = bench._engine_gradient(task, contact).ravel()
+def test_stock_mjx_runs_the_same_samples() -> None:
+    """The rival's costs are ours: same starts, noise, policy and contact."""
+    task = make_task("tennis", horizon=5)
+    (cell,), _ = plan_cells(task, ["mujoco"], [4000.0])
+    keys = jax.random.split(jax.random.key(0), 4)
+    values, _ = bench._stock_programs(task, cell.contact, keys, jax.local_devices())
+    ours = Simulator(task, chunk_size=2).objective(cell.contact).evaluate(task.theta, jax.random.clone(keys))
+    np.testing.assert_allclose(values(), ours.value, rtol=1e-10)
 
-    def last(theta: np.ndarray) -> float:
-        host, data = bench._engine_start(task, contact)
-        for control in theta:
+
+def test_the_engines_rival_computes_a_gradient() -> None:
+    """Of the sum of the last state, by differences: the same as perturbing one control, or the start, by hand."""
+    task = make_task("pusher", horizon=20)
+    (cell,), _ = plan_cells(task, ["mujoco"], [100.0])
+    start, controls = (np.array([0.0, 1.0]), np.zeros(2)), np.full((20, 1), 0.1)
+    over_start, over_controls = bench.engine_gradient(task, cell.contact, start, controls)
+
+    def last(speed: float, controls: np.ndarray) -> float:
+        host = engine_model(task.scene, cell.contact)
+        data = mujoco.MjData(host)
+        data.qpos[:], data.qvel[0] = start[0], speed
+        for control in controls:
             data.ctrl[:] = control
             mujoco.mj_step(host, data)
         return float(np.sum(data.qpos) + np.sum(data.qvel))
 
     for index in (0, 7, 19):
-        step = 1e-4 * np.eye(20)[index]
-        difference = (last(np.asarray(task.theta) + step) - last(np.asarray(task.theta) - step)) / 2e-4
-        assert gradient[index] == pytest.approx(difference, rel=1e-5)
+        step = 1e-4 * np.eye(20)[:, index : index + 1]
+        difference = (last(0.0, controls + step) - last(0.0, controls - step)) / 2e-4
+        assert over_controls[index, 0] == pytest.approx(difference, rel=1e-5)
+    assert over_start[2] == pytest.approx((last(1e-5, controls) - last(-1e-5, controls)) / 2e-5, rel=1e-4)
 
 
-def test_plans_refuse_what_the_rivals_cannot_run() -> None:
-    task = make_task("pusher", horizon=3)
+def test_plans_refuse_an_empty_batch() -> None:
     with pytest.raises(ValueError, match="samples must be at least 1"):
-        bench.plan_bench(task, 0)
-    with pytest.raises(ValueError, match="open loops from a fixed start"):
-        bench.plan_bench(task.replace(start=lambda key: task.start), 10)
+        bench.plan_bench(make_task("pusher", horizon=3), 0)
 
 
 @pytest.mark.slow

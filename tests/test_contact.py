@@ -274,6 +274,10 @@ def test_mixed_signs_have_no_stiffness() -> None:
 def test_every_family_builds(name: str) -> None:
     scene, family = load_scene("pusher"), FAMILIES[name]
     mass = effective_mass(scene, "pusher", "slider")
+    if family.solimp is None:
+        with pytest.raises(ValueError, match="use None in place of a contact model"):
+            family_model(name, scene, effective_mass=mass)
+        return
     if not family.swept:
         contact = family_model(name, scene, effective_mass=mass)
         np.testing.assert_array_equal(contact.solref, family.solref)
@@ -344,12 +348,6 @@ def test_the_stability_limit(pressed, relative_damping: float) -> None:
     assert below < 6  # 1 / sqrt(1 - 0.96) = 5: the largest transient of the undamped map
     assert above > 0.3 * roots[1] ** 24
     assert above > below
-
-
-def test_zero_damping_keeps_the_derivative_finite() -> None:
-    """The damping that stands in for zero changes a velocity by 1e-12 h v, less than its rounding."""
-    contact = contact_model((-1000.0, 0.0), scene=load_scene("pusher"))
-    assert -1e-11 < float(contact.solref[1]) < 0
 
 
 def test_rows_exist_where_contact_begins() -> None:

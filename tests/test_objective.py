@@ -16,7 +16,7 @@ from mjx_study import constraint, dynamics
 from mjx_study.contact import ContactModel, contact_model, family_model
 from mjx_study.dynamics import State, initial_state
 from mjx_study.objective import MAX_CHUNK, Simulator, chunk_for
-from mjx_study.policy import OpenLoop, Policy
+from mjx_study.policy import Launch, LinearFeedback, OpenLoop, Policy
 from mjx_study.scene import put_scene
 from mjx_study.task import Task
 from mjx_study.tasks import make_task
@@ -261,24 +261,9 @@ def test_odd_part_is_half_the_difference_of_mirrored_noise(simulator):
 # Feedback and random starts: one variant of the pusher
 
 
-@dataclasses.dataclass(frozen=True)
-class Feedback:
-    """A constant push and a linear feedback of both positions and velocities: theta = (push, 4 gains)."""
-
-    horizon: int
-    num_params: int = 5
-
-    def feedforward(self, theta):
-        return jnp.full((self.horizon, 1), theta[0])
-
-    def feedback(self, theta, state: State):
-        return jnp.sum(theta[1:] * jnp.concatenate([state.qpos, state.qvel]))[None]
-
-    def score(self, theta, states: State, noise_gradient):
-        def controls(theta):
-            return self.feedforward(theta) + jax.vmap(lambda state: self.feedback(theta, state))(states)
-
-        return jax.vjp(controls, theta)[1](noise_gradient)[0]
+def features(state: State):
+    """One, and both positions and velocities: theta is a constant push and 4 gains."""
+    return jnp.concatenate([jnp.ones(1), state.qpos, state.qvel])
 
 
 STEPS = 20
@@ -294,11 +279,25 @@ def closed_loop() -> Simulator:
         gap = 1e-3 * jax.random.uniform(key)
         return initial_state(task.scene, qpos=jnp.stack([0.0 * gap, 1.0 + gap]), qvel=jnp.array([0.1, 0.0]))
 
-    return Simulator(task.replace(policy=Feedback(STEPS), theta=GAINS, start=start), chunk_size=16)
+    policy = LinearFeedback(STEPS, 1, 5, features)
+    return Simulator(task.replace(policy=policy, theta=GAINS, start=start), chunk_size=16)
 
 
-def test_a_feedback_policy_is_a_policy():
-    assert isinstance(Feedback(STEPS), Policy) and isinstance(OpenLoop(3, 2), Policy)
+def test_policies_are_policies():
+    launch = Launch(2, 3, 1, lambda start, decision: start)
+    assert all(isinstance(policy, Policy) for policy in (OpenLoop(3, 2), LinearFeedback(3, 1, 5, features), launch))
+
+
+def test_a_linear_policys_score_is_its_vector_jacobian_product():
+    policy = LinearFeedback(4, 2, 5, features)
+    theta, noise = (jax.random.normal(key, shape) for key, shape in zip(sample_keys(2), ((10,), (4, 2)), strict=True))
+    states = State(*(jax.random.normal(key, (4, 2)) for key in sample_keys(4, 1)))
+
+    def controls(theta):
+        return policy.feedforward(theta, 0 * noise) + jax.vmap(lambda state: policy.feedback(theta, state))(states)
+
+    expected = jax.vjp(controls, theta)[1](noise)[0]
+    np.testing.assert_allclose(policy.score(theta, states, noise), expected, rtol=1e-14)
 
 
 def test_baseline_of_a_random_start_is_each_samples_own(closed_loop):
@@ -332,7 +331,7 @@ def test_feedback_gives_both_orders_one_mean(closed_loop):
 
 
 def test_odd_part_refuses_feedback(closed_loop):
-    with pytest.raises(ValueError, match="needs an open-loop policy"):
+    with pytest.raises(ValueError, match="needs a policy whose noise is added to theta"):
         closed_loop.objective(penalty(10.0)).evaluate_odd(GAINS, sample_keys(2))
 
 

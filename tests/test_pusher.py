@@ -65,14 +65,14 @@ def test_effective_mass_is_the_reduced_mass():
 
 @functools.cache
 def states_program():
-    """States of a noise-free rollout, through the task's own cost function."""
+    """States of a noise-free rollout, the last included, through the task's own cost function."""
     simulator = pusher_simulator()
     key = jax.random.key_data(jax.random.key(0))
     program = jax.jit(lambda theta, contact: simulator._cost(theta, contact, 1.0, key, 0.0)[1][0])
 
     def states(contact: ContactModel, controls: np.ndarray) -> np.ndarray:
-        before = program(jnp.asarray(controls.ravel()), contact)
-        return np.concatenate([before.qpos, before.qvel], axis=1)
+        visited = program(jnp.asarray(controls.ravel()), contact)
+        return np.concatenate([visited.qpos, visited.qvel], axis=1)
 
     return states
 
@@ -89,10 +89,10 @@ def test_rollout_matches_the_reference_at_the_rate_of_the_impedance(stiffness, n
     = 1 at d = 1e-2 and 0.1 at 1e-3, and slopes lie within log10(1.1) = 0.04 and log10(2) = 0.3 of one.
     """
     controls, errors = INPUTS[name], []
-    limit = roll_out(Pusher(stiffness), START, controls).states[:-1]
+    limit = roll_out(Pusher(stiffness), START, controls).states
     for impedance in (1e-4, 1e-3, 1e-2):
         states = states_program()(penalty(stiffness, impedance), controls)
-        exact = roll_out(ImpedancePusher(stiffness, impedance=impedance), START, controls).states[:-1]
+        exact = roll_out(ImpedancePusher(stiffness, impedance=impedance), START, controls).states
         np.testing.assert_allclose(states, exact, rtol=0, atol=1e-11)  # K = 1000 amplifies rounding 1e4-fold
         errors.append(np.abs(states - limit).max())
     assert errors[0] < 1e-4 * np.abs(controls).max() / 0.1 * np.sqrt(0.05 / stiffness)

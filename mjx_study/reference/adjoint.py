@@ -1,8 +1,10 @@
 r"""Rollouts of an analytic system and their gradient by one adjoint sweep.
 
-With A_h, B_h the Jacobians of a step,
+The control is u_h = c_h + K x_h, with an optional feedback matrix K. With A_h, B_h the Jacobians of a step,
 
-    lambda_{H+1} = grad c_final,   lambda_h = c_x + A_h^T lambda_{h+1},   dV/du_h = c_u + B_h^T lambda_{h+1}.
+    lambda_{H+1} = grad c_final,   mu_h = c_u + B_h^T lambda_{h+1},   lambda_h = c_x + A_h^T lambda_{h+1} + K^T mu_h,
+
+    dV/dx_1 = lambda_1,   dV/dc_h = mu_h,   dV/dK = sum_h mu_h x_h^T.
 """
 
 import dataclasses
@@ -15,40 +17,109 @@ from mjx_study.reference.system import System
 
 @dataclasses.dataclass(frozen=True)
 class Rollout:
-    """States with the start first, and the total cost of each member of the batch."""
+    """A simulated batch.
 
-    states: Float[np.ndarray, "steps *batch states"]
+    Attributes:
+        states: with the start first.
+        controls: as applied, feedback included.
+        value: total cost of each member.
+    """
+
+    states: Float[np.ndarray, "*batch steps states"]
+    controls: Float[np.ndarray, "*batch horizon controls"]
     value: Float[np.ndarray, "*batch"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Gradients:
+    """Derivatives of the total cost, for each member of the batch by itself.
+
+    Attributes:
+        start: with respect to the start state.
+        controls: with respect to the control sequence c.
+        feedback: with respect to the feedback matrix K; None where there is none.
+    """
+
+    start: Float[np.ndarray, "*batch states"]
+    controls: Float[np.ndarray, "*batch horizon controls"]
+    feedback: Float[np.ndarray, "*batch controls states"] | None
 
 
 def roll_out(
     system: System,
-    start: Float[np.ndarray, " states"],
-    controls: Float[np.ndarray, "*batch horizon controls"],
+    start: Float[np.ndarray, "... states"],
+    controls: Float[np.ndarray, "... horizon controls"],
+    feedback: Float[np.ndarray, "_ _"] | None = None,
 ) -> Rollout:
-    """Simulate an open-loop control sequence from `start`."""
-    state = np.broadcast_to(np.asarray(start, float), (*controls.shape[:-2], system.num_states))
-    states, value = [state], np.zeros(controls.shape[:-2])
-    for step in range(controls.shape[-2]):
-        value = value + system.cost(state, controls[..., step, :])
-        state = system.step(state, controls[..., step, :])
-        states.append(state)
-    return Rollout(np.stack(states), np.asarray(value + system.final_cost(state)))
+    """Simulate u_h = controls_h + feedback x_h from `start`; the batches of start and controls are broadcast.
+
+    Raises:
+        ValueError: a start, a control sequence or a feedback matrix that does not fit the system.
+    """
+    start, controls = np.asarray(start, float), np.asarray(controls, float)
+    _check(system, start, controls, feedback)
+    batch, horizon = np.broadcast_shapes(start.shape[:-1], controls.shape[:-2]), controls.shape[-2]
+    state = np.broadcast_to(start, (*batch, system.num_states))
+    states = np.empty((*batch, horizon + 1, system.num_states))
+    applied = np.array(np.broadcast_to(controls, (*batch, *controls.shape[-2:])))
+    value = np.zeros(batch)
+    states[..., 0, :] = state
+    for step in range(horizon):
+        if feedback is not None:
+            applied[..., step, :] += state @ feedback.T
+        value = value + system.cost(state, applied[..., step, :])
+        state = system.step(state, applied[..., step, :])
+        states[..., step + 1, :] = state
+    return Rollout(states, applied, np.asarray(value + system.final_cost(state)))
 
 
-def value_and_gradient(
+def value_and_gradients(
     system: System,
-    start: Float[np.ndarray, " states"],
-    controls: Float[np.ndarray, "*batch horizon controls"],
-) -> tuple[Float[np.ndarray, "*batch"], Float[np.ndarray, "*batch horizon controls"]]:
-    """Total cost and its exact gradient with respect to the controls."""
-    rollout = roll_out(system, start, controls)
-    adjoint = system.final_gradient(rollout.states[-1])
-    gradient = np.empty(controls.shape)
-    for step in reversed(range(controls.shape[-2])):
-        state, control = rollout.states[step], controls[..., step, :]
+    start: Float[np.ndarray, "... states"],
+    controls: Float[np.ndarray, "... horizon controls"],
+    feedback: Float[np.ndarray, "_ _"] | None = None,
+) -> tuple[Float[np.ndarray, "..."], Gradients]:
+    """Total cost and its exact gradients with respect to start, control sequence and feedback matrix.
+
+    Raises:
+        ValueError: as `roll_out`.
+    """
+    rollout = roll_out(system, start, controls, feedback)
+    adjoint = system.final_gradient(rollout.states[..., -1, :])
+    gradient = np.empty(rollout.controls.shape)
+    for step in reversed(range(rollout.controls.shape[-2])):
+        state, control = rollout.states[..., step, :], rollout.controls[..., step, :]
         over_state, over_control = system.jacobians(state, control)
         cost_state, cost_control = system.cost_gradients(state, control)
         gradient[..., step, :] = cost_control + np.einsum("...ij,...i->...j", over_control, adjoint)
         adjoint = cost_state + np.einsum("...ij,...i->...j", over_state, adjoint)
-    return rollout.value, gradient
+        if feedback is not None:
+            adjoint = adjoint + gradient[..., step, :] @ feedback
+    over_feedback = None
+    if feedback is not None:
+        over_feedback = np.einsum("...hu,...hx->...ux", gradient, rollout.states[..., :-1, :])
+    return rollout.value, Gradients(adjoint, gradient, over_feedback)
+
+
+def value_and_gradient(
+    system: System,
+    start: Float[np.ndarray, "... states"],
+    controls: Float[np.ndarray, "... horizon controls"],
+) -> tuple[Float[np.ndarray, "..."], Float[np.ndarray, "... horizon controls"]]:
+    """Total cost of an open loop and its exact gradient with respect to the controls.
+
+    Raises:
+        ValueError: as `roll_out`.
+    """
+    value, gradients = value_and_gradients(system, start, controls)
+    return value, gradients.controls
+
+
+def _check(system: System, start: np.ndarray, controls: np.ndarray, feedback: np.ndarray | None) -> None:
+    states, inputs = system.num_states, system.num_controls
+    if start.shape[-1:] != (states,):
+        raise ValueError(f"the start must end in an axis of {states} states, got shape {start.shape}")
+    if controls.ndim < 2 or controls.shape[-1] != inputs:
+        raise ValueError(f"controls must be (..., horizon, {inputs}), got shape {controls.shape}")
+    if feedback is not None and feedback.shape != (inputs, states):
+        raise ValueError(f"the feedback matrix must be ({inputs}, {states}), got shape {feedback.shape}")

@@ -10,9 +10,11 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float
 
+from mjx_study.reference.quadratic_cost import QuadraticCost
+
 
 @dataclasses.dataclass(frozen=True)
-class Pusher:
+class Pusher(QuadraticCost):
     """State (x1, x2, v1, v2) [m, m/s], control: the force on the first mass [N].
 
     Attributes:
@@ -61,23 +63,3 @@ class Pusher:
         over_state = np.concatenate([identity + h * velocity_rows, velocity_rows], axis=-2)
         over_control = np.array([h * gain, 0.0, gain, 0.0])[:, None]
         return over_state, np.broadcast_to(over_control, (*state.shape, 1))
-
-    def cost(
-        self, state: Float[np.ndarray, "*batch 4"], control: Float[np.ndarray, "*batch 1"]
-    ) -> Float[np.ndarray, "*batch"]:
-        """e^T Q e + R u^2 with e = x - goal."""
-        return np.asarray(self.final_cost(state) + self.control_weight * np.sum(control**2, axis=-1))
-
-    def cost_gradients(
-        self, state: Float[np.ndarray, "*batch 4"], control: Float[np.ndarray, "*batch 1"]
-    ) -> tuple[Float[np.ndarray, "*batch 4"], Float[np.ndarray, "*batch 1"]]:
-        """2 Q e and 2 R u."""
-        return self.final_gradient(state), 2 * self.control_weight * control
-
-    def final_cost(self, state: Float[np.ndarray, "*batch 4"]) -> Float[np.ndarray, "*batch"]:
-        """e^T Q e."""
-        return np.asarray(np.sum(np.array(self.state_weight) * (state - np.array(self.goal)) ** 2, axis=-1))
-
-    def final_gradient(self, state: Float[np.ndarray, "*batch 4"]) -> Float[np.ndarray, "*batch 4"]:
-        """2 Q e."""
-        return 2 * np.array(self.state_weight) * (state - np.array(self.goal))

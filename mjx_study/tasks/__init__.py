@@ -1,12 +1,32 @@
 """The systems of the study, each in a short file of the same parts in the same order."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Final
 
 from mjx_study.task import Task
+from mjx_study.tasks.ball_wall import ball_wall
+from mjx_study.tasks.double_pendulum import double_pendulum
+from mjx_study.tasks.momentum_transfer import momentum_transfer
 from mjx_study.tasks.pusher import pusher
+from mjx_study.tasks.sliding_box import sliding_box
+from mjx_study.tasks.tennis import tennis
 
-TASKS: Final[dict[str, Callable[..., Task]]] = {"pusher": pusher}
+TASKS: Final[dict[str, Callable[..., Task]]] = {
+    "pusher": pusher,
+    "sliding_box": sliding_box,
+    "ball_wall": ball_wall,
+    "ball_wall:dome": partial(ball_wall, "dome"),
+    "momentum_transfer": momentum_transfer,
+    "tennis": tennis,
+    "double_pendulum": double_pendulum,
+}
+"""Builders by name; a variant of a system is a name of its own, such as `ball_wall:dome`."""
+
+
+def task_names() -> list[str]:
+    """Names of the tasks."""
+    return list(TASKS)
 
 
 def make_task(name: str, **options) -> Task:
@@ -20,4 +40,14 @@ def make_task(name: str, **options) -> Task:
     return TASKS[name](**options)
 
 
-__all__ = ["TASKS", "make_task", "pusher"]
+__all__ = [
+    "TASKS",
+    "ball_wall",
+    "double_pendulum",
+    "make_task",
+    "momentum_transfer",
+    "pusher",
+    "sliding_box",
+    "task_names",
+    "tennis",
+]

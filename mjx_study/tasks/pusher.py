@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 from mjx_study.dynamics import State, initial_state
 from mjx_study.policy import OpenLoop
 from mjx_study.reference import Pusher, ReferenceObjective
-from mjx_study.scene import SceneError, load_scene
+from mjx_study.scene import load_scene, require
 from mjx_study.task import Task
 
 HORIZON: Final = 200
@@ -37,11 +37,7 @@ def pusher(*, horizon: int = HORIZON, model: str | Path = "pusher", **scene_opti
         **scene_options: see `load_scene`.
     """
     scene = load_scene(model, **scene_options)
-    for joint in ("pusher", "slider"):
-        scene.joint(joint)
-    sizes = (scene.host.nq, scene.host.nv, scene.host.nu)
-    if sizes != (2, 2, 1):
-        raise SceneError(f"{scene.name} has nq, nv, nu = {sizes}; the pusher task needs two slide joints and one motor")
+    require(scene, joints=("pusher", "slider"), geoms=("pusher", "slider"), sizes=(2, 2, 1))
     weight, goal = np.array(STATE_WEIGHT), np.array(GOAL)
 
     def state_cost(state: State) -> Float[Array, ""]:

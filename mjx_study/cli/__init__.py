@@ -1,0 +1,58 @@
+"""The command line: parse, check, call, print; exit codes.
+
+0 what was asked was done; 1 a check that was asked for failed; 2 a bad option or file, in one line, with nothing
+written; 130 interrupted. Each command has a module of its own, with `add` for its options and `run`.
+"""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from importlib import metadata
+
+from mjx_study.cli import bench, compare, gradcheck, landscape, rollout, tasks
+from mjx_study.cli.options import INTERRUPTED, Parser, UsageError
+
+EXAMPLES = """\
+start here:
+  mjx-study compare pusher                       which estimator, at which contact stiffness? 20 s once compiled
+  mjx-study compare pusher --output out          the same, with a figure and the numbers on disk
+  mjx-study landscape ball_wall --output out     the cost, the cost with noise, and the slopes that estimators see
+  mjx-study rollout tennis                       pictures and a film of a task
+  mjx-study gradcheck pusher                     are the derivatives right? exit code 1 if not
+  mjx-study bench pusher                         what does a gradient cost on this machine?
+"""
+COMMANDS = (compare, landscape, rollout, gradcheck, bench, tasks)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line and return its exit code."""
+    try:
+        options = parser().parse_args(arguments)
+        return options.run(options)
+    except UsageError as error:
+        print(f"mjx-study: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print(INTERRUPTED, file=sys.stderr)
+        return 130
+    except BrokenPipeError:
+        sys.stderr.close()
+        return 1
+
+
+def parser() -> argparse.ArgumentParser:
+    """The whole command line."""
+    root = Parser(
+        prog="mjx-study",
+        description=f"{metadata.metadata('mjx-study')['Summary']}.",
+        epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    root.add_argument("--version", action="version", version=f"mjx-study {metadata.version('mjx-study')}")
+    commands = root.add_subparsers(title="commands", metavar="COMMAND", required=True)
+    for command in COMMANDS:
+        command.add(commands)
+    return root
+
+
+__all__ = ["main", "parser"]

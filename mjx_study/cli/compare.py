@@ -1,0 +1,122 @@
+"""mjx-study compare."""
+
+import argparse
+import json
+import sys
+from pathlib import Path
+
+from estimators import BASELINES, ESTIMATORS
+from mjx_study.cli.options import (
+    Commands,
+    add_command,
+    add_task_options,
+    computing,
+    configure_process,
+    names,
+    usage_errors,
+)
+from mjx_study.comparison import CompareConfig
+from mjx_study.console import alarms, print_comparison
+from mjx_study.contact import FAMILIES
+from mjx_study.plots import plot_comparison, save_figure
+from mjx_study.results import as_json, prepare_folder, save
+from mjx_study.study import compare, plan_compare
+
+EXAMPLES = """\
+examples:
+  mjx-study compare pusher --stiffness 10,1000 --contact penalty,mujoco_default
+  mjx-study compare pusher --estimators zobg,fobg,aobg,ivw --gamma 50 --samples 1000
+  mjx-study compare pusher --json > pusher.json
+
+estimators:
+{estimators}
+
+contact families (K: from --stiffness):
+{families}
+
+columns of the table:
+  variance        trace of the sample covariance of one gradient sample, with a jackknife interval
+  relative error  distance of the mean to a reference gradient, over the norm of the reference
+  alpha           weight of the first-order batch in AoBG
+  epsilon, B      confidence radius of the zeroth-order mean; distance between the two means
+  residual        largest relative imbalance left by MuJoCo's constraint solver
+  ms              computing time of one sample in milliseconds, compilation excluded
+  lost            samples that overflowed or became NaN; they are left out, and a warning says so
+"""
+FIELDS = (
+    "task stiffness contact estimators samples reference_samples sigma seed baseline gamma failure_probability "
+    "variance_proxy radius confidence damping cone horizon model chunk_size"
+).split()
+
+
+def add(commands: Commands) -> None:
+    """Register the command."""
+    epilog = EXAMPLES.format(
+        estimators="\n".join(f"  {item.name:<15} {item.description}" for item in ESTIMATORS.values()),
+        families="\n".join(f"  {item.name:<15} {item.description}" for item in FAMILIES.values()),
+    )
+    command = add_command(commands, "compare", "compare gradient estimators over contact models", run, epilog)
+    add_task_options(command)
+    command.add_argument("--estimators", type=names, metavar="NAME[,NAME]", help="default: zobg,fobg,aobg")
+    command.add_argument("--samples", type=int, metavar="N", help="samples in each batch (default: 400)")
+    command.add_argument(
+        "--reference-samples", type=int, metavar="N", help="pairs of rollouts behind each reference (default: 600)"
+    )
+    command.add_argument("--baseline", choices=list(BASELINES), help="of zeroth-order samples (default: zero_noise)")
+    command.add_argument(
+        "--gamma", type=_gamma, metavar="G", help="AoBG's accuracy bound; inf for none (default: the task's)"
+    )
+    command.add_argument(
+        "--failure-probability", type=float, metavar="P", help="that epsilon's interval misses (default: 0.05)"
+    )
+    command.add_argument(
+        "--variance-proxy", metavar="S2", help="variance or second_moment, in epsilon (default: variance)"
+    )
+    command.add_argument(
+        "--radius", type=_radius, metavar="R", help="max_deviation or a number, in epsilon (default: max_deviation)"
+    )
+    command.add_argument("--confidence", type=float, metavar="P", help="of the reported intervals (default: 0.95)")
+    command.add_argument(
+        "--chunk-size", type=int, metavar="N", help="samples per device and call (default: by --samples)"
+    )
+    command.add_argument("--output", type=Path, metavar="DIR", help="write the figure and the numbers to this folder")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Compare, print, and write where an output folder is given."""
+    with usage_errors():
+        configure_process(options)
+        fields = {name: getattr(options, name) for name in FIELDS}
+        config = CompareConfig(**{name: value for name, value in fields.items() if value is not None})
+        plan = plan_compare(config)
+        folder = None if options.output is None else prepare_folder(options.output)
+    with computing() as progress:
+        result = compare(plan, progress)
+    written = []
+    if folder is not None:
+        written = save(result, folder) + save_figure(plot_comparison(result), folder, "comparison")
+    if options.json:
+        print(json.dumps(as_json(result), allow_nan=False))
+        for warning in alarms(result):
+            print(f"warning: {warning}", file=sys.stderr)
+    else:
+        print_comparison(result)
+        if written:
+            print(f"written: {', '.join(map(str, written))}")
+        else:
+            print("add --output DIR for a figure and the numbers on disk")
+    return 0
+
+
+def _gamma(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is neither a number nor inf") from None
+
+
+def _radius(text: str) -> float | str:
+    try:
+        return float(text)
+    except ValueError:
+        return text

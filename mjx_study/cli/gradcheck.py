@@ -1,0 +1,90 @@
+"""mjx-study gradcheck."""
+
+import argparse
+from pathlib import Path
+
+from mjx_study import gradcheck as check
+from mjx_study.cli.options import (
+    Commands,
+    UsageError,
+    add_command,
+    add_contact_options,
+    add_process_options,
+    computing,
+    configure_process,
+    names,
+    print_report,
+    usage_errors,
+)
+from mjx_study.gradcheck.check import HORIZON, STATES, GradcheckPlan
+from mjx_study.scene import CONES, SOLVERS, load_scene
+from mjx_study.tasks import make_task, task_names
+
+EPILOG = """\
+Columns, all relative, each the worst over the states:
+  modes        reverse mode against forward mode
+  differences  the derivative over state and control against central differences
+  parameters   the same over solref, solimp and friction
+  one-sided    how far the two one-sided differences disagree: 0 where the map is smooth
+  closed form  against a hand-derived gradient of the task's analytic counterpart, another model of the same system
+  C step       the acceleration against the C engine's; contacts may be placed differently
+  C engine     the Jacobian against mjd_transitionFD's, where the steps agree
+  mjx.step     the derivative of mjx.step itself, with --stock: what one would have without this project
+  residual     what the solver leaves; the derivative is only as good as this
+
+Exit code 1 where a derivative is wrong, NaN, silently zero or unconverged. Kinks and jumps are properties of the step,
+and different contacts are no error of a derivative: they are reported, and do not fail.
+"""
+
+
+def add(commands: Commands) -> None:
+    """Register the command."""
+    summary = "check derivatives against differences, the C engine and a closed form"
+    command = add_command(commands, "gradcheck", summary, run, EPILOG)
+    command.add_argument(
+        "task", metavar="TASK|FILE.xml", help=f"one of: {', '.join(task_names())}; or any MJCF that MJX runs"
+    )
+    add_contact_options(command)
+    command.add_argument("--pair", type=names, metavar="GEOM,GEOM", help="contact of a file that a stiffness is for")
+    command.add_argument("--cone", choices=list(CONES), help="friction cone (default: the MJCF's)")
+    command.add_argument("--solver", choices=list(SOLVERS), help="constraint solver (default: the MJCF's)")
+    command.add_argument("--iterations", type=int, metavar="N", help="of the solver (default: the MJCF's)")
+    command.add_argument("--ls-iterations", type=int, metavar="N", help="of its line search (default: the MJCF's)")
+    command.add_argument("--horizon", type=int, metavar="H", help=f"steps (default: the task's; of a file {HORIZON})")
+    command.add_argument("--model", metavar="FILE.xml", help="an MJCF in place of the task's own")
+    command.add_argument("--states", type=int, default=STATES, metavar="N", help=f"states to check (default: {STATES})")
+    command.add_argument("--stock", action="store_true", help="check the derivative of mjx.step itself, too")
+    command.add_argument("--verbose", action="store_true", help="every entry of every finding")
+    add_process_options(command)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Check and print; 1 where something is wrong."""
+    with usage_errors():
+        configure_process(options)
+        plan = _plan(options)
+    with computing() as progress:
+        report = check.gradcheck(plan, progress)
+    print_report(options, report.as_json(), report.lines(verbose=options.verbose))
+    return 0 if report.passed else 1
+
+
+def _plan(options: argparse.Namespace) -> GradcheckPlan:
+    common = {"seed": options.seed, "damping": options.damping, "states": options.states, "stock": options.stock}
+    scene_options = {name: getattr(options, name) for name in ("cone", "solver", "iterations", "ls_iterations")}
+    scene_options = {name: value for name, value in scene_options.items() if value is not None}
+    if Path(options.task).suffix.lower() != ".xml":
+        if options.pair is not None:
+            raise UsageError("--pair is for files; a task has its own")
+        chosen = {name: getattr(options, name) for name in ("horizon", "model") if getattr(options, name) is not None}
+        task = make_task(options.task, **chosen, **scene_options)
+        return check.plan_gradcheck(task, options.contact, options.stiffness, **common)
+    if options.model is not None:
+        raise UsageError("--model replaces the MJCF of a task, and this is a file already")
+    if options.pair is not None and len(options.pair) != 2:
+        raise UsageError(f"--pair takes the names of two geoms, got {len(options.pair)}")
+    scene = load_scene(options.task, **scene_options)
+    horizon = HORIZON if options.horizon is None else options.horizon
+    return check.plan_scene_gradcheck(
+        scene, options.contact, options.stiffness, pair=options.pair, horizon=horizon, **common
+    )

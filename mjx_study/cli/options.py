@@ -1,0 +1,152 @@
+"""What the commands share: options, their checks, one line for what is wrong, and a clean end when interrupted."""
+
+import argparse
+import json
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable, Generator, Sequence
+from contextlib import contextmanager
+from typing import Any, NoReturn
+
+from mjx_study.console import progress_bar, show_cursor
+from mjx_study.contact import FAMILIES
+from mjx_study.runtime import PRECISIONS, configure
+from mjx_study.scene import CONES
+from mjx_study.study import Progress
+from mjx_study.task import Task
+from mjx_study.tasks import make_task, task_names
+
+INTERRUPTED = "mjx-study: interrupted; nothing was written"
+
+
+class UsageError(ValueError):
+    """A bad option or file: one line, exit code 2."""
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser whose errors are UsageErrors."""
+
+    def error(self, message: str) -> NoReturn:
+        raise UsageError(f"{message} (see {self.prog} --help)")
+
+
+Commands = Any
+"""argparse's collection of subparsers, whose class is private."""
+
+
+def add_command(
+    commands: Commands, name: str, summary: str, run: Callable[[argparse.Namespace], int], epilog: str = ""
+) -> argparse.ArgumentParser:
+    """A subcommand with `--json`."""
+    command = commands.add_parser(
+        name,
+        help=summary,
+        description=summary[0].upper() + summary[1:] + ".",
+        epilog=epilog,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    command.set_defaults(run=run)
+    command.add_argument("--json", action="store_true", help="print the figures as JSON on standard output")
+    return command
+
+
+def add_task_options(command: argparse.ArgumentParser, *, contact: bool = True) -> None:
+    """The task, what may replace its own settings, and how it is computed."""
+    command.add_argument("task", metavar="TASK", help=f"one of: {', '.join(task_names())}")
+    if contact:
+        add_contact_options(command)
+    command.add_argument("--sigma", type=float, metavar="S", help="noise, in the unit of what it is added to")
+    command.add_argument("--cone", choices=list(CONES), help="friction cone (default: the MJCF's)")
+    command.add_argument("--horizon", type=int, metavar="H", help="steps (default: the task's)")
+    command.add_argument("--model", metavar="FILE.xml", help="an MJCF in place of the task's own")
+    add_process_options(command)
+
+
+def add_contact_options(command: argparse.ArgumentParser) -> None:
+    """The contact models."""
+    command.add_argument(
+        "--stiffness", type=numbers, metavar="K[,K]", help="contact stiffnesses in N/m (default: the task's sweep)"
+    )
+    command.add_argument("--contact", type=names, metavar="FAMILY[,FAMILY]", help=f"of: {', '.join(FAMILIES)}")
+    command.add_argument(
+        "--damping", type=float, metavar="B", help="contact damping in N s/m, in place of the family's"
+    )
+
+
+def add_process_options(command: argparse.ArgumentParser) -> None:
+    """Randomness, precision, devices."""
+    command.add_argument("--seed", type=int, default=0, metavar="N", help="of all randomness (default: 0)")
+    command.add_argument("--precision", choices=PRECISIONS, default="float64", help="default: float64")
+    command.add_argument(
+        "--devices", type=int, metavar="N", help="CPU devices (default: one per core; with JAX 0.11 one)"
+    )
+
+
+def configure_process(options: argparse.Namespace) -> None:
+    """Set JAX up as the options ask; a command without such options gets float64 and one device."""
+    configure(precision=getattr(options, "precision", PRECISIONS[0]), cpu_devices=getattr(options, "devices", 1))
+
+
+def task_of(options: argparse.Namespace) -> Task:
+    """The task that the options describe."""
+    chosen = {name: getattr(options, name) for name in ("cone", "horizon", "model")}
+    task = make_task(options.task, **{name: value for name, value in chosen.items() if value is not None})
+    return task if options.sigma is None else task.replace(sigma=options.sigma)
+
+
+@contextmanager
+def usage_errors() -> Generator[None]:
+    """Turns what a user can get wrong into a UsageError; used around checks only, never around computing."""
+    try:
+        yield
+    except (ValueError, OSError) as error:
+        raise UsageError(str(error)) from error
+
+
+@contextmanager
+def computing() -> Generator[Progress]:
+    """A progress bar around computing; an interrupt ends the process at once, with one line and exit code 130.
+
+    An exception would not do: JAX calls back into Python while it traces, and what is raised there may be lost.
+    Nothing is on disk yet, or only what is complete, so there is nothing to undo.
+    """
+    previous = signal.getsignal(signal.SIGINT)
+    # Only the main thread may set a handler, and a background job that ignores interrupts goes on ignoring them.
+    ours = threading.current_thread() is threading.main_thread() and previous is not signal.SIG_IGN
+    if ours:
+        signal.signal(signal.SIGINT, _leave)
+    try:
+        with progress_bar() as progress:
+            yield progress
+    finally:
+        if ours:
+            signal.signal(signal.SIGINT, previous)
+
+
+def _leave(*_: object) -> NoReturn:
+    show_cursor()
+    print(INTERRUPTED, file=sys.stderr, flush=True)
+    os._exit(130)
+
+
+def print_report(options: argparse.Namespace, document: dict[str, Any], lines: Sequence[str]) -> None:
+    """The document as JSON where that is asked for, otherwise the lines."""
+    if options.json:
+        print(json.dumps(document, allow_nan=False))
+    else:
+        print("\n".join(lines))
+
+
+def numbers(text: str) -> tuple[float, ...]:
+    """A list of numbers such as 10,100,1000."""
+    try:
+        return tuple(float(part) for part in text.split(",") if part.strip())
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a list of numbers such as 10,100,1000") from None
+
+
+def names(text: str) -> tuple[str, ...]:
+    """A list of names such as zobg,fobg."""
+    return tuple(part.strip() for part in text.split(",") if part.strip())

@@ -1,0 +1,273 @@
+"""mjx-study rollout."""
+
+import argparse
+import dataclasses
+import json
+import math
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from mjx_study import objective
+from mjx_study.cli.options import (
+    Commands,
+    UsageError,
+    add_command,
+    add_task_options,
+    computing,
+    configure_process,
+    print_report,
+    task_of,
+    usage_errors,
+)
+from mjx_study.console import number
+from mjx_study.contact import FAMILIES
+from mjx_study.plots import save_figure
+from mjx_study.render import (
+    FORMATS,
+    RENDERERS,
+    VIEWS,
+    Motion,
+    RenderError,
+    animate,
+    check_format,
+    resolve_renderer,
+    strip,
+    stroboscope,
+)
+from mjx_study.results import prepare_folder, write_whole
+from mjx_study.scene import load_model
+from mjx_study.study import Cell, plan_cells
+from mjx_study.table import format_table
+from mjx_study.task import Task
+
+EPILOG = """\
+Simulates one rollout and shows it: strip.png (pictures at even times), stroboscope.png (one picture with ghosts),
+rollout.gif or .mp4, and trajectory.npz (time [s], qpos, qvel, controls). Without OpenGL everything is drawn from the
+model's geometry; with it, strip and film are MuJoCo's own renderings.
+
+TASK may also be an MJCF file of your own (FILE.xml): it moves as MuJoCo's C engine moves it, from its first keyframe if
+it has one, for 2 s unless --horizon says otherwise.
+
+examples:
+  mjx-study rollout pusher
+  mjx-study rollout ball_wall --contact penalty --stiffness 1e4 --slow 4
+  mjx-study rollout tennis --noise --seed 3 --theta learnt.npy
+  mjx-study rollout humanoid.xml --horizon 500 --view xz --format mp4
+"""
+PASSIVE_SECONDS = 2.0
+MOST_BODIES = 12
+LARGEST = 1e10  # beyond this MuJoCo itself calls a coordinate bad
+
+
+@dataclasses.dataclass(frozen=True)
+class Rollout:
+    """What was simulated; controls are those of each step, one row fewer than there are states.
+
+    Attributes:
+        title: in one line.
+        model: what moved.
+        qpos, qvel, controls: the trajectory.
+        facts: what is known about it, as JSON has it.
+        focus: geoms to show in any case.
+    """
+
+    title: str
+    model: mujoco.MjModel
+    qpos: np.ndarray
+    qvel: np.ndarray
+    controls: np.ndarray
+    facts: dict[str, Any]
+    focus: tuple[int, ...] = ()
+
+    @property
+    def time(self) -> np.ndarray:
+        """Of each state [s]."""
+        return np.arange(len(self.qpos)) * self.model.opt.timestep
+
+    @property
+    def lasting(self) -> int:
+        """How many states there are before the first that is not finite."""
+        state = np.concatenate([self.qpos, self.qvel], axis=1)
+        good = np.all(np.abs(state) < LARGEST, axis=1)
+        return len(good) if good.all() else int(np.argmin(good))
+
+
+def add(commands: Commands) -> None:
+    """Register the command."""
+    command = add_command(commands, "rollout", "show a rollout: pictures, a film and its numbers", run, EPILOG)
+    add_task_options(command, contact=False)
+    command.add_argument("--contact", metavar="FAMILY", help=f"one of: {', '.join(FAMILIES)} (default: the task's)")
+    command.add_argument("--stiffness", type=float, metavar="K", help="contact stiffness in N/m (default: the task's)")
+    command.add_argument("--damping", type=float, metavar="B", help="contact damping in N s/m")
+    command.add_argument("--noise", action="store_true", help="with the noise of sample --seed (default: none)")
+    command.add_argument("--theta", type=Path, metavar="FILE", help="parameters, .json or .npy (default: the task's)")
+    command.add_argument("--frames", type=int, default=6, metavar="N", help="pictures in the strip (default: 6)")
+    command.add_argument("--view", choices=["auto", *VIEWS], default="auto", help="default: where most happens")
+    command.add_argument("--renderer", choices=RENDERERS, default="auto", help="default: auto, opengl where it works")
+    command.add_argument("--format", choices=FORMATS, default="gif", help="of the film (default: gif)")
+    command.add_argument("--slow", type=float, default=1.0, metavar="FACTOR", help="slow motion (default: 1)")
+    command.add_argument("--output", type=Path, metavar="DIR", help="default: results/TASK-rollout")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Simulate, draw, write, print."""
+    with usage_errors():
+        configure_process(options)
+        check_format(options.format)
+        for name, least in (("frames", 1), ("seed", 0)):
+            if getattr(options, name) < least:
+                raise ValueError(f"{name} must be at least {least}, got {getattr(options, name)}")
+        if not (options.slow > 0 and math.isfinite(options.slow)):
+            raise ValueError(f"slow must be a positive number, got {options.slow}")
+        if options.sigma is not None and not options.noise:
+            raise ValueError("--sigma has an effect only with --noise")
+        simulate, messages = _plan(options)
+        resolve_renderer(options.renderer)
+        folder = prepare_folder(options.output or Path("results") / f"{_stem(options.task)}-rollout")
+    with computing() as progress:
+        progress(0, 2, "simulating")
+        rollout = simulate()
+        progress(1, 2, "drawing")
+        written = _write(rollout, folder, options)
+    if rollout.lasting < len(rollout.qpos):
+        messages += (f"the state is not finite from {rollout.time[rollout.lasting]:g} s on; pictures end before",)
+    document = rollout.facts | {"warnings": list(messages), "written": [str(path) for path in written]}
+    print_report(options, document, _lines(rollout, messages, written))
+    return 0
+
+
+def _plan(options: argparse.Namespace):
+    """A function without arguments that simulates what the options ask for, and what there is to warn about."""
+    if Path(options.task).suffix.lower() != ".xml":
+        return _plan_task(options)
+    unfit = ("contact", "stiffness", "damping", "noise", "sigma", "theta", "model")
+    given = [f"--{name}" for name in unfit if getattr(options, name) not in (None, False)]
+    if given:
+        raise ValueError(f"{', '.join(given)}: only for a task; {options.task} moves as its MJCF says")
+    if options.horizon is not None and options.horizon < 1:
+        raise ValueError(f"horizon must be at least 1 step, got {options.horizon}")
+    model = load_model(options.task, **({} if options.cone is None else {"cone": options.cone}))
+    steps = options.horizon or max(1, round(PASSIVE_SECONDS / model.opt.timestep))
+    return partial(_simulate_passive, model, Path(options.task).stem, steps), ()
+
+
+def _plan_task(options: argparse.Namespace):
+    task = task_of(options)
+    family = options.contact or ("mujoco" if "mujoco" in task.families else task.families[0])
+    stiffness = task.stiffnesses[len(task.stiffnesses) // 2] if options.stiffness is None else options.stiffness
+    cells, messages = plan_cells(task, (family,), (stiffness,), options.damping)
+    theta = task.theta if options.theta is None else _load_theta(options.theta, task)
+    return partial(_simulate_task, task, cells[0], theta, options.seed, options.noise), messages
+
+
+def _load_theta(path: Path, task: Task) -> jax.Array:
+    """Parameters from a file.
+
+    Raises:
+        ValueError: it cannot be read, is of another kind, or does not hold one finite number for each parameter.
+    """
+    try:
+        content = json.loads(path.read_text()) if path.suffix == ".json" else np.load(path, allow_pickle=False)
+        values = np.asarray(content, float).reshape(-1)
+    except OSError as error:
+        raise ValueError(f"cannot read {path}: {error.strerror or error}") from error
+    except (ValueError, TypeError, EOFError) as error:
+        raise ValueError(f"{path} is neither a .json list of numbers nor a .npy array") from error
+    if values.shape != (task.policy.num_params,) or not np.all(np.isfinite(values)):
+        raise ValueError(f"{path} holds {values.size} numbers; {task.name} needs {task.policy.num_params} finite ones")
+    return jnp.asarray(values, task.theta.dtype)
+
+
+def _simulate_task(task: Task, cell: Cell, theta: jax.Array, seed: int, noisy: bool) -> Rollout:
+    program = jax.jit(partial(objective.simulate, task))
+    outputs = program(theta, cell.contact, jax.random.key(seed), jnp.asarray(float(noisy), theta.dtype))
+    states, controls, cost, residual = jax.device_get(outputs)
+    facts = {
+        "task": task.name,
+        "contact": cell.family,
+        "stiffness": cell.stiffness,
+        "sigma": task.sigma if noisy else 0.0,
+        "seed": seed,
+        "cost": float(cost) if np.isfinite(cost) else None,
+        "residual": float(residual) if np.isfinite(residual) else None,
+    }
+    noise = f"noise {task.sigma:g}, seed {seed}" if noisy else "no noise"
+    title = f"{task.name}: {cell.label}, {noise}"
+    rollout = _rollout(title, task.scene.host, states.qpos, states.qvel, controls, facts)
+    return dataclasses.replace(rollout, focus=tuple(task.scene.geom(name) for name in task.contact_pair or ()))
+
+
+def _simulate_passive(model: mujoco.MjModel, name: str, steps: int) -> Rollout:
+    """Motion by MuJoCo's C engine from the first keyframe or the reference pose, with constant controls."""
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET  # a state that is bad shall be seen
+    data = mujoco.MjData(model)
+    if model.nkey:
+        mujoco.mj_resetDataKeyframe(model, data, 0)
+    qpos, qvel = np.empty((steps + 1, model.nq)), np.empty((steps + 1, model.nv))
+    qpos[0], qvel[0] = data.qpos, data.qvel
+    for index in range(steps):
+        mujoco.mj_step(model, data)
+        qpos[index + 1], qvel[index + 1] = data.qpos, data.qvel
+    controls = np.tile(data.ctrl, (steps, 1))
+    return _rollout(f"{name}: C engine", model, qpos, qvel, controls, {"task": name})
+
+
+def _rollout(
+    title: str, model: mujoco.MjModel, qpos: np.ndarray, qvel: np.ndarray, controls: np.ndarray, facts: dict[str, Any]
+) -> Rollout:
+    """A rollout with the facts that every one has: steps, duration, and where the bodies' centres of mass ended."""
+    steps = len(qpos) - 1
+    rollout = Rollout(title, model, np.asarray(qpos, float), np.asarray(qvel, float), np.asarray(controls), facts)
+    last = rollout.lasting - 1
+    facts |= {"steps": steps, "duration": steps * model.opt.timestep, "finite": last == steps, "bodies": {}}
+    if last >= 0:
+        data = mujoco.MjData(model)
+        data.qpos[:] = rollout.qpos[last]
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        for body in np.flatnonzero(model.body_weldid):
+            facts["bodies"][model.body(body).name or f"body {body}"] = data.xipos[body].tolist()
+    return rollout
+
+
+def _write(rollout: Rollout, folder: Path, options: argparse.Namespace) -> list[Path]:
+    """Everything that a rollout leaves; what can fail comes first, so that then nothing is written."""
+    if rollout.lasting == 0:
+        raise UsageError(f"{rollout.title}: the first state is not finite")
+    motion = Motion(rollout.model, rollout.time[: rollout.lasting], rollout.qpos[: rollout.lasting], rollout.focus)
+    view, renderer = options.view, options.renderer
+    try:
+        pictures = strip(motion, frames=options.frames, view=view, renderer=renderer)
+        ghosts = stroboscope(motion, view=view)
+        film = animate(motion, folder / f"rollout.{options.format}", slow=options.slow, view=view, renderer=renderer)
+    except RenderError as error:
+        raise UsageError(str(error)) from error
+    arrays = {"time": rollout.time, "qpos": rollout.qpos, "qvel": rollout.qvel, "controls": rollout.controls}
+    numbers = write_whole(folder / "trajectory.npz", lambda file: np.savez_compressed(file, **arrays))  # type: ignore[arg-type]
+    return [*save_figure(pictures, folder, "strip"), *save_figure(ghosts, folder, "stroboscope"), film, numbers]
+
+
+def _lines(rollout: Rollout, messages: tuple[str, ...], written: list[Path]) -> list[str]:
+    facts, model = rollout.facts, rollout.model
+    lines = [rollout.title]
+    if "cost" in facts:
+        lines.append(f"cost {number(facts['cost'], 6)}, largest solver residual {number(facts['residual'], 2)}")
+    lines.append(f"{facts['steps']} steps of {1e3 * model.opt.timestep:g} ms, {facts['duration']:g} s")
+    rows = [[name, *(f"{value:.4f}" for value in place)] for name, place in facts["bodies"].items()]
+    if rows:
+        lines += format_table(rows[:MOST_BODIES], ["ended at", "x [m]", "y [m]", "z [m]"])
+    if len(rows) > MOST_BODIES:
+        lines.append(f"and {len(rows) - MOST_BODIES} more bodies: --json lists them all")
+    lines += [f"warning: {message}" for message in messages]
+    return [*lines, f"written to {written[0].parent}: {', '.join(path.name for path in written)}"]
+
+
+def _stem(task: str) -> str:
+    """The name of a task or an MJCF file as part of a folder's name."""
+    return (Path(task).stem if task.lower().endswith(".xml") else task).replace(":", "-")

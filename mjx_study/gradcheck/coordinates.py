@@ -1,0 +1,179 @@
+"""What a step is differentiated by: one flat vector of small changes of state, control and contact parameters.
+
+Positions change in the tangent space, so that quaternions stay what they are; their length is a coordinate of its own,
+which together with the tangent space is all that a raw quaternion can do. Parameters are those of every geom and pair
+at once, each in units of its own size.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Final
+
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jaxtyping import Array, Float
+
+from mjx_study._mjx import mjx
+from mjx_study.contact import ContactModel, apply_contact
+from mjx_study.dynamics import State
+from mjx_study.integration import integrate_position
+from mjx_study.scene import Scene
+
+PARAMETERS: Final = (
+    *("solref[0]", "solref[1]"),
+    *("solimp[d_0]", "solimp[d_width]", "solimp[width]", "solimp[midpoint]", "solimp[power]"),
+    *("friction[sliding]", "friction[torsional]", "friction[rolling]"),
+)
+LENGTH: Final = "quaternion length"
+_BALL, _FREE = int(mujoco.mjtJoint.mjJNT_BALL), int(mujoco.mjtJoint.mjJNT_FREE)
+
+
+@dataclasses.dataclass(frozen=True)
+class Coordinate:
+    """One entry of the flat vector, or of what a step returns.
+
+    Attributes:
+        block: qpos, quaternion length, qvel, act, ctrl or contact.
+        name: within the block.
+        joint: index of the joint that it belongs to, or -1.
+    """
+
+    block: str
+    name: str
+    joint: int = -1
+
+    def __str__(self) -> str:
+        return self.name if self.block == "contact" else f"{self.block}[{self.name}]"
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Coordinates:
+    """The layout of the flat vector of one scene under one contact model.
+
+    Attributes:
+        scene: the scene.
+        inputs: names of its entries, in the order position, quaternion lengths, velocity, activation, control, and
+            contact parameters where the scene has contacts.
+        outputs: names of what a step returns: position, velocity, activation.
+        scales: size of each contact parameter, empty where there are none.
+    """
+
+    scene: Scene
+    inputs: tuple[Coordinate, ...]
+    outputs: tuple[Coordinate, ...]
+    scales: Float[np.ndarray, " parameters"]
+
+    @property
+    def num_state(self) -> int:
+        """How many inputs are no contact parameters."""
+        return len(self.inputs) - len(self.scales)
+
+    def columns(self, *blocks: str) -> list[int]:
+        """Indices of the inputs in these blocks."""
+        return [index for index, coordinate in enumerate(self.inputs) if coordinate.block in blocks]
+
+    def blocks(self) -> list[str]:
+        """The blocks of inputs that are not empty, in order."""
+        return list(dict.fromkeys(coordinate.block for coordinate in self.inputs))
+
+    def state(
+        self, base: State, control: Float[Array, " nu"], change: Float[Array, " changes"]
+    ) -> tuple[State, Float[Array, " nu"]]:
+        """State and control after a change of the first `num_state` entries."""
+        host = self.scene.host
+        starts = np.cumsum([host.nv, len(quaternions(host)), host.nv, host.na])
+        tangent, stretch, qvel, act, ctrl = jnp.split(change[: self.num_state], starts)
+        qpos = integrate_position(host, base.qpos, tangent, 1.0)
+        for index, (_, first) in enumerate(quaternions(host)):
+            qpos = qpos.at[first : first + 4].multiply(1 + stretch[index])
+        return dataclasses.replace(base, qpos=qpos, qvel=base.qvel + qvel, act=base.act + act), control + ctrl
+
+    def model(
+        self, contact: ContactModel | None, scales: Float[Array, " parameters"], change: Float[Array, " parameters"]
+    ) -> mjx.Model:
+        """The model with a contact model and a change of its parameters, in units of `scales`."""
+        model = apply_contact(self.scene.model, contact)
+        if not len(scales):
+            return model
+        shift = change * scales
+        solref, solimp, friction = shift[:2], shift[2:7], shift[7:]
+        pair = friction[jnp.array([0, 0, 1, 2, 2])]
+        return model.replace(
+            geom_solref=model.geom_solref + solref,
+            geom_solimp=model.geom_solimp + solimp,
+            geom_friction=model.geom_friction + friction,
+            pair_solref=model.pair_solref + solref,
+            pair_solimp=model.pair_solimp + solimp,
+            pair_friction=model.pair_friction + pair,
+        )
+
+
+def coordinates(scene: Scene, contact: ContactModel | None) -> Coordinates:
+    """The layout for a scene under a contact model."""
+    host = scene.host
+    dofs = dof_names(host)
+    activations = _activation_names(host)
+    inputs = [
+        *(Coordinate("qpos", *dof) for dof in dofs),
+        *(Coordinate(LENGTH, joint_name(host, joint), joint) for joint, _ in quaternions(host)),
+        *(Coordinate("qvel", *dof) for dof in dofs),
+        *(Coordinate("act", name) for name in activations),
+        *(Coordinate("ctrl", _name(host, mujoco.mjtObj.mjOBJ_ACTUATOR, "actuator", i)) for i in range(host.nu)),
+    ]
+    scales = _parameter_scales(scene, contact)
+    if len(scales):
+        inputs += [Coordinate("contact", name) for name in PARAMETERS]
+    outputs = [*(Coordinate("qpos", *dof) for dof in dofs), *(Coordinate("qvel", *dof) for dof in dofs)]
+    outputs += [Coordinate("act", name) for name in activations]
+    return Coordinates(scene, tuple(inputs), tuple(outputs), scales)
+
+
+def quaternions(host: mujoco.MjModel) -> list[tuple[int, int]]:
+    """Joint and first index in qpos of each quaternion."""
+    pairs = enumerate(zip(host.jnt_type.tolist(), host.jnt_qposadr.tolist(), strict=True))
+    return [(joint, first + 3 * (kind == _FREE)) for joint, (kind, first) in pairs if kind in (_FREE, _BALL)]
+
+
+def dof_names(host: mujoco.MjModel) -> list[tuple[str, int]]:
+    """A name for each degree of freedom, and its joint."""
+    moves = [f"translation {axis}" for axis in "xyz"]
+    turns = [f"rotation {axis}" for axis in "xyz"]
+    names: list[tuple[str, int]] = []
+    for joint, kind in enumerate(host.jnt_type):
+        name = joint_name(host, joint)
+        parts: Sequence[str] = {_FREE: [*moves, *turns], _BALL: turns}.get(int(kind), [""])
+        names += [(f"{name}, {part}" if part else name, joint) for part in parts]
+    return names
+
+
+def joint_name(host: mujoco.MjModel, joint: int) -> str:
+    """A joint's name; where it has none, that of its body."""
+    name = mujoco.mj_id2name(host, mujoco.mjtObj.mjOBJ_JOINT, joint)
+    if name:
+        return name
+    body = mujoco.mj_id2name(host, mujoco.mjtObj.mjOBJ_BODY, int(host.jnt_bodyid[joint]))
+    return f"joint {joint} of {body}" if body else f"joint {joint}"
+
+
+def _name(host: mujoco.MjModel, kind: mujoco.mjtObj, noun: str, index: int) -> str:
+    return mujoco.mj_id2name(host, kind, index) or f"{noun} {index}"
+
+
+def _activation_names(host: mujoco.MjModel) -> list[str]:
+    names = [""] * host.na
+    for index, (first, count) in enumerate(zip(host.actuator_actadr, host.actuator_actnum, strict=True)):
+        for entry in range(max(int(count), 0) if first >= 0 else 0):
+            names[first + entry] = _name(host, mujoco.mjtObj.mjOBJ_ACTUATOR, "actuator", index)
+    return names
+
+
+def _parameter_scales(scene: Scene, contact: ContactModel | None) -> Float[np.ndarray, " parameters"]:
+    """The largest size of each parameter over all geoms, 1 where all are 0."""
+    rows = scene.template._impl
+    if rows.contact.dim.size == 0:  # pyright: ignore[reportAttributeAccessIssue]
+        return np.zeros(0)
+    model = apply_contact(scene.model, contact)
+    leaves = [np.asarray(leaf) for leaf in (model.geom_solref, model.geom_solimp, model.geom_friction)]
+    largest = np.concatenate([np.abs(leaf).max(axis=0) for leaf in leaves])
+    return np.where(largest > 0, largest, 1.0)

@@ -1,0 +1,172 @@
+"""The gradient of a task's whole cost: reverse against forward mode, differences, and a closed form."""
+
+import dataclasses
+from typing import Any, Final
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mjx_study.contact import ContactModel
+from mjx_study.engine import HostState
+from mjx_study.gradcheck.differences import differences, moves
+from mjx_study.gradcheck.programs import compile_quickly
+from mjx_study.noise import split_sample_key
+from mjx_study.objective import rollout_cost
+from mjx_study.study import Cell
+from mjx_study.task import Task
+
+DIRECTIONS: Final = 6
+BATCH: Final = 8
+"""Rollouts in one call of the program of costs."""
+DIFFERENCE_TOLERANCE: Final = 1e-6
+MODES_TOLERANCE: Final = 1e-9
+
+
+@dataclasses.dataclass(frozen=True)
+class CostCheck:
+    """The checks of one contact model's whole-horizon gradient; figures are relative to its norm.
+
+    Attributes:
+        contact: family.
+        stiffness: K [N/m].
+        gradient_norm: in cost per unit of theta.
+        modes: reverse mode against forward mode, along some directions.
+        difference: against central differences, along the same directions.
+        one_sided: how far the two one-sided differences disagree at the shortest step.
+        closed_form: against the reference system's hand-derived gradient; another model of the same system, so that it
+            measures how far apart the two are. None where the contact model has none.
+        residual: largest relative solver residual of the rollout.
+        verdict: right, kink, jump, unconverged, nan or wrong.
+    """
+
+    contact: str
+    stiffness: float
+    gradient_norm: float
+    modes: float
+    difference: float
+    one_sided: float
+    closed_form: float | None
+    residual: float
+    verdict: str
+
+
+class CostPrograms:
+    """Noise-free cost of a task from the start that a key draws, as compiled programs of theta and contact model."""
+
+    def __init__(self, task: Task, seed: int):
+        self.task = task
+        self.key = jax.random.key(seed)
+        self.start = task.draw_start(split_sample_key(jax.random.clone(self.key))[0])
+        self._compiled: dict[Any, Any] = {}
+
+    def gradient(self, contact: ContactModel | None) -> Any:
+        """(cost, (states, controls, residual)), and the gradient, by reverse mode."""
+        return self._run("gradient", jax.value_and_grad(self._cost, has_aux=True), self._theta, contact)
+
+    def slopes(self, contact: ContactModel | None, directions: np.ndarray) -> np.ndarray:
+        """Derivatives along directions, by forward mode."""
+
+        def along(theta, contact, directions):
+            _, push = jax.linearize(lambda x: self._cost(x, contact)[0], theta)
+            return jax.lax.map(push, directions)
+
+        return np.asarray(self._run("slopes", along, self._theta, contact, directions))
+
+    def costs(self, contact: ContactModel | None, changes: np.ndarray) -> np.ndarray:
+        """Costs after changes of theta."""
+
+        def many(thetas, contact):
+            return jax.vmap(lambda theta: self._cost(theta, contact)[0])(thetas)
+
+        rows = -(-len(changes) // BATCH) * BATCH
+        thetas = np.broadcast_to(np.asarray(self._theta), (rows, len(self._theta))).copy()
+        thetas[: len(changes)] += changes
+        chunks = [self._run("costs", many, part, contact) for part in thetas.reshape(-1, BATCH, thetas.shape[1])]
+        return np.concatenate(chunks)[: len(changes)]
+
+    @property
+    def _theta(self):
+        return self.task.theta
+
+    def _cost(self, theta, contact):
+        silent = jnp.zeros(self.task.policy.noise_shape, theta.dtype)
+        return rollout_cost(self.task, theta, contact, self.start, silent)
+
+    def _run(self, name: str, function: Any, *arguments: Any) -> Any:
+        key = (name, arguments[1] is None)
+        if key not in self._compiled:
+            self._compiled[key] = compile_quickly(function, *arguments)
+        return self._compiled[key](*arguments)
+
+
+def check_cost(programs: CostPrograms, cell: Cell, seed: int) -> tuple[CostCheck, list[HostState]]:
+    """Check one contact model's gradient; also the states of its rollout, each with its control."""
+    task = programs.task
+    (_, (states, controls, residual)), gradient = programs.gradient(cell.contact)
+    gradient = np.asarray(gradient)
+    norm = float(np.linalg.norm(gradient))
+    scale = norm if norm > 0 else 1.0
+    directions = np.random.default_rng(seed).normal(size=(DIRECTIONS, len(task.theta)))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    slopes = programs.slopes(cell.contact, directions)
+    modes = float(np.max(np.abs(slopes - directions @ gradient))) / scale
+    truth = differences(programs.costs(cell.contact, moves(directions))[:, None])
+    error = np.abs(directions @ gradient - truth.value[0])
+    closed_form = _against_closed_form(task, cell, gradient, jax.random.clone(programs.key))
+    apart = error > DIFFERENCE_TOLERANCE * scale + 3 * truth.uncertainty[0]
+    verdict = cost_verdict(
+        finite=bool(np.all(np.isfinite(gradient))),
+        modes=modes,
+        residual=float(residual),
+        excused=[
+            "jump" if jump else "kink" if kink and miss <= gap else None
+            for far, jump, kink, miss, gap in zip(apart, truth.jump[0], truth.kink[0], error, truth.gap[0], strict=True)
+            if far
+        ],
+    )
+    check = CostCheck(
+        cell.family,
+        cell.stiffness,
+        norm,
+        modes,
+        float(error.max() / scale),
+        float(truth.gap.max() / scale),
+        closed_form,
+        float(residual),
+        verdict,
+    )
+    return check, _host_states(states, controls)
+
+
+def cost_verdict(*, finite: bool, modes: float, residual: float, excused: list[str | None]) -> str:
+    """The verdict on a gradient.
+
+    Args:
+        finite: whether it is.
+        modes: relative difference of the two modes.
+        residual: of the solver.
+        excused: for each direction whose difference disagrees, kink or jump, or None where there is no excuse.
+    """
+    if not finite:
+        return "nan"
+    if not residual <= DIFFERENCE_TOLERANCE:
+        return "unconverged"
+    if not modes <= MODES_TOLERANCE or None in excused:
+        return "wrong"
+    return max((name for name in excused if name), key=("kink", "jump").index, default="right")
+
+
+def _against_closed_form(task: Task, cell: Cell, gradient: np.ndarray, key: Any) -> float | None:
+    if task.reference is None or cell.family != "penalty":
+        return None
+    exact = np.asarray(task.reference(cell.stiffness).value_and_gradient(task.theta, key)[1])
+    size = float(np.linalg.norm(exact))
+    return float(np.linalg.norm(gradient - exact)) / (size if size > 0 else 1.0)
+
+
+def _host_states(states: Any, controls: Any) -> list[HostState]:
+    """The states of a rollout before each step."""
+    qpos, qvel, act, warmstart = map(np.asarray, (states.qpos, states.qvel, states.act, states.warmstart))
+    controls = np.asarray(controls)
+    return [HostState(qpos[i], qvel[i], act[i], controls[i], warmstart[i]) for i in range(len(controls))]

@@ -1,0 +1,122 @@
+"""A verdict on each entry of a Jacobian: right, or what is wrong with it, or why there is no derivative to be right."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from mjx_study.gradcheck.coordinates import Coordinates
+from mjx_study.gradcheck.differences import Differences
+
+TOLERANCE: Final = 1e-6
+"""Of an entry, relative to the largest in its row and block, beyond three uncertainties of the difference."""
+MODES_TOLERANCE: Final = 1e-9
+RESIDUAL_TOLERANCE: Final = 1e-6
+FAINT: Final = 1e-3
+"""Size of a row's entries relative to the largest of its kind below which it counts as that large."""
+RESOLVED: Final = 1e-5
+"""Relative uncertainty above which a difference says nothing precise; such entries do not enter the worst error."""
+
+VERDICTS: Final = ("right", "kink", "jump", "unconverged", "zero", "nan", "wrong")
+RIGHT, KINK, JUMP, UNCONVERGED, ZERO, NAN, WRONG = range(7)
+FAILURES: Final = ("unconverged", "zero", "nan", "wrong")
+MEANING: Final = {
+    "kink": "the step's one-sided slopes disagree, however short: there is no derivative to compare with",
+    "jump": "the step itself jumps here, which no derivative sees",
+    "unconverged": "the derivative is that of another point, because the solver stopped early",
+    "zero": "the derivative is exactly zero, silently, where the step does change",
+    "nan": "the derivative is not a number",
+    "wrong": "the derivative is not that of the step",
+    "placement": "MJX and the C engine compute another step",
+}
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Judged:
+    """Verdicts of one derivative of one step.
+
+    Attributes:
+        codes: index into VERDICTS of each entry.
+        error: worst relative error of the entries that are right and that differences resolve.
+    """
+
+    codes: Int[np.ndarray, "outputs inputs"]
+    error: float
+
+
+def judge(
+    layout: Coordinates,
+    jacobian: Float[np.ndarray, "outputs inputs"],
+    truth: Differences,
+    converged: Float[np.ndarray, "outputs inputs"] | None = None,
+) -> Judged:
+    """Compare a derivative with differences.
+
+    Args:
+        layout: names the blocks, within which entries of a row are compared in size.
+        jacobian: the derivative.
+        truth: what differences found.
+        converged: the derivative from a converged start of the solver, which tells an unconverged solve from a wrong
+            derivative; None where the solver had converged.
+    """
+    scale = row_scales(layout, jacobian, truth)
+    allowed = TOLERANCE * scale + 3 * truth.uncertainty
+    error = np.abs(jacobian - truth.value)
+    right = error <= allowed  # not where it is NaN
+    resolved = truth.uncertainty <= RESOLVED * scale
+
+    codes = np.full(jacobian.shape, WRONG)
+    # A derivative between the two slopes, or near them, is as good as there is; zero outside of them is not.
+    within = error <= np.maximum(truth.gap, allowed)
+    outside = (jacobian == 0) & (np.abs(truth.value) > 0.51 * truth.gap + allowed)
+    codes[(jacobian == 0) & ~right] = ZERO
+    if converged is not None:
+        codes[~right & (np.abs(converged - truth.value) <= allowed)] = UNCONVERGED
+    codes[right] = RIGHT
+    # The mean of two slopes agrees with central differences, and anything agrees with those over a jump.
+    codes[truth.kink & within & ~outside & (~right | (truth.gap > FAINT * scale))] = KINK
+    codes[truth.jump & ~(right & resolved)] = JUMP
+    codes[~np.isfinite(jacobian)] = NAN
+    figures = np.where(right & resolved, error / scale, 0.0)
+    return Judged(codes, float(figures.max(initial=0.0)))
+
+
+def row_scales(
+    layout: Coordinates, jacobian: Float[np.ndarray, "outputs inputs"], truth: Differences | None = None
+) -> Float[np.ndarray, "outputs inputs"]:
+    """What an entry's error is relative to: the largest of its row, among derivatives and differences by one block.
+
+    Rows that hardly depend on a block, and so hold rounding alone, count as `FAINT` of the largest row of their kind.
+    """
+    scale = np.empty(jacobian.shape)
+    size = np.where(np.isfinite(jacobian), np.abs(jacobian), 0.0)
+    if truth is not None:
+        size = np.maximum(size, np.abs(truth.value))
+    kinds = np.array([output.block for output in layout.outputs])
+    for block in layout.blocks():
+        columns = layout.columns(block)
+        largest = size[:, columns].max(axis=1)
+        for kind in dict.fromkeys(kinds):
+            rows = kinds == kind
+            floor = max(FAINT * float(largest[rows].max()), 1e-10)
+            scale[np.ix_(rows, columns)] = np.maximum(largest[rows], floor)[:, None]
+    return scale
+
+
+def modes_apart(
+    layout: Coordinates, first: Float[np.ndarray, "outputs inputs"], second: Float[np.ndarray, "outputs inputs"]
+) -> float:
+    """Largest relative difference of two derivatives where neither is NaN.
+
+    Entries far below the largest of all may differ by its rounding.
+    """
+    largest = np.nan_to_num(np.abs(first), nan=0.0, posinf=0.0).max(initial=0.0)
+    error = np.abs(first - second) / np.maximum(row_scales(layout, first), 1e-6 * largest)
+    return float(np.nan_to_num(error, nan=0.0).max(initial=0.0))
+
+
+def worst_verdict(verdicts: Sequence[str]) -> str:
+    """The gravest of some verdicts; right where there is none."""
+    return max(verdicts, key=VERDICTS.index, default="right")

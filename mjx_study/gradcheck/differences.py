@@ -1,0 +1,86 @@
+"""Differences over a ladder of step sizes: the derivative where there is one, and what there is in its place.
+
+Central differences of a smooth map settle as the step shrinks, until rounding takes over; the plateau between is the
+derivative, and how flat it is its uncertainty. The second difference |f(x + h) - 2 f(x) + f(x - h)| tells the rest: it
+falls like h^2 where the map is smooth, like h at a kink, whose two one-sided slopes disagree at every step, and not at
+all at a jump.
+"""
+
+import dataclasses
+from typing import Final
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+RATIO: Final = 4.0
+SIZES: Final = tuple(2.5e-4 / RATIO**power for power in range(8))
+"""Step sizes [m, rad, ...], down to 1.5e-8; the finest smooth structure of MuJoCo's contact is 1 mm."""
+ROUNDING: Final = 1e-13
+"""Noise of a step's output relative to its size, solved to rounding."""
+SMOOTH, KINK = 1.5, 0.5
+"""Powers of h between which the second difference is a kink's, 1."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Differences:
+    """What differences say of a Jacobian, entry by entry.
+
+    Attributes:
+        value: the derivative by central differences where there is one, else the mean of the one-sided slopes.
+        uncertainty: of the value.
+        gap: by how much the one-sided slopes disagree at the smallest step that rounding leaves alone.
+        kink: where they disagree however small the step.
+        jump: where the map itself jumps.
+    """
+
+    value: Float[np.ndarray, "outputs columns"]
+    uncertainty: Float[np.ndarray, "outputs columns"]
+    gap: Float[np.ndarray, "outputs columns"]
+    kink: Bool[np.ndarray, "outputs columns"]
+    jump: Bool[np.ndarray, "outputs columns"]
+
+
+def moves(columns: Float[np.ndarray, "columns inputs"]) -> Float[np.ndarray, "moves inputs"]:
+    """All changes that `differences` needs the outputs of: none, then every step size forwards and backwards."""
+    steps = (np.array(SIZES)[:, None, None] * columns).reshape(-1, columns.shape[1])
+    return np.concatenate([np.zeros((1, columns.shape[1])), steps, -steps])
+
+
+def differences(outputs: Float[np.ndarray, "moves outputs"]) -> Differences:
+    """Read the outputs after `moves`."""
+    sizes = np.array(SIZES)[:, None, None]
+    here, rest = outputs[0], outputs[1:].reshape(2, len(SIZES), -1, outputs.shape[1])
+    above, below = rest
+    central = (above - below) / (2 * sizes)
+    # one Richardson step: the error in h^2 goes
+    better = (RATIO**2 * central[1:] - central[:-1]) / (RATIO**2 - 1)
+    change = np.abs(np.diff(better, axis=0))
+    spread = np.maximum(change[1:], change[:-1])  # three neighbours on the ladder agree this well
+    noise = ROUNDING * np.maximum(np.abs(here), 1e-2)
+    spread = spread + noise / sizes[2 : 2 + len(spread)]
+    best = np.argmin(spread, axis=0)[None]
+    value = np.take_along_axis(better[1:-1], best, axis=0)[0]
+    uncertainty = np.take_along_axis(spread, best, axis=0)[0]
+
+    second = np.abs(above - 2 * here + below)
+    loud = second > 100 * noise
+    # the power of h over the last two ratios in which rounding plays no part
+    usable = loud[2:] & loud[1:-1] & loud[:-2]
+    last = np.where(usable.any(axis=0), len(usable) - 1 - np.argmax(usable[::-1], axis=0), 0)[None]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        power = np.log(second[:-2] / second[2:]) / np.log(RATIO) / 2
+    power = np.where(usable.any(axis=0), np.take_along_axis(power, last, axis=0)[0], np.inf)
+    gap = np.take_along_axis(second[2:] / sizes[2:], last, axis=0)[0]
+    gap = np.where(usable.any(axis=0), gap, 0.0)
+    # where the second difference falls off below a size, the kink or jump is that far away and not here
+    following = np.take_along_axis(np.concatenate([second[3:], second[-1:]]), last, axis=0)[0]
+    expected = np.take_along_axis(second[2:], last, axis=0)[0] * RATIO ** -np.maximum(power, 0.0)
+    finest = last[0] >= len(usable) - 2
+    here_too = finest | (following > expected / RATIO) | (expected <= 200 * noise)
+    kink, jump = (power < SMOOTH) & (power >= KINK) & here_too, (power < KINK) & here_too
+
+    # ... and only steps that do not reach it see the derivative
+    nearby = (power < SMOOTH) & ~here_too
+    value = np.where(nearby, central[-2], value)
+    uncertainty = np.where(nearby, np.abs(central[-1] - central[-2]) + noise / SIZES[-1], uncertainty)
+    return Differences(value.T, uncertainty.T, gap.T, kink.T, jump.T)

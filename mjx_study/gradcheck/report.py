@@ -1,0 +1,250 @@
+"""What a gradient check found, as data and as text."""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from typing import Any, Final
+
+from mjx_study.gradcheck.cost import CostCheck
+from mjx_study.gradcheck.diagnosis import FAILURES, MEANING
+from mjx_study.table import format_table
+
+SHOWN: Final = 12
+"""Findings in the text unless all are asked for."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Entry:
+    """One entry of one step's Jacobian that is not right.
+
+    Attributes:
+        state: in words.
+        index: steps since the start of the rollout.
+        time: the same [s].
+        name: as in d qvel[hinge] / d ctrl[motor].
+        derivative: by automatic differentiation, or MJX's value.
+        difference: by central differences, or the C engine's value; None where there is none.
+        gap: of the one-sided slopes.
+    """
+
+    state: str
+    index: int
+    time: float
+    name: str
+    derivative: float
+    difference: float | None
+    gap: float | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Finding:
+    """Entries that are not right for one reason.
+
+    Attributes:
+        contact: label of the contact model.
+        who: whose derivative: `project`, or `mjx.step` for MJX's own.
+        verdict: kink, jump, unconverged, zero, nan, wrong or placement.
+        modes: of differentiation that show it: forward, reverse, tape.
+        cause: one sentence.
+        entries: all of them.
+    """
+
+    contact: str
+    who: str
+    verdict: str
+    modes: tuple[str, ...]
+    cause: str
+    entries: tuple[Entry, ...]
+
+    @property
+    def fails(self) -> bool:
+        """Whether it makes the check fail: the project's own derivative is not what it should be."""
+        return self.who == "project" and self.verdict in FAILURES
+
+    def line(self) -> str:
+        """The finding in a sentence, with one entry as example."""
+        example, states = self.entries[0], len({entry.state for entry in self.entries})
+        who = f"{self.who}: " if self.who != "project" else ""
+        where = example.state if states == 1 else f"{states} states"
+        count = where if len(self.entries) == 1 else f"{len(self.entries)} entries, {where}"
+        modes = f", {' and '.join(self.modes)} mode" if self.who == "project" and len(self.modes) in (1, 2) else ""
+        if not example.name:
+            return f"{who}{self.verdict} ({count}): {self.cause}"
+        numbers = _numbers(example)
+        return f"{who}{self.verdict} ({count}{modes}), as {example.name} {numbers}: {self.cause}"
+
+
+def _numbers(entry: Entry) -> str:
+    there = "" if entry.difference is None else f", differences {entry.difference:.6g}"
+    gap = f" (one-sided apart by {entry.gap:.2g})" if entry.gap else ""
+    return f"= {entry.derivative:.6g}{there}{gap}"
+
+
+@dataclasses.dataclass(frozen=True)
+class StepCheck:
+    """The checks of single steps under one contact model; every figure is relative, the worst over the states.
+
+    Attributes:
+        contact: family.
+        stiffness: K [N/m]; 0 where the contact model was not made from one.
+        states: number of states.
+        entries: of their Jacobians, in all.
+        modes: reverse against forward mode.
+        differences: derivative over state and control against central differences.
+        parameters: the same over contact parameters; None where there are no contacts.
+        engine_step: the step's acceleration against the C engine's.
+        engine: the Jacobian against the C engine's, where the steps agree; None where they nowhere do.
+        stock: the derivative of `mjx.step`, likewise; None where it was not asked for, infinite where it is NaN.
+        residual: of the solver.
+        verdict: the gravest of the findings on the project's own derivative.
+    """
+
+    contact: str
+    stiffness: float
+    states: int
+    entries: int
+    modes: float
+    differences: float
+    parameters: float | None
+    engine_step: float
+    engine: float | None
+    stock: float | None
+    residual: float
+    verdict: str
+
+
+@dataclasses.dataclass(frozen=True)
+class GradcheckReport:
+    """All checks and findings, with what they depended on.
+
+    Attributes:
+        subject: the task or file.
+        summary: what was checked, one line.
+        costs: of whole-horizon gradients, one per contact model; empty for a file.
+        steps: of single steps, one per contact model.
+        findings: what is not right, gravest first.
+        warnings: about contact models.
+        environment: versions and machine.
+    """
+
+    subject: str
+    summary: str
+    costs: tuple[CostCheck, ...]
+    steps: tuple[StepCheck, ...]
+    findings: tuple[Finding, ...]
+    warnings: tuple[str, ...]
+    environment: dict[str, Any]
+
+    @property
+    def passed(self) -> bool:
+        """Whether no derivative of the project is wrong, NaN, silently zero or unconverged."""
+        verdicts = [check.verdict for check in (*self.costs, *self.steps)]
+        return not any(verdict in FAILURES for verdict in verdicts)
+
+    def as_json(self) -> dict[str, Any]:
+        """The report as plain data; figures that are not finite become None."""
+        return _plain(dataclasses.asdict(self) | {"passed": self.passed})
+
+    def lines(self, *, verbose: bool = False) -> list[str]:
+        """The report as text; `verbose` has every entry of every finding."""
+        lines = [f"{self.subject}: {self.summary}", ""]
+        if self.costs:
+            lines += ["gradient of the whole cost", *self._cost_table(), ""]
+        lines += ["one step", *self._step_table(), ""]
+        lines += self._finding_lines(verbose)
+        lines += [f"warning: {text}" for text in self.warnings]
+        verdict = "every derivative that exists is right" if self.passed else "SOMETHING IS WRONG: see above"
+        return [*lines, verdict]
+
+    def _cost_table(self) -> list[str]:
+        header = ["contact", "K [N/m]", "|gradient|", "modes", "differences", "one-sided", "closed form", "residual"]
+        rows = [
+            [
+                check.contact,
+                _stiffness(check.stiffness),
+                f"{check.gradient_norm:.4g}",
+                *map(
+                    _figure,
+                    (check.modes, check.difference, check.one_sided, check.closed_form, check.residual),
+                ),
+                _verdict(check.verdict),
+            ]
+            for check in self.costs
+        ]
+        return _without_empty(rows, [*header, "verdict"])
+
+    def _step_table(self) -> list[str]:
+        header = ["contact", "K [N/m]", "states", "modes", "differences", "parameters", "C step", "C engine"]
+        rows = [
+            [
+                check.contact,
+                _stiffness(check.stiffness),
+                str(check.states),
+                *map(
+                    _figure,
+                    (
+                        check.modes,
+                        check.differences,
+                        check.parameters,
+                        check.engine_step,
+                        check.engine,
+                        check.stock,
+                        check.residual,
+                    ),
+                ),
+                _verdict(check.verdict),
+            ]
+            for check in self.steps
+        ]
+        return _without_empty(rows, [*header, "mjx.step", "residual", "verdict"])
+
+    def _finding_lines(self, verbose: bool) -> list[str]:
+        """Findings of one kind and cause once, whatever the number of contact models that show it."""
+        alike: dict[tuple[str, str, str], list[Finding]] = {}
+        for finding in self.findings:
+            alike.setdefault((finding.who, finding.verdict, finding.cause), []).append(finding)
+        shown = list(alike.values()) if verbose else list(alike.values())[:SHOWN]
+        lines: list[str] = []
+        for group in shown:
+            contacts = list(dict.fromkeys(finding.contact for finding in group))
+            others = f" (and {len(contacts) - 1} more contact models)" if len(contacts) > 1 else ""
+            lines.append(f"{contacts[0]}{others}: {group[0].line()}" if len(self.steps) > 1 else group[0].line())
+            for finding in group if verbose else ():
+                label = f"{finding.contact}, " if len(self.steps) > 1 else ""
+                lines += [
+                    f"    {label}{entry.state} ({entry.time:.4g} s)  {entry.name} {_numbers(entry)}"
+                    for entry in finding.entries
+                ]
+        if len(shown) < len(alike):
+            lines.append(f"and {len(alike) - len(shown)} more of the kind (--verbose shows all)")
+        verdicts = dict.fromkeys(finding.verdict for finding in self.findings)
+        lines += [f"{verdict}: {MEANING[verdict]}" for verdict in verdicts if verdict in MEANING]
+        return [*lines, ""] if lines else []
+
+
+def _stiffness(value: float) -> str:
+    return f"{value:g}" if value else "-"
+
+
+def _verdict(name: str) -> str:
+    return f"right, but {name}s" if name in ("kink", "jump") else name
+
+
+def _figure(value: float | None) -> str:
+    return "-" if value is None else "NaN" if math.isinf(value) or math.isnan(value) else f"{value:.1e}"
+
+
+def _without_empty(rows: Sequence[Sequence[str]], header: Sequence[str]) -> list[str]:
+    """The table without columns that say nothing."""
+    kept = [index for index in range(len(header)) if any(row[index] != "-" for row in rows)]
+    return format_table([[row[index] for index in kept] for row in rows], [header[index] for index in kept])
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _plain(part) for key, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(part) for part in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

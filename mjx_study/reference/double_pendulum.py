@@ -1,0 +1,140 @@
+r"""Two point masses on massless rods, without friction or actuation; chaotic, and smooth.
+
+With c, s = cos q_2, sin q_2 and k = g / l (the masses are equal and cancel),
+
+    [3 + 2 c, 1 + c; 1 + c, 1] a = (s v_2 (2 v_1 + v_2) - k (2 sin q_1 + sin(q_1 + q_2)),
+                                    -s v_1^2 - k sin(q_1 + q_2)),
+
+integrated by the classical Runge-Kutta method of order 4.
+
+Reference: Suh et al. 2022, chaos example; equations of motion from the Lagrangian, so that energy is conserved.
+"""
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Float
+
+
+@dataclasses.dataclass(frozen=True)
+class DoublePendulum:
+    """State (q1, q2, v1, v2) [rad, rad/s]; no control; cost |(q1, q2) - goal|^2 at the end.
+
+    q1 is the first rod's angle from hanging straight down, q2 the second's relative to the first (MuJoCo's joint
+    coordinate), so that both are 0 at rest. Angles are never wrapped: the final state depends smoothly on the start.
+
+    Attributes:
+        timestep: h [s].
+        mass: of each point [kg].
+        length: of each rod [m].
+        gravity: g [m/s^2].
+        goal: angles that the cost pulls to [rad].
+    """
+
+    timestep: float = 0.001
+    mass: float = 0.1
+    length: float = 1.0
+    gravity: float = 9.81
+    goal: tuple[float, float] = (0.0, 0.0)
+    num_states: int = 4
+    num_controls: int = 0
+
+    def step(
+        self, state: Float[np.ndarray, "*batch 4"], control: Float[np.ndarray, "*batch 0"]
+    ) -> Float[np.ndarray, "*batch 4"]:
+        """The state after one timestep."""
+        h = self.timestep
+        first = self._rate(state)
+        second = self._rate(state + h / 2 * first)
+        third = self._rate(state + h / 2 * second)
+        fourth = self._rate(state + h * third)
+        return state + h / 6 * (first + 2 * second + 2 * third + fourth)
+
+    def jacobians(
+        self, state: Float[np.ndarray, "*batch 4"], control: Float[np.ndarray, "*batch 0"]
+    ) -> tuple[Float[np.ndarray, "*batch 4 4"], Float[np.ndarray, "*batch 4 0"]]:
+        """Derivatives of `step`, by the chain rule through its four stages."""
+        h, identity = self.timestep, np.eye(4)
+        rate, slope = self._rate(state), self._rate_jacobian(state)
+        total = slope
+        for fraction, weight in ((0.5, 2.0), (0.5, 2.0), (1.0, 1.0)):
+            stage = state + fraction * h * rate
+            slope = self._rate_jacobian(stage) @ (identity + fraction * h * slope)
+            rate = self._rate(stage)
+            total = total + weight * slope
+        return identity + h / 6 * total, np.zeros((*state.shape, 0))
+
+    def energy(self, state: Float[np.ndarray, "*batch 4"]) -> Float[np.ndarray, "*batch"]:
+        """Kinetic and potential energy, 0 at height 0 of the pivot [J]."""
+        first, second, mixed = self._inertia(state)
+        v1, v2 = state[..., 2], state[..., 3]
+        kinetic = 0.5 * self.mass * self.length**2 * (first * v1**2 + 2 * mixed * v1 * v2 + second * v2**2)
+        height = -self.length * (2 * np.cos(state[..., 0]) + np.cos(state[..., 0] + state[..., 1]))
+        return np.asarray(kinetic + self.mass * self.gravity * height)
+
+    def accelerations(self, state: Float[np.ndarray, "*batch 4"]) -> Float[np.ndarray, "*batch 2"]:
+        """Angular accelerations of both joints [rad/s^2]."""
+        return self._solve(state, self._torques(state)[..., None])[..., 0]
+
+    def acceleration_jacobian(self, state: Float[np.ndarray, "*batch 4"]) -> Float[np.ndarray, "*batch 2 4"]:
+        """Derivative of `accelerations`: M da = dr - dM a, with r the right side above."""
+        q1, q2, v1, v2 = np.moveaxis(state, -1, 0)
+        sine, cosine, pull = np.sin(q2), np.cos(q2), self.gravity / self.length
+        a1, a2 = np.moveaxis(self.accelerations(state), -1, 0)
+        lower = -pull * np.cos(q1 + q2)
+        rows = (
+            (
+                lower - 2 * pull * np.cos(q1),
+                lower + cosine * v2 * (2 * v1 + v2) + sine * (2 * a1 + a2),
+                2 * sine * v2,
+                2 * sine * (v1 + v2),
+            ),
+            (lower, lower - cosine * v1**2 + sine * a1, -2 * sine * v1, np.zeros_like(v1)),
+        )
+        return self._solve(state, np.stack([np.stack(row, axis=-1) for row in rows], axis=-2))
+
+    def cost(
+        self, state: Float[np.ndarray, "*batch 4"], control: Float[np.ndarray, "*batch 0"]
+    ) -> Float[np.ndarray, "*batch"]:
+        """0: only the last state counts."""
+        return np.zeros(state.shape[:-1])
+
+    def cost_gradients(
+        self, state: Float[np.ndarray, "*batch 4"], control: Float[np.ndarray, "*batch 0"]
+    ) -> tuple[Float[np.ndarray, "*batch 4"], Float[np.ndarray, "*batch 0"]]:
+        """Zeros."""
+        return np.zeros(state.shape), np.zeros(control.shape)
+
+    def final_cost(self, state: Float[np.ndarray, "*batch 4"]) -> Float[np.ndarray, "*batch"]:
+        """|(q1, q2) - goal|^2 [rad^2]."""
+        return np.asarray(np.sum((state[..., :2] - np.array(self.goal)) ** 2, axis=-1))
+
+    def final_gradient(self, state: Float[np.ndarray, "*batch 4"]) -> Float[np.ndarray, "*batch 4"]:
+        """2 ((q1, q2) - goal), and 0 for the velocities."""
+        error = state[..., :2] - np.array(self.goal)
+        return np.concatenate([2 * error, np.zeros(error.shape)], axis=-1)
+
+    def _rate(self, state):
+        return np.concatenate([state[..., 2:], self.accelerations(state)], axis=-1)
+
+    def _rate_jacobian(self, state):
+        slope = self.acceleration_jacobian(state)
+        return np.concatenate([np.broadcast_to(np.eye(2, 4, 2), slope.shape), slope], axis=-2)
+
+    def _torques(self, state):
+        q1, q2, v1, v2 = np.moveaxis(state, -1, 0)
+        sine, pull = np.sin(q2), self.gravity / self.length
+        outer = pull * np.sin(q1 + q2)
+        return np.stack([sine * v2 * (2 * v1 + v2) - 2 * pull * np.sin(q1) - outer, -sine * v1**2 - outer], axis=-1)
+
+    def _inertia(self, state):
+        """Entries 11, 22 and 12 of the joint inertia over m l^2."""
+        cosine = np.cos(state[..., 1])
+        return 3 + 2 * cosine, np.ones_like(cosine), 1 + cosine
+
+    def _solve(self, state, right):
+        """Inverse inertia times (..., 2, columns); the determinant is 2 - cos^2 q_2, never below 1."""
+        first, second, mixed = (entry[..., None] for entry in self._inertia(state))
+        upper, lower = right[..., 0, :], right[..., 1, :]
+        rows = [second * upper - mixed * lower, first * lower - mixed * upper]
+        return np.stack(rows, axis=-2) / (first * second - mixed**2)[..., None]

@@ -1,0 +1,89 @@
+r"""The step, and Coulomb friction's ramp in its place: both smoothed in closed form.
+
+With Phi, phi the standard normal distribution and density,
+
+    step:  F = Phi(theta / sigma),   grad F = phi(theta / sigma) / sigma, all of it jump term;
+    ramp:  F = (G(theta + nu/2) - G(theta - nu/2)) / nu,   grad F = (Phi(. + nu/2) - Phi(. - nu/2)) / nu,
+
+where G(a) = E max(a + w, 0) = a Phi(a / sigma) + sigma phi(a / sigma).
+"""
+
+import dataclasses
+import math
+
+import numpy as np
+from jaxtyping import Float
+from scipy.special import ndtr
+
+from mjx_study.reference.function import Jump, Smoothed, normal_density
+
+
+@dataclasses.dataclass(frozen=True)
+class Heaviside:
+    """1 where x >= 0, else 0."""
+
+    num_params: int = 1
+    period: float = math.inf
+
+    def value(self, x: Float[np.ndarray, "*batch 1"]) -> Float[np.ndarray, "*batch"]:
+        """1 where x >= 0, else 0."""
+        return np.asarray(x[..., 0] >= 0, float)
+
+    def gradient(self, x: Float[np.ndarray, "*batch 1"]) -> Float[np.ndarray, "*batch 1"]:
+        """0 everywhere."""
+        return np.zeros(x.shape)
+
+    def jumps(self) -> tuple[Jump, ...]:
+        """One, of size 1 at 0."""
+        return (Jump(0.0, 1.0),)
+
+    def breakpoints(self) -> tuple[float, ...]:
+        """0."""
+        return (0.0,)
+
+    def smoothed(self, theta: Float[np.ndarray, " 1"], sigma: float) -> Smoothed:
+        """F = Phi(theta / sigma); the gradient is all jump term."""
+        gradient = np.array([normal_density(theta[0] / sigma) / sigma])
+        return Smoothed(float(ndtr(theta[0] / sigma)), gradient, gradient)
+
+
+@dataclasses.dataclass(frozen=True)
+class RelaxedHeaviside:
+    """clip(x / width + 1/2, 0, 1), continuous.
+
+    Attributes:
+        width: nu, the slip tolerance; in the unit of x.
+
+    Reference: Suh et al. 2022, Coulomb friction example, whose slope 2 t / nu does not meet the step at +-nu / 2.
+    """
+
+    width: float
+    num_params: int = 1
+    period: float = math.inf
+
+    def __post_init__(self) -> None:
+        if not (self.width > 0 and math.isfinite(self.width)):
+            raise ValueError(f"width must be positive and finite, got {self.width}")
+
+    def value(self, x: Float[np.ndarray, "*batch 1"]) -> Float[np.ndarray, "*batch"]:
+        """clip(x / nu + 1/2, 0, 1)."""
+        return np.asarray(np.clip(x[..., 0] / self.width + 0.5, 0.0, 1.0))
+
+    def gradient(self, x: Float[np.ndarray, "*batch 1"]) -> Float[np.ndarray, "*batch 1"]:
+        """1 / nu on the ramp, else 0."""
+        return np.where(np.abs(x) < self.width / 2, 1 / self.width, 0.0)
+
+    def jumps(self) -> tuple[Jump, ...]:
+        """None."""
+        return ()
+
+    def breakpoints(self) -> tuple[float, ...]:
+        """The ends of the ramp."""
+        return (-self.width / 2, self.width / 2)
+
+    def smoothed(self, theta: Float[np.ndarray, " 1"], sigma: float) -> Smoothed:
+        """F and grad F by differences over the ramp: rounding of about 1e-16 / nu."""
+        ends = [float(theta[0]) + self.width / 2, float(theta[0]) - self.width / 2]
+        upper, lower = (end * ndtr(end / sigma) + sigma * normal_density(end / sigma) for end in ends)
+        slope = (ndtr(ends[0] / sigma) - ndtr(ends[1] / sigma)) / self.width
+        return Smoothed(float((upper - lower) / self.width), np.array([slope]), np.zeros(1))

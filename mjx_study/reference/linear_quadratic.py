@@ -1,0 +1,140 @@
+r"""A linear system with a quadratic cost, where every expectation has a closed form.
+
+    x' = A x + B u,   V = sum_h x_h^T Q x_h + u_h^T R u_h + x_{H+1}^T P x_{H+1}
+
+An open loop U = theta + w, w ~ N(0, sigma^2 I), makes V a quadratic form, V = U^T M U + 2 b^T U + c, so that
+
+    F = V(theta) + sigma^2 tr M,   grad F = 2 (M theta + b),   Cov[FoBG sample] = 4 sigma^2 M^2.
+"""
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Float
+
+from mjx_study.reference.function import Smoothed, check_noise
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class LinearQuadratic:
+    """State and control of any size, in any unit.
+
+    Attributes:
+        transition: A, (states, states).
+        control: B, (states, controls).
+        state_weight: Q, (states, states), symmetric.
+        control_weight: R, (controls, controls), symmetric.
+        final_weight: P, (states, states), symmetric.
+    """
+
+    transition: Float[np.ndarray, "..."]
+    control: Float[np.ndarray, "..."]
+    state_weight: Float[np.ndarray, "..."]
+    control_weight: Float[np.ndarray, "..."]
+    final_weight: Float[np.ndarray, "..."]
+
+    def __post_init__(self) -> None:
+        if self.transition.ndim != 2 or self.control.ndim != 2:
+            raise ValueError("transition and control must be matrices")
+        states, controls = self.transition.shape[0], self.control.shape[1]
+        expected = {"transition": (states, states), "control": (states, controls)}
+        expected |= {"state_weight": (states, states), "final_weight": (states, states)}
+        expected |= {"control_weight": (controls, controls)}
+        for name, shape in expected.items():
+            if getattr(self, name).shape != shape:
+                raise ValueError(f"{name} must have shape {shape}, got {getattr(self, name).shape}")
+        for name in ("state_weight", "control_weight", "final_weight"):
+            if not np.array_equal(getattr(self, name), getattr(self, name).T):
+                raise ValueError(f"{name} must be symmetric")
+
+    @property
+    def num_states(self) -> int:
+        """Length of the state."""
+        return self.control.shape[0]
+
+    @property
+    def num_controls(self) -> int:
+        """Length of the control."""
+        return self.control.shape[1]
+
+    def step(
+        self, state: Float[np.ndarray, "*batch states"], control: Float[np.ndarray, "*batch controls"]
+    ) -> Float[np.ndarray, "*batch states"]:
+        """A x + B u."""
+        return state @ self.transition.T + control @ self.control.T
+
+    def jacobians(
+        self, state: Float[np.ndarray, "*batch states"], control: Float[np.ndarray, "*batch controls"]
+    ) -> tuple[Float[np.ndarray, "*batch states states"], Float[np.ndarray, "*batch states controls"]]:
+        """A and B."""
+        batch = state.shape[:-1]
+        over_state = np.broadcast_to(self.transition, (*batch, *self.transition.shape))
+        return over_state, np.broadcast_to(self.control, (*batch, *self.control.shape))
+
+    def cost(
+        self, state: Float[np.ndarray, "*batch states"], control: Float[np.ndarray, "*batch controls"]
+    ) -> Float[np.ndarray, "*batch"]:
+        """x^T Q x + u^T R u."""
+        return np.asarray(_form(self.state_weight, state) + _form(self.control_weight, control))
+
+    def cost_gradients(
+        self, state: Float[np.ndarray, "*batch states"], control: Float[np.ndarray, "*batch controls"]
+    ) -> tuple[Float[np.ndarray, "*batch states"], Float[np.ndarray, "*batch controls"]]:
+        """2 Q x and 2 R u."""
+        return 2 * state @ self.state_weight, 2 * control @ self.control_weight
+
+    def final_cost(self, state: Float[np.ndarray, "*batch states"]) -> Float[np.ndarray, "*batch"]:
+        """x^T P x."""
+        return np.asarray(_form(self.final_weight, state))
+
+    def final_gradient(self, state: Float[np.ndarray, "*batch states"]) -> Float[np.ndarray, "*batch states"]:
+        """2 P x."""
+        return 2 * state @ self.final_weight
+
+    def smoothed(
+        self,
+        start: Float[np.ndarray, " states"],
+        controls: Float[np.ndarray, "horizon controls"],
+        sigma: float,
+    ) -> Smoothed:
+        """F and grad F of an open loop, exactly; theta is `controls`, flattened.
+
+        Raises:
+            ValueError: sigma is not positive and finite.
+        """
+        check_noise(sigma)
+        theta = controls.reshape(-1)
+        square, linear, constant = self.quadratic_form(start, len(controls))
+        value = theta @ square @ theta + 2 * linear @ theta + constant + sigma**2 * np.trace(square)
+        return Smoothed(float(value), 2 * (square @ theta + linear), np.zeros(len(theta)))
+
+    def first_order_variance(self, horizon: int, sigma: float) -> float:
+        """E|g - E g|^2 = 4 sigma^2 tr(M^2) of a first-order sample of an open loop; the same for every theta and start.
+
+        Raises:
+            ValueError: sigma is not positive and finite.
+        """
+        check_noise(sigma)
+        square, _, _ = self.quadratic_form(np.zeros(self.num_states), horizon)
+        return float(4 * sigma**2 * np.sum(square**2))
+
+    def quadratic_form(
+        self, start: Float[np.ndarray, " states"], horizon: int
+    ) -> tuple[Float[np.ndarray, "params params"], Float[np.ndarray, " params"], float]:
+        """M, b and c of V = U^T M U + 2 b^T U + c, U the flattened control sequence."""
+        size = horizon * self.num_controls
+        square = np.kron(np.eye(horizon), self.control_weight)
+        linear, constant = np.zeros(size), 0.0
+        free, response = np.asarray(start, float), np.zeros((self.num_states, size))  # x_h = free + response U
+        for step in range(horizon + 1):
+            weight = self.final_weight if step == horizon else self.state_weight
+            square = square + response.T @ weight @ response
+            linear, constant = linear + response.T @ weight @ free, constant + free @ weight @ free
+            if step < horizon:
+                free, response = self.transition @ free, self.transition @ response
+                response[:, step * self.num_controls : (step + 1) * self.num_controls] += self.control
+        return square, linear, float(constant)
+
+
+def _form(weight, vector):
+    return np.einsum("...i,ij,...j->...", vector, weight, vector)

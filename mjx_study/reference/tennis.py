@@ -1,0 +1,145 @@
+r"""A ball in the plane and a paddle moved by commanded velocities; impacts at their exact times inside the step.
+
+In a step of h the ball flies straight and the paddle moves with its commanded velocity; at an impact the ball's
+velocity relative to the paddle's surface is mirrored (see `paddle`), and both go on for the rest of the step. Then the
+ball's velocity is multiplied by `damping`. No gravity.
+
+A step that meets an impact has the derivative of the impact time in its Jacobian. With the motion y' = f before and
+f_+ after, the reflection R and the clearance g, that is the saltation matrix DR + (f_+ - DR f) Dg / (Dg f).
+
+The rollout jumps where an impact passes from one step to the next: the paddle's command changes there at once, and the
+ball's velocity with it, by twice the change along the normal (and by twice 1 - damping of the paddle's speed, because
+the damping then comes on the other side of the impact). With the edges, that is what a first-order estimate misses.
+
+Reference: Suh et al. 2022, tennis example, with its published numbers; the impact there is elastic too.
+"""
+
+import dataclasses
+from typing import Final
+
+import numpy as np
+from jaxtyping import Float
+
+from mjx_study.reference.paddle import first_impact, reflected, reflected_slope, time_slope
+
+MAX_IMPACTS: Final = 4
+"""Within one step; a ball that still approaches the paddle after so many passes through."""
+CONTROL_SLOPE: Final = np.eye(3, 10, 7)
+"""Derivative of the control with respect to (state, control)."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Tennis:
+    """State (ball x, y, vx, vy, paddle x, y, angle) [m, m/s, rad], control: the paddle's velocities [m/s, rad/s].
+
+    Cost: R |u|^2 per step and e^T Q e at the end, e = x - goal.
+
+    Attributes:
+        timestep: h [s].
+        radius: of the ball [m].
+        half_width: of the paddle's faces [m].
+        half_height: from the paddle's middle to its faces [m].
+        damping: factor on the ball's velocity per step.
+        goal: state that the cost pulls to.
+        final_weight: diagonal of Q.
+        control_weight: R.
+    """
+
+    timestep: float = 0.05
+    radius: float = 0.15
+    half_width: float = 0.8
+    half_height: float = 0.05
+    damping: float = 0.999
+    goal: tuple[float, ...] = (0.0, 2.5, 0.0, 0.0, 0.0, 0.0, 0.0)
+    final_weight: tuple[float, ...] = (100.0, 100.0, 10.0, 10.0, 0.0, 0.0, 0.0)
+    control_weight: float = 0.001
+    num_states: int = 7
+    num_controls: int = 3
+
+    def step(
+        self, state: Float[np.ndarray, "*batch 7"], control: Float[np.ndarray, "*batch 3"]
+    ) -> Float[np.ndarray, "*batch 7"]:
+        """The state after one timestep."""
+        after, _, _ = self._move(state, control, differentiate=False)
+        return after
+
+    def jacobians(
+        self, state: Float[np.ndarray, "*batch 7"], control: Float[np.ndarray, "*batch 3"]
+    ) -> tuple[Float[np.ndarray, "*batch 7 7"], Float[np.ndarray, "*batch 7 3"]]:
+        """Derivatives of `step` at fixed events, the derivatives of impact times included."""
+        _, slope, _ = self._move(state, control, differentiate=True)
+        assert slope is not None
+        return slope[..., :7], slope[..., 7:]
+
+    def impacts(self, state: Float[np.ndarray, "*batch 7"], control: Float[np.ndarray, "*batch 3"]) -> np.ndarray:
+        """Number of impacts within the step."""
+        _, _, count = self._move(state, control, differentiate=False)
+        return count
+
+    def cost(
+        self, state: Float[np.ndarray, "*batch 7"], control: Float[np.ndarray, "*batch 3"]
+    ) -> Float[np.ndarray, "*batch"]:
+        """R |u|^2."""
+        return np.asarray(self.control_weight * np.sum(control**2, axis=-1))
+
+    def cost_gradients(
+        self, state: Float[np.ndarray, "*batch 7"], control: Float[np.ndarray, "*batch 3"]
+    ) -> tuple[Float[np.ndarray, "*batch 7"], Float[np.ndarray, "*batch 3"]]:
+        """0 and 2 R u."""
+        return np.zeros(state.shape), 2 * self.control_weight * control
+
+    def final_cost(self, state: Float[np.ndarray, "*batch 7"]) -> Float[np.ndarray, "*batch"]:
+        """e^T Q e."""
+        return np.asarray(np.sum(np.array(self.final_weight) * (state - np.array(self.goal)) ** 2, axis=-1))
+
+    def final_gradient(self, state: Float[np.ndarray, "*batch 7"]) -> Float[np.ndarray, "*batch 7"]:
+        """2 Q e."""
+        return 2 * np.array(self.final_weight) * (state - np.array(self.goal))
+
+    def _move(self, state, control, *, differentiate: bool):
+        """State after a step; if asked, its derivative (..., 7, 10) with respect to (state, control); impact counts."""
+        batch = state.shape[:-1]
+        now, control = np.array(state, float).reshape(-1, 7), np.asarray(control, float).reshape(-1, 3)
+        samples = len(now)
+        left, count, flying = np.full(samples, self.timestep), np.zeros(samples, int), np.arange(samples)
+        slope = np.tile(np.eye(7, 10), (samples, 1, 1)) if differentiate else None
+        left_slope = np.zeros((samples, 10))
+        reach = self.half_height + self.radius
+        for _ in range(MAX_IMPACTS):
+            hits, time, _ = first_impact(now[flying], control[flying], left[flying], reach, self.half_width)
+            flying = flying[hits]
+            if len(flying) == 0:
+                break
+            count[flying] += 1
+            before, command = now[flying], control[flying]
+            touch = before + time[:, None] * _motion(before, command)
+            if slope is not None:
+                at_fixed_time = slope[flying] + time[:, None, None] * _motion_slope(slope[flying])
+                over_time = time_slope(touch, command, at_fixed_time)
+                touch_slope = at_fixed_time + _motion(before, command)[..., None] * over_time[:, None]
+                touch_slope[:, 2:4] = reflected_slope(touch, command, touch_slope, CONTROL_SLOPE)
+                slope[flying] = touch_slope
+                left_slope[flying] -= over_time
+            touch[:, 2:4] = reflected(touch, command)
+            now[flying] = touch
+            left[flying] -= time
+        motion = _motion(now, control)
+        if slope is not None:
+            slope = slope + left[:, None, None] * _motion_slope(slope) + motion[..., None] * left_slope[:, None]
+            slope[:, 2:4] *= self.damping
+            slope = slope.reshape(*batch, 7, 10)
+        now = now + left[:, None] * motion
+        now[:, 2:4] *= self.damping
+        return now.reshape(*batch, 7), slope, count.reshape(batch)
+
+
+def _motion(state, control):
+    """Rate of the state between impacts."""
+    return np.concatenate([state[:, 2:4], np.zeros((len(state), 2)), control], axis=-1)
+
+
+def _motion_slope(slope):
+    """Derivative of `_motion` where the state has the derivative `slope`."""
+    still = np.zeros((len(slope), 2, 10))
+    commanded = np.broadcast_to(CONTROL_SLOPE, (len(slope), 3, 10))
+    return np.concatenate([slope[:, 2:4], still, commanded], axis=-2)

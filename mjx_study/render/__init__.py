@@ -1,0 +1,27 @@
+"""Pictures and films of a motion; nothing here simulates.
+
+A drawing needs no OpenGL: every geom is projected along a coordinate axis. Where OpenGL works, MuJoCo's own renderer
+takes its place, in a process of its own.
+"""
+
+from mjx_study.render.animation import FORMATS, animate, check_format
+from mjx_study.render.figures import strip, stroboscope
+from mjx_study.render.framing import choose_view, resolve_view
+from mjx_study.render.motion import Motion
+from mjx_study.render.opengl import RENDERERS, RenderError, resolve_renderer
+from mjx_study.render.outline import VIEWS
+
+__all__ = [
+    "FORMATS",
+    "RENDERERS",
+    "VIEWS",
+    "Motion",
+    "RenderError",
+    "animate",
+    "check_format",
+    "choose_view",
+    "resolve_renderer",
+    "resolve_view",
+    "strip",
+    "stroboscope",
+]

@@ -1,0 +1,51 @@
+"""Runs MuJoCo's renderer in a process of its own: `python _opengl_worker.py FOLDER`.
+
+An OpenGL library may abort the process, print, or fail at exit; and MuJoCo takes its backend (MUJOCO_GL) when it is
+imported. So this file is executed by path, and imports nothing of this package.
+
+Reads model.mjb and request.npz (qpos, camera: lookat, distance, azimuth, elevation; width, height), writes images.npy.
+"""
+
+import sys
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+
+def main(folder: Path) -> None:
+    """Render every configuration of a request."""
+    request = np.load(folder / "request.npz")
+    model = mujoco.MjModel.from_binary_path(str(folder / "model.mjb"))
+    width, height = int(request["width"]), int(request["height"])
+    model.vis.global_.offwidth, model.vis.global_.offheight = width, height
+    data = mujoco.MjData(model)
+    camera = mujoco.MjvCamera()
+    camera.lookat[:] = request["lookat"]
+    camera.distance, camera.azimuth, camera.elevation = (
+        float(request[name]) for name in ("distance", "azimuth", "elevation")
+    )
+    images = np.empty((len(request["qpos"]), height, width, 3), np.uint8)
+    renderer = mujoco.Renderer(model, height, width)
+    for image, qpos in zip(images, request["qpos"], strict=True):
+        data.qpos[:] = qpos
+        mujoco.mj_forward(model, data)
+        renderer.update_scene(data, camera)
+        renderer.render(out=image)
+        if not _has_sky(model):
+            renderer.enable_segmentation_rendering()
+            nothing = renderer.render()[:, :, 0] < 0
+            renderer.disable_segmentation_rendering()
+            image[nothing] = 255
+    renderer.close()
+    with (folder / "images.npy").open("wb") as file:
+        np.save(file, images)
+
+
+def _has_sky(model: mujoco.MjModel) -> bool:
+    """Whether a model has a skybox; without one the background would be black."""
+    return bool(np.any(model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX))
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))

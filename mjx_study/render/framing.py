@@ -1,0 +1,154 @@
+"""Which way to look at a motion, and how much of its scene to show."""
+
+import dataclasses
+import functools
+from typing import Final
+
+import mujoco
+import numpy as np
+from jaxtyping import Float
+
+from mjx_study.render.motion import Motion
+from mjx_study.render.outline import VIEWS, View
+
+_SAMPLED_TIMES: Final = 100
+_SURROUNDINGS: Final = 0.35  # of the larger side: how far around the motion fixed things are still shown
+_MARGIN: Final = 0.06  # of the larger side
+_LONGEST: Final = 4.5  # ratio of the sides
+_EDGE_ON: Final = 0.05  # a plane is seen as a line where its normal is this near to the picture's plane
+
+
+@dataclasses.dataclass(frozen=True)
+class Bounds:
+    """A rectangle of the picture's plane [m]."""
+
+    low: Float[np.ndarray, " axes"]
+    high: Float[np.ndarray, " axes"]
+
+    @property
+    def size(self) -> Float[np.ndarray, " axes"]:
+        """Width and height [m]."""
+        return self.high - self.low
+
+    def united(self, other: "Bounds") -> "Bounds":
+        """The smallest rectangle around both."""
+        return Bounds(np.minimum(self.low, other.low), np.maximum(self.high, other.high))
+
+    def cut(self, other: "Bounds") -> "Bounds":
+        """The part inside another one, which this one must overlap."""
+        return Bounds(np.maximum(self.low, other.low), np.minimum(self.high, other.high))
+
+    def grown(self, distance: float) -> "Bounds":
+        """With a margin on every side [m]."""
+        return Bounds(self.low - distance, self.high + distance)
+
+    def overlaps(self, other: "Bounds") -> bool:
+        """Whether the two have a point in common."""
+        return bool(np.all(self.low <= other.high) and np.all(other.low <= self.high))
+
+
+def resolve_view(motion: Motion, name: str) -> View:
+    """A view by name; `auto` for `choose_view`. Raises ValueError, listing the choices, for an unknown name."""
+    if name == "auto":
+        return choose_view(motion)
+    if name not in VIEWS:
+        raise ValueError(f"unknown view {name!r}; choose from auto, {', '.join(VIEWS)}")
+    return VIEWS[name]
+
+
+def choose_view(motion: Motion) -> View:
+    """The view in whose plane most happens.
+
+    Along each axis: the room that the moving geoms take up plus the way that their farthest moved corner goes. What
+    is vertical counts twice, since a view from above hides contact with the ground. The axis with least is looked
+    along; of equal ones the one that keeps the vertical, and then y.
+    """
+    shown = motion.visible & motion.moving[motion.model.geom_bodyid] & ~_planes(motion.model)
+    corners = _corners(motion, shown) if shown.any() else motion.poses.centre[:, motion.moving]
+    if corners.size == 0:
+        return VIEWS["xz"]
+    score = np.ptp(corners, axis=(0, 1)) + np.ptp(corners, axis=0).max(axis=0)
+    gravity = np.abs(motion.model.opt.gravity)
+    vertical = int(np.argmax(gravity)) if gravity.any() else 2
+    score[vertical] *= 2
+    score[vertical] += 1e-3 * score.max()
+    score[1] -= 1e-6 * score.max()
+    return {1: VIEWS["xz"], 2: VIEWS["xy"], 0: VIEWS["yz"]}[int(np.argmin(score))]
+
+
+def bounds(motion: Motion, view: View) -> Bounds:
+    """What a picture of the whole motion shows: all that moves, with the fixed things around it."""
+    model, geoms, wanted = motion.model, motion.visible & ~_planes(motion.model), _wanted(motion)
+    fixed = [_swept(motion, np.arange(model.ngeom) == geom, view.plane) for geom in np.flatnonzero(geoms & ~wanted)]
+    if (geoms & wanted).any():
+        swept = _swept(motion, geoms & wanted, view.plane)
+    else:
+        swept = functools.reduce(Bounds.united, fixed) if fixed else Bounds(np.full(2, -0.5), np.full(2, 0.5))
+    side = max(swept.size.max(), 1e-3)
+    nearby = swept.grown(_SURROUNDINGS * side)
+    shown = swept
+    for other in fixed:
+        if nearby.overlaps(other):
+            shown = shown.united(other.cut(nearby))
+    for point, normal in edges(motion, view):
+        corners = np.array([[x, y] for x in (swept.low[0], swept.high[0]) for y in (swept.low[1], swept.high[1])])
+        distances = (corners - point) @ normal
+        nearest = corners[np.argmin(distances)] - distances.min() * normal
+        if distances.min() > 0 and nearby.overlaps(Bounds(nearest, nearest)):
+            shown = shown.united(Bounds(nearest, nearest))
+    shown = shown.grown(_MARGIN * max(shown.size.max(), 1e-3))
+    missing = np.maximum(shown.size.max() / _LONGEST - shown.size, 0) / 2
+    return Bounds(shown.low - missing, shown.high + missing)
+
+
+def depths(motion: Motion, view: View) -> tuple[float, float]:
+    """The farthest and the nearest point, towards the viewer, of what a picture must show [m]."""
+    along, geoms = int(np.argmax(np.abs(view.towards))), motion.visible & ~_planes(motion.model) & _wanted(motion)
+    if not geoms.any():
+        return 0.0, 0.0
+    box = _swept(motion, geoms, [along])
+    far, near = sorted((float(box.low[0] * view.towards[along]), float(box.high[0] * view.towards[along])))
+    return far, near
+
+
+def edges(motion: Motion, view: View) -> list[tuple[Float[np.ndarray, " 2"], Float[np.ndarray, " 2"]]]:
+    """A point and the unit normal of every visible plane that is seen edge on; MuJoCo's planes have no end."""
+    found = []
+    for geom in np.flatnonzero(motion.visible & _planes(motion.model)):
+        position, normal = motion.poses.position[0, geom], motion.poses.rotation[0, geom, :, 2]
+        if abs(normal @ view.towards) < _EDGE_ON:
+            flat = normal[view.plane]
+            found.append((position[view.plane], flat / np.linalg.norm(flat)))
+    return found
+
+
+def _planes(model: mujoco.MjModel) -> np.ndarray:
+    return model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
+
+
+def _corners(motion: Motion, geoms: np.ndarray) -> np.ndarray:
+    """Corners (times, points, 3) of the geoms' boxes at some of the times."""
+    times = motion.at(_SAMPLED_TIMES)
+    centre, half = motion.model.geom_aabb[geoms, :3], motion.model.geom_aabb[geoms, 3:]
+    signs = np.array(np.meshgrid(*[(-1.0, 1.0)] * 3)).reshape(3, 8).T
+    local = centre[:, None] + signs * half[:, None]
+    position, rotation = motion.poses.position[times][:, geoms], motion.poses.rotation[times][:, geoms]
+    return (position[:, :, None] + np.einsum("tgij,gcj->tgci", rotation, local)).reshape(len(times), -1, 3)
+
+
+def _wanted(motion: Motion) -> np.ndarray:
+    """Geoms that a picture must show: those that can move, and those in focus."""
+    return motion.moving[motion.model.geom_bodyid] | np.isin(np.arange(motion.model.ngeom), motion.focus)
+
+
+def _swept(motion: Motion, geoms: np.ndarray, axes: list[int]) -> Bounds:
+    """What some geoms, at least one, cover over the whole motion."""
+    model, poses = motion.model, motion.poses
+    rotation = poses.rotation[:, geoms][:, :, axes]
+    shift = np.einsum("tgij,gj->tgi", rotation, model.geom_aabb[geoms, :3])
+    centre = poses.position[:, geoms][:, :, axes] + shift
+    half = np.einsum("tgij,gj->tgi", np.abs(rotation), model.geom_aabb[geoms, 3:])
+    # MuJoCo's ball around a geom has the geom's centre: it bounds only a box that has the same.
+    centred = ~np.any(model.geom_aabb[geoms, :3], axis=1)
+    half = np.minimum(half, np.where(centred, model.geom_rbound[geoms], np.inf)[:, None])
+    return Bounds((centre - half).min(axis=(0, 1)), (centre + half).max(axis=(0, 1)))

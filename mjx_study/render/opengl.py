@@ -1,0 +1,170 @@
+"""A motion rendered by MuJoCo itself, in a process of its own, where OpenGL works."""
+
+import copy
+import functools
+import math
+import os
+import platform
+import subprocess
+import sys
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Final
+
+import mujoco
+import numpy as np
+from jaxtyping import Int, UInt8
+
+from mjx_study.render.drawing import Drawing, geom_colours
+from mjx_study.render.framing import depths
+
+RENDERERS: Final = ("auto", "drawing", "opengl")
+_WORKER: Final = Path(__file__).with_name("_opengl_worker.py")
+_PIXELS: Final = 640  # of the larger side
+_LONGEST: Final = 3.0  # ratio of the sides
+_ELEVATION: Final = {"xz": -12.0, "yz": -12.0, "xy": -89.0}
+_AZIMUTH: Final = {"xz": 90.0, "yz": 180.0, "xy": 90.0}
+_FIELD_OF_VIEW: Final = 20.0  # [degrees]; near enough to orthographic that spheres are round
+_SHADOW: Final = 2048  # most pixels of a shadow map; larger ones take seconds per image without a GPU
+_PROBE_SECONDS: Final = 30.0
+_PROBE: Final = """
+import mujoco
+model = mujoco.MjModel.from_xml_string("<mujoco><worldbody><geom size='.1'/></worldbody></mujoco>")
+data = mujoco.MjData(model)
+mujoco.mj_forward(model, data)
+renderer = mujoco.Renderer(model, 16, 16)
+renderer.update_scene(data)
+assert renderer.render().any(), "it renders nothing"
+renderer.close()
+"""
+
+
+class RenderError(ValueError):
+    """A picture that cannot be made on this machine, or in this way."""
+
+
+def resolve_renderer(name: str) -> str:
+    """`drawing` or `opengl`; auto is opengl where it works.
+
+    Raises:
+        ValueError: an unknown name.
+        RenderError: opengl where it does not work.
+    """
+    if name not in RENDERERS:
+        raise ValueError(f"unknown renderer {name!r}; choose from {', '.join(RENDERERS)}")
+    if name == "drawing":
+        return name
+    backend, reason = _backend(_chosen())
+    if backend is None and name == "opengl":
+        raise RenderError(f"MuJoCo's renderer does not work here ({reason}); use the renderer drawing")
+    return "drawing" if backend is None else "opengl"
+
+
+def images(
+    drawing: Drawing, indices: Int[np.ndarray, " frames"], renderer: str
+) -> UInt8[np.ndarray, "frames height width 3"] | None:
+    """MuJoCo's images at some of a motion's times, or None where it is to be drawn.
+
+    Raises:
+        ValueError: an unknown renderer.
+        RenderError: opengl was asked for by name and does not work here, or fails on this model.
+    """
+    if resolve_renderer(renderer) == "drawing":
+        return None
+    try:
+        return _render(drawing, indices)
+    except RenderError:
+        if renderer == "auto":
+            return None
+        raise
+
+
+def _render(drawing: Drawing, indices: np.ndarray) -> np.ndarray:
+    """Images from a free camera that looks the same way as the drawing."""
+    backend, _ = _backend(_chosen())
+    assert backend is not None, "the renderer has been resolved"
+    motion, view, shown = drawing.motion, drawing.view, drawing.bounds
+    width, height = _image_size(shown.size)
+    aspect, half_angle = width / height, math.radians(_FIELD_OF_VIEW) / 2
+    lookat = np.zeros(3)
+    lookat[view.plane] = (shown.low + shown.high) / 2
+    far, near = depths(motion, view)
+    lookat += (far + near) / 2 * view.towards
+    distance = max(shown.size[1], shown.size[0] / aspect) / 2 / math.tan(half_angle) + (near - far) / 2
+    model = copy.copy(motion.model)
+    model.geom_rgba[:] = np.where(model.geom_matid[:, None] < 0, geom_colours(motion), model.geom_rgba)
+    model.vis.global_.fovy = _FIELD_OF_VIEW
+    model.vis.quality.shadowsize = min(int(model.vis.quality.shadowsize), _SHADOW)
+    if model.nlight == 0:  # MuJoCo's headlight alone is dim
+        model.vis.headlight.ambient[:], model.vis.headlight.diffuse[:] = 0.55, 0.45
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        mujoco.mj_saveModel(model, str(folder / "model.mjb"), None)
+        np.savez(
+            folder / "request.npz",
+            qpos=motion.qpos[indices],
+            lookat=lookat,
+            distance=distance,
+            azimuth=_AZIMUTH[view.name],
+            elevation=_ELEVATION[view.name],
+            width=width,
+            height=height,
+        )
+        failure = _run([str(_WORKER), name], backend, timeout=None)
+        if failure is not None:
+            raise RenderError(f"MuJoCo's renderer failed ({failure}); use the renderer drawing")
+        return np.load(folder / "images.npy")
+
+
+def _chosen() -> str:
+    """The backend that the user asks for, or nothing."""
+    return os.environ.get("MUJOCO_GL", "").strip().lower()
+
+
+@functools.cache
+def _backend(chosen: str) -> tuple[str | None, str]:
+    """The first backend that renders a small scene, and why there is none; `chosen` is the user's MUJOCO_GL."""
+    reasons = []
+    for backend in [chosen] if chosen else _candidates(os.environ):
+        failure = _run(["-c", _PROBE], backend, timeout=_PROBE_SECONDS)
+        if failure is None:
+            return backend, ""
+        reasons.append(f"{backend or 'default'}: {failure}")
+    return None, "; ".join(reasons)
+
+
+def _candidates(environment: Mapping[str, str]) -> list[str]:
+    """Values of MUJOCO_GL to try; without a screen only EGL and OSMesa can work on Linux."""
+    if platform.system() != "Linux":
+        return [""]
+    screen = "DISPLAY" in environment or "WAYLAND_DISPLAY" in environment
+    return ["egl", "glfw", "osmesa"] if screen else ["egl", "osmesa"]
+
+
+def _run(arguments: list[str], backend: str, timeout: float | None) -> str | None:
+    """Run Python with an OpenGL backend, quietly; returns what went wrong, in one line, or None."""
+    command = [sys.executable, "-P", *arguments]
+    try:
+        done = subprocess.run(
+            command,
+            env=os.environ | {"MUJOCO_GL": backend},
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            errors="replace",
+            timeout=timeout,
+        )
+    except subprocess.TimeoutExpired:
+        return f"no answer in {timeout:g} s"
+    if done.returncode < 0:
+        return f"signal {-done.returncode}"
+    lines = done.stderr.strip().splitlines()
+    return None if done.returncode == 0 else (lines[-1] if lines else f"exit code {done.returncode}")
+
+
+def _image_size(size: np.ndarray) -> tuple[int, int]:
+    """Width and height in pixels, both even."""
+    ratio = float(np.clip(size[0] / size[1], 1 / _LONGEST, _LONGEST))
+    width, height = (_PIXELS, _PIXELS / ratio) if ratio >= 1 else (_PIXELS * ratio, _PIXELS)
+    return 2 * round(width / 2), 2 * round(height / 2)

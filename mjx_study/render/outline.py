@@ -1,0 +1,161 @@
+"""Outlines of geoms, as seen from afar along a coordinate axis."""
+
+import dataclasses
+from typing import Final
+
+import mujoco
+import numpy as np
+from jaxtyping import Float
+
+Geom = mujoco.mjtGeom
+_ANGLE: Final = np.linspace(0, 2 * np.pi, 97)[:-1]
+CIRCLE: Final = np.stack([np.cos(_ANGLE), np.sin(_ANGLE)], axis=1)
+"""Points of a unit circle; a drawn circle is this polygon."""
+_MESH_POINTS: Final = 400
+
+
+@dataclasses.dataclass(frozen=True)
+class View:
+    """An orthographic projection along a coordinate axis; axes are numbered 0, 1, 2 for x, y, z.
+
+    Attributes:
+        name: the two axes, horizontal first: `"xz"`.
+        right: the axis that points to the right.
+        up: the axis that points up.
+    """
+
+    name: str
+    right: int
+    up: int
+
+    @property
+    def plane(self) -> list[int]:
+        """The two axes of the picture."""
+        return [self.right, self.up]
+
+    @property
+    def towards(self) -> Float[np.ndarray, " 3"]:
+        """Unit vector from the scene to the viewer."""
+        unit = np.eye(3)
+        return np.cross(unit[self.right], unit[self.up])
+
+
+VIEWS: Final = {view.name: view for view in (View("xz", 0, 2), View("xy", 0, 1), View("yz", 1, 2))}
+
+
+@dataclasses.dataclass(frozen=True)
+class Shape:
+    """A geom in its own frame: the convex hull of points, every one with a ball of some radius around it [m].
+
+    Attributes:
+        points: corners, ends of an axis, or vertices.
+        radius: of the balls: 0 for a polyhedron.
+        semi_axes: of an ellipsoid, which is not such a hull; None for all others.
+        cell: largest distance between neighbouring points of a height field [m], which is seen as a profile and not as
+            its hull; None for all others.
+    """
+
+    points: Float[np.ndarray, "points 3"]
+    radius: float = 0.0
+    semi_axes: Float[np.ndarray, " 3"] | None = None
+    cell: float | None = None
+
+    def outline(
+        self, position: Float[np.ndarray, " 3"], rotation: Float[np.ndarray, "3 3"], view: View
+    ) -> Float[np.ndarray, "corners 2"]:
+        """Corners of the projection [m], counter-clockwise; curves are polygons inscribed in them."""
+        centre, projection = position[view.plane], rotation[view.plane]
+        if self.semi_axes is not None:
+            # The point of an ellipsoid A S^2 that is farthest along u is A A^T u / |A^T u|.
+            pulled = CIRCLE @ (projection * self.semi_axes)
+            return centre + pulled @ (projection * self.semi_axes).T / np.linalg.norm(pulled, axis=1, keepdims=True)
+        flat = centre + self.points @ projection.T
+        if self.cell is not None and projection[1, 2] > 0.9:
+            return _profile(flat)
+        if self.radius:
+            flat = (flat[:, None] + self.radius * CIRCLE).reshape(-1, 2)
+        return convex_hull(flat)
+
+    def slice(
+        self, position: Float[np.ndarray, " 3"], rotation: Float[np.ndarray, "3 3"], view: View, depth: float
+    ) -> "Shape":
+        """A height field cut where something stands: only the points near a depth, towards the viewer [m]."""
+        if self.cell is None:
+            return self
+        distance = np.abs((position + self.points @ rotation.T) @ view.towards - depth)
+        return dataclasses.replace(self, points=self.points[distance <= distance.min() + 0.5 * self.cell])
+
+
+def shape_of(model: mujoco.MjModel, geom: int) -> Shape | None:
+    """The shape of a geom; None for a plane, which has no outline."""
+    kind, size, mesh = Geom(model.geom_type[geom]), model.geom_size[geom], int(model.geom_dataid[geom])
+    ends = np.array([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]])
+    if kind == Geom.mjGEOM_SPHERE:
+        return Shape(np.zeros((1, 3)), radius=float(size[0]))
+    if kind == Geom.mjGEOM_CAPSULE:
+        return Shape(ends * size[1], radius=float(size[0]))
+    if kind == Geom.mjGEOM_ELLIPSOID:
+        return Shape(np.zeros((1, 3)), semi_axes=np.array(size))
+    if kind == Geom.mjGEOM_CYLINDER:
+        ring = np.pad(size[0] * CIRCLE, ((0, 0), (0, 1)))
+        return Shape(np.concatenate([ring + end * size[1] for end in ends]))
+    if kind == Geom.mjGEOM_BOX:
+        signs = np.array(np.meshgrid(*[(-1.0, 1.0)] * 3)).reshape(3, 8).T
+        return Shape(signs * size)
+    if kind in (Geom.mjGEOM_MESH, Geom.mjGEOM_SDF) and mesh >= 0:
+        start = int(model.mesh_vertadr[mesh])
+        return Shape(_extreme(model.mesh_vert[start : start + int(model.mesh_vertnum[mesh])].astype(float)))
+    if kind == Geom.mjGEOM_HFIELD:
+        spacing = 2 * model.hfield_size[mesh, :2] / (model.hfield_ncol[mesh] - 1, model.hfield_nrow[mesh] - 1)
+        return Shape(_terrain(model, mesh), cell=float(spacing.max()))
+    return None
+
+
+def convex_hull(points: Float[np.ndarray, "points 2"]) -> Float[np.ndarray, "corners 2"]:
+    """Corners of the convex hull in the plane, counter-clockwise (Andrew's monotone chain)."""
+    ordered = points[np.lexsort((points[:, 1], points[:, 0]))].tolist()
+
+    def chain(sequence: list[list[float]]) -> list[list[float]]:
+        kept: list[list[float]] = []
+        for x, y in sequence:
+            while len(kept) > 1:
+                (ax, ay), (bx, by) = kept[-2], kept[-1]
+                if (bx - ax) * (y - ay) > (by - ay) * (x - ax):
+                    break
+                kept.pop()
+            kept.append([x, y])
+        return kept[:-1]
+
+    return np.array(chain(ordered) + chain(ordered[::-1]) or ordered[:1])
+
+
+def _extreme(points: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, "kept 3"]:
+    """The points that are farthest in some direction, of a sample of directions where there are many points."""
+    if len(points) <= _MESH_POINTS:
+        return points
+    height = np.linspace(-1, 1, _MESH_POINTS)
+    turn = np.pi * (1 + 5**0.5) * np.arange(_MESH_POINTS)
+    across = np.sqrt(1 - height**2)
+    directions = np.stack([across * np.cos(turn), across * np.sin(turn), height], axis=1)
+    return points[np.unique(np.argmax(points @ directions.T, axis=0))]
+
+
+def _terrain(model: mujoco.MjModel, field: int) -> Float[np.ndarray, "points 3"]:
+    """Vertices of a height field, with a base under each."""
+    rows, columns, start = (int(part[field]) for part in (model.hfield_nrow, model.hfield_ncol, model.hfield_adr))
+    x, y, height, base = model.hfield_size[field]
+    data = model.hfield_data[start : start + rows * columns]
+    ys, xs = np.meshgrid(np.linspace(-y, y, rows), np.linspace(-x, x, columns), indexing="ij")
+    top = np.stack([xs.ravel(), ys.ravel(), height * data], axis=1)
+    return np.concatenate([top, top * (1, 1, 0) - (0, 0, base)])
+
+
+def _profile(points: Float[np.ndarray, "points 2"]) -> Float[np.ndarray, "corners 2"]:
+    """The highest point at each place along the horizontal, closed below."""
+    places = np.unique(np.round(points[:, 0], 6))
+    places = places[:: max(1, len(places) // 400)]
+    index = np.argmin(np.abs(points[:, :1] - places), axis=1)
+    highest = np.full(len(places), -np.inf)
+    np.maximum.at(highest, index, points[:, 1])
+    bottom = points[:, 1].min()
+    return np.array([[places[0], bottom], [places[-1], bottom], *np.stack([places, highest], axis=1)[::-1]])

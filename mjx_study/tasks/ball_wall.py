@@ -1,0 +1,90 @@
+"""Throwing a ball as far as possible, with a wall in its way: one launch angle.
+
+Lengths are ten times those of Suh et al. 2022 and speeds sqrt(10) times, which leaves the flight's shape alone; the
+cost is in the paper's lengths. In the paper the ball drops at the wall and stays where it lands; here floor and wall
+have friction 5, and the contact is well damped in the families without a damping ratio of their own. The wall is a
+`box`, or a box with a round top, the `dome`, on which the angle of the bounce varies without a jump; where the ball
+ends still jumps there, since friction holds one that grazes the top.
+"""
+
+from pathlib import Path
+from typing import Final
+
+import jax.numpy as jnp
+import mujoco
+from jaxtyping import Array, Float
+
+from mjx_study.dynamics import State, initial_state
+from mjx_study.policy import Launch
+from mjx_study.reference import BallWall, FunctionObjective
+from mjx_study.scene import SceneError, load_model, put_scene, require
+from mjx_study.task import Task
+
+HORIZON: Final = 400
+LENGTH_SCALE: Final = 10.0
+SPEED: Final = 1.0  # [m/s], in the paper's lengths
+ANGLE: Final = 0.1  # [rad]
+SIGMA: Final = 0.1  # [rad]
+DAMPING: Final = 100.0  # [N s/m]
+GAMMA: Final = 0.01
+VARIANTS: Final = ("box", "dome")
+
+
+def ball_wall(
+    variant: str = "box", *, horizon: int = HORIZON, model: str | Path = "ball_wall", **scene_options: str | float
+) -> Task:
+    """-(x / 10)^2 with x [m] where the ball ends.
+
+    Args:
+        variant: of the wall: box or dome.
+        horizon: number of 2 ms steps; the highest flight takes 330.
+        model: another MJCF in its place, with the slide joints `x`, `z` and the geoms `ball`, `wall`, `dome`.
+        **scene_options: see `load_scene`.
+
+    Raises:
+        ValueError: unknown variant.
+    """
+    if variant not in VARIANTS:
+        raise ValueError(f"unknown variant {variant!r} of ball_wall; choose from {', '.join(VARIANTS)}")
+    host = load_model(model, **scene_options)
+    if variant == "dome":
+        _raise_dome(host)
+    scene = put_scene(host, "ball_wall")
+    require(scene, joints=("x", "z"), geoms=("ball", "wall", "dome"), sizes=(2, 2, 0))
+    dtype = scene.template.qpos.dtype
+    speed = SPEED * LENGTH_SCALE**0.5
+
+    def launched(start: State, decision: Float[Array, " params"]) -> State:
+        direction = jnp.stack([jnp.cos(decision[0]), jnp.sin(decision[0])])
+        return State(start.qpos, speed * direction, start.act, start.warmstart)
+
+    return Task(
+        name="ball_wall" if variant == "box" else f"ball_wall:{variant}",
+        description=f"throw a ball far, with a wall ({variant}) in its way; one launch angle",
+        scene=scene,
+        horizon=horizon,
+        policy=Launch(1, horizon, scene.host.nu, launched),
+        theta=jnp.full(1, ANGLE, dtype),
+        sigma=SIGMA,
+        start=initial_state(scene),
+        running_cost=lambda state, control: jnp.zeros((), dtype),
+        final_cost=lambda state: -((state.qpos[0] / LENGTH_SCALE) ** 2),
+        contact_pair=("ball", "wall"),
+        gamma=GAMMA,
+        reference=lambda stiffness: FunctionObjective(BallWall(), SIGMA),
+        damping=DAMPING,
+        span=(0.0, 1.5),
+        stiffnesses=(1000.0, 3000.0, 10000.0),
+    )
+
+
+def _raise_dome(host: mujoco.MjModel) -> None:
+    """Lower the wall by the dome's radius and let the dome collide and be seen."""
+    wall, dome = (mujoco.mj_name2id(host, mujoco.mjtObj.mjOBJ_GEOM, name) for name in ("wall", "dome"))
+    if min(wall, dome) < 0:
+        raise SceneError("the model of ball_wall needs the geoms wall and dome")
+    radius = host.geom_size[dome, 0]
+    host.geom_size[wall, 2] -= radius / 2
+    host.geom_pos[wall, 2] -= radius / 2
+    host.geom_contype[dome] = host.geom_conaffinity[dome] = 1
+    host.geom_rgba[dome, 3] = 1

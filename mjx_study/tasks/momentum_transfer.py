@@ -1,0 +1,70 @@
+"""Hitting a pivoting bar with a ball so that it turns as fast as possible: one launch angle.
+
+The lever arm grows with the angle up to 45 degrees, past which the ball misses: the best angle lies at the edge of a
+cliff. The bar's angular momentum is measured in units of m v d, so a bar that does not give way and an inelastic hit
+give the -sin^2 theta of Suh et al. 2022. An undamped spring is elastic, which doubles the momentum, and the real bar
+gives way a little: `MomentumTransfer` has both. The bar points up only, so below 0 the ball misses here and not there.
+"""
+
+from pathlib import Path
+from typing import Final
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from mjx_study.dynamics import State, initial_state
+from mjx_study.policy import Launch
+from mjx_study.reference import FunctionObjective, MomentumTransfer
+from mjx_study.scene import load_scene, require
+from mjx_study.task import Task
+
+HORIZON: Final = 400
+SPEED: Final = 2.0  # [m/s]
+DISTANCE: Final = 0.7  # from the start to where the ball's centre meets the bar [m]
+ANGLE: Final = 0.1  # [rad]
+SIGMA: Final = 0.02  # [rad]
+GAMMA: Final = 0.2
+BALL, BAR = 1, 2  # bodies
+
+
+def momentum_transfer(
+    *, horizon: int = HORIZON, model: str | Path = "momentum_transfer", **scene_options: str | float
+) -> Task:
+    """-(I omega / (m v d))^2 with I omega the bar's angular momentum at the end.
+
+    Args:
+        horizon: number of 2 ms steps; the ball arrives within 250.
+        model: another MJCF in its place, with the slide joints `x`, `y`, the hinge `pivot` and the geoms `ball`, `bar`.
+        **scene_options: see `load_scene`.
+    """
+    scene = load_scene(model, **scene_options)
+    require(scene, joints=("x", "y", "pivot"), geoms=("ball", "bar"), sizes=(3, 3, 0))
+    dtype = scene.template.qpos.dtype
+    mass, inertia = float(scene.host.body_mass[BALL]), float(scene.host.body_inertia[BAR, 2])
+    unit = mass * SPEED * DISTANCE  # [kg m^2/s]
+
+    def launched(start: State, decision: Float[Array, " params"]) -> State:
+        velocity = SPEED * jnp.stack([jnp.cos(decision[0]), jnp.sin(decision[0]), jnp.zeros_like(decision[0])])
+        return State(start.qpos, velocity, start.act, start.warmstart)
+
+    def reference(stiffness: float) -> FunctionObjective:
+        function = MomentumTransfer(restitution=1.0, inertia_ratio=mass * DISTANCE**2 / inertia)
+        return FunctionObjective(function, SIGMA)
+
+    return Task(
+        name="momentum_transfer",
+        description="hit a pivoting bar as hard as possible with a ball; one launch angle",
+        scene=scene,
+        horizon=horizon,
+        policy=Launch(1, horizon, scene.host.nu, launched),
+        theta=jnp.full(1, ANGLE, dtype),
+        sigma=SIGMA,
+        start=initial_state(scene),
+        running_cost=lambda state, control: jnp.zeros((), dtype),
+        final_cost=lambda state: -((inertia * state.qvel[2] / unit) ** 2),
+        contact_pair=("ball", "bar"),
+        gamma=GAMMA,
+        reference=reference,
+        span=(0.0, 1.0),
+        stiffnesses=(3000.0, 10000.0, 30000.0),
+    )

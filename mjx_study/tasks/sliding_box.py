@@ -1,0 +1,69 @@
+"""Dragging a box by friction: an open-loop force on a block that stands on it.
+
+Suh et al. 2022 write the friction as clip(1.8 v, +-0.18) N of the slip v while the block is above the box, and nothing
+past the edge. Here it is MuJoCo's Coulomb cone with the same limit, mu m g = 0.18 N, and the contact's damping in place
+of the slope: 1.8 N s/m in the families without a damping ratio. The block's height is a coordinate, so it is pressed on
+the box by its weight alone and really falls past the edge. Numbers and horizon are the published example's.
+"""
+
+from pathlib import Path
+from typing import Final
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from mjx_study.dynamics import State, initial_state
+from mjx_study.policy import OpenLoop
+from mjx_study.reference import ReferenceObjective, SlidingBox
+from mjx_study.scene import load_scene, require
+from mjx_study.task import Task
+
+HORIZON: Final = 400
+GOAL: Final = (2.0, 2.0, 0.0, 0.0)  # block and box: positions [m], velocities [m/s]
+STATE_WEIGHT: Final = (0.1, 10.0, 0.1, 0.1)
+CONTROL_WEIGHT: Final = 1.0  # [1/N^2]
+SIGMA: Final = 0.1  # [N]
+SLIP_DAMPING: Final = 1.8  # [N s/m]
+GAMMA: Final = 2e4
+BLOCK, BOX = 0, 2  # among the coordinates block, height, box
+
+
+def sliding_box(*, horizon: int = HORIZON, model: str | Path = "sliding_box", **scene_options: str | float) -> Task:
+    """sum_h e_h^T Q e_h + R u_h^2 + e_{H+1}^T Q e_{H+1}, e the horizontal state minus the goal.
+
+    Args:
+        horizon: number of 5 ms steps.
+        model: another MJCF in its place, with the slide joints `block`, `height`, `box` in this order.
+        **scene_options: see `load_scene`.
+    """
+    scene = load_scene(model, **scene_options)
+    require(scene, joints=("block", "height", "box"), geoms=("foot", "box"), sizes=(3, 3, 1))
+    dtype = scene.template.qpos.dtype
+    weight, goal = np.array(STATE_WEIGHT, dtype), np.array(GOAL, dtype)
+
+    def state_cost(state: State) -> Float[Array, ""]:
+        kept = np.array([BLOCK, BOX])
+        error = jnp.concatenate([state.qpos[kept], state.qvel[kept]]) - goal
+        return jnp.sum(weight * error**2)
+
+    def running_cost(state: State, control: Float[Array, " nu"]) -> Float[Array, ""]:
+        return state_cost(state) + CONTROL_WEIGHT * jnp.sum(control**2)
+
+    return Task(
+        name="sliding_box",
+        description="drag a box by friction; 400 open-loop forces",
+        scene=scene,
+        horizon=horizon,
+        policy=OpenLoop(horizon, scene.host.nu),
+        theta=jnp.zeros(horizon * scene.host.nu, dtype),
+        sigma=SIGMA,
+        start=initial_state(scene),
+        running_cost=running_cost,
+        final_cost=state_cost,
+        contact_pair=("foot", "box"),
+        gamma=GAMMA,
+        reference=lambda stiffness: ReferenceObjective(SlidingBox(), (0.0, 0.0, 0.0, 0.0), horizon, SIGMA),
+        damping=SLIP_DAMPING,
+        stiffnesses=(100.0, 200.0, 500.0, 1000.0),
+    )

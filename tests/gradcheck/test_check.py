@@ -1,0 +1,215 @@
+"""The check passes what is right, and finds, names and explains what is not."""
+
+import json
+from pathlib import Path
+
+import jax
+import mujoco
+import pytest
+
+from mjx_study import cli, dynamics
+from mjx_study.cli import options
+from mjx_study.gradcheck import Finding, GradcheckReport, gradcheck, plan_gradcheck, plan_scene_gradcheck
+from mjx_study.scene import load_scene, put_scene
+from mjx_study.tasks import make_task
+from tests.scenes import plain_warm_start
+
+CONVERGED = 'iterations="100" ls_iterations="50"'
+BALL = (
+    '<body name="ball"><joint name="{name}" type="slide" axis="{axis}"/><geom name="ball" size=".1" mass="1"/></body>'
+)
+
+
+def check(xml: str, *families: str, states: int = 1, **options: object) -> GradcheckReport:
+    """The report on a scene."""
+    scene = put_scene(mujoco.MjModel.from_xml_string(f"<mujoco>{xml}</mujoco>"), "scene")
+    plan = plan_scene_gradcheck(scene, families or None, seed=0, states=states, horizon=20, **options)  # type: ignore[arg-type]
+    return gradcheck(plan)
+
+
+def only(report: GradcheckReport, verdict: str) -> Finding:
+    """The one finding of a verdict."""
+    (finding,) = [finding for finding in report.findings if finding.verdict == verdict]
+    return finding
+
+
+@pytest.fixture
+def configured(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The tests' own settings stand: JAX takes its devices once per process."""
+    monkeypatch.setattr(options, "configure", lambda **_: None)
+
+
+@pytest.mark.usefixtures("configured")
+def test_the_pusher_is_right(capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["gradcheck", "pusher", "--horizon", "12", "--stiffness", "100", "--states", "2"]
+    assert cli.main([*arguments, "--contact", "penalty,mujoco_default", "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["passed"] is True
+    penalty, default = document["costs"]
+    assert penalty["verdict"] == default["verdict"] == "right"
+    assert penalty["closed_form"] < 1e-3 and default["closed_form"] is None
+    for cost in (penalty, default):
+        assert cost["modes"] < 1e-10 and cost["difference"] < 1e-6 and cost["residual"] < 1e-9
+    for step in document["steps"]:
+        assert step["modes"] < 1e-10 and step["differences"] < 1e-6 and step["parameters"] < 1e-6
+        assert step["engine_step"] < 1e-8 and step["engine"] < 1e-5
+
+
+@pytest.mark.usefixtures("configured")
+def test_a_wrong_derivative_is_found(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    right = dynamics.step_jacobian
+
+    def slightly_wrong(*arguments):
+        over_step, over_qacc = right(*arguments)
+        return over_step * (1 + 1e-4), over_qacc
+
+    monkeypatch.setattr(dynamics, "step_jacobian", slightly_wrong)
+    arguments = ["gradcheck", "pusher", "--horizon", "6", "--stiffness", "100", "--contact", "penalty", "--states", "1"]
+    assert cli.main(arguments) == 1
+    printed = capsys.readouterr().out
+    assert "wrong" in printed and "SOMETHING IS WRONG" in printed
+
+
+def test_a_kink_is_told_from_a_wrong_derivative() -> None:
+    """Without a first push the bodies rest exactly at the onset of contact, where a difference straddles it."""
+    task = make_task("pusher", horizon=6)
+    task = task.replace(theta=task.theta.at[0].set(0.0))
+    report = gradcheck(plan_gradcheck(task, ["mujoco"], [100.0], seed=0, states=1))
+    assert report.passed and report.steps[0].verdict == "kink"
+    assert all("onset" in finding.cause for finding in report.findings), report.findings
+    assert any(line.startswith("kink:") for line in report.lines())
+
+
+def test_a_jump_is_told_from_a_wrong_derivative() -> None:
+    """MuJoCo's default contact begins with its damping force: a ball that arrives with speed meets a jump."""
+    falling = BALL.format(name="z", axis="0 0 1").replace("<body", '<body pos="0 0 .1"')
+    key = '<keyframe><key qpos="0" qvel="-1"/></keyframe>'
+    floor = '<geom name="floor" type="plane" size="1 1 1"/>'
+    report = check(f"<option {CONVERGED}/><worldbody>{floor}{falling}</worldbody>{key}")
+    jump = only(report, "jump")
+    assert "floor and ball is at its onset" in jump.cause, jump.cause
+    assert report.passed and "d qvel[z] / d qpos[z]" in {entry.name for entry in jump.entries}
+
+
+def test_a_control_at_its_bound_is_a_kink() -> None:
+    motor = '<actuator><motor name="push" joint="x" ctrlrange="0 1" ctrllimited="true"/></actuator>'
+    world = f"<worldbody>{BALL.format(name='x', axis='1 0 0')}</worldbody>"
+    report = check(world + motor)
+    assert only(report, "kink").cause == "a control is at the end of its range, where MuJoCo clips it"
+    assert {entry.name for entry in only(report, "kink").entries} == {
+        "d qpos[x] / d ctrl[push]",
+        "d qvel[x] / d ctrl[push]",
+    }
+
+
+def test_a_silent_zero_fails() -> None:
+    tendon = '<tendon><spatial stiffness="100" springlength="0"><site site="a"/><site site="b"/></spatial></tendon>'
+    body = '<body><joint name="y" type="slide" axis="0 1 0"/><geom size=".1" mass="1"/><site name="b"/></body>'
+    report = check(f'<worldbody><site name="a"/>{body}</worldbody>{tendon}')
+    zero = only(report, "zero")
+    assert not report.passed and zero.fails and "tendon of no length" in zero.cause
+    assert report.lines()[-1] == "SOMETHING IS WRONG: see above"
+
+
+def test_a_nan_fails_in_the_mode_that_has_it() -> None:
+    tendon = '<tendon><fixed name="t" actuatorfrcrange="-1 1"><joint joint="x" coef="1"/></fixed></tendon>'
+    far = '<geom type="plane" size="1 1 1" pos="0 0 -9"/>'  # with contacts, reverse mode is checked on the tape as well
+    world = f"<worldbody>{far}{BALL.format(name='x', axis='1 0 0')}</worldbody>"
+    report = check(f'{world}{tendon}<actuator><motor name="push" tendon="t"/></actuator>')
+    nan = only(report, "nan")
+    assert not report.passed and nan.modes == ("tape",) and "limited actuator force" in nan.cause
+
+
+def test_an_unconverged_solve_is_told_from_a_wrong_derivative() -> None:
+    """One iteration on two contacts that compete; given its budget, the same scene is right."""
+    sliding = (
+        '<geom type="plane" size="1 1 1"/><body pos="0 0 .0996"><joint name="z" type="slide" axis="0 0 1"/>'
+        '<joint name="x" type="slide" axis="1 0 0"/><joint name="turn" axis="0 1 0"/><geom size=".1" mass="1"/>'
+        '<geom size=".1" pos=".3 0 0" mass="1"/></body>'
+    )
+    key = '<keyframe><key qpos="0 0 0" qvel="-.1 .3 .2"/></keyframe>'
+    with plain_warm_start():  # which would solve so few coordinates by itself
+        short = check(f'<option solver="CG" iterations="1" ls_iterations="2"/><worldbody>{sliding}</worldbody>{key}')
+    assert not short.passed and {f.verdict for f in short.findings if f.fails} == {"unconverged"}
+    assert all("iterations=1 and ls_iterations=2" in finding.cause for finding in short.findings if finding.fails)
+    whole = check(f'<option solver="CG" {CONVERGED}/><worldbody>{sliding}</worldbody>{key}')
+    assert whole.passed and whole.steps[0].residual < 1e-9
+
+
+def test_contacts_placed_differently_are_reported_and_do_not_fail() -> None:
+    """MuJoCo and MJX pick other points of the area in which two boxes touch."""
+    boxes = (
+        '<geom name="table" type="box" size="1 1 .1" pos="0 0 -.1"/><body pos="0 0 .099" euler="0 0 20">'
+        '<joint name="z" type="slide" axis="0 0 1"/><joint name="tilt" axis="0 1 0"/>'
+        '<geom name="box" type="box" size=".1 .2 .1" mass="1"/></body>'
+    )
+    key = '<keyframe><key qpos="0 .0005" qvel="0 .1"/></keyframe>'
+    report = check(f"<option {CONVERGED}/><worldbody>{boxes}</worldbody>{key}")
+    placement = only(report, "placement")
+    assert report.passed and not placement.fails and "table and box" in placement.cause
+    assert report.steps[0].engine is None  # another step has another derivative
+
+
+def test_stock_derivatives_are_checked_apart() -> None:
+    """MJX takes the derivative of a rotation at rest as zero: a finding that is not the project's."""
+    world = '<worldbody><body><joint name="ball" type="ball"/><geom size=".1" mass="1"/></body></worldbody>'
+    report = check(world, stock=True)
+    zero = only(report, "zero")
+    assert report.passed and zero.who == "mjx.step" and "norm of its angular velocity" in zero.cause
+    assert report.steps[0].verdict == "right" and report.steps[0].stock == pytest.approx(1.0)
+
+
+def test_a_stiffness_needs_the_pair_that_it_acts_on() -> None:
+    scene = load_scene("pusher")
+    for arguments in ((["penalty"], None), (["mujoco_default"], [10.0]), (["penalty"], [10.0])):
+        with pytest.raises(ValueError, match="--pair"):
+            plan_scene_gradcheck(scene, *arguments, seed=0)
+    plan = plan_scene_gradcheck(scene, ["penalty"], [10.0, 100.0], seed=0, pair=("pusher", "slider"))
+    assert [cell.stiffness for cell in plan.cells] == [10.0, 100.0]
+    with pytest.raises(ValueError, match="no geom 'nothing'"):
+        plan_scene_gradcheck(scene, ["penalty"], [10.0], seed=0, pair=("pusher", "nothing"))
+
+
+def test_plans_refuse_what_cannot_be_checked() -> None:
+    task = make_task("pusher", horizon=3)
+    with jax.enable_x64(False):
+        single = make_task("pusher", horizon=3)
+    with pytest.raises(ValueError, match="needs float64"):
+        plan_gradcheck(single, ["penalty"], [10.0], seed=0)
+    with pytest.raises(ValueError, match="no contact model"):
+        plan_gradcheck(task, [], [10.0], seed=0)
+    with pytest.raises(ValueError, match="states must be at least 1"):
+        plan_gradcheck(task, ["penalty"], [10.0], seed=0, states=0)
+    fixed = put_scene(
+        mujoco.MjModel.from_xml_string('<mujoco><worldbody><geom size="1"/></worldbody></mujoco>'), "stone"
+    )
+    with pytest.raises(ValueError, match="no degree of freedom"):
+        plan_scene_gradcheck(fixed, seed=0)
+
+
+@pytest.mark.usefixtures("configured")
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["pusher", "--pair", "a,b"], "--pair is for files"),
+        (["FILE", "--pair", "a"], "names of two geoms, got 1"),
+        (["FILE", "--model", "FILE"], "a file already"),
+        (["FILE", "--contact", "penalty"], "give --stiffness in N/m, and --pair"),
+        (["FILE", "--stiffness", "100"], "give --pair GEOM,GEOM"),
+        (["missing.xml"], "missing.xml"),
+        (["broken.xml"], "broken.xml"),
+    ],
+)
+def test_bad_requests_are_said_in_a_line(
+    arguments: list[str],
+    message: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "ball.xml").write_text(f"<mujoco><worldbody>{BALL.format(name='x', axis='1 0 0')}</worldbody></mujoco>")
+    (tmp_path / "broken.xml").write_text("<mujoco><worldbody>")
+    assert cli.main(["gradcheck", *(part.replace("FILE", "ball.xml") for part in arguments)]) == 2
+    printed = capsys.readouterr()
+    assert message in printed.err and printed.err.count("\n") == 1 and printed.out == ""

@@ -1,0 +1,117 @@
+"""Every verdict on an entry, and where each begins."""
+
+from functools import cache
+
+import mujoco
+import numpy as np
+import pytest
+
+from mjx_study.gradcheck import diagnosis
+from mjx_study.gradcheck.coordinates import Coordinates, coordinates
+from mjx_study.gradcheck.diagnosis import VERDICTS, judge, modes_apart, worst_verdict
+from mjx_study.gradcheck.differences import Differences
+from mjx_study.scene import put_scene
+
+CART = """<mujoco><worldbody><body name="cart"><joint name="x" type="slide" axis="1 0 0"/><geom size=".1"/></body>
+</worldbody><actuator><motor name="push" joint="x"/></actuator></mujoco>"""
+
+
+@cache
+def layout() -> Coordinates:
+    """One slide joint and one motor: outputs (qpos, qvel), inputs (qpos, qvel, ctrl)."""
+    return coordinates(put_scene(mujoco.MjModel.from_xml_string(CART), "cart"), None)
+
+
+TRUE = np.array([[1.0, 0.01, 1e-4], [0.5, 1.0, 0.01]])
+
+
+def verdict(
+    entry: float,
+    *,
+    value: float = 0.5,
+    uncertainty: float = 0.0,
+    gap: float = 0.0,
+    kink: bool = False,
+    jump: bool = False,
+    converged: float | None = None,
+) -> str:
+    """The verdict on d qvel / d qpos, everything else right."""
+    derivative, truth = TRUE.copy(), TRUE.copy()
+    derivative[1, 0], truth[1, 0] = entry, value
+    there = np.zeros_like(TRUE)
+    there[1, 0] = 1
+    exact = None
+    if converged is not None:
+        exact = TRUE.copy()
+        exact[1, 0] = converged
+    found = Differences(truth, uncertainty * there, gap * there, (kink * there) > 0, (jump * there) > 0)
+    codes = judge(layout(), derivative, found, exact).codes
+    assert (np.delete(codes, 3) == diagnosis.RIGHT).all()
+    return VERDICTS[codes[1, 0]]
+
+
+def test_names_of_the_layout() -> None:
+    assert [str(source) for source in layout().inputs] == ["qpos[x]", "qvel[x]", "ctrl[push]"]
+    assert [str(output) for output in layout().outputs] == ["qpos[x]", "qvel[x]"]
+
+
+def test_right_within_the_tolerance_and_the_uncertainty() -> None:
+    assert verdict(0.5) == "right"
+    assert verdict(0.5 * (1 + 0.9e-6)) == "right"
+    assert verdict(0.5 * (1 + 1.1e-5)) == "wrong"
+    assert verdict(0.51, uncertainty=0.004) == "right"
+
+
+def test_wrong() -> None:
+    assert verdict(0.51) == "wrong"
+
+
+def test_nan() -> None:
+    assert verdict(float("nan")) == "nan"
+    assert verdict(float("inf")) == "nan"
+    assert verdict(float("nan"), kink=True, jump=True, gap=1.0) == "nan"  # nothing excuses it
+
+
+def test_a_silent_zero() -> None:
+    assert verdict(0.0) == "zero"
+    assert verdict(0.0, value=0.0) == "right"
+
+
+def test_a_kink_excuses_a_derivative_between_its_slopes() -> None:
+    assert verdict(0.75, kink=True, gap=0.5) == "kink"
+    assert verdict(2.0, kink=True, gap=0.5) == "wrong"
+    # zero is one of the slopes 0 and 1, and none of the slopes 0.4 and 0.6
+    assert verdict(0.0, kink=True, gap=1.0) == "kink"
+    assert verdict(0.0, kink=True, gap=0.2) == "zero"
+
+
+def test_a_jump_excuses_any_derivative() -> None:
+    assert verdict(7.0, jump=True) == "jump"
+    assert verdict(0.0, jump=True) == "jump"
+
+
+def test_an_unconverged_solve_is_told_from_a_wrong_derivative() -> None:
+    assert verdict(0.51, converged=0.5) == "unconverged"
+    assert verdict(0.51, converged=0.51) == "wrong"
+
+
+def test_the_error_leaves_out_what_differences_do_not_resolve() -> None:
+    none, never = np.zeros_like(TRUE), np.zeros(TRUE.shape, bool)
+    truth = Differences(TRUE * (1 + 1e-7), none, none, never, never)
+    assert judge(layout(), TRUE, truth).error == pytest.approx(1e-7, rel=1e-3)
+    vague = np.full_like(TRUE, 1e-3)
+    assert judge(layout(), TRUE, Differences(truth.value, vague, none, never, never)).error == 0.0
+
+
+def test_modes_are_compared_by_rows_and_blocks() -> None:
+    other = TRUE.copy()
+    assert modes_apart(layout(), TRUE, other) == 0
+    other[1, 2] *= 1 + 1e-5
+    assert modes_apart(layout(), TRUE, other) == pytest.approx(1e-5, rel=1e-3)
+    other[1, 2] = np.nan  # a finding of its own
+    assert modes_apart(layout(), TRUE, other) == 0
+
+
+def test_the_gravest_verdict() -> None:
+    assert worst_verdict([]) == "right"
+    assert worst_verdict(["kink", "zero", "jump"]) == "zero"

@@ -1,0 +1,76 @@
+"""Differences over a ladder of steps find the derivative, or what is there in its place."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from mjx_study.gradcheck.differences import RATIO, SIZES, Differences, differences, moves
+
+
+def read(function: Callable[[np.ndarray], np.ndarray], noise: float = 0.0) -> Differences:
+    """Differences of a function of one variable at zero, with rounding of a given size."""
+    points = moves(np.ones((1, 1)))[:, 0]
+    random = np.random.default_rng(0)
+    return differences((function(points) + noise * random.normal(size=points.shape))[:, None])
+
+
+def test_moves_are_the_ladder_both_ways() -> None:
+    changes = moves(np.eye(2))
+    assert changes.shape == (1 + 2 * 2 * len(SIZES), 2)
+    assert not changes[0].any() and changes[1].tolist() == [SIZES[0], 0] and changes[2].tolist() == [0, SIZES[0]]
+    np.testing.assert_array_equal(changes[1 : 1 + 2 * len(SIZES)], -changes[1 + 2 * len(SIZES) :])
+
+
+@pytest.mark.parametrize("length", [1.0, 1e-2, 1e-3])
+def test_a_smooth_function(length: float) -> None:
+    """Down to the finest structure of MuJoCo's contact, a millimetre."""
+    found = read(lambda x: np.exp(x / length), noise=1e-15)
+    assert found.value[0, 0] * length == pytest.approx(1, abs=1e-6 * length**-0.5)
+    assert abs(found.value[0, 0] - 1 / length) <= 3 * found.uncertainty[0, 0]
+    assert not found.kink[0, 0] and not found.jump[0, 0]
+
+
+def test_many_outputs_and_columns_keep_their_places() -> None:
+    matrix = np.random.default_rng(1).normal(size=(3, 2))
+    found = differences(moves(np.eye(2)) @ matrix.T)
+    assert found.value.shape == (3, 2)
+    np.testing.assert_allclose(found.value, matrix, rtol=1e-9)
+
+
+@pytest.mark.parametrize("scale", [1e-4, 1.0, 1e3])
+def test_a_kink(scale: float) -> None:
+    found = read(lambda x: scale * (np.abs(x) + 0.5 * x), noise=1e-16 * scale)
+    assert found.kink[0, 0] and not found.jump[0, 0]
+    assert found.value[0, 0] == pytest.approx(0.5 * scale, rel=1e-6)  # the mean of the slopes
+    assert found.gap[0, 0] == pytest.approx(2 * scale, rel=1e-6)
+
+
+def test_a_kink_with_curvature() -> None:
+    found = read(lambda x: np.where(x > 0, np.expm1(300 * x), 0.0))
+    assert found.kink[0, 0] and not found.jump[0, 0]
+    assert found.gap[0, 0] == pytest.approx(300, rel=1e-3)
+
+
+def test_a_kink_nearby_is_none_here() -> None:
+    """Where short steps do not reach it, there is a derivative."""
+    found = read(lambda x: 2 * x + np.maximum(x - 2e-6, 0.0), noise=1e-17)
+    assert not found.kink[0, 0] and not found.jump[0, 0]
+    assert found.value[0, 0] == pytest.approx(2, rel=1e-6)
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+@pytest.mark.parametrize("size", [1e-6, 1.0])
+def test_a_jump(side: str, size: float) -> None:
+    found = read(lambda x: np.where(x > 0 if side == "right" else x >= 0, size, 0.0) + x)
+    assert found.jump[0, 0] and not found.kink[0, 0]
+
+
+def test_rounding_is_no_jump() -> None:
+    found = read(lambda x: np.ones_like(x), noise=1e-16)
+    assert not found.jump[0, 0] and not found.kink[0, 0]
+    assert abs(found.value[0, 0]) <= found.uncertainty[0, 0]
+
+
+def test_the_ladder_ends_below_what_a_contact_can_show() -> None:
+    assert SIZES[-1] < 1e-6 and SIZES[0] / SIZES[1] == pytest.approx(RATIO)

@@ -1,0 +1,66 @@
+"""One table of the scalar functions, each at a generic point with a generic noise level."""
+
+import dataclasses
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from mjx_study.reference import (
+    BallWall,
+    Function,
+    Heaviside,
+    Jump,
+    MomentumTransfer,
+    Quadratic,
+    RelaxedHeaviside,
+    ScalarFunction,
+)
+
+
+class FunctionCase(NamedTuple):
+    """A function, theta and sigma."""
+
+    function: Function
+    theta: np.ndarray
+    sigma: float
+
+
+FUNCTIONS = {
+    "heaviside": FunctionCase(Heaviside(), np.array([0.3]), 0.6),
+    "relaxed_heaviside": FunctionCase(RelaxedHeaviside(0.2), np.array([0.3]), 0.6),
+    "ball_wall": FunctionCase(BallWall(), np.array([0.65]), 0.1),
+    "ball_wall, far": FunctionCase(BallWall(distance=0.2), np.array([0.65]), 0.1),
+    "ball_wall, high": FunctionCase(BallWall(height=0.05), np.array([0.4]), 0.1),
+    "momentum_transfer": FunctionCase(MomentumTransfer(), np.array([0.75]), 0.1),
+    "momentum_transfer, heavy ball": FunctionCase(
+        MomentumTransfer(edge=1.0, restitution=0.6, inertia_ratio=0.3), np.array([-0.9]), 0.2
+    ),
+}
+QUADRATIC = FunctionCase(
+    Quadratic(np.array([[1.0, 0.4, 0.0], [0.4, -0.5, 0.3], [0.0, 0.3, 0.8]]), np.array([0.3, -1.0, 0.5]), 2.0),
+    np.array([1.5, -2.0, 1.0]),
+    0.7,
+)
+JUMPING = ("heaviside", "ball_wall", "momentum_transfer", "momentum_transfer, heavy ball")
+
+
+@dataclasses.dataclass(frozen=True)
+class WithoutClosedForm:
+    """A scalar function whose closed form is hidden, so that quadrature has to do."""
+
+    function: ScalarFunction
+    num_params: int = 1
+    period: float = math.inf
+
+    def value(self, x: np.ndarray) -> np.ndarray:
+        return self.function.value(x)
+
+    def gradient(self, x: np.ndarray) -> np.ndarray:
+        return self.function.gradient(x)
+
+    def jumps(self) -> tuple[Jump, ...]:
+        return self.function.jumps()
+
+    def breakpoints(self) -> tuple[float, ...]:
+        return self.function.breakpoints()

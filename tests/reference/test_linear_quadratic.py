@@ -1,0 +1,89 @@
+"""The linear-quadratic system: its closed forms against rollouts and samples."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from estimators import first_order, zeroth_order
+from mjx_study.reference import LinearQuadratic, ReferenceObjective, roll_out, value_and_gradient
+from tests.estimators.statistics_helpers import assert_mean_is, assert_variance_is
+from tests.reference.systems import linear_quadratic
+
+HORIZON, SIGMA, SAMPLES = 4, 0.3, 100_000
+SYSTEM = linear_quadratic()
+START = (1.0, -0.5, 0.7)
+RNG = np.random.default_rng(0)
+CONTROLS = RNG.standard_normal((HORIZON, 2))
+OBJECTIVE = ReferenceObjective(SYSTEM, START, HORIZON, SIGMA)
+
+
+def keys(seed: int):
+    return jax.random.split(jax.random.key(seed), SAMPLES)
+
+
+def test_the_quadratic_form_is_the_rollout_s_cost():
+    square, linear, constant = SYSTEM.quadratic_form(np.array(START), HORIZON)
+    for _ in range(3):
+        controls = RNG.standard_normal((HORIZON, 2))
+        theta = controls.ravel()
+        value = roll_out(SYSTEM, np.array(START), controls).value
+        assert theta @ square @ theta + 2 * linear @ theta + constant == pytest.approx(value, rel=1e-12)
+
+
+def test_smoothed_by_moments():
+    """F by the recursion of the state's mean and covariance; its gradient is that of the noise-free cost."""
+    mean, covariance, cost = np.array(START), np.zeros((3, 3)), 0.0
+    for control in CONTROLS:
+        cost += mean @ SYSTEM.state_weight @ mean + np.trace(SYSTEM.state_weight @ covariance)
+        cost += control @ SYSTEM.control_weight @ control + SIGMA**2 * np.trace(SYSTEM.control_weight)
+        mean = SYSTEM.transition @ mean + SYSTEM.control @ control
+        covariance = SYSTEM.transition @ covariance @ SYSTEM.transition.T + SIGMA**2 * SYSTEM.control @ SYSTEM.control.T
+    cost += mean @ SYSTEM.final_weight @ mean + np.trace(SYSTEM.final_weight @ covariance)
+    exact = SYSTEM.smoothed(np.array(START), CONTROLS, SIGMA)
+    assert exact.value == pytest.approx(cost, rel=1e-12)
+    gradient = value_and_gradient(SYSTEM, np.array(START), CONTROLS)[1]
+    np.testing.assert_allclose(exact.gradient, gradient.ravel(), rtol=1e-12)
+    np.testing.assert_array_equal(exact.jump_term, 0)
+
+
+def test_both_orders_are_unbiased_and_the_first_has_the_variance_of_the_closed_form():
+    exact, theta = SYSTEM.smoothed(np.array(START), CONTROLS, SIGMA), jnp.asarray(CONTROLS.ravel())
+    batch = OBJECTIVE.evaluate(theta, keys(0))
+    assert_mean_is(np.asarray(batch.value)[:, None], [exact.value])
+    assert_mean_is(zeroth_order(batch, "zero_noise").per_sample, exact.gradient)
+    estimate = first_order(OBJECTIVE.differentiate(theta, keys(1)))
+    assert_mean_is(estimate.per_sample, exact.gradient)
+    assert_variance_is(estimate, exact.gradient, SYSTEM.first_order_variance(HORIZON, SIGMA))
+
+
+def test_moved_theta_is_seen():
+    exact = SYSTEM.smoothed(np.array(START), CONTROLS, SIGMA)
+    estimate = first_order(OBJECTIVE.differentiate(jnp.asarray(1.1 * CONTROLS.ravel()), keys(1)))
+    with pytest.raises(AssertionError, match="off by"):
+        assert_mean_is(estimate.per_sample, exact.gradient)
+
+
+@pytest.mark.parametrize(
+    ("name", "wrong", "match"),
+    [
+        ("transition", np.zeros(3), "must be matrices"),
+        ("control", np.zeros(3), "must be matrices"),
+        ("transition", np.zeros((3, 2)), r"transition must have shape \(3, 3\), got \(3, 2\)"),
+        ("control", np.zeros((2, 2)), r"control must have shape \(3, 2\), got \(2, 2\)"),
+        ("state_weight", np.zeros((2, 2)), r"state_weight must have shape \(3, 3\), got \(2, 2\)"),
+        ("control_weight", np.array([[1.0, 1.0], [0.0, 1.0]]), "control_weight must be symmetric"),
+        ("final_weight", np.triu(np.ones((3, 3))), "final_weight must be symmetric"),
+    ],
+)
+def test_refuses_matrices_that_do_not_fit(name, wrong, match):
+    matrices = {name: getattr(SYSTEM, name) for name in SYSTEM.__dataclass_fields__}
+    with pytest.raises(ValueError, match=match):
+        LinearQuadratic(**{**matrices, name: wrong})
+
+
+def test_refuses_a_sigma_of_zero():
+    with pytest.raises(ValueError, match="sigma must be positive and finite"):
+        SYSTEM.smoothed(np.array(START), CONTROLS, 0.0)
+    with pytest.raises(ValueError, match="sigma must be positive and finite"):
+        SYSTEM.first_order_variance(HORIZON, float("inf"))

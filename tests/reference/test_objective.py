@@ -1,0 +1,228 @@
+"""Systems and functions through the estimators: what is unbiased, what is not and by how much."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from estimators import Objective, first_order, zeroth_order
+from mjx_study.noise import split_sample_key, standard_noise
+from mjx_study.reference import (
+    DoublePendulum,
+    FunctionObjective,
+    LinearQuadratic,
+    Reference,
+    ReferenceObjective,
+    RelaxedHeaviside,
+    Tennis,
+    draw_start,
+    roll_out,
+    smoothed,
+    value_and_gradients,
+)
+from tests.estimators import objectives
+from tests.estimators.statistics_helpers import assert_mean_is
+from tests.reference.functions import FUNCTIONS, JUMPING, QUADRATIC, FunctionCase
+from tests.reference.systems import linear_quadratic
+
+SAMPLES = 200_000
+HORIZON, SIGMA = 3, 0.4
+SYSTEM = linear_quadratic()
+CASES = {**FUNCTIONS, "quadratic": QUADRATIC}
+
+
+def start_distribution(key):
+    return jnp.array([1.0, -0.5, 0.2]) + 0.3 * jax.random.normal(key, (3,))
+
+
+OBJECTIVES = {
+    "controls": ReferenceObjective(SYSTEM, (1.0, -0.5, 0.2), HORIZON, SIGMA),
+    "controls, random start": ReferenceObjective(SYSTEM, start_distribution, HORIZON, SIGMA),
+    "feedback": ReferenceObjective(SYSTEM, (1.0, -0.5, 0.2), HORIZON, SIGMA, "feedback"),
+    "feedback, random start": ReferenceObjective(SYSTEM, start_distribution, HORIZON, SIGMA, "feedback"),
+    "start": ReferenceObjective(SYSTEM, None, HORIZON, SIGMA, "start"),
+    "pendulum": ReferenceObjective(DoublePendulum(), None, 5, SIGMA, "start"),
+    "tennis": ReferenceObjective(Tennis(), draw_start, 20, 0.01, "feedback"),
+    "function": FunctionObjective(QUADRATIC.function, 0.7),
+}
+SIZES = [6, 6, 6, 6, 3, 4, 21, 3]
+table = pytest.mark.parametrize("name", OBJECTIVES)
+
+
+def keys(count: int, seed: int = 0):
+    return jax.random.split(jax.random.key(seed), count)
+
+
+def point(objective: Objective) -> jax.Array:
+    return jnp.asarray(0.1 * np.random.default_rng(0).standard_normal(objective.num_params))
+
+
+@table
+def test_is_an_objective(name: str):
+    assert isinstance(OBJECTIVES[name], Objective) and isinstance(OBJECTIVES[name], Reference)
+    assert OBJECTIVES[name].num_params == dict(zip(OBJECTIVES, SIZES, strict=True))[name]
+
+
+@table
+def test_sample_depends_on_its_key_alone_and_both_orders_on_the_same_noise(name: str):
+    objective = OBJECTIVES[name]
+    theta = point(objective)
+    batch, derivative = objective.evaluate(theta, keys(6)), objective.differentiate(theta, keys(6))
+    assert batch.score.shape == derivative.gradient.shape == (6, objective.num_params)
+    np.testing.assert_array_equal(batch.value, derivative.value)
+    part, part_derivative = objective.evaluate(theta, keys(6)[2:4]), objective.differentiate(theta, keys(6)[2:4])
+    for whole, piece in ((batch.value, part.value), (batch.score, part.score), (batch.baseline, part.baseline)):
+        np.testing.assert_allclose(whole[2:4], piece, rtol=1e-12)
+    np.testing.assert_allclose(derivative.gradient[2:4], part_derivative.gradient, rtol=1e-10)
+
+
+@pytest.mark.parametrize("name", ["controls", "controls, random start"])
+def test_noise_start_and_baseline_are_those_of_the_key(name: str):
+    objective = OBJECTIVES[name]
+    theta = point(objective)
+    batch = objective.evaluate(theta, keys(3))
+    for index in range(3):
+        start_key, noise_key = split_sample_key(keys(3)[index])
+        noise = SIGMA * np.asarray(standard_noise(noise_key, (HORIZON, 2), jnp.float64))
+        start = np.asarray(start_distribution(start_key)) if "random" in name else np.array([1.0, -0.5, 0.2])
+        controls = np.asarray(theta).reshape(HORIZON, 2)
+        np.testing.assert_allclose(batch.score[index], noise.ravel() / SIGMA**2, rtol=1e-14)
+        np.testing.assert_allclose(batch.value[index], roll_out(SYSTEM, start, controls + noise).value, rtol=1e-13)
+        np.testing.assert_allclose(batch.baseline[index], roll_out(SYSTEM, start, controls).value, rtol=1e-13)
+
+
+@table
+def test_value_and_gradient_is_the_noise_free_rollout_from_the_key_s_start(name: str):
+    objective = OBJECTIVES[name]
+    assert isinstance(objective, Reference)
+    theta = point(objective)
+    value, gradient = objective.value_and_gradient(theta, keys(3)[1])
+    assert isinstance(value, float) and gradient.shape == (objective.num_params,)
+    assert value == pytest.approx(float(objective.evaluate(theta, keys(3)).baseline[1]), rel=1e-12)
+    if isinstance(objective, ReferenceObjective):
+        key_start = np.asarray(theta)
+        if objective.start is not None:
+            key_start = objective.start
+            if callable(key_start):
+                key_start = key_start(split_sample_key(keys(3)[1])[0])
+        matrix = (
+            np.asarray(theta).reshape(objective.system.num_controls, -1) if objective.decision == "feedback" else None
+        )
+        controls = np.zeros((objective.horizon, objective.system.num_controls))
+        if objective.decision == "controls":
+            controls = np.asarray(theta).reshape(controls.shape)
+        _, gradients = value_and_gradients(objective.system, np.asarray(key_start), controls, matrix)
+        expected = getattr(gradients, objective.decision).ravel()
+    else:
+        expected = QUADRATIC.function.gradient(np.asarray(theta))
+    np.testing.assert_allclose(gradient, expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize("case", CASES.values(), ids=CASES.keys())
+def test_zeroth_order_is_unbiased(case: FunctionCase):
+    function, theta, sigma = case
+    exact = smoothed(function, theta, sigma)
+    batch = FunctionObjective(function, sigma).evaluate(jnp.asarray(theta), keys(SAMPLES, 1))
+    assert_mean_is(np.asarray(batch.value)[:, None], [exact.value])
+    assert_mean_is(zeroth_order(batch, "zero_noise").per_sample, exact.gradient)
+
+
+@pytest.mark.parametrize("name", ["relaxed_heaviside", "ball_wall, far", "quadratic"])
+def test_first_order_is_unbiased_where_the_function_is_continuous(name: str):
+    function, theta, sigma = CASES[name]
+    exact = smoothed(function, theta, sigma)
+    estimate = first_order(FunctionObjective(function, sigma).differentiate(jnp.asarray(theta), keys(SAMPLES, 2)))
+    np.testing.assert_array_equal(exact.jump_term, 0)
+    assert_mean_is(estimate.per_sample, exact.gradient)
+
+
+@pytest.mark.parametrize("name", JUMPING)
+def test_first_order_misses_exactly_the_jump_term(name: str):
+    function, theta, sigma = CASES[name]
+    exact = smoothed(function, theta, sigma)
+    estimate = first_order(FunctionObjective(function, sigma).differentiate(jnp.asarray(theta), keys(SAMPLES, 3)))
+    bias = np.asarray(estimate.per_sample) - exact.gradient
+    assert_mean_is(bias, -exact.jump_term)  # the resolution is 5 % of the jump term
+    for wrong in (np.zeros(1), exact.jump_term, -0.9 * exact.jump_term):
+        with pytest.raises(AssertionError, match="off by|no power"):
+            assert_mean_is(bias, wrong, resolution=np.inf)
+
+
+def test_relaxation_s_variance_is_the_closed_form():
+    """p (1 - p) / nu^2 with p = nu grad F: it grows as 1 / nu while the mean stays."""
+    theta, sigma, width = np.array([0.3]), 0.6, 0.2
+    slope = smoothed(RelaxedHeaviside(width), theta, sigma).gradient[0]
+    probability = width * slope
+    objective = FunctionObjective(RelaxedHeaviside(width), sigma)
+    estimate = first_order(objective.differentiate(jnp.asarray(theta), keys(SAMPLES, 4)))
+    squares = (np.asarray(estimate.per_sample) - slope) ** 2
+    assert_mean_is(squares, [probability * (1 - probability) / width**2])
+
+
+@pytest.mark.parametrize("order", ["zeroth", "first"])
+def test_feedback_with_random_starts_is_unbiased(order: str):
+    """Against the recursion of the state's second moment, differentiated by JAX."""
+    closed = objectives.LinearQuadratic()
+    system = LinearQuadratic(
+        closed.transition, closed.control, closed.state_cost, closed.control_cost, closed.state_cost
+    )
+    objective = ReferenceObjective(
+        system,
+        lambda key: jnp.asarray(closed.start) + closed.start_deviation * jax.random.normal(key, (2,)),
+        closed.horizon,
+        closed.sigma,
+        "feedback",
+    )
+    theta = jnp.array([0.4, 0.1, 0.2, 0.5])
+    value, exact = jax.value_and_grad(closed.expected_cost)(theta)
+    if order == "zeroth":
+        batch = objective.evaluate(theta, keys(SAMPLES, 5))
+        assert_mean_is(np.asarray(batch.value)[:, None], [value])
+        assert_mean_is(zeroth_order(batch, "zero_noise").per_sample, exact)
+    else:
+        assert_mean_is(first_order(objective.differentiate(theta, keys(SAMPLES, 6))).per_sample, exact)
+
+
+@pytest.mark.parametrize("order", ["zeroth", "first"])
+def test_start_as_decision_is_unbiased(order: str):
+    """Without control V = x_1^T S x_1, so F = theta^T S theta + sigma^2 tr S."""
+    moment = SYSTEM.final_weight
+    for _ in range(HORIZON):
+        moment = SYSTEM.state_weight + SYSTEM.transition.T @ moment @ SYSTEM.transition
+    objective, theta = OBJECTIVES["start"], np.array([1.0, -0.5, 0.7])
+    if order == "zeroth":
+        batch = objective.evaluate(jnp.asarray(theta), keys(SAMPLES, 7))
+        assert_mean_is(np.asarray(batch.value)[:, None], [theta @ moment @ theta + SIGMA**2 * np.trace(moment)])
+        assert_mean_is(zeroth_order(batch, "zero_noise").per_sample, 2 * moment @ theta)
+    else:
+        batch = objective.differentiate(jnp.asarray(theta), keys(SAMPLES, 8))
+        assert_mean_is(first_order(batch).per_sample, 2 * moment @ theta)
+
+
+@pytest.mark.parametrize(
+    ("changes", "match"),
+    [
+        ({"sigma": 0.0}, "sigma must be positive and finite"),
+        ({"decision": "everything"}, "unknown decision 'everything'; choose from controls, feedback, start"),
+        ({"horizon": 0}, "horizon must be at least 1 step, got 0"),
+        ({"decision": "start"}, "then it must be None"),
+        ({"start": None}, "give a start"),
+        ({"start": (0.0, 1.0)}, "the start must have 3 entries, got 2"),
+    ],
+)
+def test_refuses(changes, match):
+    arguments = {"system": SYSTEM, "start": (0.0, 0.0, 0.0), "horizon": 3, "sigma": 1.0}
+    with pytest.raises(ValueError, match=match):
+        ReferenceObjective(**{**arguments, **changes})
+
+
+@table
+def test_refuses_a_theta_of_another_length(name: str):
+    objective = OBJECTIVES[name]
+    with pytest.raises(ValueError, match=rf"theta must have shape \({objective.num_params},\), got \(2,\)"):
+        objective.evaluate(jnp.zeros(2), keys(3))
+
+
+def test_function_objective_refuses_no_noise():
+    with pytest.raises(ValueError, match="sigma must be positive and finite"):
+        FunctionObjective(QUADRATIC.function, -1.0)

@@ -1,0 +1,98 @@
+"""The terms that stand in for MJX's have its values, and the derivatives that its own lack."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mjx_study import repairs
+from mjx_study._mjx import mjx
+from mjx_study.scene import load_scene
+
+UNIT = st.floats(-1, 1)
+
+
+def original(module: str, name: str) -> Any:
+    return getattr(repairs._module(module), name)
+
+
+@settings(deadline=None, max_examples=60)
+@given(
+    solref=st.one_of(
+        st.tuples(st.floats(1e-4, 1), st.floats(0.01, 3)), st.tuples(st.floats(-1e5, -1), st.floats(-1e3, -0.1))
+    ),
+    low=st.floats(-0.5, 1.5),
+    high=st.floats(-0.5, 1.5),
+    width=st.floats(-0.1, 0.1),
+    midpoint=st.floats(-0.5, 1.5),
+    power=st.sampled_from([0.5, 1.0, 2.0, 3.0, 5.0]),
+    position=st.floats(-0.2, 0.2),
+)
+def test_stiffness_damping_and_impedance_are_mjxs(solref, low, high, width, midpoint, power, position) -> None:
+    """Whatever the parameters, those out of MuJoCo's bounds among them."""
+    model, solimp = load_scene("pusher").model, jnp.array([low, high, width, midpoint, power])
+    arguments = model, jnp.array(solref), solimp, jnp.array(position)
+    for ours, theirs in zip(
+        repairs.stiffness_damping_impedance(*arguments), original("constraint", "_kbi")(*arguments), strict=True
+    ):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-12)
+
+
+@settings(deadline=None, max_examples=40)
+@given(st.lists(UNIT, min_size=8, max_size=8))
+def test_rotations_are_mjxs(numbers: list[float]) -> None:
+    parts = np.array(numbers).reshape(2, 4) + np.array([[0.0, 1e-3, 0, 0], [1e-3, 0, 0, 0]])
+    first, second = (jnp.array(part / np.linalg.norm(part)) for part in parts)
+    axis, angle = original("math", "quat_to_axis_angle")(first)
+    ours, one = repairs.rotation_vector(first)
+    # half a turn may go either way round
+    np.testing.assert_allclose(ours * one, axis * angle, atol=1e-7 if abs(float(first[0])) < 1e-7 else 1e-10)
+    difference = repairs.rotation_difference(second, first)
+    np.testing.assert_allclose(difference, original("math", "quat_sub")(second, first), atol=1e-10)
+
+
+def test_a_rotation_has_its_derivative_at_no_angle() -> None:
+    still = jnp.array([1.0, 0, 0, 0])
+    right = np.concatenate([np.zeros((3, 1)), 2 * np.eye(3)], axis=1)  # sin(angle / 2) is half the angle
+    np.testing.assert_allclose(jax.jacfwd(lambda q: repairs.rotation_vector(q)[0])(still), right, atol=1e-15)
+    np.testing.assert_allclose(jax.jacrev(lambda q: repairs.rotation_difference(q, still))(still), right, atol=1e-15)
+
+
+def test_mjxs_own_functions_are_back_afterwards() -> None:
+    before = {key: original(*key) for key in repairs._REPLACED}
+    with pytest.raises(KeyError), repairs.repaired(), repairs.repaired():
+        assert all(original(*key) is repairs._REPLACED[key] for key in before)
+        raise KeyError
+    assert all(original(*key) is function for key, function in before.items())
+
+
+def test_another_mjx_is_an_error_and_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    own = original("constraint", "_kbi")
+    monkeypatch.setattr(repairs, "_REPLACED", {**repairs._REPLACED, ("math", "no_such_function"): jnp.sin})
+    with pytest.raises(RuntimeError, match="no math.no_such_function"), repairs.repaired():
+        pytest.fail("nothing may be traced")
+    assert original("constraint", "_kbi") is own
+
+
+def test_tendon_springs_are_linear_at_rest() -> None:
+    """Zero in value; in derivative what is missing where MJX's two halves meet."""
+    xml = """<mujoco><worldbody><body><joint name="x" type="slide"/><geom size=".1" mass="1"/></body></worldbody>
+    <tendon><fixed stiffness="100" springlength="0"><joint joint="x" coef="2"/></fixed></tendon></mujoco>"""
+    host = mujoco.MjModel.from_xml_string(xml)
+    model = mjx.put_model(host)
+    data = mjx.put_data(host, mujoco.MjData(host))
+
+    def gap(x):
+        moved = mjx.kinematics(model, data.replace(qpos=x[None]))
+        return repairs.tendon_spring_gap(model, mjx.tendon(model, mjx.com_pos(model, moved)))[0]
+
+    program = jax.jit(jax.value_and_grad(gap))
+    assert repairs.has_tendon_springs(model)
+    assert [float(part) for part in program(jnp.zeros(()))] == [0.0, -400.0]
+    assert [float(part) for part in program(jnp.array(0.1))] == [0.0, 0.0]
+    assert not repairs.has_tendon_springs(load_scene("pusher").model)

@@ -1,0 +1,232 @@
+"""`mjx-study rollout`: numbers are those of the objective and of the C engine, files are whole, errors are clear."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from PIL import Image, ImageSequence
+
+from mjx_study.cli import options as shared
+from mjx_study.cli import rollout
+from mjx_study.objective import Simulator
+from mjx_study.render import RenderError
+from mjx_study.study import plan_cells
+from mjx_study.tasks import make_task
+
+SHORT = ["pusher", "--horizon", "10", "--renderer", "drawing"]
+FILES = ["rollout.gif", "strip.pdf", "strip.png", "stroboscope.pdf", "stroboscope.png", "trajectory.npz"]
+PENDULUM = """<mujoco><option timestep=".01"/><worldbody>
+  <body name="rod"><joint name="hinge" axis="0 1 0"/><geom type="capsule" size=".05" fromto="0 0 0 1 0 0"/></body>
+</worldbody><actuator><motor joint="hinge"/></actuator>{keyframe}</mujoco>"""
+KEYFRAME = '<keyframe><key qpos=".3" qvel="-1" ctrl="2"/></keyframe>'
+
+
+@pytest.fixture(autouse=True)
+def elsewhere(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """Default folders lie in a temporary one; the tests' own settings of JAX stand."""
+    monkeypatch.setattr(shared, "configure", lambda **_: None)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def call(*arguments: str) -> int:
+    """The command alone, by its own parser."""
+    root = shared.Parser(prog="mjx-study")
+    rollout.add(root.add_subparsers())
+    options = root.parse_args(["rollout", *arguments])
+    return options.run(options)
+
+
+def document(capsys: pytest.CaptureFixture[str], *arguments: str) -> dict[str, Any]:
+    """What a run prints as JSON, and nothing else."""
+    assert call(*arguments, "--json") == 0
+    printed = capsys.readouterr()
+    assert printed.err == ""
+    return json.loads(printed.out)
+
+
+@pytest.mark.parametrize("noise", [[], ["--noise", "--seed", "3"]], ids=["silent", "noisy"])
+def test_the_cost_is_the_objectives(capsys: pytest.CaptureFixture[str], noise: list[str]) -> None:
+    """The same sample as in a batch: the value with its key's noise, the baseline without."""
+    facts = document(capsys, *SHORT, "--contact", "penalty", "--stiffness", "1000", *noise)
+    task = make_task("pusher", horizon=10)
+    (cell,), _ = plan_cells(task, ("penalty",), (1000.0,))
+    batch = Simulator(task, chunk_size=1).objective(cell.contact).evaluate(task.theta, jax.random.key(3)[None])
+    assert facts["cost"] == pytest.approx(float((batch.value if noise else batch.baseline)[0]), rel=1e-9)
+    assert facts["contact"] == "penalty" and facts["stiffness"] == 1000 and facts["finite"]
+    assert facts["sigma"] == (0.1 if noise else 0) and facts["residual"] < 1e-6
+
+
+def test_a_trajectory_has_every_state_and_control(capsys: pytest.CaptureFixture[str], elsewhere: Path) -> None:
+    facts = document(capsys, *SHORT)
+    folder = elsewhere / "results" / "pusher-rollout"
+    assert sorted(path.name for path in folder.iterdir()) == FILES
+    assert sorted(facts["written"]) == [f"results/pusher-rollout/{name}" for name in FILES]
+    data = np.load(folder / "trajectory.npz")
+    np.testing.assert_allclose(data["time"], 0.005 * np.arange(11))
+    assert data["qpos"].shape == data["qvel"].shape == (11, 2)
+    np.testing.assert_allclose(data["qpos"][0], [0, 1])
+    np.testing.assert_allclose(data["controls"], np.full((10, 1), 0.1))
+    assert facts["steps"] == 10 and facts["duration"] == pytest.approx(0.05)
+    # The pusher starts at 0, and the slider's joint is 1 where its body is at 1.
+    assert facts["bodies"]["pusher"] == pytest.approx([data["qpos"][-1, 0], 0, 0])
+    assert facts["bodies"]["slider"] == pytest.approx([data["qpos"][-1, 1], 0, 0])
+
+
+def test_pictures_and_film_are_whole(capsys: pytest.CaptureFixture[str], elsewhere: Path) -> None:
+    assert call(*SHORT, "--output", "out", "--frames", "3", "--slow", "4") == 0
+    with Image.open(elsewhere / "out" / "rollout.gif") as film:
+        lengths = [frame.info["duration"] for frame in ImageSequence.Iterator(film)]
+    assert sum(lengths) == pytest.approx(4 * 50 + 500, abs=11)
+    with Image.open(elsewhere / "out" / "strip.png") as picture:
+        assert picture.width > 600
+    printed = capsys.readouterr().out
+    for words in ("no noise", "10 steps of 5 ms, 0.05 s", "largest solver residual", "x [m]", "slider", "strip.png"):
+        assert words in printed
+
+
+@pytest.mark.parametrize("kind", ["json", "npy"])
+def test_theta_from_a_file(capsys: pytest.CaptureFixture[str], elsewhere: Path, kind: str) -> None:
+    theta = np.linspace(0, 1, 10)
+    path = elsewhere / f"theta.{kind}"
+    if kind == "json":
+        path.write_text(json.dumps(theta.tolist()))
+    else:
+        np.save(path, theta.reshape(10, 1))
+    document(capsys, *SHORT, "--theta", str(path))
+    data = np.load(elsewhere / "results" / "pusher-rollout" / "trajectory.npz")
+    np.testing.assert_allclose(data["controls"][:, 0], theta)
+
+
+@pytest.mark.parametrize("keyframe", ["", KEYFRAME], ids=["reference pose", "keyframe"])
+def test_an_mjcf_moves_as_the_c_engine_moves_it(
+    capsys: pytest.CaptureFixture[str], elsewhere: Path, keyframe: str
+) -> None:
+    path = elsewhere / "rod.xml"
+    path.write_text(PENDULUM.format(keyframe=keyframe))
+    facts = document(capsys, str(path), "--renderer", "drawing")
+    model = mujoco.MjModel.from_xml_path(str(path))
+    data = mujoco.MjData(model)
+    if keyframe:
+        data.qpos[0], data.qvel[0], data.ctrl[0] = 0.3, -1, 2
+    for _ in range(200):
+        mujoco.mj_step(model, data)
+    written = np.load(elsewhere / "results" / "rod-rollout" / "trajectory.npz")
+    assert written["qpos"].shape == (201, 1) and written["controls"].shape == (200, 1)
+    np.testing.assert_allclose(written["qpos"][-1], data.qpos, rtol=1e-12)
+    np.testing.assert_allclose(written["qvel"][-1], data.qvel, rtol=1e-12)
+    np.testing.assert_allclose(written["controls"], 2.0 if keyframe else 0.0)
+    mujoco.mj_forward(model, data)
+    assert facts["bodies"]["rod"] == pytest.approx(data.body("rod").xipos.tolist())
+    assert facts["duration"] == pytest.approx(2) and "cost" not in facts
+
+
+def test_a_rollout_that_is_lost_is_shown_as_far_as_it_goes(capsys: pytest.CaptureFixture[str], elsewhere: Path) -> None:
+    path = elsewhere / "runaway.xml"
+    path.write_text(
+        """<mujoco><option timestep=".01" gravity="0 0 0"/><worldbody><body name="ball">
+        <joint type="slide" axis="1 0 0" stiffness="-1e4"/><geom size=".1" mass="1"/></body></worldbody>
+        <keyframe><key qpos="1"/></keyframe></mujoco>"""
+    )
+    facts = document(capsys, str(path), "--horizon", "100", "--renderer", "drawing")
+    assert not facts["finite"] and "the state is not finite from" in facts["warnings"][0]
+    data = np.load(elsewhere / "results" / "runaway-rollout" / "trajectory.npz")
+    assert len(data["qpos"]) == 101
+    good = np.all(np.abs(data["qpos"]) < 1e10, axis=1) & np.all(np.abs(data["qvel"]) < 1e10, axis=1)
+    assert not good.all() and facts["bodies"]["ball"][0] == pytest.approx(data["qpos"][np.argmin(good) - 1, 0])
+
+
+def test_a_theta_without_a_finite_cost(capsys: pytest.CaptureFixture[str], elsewhere: Path) -> None:
+    np.save(elsewhere / "theta.npy", np.full(10, 1e200))
+    facts = document(capsys, *SHORT, "--theta", "theta.npy")
+    assert facts["cost"] is None and not facts["finite"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["puhser"], "unknown task 'puhser'; choose from pusher"),
+        (["pusher", "--contact", "spring"], "unknown contact family 'spring'; choose from"),
+        (["pusher", "--stiffness", "-5"], "stiffness must be positive"),
+        (["pusher", "--frames", "0"], "frames must be at least 1, got 0"),
+        (["pusher", "--seed", "-1"], "seed must be at least 0, got -1"),
+        (["pusher", "--slow", "0"], "slow must be a positive number, got 0"),
+        (["pusher", "--sigma", "0.2"], "--sigma has an effect only with --noise"),
+        (["pusher", "--sigma", "-1", "--noise"], "sigma must be positive"),
+        (["pusher", "--view", "zx"], "invalid choice: 'zx'"),
+        (["pusher", "--renderer", "povray"], "invalid choice: 'povray'"),
+        (["pusher", "--format", "avi"], "invalid choice: 'avi'"),
+        (["pusher", "--theta", "nowhere.npy"], "cannot read nowhere.npy: No such file or directory"),
+        (["pusher", "--theta", "broken.json"], "broken.json is neither a .json list of numbers nor a .npy array"),
+        (["pusher", "--theta", "broken.npy"], "broken.npy is neither a .json list of numbers nor a .npy array"),
+        (["pusher", "--theta", "short.json"], "short.json holds 2 numbers; pusher needs 200 finite ones"),
+        (["pusher", "--theta", "nan.json", "--horizon", "2"], "nan.json holds 2 numbers; pusher needs 2 finite ones"),
+        (["nowhere.xml"], "no MJCF file at nowhere.xml"),
+        (["broken.xml"], "broken.xml is not a valid MJCF"),
+        (["rod.xml", "--horizon", "0"], "horizon must be at least 1 step, got 0"),
+        (["rod.xml", "--contact", "penalty", "--noise"], "--contact, --noise: only for a task; rod.xml moves as"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+)
+def test_bad_options(elsewhere: Path, arguments: list[str], says: str) -> None:
+    """One line, before anything is computed or written."""
+    (elsewhere / "broken.json").write_text('{"theta": [1]}')
+    (elsewhere / "broken.npy").write_bytes(b"nothing")
+    (elsewhere / "short.json").write_text("[1, 2]")
+    (elsewhere / "nan.json").write_text("[1, NaN]")
+    (elsewhere / "broken.xml").write_text("<mujoco>")
+    (elsewhere / "rod.xml").write_text(PENDULUM.format(keyframe=""))
+    with pytest.raises(shared.UsageError) as refused:
+        call(*arguments)
+    assert says in str(refused.value)
+    assert not (elsewhere / "results").exists()
+
+
+def test_mp4_without_ffmpeg_and_opengl_without_a_library(monkeypatch: pytest.MonkeyPatch, elsewhere: Path) -> None:
+    monkeypatch.setenv("PATH", str(elsewhere))
+    with pytest.raises(shared.UsageError, match="mp4 needs ffmpeg, which is not on the PATH; use the format gif"):
+        call("pusher", "--format", "mp4")
+    monkeypatch.setenv("MUJOCO_GL", "off")
+    with pytest.raises(shared.UsageError, match="MuJoCo's renderer does not work here .*; use the renderer drawing"):
+        call("pusher", "--renderer", "opengl")
+    assert not (elsewhere / "results").exists()
+
+
+def test_a_film_that_fails_leaves_nothing(monkeypatch: pytest.MonkeyPatch, elsewhere: Path) -> None:
+    def fail(*_: object, **__: object) -> Path:
+        raise RenderError("ffmpeg cannot write an mp4 here")
+
+    monkeypatch.setattr(rollout, "animate", fail)
+    with pytest.raises(shared.UsageError, match="ffmpeg cannot write an mp4 here"):
+        call(*SHORT, "--output", "out")
+    assert list((elsewhere / "out").iterdir()) == []
+
+
+def test_a_start_that_is_not_finite_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    task = make_task("pusher", horizon=2)
+    start = task.draw_start(jax.random.key(0))
+    lost = type(start)(jnp.full(2, jnp.nan), start.qvel, start.act, start.warmstart)
+    monkeypatch.setattr(rollout, "task_of", lambda options: task.replace(start=lost))
+    with pytest.raises(shared.UsageError, match="pusher: .*: the first state is not finite"):
+        call(*SHORT, "--output", "out")
+
+
+def test_many_bodies_are_not_all_printed(capsys: pytest.CaptureFixture[str], elsewhere: Path) -> None:
+    bodies = "".join(f'<body pos="{k} 0 1"><freejoint/><geom size=".1"/></body>' for k in range(14))
+    (elsewhere / "many.xml").write_text(f"<mujoco><worldbody>{bodies}</worldbody></mujoco>")
+    assert call("many.xml", "--horizon", "5", "--renderer", "drawing") == 0
+    printed = capsys.readouterr().out
+    assert "body 12" in printed and "body 13" not in printed and "and 2 more bodies" in printed
+
+
+def test_help_teaches(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        call("--help")
+    text = capsys.readouterr().out
+    for taught in ("FILE.xml", "trajectory.npz", "stroboscope", "mjx-study rollout pusher", "opengl", "--slow"):
+        assert taught in text
