@@ -8,14 +8,20 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from mjx_study.engine import HostState
+from mjx_study.engine import HostState, host_data
 from mjx_study.gradcheck.coordinates import Coordinate, Coordinates, joint_name, quaternions
 from mjx_study.gradcheck.placement import geom_label
 from mjx_study.scene import num_constraint_rows
 
 NEAR: Final = 2e-6
 """How close to a switch a distance must be to be its cause; about the shortest difference [m, rad, relative]."""
+PARALLEL: Final = 1e-5
+"""Angle below which two directions count as parallel [rad]; contact points turn within fewer."""
 UNKNOWN: Final = "unknown"
+_SLIDE, _HINGE = int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE)
+_PLANE, _CAPSULE, _CYLINDER = (
+    int(kind) for kind in (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_CYLINDER)
+)
 SINGULAR: Final = "the inertia matrix is singular (a body lacks mass, or joints do the same)"
 
 
@@ -60,7 +66,7 @@ def cause_of_fault(place: Place, output: Coordinate, source: Coordinate, *, stoc
 
 def cause_of_kink(place: Place, output: Coordinate, source: Coordinate) -> str:
     """What switches here."""
-    rules = (_control_bound, _parameter_bound, _onset, _limit, _row_switch, _friction_loss, _muscle)
+    rules = (_control_bound, _parameter_bound, _onset, _limit, _row_switch, _friction_loss, _muscle, _degenerate)
     found = next((text for rule in rules if (text := rule(place, output, source))), None)
     return found or "a clip, a maximum or a choice between features switches here"
 
@@ -168,6 +174,33 @@ _FAULTS: tuple[Rule, ...] = (
 )
 
 
+def degenerate_contact(place: Place) -> str | None:
+    """A contact whose points are placed by a direction that vanishes, if there is one.
+
+    The step jumps there, and nearby it changes faster than differences can follow; likewise in C.
+    """
+    host, touching = place.host, place.touching()
+    if not len(touching):
+        return None
+    data = host_data(host, place.state)
+    mujoco.mj_kinematics(host, data)
+    axes = data.geom_xmat.reshape(-1, 3, 3)[:, :, 2]
+    for geoms in place.stages["geom"][touching]:
+        kinds = {int(host.geom_type[geom]): int(geom) for geom in geoms}
+        parallel = float(np.linalg.norm(np.cross(axes[geoms[0]], axes[geoms[1]]))) < PARALLEL
+        labels = [geom_label(host, int(geom)) for geom in geoms]
+        if parallel and kinds.keys() == {_PLANE, _CYLINDER}:
+            upright = geom_label(host, kinds[_CYLINDER])
+            return f"{upright} stands upright, and its contact points turn with the direction in which it tilts"
+        if parallel and kinds.keys() == {_CAPSULE}:
+            return f"{' and '.join(labels)} are parallel, and where they touch jumps with the direction of their angle"
+    return None
+
+
+def _degenerate(place: Place, output: Coordinate, source: Coordinate) -> str | None:
+    return degenerate_contact(place)
+
+
 def _onset(place: Place, output: Coordinate, source: Coordinate) -> str | None:
     gap = place.stages["dist"] - place.stages["margin"]
     near = np.flatnonzero(np.abs(gap) < NEAR)
@@ -180,7 +213,7 @@ def _onset(place: Place, output: Coordinate, source: Coordinate) -> str | None:
 def _limit(place: Place, output: Coordinate, source: Coordinate) -> str | None:
     host = place.host
     for joint in np.flatnonzero(host.jnt_limited):
-        if host.jnt_type[joint] in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE):
+        if host.jnt_type[joint] in (_SLIDE, _HINGE):
             low, high = host.jnt_range[joint]
             position = place.state.qpos[host.jnt_qposadr[joint]]
             margin = host.jnt_margin[joint]

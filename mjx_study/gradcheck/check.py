@@ -12,7 +12,7 @@ from mjx_study.contact import FAMILIES, ContactModel, apply_contact
 from mjx_study.dynamics import initial_state
 from mjx_study.engine import HostState, converged_host, transition_jacobian
 from mjx_study.gradcheck import diagnosis
-from mjx_study.gradcheck.causes import SINGULAR, Place, cause_of_fault, cause_of_kink, singular
+from mjx_study.gradcheck.causes import SINGULAR, Place, cause_of_fault, cause_of_kink, degenerate_contact, singular
 from mjx_study.gradcheck.coordinates import Coordinates, coordinates
 from mjx_study.gradcheck.cost import CostCheck, CostPrograms, check_cost
 from mjx_study.gradcheck.diagnosis import Judged, judge, modes_apart, worst_verdict
@@ -230,9 +230,14 @@ class _Work:
 
 def _summary(plan: GradcheckPlan) -> str:
     host = plan.subject.scene.host
-    parts = [f"{host.nv} degrees of freedom"]
-    parts += [f"{count} {noun}" for count, noun in ((host.na, "activations"), (host.nu, "controls")) if count]
-    return f"{', '.join(parts)}; {plan.states} states of {plan.subject.horizon} steps of {host.opt.timestep:g} s"
+    parts = [_count(host.nv, "degree", "of freedom")]
+    parts += [_count(number, noun) for number, noun in ((host.na, "activation"), (host.nu, "control")) if number]
+    taken = f"{_count(plan.states, 'state')} of {_count(plan.subject.horizon, 'step')} of {host.opt.timestep:g} s"
+    return f"{', '.join(parts)}; {taken}"
+
+
+def _count(number: int, noun: str, rest: str = "") -> str:
+    return f"{number} {noun}{'' if number == 1 else 's'}{rest and ' ' + rest}"
 
 
 def _along(scene: Scene, contact: ContactModel | None, visited: list[HostState], count: int) -> list[Sample]:
@@ -290,16 +295,20 @@ def check_state(programs: Programs, setting: Setting, sample: Sample, *, stock: 
     derivatives = {"forward": linear.forward, "reverse": linear.reverse}
     if linear.tape is not None:
         derivatives["tape"] = linear.tape
-    judged = {mode: judge(layout, jacobian, truth, converged) for mode, jacobian in derivatives.items()}
-    if stock:
-        derivatives["mjx.step"] = programs.stock(setting, sample.state)
-        judged["mjx.step"] = judge(layout, derivatives["mjx.step"], truth)
-    apart = [modes_apart(layout, linear.forward, derivatives[mode]) for mode in ("reverse", "tape") if mode in judged]
     stages = programs.stages(setting, sample.state)
-    placement = compare_engines(layout.scene, contact, sample.state, stages, qacc)
-    engine = None if placement.text else _engine_error(layout, contact, solved, truth, linear)
     model = apply_contact(layout.scene.model, contact)
     place = Place(layout, sample.state, stages, qacc, np.asarray(model.geom_solref), np.asarray(model.geom_solimp))
+    known = {
+        "starved": not linear.residual <= diagnosis.RESIDUAL_TOLERANCE,
+        "degenerate": degenerate_contact(place) is not None,
+    }
+    judged = {mode: judge(layout, jacobian, truth, converged, **known) for mode, jacobian in derivatives.items()}
+    if stock:
+        derivatives["mjx.step"] = programs.stock(setting, sample.state)
+        judged["mjx.step"] = judge(layout, derivatives["mjx.step"], truth, degenerate=known["degenerate"])
+    apart = [modes_apart(layout, linear.forward, derivatives[mode]) for mode in ("reverse", "tape") if mode in judged]
+    placement = compare_engines(layout.scene, contact, sample.state, stages, qacc)
+    engine = None if placement.text else _engine_error(layout, contact, solved, truth, linear)
     return StateCheck(
         sample,
         linear,
@@ -436,8 +445,10 @@ def _add_states(groups: dict[Any, list[Entry]], check: StateCheck, layout: Coord
     if not check.linear.residual <= diagnosis.RESIDUAL_TOLERANCE:
         add("unconverged", (), f"residual {check.linear.residual:.1e}; {_budget(layout)}", check.linear.residual)
     if not check.modes <= diagnosis.MODES_TOLERANCE:
-        why = f": {SINGULAR}" if singular(check.place) else ""
-        add("wrong", (), f"the two modes of differentiation disagree by {check.modes:.1e}{why}", check.modes)
+        nearby = degenerate_contact(check.place)
+        why = SINGULAR if singular(check.place) else nearby
+        text = f"the two modes of differentiation disagree by {check.modes:.1e}"
+        add("jump" if nearby else "wrong", (), f"{text}: {why}" if why else text, check.modes)
     if check.placement:
         add("placement", (), f"acceleration apart by {check.engine_step:.1e}: {check.placement}", check.engine_step)
 

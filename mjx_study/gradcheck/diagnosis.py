@@ -12,7 +12,8 @@ from mjx_study.gradcheck.differences import Differences
 
 TOLERANCE: Final = 1e-6
 """Of an entry, relative to the largest in its row and block, beyond three uncertainties of the difference."""
-MODES_TOLERANCE: Final = 1e-9
+MODES_TOLERANCE: Final = 1e-7
+"""Relative difference of forward and reverse mode; rounding alone comes to 1e-8 where the solve is ill-conditioned."""
 RESIDUAL_TOLERANCE: Final = 1e-6
 FAINT: Final = 1e-3
 """Size of a row's entries relative to the largest of its kind below which it counts as that large."""
@@ -51,6 +52,9 @@ def judge(
     jacobian: Float[np.ndarray, "outputs inputs"],
     truth: Differences,
     converged: Float[np.ndarray, "outputs inputs"] | None = None,
+    *,
+    starved: bool = False,
+    degenerate: bool = False,
 ) -> Judged:
     """Compare a derivative with differences.
 
@@ -60,6 +64,8 @@ def judge(
         truth: what differences found.
         converged: the derivative from a converged start of the solver, which tells an unconverged solve from a wrong
             derivative; None where the solver had converged.
+        starved: whether so much is left of the solve that no entry can be called wrong.
+        degenerate: whether the step jumps so near that differences reach across it.
     """
     scale = row_scales(layout, jacobian, truth)
     allowed = TOLERANCE * scale + 3 * truth.uncertainty
@@ -74,10 +80,12 @@ def judge(
     codes[(jacobian == 0) & ~right] = ZERO
     if converged is not None:
         codes[~right & (np.abs(converged - truth.value) <= allowed)] = UNCONVERGED
+    if starved:
+        codes[:] = UNCONVERGED
     codes[right] = RIGHT
     # The mean of two slopes agrees with central differences, and anything agrees with those over a jump.
     codes[truth.kink & within & ~outside & (~right | (truth.gap > FAINT * scale))] = KINK
-    codes[truth.jump & ~(right & resolved)] = JUMP
+    codes[(truth.jump & ~(right & resolved)) | (degenerate & ~right)] = JUMP
     codes[~np.isfinite(jacobian)] = NAN
     figures = np.where(right & resolved, error / scale, 0.0)
     return Judged(codes, float(figures.max(initial=0.0)))

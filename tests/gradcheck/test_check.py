@@ -102,6 +102,26 @@ def test_a_control_at_its_bound_is_a_kink() -> None:
     }
 
 
+def test_a_joint_at_its_limit_is_named() -> None:
+    joint = '<joint name="x" type="slide" axis="1 0 0" limited="true" range="0 1"/>'
+    report = check(f'<worldbody><body>{joint}<geom size=".1" mass="1"/></body></worldbody>')
+    causes = {finding.cause for finding in report.findings}
+    assert report.passed and causes == {"x is at its limit"}
+
+
+def test_an_upright_cylinder_is_at_a_jump_that_differences_reach_across() -> None:
+    """Its three contact points turn with the direction in which it tilts, however little: here 1e-9 rad."""
+    cylinder = (
+        '<body pos="0 0 .0999"><joint name="z" type="slide" axis="0 0 1"/><joint name="a"/>'
+        '<joint name="b" axis="0 1 0"/><geom name="can" type="cylinder" size=".1 .1" mass="1"/></body>'
+    ).replace('name="a"', 'name="a" axis="1 0 0"')
+    key = '<keyframe><key qpos="0 1e-9 0"/></keyframe>'
+    floor = '<geom type="plane" size="1 1 1"/>'
+    report = check(f"<option {CONVERGED}/><worldbody>{floor}{cylinder}</worldbody>{key}")
+    assert report.passed and all("can stands upright" in f.cause for f in report.findings if f.verdict == "jump")
+    assert report.steps[0].verdict == "jump"
+
+
 def test_a_silent_zero_fails() -> None:
     tendon = '<tendon><spatial stiffness="100" springlength="0"><site site="a"/><site site="b"/></spatial></tendon>'
     body = '<body><joint name="y" type="slide" axis="0 1 0"/><geom size=".1" mass="1"/><site name="b"/></body>'
