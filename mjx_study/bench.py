@@ -43,8 +43,9 @@ class BenchReport:
     Attributes:
         task, samples, horizon: what was run.
         contact: family and stiffness of the contact.
-        value_seconds: a zeroth-order sample, one rollout [s].
+        value_seconds: a zeroth-order sample, one rollout and its share of baselines [s].
         gradient_seconds: a first-order sample, one rollout and its gradient [s].
+        rollout_seconds: one rollout [s].
         stock_value_seconds: a rollout through stock MJX with the same solver budget [s].
         stock_gradient_seconds: a gradient through stock MJX with one solver iteration [s].
         engine_gradient_seconds: a gradient by the C engine's differences on as many threads [s]; None where it has
@@ -59,6 +60,7 @@ class BenchReport:
     contact: str
     value_seconds: float
     gradient_seconds: float
+    rollout_seconds: float
     stock_value_seconds: float
     stock_gradient_seconds: float
     engine_gradient_seconds: float | None
@@ -70,7 +72,7 @@ class BenchReport:
         """The figures that can be compared between machines."""
         ratios = {
             "gradient_per_value": self.gradient_seconds / self.value_seconds,
-            "values_over_stock": self.stock_value_seconds / self.value_seconds,
+            "rollouts_over_stock": self.stock_value_seconds / self.rollout_seconds,
             "speedup_over_stock": self.stock_gradient_seconds / self.gradient_seconds,
         }
         if self.engine_gradient_seconds is not None:
@@ -96,14 +98,15 @@ class BenchReport:
             f"{self.environment['precision']}, {len(devices)} x {self.environment['backend']} "
             f"({self.environment['processor']})",
             "per sample:",
-            *rate("zeroth order (one rollout)", self.value_seconds),
+            *rate("zeroth order (rollout and baseline)", self.value_seconds),
             *rate("first order (rollout and gradient)", self.gradient_seconds),
+            *rate("a rollout", self.rollout_seconds),
             *rate("a rollout through mjx.step", self.stock_value_seconds),
             *rate("jax.grad through mjx.step, one iteration", self.stock_gradient_seconds),
             *rate("C engine, mjd_transitionFD and adjoint", self.engine_gradient_seconds),
             "ratios of this run:",
             f"  a first-order sample costs {ratios['gradient_per_value']:.2f} zeroth-order samples",
-            f"  rollouts per second: {ratios['values_over_stock']:.2f} x stock mjx.step",
+            f"  rollouts per second: {ratios['rollouts_over_stock']:.2f} x stock mjx.step",
             f"  gradients per second: {ratios['speedup_over_stock']:.2f} x stock mjx.step{engine}",
             f"  memory of {self.samples} gradients at once: {self.gradient_memory:.1f} MiB",
         ]
@@ -137,11 +140,14 @@ def bench(plan: BenchPlan, progress: Progress = lambda done, total, what: None) 
     keys = jax.random.split(jax.random.key(0), samples)
     simulator = Simulator(task, chunk_size=chunk_for(samples, devices))
     objective = simulator.objective(cell.contact)
+    key_data, noisy = np.asarray(jax.random.key_data(keys)), np.ones(samples, task.scene.template.qpos.dtype)
+    progress(0, 8, f"{task.name}: compiling stock")
     stock_samples = min(samples, STOCK_BATCH[devices[0].platform] * len(devices))
-    stock_value, stock_gradient = _stock_programs(task, cell.contact, keys[:stock_samples], devices)
+    stock_samples, stock_value, stock_gradient = _fitting_stock(task, cell.contact, keys, stock_samples, devices)
     contenders: dict[str, tuple[int, Callable[[], Any]]] = {
         "value": (samples, lambda: objective.evaluate(task.theta, keys)),
         "gradient": (samples, lambda: objective.differentiate(task.theta, keys)),
+        "rollout": (samples, lambda: simulator.run_values(task.theta, cell.contact, task.sigma, key_data, noisy)),
         "stock_value": (stock_samples, stock_value),
         "stock_gradient": (stock_samples, stock_gradient),
     }
@@ -172,6 +178,20 @@ def _seconds(call: Callable[[], Any]) -> float:
     start = time.perf_counter()
     jax.block_until_ready(call())
     return time.perf_counter() - start
+
+
+def _fitting_stock(task: Task, contact: ContactModel | None, keys: Any, samples: int, devices: Any):
+    """How many samples' gradients through `mjx.step` fit in memory, halved until they do, and the programs."""
+    while True:
+        value, gradient = _stock_programs(task, contact, keys[:samples], devices)
+        try:
+            jax.block_until_ready(gradient())
+        except jax.errors.JaxRuntimeError as error:
+            if "RESOURCE_EXHAUSTED" not in str(error) or samples <= len(devices):
+                raise
+            samples //= 2
+        else:
+            return samples, value, gradient
 
 
 def _stock_programs(task: Task, contact: ContactModel | None, keys: Any, devices: Any) -> tuple[Callable[[], Any], ...]:

@@ -32,6 +32,8 @@ PREDICTOR_STEPS: Final = 2
 GENEROUS: Final = (100, 50)
 """Iterations of the solver and of its line search that `solve_to_rounding` allows."""
 POLISHING_STEPS: Final = 4
+EPSILON: Final = 1e-14
+"""Relative rounding of a force in the solver's equation."""
 
 
 def row_force(model: mjx.Model, data: mjx.Data, slack: Float[Array, " rows"]) -> Float[Array, " rows"]:
@@ -150,19 +152,29 @@ def solve_to_rounding(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]:
     """The constrained acceleration as exactly as numbers allow, whatever the model's own budgets; values only.
 
     MJX stops where its cost no longer falls, the square root of rounding from the solution, which differences over
-    short steps see. Newton steps on the equation itself have no such floor; one that does not lessen it is dropped.
+    short steps see. Newton steps on the equation itself have no such floor; one that leads away is dropped.
     """
     if num_constraint_rows(data) == 0:
         return data.qacc_smooth
     budget = {"iterations": GENEROUS[0], "ls_iterations": GENEROUS[1], "tolerance": jnp.full_like(data.time, 1e-15)}
     qacc = run_solver(model.replace(opt=model.opt.replace(**budget)), data)
 
-    def distance(x):
-        return jnp.sum(jnp.abs(imbalance(model, data, x)))
+    def newton(x):
+        """The step from x, and how far x is from the solution in the norm of the stiffness, free of units."""
+        step = _newton_step(model, data, x) - x
+        return step, jnp.abs(jnp.vdot(imbalance(model, data, x), step))
 
+    terms = (mjx.mul_m(model, data, qacc), data.qfrc_smooth, constraint_force(model, data, qacc))
+    rounding = EPSILON * sum(jnp.abs(term) for term in terms)
+    floor = jnp.sum(rounding**2 / jnp.diag(mjx.full_m(model, data)))
+    step, distance = newton(qacc)
     for _ in range(POLISHING_STEPS):
-        candidate = _newton_step(model, data, qacc)
-        qacc = jnp.where(distance(candidate) < distance(qacc), candidate, qacc)
+        candidate = qacc + step
+        following, nearer = newton(candidate)
+        better = nearer < jnp.maximum(distance, floor)  # below the floor a step still follows small changes
+        qacc, step, distance = (
+            jnp.where(better, new, old) for new, old in ((candidate, qacc), (following, step), (nearer, distance))
+        )
     return qacc
 
 

@@ -23,9 +23,10 @@ from mjx_study.dynamics import State, rollout
 from mjx_study.noise import split_sample_key, standard_noise
 from mjx_study.task import Task, check_sigma
 
-MAX_CHUNK: Final = {"cpu": 512, "gpu": 32768, "tpu": 32768}
+MAX_CHUNK: Final = {"cpu": 512, "gpu": 2**15 + 1, "tpu": 2**15 + 1}
 """Most samples per device in one call, by backend: a CPU gains nothing from larger batches, an accelerator needs them;
-and this bounds memory (about 40 kB for each gradient of 200 steps of a two-joint model)."""
+and this bounds memory (about 40 kB for each gradient of 200 steps of a two-joint model). One more than a power of two,
+for the baseline."""
 
 
 def rollout_cost(

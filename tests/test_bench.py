@@ -21,7 +21,7 @@ def configured(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(options, "configure", lambda **_: None)
 
 
-RATIOS = {"gradient_per_value", "values_over_stock", "speedup_over_stock"}
+RATIOS = {"gradient_per_value", "rollouts_over_stock", "speedup_over_stock"}
 
 
 @pytest.mark.parametrize(

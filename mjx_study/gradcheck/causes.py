@@ -16,12 +16,11 @@ from mjx_study.scene import num_constraint_rows
 NEAR: Final = 2e-6
 """How close to a switch a distance must be to be its cause; about the shortest difference [m, rad, relative]."""
 PARALLEL: Final = 1e-5
-"""Angle below which two directions count as parallel [rad]; contact points turn within fewer."""
+"""Angle [rad] or distance [m] below which two directions or points count as one; contact points turn within less."""
 UNKNOWN: Final = "unknown"
 _SLIDE, _HINGE = int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE)
-_PLANE, _CAPSULE, _CYLINDER = (
-    int(kind) for kind in (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_CYLINDER)
-)
+_PLANE, _SPHERE = int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_SPHERE)
+_CAPSULE, _CYLINDER = int(mujoco.mjtGeom.mjGEOM_CAPSULE), int(mujoco.mjtGeom.mjGEOM_CYLINDER)
 SINGULAR: Final = "the inertia matrix is singular (a body lacks mass, or joints do the same)"
 
 
@@ -67,6 +66,8 @@ def cause_of_fault(place: Place, output: Coordinate, source: Coordinate, *, stoc
 def cause_of_kink(place: Place, output: Coordinate, source: Coordinate) -> str:
     """What switches here."""
     rules = (_control_bound, _parameter_bound, _onset, _limit, _row_switch, _friction_loss, _muscle, _degenerate)
+    if output.block == "act":  # which nothing that touches moves
+        rules = (_control_bound, _muscle)
     found = next((text for rule in rules if (text := rule(place, output, source))), None)
     return found or "a clip, a maximum or a choice between features switches here"
 
@@ -184,11 +185,13 @@ def degenerate_contact(place: Place) -> str | None:
         return None
     data = host_data(host, place.state)
     mujoco.mj_kinematics(host, data)
-    axes = data.geom_xmat.reshape(-1, 3, 3)[:, :, 2]
+    axes, centres = data.geom_xmat.reshape(-1, 3, 3)[:, :, 2], data.geom_xpos
     for geoms in place.stages["geom"][touching]:
         kinds = {int(host.geom_type[geom]): int(geom) for geom in geoms}
         parallel = float(np.linalg.norm(np.cross(axes[geoms[0]], axes[geoms[1]]))) < PARALLEL
         labels = [geom_label(host, int(geom)) for geom in geoms]
+        if kinds.keys() == {_SPHERE} and np.linalg.norm(centres[geoms[0]] - centres[geoms[1]]) < PARALLEL:
+            return f"the centres of {' and '.join(labels)} coincide, and no direction is the contact's normal"
         if parallel and kinds.keys() == {_PLANE, _CYLINDER}:
             upright = geom_label(host, kinds[_CYLINDER])
             return f"{upright} stands upright, and its contact points turn with the direction in which it tilts"

@@ -20,6 +20,7 @@ from mjx_study.gradcheck.differences import Differences, differences, moves
 from mjx_study.gradcheck.placement import compare_engines
 from mjx_study.gradcheck.programs import Linear, Programs, Setting
 from mjx_study.gradcheck.report import Entry, Finding, GradcheckReport, StepCheck
+from mjx_study.gradcheck.rounding import solution_noise
 from mjx_study.gradcheck.states import Sample, choose, reached, sample_states
 from mjx_study.policy import OpenLoop
 from mjx_study.runtime import environment
@@ -289,13 +290,14 @@ def check_state(programs: Programs, setting: Setting, sample: Sample, *, stock: 
     still = np.zeros((1, len(layout.inputs)))
     qacc = programs.values(setting, sample.state, reference, still)[2]
     solved = dataclasses.replace(sample.state, warmstart=qacc)
-    truth = differences(programs.values(setting, solved, reference, moves(np.eye(len(layout.inputs))))[0])
+    stages = programs.stages(setting, sample.state)
+    floor = solution_noise(layout, stages, qacc)
+    truth = differences(programs.values(setting, solved, reference, moves(np.eye(len(layout.inputs))))[0], floor)
     converged = None if linear.residual <= 1e-10 else programs.linear(setting, solved).forward
 
     derivatives = {"forward": linear.forward, "reverse": linear.reverse}
     if linear.tape is not None:
         derivatives["tape"] = linear.tape
-    stages = programs.stages(setting, sample.state)
     model = apply_contact(layout.scene.model, contact)
     place = Place(layout, sample.state, stages, qacc, np.asarray(model.geom_solref), np.asarray(model.geom_solimp))
     known = {

@@ -12,11 +12,13 @@ from mjx_study.gradcheck.differences import Differences
 
 TOLERANCE: Final = 1e-6
 """Of an entry, relative to the largest in its row and block, beyond three uncertainties of the difference."""
-MODES_TOLERANCE: Final = 1e-7
-"""Relative difference of forward and reverse mode; rounding alone comes to 1e-8 where the solve is ill-conditioned."""
+MODES_TOLERANCE: Final = 1e-6
+"""Relative difference of forward and reverse mode; rounding alone comes to 1e-7 where the solve is ill-conditioned."""
 RESIDUAL_TOLERANCE: Final = 1e-6
 FAINT: Final = 1e-3
 """Size of a row's entries relative to the largest of its kind below which it counts as that large."""
+STEEP: Final = 0.1
+"""One-sided slopes that differ by more than this, relative to the largest of a row, are not the rounding of a step."""
 RESOLVED: Final = 1e-5
 """Relative uncertainty above which a difference says nothing precise; such entries do not enter the worst error."""
 
@@ -85,7 +87,7 @@ def judge(
     codes[right] = RIGHT
     # The mean of two slopes agrees with central differences, and anything agrees with those over a jump.
     codes[truth.kink & within & ~outside & (~right | (truth.gap > FAINT * scale))] = KINK
-    codes[(truth.jump & ~(right & resolved)) | (degenerate & ~right)] = JUMP
+    codes[(truth.jump & (~right | (truth.gap > STEEP * scale))) | (degenerate & ~right)] = JUMP
     codes[~np.isfinite(jacobian)] = NAN
     figures = np.where(right & resolved, error / scale, 0.0)
     return Judged(codes, float(figures.max(initial=0.0)))

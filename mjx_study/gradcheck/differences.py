@@ -46,8 +46,15 @@ def moves(columns: Float[np.ndarray, "columns inputs"]) -> Float[np.ndarray, "mo
     return np.concatenate([np.zeros((1, columns.shape[1])), steps, -steps])
 
 
-def differences(outputs: Float[np.ndarray, "moves outputs"]) -> Differences:
-    """Read the outputs after `moves`."""
+def differences(
+    outputs: Float[np.ndarray, "moves outputs"], noise_floor: Float[np.ndarray, " outputs"] | None = None
+) -> Differences:
+    """Read the outputs after `moves`.
+
+    Args:
+        outputs: one row for each change.
+        noise_floor: how far rounding may move each output, beyond `ROUNDING`.
+    """
     sizes = np.array(SIZES)[:, None, None]
     here, rest = outputs[0], outputs[1:].reshape(2, len(SIZES), -1, outputs.shape[1])
     above, below = rest
@@ -56,7 +63,7 @@ def differences(outputs: Float[np.ndarray, "moves outputs"]) -> Differences:
     better = (RATIO**2 * central[1:] - central[:-1]) / (RATIO**2 - 1)
     change = np.abs(np.diff(better, axis=0))
     spread = np.maximum(change[1:], change[:-1])  # three neighbours on the ladder agree this well
-    noise = ROUNDING * np.maximum(np.abs(here), 1e-2)
+    noise = ROUNDING * np.maximum(np.abs(here), 1e-2) + (0.0 if noise_floor is None else noise_floor)
     spread = spread + noise / sizes[2 : 2 + len(spread)]
     best = np.argmin(spread, axis=0)[None]
     value = np.take_along_axis(better[1:-1], best, axis=0)[0]

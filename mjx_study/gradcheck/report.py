@@ -207,7 +207,7 @@ class GradcheckReport:
         lines: list[str] = []
         for group in shown:
             contacts = list(dict.fromkeys(finding.contact for finding in group))
-            others = f" (and {len(contacts) - 1} more contact models)" if len(contacts) > 1 else ""
+            others = f" (and {len(contacts) - 1} more)" if len(contacts) > 1 else ""
             lines.append(f"{contacts[0]}{others}: {group[0].line()}" if len(self.steps) > 1 else group[0].line())
             for finding in group if verbose else ():
                 label = f"{finding.contact}, " if len(self.steps) > 1 else ""

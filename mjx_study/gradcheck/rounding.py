@@ -1,0 +1,30 @@
+"""How precisely a step can be computed at all, which limits what differences of it can tell."""
+
+from typing import Any, Final
+
+import numpy as np
+from jaxtyping import Float
+
+from mjx_study.gradcheck.coordinates import Coordinates
+
+EPSILON: Final = 1e-15
+"""A few roundings of a float64."""
+
+
+def solution_noise(
+    layout: Coordinates, stages: dict[str, Any], qacc: Float[np.ndarray, " nv"]
+) -> Float[np.ndarray, " outputs"]:
+    """How far rounding may move the outputs of a step whose equation M a - q - J^T f(J a) = 0 is solved exactly.
+
+    Each term is rounded, by EPSILON of its size, and the equation's inverse carries that into the acceleration.
+    """
+    jacobian, timestep = stages["efc_J"], layout.scene.timestep
+    weighted = stages["efc_D"][:, None] * np.abs(jacobian)
+    size = np.abs(stages["qM"]) @ np.abs(qacc) + np.abs(stages["qM"] @ stages["qacc_smooth"])
+    size += weighted.T @ (np.abs(jacobian) @ np.abs(qacc) + np.abs(stages["efc_aref"]))
+    stiffness = stages["qM"] + jacobian.T @ (stages["efc_D"][:, None] * jacobian)
+    if not (np.all(np.isfinite(stiffness)) and np.linalg.cond(stiffness) < 1 / EPSILON):
+        return np.zeros(len(layout.outputs))
+    velocity = timestep * EPSILON * np.abs(np.linalg.inv(stiffness)) @ size
+    activation = np.zeros(len(layout.outputs) - 2 * len(velocity))
+    return np.concatenate([timestep * velocity, velocity, activation])
