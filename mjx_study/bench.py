@@ -140,14 +140,16 @@ def bench(plan: BenchPlan, progress: Progress = lambda done, total, what: None) 
     keys = jax.random.split(jax.random.key(0), samples)
     simulator = Simulator(task, chunk_size=chunk_for(samples, devices))
     objective = simulator.objective(cell.contact)
-    key_data, noisy = np.asarray(jax.random.key_data(keys)), np.ones(samples, task.scene.template.qpos.dtype)
+    full = -(-samples // (simulator.chunk_size * len(devices))) * simulator.chunk_size * len(devices)
+    key_data = np.resize(jax.random.key_data(keys), (full, 2))  # chunks without padding, which stock has not either
+    noisy = np.ones(full, task.scene.template.qpos.dtype)
     progress(0, 8, f"{task.name}: compiling stock")
     stock_samples = min(samples, STOCK_BATCH[devices[0].platform] * len(devices))
     stock_samples, stock_value, stock_gradient = _fitting_stock(task, cell.contact, keys, stock_samples, devices)
     contenders: dict[str, tuple[int, Callable[[], Any]]] = {
         "value": (samples, lambda: objective.evaluate(task.theta, keys)),
         "gradient": (samples, lambda: objective.differentiate(task.theta, keys)),
-        "rollout": (samples, lambda: simulator.run_values(task.theta, cell.contact, task.sigma, key_data, noisy)),
+        "rollout": (full, lambda: simulator.run_values(task.theta, cell.contact, task.sigma, key_data, noisy)),
         "stock_value": (stock_samples, stock_value),
         "stock_gradient": (stock_samples, stock_gradient),
     }

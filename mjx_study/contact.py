@@ -3,7 +3,10 @@ r"""Contact models: how MuJoCo's soft contact is parametrised, in MuJoCo's own t
 MuJoCo's contact acts on acceleration. Along the normal, with impedance d, penetration r < 0 and unconstrained
 acceleration a_0, the acceleration becomes
 
-    a_1 = (1 - d) a_0 - b v - k r,        k [1/s^2], b [1/s].
+    a_1 = (1 - d) a_0 - s b v - s^2 k r,        s = d / d_width,    k [1/s^2], b [1/s].
+
+The impedance d = d(r) goes from d_0 at first touch to d_width at the depth `width` and beyond, where s = 1; with
+d_0 = d_width s is 1 throughout, and with d_0 near 0 spring and damper set in gradually.
 
 For two bodies of effective mass m_eff along the normal a spring of K [N/m] and a damper of B [N s/m] are k = K / m_eff,
 b = B / m_eff. One family holds both ends of the study's question: d -> 0 is the penalty method, a spring added to the

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -68,7 +68,7 @@ def plot_comparison(result: CompareResult) -> Figure:
 
 def plot_landscape(result: Landscape) -> Figure:
     """Cost and smoothed cost above, the slopes that ZoBG and FoBG see below; a column for each contact model."""
-    figure = Figure(figsize=(1.2 + 2.9 * len(result.curves), 5.6), layout="constrained")
+    figure = Figure(figsize=(1.2 + 2.9 * len(result.curves), 6.2), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots(2, len(result.curves), sharex=True, sharey="row", squeeze=False)
     t = result.position
@@ -83,8 +83,8 @@ def plot_landscape(result: Landscape) -> Figure:
             _mean_with_band(below, t, mean, error, colour, f"mean of {label}")
         if curve.exact is not None:
             style = {"color": "black", "linestyle": ":", "linewidth": 1.2}
-            below.plot(t, curve.exact.slope, **style, label="slope of the mean cost, exact")
-            below.plot(t, curve.exact.first, **style | {"color": STYLE["fobg"][1]}, label="mean of FoBG, exact")
+            below.plot(t, curve.exact.slope, **style, label="slope of the mean cost, quadrature")
+            below.plot(t, curve.exact.first, **style | {"color": STYLE["fobg"][1]}, label="mean of FoBG, quadrature")
         above.set_title(_curve_title(curve), fontsize="medium")
         below.axhline(0, color="0.7", linewidth=0.8)
         below.set_xlabel("theta" if len(result.direction) == 1 else f"t along direction {result.config.direction}")
@@ -94,8 +94,11 @@ def plot_landscape(result: Landscape) -> Figure:
     axes[1, 0].set_ylim(low, high)
     axes[0, 0].set_ylabel("cost")
     axes[1, 0].set_ylabel("slope")
-    axes[0, 0].legend(frameon=False, fontsize="small")
-    axes[1, 0].legend(frameon=False, fontsize="small")
+    legend: dict[str, Any] = {}
+    for axis in axes.flat:
+        handles, labels = axis.get_legend_handles_labels()
+        legend |= dict(zip(labels, handles, strict=True))
+    figure.legend(legend.values(), legend, loc="outside lower center", ncols=3, frameon=False, fontsize="small")
     config = result.config
     figure.suptitle(
         f"{config.task}: sigma = {config.sigma:g}, {config.samples} samples at each point (bands: 95 %)",
@@ -106,7 +109,7 @@ def plot_landscape(result: Landscape) -> Figure:
 
 def _curve_title(curve: Curve) -> str:
     if curve.family == "reference":
-        return "analytic reference"
+        return "analytic reference\n(of penalty contact)"
     return f"{TITLES[curve.family]}\nK = {curve.stiffness:g} N/m" if curve.stiffness else TITLES[curve.family]
 
 

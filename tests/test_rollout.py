@@ -141,6 +141,13 @@ def test_a_rollout_that_is_lost_is_shown_as_far_as_it_goes(capsys: pytest.Captur
     assert not good.all() and facts["bodies"]["ball"][0] == pytest.approx(data["qpos"][np.argmin(good) - 1, 0])
 
 
+def test_theta_as_numbers(capsys: pytest.CaptureFixture[str], elsewhere: Path) -> None:
+    facts = document(capsys, "pusher", "--horizon", "3", "--frames", "1", "--theta=-0.5,1,2e-1")
+    assert facts["theta"] == [-0.5, 1.0, 0.2]
+    data = np.load(elsewhere / "results" / "pusher-rollout" / "trajectory.npz")
+    np.testing.assert_allclose(data["controls"][:, 0], [-0.5, 1.0, 0.2])
+
+
 def test_a_theta_without_a_finite_cost(capsys: pytest.CaptureFixture[str], elsewhere: Path) -> None:
     np.save(elsewhere / "theta.npy", np.full(10, 1e200))
     facts = document(capsys, *SHORT, "--theta", "theta.npy")
@@ -164,8 +171,12 @@ def test_a_theta_without_a_finite_cost(capsys: pytest.CaptureFixture[str], elsew
         (["pusher", "--theta", "nowhere.npy"], "cannot read nowhere.npy: No such file or directory"),
         (["pusher", "--theta", "broken.json"], "broken.json is neither a .json list of numbers nor a .npy array"),
         (["pusher", "--theta", "broken.npy"], "broken.npy is neither a .json list of numbers nor a .npy array"),
-        (["pusher", "--theta", "short.json"], "short.json holds 2 numbers; pusher needs 200 finite ones"),
-        (["pusher", "--theta", "nan.json", "--horizon", "2"], "nan.json holds 2 numbers; pusher needs 2 finite ones"),
+        (["pusher", "--theta", "short.json"], "short.json holds 2 numbers; pusher needs 200, all of them finite"),
+        (
+            ["pusher", "--theta", "nan.json", "--horizon", "2"],
+            "nan.json holds 2 numbers; pusher needs 2, all of them finite",
+        ),
+        (["pusher", "--theta", "0.1,0.2"], "--theta holds 2 numbers; pusher needs 200, all of them finite"),
         (["nowhere.xml"], "no MJCF file at nowhere.xml"),
         (["broken.xml"], "broken.xml is not a valid MJCF"),
         (["rod.xml", "--horizon", "0"], "horizon must be at least 1 step, got 0"),

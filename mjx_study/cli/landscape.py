@@ -31,6 +31,9 @@ examples:
 Top row of the figure: the cost without noise, and the mean cost with noise (its smoothed objective) with a 95 % band.
 Bottom row: the mean of ZoBG and of FoBG along the line, with theirs. Where the smoothed objective has a slope that the
 mean of FoBG does not have, the cost jumps: a first-order gradient does not see jumps.
+
+A decision of one number also gets both slopes without sampling error, by quadrature over 1500 rollouts and gradients of
+each contact model, whatever --points and --samples.
 """
 FIELDS = "task contact stiffness damping points span direction samples sigma seed".split()
 
@@ -39,8 +42,8 @@ def add(commands: Commands) -> None:
     """Register the command."""
     summary = "draw a decision's cost, its smoothed cost and the slope that each estimator sees"
     command = add_command(commands, "landscape", summary, run, EPILOG)
-    add_task_options(command)
-    command.add_argument("--samples", type=int, metavar="N", help="samples at each point (default: 200)")
+    add_task_options(command, stiffness="the middle one of the task's sweep")
+    command.add_argument("--samples", type=int, metavar="N", help="samples at each point (default: 100)")
     command.add_argument("--points", type=int, metavar="N", help="points on the line (default: 41)")
     command.add_argument("--span", type=numbers, metavar="LO,HI", help="range of the line (default: the task's)")
     command.add_argument(

@@ -48,15 +48,22 @@ def add_command(
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     command.set_defaults(run=run)
-    command.add_argument("--json", action="store_true", help="print the figures as JSON on standard output")
+    command.add_argument("--json", action="store_true", help="print the numbers as JSON on standard output")
     return command
 
 
-def add_task_options(command: argparse.ArgumentParser, *, contact: bool = True) -> None:
+def add_task_options(
+    command: argparse.ArgumentParser,
+    *,
+    contact: bool = True,
+    stiffness: str = "the task's sweep",
+    files: str = "",
+) -> None:
     """The task, what may replace its own settings, and how it is computed."""
-    command.add_argument("task", metavar="TASK", help=f"one of: {', '.join(task_names())}")
+    metavar = "TASK|FILE.xml" if files else "TASK"
+    command.add_argument("task", metavar=metavar, help=f"one of: {', '.join(task_names())}{files}")
     if contact:
-        add_contact_options(command)
+        add_contact_options(command, stiffness)
     command.add_argument("--sigma", type=float, metavar="S", help="noise, in the unit of what it is added to")
     command.add_argument("--cone", choices=list(CONES), help="friction cone (default: the MJCF's)")
     command.add_argument("--horizon", type=int, metavar="H", help="steps (default: the task's)")
@@ -64,10 +71,10 @@ def add_task_options(command: argparse.ArgumentParser, *, contact: bool = True) 
     add_process_options(command)
 
 
-def add_contact_options(command: argparse.ArgumentParser) -> None:
+def add_contact_options(command: argparse.ArgumentParser, stiffness: str = "the task's sweep") -> None:
     """The contact models."""
     command.add_argument(
-        "--stiffness", type=numbers, metavar="K[,K]", help="contact stiffnesses in N/m (default: the task's sweep)"
+        "--stiffness", type=numbers, metavar="K[,K]", help=f"contact stiffnesses in N/m (default: {stiffness})"
     )
     command.add_argument("--contact", type=names, metavar="FAMILY[,FAMILY]", help=f"of: {', '.join(FAMILIES)}")
     command.add_argument(

@@ -56,7 +56,7 @@ it has one, for 2 s unless --horizon says otherwise.
 
 examples:
   mjx-study rollout pusher
-  mjx-study rollout ball_wall --contact penalty --stiffness 1e4 --slow 4
+  mjx-study rollout ball_wall --theta 0.75 --stiffness 1e4 --slow 4
   mjx-study rollout tennis --noise --seed 3 --theta learnt.npy
   mjx-study rollout humanoid.xml --horizon 500 --view xz --format mp4
 """
@@ -101,12 +101,14 @@ class Rollout:
 def add(commands: Commands) -> None:
     """Register the command."""
     command = add_command(commands, "rollout", "show a rollout: pictures, a film and its numbers", run, EPILOG)
-    add_task_options(command, contact=False)
+    add_task_options(command, contact=False, files="; or any MJCF")
     command.add_argument("--contact", metavar="FAMILY", help=f"one of: {', '.join(FAMILIES)} (default: the task's)")
     command.add_argument("--stiffness", type=float, metavar="K", help="contact stiffness in N/m (default: the task's)")
     command.add_argument("--damping", type=float, metavar="B", help="contact damping in N s/m")
     command.add_argument("--noise", action="store_true", help="with the noise of sample --seed (default: none)")
-    command.add_argument("--theta", type=Path, metavar="FILE", help="parameters, .json or .npy (default: the task's)")
+    command.add_argument(
+        "--theta", metavar="FILE|X[,X]", help="parameters: a .json or .npy file, or the numbers (default: the task's)"
+    )
     command.add_argument("--frames", type=int, default=6, metavar="N", help="pictures in the strip (default: 6)")
     command.add_argument("--view", choices=["auto", *VIEWS], default="auto", help="default: where most happens")
     command.add_argument("--renderer", choices=RENDERERS, default="auto", help="default: auto, opengl where it works")
@@ -162,26 +164,35 @@ def _plan_task(options: argparse.Namespace):
     family = options.contact or ("mujoco" if "mujoco" in task.families else task.families[0])
     stiffness = task.stiffnesses[len(task.stiffnesses) // 2] if options.stiffness is None else options.stiffness
     cells, messages = plan_cells(task, (family,), (stiffness,), options.damping)
-    theta = task.theta if options.theta is None else _load_theta(options.theta, task)
+    theta = task.theta if options.theta is None else jnp.asarray(_theta(options.theta, task), task.theta.dtype)
     return partial(_simulate_task, task, cells[0], theta, options.seed, options.noise), messages
 
 
-def _load_theta(path: Path, task: Task) -> jax.Array:
-    """Parameters from a file.
+def _theta(text: str, task: Task) -> np.ndarray:
+    """Parameters as numbers or from a file.
 
     Raises:
-        ValueError: it cannot be read, is of another kind, or does not hold one finite number for each parameter.
+        ValueError: the file cannot be read or is of another kind, or there is not one finite number for each parameter.
     """
     try:
+        source, values = "--theta", np.array([float(part) for part in text.split(",")])
+    except ValueError:
+        source, values = text, _load_numbers(Path(text))
+    if values.shape != (task.policy.num_params,) or not np.all(np.isfinite(values)):
+        raise ValueError(
+            f"{source} holds {values.size} numbers; {task.name} needs {task.policy.num_params}, all of them finite"
+        )
+    return values
+
+
+def _load_numbers(path: Path) -> np.ndarray:
+    try:
         content = json.loads(path.read_text()) if path.suffix == ".json" else np.load(path, allow_pickle=False)
-        values = np.asarray(content, float).reshape(-1)
+        return np.asarray(content, float).reshape(-1)
     except OSError as error:
         raise ValueError(f"cannot read {path}: {error.strerror or error}") from error
     except (ValueError, TypeError, EOFError) as error:
         raise ValueError(f"{path} is neither a .json list of numbers nor a .npy array") from error
-    if values.shape != (task.policy.num_params,) or not np.all(np.isfinite(values)):
-        raise ValueError(f"{path} holds {values.size} numbers; {task.name} needs {task.policy.num_params} finite ones")
-    return jnp.asarray(values, task.theta.dtype)
 
 
 def _simulate_task(task: Task, cell: Cell, theta: jax.Array, seed: int, noisy: bool) -> Rollout:
@@ -192,13 +203,15 @@ def _simulate_task(task: Task, cell: Cell, theta: jax.Array, seed: int, noisy: b
         "task": task.name,
         "contact": cell.family,
         "stiffness": cell.stiffness,
+        "theta": np.asarray(theta, float).tolist(),
         "sigma": task.sigma if noisy else 0.0,
         "seed": seed,
         "cost": float(cost) if np.isfinite(cost) else None,
         "residual": float(residual) if np.isfinite(residual) else None,
     }
     noise = f"noise {task.sigma:g}, seed {seed}" if noisy else "no noise"
-    title = f"{task.name}: {cell.label}, {noise}"
+    decision = f"theta {float(theta[0]):g}, " if theta.size == 1 else ""
+    title = f"{task.name}: {cell.label}, {decision}{noise}"
     rollout = _rollout(title, task.scene.host, states.qpos, states.qvel, controls, facts)
     return dataclasses.replace(rollout, focus=tuple(task.scene.geom(name) for name in task.contact_pair or ()))
 

@@ -21,6 +21,8 @@ def run(options: argparse.Namespace) -> int:
         | {"effective_mass": task.effective_mass if task.contact_pair else None, "description": task.description}
         for task in tasks
     ]
-    lines = [f"{row['name']:<17} {row['description']} ({row['params']} params)" for row in rows]
+    lines = [
+        f"{row['name']:<17} {row['description']} ({row['params']} parameter{'s' * (row['params'] > 1)})" for row in rows
+    ]
     print_report(options, {"tasks": rows}, lines)
     return 0

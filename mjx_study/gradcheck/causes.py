@@ -210,7 +210,7 @@ def _onset(place: Place, output: Coordinate, source: Coordinate) -> str | None:
     if not len(near):
         return None
     pair = " and ".join(geom_label(place.host, int(geom)) for geom in place.stages["geom"][near[0]])
-    return f"contact of {pair} is at its onset ({gap[near[0]]:.1e} m)"
+    return f"contact of {pair} is at its onset ({abs(gap[near[0]]):.1e} m away)"
 
 
 def _limit(place: Place, output: Coordinate, source: Coordinate) -> str | None:

@@ -233,7 +233,7 @@ def _summary(plan: GradcheckPlan) -> str:
     host = plan.subject.scene.host
     parts = [_count(host.nv, "degree", "of freedom")]
     parts += [_count(number, noun) for number, noun in ((host.na, "activation"), (host.nu, "control")) if number]
-    taken = f"{_count(plan.states, 'state')} of {_count(plan.subject.horizon, 'step')} of {host.opt.timestep:g} s"
+    taken = f"{_count(plan.states, 'state')} along {_count(plan.subject.horizon, 'step')} of {host.opt.timestep:g} s"
     return f"{', '.join(parts)}; {taken}"
 
 

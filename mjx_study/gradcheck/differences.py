@@ -3,7 +3,7 @@
 Central differences of a smooth map settle as the step shrinks, until rounding takes over; the plateau between is the
 derivative, and how flat it is its uncertainty. The second difference |f(x + h) - 2 f(x) + f(x - h)| tells the rest: it
 falls like h^2 where the map is smooth, like h at a kink, whose two one-sided slopes disagree at every step, and not at
-all at a jump.
+all at a jump; nor does |f(x + h) - f(x - h)|, which alone shows a jump that is odd about x.
 """
 
 import dataclasses
@@ -28,7 +28,8 @@ class Differences:
     Attributes:
         value: the derivative by central differences where there is one, else the mean of the one-sided slopes.
         uncertainty: of the value.
-        gap: by how much the one-sided slopes disagree at the smallest step that rounding leaves alone.
+        gap: by how much the one-sided slopes disagree at the smallest step that rounding leaves alone; at an odd jump
+            how steep the difference is.
         kink: where they disagree however small the step.
         jump: where the map itself jumps.
     """
@@ -69,25 +70,35 @@ def differences(
     value = np.take_along_axis(better[1:-1], best, axis=0)[0]
     uncertainty = np.take_along_axis(spread, best, axis=0)[0]
 
-    second = np.abs(above - 2 * here + below)
-    loud = second > 100 * noise
-    # the power of h over the last two ratios in which rounding plays no part
-    usable = loud[2:] & loud[1:-1] & loud[:-2]
-    last = np.where(usable.any(axis=0), len(usable) - 1 - np.argmax(usable[::-1], axis=0), 0)[None]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        power = np.log(second[:-2] / second[2:]) / np.log(RATIO) / 2
-    power = np.where(usable.any(axis=0), np.take_along_axis(power, last, axis=0)[0], np.inf)
-    gap = np.take_along_axis(second[2:] / sizes[2:], last, axis=0)[0]
-    gap = np.where(usable.any(axis=0), gap, 0.0)
-    # where the second difference falls off below a size, the kink or jump is that far away and not here
-    following = np.take_along_axis(np.concatenate([second[3:], second[-1:]]), last, axis=0)[0]
-    expected = np.take_along_axis(second[2:], last, axis=0)[0] * RATIO ** -np.maximum(power, 0.0)
-    finest = last[0] >= len(usable) - 2
-    here_too = finest | (following > expected / RATIO) | (expected <= 200 * noise)
+    power, gap, here_too = _falloff(np.abs(above - 2 * here + below), noise)
     kink, jump = (power < SMOOTH) & (power >= KINK) & here_too, (power < KINK) & here_too
+    # one-sided slopes agree across a jump that is odd about this point, but the first difference does not fall off
+    slope_power, steepness, odd_here = _falloff(np.abs(above - below), noise)
+    odd = (slope_power < KINK) & odd_here & ~jump
+    kink, jump, gap = kink & ~odd, jump | odd, np.where(odd, steepness, gap)
 
     # ... and only steps that do not reach it see the derivative
     nearby = (power < SMOOTH) & ~here_too
     value = np.where(nearby, central[-2], value)
     uncertainty = np.where(nearby, np.abs(central[-1] - central[-2]) + noise / SIZES[-1], uncertainty)
     return Differences(value.T, uncertainty.T, gap.T, kink.T, jump.T)
+
+
+def _falloff(amount: Float[np.ndarray, "sizes columns outputs"], noise: Float[np.ndarray, "..."]):
+    """The power of h with which an amount falls off, the amount over h, and whether its cause is here, not nearby."""
+    sizes = np.array(SIZES)[:, None, None]
+    loud = amount > 100 * noise
+    # the power over the last two ratios in which rounding plays no part
+    usable = loud[2:] & loud[1:-1] & loud[:-2]
+    last = np.where(usable.any(axis=0), len(usable) - 1 - np.argmax(usable[::-1], axis=0), 0)[None]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        power = np.log(amount[:-2] / amount[2:]) / np.log(RATIO) / 2
+    power = np.where(usable.any(axis=0), np.take_along_axis(power, last, axis=0)[0], np.inf)
+    over_size = np.take_along_axis(amount[2:] / sizes[2:], last, axis=0)[0]
+    over_size = np.where(usable.any(axis=0), over_size, 0.0)
+    # where the amount falls off below a size, the kink or jump is that far away and not here
+    following = np.take_along_axis(np.concatenate([amount[3:], amount[-1:]]), last, axis=0)[0]
+    expected = np.take_along_axis(amount[2:], last, axis=0)[0] * RATIO ** -np.maximum(power, 0.0)
+    finest = last[0] >= len(usable) - 2
+    here_too = finest | (following > expected / RATIO) | (expected <= 200 * noise)
+    return power, over_size, here_too

@@ -70,14 +70,15 @@ class Finding:
         modes = f", {' and '.join(self.modes)} mode" if self.who == "project" and len(self.modes) in (1, 2) else ""
         if not example.name:
             return f"{who}{self.verdict} ({count}): {self.cause}"
-        numbers = _numbers(example)
+        numbers = self._numbers(example)
         return f"{who}{self.verdict} ({count}{modes}), as {example.name} {numbers}: {self.cause}"
 
-
-def _numbers(entry: Entry) -> str:
-    there = "" if entry.difference is None else f", differences {entry.difference:.6g}"
-    gap = f" (one-sided apart by {entry.gap:.2g})" if entry.gap else ""
-    return f"= {entry.derivative:.6g}{there}{gap}"
+    def _numbers(self, entry: Entry) -> str:
+        if self.verdict == "jump" and entry.gap:
+            return f"= {entry.derivative:.6g}, but differences reach {entry.gap:.2g}"
+        there = "" if entry.difference is None else f", differences {entry.difference:.6g}"
+        gap = f" (one-sided apart by {entry.gap:.2g})" if entry.gap else ""
+        return f"= {entry.derivative:.6g}{there}{gap}"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -212,7 +213,7 @@ class GradcheckReport:
             for finding in group if verbose else ():
                 label = f"{finding.contact}, " if len(self.steps) > 1 else ""
                 lines += [
-                    f"    {label}{entry.state} ({entry.time:.4g} s)  {entry.name} {_numbers(entry)}"
+                    f"    {label}{entry.state} ({entry.time:.4g} s)  {entry.name} {finding._numbers(entry)}"
                     for entry in finding.entries
                 ]
         if len(shown) < len(alike):

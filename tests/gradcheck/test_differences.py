@@ -66,6 +66,19 @@ def test_a_jump(side: str, size: float) -> None:
     assert found.jump[0, 0] and not found.kink[0, 0]
 
 
+def test_a_jump_that_is_odd() -> None:
+    """Its one-sided slopes agree at every step."""
+    found = read(lambda x: 1e-3 * np.sign(x) + x, noise=1e-17)
+    assert found.jump[0, 0] and not found.kink[0, 0]
+    assert found.gap[0, 0] > 100
+
+
+def test_an_odd_jump_nearby_is_none_here() -> None:
+    found = read(lambda x: 1e-3 * np.sign(x) * (np.abs(x) > 2e-6) + 2 * x, noise=1e-18)
+    assert not found.jump[0, 0] and not found.kink[0, 0]
+    assert found.value[0, 0] == pytest.approx(2, rel=1e-6)
+
+
 def test_rounding_is_no_jump() -> None:
     found = read(lambda x: np.ones_like(x), noise=1e-16)
     assert not found.jump[0, 0] and not found.kink[0, 0]
