@@ -8,30 +8,68 @@ Reference: Suh, Simchowitz, Zhang, Tedrake, "Do Differentiable Simulators Give B
 
 from estimators.alpha_order import alpha_order, constrained_alpha, interpolate, inverse_variance_alpha
 from estimators.baselines import BASELINES, leave_one_out, none, zero_noise
-from estimators.confidence import bernstein_epsilon
-from estimators.first_order import first_order
-from estimators.registry import ESTIMATORS, Estimator, EstimatorOptions, combine, estimate
+from estimators.bias import BiasTest, EmpiricalBias, bias_test, empirical_bias
+from estimators.confidence import VARIANCE_PROXIES, bernstein_epsilon, coverage_interval, variance_upper_bound
+from estimators.ddcg import discontinuity_gated
+from estimators.first_order import clipped_first_order, first_order
+from estimators.noise import NOISES, NoiseDensity
+from estimators.propagation import total_propagation, truncated_first_order
+from estimators.registry import ESTIMATORS, ORACLES, Estimator, EstimatorOptions, Oracle, combine, draw, estimate
 from estimators.statistics import Comparison, compare, norm_quantiles, summarise, variance_interval
-from estimators.types import AlphaChoice, Differentiation, Evaluation, GradientEstimate, Objective
-from estimators.zeroth_order import delta_control_variate, zeroth_order
+from estimators.stepwise import antithetic_cost_to_go, cost_to_go, stepwise_inverse_variance
+from estimators.types import (
+    AlphaChoice,
+    Differentiation,
+    Evaluation,
+    GradientEstimate,
+    Linearisation,
+    Objective,
+    PairedObjective,
+    StepDifferentiation,
+    StepEvaluation,
+    StepwiseObjective,
+    pull_back,
+)
+from estimators.zeroth_order import antithetic, delta_control_variate, zeroth_order
 
 __all__ = [
     "BASELINES",
     "ESTIMATORS",
+    "NOISES",
+    "ORACLES",
+    "VARIANCE_PROXIES",
     "AlphaChoice",
+    "BiasTest",
     "Comparison",
     "Differentiation",
+    "EmpiricalBias",
     "Estimator",
     "EstimatorOptions",
     "Evaluation",
     "GradientEstimate",
+    "Linearisation",
+    "NoiseDensity",
     "Objective",
+    "Oracle",
+    "PairedObjective",
+    "StepDifferentiation",
+    "StepEvaluation",
+    "StepwiseObjective",
     "alpha_order",
+    "antithetic",
+    "antithetic_cost_to_go",
     "bernstein_epsilon",
+    "bias_test",
+    "clipped_first_order",
     "combine",
     "compare",
     "constrained_alpha",
+    "cost_to_go",
+    "coverage_interval",
     "delta_control_variate",
+    "discontinuity_gated",
+    "draw",
+    "empirical_bias",
     "estimate",
     "first_order",
     "interpolate",
@@ -39,8 +77,13 @@ __all__ = [
     "leave_one_out",
     "none",
     "norm_quantiles",
+    "pull_back",
+    "stepwise_inverse_variance",
     "summarise",
+    "total_propagation",
+    "truncated_first_order",
     "variance_interval",
+    "variance_upper_bound",
     "zero_noise",
     "zeroth_order",
 ]

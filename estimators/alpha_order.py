@@ -11,14 +11,16 @@ from estimators.types import AlphaChoice, GradientEstimate
 Scalar = Float[Array, ""]
 
 
-def inverse_variance_alpha(variance_zeroth: Scalar, variance_first: Scalar) -> Scalar:
+def inverse_variance_alpha(
+    variance_zeroth: Float[Array, "*nodes"], variance_first: Float[Array, "*nodes"]
+) -> Float[Array, "*nodes"]:
     """The weight of least variance: alpha = sigmahat_0^2 / (sigmahat_0^2 + sigmahat_1^2).
 
     Where the variances do not decide (both zero, both infinite, either one undefined) it is 0: a first-order
     batch is trusted on evidence only.
 
     Args:
-        variance_zeroth: sigmahat_0^2 >= 0, [cost^2/param^2].
+        variance_zeroth: sigmahat_0^2 >= 0, [cost^2/param^2]; one for each weight.
         variance_first: sigmahat_1^2 >= 0, [cost^2/param^2].
 
     Returns:

@@ -1,12 +1,15 @@
 """How far a batch mean may be from its expectation."""
 
+import math
+
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from estimators.statistics import finite_rows
 from estimators.types import GradientEstimate
 
-VARIANCE_PROXIES = ("variance", "second_moment")
+VARIANCE_PROXIES = ("variance", "second_moment", "upper_bound")
 MAX_DEVIATION = "max_deviation"
 
 
@@ -22,16 +25,18 @@ def bernstein_epsilon(
         epsilon = sqrt(2 s2 L / N) + 2 R L / (3 N),   L = log((d + 1) / failure_probability)
 
     ||gbar - E g|| <= epsilon with probability at least 1 - failure_probability, if s2 >= E||g_i - E g||^2 and
-    R >= ||g_i - E g|| always. Neither can be read off the samples: both variance proxies are estimates of s2,
-    and "max_deviation", R = max_i ||g_i - gbar||, is a plug-in and no bound (Gaussian scores have none). Pass
-    R as a number where one is known. The code published with the paper puts delta = 0.95 into the logarithm
-    in place of a probability of failure, and a constant for R in each example.
+    R >= ||g_i - E g|| always (vector Bernstein inequality). Neither can be read off the samples: "variance" and
+    "second_moment" are estimates of s2, and "max_deviation", R = max_i ||g_i - gbar||, is a plug-in and no bound
+    (Gaussian scores have none). Where a bound R is known, "upper_bound" makes the statement rigorous for every N:
+    half of the failure probability goes to s2 = `variance_upper_bound`, half to the inequality. The code published
+    with the paper puts delta = 0.95 into the logarithm in place of a probability of failure, and a constant for R in
+    each example.
 
     Args:
         estimate: The zeroth-order estimate.
         failure_probability: In (0, 1).
-        variance_proxy: "variance", s2 = sigmahat^2, or "second_moment", s2 = (1/N) sum_i ||g_i||^2, which is
-            no smaller than (1 - 1/N) sigmahat^2.
+        variance_proxy: "variance", s2 = sigmahat^2; "second_moment", s2 = (1/N) sum_i ||g_i||^2, which is
+            no smaller than (1 - 1/N) sigmahat^2; or "upper_bound", which needs R as a number.
         radius: "max_deviation", or R >= 0, [cost/param].
 
     Returns:
@@ -42,7 +47,8 @@ def bernstein_epsilon(
 
     Reference: Suh et al. 2022, appendix "Empirical Bernstein confidence", whose right-hand side must be
     delta, the probability of failure (printed 1 - delta), and whose second moment must be a mean (printed as
-    a sum).
+    a sum). The inequality: Tropp, "An introduction to matrix concentration inequalities", 2015, theorem 1.6.2, for
+    a matrix of one column.
     """
     check_confidence_arguments(failure_probability, variance_proxy, radius)
     dtype = estimate.per_sample.dtype
@@ -50,6 +56,9 @@ def bernstein_epsilon(
     count = estimate.num_finite.astype(dtype)
     if variance_proxy == "variance":
         variance = estimate.variance
+    elif variance_proxy == "upper_bound":
+        failure_probability = failure_probability / 2
+        variance = variance_upper_bound(estimate, jnp.asarray(radius, dtype), failure_probability)
     else:
         kept = jnp.where(finite[:, None], estimate.per_sample, 0.0)
         variance = jnp.sum(kept**2) / count
@@ -60,6 +69,74 @@ def bernstein_epsilon(
         bound = jnp.asarray(radius, dtype)
     logarithm = jnp.log(jnp.asarray((estimate.mean.shape[0] + 1) / failure_probability, dtype))
     return jnp.sqrt(2.0 * variance * logarithm / count) + 2.0 * bound * logarithm / (3.0 * count)
+
+
+def variance_upper_bound(
+    estimate: GradientEstimate, radius: Float[Array, ""], failure_probability: float
+) -> Float[Array, ""]:
+    """Upper confidence bound on the variance of one sample, rigorous for every N >= 2.
+
+    For disjoint pairs of samples y = ||g_i - g_j||^2 / 2 has mean E||g - E g||^2 and lies in [0, 2 R^2]. With p the
+    mean of n = floor(N/2) of them over 2 R^2, the bound is 2 R^2 times the largest q >= p with
+
+        n kl(p, q) <= log(1 / failure_probability),    kl(p, q) = p log(p/q) + (1 - p) log((1-p)/(1-q)).
+
+    Args:
+        estimate: The estimate; pairs with a row that is not finite are left out.
+        radius: R >= ||g_i - E g|| always, [cost/param].
+        failure_probability: In (0, 1).
+
+    Returns:
+        The bound, [cost^2/param^2]; 2 R^2 where there is no pair.
+
+    Reference: Hoeffding, "Probability inequalities for sums of bounded random variables", 1963, theorem 1.
+    """
+    rows = estimate.per_sample
+    count = rows.shape[0] // 2
+    one, other = rows[0 : 2 * count : 2], rows[1 : 2 * count : 2]
+    finite = finite_rows(one) & finite_rows(other)
+    most = 2.0 * radius**2
+    halves = jnp.where(finite, jnp.sum((one - other) ** 2, axis=1) / 2.0, 0.0)
+    pairs = jnp.sum(finite).astype(rows.dtype)
+    share = jnp.clip(jnp.sum(halves) / jnp.maximum(pairs, 1.0) / jnp.where(most > 0, most, 1.0), 0.0, 1.0)
+    budget = math.log(1.0 / failure_probability)
+
+    def divergence(q: Float[Array, ""]) -> Float[Array, ""]:
+        return jax.scipy.special.rel_entr(share, q) + jax.scipy.special.rel_entr(1.0 - share, 1.0 - q)
+
+    def halve(_, bracket: tuple[Float[Array, ""], Float[Array, ""]]) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        low, high = bracket
+        middle = (low + high) / 2.0
+        inside = pairs * divergence(middle) <= budget
+        return jnp.where(inside, middle, low), jnp.where(inside, high, middle)
+
+    _, upper = jax.lax.fori_loop(0, 60, halve, (share, jnp.ones_like(share)))
+    return most * upper
+
+
+def coverage_interval(covered: Bool[Array, " trials"], confidence: float) -> tuple[float, float, float]:
+    """How often a bound held, with its Wilson score interval.
+
+    Args:
+        covered: Whether it held, trial by independent trial.
+        confidence: Nominal coverage of the interval, in (0, 1).
+
+    Returns:
+        The share, and the interval's lower and upper end.
+
+    Raises:
+        ValueError: There is no trial, or the confidence is outside (0, 1).
+    """
+    if len(covered) == 0:
+        raise ValueError("coverage needs at least one trial; got none")
+    if not 0.0 < confidence < 1.0:
+        raise ValueError(f"confidence must lie strictly between 0 and 1; got {confidence}; 0.95 is customary")
+    trials, share = len(covered), float(jnp.mean(covered))
+    quantile = float(jax.scipy.special.ndtri(0.5 + confidence / 2.0))
+    squared = quantile**2 / trials
+    centre = (share + squared / 2) / (1 + squared)
+    half_width = quantile / (1 + squared) * math.sqrt(share * (1 - share) / trials + squared / (4 * trials))
+    return share, max(0.0, centre - half_width), min(1.0, centre + half_width)
 
 
 def check_confidence_arguments(failure_probability: float, variance_proxy: str, radius: object) -> None:
@@ -82,6 +159,10 @@ def check_confidence_arguments(failure_probability: float, variance_proxy: str, 
         raise ValueError(f"variance_proxy must be one of {', '.join(VARIANCE_PROXIES)}; got {variance_proxy!r}")
     if isinstance(radius, str) and radius != MAX_DEVIATION:
         raise ValueError(f"radius must be {MAX_DEVIATION!r} or a number; got {radius!r}")
+    if variance_proxy == "upper_bound" and isinstance(radius, str):
+        raise ValueError(
+            f"variance_proxy 'upper_bound' needs a bound on ||g_i - E g|| as radius; got {radius!r}, which is none"
+        )
     if isinstance(radius, int | float) and not 0.0 <= radius < float("inf"):
         raise ValueError(
             f"radius must be finite and not negative; got {radius}; without a bound, pass {MAX_DEVIATION!r}"

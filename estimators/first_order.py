@@ -1,6 +1,7 @@
 """First-order estimates: the mean of the samples' own gradients."""
 
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from estimators.statistics import summarise
 from estimators.types import Differentiation, GradientEstimate
@@ -28,3 +29,30 @@ def first_order(differentiation: Differentiation) -> GradientEstimate:
     """
     finite = jnp.isfinite(differentiation.value)
     return summarise(jnp.where(finite[:, None], differentiation.gradient, jnp.nan))
+
+
+def clipped_first_order(differentiation: Differentiation, max_norm: float | Float[Array, ""]) -> GradientEstimate:
+    """First-order batched gradient with the norm of every sample bounded.
+
+        g_i = grad_theta f_i min(1, c / ||grad_theta f_i||)
+
+    Biased as soon as a sample is clipped; the bias is at most E max(0, ||grad f_i|| - c), beside that of the
+    first-order mean.
+
+    Args:
+        differentiation: The batch.
+        max_norm: c > 0, [cost/param].
+
+    Returns:
+        The estimate, one row per sample.
+
+    Reference: Pascanu, Mikolov, Bengio, "On the difficulty of training recurrent neural networks", ICML 2013, there
+    for the mean.
+    """
+    rows = first_order(differentiation).per_sample
+    largest = jnp.max(jnp.abs(rows), axis=1, keepdims=True)  # scaled by it, no square overflows
+    scaled = rows / jnp.where(largest > 0, largest, 1.0)
+    norm = largest * jnp.linalg.norm(scaled, axis=1, keepdims=True)
+    bound = jnp.asarray(max_norm, rows.dtype)
+    direction = scaled / jnp.where(largest > 0, jnp.linalg.norm(scaled, axis=1, keepdims=True), 1.0)
+    return summarise(jnp.where(norm > bound, bound * direction, rows))

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
+import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key
 
 from estimators.pytree import register_pytree
@@ -49,9 +50,93 @@ class Differentiation:
     residual: Float[Array, " samples"] | None = None
 
 
+@register_pytree
+@dataclass(frozen=True)
+class StepEvaluation:
+    """A batch of rollouts that were evaluated and not differentiated, step by step.
+
+    Noise acts at S steps in m dimensions: at every step of a policy, or once (S = 1) where theta + w is a decision
+    made before the simulation.
+
+    Attributes:
+        value_to_go: V_h^i, the cost from step h on; V_1 is the total, [cost].
+        baseline_to_go: The same of the zero-noise rollout from the same start, [cost].
+        noise_score: grad psi(w_h^i); w / sigma^2 for Gaussian noise, [1/control].
+        policy_jacobian: D_theta pi(x_h^i), [control/param]; None where theta has one entry for each entry of the
+            noise, in the same order, and acts as it does.
+        residual: As in `Evaluation`.
+    """
+
+    value_to_go: Float[Array, "samples steps"]
+    baseline_to_go: Float[Array, "samples steps"]
+    noise_score: Float[Array, "samples steps controls"]
+    policy_jacobian: Float[Array, "samples steps controls params"] | None
+    residual: Float[Array, " samples"] | None = None
+
+
+@register_pytree
+@dataclass(frozen=True)
+class StepDifferentiation:
+    """A batch of rollouts that were differentiated with respect to the noise of every step.
+
+    Attributes:
+        value: V_1^i, the total cost, [cost].
+        noise_gradient: dV_1^i / dw_h, which is dV_1^i / du_h, [cost/control].
+        policy_jacobian: As in `StepEvaluation`.
+        residual: As in `Differentiation`.
+    """
+
+    value: Float[Array, " samples"]
+    noise_gradient: Float[Array, "samples steps controls"]
+    policy_jacobian: Float[Array, "samples steps controls params"] | None
+    residual: Float[Array, " samples"] | None = None
+
+
+@register_pytree
+@dataclass(frozen=True)
+class Linearisation:
+    """A batch of rollouts with every derivative that a backward recursion needs.
+
+    Attributes:
+        steps: The same rollouts step by step.
+        cost_state: Derivative of each step's cost over the state, [cost/state].
+        cost_control: ... and over the control, [cost/control].
+        final_state: Derivative of the final cost, [cost/state].
+        over_state: Derivative of each step's next state over the state.
+        over_control: ... and over the control, [state/control].
+        policy_state: Derivative of the policy over the state, [control/state]; None for an open loop.
+        start_jacobian: Derivative of the start over theta, where theta and the noise act on the start and on nothing
+            else, [state/param]; otherwise None.
+    """
+
+    steps: StepEvaluation
+    cost_state: Float[Array, "samples horizon states"]
+    cost_control: Float[Array, "samples horizon inputs"]
+    final_state: Float[Array, "samples states"]
+    over_state: Float[Array, "samples horizon states states"]
+    over_control: Float[Array, "samples horizon states inputs"]
+    policy_state: Float[Array, "samples horizon inputs states"] | None
+    start_jacobian: Float[Array, "samples states params"] | None
+
+
+def pull_back(
+    adjoint: Float[Array, "samples steps controls"],
+    policy_jacobian: Float[Array, "samples steps controls params"] | None,
+) -> Float[Array, "samples params"]:
+    """sum_h D_theta pi(x_h)^T adjoint_h of each sample; the adjoint itself where theta is the noise's own place.
+
+    Args:
+        adjoint: A quantity per unit of control, such as dV/du_h, [cost/control].
+        policy_jacobian: As in `StepEvaluation`.
+    """
+    if policy_jacobian is None:
+        return adjoint.reshape(adjoint.shape[0], -1)
+    return jnp.einsum("ishp,ish->ip", policy_jacobian, adjoint, precision="highest")
+
+
 @runtime_checkable
 class Objective(Protocol):
-    """A stochastic objective F(theta) = E f(theta, w): two methods, and nothing else is needed.
+    """A stochastic objective F(theta) = E f(theta, w): two methods, and for most estimators nothing else is needed.
 
     One key per sample: sample i depends on `keys[i]` alone, so a result does not depend on how samples are
     chunked or spread over devices.
@@ -71,24 +156,52 @@ class Objective(Protocol):
         ...
 
 
+@runtime_checkable
+class PairedObjective(Objective, Protocol):
+    """An objective that can also be evaluated with each sample's noise turned round."""
+
+    def evaluate_pair(
+        self, theta: Float[Array, " params"], keys: Key[Array, " samples"]
+    ) -> tuple[Evaluation, Evaluation]:
+        """The batch of `evaluate`, and the one with opposite noise from the same starts."""
+        ...
+
+
+@runtime_checkable
+class StepwiseObjective(Objective, Protocol):
+    """An objective that can also be had step by step; the samples are those of `evaluate` and `differentiate`."""
+
+    def evaluate_steps(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> StepEvaluation:
+        """Roll out without differentiating the dynamics, and keep what each step cost."""
+        ...
+
+    def differentiate_steps(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> StepDifferentiation:
+        """Roll out and differentiate every sample with respect to its noise."""
+        ...
+
+    def linearise(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> Linearisation:
+        """Roll out and keep the derivatives of every step."""
+        ...
+
+
 @register_pytree
 @dataclass(frozen=True)
 class AlphaChoice:
     """Why an interpolated estimate weighs its two batches as it does.
 
     Attributes:
-        alpha: Weight of the first-order batch, in [0, 1].
-        epsilon: Confidence radius of the zeroth-order mean, [cost/param].
-        discrepancy: B = ||gbar_1 - gbar_0||, [cost/param].
-        variance_zeroth: sigmahat_0^2 of one zeroth-order sample, [cost^2/param^2].
-        variance_first: sigmahat_1^2 of one first-order sample, [cost^2/param^2].
+        alpha: Weight of the first-order batch, in [0, 1]; the mean where there is one for every step.
+        epsilon: Confidence radius of the zeroth-order mean, [cost/param]; None where none was used.
+        discrepancy: B = ||gbar_1 - gbar_0||, [cost/param]; None where it was not used.
+        variance_zeroth: sigmahat_0^2 of one zeroth-order sample, [cost^2/param^2]; None where every step has its own.
+        variance_first: sigmahat_1^2 of one first-order sample, [cost^2/param^2]; None likewise.
     """
 
     alpha: Float[Array, ""]
-    epsilon: Float[Array, ""]
-    discrepancy: Float[Array, ""]
-    variance_zeroth: Float[Array, ""]
-    variance_first: Float[Array, ""]
+    epsilon: Float[Array, ""] | None
+    discrepancy: Float[Array, ""] | None
+    variance_zeroth: Float[Array, ""] | None
+    variance_first: Float[Array, ""] | None
 
 
 @register_pytree

@@ -35,6 +35,30 @@ def zeroth_order(evaluation: Evaluation, baseline: str) -> GradientEstimate:
     return summarise(advantage[:, None] * evaluation.score)
 
 
+def antithetic(plus: Evaluation, minus: Evaluation, baseline: str) -> GradientEstimate:
+    """Zeroth-order batched gradient over pairs of opposite noise.
+
+        g_i = ((f_i^+ - b_i^+) s_i^+ + (f_i^- - b_i^-) s_i^-) / 2
+
+    A pair is one sample. Unbiased where the noise is symmetric. Where the noise is added to theta itself the two
+    scores are opposite, any baseline that a pair shares cancels, and what is left is the part of f that is odd in the
+    noise, ((f^+ - f^-) / 2) s^+, all of the signal without the even part's variance.
+
+    Args:
+        plus: The batch.
+        minus: The batch of the same starts and the opposite noise.
+        baseline: A name in `BASELINES`, applied within each half.
+
+    Returns:
+        The estimate, one row per pair.
+
+    Raises:
+        ValueError: No baseline has that name.
+    """
+    above, below = (zeroth_order(batch, baseline).per_sample for batch in (plus, minus))
+    return summarise((above + below) / 2.0)
+
+
 def delta_control_variate(
     evaluation: Evaluation,
     gradient: Float[Array, " params"],

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from estimators import ESTIMATORS
+from estimators.ddcg import PUBLISHED_TOLERANCE
 from mjx_study.contact import FAMILIES
 
 
@@ -27,7 +28,7 @@ class CompareConfig:
         baseline: of zeroth-order estimates: zero_noise, leave_one_out or none.
         gamma: accuracy that the alpha-order estimate must keep, in the unit of the gradient; None for the task's.
         failure_probability: of the confidence radius epsilon.
-        variance_proxy: in epsilon: variance or second_moment.
+        variance_proxy: in epsilon: variance, second_moment or upper_bound.
         radius: R in epsilon: max_deviation, or a bound in the unit of the gradient.
         confidence: of the intervals that are reported.
         damping: of the contact [N s/m]; None for each family's damping ratio.
@@ -35,6 +36,10 @@ class CompareConfig:
         horizon: steps; None for the task's.
         model: an MJCF in place of the task's own; None for that.
         chunk_size: samples per device and call; None to choose by the number of samples.
+        noise: name of the noise's density; None for the task's.
+        max_norm: of a sample of the clipped first-order estimate, in the unit of the gradient.
+        window: steps between cuts of the truncated first-order estimate.
+        tolerance: of the discontinuity test of "ddcg".
     """
 
     task: str
@@ -56,6 +61,10 @@ class CompareConfig:
     horizon: int | None = None
     model: str | None = None
     chunk_size: int | None = None
+    noise: str | None = None
+    max_norm: float | None = None
+    window: int | None = None
+    tolerance: float = PUBLISHED_TOLERANCE
 
     def __post_init__(self) -> None:
         for label, names, choices in (
@@ -114,7 +123,9 @@ class Row:
         alpha: weight of the first-order batch; None for an estimator of one batch.
         epsilon: confidence radius of the zeroth-order mean; None likewise.
         discrepancy: B, the distance between the two means; None likewise.
+        bias_p_value: that the mean's distance to the reference is chance; see `estimators.bias_test`.
         seconds_per_sample: of computing, compilation excluded.
+        variance_seconds: variance times seconds per sample, the variance that a second of computing leaves.
         residual: largest relative solver residual in the batches.
         unconverged: samples whose residual is above the threshold.
         nonfinite: samples left out because they were not finite.
@@ -142,7 +153,9 @@ class Row:
     alpha: float | None
     epsilon: float | None
     discrepancy: float | None
+    bias_p_value: float
     seconds_per_sample: float
+    variance_seconds: float
     residual: float
     unconverged: int
     nonfinite: int

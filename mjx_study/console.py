@@ -44,7 +44,7 @@ def _with_error(value: float, error: float) -> str:
 
 
 def columns(confidence: float) -> list[list[Column]]:
-    """The comparison's table in two halves, each narrow enough for 80 characters."""
+    """The comparison's table in three parts, each narrow enough for 80 characters."""
     identity: list[Column] = [
         ("K [N/m]", lambda row: number(row.stiffness or None)),
         ("estimator", lambda row: STYLE[row.estimator][0]),
@@ -59,11 +59,14 @@ def columns(confidence: float) -> list[list[Column]]:
         ("alpha", lambda row: "-" if row.alpha is None else f"{row.alpha:.3f}"),
         ("epsilon", lambda row: number(row.epsilon)),
         ("B", lambda row: number(row.discrepancy)),
+    ]
+    computing: list[Column] = [
         ("ms", lambda row: f"{1e3 * row.seconds_per_sample:.2f}"),
+        ("variance x s", lambda row: number(row.variance_seconds)),
         ("residual", lambda row: number(row.residual, 2)),
         ("lost", lambda row: str(row.nonfinite)),
     ]
-    return [identity + values, identity + details]
+    return [identity + values, identity + details, identity + computing]
 
 
 def print_comparison(result: CompareResult, print_line: Callable[[str], None] = print) -> None:
@@ -73,8 +76,8 @@ def print_comparison(result: CompareResult, print_line: Callable[[str], None] = 
         f"{config.task}: {config.samples} samples in each batch, sigma {config.sigma:g}, {config.horizon} steps, "
         f"{config.cone} cone, seed {config.seed}, {result.environment['precision']}"
     )
-    halves = columns(config.confidence)
-    whole = halves[0] + halves[1][2:]
+    parts = columns(config.confidence)
+    whole = parts[0] + [column for part in parts[1:] for column in part[2:]]
     for family in result.families:
         rows = [row for row in result.rows if row.contact == family]
         print_line("")
@@ -83,7 +86,7 @@ def print_comparison(result: CompareResult, print_line: Callable[[str], None] = 
         if max(map(len, text)) <= shutil.get_terminal_size((140, 24)).columns:
             blocks = [text]
         else:
-            blocks = [_table(rows, half) for half in halves]
+            blocks = [_table(rows, part) for part in parts]
         for block in blocks:
             for line in block:
                 print_line(line)

@@ -1,14 +1,14 @@
 """(Task, ContactModel) -> the Objective that estimators see.
 
-Batching, chunks and devices live here and nowhere else. A `Simulator` holds the two compiled programs of a task, one
-that evaluates and one that differentiates; contact parameters, theta, sigma and keys are arguments, so a sweep over
+Batching, chunks and devices live here and nowhere else. A `Simulator` holds the compiled programs of a task, one for
+each kind of batch that estimators ask for; contact parameters, theta, sigma and keys are arguments, so a sweep over
 them compiles nothing new. Samples are spread over the devices with `jax.shard_map`, where each device leaves the
 solver's loop on its own, in chunks of fixed size that bound memory.
 """
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Final
 
 import jax
@@ -17,10 +17,10 @@ import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Float, Key
 
-from estimators import Differentiation, Evaluation
+from estimators import Differentiation, Evaluation, Linearisation, StepDifferentiation, StepEvaluation
 from mjx_study.contact import ContactModel, apply_contact
-from mjx_study.dynamics import State, rollout
-from mjx_study.noise import split_sample_key, standard_noise
+from mjx_study.dynamics import State, rollout, step
+from mjx_study.noise import noise_score, split_sample_key, standard_noise
 from mjx_study.task import Task, check_sigma
 
 MAX_CHUNK: Final = {"cpu": 512, "gpu": 2**15 + 1, "tpu": 2**15 + 1}
@@ -58,8 +58,7 @@ def rollout_cost(
     model = apply_contact(task.scene.model, contact)
     first = task.policy.place(theta, noise, start)
     states, controls, residuals = rollout(task.scene, model, first, control_law, task.horizon)
-    last = jax.tree.map(lambda leaf: leaf[-1], states)
-    cost = jnp.sum(jax.vmap(task.running_cost)(_before_each_step(states), controls)) + task.final_cost(last)
+    cost = jnp.sum(jax.vmap(task.running_cost)(_before_each_step(states), controls)) + task.final_cost(_last(states))
     return cost, (states, controls, jnp.max(residuals))
 
 
@@ -80,13 +79,22 @@ def simulate(
         noise_scale: factor on the noise; 0 for a rollout without.
     """
     start_key, noise_key = split_sample_key(key)
-    noise = noise_scale * task.sigma * standard_noise(noise_key, task.policy.noise_shape, theta.dtype)
+    noise = noise_scale * task.sigma * standard_noise(noise_key, task.policy.noise_shape, theta.dtype, task.noise)
     cost, (states, controls, residual) = rollout_cost(task, theta, contact, task.draw_start(start_key), noise)
     return states, controls, cost, residual
 
 
 def _before_each_step(states: State) -> State:
     return jax.tree.map(lambda leaf: leaf[:-1], states)
+
+
+def _last(states: State) -> State:
+    return jax.tree.map(lambda leaf: leaf[-1], states)
+
+
+def _coordinates(state: State) -> Float[Array, " states"]:
+    """The state as a vector; the solver's warm start is no part of it."""
+    return jnp.concatenate([state.qpos, state.qvel, state.act])
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -108,8 +116,8 @@ class Simulator:
             raise ValueError(f"chunk_size must be at least 1 sample, got {self.chunk_size}")
         devices = tuple(self.devices) or tuple(jax.local_devices())
         object.__setattr__(self, "devices", devices)
-        for name, program in (("_values", self._sample_value), ("_gradients", self._sample_gradient)):
-            object.__setattr__(self, name, self._compile(program, devices))
+        programs = {name: self._compile(program, devices) for name, program in self.sample_programs.items()}
+        object.__setattr__(self, "_programs", programs)
 
     def objective(self, contact: ContactModel | None, sigma: float | None = None) -> "MjxObjective":
         """Bind a contact model, and a noise level other than the task's."""
@@ -118,7 +126,21 @@ class Simulator:
     @property
     def num_compilations(self) -> int:
         """How many programs this simulator has compiled so far."""
-        return sum(program._cache_size() for program in (self._values, self._gradients))  # type: ignore[attr-defined]
+        return sum(program._cache_size() for program in self._programs.values())  # type: ignore[attr-defined]
+
+    @property
+    def sample_programs(self) -> dict[str, Callable[..., Any]]:
+        """What one sample's rollout gives for each kind of batch, as pure functions to be batched.
+
+        Each takes (theta, contact, sigma, key data, factor on the noise).
+        """
+        return {
+            "value": self._sample_value,
+            "gradient": self._sample_gradient,
+            "steps": self._sample_steps,
+            "step_gradient": self._sample_step_gradient,
+            "linearisation": self._sample_linearisation,
+        }
 
     def gradient_memory(self, contact: ContactModel | None, samples: int) -> int:
         """Temporary memory of the gradients of a batch, all chunks at once on all devices [bytes], as XLA plans it."""
@@ -126,7 +148,7 @@ class Simulator:
         dtype = self.task.scene.template.qpos.dtype
         keys = np.asarray(jax.random.key_data(jax.random.split(jax.random.key(0), capacity)))
         arguments = (self.task.theta, contact, np.asarray(1.0, dtype), keys, np.ones(capacity, dtype))
-        plan = self._gradients.lower(*arguments).compile().memory_analysis()  # type: ignore[attr-defined]
+        plan = self._programs["gradient"].lower(*arguments).compile().memory_analysis()  # type: ignore[attr-defined]
         return plan.temp_size_in_bytes * len(self.devices) * samples // capacity
 
     def _compile(self, program, devices: tuple[Any, ...]):
@@ -143,28 +165,100 @@ class Simulator:
             )
         )
 
-    def _cost(self, theta, contact, sigma, key_data, noise_scale) -> tuple[Array, tuple[State, Array, Array]]:
-        """Cost of one rollout, and its states, noise and largest solver residual."""
+    def _draw(self, sigma, key_data, noise_scale) -> tuple[State, Float[Array, "steps dimensions"]]:
+        """Start and noise of a sample."""
         task = self.task
         start_key, noise_key = split_sample_key(jax.random.wrap_key_data(key_data))
         dtype = task.scene.template.qpos.dtype
-        noise = noise_scale * sigma * standard_noise(noise_key, task.policy.noise_shape, dtype)
-        cost, (states, _, residual) = rollout_cost(task, theta, contact, task.draw_start(start_key), noise)
-        return cost, (states, noise, residual)
+        standard = standard_noise(noise_key, task.policy.noise_shape, dtype, task.noise)
+        return task.draw_start(start_key), noise_scale * sigma * standard
+
+    def _cost(self, theta, contact, sigma, key_data, noise_scale):
+        """Cost of one rollout, and its states, controls, noise and largest solver residual."""
+        start, noise = self._draw(sigma, key_data, noise_scale)
+        cost, (states, controls, residual) = rollout_cost(self.task, theta, contact, start, noise)
+        return cost, (states, controls, noise, residual)
 
     def _sample_value(self, theta, contact, sigma, key_data, noise_scale):
-        value, (states, noise, residual) = self._cost(theta, contact, sigma, key_data, noise_scale)
-        score = self.task.policy.score(theta, _before_each_step(states), noise / sigma**2)
-        return value, score, residual
+        value, (states, _, noise, residual) = self._cost(theta, contact, sigma, key_data, noise_scale)
+        scores = noise_score(noise, sigma, self.task.noise)
+        return value, self.task.policy.score(theta, _before_each_step(states), scores), residual
 
     def _sample_gradient(self, theta, contact, sigma, key_data, noise_scale):
-        (value, (_, _, residual)), gradient = jax.value_and_grad(self._cost, has_aux=True)(
+        (value, (*_, residual)), gradient = jax.value_and_grad(self._cost, has_aux=True)(
             theta, contact, sigma, key_data, noise_scale
         )
         return value, gradient, residual
 
-    def _run(self, program, theta, contact, sigma, keys, noise_scale):
-        """Call a program chunk by chunk; the last chunk is padded by repeating its last sample."""
+    def _sample_steps(self, theta, contact, sigma, key_data, noise_scale):
+        _, (states, controls, noise, residual) = self._cost(theta, contact, sigma, key_data, noise_scale)
+        return self._step_terms(theta, states, controls, noise, sigma), residual
+
+    def _sample_step_gradient(self, theta, contact, sigma, key_data, noise_scale):
+        start, noise = self._draw(sigma, key_data, noise_scale)
+        (value, (states, _, residual)), gradient = jax.value_and_grad(
+            lambda noise: rollout_cost(self.task, theta, contact, start, noise), has_aux=True
+        )(noise)
+        return value, gradient, self._policy_jacobian(theta, states), residual
+
+    def _sample_linearisation(self, theta, contact, sigma, key_data, noise_scale):
+        task = self.task
+        start, noise = self._draw(sigma, key_data, noise_scale)
+        _, (states, controls, residual) = rollout_cost(task, theta, contact, start, noise)
+        model, before, last = apply_contact(task.scene.model, contact), _before_each_step(states), _last(states)
+        sizes = np.cumsum([states.qpos.shape[1], states.qvel.shape[1]])
+
+        def state_of(vector, like: State) -> State:
+            qpos, qvel, act = jnp.split(vector, sizes)
+            return State(qpos, qvel, act, like.warmstart)
+
+        def derivatives(state: State, control):
+            vector = _coordinates(state)
+            following = lambda x, u: _coordinates(step(task.scene, model, state_of(x, state), u)[0])  # noqa: E731
+            over_cost = jax.grad(lambda x, u: task.running_cost(state_of(x, state), u), argnums=(0, 1))
+            feedback = lambda x: task.policy.feedback(theta, state_of(x, state))  # noqa: E731
+            over_policy = None if task.policy.additive else jax.jacfwd(feedback)(vector)
+            return over_cost(vector, control), jax.jacfwd(following, argnums=(0, 1))(vector, control), over_policy
+
+        over_cost, over_step, over_policy = jax.vmap(derivatives)(before, controls)
+        over_final = jax.grad(lambda x: task.final_cost(state_of(x, last)))(_coordinates(last))
+        over_start = None
+        if task.policy.at_start:
+            over_start = jax.jacfwd(lambda at: _coordinates(task.policy.place(at, noise, start)))(theta)
+        terms = self._step_terms(theta, states, controls, noise, sigma)
+        return terms, residual, (*over_cost, over_final, *over_step, over_policy, over_start)
+
+    def _step_terms(self, theta, states, controls, noise, sigma):
+        """Costs to go from each step at which there is noise, the noise's scores, and the policy's Jacobian."""
+        running = jax.vmap(self.task.running_cost)(_before_each_step(states), controls)
+        to_go = jnp.cumsum(running[::-1])[::-1] + self.task.final_cost(_last(states))
+        return to_go[: len(noise)], noise_score(noise, sigma, self.task.noise), self._policy_jacobian(theta, states)
+
+    def _policy_jacobian(self, theta, states):
+        policy = self.task.policy
+        if policy.additive:
+            return None
+        return jax.vmap(lambda state: jax.jacrev(lambda at: policy.feedback(at, state))(theta))(
+            _before_each_step(states)
+        )
+
+    def run(self, name: str, theta, contact, sigma, keys, noise_scale):
+        """Run one of `sample_programs` chunk by chunk; the last chunk is padded by repeating its last sample.
+
+        Args:
+            name: of the program.
+            theta: parameters, (params,).
+            contact: the contact model; None for the MJCF's own.
+            sigma: standard deviation of the noise.
+            keys: data of each sample's key.
+            noise_scale: factor on each sample's noise.
+
+        Returns:
+            What the program gives, with an axis of samples in front; NumPy arrays.
+
+        Raises:
+            ValueError: sigma or theta is unfit, or there is no sample.
+        """
         check_sigma(sigma)
         if theta.shape != (self.task.policy.num_params,):
             raise ValueError(f"theta has shape {theta.shape}, the policy needs ({self.task.policy.num_params},)")
@@ -173,21 +267,22 @@ class Simulator:
         dtype = self.task.scene.template.qpos.dtype
         samples, capacity = len(noise_scale), self.chunk_size * len(self.devices)
         padded = np.minimum(np.arange(math.ceil(samples / capacity) * capacity), samples - 1)
+        program = self._programs[name]  # type: ignore[attr-defined]
         outputs = [
             program(theta, contact, np.asarray(sigma, dtype), keys[part], noise_scale[part])
             for part in padded.reshape(-1, capacity)
         ]
         host = jax.device_get(outputs)
-        return [np.concatenate(leaves)[:samples] for leaves in zip(*host, strict=True)]
+        return jax.tree.map(lambda *leaves: np.concatenate(leaves)[:samples], *host)
 
     def run_values(self, theta, contact, sigma, key_data, noise_scale):
         """Values, scores and residuals of samples, each with its key's data and a factor on its noise; NumPy arrays."""
-        return self._run(self._values, theta, contact, sigma, key_data, noise_scale)  # type: ignore[attr-defined]
+        return self.run("value", theta, contact, sigma, key_data, noise_scale)
 
     def run_gradients(self, theta, contact, sigma, key_data):
         """Values, gradients and residuals of samples, each with its key's data; NumPy arrays."""
         scale = np.ones(len(key_data), self.task.scene.template.qpos.dtype)
-        return self._run(self._gradients, theta, contact, sigma, key_data, scale)  # type: ignore[attr-defined]
+        return self.run("gradient", theta, contact, sigma, key_data, scale)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -218,7 +313,7 @@ class MjxObjective:
         samples = len(keys)
         silent = np.arange(samples if self.simulator.task.random_start else min(samples, 1))
         scale = np.concatenate([np.ones(samples), np.zeros(len(silent))])
-        values, scores, residuals = self._values(theta, keys, np.append(np.arange(samples), silent), scale)
+        values, scores, residuals = self._run("value", theta, keys, np.append(np.arange(samples), silent), scale)
         baseline = np.broadcast_to(values[samples:], samples)
         return Evaluation(*map(jnp.asarray, (values[:samples], scores[:samples], baseline, residuals[:samples])))
 
@@ -235,7 +330,7 @@ class MjxObjective:
             raise ValueError("the odd part of an objective needs a policy whose noise is added to theta")
         samples = len(keys)
         scale = np.repeat([1.0, -1.0], samples)
-        values, scores, residuals = self._values(theta, keys, np.tile(np.arange(samples), 2), scale)
+        values, scores, residuals = self._run("value", theta, keys, np.tile(np.arange(samples), 2), scale)
         odd = (values[:samples] - values[samples:]) / 2
         residual = np.maximum(residuals[:samples], residuals[samples:])
         return Evaluation(*map(jnp.asarray, (odd, scores[:samples], np.zeros_like(odd), residual)))
@@ -246,7 +341,7 @@ class MjxObjective:
         """Two evaluations whose noises are opposite, sample by sample, from the same starts; three rollouts each."""
         samples = len(keys)
         scale = np.repeat([1.0, -1.0, 0.0], samples)
-        values, scores, residuals = self._values(theta, keys, np.tile(np.arange(samples), 3), scale)
+        values, scores, residuals = self._run("value", theta, keys, np.tile(np.arange(samples), 3), scale)
         above, below = slice(samples), slice(samples, 2 * samples)
         silent = jnp.asarray(values[2 * samples :])
         plus, minus = (
@@ -261,11 +356,64 @@ class MjxObjective:
         outputs = self.simulator.run_gradients(theta, self.contact, self.sigma, key_data)
         return Differentiation(*map(jnp.asarray, outputs))
 
-    def _values(self, theta, keys, rows, noise_scale):
-        # Rows of the bare key data: one noise is drawn on purpose for several rollouts, which is no reuse of a key.
+    def evaluate_steps(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> StepEvaluation:
+        """The rollouts of `evaluate`, step by step."""
+        (steps,) = self._evaluate_steps(theta, keys, (1.0,))
+        return steps
+
+    def evaluate_step_pair(
+        self, theta: Float[Array, " params"], keys: Key[Array, " samples"]
+    ) -> tuple[StepEvaluation, StepEvaluation]:
+        """The rollouts of `evaluate_pair`, step by step."""
+        plus, minus = self._evaluate_steps(theta, keys, (1.0, -1.0))
+        return plus, minus
+
+    def differentiate_steps(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> StepDifferentiation:
+        """The rollouts of `differentiate`, with the derivative of each sample's cost by its noise."""
+        return StepDifferentiation(*jax.tree.map(jnp.asarray, self._run("step_gradient", theta, keys)))
+
+    def linearise(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> Linearisation:
+        """The rollouts of `differentiate`, with the derivatives of every step.
+
+        The state is (qpos, qvel, act), so that a quaternion counts four.
+        """
+        (terms, residual, derivatives), silent = (
+            self._run("linearisation", theta, keys),
+            self._silent_to_go(theta, keys),
+        )
+        to_go, scores, jacobian = terms
+        steps = StepEvaluation(*jax.tree.map(jnp.asarray, (to_go, silent, scores, jacobian, residual)))
+        return Linearisation(steps, *jax.tree.map(jnp.asarray, derivatives))
+
+    def _evaluate_steps(self, theta, keys, signs: tuple[float, ...]) -> list[StepEvaluation]:
+        samples = len(keys)
+        scale = np.repeat(signs, samples)
+        (to_go, scores, jacobian), residual = self._run(
+            "steps", theta, keys, np.tile(np.arange(samples), len(signs)), scale
+        )
+        silent = self._silent_to_go(theta, keys)
+
+        def half(part: slice) -> StepEvaluation:
+            pick = lambda leaf: jnp.asarray(leaf[part])  # noqa: E731
+            terms = jax.tree.map(pick, (to_go, scores, jacobian, residual))
+            return StepEvaluation(terms[0], jnp.asarray(silent), *terms[1:])
+
+        return [half(slice(index * samples, (index + 1) * samples)) for index in range(len(signs))]
+
+    def _silent_to_go(self, theta, keys):
+        """Costs to go of the rollouts without noise, one where all samples share it."""
+        rows = np.arange(len(keys) if self.simulator.task.random_start else min(len(keys), 1))
+        (to_go, *_), _ = self._run("steps", theta, keys, rows, np.zeros(len(rows)))
+        return np.broadcast_to(to_go, (len(keys), to_go.shape[1]))
+
+    def _run(self, name: str, theta, keys, rows=None, noise_scale=None):
+        """A program on rows of the keys, all of them once unless told otherwise."""
+        rows = np.arange(len(keys)) if rows is None else rows
+        scale = np.ones(len(rows)) if noise_scale is None else noise_scale
+        # The bare key data: one noise is drawn on purpose for several rollouts, which is no reuse of a key.
         key_data = np.asarray(jax.random.key_data(keys))[rows]
-        scale = noise_scale.astype(self.simulator.task.scene.template.qpos.dtype)
-        return self.simulator.run_values(theta, self.contact, self.sigma, key_data, scale)
+        dtype = self.simulator.task.scene.template.qpos.dtype
+        return self.simulator.run(name, theta, self.contact, self.sigma, key_data, scale.astype(dtype))
 
 
 def chunk_for(samples: int, devices: Sequence[Any]) -> int:

@@ -18,9 +18,18 @@ from mjx_study.results import write_whole
 # Okabe and Ito's colours, told apart in print and by colour-blind eyes; markers repeat the distinction.
 STYLE: Final = {
     "zobg": ("ZoBG", "#0072B2", "o"),
+    "zobg_antithetic": ("ZoBG, antithetic", "#56B4E9", "v"),
+    "zobg_to_go": ("ZoBG, costs to go", "#56B4E9", "P"),
+    "zobg_to_go_antithetic": ("ZoBG, to go, antithetic", "#0072B2", "X"),
     "fobg": ("FoBG", "#D55E00", "s"),
+    "fobg_clipped": ("FoBG, clipped", "#E69F00", "<"),
+    "fobg_truncated": ("FoBG, truncated", "#E69F00", ">"),
     "aobg": ("AoBG", "#009E73", "D"),
     "ivw": ("IVW", "#CC79A7", "^"),
+    "ivw_h": ("IVW-H", "#CC79A7", "p"),
+    "total_propagation": ("total propagation", "#000000", "*"),
+    "ddcg": ("DDCG", "#009E73", "h"),
+    "delta": ("delta", "#777777", "d"),
 }
 NO_CONTACT: Final = 1.0
 """Place on a stiffness axis of a task without contact."""

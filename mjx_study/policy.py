@@ -35,6 +35,11 @@ class Policy(Protocol):
         """Whether the noise is added to theta entry by entry, so that the score is w / sigma^2 and nothing else."""
         ...
 
+    @property
+    def at_start(self) -> bool:
+        """Whether theta and the noise act on the start state and on nothing else."""
+        ...
+
     def place(self, theta: Float[Array, " params"], noise: Float[Array, "steps dimensions"], start: State) -> State:
         """The start state, where theta acts on it."""
         ...
@@ -68,6 +73,7 @@ class OpenLoop:
     horizon: int
     controls: int
     additive: bool = dataclasses.field(default=True, init=False)
+    at_start: bool = dataclasses.field(default=False, init=False)
 
     @property
     def num_params(self) -> int:
@@ -116,6 +122,7 @@ class LinearFeedback:
     num_features: int
     features: Callable[[State], Float[Array, " features"]]
     additive: bool = dataclasses.field(default=False, init=False)
+    at_start: bool = dataclasses.field(default=False, init=False)
 
     @property
     def num_params(self) -> int:
@@ -164,6 +171,7 @@ class Launch:
     controls: int
     launched: Callable[[State, Float[Array, " params"]], State]
     additive: bool = dataclasses.field(default=True, init=False)
+    at_start: bool = dataclasses.field(default=True, init=False)
 
     @property
     def noise_shape(self) -> tuple[int, int]:

@@ -1,7 +1,7 @@
 """The comparison of estimators over contact models: planning it, running it, and one row per estimate.
 
 A plan is checked completely before anything is computed. In each cell (one contact model) the estimators share their
-batches: one of evaluations, one of differentiations, drawn from independent keys; alpha-order estimates combine the
+batches: those of values and those of derivatives, drawn from independent keys; interpolated estimates combine the
 two. The same keys are used in every cell, so differences between contact models are not sampling noise.
 """
 
@@ -17,10 +17,10 @@ from typing import Any, Final
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Key
 
 import estimators
-from estimators import ESTIMATORS, Differentiation, EstimatorOptions, Evaluation, GradientEstimate
+from estimators import ESTIMATORS, ORACLES, EstimatorOptions, Evaluation, GradientEstimate, Linearisation
 from mjx_study.comparison import CompareConfig, CompareResult, Row
 from mjx_study.contact import FAMILIES, ContactModel, ContactWarning, family_model, stiffness_from_solref
 from mjx_study.objective import MjxObjective, Simulator, chunk_for
@@ -31,6 +31,11 @@ from mjx_study.tasks import make_task
 
 UNCONVERGED: Final = {"float64": 1e-6, "float32": 1e-3}
 """Relative solver residual above which a sample is reported as unconverged."""
+BIAS_DRAWS: Final = 999
+"""Draws of the test for bias; its least p-value is 0.001."""
+GAUSSIAN_ONLY: Final = ("ddcg", "delta")
+ADDITIVE_ONLY: Final = ("delta",)
+"""Estimators whose formula needs Gaussian noise, or noise that is added to theta."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,15 +75,20 @@ def plan_compare(config: CompareConfig) -> ComparePlan:
     """
     scene_options: dict[str, Any] = {"cone": config.cone, "horizon": config.horizon, "model": config.model}
     task = make_task(config.task, **{name: value for name, value in scene_options.items() if value is not None})
-    if config.sigma is not None:
-        task = task.replace(sigma=config.sigma)
+    changes = {"sigma": config.sigma, "noise": config.noise}
+    task = task.replace(**{name: value for name, value in changes.items() if value is not None})
     options = EstimatorOptions(
         baseline=config.baseline,
         gamma=task.gamma if config.gamma is None else config.gamma,
         failure_probability=config.failure_probability,
         variance_proxy=config.variance_proxy,
         radius=config.radius,
+        sigma=task.sigma,
+        max_norm=config.max_norm,
+        window=config.window,
+        tolerance=config.tolerance,
     )
+    check_estimators(config.estimators, task, options)
     chunk = chunk_for(config.samples, jax.local_devices()) if config.chunk_size is None else config.chunk_size
     cells, messages = plan_cells(task, config.contact, config.stiffness, config.damping)
     families = tuple(dict.fromkeys(cell.family for cell in cells))
@@ -87,6 +97,7 @@ def plan_compare(config: CompareConfig) -> ComparePlan:
         contact=families,
         stiffness=config.stiffness or (task.stiffnesses if any(FAMILIES[name].swept for name in families) else None),
         sigma=task.sigma,
+        noise=task.noise,
         gamma=options.gamma,
         horizon=task.horizon,
         chunk_size=chunk,
@@ -94,6 +105,20 @@ def plan_compare(config: CompareConfig) -> ComparePlan:
         model=None if config.model is None else str(Path(config.model)),
     )
     return ComparePlan(resolved, task, cells, options, messages)
+
+
+def check_estimators(names: Sequence[str], task: Task, options: EstimatorOptions) -> None:
+    """Refuse estimators whose formula does not hold for a task, or that lack an option.
+
+    Raises:
+        ValueError: an option is not set; the noise is not Gaussian, or not on theta, where the formula needs it.
+    """
+    for name in names:
+        ESTIMATORS[name].check(options)
+        if name in GAUSSIAN_ONLY and task.noise != "gaussian":
+            raise ValueError(f"{name!r} holds for Gaussian noise only; the noise is {task.noise}")
+        if name in ADDITIVE_ONLY and not task.policy.additive:
+            raise ValueError(f"{name!r} needs noise that is added to theta itself; {task.name} has a feedback policy")
 
 
 def plan_cells(
@@ -148,27 +173,29 @@ def compare(plan: ComparePlan, progress: Progress = lambda done, total, what: No
     config, task = plan.config, plan.task
     assert config.chunk_size is not None, "a plan's configuration is resolved"
     simulator = Simulator(task, chunk_size=config.chunk_size)
-    needed = {order for name in config.estimators for order in ESTIMATORS[name].order_of_oracle}
+    needed = {"evaluation", *(oracle for name in config.estimators for oracle in ESTIMATORS[name].needs)}
+    oracles = tuple(name for name in ORACLES if name in needed)
     keys = _Keys(config)
 
     total = len(plan.cells) + 1
     progress(0, total, "compiling")
     for cell in {cell.contact is None: cell for cell in plan.cells}.values():
-        _compile(simulator, cell)
+        _compile(simulator, cell, oracles)
 
     rows: list[Row] = []
     gradients, references, candidates = [], [], []
     for done, cell in enumerate(plan.cells, start=1):
         progress(done, total, cell.label)
         objective = simulator.objective(cell.contact)
-        zeroth, zeroth_seconds = _timed(objective.evaluate, task.theta, keys.zeroth)
-        first = first_seconds = None
-        if 1 in needed:
-            first, first_seconds = _timed(objective.differentiate, task.theta, keys.first)
-        reference = _reference(objective, keys, zeroth, candidates)
-        summary = _summarise(zeroth, first, reference, config.estimators, plan.options, config.confidence)
+        batches, seconds = {}, {}
+        for name in oracles:
+            method = getattr(objective, ORACLES[name].method)
+            drawn = jax.random.clone((keys.zeroth, keys.first)[ORACLES[name].order])  # shared on purpose
+            batches[name], seconds[name] = _timed(method, task.theta, drawn)
+        reference = _reference(objective, keys, batches["evaluation"], candidates)
+        summary = _summarise(batches, reference, keys.test, config.estimators, plan.options, config.confidence)
         for name, numbers, gradient in summary:
-            rows.append(_row(cell, name, config.samples, numbers, zeroth_seconds, first_seconds, zeroth, first))
+            rows.append(_row(cell, name, config.samples, numbers, seconds, batches))
             gradients.append(gradient)
             references.append(np.asarray(reference.mean))
     progress(total, total, "done")
@@ -179,20 +206,20 @@ class _Keys:
     """Independent keys of the batches; the same in every cell."""
 
     def __init__(self, config: CompareConfig):
-        names = ("zeroth", "first", "odd", "candidate")
+        names = ("zeroth", "first", "odd", "candidate", "test")
         sizes = (config.samples, config.samples, config.reference_samples, max(64, config.samples // 4))
-        streams = jax.random.split(jax.random.key(config.seed), len(names))
+        *streams, self.test = jax.random.split(jax.random.key(config.seed), len(names))
         self.zeroth, self.first, self.odd, self.candidate = (
             jax.random.split(stream, size) for stream, size in zip(streams, sizes, strict=True)
         )
 
 
-def _compile(simulator: Simulator, cell: Cell) -> None:
-    """Compile both programs, so that no cell's time holds it; in turn, since tracing in two threads can crash JAX."""
+def _compile(simulator: Simulator, cell: Cell, oracles: Sequence[str]) -> None:
+    """Compile what is needed, so that no cell's time holds it; in turn, since tracing in two threads can crash JAX."""
     objective, theta = simulator.objective(cell.contact), simulator.task.theta
     keys = jax.random.split(jax.random.key(0), 1)
-    objective.evaluate(theta, keys)
-    objective.differentiate(theta, keys)
+    for name in dict.fromkeys([*oracles, "differentiation"]):  # the reference's control variate needs it
+        getattr(objective, ORACLES[name].method)(theta, jax.random.clone(keys))
 
 
 def _timed(method: Callable[..., Any], *arguments: Any) -> tuple[Any, float]:
@@ -206,7 +233,8 @@ def _reference(
 ) -> GradientEstimate:
     """The reference gradient of a cell; adds this cell's control variate to the candidates of those to come."""
     theta = objective.simulator.task.theta
-    if not objective.simulator.task.policy.additive:
+    task = objective.simulator.task
+    if not task.policy.additive or task.noise != "gaussian":
         return _antithetic_gradient(*objective.evaluate_pair(theta, keys.odd))
     gradients = objective.differentiate(theta, keys.candidate).gradient
     candidates.append(jnp.median(gradients, axis=0))
@@ -226,26 +254,27 @@ def _reference_gradient(
 
 
 def _summarise(
-    zeroth: Evaluation,
-    first: Differentiation | None,
+    batches: dict[str, Any],
     reference: GradientEstimate,
+    key: Key[Array, ""],
     names: tuple[str, ...],
     options: EstimatorOptions,
     confidence: float,
 ) -> list[tuple[str, dict[str, Any], np.ndarray]]:
-    numbers = jax.device_get(_numbers(zeroth, first, reference, names, options, confidence))
+    numbers = jax.device_get(_numbers(batches, reference, jax.random.clone(key), names, options, confidence))
     return [(name, values, values.pop("gradient")) for name, values in zip(names, numbers, strict=True)]
 
 
 @partial(jax.jit, static_argnames=("names", "options", "confidence"))
-def _numbers(zeroth, first, reference, names, options, confidence):
+def _numbers(batches, reference, key, names, options, confidence):
     """The numbers of each row that are functions of the batches alone."""
     result = []
     for name in names:
-        estimate = estimators.combine(name, zeroth, first, options)
+        estimate = estimators.combine(name, batches, options)
         lower, upper = estimators.variance_interval(estimate, confidence)
         median, high, most = estimators.norm_quantiles(estimate, (0.5, 0.9, 1.0))
         against = estimators.compare(estimate, reference)
+        test = estimators.bias_test(estimate, reference, jax.random.clone(key), num_draws=BIAS_DRAWS)
         choice = estimate.alpha
         result.append(
             {
@@ -266,6 +295,7 @@ def _numbers(zeroth, first, reference, names, options, confidence):
                 "alpha": None if choice is None else choice.alpha,
                 "epsilon": None if choice is None else choice.epsilon,
                 "discrepancy": None if choice is None else choice.discrepancy,
+                "bias_p_value": test.p_value,
                 "nonfinite": estimate.num_nonfinite,
             }
         )
@@ -277,15 +307,12 @@ def _row(
     name: str,
     samples: int,
     numbers: dict[str, Any],
-    zeroth_seconds: float,
-    first_seconds: float | None,
-    zeroth: Evaluation,
-    first: Differentiation | None,
+    batch_seconds: dict[str, float],
+    batches: dict[str, Any],
 ) -> Row:
-    orders = ESTIMATORS[name].order_of_oracle
-    batches = [(zeroth, zeroth_seconds), (first, first_seconds)]
-    seconds = sum(batches[order][1] or 0.0 for order in orders)
-    residuals = np.concatenate([np.asarray(batches[order][0].residual) for order in orders])
+    needs = ESTIMATORS[name].needs
+    seconds = sum(batch_seconds[oracle] for oracle in needs)
+    residuals = np.concatenate([_residuals(batches[oracle]) for oracle in needs])
     threshold = UNCONVERGED[str(residuals.dtype)]
     nonfinite = int(numbers.pop("nonfinite"))
     return Row(
@@ -296,8 +323,16 @@ def _row(
         estimator=name,
         samples=samples,
         seconds_per_sample=seconds / samples,
+        variance_seconds=float(numbers["variance"]) * seconds / samples,
         residual=float(np.max(np.where(np.isfinite(residuals), residuals, math.inf))),
         unconverged=int(np.sum(~(residuals <= threshold))),
         nonfinite=nonfinite,
         **{key: None if value is None else float(value) for key, value in numbers.items()},  # type: ignore[arg-type]
     )
+
+
+def _residuals(batch: Any) -> Float[np.ndarray, " rollouts"]:
+    """The solver's residual of every rollout of a batch, whatever its kind."""
+    parts = batch if isinstance(batch, tuple) else (batch,)
+    steps = [part.steps if isinstance(part, Linearisation) else part for part in parts]
+    return np.concatenate([np.asarray(part.residual) for part in steps])

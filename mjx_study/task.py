@@ -9,6 +9,7 @@ from jaxtyping import Array, Float, Key
 
 from mjx_study.contact import effective_mass
 from mjx_study.dynamics import State
+from mjx_study.noise import check_density
 from mjx_study.policy import Policy
 from mjx_study.reference import Reference
 from mjx_study.scene import Scene
@@ -28,7 +29,7 @@ class Task:
         horizon: number of steps H.
         policy: maps theta, noise and state to start and controls.
         theta: where gradients are taken unless told otherwise, (params,).
-        sigma: standard deviation of the Gaussian noise, in the unit of what it is added to.
+        sigma: standard deviation of the noise, in the unit of what it is added to.
         start: the start state, or a distribution over start states as a function of a key.
         running_cost: c(state, control) of each step before it is taken.
         final_cost: c(state) after the last step.
@@ -41,6 +42,7 @@ class Task:
         stiffnesses: that a sweep takes unless told otherwise [N/m].
         families: contact families that a sweep takes unless told otherwise.
         span: range of a decision of one number that a landscape shows; None for a range about theta.
+        noise: name of the noise's density in `estimators.NOISES`.
     """
 
     name: str
@@ -60,11 +62,13 @@ class Task:
     stiffnesses: tuple[float, ...] = STIFFNESSES
     families: tuple[str, ...] = FAMILIES
     span: tuple[float, float] | None = None
+    noise: str = "gaussian"
 
     def __post_init__(self) -> None:
         if self.horizon < 1:
             raise ValueError(f"horizon must be at least 1 step, got {self.horizon}")
         check_sigma(self.sigma)
+        check_density(self.noise)
         if self.theta.shape != (self.policy.num_params,):
             raise ValueError(f"theta has shape {self.theta.shape}, the policy needs ({self.policy.num_params},)")
 

@@ -423,7 +423,7 @@ def test_memory_of_a_thousand_gradients(large):
     task = pusher_task()
     keys = np.asarray(jax.random.key_data(sample_keys(1000)))
     arguments = (task.theta, penalty(10.0), np.asarray(SIGMA), keys, np.ones(1000))
-    plan = large._gradients.lower(*arguments).compile().memory_analysis()
+    plan = large._programs["gradient"].lower(*arguments).compile().memory_analysis()
     temporary = plan.temp_size_in_bytes * len(large.devices)  # the plan is one device's
     output = plan.output_size_in_bytes * len(large.devices)
     assert 1000 * HORIZON * 8 <= output <= 1000 * (HORIZON + 10) * 8  # gradients, values, residuals

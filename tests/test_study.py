@@ -30,6 +30,7 @@ def row(estimator: str, stiffness: float, variance: float, **changes: Any) -> Ro
     values |= {"solref": (-stiffness / 0.05, 0.0), "solimp": (1e-4, 1e-4, 1e-3, 0.5, 2.0), "unconverged": 0}
     values |= {"alpha": None, "epsilon": None, "discrepancy": None, "nonfinite": 0, "reference_norm": 10.0}
     values |= {"reference_uncertainty": 0.01, "relative_error": 0.01, "cosine": 1.0, "gradient_norm": 10.0}
+    values |= {"bias_p_value": 0.5}
     return Row(**(values | changes))
 
 
@@ -135,12 +136,11 @@ def test_findings_follow_the_intervals() -> None:
 
 
 def test_bias_is_reported_only_beyond_what_noise_explains() -> None:
-    noise = math.hypot(math.sqrt(1 / 100) / 10, 0.01)
-    quiet = row("fobg", 10, 1, relative_error=2.9 * noise)
-    loud = row("fobg", 10, 1, relative_error=3.1 * noise)
+    quiet = row("fobg", 10, 1, relative_error=0.044, bias_p_value=0.002)
+    loud = row("fobg", 10, 1, relative_error=0.044, bias_p_value=0.001)
     assert findings(result(quiet)) == []
     (sentence,) = findings(result(loud))
-    assert "FoBG's mean is biased by 4.4% at K = 10 N/m" in sentence
+    assert sentence == "penalty: FoBG's mean is biased by 4.4% at K = 10 N/m (p <= 0.001)"
 
 
 def test_alarms_name_what_must_not_be_overlooked() -> None:
@@ -201,7 +201,7 @@ def test_numbers_are_short(value: float | None, digits: int, shown: str) -> None
     assert console.number(value, digits) == shown
 
 
-@pytest.mark.parametrize(("columns", "tables"), [(200, 1), (80, 2)])
+@pytest.mark.parametrize(("columns", "tables"), [(200, 1), (80, 3)])
 def test_the_table_fits_the_terminal(monkeypatch: pytest.MonkeyPatch, columns: int, tables: int) -> None:
     monkeypatch.setenv("COLUMNS", str(columns))
     lines: list[str] = []

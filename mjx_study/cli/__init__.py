@@ -9,7 +9,7 @@ import sys
 from collections.abc import Sequence
 from importlib import metadata
 
-from mjx_study.cli import bench, compare, gradcheck, landscape, rollout, tasks
+from mjx_study.cli import bench, compare, estimators, gradcheck, landscape, rollout, tasks
 from mjx_study.cli.options import INTERRUPTED, Parser, UsageError
 
 EXAMPLES = """\
@@ -21,7 +21,7 @@ start here:
   mjx-study gradcheck pusher                     are the derivatives right? exit code 1 if not
   mjx-study bench pusher                         what does a gradient cost on this machine?
 """
-COMMANDS = (compare, landscape, rollout, gradcheck, bench, tasks)
+COMMANDS = (compare, landscape, rollout, gradcheck, bench, tasks, estimators)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -5,7 +5,7 @@ import json
 import sys
 from pathlib import Path
 
-from estimators import BASELINES, ESTIMATORS
+from estimators import BASELINES, ESTIMATORS, NOISES
 from mjx_study.cli.options import (
     Commands,
     add_command,
@@ -41,18 +41,19 @@ columns of the table:
   epsilon, B      confidence radius of the zeroth-order mean; distance between the two means
   residual        largest relative imbalance left by MuJoCo's constraint solver
   ms              computing time of one sample in milliseconds, compilation excluded
+  variance x s    variance times that time: the variance that a second of computing leaves
   lost            samples that overflowed or became NaN; they are left out, and a warning says so
 """
 FIELDS = (
     "task stiffness contact estimators samples reference_samples sigma seed baseline gamma failure_probability "
-    "variance_proxy radius confidence damping cone horizon model chunk_size"
+    "variance_proxy radius confidence damping cone horizon model chunk_size noise max_norm window tolerance"
 ).split()
 
 
 def add(commands: Commands) -> None:
     """Register the command."""
     epilog = EXAMPLES.format(
-        estimators="\n".join(f"  {item.name:<15} {item.description}" for item in ESTIMATORS.values()),
+        estimators="\n".join(f"  {item.name:<21} {item.description}" for item in ESTIMATORS.values()),
         families="\n".join(f"  {item.name:<15} {item.description}" for item in FAMILIES.values()),
     )
     command = add_command(commands, "compare", "compare gradient estimators over contact models", run, epilog)
@@ -62,6 +63,7 @@ def add(commands: Commands) -> None:
     command.add_argument(
         "--reference-samples", type=int, metavar="N", help="pairs of rollouts behind each reference (default: 600)"
     )
+    command.add_argument("--noise", choices=list(NOISES), help="density of the noise (default: gaussian)")
     command.add_argument("--baseline", choices=list(BASELINES), help="of zeroth-order samples (default: zero_noise)")
     command.add_argument(
         "--gamma", type=_gamma, metavar="G", help="AoBG's accuracy bound; inf for none (default: the task's)"
@@ -70,11 +72,16 @@ def add(commands: Commands) -> None:
         "--failure-probability", type=float, metavar="P", help="that epsilon's interval misses (default: 0.05)"
     )
     command.add_argument(
-        "--variance-proxy", metavar="S2", help="variance or second_moment, in epsilon (default: variance)"
+        "--variance-proxy",
+        metavar="S2",
+        help="variance, second_moment or upper_bound, in epsilon (default: variance)",
     )
     command.add_argument(
         "--radius", type=_radius, metavar="R", help="max_deviation or a number, in epsilon (default: max_deviation)"
     )
+    command.add_argument("--max-norm", type=float, metavar="G", help="of a sample of fobg_clipped")
+    command.add_argument("--window", type=int, metavar="H", help="steps between cuts of fobg_truncated")
+    command.add_argument("--tolerance", type=float, metavar="C", help="of ddcg's test (default: 0.3)")
     command.add_argument("--confidence", type=float, metavar="P", help="of the reported intervals (default: 0.95)")
     command.add_argument(
         "--chunk-size", type=int, metavar="N", help="samples per device and call (default: by --samples)"

@@ -23,11 +23,18 @@ class Rollout:
         states: with the start first.
         controls: as applied, feedback included.
         value: total cost of each member.
+        costs: of each step, and the final one.
     """
 
     states: Float[np.ndarray, "*batch steps states"]
     controls: Float[np.ndarray, "*batch horizon controls"]
     value: Float[np.ndarray, "*batch"]
+    costs: Float[np.ndarray, "*batch steps"]
+
+    @property
+    def value_to_go(self) -> Float[np.ndarray, "*batch horizon"]:
+        """Cost from each step on."""
+        return np.cumsum(self.costs[..., ::-1], axis=-1)[..., :0:-1]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,15 +69,16 @@ def roll_out(
     state = np.broadcast_to(start, (*batch, system.num_states))
     states = np.empty((*batch, horizon + 1, system.num_states))
     applied = np.array(np.broadcast_to(controls, (*batch, *controls.shape[-2:])))
-    value = np.zeros(batch)
+    costs = np.empty((*batch, horizon + 1))
     states[..., 0, :] = state
     for step in range(horizon):
         if feedback is not None:
             applied[..., step, :] += state @ feedback.T
-        value = value + system.cost(state, applied[..., step, :])
+        costs[..., step] = system.cost(state, applied[..., step, :])
         state = system.step(state, applied[..., step, :])
         states[..., step + 1, :] = state
-    return Rollout(states, applied, np.asarray(value + system.final_cost(state)))
+    costs[..., horizon] = system.final_cost(state)
+    return Rollout(states, applied, np.asarray(np.sum(costs, axis=-1)), costs)
 
 
 def value_and_gradients(

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
-from estimators import Differentiation, Evaluation, Objective
-from mjx_study.noise import split_sample_key, standard_noise
+from estimators import Differentiation, Evaluation, Linearisation, Objective, StepDifferentiation, StepEvaluation
+from mjx_study.noise import check_density, noise_score, split_sample_key, standard_noise
 from mjx_study.reference.adjoint import roll_out, value_and_gradients
 from mjx_study.reference.function import Function, check_noise
 from mjx_study.reference.system import System
@@ -34,7 +34,7 @@ class Reference(Objective, Protocol):
 
 @dataclasses.dataclass(frozen=True)
 class ReferenceObjective:
-    """F(theta) = E V_1 of a policy on an analytic system, with w ~ N(0, sigma^2 I).
+    """F(theta) = E V_1 of a policy on an analytic system, with noise w of standard deviation sigma.
 
     What theta is, and where the noise goes:
 
@@ -50,6 +50,7 @@ class ReferenceObjective:
         horizon: number of steps.
         sigma: standard deviation of the noise, in the unit of what it is added to.
         decision: what theta is, see above.
+        noise: name of the noise's density in `estimators.NOISES`.
     """
 
     system: System
@@ -57,9 +58,11 @@ class ReferenceObjective:
     horizon: int
     sigma: float
     decision: str = "controls"
+    noise: str = "gaussian"
 
     def __post_init__(self) -> None:
         check_noise(self.sigma)
+        check_density(self.noise)
         if self.decision not in DECISIONS:
             raise ValueError(f"unknown decision {self.decision!r}; choose from {', '.join(DECISIONS)}")
         if self.horizon < 1:
@@ -77,21 +80,61 @@ class ReferenceObjective:
 
     def evaluate(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> Evaluation:
         """Values and scores by rollouts alone."""
+        return self._evaluation(theta, *self._draw(keys))
+
+    def evaluate_pair(
+        self, theta: Float[Array, " params"], keys: Key[Array, " samples"]
+    ) -> tuple[Evaluation, Evaluation]:
+        """Two evaluations whose noises are opposite, sample by sample, from the same starts."""
         starts, noise = self._draw(keys)
-        rollout = roll_out(self.system, *self._policy(theta, starts, noise))
-        silent = roll_out(self.system, *self._policy(theta, starts, np.zeros(noise.shape[1:])))
-        score = noise
-        if self.decision == "feedback":
-            score = np.einsum("shu,shx->sux", noise, rollout.states[:, :-1])
-        score = score.reshape(len(noise), -1) / self.sigma**2
-        baseline = np.broadcast_to(silent.value, len(noise))
-        return Evaluation(jnp.asarray(rollout.value), jnp.asarray(score), jnp.asarray(baseline))
+        return self._evaluation(theta, starts, noise), self._evaluation(theta, starts, -noise)
+
+    def evaluate_steps(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> StepEvaluation:
+        """The rollouts of `evaluate`, step by step."""
+        return self._steps(theta, *self._draw(keys))[0]
+
+    def evaluate_step_pair(
+        self, theta: Float[Array, " params"], keys: Key[Array, " samples"]
+    ) -> tuple[StepEvaluation, StepEvaluation]:
+        """The rollouts of `evaluate_pair`, step by step."""
+        starts, noise = self._draw(keys)
+        return self._steps(theta, starts, noise)[0], self._steps(theta, starts, -noise)[0]
 
     def differentiate(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> Differentiation:
         """Values and hand-derived gradients."""
         starts, noise = self._draw(keys)
         value, gradient = self._differentiate(theta, starts, noise)
         return Differentiation(jnp.asarray(value), jnp.asarray(gradient.reshape(len(noise), -1)))
+
+    def differentiate_steps(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> StepDifferentiation:
+        """The rollouts of `differentiate`, with the derivative of each sample's cost by its noise."""
+        starts, noise = self._draw(keys)
+        value, gradients = value_and_gradients(self.system, *self._policy(theta, starts, noise))
+        over_noise = gradients.start[:, None] if self.decision == "start" else gradients.controls
+        jacobian = self._policy_jacobian(roll_out(self.system, *self._policy(theta, starts, noise)).states)
+        return StepDifferentiation(jnp.asarray(value), jnp.asarray(over_noise), jacobian)
+
+    def linearise(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> Linearisation:
+        """The rollouts of `differentiate`, with the derivatives of every step."""
+        steps, rollout, feedback = self._steps(theta, *self._draw(keys))
+        before, samples = rollout.states[:, :-1], len(rollout.value)
+        over_cost = self.system.cost_gradients(before, rollout.controls)
+        over_step = self.system.jacobians(before, rollout.controls)
+        over_final = self.system.final_gradient(rollout.states[:, -1])
+        shape = (samples, self.horizon, self.system.num_controls, self.system.num_states)
+        over_policy = None if feedback is None else jnp.broadcast_to(feedback, shape)
+        size = self.system.num_states
+        over_start = jnp.broadcast_to(jnp.eye(size), (samples, size, size)) if self.decision == "start" else None
+        return Linearisation(
+            steps=steps,
+            cost_state=jnp.asarray(over_cost[0]),
+            cost_control=jnp.asarray(over_cost[1]),
+            final_state=jnp.asarray(over_final),
+            over_state=jnp.asarray(over_step[0]),
+            over_control=jnp.asarray(over_step[1]),
+            policy_state=over_policy,
+            start_jacobian=over_start,
+        )
 
     def value_and_gradient(
         self, theta: Float[Array, " params"], key: Key[Array, ""]
@@ -107,6 +150,34 @@ class ReferenceObjective:
             return (1, self.system.num_states)
         return (self.horizon, self.system.num_controls)
 
+    def _evaluation(self, theta, starts, noise) -> Evaluation:
+        rollout = roll_out(self.system, *self._policy(theta, starts, noise))
+        silent = roll_out(self.system, *self._policy(theta, starts, np.zeros(noise.shape[1:])))
+        score = np.asarray(noise_score(jnp.asarray(noise), self.sigma, self.noise))
+        if self.decision == "feedback":
+            score = np.einsum("shu,shx->sux", score, rollout.states[:, :-1])
+        baseline = np.broadcast_to(silent.value, len(noise))
+        return Evaluation(jnp.asarray(rollout.value), jnp.asarray(score.reshape(len(noise), -1)), jnp.asarray(baseline))
+
+    def _steps(self, theta, starts, noise):
+        """What each step cost; the rollout; the feedback matrix, or None."""
+        rollout = roll_out(self.system, *self._policy(theta, starts, noise))
+        silent = roll_out(self.system, *self._policy(theta, starts, np.zeros(noise.shape[1:])))
+        to_go = (part.value_to_go[..., : noise.shape[1]] for part in (rollout, silent))
+        value, baseline = (jnp.asarray(np.broadcast_to(part, noise.shape[:2])) for part in to_go)
+        score = jnp.asarray(noise_score(jnp.asarray(noise), self.sigma, self.noise))
+        steps = StepEvaluation(value, baseline, score, self._policy_jacobian(rollout.states))
+        gains = np.asarray(theta).reshape(self.system.num_controls, -1) if self.decision == "feedback" else None
+        return steps, rollout, gains
+
+    def _policy_jacobian(self, states):
+        """D_theta (Theta x) of every step; None where theta is the noise's own place."""
+        if self.decision != "feedback":
+            return None
+        controls = self.system.num_controls
+        jacobian = np.einsum("uv,shx->shuvx", np.eye(controls), states[:, :-1])
+        return jnp.asarray(jacobian.reshape(*jacobian.shape[:3], self.num_params))
+
     def _fixed_start(self) -> np.ndarray:
         return np.zeros(self.system.num_states) if self.start is None else np.array(self.start, float)
 
@@ -116,7 +187,7 @@ class ReferenceObjective:
         def one(key):
             start_key, noise_key = split_sample_key(key)
             start = self.start(start_key) if callable(self.start) else ()
-            return start, standard_noise(noise_key, self._noise_shape, jnp.float64)
+            return start, standard_noise(noise_key, self._noise_shape, jnp.float64, self.noise)
 
         start, noise = jax.vmap(one)(keys)
         return np.asarray(start) if callable(self.start) else self._fixed_start(), self.sigma * np.asarray(noise)
@@ -140,18 +211,21 @@ class ReferenceObjective:
 
 @dataclasses.dataclass(frozen=True)
 class FunctionObjective:
-    """F(theta) = E f(theta + w) of a function of the parameters alone, with w ~ N(0, sigma^2 I).
+    """F(theta) = E f(theta + w) of a function of the parameters alone, with noise w of standard deviation sigma.
 
     Attributes:
         function: f.
         sigma: standard deviation of the noise, in the unit of theta.
+        noise: name of the noise's density in `estimators.NOISES`.
     """
 
     function: Function
     sigma: float
+    noise: str = "gaussian"
 
     def __post_init__(self) -> None:
         check_noise(self.sigma)
+        check_density(self.noise)
 
     @property
     def num_params(self) -> int:
@@ -159,17 +233,53 @@ class FunctionObjective:
         return self.function.num_params
 
     def evaluate(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> Evaluation:
-        """Values and scores w / sigma^2."""
+        """Values and scores."""
+        return self._evaluation(theta, self._noise(keys))
+
+    def evaluate_pair(
+        self, theta: Float[Array, " params"], keys: Key[Array, " samples"]
+    ) -> tuple[Evaluation, Evaluation]:
+        """Two evaluations whose noises are opposite, sample by sample."""
         noise = self._noise(keys)
-        point = self._point(theta)
-        baseline = np.broadcast_to(self.function.value(point), len(noise))
-        value = self.function.value(point + noise)
-        return Evaluation(*map(jnp.asarray, (value, noise / self.sigma**2, baseline)))
+        return self._evaluation(theta, noise), self._evaluation(theta, -noise)
+
+    def evaluate_steps(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> StepEvaluation:
+        """The samples of `evaluate`; there is one step."""
+        return _one_step(self.evaluate(theta, keys))
+
+    def evaluate_step_pair(
+        self, theta: Float[Array, " params"], keys: Key[Array, " samples"]
+    ) -> tuple[StepEvaluation, StepEvaluation]:
+        """The samples of `evaluate_pair`; there is one step."""
+        plus, minus = self.evaluate_pair(theta, keys)
+        return _one_step(plus), _one_step(minus)
 
     def differentiate(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> Differentiation:
         """Values and hand-derived gradients."""
         points = self._point(theta) + self._noise(keys)
         return Differentiation(jnp.asarray(self.function.value(points)), jnp.asarray(self.function.gradient(points)))
+
+    def differentiate_steps(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> StepDifferentiation:
+        """The samples of `differentiate`; there is one step."""
+        batch = self.differentiate(theta, keys)
+        return StepDifferentiation(batch.value, batch.gradient[:, None], None)
+
+    def linearise(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> Linearisation:
+        """f as the final cost of a rollout without steps, whose start is theta + w."""
+        noise = self._noise(keys)
+        samples, size = noise.shape
+        none = jnp.zeros((samples, 0, size))
+        final = jnp.asarray(self.function.gradient(self._point(theta) + noise))
+        return Linearisation(
+            steps=_one_step(self._evaluation(theta, noise)),
+            cost_state=none,
+            cost_control=none[:, :, :0],
+            final_state=final,
+            over_state=jnp.zeros((samples, 0, size, size)),
+            over_control=jnp.zeros((samples, 0, size, 0)),
+            policy_state=None,
+            start_jacobian=jnp.broadcast_to(jnp.eye(size), (samples, size, size)),
+        )
 
     def value_and_gradient(
         self, theta: Float[Array, " params"], key: Key[Array, ""]
@@ -178,9 +288,15 @@ class FunctionObjective:
         point = self._point(theta)
         return float(self.function.value(point)), self.function.gradient(point)
 
+    def _evaluation(self, theta, noise) -> Evaluation:
+        point = self._point(theta)
+        baseline = np.broadcast_to(self.function.value(point), len(noise))
+        score = noise_score(jnp.asarray(noise), self.sigma, self.noise)
+        return Evaluation(*map(jnp.asarray, (self.function.value(point + noise), score, baseline)))
+
     def _noise(self, keys) -> np.ndarray:
         shape = (1, self.num_params)
-        draw = jax.vmap(lambda key: standard_noise(split_sample_key(key)[1], shape, jnp.float64))
+        draw = jax.vmap(lambda key: standard_noise(split_sample_key(key)[1], shape, jnp.float64, self.noise))
         return self.sigma * np.asarray(draw(keys))[:, 0]
 
     def _point(self, theta) -> np.ndarray:
@@ -188,3 +304,7 @@ class FunctionObjective:
         if point.shape != (self.num_params,):
             raise ValueError(f"theta must have shape ({self.num_params},), got {point.shape}")
         return point
+
+
+def _one_step(batch: Evaluation) -> StepEvaluation:
+    return StepEvaluation(batch.value[:, None], batch.baseline[:, None], batch.score[:, None], None)

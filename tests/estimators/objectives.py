@@ -9,7 +9,7 @@ import numpy as np
 from jax import Array
 from jax.scipy.stats import norm
 
-from estimators import Differentiation, Evaluation
+from estimators import Differentiation, Evaluation, Linearisation, StepDifferentiation, StepEvaluation
 
 
 @dataclass(frozen=True)
@@ -24,17 +24,55 @@ class OneStep:
         return self.sigma * jax.vmap(lambda key: jax.random.normal(key, theta.shape, theta.dtype))(keys)
 
     def evaluate(self, theta: Array, keys: Array) -> Evaluation:
-        noise = self.noise(theta, keys)
+        return self.at_noise(theta, self.noise(theta, keys))
+
+    def at_noise(self, theta: Array, noise: Array) -> Evaluation:
         return Evaluation(
             value=jax.vmap(self.function)(theta[None, :] + noise),
             score=noise / self.sigma**2,
-            baseline=jnp.full(keys.shape, self.function(theta)),
+            baseline=jnp.full(noise.shape[:1], self.function(theta)),
+        )
+
+    def evaluate_pair(self, theta: Array, keys: Array) -> tuple[Evaluation, Evaluation]:
+        noise = self.noise(theta, keys)
+        return self.at_noise(theta, noise), self.at_noise(theta, -noise)
+
+    def evaluate_steps(self, theta: Array, keys: Array) -> StepEvaluation:
+        return one_step(self.evaluate(theta, keys))
+
+    def evaluate_step_pair(self, theta: Array, keys: Array) -> tuple[StepEvaluation, StepEvaluation]:
+        plus, minus = self.evaluate_pair(theta, keys)
+        return one_step(plus), one_step(minus)
+
+    def differentiate_steps(self, theta: Array, keys: Array) -> StepDifferentiation:
+        batch = self.differentiate(theta, keys)
+        return StepDifferentiation(batch.value, batch.gradient[:, None], None)
+
+    def linearise(self, theta: Array, keys: Array) -> Linearisation:
+        """f as the final cost of no step at all, from the start theta + w."""
+        steps = one_step(self.evaluate(theta, jax.random.clone(keys)))
+        final = self.differentiate(theta, keys).gradient
+        samples, size = final.shape
+        empty = jnp.zeros((samples, 0, size), theta.dtype)
+        return Linearisation(
+            steps=steps,
+            cost_state=empty,
+            cost_control=empty[:, :, :0],
+            final_state=final,
+            over_state=jnp.zeros((samples, 0, size, size), theta.dtype),
+            over_control=jnp.zeros((samples, 0, size, 0), theta.dtype),
+            policy_state=None,
+            start_jacobian=jnp.broadcast_to(jnp.eye(size, dtype=theta.dtype), (samples, size, size)),
         )
 
     def differentiate(self, theta: Array, keys: Array) -> Differentiation:
         inputs = theta[None, :] + self.noise(theta, keys)
         value, gradient = jax.vmap(jax.value_and_grad(self.function))(inputs)
         return Differentiation(value=value, gradient=gradient)
+
+
+def one_step(batch: Evaluation) -> StepEvaluation:
+    return StepEvaluation(batch.value[:, None], batch.baseline[:, None], batch.score[:, None], None)
 
 
 def heaviside(sigma: float) -> OneStep:
@@ -96,26 +134,69 @@ class LinearQuadratic:
         return start, self.sigma * jax.random.normal(noise_key, (self.horizon, 2))
 
     def rollout(self, theta: Array, start: Array, noise: Array) -> tuple[Array, Array]:
-        """Total cost and score."""
-        gain, state, cost, score = theta.reshape(2, 2), start, jnp.zeros(()), jnp.zeros((2, 2))
+        """Costs to go, and the states before each step."""
+        gain, state, costs, states = theta.reshape(2, 2), start, [], []
         for step in range(self.horizon):
             control = gain @ state + noise[step]
-            score += jnp.outer(noise[step], state) / self.sigma**2
-            cost += state @ self.state_cost @ state + control @ self.control_cost @ control
+            states.append(state)
+            costs.append(state @ self.state_cost @ state + control @ self.control_cost @ control)
             state = jnp.asarray(self.transition) @ state + jnp.asarray(self.control) @ control
-        return cost + state @ self.state_cost @ state, score.reshape(-1)
+        costs[-1] += state @ self.state_cost @ state
+        return jnp.cumsum(jnp.stack(costs)[::-1])[::-1], jnp.stack(states)
+
+    def steps(self, theta: Array, starts: Array, noise: Array) -> StepEvaluation:
+        value, states = jax.vmap(lambda start, w: self.rollout(theta, start, w))(starts, noise)
+        silent, _ = jax.vmap(lambda start, w: self.rollout(theta, start, 0 * w))(starts, noise)
+        jacobian = jnp.einsum("uv,isx->isuvx", jnp.eye(2), states).reshape(*noise.shape, 4)
+        return StepEvaluation(value, silent, noise / self.sigma**2, jacobian)
+
+    def at_noise(self, theta: Array, starts: Array, noise: Array) -> Evaluation:
+        steps = self.steps(theta, starts, noise)
+        assert steps.policy_jacobian is not None
+        score = jnp.einsum("ishp,ish->ip", steps.policy_jacobian, steps.noise_score)
+        return Evaluation(steps.value_to_go[:, 0], score, steps.baseline_to_go[:, 0])
 
     def evaluate(self, theta: Array, keys: Array) -> Evaluation:
-        def one(key: Array) -> tuple[Array, Array, Array]:
-            start, noise = self.sample(key)
-            return *self.rollout(theta, start, noise), self.rollout(theta, start, jnp.zeros_like(noise))[0]
+        return self.at_noise(theta, *jax.vmap(self.sample)(keys))
 
-        value, score, baseline = jax.vmap(one)(keys)
-        return Evaluation(value, score, baseline)
+    def evaluate_pair(self, theta: Array, keys: Array) -> tuple[Evaluation, Evaluation]:
+        starts, noise = jax.vmap(self.sample)(keys)
+        return self.at_noise(theta, starts, noise), self.at_noise(theta, starts, -noise)
+
+    def evaluate_steps(self, theta: Array, keys: Array) -> StepEvaluation:
+        return self.steps(theta, *jax.vmap(self.sample)(keys))
+
+    def evaluate_step_pair(self, theta: Array, keys: Array) -> tuple[StepEvaluation, StepEvaluation]:
+        starts, noise = jax.vmap(self.sample)(keys)
+        return self.steps(theta, starts, noise), self.steps(theta, starts, -noise)
 
     def differentiate(self, theta: Array, keys: Array) -> Differentiation:
         def one(start: Array, noise: Array) -> tuple[Array, Array]:
-            return jax.value_and_grad(lambda at: self.rollout(at, start, noise)[0])(theta)
+            return jax.value_and_grad(lambda at: self.rollout(at, start, noise)[0][0])(theta)
 
         value, gradient = jax.vmap(one)(*jax.vmap(self.sample)(keys))
         return Differentiation(value, gradient)
+
+    def differentiate_steps(self, theta: Array, keys: Array) -> StepDifferentiation:
+        starts, noise = jax.vmap(self.sample)(keys)
+        total = jax.value_and_grad(lambda w, start: self.rollout(theta, start, w)[0][0])
+        value, gradient = jax.vmap(total)(noise, starts)
+        return StepDifferentiation(value, gradient, self.steps(theta, starts, noise).policy_jacobian)
+
+    def linearise(self, theta: Array, keys: Array) -> Linearisation:
+        starts, noise = jax.vmap(self.sample)(keys)
+        gain = theta.reshape(2, 2)
+        _, states = jax.vmap(lambda start, w: self.rollout(theta, start, w))(starts, noise)
+        controls = states @ gain.T + noise
+        last = states[:, -1] @ self.transition.T + controls[:, -1] @ self.control.T
+        shape = (*noise.shape[:2], 2, 2)
+        return Linearisation(
+            steps=self.steps(theta, starts, noise),
+            cost_state=2 * states @ self.state_cost,
+            cost_control=2 * controls @ self.control_cost,
+            final_state=2 * last @ self.state_cost,
+            over_state=jnp.broadcast_to(self.transition, shape),
+            over_control=jnp.broadcast_to(self.control, shape),
+            policy_state=jnp.broadcast_to(gain, shape),
+            start_jacobian=None,
+        )

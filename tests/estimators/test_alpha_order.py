@@ -120,7 +120,7 @@ def test_choice_is_reported_and_used():
     zeroth, first = pair()
     estimate = alpha_order(zeroth, first, gamma=0.6, epsilon=0.5)
     choice = estimate.alpha
-    assert choice is not None
+    assert choice is not None and choice.discrepancy is not None
     discrepancy = np.linalg.norm(np.asarray(first.mean) - np.asarray(zeroth.mean))
     np.testing.assert_allclose(choice.discrepancy, discrepancy, rtol=1e-14)
     np.testing.assert_allclose(choice.alpha, 0.1 / discrepancy, rtol=1e-14)

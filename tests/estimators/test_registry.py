@@ -1,7 +1,7 @@
 """Running estimators by name: oracles, keys, sharing, precision, transformations and refusals."""
 
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -12,24 +12,35 @@ from jax import Array
 import estimators
 from estimators import (
     ESTIMATORS,
+    ORACLES,
     Differentiation,
     Estimator,
     EstimatorOptions,
     Evaluation,
     GradientEstimate,
+    Objective,
+    draw,
     estimate,
     zeroth_order,
 )
 from tests.estimators import objectives
 
 # Compiled whole: a fraction of the time of compiling operation by operation.
-combine = jax.jit(estimators.combine, static_argnums=(0, 3))
+combine = jax.jit(estimators.combine, static_argnums=(0, 2))
 leave_one_out = jax.jit(estimators.leave_one_out)
 
 HESSIAN = np.array([[1.0, 0.4], [0.4, 0.5]])
 OBJECTIVE = objectives.quadratic(HESSIAN, 0.5)
 THETA = np.array([1.5, -2.0])
-OPTIONS = EstimatorOptions(gamma=50.0, failure_probability=0.1, variance_proxy="variance", radius="max_deviation")
+OPTIONS = EstimatorOptions(
+    gamma=50.0,
+    failure_probability=0.1,
+    variance_proxy="variance",
+    radius="max_deviation",
+    sigma=0.5,
+    max_norm=3.0,
+    window=1,
+)
 
 
 @dataclass
@@ -37,32 +48,39 @@ class Spy:
     """Records the keys that each oracle is given."""
 
     num_params: int = 2
-    evaluated: list[Array] = field(default_factory=list)
-    differentiated: list[Array] = field(default_factory=list)
+    calls: list[tuple[str, np.ndarray]] = field(default_factory=list)
 
-    def evaluate(self, theta: Array, keys: Array) -> Evaluation:
-        self.evaluated.append(jax.random.key_data(jax.random.clone(keys)))
-        return OBJECTIVE.evaluate(theta, keys)
+    def __getattr__(self, name: str) -> Any:
+        method = getattr(OBJECTIVE, name)
 
-    def differentiate(self, theta: Array, keys: Array) -> Differentiation:
-        self.differentiated.append(jax.random.key_data(jax.random.clone(keys)))
-        return OBJECTIVE.differentiate(theta, keys)
+        def call(theta: Array, keys: Array) -> Any:
+            self.calls.append((name, np.asarray(jax.random.key_data(jax.random.clone(keys)))))
+            return method(theta, keys)
+
+        return call
 
 
 @pytest.mark.parametrize("name", ESTIMATORS)
-def test_every_estimator_calls_the_oracles_that_it_names_with_keys_used_once(name: str):
+def test_every_estimator_calls_the_oracles_that_it_names_with_independent_keys(name: str):
     spy = Spy()
-    estimate(name, spy, jnp.asarray(THETA), jax.random.key(0), 20, options=OPTIONS)
-    orders = ESTIMATORS[name].order_of_oracle
-    assert (len(spy.evaluated), len(spy.differentiated)) == (int(0 in orders), int(1 in orders))
-    keys = np.concatenate([np.asarray(batch) for batch in spy.evaluated + spy.differentiated])
-    assert len(np.unique(keys, axis=0)) == len(keys) == 20 * len(orders)
+    estimate(name, cast(Objective, spy), jnp.asarray(THETA), jax.random.key(0), 20, options=OPTIONS)
+    needs = [ORACLES[oracle] for oracle in ESTIMATORS[name].needs]
+    assert [called for called, _ in spy.calls] == [oracle.method for oracle in needs]
+    keys = np.concatenate([drawn for _, drawn in spy.calls])
+    assert len(np.unique(keys, axis=0)) == 20 * len({oracle.order for oracle in needs})
+    batches = draw(tuple(oracle.name for oracle in needs), OBJECTIVE, jnp.asarray(THETA), jax.random.key(0), 20)
+    np.testing.assert_array_equal(
+        estimators.combine(name, batches, OPTIONS).mean,
+        estimate(name, OBJECTIVE, jnp.asarray(THETA), jax.random.key(0), 20, options=OPTIONS).mean,
+    )
 
 
 def test_the_table_is_keyed_by_name():
-    assert list(ESTIMATORS) == ["zobg", "fobg", "aobg", "ivw"]
+    assert len(ESTIMATORS) == 13 and len(ORACLES) == 7
     for name, entry in ESTIMATORS.items():
-        assert isinstance(entry, Estimator) and entry.name == name and entry.description
+        assert isinstance(entry, Estimator) and entry.name == name and entry.description and entry.needs
+    for name, oracle in ORACLES.items():
+        assert oracle.name == name and oracle.order in (0, 1)
 
 
 def test_sample_i_depends_on_key_i_alone():
@@ -72,14 +90,14 @@ def test_sample_i_depends_on_key_i_alone():
     np.testing.assert_array_equal(whole.value[3:5], part.value)
 
 
-def draw(name: str, options: EstimatorOptions) -> GradientEstimate:
+def drawn(name: str, options: EstimatorOptions) -> GradientEstimate:
     return jax.jit(lambda theta: estimate(name, OBJECTIVE, theta, jax.random.key(2), 200, options=options))(
         jnp.asarray(THETA)
     )
 
 
 def shared() -> dict[str, GradientEstimate]:
-    return {name: draw(name, OPTIONS) for name in ESTIMATORS}
+    return {name: drawn(name, OPTIONS) for name in ESTIMATORS}
 
 
 def test_estimators_share_batches_given_the_same_key():
@@ -95,18 +113,18 @@ def test_estimators_share_batches_given_the_same_key():
 
 def test_ivw_is_aobg_without_a_limit():
     options = replace(OPTIONS, gamma=float("inf"))
-    unlimited = draw("aobg", options)
+    unlimited = drawn("aobg", options)
     strict = replace(OPTIONS, gamma=1e-9)
-    ivw = draw("ivw", strict)
+    ivw = drawn("ivw", strict)
     np.testing.assert_array_equal(unlimited.mean, ivw.mean)
     assert unlimited.alpha is not None and unlimited.alpha.alpha > 0.5
-    zeroth = draw("aobg", strict)
+    zeroth = drawn("aobg", strict)
     np.testing.assert_array_equal(zeroth.mean, shared()["zobg"].mean)
 
 
 @pytest.mark.parametrize(
     ("name", "baseline"),
-    [("zobg", "none"), ("zobg", "leave_one_out"), ("fobg", "none"), ("aobg", "zero_noise"), ("ivw", "none")],
+    [(name, "zero_noise") for name in ESTIMATORS] + [("zobg", "none"), ("zobg_to_go", "leave_one_out")],
 )
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 def test_precision_is_the_callers_under_jit(name: str, baseline: str, dtype: type):
@@ -167,7 +185,8 @@ def lossy_batches() -> tuple[Evaluation, Differentiation]:
 @pytest.mark.parametrize("baseline", ["zero_noise", "leave_one_out"])
 def test_lost_samples_are_counted_and_do_not_spoil_the_rest(name: str, lost: int, baseline: str):
     zeroth, first = lossy_batches()
-    result = combine(name, zeroth, first, replace(OPTIONS, baseline=baseline))
+    batches = {"evaluation": zeroth, "differentiation": first}
+    result = combine(name, batches, replace(OPTIONS, baseline=baseline))
     assert result.num_nonfinite == lost
     for leaf in (result.mean, result.variance, result.standard_error):
         assert np.all(np.isfinite(leaf))
@@ -185,22 +204,36 @@ def test_leave_one_out_is_the_mean_of_the_other_finite_values():
 
 def test_unknown_names_are_refused_with_the_choices():
     zeroth, first = lossy_batches()
-    with pytest.raises(ValueError, match="one of zobg, fobg, aobg, ivw; got 'zo'"):
-        combine("zo", zeroth, first, OPTIONS)
-    with pytest.raises(ValueError, match="one of zobg, fobg, aobg, ivw; got 'zo'"):
+    with pytest.raises(ValueError, match="one of zobg, .*, aobg, .*; got 'zo'"):
+        combine("zo", {"evaluation": zeroth, "differentiation": first}, OPTIONS)
+    with pytest.raises(ValueError, match="one of zobg, .*, aobg, .*; got 'zo'"):
         estimate("zo", OBJECTIVE, jnp.asarray(THETA), jax.random.key(0), 10, options=OPTIONS)
     with pytest.raises(ValueError, match="one of none, zero_noise, leave_one_out; got 'mean'"):
         zeroth_order(zeroth, "mean")
 
 
+class _Bare:
+    """An objective with the two methods that every one has."""
+
+    num_params = 2
+    evaluate, differentiate = OBJECTIVE.evaluate, OBJECTIVE.differentiate
+
+
 def test_missing_batches_and_impossible_sizes_are_refused():
     zeroth, first = lossy_batches()
     for name in ("zobg", "aobg", "ivw"):
-        with pytest.raises(ValueError, match=f"'{name}' needs a zeroth-order batch"):
-            combine(name, None, first, OPTIONS)
+        with pytest.raises(ValueError, match=f"'{name}' needs a zeroth-order batch; .*evaluate.*'evaluation'"):
+            combine(name, {"differentiation": first}, OPTIONS)
     for name in ("fobg", "aobg", "ivw"):
         with pytest.raises(ValueError, match=f"'{name}' needs a first-order batch"):
-            combine(name, zeroth, None, OPTIONS)
+            combine(name, {"evaluation": zeroth, "differentiation": None}, OPTIONS)
+    for name, option in (("fobg_clipped", "max_norm"), ("fobg_truncated", "window"), ("ddcg", "sigma")):
+        with pytest.raises(ValueError, match=f"'{name}' needs the option {option}"):
+            estimate(
+                name, OBJECTIVE, jnp.asarray(THETA), jax.random.key(0), 9, options=replace(OPTIONS, **{option: None})
+            )
+    with pytest.raises(ValueError, match="_Bare has no evaluate_pair, which a zeroth-order batch of pairs comes from"):
+        estimate("zobg_antithetic", _Bare(), jnp.asarray(THETA), jax.random.key(0), 9, options=OPTIONS)
     with pytest.raises(ValueError, match="at least 1, .* got 0"):
         estimate("zobg", OBJECTIVE, jnp.asarray(THETA), jax.random.key(0), 0, options=OPTIONS)
     with pytest.raises(ValueError, match=r"shape \(2,\), the objective's; got \(3,\)"):
@@ -214,7 +247,12 @@ def test_missing_batches_and_impossible_sizes_are_refused():
         ({"gamma": 0.0}, "gamma must be positive; got 0.0"),
         ({"gamma": float("nan")}, "gamma must be positive; got nan"),
         ({"failure_probability": 1.5}, "strictly between 0 and 1; got 1.5"),
-        ({"variance_proxy": "sum"}, "one of variance, second_moment; got 'sum'"),
+        ({"variance_proxy": "sum"}, "one of variance, second_moment, upper_bound; got 'sum'"),
+        ({"variance_proxy": "upper_bound"}, "'upper_bound' needs a bound .* got 'max_deviation'"),
+        ({"sigma": 0.0}, "sigma must be positive and finite; got 0.0"),
+        ({"max_norm": float("inf")}, "max_norm must be positive and finite; got inf"),
+        ({"window": 0}, "window must be at least 1 step; got 0"),
+        ({"tolerance": 1.0}, r"tolerance must lie in \[0, 1\); got 1.0"),
         ({"radius": -0.1}, "not negative; got -0.1"),
     ],
 )

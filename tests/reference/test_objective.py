@@ -5,7 +5,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from estimators import Objective, first_order, zeroth_order
+from estimators import (
+    ESTIMATORS,
+    ORACLES,
+    EstimatorOptions,
+    Objective,
+    combine,
+    first_order,
+    pull_back,
+    truncated_first_order,
+    zeroth_order,
+)
 from mjx_study.noise import split_sample_key, standard_noise
 from mjx_study.reference import (
     DoublePendulum,
@@ -226,3 +236,32 @@ def test_refuses_a_theta_of_another_length(name: str):
 def test_function_objective_refuses_no_noise():
     with pytest.raises(ValueError, match="sigma must be positive and finite"):
         FunctionObjective(QUADRATIC.function, -1.0)
+
+
+@table
+def test_all_kinds_of_batches_agree(name: str):
+    """With every decision that theta can be; and every estimator runs on them."""
+    objective = OBJECTIVES[name]
+    theta = point(objective)
+    batches = {kind: getattr(objective, oracle.method)(theta, keys(5, seed=3)) for kind, oracle in ORACLES.items()}
+    evaluation, steps, differentiation = (batches[kind] for kind in ("evaluation", "steps", "differentiation"))
+    by_step, linearisation = batches["step_differentiation"], batches["linearisation"]
+    close = lambda one, other: np.testing.assert_allclose(one, other, rtol=1e-10, atol=1e-12)  # noqa: E731
+    close(steps.value_to_go[:, 0], evaluation.value)
+    close(steps.baseline_to_go[:, 0], evaluation.baseline)
+    close(pull_back(steps.noise_score, steps.policy_jacobian), evaluation.score)
+    close(pull_back(by_step.noise_gradient, by_step.policy_jacobian), differentiation.gradient)
+    close(truncated_first_order(linearisation, 10**6).per_sample, differentiation.gradient)
+    close(batches["pair"][0].value, evaluation.value)
+    close(batches["step_pair"][1].value_to_go[:, 0], batches["pair"][1].value)
+    options = EstimatorOptions(
+        gamma=1.0,
+        failure_probability=0.1,
+        variance_proxy="variance",
+        radius="max_deviation",
+        sigma=objective.sigma,
+        max_norm=1.0,
+        window=2,
+    )
+    for estimator in ESTIMATORS:
+        assert np.all(np.isfinite(combine(estimator, batches, options).mean)), estimator

@@ -1,0 +1,126 @@
+"""Whether a first-order mean is biased, and how much of it a rare event carries."""
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Key
+
+from estimators.pytree import register_pytree
+from estimators.statistics import finite_rows, summarise
+from estimators.types import GradientEstimate
+
+
+@register_pytree
+@dataclass(frozen=True)
+class BiasTest:
+    """A test of E[g_1] = E[g_0]. See `bias_test`.
+
+    Attributes:
+        distance: ||gbar_1 - gbar_0||, [cost/param].
+        squared_bias: An unbiased estimate of ||E g_1 - E g_0||^2, which may be negative, [cost^2/param^2].
+        p_value: Probability of a distance at least as large if there is no bias.
+    """
+
+    distance: Float[Array, ""]
+    squared_bias: Float[Array, ""]
+    p_value: Float[Array, ""]
+
+
+def bias_test(first: GradientEstimate, zeroth: GradientEstimate, key: Key[Array, ""], *, num_draws: int) -> BiasTest:
+    """Two-sample test of whether a first-order mean estimates another gradient than a zeroth-order one.
+
+        T = ||gbar_1 - gbar_0||,   T* = ||sum_i e_i (g_1i - gbar_1)/n_1 - sum_j e'_j (g_0j - gbar_0)/n_0||
+
+    with independent standard normal multipliers e, e'. The p-value is the share of draws of T* that reach T, the
+    observed T among them: a multiplier bootstrap, which needs no inverse covariance and so works with more parameters
+    than samples. Asymptotic: with heavy tails and few samples it rejects too rarely or too often, and a rare event that
+    neither batch holds is seen by no test.
+
+    Args:
+        first: First-order estimate.
+        zeroth: Zeroth-order estimate from independent samples.
+        key: For the multipliers; used up.
+        num_draws: Of T*, >= 1; 1 / (num_draws + 1) is the least p-value.
+
+    Returns:
+        The test; NaN where an estimate has fewer than two finite rows.
+
+    Raises:
+        ValueError: There is nothing to draw, or the parameters differ in number.
+
+    Reference: Chernozhukov, Chetverikov, Kato, "Gaussian approximations and multiplier bootstrap for maxima of sums
+    of high-dimensional random vectors", Annals of Statistics 41, 2013, there for another norm.
+    """
+    if num_draws < 1:
+        raise ValueError(f"num_draws must be at least 1; got {num_draws}; 999 gives p-values down to 0.001")
+    if first.mean.shape != zeroth.mean.shape:
+        raise ValueError(f"the estimates must have the same parameters; got {first.mean.shape} and {zeroth.mean.shape}")
+    distance = jnp.linalg.norm(first.mean - zeroth.mean)
+    noise = sum(jnp.sum(estimate.standard_error**2) for estimate in (first, zeroth))
+    drawn = sum(
+        _multiplied(estimate, stream, num_draws)
+        for estimate, stream in zip((first, zeroth), jax.random.split(key), strict=True)
+    )
+    reached = jnp.sum(jnp.linalg.norm(drawn, axis=1) >= distance).astype(distance.dtype)
+    p_value = (1.0 + reached) / (1.0 + num_draws)
+    defined = (first.num_finite > 1) & (zeroth.num_finite > 1)
+    return BiasTest(distance, distance**2 - noise, jnp.where(defined, p_value, jnp.nan))
+
+
+def _multiplied(estimate: GradientEstimate, key: Key[Array, ""], num_draws: int) -> Float[Array, "draws params"]:
+    """Means of the centred rows times standard normal numbers; the sign that a difference gives is immaterial."""
+    rows = estimate.per_sample
+    centred = jnp.where(finite_rows(rows)[:, None], rows - estimate.mean[None, :], 0.0)
+    count = estimate.num_finite.astype(rows.dtype)
+    multipliers = jax.random.normal(key, (num_draws, rows.shape[0]), rows.dtype)
+    return jnp.matmul(multipliers, centred, precision="highest") / jnp.sqrt(count * jnp.maximum(count - 1.0, 1.0))
+
+
+@register_pytree
+@dataclass(frozen=True)
+class EmpiricalBias:
+    """(beta, Delta, S)-empirical bias, estimated. See `empirical_bias`.
+
+    Attributes:
+        beta: Share of the samples that are set aside.
+        discrepancy: Delta = ||mean of the others - reference||, [cost/param].
+        variance: S, the variance of the others, [cost^2/param^2].
+    """
+
+    beta: Float[Array, ""]
+    discrepancy: Float[Array, ""]
+    variance: Float[Array, ""]
+
+
+def empirical_bias(estimate: GradientEstimate, reference: Float[Array, " params"], num_rare: int) -> EmpiricalBias:
+    """What a batch shows that by chance holds none of its rarest samples.
+
+    A random vector z has (beta, Delta, S)-empirical bias if there is an event of probability at least 1 - beta on which
+    its mean is Delta or more from E z, though its variance is at most S: a batch of fewer than about 1 / beta samples
+    then looks precise and is wrong. The event here: all but the `num_rare` samples farthest from the median.
+
+    Args:
+        estimate: The estimate.
+        reference: E z, from elsewhere, [cost/param].
+        num_rare: Samples to set aside, from 0 to the number of samples less 2.
+
+    Returns:
+        The three numbers; a lower bound on Delta at that beta as far as this event goes.
+
+    Raises:
+        ValueError: Too few samples would be left.
+
+    Reference: Suh et al. 2022, def. of empirical bias, and the lemma Var z >= Delta_0^2 / beta with Delta_0 =
+    max(0, (1 - beta) Delta - beta ||E z||).
+    """
+    rows = estimate.per_sample
+    if not 0 <= num_rare <= rows.shape[0] - 2:
+        raise ValueError(f"num_rare must leave at least 2 of {rows.shape[0]} samples; got {num_rare}")
+    finite = finite_rows(rows)
+    centre = jnp.nanmedian(jnp.where(finite[:, None], rows, jnp.nan), axis=0)
+    distance = jnp.where(finite, jnp.linalg.norm(rows - centre[None, :], axis=1), -1.0)
+    rank = jnp.argsort(jnp.argsort(-distance))
+    kept = summarise(jnp.where((rank >= num_rare)[:, None], rows, jnp.nan))
+    beta = jnp.asarray(num_rare, rows.dtype) / estimate.num_finite.astype(rows.dtype)
+    return EmpiricalBias(beta, jnp.linalg.norm(kept.mean - reference), kept.variance)

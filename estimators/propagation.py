@@ -1,0 +1,148 @@
+"""Estimates by a backward recursion over the derivatives of every step."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from estimators.alpha_order import inverse_variance_alpha
+from estimators.statistics import finite_rows, summarise
+from estimators.stepwise import control_scores, node_variance
+from estimators.types import AlphaChoice, GradientEstimate, Linearisation, pull_back
+
+Controls = Float[Array, "samples inputs"]
+Adjoint = Float[Array, "samples states"]
+
+
+def truncated_first_order(linearisation: Linearisation, window: int) -> GradientEstimate:
+    """First-order batched gradient with the adjoint cut every `window` steps.
+
+        lambda_h = c_x + phi_x^T lambda_{h+1} + pi_x^T g_h,   g_h = c_u + phi_u^T lambda_{h+1},
+        lambda_{h+1} = 0 in these where h is a multiple of the window
+
+    A control then answers for at most `window` steps of cost, and no product of more than `window` Jacobians is
+    formed: less variance where products grow, and a bias, since what it does later is left out. A window of at least
+    the horizon is the first-order batched gradient.
+
+    Args:
+        linearisation: The batch.
+        window: Steps between cuts, >= 1.
+
+    Returns:
+        The estimate, one row per sample.
+
+    Raises:
+        ValueError: The window is below 1.
+    """
+    if window < 1:
+        raise ValueError(f"window must be at least 1 step; got {window}")
+    horizon = linearisation.cost_state.shape[1]
+    keeps = jnp.arange(1, horizon + 1) % window != 0
+    keeps = keeps.at[-1].set(True) if horizon else keeps  # the end of the horizon is no cut
+    adjoint, controls, _ = _sweep(
+        linearisation, lambda derivative, _: (derivative, jnp.ones((), derivative.dtype)), keeps
+    )
+    return summarise(_gradient(linearisation, adjoint, controls))
+
+
+def total_propagation(linearisation: Linearisation, baseline: str) -> GradientEstimate:
+    """First- and zeroth-order estimates mixed at every step of the backward recursion.
+
+        g_h = alpha_h (c_u + phi_u^T lambda_{h+1}) + (1 - alpha_h) grad psi(w_h) (V_h - b_h)
+        lambda_h = c_x + phi_x^T lambda_{h+1} + pi_x^T g_h,     g = sum_h D_theta pi^T g_h
+
+    alpha_h is the inverse-variance weight of the two shares D_theta pi^T (...) of the gradient. What has been mixed
+    flows on to earlier steps, so the growth of derivatives over a long horizon stops where values do better; in an
+    open loop nothing flows through the policy, and a step is mixed without effect on others. Both come from
+    the same rollouts, as published, so that they are not independent.
+
+    Args:
+        linearisation: The batch.
+        baseline: A name in `BASELINES`, applied step by step.
+
+    Returns:
+        The estimate; its `alpha` holds the mean weight.
+
+    Raises:
+        ValueError: No baseline has that name.
+
+    Reference: Parmas, Rasmussen, Peters, Doya, "PIPPS: Flexible model-based policy search robust to the curse of
+    chaos", ICML 2018, where noise acts on states; here it acts on controls.
+    """
+    steps = linearisation.steps
+    scores = control_scores(steps, baseline)
+    finite = jnp.isfinite(steps.value_to_go[:, 0]) & finite_rows(scores.reshape(scores.shape[0], -1))
+
+    def mix(derivative: Controls, node: tuple[Controls, Array | None]) -> tuple[Controls, Float[Array, ""]]:
+        score, jacobian = node
+        usable = finite & finite_rows(derivative)
+        shares = [
+            pull_back(part[:, None], None if jacobian is None else jacobian[:, None]) for part in (score, derivative)
+        ]
+        alpha = inverse_variance_alpha(*(jnp.sum(node_variance(share, usable)) for share in shares))
+        return _weigh(alpha, score, derivative), alpha
+
+    horizon = linearisation.cost_state.shape[1]
+    if linearisation.start_jacobian is None:
+        jacobian = None if steps.policy_jacobian is None else jnp.moveaxis(steps.policy_jacobian, 1, 0)
+        nodes = (jnp.moveaxis(scores, 1, 0), jacobian)
+        adjoint, controls, alphas = _sweep(linearisation, mix, jnp.ones(horizon, bool), nodes)
+        rows = _gradient(linearisation, adjoint, controls)
+    else:  # one decision, before the first step
+        adjoint, controls, _ = _sweep(
+            linearisation, lambda derivative, _: (derivative, jnp.ones((), derivative.dtype)), jnp.ones(horizon, bool)
+        )
+        rows, alphas = mix(_gradient(linearisation, adjoint, controls), (scores[:, 0], None))
+    rows = jnp.where(finite[:, None], rows, jnp.nan)
+    estimate = summarise(rows)
+    return replace(estimate, alpha=AlphaChoice(jnp.mean(alphas), None, None, None, None))
+
+
+def _sweep(
+    linearisation: Linearisation,
+    node: Callable[..., tuple[Controls, Float[Array, ""]]],
+    keeps: Bool[Array, " horizon"],
+    inputs: object = None,
+) -> tuple[Adjoint, Float[Array, "samples horizon inputs"], Float[Array, " horizon"]]:
+    """The recursion: the start's adjoint, g_h of every step, and the weights that `node` chose."""
+
+    def back(adjoint: Adjoint, step):
+        keep, cost_state, cost_control, over_state, over_control, policy_state, given = step
+        adjoint = jnp.where(keep, adjoint, 0.0)
+        derivative = cost_control + jnp.einsum("isc,is->ic", over_control, adjoint, precision="highest")
+        mixed, weight = node(derivative, given)
+        adjoint = cost_state + jnp.einsum("ist,is->it", over_state, adjoint, precision="highest")
+        if policy_state is not None:
+            adjoint = adjoint + jnp.einsum("ics,ic->is", policy_state, mixed, precision="highest")
+        return adjoint, (mixed, weight)
+
+    fields = (
+        linearisation.cost_state,
+        linearisation.cost_control,
+        linearisation.over_state,
+        linearisation.over_control,
+        linearisation.policy_state,
+    )
+    by_step = [None if field is None else jnp.moveaxis(field, 1, 0) for field in fields]
+    adjoint, (controls, weights) = jax.lax.scan(
+        back, linearisation.final_state, (keeps, *by_step, inputs), reverse=True
+    )
+    return adjoint, jnp.moveaxis(controls, 0, 1), weights
+
+
+def _gradient(
+    linearisation: Linearisation, adjoint: Adjoint, controls: Float[Array, "samples horizon inputs"]
+) -> Float[Array, "samples params"]:
+    """The gradient over theta from the adjoints of start and controls; NaN for a value that is not finite."""
+    if linearisation.start_jacobian is None:
+        rows = pull_back(controls, linearisation.steps.policy_jacobian)
+    else:
+        rows = jnp.einsum("isp,is->ip", linearisation.start_jacobian, adjoint, precision="highest")
+    return jnp.where(jnp.isfinite(linearisation.steps.value_to_go[:, :1]), rows, jnp.nan)
+
+
+def _weigh(alpha: Float[Array, ""], score: Controls, derivative: Controls) -> Controls:
+    """Weighted sum in which nothing times NaN is nothing."""
+    return jnp.where(alpha == 1, 0.0, (1.0 - alpha) * score) + jnp.where(alpha == 0, 0.0, alpha * derivative)

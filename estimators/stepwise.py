@@ -1,0 +1,143 @@
+"""Estimates from single steps: costs to go in place of total costs, and a weight for every step."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from estimators.alpha_order import inverse_variance_alpha
+from estimators.baselines import BASELINES
+from estimators.statistics import finite_rows, summarise
+from estimators.types import (
+    AlphaChoice,
+    Evaluation,
+    GradientEstimate,
+    StepDifferentiation,
+    StepEvaluation,
+    pull_back,
+)
+
+
+def cost_to_go(steps: StepEvaluation, baseline: str) -> GradientEstimate:
+    """Zeroth-order batched gradient that credits a step's noise with the cost from that step on.
+
+        g_i = sum_h D_theta pi(x_h^i)^T grad psi(w_h^i) (V_h^i - b_h^i)
+
+    The same mean as with total costs, since what came before a step does not depend on its noise, and less
+    variance.
+
+    Args:
+        steps: The batch.
+        baseline: A name in `BASELINES`, applied step by step.
+
+    Returns:
+        The estimate, one row per sample.
+
+    Raises:
+        ValueError: No baseline has that name.
+
+    Reference: Suh et al. 2022, appendix on the policy gradient.
+    """
+    return summarise(pull_back(control_scores(steps, baseline), steps.policy_jacobian))
+
+
+def antithetic_cost_to_go(plus: StepEvaluation, minus: StepEvaluation, baseline: str) -> GradientEstimate:
+    """`cost_to_go` over pairs of opposite noise; a pair is one sample.
+
+    Args:
+        plus: The batch.
+        minus: The batch of the same starts and the opposite noise.
+        baseline: A name in `BASELINES`, applied within each half.
+
+    Returns:
+        The estimate, one row per pair.
+    """
+    above, below = (cost_to_go(steps, baseline).per_sample for steps in (plus, minus))
+    return summarise((above + below) / 2.0)
+
+
+def control_scores(steps: StepEvaluation, baseline: str) -> Float[Array, "samples steps controls"]:
+    """grad psi(w_h^i) (V_h^i - b_h^i), a zeroth-order sample of dV/du_h, [cost/control].
+
+    Raises:
+        ValueError: No baseline has that name.
+    """
+    if baseline not in BASELINES:
+        raise ValueError(f"baseline must be one of {', '.join(BASELINES)}; got {baseline!r}")
+
+    def advantage(value: Float[Array, " samples"], silent: Float[Array, " samples"]) -> Float[Array, " samples"]:
+        none = jnp.zeros((value.shape[0], 0), value.dtype)
+        return value - BASELINES[baseline](Evaluation(value, none, silent))
+
+    advantages = jax.vmap(advantage, in_axes=1, out_axes=1)(steps.value_to_go, steps.baseline_to_go)
+    return steps.noise_score * advantages[:, :, None]
+
+
+def stepwise_inverse_variance(zeroth: StepEvaluation, first: StepDifferentiation, baseline: str) -> GradientEstimate:
+    """Inverse-variance weights for every step and control (IVW-H).
+
+        g_i = sum_h D_theta pi^T [ alpha_h * dV^i/du_h + (1 - alpha_h) * grad psi(w_h^i) (V_h^i - b_h^i) ]
+
+    with alpha_h of each control the inverse-variance weight of the two quantities that it weighs, over the batch.
+    The batches are independent, and each is pulled back through its own states. Variance and standard errors take
+    the weights as given.
+
+    Args:
+        zeroth: Batch of evaluations.
+        first: Batch of differentiations from the same number of independent samples.
+        baseline: A name in `BASELINES`, applied step by step.
+
+    Returns:
+        The estimate; its `alpha` holds the mean weight.
+
+    Raises:
+        ValueError: The batches differ in shape, or no baseline has that name.
+
+    Reference: Onoda, Parmas, Yaguchi, Matsuo, arXiv 2604.18161, ICLR 2026.
+    """
+    from_values, from_gradients = control_scores(zeroth, baseline), first.noise_gradient
+    if from_values.shape != from_gradients.shape:
+        raise ValueError(
+            "the two batches must have the same shape (samples, steps, controls); "
+            f"got {from_values.shape} zeroth-order and {from_gradients.shape} first-order"
+        )
+    from_gradients = jnp.where(jnp.isfinite(first.value)[:, None, None], from_gradients, jnp.nan)
+    variances = [_node_variances(samples) for samples in (from_values, from_gradients)]
+    alpha = inverse_variance_alpha(*variances)
+    lower, upper = (
+        summarise(pull_back(jnp.where(weight == 0, 0.0, weight[None] * samples), jacobian))
+        for weight, samples, jacobian in (
+            (1.0 - alpha, from_values, zeroth.policy_jacobian),
+            (alpha, from_gradients, first.policy_jacobian),
+        )
+    )
+    choice = AlphaChoice(jnp.mean(alpha), None, None, None, None)
+    return replace(sum_independent(lower, upper), alpha=choice)
+
+
+def sum_independent(one: GradientEstimate, other: GradientEstimate) -> GradientEstimate:
+    """The sum of two estimates from independent batches of the same size; row i of one is paired with row i."""
+    per_sample = one.per_sample + other.per_sample
+    return GradientEstimate(
+        per_sample=per_sample,
+        mean=one.mean + other.mean,
+        variance=one.variance + other.variance,
+        standard_error=jnp.hypot(one.standard_error, other.standard_error),
+        num_finite=jnp.sum(finite_rows(per_sample)),
+    )
+
+
+def _node_variances(samples: Float[Array, "samples steps controls"]) -> Float[Array, "steps controls"]:
+    """Variance over the samples that are finite in every entry."""
+    finite = finite_rows(samples.reshape(samples.shape[0], -1))
+    return node_variance(samples, finite)
+
+
+def node_variance(samples: Float[Array, "samples ..."], finite: Bool[Array, " samples"]) -> Float[Array, "..."]:
+    """Variance of each entry over the samples marked as finite; NaN for fewer than two."""
+    mask = finite.reshape(-1, *(1,) * (samples.ndim - 1))
+    count = jnp.sum(finite).astype(samples.dtype)
+    mean = jnp.sum(jnp.where(mask, samples, 0.0), axis=0) / count
+    squares = jnp.sum(jnp.where(mask, (samples - mean[None]) ** 2, 0.0), axis=0)
+    return jnp.where(count > 1, squares / jnp.maximum(count - 1.0, 1.0), jnp.nan)

@@ -1,0 +1,54 @@
+"""mjx-study estimators."""
+
+import argparse
+
+from estimators import ESTIMATORS, NOISES
+from mjx_study.cli.options import Commands, add_command, print_report
+
+EPILOG = """\
+What each needs: values (rollouts), pairs (of opposite noise), steps (costs to go), gradients, or derivatives of every
+step. compare and optimise take any of them with --estimators and --estimator.
+"""
+WORDS = {
+    "evaluation": "values",
+    "pair": "pairs",
+    "steps": "steps",
+    "step_pair": "pairs by step",
+    "differentiation": "gradients",
+    "step_differentiation": "gradients by step",
+    "linearisation": "derivatives of steps",
+}
+
+
+def add(commands: Commands) -> None:
+    """Register the command."""
+    add_command(commands, "estimators", "list the gradient estimators and the noise densities", run, EPILOG)
+
+
+def run(options: argparse.Namespace) -> int:
+    """List what there is."""
+    entries = [
+        {
+            "name": item.name,
+            "description": item.description,
+            "needs": list(item.needs),
+            "requires": [f"--{name.replace('_', '-')}" for name in item.requires if name != "sigma"],
+        }
+        for item in ESTIMATORS.values()
+    ]
+    densities = [{"name": item.name, "description": item.description} for item in NOISES.values()]
+    rows = [[entry["name"], _needs(entry), entry["description"]] for entry in entries]
+    width = max(len(row[0]) for row in rows), max(len(row[1]) for row in rows)
+    lines = [f"{name:<{width[0]}}  {needs:<{width[1]}}  {description}" for name, needs, description in rows]
+    lines += [
+        "",
+        "noise densities (--noise)",
+        *(f"{item['name']:<{width[0]}}  {item['description']}" for item in densities),
+    ]
+    print_report(options, {"estimators": entries, "noises": densities}, lines)
+    return 0
+
+
+def _needs(entry) -> str:
+    words = " + ".join(WORDS[name] for name in entry["needs"])
+    return f"{words}, {', '.join(entry['requires'])}" if entry["requires"] else words

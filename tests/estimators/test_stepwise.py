@@ -1,0 +1,300 @@
+"""Estimates from single steps and from the backward recursion: identities, means, variances, and where they fail."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import Array
+
+import estimators
+from estimators import (
+    ESTIMATORS,
+    NOISES,
+    Differentiation,
+    EstimatorOptions,
+    Evaluation,
+    GradientEstimate,
+    Linearisation,
+    StepDifferentiation,
+    StepEvaluation,
+    discontinuity_gated,
+    first_order,
+    pull_back,
+    stepwise_inverse_variance,
+    total_propagation,
+    truncated_first_order,
+)
+from estimators.stepwise import control_scores
+from tests.estimators import objectives
+from tests.estimators.statistics_helpers import assert_mean_is
+
+SAMPLES = 100_000
+FEEDBACK = objectives.LinearQuadratic()
+THETA = np.array([0.4, 0.1, 0.2, 0.5])
+HESSIAN = np.array([[1.0, 0.4, 0.0], [0.4, -0.5, 0.3], [0.0, 0.3, 0.8]])
+UNBIASED = [name for name in ESTIMATORS if name not in ("fobg_clipped", "fobg_truncated")]
+
+
+def options(sigma: float) -> EstimatorOptions:
+    return EstimatorOptions(
+        gamma=float("inf"),
+        failure_probability=0.1,
+        variance_proxy="variance",
+        radius="max_deviation",
+        sigma=sigma,
+        max_norm=1e9,
+        window=99,
+    )
+
+
+def run(name: str, objective, theta, *, samples: int = SAMPLES, seed: int = 3, **changes) -> GradientEstimate:
+    chosen = replace(options(objective.sigma), **changes)
+    program = jax.jit(
+        lambda key: estimators.estimate(name, objective, jnp.asarray(theta), key, samples, options=chosen)
+    )
+    return program(jax.random.key(seed))
+
+
+@pytest.fixture(scope="module")
+def lots() -> dict[str, dict[str, GradientEstimate]]:
+    """Every estimator on a feedback policy and on an open loop, both smooth."""
+    return {
+        "feedback": {name: run(name, FEEDBACK, THETA) for name in ESTIMATORS if name != "delta"},
+        "open loop": {name: run(name, objectives.quadratic(HESSIAN, 0.7), [1.5, -2.0, 1.0]) for name in ESTIMATORS},
+    }
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+@pytest.mark.parametrize("case", ["feedback", "open loop"])
+def test_every_estimator_is_unbiased_where_the_objective_is_smooth(case: str, name: str, lots) -> None:
+    """A clip beyond every sample and a window beyond the horizon change nothing."""
+    if (case, name) == ("feedback", "delta"):
+        pytest.skip("its mean is known for noise on theta itself only")
+    exact = (
+        jax.grad(FEEDBACK.expected_cost)(jnp.asarray(THETA))
+        if case == "feedback"
+        else HESSIAN @ np.array([1.5, -2.0, 1.0])
+    )
+    estimate = lots[case][name]
+    z = (np.asarray(estimate.mean) - np.asarray(exact)) / np.asarray(estimate.standard_error)
+    assert np.all(np.abs(z) < 4.0), z
+    assert np.linalg.norm(estimate.standard_error) * 4 < 0.1 * np.linalg.norm(exact), "no power"
+
+
+def test_less_variance_where_theory_says_so(lots) -> None:
+    """Costs to go and antithetic pairs below their parents; a weight for every step below one for all."""
+    variance = {name: float(estimate.variance) for name, estimate in lots["feedback"].items()}
+    assert variance["zobg_to_go"] < 0.95 * variance["zobg"]
+    assert variance["zobg_to_go_antithetic"] < 0.95 * variance["zobg_to_go"]
+    assert variance["zobg_antithetic"] < 0.95 * variance["zobg"]
+    assert variance["ivw_h"] < variance["ivw"] < 0.95 * variance["fobg"]
+
+
+def test_antithetic_pairs_of_an_even_function_have_no_variance() -> None:
+    """At its centre a quadratic is even: both halves of a pair cancel, and the gradient there is zero."""
+    estimate = run("zobg_antithetic", objectives.quadratic(HESSIAN, 0.7), [0.0, 0.0, 0.0], samples=50)
+    np.testing.assert_allclose(estimate.per_sample, 0.0, atol=1e-13)
+
+
+@pytest.mark.parametrize("name", UNBIASED)
+def test_what_each_makes_of_a_jump(name: str) -> None:
+    """Zeroth order finds the jump's slope, inverse variances trust the flat derivative, DDCG's test sees the jump."""
+    objective, theta = objectives.heaviside(0.6), [0.3]
+    exact = objectives.heaviside_gradient(jnp.asarray(theta), 0.6)
+    estimate = run(name, objective, theta)
+    if name in ("fobg", "ivw", "aobg", "ivw_h", "total_propagation"):  # aobg: gamma is infinite here
+        assert estimate.mean[0] == 0.0 and exact[0] > 0.5
+    else:
+        assert_mean_is(estimate.per_sample, exact)
+    if name == "ddcg":
+        assert estimate.alpha is not None and estimate.alpha.alpha == 0.0
+
+
+@pytest.mark.parametrize("baseline", ["none", "zero_noise", "leave_one_out"])
+def test_costs_to_go_are_unbiased_with_every_baseline(baseline: str) -> None:
+    estimate = run("zobg_to_go", FEEDBACK, THETA, samples=400_000, baseline=baseline)
+    assert_mean_is(estimate.per_sample, jax.grad(FEEDBACK.expected_cost)(jnp.asarray(THETA)), resolution=0.1)
+
+
+def test_a_baseline_of_the_whole_batch_would_be_caught() -> None:
+    """The test of means has the power to see the bias 1/N of a baseline that holds the sample itself."""
+    objective, theta, batch = objectives.linear(np.array([1.0, -2.0]), 0.5), jnp.array([3.0, 1.0]), 4
+    keys = jax.random.split(jax.random.key(0), (50_000, batch))
+
+    @jax.jit
+    @jax.vmap
+    def biased(keys: Array) -> Array:
+        evaluation = objective.evaluate(theta, keys)
+        advantage = evaluation.value - jnp.mean(evaluation.value)
+        return jnp.mean(advantage[:, None] * evaluation.score, axis=0)
+
+    rows = biased(keys)
+    assert_mean_is(rows, np.array([1.0, -2.0]) * (1 - 1 / batch))
+    with pytest.raises(AssertionError, match="off by"):
+        assert_mean_is(rows, np.array([1.0, -2.0]))
+
+
+@pytest.fixture(scope="module")
+def few() -> tuple[Differentiation, StepDifferentiation, Linearisation, StepEvaluation, Evaluation]:
+    """The same 40 rollouts in every form."""
+    theta, keys = jnp.asarray(THETA), jax.random.split(jax.random.key(5), 40)
+
+    @jax.jit
+    def draw(keys):
+        methods = ("differentiate", "differentiate_steps", "linearise", "evaluate_steps", "evaluate")
+        return tuple(getattr(FEEDBACK, name)(theta, jax.random.clone(keys)) for name in methods)
+
+    return draw(keys)
+
+
+def test_all_batches_tell_the_same_story(few) -> None:
+    differentiation, by_step, linearisation, steps, evaluation = few
+    pulled = pull_back(by_step.noise_gradient, by_step.policy_jacobian)
+    np.testing.assert_allclose(pulled, differentiation.gradient, rtol=1e-12)
+    np.testing.assert_allclose(truncated_first_order(linearisation, 3).per_sample, differentiation.gradient, rtol=1e-12)
+    np.testing.assert_allclose(steps.value_to_go[:, 0], evaluation.value, rtol=1e-13)
+    np.testing.assert_allclose(pull_back(steps.noise_score, steps.policy_jacobian), evaluation.score, rtol=1e-12)
+
+
+@pytest.mark.parametrize("window", [1, 2])
+def test_a_truncated_adjoint_is_a_sum_over_windows(few, window: int) -> None:
+    """Against forward differentiation of each window's costs alone, from the states where it begins."""
+    linearisation = few[2]
+    theta, keys = jnp.asarray(THETA), jax.random.split(jax.random.key(5), 40)
+    starts, noise = jax.vmap(FEEDBACK.sample)(keys)
+    cuts = [*range(0, FEEDBACK.horizon, window), FEEDBACK.horizon]
+
+    def cost(theta: Array, start: Array, noise: Array) -> Array:
+        total, state = jnp.zeros(()), start
+        for low, high in zip(cuts[:-1], cuts[1:], strict=True):
+            state = jax.lax.stop_gradient(state)
+            for step in range(low, high):
+                control = theta.reshape(2, 2) @ state + noise[step]
+                total += state @ FEEDBACK.state_cost @ state + control @ FEEDBACK.control_cost @ control
+                state = jnp.asarray(FEEDBACK.transition) @ state + jnp.asarray(FEEDBACK.control) @ control
+            if high == FEEDBACK.horizon:
+                total += state @ FEEDBACK.state_cost @ state
+        return total
+
+    expected = jax.jit(jax.vmap(jax.grad(cost), in_axes=(None, 0, 0)))(theta, starts, noise)
+    np.testing.assert_allclose(truncated_first_order(linearisation, window).per_sample, expected, rtol=1e-11)
+
+
+def test_stepwise_weights_are_those_of_each_step(few) -> None:
+    """By NumPy; and a step without first-order variance takes the derivative alone."""
+    *_, steps, _ = few
+    first = few[1]
+    estimate = stepwise_inverse_variance(steps, first, "zero_noise")
+    scores = np.asarray(control_scores(steps, "zero_noise"))
+    gradients = np.asarray(first.noise_gradient)
+    alpha = scores.var(0, ddof=1) / (scores.var(0, ddof=1) + gradients.var(0, ddof=1))
+    expected = pull_back(jnp.asarray((1 - alpha) * scores), steps.policy_jacobian) + pull_back(
+        jnp.asarray(alpha * gradients), first.policy_jacobian
+    )
+    np.testing.assert_allclose(estimate.mean, np.mean(expected, 0), rtol=1e-10)
+    assert estimate.alpha is not None
+    np.testing.assert_allclose(estimate.alpha.alpha, alpha.mean(), rtol=1e-12)
+    certain = replace(first, noise_gradient=jnp.broadcast_to(first.noise_gradient[:1], gradients.shape))
+    assert stepwise_inverse_variance(steps, certain, "zero_noise").alpha.alpha == 1.0  # type: ignore[union-attr]
+
+
+def test_propagation_is_the_recursion_written_out(few) -> None:
+    """By NumPy, sample by sample, with the weights of each step's shares of the gradient."""
+    linearisation = few[2]
+    steps, scores = linearisation.steps, np.asarray(control_scores(linearisation.steps, "none"))
+    adjoint, gradient = np.asarray(linearisation.final_state), 0.0
+    jacobian = np.asarray(steps.policy_jacobian)
+    for step in reversed(range(FEEDBACK.horizon)):
+        over_control = np.asarray(linearisation.over_control[:, step])
+        derivative = np.asarray(linearisation.cost_control[:, step]) + np.einsum("isc,is->ic", over_control, adjoint)
+        shares = [np.einsum("icp,ic->ip", jacobian[:, step], part) for part in (scores[:, step], derivative)]
+        low, high = (np.trace(np.cov(share.T)) for share in shares)
+        alpha = low / (low + high)
+        mixed = alpha * derivative + (1 - alpha) * scores[:, step]
+        gradient = gradient + np.einsum("icp,ic->ip", jacobian[:, step], mixed)
+        assert linearisation.policy_state is not None
+        adjoint = (
+            np.asarray(linearisation.cost_state[:, step])
+            + np.einsum("ist,is->it", linearisation.over_state[:, step], adjoint)
+            + np.einsum("ics,ic->is", linearisation.policy_state[:, step], mixed)
+        )
+    np.testing.assert_allclose(total_propagation(linearisation, "none").per_sample, gradient, rtol=1e-10)
+
+
+def test_lost_samples_do_not_spoil_the_rest(few) -> None:
+    """A value, or a derivative, that is not finite takes its own row with it and no other."""
+    *_, linearisation, steps, _ = few
+    broken = replace(steps, value_to_go=steps.value_to_go.at[3].set(jnp.nan))
+    estimate = stepwise_inverse_variance(broken, few[1], "leave_one_out")
+    assert estimate.num_nonfinite == 1 and np.all(np.isfinite(estimate.mean))
+    wild = replace(few[1], noise_gradient=few[1].noise_gradient.at[7, 1].set(jnp.inf))
+    assert stepwise_inverse_variance(broken, wild, "none").num_nonfinite == 2
+    lost = replace(linearisation, steps=broken, over_state=linearisation.over_state.at[9].set(jnp.nan))
+    for result in (total_propagation(lost, "zero_noise"), truncated_first_order(lost, 3)):
+        assert result.num_nonfinite == 2 and np.all(np.isfinite(result.mean))
+
+
+def test_ddcg_is_exact_on_quadratics_and_sees_a_jump() -> None:
+    """Without tolerance, a quadratic is just at the boundary: both sides agree within sampling."""
+    objective, theta = objectives.quadratic(HESSIAN, 0.7), jnp.array([1.5, -2.0, 1.0])
+    keys = jax.random.split(jax.random.key(6), 400_000)
+    batch, evaluation = objective.differentiate_steps(theta, keys), objective.evaluate(theta, jax.random.clone(keys))
+    gradients = np.asarray(batch.noise_gradient[:, 0])
+    left = np.trace(np.cov(gradients.T))
+    right = 2 * np.var(np.asarray(evaluation.value)) / 0.49 - 2 * np.sum(gradients.mean(0) ** 2)
+    assert left == pytest.approx(right, rel=0.02)
+    assert discontinuity_gated(evaluation, batch, "zero_noise", 0.7).alpha.alpha > 0  # type: ignore[union-attr]
+    with pytest.raises(ValueError, match=r"must lie in \[0, 1\); got 1.5"):
+        discontinuity_gated(evaluation, batch, "zero_noise", 0.7, tolerance=1.5)
+
+
+def test_clipping_bounds_every_sample_and_its_bias() -> None:
+    objective, theta = objectives.quadratic(HESSIAN, 0.7), [1.5, -2.0, 1.0]
+    free, clipped = run("fobg", objective, theta), run("fobg_clipped", objective, theta, max_norm=2.0)
+    norms = np.linalg.norm(free.per_sample, axis=1)
+    np.testing.assert_allclose(np.linalg.norm(clipped.per_sample, axis=1), np.minimum(norms, 2.0), rtol=1e-12)
+    inside = norms <= 2.0
+    np.testing.assert_array_equal(np.asarray(clipped.per_sample)[inside], np.asarray(free.per_sample)[inside])
+    assert np.linalg.norm(clipped.mean - free.mean) <= np.mean(np.maximum(norms - 2.0, 0.0)) + 1e-12
+    huge = Differentiation(jnp.zeros(2), jnp.array([[3e200, 4e200], [0.0, 0.0]]))
+    np.testing.assert_allclose(
+        estimators.clipped_first_order(huge, 5.0).per_sample, [[3.0, 4.0], [0.0, 0.0]], rtol=1e-14
+    )
+    assert first_order(huge).num_finite == 2
+
+
+def test_windows_and_shapes_out_of_range_are_refused(few) -> None:
+    with pytest.raises(ValueError, match="at least 1 step; got 0"):
+        truncated_first_order(few[2], 0)
+    half = jax.tree.map(lambda leaf: leaf[:20], few[3])
+    with pytest.raises(ValueError, match=r"same shape .* got \(20, 3, 2\) zeroth-order and \(40, 3, 2\) first-order"):
+        stepwise_inverse_variance(half, few[1], "none")
+    for act in (lambda: estimators.cost_to_go(few[3], "mean"), lambda: total_propagation(few[2], "mean")):
+        with pytest.raises(ValueError, match="one of none, zero_noise, leave_one_out; got 'mean'"):
+            act()
+
+
+@pytest.mark.parametrize("name", NOISES)
+def test_a_noise_density_and_its_score(name: str) -> None:
+    """Mean 0, variance 1; E[psi'] = 0, E[z psi'] = 1, E[psi'^2] as stated: Stein's identities."""
+    noise = NOISES[name]
+    z = noise.draw(jax.random.key(7), (400_000, 1), jnp.float64)
+    score = noise.score(z)
+    moments = jnp.concatenate([z**2, z * score, score**2], axis=1)
+    assert_mean_is(moments, [1.0, 1.0, noise.information], resolution=0.06)
+    spread = np.asarray([z.std(), score.std()])[:, None] / np.sqrt(len(z))
+    assert np.all(np.abs([z.mean(), score.mean()])[:, None] < 4 * spread)
+    assert noise.name == name and noise.information >= 1.0
+
+
+@pytest.mark.parametrize("name", NOISES)
+def test_zeroth_order_is_unbiased_under_every_noise(name: str) -> None:
+    """d/dtheta E[(theta + s z)^3] = 3 (theta^2 + s^2) for any density of variance 1 without skew."""
+    noise, sigma, theta = NOISES[name], 0.5, 1.0
+    z = noise.draw(jax.random.key(8), (2_000_000, 1), jnp.float64)
+    value = (theta + sigma * z[:, 0]) ** 3
+    batch = Evaluation(value, noise.score(z) / sigma, jnp.full(len(z), theta**3))
+    estimate = jax.jit(lambda batch: estimators.zeroth_order(batch, "zero_noise"))(batch)
+    assert_mean_is(estimate.per_sample, [3 * (theta**2 + sigma**2)])

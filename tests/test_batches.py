@@ -1,0 +1,142 @@
+"""Every kind of batch of every task, in MJX and on its reference: the same rollouts seen in different ways."""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import estimators
+from estimators import ESTIMATORS, EstimatorOptions, pull_back, truncated_first_order
+from mjx_study import dynamics
+from mjx_study.objective import Simulator, simulate
+from mjx_study.study import check_estimators, plan_cells
+from mjx_study.task import Task
+from mjx_study.tasks import make_task
+
+# What each stands for: an open loop; feedback from random starts, five bodies; one decision before the simulation.
+TASKS = {"pusher": 12, "tennis": 8, "double_pendulum": 10}
+SAMPLES = 6
+
+
+def options(task: Task) -> EstimatorOptions:
+    return EstimatorOptions(
+        gamma=task.gamma,
+        failure_probability=0.1,
+        variance_proxy="variance",
+        radius="max_deviation",
+        sigma=task.sigma,
+        max_norm=1e9,
+        window=task.horizon,
+    )
+
+
+@pytest.fixture(scope="module", params=TASKS)
+def drawn(request: pytest.FixtureRequest) -> tuple[Task, Any, dict[str, Any]]:
+    """A task of few steps, its MJX objective, and one batch of every kind from the same keys."""
+    task = make_task(request.param, horizon=TASKS[request.param])
+    theta = task.theta + 0.05 * jax.random.normal(jax.random.key(1), task.theta.shape)
+    task = task.replace(theta=theta)
+    family = "penalty" if task.contact_pair else "mjcf"
+    (cell,), _ = plan_cells(task, [family], [task.stiffnesses[0]] if task.contact_pair else None)
+    objective = Simulator(task, chunk_size=2).objective(cell.contact)
+    keys = jax.random.split(jax.random.key(0), SAMPLES)
+    batches = {
+        name: getattr(objective, oracle.method)(task.theta, jax.random.clone(keys))
+        for name, oracle in estimators.ORACLES.items()
+    }
+    return task, objective, batches
+
+
+def test_the_batches_agree(drawn) -> None:
+    """Values, scores and gradients are the same whichever batch they are read from."""
+    task, _, batches = drawn
+    evaluation, steps, differentiation = (batches[name] for name in ("evaluation", "steps", "differentiation"))
+    by_step, linearisation = batches["step_differentiation"], batches["linearisation"]
+    close = lambda one, other: np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9 * np.abs(other).max())  # noqa: E731
+    for value in (steps.value_to_go[:, 0], differentiation.value, by_step.value, linearisation.steps.value_to_go[:, 0]):
+        close(value, evaluation.value)
+    close(steps.baseline_to_go[:, 0], evaluation.baseline)
+    close(linearisation.steps.baseline_to_go, steps.baseline_to_go)
+    close(pull_back(steps.noise_score, steps.policy_jacobian), evaluation.score)
+    close(pull_back(by_step.noise_gradient, by_step.policy_jacobian), differentiation.gradient)
+    close(truncated_first_order(linearisation, task.horizon).per_sample, differentiation.gradient)
+    assert steps.noise_score.shape == (SAMPLES, *task.policy.noise_shape)
+    for plus, minus, whole in (
+        (*batches["pair"], evaluation),
+        (*batches["step_pair"], steps),
+    ):
+        for field in dataclasses.fields(whole):
+            one, other = getattr(plus, field.name), getattr(whole, field.name)
+            assert (one is None) == (other is None)
+            if one is not None:
+                close(one, other)
+        assert not np.allclose(
+            minus.score if hasattr(minus, "score") else minus.noise_score,
+            plus.score if hasattr(plus, "score") else plus.noise_score,
+        )
+
+
+def test_costs_to_go_are_sums_of_what_is_left(drawn) -> None:
+    """Their differences are the running costs, which `simulate` gives one by one."""
+    task, objective, batches = drawn
+    steps = batches["steps"]
+    if task.policy.at_start:
+        assert steps.value_to_go.shape == (SAMPLES, 1)
+        return
+    key = jax.random.split(jax.random.key(0), SAMPLES)[2]
+    states, controls, *_ = jax.jit(lambda contact: simulate(task, task.theta, contact, key, 1.0))(objective.contact)
+    before = jax.tree.map(lambda leaf: leaf[:-1], states)
+    running = jax.vmap(task.running_cost)(before, controls)
+    np.testing.assert_allclose(-np.diff(steps.value_to_go[2]), running[:-1], rtol=1e-8, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_every_estimator_runs_on_every_kind_of_task(drawn, name: str) -> None:
+    task, _, batches = drawn
+    if name == "delta" and not task.policy.additive:
+        with pytest.raises(
+            ValueError, match="'delta' needs noise that is added to theta itself; tennis has a feedback"
+        ):
+            check_estimators([name], task, options(task))
+        return
+    check_estimators([name], task, options(task))
+    estimate = estimators.combine(name, batches, options(task))
+    assert estimate.mean.shape == task.theta.shape and np.all(np.isfinite(estimate.mean))
+    assert estimate.num_finite == SAMPLES
+
+
+def test_a_formula_that_needs_gaussian_noise_refuses_another() -> None:
+    task = make_task("pusher", horizon=3).replace(noise="laplace")
+    with pytest.raises(ValueError, match="'ddcg' holds for Gaussian noise only; the noise is laplace"):
+        check_estimators(["zobg", "ddcg"], task, options(task))
+    with pytest.raises(ValueError, match="one of gaussian, logistic, laplace, student; got 'cauchy'"):
+        task.replace(noise="cauchy")
+
+
+@pytest.mark.parametrize("noise", ["gaussian", "laplace"])
+def test_a_reference_draws_the_noise_that_mjx_draws(noise: str) -> None:
+    """Same keys, same density: the pusher's two simulations differ by the contact's impedance and nothing else."""
+    task = make_task("pusher", horizon=20).replace(noise=noise)
+    (cell,), _ = plan_cells(task, ["penalty"], [100.0])
+    assert task.reference is not None
+    reference = dataclasses.replace(task.reference(100.0), noise=noise)  # type: ignore[type-var]
+    keys = jax.random.split(jax.random.key(2), 4)
+    ours = Simulator(task, chunk_size=2).objective(cell.contact).evaluate(task.theta, keys)
+    theirs = reference.evaluate(task.theta, jax.random.clone(keys))
+    np.testing.assert_allclose(ours.value, theirs.value, rtol=1e-4)
+    np.testing.assert_allclose(ours.score, theirs.score, rtol=1e-12)
+
+
+def test_linearising_a_large_model_uses_the_tape(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Forward mode through the tape program gives the Jacobians of the Jacobian program."""
+    task = make_task("pusher", horizon=5)
+    (cell,), _ = plan_cells(task, ["penalty"], [100.0])
+    keys = jax.random.split(jax.random.key(4), 2)
+    small = Simulator(task, chunk_size=1).objective(cell.contact).linearise(task.theta, keys)
+    monkeypatch.setattr(dynamics, "JACOBIAN_COLUMNS", 0)
+    large = Simulator(task, chunk_size=1).objective(cell.contact).linearise(task.theta, jax.random.clone(keys))
+    for one, other in zip(jax.tree.leaves(small), jax.tree.leaves(large), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9 * float(jnp.abs(other).max()))
