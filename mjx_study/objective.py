@@ -314,7 +314,7 @@ class MjxObjective:
         silent = np.arange(samples if self.simulator.task.random_start else min(samples, 1))
         scale = np.concatenate([np.ones(samples), np.zeros(len(silent))])
         values, scores, residuals = self._run("value", theta, keys, np.append(np.arange(samples), silent), scale)
-        baseline = np.broadcast_to(values[samples:], samples)
+        baseline = jnp.broadcast_to(values[samples:], samples)
         return Evaluation(*map(jnp.asarray, (values[:samples], scores[:samples], baseline, residuals[:samples])))
 
     def evaluate_odd(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> Evaluation:
@@ -332,8 +332,8 @@ class MjxObjective:
         scale = np.repeat([1.0, -1.0], samples)
         values, scores, residuals = self._run("value", theta, keys, np.tile(np.arange(samples), 2), scale)
         odd = (values[:samples] - values[samples:]) / 2
-        residual = np.maximum(residuals[:samples], residuals[samples:])
-        return Evaluation(*map(jnp.asarray, (odd, scores[:samples], np.zeros_like(odd), residual)))
+        residual = jnp.maximum(residuals[:samples], residuals[samples:])
+        return Evaluation(*map(jnp.asarray, (odd, scores[:samples], jnp.zeros_like(odd), residual)))
 
     def evaluate_pair(
         self, theta: Float[Array, " params"], keys: Key[Array, " samples"]
@@ -352,9 +352,7 @@ class MjxObjective:
 
     def differentiate(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> Differentiation:
         """Values and exact gradients of each sample's cost with respect to theta."""
-        key_data = np.asarray(jax.random.key_data(keys))
-        outputs = self.simulator.run_gradients(theta, self.contact, self.sigma, key_data)
-        return Differentiation(*map(jnp.asarray, outputs))
+        return Differentiation(*map(jnp.asarray, self._run("gradient", theta, keys)))
 
     def evaluate_steps(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> StepEvaluation:
         """The rollouts of `evaluate`, step by step."""
@@ -404,7 +402,7 @@ class MjxObjective:
         """Costs to go of the rollouts without noise, one where all samples share it."""
         rows = np.arange(len(keys) if self.simulator.task.random_start else min(len(keys), 1))
         (to_go, *_), _ = self._run("steps", theta, keys, rows, np.zeros(len(rows)))
-        return np.broadcast_to(to_go, (len(keys), to_go.shape[1]))
+        return jnp.broadcast_to(to_go, (len(keys), to_go.shape[1]))
 
     def _run(self, name: str, theta, keys, rows=None, noise_scale=None):
         """A program on rows of the keys, all of them once unless told otherwise."""
@@ -414,6 +412,31 @@ class MjxObjective:
         key_data = np.asarray(jax.random.key_data(keys))[rows]
         dtype = self.simulator.task.scene.template.qpos.dtype
         return self.simulator.run(name, theta, self.contact, self.sigma, key_data, scale.astype(dtype))
+
+
+@dataclasses.dataclass(frozen=True)
+class TracedObjective(MjxObjective):
+    """The same objective inside a larger compiled program: nothing returns to the host between batch and estimate."""
+
+    def _run(self, name: str, theta, keys, rows=None, noise_scale=None):
+        simulator = self.simulator
+        rows = np.arange(len(keys)) if rows is None else rows
+        dtype = simulator.task.scene.template.qpos.dtype
+        scale = np.ones(len(rows), dtype) if noise_scale is None else np.asarray(noise_scale, dtype)
+        capacity = simulator.chunk_size * len(simulator.devices)
+        chunks = np.minimum(np.arange(math.ceil(len(rows) / capacity) * capacity), len(rows) - 1).reshape(-1, capacity)
+        program, key_data = simulator._programs[name], jax.random.key_data(keys)  # type: ignore[attr-defined]
+        sigma = jnp.asarray(self.sigma, dtype)
+
+        def call(chunk):
+            drawn, factor = chunk
+            return program(theta, self.contact, sigma, drawn, factor)
+
+        parts = key_data[rows[chunks]], jnp.asarray(scale[chunks])
+        if len(chunks) == 1:
+            return jax.tree.map(lambda leaf: leaf[: len(rows)], call(jax.tree.map(lambda part: part[0], parts)))
+        outputs = jax.lax.map(call, parts)
+        return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[: len(rows)], outputs)
 
 
 def chunk_for(samples: int, devices: Sequence[Any]) -> int:

@@ -33,16 +33,21 @@ def prepare_folder(folder: str | Path) -> Path:
 
 def as_json(result: CompareResult) -> dict[str, Any]:
     """A comparison as plain data; numbers that are not finite become null, an infinite gamma "inf"."""
-    config = dataclasses.asdict(result.config)
-    if config["gamma"] == math.inf:
-        config["gamma"] = "inf"
     document = {
-        "config": config,
+        "config": dataclasses.asdict(result.config),
         "environment": result.environment,
         "findings": findings(result),
         "warnings": list(result.warnings),
         "rows": [dataclasses.asdict(row) for row in result.rows],
     }
+    return as_plain(document)
+
+
+def as_plain(document: dict[str, Any]) -> dict[str, Any]:
+    """A document that JSON can hold: numbers that are not finite become null, an infinite gamma "inf"."""
+    config = document.get("config")
+    if config is not None and config.get("gamma") == math.inf:
+        document = document | {"config": config | {"gamma": "inf"}}
     return _finite(document)
 
 

@@ -18,6 +18,23 @@ STIFFNESSES: Final = (10.0, 100.0, 300.0, 550.0, 1000.0, 1200.0)
 FAMILIES: Final = ("penalty", "mujoco", "mujoco_stiff")
 
 
+@dataclasses.dataclass(frozen=True)
+class Recipe:
+    """How a task is optimised unless told otherwise.
+
+    Attributes:
+        learning_rate: of plain gradient descent.
+        iterations: number of steps.
+        samples: in each batch.
+        decay: power a of the learning rate's decay, learning_rate / i^a at iteration i = 1, 2, ...
+    """
+
+    learning_rate: float
+    iterations: int
+    samples: int
+    decay: float = 0.0
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Task:
     """Everything that defines F(theta) = E V_1 except the contact model.
@@ -43,6 +60,7 @@ class Task:
         families: contact families that a sweep takes unless told otherwise.
         span: range of a decision of one number that a landscape shows; None for a range about theta.
         noise: name of the noise's density in `estimators.NOISES`.
+        recipe: how it is optimised unless told otherwise; None where every number has to be given.
     """
 
     name: str
@@ -63,6 +81,7 @@ class Task:
     families: tuple[str, ...] = FAMILIES
     span: tuple[float, float] | None = None
     noise: str = "gaussian"
+    recipe: Recipe | None = None
 
     def __post_init__(self) -> None:
         if self.horizon < 1:

@@ -36,6 +36,8 @@ LAYERS = [
     "mjx_study.gradcheck",
     "mjx_study.bench",
     "mjx_study.results",
+    "mjx_study.descent",
+    "mjx_study.optimise",
     "mjx_study.render",
     "mjx_study.plots",
     "mjx_study.console",

@@ -109,6 +109,7 @@ def add(commands: Commands) -> None:
     command.add_argument(
         "--theta", metavar="FILE|X[,X]", help="parameters: a .json or .npy file, or the numbers (default: the task's)"
     )
+    command.add_argument("--policy", type=Path, metavar="FILE", help="a policy that optimise wrote, policy-NAME.json")
     command.add_argument("--frames", type=int, default=6, metavar="N", help="pictures in the strip (default: 6)")
     command.add_argument("--view", choices=["auto", *VIEWS], default="auto", help="default: where most happens")
     command.add_argument("--renderer", choices=RENDERERS, default="auto", help="default: auto, opengl where it works")
@@ -148,7 +149,7 @@ def _plan(options: argparse.Namespace):
     """A function without arguments that simulates what the options ask for, and what there is to warn about."""
     if Path(options.task).suffix.lower() != ".xml":
         return _plan_task(options)
-    unfit = ("contact", "stiffness", "damping", "noise", "sigma", "theta", "model")
+    unfit = ("contact", "stiffness", "damping", "noise", "sigma", "theta", "policy", "model")
     given = [f"--{name}" for name in unfit if getattr(options, name) not in (None, False)]
     if given:
         raise ValueError(f"{', '.join(given)}: only for a task; {options.task} moves as its MJCF says")
@@ -160,12 +161,38 @@ def _plan(options: argparse.Namespace):
 
 
 def _plan_task(options: argparse.Namespace):
+    if options.policy is not None:
+        _apply_policy(options)
     task = task_of(options)
     family = options.contact or ("mujoco" if "mujoco" in task.families else task.families[0])
     stiffness = task.stiffnesses[len(task.stiffnesses) // 2] if options.stiffness is None else options.stiffness
     cells, messages = plan_cells(task, (family,), (stiffness,), options.damping)
     theta = task.theta if options.theta is None else jnp.asarray(_theta(options.theta, task), task.theta.dtype)
     return partial(_simulate_task, task, cells[0], theta, options.seed, options.noise), messages
+
+
+def _apply_policy(options: argparse.Namespace) -> None:
+    """Take theta, and what was not given of contact and horizon, from a policy file.
+
+    Raises:
+        ValueError: the file cannot be read, is no policy, or is one of another task; or theta is given too.
+    """
+    path = options.policy
+    if options.theta is not None:
+        raise ValueError("--policy and --theta both say what theta is; give one of them")
+    try:
+        policy = json.loads(path.read_text())
+        task, theta = policy["task"], [float(value) for value in policy["theta"]]
+    except OSError as error:
+        raise ValueError(f"cannot read {path}: {error.strerror or error}") from error
+    except (ValueError, TypeError, KeyError) as error:
+        raise ValueError(f"{path} is not a policy that optimise wrote") from error
+    if task != options.task:
+        raise ValueError(f"{path} is a policy of {task}, not of {options.task}")
+    options.theta = ",".join(map(repr, theta))
+    for name in ("contact", "stiffness", "horizon"):
+        if getattr(options, name) is None and policy.get(name):
+            setattr(options, name, policy[name])
 
 
 def _theta(text: str, task: Task) -> np.ndarray:

@@ -18,7 +18,7 @@ from mjx_study.dynamics import State, initial_state
 from mjx_study.policy import Launch
 from mjx_study.reference import BallWall, FunctionObjective
 from mjx_study.scene import SceneError, load_model, put_scene, require
-from mjx_study.task import Task
+from mjx_study.task import Recipe, Task
 
 HORIZON: Final = 400
 LENGTH_SCALE: Final = 10.0
@@ -27,6 +27,7 @@ ANGLE: Final = 0.1  # [rad]
 SIGMA: Final = 0.1  # [rad]
 DAMPING: Final = 100.0  # [N s/m]
 GAMMA: Final = 0.01
+RECIPE: Final = Recipe(0.1, 1000, 50)
 VARIANTS: Final = ("box", "dome")
 
 
@@ -71,6 +72,7 @@ def ball_wall(
         final_cost=lambda state: -((state.qpos[0] / LENGTH_SCALE) ** 2),
         contact_pair=("ball", "wall"),
         gamma=GAMMA,
+        recipe=RECIPE,
         reference=lambda stiffness: FunctionObjective(BallWall(), SIGMA),
         damping=DAMPING,
         span=(0.0, 1.5),

@@ -15,11 +15,12 @@ from mjx_study.dynamics import State, initial_state
 from mjx_study.policy import Launch
 from mjx_study.reference import DoublePendulum, ReferenceObjective
 from mjx_study.scene import load_scene, require
-from mjx_study.task import Task
+from mjx_study.task import Recipe, Task
 
 HORIZON: Final = 1000
 START: Final = (1.5707963267948966, 0.0, 5.0, -5.0)  # angles [rad], velocities [rad/s]
 SIGMA: Final = 0.5  # on each entry of the initial state [rad or rad/s]
+RECIPE: Final = Recipe(1e-3, 200, 100)
 
 
 def double_pendulum(
@@ -52,6 +53,7 @@ def double_pendulum(
         final_cost=lambda state: jnp.sum(state.qpos**2),
         contact_pair=None,
         gamma=float("inf"),
+        recipe=RECIPE,
         reference=lambda stiffness: ReferenceObjective(
             DoublePendulum(timestep=scene.timestep), None, horizon, SIGMA, decision="start"
         ),

@@ -16,7 +16,7 @@ from mjx_study.dynamics import State, initial_state
 from mjx_study.policy import Launch
 from mjx_study.reference import FunctionObjective, MomentumTransfer
 from mjx_study.scene import load_scene, require
-from mjx_study.task import Task
+from mjx_study.task import Recipe, Task
 
 HORIZON: Final = 400
 SPEED: Final = 2.0  # [m/s]
@@ -24,6 +24,7 @@ DISTANCE: Final = 0.7  # from the start to where the ball's centre meets the bar
 ANGLE: Final = 0.1  # [rad]
 SIGMA: Final = 0.02  # [rad]
 GAMMA: Final = 0.2
+RECIPE: Final = Recipe(0.01, 500, 50)
 BALL, BAR = 1, 2  # bodies
 
 
@@ -64,6 +65,7 @@ def momentum_transfer(
         final_cost=lambda state: -((inertia * state.qvel[2] / unit) ** 2),
         contact_pair=("ball", "bar"),
         gamma=GAMMA,
+        recipe=RECIPE,
         reference=reference,
         span=(0.0, 1.0),
         stiffnesses=(3000.0, 10000.0, 30000.0),

@@ -16,7 +16,7 @@ from mjx_study.dynamics import State, initial_state
 from mjx_study.policy import OpenLoop
 from mjx_study.reference import Pusher, ReferenceObjective
 from mjx_study.scene import load_scene, require
-from mjx_study.task import Task
+from mjx_study.task import Recipe, Task
 
 HORIZON: Final = 200
 START: Final = (0.0, 1.0)  # positions [m]: touching, at rest
@@ -26,6 +26,7 @@ CONTROL_WEIGHT: Final = 1.0  # [1/N^2]
 FORCE: Final = 0.1  # [N] at every step
 SIGMA: Final = 0.1  # [N]
 GAMMA: Final = 1e8
+RECIPE: Final = Recipe(1e-3, 500, 10)
 
 
 def pusher(*, horizon: int = HORIZON, model: str | Path = "pusher", **scene_options: str | float) -> Task:
@@ -60,6 +61,7 @@ def pusher(*, horizon: int = HORIZON, model: str | Path = "pusher", **scene_opti
         final_cost=state_cost,
         contact_pair=("pusher", "slider"),
         gamma=GAMMA,
+        recipe=RECIPE,
         reference=lambda stiffness: ReferenceObjective(
             Pusher(stiffness, timestep=scene.timestep), (*START, 0.0, 0.0), horizon, SIGMA
         ),

@@ -17,7 +17,7 @@ from mjx_study.dynamics import State, initial_state
 from mjx_study.policy import OpenLoop
 from mjx_study.reference import ReferenceObjective, SlidingBox
 from mjx_study.scene import load_scene, require
-from mjx_study.task import Task
+from mjx_study.task import Recipe, Task
 
 HORIZON: Final = 400
 GOAL: Final = (2.0, 2.0, 0.0, 0.0)  # block and box: positions [m], velocities [m/s]
@@ -26,6 +26,7 @@ CONTROL_WEIGHT: Final = 1.0  # [1/N^2]
 SIGMA: Final = 0.1  # [N]
 SLIP_DAMPING: Final = 1.8  # [N s/m]
 GAMMA: Final = 2e4
+RECIPE: Final = Recipe(1e-4, 100, 10)
 BLOCK, BOX = 0, 2  # among the coordinates block, height, box
 
 
@@ -63,6 +64,7 @@ def sliding_box(*, horizon: int = HORIZON, model: str | Path = "sliding_box", **
         final_cost=state_cost,
         contact_pair=("foot", "box"),
         gamma=GAMMA,
+        recipe=RECIPE,
         reference=lambda stiffness: ReferenceObjective(SlidingBox(), (0.0, 0.0, 0.0, 0.0), horizon, SIGMA),
         damping=SLIP_DAMPING,
         stiffnesses=(100.0, 200.0, 500.0, 1000.0),

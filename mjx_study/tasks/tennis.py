@@ -16,7 +16,7 @@ from mjx_study.dynamics import State, initial_state
 from mjx_study.policy import LinearFeedback
 from mjx_study.reference import ReferenceObjective, Tennis, draw_start
 from mjx_study.scene import load_model, put_scene, require
-from mjx_study.task import Task
+from mjx_study.task import Recipe, Task
 
 HORIZON: Final = 200
 TIME_SCALE: Final = 10.0
@@ -25,6 +25,7 @@ TARGET: Final = (0.0, 2.5, 0.0, 0.0)  # position [m], velocity [m/s]
 CONTROL_WEIGHT: Final = 0.001
 SIGMA: Final = 0.01
 GAMMA: Final = 1000.0
+RECIPE: Final = Recipe(1e-6, 200, 1000, decay=0.1)
 FEATURES: Final = 7
 
 
@@ -72,6 +73,7 @@ def tennis(*, horizon: int = HORIZON, model: str | Path = "tennis", **scene_opti
         final_cost=lambda state: jnp.sum(weight * (features(state)[:4] - target) ** 2),
         contact_pair=("ball", "paddle"),
         gamma=GAMMA,
+        recipe=RECIPE,
         reference=lambda stiffness: ReferenceObjective(Tennis(), draw_start, horizon, SIGMA, decision="feedback"),
         stiffnesses=(1000.0, 2000.0, 5000.0, 10000.0),
     )

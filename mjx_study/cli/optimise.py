@@ -1,0 +1,205 @@
+"""mjx-study optimise."""
+
+import argparse
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from estimators import BASELINES, NOISES
+from mjx_study.cli.options import (
+    Commands,
+    add_command,
+    add_task_options,
+    computing,
+    configure_process,
+    names,
+    print_report,
+    usage_errors,
+)
+from mjx_study.console import number
+from mjx_study.contact import FAMILIES
+from mjx_study.optimise import OptimiseConfig, OptimiseResult, Run, load_checkpoint, optimise, plan_optimise
+from mjx_study.plots import STYLE, plot_optimisation, save_figure
+from mjx_study.results import as_plain, prepare_folder, write_whole
+from mjx_study.table import format_table
+
+EPILOG = """\
+Every estimator starts from the task's theta and draws the same noise. Without --learning-rate, --iterations and
+--samples the task's own are taken, which are the paper's: plain gradient descent.
+
+With --output DIR: optimisation.png and .pdf (cost against iterations, rollouts and seconds; alpha), results.json, the
+best seed's policy of each estimator (policy-NAME.json, for rollout --policy), and run-NAME.npz, from which the same
+command goes on where it was stopped, or with more --iterations.
+
+examples:
+  mjx-study optimise pusher --contact penalty --stiffness 1000 --output out
+  mjx-study optimise ball_wall --reference --estimator zobg,fobg,aobg --seeds 5
+  mjx-study optimise pusher --estimator ivw_h --optimizer adam --learning-rate 0.01
+  mjx-study rollout pusher --policy out/policy-aobg.json
+
+columns of the table:
+  cost        mean cost with noise of the final policy over --evaluation-samples rollouts, the same for all, and its
+              standard deviation over seeds
+  alpha       mean weight of first-order gradients in the last tenth of the iterations
+  rollouts    simulated per seed, those that were differentiated and baselines included
+"""
+FIELDS = (
+    "task estimators contact stiffness damping reference iterations samples learning_rate decay optimizer seeds seed "
+    "sigma noise baseline gamma failure_probability variance_proxy radius max_norm window tolerance cone horizon model "
+    "evaluation_samples chunk_size"
+).split()
+
+
+def add(commands: Commands) -> None:
+    """Register the command."""
+    command = add_command(commands, "optimise", "optimise a policy with any estimator", run, EPILOG)
+    add_task_options(command, contact=False)
+    command.add_argument("--contact", metavar="FAMILY", help=f"one of: {', '.join(FAMILIES)} (default: the task's)")
+    command.add_argument("--stiffness", type=float, metavar="K", help="contact stiffness in N/m (default: the task's)")
+    command.add_argument("--damping", type=float, metavar="B", help="contact damping in N s/m")
+    command.add_argument("--reference", action="store_true", help="on the analytic reference in place of MJX")
+    command.add_argument(
+        "--estimator",
+        dest="estimators",
+        type=names,
+        metavar="NAME[,NAME]",
+        help="default: zobg,fobg,aobg; `mjx-study estimators` lists them",
+    )
+    command.add_argument("--iterations", type=int, metavar="N", help="default: the task's")
+    command.add_argument("--samples", type=int, metavar="N", help="in each batch (default: the task's)")
+    command.add_argument("--seeds", type=int, metavar="N", help="runs of each estimator (default: 3)")
+    command.add_argument("--optimizer", metavar="NAME", help="of optax (default: sgd)")
+    command.add_argument("--learning-rate", type=float, metavar="R", help="default: the task's")
+    command.add_argument("--decay", type=float, metavar="A", help="learning rate / i^A (default: the task's)")
+    command.add_argument("--noise", choices=list(NOISES), help="density of the noise (default: gaussian)")
+    command.add_argument("--baseline", choices=list(BASELINES), help="of zeroth-order samples (default: zero_noise)")
+    command.add_argument("--gamma", type=float, metavar="G", help="AoBG's accuracy bound (default: the task's)")
+    command.add_argument("--failure-probability", type=float, metavar="P", help="of epsilon (default: 0.05)")
+    command.add_argument("--variance-proxy", metavar="S2", help="in epsilon (default: variance)")
+    command.add_argument("--radius", type=_radius, metavar="R", help="in epsilon (default: max_deviation)")
+    command.add_argument("--max-norm", type=float, metavar="G", help="of a sample of fobg_clipped")
+    command.add_argument("--window", type=int, metavar="H", help="steps between cuts of fobg_truncated")
+    command.add_argument("--tolerance", type=float, metavar="C", help="of ddcg's test (default: 0.3)")
+    command.add_argument(
+        "--evaluation-samples", type=int, metavar="N", help="rollouts behind a final cost (default: 200)"
+    )
+    command.add_argument("--chunk-size", type=int, metavar="N", help="samples per device and call")
+    command.add_argument("--output", type=Path, metavar="DIR", help="write figure, numbers, policies and checkpoints")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Optimise, print, and write where an output folder is given."""
+    with usage_errors():
+        configure_process(options)
+        fields = {name: getattr(options, name) for name in FIELDS}
+        plan = plan_optimise(OptimiseConfig(**{name: value for name, value in fields.items() if value is not None}))
+        folder = None if options.output is None else prepare_folder(options.output)
+        if folder is not None:  # refused here, before anything is computed
+            for name in plan.config.estimators:
+                load_checkpoint(folder, name, plan.config)
+    with computing() as progress:
+        result = optimise(plan, folder, progress)
+    document = as_document(result)
+    written = [] if folder is None else _save(result, document, folder)
+    print_report(options, document, _lines(result, written))
+    return 0
+
+
+def as_document(result: OptimiseResult) -> dict[str, Any]:
+    """A result as plain data; histories by iteration and seed."""
+    runs = [
+        {
+            "estimator": run.estimator,
+            "final_cost": run.final_cost.tolist(),
+            "final_cost_se": run.final_cost_se.tolist(),
+            "best_seed": run.best,
+            "stopped": [{"seed": seed, "iteration": at, "reason": why} for seed, (at, why) in run.stopped.items()],
+            "rollouts_per_iteration": run.rollouts,
+            "seconds": run.seconds.tolist(),
+            "history": {name: values.tolist() for name, values in run.history.items()},
+            "theta": run.theta.tolist(),
+        }
+        for run in result.runs
+    ]
+    return as_plain(
+        {
+            "config": vars(result.config),
+            "environment": result.environment,
+            "start_cost": result.start_cost,
+            "warnings": list(result.warnings),
+            "runs": runs,
+        }
+    )
+
+
+def _save(result: OptimiseResult, document: dict[str, Any], folder: Path) -> list[Path]:
+    text = json.dumps(document, allow_nan=False) + "\n"
+    written = [write_whole(folder / "results.json", lambda file: file.write(text.encode()))]
+    for run in result.runs:
+        policy = {
+            "task": result.config.task,
+            "estimator": run.estimator,
+            "seed": run.best,
+            "cost": float(run.final_cost[run.best]),
+            "contact": result.config.contact,
+            "stiffness": result.config.stiffness,
+            "horizon": result.config.horizon,
+            "theta": run.theta[run.best].tolist(),
+        }
+        content = (json.dumps(as_plain(policy)) + "\n").encode()
+        written.append(
+            write_whole(folder / f"policy-{run.estimator}.json", lambda file, data=content: file.write(data))
+        )
+    return [*written, *save_figure(plot_optimisation(result), folder, "optimisation")]
+
+
+def _lines(result: OptimiseResult, written: list[Path]) -> list[str]:
+    config = result.config
+    where = "analytic reference" if config.reference else config.contact
+    if not config.reference and config.stiffness:
+        where = f"{where}, K = {config.stiffness:g} N/m"
+    decay = f" / i^{config.decay:g}" if config.decay else ""
+    mean, error = result.start_cost
+    lines = [
+        f"{config.task}: {where}; {config.optimizer}, learning rate {config.learning_rate:g}{decay}, "
+        f"{config.iterations} iterations",
+        f"{config.samples} samples in each batch, {config.seeds} seeds from {config.seed}, sigma {config.sigma:g}; "
+        f"cost at the start {number(mean, 4)} ± {number(error, 2)}",
+        "",
+        *format_table(
+            [_row(run) for run in result.runs], ["estimator", "cost", "best", "alpha", "rollouts", "seconds"]
+        ),
+    ]
+    for run in result.runs:
+        for seed, (iteration, reason) in run.stopped.items():
+            lines.append(f"{STYLE[run.estimator][0]}, seed {seed}: stopped at iteration {iteration}, {reason}")
+    lines += [f"warning: {message}" for message in result.warnings]
+    hint = "add --output DIR for a figure, the policies, and to go on later"
+    if not written:
+        return [*lines, hint]
+    return [*lines, f"written to {written[0].parent}: {', '.join(path.name for path in written)}"]
+
+
+def _row(run: Run) -> list[str]:
+    costs = run.final_cost[np.isfinite(run.final_cost)]
+    spread = f" ± {number(float(np.std(costs, ddof=1)), 2)}" if len(costs) > 1 else ""
+    tail = run.history["alpha"][-max(1, len(run.seconds) // 10) :]
+    alpha = float(np.nanmean(tail)) if np.any(np.isfinite(tail)) else math.nan
+    return [
+        STYLE[run.estimator][0],
+        (number(float(np.mean(costs)), 4) if len(costs) else "nan") + spread,
+        number(float(np.min(costs)), 4) if len(costs) else "nan",
+        "-" if math.isnan(alpha) else f"{alpha:.3f}",
+        str(run.rollouts * len(run.seconds)),
+        f"{run.seconds[-1]:.1f}" if len(run.seconds) else "-",
+    ]
+
+
+def _radius(text: str) -> float | str:
+    try:
+        return float(text)
+    except ValueError:
+        return text

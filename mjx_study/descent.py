@@ -1,0 +1,164 @@
+"""One iteration of stochastic gradient descent for several seeds at once, and when a seed stops; pure functions."""
+
+import dataclasses
+from typing import Any, Final
+
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Bool, Float, Int
+
+import estimators
+from estimators import ESTIMATORS, EstimatorOptions, Linearisation, StepEvaluation
+from estimators.pytree import register_pytree
+
+DIVERGED: Final = 1e6
+"""A mean cost this many times the first one's size is a diverged run."""
+REASONS: Final = (
+    "",
+    "no sample of the batch is finite",
+    "the gradient estimate is not finite",
+    "the parameters are not finite after the update",
+    f"the mean cost is beyond {DIVERGED:g} times the first one's size",
+)
+"""Why a seed stopped, by code; 0 for one that goes on."""
+
+
+@register_pytree
+@dataclasses.dataclass(frozen=True)
+class Descent:
+    """Where all seeds of a run are.
+
+    Attributes:
+        theta: parameters of each seed.
+        optimizer: state of the optimiser of each seed.
+        reason: index into `REASONS`; a seed with one stays where it is.
+        first_cost: size of each seed's mean cost at its first iteration.
+    """
+
+    theta: Float[Array, "*seeds params"]
+    optimizer: Any
+    reason: Int[Array, "*seeds"]
+    first_cost: Float[Array, "*seeds"]
+
+
+@register_pytree
+@dataclasses.dataclass(frozen=True)
+class Record:
+    """What an iteration tells of each seed; NaN for one that has stopped.
+
+    Attributes:
+        cost: mean over the batch, at the parameters before the update.
+        gradient_norm: of the estimate.
+        variance: of one sample.
+        alpha: weight of the first-order batch; NaN for an estimator of one batch.
+        nonfinite: samples left out.
+        residual: largest of the solver's in the batch; 0 for a closed form.
+    """
+
+    cost: Float[Array, "*seeds"]
+    gradient_norm: Float[Array, "*seeds"]
+    variance: Float[Array, "*seeds"]
+    alpha: Float[Array, "*seeds"]
+    nonfinite: Float[Array, "*seeds"]
+    residual: Float[Array, "*seeds"]
+
+
+def make_optimizer(name: str, learning_rate: float, decay: float) -> optax.GradientTransformation:
+    """An optimiser of optax by its name there, with learning rate learning_rate / i^decay at iteration i.
+
+    Raises:
+        ValueError: optax has no such optimiser, or it takes more than a learning rate, or a number is out of range.
+    """
+    if not learning_rate > 0 or not learning_rate < float("inf"):
+        raise ValueError(f"the learning rate must be positive and finite, got {learning_rate}")
+    if not 0 <= decay <= 2:
+        raise ValueError(f"the decay of the learning rate must be a power from 0 to 2, got {decay}")
+    factory = getattr(optax, name, None)
+    try:
+        optimizer = factory(lambda count: learning_rate / (1.0 + count) ** decay)  # type: ignore[misc]
+    except TypeError:
+        optimizer = None
+    if not isinstance(optimizer, optax.GradientTransformation):
+        raise ValueError(f"optax has no optimiser {name!r} that takes a learning rate; sgd, adam and rmsprop are some")
+    return optimizer
+
+
+def begin(optimizer: optax.GradientTransformation, theta: Float[Array, " params"], seeds: int) -> Descent:
+    """All seeds at the same parameters."""
+    thetas = jnp.broadcast_to(theta, (seeds, *theta.shape))
+    return Descent(
+        thetas, jax.vmap(optimizer.init)(thetas), jnp.zeros(seeds, int), jnp.full(seeds, jnp.nan, theta.dtype)
+    )
+
+
+def advance(
+    state: Descent,
+    batches: dict[str, Any],
+    estimator: str,
+    options: EstimatorOptions,
+    optimizer: optax.GradientTransformation,
+) -> tuple[Descent, Record]:
+    """One iteration of every seed that goes on.
+
+    Args:
+        state: before it.
+        batches: of the estimator's oracles, with an axis of seeds in front of each array.
+        estimator: name in `ESTIMATORS`.
+        options: of the estimate.
+        optimizer: of optax.
+
+    Returns:
+        The state after it, and what it tells.
+    """
+    return jax.vmap(lambda state, batches: _advance_one(state, batches, estimator, options, optimizer))(state, batches)
+
+
+def _advance_one(state: Descent, batches, estimator, options, optimizer):
+    estimate = estimators.combine(estimator, batches, options)
+    value, residual = _values(batches[ESTIMATORS[estimator].needs[0]])
+    finite = jnp.isfinite(value)
+    cost = jnp.sum(jnp.where(finite, value, 0.0)) / jnp.sum(finite)
+    first_cost = jnp.where(jnp.isnan(state.first_cost), jnp.abs(cost), state.first_cost)
+    updates, optimizer_state = optimizer.update(estimate.mean, state.optimizer, state.theta)
+    theta: Array = optax.apply_updates(state.theta, updates)  # type: ignore[assignment]
+    # the gravest reason last
+    reason = jnp.zeros((), int)
+    for code, holds in (
+        (4, jnp.abs(cost) > DIVERGED * jnp.maximum(first_cost, 1e-12)),
+        (3, ~jnp.all(jnp.isfinite(theta))),
+        (2, ~jnp.all(jnp.isfinite(estimate.mean))),
+        (1, estimate.num_finite == 0),
+    ):
+        reason = jnp.where(holds, code, reason)
+    stopped_before = state.reason != 0
+    reason = jnp.where(stopped_before, state.reason, reason)
+    moves = reason == 0
+    following = Descent(
+        jnp.where(moves, theta, state.theta),
+        jax.tree.map(lambda new, old: jnp.where(moves, new, old), optimizer_state, state.optimizer),
+        reason,
+        first_cost,
+    )
+    nan = jnp.full((), jnp.nan, theta.dtype)
+    figures = (
+        cost,
+        jnp.linalg.norm(estimate.mean),
+        estimate.variance,
+        nan if estimate.alpha is None else estimate.alpha.alpha,
+        estimate.num_nonfinite.astype(theta.dtype),
+        jnp.zeros((), theta.dtype) if residual is None else jnp.max(residual),
+    )
+    return following, Record(*(jnp.where(stopped_before, nan, figure) for figure in figures))
+
+
+def _values(batch) -> tuple[Float[Array, " samples"], Float[Array, " samples"] | None]:
+    """Total costs and residuals of a batch, whatever its kind."""
+    batch = batch[0] if isinstance(batch, tuple) else batch
+    batch = batch.steps if isinstance(batch, Linearisation) else batch
+    return (batch.value_to_go[:, 0] if isinstance(batch, StepEvaluation) else batch.value), batch.residual
+
+
+def going(state: Descent) -> Bool[Array, "*seeds"]:
+    """Which seeds have not stopped."""
+    return state.reason == 0

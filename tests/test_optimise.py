@@ -1,0 +1,321 @@
+"""Optimisation: it goes down, goes on where it stopped, stops where it must, and compiles once."""
+
+import dataclasses
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from PIL import Image
+
+import estimators
+from estimators import ESTIMATORS, Differentiation
+from mjx_study import cli, descent, optimise
+from mjx_study.cli import options
+from mjx_study.descent import REASONS, begin, make_optimizer
+from mjx_study.objective import Simulator
+from mjx_study.optimise import OptimiseConfig, plan_optimise
+from mjx_study.study import plan_cells
+from mjx_study.tasks import TASKS, make_task
+
+SHORT: dict[str, Any] = {
+    "horizon": 60,
+    "iterations": 6,
+    "seeds": 2,
+    "samples": 5,
+    "evaluation_samples": 8,
+    "learning_rate": 0.01,
+}
+
+
+def config(task: str = "pusher", **changes: Any) -> OptimiseConfig:
+    return OptimiseConfig(task=task, **({"contact": "penalty", "stiffness": 100.0} | SHORT | changes))
+
+
+def on_reference(task: str, **changes: Any) -> OptimiseConfig:
+    return OptimiseConfig(task=task, reference=True, **changes)
+
+
+@pytest.fixture(scope="module")
+def short() -> optimise.OptimiseResult:
+    """Two estimators through MJX, six iterations of two seeds."""
+    return optimise.optimise(plan_optimise(config(estimators=("zobg", "aobg"))))
+
+
+def test_a_run_has_its_whole_history(short: optimise.OptimiseResult) -> None:
+    zeroth, alpha = short.runs
+    for run in short.runs:
+        assert run.theta.shape == (2, 60) and run.seconds.shape == (6,)
+        assert all(values.shape == (6, 2) for values in run.history.values())
+        assert np.all(np.diff(run.seconds) > 0) and not run.stopped
+        assert np.all(run.history["cost"][-1] < run.history["cost"][0])
+        assert np.all(run.final_cost < short.start_cost[0] - 4 * short.start_cost[1])
+    assert np.all(np.isnan(zeroth.history["alpha"])) and np.all(alpha.history["alpha"] > 0.5)
+    assert (zeroth.rollouts, alpha.rollouts) == (6, 11)
+    assert short.config.sigma == 0.1 and short.config.decay == 0.0
+
+
+def test_seeds_are_those_of_runs_of_one(short: optimise.OptimiseResult) -> None:
+    """The first seed's run does not depend on how many there are beside it."""
+    alone = optimise.optimise(plan_optimise(config(estimators=("zobg",), seeds=1)))
+    np.testing.assert_allclose(alone.runs[0].theta[0], short.runs[0].theta[0], rtol=1e-10)
+    assert not np.allclose(short.runs[0].theta[0], short.runs[0].theta[1], rtol=1e-6)
+
+
+def test_an_iteration_is_gradient_descent_on_the_estimate(short: optimise.OptimiseResult) -> None:
+    """The first step by hand: theta minus the learning rate times the estimate with the same keys."""
+    plan = plan_optimise(config(estimators=("aobg",), iterations=1))
+    objective = Simulator(plan.task, chunk_size=3).objective(plan.cell.contact)
+    key = jax.random.fold_in(jax.random.fold_in(jax.random.key(0), 1), 0)
+    estimate = estimators.estimate("aobg", objective, plan.task.theta, key, 5, options=plan.options)
+    run = optimise.optimise(plan).runs[0]
+    np.testing.assert_allclose(run.theta[1], plan.task.theta - 0.01 * estimate.mean, rtol=1e-10)
+    assert run.history["gradient_norm"][0, 1] == pytest.approx(float(jnp.linalg.norm(estimate.mean)), rel=1e-9)
+
+
+@pytest.mark.parametrize("reference", [False, True], ids=["MJX", "reference"])
+def test_a_stopped_run_goes_on_to_the_same_end(tmp_path: Path, reference: bool) -> None:
+    """Bit for bit, with an optimiser that has a memory."""
+    common: dict[str, Any] = {
+        "optimizer": "adam",
+        "learning_rate": 0.01,
+        "estimators": ("fobg",),
+        "reference": reference,
+    }
+    whole = optimise.optimise(plan_optimise(config(**common, iterations=5)))
+    optimise.optimise(plan_optimise(config(**common, iterations=2)), tmp_path)
+    resumed = optimise.optimise(plan_optimise(config(**common, iterations=5)), tmp_path)
+    np.testing.assert_array_equal(resumed.runs[0].theta, whole.runs[0].theta)
+    for name, values in whole.runs[0].history.items():
+        np.testing.assert_array_equal(resumed.runs[0].history[name], values)
+    # a finished run is read, not computed
+    again = optimise.optimise(plan_optimise(config(**common, iterations=5)), tmp_path)
+    np.testing.assert_array_equal(again.runs[0].seconds, resumed.runs[0].seconds)
+
+
+def test_a_folder_of_another_run_or_a_damaged_file_is_refused(tmp_path: Path) -> None:
+    plan = plan_optimise(config(estimators=("zobg",), iterations=1, reference=True))
+    optimise.optimise(plan, tmp_path)
+    path = optimise.checkpoint_path(tmp_path, "zobg")
+    kept = path.read_bytes()
+    other = plan_optimise(config(estimators=("zobg",), iterations=1, reference=True, sigma=0.2))
+    with pytest.raises(ValueError, match="holds another run .sigma 0.1 there and 0.2 here.; choose another folder"):
+        optimise.optimise(other, tmp_path)
+    for damaged in (kept[: len(kept) // 2], b"nonsense", kept[:200] + bytes([kept[200] ^ 1]) + kept[201:]):
+        path.write_bytes(damaged)
+        with pytest.raises(ValueError, match="is damaged .*; move it away to start again"):
+            optimise.optimise(plan, tmp_path)
+        assert path.read_bytes() == damaged
+
+
+def test_a_seed_that_diverges_stops_and_the_others_go_on() -> None:
+    """One iteration by hand of three seeds: fine, not finite, already stopped."""
+    optimizer = make_optimizer("sgd", 0.1, 0.0)
+    state = begin(optimizer, jnp.array([1.0, 2.0]), 4)
+    state = dataclasses.replace(state, reason=jnp.array([0, 0, 3, 0]), first_cost=jnp.array([1.0, 1.0, 1.0, 1e-3]))
+    value = jnp.ones((4, 5)).at[3].set(1e6)
+    gradient = jnp.ones((4, 5, 2)).at[1].set(jnp.nan)
+    chosen = plan_optimise(config(reference=True)).options
+    after, record = descent.advance(
+        state,
+        {"differentiation": jax.vmap(lambda f, g: Differentiation(f, g))(value, gradient)},
+        "fobg",
+        chosen,
+        optimizer,
+    )
+    np.testing.assert_allclose(after.theta, [[0.9, 1.9], [1, 2], [1, 2], [1, 2]])
+    assert after.reason.tolist() == [0, 1, 3, 4]
+    np.testing.assert_array_equal(np.isnan(record.cost), [False, False, True, False])
+    assert record.nonfinite[1] == 5
+
+
+def test_a_diverging_run_keeps_its_history_and_says_why() -> None:
+    """A learning rate that is far too large, on the analytic pusher."""
+    plan = plan_optimise(config(estimators=("fobg",), learning_rate=1.0, iterations=400, reference=True, seeds=2))
+    run = optimise.optimise(plan).runs[0]
+    assert set(run.stopped) == {0, 1}
+    for iteration, reason in run.stopped.values():
+        assert 1 < iteration < 400 and reason in REASONS[1:]
+    assert len(run.seconds) < 400 and np.isfinite(run.history["cost"][0]).all()
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_every_estimator_optimises(name: str) -> None:
+    changes: dict[str, Any] = {"max_norm": 1e3, "window": 40}
+    run = optimise.optimise(plan_optimise(config(estimators=(name,), reference=True, **changes))).runs[0]
+    assert np.all(run.history["cost"][-1] < run.history["cost"][0])
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_every_task_has_a_recipe_that_plans(task: str) -> None:
+    plan = plan_optimise(OptimiseConfig(task=task))
+    assert plan.task.recipe is not None and plan.config.iterations == plan.task.recipe.iterations
+
+
+@pytest.mark.parametrize("name", ["sgd", "adam", "rmsprop", "adamw"])
+def test_any_optimiser_of_optax(name: str) -> None:
+    optimizer = make_optimizer(name, 0.1, 0.5)
+    state = optimizer.init(jnp.ones(2))
+    update, _ = optimizer.update(jnp.ones(2), state, jnp.ones(2))
+    assert np.all(np.asarray(update) < 0)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"estimators": ()}, "no estimator given; choose from zobg"),
+        ({"estimators": ("gobg",)}, "unknown estimator 'gobg'"),
+        ({"estimators": ("zobg", "zobg")}, "given twice: zobg, zobg"),
+        ({"seeds": 0}, "seeds must be at least 1, got 0"),
+        ({"samples": 1}, "samples must be at least 2, got 1"),
+        ({"seed": -1}, "seed must not be negative"),
+        ({"optimizer": "ascent"}, "optax has no optimiser 'ascent'"),
+        ({"optimizer": "apply_updates"}, "optax has no optimiser 'apply_updates'"),
+        ({"learning_rate": 0.0}, "learning rate must be positive and finite, got 0.0"),
+        ({"decay": 3.0}, "a power from 0 to 2, got 3.0"),
+        ({"estimators": ("fobg_truncated",)}, "'fobg_truncated' needs the option window"),
+        ({"noise": "laplace", "estimators": ("delta",)}, "'delta' holds for Gaussian noise only"),
+    ],
+)
+def test_what_cannot_be_run_is_refused(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        plan_optimise(config(**changes))
+
+
+def test_a_task_without_recipe_or_reference_says_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    bare = make_task("pusher", horizon=3).replace(recipe=None, reference=None)
+    monkeypatch.setattr(optimise, "make_task", lambda *_, **__: bare)
+    with pytest.raises(ValueError, match="pusher has no recipe: give learning rate"):
+        plan_optimise(config(horizon=3, decay=0.0, learning_rate=None))
+    with pytest.raises(ValueError, match="pusher has no analytic reference"):
+        plan_optimise(config(horizon=3, reference=True))
+
+
+def test_one_compilation_for_all_iterations(monkeypatch: pytest.MonkeyPatch) -> None:
+    compiled: list[Any] = []
+    jit = jax.jit
+
+    def spy(function, *args, **kwargs):
+        compiled.append(jit(function, *args, **kwargs))
+        return compiled[-1]
+
+    monkeypatch.setattr(optimise.jax, "jit", spy)
+    optimise.optimise(plan_optimise(config(estimators=("zobg",), horizon=3)))
+    steps = [program for program in compiled if program.__wrapped__.__name__ == "<lambda>"]
+    assert [program._cache_size() for program in steps] == [1, 1]  # the keys of an iteration, and the iteration
+
+
+# The claims of Suh et al. 2022 on the analytic systems, each with several seeds.
+
+
+@pytest.mark.slow
+def test_ball_wall_first_order_stays_in_the_flat_region() -> None:
+    """Zeroth and alpha order clear the wall; first order, and inverse variances, stay short of it."""
+    names = ("zobg", "fobg", "aobg", "ivw")
+    result = optimise.optimise(plan_optimise(on_reference("ball_wall", estimators=names)))
+    cost = {run.estimator: run.final_cost for run in result.runs}
+    assert np.all(cost["zobg"] < -0.009) and np.all(cost["aobg"] < -0.009)
+    assert np.all(cost["fobg"] > -0.005) and np.all(cost["ivw"] > -0.005)
+
+
+@pytest.mark.slow
+def test_momentum_transfer_first_order_goes_over_the_edge() -> None:
+    """The others stop inside, where there is momentum to be had."""
+    names = ("zobg", "fobg", "aobg")
+    result = optimise.optimise(plan_optimise(on_reference("momentum_transfer", estimators=names)))
+    runs = {run.estimator: run for run in result.runs}
+    assert np.all(runs["fobg"].theta > np.pi / 4) and np.all(runs["fobg"].final_cost > -0.2)
+    for name in ("zobg", "aobg"):
+        assert np.all(runs[name].theta < np.pi / 4) and np.all(
+            runs[name].final_cost < 2 * runs["fobg"].final_cost.min()
+        )
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """A folder that the command wrote, and what it printed."""
+    folder = tmp_path_factory.mktemp("optimise") / "out"
+    arguments = ["optimise", "pusher", "--reference", "--horizon", "8", "--iterations", "4", "--seeds", "2"]
+    patch = pytest.MonkeyPatch()
+    patch.setattr(options, "configure", lambda **_: None)
+    lines: list[str] = []
+    patch.setattr("builtins.print", lambda *parts, **_: lines.append(" ".join(map(str, parts))))
+    try:
+        assert cli.main([*arguments, "--samples", "4", "--evaluation-samples", "5", "--output", str(folder)]) == 0
+    finally:
+        patch.undo()
+    return folder, "\n".join(lines)
+
+
+def test_the_command_writes_figure_numbers_policies_and_checkpoints(written: tuple[Path, str]) -> None:
+    folder, printed = written
+    names = ("zobg", "fobg", "aobg")
+    expected = {"results.json", "optimisation.png", "optimisation.pdf"}
+    expected |= {f"policy-{name}.json" for name in names} | {f"run-{name}.npz" for name in names}
+    assert {path.name for path in folder.iterdir()} == expected
+    document = json.loads((folder / "results.json").read_text())
+    assert [run["estimator"] for run in document["runs"]] == list(names)
+    assert np.shape(document["runs"][0]["history"]["cost"]) == (4, 2)
+    with Image.open(folder / "optimisation.png") as picture:
+        assert picture.width > 1000
+    for words in ("analytic reference; sgd, learning rate 0.001", "2 seeds from 0", "ZoBG", "rollouts", "seconds"):
+        assert words in printed
+
+
+def test_a_policy_is_replayed(
+    written: tuple[Path, str], capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(options, "configure", lambda **_: None)
+    policy = written[0] / "policy-fobg.json"
+    theta = json.loads(policy.read_text())["theta"]
+    arguments = ["rollout", "pusher", "--policy", str(policy), "--frames", "1", "--json"]
+    assert cli.main([*arguments, "--output", str(tmp_path / "replay")]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["theta"] == theta and facts["steps"] == 8
+    for wrong, says in (
+        (["rollout", "sliding_box", "--policy", str(policy)], "is a policy of pusher, not of sliding_box"),
+        (["rollout", "pusher", "--policy", str(policy), "--theta", "1"], "both say what theta is"),
+        (["rollout", "pusher", "--policy", str(written[0] / "results.json")], "is not a policy that optimise wrote"),
+        (["rollout", "pusher", "--policy", "nowhere.json"], "cannot read nowhere.json"),
+    ):
+        assert cli.main(wrong) == 2
+        assert says in capsys.readouterr().err
+
+
+def test_bad_options_get_one_line(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, written) -> None:
+    monkeypatch.setattr(options, "configure", lambda **_: None)
+    for arguments, says in (
+        (["pusher", "--estimator", "gobg"], "unknown estimator 'gobg'"),
+        (["pusher", "--reference", "--sigma", "0.3", "--output", str(written[0])], "holds another run"),
+    ):
+        assert cli.main(["optimise", *arguments]) == 2
+        error = capsys.readouterr().err
+        assert says in error and error.count("\n") == 1
+
+
+@pytest.mark.slow
+def test_the_descent_costs_little_beside_its_rollouts() -> None:
+    """An iteration takes at most 1.15 times its rollouts and gradients; ten seeds under half of ten runs."""
+    plan = plan_optimise(config(estimators=("aobg",), samples=100, horizon=100, iterations=30, seeds=1))
+    run = optimise.optimise(plan).runs[0]
+    (cell,), _ = plan_cells(plan.task, ["penalty"], [100.0])
+    simulator = Simulator(plan.task, chunk_size=plan.config.chunk_size or 1)
+    objective = simulator.objective(cell.contact)
+
+    def batch() -> float:
+        keys = jax.random.split(jax.random.key(0), 100)
+        start = time.perf_counter()
+        objective.evaluate(plan.task.theta, keys)
+        objective.differentiate(plan.task.theta, jax.random.clone(keys))
+        return time.perf_counter() - start
+
+    batch()
+    bare = float(np.median([batch() for _ in range(20)]))
+    assert np.median(np.diff(run.seconds)) <= 1.15 * bare
+    small: dict[str, Any] = {"estimators": ("fobg",), "samples": 10, "horizon": 100, "iterations": 30}
+    one, ten = (optimise.optimise(plan_optimise(config(**small, seeds=count))).runs[0] for count in (1, 10))
+    assert ten.seconds[-1] < 0.5 * 10 * one.seconds[-1]
