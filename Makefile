@@ -25,6 +25,8 @@ figures: $(STAMP) ## Make the figures of docs/ again
 	$(BIN)/mjx-study compare pusher --output results/pusher && cp results/pusher/comparison.png docs/pusher.png
 	$(BIN)/mjx-study landscape momentum_transfer --contact penalty,mujoco_default,smooth_onset --output results/onset
 	cp results/onset/landscape.png docs/onset.png
+	$(BIN)/mjx-study optimise pusher --contact penalty --stiffness 1000 --output results/optimisation
+	cp results/optimisation/optimisation.png docs/optimisation.png
 	$(BIN)/python docs/make_figures.py
 
 test: $(STAMP) ## Run the tests, less the slow ones (PYTEST_ARGS='-k name' in place of two workers)

@@ -24,6 +24,7 @@ from jaxtyping import Array, Float, Key
 from estimators import ESTIMATORS, ORACLES, EstimatorOptions, Objective, draw
 from estimators.ddcg import PUBLISHED_TOLERANCE
 from mjx_study.descent import REASONS, Descent, Record, advance, begin, going, make_optimizer
+from mjx_study.network import with_network
 from mjx_study.objective import Simulator, TracedObjective, chunk_for
 from mjx_study.results import write_whole
 from mjx_study.runtime import environment
@@ -48,6 +49,7 @@ class OptimiseConfig:
         stiffness: of the contact [N/m]; None for the middle one of the task's.
         damping: of the contact [N s/m]; None for the family's.
         reference: run on the analytic reference in place of MJX.
+        network: widths of the hidden layers of a network in place of the task's policy; None for that.
         iterations, samples, learning_rate, decay: None for the task's recipe.
         optimizer: name of an optimiser of optax.
         seeds: runs of each estimator.
@@ -66,6 +68,7 @@ class OptimiseConfig:
     stiffness: float | None = None
     damping: float | None = None
     reference: bool = False
+    network: tuple[int, ...] | None = None
     iterations: int | None = None
     samples: int | None = None
     learning_rate: float | None = None
@@ -127,6 +130,10 @@ def plan_optimise(config: OptimiseConfig) -> OptimisePlan:
     task = make_task(config.task, **{name: value for name, value in scene_options.items() if value is not None})
     changes = {"sigma": config.sigma, "noise": config.noise}
     task = task.replace(**{name: value for name, value in changes.items() if value is not None})
+    if config.network is not None:
+        if config.reference:
+            raise ValueError("a network needs MJX: the analytic references take the task's own policy")
+        task = with_network(task, config.network, jax.random.key(config.seed))
     if config.reference and task.reference is None:
         raise ValueError(f"{task.name} has no analytic reference")
     numbers = {}

@@ -25,6 +25,7 @@ LAYERS = [
     "mjx_study.dynamics",
     "mjx_study.policy",
     "mjx_study.task",
+    "mjx_study.network",
     "mjx_study.tasks",
     "mjx_study.objective",
     "mjx_study.reference_gradient",

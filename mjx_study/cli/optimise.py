@@ -38,6 +38,7 @@ examples:
   mjx-study optimise pusher --contact penalty --stiffness 1000 --output out
   mjx-study optimise ball_wall --reference --estimator zobg,fobg,aobg --seeds 5
   mjx-study optimise pusher --estimator ivw_h --optimizer adam --learning-rate 0.01
+  mjx-study optimise tennis --network 16,16 --optimizer adam --learning-rate 0.003 --contact penalty
   mjx-study rollout pusher --policy out/policy-aobg.json
 
 columns of the table:
@@ -46,10 +47,11 @@ columns of the table:
   alpha       mean weight of first-order gradients in the last tenth of the iterations
   rollouts    simulated per seed, those that were differentiated and baselines included
 """
+RESUMABLE = "mjx-study: interrupted; the same command goes on from the last checkpoint, at most 20 s ago"
 FIELDS = (
-    "task estimators contact stiffness damping reference iterations samples learning_rate decay optimizer seeds seed "
-    "sigma noise baseline gamma failure_probability variance_proxy radius max_norm window tolerance cone horizon model "
-    "evaluation_samples chunk_size"
+    "task estimators contact stiffness damping reference network iterations samples learning_rate decay optimizer "
+    "seeds seed sigma noise baseline gamma failure_probability variance_proxy radius max_norm window tolerance cone "
+    "horizon model evaluation_samples chunk_size"
 ).split()
 
 
@@ -61,6 +63,9 @@ def add(commands: Commands) -> None:
     command.add_argument("--stiffness", type=float, metavar="K", help="contact stiffness in N/m (default: the task's)")
     command.add_argument("--damping", type=float, metavar="B", help="contact damping in N s/m")
     command.add_argument("--reference", action="store_true", help="on the analytic reference in place of MJX")
+    command.add_argument(
+        "--network", type=_widths, metavar="N[,N]", help="a tanh network of these hidden widths as policy, started at 0"
+    )
     command.add_argument(
         "--estimator",
         dest="estimators",
@@ -100,7 +105,7 @@ def run(options: argparse.Namespace) -> int:
         if folder is not None:  # refused here, before anything is computed
             for name in plan.config.estimators:
                 load_checkpoint(folder, name, plan.config)
-    with computing() as progress:
+    with computing(*([] if folder is None else [RESUMABLE])) as progress:
         result = optimise(plan, folder, progress)
     document = as_document(result)
     written = [] if folder is None else _save(result, document, folder)
@@ -147,6 +152,7 @@ def _save(result: OptimiseResult, document: dict[str, Any], folder: Path) -> lis
             "contact": result.config.contact,
             "stiffness": result.config.stiffness,
             "horizon": result.config.horizon,
+            "network": result.config.network,
             "theta": run.theta[run.best].tolist(),
         }
         content = (json.dumps(as_plain(policy)) + "\n").encode()
@@ -196,6 +202,13 @@ def _row(run: Run) -> list[str]:
         str(run.rollouts * len(run.seconds)),
         f"{run.seconds[-1]:.1f}" if len(run.seconds) else "-",
     ]
+
+
+def _widths(text: str) -> tuple[int, ...]:
+    try:
+        return tuple(int(part) for part in text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a list of widths such as 16,16") from None
 
 
 def _radius(text: str) -> float | str:

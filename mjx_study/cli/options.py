@@ -113,7 +113,7 @@ def usage_errors() -> Generator[None]:
 
 
 @contextmanager
-def computing() -> Generator[Progress]:
+def computing(interrupted: str = INTERRUPTED) -> Generator[Progress]:
     """A progress bar around computing; an interrupt ends the process at once, with one line and exit code 130.
 
     An exception would not do: JAX calls back into Python while it traces, and what is raised there may be lost.
@@ -123,7 +123,7 @@ def computing() -> Generator[Progress]:
     # Only the main thread may set a handler, and a background job that ignores interrupts goes on ignoring them.
     ours = threading.current_thread() is threading.main_thread() and previous is not signal.SIG_IGN
     if ours:
-        signal.signal(signal.SIGINT, _leave)
+        signal.signal(signal.SIGINT, lambda *_: _leave(interrupted))
     try:
         with progress_bar() as progress:
             yield progress
@@ -132,9 +132,9 @@ def computing() -> Generator[Progress]:
             signal.signal(signal.SIGINT, previous)
 
 
-def _leave(*_: object) -> NoReturn:
+def _leave(message: str) -> NoReturn:
     show_cursor()
-    print(INTERRUPTED, file=sys.stderr, flush=True)
+    print(message, file=sys.stderr, flush=True)
     os._exit(130)
 
 

@@ -27,6 +27,7 @@ from mjx_study.cli.options import (
 )
 from mjx_study.console import number
 from mjx_study.contact import FAMILIES
+from mjx_study.network import with_network
 from mjx_study.plots import save_figure
 from mjx_study.render import (
     FORMATS,
@@ -161,9 +162,10 @@ def _plan(options: argparse.Namespace):
 
 
 def _plan_task(options: argparse.Namespace):
-    if options.policy is not None:
-        _apply_policy(options)
+    network = None if options.policy is None else _apply_policy(options)
     task = task_of(options)
+    if network is not None:
+        task = with_network(task, network, jax.random.key(0))  # whose weights theta replaces
     family = options.contact or ("mujoco" if "mujoco" in task.families else task.families[0])
     stiffness = task.stiffnesses[len(task.stiffnesses) // 2] if options.stiffness is None else options.stiffness
     cells, messages = plan_cells(task, (family,), (stiffness,), options.damping)
@@ -171,8 +173,8 @@ def _plan_task(options: argparse.Namespace):
     return partial(_simulate_task, task, cells[0], theta, options.seed, options.noise), messages
 
 
-def _apply_policy(options: argparse.Namespace) -> None:
-    """Take theta, and what was not given of contact and horizon, from a policy file.
+def _apply_policy(options: argparse.Namespace) -> tuple[int, ...] | None:
+    """Take theta, and what was not given of contact and horizon, from a policy file; returns a network's widths.
 
     Raises:
         ValueError: the file cannot be read, is no policy, or is one of another task; or theta is given too.
@@ -193,6 +195,8 @@ def _apply_policy(options: argparse.Namespace) -> None:
     for name in ("contact", "stiffness", "horizon"):
         if getattr(options, name) is None and policy.get(name):
             setattr(options, name, policy[name])
+    widths = policy.get("network")
+    return None if widths is None else tuple(map(int, widths))
 
 
 def _theta(text: str, task: Task) -> np.ndarray:

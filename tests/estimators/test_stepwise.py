@@ -237,8 +237,8 @@ def test_lost_samples_do_not_spoil_the_rest(few) -> None:
 
 
 def test_ddcg_is_exact_on_quadratics_and_sees_a_jump() -> None:
-    """Without tolerance, a quadratic is just at the boundary: both sides agree within sampling."""
-    objective, theta = objectives.quadratic(HESSIAN, 0.7), jnp.array([1.5, -2.0, 1.0])
+    """Without tolerance, a quadratic is just at the boundary: both sides agree within sampling, 0.3 %."""
+    objective, theta = objectives.quadratic(HESSIAN, 0.7), jnp.array([0.15, -0.2, 0.1])
     keys = jax.random.split(jax.random.key(6), 400_000)
     batch, evaluation = objective.differentiate_steps(theta, keys), objective.evaluate(theta, jax.random.clone(keys))
     gradients = np.asarray(batch.noise_gradient[:, 0])
