@@ -8,7 +8,7 @@ Reference: Suh, Simchowitz, Zhang, Tedrake, "Do Differentiable Simulators Give B
 
 from estimators.alpha_order import alpha_order, constrained_alpha, interpolate, inverse_variance_alpha
 from estimators.baselines import BASELINES, leave_one_out, none, zero_noise
-from estimators.bias import BiasTest, EmpiricalBias, bias_test, empirical_bias
+from estimators.bias import BiasTest, EmpiricalBias, bias_test, empirical_bias, squared_bias_of_means
 from estimators.confidence import VARIANCE_PROXIES, bernstein_epsilon, coverage_interval, variance_upper_bound
 from estimators.ddcg import discontinuity_gated
 from estimators.first_order import clipped_first_order, first_order
@@ -78,6 +78,7 @@ __all__ = [
     "none",
     "norm_quantiles",
     "pull_back",
+    "squared_bias_of_means",
     "stepwise_inverse_variance",
     "summarise",
     "total_propagation",

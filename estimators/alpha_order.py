@@ -107,12 +107,12 @@ def interpolate(zeroth: GradientEstimate, first: GradientEstimate, alpha: float 
     alpha = jnp.asarray(alpha, zeroth.per_sample.dtype)
 
     linear, squared = (1.0 - alpha, alpha), ((1.0 - alpha) ** 2, alpha**2)
-    per_sample = _weigh(linear, zeroth.per_sample, first.per_sample)
+    per_sample = weigh(linear, zeroth.per_sample, first.per_sample)
     return GradientEstimate(
         per_sample=per_sample,
-        mean=_weigh(linear, zeroth.mean, first.mean),
-        variance=_weigh(squared, zeroth.variance, first.variance),
-        standard_error=jnp.sqrt(_weigh(squared, zeroth.standard_error**2, first.standard_error**2)),
+        mean=weigh(linear, zeroth.mean, first.mean),
+        variance=weigh(squared, zeroth.variance, first.variance),
+        standard_error=jnp.sqrt(weigh(squared, zeroth.standard_error**2, first.standard_error**2)),
         num_finite=jnp.sum(finite_rows(per_sample)),
     )
 
@@ -156,8 +156,8 @@ def alpha_order(
     return replace(interpolate(zeroth, first, alpha), alpha=choice)
 
 
-def _weigh(
-    weights: tuple[Scalar, Scalar], zeroth: Float[Array, "*shape"], first: Float[Array, "*shape"]
+def weigh(
+    weights: tuple[float | Scalar, float | Scalar], zeroth: Float[Array, "*shape"], first: Float[Array, "*shape"]
 ) -> Float[Array, "*shape"]:
     """Weighted sum in which nothing times NaN is nothing."""
     weight_zeroth, weight_first = weights

@@ -43,3 +43,14 @@ BASELINES: dict[str, Callable[[Evaluation], Float[Array, " samples"]]] = {
     "zero_noise": zero_noise,
     "leave_one_out": leave_one_out,
 }
+
+
+def find_baseline(name: str) -> Callable[[Evaluation], Float[Array, " samples"]]:
+    """The baseline of that name.
+
+    Raises:
+        ValueError: there is none.
+    """
+    if name not in BASELINES:
+        raise ValueError(f"baseline must be one of {', '.join(BASELINES)}; got {name!r}")
+    return BASELINES[name]

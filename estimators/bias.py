@@ -77,6 +77,40 @@ def _multiplied(estimate: GradientEstimate, key: Key[Array, ""], num_draws: int)
     return jnp.matmul(multipliers, centred, precision="highest") / jnp.sqrt(count * jnp.maximum(count - 1.0, 1.0))
 
 
+def squared_bias_of_means(
+    means: Float[Array, "batches params"], reference: GradientEstimate
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """An unbiased estimate of ||E gbar - E g||^2 from the means of independent batches, for any estimator.
+
+        sum_{i != j} d_i^T d_j / (S (S - 1)) - sum_k se_k^2,   d_i = gbar_i - reference, se its standard error
+
+    The products of different batches leave out the noise of the means, the second term that of the reference, which all
+    share. It may be negative where there is no bias to be seen.
+
+    Args:
+        means: Of S >= 3 batches, [cost/param].
+        reference: An unbiased estimate of the gradient from other samples.
+
+    Returns:
+        The estimate and its standard error, [cost^2/param^2]: a jackknife over the batches, and twice the bias
+        times the reference's error, plus its square, which is the most that the reference can contribute. NaN for
+        fewer batches.
+    """
+    count = means.shape[0]
+    if count < 3:
+        undefined = jnp.full((), jnp.nan, means.dtype)
+        return undefined, undefined
+    gaps = means - reference.mean[None, :]
+    products = jnp.matmul(gaps, gaps.T, precision="highest")
+    others = products - jnp.diag(jnp.diag(products))
+    noise = jnp.sum(reference.standard_error**2)
+    value = jnp.sum(others) / (count * (count - 1)) - noise
+    without = (jnp.sum(others) - 2 * jnp.sum(others, axis=1)) / ((count - 1) * (count - 2)) - noise
+    own = (count - 1) / count * jnp.sum((without - jnp.mean(without)) ** 2)
+    shared = 2 * jnp.sqrt(jnp.maximum(value, 0.0) * noise) + noise
+    return value, jnp.hypot(jnp.sqrt(own), shared)
+
+
 @register_pytree
 @dataclass(frozen=True)
 class EmpiricalBias:

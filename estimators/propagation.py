@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from estimators.alpha_order import inverse_variance_alpha
+from estimators.alpha_order import inverse_variance_alpha, weigh
 from estimators.statistics import finite_rows, summarise
 from estimators.stepwise import control_scores, node_variance
 from estimators.types import AlphaChoice, GradientEstimate, Linearisation, pull_back
@@ -82,7 +82,7 @@ def total_propagation(linearisation: Linearisation, baseline: str) -> GradientEs
             pull_back(part[:, None], None if jacobian is None else jacobian[:, None]) for part in (score, derivative)
         ]
         alpha = inverse_variance_alpha(*(jnp.sum(node_variance(share, usable)) for share in shares))
-        return _weigh(alpha, score, derivative), alpha
+        return weigh((1.0 - alpha, alpha), score, derivative), alpha
 
     horizon = linearisation.cost_state.shape[1]
     if linearisation.start_jacobian is None:
@@ -141,8 +141,3 @@ def _gradient(
     else:
         rows = jnp.einsum("isp,is->ip", linearisation.start_jacobian, adjoint, precision="highest")
     return jnp.where(jnp.isfinite(linearisation.steps.value_to_go[:, :1]), rows, jnp.nan)
-
-
-def _weigh(alpha: Float[Array, ""], score: Controls, derivative: Controls) -> Controls:
-    """Weighted sum in which nothing times NaN is nothing."""
-    return jnp.where(alpha == 1, 0.0, (1.0 - alpha) * score) + jnp.where(alpha == 0, 0.0, alpha * derivative)

@@ -12,7 +12,7 @@ import jax
 from jaxtyping import Array, Float, Key
 
 from estimators.alpha_order import alpha_order
-from estimators.baselines import BASELINES
+from estimators.baselines import find_baseline
 from estimators.confidence import bernstein_epsilon, check_confidence_arguments
 from estimators.ddcg import PUBLISHED_TOLERANCE, discontinuity_gated
 from estimators.first_order import clipped_first_order, first_order
@@ -52,8 +52,7 @@ class EstimatorOptions:
     tolerance: float = PUBLISHED_TOLERANCE
 
     def __post_init__(self):
-        if self.baseline not in BASELINES:
-            raise ValueError(f"baseline must be one of {', '.join(BASELINES)}; got {self.baseline!r}")
+        find_baseline(self.baseline)
         if not self.gamma > 0.0:
             raise ValueError(f"gamma must be positive; got {self.gamma}; float('inf') sets no limit")
         for name in ("sigma", "max_norm"):

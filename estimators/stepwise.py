@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from estimators.alpha_order import inverse_variance_alpha
-from estimators.baselines import BASELINES
+from estimators.baselines import find_baseline
 from estimators.statistics import finite_rows, summarise
 from estimators.types import (
     AlphaChoice,
@@ -63,12 +63,11 @@ def control_scores(steps: StepEvaluation, baseline: str) -> Float[Array, "sample
     Raises:
         ValueError: No baseline has that name.
     """
-    if baseline not in BASELINES:
-        raise ValueError(f"baseline must be one of {', '.join(BASELINES)}; got {baseline!r}")
+    found = find_baseline(baseline)
 
     def advantage(value: Float[Array, " samples"], silent: Float[Array, " samples"]) -> Float[Array, " samples"]:
         none = jnp.zeros((value.shape[0], 0), value.dtype)
-        return value - BASELINES[baseline](Evaluation(value, none, silent))
+        return value - found(Evaluation(value, none, silent))
 
     advantages = jax.vmap(advantage, in_axes=1, out_axes=1)(steps.value_to_go, steps.baseline_to_go)
     return steps.noise_score * advantages[:, :, None]

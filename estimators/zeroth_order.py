@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from estimators.baselines import BASELINES
+from estimators.baselines import find_baseline
 from estimators.statistics import summarise
 from estimators.types import Evaluation, GradientEstimate
 
@@ -29,9 +29,7 @@ def zeroth_order(evaluation: Evaluation, baseline: str) -> GradientEstimate:
     Reference: Suh et al. 2022, def. of the ZoBG and lemma on its variance (which prints H n for the noise
     dimensions).
     """
-    if baseline not in BASELINES:
-        raise ValueError(f"baseline must be one of {', '.join(BASELINES)}; got {baseline!r}")
-    advantage = evaluation.value - BASELINES[baseline](evaluation)
+    advantage = evaluation.value - find_baseline(baseline)(evaluation)
     return summarise(advantage[:, None] * evaluation.score)
 
 
