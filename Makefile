@@ -13,7 +13,7 @@ UV_VERSION := 0.13.8
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo figures test test-all lint format lock clean
+.PHONY: help demo figures study test test-all lint format lock clean
 
 help: ## List the targets
 	@awk 'BEGIN { FS = ":.*## " } /^[a-z-]+:.*## / { printf "  %-10s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
@@ -28,6 +28,9 @@ figures: $(STAMP) ## Make the figures of docs/ again
 	$(BIN)/mjx-study optimise pusher --contact penalty --stiffness 1000 --output results/optimisation
 	cp results/optimisation/optimisation.png docs/optimisation.png
 	$(BIN)/python docs/make_figures.py
+
+study: $(STAMP) ## Sweep stiffness and draw the README's figures of it again (half an hour; resumable)
+	$(BIN)/python docs/make_study.py
 
 test: $(STAMP) ## Run the tests, less the slow ones (PYTEST_ARGS='-k name' in place of two workers)
 	$(BIN)/python -m pytest $(PYTEST_ARGS)

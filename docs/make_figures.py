@@ -25,6 +25,7 @@ from matplotlib.figure import Figure
 from matplotlib.transforms import Affine2D
 from PIL import Image
 
+from mjx_study.configuration import plan_cells
 from mjx_study.contact import ContactModel, contact_model, solref_from_stiffness
 from mjx_study.dynamics import State, initial_state
 from mjx_study.objective import rollout_cost
@@ -41,7 +42,6 @@ from mjx_study.reference import (
 from mjx_study.render import VIEWS, Motion
 from mjx_study.render.drawing import PALETTE, Drawing
 from mjx_study.runtime import configure
-from mjx_study.study import plan_cells
 from mjx_study.task import Task
 from mjx_study.tasks import make_task
 

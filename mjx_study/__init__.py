@@ -22,25 +22,29 @@ from mjx_study.policy import Launch, LinearFeedback, OpenLoop, Policy
 from mjx_study.runtime import configure
 from mjx_study.scene import Scene, SceneError, load_scene, put_scene
 from mjx_study.study import compare, plan_compare
-from mjx_study.task import Task
+from mjx_study.study_plots import plot_study
+from mjx_study.sweep import SweepConfig, load_study, plan_sweep, run_sweep
+from mjx_study.task import Recipe, Task
 from mjx_study.tasks import TASKS, make_task
 
 __all__ = [
-    "FAMILIES",
-    "TASKS",
     "CompareConfig",
     "CompareResult",
     "ContactModel",
     "ContactWarning",
-    "MjxObjective",
+    "FAMILIES",
     "Launch",
     "LinearFeedback",
+    "MjxObjective",
     "OpenLoop",
     "Policy",
+    "Recipe",
     "Scene",
     "SceneError",
     "Simulator",
     "State",
+    "SweepConfig",
+    "TASKS",
     "Task",
     "apply_contact",
     "compare",
@@ -50,10 +54,14 @@ __all__ = [
     "family_model",
     "initial_state",
     "load_scene",
+    "load_study",
     "make_task",
     "plan_compare",
+    "plan_sweep",
+    "plot_study",
     "put_scene",
     "rollout",
+    "run_sweep",
     "simulate",
     "solref_from_stiffness",
     "step",

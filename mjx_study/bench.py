@@ -21,13 +21,13 @@ import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
 from mjx_study._mjx import mjx
+from mjx_study.configuration import Progress, plan_cells
 from mjx_study.contact import ContactModel, apply_contact
 from mjx_study.dynamics import State
 from mjx_study.engine import engine_model
 from mjx_study.noise import split_sample_key, standard_noise
 from mjx_study.objective import Simulator, chunk_for, simulate
 from mjx_study.runtime import environment
-from mjx_study.study import Progress, plan_cells
 from mjx_study.task import Task
 
 REPEATS: Final = 5
@@ -149,7 +149,7 @@ def bench(plan: BenchPlan, progress: Progress = lambda done, total, what: None) 
     contenders: dict[str, tuple[int, Callable[[], Any]]] = {
         "value": (samples, lambda: objective.evaluate(task.theta, keys)),
         "gradient": (samples, lambda: objective.differentiate(task.theta, keys)),
-        "rollout": (full, lambda: simulator.run_values(task.theta, cell.contact, task.sigma, key_data, noisy)),
+        "rollout": (full, lambda: simulator.run("value", task.theta, cell.contact, task.sigma, key_data, noisy)),
         "stock_value": (stock_samples, stock_value),
         "stock_gradient": (stock_samples, stock_gradient),
     }

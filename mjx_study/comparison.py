@@ -1,105 +1,48 @@
 """What a comparison is asked for, and what it answers: plain data, with every field explained."""
 
 import dataclasses
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from estimators import ESTIMATORS
-from estimators.ddcg import PUBLISHED_TOLERANCE
+from mjx_study.configuration import EstimatorConfig, check_names, refuse_repeats
 from mjx_study.contact import FAMILIES
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class CompareConfig:
-    """Everything that decides the result of a comparison.
+class CompareConfig(EstimatorConfig):
+    """Everything that decides the result of a comparison; see also `EstimatorConfig`.
 
     Attributes:
-        task: name of a task.
         stiffness: contact stiffnesses [N/m], for the families that take one; None for the task's.
         contact: names of contact families; None for the task's.
-        estimators: names of estimators.
         samples: in each batch; an alpha-order estimate uses two batches.
         reference_samples: pairs of rollouts behind each reference gradient.
-        sigma: standard deviation of the noise, in the unit of what it is added to; None for the task's.
-        seed: of all randomness.
-        baseline: of zeroth-order estimates: zero_noise, leave_one_out or none.
-        gamma: accuracy that the alpha-order estimate must keep, in the unit of the gradient; None for the task's.
-        failure_probability: of the confidence radius epsilon.
-        variance_proxy: in epsilon: variance, second_moment or upper_bound.
-        radius: R in epsilon: max_deviation, or a bound in the unit of the gradient.
         confidence: of the intervals that are reported.
-        damping: of the contact [N s/m]; None for each family's damping ratio.
-        cone: pyramidal or elliptic; None for the MJCF's.
-        horizon: steps; None for the task's.
-        model: an MJCF in place of the task's own; None for that.
-        chunk_size: samples per device and call; None to choose by the number of samples.
-        noise: name of the noise's density; None for the task's.
-        max_norm: of a sample of the clipped first-order estimate, in the unit of the gradient.
-        window: steps between cuts of the truncated first-order estimate.
-        tolerance: of the discontinuity test of "ddcg".
     """
 
-    task: str
     stiffness: tuple[float, ...] | None = None
     contact: tuple[str, ...] | None = None
-    estimators: tuple[str, ...] = ("zobg", "fobg", "aobg")
     samples: int = 400
     reference_samples: int = 600
-    sigma: float | None = None
-    seed: int = 0
-    baseline: str = "zero_noise"
-    gamma: float | None = None
-    failure_probability: float = 0.05
-    variance_proxy: str = "variance"
-    radius: str | float = "max_deviation"
     confidence: float = 0.95
-    damping: float | None = None
-    cone: str | None = None
-    horizon: int | None = None
-    model: str | None = None
-    chunk_size: int | None = None
-    noise: str | None = None
-    max_norm: float | None = None
-    window: int | None = None
-    tolerance: float = PUBLISHED_TOLERANCE
 
     def __post_init__(self) -> None:
-        for label, names, choices in (
-            ("contact family", self.contact, FAMILIES),
-            ("estimator", self.estimators, ESTIMATORS),
-        ):
-            if names is None:
-                continue
-            if not names:
-                raise ValueError(f"no {label} given; choose from {', '.join(choices)}")
-            _refuse_repeats(label, names)
-            for name in names:
-                if name not in choices:
-                    raise ValueError(f"unknown {label} {name!r}; choose from {', '.join(choices)}")
+        if self.contact is not None:
+            check_names("contact family", self.contact, FAMILIES)
+        super().__post_init__()
         if self.stiffness is not None:
             if not self.stiffness:
                 raise ValueError("no stiffness given: give at least one, in N/m")
-            _refuse_repeats("stiffness", self.stiffness)
+            refuse_repeats("stiffness", self.stiffness)
             if self.contact is not None and not any(FAMILIES[name].swept for name in self.contact):
                 raise ValueError(f"contact {', '.join(self.contact)} takes no stiffness; leave --stiffness out")
         for label, count, least in (("samples", self.samples, 3), ("reference_samples", self.reference_samples, 3)):
             if count < least:
                 raise ValueError(f"{label} must be at least {least}, so that a variance has an interval; got {count}")
-        if self.chunk_size is not None and self.chunk_size < 1:
-            raise ValueError(f"chunk_size must be at least 1 sample, got {self.chunk_size}")
         if not 0 < self.confidence < 1:
             raise ValueError(f"confidence must lie strictly between 0 and 1, got {self.confidence}")
-        if self.seed < 0:
-            raise ValueError(f"seed must not be negative, got {self.seed}")
-
-
-def _refuse_repeats(label: str, values: Sequence[object]) -> None:
-    repeated = {str(value) for value in values if values.count(value) > 1}
-    if repeated:
-        raise ValueError(f"{label} given twice: {', '.join(sorted(repeated))}")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -23,12 +23,12 @@ import numpy as np
 from jaxtyping import Array, Float, Key
 
 from estimators import GradientEstimate, Objective, first_order, zeroth_order
+from mjx_study.configuration import Cell, Progress, plan_cells
 from mjx_study.contact import ContactModel
 from mjx_study.objective import Simulator, chunk_for
 from mjx_study.quadrature import Line, Means, grid, means
 from mjx_study.reference import FunctionObjective, Reference, ScalarFunction, smoothed
 from mjx_study.runtime import environment
-from mjx_study.study import Cell, Progress, plan_cells
 from mjx_study.task import Task
 
 SPAN_SIGMAS: Final = 10.0
@@ -199,7 +199,7 @@ def plan_landscape(config: LandscapeConfig, task: Task) -> LandscapePlan:
         ValueError: a direction, family, stiffness or noise that cannot be used.
     """
     task = task if config.sigma is None else task.replace(sigma=config.sigma)
-    stiffness = config.stiffness or (task.stiffnesses[len(task.stiffnesses) // 2],)
+    stiffness = config.stiffness or (task.middle_stiffness,)
     cells, messages = plan_cells(task, config.contact, stiffness, config.damping)
     if not cells:
         raise ValueError("no contact model: give at least one contact family")

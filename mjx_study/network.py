@@ -1,7 +1,6 @@
 """A neural network as policy: any task with controls can have one in place of its own."""
 
 import dataclasses
-from collections.abc import Callable
 from itertools import pairwise
 
 import jax
@@ -9,12 +8,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
 from mjx_study.dynamics import State
-from mjx_study.policy import LinearFeedback
+from mjx_study.policy import Feedback, LinearFeedback
 from mjx_study.task import Task
 
 
 @dataclasses.dataclass(frozen=True)
-class Network:
+class Network(Feedback):
     """u_h = net(phi(x_h)) + w_h with tanh layers and a linear last one; theta is all weights and biases, flattened.
 
     Attributes:
@@ -25,13 +24,7 @@ class Network:
         hidden: width of each hidden layer.
     """
 
-    horizon: int
-    controls: int
-    num_features: int
-    features: Callable[[State], Float[Array, " features"]]
     hidden: tuple[int, ...]
-    additive: bool = dataclasses.field(default=False, init=False)
-    at_start: bool = dataclasses.field(default=False, init=False)
 
     def __post_init__(self) -> None:
         if not self.hidden or min(self.hidden) < 1:
@@ -47,11 +40,6 @@ class Network:
         """Weights and biases of all layers."""
         return sum((inputs + 1) * outputs for inputs, outputs in self.shapes)
 
-    @property
-    def noise_shape(self) -> tuple[int, int]:
-        """(H, m)."""
-        return self.horizon, self.controls
-
     def initial(self, key: Key[Array, ""], dtype) -> Float[Array, " params"]:
         """Normal weights of variance 1 / inputs; biases and the last layer 0, so that it starts without control."""
         parts = []
@@ -62,16 +50,6 @@ class Network:
             weights = scale * jax.random.normal(drawn, (inputs, outputs), dtype)
             parts += [weights.reshape(-1), jnp.zeros(outputs, dtype)]
         return jnp.concatenate(parts)
-
-    def place(self, theta: Float[Array, " params"], noise: Float[Array, "steps dimensions"], start: State) -> State:
-        """The start as it is."""
-        return start
-
-    def feedforward(
-        self, theta: Float[Array, " params"], noise: Float[Array, "steps dimensions"]
-    ) -> Float[Array, "horizon nu"]:
-        """The noise."""
-        return noise
 
     def feedback(self, theta: Float[Array, " params"], state: State) -> Float[Array, " nu"]:
         """net(phi(x))."""

@@ -275,15 +275,6 @@ class Simulator:
         host = jax.device_get(outputs)
         return jax.tree.map(lambda *leaves: np.concatenate(leaves)[:samples], *host)
 
-    def run_values(self, theta, contact, sigma, key_data, noise_scale):
-        """Values, scores and residuals of samples, each with its key's data and a factor on its noise; NumPy arrays."""
-        return self.run("value", theta, contact, sigma, key_data, noise_scale)
-
-    def run_gradients(self, theta, contact, sigma, key_data):
-        """Values, gradients and residuals of samples, each with its key's data; NumPy arrays."""
-        scale = np.ones(len(key_data), self.task.scene.template.qpos.dtype)
-        return self.run("gradient", theta, contact, sigma, key_data, scale)
-
 
 @dataclasses.dataclass(frozen=True)
 class MjxObjective:

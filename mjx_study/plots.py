@@ -100,7 +100,7 @@ def plot_landscape(result: Landscape) -> Figure:
         below.set_xlabel("theta" if len(result.direction) == 1 else f"t along direction {result.config.direction}")
         for panel in (above, below):
             panel.grid(alpha=0.25)
-    low, high = _robust_limits([array for curve in result.curves for array in (curve.zeroth, curve.first)])
+    low, high = robust_limits([array for curve in result.curves for array in (curve.zeroth, curve.first)])
     axes[1, 0].set_ylim(low, high)
     axes[0, 0].set_ylabel("cost")
     axes[1, 0].set_ylabel("slope")
@@ -131,7 +131,7 @@ def plot_optimisation(result: OptimiseResult) -> Figure:
         panel.set_xlabel(label)
         panel.grid(alpha=0.25)
         values = np.concatenate([run.history["cost"].ravel() for run in result.runs])
-        low, high = _robust_limits([values])
+        low, high = robust_limits([values])
         panel.set_ylim(low, high)
     axes[0].set_ylabel("mean cost of the batch")
     if weighed:
@@ -176,7 +176,7 @@ def _mean_with_band(axes: Axes, x, mean, error, color: str, label: str) -> None:
     axes.fill_between(x, mean - 1.96 * error, mean + 1.96 * error, color=color, alpha=0.2, linewidth=0)
 
 
-def _robust_limits(curves: Sequence[np.ndarray]) -> tuple[float, float]:
+def robust_limits(curves: Sequence[np.ndarray]) -> tuple[float, float]:
     """Limits that hold all but the wildest hundredth of the values."""
     values = np.concatenate(curves)
     values = values[np.isfinite(values)]
@@ -198,7 +198,7 @@ def _variance_panel(axes: Axes, rows: Sequence[Row], estimators: Sequence[str]) 
         label, colour, marker = STYLE[name]
         mine = [row for row in rows if row.estimator == name]
         x, y, lower, upper = _columns(mine, "stiffness", "variance", "variance_lower", "variance_upper")
-        _line_with_band(axes, x, y, lower, upper, label=label, color=colour, marker=marker)
+        line_with_band(axes, x, y, lower, upper, label=label, color=colour, marker=marker)
     axes.set_xscale("log")
     axes.set_yscale("log")
     axes.grid(alpha=0.25)
@@ -209,7 +209,7 @@ def _error_panel(axes: Axes, rows: Sequence[Row], estimators: Sequence[str]) -> 
         _, colour, marker = STYLE[name]
         mine = [row for row in rows if row.estimator == name]
         x, y, error = _columns(mine, "stiffness", "relative_error", "relative_error_se")
-        _line_with_band(axes, x, y, np.maximum(y - 1.96 * error, y / 10), y + 1.96 * error, color=colour, marker=marker)
+        line_with_band(axes, x, y, np.maximum(y - 1.96 * error, y / 10), y + 1.96 * error, color=colour, marker=marker)
     reference = [row for row in rows if row.estimator == estimators[0]]
     x, floor = _columns(reference, "stiffness", "reference_uncertainty")
     axes.plot(x, floor, color="0.4", linestyle=":", marker="_", label="uncertainty of the reference")
@@ -218,7 +218,7 @@ def _error_panel(axes: Axes, rows: Sequence[Row], estimators: Sequence[str]) -> 
     axes.grid(alpha=0.25)
 
 
-def _line_with_band(axes: Axes, x, y, lower, upper, *, color: str, marker: str, label: str | None = None) -> None:
+def line_with_band(axes: Axes, x, y, lower, upper, *, color: str, marker: str, label: str | None = None) -> None:
     axes.plot(x, y, color=color, marker=marker, markersize=4.5, label=label)
     if len(x) > 1:
         axes.fill_between(x, lower, upper, color=color, alpha=0.2, linewidth=0)

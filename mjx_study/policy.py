@@ -107,8 +107,8 @@ class OpenLoop:
 
 
 @dataclasses.dataclass(frozen=True)
-class LinearFeedback:
-    """u_h = Theta phi(x_h) + w_h: theta is Theta (controls, features), flattened.
+class Feedback:
+    """Base of the policies u_h = pi(phi(x_h), theta) + w_h.
 
     Attributes:
         horizon: number of steps H.
@@ -125,11 +125,6 @@ class LinearFeedback:
     at_start: bool = dataclasses.field(default=False, init=False)
 
     @property
-    def num_params(self) -> int:
-        """m times the number of features."""
-        return self.controls * self.num_features
-
-    @property
     def noise_shape(self) -> tuple[int, int]:
         """(H, m)."""
         return self.horizon, self.controls
@@ -143,6 +138,23 @@ class LinearFeedback:
     ) -> Float[Array, "horizon nu"]:
         """The noise."""
         return noise
+
+
+@dataclasses.dataclass(frozen=True)
+class LinearFeedback(Feedback):
+    """u_h = Theta phi(x_h) + w_h: theta is Theta (controls, features), flattened.
+
+    Attributes:
+        horizon: number of steps H.
+        controls: number of controls m.
+        num_features: length of phi.
+        features: phi, the state as the policy sees it.
+    """
+
+    @property
+    def num_params(self) -> int:
+        """m times the number of features."""
+        return self.controls * self.num_features
 
     def feedback(self, theta: Float[Array, " params"], state: State) -> Float[Array, " nu"]:
         """Theta phi(x)."""

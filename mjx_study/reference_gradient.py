@@ -14,7 +14,7 @@ from collections.abc import Sequence
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from estimators import Evaluation, GradientEstimate, delta_control_variate, summarise, zeroth_order
+from estimators import Evaluation, GradientEstimate, delta_control_variate
 
 
 def reference_gradient(
@@ -40,15 +40,3 @@ def reference_gradient(
         best = jnp.where(gain > explained, jnp.where(usable, slope * candidate, 0.0), best)
         explained = jnp.maximum(explained, gain)
     return delta_control_variate(odd, best, sigma)
-
-
-def antithetic_gradient(plus: Evaluation, minus: Evaluation) -> GradientEstimate:
-    """An unbiased estimate of grad F for a policy with feedback: the mean over noises of opposite sign.
-
-    Each rollout has its own score there, so no linear control variate has a known mean.
-
-    Args:
-        plus, minus: evaluations with opposite noises, sample by sample, with zero-noise baselines.
-    """
-    pairs = [zeroth_order(batch, "zero_noise").per_sample for batch in (plus, minus)]
-    return summarise((pairs[0] + pairs[1]) / 2)

@@ -62,11 +62,13 @@ def save(result: CompareResult, folder: Path) -> list[Path]:
 
 
 def write_whole(path: Path, write: Callable[[IO[bytes]], Any]) -> Path:
-    """Write a file beside its place and move it there, so that it is never seen half written."""
+    """Write a file beside its place and move it there, so that it is never half there, after a loss of power either."""
     handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     try:
         with os.fdopen(handle, "wb") as file:
             write(file)
+            file.flush()
+            os.fsync(file.fileno())
         os.chmod(temporary, 0o644)
         os.replace(temporary, path)
     except BaseException:

@@ -8,7 +8,6 @@ two. The same keys are used in every cell, so differences between contact models
 import dataclasses
 import math
 import time
-import warnings
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -22,34 +21,24 @@ from jaxtyping import Array, Float, Key
 import estimators
 from estimators import ESTIMATORS, ORACLES, EstimatorOptions, Evaluation, GradientEstimate, Linearisation
 from mjx_study.comparison import CompareConfig, CompareResult, Row
-from mjx_study.contact import FAMILIES, ContactModel, ContactWarning, family_model, stiffness_from_solref
-from mjx_study.objective import MjxObjective, Simulator, chunk_for
-from mjx_study.reference_gradient import antithetic_gradient, reference_gradient
+from mjx_study.configuration import (
+    Cell,
+    Progress,
+    configured_options,
+    configured_task,
+    plan_cells,
+    resolved_fields,
+)
+from mjx_study.contact import FAMILIES
+from mjx_study.objective import MjxObjective, Simulator
+from mjx_study.reference_gradient import reference_gradient
 from mjx_study.runtime import environment
 from mjx_study.task import Task
-from mjx_study.tasks import make_task
 
 UNCONVERGED: Final = {"float64": 1e-6, "float32": 1e-3}
 """Relative solver residual above which a sample is reported as unconverged."""
 BIAS_DRAWS: Final = 999
 """Draws of the test for bias; its least p-value is 0.001."""
-GAUSSIAN_ONLY: Final = ("ddcg", "delta")
-ADDITIVE_ONLY: Final = ("delta",)
-"""Estimators whose formula needs Gaussian noise, or noise that is added to theta."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Cell:
-    """One contact model of a comparison."""
-
-    family: str
-    stiffness: float
-    contact: ContactModel | None
-
-    @property
-    def label(self) -> str:
-        """As messages name it."""
-        return f"{self.family}, K = {self.stiffness:g} N/m" if self.stiffness else self.family
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,109 +52,24 @@ class ComparePlan:
     warnings: tuple[str, ...]
 
 
-Progress = Callable[[int, int, str], None]
-"""Called with (work done, work in all, what is being done)."""
-
-
 def plan_compare(config: CompareConfig) -> ComparePlan:
     """Check a configuration and resolve its defaults, computing nothing.
 
     Raises:
         ValueError: anything about the configuration that cannot be run; the message says what is accepted.
     """
-    scene_options: dict[str, Any] = {"cone": config.cone, "horizon": config.horizon, "model": config.model}
-    task = make_task(config.task, **{name: value for name, value in scene_options.items() if value is not None})
-    changes = {"sigma": config.sigma, "noise": config.noise}
-    task = task.replace(**{name: value for name, value in changes.items() if value is not None})
-    options = EstimatorOptions(
-        baseline=config.baseline,
-        gamma=task.gamma if config.gamma is None else config.gamma,
-        failure_probability=config.failure_probability,
-        variance_proxy=config.variance_proxy,
-        radius=config.radius,
-        sigma=task.sigma,
-        max_norm=config.max_norm,
-        window=config.window,
-        tolerance=config.tolerance,
-    )
-    check_estimators(config.estimators, task, options)
-    chunk = chunk_for(config.samples, jax.local_devices()) if config.chunk_size is None else config.chunk_size
+    task = configured_task(config)
+    options = configured_options(config, task)
     cells, messages = plan_cells(task, config.contact, config.stiffness, config.damping)
     families = tuple(dict.fromkeys(cell.family for cell in cells))
     resolved = dataclasses.replace(
         config,
         contact=families,
         stiffness=config.stiffness or (task.stiffnesses if any(FAMILIES[name].swept for name in families) else None),
-        sigma=task.sigma,
-        noise=task.noise,
-        gamma=options.gamma,
-        horizon=task.horizon,
-        chunk_size=chunk,
-        cone={0: "pyramidal", 1: "elliptic"}[int(task.scene.host.opt.cone)],
         model=None if config.model is None else str(Path(config.model)),
+        **resolved_fields(config, task, config.samples),
     )
     return ComparePlan(resolved, task, cells, options, messages)
-
-
-def check_estimators(names: Sequence[str], task: Task, options: EstimatorOptions) -> None:
-    """Refuse estimators whose formula does not hold for a task, or that lack an option.
-
-    Raises:
-        ValueError: an option is not set; the noise is not Gaussian, or not on theta, where the formula needs it.
-    """
-    for name in names:
-        ESTIMATORS[name].check(options)
-        if name in GAUSSIAN_ONLY and task.noise != "gaussian":
-            raise ValueError(f"{name!r} holds for Gaussian noise only; the noise is {task.noise}")
-        if name in ADDITIVE_ONLY and not task.policy.additive:
-            raise ValueError(f"{name!r} needs noise that is added to theta itself; {task.name} has a feedback policy")
-
-
-def plan_cells(
-    task: Task,
-    families: Sequence[str] | None = None,
-    stiffnesses: Sequence[float] | None = None,
-    damping: float | None = None,
-) -> tuple[tuple[Cell, ...], tuple[str, ...]]:
-    """The contact models of a sweep, family by family, and what there is to warn about.
-
-    Args:
-        task: gives what is None, and the effective mass.
-        families: names of contact families.
-        stiffnesses: for families that take one [N/m].
-        damping: in place of each family's [N s/m].
-
-    Raises:
-        ValueError: a family is unknown, or a stiffness or damping is out of range.
-    """
-    cells, messages = [], []
-    for family in task.families if families is None else families:
-        swept = family not in FAMILIES or FAMILIES[family].swept
-        undamped = swept and family in FAMILIES and FAMILIES[family].dampratio == 0
-        own = damping if damping is not None else task.damping if undamped else None
-        for stiffness in (task.stiffnesses if stiffnesses is None else stiffnesses) if swept else (None,):
-            with warnings.catch_warnings(record=True) as caught:
-                warnings.simplefilter("always", ContactWarning)
-                contact = None if family == "mjcf" else _contact(task, family, stiffness, own if swept else None)
-            cell = Cell(family, stiffness or _stiffness(task, contact), contact)
-            cells.append(cell)
-            messages += [f"{cell.label}: {warning.message}" for warning in caught]
-    return tuple(cells), tuple(messages)
-
-
-def _contact(task: Task, family: str, stiffness: float | None, damping: float | None) -> ContactModel:
-    return family_model(family, task.scene, stiffness=stiffness, damping=damping, effective_mass=task.effective_mass)
-
-
-def _stiffness(task: Task, contact: ContactModel | None) -> float:
-    """Spring K [N/m] of a contact model that was not made from one; 0 where there is no contact."""
-    if task.contact_pair is None:
-        return 0.0
-    if contact is None:
-        solref = task.scene.host.geom_solref[task.scene.geom(task.contact_pair[0])]
-    else:
-        solref = np.asarray(contact.solref)
-    return stiffness_from_solref(solref.tolist(), effective_mass=task.effective_mass)[0]
 
 
 def compare(plan: ComparePlan, progress: Progress = lambda done, total, what: None) -> CompareResult:
@@ -192,7 +96,7 @@ def compare(plan: ComparePlan, progress: Progress = lambda done, total, what: No
             method = getattr(objective, ORACLES[name].method)
             drawn = jax.random.clone((keys.zeroth, keys.first)[ORACLES[name].order])  # shared on purpose
             batches[name], seconds[name] = _timed(method, task.theta, drawn)
-        reference = _reference(objective, keys, batches["evaluation"], candidates)
+        reference = reference_of(objective, keys.odd, keys.candidate, batches["evaluation"], candidates)
         summary = _summarise(batches, reference, keys.test, config.estimators, plan.options, config.confidence)
         for name, numbers, gradient in summary:
             rows.append(_row(cell, name, config.samples, numbers, seconds, batches))
@@ -228,22 +132,35 @@ def _timed(method: Callable[..., Any], *arguments: Any) -> tuple[Any, float]:
     return result, time.perf_counter() - start
 
 
-def _reference(
-    objective: MjxObjective, keys: _Keys, pilot: Evaluation, candidates: list[Float[Array, " params"]]
+def reference_of(
+    objective: MjxObjective,
+    odd_keys: Key[Array, " pairs"],
+    candidate_keys: Key[Array, " samples"],
+    pilot: Evaluation,
+    candidates: list[Float[Array, " params"]],
 ) -> GradientEstimate:
-    """The reference gradient of a cell; adds this cell's control variate to the candidates of those to come."""
-    theta = objective.simulator.task.theta
+    """The reference gradient of a contact model.
+
+    Args:
+        objective: the task under that contact model.
+        odd_keys: of the pairs of rollouts.
+        candidate_keys: of the first-order samples whose median is a candidate for the control variate.
+        pilot: a batch from other keys, which picks among the candidates.
+        candidates: those of other contact models; this one's is added.
+    """
     task = objective.simulator.task
+    theta = task.theta
     if not task.policy.additive or task.noise != "gaussian":
-        return _antithetic_gradient(*objective.evaluate_pair(theta, keys.odd))
-    gradients = objective.differentiate(theta, keys.candidate).gradient
+        plus, minus = objective.evaluate_pair(theta, odd_keys)
+        return _antithetic(plus, minus, "zero_noise")
+    gradients = objective.differentiate(theta, candidate_keys).gradient
     candidates.append(jnp.median(gradients, axis=0))
     newest = jnp.stack((candidates[-1:] + candidates[-2::-1])[:8])
     padded = jnp.concatenate([newest, jnp.zeros((8 - len(newest), len(theta)), newest.dtype)])
-    return _reference_gradient(objective.evaluate_odd(theta, keys.odd), pilot, padded, objective.sigma)
+    return _reference_gradient(objective.evaluate_odd(theta, odd_keys), pilot, padded, objective.sigma)
 
 
-_antithetic_gradient = jax.jit(antithetic_gradient)
+_antithetic = jax.jit(estimators.antithetic, static_argnames="baseline")
 
 
 @partial(jax.jit, static_argnames="sigma")
@@ -261,13 +178,13 @@ def _summarise(
     options: EstimatorOptions,
     confidence: float,
 ) -> list[tuple[str, dict[str, Any], np.ndarray]]:
-    numbers = jax.device_get(_numbers(batches, reference, jax.random.clone(key), names, options, confidence))
+    numbers = jax.device_get(estimate_numbers(batches, reference, jax.random.clone(key), names, options, confidence))
     return [(name, values, values.pop("gradient")) for name, values in zip(names, numbers, strict=True)]
 
 
 @partial(jax.jit, static_argnames=("names", "options", "confidence"))
-def _numbers(batches, reference, key, names, options, confidence):
-    """The numbers of each row that are functions of the batches alone."""
+def estimate_numbers(batches, reference, key, names, options, confidence):
+    """The numbers of each estimator's row that are functions of the batches and the reference gradient alone."""
     result = []
     for name in names:
         estimate = estimators.combine(name, batches, options)
@@ -312,7 +229,7 @@ def _row(
 ) -> Row:
     needs = ESTIMATORS[name].needs
     seconds = sum(batch_seconds[oracle] for oracle in needs)
-    residuals = np.concatenate([_residuals(batches[oracle]) for oracle in needs])
+    residuals = np.concatenate([residuals_of(batches[oracle]) for oracle in needs])
     threshold = UNCONVERGED[str(residuals.dtype)]
     nonfinite = int(numbers.pop("nonfinite"))
     return Row(
@@ -331,7 +248,7 @@ def _row(
     )
 
 
-def _residuals(batch: Any) -> Float[np.ndarray, " rollouts"]:
+def residuals_of(batch: Any) -> Float[np.ndarray, " rollouts"]:
     """The solver's residual of every rollout of a batch, whatever its kind."""
     parts = batch if isinstance(batch, tuple) else (batch,)
     steps = [part.steps if isinstance(part, Linearisation) else part for part in parts]

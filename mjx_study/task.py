@@ -1,6 +1,7 @@
 """A task: a scene, where it starts, a policy, its noise, and a cost."""
 
 import dataclasses
+import math
 from collections.abc import Callable
 from typing import Final
 
@@ -35,7 +36,17 @@ class Recipe:
     decay: float = 0.0
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+def no_running_cost(state: State, control: Float[Array, " nu"]) -> Float[Array, ""]:
+    """0: the steps cost nothing."""
+    return jax.numpy.zeros((), state.qpos.dtype)
+
+
+def no_final_cost(state: State) -> Float[Array, ""]:
+    """0: the last state costs nothing."""
+    return jax.numpy.zeros((), state.qpos.dtype)
+
+
+@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class Task:
     """Everything that defines F(theta) = E V_1 except the contact model.
 
@@ -48,10 +59,11 @@ class Task:
         theta: where gradients are taken unless told otherwise, (params,).
         sigma: standard deviation of the noise, in the unit of what it is added to.
         start: the start state, or a distribution over start states as a function of a key.
-        running_cost: c(state, control) of each step before it is taken.
-        final_cost: c(state) after the last step.
+        running_cost: c(state, control) of each step before it is taken; none by default, where there is a final one.
+        final_cost: c(state) after the last step; none by default, where there is a running one.
         contact_pair: names of the two geoms whose contact is swept; None where there is no contact.
-        gamma: AoBG's accuracy bound, in the unit of the gradient.
+        gamma: AoBG's accuracy bound, in the unit of the gradient; infinite by default, which is inverse-variance
+            weighting.
         reference: the analytic system in place of the penalty family, as a function of the stiffness [N/m]; None where
             there is none.
         damping: of the contact in families without a damping ratio of their own [N s/m], or None; friction needs some,
@@ -61,20 +73,22 @@ class Task:
         span: range of a decision of one number that a landscape shows; None for a range about theta.
         noise: name of the noise's density in `estimators.NOISES`.
         recipe: how it is optimised unless told otherwise; None where every number has to be given.
+        outcomes: what a rollout came to, by name, from its states with the start first; what is reported of a policy
+            beside its cost. None where the cost says it all.
     """
 
     name: str
-    description: str
+    description: str = ""
     scene: Scene
     horizon: int
     policy: Policy
     theta: Float[Array, " params"]
     sigma: float
     start: State | Callable[[Key[Array, ""]], State]
-    running_cost: Callable[[State, Float[Array, " nu"]], Float[Array, ""]]
-    final_cost: Callable[[State], Float[Array, ""]]
+    running_cost: Callable[[State, Float[Array, " nu"]], Float[Array, ""]] = no_running_cost
+    final_cost: Callable[[State], Float[Array, ""]] = no_final_cost
     contact_pair: tuple[str, str] | None
-    gamma: float
+    gamma: float = math.inf
     reference: Callable[[float], Reference] | None = None
     damping: float | None = None
     stiffnesses: tuple[float, ...] = STIFFNESSES
@@ -82,12 +96,15 @@ class Task:
     span: tuple[float, float] | None = None
     noise: str = "gaussian"
     recipe: Recipe | None = None
+    outcomes: Callable[[State], dict[str, Float[Array, ""]]] | None = None
 
     def __post_init__(self) -> None:
         if self.horizon < 1:
             raise ValueError(f"horizon must be at least 1 step, got {self.horizon}")
         check_sigma(self.sigma)
         check_density(self.noise)
+        if self.running_cost is no_running_cost and self.final_cost is no_final_cost:
+            raise ValueError("a task needs a running_cost, a final_cost, or both")
         if self.theta.shape != (self.policy.num_params,):
             raise ValueError(f"theta has shape {self.theta.shape}, the policy needs ({self.policy.num_params},)")
 
@@ -95,6 +112,16 @@ class Task:
     def random_start(self) -> bool:
         """Whether the start is drawn per sample."""
         return not isinstance(self.start, State)
+
+    @property
+    def main_family(self) -> str:
+        """The contact family of a single run unless told otherwise: MuJoCo's impedance where the task sweeps it."""
+        return "mujoco" if "mujoco" in self.families else self.families[0]
+
+    @property
+    def middle_stiffness(self) -> float:
+        """The stiffness of a single run unless told otherwise, the middle one of the sweep [N/m]."""
+        return self.stiffnesses[len(self.stiffnesses) // 2]
 
     @property
     def effective_mass(self) -> float:

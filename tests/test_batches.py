@@ -11,8 +11,8 @@ import pytest
 import estimators
 from estimators import ESTIMATORS, EstimatorOptions, pull_back, truncated_first_order
 from mjx_study import dynamics
+from mjx_study.configuration import check_estimators, plan_cells
 from mjx_study.objective import Simulator, simulate
-from mjx_study.study import check_estimators, plan_cells
 from mjx_study.task import Task
 from mjx_study.tasks import make_task
 

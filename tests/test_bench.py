@@ -9,9 +9,9 @@ import pytest
 
 from mjx_study import bench, cli
 from mjx_study.cli import options
+from mjx_study.configuration import plan_cells
 from mjx_study.engine import engine_model
 from mjx_study.objective import Simulator
-from mjx_study.study import plan_cells
 from mjx_study.tasks import make_task
 
 

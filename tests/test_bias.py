@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from mjx_study.configuration import plan_cells
 from mjx_study.quadrature import Line, Means, grid, means
-from mjx_study.study import plan_cells
 from mjx_study.tasks import make_task
 
 

@@ -189,7 +189,7 @@ def test_tasks(capsys: pytest.CaptureFixture[str]) -> None:
         (["compare", "pusher", "--estimators", "zobg,zobg"], "estimator given twice: zobg"),
         (["compare", "pusher", "--damping", "-1"], "damping must be >= 0"),
         (["compare", "pusher", "--gamma", "0"], "gamma must be positive"),
-        (["compare", "pusher", "--gamma", "big"], "neither a number nor inf"),
+        (["compare", "pusher", "--gamma", "big"], "argument --gamma: invalid float value: 'big'"),
         (["compare", "pusher", "--radius", "huge"], "radius"),
         (["compare", "pusher", "--variance-proxy", "range"], "variance_proxy"),
         (["compare", "pusher", "--failure-probability", "2"], "failure_probability"),

@@ -15,11 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from mjx_study.configuration import plan_cells
 from mjx_study.contact import ContactModel, ContactWarning
 from mjx_study.noise import split_sample_key
 from mjx_study.objective import simulate
 from mjx_study.reference import BallWall, MomentumTransfer, SlidingBox, Tennis, draw_start, roll_out
-from mjx_study.study import plan_cells
 from mjx_study.task import Task
 from mjx_study.tasks import make_task
 

@@ -1,6 +1,7 @@
 """What the README shows works as it stands there."""
 
 import re
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -33,14 +34,14 @@ def test_the_python_example_runs(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_every_command_parses(page: Path) -> None:
-    commands = [line.split("#")[0].split() for line in "".join(blocks("sh", page.read_text())).splitlines()]
+    commands = [shlex.split(line, comments=True) for line in "".join(blocks("sh", page.read_text())).splitlines()]
     ours = [command[1:] for command in commands if command[:1] == ["mjx-study"]]
-    assert len(ours) >= 1 or page.name == "gradient-faults.md"  # whose blocks are Python
+    assert len(ours) >= 1 or page.name in ("concepts.md", "gradient-faults.md")  # prose; Python
     for arguments in ours:
         options = cli.parser().parse_args(arguments)
         assert callable(options.run)
         task = getattr(options, "task", "pusher")
-        assert task in TASKS or task in ("TASK", "my_model.xml"), task
+        assert task in TASKS or task in ("TASK", "my_model.xml") or ":" in task, task
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)

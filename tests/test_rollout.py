@@ -13,9 +13,9 @@ from PIL import Image, ImageSequence
 
 from mjx_study.cli import options as shared
 from mjx_study.cli import rollout
+from mjx_study.configuration import plan_cells
 from mjx_study.objective import Simulator
 from mjx_study.render import RenderError
-from mjx_study.study import plan_cells
 from mjx_study.tasks import make_task
 
 SHORT = ["pusher", "--horizon", "10", "--renderer", "drawing"]

@@ -9,7 +9,19 @@ import sys
 from collections.abc import Sequence
 from importlib import metadata
 
-from mjx_study.cli import bench, compare, estimators, gradcheck, landscape, optimise, rollout, tasks
+from mjx_study.cli import (
+    bench,
+    compare,
+    estimators,
+    gradcheck,
+    landscape,
+    optimise,
+    plot,
+    report,
+    rollout,
+    sweep,
+    tasks,
+)
 from mjx_study.cli.options import INTERRUPTED, Parser, UsageError
 
 EXAMPLES = """\
@@ -17,12 +29,13 @@ start here:
   mjx-study compare pusher                       which estimator, at which contact stiffness? 20 s once compiled
   mjx-study compare pusher --output out          the same, with a figure and the numbers on disk
   mjx-study optimise pusher --output out         and what does each achieve as gradient descent goes on?
+  mjx-study sweep pusher --output out            both over many contact models; resumable; then plot out, report out
   mjx-study landscape ball_wall --output out     the cost, the cost with noise, and the slopes that estimators see
   mjx-study rollout tennis                       pictures and a film of a task
   mjx-study gradcheck pusher                     are the derivatives right? exit code 1 if not
   mjx-study bench pusher                         what does a gradient cost on this machine?
 """
-COMMANDS = (compare, optimise, landscape, rollout, gradcheck, bench, tasks, estimators)
+COMMANDS = (compare, optimise, sweep, plot, report, landscape, rollout, gradcheck, bench, tasks, estimators)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -5,10 +5,11 @@ import json
 import sys
 from pathlib import Path
 
-from estimators import BASELINES, ESTIMATORS, NOISES
+from estimators import ESTIMATORS
 from mjx_study.cli.options import (
     Commands,
     add_command,
+    add_estimator_options,
     add_task_options,
     computing,
     configure_process,
@@ -63,25 +64,7 @@ def add(commands: Commands) -> None:
     command.add_argument(
         "--reference-samples", type=int, metavar="N", help="pairs of rollouts behind each reference (default: 600)"
     )
-    command.add_argument("--noise", choices=list(NOISES), help="density of the noise (default: gaussian)")
-    command.add_argument("--baseline", choices=list(BASELINES), help="of zeroth-order samples (default: zero_noise)")
-    command.add_argument(
-        "--gamma", type=_gamma, metavar="G", help="AoBG's accuracy bound; inf for none (default: the task's)"
-    )
-    command.add_argument(
-        "--failure-probability", type=float, metavar="P", help="that epsilon's interval misses (default: 0.05)"
-    )
-    command.add_argument(
-        "--variance-proxy",
-        metavar="S2",
-        help="variance, second_moment or upper_bound, in epsilon (default: variance)",
-    )
-    command.add_argument(
-        "--radius", type=_radius, metavar="R", help="max_deviation or a number, in epsilon (default: max_deviation)"
-    )
-    command.add_argument("--max-norm", type=float, metavar="G", help="of a sample of fobg_clipped")
-    command.add_argument("--window", type=int, metavar="H", help="steps between cuts of fobg_truncated")
-    command.add_argument("--tolerance", type=float, metavar="C", help="of ddcg's test (default: 0.3)")
+    add_estimator_options(command)
     command.add_argument("--confidence", type=float, metavar="P", help="of the reported intervals (default: 0.95)")
     command.add_argument(
         "--chunk-size", type=int, metavar="N", help="samples per device and call (default: by --samples)"
@@ -113,17 +96,3 @@ def run(options: argparse.Namespace) -> int:
         else:
             print("add --output DIR for a figure and the numbers on disk")
     return 0
-
-
-def _gamma(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is neither a number nor inf") from None
-
-
-def _radius(text: str) -> float | str:
-    try:
-        return float(text)
-    except ValueError:
-        return text

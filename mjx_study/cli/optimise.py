@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from estimators import BASELINES, NOISES
 from mjx_study.cli.options import (
     Commands,
     add_command,
+    add_estimator_options,
     add_task_options,
     computing,
     configure_process,
@@ -21,7 +21,7 @@ from mjx_study.cli.options import (
 )
 from mjx_study.console import number
 from mjx_study.contact import FAMILIES
-from mjx_study.optimise import OptimiseConfig, OptimiseResult, Run, load_checkpoint, optimise, plan_optimise
+from mjx_study.optimise import OptimiseConfig, OptimiseResult, Run, kept_runs, optimise, plan_optimise
 from mjx_study.plots import STYLE, plot_optimisation, save_figure
 from mjx_study.results import as_plain, prepare_folder, write_whole
 from mjx_study.table import format_table
@@ -44,6 +44,7 @@ examples:
 columns of the table:
   cost        mean cost with noise of the final policy over --evaluation-samples rollouts, the same for all, and its
               standard deviation over seeds
+  hit, ...    what a task counts beside its cost, the mean over the same rollouts
   alpha       mean weight of first-order gradients in the last tenth of the iterations
   rollouts    simulated per seed, those that were differentiated and baselines included
 """
@@ -79,15 +80,7 @@ def add(commands: Commands) -> None:
     command.add_argument("--optimizer", metavar="NAME", help="of optax (default: sgd)")
     command.add_argument("--learning-rate", type=float, metavar="R", help="default: the task's")
     command.add_argument("--decay", type=float, metavar="A", help="learning rate / i^A (default: the task's)")
-    command.add_argument("--noise", choices=list(NOISES), help="density of the noise (default: gaussian)")
-    command.add_argument("--baseline", choices=list(BASELINES), help="of zeroth-order samples (default: zero_noise)")
-    command.add_argument("--gamma", type=float, metavar="G", help="AoBG's accuracy bound (default: the task's)")
-    command.add_argument("--failure-probability", type=float, metavar="P", help="of epsilon (default: 0.05)")
-    command.add_argument("--variance-proxy", metavar="S2", help="in epsilon (default: variance)")
-    command.add_argument("--radius", type=_radius, metavar="R", help="in epsilon (default: max_deviation)")
-    command.add_argument("--max-norm", type=float, metavar="G", help="of a sample of fobg_clipped")
-    command.add_argument("--window", type=int, metavar="H", help="steps between cuts of fobg_truncated")
-    command.add_argument("--tolerance", type=float, metavar="C", help="of ddcg's test (default: 0.3)")
+    add_estimator_options(command)
     command.add_argument(
         "--evaluation-samples", type=int, metavar="N", help="rollouts behind a final cost (default: 200)"
     )
@@ -103,8 +96,7 @@ def run(options: argparse.Namespace) -> int:
         plan = plan_optimise(OptimiseConfig(**{name: value for name, value in fields.items() if value is not None}))
         folder = None if options.output is None else prepare_folder(options.output)
         if folder is not None:  # refused here, before anything is computed
-            for name in plan.config.estimators:
-                load_checkpoint(folder, name, plan.config)
+            kept_runs(folder, plan.config)
     with computing(*([] if folder is None else [RESUMABLE])) as progress:
         result = optimise(plan, folder, progress)
     document = as_document(result)
@@ -120,6 +112,7 @@ def as_document(result: OptimiseResult) -> dict[str, Any]:
             "estimator": run.estimator,
             "final_cost": run.final_cost.tolist(),
             "final_cost_se": run.final_cost_se.tolist(),
+            "outcomes": {name: values.tolist() for name, values in run.outcomes.items()},
             "best_seed": run.best,
             "stopped": [{"seed": seed, "iteration": at, "reason": why} for seed, (at, why) in run.stopped.items()],
             "rollouts_per_iteration": run.rollouts,
@@ -134,6 +127,7 @@ def as_document(result: OptimiseResult) -> dict[str, Any]:
             "config": vars(result.config),
             "environment": result.environment,
             "start_cost": result.start_cost,
+            "start_outcomes": result.start_outcomes,
             "warnings": list(result.warnings),
             "runs": runs,
         }
@@ -167,16 +161,18 @@ def _lines(result: OptimiseResult, written: list[Path]) -> list[str]:
     where = "analytic reference" if config.reference else config.contact
     if not config.reference and config.stiffness:
         where = f"{where}, K = {config.stiffness:g} N/m"
+    outcomes = "".join(f", {name} {value:.3f}" for name, value in result.start_outcomes.items())
     decay = f" / i^{config.decay:g}" if config.decay else ""
     mean, error = result.start_cost
     lines = [
         f"{config.task}: {where}; {config.optimizer}, learning rate {config.learning_rate:g}{decay}, "
         f"{config.iterations} iterations",
         f"{config.samples} samples in each batch, {config.seeds} seeds from {config.seed}, sigma {config.sigma:g}; "
-        f"cost at the start {number(mean, 4)} ± {number(error, 2)}",
+        f"cost at the start {number(mean, 4)} ± {number(error, 2)}{outcomes}",
         "",
         *format_table(
-            [_row(run) for run in result.runs], ["estimator", "cost", "best", "alpha", "rollouts", "seconds"]
+            [_row(run) for run in result.runs],
+            ["estimator", "cost", "best", *result.start_outcomes, "alpha", "rollouts", "seconds"],
         ),
     ]
     for run in result.runs:
@@ -191,17 +187,25 @@ def _lines(result: OptimiseResult, written: list[Path]) -> list[str]:
 
 def _row(run: Run) -> list[str]:
     costs = run.final_cost[np.isfinite(run.final_cost)]
-    spread = f" ± {number(float(np.std(costs, ddof=1)), 2)}" if len(costs) > 1 else ""
     tail = run.history["alpha"][-max(1, len(run.seconds) // 10) :]
     alpha = float(np.nanmean(tail)) if np.any(np.isfinite(tail)) else math.nan
     return [
         STYLE[run.estimator][0],
-        (number(float(np.mean(costs)), 4) if len(costs) else "nan") + spread,
+        _mean_and_spread(costs, 4),
         number(float(np.min(costs)), 4) if len(costs) else "nan",
+        *(_mean_and_spread(values, 3) for values in run.outcomes.values()),
         "-" if math.isnan(alpha) else f"{alpha:.3f}",
         str(run.rollouts * len(run.seconds)),
         f"{run.seconds[-1]:.1f}" if len(run.seconds) else "-",
     ]
+
+
+def _mean_and_spread(values: np.ndarray, digits: int) -> str:
+    values = values[np.isfinite(values)]
+    if len(values) == 0:
+        return "nan"
+    spread = f" ± {number(float(np.std(values, ddof=1)), 2)}" if len(values) > 1 else ""
+    return number(float(np.mean(values)), digits) + spread
 
 
 def _widths(text: str) -> tuple[int, ...]:
@@ -209,10 +213,3 @@ def _widths(text: str) -> tuple[int, ...]:
         return tuple(int(part) for part in text.split(","))
     except ValueError:
         raise argparse.ArgumentTypeError(f"{text!r} is not a list of widths such as 16,16") from None
-
-
-def _radius(text: str) -> float | str:
-    try:
-        return float(text)
-    except ValueError:
-        return text

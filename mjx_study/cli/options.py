@@ -10,11 +10,12 @@ from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
 from typing import Any, NoReturn
 
+from estimators import BASELINES, NOISES
+from mjx_study.configuration import Progress
 from mjx_study.console import progress_bar, show_cursor
 from mjx_study.contact import FAMILIES
 from mjx_study.runtime import PRECISIONS, configure
 from mjx_study.scene import CONES
-from mjx_study.study import Progress
 from mjx_study.task import Task
 from mjx_study.tasks import make_task, task_names
 
@@ -61,7 +62,9 @@ def add_task_options(
 ) -> None:
     """The task, what may replace its own settings, and how it is computed."""
     metavar = "TASK|FILE.xml" if files else "TASK"
-    command.add_argument("task", metavar=metavar, help=f"one of: {', '.join(task_names())}{files}")
+    command.add_argument(
+        "task", metavar=metavar, help=f"one of: {', '.join(task_names())}; or module:name of your own{files}"
+    )
     if contact:
         add_contact_options(command, stiffness)
     command.add_argument("--sigma", type=float, metavar="S", help="noise, in the unit of what it is added to")
@@ -80,6 +83,32 @@ def add_contact_options(command: argparse.ArgumentParser, stiffness: str = "the 
     command.add_argument(
         "--damping", type=float, metavar="B", help="contact damping in N s/m, in place of the family's"
     )
+
+
+def add_estimator_options(command: argparse.ArgumentParser) -> None:
+    """The noise, and what estimators let one choose; see `estimators.EstimatorOptions`."""
+    command.add_argument("--noise", choices=list(NOISES), help="density of the noise (default: gaussian)")
+    command.add_argument("--baseline", choices=list(BASELINES), help="of zeroth-order samples (default: zero_noise)")
+    command.add_argument(
+        "--gamma", type=float, metavar="G", help="AoBG's accuracy bound; inf for none (default: the task's)"
+    )
+    command.add_argument(
+        "--failure-probability", type=float, metavar="P", help="that epsilon's interval misses (default: 0.05)"
+    )
+    command.add_argument(
+        "--variance-proxy",
+        metavar="S2",
+        help="variance, second_moment or upper_bound, in epsilon (default: variance)",
+    )
+    command.add_argument(
+        "--radius",
+        type=number_or_name,
+        metavar="R",
+        help="max_deviation or a number, in epsilon (default: max_deviation)",
+    )
+    command.add_argument("--max-norm", type=float, metavar="G", help="of a sample of fobg_clipped")
+    command.add_argument("--window", type=int, metavar="H", help="steps between cuts of fobg_truncated")
+    command.add_argument("--tolerance", type=float, metavar="C", help="of ddcg's test (default: 0.3)")
 
 
 def add_process_options(command: argparse.ArgumentParser) -> None:
@@ -152,6 +181,14 @@ def numbers(text: str) -> tuple[float, ...]:
         return tuple(float(part) for part in text.split(",") if part.strip())
     except ValueError:
         raise argparse.ArgumentTypeError(f"{text!r} is not a list of numbers such as 10,100,1000") from None
+
+
+def number_or_name(text: str) -> float | str:
+    """A number where it is one."""
+    try:
+        return float(text)
+    except ValueError:
+        return text
 
 
 def names(text: str) -> tuple[str, ...]:

@@ -25,6 +25,7 @@ from mjx_study.cli.options import (
     task_of,
     usage_errors,
 )
+from mjx_study.configuration import Cell, plan_cells
 from mjx_study.console import number
 from mjx_study.contact import FAMILIES
 from mjx_study.network import with_network
@@ -43,7 +44,6 @@ from mjx_study.render import (
 )
 from mjx_study.results import prepare_folder, write_whole
 from mjx_study.scene import load_model
-from mjx_study.study import Cell, plan_cells
 from mjx_study.table import format_table
 from mjx_study.task import Task
 
@@ -162,19 +162,22 @@ def _plan(options: argparse.Namespace):
 
 
 def _plan_task(options: argparse.Namespace):
-    network = None if options.policy is None else _apply_policy(options)
+    policy = {} if options.policy is None else _load_policy(options)
+    for name in ("contact", "stiffness", "horizon"):
+        if getattr(options, name) is None and policy.get(name):
+            setattr(options, name, policy[name])
     task = task_of(options)
-    if network is not None:
-        task = with_network(task, network, jax.random.key(0))  # whose weights theta replaces
-    family = options.contact or ("mujoco" if "mujoco" in task.families else task.families[0])
-    stiffness = task.stiffnesses[len(task.stiffnesses) // 2] if options.stiffness is None else options.stiffness
-    cells, messages = plan_cells(task, (family,), (stiffness,), options.damping)
-    theta = task.theta if options.theta is None else jnp.asarray(_theta(options.theta, task), task.theta.dtype)
+    if policy.get("network") is not None:
+        task = with_network(task, tuple(policy["network"]), jax.random.key(0))  # whose weights theta replaces
+    stiffness = task.middle_stiffness if options.stiffness is None else options.stiffness
+    cells, messages = plan_cells(task, (options.contact or task.main_family,), (stiffness,), options.damping)
+    source, values = _theta(options, policy)
+    theta = task.theta if values is None else jnp.asarray(_checked(source, values, task), task.theta.dtype)
     return partial(_simulate_task, task, cells[0], theta, options.seed, options.noise), messages
 
 
-def _apply_policy(options: argparse.Namespace) -> tuple[int, ...] | None:
-    """Take theta, and what was not given of contact and horizon, from a policy file; returns a network's widths.
+def _load_policy(options: argparse.Namespace) -> dict[str, Any]:
+    """A policy that optimise wrote.
 
     Raises:
         ValueError: the file cannot be read, is no policy, or is one of another task; or theta is given too.
@@ -184,31 +187,38 @@ def _apply_policy(options: argparse.Namespace) -> tuple[int, ...] | None:
         raise ValueError("--policy and --theta both say what theta is; give one of them")
     try:
         policy = json.loads(path.read_text())
-        task, theta = policy["task"], [float(value) for value in policy["theta"]]
+        task, policy["theta"] = policy["task"], np.array(policy["theta"], float)
     except OSError as error:
         raise ValueError(f"cannot read {path}: {error.strerror or error}") from error
     except (ValueError, TypeError, KeyError) as error:
         raise ValueError(f"{path} is not a policy that optimise wrote") from error
     if task != options.task:
         raise ValueError(f"{path} is a policy of {task}, not of {options.task}")
-    options.theta = ",".join(map(repr, theta))
-    for name in ("contact", "stiffness", "horizon"):
-        if getattr(options, name) is None and policy.get(name):
-            setattr(options, name, policy[name])
-    widths = policy.get("network")
-    return None if widths is None else tuple(map(int, widths))
+    return policy
 
 
-def _theta(text: str, task: Task) -> np.ndarray:
-    """Parameters as numbers or from a file.
+def _theta(options: argparse.Namespace, policy: dict[str, Any]) -> tuple[str, np.ndarray | None]:
+    """Where parameters are from, and their values: a policy's, the command line's, a file's, or none.
 
     Raises:
-        ValueError: the file cannot be read or is of another kind, or there is not one finite number for each parameter.
+        ValueError: the file cannot be read or is of another kind.
     """
+    if policy:
+        return str(options.policy), policy["theta"]
+    if options.theta is None:
+        return "", None
     try:
-        source, values = "--theta", np.array([float(part) for part in text.split(",")])
+        return "--theta", np.array([float(part) for part in options.theta.split(",")])
     except ValueError:
-        source, values = text, _load_numbers(Path(text))
+        return options.theta, _load_numbers(Path(options.theta))
+
+
+def _checked(source: str, values: np.ndarray, task: Task) -> np.ndarray:
+    """The values, one finite number for each parameter.
+
+    Raises:
+        ValueError: they are not.
+    """
     if values.shape != (task.policy.num_params,) or not np.all(np.isfinite(values)):
         raise ValueError(
             f"{source} holds {values.size} numbers; {task.name} needs {task.policy.num_params}, all of them finite"

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from mjx_study.configuration import Cell, Progress, plan_cells
 from mjx_study.contact import FAMILIES, ContactModel, apply_contact
 from mjx_study.dynamics import initial_state
 from mjx_study.engine import HostState, converged_host, transition_jacobian
@@ -25,7 +26,6 @@ from mjx_study.gradcheck.states import Sample, choose, reached, sample_states
 from mjx_study.policy import OpenLoop
 from mjx_study.runtime import environment
 from mjx_study.scene import Scene
-from mjx_study.study import Cell, Progress, plan_cells
 from mjx_study.task import Task
 
 STIFFNESS: Final = (10.0, 100.0, 1000.0)

@@ -7,13 +7,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mjx_study.configuration import Cell
 from mjx_study.contact import ContactModel
 from mjx_study.engine import HostState
 from mjx_study.gradcheck.differences import differences, moves
 from mjx_study.gradcheck.programs import compile_quickly
 from mjx_study.noise import split_sample_key
 from mjx_study.objective import rollout_cost
-from mjx_study.study import Cell
 from mjx_study.task import Task
 
 DIRECTIONS: Final = 6

@@ -13,7 +13,7 @@ from mjx_study.reference.quadratic import Quadratic
 from mjx_study.reference.quadratic_cost import QuadraticCost
 from mjx_study.reference.sliding_box import SlidingBox
 from mjx_study.reference.system import System
-from mjx_study.reference.tennis import Tennis
+from mjx_study.reference.tennis import Tennis, tennis_outcomes
 from mjx_study.reference.tennis_start import draw_start
 
 __all__ = [
@@ -43,6 +43,7 @@ __all__ = [
     "draw_start",
     "roll_out",
     "smoothed",
+    "tennis_outcomes",
     "value_and_gradient",
     "value_and_gradients",
 ]

@@ -93,6 +93,11 @@ def value_and_gradients(
         ValueError: as `roll_out`.
     """
     rollout = roll_out(system, start, controls, feedback)
+    return rollout.value, gradients_along(system, rollout, feedback)
+
+
+def gradients_along(system: System, rollout: Rollout, feedback: Float[np.ndarray, "_ _"] | None = None) -> Gradients:
+    """Exact gradients of a rollout's total cost."""
     adjoint = system.final_gradient(rollout.states[..., -1, :])
     gradient = np.empty(rollout.controls.shape)
     for step in reversed(range(rollout.controls.shape[-2])):
@@ -106,7 +111,7 @@ def value_and_gradients(
     over_feedback = None
     if feedback is not None:
         over_feedback = np.einsum("...hu,...hx->...ux", gradient, rollout.states[..., :-1, :])
-    return rollout.value, Gradients(adjoint, gradient, over_feedback)
+    return Gradients(adjoint, gradient, over_feedback)
 
 
 def value_and_gradient(

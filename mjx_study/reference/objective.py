@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, Key
 
 from estimators import Differentiation, Evaluation, Linearisation, Objective, StepDifferentiation, StepEvaluation
 from mjx_study.noise import check_density, noise_score, split_sample_key, standard_noise
-from mjx_study.reference.adjoint import roll_out, value_and_gradients
+from mjx_study.reference.adjoint import gradients_along, roll_out, value_and_gradients
 from mjx_study.reference.function import Function, check_noise
 from mjx_study.reference.system import System
 
@@ -29,6 +29,10 @@ class Reference(Objective, Protocol):
         self, theta: Float[Array, " params"], key: Key[Array, ""]
     ) -> tuple[float, Float[np.ndarray, " params"]]:
         """Noise-free cost and its gradient, from the start that `key` draws."""
+        ...
+
+    def observe(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> dict[str, np.ndarray]:
+        """What rollouts came to, by name and sample; empty where there is nothing but the cost."""
         ...
 
 
@@ -51,6 +55,8 @@ class ReferenceObjective:
         sigma: standard deviation of the noise, in the unit of what it is added to.
         decision: what theta is, see above.
         noise: name of the noise's density in `estimators.NOISES`.
+        outcomes: what rollouts came to, by name, from their states with the start first; None where the cost says it
+            all.
     """
 
     system: System
@@ -59,6 +65,7 @@ class ReferenceObjective:
     sigma: float
     decision: str = "controls"
     noise: str = "gaussian"
+    outcomes: Callable[[Float[np.ndarray, "samples steps states"]], dict[str, np.ndarray]] | None = None
 
     def __post_init__(self) -> None:
         check_noise(self.sigma)
@@ -109,10 +116,13 @@ class ReferenceObjective:
     def differentiate_steps(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> StepDifferentiation:
         """The rollouts of `differentiate`, with the derivative of each sample's cost by its noise."""
         starts, noise = self._draw(keys)
-        value, gradients = value_and_gradients(self.system, *self._policy(theta, starts, noise))
+        start, controls, *feedback = self._policy(theta, starts, noise)
+        rollout = roll_out(self.system, start, controls, *feedback)
+        gradients = gradients_along(self.system, rollout, *feedback)
         over_noise = gradients.start[:, None] if self.decision == "start" else gradients.controls
-        jacobian = self._policy_jacobian(roll_out(self.system, *self._policy(theta, starts, noise)).states)
-        return StepDifferentiation(jnp.asarray(value), jnp.asarray(over_noise), jacobian)
+        return StepDifferentiation(
+            jnp.asarray(rollout.value), jnp.asarray(over_noise), self._policy_jacobian(rollout.states)
+        )
 
     def linearise(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> Linearisation:
         """The rollouts of `differentiate`, with the derivatives of every step."""
@@ -135,6 +145,12 @@ class ReferenceObjective:
             policy_state=over_policy,
             start_jacobian=over_start,
         )
+
+    def observe(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> dict[str, np.ndarray]:
+        """The outcomes of the rollouts of `evaluate`."""
+        if self.outcomes is None:
+            return {}
+        return self.outcomes(roll_out(self.system, *self._policy(theta, *self._draw(keys))).states)
 
     def value_and_gradient(
         self, theta: Float[Array, " params"], key: Key[Array, ""]
@@ -287,6 +303,10 @@ class FunctionObjective:
         """f(theta) and its gradient; a function has no start to draw, so the key is not used."""
         point = self._point(theta)
         return float(self.function.value(point)), self.function.gradient(point)
+
+    def observe(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> dict[str, np.ndarray]:
+        """Nothing: a function's value is all there is."""
+        return {}
 
     def _evaluation(self, theta, noise) -> Evaluation:
         point = self._point(theta)

@@ -15,13 +15,15 @@ Reference: Suh et al. 2022, tennis example, with its published numbers; the impa
 """
 
 import dataclasses
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from jaxtyping import Float
 
 from mjx_study.reference.paddle import first_impact, reflected, reflected_slope, time_slope
 
+TURNED: Final = 1e-3
+"""Angle by which a velocity that was not reflected is never off [rad]."""
 MAX_IMPACTS: Final = 4
 """Within one step; a ball that still approaches the paddle after so many passes through."""
 CONTROL_SLOPE: Final = np.eye(3, 10, 7)
@@ -131,6 +133,21 @@ class Tennis:
         now = now + left[:, None] * motion
         now[:, 2:4] *= self.damping
         return now.reshape(*batch, 7), slope, count.reshape(batch)
+
+
+def tennis_outcomes(
+    position: Float[Any, "*batch steps 2"], velocity: Float[Any, "*batch steps 2"]
+) -> dict[str, Float[Any, "*batch"]]:
+    """Whether the ball was hit, and its distance from the target at the end [m], from its motion; NumPy or JAX arrays.
+
+    Nothing but the paddle turns the ball's velocity.
+    """
+    first = velocity[..., :1, :]
+    across = first[..., 0] * velocity[..., 1] - first[..., 1] * velocity[..., 0]
+    along = first[..., 0] * velocity[..., 0] + first[..., 1] * velocity[..., 1]
+    turned = (abs(across) > TURNED * abs(along)) | (along < 0)
+    away = position[..., -1, :] - np.array(Tennis.goal[:2])
+    return {"hit": turned.any(-1) * 1.0, "distance [m]": (away**2).sum(-1) ** 0.5}
 
 
 def _motion(state, control):

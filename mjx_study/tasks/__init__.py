@@ -8,6 +8,7 @@ from mjx_study.task import Task
 from mjx_study.tasks.ball_wall import ball_wall
 from mjx_study.tasks.double_pendulum import double_pendulum
 from mjx_study.tasks.momentum_transfer import momentum_transfer
+from mjx_study.tasks.own import MissingModuleError, own_task, registered_names, registered_place
 from mjx_study.tasks.pusher import pusher
 from mjx_study.tasks.sliding_box import sliding_box
 from mjx_study.tasks.tennis import tennis
@@ -25,19 +26,35 @@ TASKS: Final[dict[str, Callable[..., Task]]] = {
 
 
 def task_names() -> list[str]:
-    """Names of the tasks."""
+    """Names of the tasks of this package."""
     return list(TASKS)
 
 
 def make_task(name: str, **options) -> Task:
     """Build a task by name; `options` go to its builder (`cone`, `horizon`, ...).
 
+    Args:
+        name: of a task of this package, then of one that an installed package registers (entry point group
+            `mjx_study.tasks`), then `module:attribute` of a Task or of a function of the options that returns one.
+        **options: those that are given; a Task that is made already takes none.
+
     Raises:
-        ValueError: unknown name; the message lists the choices.
+        ValueError: unknown name; the message lists the choices. Or a task of one's own cannot be had: its module or
+            function raises, is not there, does not take an option, or gives no Task.
     """
-    if name not in TASKS:
-        raise ValueError(f"unknown task {name!r}; choose from {', '.join(TASKS)}")
-    return TASKS[name](**options)
+    if name in TASKS:
+        return TASKS[name](**options)
+    place = registered_place(name)
+    if place is not None:
+        return own_task(place, options)
+    reason = ""
+    if ":" in name:
+        try:
+            return own_task(name, options)
+        except MissingModuleError as error:
+            reason = f" ({error})"
+    choices = dict.fromkeys([*TASKS, *registered_names()])
+    raise ValueError(f"unknown task {name!r}; choose from {', '.join(choices)}, or module:name of your own{reason}")
 
 
 __all__ = [

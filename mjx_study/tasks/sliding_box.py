@@ -41,6 +41,7 @@ def sliding_box(*, horizon: int = HORIZON, model: str | Path = "sliding_box", **
     scene = load_scene(model, **scene_options)
     require(scene, joints=("block", "height", "box"), geoms=("foot", "box"), sizes=(3, 3, 1))
     dtype = scene.template.qpos.dtype
+    edge = float(scene.host.geom_size[scene.geom("box")][0])
     weight, goal = np.array(STATE_WEIGHT, dtype), np.array(GOAL, dtype)
 
     def state_cost(state: State) -> Float[Array, ""]:
@@ -65,7 +66,16 @@ def sliding_box(*, horizon: int = HORIZON, model: str | Path = "sliding_box", **
         contact_pair=("foot", "box"),
         gamma=GAMMA,
         recipe=RECIPE,
-        reference=lambda stiffness: ReferenceObjective(SlidingBox(), (0.0, 0.0, 0.0, 0.0), horizon, SIGMA),
+        outcomes=lambda states: {
+            "aboard": jnp.where(jnp.abs(states.qpos[-1, BLOCK] - states.qpos[-1, BOX]) < edge, 1.0, 0.0)
+        },
+        reference=lambda stiffness: ReferenceObjective(
+            SlidingBox(),
+            (0.0, 0.0, 0.0, 0.0),
+            horizon,
+            SIGMA,
+            outcomes=lambda states: {"aboard": SlidingBox().on_box(states[..., -1, :]) * 1.0},
+        ),
         damping=SLIP_DAMPING,
         stiffnesses=(100.0, 200.0, 500.0, 1000.0),
     )

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Key
 
 from mjx_study.dynamics import State, initial_state
 from mjx_study.policy import LinearFeedback
-from mjx_study.reference import ReferenceObjective, Tennis, draw_start
+from mjx_study.reference import ReferenceObjective, Tennis, draw_start, tennis_outcomes
 from mjx_study.scene import load_model, put_scene, require
 from mjx_study.task import Recipe, Task
 
@@ -74,6 +74,14 @@ def tennis(*, horizon: int = HORIZON, model: str | Path = "tennis", **scene_opti
         contact_pair=("ball", "paddle"),
         gamma=GAMMA,
         recipe=RECIPE,
-        reference=lambda stiffness: ReferenceObjective(Tennis(), draw_start, horizon, SIGMA, decision="feedback"),
+        outcomes=lambda states: tennis_outcomes(states.qpos[:, :2], states.qvel[:, :2]),
+        reference=lambda stiffness: ReferenceObjective(
+            Tennis(),
+            draw_start,
+            horizon,
+            SIGMA,
+            decision="feedback",
+            outcomes=lambda states: tennis_outcomes(states[..., :2], states[..., 2:4]),
+        ),
         stiffnesses=(1000.0, 2000.0, 5000.0, 10000.0),
     )

@@ -1,0 +1,61 @@
+"""Draws docs/variance.png, docs/bias.png and docs/achieved.png: what the README says about stiffness.
+
+    python docs/make_study.py
+
+Three sweeps, in results/study/; half an hour on two cores, and it goes on where it was stopped.
+"""
+
+from pathlib import Path
+from typing import Final
+
+from make_figures import save
+
+from mjx_study.console import progress_bar
+from mjx_study.runtime import configure
+from mjx_study.study_plots import plot_study
+from mjx_study.sweep import SweepConfig, load_study, plan_sweep, run_sweep
+
+HERE: Final = Path(__file__).parent
+
+
+def decades(first: int, last: int, count: int) -> tuple[float, ...]:
+    """Powers of ten, evenly spaced in their exponent."""
+    return tuple(float(f"{10 ** (first + index * (last - first) / (count - 1)):.12g}") for index in range(count))
+
+
+SWEEPS: Final = {
+    "variance": SweepConfig(
+        tasks=("pusher",),
+        contact=("penalty", "mujoco", "mujoco_stiff"),
+        stiffness=decades(1, 4, 13),
+    ),
+    "bias": SweepConfig(
+        tasks=("momentum_transfer",),
+        contact=("penalty", "mujoco", "smooth_onset"),
+        stiffness=decades(3, 5, 5),
+        reference_samples=3000,
+    ),
+    "achieved": SweepConfig(
+        tasks=("pusher",),
+        contact=("penalty", "mujoco", "mujoco_stiff"),
+        stiffness=decades(1, 4, 7),
+        iterations=500,
+        samples=(10,),
+        seeds=5,
+    ),
+}
+
+
+def main() -> None:
+    configure()
+    for name, config in SWEEPS.items():
+        folder = HERE.parent / "results" / "study" / name
+        with progress_bar() as progress:
+            run_sweep(plan_sweep(config), folder, progress)
+        path = HERE / f"{name}.png"
+        save(plot_study(load_study(folder))[name], path)
+        print(f"written: {path}")
+
+
+if __name__ == "__main__":
+    main()

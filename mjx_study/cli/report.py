@@ -1,0 +1,38 @@
+"""mjx-study report."""
+
+import argparse
+from pathlib import Path
+
+from mjx_study.cli.options import Commands, add_command, print_report, usage_errors
+from mjx_study.report import report
+from mjx_study.results import prepare_folder, write_whole
+from mjx_study.sweep import load_study, what_to_beware_of
+
+EPILOG = """\
+Writes FOLDER/report.html: one page that needs no other file, with warnings, figures, a table, the whole configuration,
+versions and machine, and the command that made it. Works while the study is still being computed.
+
+example:
+  mjx-study report out
+"""
+
+
+def add(commands: Commands) -> None:
+    """Register the command."""
+    command = add_command(commands, "report", "write a study as one HTML page", run, EPILOG)
+    command.add_argument("folder", type=Path, metavar="FOLDER", help="of a study, made by sweep")
+    command.add_argument("--output", type=Path, metavar="FILE.html", help="default: FOLDER/report.html")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Load, write."""
+    with usage_errors():
+        dataset = load_study(options.folder)
+        path = options.output or options.folder / "report.html"
+        prepare_folder(path.parent)
+    page = report(dataset).encode()
+    write_whole(path, lambda file: file.write(page))
+    warnings = list(what_to_beware_of(dataset))
+    lines = [f"warning: {message}" for message in warnings] + [f"written: {path} ({len(page) / 1e6:.1f} MB)"]
+    print_report(options, {"written": str(path), "warnings": warnings}, lines)
+    return 0

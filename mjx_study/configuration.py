@@ -1,0 +1,254 @@
+"""What every study is asked for, checked and resolved: the task, its contact models, its estimators."""
+
+import dataclasses
+import itertools
+import warnings
+from collections.abc import Callable, Collection, Sequence
+from typing import Any, Final
+
+import jax
+import numpy as np
+
+from estimators import ESTIMATORS, EstimatorOptions
+from estimators.ddcg import PUBLISHED_TOLERANCE
+from mjx_study.contact import (
+    DEFAULT_SOLIMP,
+    DEFAULT_SOLREF,
+    FAMILIES,
+    ContactModel,
+    ContactWarning,
+    contact_model,
+    family_model,
+    stiffness_from_solref,
+)
+from mjx_study.objective import chunk_for
+from mjx_study.task import Task
+from mjx_study.tasks import make_task
+
+GAUSSIAN_ONLY: Final = ("ddcg", "delta")
+ADDITIVE_ONLY: Final = ("delta",)
+"""Estimators whose formula needs Gaussian noise, or noise that is added to theta."""
+
+Progress = Callable[[int, int, str], None]
+"""Called with (work done, work in all, what is being done)."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class EstimatorConfig:
+    """What decides how estimators run on a task; base of the configurations of studies.
+
+    Attributes:
+        task: name of a task.
+        estimators: names of estimators.
+        seed: of all randomness.
+        sigma: standard deviation of the noise, in the unit of what it is added to; None for the task's.
+        noise: name of the noise's density; None for the task's.
+        baseline: of zeroth-order estimates: zero_noise, leave_one_out or none.
+        gamma: accuracy that the alpha-order estimate must keep, in the unit of the gradient; None for the task's.
+        failure_probability: of the confidence radius epsilon.
+        variance_proxy: in epsilon: variance, second_moment or upper_bound.
+        radius: R in epsilon: max_deviation, or a bound in the unit of the gradient.
+        max_norm: of a sample of the clipped first-order estimate, in the unit of the gradient.
+        window: steps between cuts of the truncated first-order estimate.
+        tolerance: of the discontinuity test of "ddcg".
+        damping: of the contact [N s/m]; None for each family's.
+        cone: pyramidal or elliptic; None for the MJCF's.
+        horizon: steps; None for the task's.
+        model: an MJCF in place of the task's own; None for that.
+        chunk_size: samples per device and call; None to choose by the number of samples.
+    """
+
+    task: str
+    estimators: tuple[str, ...] = ("zobg", "fobg", "aobg")
+    seed: int = 0
+    sigma: float | None = None
+    noise: str | None = None
+    baseline: str = "zero_noise"
+    gamma: float | None = None
+    failure_probability: float = 0.05
+    variance_proxy: str = "variance"
+    radius: str | float = "max_deviation"
+    max_norm: float | None = None
+    window: int | None = None
+    tolerance: float = PUBLISHED_TOLERANCE
+    damping: float | None = None
+    cone: str | None = None
+    horizon: int | None = None
+    model: str | None = None
+    chunk_size: int | None = None
+
+    def __post_init__(self) -> None:
+        check_names("estimator", self.estimators, ESTIMATORS)
+        if self.chunk_size is not None and self.chunk_size < 1:
+            raise ValueError(f"chunk_size must be at least 1 sample, got {self.chunk_size}")
+        if self.seed < 0:
+            raise ValueError(f"seed must not be negative, got {self.seed}")
+
+
+def check_names(label: str, names: Sequence[str], choices: Collection[str]) -> None:
+    """Refuse a selection that is empty, names what there is not, or names something twice.
+
+    Raises:
+        ValueError: with the choices.
+    """
+    if not names:
+        raise ValueError(f"no {label} given; choose from {', '.join(choices)}")
+    refuse_repeats(label, names)
+    for name in names:
+        if name not in choices:
+            raise ValueError(f"unknown {label} {name!r}; choose from {', '.join(choices)}")
+
+
+def refuse_repeats(label: str, values: Sequence[object]) -> None:
+    """Raises ValueError for a value that occurs twice."""
+    repeated = {str(value) for value in values if values.count(value) > 1}
+    if repeated:
+        raise ValueError(f"{label} given twice: {', '.join(sorted(repeated))}")
+
+
+@dataclasses.dataclass(frozen=True)
+class Cell:
+    """One contact model of a comparison."""
+
+    family: str
+    stiffness: float
+    contact: ContactModel | None
+
+    @property
+    def label(self) -> str:
+        """As messages name it."""
+        return f"{self.family}, K = {self.stiffness:g} N/m" if self.stiffness else self.family
+
+
+def configured_task(config: EstimatorConfig) -> Task:
+    """The task that a configuration names, with what the configuration changes of it.
+
+    Raises:
+        ValueError: there is no such task, or it cannot be changed so.
+    """
+    scene_options: dict[str, Any] = {"cone": config.cone, "horizon": config.horizon, "model": config.model}
+    task = make_task(config.task, **{name: value for name, value in scene_options.items() if value is not None})
+    changes = {"sigma": config.sigma, "noise": config.noise}
+    return task.replace(**{name: value for name, value in changes.items() if value is not None})
+
+
+def configured_options(config: EstimatorConfig, task: Task) -> EstimatorOptions:
+    """The options of a configuration's estimators, checked against the task.
+
+    Raises:
+        ValueError: an option is out of range, or an estimator cannot run on the task.
+    """
+    options = EstimatorOptions(
+        baseline=config.baseline,
+        gamma=task.gamma if config.gamma is None else config.gamma,
+        failure_probability=config.failure_probability,
+        variance_proxy=config.variance_proxy,
+        radius=config.radius,
+        sigma=task.sigma,
+        max_norm=config.max_norm,
+        window=config.window,
+        tolerance=config.tolerance,
+    )
+    check_estimators(config.estimators, task, options)
+    return options
+
+
+def resolved_fields(config: EstimatorConfig, task: Task, samples: int) -> dict[str, Any]:
+    """Fields of a configuration that the task or the devices decide where it leaves them open."""
+    chunk = chunk_for(samples, jax.local_devices()) if config.chunk_size is None else config.chunk_size
+    return {
+        "sigma": task.sigma,
+        "noise": task.noise,
+        "gamma": task.gamma if config.gamma is None else config.gamma,
+        "horizon": task.horizon,
+        "cone": {0: "pyramidal", 1: "elliptic"}[int(task.scene.host.opt.cone)],
+        "chunk_size": chunk,
+    }
+
+
+def check_estimators(names: Sequence[str], task: Task, options: EstimatorOptions) -> None:
+    """Refuse estimators whose formula does not hold for a task, or that lack an option.
+
+    Raises:
+        ValueError: an option is not set; the noise is not Gaussian, or not on theta, where the formula needs it.
+    """
+    for name in names:
+        ESTIMATORS[name].check(options)
+        if name in GAUSSIAN_ONLY and task.noise != "gaussian":
+            raise ValueError(f"{name!r} holds for Gaussian noise only; the noise is {task.noise}")
+        if name in ADDITIVE_ONLY and not task.policy.additive:
+            raise ValueError(f"{name!r} needs noise that is added to theta itself; {task.name} has a feedback policy")
+
+
+def plan_cells(
+    task: Task,
+    families: Sequence[str] | None = None,
+    stiffnesses: Sequence[float] | None = None,
+    damping: float | None = None,
+) -> tuple[tuple[Cell, ...], tuple[str, ...]]:
+    """The contact models of a sweep, family by family, and what there is to warn about.
+
+    Args:
+        task: gives what is None, and the effective mass.
+        families: names of contact families.
+        stiffnesses: for families that take one [N/m].
+        damping: in place of each family's [N s/m].
+
+    Raises:
+        ValueError: a family is unknown, or a stiffness or damping is out of range.
+    """
+    cells, messages = [], []
+    for family in task.families if families is None else families:
+        swept = family not in FAMILIES or FAMILIES[family].swept
+        undamped = swept and family in FAMILIES and FAMILIES[family].dampratio == 0
+        own = damping if damping is not None else task.damping if undamped else None
+        for stiffness in (task.stiffnesses if stiffnesses is None else stiffnesses) if swept else (None,):
+            with warnings.catch_warnings(record=True) as caught:
+                warnings.simplefilter("always", ContactWarning)
+                contact = None if family == "mjcf" else _contact(task, family, stiffness, own if swept else None)
+            cell = Cell(family, stiffness or _stiffness(task, contact), contact)
+            cells.append(cell)
+            messages += [f"{cell.label}: {warning.message}" for warning in caught]
+    return tuple(cells), tuple(messages)
+
+
+def solver_cells(
+    task: Task, solrefs: Sequence[Sequence[float]], solimps: Sequence[Sequence[float]]
+) -> tuple[tuple[Cell, ...], tuple[str, ...]]:
+    """Contact models in MuJoCo's own terms, every solref with every solimp, and what there is to warn about.
+
+    Args:
+        task: gives the scene, and the effective mass for the stiffness that is reported.
+        solrefs: pairs of numbers; none for MuJoCo's default.
+        solimps: of five numbers each; none for MuJoCo's default.
+
+    Raises:
+        ValueError: MuJoCo would alter a value without an error.
+    """
+    cells, messages = [], []
+    for solref, solimp in itertools.product(solrefs or (DEFAULT_SOLREF,), solimps or (DEFAULT_SOLIMP,)):
+        if len(solref) != 2 or len(solimp) != 5:
+            raise ValueError(f"solref takes 2 numbers and solimp 5, got {len(solref)} and {len(solimp)}")
+        name = " ".join(f"{value:g}" for value in solref)
+        name = f"solref {name}" if not solimps else f"solref {name} solimp {' '.join(f'{v:g}' for v in solimp)}"
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always", ContactWarning)
+            contact = contact_model(solref, solimp, scene=task.scene)
+        cells.append(Cell(name, _stiffness(task, contact), contact))
+        messages += [f"{name}: {warning.message}" for warning in caught]
+    return tuple(cells), tuple(messages)
+
+
+def _contact(task: Task, family: str, stiffness: float | None, damping: float | None) -> ContactModel:
+    return family_model(family, task.scene, stiffness=stiffness, damping=damping, effective_mass=task.effective_mass)
+
+
+def _stiffness(task: Task, contact: ContactModel | None) -> float:
+    """Spring K [N/m] of a contact model that was not made from one; 0 where there is no contact."""
+    if task.contact_pair is None:
+        return 0.0
+    if contact is None:
+        solref = task.scene.host.geom_solref[task.scene.geom(task.contact_pair[0])]
+    else:
+        solref = np.asarray(contact.solref)
+    return stiffness_from_solref(solref.tolist(), effective_mass=task.effective_mass)[0]

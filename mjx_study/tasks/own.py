@@ -1,0 +1,149 @@
+"""Tasks from outside this package: `module:name` of a module that Python can import, or registered by a package."""
+
+import importlib
+import inspect
+import sys
+import traceback
+from collections.abc import Callable, Generator, Sequence
+from contextlib import contextmanager, suppress
+from importlib import metadata
+from operator import attrgetter
+from pathlib import Path
+from types import ModuleType
+from typing import Any, Final
+
+from mjx_study.task import Task
+
+GROUP: Final = "mjx_study.tasks"
+"""Entry point group in which installed packages register tasks."""
+
+
+class MissingModuleError(ValueError):
+    """The module of a `module:name` is nowhere to be found."""
+
+
+def registered_names() -> list[str]:
+    """Names of the tasks that installed packages register."""
+    return sorted({point.name for point in metadata.entry_points(group=GROUP)})
+
+
+def registered_place(name: str) -> str | None:
+    """Where a registered task is, as `module:name`; None for a name that no package registers.
+
+    Raises:
+        ValueError: packages register different tasks by this name.
+    """
+    places = {f"{point.module}:{point.attr}" for point in metadata.entry_points(group=GROUP, name=name)}
+    if len(places) > 1:
+        raise ValueError(f"task {name!r} is registered more than once; choose from {', '.join(sorted(places))}")
+    return next(iter(places), None)
+
+
+def own_task(place: str, options: dict[str, Any]) -> Task:
+    """The task at a place: a Task, or what a function of the options returns.
+
+    The current directory counts as importable, in the console script too.
+
+    Args:
+        place: `module:name`.
+        options: those that are given, for the function; a Task takes none.
+
+    Raises:
+        MissingModuleError: there is no such module.
+        ValueError: the module raises, or there is no Task nor a function that takes the options and returns one.
+    """
+    module, _, name = place.partition(":")
+    with _importable_here():
+        found = _find(_load(module), name)
+        if not isinstance(found, Task):
+            return _build(place, found, options)
+    if options:
+        raise ValueError(
+            f"{place} is a Task that is made already, and {_listed(options)} cannot change it: "
+            "give a function that takes this and returns the Task"
+        )
+    return found
+
+
+def _load(name: str) -> ModuleType:
+    if not all(part.isidentifier() for part in name.split(".")) or name.endswith(".py"):
+        raise MissingModuleError(f"{name!r} is no module: write it as in an import, without a folder or .py")
+    importlib.invalidate_caches()
+    try:
+        return importlib.import_module(name)
+    except (Exception, SystemExit) as error:
+        if isinstance(error, ModuleNotFoundError) and f"{name}.".startswith(f"{error.name}."):
+            raise MissingModuleError(f"there is no module {error.name!r} here or installed") from error
+        raise ValueError(f"importing {name} raised {_described(error)}") from error
+
+
+def _find(module: ModuleType, name: str) -> object:
+    try:
+        return attrgetter(name)(module)
+    except AttributeError:
+        own = [
+            label
+            for label, value in vars(module).items()
+            if isinstance(value, Task) or (inspect.isfunction(value) and value.__module__ == module.__name__)
+        ]
+        raise ValueError(f"{module.__name__} has no {name!r}; it has {', '.join(own) or 'no task'}") from None
+
+
+def _build(place: str, builder: object, options: dict[str, Any]) -> Task:
+    if not callable(builder):
+        raise ValueError(
+            f"{place} is neither a Task nor a function that returns one, but of type {type(builder).__name__}"
+        )
+    _check_arguments(place, builder, options)
+    try:
+        task = builder(**options)
+    except Exception as error:
+        raise ValueError(f"{place} raised {_described(error)}") from error
+    if not isinstance(task, Task):
+        raise ValueError(f"{place} returned no Task, but something of type {type(task).__name__}")
+    return task
+
+
+def _check_arguments(place: str, builder: Callable[..., object], options: dict[str, Any]) -> None:
+    try:
+        parameters = inspect.signature(builder).parameters.values()
+    except (TypeError, ValueError):  # of some functions that are not Python's
+        return
+    named = [p for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)]
+    by_keyword = {p.name for p in named if p.kind is not p.POSITIONAL_ONLY}
+    refused = [name for name in options if name not in by_keyword]
+    if refused and not any(p.kind is p.VAR_KEYWORD for p in parameters):
+        raise ValueError(f"{place} does not take {_listed(refused)}: give it an argument of this name, or **options")
+    missing = [p.name for p in named if p.default is p.empty and p.name not in by_keyword & options.keys()]
+    if missing:
+        raise ValueError(f"{place} needs {_listed(missing)}, which is not given: give it a default")
+
+
+def _listed(names: Sequence[str] | dict[str, Any]) -> str:
+    return " and ".join(names)
+
+
+def _described(error: BaseException) -> str:
+    """Type and message in one line, and the innermost line of the user's file that it came through."""
+    text = f"{type(error).__name__}: {' '.join(str(error).split())}".removesuffix(": ")
+    skipped = (__file__, importlib.__file__, "<frozen importlib")
+    frames = [f for f in traceback.extract_tb(error.__traceback__) if not f.filename.startswith(skipped)]
+    if not frames:
+        return text
+    last = [frame for frame in frames if frame.filename == frames[0].filename][-1]
+    return f"{text} ({Path(last.filename).name}, line {last.lineno})"
+
+
+@contextmanager
+def _importable_here() -> Generator[None]:
+    """The current directory in front of where Python looks for modules, as for `python -m`."""
+    here = str(Path.cwd())
+    if here in sys.path or "" in sys.path:
+        yield
+        return
+    sys.path.insert(0, here)
+    try:
+        yield
+    finally:
+        with suppress(ValueError):
+            sys.path.remove(here)

@@ -1,0 +1,495 @@
+"""Sweeps: labelled numbers that are right, and folders that survive whatever happens to a process."""
+
+import dataclasses
+import json
+import os
+import random
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import xarray as xr
+
+import estimators
+from mjx_study import cli, store, study_plots
+from mjx_study import sweep as module
+from mjx_study.cli import options
+from mjx_study.cli.sweep import _fields, _many, _range, _solver_values
+from mjx_study.contact import stiffness_from_solref
+from mjx_study.objective import Simulator
+from mjx_study.report import report
+from mjx_study.store import Store, StudyError
+from mjx_study.sweep import MEASURED, SweepConfig, load_study, plan_sweep, run_sweep
+from mjx_study.tasks import make_task
+
+SMALL: dict[str, Any] = {
+    "tasks": ("pusher",),
+    "contact": ("penalty", "mujoco"),
+    "stiffness": (10.0, 1000.0),
+    "samples": (4, 8),
+    "seeds": 3,
+    "horizon": 20,
+    "reference_samples": 6,
+    "chunk_size": 24,
+}
+
+
+def config(**changes: Any) -> SweepConfig:
+    return SweepConfig(**(SMALL | changes))
+
+
+def same(one: xr.Dataset, other: xr.Dataset) -> bool:
+    """All but what was measured with a clock, and when and where."""
+    return one.drop_vars(MEASURED, errors="ignore").equals(other.drop_vars(MEASURED, errors="ignore"))
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("study") / "undisturbed"
+    run_sweep(plan_sweep(config()), folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def descents(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("study") / "descents"
+    changes: dict[str, Any] = {"iterations": 4, "samples": (4,), "evaluation_samples": 50, "learning_rate": 0.003}
+    run_sweep(plan_sweep(config(**changes, estimators=("fobg", "aobg"))), folder)
+    return folder
+
+
+def test_results_are_labelled(undisturbed: Path) -> None:
+    data = load_study(undisturbed)
+    assert dict(data.sizes) == {
+        "task": 1, "timestep": 1, "cone": 1, "model": 4, "sigma": 1, "samples": 2, "estimator": 3, "seed": 3,
+    }  # fmt: skip
+    assert data["contact"].values.tolist() == ["penalty", "penalty", "mujoco", "mujoco"]
+    assert data["stiffness"].attrs["units"] == "N/m" and data["timestep"].attrs["units"] == "s"
+    for name, variable in data.data_vars.items():
+        assert variable.attrs["units"] and variable.attrs["long_name"], name
+        alpha_only = name in ("alpha", "epsilon", "discrepancy")
+        known = variable.sel(estimator="aobg") if alpha_only else variable
+        assert bool(known.notnull().all()), name
+    config_kept = json.loads(data.attrs["config"])
+    assert config_kept["stiffness"] == [10.0, 1000.0] and config_kept["kind"] == "gradients"
+    assert json.loads(data.attrs["environment"])["precision"] == "float64" and data.attrs["missing_cells"] == 0
+    with xr.open_dataset(undisturbed / "results.nc") as stored:
+        assert stored.equals(data)
+
+
+def test_numbers_are_those_of_the_estimators(undisturbed: Path) -> None:
+    """One seed of one cell by hand, with keys that the configuration determines."""
+    data = load_study(undisturbed)
+    task = make_task("pusher", horizon=20)
+    plan = plan_sweep(config())
+    cell = next(cell for cell in plan.cells if cell.model.label == "mujoco, K = 1000 N/m" and cell.samples == 8)
+    objective = Simulator(task, chunk_size=5).objective(cell.model.contact)
+    zeroth, first, *_ = jax.random.split(jax.random.key(0), 5)
+    keys = [jax.random.split(jax.random.split(stream, 3)[1], 8) for stream in (zeroth, first)]
+    found = data.sel(model="mujoco 1000", samples=8, seed=1).squeeze()
+    low = estimators.zeroth_order(objective.evaluate(task.theta, keys[0]), "zero_noise")
+    high = estimators.first_order(objective.differentiate(task.theta, keys[1]))
+    assert float(found["variance"].sel(estimator="zobg")) == pytest.approx(float(low.variance), rel=1e-8)
+    assert float(found["variance"].sel(estimator="fobg")) == pytest.approx(float(high.variance), rel=1e-6)
+    assert float(found["gradient_norm"].sel(estimator="fobg")) == pytest.approx(
+        float(jnp.linalg.norm(high.mean)), rel=1e-8
+    )
+    assert float(found["residual"]) < 1e-6 and float(found["unconverged"]) == 0
+
+
+def test_one_compilation_serves_all_contact_models(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[Simulator] = []
+    monkeypatch.setattr(
+        module, "Simulator", lambda *args, **kwargs: made.append(Simulator(*args, **kwargs)) or made[-1]
+    )
+    plan = plan_sweep(config(timestep=(0.005, 0.0025), samples=(4,), seeds=3, reference_samples=3))
+    run_sweep(plan, tmp_path / "out")
+    assert len(made) == 2 == len(plan.groups) and plan.compilations == 4
+    for simulator in made:
+        sizes = {name: program._cache_size() for name, program in simulator._programs.items()}  # type: ignore[attr-defined]
+        assert sizes["value"] == sizes["gradient"] == 1, sizes
+
+
+def test_a_cell_does_not_depend_on_the_others(undisturbed: Path, tmp_path: Path) -> None:
+    """Computed alone, in another process's order, or beside others: the same bits."""
+    plan = plan_sweep(config())
+    kept = Store.open(undisturbed)
+    last = len(plan.cells) - 1
+    compute = module._compute_gradients(plan)
+    alone = compute(plan.cells[last])
+    for name, array in kept.read(last).items():
+        if name not in MEASURED:
+            np.testing.assert_array_equal(array, alone[name], err_msg=name)
+
+
+def test_descents_are_labelled(descents: Path) -> None:
+    data = load_study(descents)
+    assert data["cost"].dims == (
+        "task",
+        "timestep",
+        "cone",
+        "model",
+        "sigma",
+        "samples",
+        "iteration",
+        "seed",
+        "estimator",
+    )
+    assert data.sizes["iteration"] == 4 and bool((data["final_cost"] < data["start_cost"]).sel(estimator="fobg").all())
+    assert bool(data["stopped_at"].isnull().all())
+    assert data["rollouts"].squeeze().isel(model=0).values.tolist() == [4, 9]
+
+
+# Disturbances. The command runs in processes of its own, which are killed, starved and raced.
+
+ARGUMENTS = ["pusher", "--contact", "penalty,mujoco", "--stiffness", "10,1000", "--samples", "4,8", "--seeds", "3",
+             "--horizon", "20", "--reference-samples", "6", "--chunk-size", "24", "--devices", "2"]  # fmt: skip
+
+
+def process(folder: Path, *more: str, **kwargs: Any) -> subprocess.Popen[str]:
+    command = [sys.executable, "-m", "mjx_study", "sweep", *ARGUMENTS, "--output", str(folder), *more]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **kwargs)
+
+
+ZYGOTE = """
+import json, os, random, signal, sys, time
+from pathlib import Path
+import numpy as np
+from mjx_study.store import Store
+
+folder, cells = Path(sys.argv[1]), 40
+document = {"config": {"kind": "test"}, "cells": [{} for _ in range(cells)]}
+
+def work():
+    store = Store.create(folder, document)
+    for index in store.missing:
+        with store.claim(index) as ours:
+            if ours and not store.has(index):
+                time.sleep(0.002)
+                store.write(index, {"values": np.random.default_rng(index).normal(size=100_000)})
+
+rng, kills = random.Random(0), 0
+while kills < 20:
+    child = os.fork()
+    if child == 0:
+        work()
+        os._exit(0)
+    time.sleep(rng.random() * 0.06)
+    os.kill(child, signal.SIGKILL)
+    kills += os.waitpid(child, 0)[1] == signal.SIGKILL
+    if not Store.open(folder).missing if (folder / "study.json").exists() else False:
+        break
+print(kills)
+work()
+"""
+
+
+def test_killed_at_any_moment_a_folder_is_whole(tmp_path: Path) -> None:
+    """Kills by SIGKILL at random moments of writing; each cell is then there with its own numbers, or not at all."""
+    done = subprocess.run([sys.executable, "-c", ZYGOTE, str(tmp_path / "out")], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert int(done.stdout) >= 5
+    kept = Store.open(tmp_path / "out")
+    assert kept.missing == []
+    for index in range(40):
+        values = kept.read(index)["values"]
+        np.testing.assert_array_equal(values, np.random.default_rng(index).normal(size=100_000))
+
+
+@pytest.mark.slow
+def test_a_killed_sweep_goes_on_to_the_same_data(undisturbed: Path, tmp_path: Path) -> None:
+    """The command itself, killed twenty times at random moments and started again each time."""
+    folder, rng, kills = tmp_path / "out", random.Random(1), 0
+    while kills < 20:
+        running = process(folder)
+        time.sleep(3 + 9 * rng.random())
+        running.send_signal(signal.SIGKILL)
+        running.communicate()
+        if running.returncode == 0:
+            break
+        kills += 1
+    assert process(folder).wait() == 0
+    assert kills >= 3 and same(load_study(folder), load_study(undisturbed))
+
+
+def test_two_processes_share_a_study_and_a_third_has_nothing_to_do(undisturbed: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "out"
+    both = [process(folder), process(folder)]
+    said = [running.communicate()[0] for running in both]
+    assert [running.returncode for running in both] == [0, 0]
+    computed = [int(re.search(r"computed (\d+) cells", text).group(1)) for text in said]  # type: ignore[union-attr]
+    assert sum(computed) == 8
+    assert same(load_study(folder), load_study(undisturbed))
+    plan = plan_sweep(config())
+    assert run_sweep(plan, folder).computed == 0
+
+
+def copy_of(folder: Path, to: Path) -> Path:
+    (to / "cells").mkdir(parents=True)
+    for path in [folder / "study.json", *(folder / "cells").iterdir()]:
+        (to / path.relative_to(folder)).write_bytes(path.read_bytes())
+    return to
+
+
+def test_missing_cells_are_computed_and_no_others(undisturbed: Path, tmp_path: Path) -> None:
+    folder = copy_of(undisturbed, tmp_path / "out")
+    before = {path.name: path.stat().st_mtime_ns for path in (folder / "cells").iterdir()}
+    (folder / "cells" / "00003.npz").unlink()
+    unfinished = load_study(folder)
+    assert unfinished.attrs["missing_cells"] == 1 and int(unfinished["residual"].isnull().sum()) == 1
+    assert "1 cells are not computed yet" in " ".join(module.what_to_beware_of(unfinished))
+    result = run_sweep(plan_sweep(config()), folder)
+    assert result.computed == 1 and same(result.dataset, load_study(undisturbed))
+    after = {path.name: path.stat().st_mtime_ns for path in (folder / "cells").iterdir()}
+    assert {name for name in after if after[name] != before[name]} == {"00003.npz"}
+
+
+@pytest.mark.parametrize("damage", ["truncated", "flipped", "foreign", "nonsense"])
+def test_a_damaged_cell_is_refused_and_left_alone(undisturbed: Path, tmp_path: Path, damage: str) -> None:
+    folder = copy_of(undisturbed, tmp_path / "out")
+    path = folder / "cells" / "00002.npz"
+    content = path.read_bytes()
+    if damage == "truncated":
+        path.write_bytes(content[: len(content) // 2])
+    elif damage == "flipped":
+        middle = content.index(b"variance.npy") + 200
+        path.write_bytes(content[:middle] + bytes([content[middle] ^ 4]) + content[middle + 1 :])
+    elif damage == "nonsense":
+        path.write_bytes(b"nonsense")
+    else:
+        other = Store.create(tmp_path / "other", {"config": {"kind": "other"}, "cells": [{}] * 3})
+        other.write(2, Store.open(undisturbed).read(2))
+        path.write_bytes(other.path(2).read_bytes())
+    damaged = path.read_bytes()
+    says = "is a cell of another study" if damage == "foreign" else "is damaged"
+    for use in (lambda: run_sweep(plan_sweep(config()), folder), lambda: load_study(folder)):
+        with pytest.raises(StudyError, match=f"00002.npz {says}.*; move it away to compute it again"):
+            use()
+    assert path.read_bytes() == damaged
+
+
+def test_a_folder_of_another_study_is_refused(undisturbed: Path, tmp_path: Path) -> None:
+    folder = copy_of(undisturbed, tmp_path / "out")
+    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    with pytest.raises(StudyError, match="holds another study .seed 0 there and 1 here.; choose another folder"):
+        run_sweep(plan_sweep(config(seed=1)), folder)
+    assert before == {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    (folder / "study.json").write_text("{")
+    with pytest.raises(StudyError, match="study.json is damaged"):
+        run_sweep(plan_sweep(config()), folder)
+    (folder / "study.json").unlink()
+    with pytest.raises(StudyError, match="cells of a study without its study.json"):
+        run_sweep(plan_sweep(config()), folder)
+    with pytest.raises(StudyError, match="holds no study"):
+        load_study(tmp_path)
+    (tmp_path / "study.json").write_text(json.dumps({"format": 99, "config": {}, "cells": []}))
+    with pytest.raises(StudyError, match="is of format 99; this program reads 1"):
+        load_study(tmp_path)
+
+
+LIMITED = """
+import os, resource, signal, sys
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (5500, 5500))
+os.execv(sys.executable, [sys.executable, "-m", "mjx_study", "sweep", *sys.argv[1:]])
+"""
+
+
+def test_a_full_disk_leaves_what_is_complete(undisturbed: Path, tmp_path: Path) -> None:
+    """Files of more than 5 kB cannot be written by this process: a write that fails on its way, as on a full disk."""
+    folder = tmp_path / "out"
+
+    environment = os.environ | {"JAX_ENABLE_COMPILATION_CACHE": "false"}
+    command = [sys.executable, "-c", LIMITED, *ARGUMENTS, "--output", str(folder), "--json"]
+    running = subprocess.run(command, capture_output=True, text=True, env=environment)
+    error = running.stderr
+    assert running.returncode == 2, error
+    assert "cannot write to" in error and "the same command goes on" in error
+    assert error.count("\n") == 1 and not list((folder / "cells").iterdir())
+    assert run_sweep(plan_sweep(config()), folder).computed == 8
+    assert same(load_study(folder), load_study(undisturbed))
+
+
+def test_a_write_that_fails_keeps_the_cells_before_it(
+    undisturbed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole, calls = store.write_whole, [0]
+
+    def failing(path: Path, write: Any) -> Path:
+        calls[0] += 1
+        if calls[0] > 4:  # study.json and three cells fit
+            raise OSError(28, "No space left on device")
+        return whole(path, write)
+
+    monkeypatch.setattr(store, "write_whole", failing)
+    with pytest.raises(OSError, match="No space left"):
+        run_sweep(plan_sweep(config()), tmp_path / "out")
+    monkeypatch.undo()
+    assert len(Store.open(tmp_path / "out").missing) == 5
+    result = run_sweep(plan_sweep(config()), tmp_path / "out")
+    assert result.computed == 5 and same(result.dataset, load_study(undisturbed))
+
+
+def test_a_folder_that_cannot_be_written_to_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ValueError, match="cannot write to the output folder"):
+        run_sweep(plan_sweep(config()), tmp_path / "file")
+
+
+# The command's text, figures and page.
+
+
+@pytest.mark.parametrize(
+    ("text", "values"),
+    [
+        ("10", [10.0]),
+        ("10:1000:3:log", [10.0, 100.0, 1000.0]),
+        ("0:1:5", [0.0, 0.25, 0.5, 0.75, 1.0]),
+        ("-1e4:-1e2:3:log", [-1e4, -1e3, -1e2]),
+    ],
+)
+def test_ranges(text: str, values: list[float]) -> None:
+    assert _range(text) == values
+
+
+def test_lists_from_text_numbers_and_files() -> None:
+    assert _many("10:100:2:log,1000", float) == (10.0, 100.0, 1000.0)
+    assert _many([3, 10], int) == (3, 10) and _many(5, int) == (5,) and _many("a", str) == ("a",)
+    assert _solver_values("solref", "-100,-1000;-5") == ((-100.0, -5.0), (-1000.0, -5.0))
+    assert _solver_values("solimp", "0.9,0.95,0.001,0.5,2") == ((0.9, 0.95, 0.001, 0.5, 2.0),)
+    for wrong in ("10:1000", "1:10:1", "0:10:3:log", "a", "1:2:3:lin"):
+        with pytest.raises(ValueError, match="is neither a number nor a range"):
+            _range(wrong)
+    with pytest.raises(ValueError, match="2.5 is not a whole number"):
+        _many("2.5", int)
+    with pytest.raises(ValueError, match="'x' is no number"):
+        _many(["x"], float)
+
+
+def test_a_file_and_flags_are_one_configuration(tmp_path: Path) -> None:
+    path = tmp_path / "study.toml"
+    path.write_text('tasks = ["pusher"]\nstiffness = "10:1000:3:log"\nsamples = [4, 8]\nseeds = 2\nhorizon = 9\n')
+    parsed = cli.parser().parse_args(["sweep", "--config", str(path), "--seeds", "3", "--output", "x"])
+    assert SweepConfig(**_fields(parsed)) == SweepConfig(
+        tasks=("pusher",), stiffness=(10.0, 100.0, 1000.0), samples=(4, 8), seeds=3, horizon=9
+    )
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"tasks": ()}, "no task given"),
+        ({"tasks": ("puhser",)}, "unknown task 'puhser'"),
+        ({"estimators": ("gobg",)}, "unknown estimator 'gobg'"),
+        ({"contact": ("soft",)}, "unknown contact family 'soft'"),
+        ({"stiffness": ()}, "no stiffness given"),
+        ({"stiffness": (10.0, 10.0)}, "stiffness given twice: 10.0"),
+        ({"samples": (2,)}, "samples must be at least 3"),
+        ({"seeds": 0}, "seeds must be at least 1, got 0"),
+        ({"timestep": (2.0,)}, "timestep must lie between 0 and 1 s"),
+        ({"sigma": (-1.0,)}, "sigma must be positive"),
+        ({"contact": (), "stiffness": None}, "no contact model"),
+        ({"solref": ((1.0, 2.0, 3.0),)}, "solref takes 2 numbers and solimp 5, got 3 and 5"),
+        ({"iterations": 3, "optimizer": "ascent"}, "optax has no optimiser 'ascent'"),
+        ({"estimators": ("fobg_truncated",)}, "'fobg_truncated' needs the option window"),
+    ],
+)
+def test_what_cannot_be_swept_is_refused(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        plan_sweep(config(**changes))
+
+
+def test_contact_models_in_mujocos_terms() -> None:
+    plan = plan_sweep(config(contact=(), solref=((-1000.0, -5.0), (0.02, 1.0)), solimp=((0.9, 0.95, 0.001, 0.5, 2.0),)))
+    models = [cell.model for cell in plan.cells if cell.samples == 4]
+    assert [model.family for model in models] == [
+        "solref -1000 -5 solimp 0.9 0.95 0.001 0.5 2", "solref 0.02 1 solimp 0.9 0.95 0.001 0.5 2"
+    ]  # fmt: skip
+    mass = make_task("pusher").effective_mass
+    assert models[0].stiffness == pytest.approx(stiffness_from_solref([-1000.0, -5.0], effective_mass=mass)[0])
+
+
+def test_every_axis_gets_its_figures(undisturbed: Path, descents: Path) -> None:
+    assert set(study_plots.plot_study(load_study(undisturbed))) == {
+        "variance", "bias", "alpha", "error_against_samples", "map_stiffness_samples",
+    }  # fmt: skip
+    assert set(study_plots.plot_study(load_study(descents))) == {"achieved", "descent"}
+    for name, figure in study_plots.plot_study(load_study(descents)).items():
+        for axes in figure.axes:
+            assert axes.get_xlabel() or axes.get_shared_x_axes or name, name
+        assert any(axes.get_ylabel() for axes in figure.axes)
+
+
+def test_an_unfinished_study_can_be_drawn(undisturbed: Path, tmp_path: Path) -> None:
+    folder = copy_of(undisturbed, tmp_path / "out")
+    for index in (1, 2, 3, 6):
+        (folder / "cells" / f"{index:05d}.npz").unlink()
+    assert "variance" in study_plots.plot_study(load_study(folder))
+    for path in (folder / "cells").iterdir():
+        path.unlink()
+    assert study_plots.plot_study(load_study(folder)) == {}
+    assert "no cell is computed" in report(load_study(folder))
+
+
+def test_the_commands_write_figures_and_a_page(
+    undisturbed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(options, "configure", lambda **_: None)
+    folder = copy_of(undisturbed, tmp_path / "out")
+    assert cli.main(["sweep", *ARGUMENTS[:-2], "--output", str(folder), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["computed"] == 0 and told["cells"]["model"] == 4
+    assert cli.main(["plot", str(folder)]) == 0
+    assert {"variance.png", "variance.pdf", "bias.png", "alpha.png"} <= {path.name for path in folder.iterdir()}
+    assert cli.main(["report", str(folder)]) == 0
+    page = (folder / "report.html").read_text()
+    assert page.count("data:image/png;base64,") == 5 and "http" not in page.replace("http-equiv", "")
+    assert "penalty 1000" in page and "mjx-study" in page and "jaxlib" in page and "<script" not in page
+    for wrong, says in (
+        (["plot", str(tmp_path)], "holds no study"),
+        (["report", str(tmp_path)], "holds no study"),
+        (["sweep", "--output", str(tmp_path / "x")], "no task: name one"),
+        (["sweep", *ARGUMENTS[:-2], "--seed", "4", "--output", str(folder)], "holds another study"),
+        (["sweep", "--config", "nowhere.toml", "--output", "x"], "cannot read nowhere.toml"),
+    ):
+        capsys.readouterr()
+        assert cli.main(wrong) == 2
+        error = capsys.readouterr().err
+        assert says in error and error.count("\n") == 1
+
+
+def test_the_example_of_the_page_runs(undisturbed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    page = (Path(__file__).parents[1] / "docs" / "studies.md").read_text()
+    (code,) = re.findall(r"```py\n(.*?)```", page, re.DOTALL)
+    (toml,) = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
+    copy_of(undisturbed, tmp_path / "out")
+    monkeypatch.chdir(tmp_path)
+    found: dict[str, Any] = {}
+    exec(code, found)
+    assert found["ahead"].dims == ("model",) and bool(found["ahead"].all())  # so few steps are calm at any stiffness
+    (tmp_path / "study.toml").write_text(toml)
+    parsed = cli.parser().parse_args(["sweep", "--config", "study.toml", "--output", "x"])
+    assert len(plan_sweep(SweepConfig(**_fields(parsed))).cells) == 52
+    for name in load_study(tmp_path / "out").variables:
+        assert f"`{name}`" in page, name
+
+
+def test_the_configuration_is_that_of_the_flags() -> None:
+    """Every option of an estimator reaches its cells."""
+    plan = plan_sweep(config(baseline="leave_one_out", gamma=3.0, tolerance=0.1, failure_probability=0.2))
+    chosen = module._options(plan, plan.cells[0])
+    assert (chosen.baseline, chosen.gamma, chosen.tolerance, chosen.failure_probability) == (
+        "leave_one_out",
+        3.0,
+        0.1,
+        0.2,
+    )
+    assert dataclasses.asdict(plan.config)["gamma"] == 3.0
