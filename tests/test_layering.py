@@ -42,6 +42,7 @@ LAYERS = [
     "mjx_study.checkpoint",
     "mjx_study.optimise",
     "mjx_study.store",
+    "mjx_study.sweep_plan",
     "mjx_study.sweep",
     "mjx_study.render",
     "mjx_study.plots",

@@ -28,6 +28,7 @@ from mjx_study.objective import Simulator
 from mjx_study.report import report
 from mjx_study.store import Store, StudyError
 from mjx_study.sweep import MEASURED, SweepConfig, load_study, plan_sweep, run_sweep
+from mjx_study.sweep_plan import estimator_options
 from mjx_study.tasks import make_task
 
 SMALL: dict[str, Any] = {
@@ -485,7 +486,7 @@ def test_the_example_of_the_page_runs(undisturbed: Path, tmp_path: Path, monkeyp
 def test_the_configuration_is_that_of_the_flags() -> None:
     """Every option of an estimator reaches its cells."""
     plan = plan_sweep(config(baseline="leave_one_out", gamma=3.0, tolerance=0.1, failure_probability=0.2))
-    chosen = module._options(plan, plan.cells[0])
+    chosen = estimator_options(plan, plan.cells[0])
     assert (chosen.baseline, chosen.gamma, chosen.tolerance, chosen.failure_probability) == (
         "leave_one_out",
         3.0,

@@ -1,0 +1,234 @@
+"""What a sweep is asked for, and the cells that it comes to."""
+
+import dataclasses
+import itertools
+from typing import Final
+
+import jax
+
+from estimators import ESTIMATORS, EstimatorOptions
+from estimators.ddcg import PUBLISHED_TOLERANCE
+from mjx_study.configuration import (
+    Cell,
+    EstimatorConfig,
+    check_estimators,
+    check_names,
+    configured_options,
+    plan_cells,
+    refuse_repeats,
+    solver_cells,
+)
+from mjx_study.contact import FAMILIES
+from mjx_study.objective import chunk_for
+from mjx_study.optimise import OptimiseConfig, OptimisePlan, plan_optimise
+from mjx_study.task import Task, check_sigma
+from mjx_study.tasks import make_task
+
+LARGEST_BATCH: Final = 20_000
+"""Samples that are drawn at once; more seeds than fit are drawn in turn."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SweepConfig:
+    """Everything that decides a sweep.
+
+    Attributes:
+        tasks: names of tasks.
+        estimators: names of estimators.
+        contact: contact families; None for each task's. Empty for none but those of `solref`.
+        stiffness: of the families that take one [N/m]; None for each task's.
+        damping: of the contact [N s/m]; None for each family's.
+        solref, solimp: contact models in MuJoCo's own terms, every solref with every solimp, beside the families;
+            either alone goes with MuJoCo's default of the other.
+        timestep: [s]; None for the MJCF's.
+        cone: pyramidal, elliptic; None for the MJCF's.
+        sigma: standard deviations of the noise; None for each task's.
+        samples: sizes of a batch.
+        seeds: batches of each size, or descents.
+        iterations: of gradient descent; None to estimate gradients where each task starts.
+        optimizer, learning_rate, decay: of the descent, as in `OptimiseConfig`.
+        reference_samples: pairs of rollouts behind each reference gradient.
+        evaluation_samples: rollouts behind the cost of a final policy.
+        seed, noise, baseline, gamma, failure_probability, variance_proxy, radius, max_norm, window, tolerance,
+            horizon, model, chunk_size: as in `EstimatorConfig`.
+    """
+
+    tasks: tuple[str, ...]
+    estimators: tuple[str, ...] = ("zobg", "fobg", "aobg")
+    contact: tuple[str, ...] | None = None
+    stiffness: tuple[float, ...] | None = None
+    damping: float | None = None
+    solref: tuple[tuple[float, ...], ...] = ()
+    solimp: tuple[tuple[float, ...], ...] = ()
+    timestep: tuple[float, ...] | None = None
+    cone: tuple[str, ...] | None = None
+    sigma: tuple[float, ...] | None = None
+    samples: tuple[int, ...] = (100,)
+    seeds: int = 10
+    iterations: int | None = None
+    optimizer: str = "sgd"
+    learning_rate: float | None = None
+    decay: float | None = None
+    reference_samples: int = 600
+    evaluation_samples: int = 200
+    seed: int = 0
+    noise: str | None = None
+    baseline: str = "zero_noise"
+    gamma: float | None = None
+    failure_probability: float = 0.05
+    variance_proxy: str = "variance"
+    radius: str | float = "max_deviation"
+    max_norm: float | None = None
+    window: int | None = None
+    tolerance: float = PUBLISHED_TOLERANCE
+    horizon: int | None = None
+    model: str | None = None
+    chunk_size: int | None = None
+
+    def __post_init__(self) -> None:
+        if not self.tasks:
+            raise ValueError("no task given")
+        check_names("estimator", self.estimators, ESTIMATORS)
+        if self.contact:
+            check_names("contact family", self.contact, FAMILIES)
+        for name in ("tasks", "stiffness", "solref", "solimp", "timestep", "cone", "sigma", "samples"):
+            values = getattr(self, name)
+            if values is not None:
+                refuse_repeats(name, values)
+            if values == () and name not in ("solref", "solimp"):
+                raise ValueError(f"no {name} given: give at least one, or leave it out")
+        counts = {"seeds": 1, "reference_samples": 3, "evaluation_samples": 2, "iterations": 1, "chunk_size": 1}
+        for name, least in counts.items():
+            value = getattr(self, name)
+            if value is not None and value < least:
+                raise ValueError(f"{name.replace('_', ' ')} must be at least {least}, got {value}")
+        if min(self.samples) < 3:
+            raise ValueError(f"samples must be at least 3, so that a variance has an error; got {min(self.samples)}")
+        for step in self.timestep or ():
+            if not 0 < step < 1:
+                raise ValueError(f"timestep must lie between 0 and 1 s, got {step:g}")
+
+
+@dataclasses.dataclass(frozen=True)
+class Group:
+    """What one compilation serves."""
+
+    task: Task
+    timestep: float
+    cone: str
+    models: tuple[Cell, ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class SweepCell:
+    """One file of a study.
+
+    Attributes:
+        group: index of the group.
+        model: the contact model.
+        sigma: of the noise.
+        samples: in each batch.
+    """
+
+    group: int
+    model: Cell
+    sigma: float
+    samples: int
+
+
+@dataclasses.dataclass(frozen=True)
+class SweepPlan:
+    """A sweep that has been checked.
+
+    Attributes:
+        config: as given.
+        groups: what is compiled.
+        cells: what is computed, in this order.
+        chunk_size: samples per device and call, for the devices here unless the configuration gives it.
+        warnings: about contact models.
+    """
+
+    config: SweepConfig
+    groups: tuple[Group, ...]
+    cells: tuple[SweepCell, ...]
+    chunk_size: int
+    warnings: tuple[str, ...]
+
+    @property
+    def compilations(self) -> int:
+        """Programs of rollouts that are needed: two for each group, or one for each of its descents."""
+        if self.config.iterations is None:
+            return 2 * len(self.groups)
+        settings = {(cell.group, cell.sigma, cell.samples) for cell in self.cells}
+        return len(settings) * len(self.config.estimators)
+
+    def label(self, cell: SweepCell) -> str:
+        """As messages name a cell."""
+        group = self.groups[cell.group]
+        return f"{group.task.name}, {cell.model.label}, h = {group.timestep:g} s, N = {cell.samples}"
+
+
+def plan_sweep(config: SweepConfig) -> SweepPlan:
+    """Check a configuration and resolve its defaults, computing nothing.
+
+    Raises:
+        ValueError: anything about the configuration that cannot be run; the message says what is accepted.
+    """
+    groups: list[Group] = []
+    cells: list[SweepCell] = []
+    messages: list[str] = []
+    for name, timestep, cone in itertools.product(config.tasks, config.timestep or (None,), config.cone or (None,)):
+        task = _build(config, name, timestep, cone)
+        models, told = plan_cells(task, config.contact, config.stiffness, config.damping)
+        if config.solref or config.solimp:
+            more, also = solver_cells(task, config.solref, config.solimp)
+            models, told = models + more, told + also
+        if not models:
+            raise ValueError("no contact model: give at least one contact family, solref or solimp")
+        host = task.scene.host
+        group = Group(task, float(host.opt.timestep), {0: "pyramidal", 1: "elliptic"}[int(host.opt.cone)], models)
+        at = f"h = {group.timestep:g} s: " if config.timestep is not None else ""
+        messages += [f"{at}{message}" for message in told]
+        for model, sigma, samples in itertools.product(models, config.sigma or (task.sigma,), config.samples):
+            check_sigma(sigma)
+            cells.append(SweepCell(len(groups), model, sigma, samples))
+        groups.append(group)
+    most = min(LARGEST_BATCH, max(config.samples) * (1 if config.iterations else config.seeds))
+    chunk = chunk_for(most, jax.local_devices()) if config.chunk_size is None else config.chunk_size
+    plan = SweepPlan(config, tuple(groups), tuple(cells), chunk, tuple(dict.fromkeys(messages)))
+    for cell in {cell.group: cell for cell in cells}.values():
+        estimator_options(plan, cell)
+        if config.iterations is not None:
+            descent_plan(plan, cell)
+    return plan
+
+
+def _build(config: SweepConfig, name: str, timestep: float | None, cone: str | None) -> Task:
+    chosen = {"timestep": timestep, "cone": cone, "horizon": config.horizon, "model": config.model}
+    task = make_task(name, **{key: value for key, value in chosen.items() if value is not None})
+    return task if config.noise is None else task.replace(noise=config.noise)
+
+
+def estimator_options(plan: SweepPlan, cell: SweepCell) -> EstimatorOptions:
+    """Those of a cell's estimators, checked against its task."""
+    config, task = plan.config, plan.groups[cell.group].task.replace(sigma=cell.sigma)
+    options = configured_options(_shared(config, task), task)
+    check_estimators(config.estimators, task, options)
+    return options
+
+
+def _shared(config: SweepConfig, task: Task) -> EstimatorConfig:
+    names = {field.name for field in dataclasses.fields(EstimatorConfig)} & {
+        field.name for field in dataclasses.fields(SweepConfig)
+    }
+    kept = {name: getattr(config, name) for name in names - {"sigma", "cone"}}
+    return EstimatorConfig(task=task.name, **kept)
+
+
+def descent_plan(plan: SweepPlan, cell: SweepCell) -> OptimisePlan:
+    """A cell's descents."""
+    config, task = plan.config, plan.groups[cell.group].task.replace(sigma=cell.sigma)
+    names = ("iterations", "seeds", "optimizer", "learning_rate", "decay", "evaluation_samples")
+    chosen = {field.name: getattr(_shared(config, task), field.name) for field in dataclasses.fields(EstimatorConfig)}
+    descent = OptimiseConfig(**chosen, **{name: getattr(config, name) for name in names}, samples=cell.samples)
+    return plan_optimise(descent, task, cell.model)
