@@ -217,8 +217,9 @@ def test_a_killed_sweep_goes_on_to_the_same_data(undisturbed: Path, tmp_path: Pa
         if running.returncode == 0:
             break
         kills += 1
-    assert process(folder).wait() == 0
-    assert kills >= 3 and same(load_study(folder), load_study(undisturbed))
+    last = process(folder)
+    last.communicate()
+    assert last.returncode == 0 and kills >= 3 and same(load_study(folder), load_study(undisturbed))
 
 
 def test_two_processes_share_a_study_and_a_third_has_nothing_to_do(undisturbed: Path, tmp_path: Path) -> None:

@@ -12,6 +12,9 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, Final
 
+import jax
+import jax.numpy as jnp
+
 from mjx_study.task import Task
 
 GROUP: Final = "mjx_study.tasks"
@@ -50,19 +53,20 @@ def own_task(place: str, options: dict[str, Any]) -> Task:
 
     Raises:
         MissingModuleError: there is no such module.
-        ValueError: the module raises, or there is no Task nor a function that takes the options and returns one.
+        ValueError: the module raises, there is no Task nor a function that takes the options and returns one, or parts
+            of the Task do not fit together.
     """
     module, _, name = place.partition(":")
     with _importable_here():
         found = _find(_load(module), name)
-        if not isinstance(found, Task):
-            return _build(place, found, options)
-    if options:
-        raise ValueError(
-            f"{place} is a Task that is made already, and {_listed(options)} cannot change it: "
-            "give a function that takes this and returns the Task"
-        )
-    return found
+        if isinstance(found, Task) and options:
+            raise ValueError(
+                f"{place} is a Task that is made already, and {_listed(options)} cannot change it: "
+                "give a function that takes this and returns the Task"
+            )
+        task = found if isinstance(found, Task) else _build(place, found, options)
+        _check_shapes(place, task)
+    return task
 
 
 def _load(name: str) -> ModuleType:
@@ -117,6 +121,35 @@ def _check_arguments(place: str, builder: Callable[..., object], options: dict[s
     missing = [p.name for p in named if p.default is p.empty and p.name not in by_keyword & options.keys()]
     if missing:
         raise ValueError(f"{place} needs {_listed(missing)}, which is not given: give it a default")
+
+
+def _check_shapes(place: str, task: Task) -> None:
+    """Refuse what broadcasting and clamped indices would let pass; traces, and computes nothing."""
+    policy, dtype = task.policy, task.scene.template.qpos.dtype
+    steps, controls = task.horizon, task.scene.host.nu
+    if jnp.asarray(task.theta).dtype != dtype:
+        raise ValueError(f"{place}: theta is {task.theta.dtype}, and the simulation {dtype}")
+    start = _shapes(place, "start", lambda: task.draw_start(jax.random.key(0)))
+    noise = jax.ShapeDtypeStruct(policy.noise_shape, dtype)
+    control = jax.ShapeDtypeStruct((controls,), dtype)
+    parts = {
+        "policy's feedforward": (policy.feedforward, (task.theta, noise), (steps, controls)),
+        "policy's feedback": (policy.feedback, (task.theta, start), (controls,)),
+        "running_cost": (task.running_cost, (start, control), ()),
+        "final_cost": (task.final_cost, (start,), ()),
+    }
+    for part, (function, arguments, needed) in parts.items():
+        found = _shapes(place, part, function, *arguments)
+        if found is not None and found.shape != needed:
+            fitting = f"; {steps} steps and {controls} controls need {needed}" if needed else ", and a cost is a scalar"
+            raise ValueError(f"{place}: the {part} has shape {found.shape}{fitting}")
+
+
+def _shapes(place: str, part: str, function: Callable[..., Any], *arguments: Any) -> Any:
+    try:
+        return jax.eval_shape(function, *arguments)
+    except Exception as error:
+        raise ValueError(f"{place}: the {part} raised {_described(error)}") from error
 
 
 def _listed(names: Sequence[str] | dict[str, Any]) -> str:

@@ -1,0 +1,161 @@
+"""The notebooks run from top to bottom, show what a run of them gave, and use nothing that is private."""
+
+import ast
+import re
+from pathlib import Path
+from typing import Any
+
+import nbformat
+import pytest
+from nbclient import NotebookClient
+
+import mjx_study
+
+ROOT = Path(__file__).parents[1]
+NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
+LARGEST = 300_000
+"""Bytes of a notebook with its outputs."""
+SMALL = {
+    "1_stiffness_sweep": "STIFFNESS, SEEDS, SAMPLES, REFERENCE_SAMPLES = (10.0, 1200.0), 2, 8, 40",
+    "2_which_estimator": "SAMPLES, REFERENCE_SAMPLES, ITERATIONS = 8, 20, 3",
+    "3_bring_your_own": (
+        "STATES, SAMPLES, REFERENCE_SAMPLES, POINTS = 1, 8, 20, 3\nCONTACT, STIFFNESS = ('penalty', 'mujoco'), 1000.0"
+    ),
+    "4_are_mjx_gradients_right": "STATES, STEPS, FORCES, POINTS = 1, 5, 3, 3",
+}
+"""In place of the cell of parameters, so that a run is short."""
+ABSOLUTE = re.compile(r"(?<![\w.~])/(?:home|root|Users|tmp|var|usr|opt|mnt|srv|private|proc)/|[A-Z]:\\\\")
+
+each = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+
+
+def read(path: Path) -> nbformat.NotebookNode:
+    return nbformat.read(path, as_version=4)
+
+
+def code_cells(notebook: nbformat.NotebookNode) -> list[Any]:
+    return [cell for cell in notebook.cells if cell.cell_type == "code"]
+
+
+def python(cell: Any) -> ast.Module:
+    """A cell's code without its magics."""
+    return ast.parse("\n".join(line for line in cell.source.splitlines() if not line.startswith("%")))
+
+
+def assigned(source: str) -> set[str]:
+    return {node.id for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Name)}
+
+
+def shown(output: Any) -> list[str]:
+    """What a reader sees of an output, pictures left out."""
+    if output.output_type == "stream":
+        return [output.text]
+    return [text for kind, text in output.get("data", {}).items() if kind.startswith("text/")]
+
+
+def private(tree: ast.AST) -> list[str]:
+    """Names of ours that code uses although they are not public."""
+    found = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            found += [alias.name for alias in node.names if "._" in f".{alias.name}"]
+        elif isinstance(node, ast.ImportFrom):
+            names = [f"{node.module}.{alias.name}" for alias in node.names]
+            found += [name for name in names if "._" in f".{name}"]
+        elif isinstance(node, ast.Attribute):
+            of_ours = isinstance(node.value, ast.Name) and node.value.id == "mjx_study"
+            if node.attr.startswith("_"):
+                found.append(node.attr)
+            elif of_ours and node.attr not in mjx_study.__all__:
+                found.append(f"mjx_study.{node.attr}")
+    return found
+
+
+def test_there_is_one_for_each_question() -> None:
+    assert [path.stem for path in NOTEBOOKS] == list(SMALL)
+
+
+@each
+def test_runs(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """At a small size, in an empty folder, where it leaves nothing behind."""
+    notebook = read(path)
+    (parameters,) = [cell for cell in code_cells(notebook) if "parameters" in cell.metadata.get("tags", ())]
+    assert assigned(SMALL[path.stem]) == assigned(parameters.source)
+    parameters.source = SMALL[path.stem]
+    monkeypatch.setenv("IPYTHONDIR", str(tmp_path / "ipython"))  # no start-up files of whoever runs the tests
+    folder = tmp_path / "run"
+    folder.mkdir()
+    client = NotebookClient(notebook, timeout=600, kernel_name="python3", resources={"metadata": {"path": str(folder)}})
+    client.execute()  # raises the first error of a cell
+    assert all(cell.execution_count for cell in code_cells(notebook))
+    assert list(folder.iterdir()) == []
+
+
+@each
+def test_outputs_are_of_one_whole_run(path: Path) -> None:
+    cells = code_cells(read(path))
+    assert [cell.execution_count for cell in cells] == list(range(1, len(cells) + 1))
+    outputs = [output for cell in cells for output in cell.outputs]
+    assert any("image/png" in output.get("data", {}) for output in outputs)
+    assert not [output for output in outputs if output.output_type == "error"]
+    assert not [output.text for output in outputs if output.get("name") == "stderr"]
+    assert not [text for output in outputs for text in shown(output) if "Traceback" in text or "Warning" in text]
+
+
+@each
+def test_nothing_of_the_machine_is_kept(path: Path) -> None:
+    notebook = read(path)
+    texts = [cell.source for cell in notebook.cells]
+    texts += [text for cell in code_cells(notebook) for output in cell.outputs for text in shown(output)]
+    for text in texts:
+        assert not ABSOLUTE.search(text) and str(ROOT) not in text, text
+    assert {key for cell in notebook.cells for key in cell.metadata} <= {"tags"}
+    assert set(notebook.metadata) == {"kernelspec", "language_info"}
+    assert path.stat().st_size < LARGEST
+
+
+@each
+def test_the_title_asks_and_the_text_answers(path: Path) -> None:
+    notebook = read(path)
+    first, *rest = notebook.cells
+    title, _, answer = first.source.partition("\n")
+    assert first.cell_type == "markdown" and title.startswith("# ") and title.endswith("?")
+    assert len(re.findall(r"\.(?:\s|$)", answer)) == 2, "an answer has two sentences"
+    known = [text for cell in code_cells(notebook) for output in cell.outputs for text in shown(output)]
+    known += [cell.source for cell in code_cells(notebook)]
+    for number in re.findall(r"\d+(?:\.\d+)?", answer):
+        assert any(number in text for text in known), f"{number} is nowhere in the code or its outputs"
+    assert "mjx_study.configure()" in next(cell for cell in rest if cell.cell_type == "code").source
+
+
+@each
+def test_links_lead_somewhere(path: Path) -> None:
+    text = "\n".join(cell.source for cell in read(path).cells if cell.cell_type == "markdown")
+    targets = re.findall(r"\]\(([^)]+)\)", text)
+    assert targets
+    for target in targets:
+        place, _, anchor = target.partition("#")
+        assert target.startswith("https://") or (path.parent / place).is_file(), target
+        if anchor:
+            headings = re.findall(r"^#+ (.*)$", (path.parent / place).read_text(), re.MULTILINE)
+            assert anchor in [re.sub(r"[^\w -]", "", heading).lower().replace(" ", "-") for heading in headings], target
+
+
+@each
+def test_only_public_names_are_used(path: Path) -> None:
+    assert not [name for cell in code_cells(read(path)) for name in private(python(cell))]
+
+
+@pytest.mark.parametrize(
+    ("source", "found"),
+    [
+        ("from mjx_study._mjx import mjx", ["mjx_study._mjx.mjx"]),
+        ("import mjx_study._mjx", ["mjx_study._mjx"]),
+        ("from mjx_study.study import _row", ["mjx_study.study._row"]),
+        ("task._hidden", ["_hidden"]),
+        ("mjx_study.UNHEARD_OF", ["mjx_study.UNHEARD_OF"]),
+        ("import mjx_study\nmjx_study.compare(plan).rows", []),
+    ],
+)
+def test_the_walk_sees(source: str, found: list[str]) -> None:
+    assert private(ast.parse(source)) == found

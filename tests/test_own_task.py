@@ -1,0 +1,292 @@
+"""A task of the user's own: the page that explains it works as it stands there, and each mistake gets one line."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+from mjx_study.gradcheck.check import plan_gradcheck
+from mjx_study.landscape import LandscapeConfig, plan_landscape
+from mjx_study.optimise import OptimiseConfig, plan_optimise
+from mjx_study.study import CompareConfig, plan_compare
+from mjx_study.task import Task
+from mjx_study.tasks import make_task
+from mjx_study.tasks.own import GROUP
+
+ROOT = Path(__file__).parents[1]
+PAGE = (ROOT / "docs" / "extending.md").read_text()
+MJCF, PYTHON, OTHERS = (
+    *re.findall(r"```xml\n(.*?)```", PAGE, re.DOTALL),
+    *re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL),
+)
+SMALL = ["--horizon", "40", "--stiffness", "3000", "--contact", "smooth_onset"]
+TINY = """
+import jax.numpy as jnp
+from mjx_study import OpenLoop, Task, initial_state, load_scene
+
+def hop(horizon=3, **options):
+    scene, policy = load_scene("pusher", **options), OpenLoop(horizon, 1)
+    return Task(name="hop", scene=scene, horizon=horizon, policy=policy, theta=jnp.zeros(horizon), sigma=1.0,
+                start=initial_state(scene), contact_pair=("pusher", "slider"), final_cost=lambda state: state.qpos[1])
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The page's two files, as a user has them."""
+    path = tmp_path_factory.mktemp("mine")
+    (path / "hopper.xml").write_text(MJCF)
+    (path / "my_tasks.py").write_text(PYTHON)
+    return path
+
+
+@pytest.fixture(autouse=True)
+def nothing_stays_imported() -> Iterator[None]:
+    before, path = set(sys.modules), list(sys.path)
+    yield
+    assert sys.path == path
+    for name in set(sys.modules) - before:
+        if name.split(".")[0] in ("my_tasks", "mine", "broken", "inner"):
+            del sys.modules[name]
+
+
+@pytest.fixture
+def write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Writes the module `mine` into the current directory, which Python has no reason to look into."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [entry for entry in sys.path if entry not in ("", str(tmp_path))])
+
+    def write(source: str, name: str = "mine") -> None:
+        (tmp_path / f"{name}.py").write_text(source)
+
+    return write
+
+
+@pytest.fixture
+def register(monkeypatch: pytest.MonkeyPatch):
+    """Has installed packages register tasks, given as (name, place)."""
+
+    def register(*points: tuple[str, str]) -> None:
+        registered = metadata.EntryPoints([metadata.EntryPoint(*point, GROUP) for point in points])
+        monkeypatch.setattr(metadata, "entry_points", lambda **wanted: registered.select(**wanted))
+
+    return register
+
+
+def run(folder: Path, *arguments: str) -> dict[str, Any]:
+    """A command in a process of its own, with compiled programs kept between runs of the tests."""
+    environment = os.environ | {"XDG_CACHE_HOME": str(ROOT / ".pytest_cache" / "own_task")}
+    environment |= {"XLA_FLAGS": "--xla_backend_optimization_level=0"}  # compiling takes longer than running
+    command = [sys.executable, "-m", "mjx_study", *arguments, *SMALL, "--json"]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=folder, env=environment, timeout=900)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+def refused(name: str, **options: Any) -> str:
+    with pytest.raises(ValueError) as error:
+        make_task(name, **options)
+    message = str(error.value)
+    assert "\n" not in message
+    return message
+
+
+# The page
+
+
+def test_the_example_is_short() -> None:
+    assert len([line for line in PYTHON.splitlines() if line.strip()]) < 20
+    assert len(MJCF.splitlines()) < 25
+
+
+def test_compare(folder: Path) -> None:
+    """FoBG's four samples are nearer to the reference than ZoBG's, whose variance is many times as large."""
+    document = run(folder, "compare", "my_tasks:hopper", "--samples", "4", "--reference-samples", "4")
+    assert document["config"]["task"] == "my_tasks:hopper"
+    assert document["config"]["horizon"] == 40 and document["config"]["gamma"] == "inf"
+    rows = {row["estimator"]: row for row in document["rows"]}
+    assert list(rows) == ["zobg", "fobg", "aobg"]
+    assert all(row["nonfinite"] == 0 and row["residual"] < 1e-6 for row in rows.values())
+    assert rows["fobg"]["relative_error"] < rows["zobg"]["relative_error"]
+    assert rows["fobg"]["variance"] < 0.1 * rows["zobg"]["variance"]
+
+
+def test_optimise(folder: Path) -> None:
+    arguments = ["--estimator", "fobg", "--iterations", "2", "--samples", "4", "--seeds", "2", "--learning-rate", "1"]
+    document = run(folder, "optimise", "my_tasks:hopper", *arguments, "--evaluation-samples", "4")
+    (found,) = document["runs"]
+    assert len(found["final_cost"]) == 2 and found["stopped"] == []
+    assert max(found["final_cost"]) < document["start_cost"][0] - 0.05
+    assert len(found["theta"][0]) == 80
+
+
+def test_sweep_and_plot(folder: Path) -> None:
+    arguments = ["--samples", "4", "--seeds", "2", "--reference-samples", "4", "--output", "out"]
+    document = run(folder, "sweep", "my_tasks:hopper", *arguments)
+    assert document["computed"] == 1 and document["cells"]["estimator"] == 3
+    command = [sys.executable, "-m", "mjx_study", "plot", "out"]
+    assert subprocess.run(command, cwd=folder, capture_output=True).returncode == 0
+    assert (folder / "out" / "variance.png").is_file()
+
+
+@pytest.mark.slow
+def test_gradcheck(folder: Path) -> None:
+    """Exit code 0: the derivatives are right."""
+    document = run(folder, "gradcheck", "my_tasks:hopper", "--states", "1")
+    assert document
+
+
+@pytest.mark.parametrize("name", ["hopper", "feedback", "thrown"])
+def test_every_command_plans_with_it(name: str, write, tmp_path: Path) -> None:
+    (tmp_path / "hopper.xml").write_text(MJCF)
+    write(PYTHON + OTHERS, "my_tasks")
+    task = f"my_tasks:{name}"
+    built = make_task(task, horizon=5, cone="pyramidal")
+    assert built.horizon == 5 and built.name == "hopper" and built.scene.host.opt.cone == 0
+    assert len(plan_compare(CompareConfig(task=task)).cells) == 12
+    assert plan_optimise(OptimiseConfig(task=task)).config.stiffness == 1e4
+    assert plan_landscape(LandscapeConfig(task=task, direction="0", span=(-1.0, 1.0)), built)
+    assert plan_gradcheck(built, None, None, seed=0, states=1).is_task
+    assert built.policy.additive == (name != "feedback")
+
+
+# Names
+
+
+def test_a_task_is_found_in_the_current_directory(write) -> None:
+    write(TINY + "\nmade = hop(horizon=4)\n")
+    assert make_task("mine:hop").horizon == 3
+    assert make_task("mine:hop", horizon=7).horizon == 7
+    assert make_task("mine:made").horizon == 4
+
+
+def test_names_of_this_package_come_first(write, register) -> None:
+    write("raise RuntimeError('imported')", "ball_wall")
+    register(("pusher", "broken:pusher"))
+    assert make_task("ball_wall:dome", horizon=3).name == "ball_wall:dome"
+    assert make_task("pusher", horizon=3).name == "pusher"
+
+
+def test_packages_register_tasks(write, register) -> None:
+    write(TINY)
+    register(("hop", "mine:hop"), ("other", "broken:hop"), ("hop:high", "mine:hop"))
+    assert make_task("hop", horizon=5).horizon == 5
+    assert make_task("hop:high").horizon == 3
+    assert refused("hip").startswith("unknown task 'hip'; choose from pusher, ")
+    assert "double_pendulum, hop, hop:high, other, or module:name of your own" in refused("hip")
+    assert refused("other") == "there is no module 'broken' here or installed"
+
+
+def test_packages_at_odds(register) -> None:
+    register(("hop", "b:hop"), ("hop", "a:hop"))
+    assert refused("hop") == "task 'hop' is registered more than once; choose from a:hop, b:hop"
+
+
+def test_the_current_directory_is_on_the_path_during_the_import_only(write, tmp_path: Path) -> None:
+    write(TINY + "\nimport sys\nseen = list(sys.path)\n")
+    make_task("mine:hop")
+    assert sys.modules["mine"].seen[0] == str(tmp_path)
+    assert str(tmp_path) not in sys.path
+
+
+# Mistakes
+
+
+def test_no_such_module(write) -> None:
+    write("import nowhere_at_all", "inner")
+    assert refused("mine:hop").endswith("or module:name of your own (there is no module 'mine' here or installed)")
+    assert refused("mine.tasks:hop").endswith("(there is no module 'mine' here or installed)")
+    assert refused("ball_wall:dom").startswith("unknown task 'ball_wall:dom'; choose from pusher, ")
+    for name in ("mine.py:hop", "folder/mine:hop", ":hop", ".mine:hop"):
+        assert refused(name).endswith("is no module: write it as in an import, without a folder or .py)")
+    message = "importing inner raised ModuleNotFoundError: No module named 'nowhere_at_all' (inner.py, line 1)"
+    assert refused("inner:hop") == message
+
+
+@pytest.mark.parametrize(
+    ("source", "says"),
+    [
+        ("x = 1\ny = z", "importing mine raised NameError: name 'z' is not defined (mine.py, line 2)"),
+        ("def hop(:", "importing mine raised SyntaxError: invalid syntax (mine.py, line 1)"),
+        ("raise SystemExit", "importing mine raised SystemExit (mine.py, line 1)"),
+        ("raise ValueError('two\\nlines')", "importing mine raised ValueError: two lines (mine.py, line 1)"),
+        ("", "mine has no 'hop'; it has no task"),
+        ("from math import pi\ndef hip(): ...", "mine has no 'hop'; it has hip"),
+        ("hop = 3", "mine:hop is neither a Task nor a function that returns one, but of type int"),
+        ("def hop(): ...", "mine:hop returned no Task, but something of type NoneType"),
+        ("def hop():\n  return 1 / 0", "mine:hop raised ZeroDivisionError: division by zero (mine.py, line 2)"),
+        ("def hop(kind): ...", "mine:hop needs kind, which is not given: give it a default"),
+        (
+            "from mjx_study import load_scene\ndef hop(): load_scene('nothing.xml')",
+            "mine:hop raised SceneError: no MJCF file at nothing.xml (mine.py, line 2)",
+        ),
+    ],
+)
+def test_what_is_no_task(source: str, says: str, write) -> None:
+    write(source)
+    assert refused("mine:hop") == says
+
+
+def test_options_that_a_function_does_not_take(write) -> None:
+    write("def hop(horizon): ...\ndef hip(*, cone=None, **rest): return rest")
+    message = "mine:hop does not take cone and model: give it an argument of this name, or **options"
+    assert refused("mine:hop", horizon=3, cone="elliptic", model="a.xml") == message
+    assert refused("mine:hip", horizon=3).endswith("something of type dict")
+
+
+def test_a_task_takes_no_options(write) -> None:
+    write(TINY + "\nmade = hop()\n")
+    assert refused("mine:made", horizon=3, cone="elliptic") == (
+        "mine:made is a Task that is made already, and horizon and cone cannot change it: "
+        "give a function that takes this and returns the Task"
+    )
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (
+            "policy=OpenLoop(1, 3)",
+            "mine:bad: the policy's feedforward has shape (1, 3); 3 steps and 1 controls need (3, 1)",
+        ),
+        ("theta=jnp.zeros(3, jnp.float32)", "mine:bad: theta is float32, and the simulation float64"),
+        ("final_cost=lambda state: state.qpos", "mine:bad: the final_cost has shape (2,), and a cost is a scalar"),
+        (
+            "running_cost=lambda state, control: control",
+            "mine:bad: the running_cost has shape (1,), and a cost is a scalar",
+        ),
+        (
+            "final_cost=lambda state: state.position[0]",
+            "mine:bad: the final_cost raised AttributeError: 'State' object has no attribute 'position' (mine.py, ",
+        ),
+        ("sigma=0.0", "mine:bad raised ValueError: sigma must be positive"),
+    ],
+)
+def test_parts_that_do_not_fit(change: str, says: str, write) -> None:
+    """Broadcasting and clamped indices would let most of these pass, and give numbers."""
+    write(TINY + f"\ndef bad():\n    return hop().replace({change})\n")
+    assert refused("mine:bad").startswith(says)
+
+
+# What a task may leave out
+
+
+def test_defaults(write) -> None:
+    write(TINY)
+    task = make_task("mine:hop")
+    assert task.gamma == float("inf") and task.description == "" and task.recipe is None
+    cost = task.running_cost(task.draw_start(jax.random.key(0)), jnp.zeros(1))
+    assert cost == 0 and cost.dtype == jnp.float64
+    with pytest.raises(ValueError, match="a task needs a running_cost, a final_cost, or both"):
+        Task(
+            **{name: getattr(task, name) for name in "name scene horizon policy theta sigma start contact_pair".split()}
+        )
