@@ -19,9 +19,12 @@ SMALL = {
     "1_stiffness_sweep": "STIFFNESS, SEEDS, SAMPLES, REFERENCE_SAMPLES = (10.0, 1200.0), 2, 8, 40",
     "2_which_estimator": "SAMPLES, REFERENCE_SAMPLES, ITERATIONS = 8, 20, 3",
     "3_bring_your_own": (
-        "STATES, SAMPLES, REFERENCE_SAMPLES, POINTS = 1, 8, 20, 3\nCONTACT, STIFFNESS = ('penalty', 'mujoco'), 1000.0"
+        "STATES, SAMPLES, REFERENCE_SAMPLES, POINTS = 1, 8, 20, 3\n"
+        "CONTACT, STIFFNESS, HORIZON = ('mujoco',), 1000.0, 100"
     ),
-    "4_are_mjx_gradients_right": "STATES, STEPS, FORCES, POINTS = 1, 5, 3, 3",
+    "4_are_mjx_gradients_right": (
+        "STATES, STEPS, FORCES, POINTS = 1, 5, 3, 3\nCONTACT, HORIZON = ('mujoco_default',), 190"
+    ),
 }
 """In place of the cell of parameters, so that a run is short."""
 ABSOLUTE = re.compile(r"(?<![\w.~])/(?:home|root|Users|tmp|var|usr|opt|mnt|srv|private|proc)/|[A-Z]:\\\\")
