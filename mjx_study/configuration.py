@@ -7,6 +7,7 @@ from collections.abc import Callable, Collection, Sequence
 from typing import Any, Final
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from estimators import ESTIMATORS, EstimatorOptions
@@ -23,6 +24,7 @@ from mjx_study.contact import (
 )
 from mjx_study.objective import chunk_for
 from mjx_study.task import Task
+from mjx_study.task_checks import check_shapes
 from mjx_study.tasks import make_task
 
 GAUSSIAN_ONLY: Final = ("ddcg", "delta")
@@ -40,6 +42,7 @@ class EstimatorConfig:
     Attributes:
         task: name of a task.
         estimators: names of estimators.
+        theta: parameters at which gradients are taken or a descent begins; None for the task's.
         seed: of all randomness.
         sigma: standard deviation of the noise, in the unit of what it is added to; None for the task's.
         noise: name of the noise's density; None for the task's.
@@ -60,6 +63,7 @@ class EstimatorConfig:
 
     task: str
     estimators: tuple[str, ...] = ("zobg", "fobg", "aobg")
+    theta: tuple[float, ...] | None = None
     seed: int = 0
     sigma: float | None = None
     noise: str | None = None
@@ -120,16 +124,38 @@ class Cell:
         return f"{self.family}, K = {self.stiffness:g} N/m" if self.stiffness else self.family
 
 
-def configured_task(config: EstimatorConfig) -> Task:
-    """The task that a configuration names, with what the configuration changes of it.
+def configured_task(config: EstimatorConfig, task: Task | None = None) -> Task:
+    """The task that a configuration names, or the one that is given, with what the configuration changes of it.
 
     Raises:
-        ValueError: there is no such task, or it cannot be changed so.
+        ValueError: there is no such task, or it cannot be changed so; or parts of the given one do not fit together.
     """
-    scene_options: dict[str, Any] = {"cone": config.cone, "horizon": config.horizon, "model": config.model}
-    task = make_task(config.task, **{name: value for name, value in scene_options.items() if value is not None})
+    building = {name: getattr(config, name) for name in ("cone", "horizon", "model")}
+    building = {name: value for name, value in building.items() if value is not None}
+    if task is None:
+        task = make_task(config.task, **building)
+    elif building:
+        raise ValueError(f"{', '.join(building)}: only for a task that is built by its name; build this one so")
+    else:
+        check_shapes(task)
     changes = {"sigma": config.sigma, "noise": config.noise}
     return task.replace(**{name: value for name, value in changes.items() if value is not None})
+
+
+def at_theta(task: Task, theta: Sequence[float] | None) -> Task:
+    """The task at other parameters; as it is for None.
+
+    Raises:
+        ValueError: they are not as many as the policy has, or not finite.
+    """
+    if theta is None:
+        return task
+    values = np.asarray(theta, float)
+    if values.shape != (task.policy.num_params,) or not np.all(np.isfinite(values)):
+        raise ValueError(
+            f"theta has {values.size} numbers; {task.name} needs {task.policy.num_params}, all of them finite"
+        )
+    return task.replace(theta=jnp.asarray(values, task.theta.dtype))
 
 
 def configured_options(config: EstimatorConfig, task: Task) -> EstimatorOptions:

@@ -23,13 +23,15 @@ import numpy as np
 from jaxtyping import Array, Float, Key
 
 from estimators import GradientEstimate, Objective, first_order, zeroth_order
-from mjx_study.configuration import Cell, Progress, plan_cells
+from mjx_study.configuration import Cell, Progress, at_theta, plan_cells
 from mjx_study.contact import ContactModel
 from mjx_study.objective import Simulator, chunk_for
 from mjx_study.quadrature import Line, Means, grid, means
 from mjx_study.reference import FunctionObjective, Reference, ScalarFunction, smoothed
 from mjx_study.runtime import environment
 from mjx_study.task import Task
+from mjx_study.task_checks import check_shapes
+from mjx_study.tasks import make_task
 
 SPAN_SIGMAS: Final = 10.0
 """Half the default width of a line through many parameters, in standard deviations of the noise."""
@@ -53,6 +55,7 @@ class LandscapeConfig:
         points: on the line.
         span: first and last t; None for the task's, or 10 sigma to either side.
         direction: "random", or the index of one parameter; a decision of one number has no other.
+        theta: parameters that the line goes through, where there are several; None for the task's.
         samples: in each batch at each point.
         sigma: standard deviation of the noise, in the unit of what it is added to; None for the task's.
         seed: of all randomness.
@@ -66,6 +69,7 @@ class LandscapeConfig:
     points: int = 41
     span: tuple[float, ...] | None = None
     direction: str = "random"
+    theta: tuple[float, ...] | None = None
     samples: int = 100
     sigma: float | None = None
     seed: int = 0
@@ -75,8 +79,7 @@ class LandscapeConfig:
         for label, count, least in (("points", self.points, 2), ("samples", self.samples, 3)):
             if count < least:
                 raise ValueError(f"{label} must be at least {least}, got {count}")
-        if self.span is not None and not (len(self.span) == 2 and -math.inf < self.span[0] < self.span[1] < math.inf):
-            raise ValueError(f"span must be two numbers, the lower one first; got {self.span}")
+        check_span(self.span)
         if self.seed < 0:
             raise ValueError(f"seed must not be negative, got {self.seed}")
 
@@ -177,65 +180,107 @@ def _plain(value: Any) -> Any:
 
 
 @dataclasses.dataclass(frozen=True)
+class ThetaLine:
+    """Points theta_0 + t direction.
+
+    Attributes:
+        position: t, in the unit of theta.
+        direction: of unit length, (params,).
+        thetas: the points.
+    """
+
+    position: Float[np.ndarray, " points"]
+    direction: Float[np.ndarray, " params"]
+    thetas: tuple[Float[Array, " params"], ...]
+
+
+def line_of(task: Task, points: int, span: Sequence[float] | None, direction: str | None, seed: int) -> ThetaLine:
+    """The line through a task's theta; for a decision of one number, its range, whatever theta is.
+
+    Args:
+        task: whose parameters they are.
+        points: how many.
+        span: first and last t; None for the task's, or 10 sigma to either side.
+        direction: "random" or None, or the index of one parameter.
+        seed: of a random direction.
+
+    Raises:
+        ValueError: there is no such direction.
+    """
+    theta = np.asarray(task.theta, float)
+    along = _direction(direction or "random", len(theta), seed)
+    low, high = span or task.span or (-SPAN_SIGMAS * task.sigma, SPAN_SIGMAS * task.sigma)
+    position = np.linspace(low, high, points)
+    origin = np.zeros(1) if len(theta) == 1 else theta
+    return ThetaLine(position, along, tuple(jnp.asarray(origin + t * along, task.theta.dtype) for t in position))
+
+
+def check_span(span: Sequence[float] | None) -> None:
+    """Raises ValueError unless it is None or two numbers, the lower one first."""
+    if span is not None and not (len(span) == 2 and -math.inf < span[0] < span[1] < math.inf):
+        raise ValueError(f"span must be two numbers, the lower one first; got {span}")
+
+
+@dataclasses.dataclass(frozen=True)
 class LandscapePlan:
     """A landscape that has been checked."""
 
     config: LandscapeConfig
     task: Task
     cells: tuple[Cell, ...]
-    origin: Float[np.ndarray, " params"]
-    direction: Float[np.ndarray, " params"]
+    line: ThetaLine
     warnings: tuple[str, ...]
 
 
-def plan_landscape(config: LandscapeConfig, task: Task) -> LandscapePlan:
+def plan_landscape(config: LandscapeConfig, task: Task | None = None) -> LandscapePlan:
     """Check a configuration and resolve its defaults, computing nothing.
 
     Args:
         config: what to draw.
-        task: the task that it names, built.
+        task: in place of the one that the configuration names.
 
     Raises:
-        ValueError: a direction, family, stiffness or noise that cannot be used.
+        ValueError: a direction, family, stiffness, theta or noise that cannot be used.
     """
+    if task is None:
+        task = make_task(config.task)
+    else:
+        check_shapes(task)
+    if config.theta is not None and task.policy.num_params == 1:
+        raise ValueError("theta has one entry, and the line is its range: give --span")
+    task = at_theta(task, config.theta)
     task = task if config.sigma is None else task.replace(sigma=config.sigma)
     stiffness = config.stiffness or (task.middle_stiffness,)
     cells, messages = plan_cells(task, config.contact, stiffness, config.damping)
     if not cells:
         raise ValueError("no contact model: give at least one contact family")
-    theta = np.asarray(task.theta, float)
-    direction = _direction(config, len(theta))
-    span = config.span or task.span or (-SPAN_SIGMAS * task.sigma, SPAN_SIGMAS * task.sigma)
+    line = line_of(task, config.points, config.span, config.direction, config.seed)
     resolved = dataclasses.replace(
         config,
         contact=tuple(dict.fromkeys(cell.family for cell in cells)),
         stiffness=stiffness,
-        span=tuple(map(float, span)),
+        span=(float(line.position[0]), float(line.position[-1])),
         sigma=task.sigma,
         reference=config.reference and task.reference is not None,
     )
-    origin = np.zeros(1) if len(theta) == 1 else theta
-    return LandscapePlan(resolved, task, cells, origin, direction, messages)
+    return LandscapePlan(resolved, task, cells, line, messages)
 
 
-def _direction(config: LandscapeConfig, params: int) -> Float[np.ndarray, " params"]:
+def _direction(direction: str, params: int, seed: int) -> Float[np.ndarray, " params"]:
     if params == 1:
         return np.ones(1)
-    if config.direction == "random":
-        drawn = np.random.default_rng(config.seed).normal(size=params)
+    if direction == "random":
+        drawn = np.random.default_rng(seed).normal(size=params)
         return drawn / np.linalg.norm(drawn)
-    if not config.direction.isdigit() or int(config.direction) >= params:
-        raise ValueError(f"direction must be random or a parameter's index, 0 to {params - 1}; got {config.direction}")
-    return np.eye(params)[int(config.direction)]
+    if not direction.isdigit() or int(direction) >= params:
+        raise ValueError(f"direction must be random or a parameter's index, 0 to {params - 1}; got {direction}")
+    return np.eye(params)[int(direction)]
 
 
 def landscape(plan: LandscapePlan, progress: Progress = lambda done, total, what: None) -> Landscape:
     """Draw a landscape's curves."""
     config, task = plan.config, plan.task
-    assert config.span is not None, "a plan's configuration is resolved"
-    low, high = config.span
-    position = np.linspace(low, high, config.points)
-    thetas = [jnp.asarray(plan.origin + t * plan.direction, task.theta.dtype) for t in position]
+    position, direction, thetas = plan.line.position, plan.line.direction, plan.line.thetas
     simulator = Simulator(task, chunk_size=chunk_for(config.samples, jax.local_devices()))
     exact = _quadrature(task, position)
     objectives: list[tuple[str, str, float, Objective, Means | None]] = []
@@ -253,12 +298,12 @@ def landscape(plan: LandscapePlan, progress: Progress = lambda done, total, what
         points = []
         for theta in thetas:
             progress(len(curves) * len(thetas) + len(points), total, label)
-            points.append(_point(objective, theta, plan.direction, keys))
+            points.append(_point(objective, theta, direction, keys))
         columns = {name: np.array([point[name] for point in points]) for name in points[0]}
         nonfinite, residual = int(columns.pop("nonfinite").sum()), float(columns.pop("residual").max())
         curves.append(Curve(label, family, stiffness, **columns, nonfinite=nonfinite, residual=residual, exact=known))
     progress(total, total, "done")
-    return Landscape(config, environment(), position, plan.direction, tuple(curves), plan.warnings)
+    return Landscape(config, environment(), position, direction, tuple(curves), plan.warnings)
 
 
 def _point(

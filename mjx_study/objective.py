@@ -305,7 +305,7 @@ class MjxObjective:
         silent = np.arange(samples if self.simulator.task.random_start else min(samples, 1))
         scale = np.concatenate([np.ones(samples), np.zeros(len(silent))])
         values, scores, residuals = self._run("value", theta, keys, np.append(np.arange(samples), silent), scale)
-        baseline = jnp.broadcast_to(values[samples:], samples)
+        baseline = _for_all(values[samples:], samples)
         return Evaluation(*map(jnp.asarray, (values[:samples], scores[:samples], baseline, residuals[:samples])))
 
     def evaluate_odd(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> Evaluation:
@@ -393,7 +393,7 @@ class MjxObjective:
         """Costs to go of the rollouts without noise, one where all samples share it."""
         rows = np.arange(len(keys) if self.simulator.task.random_start else min(len(keys), 1))
         (to_go, *_), _ = self._run("steps", theta, keys, rows, np.zeros(len(rows)))
-        return jnp.broadcast_to(to_go, (len(keys), to_go.shape[1]))
+        return _for_all(to_go, len(keys))
 
     def _run(self, name: str, theta, keys, rows=None, noise_scale=None):
         """A program on rows of the keys, all of them once unless told otherwise."""
@@ -428,6 +428,12 @@ class TracedObjective(MjxObjective):
             return jax.tree.map(lambda leaf: leaf[: len(rows)], call(jax.tree.map(lambda part: part[0], parts)))
         outputs = jax.lax.map(call, parts)
         return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[: len(rows)], outputs)
+
+
+def _for_all(rows, samples: int):
+    """Rows that are one for each sample, or one for all of them; on the host without a compilation for each size."""
+    numpy = np if isinstance(rows, np.ndarray) else jnp
+    return numpy.broadcast_to(rows, (samples, *rows.shape[1:]))
 
 
 def chunk_for(samples: int, devices: Sequence[Any]) -> int:

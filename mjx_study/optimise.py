@@ -26,6 +26,7 @@ from mjx_study.configuration import (
     Cell,
     EstimatorConfig,
     Progress,
+    at_theta,
     configured_options,
     configured_task,
     plan_cells,
@@ -108,21 +109,21 @@ def plan_optimise(config: OptimiseConfig, task: Task | None = None, cell: Cell |
     Raises:
         ValueError: anything about the configuration that cannot be run; the message says what is accepted.
     """
-    task = configured_task(config) if task is None else task
+    task = configured_task(config, task)
     if config.network is not None:
         if config.reference:
             raise ValueError("a network needs MJX: the analytic references take the task's own policy")
         task = with_network(task, config.network, jax.random.key(config.seed))
+    task = at_theta(task, config.theta)
     if config.reference and task.reference is None:
         raise ValueError(f"{task.name} has no analytic reference")
-    numbers = {}
-    for name in ("iterations", "samples", "learning_rate", "decay"):
-        value = getattr(config, name)
-        if value is None:
-            if task.recipe is None:
-                raise ValueError(f"{task.name} has no recipe: give {name.replace('_', ' ')}")
-            value = getattr(task.recipe, name)
-        numbers[name] = value
+    numbers = {name: getattr(config, name) for name in ("iterations", "samples", "learning_rate", "decay")}
+    if task.recipe is None:
+        numbers["decay"] = numbers["decay"] or 0.0
+        if missing := [name.replace("_", " ") for name, value in numbers.items() if value is None]:
+            raise ValueError(f"{task.name} has no recipe: give {', '.join(missing)}")
+    else:
+        numbers = {name: getattr(task.recipe, name) if value is None else value for name, value in numbers.items()}
     make_optimizer(config.optimizer, numbers["learning_rate"], numbers["decay"])
     options = configured_options(config, task)
     messages: tuple[str, ...] = ()

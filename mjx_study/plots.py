@@ -84,13 +84,13 @@ def plot_landscape(result: Landscape) -> Figure:
     t = result.position
     for (above, below), curve in zip(axes.T, result.curves, strict=True):
         above.plot(t, curve.cost, color="0.55", linewidth=1.2, label="cost without noise")
-        _mean_with_band(above, t, curve.smoothed, curve.smoothed_se, "black", "mean cost with noise")
+        mean_with_band(above, t, curve.smoothed, curve.smoothed_se, "black", "mean cost with noise")
         for name, mean, error in (
             ("zobg", curve.zeroth, curve.zeroth_se),
             ("fobg", curve.first, curve.first_se),
         ):
             label, colour, _ = STYLE[name]
-            _mean_with_band(below, t, mean, error, colour, f"mean of {label}")
+            mean_with_band(below, t, mean, error, colour, f"mean of {label}")
         if curve.exact is not None:
             style = {"color": "black", "linestyle": ":", "linewidth": 1.2}
             below.plot(t, curve.exact.slope, **style, label="slope of the mean cost, quadrature")
@@ -171,7 +171,7 @@ def _curve_title(curve: Curve) -> str:
     return f"{TITLES[curve.family]}\nK = {curve.stiffness:g} N/m" if curve.stiffness else TITLES[curve.family]
 
 
-def _mean_with_band(axes: Axes, x, mean, error, color: str, label: str) -> None:
+def mean_with_band(axes: Axes, x, mean, error, color: str, label: str) -> None:
     axes.plot(x, mean, color=color, linewidth=1.6, label=label)
     axes.fill_between(x, mean - 1.96 * error, mean + 1.96 * error, color=color, alpha=0.2, linewidth=0)
 

@@ -32,7 +32,14 @@ CAPTIONS: Final = {
     "error_against_samples": "Relative error of the mean gradient against the number of samples.",
     "map": "First order against zeroth order over two swept parameters.",
     "achieved": "Cost of the final policies against stiffness.",
+    "landscape": "Cost along a line through theta, and the slope that the mean of each estimator has there.",
     "descent": "Cost against iterations, rollouts and seconds.",
+}
+KINDS: Final = {"gradients": "gradient estimates", "descents": "gradient descent", "landscapes": "landscapes"}
+SUMMARY: Final = {
+    "gradients": "Medians over the seeds, at the largest sample count.",
+    "descents": "Medians over the seeds, at the largest sample count.",
+    "landscapes": "At the largest sample count.",
 }
 COLUMNS: Final = {
     "variance": "variance",
@@ -41,6 +48,9 @@ COLUMNS: Final = {
     "squared_bias_se": "± (standard error)",
     "alpha": "alpha",
     "nonfinite": "lost",
+    "least_cost": "least mean cost",
+    "least_at": "at t",
+    "steepest": "steepest slope",
     "final_cost": "final cost, median",
     "stopped_at": "stopped seeds",
 }
@@ -50,7 +60,7 @@ def report(dataset: xr.Dataset) -> str:
     """The page."""
     config = json.loads(dataset.attrs["config"])
     tasks = ", ".join(config["tasks"])
-    kind = "gradient estimates" if config["kind"] == "gradients" else "gradient descent"
+    kind = KINDS[config["kind"]]
     warnings = [*json.loads(dataset.attrs["warnings"]), *what_to_beware_of(dataset)]
     parts = [
         f"<h1>{_text(tasks)}: {kind} through {dataset.sizes['model']} contact models</h1>",
@@ -58,7 +68,7 @@ def report(dataset: xr.Dataset) -> str:
         "<h2>Figures</h2>",
         *_figures(dataset),
         "<h2>Numbers</h2>",
-        "<p>Medians over the seeds, at the largest sample count. <code>results.nc</code> has all numbers.</p>",
+        f"<p>{SUMMARY[config['kind']]} <code>results.nc</code> has all numbers.</p>",
         _numbers(dataset),
         "<h2>Configuration</h2>",
         _table(
@@ -67,10 +77,16 @@ def report(dataset: xr.Dataset) -> str:
         "<h2>Provenance</h2>",
         _table(["what", "value"], _provenance(dataset)),
         "<h2>To run it again</h2>",
-        f"<pre>{_text(dataset.attrs['command'])}</pre>",
+        _again(dataset),
     ]
     head = f'<meta charset="utf-8"><title>{_text(tasks)}: {kind}</title><style>{STYLE}</style>'
     return f'<!doctype html>\n<html lang="en"><head>{head}</head><body>\n' + "\n".join(parts) + "\n</body></html>\n"
+
+
+def _again(dataset: xr.Dataset) -> str:
+    if command := dataset.attrs.get("command"):
+        return f"<pre>{_text(command)}</pre>"
+    return "<p>It was run from Python: <code>run_sweep</code> with the configuration above.</p>"
 
 
 def _figures(dataset: xr.Dataset) -> list[str]:
@@ -91,6 +107,8 @@ def _numbers(dataset: xr.Dataset) -> str:
     """A row for each cell and estimator."""
     if not dataset.data_vars:
         return ""
+    if "smoothed" in dataset:
+        dataset = _with_extremes(dataset)
     outer = [name for name in ("task", "timestep", "cone", "sigma") if dataset.sizes[name] > 1]
     variables = [name for name in COLUMNS if name in dataset]
     last = dataset.isel(samples=-1)
@@ -106,6 +124,18 @@ def _numbers(dataset: xr.Dataset) -> str:
                 rows.append([str(model), *place, str(estimator), *map(_shown, numbers)])
     titles = ["contact model", *(SWEPT.get(name, name) for name in outer), "estimator"]
     return _table([*titles, *(COLUMNS[name] for name in variables)], rows)
+
+
+def _with_extremes(dataset: xr.Dataset) -> xr.Dataset:
+    """A landscape's numbers without its points."""
+    least = dataset["smoothed"].fillna(np.inf).argmin("point")
+    found = {
+        "least_cost": dataset["smoothed"].min("point"),
+        "least_at": dataset["position"].isel(point=least),
+        "steepest": abs(dataset["slope"]).max("point"),
+        "nonfinite": dataset["nonfinite"].sum("point"),
+    }
+    return dataset.drop_vars(["nonfinite"]).assign(found)
 
 
 def _reduced(name: str, values: xr.DataArray) -> float:

@@ -24,6 +24,7 @@ from mjx_study.comparison import CompareConfig, CompareResult, Row
 from mjx_study.configuration import (
     Cell,
     Progress,
+    at_theta,
     configured_options,
     configured_task,
     plan_cells,
@@ -52,13 +53,17 @@ class ComparePlan:
     warnings: tuple[str, ...]
 
 
-def plan_compare(config: CompareConfig) -> ComparePlan:
+def plan_compare(config: CompareConfig, task: Task | None = None) -> ComparePlan:
     """Check a configuration and resolve its defaults, computing nothing.
+
+    Args:
+        config: what to compare.
+        task: in place of the one that the configuration names.
 
     Raises:
         ValueError: anything about the configuration that cannot be run; the message says what is accepted.
     """
-    task = configured_task(config)
+    task = at_theta(configured_task(config, task), config.theta)
     options = configured_options(config, task)
     cells, messages = plan_cells(task, config.contact, config.stiffness, config.damping)
     families = tuple(dict.fromkeys(cell.family for cell in cells))

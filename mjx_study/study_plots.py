@@ -12,7 +12,7 @@ from matplotlib.colors import TwoSlopeNorm
 from matplotlib.figure import Figure
 from scipy import stats
 
-from mjx_study.plots import NO_CONTACT, STYLE, TITLES, line_with_band, robust_limits
+from mjx_study.plots import NO_CONTACT, STYLE, TITLES, line_with_band, mean_with_band, robust_limits
 
 SWEPT: Final = {
     "stiffness": "contact stiffness K [N/m]",
@@ -33,26 +33,32 @@ def plot_study(dataset: xr.Dataset) -> dict[str, Figure]:
     figures: dict[str, Figure] = {}
     if not dataset.data_vars:
         return figures
-    descents = "final_cost" in dataset
-    kinds: dict[str, Callable[[xr.Dataset, str], Figure | None]]
-    if descents:
-        kinds = {"achieved": _achieved, "descent": _descent}
-    else:
-        kinds = {"variance": _variance, "bias": _bias, "alpha": _alpha}
+    quantity = _quantity(dataset)
+    kinds: dict[str, Callable[[xr.Dataset, str], Figure | None]] = {
+        "final_cost": {"achieved": _achieved, "descent": _descent},
+        "variance": {"variance": _variance, "bias": _bias, "alpha": _alpha},
+        "smoothed": {"landscape": _landscape},
+    }[quantity]
     for kind, draw in kinds.items():
         for suffix, title, part in itertools.islice(_slices(dataset), MOST_FIGURES):
             figure = draw(part, title)
             if figure is not None:
                 figures[kind + suffix] = figure
-    if not descents and dataset.sizes["samples"] > 1:
+    if quantity == "variance" and dataset.sizes["samples"] > 1:
         for suffix, title, part in itertools.islice(_slices(dataset, keep="samples"), MOST_FIGURES):
             figures["error_against_samples" + suffix] = _error_against_samples(part, title)
-    quantity = "final_cost" if descents else "variance"
+    if quantity == "smoothed":
+        return figures
     pair = [name for name in SWEPT if _length(dataset, name) > 1][:2]
     if len(pair) == 2 and {"zobg", "fobg"} <= set(dataset["estimator"].values.tolist()):
         for suffix, title, part in itertools.islice(_slices(dataset, keep=pair[1]), MOST_FIGURES):
             figures[f"map_{pair[0]}_{pair[1]}{suffix}"] = _ratio_map(part, title, quantity, pair[1])
     return figures
+
+
+def _quantity(dataset: xr.Dataset) -> str:
+    """The variable that tells what kind of study it is."""
+    return next(name for name in ("final_cost", "smoothed", "variance") if name in dataset)
 
 
 def _length(dataset: xr.Dataset, name: str) -> int:
@@ -89,7 +95,7 @@ def _short(value: Any) -> str:
 
 def _present(part: xr.Dataset) -> np.ndarray:
     """Which contact models have numbers."""
-    quantity = part["final_cost"] if "final_cost" in part else part["variance"]
+    quantity = part[_quantity(part)]
     return np.asarray(quantity.notnull().any([name for name in quantity.dims if name != "model"]))
 
 
@@ -338,4 +344,34 @@ def _descent(part: xr.Dataset, title: str) -> Figure:
     for axes, label in zip(grid[-1], ("iteration", "rollouts of one seed", "seconds, all seeds"), strict=True):
         axes.set_xlabel(label)
     figure.suptitle(f"{title} ({part.sizes['seed']} seeds: median, from least to greatest)", fontsize="medium")
+    return figure
+
+
+def _landscape(part: xr.Dataset, title: str) -> Figure:
+    """Cost and mean cost along the line above, the slope that each estimator sees below; a column for a few models."""
+    models = np.unique(np.linspace(0, part.sizes["model"] - 1, MOST_PANELS).round().astype(int))
+    figure = Figure(figsize=(1.6 + 2.9 * len(models), 6.2), layout="constrained")
+    FigureCanvasAgg(figure)
+    grid = figure.subplots(2, len(models), sharex=True, sharey="row", squeeze=False)
+    slopes = []
+    for (above, below), model in zip(grid.T, models, strict=True):
+        one = part.isel(model=model)
+        t = one["position"].values
+        above.plot(t, one["cost"], color="0.55", linewidth=1.2, label="cost without noise")
+        mean_with_band(above, t, one["smoothed"].values, one["smoothed_se"].values, "black", "mean cost with noise")
+        for mine, style in _estimators(one):
+            slopes.append(mine["slope"].values)
+            mean, error = mine["slope"].values, mine["slope_se"].values
+            mean_with_band(below, t, mean, error, style["color"], f"mean of {style['label']}")
+        above.set_title(one["model"].item(), fontsize="medium")
+        below.axhline(0, color="0.7", linewidth=0.8)
+        below.set_xlabel("t, along the line")
+        for axes in (above, below):
+            axes.grid(alpha=0.25)
+    grid[1, 0].set_ylim(*robust_limits(slopes))
+    grid[0, 0].set_ylabel("cost")
+    grid[1, 0].set_ylabel("slope along the line")
+    handles = [handle for axes in grid[:, 0] for handle in axes.get_legend_handles_labels()[0]]
+    figure.legend(handles=handles, loc="outside lower center", ncols=5, frameon=False, fontsize="small")
+    figure.suptitle(f"{title} at each point (bands: 95 %)", fontsize="medium")
     return figure

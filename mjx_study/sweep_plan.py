@@ -19,6 +19,7 @@ from mjx_study.configuration import (
     solver_cells,
 )
 from mjx_study.contact import FAMILIES
+from mjx_study.landscape import check_span, line_of
 from mjx_study.objective import chunk_for
 from mjx_study.optimise import OptimiseConfig, OptimisePlan, plan_optimise
 from mjx_study.task import Task, check_sigma
@@ -44,8 +45,11 @@ class SweepConfig:
         cone: pyramidal, elliptic; None for the MJCF's.
         sigma: standard deviations of the noise; None for each task's.
         samples: sizes of a batch.
-        seeds: batches of each size, or descents.
+        seeds: batches of each size, or descents; of landscapes, batches that are taken together at each point. None for
+            10, of landscapes 1.
         iterations: of gradient descent; None to estimate gradients where each task starts.
+        points: on a line through each task's theta, for landscapes; None for no landscapes.
+        span, direction: of that line, as in `LandscapeConfig`; None for each task's range and a random direction.
         optimizer, learning_rate, decay: of the descent, as in `OptimiseConfig`.
         reference_samples: pairs of rollouts behind each reference gradient.
         evaluation_samples: rollouts behind the cost of a final policy.
@@ -64,8 +68,11 @@ class SweepConfig:
     cone: tuple[str, ...] | None = None
     sigma: tuple[float, ...] | None = None
     samples: tuple[int, ...] = (100,)
-    seeds: int = 10
+    seeds: int | None = None
     iterations: int | None = None
+    points: int | None = None
+    span: tuple[float, ...] | None = None
+    direction: str | None = None
     optimizer: str = "sgd"
     learning_rate: float | None = None
     decay: float | None = None
@@ -97,16 +104,38 @@ class SweepConfig:
                 refuse_repeats(name, values)
             if values == () and name not in ("solref", "solimp"):
                 raise ValueError(f"no {name} given: give at least one, or leave it out")
-        counts = {"seeds": 1, "reference_samples": 3, "evaluation_samples": 2, "iterations": 1, "chunk_size": 1}
+        counts = {
+            "seeds": 1,
+            "reference_samples": 3,
+            "evaluation_samples": 2,
+            "iterations": 1,
+            "points": 2,
+            "chunk_size": 1,
+        }
         for name, least in counts.items():
             value = getattr(self, name)
             if value is not None and value < least:
                 raise ValueError(f"{name.replace('_', ' ')} must be at least {least}, got {value}")
+        if self.iterations is not None and self.points is not None:
+            raise ValueError("iterations are of descents and points of landscapes: give one of them")
+        if self.points is None and (self.span is not None or self.direction is not None):
+            raise ValueError("span and direction are of landscapes: give points as well")
+        check_span(self.span)
         if min(self.samples) < 3:
             raise ValueError(f"samples must be at least 3, so that a variance has an error; got {min(self.samples)}")
         for step in self.timestep or ():
             if not 0 < step < 1:
                 raise ValueError(f"timestep must lie between 0 and 1 s, got {step:g}")
+
+    @property
+    def kind(self) -> str:
+        """What is computed: gradients, descents or landscapes."""
+        return "descents" if self.iterations is not None else "gradients" if self.points is None else "landscapes"
+
+    @property
+    def batches(self) -> int:
+        """The number of seeds, given or not."""
+        return self.seeds or (1 if self.kind == "landscapes" else 10)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -157,7 +186,7 @@ class SweepPlan:
     @property
     def compilations(self) -> int:
         """Programs of rollouts that are needed: two for each group, or one for each of its descents."""
-        if self.config.iterations is None:
+        if self.config.kind != "descents":
             return 2 * len(self.groups)
         settings = {(cell.group, cell.sigma, cell.samples) for cell in self.cells}
         return len(settings) * len(self.config.estimators)
@@ -193,13 +222,15 @@ def plan_sweep(config: SweepConfig) -> SweepPlan:
             check_sigma(sigma)
             cells.append(SweepCell(len(groups), model, sigma, samples))
         groups.append(group)
-    most = min(LARGEST_BATCH, max(config.samples) * (1 if config.iterations else config.seeds))
+    most = min(LARGEST_BATCH, max(config.samples) * (1 if config.iterations else config.batches))
     chunk = chunk_for(most, jax.local_devices()) if config.chunk_size is None else config.chunk_size
     plan = SweepPlan(config, tuple(groups), tuple(cells), chunk, tuple(dict.fromkeys(messages)))
     for cell in {cell.group: cell for cell in cells}.values():
         estimator_options(plan, cell)
-        if config.iterations is not None:
+        if config.kind == "descents":
             descent_plan(plan, cell)
+        elif config.kind == "landscapes":
+            line_of(groups[cell.group].task, config.points or 0, config.span, config.direction, config.seed)
     return plan
 
 
@@ -221,14 +252,15 @@ def _shared(config: SweepConfig, task: Task) -> EstimatorConfig:
     names = {field.name for field in dataclasses.fields(EstimatorConfig)} & {
         field.name for field in dataclasses.fields(SweepConfig)
     }
-    kept = {name: getattr(config, name) for name in names - {"sigma", "cone"}}
+    kept = {name: getattr(config, name) for name in names - {"sigma", "cone", "horizon", "model"}}  # the task has them
     return EstimatorConfig(task=task.name, **kept)
 
 
 def descent_plan(plan: SweepPlan, cell: SweepCell) -> OptimisePlan:
     """A cell's descents."""
     config, task = plan.config, plan.groups[cell.group].task.replace(sigma=cell.sigma)
-    names = ("iterations", "seeds", "optimizer", "learning_rate", "decay", "evaluation_samples")
+    names = ("iterations", "optimizer", "learning_rate", "decay", "evaluation_samples")
     chosen = {field.name: getattr(_shared(config, task), field.name) for field in dataclasses.fields(EstimatorConfig)}
-    descent = OptimiseConfig(**chosen, **{name: getattr(config, name) for name in names}, samples=cell.samples)
+    chosen |= {name: getattr(config, name) for name in names} | {"seeds": config.batches, "samples": cell.samples}
+    descent = OptimiseConfig(**chosen)
     return plan_optimise(descent, task, cell.model)

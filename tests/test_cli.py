@@ -74,7 +74,7 @@ def test_a_result_holds_its_whole_configuration(small_run: tuple[Path, str]) -> 
     document = json.loads((small_run[0] / "results.json").read_text())
     config = document["config"]
     assert None not in [
-        value for name, value in config.items() if name not in ("damping", "model", "max_norm", "window")
+        value for name, value in config.items() if name not in ("damping", "model", "max_norm", "window", "theta")
     ]
     assert (
         config["horizon"] == 4 and config["sigma"] == 0.1 and config["gamma"] == 1e8 and config["cone"] == "pyramidal"

@@ -101,7 +101,7 @@ def test_a_direction_through_many_parameters() -> None:
         task="pusher", contact=("penalty",), stiffness=(10.0,), direction="3", points=3, samples=400, reference=False
     )
     plan = plan_landscape(config, task)
-    np.testing.assert_array_equal(plan.direction, np.eye(10)[3])
+    np.testing.assert_array_equal(plan.line.direction, np.eye(10)[3])
     assert plan.config.span == pytest.approx((-1.0, 1.0))
     (curve,) = landscape.landscape(plan).curves
     gap, error = curve.difference
@@ -113,9 +113,9 @@ def test_a_direction_through_many_parameters() -> None:
 def test_random_directions_are_unit_vectors_of_the_seed() -> None:
     task = make_task("pusher", horizon=10)
     plans = [plan_landscape(LandscapeConfig(task="pusher", seed=seed), task) for seed in (0, 0, 1)]
-    assert np.linalg.norm(plans[0].direction) == pytest.approx(1)
-    np.testing.assert_array_equal(plans[0].direction, plans[1].direction)
-    assert np.any(plans[0].direction != plans[2].direction)
+    assert np.linalg.norm(plans[0].line.direction) == pytest.approx(1)
+    np.testing.assert_array_equal(plans[0].line.direction, plans[1].line.direction)
+    assert np.any(plans[0].line.direction != plans[2].line.direction)
 
 
 class Broken:

@@ -191,8 +191,9 @@ def test_what_cannot_be_run_is_refused(changes: dict[str, Any], message: str) ->
 def test_a_task_without_recipe_or_reference_says_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     bare = make_task("pusher", horizon=3).replace(recipe=None, reference=None)
     monkeypatch.setattr(configuration, "make_task", lambda *_, **__: bare)
-    with pytest.raises(ValueError, match="pusher has no recipe: give learning rate"):
-        plan_optimise(config(horizon=3, decay=0.0, learning_rate=None))
+    with pytest.raises(ValueError, match="pusher has no recipe: give samples, learning rate$"):
+        plan_optimise(config(horizon=3, samples=None, learning_rate=None))
+    assert plan_optimise(config(horizon=3)).config.decay == 0.0
     with pytest.raises(ValueError, match="pusher has no analytic reference"):
         plan_optimise(config(horizon=3, reference=True))
 

@@ -31,7 +31,7 @@ MJCF, PYTHON, OTHERS = (
 SMALL = ["--horizon", "40", "--stiffness", "3000", "--contact", "smooth_onset"]
 TINY = """
 import jax.numpy as jnp
-from mjx_study import OpenLoop, Task, initial_state, load_scene
+from mjx_study import Launch, OpenLoop, State, Task, initial_state, load_scene
 
 def hop(horizon=3, **options):
     scene, policy = load_scene("pusher", **options), OpenLoop(horizon, 1)
@@ -271,6 +271,14 @@ def test_a_task_takes_no_options(write) -> None:
         (
             "final_cost=lambda state: state.position[0]",
             "mine:bad: the final_cost raised AttributeError: 'State' object has no attribute 'position' (mine.py, ",
+        ),
+        (
+            "policy=Launch(3, 0, 3, lambda start, theta: 1 / 0)",
+            "mine:bad: the policy's place raised ZeroDivisionError: division by zero (mine.py, ",
+        ),
+        (
+            "start=State(jnp.zeros(1), jnp.zeros(2), jnp.zeros(0), jnp.zeros(2))",
+            "mine:bad: qpos of the start has shape (1,); the scene needs (2,)",
         ),
         ("sigma=0.0", "mine:bad raised ValueError: sigma must be positive"),
     ],

@@ -169,14 +169,21 @@ def test_a_theta_without_a_finite_cost(capsys: pytest.CaptureFixture[str], elsew
         (["pusher", "--renderer", "povray"], "invalid choice: 'povray'"),
         (["pusher", "--format", "avi"], "invalid choice: 'avi'"),
         (["pusher", "--theta", "nowhere.npy"], "cannot read nowhere.npy: No such file or directory"),
-        (["pusher", "--theta", "broken.json"], "broken.json is neither a .json list of numbers nor a .npy array"),
-        (["pusher", "--theta", "broken.npy"], "broken.npy is neither a .json list of numbers nor a .npy array"),
-        (["pusher", "--theta", "short.json"], "short.json holds 2 numbers; pusher needs 200, all of them finite"),
+        (
+            ["pusher", "--theta", "broken.json"],
+            "broken.json is neither a policy, nor a .json list of numbers, nor a .npy array",
+        ),
+        (
+            ["pusher", "--theta", "broken.npy"],
+            "broken.npy is neither a policy, nor a .json list of numbers, nor a .npy array",
+        ),
+        (["pusher", "--theta", "short.json"], "theta has 2 numbers; pusher needs 200, all of them finite"),
         (
             ["pusher", "--theta", "nan.json", "--horizon", "2"],
-            "nan.json holds 2 numbers; pusher needs 2, all of them finite",
+            "theta has 2 numbers; pusher needs 2, all of them finite",
         ),
-        (["pusher", "--theta", "0.1,0.2"], "--theta holds 2 numbers; pusher needs 200, all of them finite"),
+        (["pusher", "--theta", "0.1,0.2"], "theta has 2 numbers; pusher needs 200, all of them finite"),
+        (["pusher", "--theta", "theirs.json"], "theirs.json is a policy of tennis, not of pusher"),
         (["nowhere.xml"], "no MJCF file at nowhere.xml"),
         (["broken.xml"], "broken.xml is not a valid MJCF"),
         (["rod.xml", "--horizon", "0"], "horizon must be at least 1 step, got 0"),
@@ -186,7 +193,8 @@ def test_a_theta_without_a_finite_cost(capsys: pytest.CaptureFixture[str], elsew
 )
 def test_bad_options(elsewhere: Path, arguments: list[str], says: str) -> None:
     """One line, before anything is computed or written."""
-    (elsewhere / "broken.json").write_text('{"theta": [1]}')
+    (elsewhere / "broken.json").write_text('{"teta": [1]}')
+    (elsewhere / "theirs.json").write_text('{"task": "tennis", "theta": [1]}')
     (elsewhere / "broken.npy").write_bytes(b"nothing")
     (elsewhere / "short.json").write_text("[1, 2]")
     (elsewhere / "nan.json").write_text("[1, NaN]")

@@ -19,15 +19,15 @@ import pytest
 import xarray as xr
 
 import estimators
-from mjx_study import cli, store, study_plots
-from mjx_study import sweep as module
+from mjx_study import cli, store, study_plots, sweep_cells
 from mjx_study.cli import options
 from mjx_study.cli.sweep import _fields, _many, _range, _solver_values
 from mjx_study.contact import stiffness_from_solref
-from mjx_study.objective import Simulator
+from mjx_study.objective import Simulator, simulate
 from mjx_study.report import report
 from mjx_study.store import Store, StudyError
-from mjx_study.sweep import MEASURED, SweepConfig, load_study, plan_sweep, run_sweep
+from mjx_study.sweep import SweepConfig, load_study, plan_sweep, run_sweep, what_to_beware_of
+from mjx_study.sweep_cells import MEASURED, compute_gradients
 from mjx_study.sweep_plan import estimator_options
 from mjx_study.tasks import make_task
 
@@ -40,6 +40,15 @@ SMALL: dict[str, Any] = {
     "horizon": 20,
     "reference_samples": 6,
     "chunk_size": 24,
+}
+
+LINE: dict[str, Any] = {
+    "points": 3,
+    "span": (-0.5, 0.5),
+    "direction": "3",
+    "samples": (4,),
+    "seeds": 2,
+    "estimators": ("zobg", "aobg"),
 }
 
 
@@ -64,6 +73,13 @@ def descents(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("study") / "descents"
     changes: dict[str, Any] = {"iterations": 4, "samples": (4,), "evaluation_samples": 50, "learning_rate": 0.003}
     run_sweep(plan_sweep(config(**changes, estimators=("fobg", "aobg"))), folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def landscapes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("study") / "landscapes"
+    run_sweep(plan_sweep(config(**LINE)), folder)
     return folder
 
 
@@ -109,7 +125,7 @@ def test_numbers_are_those_of_the_estimators(undisturbed: Path) -> None:
 def test_one_compilation_serves_all_contact_models(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     made: list[Simulator] = []
     monkeypatch.setattr(
-        module, "Simulator", lambda *args, **kwargs: made.append(Simulator(*args, **kwargs)) or made[-1]
+        sweep_cells, "Simulator", lambda *args, **kwargs: made.append(Simulator(*args, **kwargs)) or made[-1]
     )
     plan = plan_sweep(config(timestep=(0.005, 0.0025), samples=(4,), seeds=3, reference_samples=3))
     run_sweep(plan, tmp_path / "out")
@@ -124,7 +140,7 @@ def test_a_cell_does_not_depend_on_the_others(undisturbed: Path, tmp_path: Path)
     plan = plan_sweep(config())
     kept = Store.open(undisturbed)
     last = len(plan.cells) - 1
-    compute = module._compute_gradients(plan)
+    compute = compute_gradients(plan)
     alone = compute(plan.cells[last])
     for name, array in kept.read(last).items():
         if name not in MEASURED:
@@ -230,6 +246,7 @@ def test_two_processes_share_a_study_and_a_third_has_nothing_to_do(undisturbed: 
     computed = [int(re.search(r"computed (\d+) cells", text).group(1)) for text in said]  # type: ignore[union-attr]
     assert sum(computed) == 8
     assert same(load_study(folder), load_study(undisturbed))
+    assert load_study(folder).attrs["command"].startswith("mjx-study sweep pusher --contact")
     plan = plan_sweep(config())
     assert run_sweep(plan, folder).computed == 0
 
@@ -247,7 +264,7 @@ def test_missing_cells_are_computed_and_no_others(undisturbed: Path, tmp_path: P
     (folder / "cells" / "00003.npz").unlink()
     unfinished = load_study(folder)
     assert unfinished.attrs["missing_cells"] == 1 and int(unfinished["residual"].isnull().sum()) == 1
-    assert "1 cells are not computed yet" in " ".join(module.what_to_beware_of(unfinished))
+    assert "1 cells are not computed yet" in " ".join(what_to_beware_of(unfinished))
     result = run_sweep(plan_sweep(config()), folder)
     assert result.computed == 1 and same(result.dataset, load_study(undisturbed))
     after = {path.name: path.stat().st_mtime_ns for path in (folder / "cells").iterdir()}
@@ -346,6 +363,41 @@ def test_a_folder_that_cannot_be_written_to_is_refused(tmp_path: Path) -> None:
         run_sweep(plan_sweep(config()), tmp_path / "file")
 
 
+def test_landscapes_are_labelled_and_right(landscapes: Path) -> None:
+    """One point by hand: both batches of it are taken together, and slopes are along one force."""
+    data = load_study(landscapes)
+    assert (
+        data.sizes["point"] == 3 and "seed" not in data.dims and data["estimator"].values.tolist() == ["zobg", "aobg"]
+    )
+    cell = data.sel(model="mujoco 1000", samples=4).squeeze()
+    np.testing.assert_allclose(cell["position"], [-0.5, 0.0, 0.5])
+    task, plan = make_task("pusher", horizon=20), plan_sweep(config(**LINE))
+    contact = next(each.model.contact for each in plan.cells if each.model.label == "mujoco, K = 1000 N/m")
+    objective = Simulator(task, chunk_size=5).objective(contact)
+    zeroth, first, *_ = jax.random.split(jax.random.key(0), 5)
+    keys = [
+        jnp.concatenate([jax.random.split(each, 4) for each in jax.random.split(stream, 2)])
+        for stream in (zeroth, first)
+    ]
+    theta = task.theta.at[3].add(0.5)
+    low = estimators.zeroth_order(objective.evaluate(theta, keys[0]), "zero_noise")
+    high = estimators.first_order(objective.differentiate(theta, keys[1]))
+    found = cell.isel(point=2)
+    slopes = found["slope"].sel(estimator="zobg"), found["slope_se"].sel(estimator="zobg")
+    along = np.asarray(low.per_sample)[:, 3]
+    assert float(slopes[0]) == pytest.approx(np.mean(along), rel=1e-8)
+    assert float(slopes[1]) == pytest.approx(np.std(along, ddof=1) / 8**0.5, rel=1e-8)
+    options = estimator_options(plan, plan.cells[0])
+    mixed = estimators.combine(
+        "aobg", {"evaluation": objective.evaluate(theta, jax.random.clone(keys[0])),
+                 "differentiation": objective.differentiate(theta, jax.random.clone(keys[1]))}, options
+    )  # fmt: skip
+    assert float(found["slope"].sel(estimator="aobg")) == pytest.approx(float(mixed.mean[3]), rel=1e-8)
+    assert abs(float(mixed.mean[3]) - float(high.mean[3])) < abs(np.mean(along) - float(high.mean[3]))
+    silent = simulate(task.replace(theta=theta), theta, contact, jax.random.key(0), 0.0)[2]
+    assert float(found["cost"]) == pytest.approx(float(silent), rel=1e-10)
+
+
 # The command's text, figures and page.
 
 
@@ -395,6 +447,11 @@ def test_a_file_and_flags_are_one_configuration(tmp_path: Path) -> None:
         ({"stiffness": ()}, "no stiffness given"),
         ({"stiffness": (10.0, 10.0)}, "stiffness given twice: 10.0"),
         ({"samples": (2,)}, "samples must be at least 3"),
+        ({"iterations": 3, "points": 3}, "give one of them"),
+        ({"span": (0.0, 1.0)}, "span and direction are of landscapes: give points as well"),
+        ({"points": 1}, "points must be at least 2, got 1"),
+        ({"points": 3, "span": (1.0, 0.0)}, "span must be two numbers, the lower one first"),
+        ({"points": 3, "direction": "20"}, "direction must be random or a parameter's index, 0 to 19; got 20"),
         ({"seeds": 0}, "seeds must be at least 1, got 0"),
         ({"timestep": (2.0,)}, "timestep must lie between 0 and 1 s"),
         ({"sigma": (-1.0,)}, "sigma must be positive"),
@@ -419,15 +476,18 @@ def test_contact_models_in_mujocos_terms() -> None:
     assert models[0].stiffness == pytest.approx(stiffness_from_solref([-1000.0, -5.0], effective_mass=mass)[0])
 
 
-def test_every_axis_gets_its_figures(undisturbed: Path, descents: Path) -> None:
+def test_every_axis_gets_its_figures(undisturbed: Path, descents: Path, landscapes: Path) -> None:
     assert set(study_plots.plot_study(load_study(undisturbed))) == {
         "variance", "bias", "alpha", "error_against_samples", "map_stiffness_samples",
     }  # fmt: skip
     assert set(study_plots.plot_study(load_study(descents))) == {"achieved", "descent"}
-    for name, figure in study_plots.plot_study(load_study(descents)).items():
-        for axes in figure.axes:
-            assert axes.get_xlabel() or axes.get_shared_x_axes or name, name
-        assert any(axes.get_ylabel() for axes in figure.axes)
+    assert set(study_plots.plot_study(load_study(landscapes))) == {"landscape"}
+    assert "steepest slope" in report(load_study(landscapes))
+    for folder in (undisturbed, descents, landscapes):
+        for name, figure in study_plots.plot_study(load_study(folder)).items():
+            bottom = [axes for axes in figure.axes if axes.get_subplotspec() and axes.get_subplotspec().is_last_row()]
+            assert bottom and all(axes.get_xlabel() or axes.get_xticklabels() for axes in bottom), name
+            assert any(axes.get_ylabel() for axes in figure.axes), name
 
 
 def test_an_unfinished_study_can_be_drawn(undisturbed: Path, tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ written; 130 interrupted. Each command has a module of its own, with `add` for i
 """
 
 import argparse
+import shlex
 import sys
 from collections.abc import Sequence
 from importlib import metadata
@@ -41,7 +42,9 @@ COMMANDS = (compare, optimise, sweep, plot, report, landscape, rollout, gradchec
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code."""
     try:
-        options = parser().parse_args(arguments)
+        given = sys.argv[1:] if arguments is None else list(arguments)
+        options = parser().parse_args(given)
+        options.command_line = shlex.join(["mjx-study", *given])
         return options.run(options)
     except UsageError as error:
         print(f"mjx-study: {' '.join(str(error).split())}", file=sys.stderr)

@@ -4,6 +4,7 @@ import argparse
 import json
 import sys
 from pathlib import Path
+from typing import Any
 
 from estimators import ESTIMATORS
 from mjx_study.cli.options import (
@@ -16,6 +17,7 @@ from mjx_study.cli.options import (
     names,
     usage_errors,
 )
+from mjx_study.cli.parameters import add_theta_option, theta_of
 from mjx_study.comparison import CompareConfig
 from mjx_study.console import alarms, print_comparison
 from mjx_study.contact import FAMILIES
@@ -27,6 +29,7 @@ EXAMPLES = """\
 examples:
   mjx-study compare pusher --stiffness 10,1000 --contact penalty,mujoco_default
   mjx-study compare pusher --estimators zobg,fobg,aobg,ivw --gamma 50 --samples 1000
+  mjx-study compare pusher --theta out/policy-aobg.json    where a descent ended, in place of where it begins
   mjx-study compare pusher --json > pusher.json
 
 estimators:
@@ -59,6 +62,7 @@ def add(commands: Commands) -> None:
     )
     command = add_command(commands, "compare", "compare gradient estimators over contact models", run, epilog)
     add_task_options(command)
+    add_theta_option(command, "parameters at which gradients are taken")
     command.add_argument("--estimators", type=names, metavar="NAME[,NAME]", help="default: zobg,fobg,aobg")
     command.add_argument("--samples", type=int, metavar="N", help="samples in each batch (default: 400)")
     command.add_argument(
@@ -76,7 +80,7 @@ def run(options: argparse.Namespace) -> int:
     """Compare, print, and write where an output folder is given."""
     with usage_errors():
         configure_process(options)
-        fields = {name: getattr(options, name) for name in FIELDS}
+        fields: dict[str, Any] = {name: getattr(options, name) for name in FIELDS} | {"theta": theta_of(options)}
         config = CompareConfig(**{name: value for name, value in fields.items() if value is not None})
         plan = plan_compare(config)
         folder = None if options.output is None else prepare_folder(options.output)

@@ -42,9 +42,12 @@ def add(commands: Commands) -> None:
     summary = "check derivatives against differences, the C engine and a closed form"
     command = add_command(commands, "gradcheck", summary, run, EPILOG)
     command.add_argument(
-        "task", metavar="TASK|FILE.xml", help=f"one of: {', '.join(task_names())}; or any MJCF that MJX runs"
+        "task",
+        metavar="TASK|FILE.xml",
+        help=f"one of: {', '.join(task_names())}; module:name of your own; or any MJCF that MJX runs",
     )
-    add_contact_options(command)
+    usual = ",".join(f"{each:g}" for each in check.STIFFNESS)
+    add_contact_options(command, f"{usual}, or the task's where that is stiffer")
     command.add_argument("--pair", type=names, metavar="GEOM,GEOM", help="contact of a file that a stiffness is for")
     command.add_argument("--cone", choices=list(CONES), help="friction cone (default: the MJCF's)")
     command.add_argument("--solver", choices=list(SOLVERS), help="constraint solver (default: the MJCF's)")

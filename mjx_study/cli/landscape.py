@@ -17,6 +17,7 @@ from mjx_study.cli.options import (
     task_of,
     usage_errors,
 )
+from mjx_study.cli.parameters import add_theta_option, theta_of
 from mjx_study.landscape import Landscape, LandscapeConfig, landscape, plan_landscape
 from mjx_study.plots import plot_landscape, save_figure
 from mjx_study.results import prepare_folder, write_whole
@@ -43,6 +44,7 @@ def add(commands: Commands) -> None:
     summary = "draw a decision's cost, its smoothed cost and the slope that each estimator sees"
     command = add_command(commands, "landscape", summary, run, EPILOG)
     add_task_options(command, stiffness="the middle one of the task's sweep")
+    add_theta_option(command, "parameters that the line goes through")
     command.add_argument("--samples", type=int, metavar="N", help="samples at each point (default: 100)")
     command.add_argument("--points", type=int, metavar="N", help="points on the line (default: 41)")
     command.add_argument("--span", type=numbers, metavar="LO,HI", help="range of the line (default: the task's)")
@@ -59,7 +61,7 @@ def run(options: argparse.Namespace) -> int:
         configure_process(options)
         fields = {name: getattr(options, name) for name in FIELDS}
         given = {name: value for name, value in fields.items() if value is not None}
-        config = LandscapeConfig(**given, reference=not options.no_reference)
+        config = LandscapeConfig(**given, theta=theta_of(options), reference=not options.no_reference)
         plan = plan_landscape(config, task_of(options))
         folder = None if options.output is None else prepare_folder(options.output)
     with computing() as progress:

@@ -19,6 +19,7 @@ from mjx_study.cli.options import (
     print_report,
     usage_errors,
 )
+from mjx_study.cli.parameters import add_theta_option, theta_of
 from mjx_study.console import number
 from mjx_study.contact import FAMILIES
 from mjx_study.optimise import OptimiseConfig, OptimiseResult, Run, kept_runs, optimise, plan_optimise
@@ -27,8 +28,8 @@ from mjx_study.results import as_plain, prepare_folder, write_whole
 from mjx_study.table import format_table
 
 EPILOG = """\
-Every estimator starts from the task's theta and draws the same noise. Without --learning-rate, --iterations and
---samples the task's own are taken, which are the paper's: plain gradient descent.
+Every estimator starts from the task's theta, or from --theta, and draws the same noise. Without --learning-rate,
+--iterations and --samples the task's own are taken, which are the paper's: plain gradient descent.
 
 With --output DIR: optimisation.png and .pdf (cost against iterations, rollouts and seconds; alpha), results.json, the
 best seed's policy of each estimator (policy-NAME.json, for rollout --policy), and run-NAME.npz, from which the same
@@ -60,6 +61,7 @@ def add(commands: Commands) -> None:
     """Register the command."""
     command = add_command(commands, "optimise", "optimise a policy with any estimator", run, EPILOG)
     add_task_options(command, contact=False)
+    add_theta_option(command, "parameters to start from")
     command.add_argument("--contact", metavar="FAMILY", help=f"one of: {', '.join(FAMILIES)} (default: the task's)")
     command.add_argument("--stiffness", type=float, metavar="K", help="contact stiffness in N/m (default: the task's)")
     command.add_argument("--damping", type=float, metavar="B", help="contact damping in N s/m")
@@ -92,7 +94,7 @@ def run(options: argparse.Namespace) -> int:
     """Optimise, print, and write where an output folder is given."""
     with usage_errors():
         configure_process(options)
-        fields = {name: getattr(options, name) for name in FIELDS}
+        fields: dict[str, Any] = {name: getattr(options, name) for name in FIELDS} | {"theta": theta_of(options)}
         plan = plan_optimise(OptimiseConfig(**{name: value for name, value in fields.items() if value is not None}))
         folder = None if options.output is None else prepare_folder(options.output)
         if folder is not None:  # refused here, before anything is computed
@@ -145,6 +147,9 @@ def _save(result: OptimiseResult, document: dict[str, Any], folder: Path) -> lis
             "cost": float(run.final_cost[run.best]),
             "contact": result.config.contact,
             "stiffness": result.config.stiffness,
+            "damping": result.config.damping,
+            "cone": result.config.cone,
+            "model": result.config.model,
             "horizon": result.config.horizon,
             "network": result.config.network,
             "theta": run.theta[run.best].tolist(),

@@ -25,7 +25,8 @@ from mjx_study.cli.options import (
     task_of,
     usage_errors,
 )
-from mjx_study.configuration import Cell, plan_cells
+from mjx_study.cli.parameters import add_theta_option, theta_of
+from mjx_study.configuration import Cell, at_theta, plan_cells
 from mjx_study.console import number
 from mjx_study.contact import FAMILIES
 from mjx_study.network import with_network
@@ -107,9 +108,7 @@ def add(commands: Commands) -> None:
     command.add_argument("--stiffness", type=float, metavar="K", help="contact stiffness in N/m (default: the task's)")
     command.add_argument("--damping", type=float, metavar="B", help="contact damping in N s/m")
     command.add_argument("--noise", action="store_true", help="with the noise of sample --seed (default: none)")
-    command.add_argument(
-        "--theta", metavar="FILE|X[,X]", help="parameters: a .json or .npy file, or the numbers (default: the task's)"
-    )
+    add_theta_option(command, "parameters")
     command.add_argument("--policy", type=Path, metavar="FILE", help="a policy that optimise wrote, policy-NAME.json")
     command.add_argument("--frames", type=int, default=6, metavar="N", help="pictures in the strip (default: 6)")
     command.add_argument("--view", choices=["auto", *VIEWS], default="auto", help="default: where most happens")
@@ -163,7 +162,7 @@ def _plan(options: argparse.Namespace):
 
 def _plan_task(options: argparse.Namespace):
     policy = {} if options.policy is None else _load_policy(options)
-    for name in ("contact", "stiffness", "horizon"):
+    for name in ("contact", "stiffness", "damping", "cone", "horizon", "model"):
         if getattr(options, name) is None and policy.get(name):
             setattr(options, name, policy[name])
     task = task_of(options)
@@ -171,9 +170,8 @@ def _plan_task(options: argparse.Namespace):
         task = with_network(task, tuple(policy["network"]), jax.random.key(0))  # whose weights theta replaces
     stiffness = task.middle_stiffness if options.stiffness is None else options.stiffness
     cells, messages = plan_cells(task, (options.contact or task.main_family,), (stiffness,), options.damping)
-    source, values = _theta(options, policy)
-    theta = task.theta if values is None else jnp.asarray(_checked(source, values, task), task.theta.dtype)
-    return partial(_simulate_task, task, cells[0], theta, options.seed, options.noise), messages
+    task = at_theta(task, policy["theta"] if policy else theta_of(options))
+    return partial(_simulate_task, task, cells[0], options.seed, options.noise), messages
 
 
 def _load_policy(options: argparse.Namespace) -> dict[str, Any]:
@@ -187,7 +185,7 @@ def _load_policy(options: argparse.Namespace) -> dict[str, Any]:
         raise ValueError("--policy and --theta both say what theta is; give one of them")
     try:
         policy = json.loads(path.read_text())
-        task, policy["theta"] = policy["task"], np.array(policy["theta"], float)
+        task, policy["theta"] = policy["task"], tuple(map(float, policy["theta"]))
     except OSError as error:
         raise ValueError(f"cannot read {path}: {error.strerror or error}") from error
     except (ValueError, TypeError, KeyError) as error:
@@ -197,46 +195,8 @@ def _load_policy(options: argparse.Namespace) -> dict[str, Any]:
     return policy
 
 
-def _theta(options: argparse.Namespace, policy: dict[str, Any]) -> tuple[str, np.ndarray | None]:
-    """Where parameters are from, and their values: a policy's, the command line's, a file's, or none.
-
-    Raises:
-        ValueError: the file cannot be read or is of another kind.
-    """
-    if policy:
-        return str(options.policy), policy["theta"]
-    if options.theta is None:
-        return "", None
-    try:
-        return "--theta", np.array([float(part) for part in options.theta.split(",")])
-    except ValueError:
-        return options.theta, _load_numbers(Path(options.theta))
-
-
-def _checked(source: str, values: np.ndarray, task: Task) -> np.ndarray:
-    """The values, one finite number for each parameter.
-
-    Raises:
-        ValueError: they are not.
-    """
-    if values.shape != (task.policy.num_params,) or not np.all(np.isfinite(values)):
-        raise ValueError(
-            f"{source} holds {values.size} numbers; {task.name} needs {task.policy.num_params}, all of them finite"
-        )
-    return values
-
-
-def _load_numbers(path: Path) -> np.ndarray:
-    try:
-        content = json.loads(path.read_text()) if path.suffix == ".json" else np.load(path, allow_pickle=False)
-        return np.asarray(content, float).reshape(-1)
-    except OSError as error:
-        raise ValueError(f"cannot read {path}: {error.strerror or error}") from error
-    except (ValueError, TypeError, EOFError) as error:
-        raise ValueError(f"{path} is neither a .json list of numbers nor a .npy array") from error
-
-
-def _simulate_task(task: Task, cell: Cell, theta: jax.Array, seed: int, noisy: bool) -> Rollout:
+def _simulate_task(task: Task, cell: Cell, seed: int, noisy: bool) -> Rollout:
+    theta = task.theta
     program = jax.jit(partial(objective.simulate, task))
     outputs = program(theta, cell.contact, jax.random.key(seed), jnp.asarray(float(noisy), theta.dtype))
     states, controls, cost, residual = jax.device_get(outputs)

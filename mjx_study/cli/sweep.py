@@ -30,13 +30,15 @@ Every combination of task, contact model, timestep, cone, sigma and number of sa
 estimators are computed at once and written to DIR as one file. Stop it when you like, with Ctrl-C or kill -9; the same
 command computes what is missing, to the same numbers. Two of them at once share the work.
 
-Without --iterations, gradients are estimated where each task starts; with it, policies are optimised.
+Gradients are estimated where each task starts. With --iterations, policies are optimised; with --points, landscapes
+are drawn: the cost along a line, and the slope that every estimator sees.
 
 Numbers may be lists (10,100,1000) or ranges: FROM:TO:COUNT, or FROM:TO:COUNT:log for equal ratios.
 
 examples:
   mjx-study sweep pusher --stiffness 10:1e5:13:log --contact penalty,mujoco --output out
   mjx-study sweep pusher --stiffness 10:1e4:7:log --iterations 500 --samples 10 --seeds 5 --output descents
+  mjx-study sweep momentum_transfer --contact mujoco,smooth_onset --points 31 --timestep 0.001,0.002 --output slopes
   mjx-study sweep pusher,ball_wall --timestep 0.001,0.0025,0.005 --samples 30,100,300 --output steps
   mjx-study sweep ball_wall --solref='-1e5:-1e3:5:log;-10' --solimp 0.9,0.95,0.001,0.5,2 --output solref
   mjx-study sweep --config study.toml --output out
@@ -52,7 +54,7 @@ A TOML file holds the same options by the names of their flags, with _ for -:
 """
 RESUMABLE = "mjx-study: interrupted; the same command goes on where it stopped"
 LISTS = {"tasks": str, "estimators": str, "contact": str, "cone": str, "stiffness": float, "timestep": float,
-         "sigma": float, "samples": int}  # fmt: skip
+         "sigma": float, "samples": int, "span": float}  # fmt: skip
 
 
 def add(commands: Commands) -> None:
@@ -71,9 +73,14 @@ def add(commands: Commands) -> None:
     command.add_argument("--cone", type=names, metavar="CONE[,CONE]", help=f"of: {', '.join(CONES)}")
     command.add_argument("--sigma", metavar="S", help="noise, in the unit of what it is added to")
     command.add_argument("--samples", metavar="N", help="in each batch (default: 100)")
-    command.add_argument("--seeds", type=int, metavar="N", help="batches, or descents, of each (default: 10)")
+    command.add_argument(
+        "--seeds", type=int, metavar="N", help="batches, or descents, of each (default: 10; 1 of landscapes)"
+    )
     command.add_argument("--estimators", type=names, metavar="NAME[,NAME]", help="default: zobg,fobg,aobg")
     command.add_argument("--iterations", type=int, metavar="N", help="optimise policies, N steps each")
+    command.add_argument("--points", type=int, metavar="N", help="landscapes, on N points of a line through theta")
+    command.add_argument("--span", metavar="LO,HI", help="of that line (default: each task's)")
+    command.add_argument("--direction", metavar="DIR", help="of it: random, or a parameter's index (default: random)")
     command.add_argument("--optimizer", metavar="NAME", help="of optax (default: sgd)")
     command.add_argument("--learning-rate", type=float, metavar="R", help="default: the task's")
     command.add_argument("--decay", type=float, metavar="A", help="learning rate / i^A (default: the task's)")
@@ -84,6 +91,7 @@ def add(commands: Commands) -> None:
     command.add_argument("--model", metavar="FILE.xml", help="an MJCF in place of the task's own")
     command.add_argument("--chunk-size", type=int, metavar="N", help="samples per device and call")
     add_process_options(command)
+    command.set_defaults(seed=None)  # so that a file may say it
     command.add_argument("--output", type=Path, required=True, metavar="DIR", help="folder of the study")
 
 
@@ -92,7 +100,7 @@ def run(options: argparse.Namespace) -> int:
     with usage_errors():
         configure_process(options)
         plan = plan_sweep(SweepConfig(**_fields(options)))
-        store = open_store(plan, options.output)
+        store = open_store(plan, options.output, options.command_line)
         missing = len(store.missing)
     if not options.json:
         print("\n".join(_head(plan, missing)), flush=True)
@@ -114,8 +122,6 @@ def _fields(options: argparse.Namespace) -> dict[str, Any]:
     """The configuration's fields: flags first, then the file's."""
     fields = {field.name for field in dataclasses.fields(SweepConfig)}
     given = {name: getattr(options, name) for name in fields if getattr(options, name, None) is not None}
-    if options.seed == 0:
-        given.pop("seed")
     kept = {} if options.config is None else _from_file(options.config, fields)
     merged = {name: _value(name, value) for name, value in (kept | given).items()}
     if "tasks" not in merged:
@@ -208,9 +214,10 @@ def _solver_values(name: str, value: Any) -> tuple[tuple[float, ...], ...]:
 def _head(plan: SweepPlan, missing: int) -> list[str]:
     """The configuration as it was resolved."""
     config, cells = plan.config, len(plan.cells)
-    kind = "gradients" if config.iterations is None else f"descents of {config.iterations} iterations"
+    kind = {"descents": f"descents of {config.iterations} iterations", "landscapes": f"{config.points} points"}
     lines = [
-        f"{', '.join(config.tasks)}: {kind}, {', '.join(config.estimators)}, {config.seeds} seeds",
+        f"{', '.join(config.tasks)}: {kind.get(config.kind, config.kind)}, {', '.join(config.estimators)}, "
+        f"seeds {config.batches}",
         f"{len({(c.model.family, c.model.stiffness) for c in plan.cells})} contact models, "
         f"timestep {', '.join(dict.fromkeys(f'{group.timestep:g}' for group in plan.groups))} s, "
         f"{', '.join(dict.fromkeys(group.cone for group in plan.groups))} cone, "

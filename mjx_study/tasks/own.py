@@ -3,7 +3,6 @@
 import importlib
 import inspect
 import sys
-import traceback
 from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager, suppress
 from importlib import metadata
@@ -12,10 +11,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, Final
 
-import jax
-import jax.numpy as jnp
-
 from mjx_study.task import Task
+from mjx_study.task_checks import check_shapes, described
 
 GROUP: Final = "mjx_study.tasks"
 """Entry point group in which installed packages register tasks."""
@@ -65,7 +62,7 @@ def own_task(place: str, options: dict[str, Any]) -> Task:
                 "give a function that takes this and returns the Task"
             )
         task = found if isinstance(found, Task) else _build(place, found, options)
-        _check_shapes(place, task)
+        check_shapes(task, place)
     return task
 
 
@@ -78,7 +75,7 @@ def _load(name: str) -> ModuleType:
     except (Exception, SystemExit) as error:
         if isinstance(error, ModuleNotFoundError) and f"{name}.".startswith(f"{error.name}."):
             raise MissingModuleError(f"there is no module {error.name!r} here or installed") from error
-        raise ValueError(f"importing {name} raised {_described(error)}") from error
+        raise ValueError(f"importing {name} raised {described(error)}") from error
 
 
 def _find(module: ModuleType, name: str) -> object:
@@ -102,7 +99,7 @@ def _build(place: str, builder: object, options: dict[str, Any]) -> Task:
     try:
         task = builder(**options)
     except Exception as error:
-        raise ValueError(f"{place} raised {_described(error)}") from error
+        raise ValueError(f"{place} raised {described(error)}") from error
     if not isinstance(task, Task):
         raise ValueError(f"{place} returned no Task, but something of type {type(task).__name__}")
     return task
@@ -123,48 +120,8 @@ def _check_arguments(place: str, builder: Callable[..., object], options: dict[s
         raise ValueError(f"{place} needs {_listed(missing)}, which is not given: give it a default")
 
 
-def _check_shapes(place: str, task: Task) -> None:
-    """Refuse what broadcasting and clamped indices would let pass; traces, and computes nothing."""
-    policy, dtype = task.policy, task.scene.template.qpos.dtype
-    steps, controls = task.horizon, task.scene.host.nu
-    if jnp.asarray(task.theta).dtype != dtype:
-        raise ValueError(f"{place}: theta is {task.theta.dtype}, and the simulation {dtype}")
-    start = _shapes(place, "start", lambda: task.draw_start(jax.random.key(0)))
-    noise = jax.ShapeDtypeStruct(policy.noise_shape, dtype)
-    control = jax.ShapeDtypeStruct((controls,), dtype)
-    parts = {
-        "policy's feedforward": (policy.feedforward, (task.theta, noise), (steps, controls)),
-        "policy's feedback": (policy.feedback, (task.theta, start), (controls,)),
-        "running_cost": (task.running_cost, (start, control), ()),
-        "final_cost": (task.final_cost, (start,), ()),
-    }
-    for part, (function, arguments, needed) in parts.items():
-        found = _shapes(place, part, function, *arguments)
-        if found is not None and found.shape != needed:
-            fitting = f"; {steps} steps and {controls} controls need {needed}" if needed else ", and a cost is a scalar"
-            raise ValueError(f"{place}: the {part} has shape {found.shape}{fitting}")
-
-
-def _shapes(place: str, part: str, function: Callable[..., Any], *arguments: Any) -> Any:
-    try:
-        return jax.eval_shape(function, *arguments)
-    except Exception as error:
-        raise ValueError(f"{place}: the {part} raised {_described(error)}") from error
-
-
 def _listed(names: Sequence[str] | dict[str, Any]) -> str:
     return " and ".join(names)
-
-
-def _described(error: BaseException) -> str:
-    """Type and message in one line, and the innermost line of the user's file that it came through."""
-    text = f"{type(error).__name__}: {' '.join(str(error).split())}".removesuffix(": ")
-    skipped = (__file__, importlib.__file__, "<frozen importlib")
-    frames = [f for f in traceback.extract_tb(error.__traceback__) if not f.filename.startswith(skipped)]
-    if not frames:
-        return text
-    last = [frame for frame in frames if frame.filename == frames[0].filename][-1]
-    return f"{text} ({Path(last.filename).name}, line {last.lineno})"
 
 
 @contextmanager

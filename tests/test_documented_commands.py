@@ -1,0 +1,93 @@
+"""Every command that the README, the pages and the help show does what it says, at a small size."""
+
+import re
+import shlex
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mjx_study import cli
+from mjx_study.cli import options
+
+ROOT = Path(__file__).parents[1]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+SMALL = {
+    "compare": "--samples 4 --reference-samples 4 --horizon 4",
+    "optimise": "--iterations 2 --samples 4 --evaluation-samples 4 --seeds 2 --horizon 4",
+    "sweep": "--samples 4 --reference-samples 4 --evaluation-samples 4 --seeds 2 --horizon 4",
+    "landscape": "--points 2 --samples 4 --horizon 4",
+    "rollout": "--horizon 4 --frames 1",
+    "gradcheck": "--horizon 4 --states 1",
+    "bench": "--samples 4 --horizon 4",
+}
+# What a page takes for granted, or another one makes.
+MJCF = """<mujoco><worldbody><geom type="plane" size="1 1 0.1"/>
+<body pos="0 0 0.09"><freejoint/><geom size="0.1"/></body></worldbody></mujoco>"""
+ORDER = ("optimise", "rollout", "compare", "landscape", "gradcheck", "bench", "sweep", "plot", "report")
+
+
+def from_page(page: Path) -> list[list[str]]:
+    lines = "".join(re.findall(r"```sh\n(.*?)```", page.read_text(), re.DOTALL)).splitlines()
+    commands = [shlex.split(line, comments=True) for line in lines]
+    return [command[1:] for command in commands if command[:1] == ["mjx-study"]]
+
+
+def from_help() -> list[list[str]]:
+    """Examples of every command, those that others read from first; what an example does is said after two spaces."""
+    text = "\n".join(str(part) for part in epilogs())
+    lines = [re.split(r" {2,}| > ", line.strip())[0] for line in text.splitlines() if line.startswith("  mjx-study ")]
+    return sorted((shlex.split(line)[1:] for line in lines), key=lambda command: ORDER.index(command[0]))
+
+
+def epilogs() -> list[str | None]:
+    root = cli.parser()
+    (commands,) = (action.choices for action in root._subparsers._group_actions)  # type: ignore[union-attr]
+    return [root.epilog, *(command.epilog for command in commands.values())]  # type: ignore[union-attr]
+
+
+def small(command: list[str]) -> list[str]:
+    """The command on as little as shows that it works; later flags win."""
+    name, *rest = ["pusher" if part == "TASK" else part for part in command]
+    more = SMALL.get(name, "").split()
+    if name == "sweep":
+        more += [part for flag in ("--iterations", "--points") if flag in rest for part in (flag, "2")]
+    return [name, *rest, *more]
+
+
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with the files that the pages speak of."""
+    extending = (ROOT / "docs" / "extending.md").read_text()
+    for name, language in (("hopper.xml", "xml"), ("my_tasks.py", "python")):
+        (tmp_path / name).write_text(re.findall(rf"```{language}\n(.*?)```", extending, re.DOTALL)[0])
+    for name in ("my_model.xml", "humanoid.xml"):
+        (tmp_path / name).write_text(MJCF)
+    np.save(tmp_path / "learnt.npy", np.zeros(21))
+    (tmp_path / "study.toml").write_text('tasks = ["pusher"]\nstiffness = "10:1000:2:log"\n')
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(options, "configure", lambda **_: None)
+    return tmp_path
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("source", [*PAGES, None], ids=lambda page: page.name if page else "help")
+def test_every_command_runs(source: Path | None, here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    commands = from_help() if source is None else from_page(source)
+    assert commands or source in (ROOT / "docs" / "concepts.md", ROOT / "docs" / "gradient-faults.md")
+    for command in commands:
+        folder = command[command.index("--output") + 1] if "--output" in command else None
+        if folder is not None and command[0] in ("optimise", "sweep"):
+            shutil.rmtree(here / folder, ignore_errors=True)  # another study may be there, and would be kept
+        code = cli.main(small(command))
+        printed = capsys.readouterr()
+        assert code == 0, (command, printed.err, printed.out[-2000:])
+        assert folder is None or any((here / folder).iterdir()), command
+
+
+def test_every_example_of_the_help_parses() -> None:
+    commands = from_help()
+    assert {command[0] for command in commands} >= {"compare", "optimise", "sweep", "landscape", "rollout"}
+    for command in commands:
+        assert callable(cli.parser().parse_args(small(command)).run)
