@@ -93,6 +93,11 @@ def _short(value: Any) -> str:
     return f"{value:g}" if isinstance(value, int | float) else str(value)
 
 
+def _tick(value: float) -> str:
+    """In three digits, or whole."""
+    return f"{value:.0f}" if 100 <= value < 1e6 else f"{value:.3g}"
+
+
 def _present(part: xr.Dataset) -> np.ndarray:
     """Which contact models have numbers."""
     quantity = part[_quantity(part)]
@@ -271,9 +276,9 @@ def _ratio_map(part: xr.Dataset, title: str, quantity: str, other: str) -> Figur
             np.arange(ratio.shape[1] + 1), np.arange(ratio.shape[0] + 1), ratio,
             cmap="RdBu_r", norm=TwoSlopeNorm(0, -min(extent, 6), min(extent, 6)),
         )  # fmt: skip
-        stiffness = [f"{value:g}" for value in rows["stiffness"].values]
+        stiffness = [_tick(value) for value in rows["stiffness"].values]
         axes.set_xticks(np.arange(len(stiffness)) + 0.5, stiffness, rotation=60, ha="right", fontsize="small")
-        labels = [f"{value:g}" for value in rows[other].values]
+        labels = [_tick(value) for value in rows[other].values]
         axes.set_yticks(np.arange(len(labels)) + 0.5, labels, fontsize="small")
         axes.set_xlabel(SWEPT["stiffness"])
         axes.set_title(TITLES.get(family, family), fontsize="medium")

@@ -41,7 +41,8 @@ class SweepConfig:
         damping: of the contact [N s/m]; None for each family's.
         solref, solimp: contact models in MuJoCo's own terms, every solref with every solimp, beside the families;
             either alone goes with MuJoCo's default of the other.
-        timestep: [s]; None for the MJCF's.
+        timestep: [s]; None for the MJCF's. Each gets as many steps as take as long as the task's own, unless horizon is
+            given.
         cone: pyramidal, elliptic; None for the MJCF's.
         sigma: standard deviations of the noise; None for each task's.
         samples: sizes of a batch.
@@ -236,7 +237,11 @@ def plan_sweep(config: SweepConfig) -> SweepPlan:
 
 def _build(config: SweepConfig, name: str, timestep: float | None, cone: str | None) -> Task:
     chosen = {"timestep": timestep, "cone": cone, "horizon": config.horizon, "model": config.model}
-    task = make_task(name, **{key: value for key, value in chosen.items() if value is not None})
+    chosen = {key: value for key, value in chosen.items() if value is not None}
+    if timestep is not None and config.horizon is None:
+        own = make_task(name, **{key: value for key, value in chosen.items() if key != "timestep"})
+        chosen["horizon"] = max(1, round(own.horizon * float(own.scene.host.opt.timestep) / timestep))
+    task = make_task(name, **chosen)
     return task if config.noise is None else task.replace(noise=config.noise)
 
 

@@ -17,10 +17,9 @@ from estimators import ESTIMATORS, Differentiation
 from mjx_study import cli, configuration, descent, optimise
 from mjx_study.checkpoint import checkpoint_path
 from mjx_study.cli import options
-from mjx_study.configuration import plan_cells
 from mjx_study.descent import REASONS, begin, make_optimizer
 from mjx_study.objective import Simulator
-from mjx_study.optimise import OptimiseConfig, plan_optimise
+from mjx_study.optimise import Backend, OptimiseConfig, plan_optimise
 from mjx_study.reference import ReferenceObjective, Tennis, roll_out
 from mjx_study.tasks import TASKS, make_task
 
@@ -284,7 +283,7 @@ def test_outcomes_of_tennis_are_what_happened() -> None:
     away = np.linalg.norm(rollout.states[:, -1, :2] - [0.0, 2.5], axis=1)
     np.testing.assert_allclose(found["distance [m]"], away, rtol=1e-12)
     plan = plan_optimise(OptimiseConfig(task="tennis", contact="penalty", evaluation_samples=100))
-    hit = np.asarray(optimise.Backend(plan)._observe(task.theta, plan.cell.contact, jax.random.clone(keys))["hit"])
+    hit = np.asarray(Backend(plan)._observe(task.theta, plan.cell.contact, jax.random.clone(keys))["hit"])
     assert np.mean(hit[found["hit"] == 1]) > 0.97 and np.mean(hit) < np.mean(found["hit"]) + 0.15
 
 
@@ -294,7 +293,7 @@ def test_outcomes_of_the_sliding_box_tell_who_is_aboard() -> None:
         for reference in (False, True):
             plan = plan_optimise(OptimiseConfig(task="sliding_box", reference=reference, evaluation_samples=3))
             theta = jnp.full(400, force)
-            assert optimise.Backend(plan).outcomes(theta, plan.cell) == {"aboard": aboard}
+            assert Backend(plan).outcomes(theta, plan.cell) == {"aboard": aboard}
 
 
 @pytest.fixture(scope="module")
@@ -361,12 +360,14 @@ def test_bad_options_get_one_line(capsys: pytest.CaptureFixture[str], monkeypatc
 
 @pytest.mark.slow
 def test_the_descent_costs_little_beside_its_rollouts() -> None:
-    """An iteration takes at most 1.15 times its rollouts and gradients; ten seeds under half of ten runs."""
+    """An iteration takes at most 1.15 times its rollouts and gradients; ten seeds under half of ten runs.
+
+    Measured in turn, and the least of five: what else the machine does only adds.
+    """
     plan = plan_optimise(config(estimators=("aobg",), samples=100, horizon=100, iterations=30, seeds=1))
-    run = optimise.optimise(plan).runs[0]
-    (cell,), _ = plan_cells(plan.task, ["penalty"], [100.0])
+    backend = Backend(plan)
     simulator = Simulator(plan.task, chunk_size=plan.config.chunk_size or 1)
-    objective = simulator.objective(cell.contact)
+    objective = simulator.objective(plan.cell.contact)
 
     def batch() -> float:
         keys = jax.random.split(jax.random.key(0), 100)
@@ -375,9 +376,22 @@ def test_the_descent_costs_little_beside_its_rollouts() -> None:
         objective.differentiate(plan.task.theta, jax.random.clone(keys))
         return time.perf_counter() - start
 
+    def iteration() -> float:
+        return float(np.median(np.diff(optimise.optimise(plan, backend=backend).runs[0].seconds)))
+
     batch()
-    bare = float(np.median([batch() for _ in range(20)]))
-    assert np.median(np.diff(run.seconds)) <= 1.15 * bare
+    pairs = [(iteration(), float(np.median([batch() for _ in range(30)]))) for _ in range(5)]
+    least, bare = np.min(pairs, axis=0)
+    assert least <= 1.15 * bare, pairs
     small: dict[str, Any] = {"estimators": ("fobg",), "samples": 10, "horizon": 100, "iterations": 30}
-    one, ten = (optimise.optimise(plan_optimise(config(**small, seeds=count))).runs[0] for count in (1, 10))
-    assert ten.seconds[-1] < 0.5 * 10 * one.seconds[-1]
+    plans = [plan_optimise(config(**small, seeds=count)) for count in (1, 10)]
+    backends = [Backend(each) for each in plans]
+    seconds = [
+        [
+            optimise.optimise(each, backend=ready).runs[0].seconds[-1]
+            for each, ready in zip(plans, backends, strict=True)
+        ]
+        for _ in range(5)
+    ]
+    one, ten = np.min(seconds, axis=0)
+    assert ten < 0.5 * 10 * one, seconds

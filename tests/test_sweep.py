@@ -466,6 +466,15 @@ def test_what_cannot_be_swept_is_refused(changes: dict[str, Any], message: str) 
         plan_sweep(config(**changes))
 
 
+def test_a_timestep_keeps_the_duration() -> None:
+    """Half the step, twice as many; a horizon that is given stands."""
+    small = make_task("pusher")
+    plan = plan_sweep(config(timestep=(0.005, 0.0025), horizon=None))
+    assert [group.task.horizon for group in plan.groups] == [small.horizon, 2 * small.horizon]
+    plan = plan_sweep(config(timestep=(0.0025,), horizon=7))
+    assert [group.task.horizon for group in plan.groups] == [7]
+
+
 def test_contact_models_in_mujocos_terms() -> None:
     plan = plan_sweep(config(contact=(), solref=((-1000.0, -5.0), (0.02, 1.0)), solimp=((0.9, 0.95, 0.001, 0.5, 2.0),)))
     models = [cell.model for cell in plan.cells if cell.samples == 4]
@@ -485,7 +494,8 @@ def test_every_axis_gets_its_figures(undisturbed: Path, descents: Path, landscap
     assert "steepest slope" in report(load_study(landscapes))
     for folder in (undisturbed, descents, landscapes):
         for name, figure in study_plots.plot_study(load_study(folder)).items():
-            bottom = [axes for axes in figure.axes if axes.get_subplotspec() and axes.get_subplotspec().is_last_row()]
+            places = [(axes, axes.get_subplotspec()) for axes in figure.axes]
+            bottom = [axes for axes, place in places if place is not None and place.is_last_row()]
             assert bottom and all(axes.get_xlabel() or axes.get_xticklabels() for axes in bottom), name
             assert any(axes.get_ylabel() for axes in figure.axes), name
 
