@@ -1,8 +1,8 @@
-"""Draws docs/variance.png, docs/bias.png and docs/achieved.png: what the README says about stiffness.
+"""Draws docs/variance.png, docs/bias.png, docs/achieved.png and docs/map.png: what the README says about stiffness.
 
     python docs/make_study.py
 
-Three sweeps, in results/study/; half an hour on two cores, and it goes on where it was stopped.
+Four sweeps, in results/study/; half an hour on two cores, and it goes on where it was stopped.
 """
 
 from pathlib import Path
@@ -43,7 +43,16 @@ SWEEPS: Final = {
         samples=(10,),
         seeds=5,
     ),
+    "map": SweepConfig(
+        tasks=("pusher",),
+        contact=("penalty", "mujoco", "mujoco_stiff"),
+        stiffness=decades(1, 4, 9),
+        sigma=decades(-2, 0, 5),
+        seeds=3,
+    ),
 }
+FIGURES: Final = {"map": "map_stiffness_sigma"}
+"""Names of figures that are not their sweep's."""
 
 
 def main() -> None:
@@ -53,7 +62,7 @@ def main() -> None:
         with progress_bar() as progress:
             run_sweep(plan_sweep(config), folder, progress)
         path = HERE / f"{name}.png"
-        save(plot_study(load_study(folder))[name], path)
+        save(plot_study(load_study(folder))[FIGURES.get(name, name)], path)
         print(f"written: {path}")
 
 
