@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -108,6 +109,17 @@ def test_a_direction_through_many_parameters() -> None:
     assert curve.exact is None and np.all(np.abs(gap) < 4.5 * error)
     # the cost is nearly 2 theta of control cost along this line
     np.testing.assert_allclose(np.diff(curve.first) / np.diff([-1.0, 0.0, 1.0]), 2, rtol=0.05)
+
+
+def test_the_line_goes_through_theta() -> None:
+    task = make_task("pusher", horizon=3)
+    common: dict[str, Any] = {"direction": "1", "points": 3, "span": (-1.0, 1.0)}
+    plan = plan_landscape(LandscapeConfig(task="pusher", theta=(1.0, 2.0, 3.0), **common), task)
+    np.testing.assert_allclose(plan.line.thetas, [[1, 1, 3], [1, 2, 3], [1, 3, 3]])
+    named = plan_landscape(LandscapeConfig(task="pusher", **common))
+    assert named.task.horizon == 200 and np.all(np.asarray(named.line.thetas[1]) == np.asarray(named.task.theta))
+    with pytest.raises(ValueError, match="theta has one entry, and the line is its range: give --span"):
+        plan_landscape(LandscapeConfig(task="ball_wall", theta=(1.0,)))
 
 
 def test_random_directions_are_unit_vectors_of_the_seed() -> None:

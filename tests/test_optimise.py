@@ -60,6 +60,13 @@ def test_a_run_has_its_whole_history(short: optimise.OptimiseResult) -> None:
     assert short.config.sigma == 0.1 and short.config.decay == 0.0
 
 
+def test_a_descent_starts_where_theta_says() -> None:
+    plan = plan_optimise(config(horizon=2, theta=(0.5, -0.5)))
+    assert plan.task.theta.tolist() == [0.5, -0.5]
+    with pytest.raises(ValueError, match="theta has 2 numbers; pusher needs 13, all of them finite"):
+        plan_optimise(config(horizon=2, theta=(0.5, -0.5), network=(2,)))
+
+
 def test_seeds_are_those_of_runs_of_one(short: optimise.OptimiseResult) -> None:
     """The first seed's run does not depend on how many there are beside it."""
     alone = optimise.optimise(plan_optimise(config(estimators=("zobg",), seeds=1)))

@@ -90,11 +90,13 @@ def test_pictures_and_film_are_whole(capsys: pytest.CaptureFixture[str], elsewhe
         assert words in printed
 
 
-@pytest.mark.parametrize("kind", ["json", "npy"])
+@pytest.mark.parametrize("kind", ["json", "npy", "policy"])
 def test_theta_from_a_file(capsys: pytest.CaptureFixture[str], elsewhere: Path, kind: str) -> None:
     theta = np.linspace(0, 1, 10)
-    path = elsewhere / f"theta.{kind}"
-    if kind == "json":
+    path = elsewhere / ("theta.npy" if kind == "npy" else f"{kind}.json")
+    if kind == "policy":
+        path.write_text(json.dumps({"task": "pusher", "theta": theta.tolist()}))
+    elif kind == "json":
         path.write_text(json.dumps(theta.tolist()))
     else:
         np.save(path, theta.reshape(10, 1))

@@ -13,6 +13,7 @@ from mjx_study import console, plots, results, study
 from mjx_study.comparison import CompareConfig, CompareResult, Row
 from mjx_study.findings import findings
 from mjx_study.objective import MjxObjective, Simulator
+from mjx_study.tasks import make_task
 
 SMALL: dict[str, Any] = {"horizon": 4, "samples": 8, "reference_samples": 8}
 
@@ -216,3 +217,25 @@ def test_theta_and_sigma_reach_the_plan() -> None:
     plan = study.plan_compare(config(sigma=0.3, gamma=5.0))
     assert (plan.task.sigma, plan.options.gamma, plan.config.cone) == (0.3, 5.0, "pyramidal")
     assert jnp.all(plan.task.theta == 0.1)
+
+
+def test_gradients_are_taken_where_theta_says() -> None:
+    plan = study.plan_compare(config(theta=(0.0, 1.0, 2.0, 3.0)))
+    np.testing.assert_array_equal(plan.task.theta, np.arange(4))
+    assert plan.task.theta.dtype == jnp.float64
+    for theta in ((1.0,), (float("nan"),) * 4):
+        with pytest.raises(ValueError, match=f"theta has {len(theta)} numbers; pusher needs 4, all of them"):
+            study.plan_compare(config(theta=theta))
+
+
+def test_a_task_in_place_of_a_name() -> None:
+    """What a notebook builds runs as it is, with the configuration's noise; what does not fit is refused."""
+    task = make_task("pusher", horizon=7).replace(name="mine", gamma=3.0)
+    plan = study.plan_compare(study.CompareConfig(task="mine", sigma=0.3, stiffness=(10.0,)), task)
+    assert plan.task.scene is task.scene and plan.config.horizon == 7
+    assert (plan.task.sigma, plan.options.gamma, plan.config.task) == (0.3, 3.0, "mine")
+    with pytest.raises(ValueError, match="cone, horizon: only for a task that is built by its name"):
+        study.plan_compare(study.CompareConfig(task="mine", cone="elliptic", horizon=3), task)
+    wrong = task.replace(final_cost=lambda state: state.qpos)
+    with pytest.raises(ValueError, match="mine: the final_cost has shape .2,., and a cost is a scalar"):
+        study.plan_compare(study.CompareConfig(task="mine"), wrong)
