@@ -1,16 +1,19 @@
 """What a comparison says, in sentences, each backed by intervals."""
 
+import math
 from collections.abc import Sequence
 from typing import Final
 
-from mjx_study.comparison import CompareResult
+from mjx_study.comparison import CompareResult, Row
 
+BIASED: Final = {"fobg": "FoBG", "aobg": "AoBG", "ivw": "IVW"}
+"""Whose bias is told: first order, and the interpolations that follow it."""
 SURE: Final = 0.001
 """p-value at which a bias is reported: the least that the test's 999 draws can give."""
 
 
 def findings(result: CompareResult) -> list[str]:
-    """What the intervals say, in sentences: where FoBG's variance is above ZoBG's, and where its mean is biased."""
+    """What the intervals say, in sentences: where FoBG's variance is above ZoBG's, and whose mean is biased."""
     return [
         sentence
         for family in result.families
@@ -37,17 +40,27 @@ def _variance_finding(result: CompareResult, family: str) -> list[str]:
 
 
 def _bias_finding(result: CompareResult, family: str) -> list[str]:
-    """Where FoBG's mean is farther from the reference than any draw of the test for bias."""
-    biased = []
-    for row in result.rows:
-        if row.contact == family and row.estimator == "fobg":
-            if row.bias_p_value <= SURE:
-                biased.append(row)
+    """Where a mean is farther from the reference than any draw of the test for bias; what relies on FoBG follows it."""
+    biased = [
+        row for row in result.rows if row.contact == family and row.estimator in BIASED and row.bias_p_value <= SURE
+    ]
     return [
-        f"{family}: FoBG's mean is biased by {row.relative_error:.1%}{_at([row.stiffness])} "
-        f"(p <= {row.bias_p_value:.3f})"
+        f"{family}: {BIASED[row.estimator]}'s mean is biased by {_share(row)}{_at([row.stiffness])} "
+        f"(p <= {row.bias_p_value:.3f}){_advice(row, result)}"
         for row in biased
     ]
+
+
+def _share(row: Row) -> str:
+    """Of the reference gradient, to the digits that its error leaves."""
+    error = max(row.relative_error_se, row.reference_uncertainty)
+    return f"{row.relative_error:.1%}" if error < 0.005 else f"{float(f'{100 * row.relative_error:.2g}'):g}%"
+
+
+def _advice(row: Row, result: CompareResult) -> str:
+    """What keeps an interpolation from following a biased batch."""
+    unbounded = row.estimator == "aobg" and math.isinf(result.config.gamma or math.inf)
+    return ": it has no accuracy bound; --gamma sets one" if unbounded else ""
 
 
 def _at(stiffnesses: Sequence[float]) -> str:

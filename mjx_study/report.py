@@ -41,6 +41,8 @@ SUMMARY: Final = {
     "descents": "Medians over the seeds, at the largest sample count.",
     "landscapes": "At the largest sample count.",
 }
+PRESENT: Final = ("residual", "rollouts", "unconverged")
+"""Of every kind of study a variable that is a number wherever a cell is computed."""
 COLUMNS: Final = {
     "variance": "variance",
     "relative_error": "relative error",
@@ -119,7 +121,7 @@ def _numbers(dataset: xr.Dataset) -> str:
         for model, estimator in itertools.product(part["model"].values, part["estimator"].values):
             one = part.sel(model=model, estimator=estimator)
             numbers = [_reduced(name, one[name]) for name in variables]
-            if np.isfinite(numbers[0]):
+            if any(np.isfinite(one[name]).all() for name in PRESENT if name in one):
                 place = [_shown(part[name].item()) for name in outer]
                 rows.append([str(model), *place, str(estimator), *map(_shown, numbers)])
     titles = ["contact model", *(SWEPT.get(name, name) for name in outer), "estimator"]

@@ -196,7 +196,10 @@ def _variance(part: xr.Dataset, title: str) -> Figure:
     )
 
 
-def _bias(part: xr.Dataset, title: str) -> Figure:
+def _bias(part: xr.Dataset, title: str) -> Figure | None:
+    if not bool(part["squared_bias"].notnull().any()):
+        return None  # with fewer than three seeds there is no estimate of it
+
     def draw(axes: Axes, rows: xr.Dataset, x: np.ndarray) -> None:
         for mine, style in _estimators(rows):
             square, error = (np.asarray(mine[name], float) for name in ("squared_bias", "squared_bias_se"))
@@ -276,9 +279,9 @@ def _ratio_map(part: xr.Dataset, title: str, quantity: str, other: str) -> Figur
             np.arange(ratio.shape[1] + 1), np.arange(ratio.shape[0] + 1), ratio,
             cmap="RdBu_r", norm=TwoSlopeNorm(0, -min(extent, 6), min(extent, 6)),
         )  # fmt: skip
-        stiffness = [_tick(value) for value in rows["stiffness"].values]
+        stiffness = [_tick(float(value)) for value in rows["stiffness"].values]
         axes.set_xticks(np.arange(len(stiffness)) + 0.5, stiffness, rotation=60, ha="right", fontsize="small")
-        labels = [_tick(value) for value in rows[other].values]
+        labels = [_tick(float(value)) for value in rows[other].values]
         axes.set_yticks(np.arange(len(labels)) + 0.5, labels, fontsize="small")
         axes.set_xlabel(SWEPT["stiffness"])
         axes.set_title(TITLES.get(family, family), fontsize="medium")
@@ -343,7 +346,7 @@ def _descent(part: xr.Dataset, title: str) -> Figure:
         for axes in row:
             axes.grid(alpha=0.25)
             if curves:
-                axes.set_ylim(*robust_limits(curves))
+                axes.set_ylim(*_descent_limits(curves, float(one["start_cost"])))
         row[0].set_ylabel(f"{one['model'].item()}\nmean cost of the batch", fontsize="small")
     grid[0, 0].legend(frameon=False, fontsize="small")
     for axes, label in zip(grid[-1], ("iteration", "rollouts of one seed", "seconds, all seeds"), strict=True):
@@ -352,16 +355,24 @@ def _descent(part: xr.Dataset, title: str) -> Figure:
     return figure
 
 
+def _descent_limits(curves: list[np.ndarray], start: float) -> tuple[float, float]:
+    """Limits within which a descent goes down; one that blows up leaves them at the top."""
+    low, high = robust_limits(curves)
+    room = start - low
+    return (low, min(high, start + 2 * room)) if room > 0 else (low, high)
+
+
 def _landscape(part: xr.Dataset, title: str) -> Figure:
     """Cost and mean cost along the line above, the slope that each estimator sees below; a column for a few models."""
     models = np.unique(np.linspace(0, part.sizes["model"] - 1, MOST_PANELS).round().astype(int))
     figure = Figure(figsize=(1.6 + 2.9 * len(models), 6.2), layout="constrained")
     FigureCanvasAgg(figure)
     grid = figure.subplots(2, len(models), sharex=True, sharey="row", squeeze=False)
-    slopes = []
+    slopes, steepest = [], 0.0
     for (above, below), model in zip(grid.T, models, strict=True):
         one = part.isel(model=model)
         t = one["position"].values
+        steepest = max(steepest, float(np.nanmax(np.abs(np.gradient(one["smoothed"].values, t)), initial=0.0)))
         above.plot(t, one["cost"], color="0.55", linewidth=1.2, label="cost without noise")
         mean_with_band(above, t, one["smoothed"].values, one["smoothed_se"].values, "black", "mean cost with noise")
         for mine, style in _estimators(one):
@@ -373,7 +384,10 @@ def _landscape(part: xr.Dataset, title: str) -> Figure:
         below.set_xlabel("t, along the line")
         for axes in (above, below):
             axes.grid(alpha=0.25)
-    grid[1, 0].set_ylim(*robust_limits(slopes))
+    low, high = robust_limits(slopes)  # and a slope that is wild beside that of the mean cost leaves the axes
+    if steepest > 0:
+        low, high = max(low, -10 * steepest), min(high, 10 * steepest)
+    grid[1, 0].set_ylim(low, high)
     grid[0, 0].set_ylabel("cost")
     grid[1, 0].set_ylabel("slope along the line")
     handles = [handle for axes in grid[:, 0] for handle in axes.get_legend_handles_labels()[0]]

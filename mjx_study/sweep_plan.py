@@ -99,6 +99,8 @@ class SweepConfig:
         check_names("estimator", self.estimators, ESTIMATORS)
         if self.contact:
             check_names("contact family", self.contact, FAMILIES)
+        if self.stiffness and self.contact and not any(FAMILIES[name].swept for name in self.contact):
+            raise ValueError(f"contact {', '.join(self.contact)} takes no stiffness; leave stiffness out")
         for name in ("tasks", "stiffness", "solref", "solimp", "timestep", "cone", "sigma", "samples"):
             values = getattr(self, name)
             if values is not None:

@@ -56,7 +56,8 @@ class Task:
         scene: the compiled model.
         horizon: number of steps H.
         policy: maps theta, noise and state to start and controls.
-        theta: where gradients are taken unless told otherwise, (params,).
+        theta: where gradients are taken unless told otherwise, (params,). A weakly typed array is made a strong one:
+            otherwise what is compiled for it would be compiled again for the theta of a descent.
         sigma: standard deviation of the noise, in the unit of what it is added to.
         start: the start state, or a distribution over start states as a function of a key.
         running_cost: c(state, control) of each step before it is taken; none by default, where there is a final one.
@@ -99,6 +100,8 @@ class Task:
     outcomes: Callable[[State], dict[str, Float[Array, ""]]] | None = None
 
     def __post_init__(self) -> None:
+        theta = jax.numpy.asarray(self.theta)
+        object.__setattr__(self, "theta", jax.numpy.asarray(theta, theta.dtype))
         if self.horizon < 1:
             raise ValueError(f"horizon must be at least 1 step, got {self.horizon}")
         check_sigma(self.sigma)

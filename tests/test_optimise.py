@@ -213,7 +213,8 @@ def test_one_compilation_for_all_iterations(monkeypatch: pytest.MonkeyPatch) -> 
         return compiled[-1]
 
     monkeypatch.setattr(optimise.jax, "jit", spy)
-    optimise.optimise(plan_optimise(config(estimators=("zobg",), horizon=3)))
+    weak = make_task("pusher", horizon=3).replace(theta=jnp.full(3, 0.1))  # a type that JAX calls weak
+    optimise.optimise(plan_optimise(config(estimators=("zobg",), horizon=None), weak))
     steps = [program for program in compiled if program.__wrapped__.__name__ == "<lambda>"]
     assert [program._cache_size() for program in steps] == [1, 1]  # the keys of an iteration, and the iteration
 
@@ -322,10 +323,10 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
 def test_the_command_writes_figure_numbers_policies_and_checkpoints(written: tuple[Path, str]) -> None:
     folder, printed = written
     names = ("zobg", "fobg", "aobg")
-    expected = {"results.json", "optimisation.png", "optimisation.pdf"}
+    expected = {"optimisation.json", "optimisation.png", "optimisation.pdf"}
     expected |= {f"policy-{name}.json" for name in names} | {f"run-{name}.npz" for name in names}
     assert {path.name for path in folder.iterdir()} == expected
-    document = json.loads((folder / "results.json").read_text())
+    document = json.loads((folder / "optimisation.json").read_text())
     assert [run["estimator"] for run in document["runs"]] == list(names)
     assert np.shape(document["runs"][0]["history"]["cost"]) == (4, 2)
     with Image.open(folder / "optimisation.png") as picture:
@@ -347,7 +348,10 @@ def test_a_policy_is_replayed(
     for wrong, says in (
         (["rollout", "sliding_box", "--policy", str(policy)], "is a policy of pusher, not of sliding_box"),
         (["rollout", "pusher", "--policy", str(policy), "--theta", "1"], "both say what theta is"),
-        (["rollout", "pusher", "--policy", str(written[0] / "results.json")], "is not a policy that optimise wrote"),
+        (
+            ["rollout", "pusher", "--policy", str(written[0] / "optimisation.json")],
+            "is not a policy that optimise wrote",
+        ),
         (["rollout", "pusher", "--policy", "nowhere.json"], "cannot read nowhere.json"),
     ):
         assert cli.main(wrong) == 2

@@ -142,6 +142,13 @@ def test_bias_is_reported_only_beyond_what_noise_explains() -> None:
     assert findings(result(quiet)) == []
     (sentence,) = findings(result(loud))
     assert sentence == "penalty: FoBG's mean is biased by 4.4% at K = 10 N/m (p <= 0.001)"
+    mixed = row("aobg", 10, 1, relative_error=16.95, bias_p_value=0.001)
+    (sentence,) = findings(result(mixed))
+    assert sentence == "penalty: AoBG's mean is biased by 1700% at K = 10 N/m (p <= 0.001)"
+    (sentence,) = findings(
+        dataclasses.replace(result(mixed), config=dataclasses.replace(result().config, gamma=math.inf))
+    )
+    assert sentence.endswith("(p <= 0.001): it has no accuracy bound; --gamma sets one")
 
 
 def test_alarms_name_what_must_not_be_overlooked() -> None:

@@ -438,6 +438,31 @@ def test_a_file_and_flags_are_one_configuration(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    ("line", "says"),
+    [
+        ('seeds = "2"', "seeds must be a whole number, got '2'"),
+        ("seeds = 2.5", "seeds must be a whole number, got 2.5"),
+        ("horizon = true", "horizon must be a whole number, got True"),
+        ('gamma = "x"', "gamma must be a number, got 'x'"),
+        ("optimizer = 3", "optimizer must be text, got 3"),
+        ("radius = true", "radius must be a number, got True"),
+        ("window = 1.5", "window must be a whole number, got 1.5"),
+        ("contact = [3]", "contact: 3 is no name"),
+        ('samples = ["x"]', "samples: 'x' is no number"),
+        ("colour = 1", "unknown option colour"),
+    ],
+)
+def test_a_file_with_a_value_of_another_kind_gets_one_line(tmp_path: Path, line: str, says: str) -> None:
+    path = tmp_path / "study.toml"
+    path.write_text(f'tasks = ["pusher"]\n{line}\n')
+    with pytest.raises(ValueError, match=re.escape(says)):
+        _fields(cli.parser().parse_args(["sweep", "--config", str(path), "--output", "x"]))
+    path.write_text('tasks = ["pusher"]\npoints = 3\ndirection = 3\ngamma = 5\n')
+    fields = _fields(cli.parser().parse_args(["sweep", "--config", str(path), "--output", "x"]))
+    assert fields["direction"] == "3" and fields["gamma"] == 5
+
+
+@pytest.mark.parametrize(
     ("changes", "message"),
     [
         ({"tasks": ()}, "no task given"),
@@ -452,6 +477,7 @@ def test_a_file_and_flags_are_one_configuration(tmp_path: Path) -> None:
         ({"points": 1}, "points must be at least 2, got 1"),
         ({"points": 3, "span": (1.0, 0.0)}, "span must be two numbers, the lower one first"),
         ({"points": 3, "direction": "20"}, "direction must be random or a parameter's index, 0 to 19; got 20"),
+        ({"contact": ("mjcf",)}, "contact mjcf takes no stiffness; leave stiffness out"),
         ({"seeds": 0}, "seeds must be at least 1, got 0"),
         ({"timestep": (2.0,)}, "timestep must lie between 0 and 1 s"),
         ({"sigma": (-1.0,)}, "sigma must be positive"),
@@ -492,6 +518,10 @@ def test_every_axis_gets_its_figures(undisturbed: Path, descents: Path, landscap
     assert set(study_plots.plot_study(load_study(descents))) == {"achieved", "descent"}
     assert set(study_plots.plot_study(load_study(landscapes))) == {"landscape"}
     assert "steepest slope" in report(load_study(landscapes))
+    page = report(load_study(descents))  # both estimators of all four models, though only one has an alpha
+    assert page.count("<td>fobg</td>") == page.count("<td>aobg</td>") == 4
+    few = load_study(undisturbed).assign(squared_bias=load_study(undisturbed)["squared_bias"] * np.nan)
+    assert "bias" not in study_plots.plot_study(few)
     for folder in (undisturbed, descents, landscapes):
         for name, figure in study_plots.plot_study(load_study(folder)).items():
             places = [(axes, axes.get_subplotspec()) for axes in figure.axes]

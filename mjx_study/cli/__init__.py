@@ -30,7 +30,7 @@ start here:
   mjx-study compare pusher                       which estimator, at which contact stiffness? 20 s once compiled
   mjx-study compare pusher --output out          the same, with a figure and the numbers on disk
   mjx-study optimise pusher --output out         and what does each achieve as gradient descent goes on?
-  mjx-study sweep pusher --output out            both over many contact models; resumable; then plot out, report out
+  mjx-study sweep pusher --output out            many contact models, resumable; then plot out, report out
   mjx-study landscape ball_wall --output out     the cost, the cost with noise, and the slopes that estimators see
   mjx-study rollout tennis                       pictures and a film of a task
   mjx-study gradcheck pusher                     are the derivatives right? exit code 1 if not

@@ -31,8 +31,8 @@ EPILOG = """\
 Every estimator starts from the task's theta, or from --theta, and draws the same noise. Without --learning-rate,
 --iterations and --samples the task's own are taken, which are the paper's: plain gradient descent.
 
-With --output DIR: optimisation.png and .pdf (cost against iterations, rollouts and seconds; alpha), results.json, the
-best seed's policy of each estimator (policy-NAME.json, for rollout --policy), and run-NAME.npz, from which the same
+With --output DIR: optimisation.png and .pdf (cost against iterations, rollouts and seconds; alpha), optimisation.json,
+the best seed's policy of each estimator (policy-NAME.json, for rollout --policy), and run-NAME.npz, from which the same
 command goes on where it was stopped, or with more --iterations.
 
 examples:
@@ -138,7 +138,7 @@ def as_document(result: OptimiseResult) -> dict[str, Any]:
 
 def _save(result: OptimiseResult, document: dict[str, Any], folder: Path) -> list[Path]:
     text = json.dumps(document, allow_nan=False) + "\n"
-    written = [write_whole(folder / "results.json", lambda file: file.write(text.encode()))]
+    written = [write_whole(folder / "optimisation.json", lambda file: file.write(text.encode()))]
     for run in result.runs:
         policy = {
             "task": result.config.task,

@@ -5,7 +5,7 @@ import dataclasses
 import math
 import tomllib
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args, get_type_hints
 
 from mjx_study.cli.options import (
     Commands,
@@ -141,7 +141,23 @@ def _from_file(path: Path, fields: set[str]) -> dict[str, Any]:
     unknown = sorted(set(found) - fields)
     if unknown:
         raise ValueError(f"{path}: unknown option {', '.join(unknown)}; there are {', '.join(sorted(fields))}")
+    if isinstance(found.get("direction"), int):
+        found["direction"] = str(found["direction"])
+    for name, value in found.items():
+        _check_kind(path, name, value)
     return found
+
+
+def _check_kind(path: Path, name: str, value: Any) -> None:
+    """Raises ValueError for a single value of a file that is of another kind than its option's."""
+    if name in LISTS or name in ("solref", "solimp"):
+        return
+    kinds = get_type_hints(SweepConfig)[name]
+    accepted = tuple(kind for kind in (*get_args(kinds), kinds) if kind in (int, float, str))
+    number = (int,) if float in accepted else ()
+    if isinstance(value, bool) or not isinstance(value, accepted + number):
+        told = "a whole number" if accepted == (int,) else "text" if accepted == (str,) else "a number"
+        raise ValueError(f"{path}: {name} must be {told}, got {value!r}")
 
 
 def _value(name: str, value: Any) -> Any:
