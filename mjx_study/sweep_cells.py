@@ -12,13 +12,17 @@ import numpy as np
 from jaxtyping import Array, Float, Key
 
 import estimators
-from estimators import ESTIMATORS, ORACLES
+from estimators import ESTIMATORS, ORACLES, GradientEstimate
 from mjx_study.landscape import line_of
 from mjx_study.objective import Simulator
 from mjx_study.optimise import Backend, optimise
 from mjx_study.study import UNCONVERGED, estimate_numbers, reference_of, residuals_of
 from mjx_study.sweep_plan import LARGEST_BATCH, SweepCell, SweepPlan, descent_plan, estimator_options
 
+CANDIDATES: Final = 100
+"""First-order samples whose median is a candidate for the reference's control variate."""
+CONFIDENCE: Final = 0.95
+"""Of intervals within a batch; those over seeds are made where figures are drawn."""
 Compute = Callable[[SweepCell], dict[str, np.ndarray]]
 """Gives the numbers of a cell by variable."""
 
@@ -90,27 +94,14 @@ def compute_gradients(plan: SweepPlan) -> Callable[[SweepCell], dict[str, np.nda
         pilot = jax.tree.map(lambda leaf: leaf[0], drawn["evaluation"])
         odd, candidate = (
             jax.random.split(stream, size)
-            for stream, size in zip(keys["reference"], (config.reference_samples, 100), strict=True)
+            for stream, size in zip(keys["reference"], (config.reference_samples, CANDIDATES), strict=True)
         )
         reference = reference_of(objective, odd, candidate, pilot, [])
         tests = jax.random.split(keys["test"], config.batches)
         numbers = jax.device_get(
             _seed_numbers(drawn, reference, tests, config.estimators, estimator_options(plan, cell))
         )
-        arrays = {
-            name: np.stack([np.full(config.batches, np.nan) if row[name] is None else row[name] for row in numbers], 1)
-            for name in ("variance", "norm_90", "norm_max", "gradient_norm", "relative_error", "relative_error_se",
-                         "cosine", "alpha", "epsilon", "discrepancy", "bias_p_value", "nonfinite")
-        }  # fmt: skip
-        arrays |= {name: np.asarray(numbers[0][name][0]) for name in ("reference_norm", "reference_uncertainty")}
-        means = [jnp.asarray(row["gradient"]) for row in numbers]
-        squared = [estimators.squared_bias_of_means(each, reference) for each in means]
-        square = float(jnp.sum(reference.mean**2))
-        arrays["squared_bias"], arrays["squared_bias_se"] = (
-            np.array(each, float) / square for each in zip(*squared, strict=True)
-        )
-        gaps = [jnp.linalg.norm(jnp.mean(each, axis=0) - reference.mean) for each in means]
-        arrays["pooled_error"] = np.array(gaps, float) / square**0.5
+        arrays = _of_seeds(numbers, config.batches) | _bias(numbers, reference)
         arrays["residual"] = np.asarray(np.max(np.where(np.isfinite(residuals), residuals, np.inf)))
         arrays["unconverged"] = np.asarray(np.sum(~(residuals <= UNCONVERGED[str(residuals.dtype)])))
         per_sample = [sum(seconds[oracle] for oracle in ESTIMATORS[name].needs) for name in config.estimators]
@@ -118,6 +109,30 @@ def compute_gradients(plan: SweepPlan) -> Callable[[SweepCell], dict[str, np.nda
         return {name: np.asarray(array, float) for name, array in arrays.items()}
 
     return compute
+
+
+def _of_seeds(numbers: Sequence[dict[str, Any]], seeds: int) -> dict[str, np.ndarray]:
+    """Numbers by seed and estimator, NaN for what an estimator does not have; and those of the reference."""
+    arrays = {
+        name: np.stack([np.full(seeds, np.nan) if row[name] is None else row[name] for row in numbers], axis=1)
+        for name, (dimensions, *_) in GRADIENT_VARIABLES.items()
+        if dimensions == ("seed", "estimator")
+    }
+    first = numbers[0]  # every estimator's row has the reference's numbers, every seed the same
+    return arrays | {name: np.asarray(first[name][0]) for name in ("reference_norm", "reference_uncertainty")}
+
+
+def _bias(numbers: Sequence[dict[str, Any]], reference: GradientEstimate) -> dict[str, np.ndarray]:
+    """Each estimator's bias over the norm of the reference, from the means of its seeds."""
+    means = [jnp.asarray(row["gradient"]) for row in numbers]
+    square = float(jnp.sum(reference.mean**2))
+    squared, errors = zip(*(estimators.squared_bias_of_means(each, reference) for each in means), strict=True)
+    gaps = [jnp.linalg.norm(jnp.mean(each, axis=0) - reference.mean) for each in means]
+    return {
+        "squared_bias": np.array(squared, float) / square,
+        "squared_bias_se": np.array(errors, float) / square,
+        "pooled_error": np.array(gaps, float) / square**0.5,
+    }
 
 
 def _cell_keys(seed: int, seeds: int) -> dict[str, Any]:
@@ -149,7 +164,9 @@ def _draw(objective: Any, theta: Array, keys: dict[str, Any], oracles: Sequence[
 @partial(jax.jit, static_argnames=("names", "options"))
 def _seed_numbers(drawn: dict[str, Any], reference: Any, keys: Key[Array, " seeds"], names: Any, options: Any):
     """The numbers of every estimator, with an axis of seeds."""
-    return jax.vmap(lambda batches, key: estimate_numbers(batches, reference, key, names, options, 0.95))(drawn, keys)
+    return jax.vmap(lambda batches, key: estimate_numbers(batches, reference, key, names, options, CONFIDENCE))(
+        drawn, keys
+    )
 
 
 def compute_descents(plan: SweepPlan) -> Callable[[SweepCell], dict[str, np.ndarray]]:

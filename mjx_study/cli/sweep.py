@@ -114,7 +114,7 @@ def run(options: argparse.Namespace) -> int:
             f"cannot write to {options.output}: {error.strerror or error}; what is there is complete, and the same "
             "command goes on"
         ) from error
-    print_report(options, _document(result), _tail(result))
+    print_report(options, _document(result), _tail(result, plan))
     return 0
 
 
@@ -234,13 +234,13 @@ def _head(plan: SweepPlan, missing: int) -> list[str]:
     lines = [
         f"{', '.join(config.tasks)}: {kind.get(config.kind, config.kind)}, {', '.join(config.estimators)}, "
         f"seeds {config.batches}",
-        f"{len({(c.model.family, c.model.stiffness) for c in plan.cells})} contact models, "
+        f"contact models: {len({(c.model.family, c.model.stiffness) for c in plan.cells})}, "
         f"timestep {', '.join(dict.fromkeys(f'{group.timestep:g}' for group in plan.groups))} s, "
         f"{', '.join(dict.fromkeys(group.cone for group in plan.groups))} cone, "
         f"sigma {', '.join(dict.fromkeys(f'{cell.sigma:g}' for cell in plan.cells))}, "
         f"{', '.join(map(str, config.samples))} samples",
-        f"{cells} cells, {cells - missing} of them there; {plan.compilations} programs to compile, chunks of "
-        f"{plan.chunk_size} samples",
+        f"cells: {cells}, of which {missing} to compute"
+        + (f"; {plan.compilations} programs to compile, chunks of {plan.chunk_size} samples" if missing else ""),
     ]
     return lines + [f"warning: {message}" for message in plan.warnings]
 
@@ -255,8 +255,9 @@ def _document(result: SweepResult) -> dict[str, Any]:
     }
 
 
-def _tail(result: SweepResult) -> list[str]:
+def _tail(result: SweepResult, plan: SweepPlan) -> list[str]:
+    """What was computed, and what there is to warn about beyond what the head said."""
     sizes = ", ".join(f"{name} {size}" for name, size in result.dataset.sizes.items())
     lines = [f"computed {result.computed} cells; {sizes}"]
-    lines += [f"warning: {message}" for message in result.warnings if message not in lines]
+    lines += [f"warning: {message}" for message in result.warnings if message not in plan.warnings]
     return [*lines, f"written to {result.folder}: results.nc; mjx-study plot {result.folder} draws it"]
