@@ -16,7 +16,7 @@ NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 LARGEST = 300_000
 """Bytes of a notebook with its outputs."""
 SMALL = {
-    "1_stiffness_sweep": "STIFFNESS, SEEDS, SAMPLES, REFERENCE_SAMPLES = (10.0, 1200.0), 2, 8, 40",
+    "1_stiffness_sweep": "STIFFNESS, SEEDS, SAMPLES, REFERENCE_SAMPLES = (10.0, 1200.0), 3, 8, 40",
     "2_which_estimator": "SAMPLES, REFERENCE_SAMPLES, ITERATIONS = 8, 20, 3",
     "3_bring_your_own": (
         "STATES, SAMPLES, REFERENCE_SAMPLES, POINTS = 1, 8, 20, 3\n"
