@@ -3,18 +3,24 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Key
 
 Draw = Callable[[Key[Array, ""], tuple[int, ...], jnp.dtype], Float[Array, "..."]]
-Score = Callable[[Float[Array, "..."]], Float[Array, "..."]]
+Score = Callable[[Float[Any, "..."]], Float[Any, "..."]]
+Density = Callable[[Float[np.ndarray, "..."]], Float[np.ndarray, "..."]]
 
 LOGISTIC_SCALE = math.sqrt(3.0) / math.pi
 LAPLACE_SCALE = math.sqrt(0.5)
 DEGREES_OF_FREEDOM = 5.0
 STUDENT_SCALE = math.sqrt((DEGREES_OF_FREEDOM - 2.0) / DEGREES_OF_FREEDOM)
+STUDENT_PEAK = math.gamma((DEGREES_OF_FREEDOM + 1.0) / 2.0) / (
+    math.sqrt(DEGREES_OF_FREEDOM * math.pi) * math.gamma(DEGREES_OF_FREEDOM / 2.0)
+)
 
 
 @dataclass(frozen=True)
@@ -29,6 +35,8 @@ class NoiseDensity:
         description: One line.
         draw: Samples z from (key, shape, dtype).
         score: psi'(z).
+        density: exp(-psi(z)), in NumPy and float64: for quadrature.
+        reach: The |z| beyond which at most a given probability lies; an upper bound.
         information: E[psi'^2] >= 1; the Gaussian's is least.
     """
 
@@ -36,37 +44,64 @@ class NoiseDensity:
     description: str
     draw: Draw
     score: Score
+    density: Density
+    reach: Callable[[float], float]
     information: float
 
 
-def _student_score(z: Float[Array, "..."]) -> Float[Array, "..."]:
+def _student_score(z: Float[Any, "..."]) -> Float[Any, "..."]:
     return (DEGREES_OF_FREEDOM + 1.0) * z / (DEGREES_OF_FREEDOM * STUDENT_SCALE**2 + z**2)
+
+
+def _student_density(z: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+    power = (DEGREES_OF_FREEDOM + 1.0) / 2.0
+    return STUDENT_PEAK / STUDENT_SCALE * (1.0 + (z / STUDENT_SCALE) ** 2 / DEGREES_OF_FREEDOM) ** -power
+
+
+def _student_reach(probability: float) -> float:
+    """From the density without its 1, C (t^2 / n)^(-(n+1)/2): P(|t| > x) <= 2 C n^((n-1)/2) x^-n."""
+    n = DEGREES_OF_FREEDOM
+    return STUDENT_SCALE * (2.0 * STUDENT_PEAK * n ** ((n - 1.0) / 2.0) / probability) ** (1.0 / n)
 
 
 NOISES: dict[str, NoiseDensity] = {
     noise.name: noise
     for noise in (
-        NoiseDensity("gaussian", "the paper's", jax.random.normal, lambda z: z, 1.0),
+        NoiseDensity(
+            "gaussian",
+            "the paper's",
+            jax.random.normal,
+            score=lambda z: z,
+            density=lambda z: np.exp(-(z**2) / 2.0) / math.sqrt(2.0 * math.pi),
+            reach=lambda probability: math.sqrt(-2.0 * math.log(probability)),
+            information=1.0,
+        ),
         NoiseDensity(
             "logistic",
             "heavier tails, bounded score",
             lambda key, shape, dtype: LOGISTIC_SCALE * jax.random.logistic(key, shape, dtype),
-            lambda z: jnp.tanh(z / (2.0 * LOGISTIC_SCALE)) / LOGISTIC_SCALE,
-            1.0 / (3.0 * LOGISTIC_SCALE**2),
+            score=lambda z: jnp.tanh(z / (2.0 * LOGISTIC_SCALE)) / LOGISTIC_SCALE,
+            density=lambda z: (1.0 - np.tanh(z / (2.0 * LOGISTIC_SCALE)) ** 2) / (4.0 * LOGISTIC_SCALE),
+            reach=lambda probability: LOGISTIC_SCALE * math.log(2.0 / probability),
+            information=1.0 / (3.0 * LOGISTIC_SCALE**2),
         ),
         NoiseDensity(
             "laplace",
             "a score of constant size, which bounds zeroth-order samples",
             lambda key, shape, dtype: LAPLACE_SCALE * jax.random.laplace(key, shape, dtype),
-            lambda z: jnp.sign(z) / LAPLACE_SCALE,
-            1.0 / LAPLACE_SCALE**2,
+            score=lambda z: jnp.sign(z) / LAPLACE_SCALE,
+            density=lambda z: np.exp(-np.abs(z) / LAPLACE_SCALE) / (2.0 * LAPLACE_SCALE),
+            reach=lambda probability: -LAPLACE_SCALE * math.log(probability),
+            information=1.0 / LAPLACE_SCALE**2,
         ),
         NoiseDensity(
             "student",
             "Student's t with 5 degrees of freedom: rare large steps",
             lambda key, shape, dtype: STUDENT_SCALE * jax.random.t(key, DEGREES_OF_FREEDOM, shape, dtype),
-            _student_score,
-            (DEGREES_OF_FREEDOM + 1.0) / ((DEGREES_OF_FREEDOM + 3.0) * STUDENT_SCALE**2),
+            score=_student_score,
+            density=_student_density,
+            reach=_student_reach,
+            information=(DEGREES_OF_FREEDOM + 1.0) / ((DEGREES_OF_FREEDOM + 3.0) * STUDENT_SCALE**2),
         ),
     )
 }

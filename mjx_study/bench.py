@@ -21,7 +21,7 @@ import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
 from mjx_study._mjx import mjx
-from mjx_study.configuration import Progress, plan_cells
+from mjx_study.configuration import Cell, Progress, plan_cells
 from mjx_study.contact import ContactModel, apply_contact
 from mjx_study.dynamics import State
 from mjx_study.engine import engine_model
@@ -118,6 +118,7 @@ class BenchPlan:
 
     task: Task
     samples: int
+    cell: Cell
 
 
 def plan_bench(task: Task, samples: int) -> BenchPlan:
@@ -128,15 +129,14 @@ def plan_bench(task: Task, samples: int) -> BenchPlan:
     """
     if samples < 1:
         raise ValueError(f"samples must be at least 1, got {samples}")
-    return BenchPlan(task, samples)
+    (cell,), _ = plan_cells(task, [task.main_family], [task.middle_stiffness])
+    return BenchPlan(task, samples, cell)
 
 
 def bench(plan: BenchPlan, progress: Progress = lambda done, total, what: None) -> BenchReport:
     """Measure everything, ours and the rivals' interleaved; medians of repeats."""
-    task, samples = plan.task, plan.samples
+    task, samples, cell = plan.task, plan.samples, plan.cell
     devices = jax.local_devices()
-    family = "mujoco" if task.contact_pair else "mjcf"
-    (cell,), _ = plan_cells(task, [family], [task.stiffnesses[1]])
     keys = jax.random.split(jax.random.key(0), samples)
     simulator = Simulator(task, chunk_size=chunk_for(samples, devices))
     objective = simulator.objective(cell.contact)
@@ -205,7 +205,7 @@ def _stock_programs(task: Task, contact: ContactModel | None, keys: Any, devices
         model = scene.model.replace(opt=scene.model.opt.replace(iterations=iterations))
         model = apply_contact(model, contact)
         start_key, noise_key = split_sample_key(jax.random.wrap_key_data(key_data))
-        noise = task.sigma * standard_noise(noise_key, policy.noise_shape, dtype)
+        noise = task.sigma * standard_noise(noise_key, policy.noise_shape, dtype, task.noise)
         start = policy.place(theta, noise, task.draw_start(start_key))
 
         def advance(data, feedforward):

@@ -6,8 +6,8 @@ Along a line theta(t) = theta_0 + t * direction (for a decision of one number, t
 
 each mean with its standard error. Where F has a slope that E[FoBG] does not see, the cost jumps. The same keys are used
 at every point and for every contact model, so curves are smooth and differences between them are not sampling noise;
-zeroth- and first-order means come from independent keys. For a decision of one number the means are also had without
-sampling, by quadrature.
+zeroth- and first-order means come from independent keys. For a decision of one number from a fixed start the means are
+also had without sampling, by quadrature.
 
 Reference: Suh et al. 2022, figure of simple systems, second row.
 """
@@ -26,7 +26,7 @@ from estimators import GradientEstimate, Objective, first_order, zeroth_order
 from mjx_study.configuration import Cell, Progress, at_theta, plan_cells
 from mjx_study.contact import ContactModel
 from mjx_study.objective import Simulator, chunk_for
-from mjx_study.quadrature import Line, Means, grid, means
+from mjx_study.quadrature import Line, Means, applies, grid, means
 from mjx_study.reference import FunctionObjective, Reference, ScalarFunction, smoothed
 from mjx_study.runtime import environment
 from mjx_study.task import Task
@@ -40,7 +40,7 @@ DETECTED: Final = 4.0
 NOTABLE: Final = 0.05
 """Share of the largest slope beyond which a difference is mentioned, where there is no sampling error."""
 QUADRATURE: Final = 1500
-"""Points of the grid that quadrature uses."""
+"""Points of the grid that quadrature uses under Gaussian noise; heavier tails get more."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -58,6 +58,7 @@ class LandscapeConfig:
         theta: parameters that the line goes through, where there are several; None for the task's.
         samples: in each batch at each point.
         sigma: standard deviation of the noise, in the unit of what it is added to; None for the task's.
+        noise: name of the noise's density; None for the task's.
         seed: of all randomness.
         reference: whether the analytic reference is drawn beside the contact models, where there is one.
     """
@@ -72,6 +73,7 @@ class LandscapeConfig:
     theta: tuple[float, ...] | None = None
     samples: int = 100
     sigma: float | None = None
+    noise: str | None = None
     seed: int = 0
     reference: bool = True
 
@@ -98,7 +100,7 @@ class Curve:
         first, first_se: mean of FoBG along the direction.
         nonfinite: samples left out.
         residual: largest relative solver residual; 0 for the reference.
-        exact: the means without sampling; None where theta has several entries.
+        exact: the means without sampling; None where quadrature does not apply.
     """
 
     label: str
@@ -249,7 +251,8 @@ def plan_landscape(config: LandscapeConfig, task: Task | None = None) -> Landsca
     if config.theta is not None and task.policy.num_params == 1:
         raise ValueError("theta has one entry, and the line is its range: give --span")
     task = at_theta(task, config.theta)
-    task = task if config.sigma is None else task.replace(sigma=config.sigma)
+    changes = {"sigma": config.sigma, "noise": config.noise}
+    task = task.replace(**{name: value for name, value in changes.items() if value is not None})
     stiffness = config.stiffness or (task.middle_stiffness,)
     cells, messages = plan_cells(task, config.contact, stiffness, config.damping)
     if not cells:
@@ -261,6 +264,7 @@ def plan_landscape(config: LandscapeConfig, task: Task | None = None) -> Landsca
         stiffness=stiffness,
         span=(float(line.position[0]), float(line.position[-1])),
         sigma=task.sigma,
+        noise=task.noise,
         reference=config.reference and task.reference is not None,
     )
     return LandscapePlan(resolved, task, cells, line, messages)
@@ -285,7 +289,7 @@ def landscape(plan: LandscapePlan, progress: Progress = lambda done, total, what
     exact = _quadrature(task, position)
     objectives: list[tuple[str, str, float, Objective, Means | None]] = []
     if config.reference and task.reference is not None:
-        reference = dataclasses.replace(task.reference(plan.cells[0].stiffness), sigma=task.sigma)  # type: ignore[type-var]
+        reference = task.analytic(plan.cells[0].stiffness)
         objectives.append(("reference", "reference", 0.0, reference, _closed_form(reference, position)))
     for cell in plan.cells:
         objective = simulator.objective(cell.contact)
@@ -348,17 +352,17 @@ def _standard_error(sample: Float[np.ndarray, " samples"]) -> float:
 
 
 def _quadrature(task: Task, position: Float[np.ndarray, " points"]) -> Callable[[ContactModel | None], Means | None]:
-    """Means without sampling as a function of the contact model; None where theta has several entries."""
-    if task.policy.num_params > 1:
+    """Means without sampling as a function of the contact model; None where it does not apply."""
+    if not applies(task):
         return lambda contact: None
-    line, points = Line(task), grid(position[0], position[-1], task.sigma, QUADRATURE)
-    return lambda contact: means(points, *line(points, contact), position, task.sigma)
+    line, points = Line(task), grid(position[0], position[-1], task.sigma, QUADRATURE, task.noise)
+    return lambda contact: means(points, *line(points, contact), position, task.sigma, task.noise)
 
 
 def _closed_form(reference: Reference, position: Float[np.ndarray, " points"]) -> Means | None:
     """Means of a function of one parameter; None of any other reference."""
     if not isinstance(reference, FunctionObjective) or not isinstance(reference.function, ScalarFunction):
         return None
-    points = [smoothed(reference.function, np.array([t]), reference.sigma) for t in position]
+    points = [smoothed(reference.function, np.array([t]), reference.sigma, reference.noise) for t in position]
     value, slope, jump = np.array([(point.value, point.gradient[0], point.jump_term[0]) for point in points]).T
     return Means(value, slope, slope - jump, np.zeros_like(slope), np.zeros_like(slope))

@@ -36,7 +36,6 @@ from mjx_study.contact import ContactModel
 from mjx_study.descent import REASONS, Descent, Record, advance, begin, going, make_optimizer
 from mjx_study.network import with_network
 from mjx_study.objective import Simulator, TracedObjective, simulate
-from mjx_study.reference import Reference
 from mjx_study.runtime import environment
 from mjx_study.task import Task
 
@@ -275,7 +274,7 @@ class Backend:
                 )
             return partial(self._iterations[name], cell.contact)
         compiled = self._iterations.setdefault(name, jax.jit(update))
-        reference = self._reference(cell)
+        reference = self.task.analytic(cell.stiffness)
 
         def on_host(state: Descent, keys: Key[Array, " seeds"]) -> tuple[Descent, Record]:
             drawn = [batches(reference, theta, key) for theta, key in zip(state.theta, keys, strict=True)]
@@ -285,7 +284,9 @@ class Backend:
 
     def cost(self, theta: Float[Array, " params"], cell: Cell) -> tuple[float, float]:
         """Mean cost with noise at theta, over samples that are the same for every theta, and its standard error."""
-        objective = self._reference(cell) if self.simulator is None else self.simulator.objective(cell.contact)
+        objective = (
+            self.task.analytic(cell.stiffness) if self.simulator is None else self.simulator.objective(cell.contact)
+        )
         value = np.asarray(objective.evaluate(theta, self._evaluation_keys()).value)
         value = value[np.isfinite(value)]
         if len(value) < 2:
@@ -295,7 +296,7 @@ class Backend:
     def outcomes(self, theta: Float[Array, " params"], cell: Cell) -> dict[str, float]:
         """What the rollouts of `cost` came to: means over those that are finite."""
         if self.simulator is None:
-            found = self._reference(cell).observe(theta, self._evaluation_keys())
+            found = self.task.analytic(cell.stiffness).observe(theta, self._evaluation_keys())
         elif self.task.outcomes is None:
             return {}
         else:
@@ -305,10 +306,6 @@ class Backend:
     def _traced(self, contact: ContactModel | None) -> TracedObjective:
         assert self.simulator is not None
         return TracedObjective(self.simulator, contact, self.task.sigma)
-
-    def _reference(self, cell: Cell) -> Reference:
-        reference = self.task.reference(cell.stiffness)  # type: ignore[misc]
-        return dataclasses.replace(reference, sigma=self.task.sigma, noise=self.task.noise)  # type: ignore[type-var]
 
     def _evaluation_keys(self) -> Key[Array, " samples"]:
         key = jax.random.fold_in(jax.random.key(self.config.seed), 2**31 - 1)

@@ -66,7 +66,7 @@ class Task:
         gamma: AoBG's accuracy bound, in the unit of the gradient; infinite by default, which is inverse-variance
             weighting.
         reference: the analytic system in place of the penalty family, as a function of the stiffness [N/m]; None where
-            there is none.
+            there is none. `analytic` gives it the task's noise.
         damping: of the contact in families without a damping ratio of their own [N s/m], or None; friction needs some,
             since it is the resistance to slip.
         stiffnesses: that a sweep takes unless told otherwise [N/m].
@@ -106,6 +106,10 @@ class Task:
             raise ValueError(f"horizon must be at least 1 step, got {self.horizon}")
         check_sigma(self.sigma)
         check_density(self.noise)
+        if not self.stiffnesses:
+            raise ValueError(
+                f"{self.name} needs at least one stiffness [N/m] to sweep; leave stiffnesses out otherwise"
+            )
         if self.running_cost is no_running_cost and self.final_cost is no_final_cost:
             raise ValueError("a task needs a running_cost, a final_cost, or both")
         if self.theta.shape != (self.policy.num_params,):
@@ -115,6 +119,16 @@ class Task:
     def random_start(self) -> bool:
         """Whether the start is drawn per sample."""
         return not isinstance(self.start, State)
+
+    def analytic(self, stiffness: float) -> Reference:
+        """The reference at a contact stiffness [N/m], with the task's own noise.
+
+        Raises:
+            ValueError: there is none.
+        """
+        if self.reference is None:
+            raise ValueError(f"{self.name} has no analytic reference")
+        return dataclasses.replace(self.reference(stiffness), sigma=self.sigma, noise=self.noise)  # type: ignore[type-var]
 
     @property
     def main_family(self) -> str:

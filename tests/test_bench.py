@@ -1,6 +1,7 @@
 """The benchmark measures what it says, and its ratios hold."""
 
 import json
+from typing import Any
 
 import jax
 import mujoco
@@ -42,8 +43,8 @@ def test_bench_prints_its_ratios_and_the_machine(capsys: pytest.CaptureFixture[s
 
 
 def test_stock_mjx_runs_the_same_samples() -> None:
-    """The rival's costs are ours: same starts, noise, policy and contact."""
-    task = make_task("tennis", horizon=5)
+    """The rival's costs are ours: same starts, noise of the task's own density, policy and contact."""
+    task = make_task("tennis", horizon=5).replace(noise="laplace")
     (cell,), _ = plan_cells(task, ["mujoco"], [4000.0])
     keys = jax.random.split(jax.random.key(0), 4)
     values, _ = bench._stock_programs(task, cell.contact, keys, jax.local_devices())
@@ -77,6 +78,20 @@ def test_the_engines_rival_computes_a_gradient() -> None:
 def test_plans_refuse_an_empty_batch() -> None:
     with pytest.raises(ValueError, match="samples must be at least 1"):
         bench.plan_bench(make_task("pusher", horizon=3), 0)
+
+
+def test_plans_take_the_task_s_own_contact() -> None:
+    """Its main family at its middle stiffness, also where there is one, or no family of MuJoCo's impedance."""
+    task = make_task("pusher", horizon=3)
+    cases: tuple[tuple[dict[str, Any], str, float], ...] = (
+        ({"stiffnesses": (700.0,)}, "mujoco", 700.0),
+        ({"stiffnesses": (10.0, 20.0, 30.0), "families": ("penalty",)}, "penalty", 20.0),
+    )
+    for changes, family, stiffness in cases:
+        cell = bench.plan_bench(task.replace(**changes), 1).cell
+        assert (cell.family, cell.stiffness) == (family, stiffness)
+    with pytest.raises(ValueError, match="pusher needs at least one stiffness"):
+        task.replace(stiffnesses=())
 
 
 @pytest.mark.slow

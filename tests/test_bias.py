@@ -10,9 +10,9 @@ from mjx_study.tasks import make_task
 
 def measured(name: str, families: tuple[str, ...], position: np.ndarray, size: int) -> dict[str, Means]:
     task = make_task(name)
-    line, points = Line(task), grid(position.min(), position.max(), task.sigma, size)
+    line, points = Line(task), grid(position.min(), position.max(), task.sigma, size, task.noise)
     cells, _ = plan_cells(task, families, [10000.0])
-    return {cell.family: means(points, *line(points, cell.contact), position, task.sigma) for cell in cells}
+    return {cell.family: means(points, *line(points, cell.contact), position, task.sigma, task.noise) for cell in cells}
 
 
 def test_momentum_transfer() -> None:

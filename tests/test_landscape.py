@@ -1,6 +1,7 @@
 """Landscapes: quadrature against closed forms, curves against each other, and what the command says and writes."""
 
 import json
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -8,14 +9,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy import stats
+from scipy.integrate import quad
 
-from estimators import Differentiation, Evaluation
+from estimators import NOISES, Differentiation, Evaluation
 from mjx_study import cli, landscape
 from mjx_study.cli import landscape as command
 from mjx_study.cli import options
 from mjx_study.landscape import LandscapeConfig, plan_landscape
+from mjx_study.policy import LinearFeedback
 from mjx_study.quadrature import Line, grid, means
-from mjx_study.reference import BallWall, Heaviside, Quadratic, smoothed
+from mjx_study.reference import BallWall, FunctionObjective, Heaviside, Quadratic, smoothed
+from mjx_study.task import Task
 from mjx_study.tasks import make_task
 
 
@@ -27,17 +32,26 @@ def configured(monkeypatch: pytest.MonkeyPatch) -> None:
 
 POSITION = np.linspace(0.1, 1.4, 7)
 SIGMA = 0.1
+SCIPY_DENSITIES: dict[str, Any] = {
+    "gaussian": stats.norm.pdf,
+    "logistic": partial(stats.logistic.pdf, scale=np.sqrt(3) / np.pi),
+    "laplace": partial(stats.laplace.pdf, scale=np.sqrt(0.5)),
+    "student": partial(stats.t.pdf, df=5, scale=np.sqrt(0.6)),
+}
+HALF_LINES = ((-np.inf, 0.0), (0.0, np.inf))
 
 
+@pytest.mark.parametrize("noise", NOISES)
 @pytest.mark.parametrize(
     ("function", "tolerance"),
     [(Quadratic(np.array([[3.0]]), np.array([-1.0])), 1e-4), (Heaviside(), 2e-2), (BallWall(), 2e-2)],
 )
-def test_quadrature_against_closed_forms(function, tolerance: float) -> None:
-    """Smooth functions to the reach of 5 sigma; where f jumps, to spacing times density, as the error bound says."""
-    points = grid(POSITION[0], POSITION[-1], SIGMA, 4000)
-    found = means(points, function.value(points[:, None]), function.gradient(points[:, None])[:, 0], POSITION, SIGMA)
-    exact = [smoothed(function, np.array([t]), SIGMA) for t in POSITION]
+def test_quadrature_against_closed_forms(function, tolerance: float, noise: str) -> None:
+    """Smooth functions to the reach of the grid; where f jumps, to spacing times density, as the error bound says."""
+    points = grid(POSITION[0], POSITION[-1], SIGMA, 4000, noise)
+    values, slopes = function.value(points[:, None]), function.gradient(points[:, None])[:, 0]
+    found = means(points, values, slopes, POSITION, SIGMA, noise)
+    exact = [smoothed(function, np.array([t]), SIGMA, noise) for t in POSITION]
     slope = np.array([point.gradient[0] for point in exact])
     first = np.array([point.gradient[0] - point.jump_term[0] for point in exact])
     scale = np.abs(slope).max()
@@ -48,14 +62,79 @@ def test_quadrature_against_closed_forms(function, tolerance: float) -> None:
 
 
 def test_quadrature_refuses_grids_that_cannot_serve() -> None:
-    points = grid(0.0, 1.0, SIGMA, 100)
-    with pytest.raises(ValueError, match="the grid must cover 4 sigma"):
-        means(points, points, points, POSITION[:2], SIGMA)
-    points = grid(0.0, 0.1, SIGMA, 1000)
-    with pytest.raises(ValueError, match="the grid must cover 4 sigma"):
-        means(points, points, points, POSITION, SIGMA)
-    with pytest.raises(ValueError, match="quadrature is for a decision of one number; pusher has 200"):
-        Line(make_task("pusher"))
+    for low, high, size, noise, says in (
+        (0.0, 1.0, 100, "gaussian", "5.3 sigma"),  # too coarse
+        (0.0, 0.1, 1000, "gaussian", "5.3 sigma"),  # too short
+        (POSITION[0], POSITION[-1], 1000, "laplace", "9.8 sigma"),  # enough for Gaussian noise only
+    ):
+        points = grid(low, high, SIGMA, size, "gaussian")
+        with pytest.raises(ValueError, match=f"the grid must cover {says} to each side"):
+            means(points, points, points, POSITION, SIGMA, noise)
+
+
+@pytest.mark.parametrize("noise", NOISES)
+@pytest.mark.parametrize("theta", [0.0, 0.31])
+def test_quadrature_weighs_with_the_noise_s_own_density(noise: str, theta: float) -> None:
+    """E|w|^3 and its slope at theta = 0 and off the grid, against SciPy's quadrature and densities."""
+    scipy_density = SCIPY_DENSITIES[noise]
+    points = grid(theta, theta, SIGMA, 4000, noise)
+    found = means(points, np.abs(points) ** 3, 3 * points * np.abs(points), np.array([theta]), SIGMA, noise)
+
+    def mean(function) -> float:
+        parts = [quad(lambda z: function(theta + SIGMA * z) * scipy_density(z), *ends) for ends in HALF_LINES]
+        return sum(part[0] for part in parts)
+
+    within = {"student": 0.03}.get(noise, 2e-3)  # |w|^3 against t^-6 converges slowly in the grid's reach
+    assert found.smoothed == pytest.approx(mean(lambda x: abs(x) ** 3), rel=within)
+    assert found.slope == pytest.approx(mean(lambda x: 3 * x * abs(x)), rel=within, abs=1e-6)
+    assert found.first == pytest.approx(mean(lambda x: 3 * x * abs(x)), rel=within, abs=1e-6)
+    if theta == 0.0 and noise != "gaussian":
+        assert found.smoothed / SIGMA**3 > 1.8  # 1.596 for a Gaussian, 2.121 for Laplace
+
+
+def one_gain(**changes) -> Task:
+    """A pusher of two steps whose force is one gain times a coordinate: one parameter, but no decision made once."""
+    task = make_task("pusher", horizon=2)
+    policy = LinearFeedback(task.horizon, 1, 1, lambda state: state.qpos[:1])
+    return task.replace(policy=policy, theta=jnp.zeros(1), reference=None, **changes)
+
+
+def test_quadrature_is_for_decisions_that_are_made_once_from_a_fixed_start() -> None:
+    drawn = make_task("momentum_transfer", horizon=2)
+    fixed = drawn.start
+    for task, says in (
+        (make_task("pusher"), "pusher has 200$"),
+        (one_gain(), "pusher has 1, the noise on its controls$"),
+        (drawn.replace(start=lambda key: fixed), "momentum_transfer has 1, its starts drawn$"),
+    ):
+        with pytest.raises(ValueError, match=f"quadrature is for a decision of one number.*; {says}"):
+            Line(task)
+        assert landscape._quadrature(task, POSITION)(None) is None
+
+
+@pytest.mark.slow
+def test_the_landscape_of_one_gain_is_sampled() -> None:
+    config = LandscapeConfig(task="pusher", contact=("penalty",), stiffness=(10.0,), points=2, samples=3)
+    (curve,) = landscape.landscape(plan_landscape(config, one_gain())).curves
+    assert curve.exact is None and np.all(np.isfinite(curve.first))
+
+
+def test_noise_reaches_quadrature_and_the_reference() -> None:
+    """A task's own density, or one that is asked for, weighs; jump terms are its too."""
+    task = make_task("momentum_transfer", horizon=2)
+    for asked, plan in (
+        (None, plan_landscape(LandscapeConfig(task=task.name), task.replace(noise="laplace"))),
+        ("laplace", plan_landscape(LandscapeConfig(task=task.name, noise="laplace"), task)),
+    ):
+        assert (asked or plan.task.noise) == plan.config.noise == plan.task.noise == "laplace"
+        reference = plan.task.analytic(0.0)
+        assert isinstance(reference, FunctionObjective) and reference.noise == "laplace"
+        edge = np.array([np.pi / 4])
+        found = landscape._closed_form(reference, edge)
+        assert found is not None
+        (jump,) = [jump.size for jump in reference.function.jumps() if jump.position > 0]  # type: ignore[attr-defined]
+        peak = np.sqrt(0.5) / task.sigma  # of Laplace's density; a Gaussian's is 0.4 / sigma
+        assert found.slope - found.first == pytest.approx(jump * peak, rel=1e-9)
 
 
 def flight(**options) -> landscape.LandscapePlan:

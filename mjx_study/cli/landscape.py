@@ -9,6 +9,7 @@ import numpy as np
 from mjx_study.cli.options import (
     Commands,
     add_command,
+    add_noise_option,
     add_task_options,
     computing,
     configure_process,
@@ -33,10 +34,10 @@ Top row of the figure: the cost without noise, and the mean cost with noise (its
 Bottom row: the mean of ZoBG and of FoBG along the line, with theirs. Where the smoothed objective has a slope that the
 mean of FoBG does not have, the cost jumps: a first-order gradient does not see jumps.
 
-A decision of one number also gets both slopes without sampling error, by quadrature over 1500 rollouts and gradients of
-each contact model, whatever --points and --samples.
+A decision of one number, made once from a fixed start, also gets both slopes without sampling error, by quadrature over
+1500 rollouts and gradients of each contact model (more where --noise has heavy tails), whatever --points and --samples.
 """
-FIELDS = "task contact stiffness damping points span direction samples sigma seed".split()
+FIELDS = "task contact stiffness damping points span direction samples sigma noise seed".split()
 
 
 def add(commands: Commands) -> None:
@@ -45,6 +46,7 @@ def add(commands: Commands) -> None:
     command = add_command(commands, "landscape", summary, run, EPILOG)
     add_task_options(command, stiffness="the middle one of the task's sweep")
     add_theta_option(command, "parameters that the line goes through")
+    add_noise_option(command)
     command.add_argument("--samples", type=int, metavar="N", help="samples at each point (default: 100)")
     command.add_argument("--points", type=int, metavar="N", help="points on the line (default: 41)")
     command.add_argument("--span", type=numbers, metavar="LO,HI", help="range of the line (default: the task's)")

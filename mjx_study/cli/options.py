@@ -87,7 +87,7 @@ def add_contact_options(command: argparse.ArgumentParser, stiffness: str = "the 
 
 def add_estimator_options(command: argparse.ArgumentParser) -> None:
     """The noise, and what estimators let one choose; see `estimators.EstimatorOptions`."""
-    command.add_argument("--noise", choices=list(NOISES), help="density of the noise (default: gaussian)")
+    add_noise_option(command)
     command.add_argument("--baseline", choices=list(BASELINES), help="of zeroth-order samples (default: zero_noise)")
     command.add_argument(
         "--gamma", type=float, metavar="G", help="AoBG's accuracy bound; inf for none (default: the task's)"
@@ -109,6 +109,11 @@ def add_estimator_options(command: argparse.ArgumentParser) -> None:
     command.add_argument("--max-norm", type=float, metavar="G", help="of a sample of fobg_clipped")
     command.add_argument("--window", type=int, metavar="H", help="steps between cuts of fobg_truncated")
     command.add_argument("--tolerance", type=float, metavar="C", help="of ddcg's test (default: 0.3)")
+
+
+def add_noise_option(command: argparse.ArgumentParser) -> None:
+    """The density of the noise."""
+    command.add_argument("--noise", choices=list(NOISES), help="density of the noise (default: the task's)")
 
 
 def add_process_options(command: argparse.ArgumentParser) -> None:

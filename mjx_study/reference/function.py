@@ -1,10 +1,10 @@
-r"""Scalar functions of a few parameters with jumps and kinks, and what Gaussian noise makes of them.
+r"""Scalar functions of a few parameters with jumps and kinks, and what noise makes of them.
 
-    F(theta) = E f(theta + w),   w ~ N(0, sigma^2 I)
+    F(theta) = E f(theta + w),   w = sigma z, the entries of z independent with density p = exp(-psi) of variance 1
 
-In one dimension, with jumps f(t_j+) - f(t_j-) and the standard normal density phi,
+In one dimension, with jumps f(t_j+) - f(t_j-),
 
-    grad F = E f'(theta + w) + sum_j [f(t_j+) - f(t_j-)] phi((t_j - theta) / sigma) / sigma,
+    grad F = E f'(theta + w) + sum_j [f(t_j+) - f(t_j-)] p((t_j - theta) / sigma) / sigma,
 
 so the sum, the jump term, is exactly what a first-order estimate misses: E[FoBG] = grad F - jump term.
 """
@@ -15,10 +15,15 @@ from typing import Final, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
-from scipy.integrate import quad_vec
 
-TAIL: Final = 12.0
-"""Standard deviations that quadrature covers on either side; the density beyond is below 1e-31."""
+from mjx_study.noise import check_density
+
+TAIL: Final = 1e-15
+"""Probability of noise beyond what quadrature covers."""
+NODES: Final = np.polynomial.legendre.leggauss(64)
+"""Of the rule of Gauss and Legendre between neighbouring cuts: on (-1, 1), and their weights."""
+CORE, PANEL, GROWTH = 8.0, 0.5, 1.25
+"""Standard deviations between which cuts are evenly spaced; their spacing; the ratio of those beyond."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,52 +83,70 @@ class ScalarFunction(Function, Protocol):
 class ClosedForm(Protocol):
     """A function whose smoothing needs no quadrature."""
 
+    @property
+    def any_noise(self) -> bool:
+        """Whether that holds for every density of variance sigma^2, not for Gaussian noise alone."""
+        ...
+
     def smoothed(self, theta: Float[np.ndarray, " params"], sigma: float) -> Smoothed:
         """F, grad F and the jump term."""
         ...
 
 
-def smoothed(function: Function, theta: Float[np.ndarray, " params"], sigma: float) -> Smoothed:
-    """F, grad F and the jump term: in closed form where there is one, else by adaptive quadrature to about 1e-12.
+def smoothed(
+    function: Function, theta: Float[np.ndarray, " params"], sigma: float, noise: str = "gaussian"
+) -> Smoothed:
+    """F, grad F and the jump term: in closed form where there is one, else by quadrature to about 1e-12.
 
-    Quadrature integrates f phi and f z phi / sigma between the breakpoints. It uses neither the gradient nor the jumps'
-    sizes, so that the jump formula above can be checked with it.
+    Quadrature integrates f p and f psi' p / sigma between the breakpoints, where f is smooth. It uses neither the
+    gradient nor the jumps' sizes, so that the jump formula above can be checked with it.
+
+    Args:
+        function: f.
+        theta: where.
+        sigma: standard deviation of the noise.
+        noise: name of its density in `estimators.NOISES`.
 
     Raises:
-        TypeError: the function has neither a closed form nor a list of breakpoints.
-        ValueError: theta does not have num_params entries, or sigma is not positive and finite.
+        TypeError: the function has neither a closed form for this noise nor a list of breakpoints.
+        ValueError: theta does not have num_params entries, sigma is not positive and finite, or there is no such noise.
     """
     check_noise(sigma)
+    density = check_density(noise)
     if theta.shape != (function.num_params,):
         raise ValueError(f"theta must have shape ({function.num_params},), got {theta.shape}")
-    if isinstance(function, ClosedForm):
+    if isinstance(function, ClosedForm) and (function.any_noise or noise == "gaussian"):
         return function.smoothed(theta, sigma)
     if not isinstance(function, ScalarFunction):
         raise TypeError(
             f"{type(function).__name__} cannot be smoothed: it needs a method `smoothed`, or `period`, `jumps` and "
             "`breakpoints`"
         )
-    centre = float(theta[0])
-    breaks = [break_ for point in function.breakpoints() for break_ in _copies(point, function.period, centre, sigma)]
-    # Cuts at multiples of sigma also keep the first look at the integrand from missing its peak.
-    cuts = sorted({(point - centre) / sigma for point in breaks} | set(np.arange(-8.0, 9.0, 2.0)))
+    centre, reach = float(theta[0]), density.reach(TAIL)
 
-    def integrand(z: float) -> np.ndarray:
-        weight = function.value(np.array([centre + sigma * z])) * normal_density(z)
-        return np.array([weight, weight * z])
+    def copies(point: float) -> Float[np.ndarray, " copies"]:
+        return (_copies(point, function.period, centre, reach * sigma) - centre) / sigma
 
-    integrals, _ = quad_vec(integrand, -TAIL, TAIL, epsabs=0.0, epsrel=1e-13, points=cuts)
-    jumps = [
-        jump.size * normal_density((position - centre) / sigma) / sigma
-        for jump in function.jumps()
-        for position in _copies(jump.position, function.period, centre, sigma)
-    ]
-    return Smoothed(float(integrals[0]), integrals[1:] / sigma, np.array([math.fsum(jumps)]))
+    breaks = [copies(point) for point in function.breakpoints()]
+    z, weight = _nodes(np.concatenate([_cuts(reach), *breaks]))
+    mass = weight * density.density(z) * function.value(centre + sigma * z[:, None])
+    score = np.asarray(density.score(z))
+    jumps = [jump.size * density.density(copies(jump.position)).sum() / sigma for jump in function.jumps()]
+    return Smoothed(math.fsum(mass), np.array([math.fsum(mass * score) / sigma]), np.array([math.fsum(jumps)]))
 
 
-def normal_density(z: float) -> float:
-    """Density of the standard normal distribution."""
-    return math.exp(-(z**2) / 2) / math.sqrt(2 * math.pi)
+def _cuts(reach: float) -> Float[np.ndarray, " cuts"]:
+    """Where panels end whatever the function is: 0, where a density may have a kink, among them."""
+    even = np.arange(0.0, min(CORE, reach), PANEL)
+    tail = np.geomspace(even[-1], reach, 1 + math.ceil(math.log(reach / even[-1], GROWTH)))
+    return np.concatenate([-tail, -even, even, tail])
+
+
+def _nodes(cuts: Float[np.ndarray, " cuts"]) -> tuple[Float[np.ndarray, " nodes"], Float[np.ndarray, " nodes"]]:
+    """Nodes and weights of the rule between all neighbouring cuts."""
+    edges = np.unique(cuts)
+    half, (node, weight) = np.diff(edges)[:, None] / 2, NODES
+    return (edges[:-1, None] + half * (1 + node)).ravel(), (half * weight).ravel()
 
 
 def check_noise(sigma: float) -> None:
@@ -132,12 +155,11 @@ def check_noise(sigma: float) -> None:
         raise ValueError(f"sigma must be positive and finite, in the unit of what it is added to; got {sigma}")
 
 
-def _copies(point: float, period: float, centre: float, sigma: float) -> list[float]:
-    """The point and its repetitions within reach of the noise."""
+def _copies(point: float, period: float, centre: float, reach: float) -> Float[np.ndarray, " copies"]:
+    """The point and its repetitions within reach."""
     if math.isinf(period):
-        candidates = [point]
+        candidates = np.array([point])
     else:
-        first = math.ceil((centre - TAIL * sigma - point) / period)
-        last = math.floor((centre + TAIL * sigma - point) / period)
-        candidates = [point + period * number for number in range(first, last + 1)]
-    return [candidate for candidate in candidates if abs(candidate - centre) < TAIL * sigma]
+        first, last = math.ceil((centre - reach - point) / period), math.floor((centre + reach - point) / period)
+        candidates = point + period * np.arange(first, last + 1)
+    return candidates[np.abs(candidates - centre) < reach]

@@ -1,4 +1,4 @@
-r"""The step, and Coulomb friction's ramp in its place: both smoothed in closed form.
+r"""The step, and Coulomb friction's ramp in its place: both smoothed in closed form by Gaussian noise.
 
 With Phi, phi the standard normal distribution and density,
 
@@ -15,7 +15,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy.special import ndtr
 
-from mjx_study.reference.function import Jump, Smoothed, normal_density
+from estimators import NOISES
+from mjx_study.reference.function import Jump, Smoothed
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,6 +25,7 @@ class Heaviside:
 
     num_params: int = 1
     period: float = math.inf
+    any_noise: bool = dataclasses.field(default=False, init=False)
 
     def value(self, x: Float[np.ndarray, "*batch 1"]) -> Float[np.ndarray, "*batch"]:
         """1 where x >= 0, else 0."""
@@ -43,7 +45,7 @@ class Heaviside:
 
     def smoothed(self, theta: Float[np.ndarray, " 1"], sigma: float) -> Smoothed:
         """F = Phi(theta / sigma); the gradient is all jump term."""
-        gradient = np.array([normal_density(theta[0] / sigma) / sigma])
+        gradient = np.array([NOISES["gaussian"].density(theta[0] / sigma) / sigma])
         return Smoothed(float(ndtr(theta[0] / sigma)), gradient, gradient)
 
 
@@ -60,6 +62,7 @@ class RelaxedHeaviside:
     width: float
     num_params: int = 1
     period: float = math.inf
+    any_noise: bool = dataclasses.field(default=False, init=False)
 
     def __post_init__(self) -> None:
         if not (self.width > 0 and math.isfinite(self.width)):
@@ -83,7 +86,8 @@ class RelaxedHeaviside:
 
     def smoothed(self, theta: Float[np.ndarray, " 1"], sigma: float) -> Smoothed:
         """F and grad F by differences over the ramp: rounding of about 1e-16 / nu."""
-        ends = [float(theta[0]) + self.width / 2, float(theta[0]) - self.width / 2]
-        upper, lower = (end * ndtr(end / sigma) + sigma * normal_density(end / sigma) for end in ends)
+        ends = theta + np.array([self.width / 2, -self.width / 2])
+        density = NOISES["gaussian"].density
+        upper, lower = (end * ndtr(end / sigma) + sigma * density(end / sigma) for end in ends)
         slope = (ndtr(ends[0] / sigma) - ndtr(ends[1] / sigma)) / self.width
         return Smoothed(float((upper - lower) / self.width), np.array([slope]), np.zeros(1))

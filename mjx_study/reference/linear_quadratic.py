@@ -2,7 +2,7 @@ r"""A linear system with a quadratic cost, where every expectation has a closed 
 
     x' = A x + B u,   V = sum_h x_h^T Q x_h + u_h^T R u_h + x_{H+1}^T P x_{H+1}
 
-An open loop U = theta + w, w ~ N(0, sigma^2 I), makes V a quadratic form, V = U^T M U + 2 b^T U + c, so that
+For an open loop U = theta + w, with any noise w of covariance sigma^2 I, V = U^T M U + 2 b^T U + c is a quadratic form:
 
     F = V(theta) + sigma^2 tr M,   grad F = 2 (M theta + b),   Cov[FoBG sample] = 4 sigma^2 M^2.
 """

@@ -21,6 +21,7 @@ class Quadratic:
     matrix: Float[np.ndarray, "..."]
     linear: Float[np.ndarray, " params"]
     offset: float = 0.0
+    any_noise: bool = dataclasses.field(default=True, init=False)
 
     def __post_init__(self) -> None:
         size = len(self.linear)
