@@ -23,6 +23,7 @@ from mjx_study.contact import (
     stiffness_from_solref,
 )
 from mjx_study.objective import chunk_for
+from mjx_study.table import digits_to_tell_apart
 from mjx_study.task import Task
 from mjx_study.task_checks import check_shapes
 from mjx_study.tasks import make_task
@@ -112,16 +113,24 @@ def refuse_repeats(label: str, values: Sequence[object]) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class Cell:
-    """One contact model of a comparison."""
+    """One contact model of a comparison.
+
+    Attributes:
+        family: name of the contact family, or solref and solimp.
+        stiffness: K of its spring [N/m]; 0 where there is no contact.
+        contact: the model; None for the MJCF's own.
+        digits: of the stiffness in messages, as many as tell the models of a sweep apart.
+    """
 
     family: str
     stiffness: float
     contact: ContactModel | None
+    digits: int = 6
 
     @property
     def label(self) -> str:
         """As messages name it."""
-        return f"{self.family}, K = {self.stiffness:g} N/m" if self.stiffness else self.family
+        return f"{self.family}, K = {self.stiffness:.{self.digits}g} N/m" if self.stiffness else self.family
 
 
 def configured_task(config: EstimatorConfig, task: Task | None = None) -> Task:
@@ -224,15 +233,17 @@ def plan_cells(
         ValueError: a family is unknown, or a stiffness or damping is out of range.
     """
     cells, messages = [], []
+    stiffnesses = task.stiffnesses if stiffnesses is None else stiffnesses
+    digits = digits_to_tell_apart(stiffnesses)
     for family in task.families if families is None else families:
         swept = family not in FAMILIES or FAMILIES[family].swept
         undamped = swept and family in FAMILIES and FAMILIES[family].dampratio == 0
         own = damping if damping is not None else task.damping if undamped else None
-        for stiffness in (task.stiffnesses if stiffnesses is None else stiffnesses) if swept else (None,):
+        for stiffness in stiffnesses if swept else (None,):
             with warnings.catch_warnings(record=True) as caught:
                 warnings.simplefilter("always", ContactWarning)
                 contact = None if family == "mjcf" else _contact(task, family, stiffness, own if swept else None)
-            cell = Cell(family, stiffness or _stiffness(task, contact), contact)
+            cell = Cell(family, stiffness or _stiffness(task, contact), contact, digits)
             cells.append(cell)
             messages += [f"{cell.label}: {warning.message}" for warning in caught]
     return tuple(cells), tuple(messages)
@@ -252,15 +263,16 @@ def solver_cells(
         ValueError: MuJoCo would alter a value without an error.
     """
     cells, messages = [], []
+    digits = digits_to_tell_apart(itertools.chain(*solrefs, *solimps))
     for solref, solimp in itertools.product(solrefs or (DEFAULT_SOLREF,), solimps or (DEFAULT_SOLIMP,)):
         if len(solref) != 2 or len(solimp) != 5:
             raise ValueError(f"solref takes 2 numbers and solimp 5, got {len(solref)} and {len(solimp)}")
-        name = " ".join(f"{value:g}" for value in solref)
-        name = f"solref {name}" if not solimps else f"solref {name} solimp {' '.join(f'{v:g}' for v in solimp)}"
+        parts = {"solref": solref} | ({"solimp": solimp} if solimps else {})
+        name = " ".join(f"{key} {' '.join(f'{value:.{digits}g}' for value in part)}" for key, part in parts.items())
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", ContactWarning)
             contact = contact_model(solref, solimp, scene=task.scene)
-        cells.append(Cell(name, _stiffness(task, contact), contact))
+        cells.append(Cell(name, _stiffness(task, contact), contact, digits))
         messages += [f"{name}: {warning.message}" for warning in caught]
     return tuple(cells), tuple(messages)
 

@@ -1,6 +1,7 @@
 """Figures of a study from its labelled arrays alone."""
 
 import itertools
+import re
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Final
 
@@ -13,6 +14,7 @@ from matplotlib.figure import Figure
 from scipy import stats
 
 from mjx_study.plots import NO_CONTACT, STYLE, TITLES, line_with_band, mean_with_band, robust_limits
+from mjx_study.table import digits_to_tell_apart
 
 SWEPT: Final = {
     "stiffness": "contact stiffness K [N/m]",
@@ -73,29 +75,44 @@ def _slices(dataset: xr.Dataset, keep: str = "") -> Iterator[tuple[str, str, xr.
     names = [name for name in ("task", "timestep", "cone", "sigma", "samples") if name != keep]
     choices = [range(dataset.sizes[name]) if name != "samples" else [dataset.sizes[name] - 1] for name in names]
     varied = [name for name in names if dataset.sizes[name] > 1 and name != "samples"]
+    texts = {name: _texts(dataset[name].values) for name in names}
+    taken: set[str] = set()
     for picked in itertools.product(*choices):
         part = dataset.isel(dict(zip(names, picked, strict=True)))
         part = part.isel(model=np.flatnonzero(_present(part)))
         if part.sizes["model"] == 0:
             continue
-        values = {name: part[name].item() for name in names}
-        suffix = "".join(f"_{_short(values[name])}" for name in varied)
-        told = [str(values["task"])] + [
-            f"{label} = {_short(values[name])}{unit}"
+        values = {name: texts[name][index] for name, index in zip(names, picked, strict=True)}
+        suffix = "".join(f"_{_for_file(values[name])}" for name in varied)
+        suffix += f"_{len(taken)}" if suffix in taken else ""
+        taken.add(suffix)
+        told = [values["task"]] + [
+            f"{label} = {values[name]}{unit}"
             for name, label, unit in (("timestep", "h", " s"), ("sigma", "sigma", ""), ("samples", "N", ""))
             if name in values
         ]
         told += [f"{values['cone']} cone"] if "cone" in varied else []
-        yield suffix.replace(":", "-").replace(" ", "_"), ", ".join(told), part
+        yield suffix, ", ".join(told), part
 
 
-def _short(value: Any) -> str:
-    return f"{value:g}" if isinstance(value, int | float) else str(value)
+def _texts(values: np.ndarray) -> list[str]:
+    """Names as they are, numbers in as many digits as tell them apart."""
+    if values.dtype.kind not in "iuf":
+        return [str(value) for value in values]
+    digits = digits_to_tell_apart(values.tolist())
+    return [f"{value:.{digits}g}" for value in values.tolist()]
 
 
-def _tick(value: float) -> str:
-    """In three digits, or whole."""
-    return f"{value:.0f}" if 100 <= value < 1e6 else f"{value:.3g}"
+def _for_file(text: str) -> str:
+    """Part of a file's name from what a study.json says, which may come from anywhere."""
+    return re.sub(r"[^\w.+-]", "-", text)[:60]
+
+
+def _ticks(values: np.ndarray) -> list[str]:
+    """In three digits or whole, and in more where that tells two values apart."""
+    digits = digits_to_tell_apart(values.tolist(), least=3)
+    whole = digits == 3
+    return [f"{value:.0f}" if whole and 100 <= value < 1e6 else f"{value:.{digits}g}" for value in values.tolist()]
 
 
 def _present(part: xr.Dataset) -> np.ndarray:
@@ -279,9 +296,9 @@ def _ratio_map(part: xr.Dataset, title: str, quantity: str, other: str) -> Figur
             np.arange(ratio.shape[1] + 1), np.arange(ratio.shape[0] + 1), ratio,
             cmap="RdBu_r", norm=TwoSlopeNorm(0, -min(extent, 6), min(extent, 6)),
         )  # fmt: skip
-        stiffness = [_tick(float(value)) for value in rows["stiffness"].values]
+        stiffness = _ticks(rows["stiffness"].values)
         axes.set_xticks(np.arange(len(stiffness)) + 0.5, stiffness, rotation=60, ha="right", fontsize="small")
-        labels = [_tick(float(value)) for value in rows[other].values]
+        labels = _ticks(rows[other].values)
         axes.set_yticks(np.arange(len(labels)) + 0.5, labels, fontsize="small")
         axes.set_xlabel(SWEPT["stiffness"])
         axes.set_title(TITLES.get(family, family), fontsize="medium")

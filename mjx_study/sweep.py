@@ -8,17 +8,17 @@ their own; everything else is traced.
 import dataclasses
 import time
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
-import numpy as np
 import xarray as xr
 
 from mjx_study.configuration import Progress
 from mjx_study.results import prepare_folder
 from mjx_study.runtime import environment
 from mjx_study.store import Store, StudyError, assemble, git_revision, write_dataset
+from mjx_study.sweep_axes import axes_of, solver_parameters
 from mjx_study.sweep_cells import COMPUTE, VARIABLES
-from mjx_study.sweep_plan import SweepCell, SweepConfig, SweepPlan, plan_sweep
+from mjx_study.sweep_plan import SweepConfig, SweepPlan, plan_sweep
 
 WAIT_SECONDS: Final = 0.5
 """Between looks at cells that another process computes."""
@@ -59,15 +59,19 @@ def open_store(plan: SweepPlan, folder: Path, command: str | None = None) -> Sto
     if plan.config.chunk_size is None:
         begun = (folder / "study.json").exists()
         config["chunk_size"] = Store.open(folder).document["config"]["chunk_size"] if begun else plan.chunk_size
+    axes = axes_of(plan)
     document = {
         "config": config,
         "warnings": list(plan.warnings),
         "environment": environment(),
         "revision": git_revision(),
         "command": command,
-        "models": _models(plan),
-        "axes": {name: list(values) for name, values in _axes(plan).items()},
-        "cells": [{"label": plan.label(cell), "at": _place(plan, cell)} for cell in plan.cells],
+        "models": list(axes.models),
+        "axes": axes.values,
+        "cells": [
+            {"label": plan.label(cell), "at": at} | solver_parameters(cell)
+            for cell, at in zip(plan.cells, axes.places, strict=True)
+        ],
     }
     return Store.create(prepare_folder(folder), document)
 
@@ -117,54 +121,6 @@ def run_sweep(
     dataset = load_study(folder)
     write_dataset(dataset, folder / "results.nc")
     return SweepResult(folder, dataset, computed, plan.warnings + what_to_beware_of(dataset))
-
-
-def _models(plan: SweepPlan) -> list[dict[str, Any]]:
-    """The contact models of all groups, each once."""
-    found: dict[tuple[str, float], dict[str, Any]] = {}
-    for group in plan.groups:
-        for model in group.models:
-            contact = model.contact
-            found.setdefault(
-                (model.family, model.stiffness),
-                {
-                    "contact": model.family,
-                    "stiffness": model.stiffness,
-                    "solref": None if contact is None else np.asarray(contact.solref).tolist(),
-                    "solimp": None if contact is None else np.asarray(contact.solimp).tolist(),
-                },
-            )
-    return list(found.values())
-
-
-def _axes(plan: SweepPlan) -> dict[str, list[Any]]:
-    """Values along each dimension of cells, in the order of the configuration."""
-    groups = plan.groups
-    return {
-        "task": list(dict.fromkeys(group.task.name for group in groups)),
-        "timestep": sorted({group.timestep for group in groups}),
-        "cone": list(dict.fromkeys(group.cone for group in groups)),
-        "model": [_model_name(model["contact"], model["stiffness"]) for model in _models(plan)],
-        "sigma": sorted({cell.sigma for cell in plan.cells}),
-        "samples": sorted({cell.samples for cell in plan.cells}),
-    }
-
-
-def _place(plan: SweepPlan, cell: SweepCell) -> dict[str, int]:
-    group, axes = plan.groups[cell.group], _axes(plan)
-    values = {
-        "task": group.task.name,
-        "timestep": group.timestep,
-        "cone": group.cone,
-        "model": _model_name(cell.model.family, cell.model.stiffness),
-        "sigma": cell.sigma,
-        "samples": cell.samples,
-    }
-    return {name: axes[name].index(value) for name, value in values.items()}
-
-
-def _model_name(family: str, stiffness: float) -> str:
-    return f"{family} {stiffness:g}" if stiffness else family
 
 
 def load_study(folder: str | Path) -> xr.Dataset:

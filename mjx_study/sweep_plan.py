@@ -22,6 +22,7 @@ from mjx_study.contact import FAMILIES
 from mjx_study.landscape import check_span, line_of
 from mjx_study.objective import chunk_for
 from mjx_study.optimise import OptimiseConfig, OptimisePlan, plan_optimise
+from mjx_study.table import digits_to_tell_apart
 from mjx_study.task import Task, check_sigma
 from mjx_study.tasks import make_task
 
@@ -143,8 +144,17 @@ class SweepConfig:
 
 @dataclasses.dataclass(frozen=True)
 class Group:
-    """What one compilation serves."""
+    """What one compilation serves.
 
+    Attributes:
+        name: of the task, as the configuration has it; two tasks may call themselves the same.
+        task: as it is built.
+        timestep: [s].
+        cone: pyramidal or elliptic.
+        models: contact models.
+    """
+
+    name: str
     task: Task
     timestep: float
     cone: str
@@ -197,7 +207,8 @@ class SweepPlan:
     def label(self, cell: SweepCell) -> str:
         """As messages name a cell."""
         group = self.groups[cell.group]
-        return f"{group.task.name}, {cell.model.label}, h = {group.timestep:g} s, N = {cell.samples}"
+        digits = digits_to_tell_apart(each.timestep for each in self.groups)
+        return f"{group.name}, {cell.model.label}, h = {group.timestep:.{digits}g} s, N = {cell.samples}"
 
 
 def plan_sweep(config: SweepConfig) -> SweepPlan:
@@ -218,8 +229,8 @@ def plan_sweep(config: SweepConfig) -> SweepPlan:
         if not models:
             raise ValueError("no contact model: give at least one contact family, solref or solimp")
         host = task.scene.host
-        group = Group(task, float(host.opt.timestep), {0: "pyramidal", 1: "elliptic"}[int(host.opt.cone)], models)
-        at = f"h = {group.timestep:g} s: " if config.timestep is not None else ""
+        group = Group(name, task, float(host.opt.timestep), {0: "pyramidal", 1: "elliptic"}[int(host.opt.cone)], models)
+        at = f"h = {group.timestep!r} s: " if config.timestep is not None else ""
         messages += [f"{at}{message}" for message in told]
         for model, sigma, samples in itertools.product(models, config.sigma or (task.sigma,), config.samples):
             check_sigma(sigma)

@@ -44,6 +44,7 @@ LAYERS = [
     "mjx_study.optimise",
     "mjx_study.store",
     "mjx_study.sweep_plan",
+    "mjx_study.sweep_axes",
     "mjx_study.sweep_cells",
     "mjx_study.sweep",
     "mjx_study.render",

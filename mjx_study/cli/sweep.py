@@ -4,6 +4,7 @@ import argparse
 import dataclasses
 import math
 import tomllib
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
@@ -23,6 +24,7 @@ from mjx_study.contact import FAMILIES
 from mjx_study.scene import CONES
 from mjx_study.store import StudyError
 from mjx_study.sweep import SweepConfig, SweepPlan, SweepResult, open_store, plan_sweep, run_sweep
+from mjx_study.table import digits_to_tell_apart
 from mjx_study.tasks import task_names
 
 EPILOG = """\
@@ -235,14 +237,20 @@ def _head(plan: SweepPlan, missing: int) -> list[str]:
         f"{', '.join(config.tasks)}: {kind.get(config.kind, config.kind)}, {', '.join(config.estimators)}, "
         f"seeds {config.batches}",
         f"contact models: {len({(c.model.family, c.model.stiffness) for c in plan.cells})}, "
-        f"timestep {', '.join(dict.fromkeys(f'{group.timestep:g}' for group in plan.groups))} s, "
+        f"timestep {_listed(group.timestep for group in plan.groups)} s, "
         f"{', '.join(dict.fromkeys(group.cone for group in plan.groups))} cone, "
-        f"sigma {', '.join(dict.fromkeys(f'{cell.sigma:g}' for cell in plan.cells))}, "
+        f"sigma {_listed(cell.sigma for cell in plan.cells)}, "
         f"{', '.join(map(str, config.samples))} samples",
         f"cells: {cells}, of which {missing} to compute"
         + (f"; {plan.compilations} programs to compile, chunks of {plan.chunk_size} samples" if missing else ""),
     ]
     return lines + [f"warning: {message}" for message in plan.warnings]
+
+
+def _listed(values: Iterable[float]) -> str:
+    distinct = list(dict.fromkeys(values))
+    digits = digits_to_tell_apart(distinct)
+    return ", ".join(f"{value:.{digits}g}" for value in distinct)
 
 
 def _document(result: SweepResult) -> dict[str, Any]:
