@@ -1,8 +1,9 @@
 """A scene: one MJCF, compiled by MuJoCo and put on the device for MJX."""
 
+import copy
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Any, Final
@@ -12,6 +13,7 @@ import mujoco
 import numpy as np
 
 from mjx_study._mjx import mjx
+from mjx_study.limitations import FLAGS, ignored, lacking
 
 CONES: Final = {"pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL, "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC}
 SOLVERS: Final = {"newton": mujoco.mjtSolver.mjSOL_NEWTON, "cg": mujoco.mjtSolver.mjSOL_CG}
@@ -21,6 +23,7 @@ INTEGRATORS: Final = {
     "rk4": mujoco.mjtIntegrator.mjINT_RK4,
 }
 _ENUMERATED: Final = {"cone": CONES, "solver": SOLVERS, "integrator": INTEGRATORS}
+SceneOption = str | float | int | Sequence[str]
 _POSITIVE: Final = ("timestep", "iterations", "ls_iterations", "tolerance")
 
 
@@ -85,7 +88,7 @@ def model_names() -> list[str]:
     return sorted(path.stem for path in models_folder().glob("*.xml"))
 
 
-def load_scene(source: str | Path, **options: str | float | int) -> Scene:
+def load_scene(source: str | Path, **options: SceneOption) -> Scene:
     """Compile an MJCF and put it on the device; see `load_model` for the arguments.
 
     Raises:
@@ -94,13 +97,14 @@ def load_scene(source: str | Path, **options: str | float | int) -> Scene:
     return put_scene(load_model(source, **options), Path(source).stem)
 
 
-def load_model(source: str | Path, **options: str | float | int) -> mujoco.MjModel:
+def load_model(source: str | Path, **options: SceneOption) -> mujoco.MjModel:
     """Compile an MJCF.
 
     Args:
         source: the name of a shipped model (`"pusher"`) or the path of an MJCF file.
         **options: replace what the file says: `cone` (pyramidal, elliptic), `solver` (newton, cg), `integrator`
-            (euler, implicitfast, rk4), `timestep` [s], `iterations`, `ls_iterations`, `tolerance`.
+            (euler, implicitfast, rk4), `timestep` [s], `iterations`, `ls_iterations`, `tolerance`; and
+            `disable_flags`, names of MJCF's flags to disable, as a sequence or with commas between them.
 
     Raises:
         SceneError: the file is missing or does not parse, or an option is unknown or out of range.
@@ -114,8 +118,15 @@ def load_model(source: str | Path, **options: str | float | int) -> mujoco.MjMod
     return host
 
 
-def put_scene(host: mujoco.MjModel, name: str) -> Scene:
-    """Put a compiled model on the device; raises SceneError where MJX cannot run it."""
+def put_scene(host: mujoco.MjModel, name: str, **options: SceneOption) -> Scene:
+    """Put a compiled model, or a copy with `options` as `load_model` takes them, on the device.
+
+    Raises:
+        SceneError: MJX cannot run the model, or would leave out part of it; or an option is unknown or out of range.
+    """
+    if options:
+        host = copy.copy(host)
+        _set_options(host, options)
     _refuse_unsupported(host, name)
     try:
         model = mjx.put_model(host)
@@ -129,7 +140,7 @@ def put_scene(host: mujoco.MjModel, name: str) -> Scene:
     if host.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4 and scene.has_constraints:
         raise SceneError(
             f"{name} combines RK4 with contacts, limits, equalities or friction loss: RK4's stages would solve the "
-            "constraints four times per step without an order to gain; use euler or implicitfast"
+            "constraints four times per step without an order to gain; use euler or implicitfast (--integrator)"
         )
     return scene
 
@@ -168,7 +179,7 @@ def require(scene: Scene, *, joints: tuple[str, ...], geoms: tuple[str, ...], si
         raise SceneError(f"{scene.name} has nq, nv, nu = {found}; the task needs {sizes}")
 
 
-def _set_options(host: mujoco.MjModel, options: Mapping[str, str | float | int]) -> None:
+def _set_options(host: mujoco.MjModel, options: Mapping[str, SceneOption]) -> None:
     for name, value in options.items():
         if name in _ENUMERATED:
             choices = _ENUMERATED[name]
@@ -177,16 +188,36 @@ def _set_options(host: mujoco.MjModel, options: Mapping[str, str | float | int])
             setattr(host.opt, name, choices[str(value)])
         elif name in _POSITIVE:
             number_type = type(getattr(host.opt, name))
-            if isinstance(value, str) or not (0 < value < math.inf and number_type(value) == value):
+            if not isinstance(value, float | int) or not (0 < value < math.inf and number_type(value) == value):
                 whole = "whole " if number_type is int else ""
                 raise SceneError(f"{name} must be a positive {whole}number, got {value!r}")
             setattr(host.opt, name, number_type(value))
+        elif name == "disable_flags":
+            _disable_flags(host, value)
         else:
-            raise SceneError(f"unknown option {name!r}; choose from {', '.join([*_ENUMERATED, *_POSITIVE])}")
+            known = ", ".join([*_ENUMERATED, *_POSITIVE, "disable_flags"])
+            raise SceneError(f"unknown option {name!r}; choose from {known}")
+
+
+def _disable_flags(host: mujoco.MjModel, names: SceneOption) -> None:
+    if isinstance(names, float | int):
+        raise SceneError(f"disable_flags must be names of flags, got {names!r}")
+    for name in names.split(",") if isinstance(names, str) else names:
+        if name not in FLAGS:
+            raise SceneError(f"unknown flag {name!r}; choose from {', '.join(FLAGS)}")
+        FLAGS[name].disable(host.opt)
 
 
 def _refuse_unsupported(host: mujoco.MjModel, name: str) -> None:
     for option, choices in _ENUMERATED.items():
         value = int(getattr(host.opt, option))
         if value not in {int(choice) for choice in choices.values()}:
-            raise SceneError(f"MJX lacks the {option} that {name} asks for; use one of {', '.join(choices)}")
+            raise SceneError(
+                f"MJX lacks the {option} that {name} asks for; use one of {', '.join(choices)} (--{option})"
+            )
+    if flags := lacking(host):
+        raise SceneError(
+            f"MJX lacks {', '.join(flags)}, which {name} enables; disable them (--disable-flag {','.join(flags)})"
+        )
+    if features := ignored(host):
+        raise SceneError(f"MJX would leave out part of {name}: {'; '.join(features)}")

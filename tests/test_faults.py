@@ -15,7 +15,7 @@ PAGE = (Path(__file__).parents[1] / "docs" / "gradient-faults.md").read_text()
 SECTIONS = dict(re.findall(r"^## (\d+)\n(.*?)(?=^## |\Z)", PAGE, re.DOTALL | re.MULTILINE))
 STATES = dict(re.findall(r"^\| \[(\d+)\]\(#\d+\) \|.*\| ([^|]+) \|$", PAGE, re.MULTILINE))
 OUTCOMES = dict(re.findall(r"^\| \[(\d+)\]\(#\d+\) \| [^|]+ \| ([^|]+) \|", PAGE, re.MULTILINE))
-FAST = ("1", "4", "14")
+FAST = ("1", "4")
 
 
 def code(text: str) -> str:
@@ -45,7 +45,9 @@ def test_a_fault_is_as_the_page_says(number: str, shared: dict[str, Any], monkey
     assert math.isfinite(truth)
     assert off(stock, truth), f"MJX has this right now ({stock}): say so on the page"
     assert math.isnan(stock) == ("NaN" in OUTCOMES[number]), stock
-    assert off(ours, truth) != STATES[number].startswith("cured"), (stock, ours, truth)
+    assert isinstance(ours, str) == (STATES[number] == "refused"), ours
+    if isinstance(ours, float):
+        assert off(ours, truth) != STATES[number].startswith("cured"), (stock, ours, truth)
 
 
 def off(value: float, truth: float) -> bool:

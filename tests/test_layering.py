@@ -16,6 +16,7 @@ LAYERS = [
     "mjx_study.noise",
     "mjx_study.table",
     "mjx_study.reference",
+    "mjx_study.limitations",
     "mjx_study.scene",
     "mjx_study.contact",
     "mjx_study.engine",

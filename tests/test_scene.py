@@ -10,11 +10,14 @@ import mujoco
 import numpy as np
 import pytest
 
+from mjx_study.cli.options import Parser, add_scene_options, scene_options
+from mjx_study.limitations import FLAGS
 from mjx_study.scene import (
     CONES,
     INTEGRATORS,
     SOLVERS,
     SceneError,
+    load_model,
     load_scene,
     model_names,
     models_folder,
@@ -78,6 +81,8 @@ def test_numeric_options_reach_mjx() -> None:
         ({"integrator": "implicit"}, "unknown integrator 'implicit'; choose from euler, implicitfast, rk4"),
         ({"cone": "round"}, "unknown cone 'round'; choose from pyramidal, elliptic"),
         ({"gravity": 1.0}, "unknown option 'gravity'; choose from cone, solver, integrator, timestep"),
+        ({"disable_flags": "energie"}, "unknown flag 'energie'; choose from constraint, .*, energy"),
+        ({"disable_flags": 1}, "disable_flags must be names of flags, got 1"),
         ({"timestep": 0.0}, "timestep must be a positive number, got 0.0"),
         ({"timestep": -0.1}, "timestep must be a positive number, got -0.1"),
         ({"timestep": float("nan")}, "timestep must be a positive number, got nan"),
@@ -117,16 +122,129 @@ def test_malformed_files_are_refused(text: str, message: str, tmp_path: Path) ->
 
 
 @pytest.mark.parametrize(
-    ("option", "message"),
+    ("option", "message", "remedy"),
     [
-        ('solver="PGS"', "MJX lacks the solver that here asks for; use one of newton, cg"),
-        ('integrator="implicit"', "MJX lacks the integrator that here asks for; use one of euler, implicitfast, rk4"),
+        (
+            '<option solver="PGS"/>',
+            r"MJX lacks the solver that here asks for; use one of newton, cg \(--solver\)",
+            {"solver": "newton"},
+        ),
+        (
+            '<option integrator="implicit"/>',
+            r"the integrator that here asks for; use one of euler, implicitfast, rk4 \(--integrator\)",
+            {"integrator": "euler"},
+        ),
+        (
+            '<option integrator="RK4"/>',
+            r"here combines RK4 with contacts.*; use euler or implicitfast \(--integrator\)",
+            {"integrator": "implicitfast"},
+        ),
+        (
+            '<option><flag energy="enable" sleep="enable"/></option>',
+            r"MJX lacks energy, sleep, which here enables; disable them \(--disable-flag energy,sleep\)",
+            {"disable_flags": "energy,sleep"},
+        ),
     ],
 )
-def test_options_that_mjx_lacks_are_refused(option: str, message: str) -> None:
-    host = mujoco.MjModel.from_xml_string(floor_scene(FREE_BOX, f"<option {option}/>"))
+def test_options_that_mjx_lacks_are_refused_and_what_is_told_helps(
+    option: str, message: str, remedy: dict[str, Any]
+) -> None:
+    host = mujoco.MjModel.from_xml_string(floor_scene(FREE_BOX, option))
+    before = int(host.opt.integrator), int(host.opt.solver), host.opt.enableflags
     with pytest.raises(SceneError, match=message):
         put_scene(host, "here")
+    put_scene(host, "here", **remedy)
+    assert (int(host.opt.integrator), int(host.opt.solver), host.opt.enableflags) == before
+
+
+def test_the_command_line_changes_what_is_refused(tmp_path: Path) -> None:
+    """The model of a file with everything that a message tells one to give, as `gradcheck` reads it."""
+    path = tmp_path / "walker.xml"
+    option = '<option integrator="RK4" solver="PGS"><flag energy="enable" fwdinv="enable"/></option>'
+    path.write_text(floor_scene(FREE_BOX, option))
+    parser = Parser()
+    add_scene_options(parser)
+    given = "--solver newton --disable-flag energy,fwdinv --integrator euler".split()
+    for count, message in ((0, "--solver"), (2, "--disable-flag energy,fwdinv"), (4, "--integrator")):
+        with pytest.raises(SceneError, match=message):
+            load_scene(path, **scene_options(parser.parse_args(given[:count])))
+    assert load_scene(path, **scene_options(parser.parse_args(given))).host.opt.enableflags == 0
+
+
+@pytest.mark.parametrize("flag", FLAGS)
+def test_a_disabled_flag_is_that_of_the_mjcf(flag: str, tmp_path: Path) -> None:
+    path, wanted = tmp_path / "flag.xml", tmp_path / "wanted.xml"
+    text = "<mujoco><option><flag {}/></option><worldbody><body><joint/><geom size='.1'/></body></worldbody></mujoco>"
+    path.write_text(text.format('energy="enable" override="enable"'))
+    wanted.write_text(
+        text.format(" ".join(f'{n}="enable"' for n in ("energy", "override") if n != flag) + f' {flag}="disable"')
+    )
+    model, expected = load_model(path, disable_flags=(flag,)), load_model(wanted)
+    assert model.opt.disableflags == expected.opt.disableflags
+    assert model.opt.enableflags == expected.opt.enableflags
+
+
+JOINT = """<mujoco><option {option}><flag {flag}/></option>{extension}<worldbody><body {body}><joint name="j" {joint}/>
+<geom fromto="0 0 0 0 0 -.5" type="capsule" size=".05" {geom}/></body></worldbody>{tendon}
+<actuator>{actuator}</actuator></mujoco>"""
+PID = '<extension><plugin plugin="mujoco.pid"><instance name="pid"/></plugin></extension>'
+TENDON = '<tendon><fixed {}><joint joint="j" coef="1"/></fixed></tendon>'
+MUSCLE = '<muscle joint="j" lengthrange="-2 2" force="5"/>'
+
+
+def joint(**parts: str) -> mujoco.MjModel:
+    """One joint, with what is given added."""
+    names = ("option", "flag", "extension", "body", "joint", "geom", "tendon", "actuator")
+    return mujoco.MjModel.from_xml_string(JOINT.format(**(dict.fromkeys(names, "") | parts)))
+
+
+@pytest.mark.parametrize(
+    ("parts", "message"),
+    [
+        ({"option": 'noslip_iterations="3"'}, r"noslip_iterations \(set it to 0\)"),
+        ({"extension": PID, "actuator": '<plugin joint="j" instance="pid"/>'}, "plugins of actuators"),
+        ({"actuator": '<motor joint="j" delay=".02" nsample="2"/>'}, "actuators' delay"),
+        (
+            {"actuator": '<general joint="j" dyntype="filter" dynprm="1" actearly="true"/>'},
+            "actuators' actearly",
+        ),
+        ({"actuator": '<motor joint="j" damping="1"/>'}, "actuators' damping and armature"),
+        ({"actuator": '<motor joint="j" armature="1"/>'}, "actuators' damping and armature"),
+        ({"option": 'actuatorgroupdisable="2"', "actuator": '<motor joint="j" group="2"/>'}, "actuatorgroupdisable"),
+        ({"option": 'integrator="implicitfast"', "actuator": MUSCLE}, r"muscles' damping .*--integrator euler"),
+        ({"joint": 'stiffness="1 2"'}, "polynomial stiffness or damping"),
+        ({"joint": 'damping="0 2"'}, "polynomial stiffness or damping"),
+        ({"tendon": TENDON.format('stiffness="1 2"')}, "polynomial stiffness or damping"),
+        ({"tendon": TENDON.format('damping="0 2"')}, "polynomial stiffness or damping"),
+        ({"geom": 'adhesion="3"'}, "adhesion of geoms"),
+        ({"geom": 'surfacevel="1 0 0 0 0 0"'}, "surfacevel"),
+        ({"option": 'viscosity=".1"', "geom": 'fluidshape="ellipsoid"'}, 'fluidshape="ellipsoid"'),
+        ({"flag": 'spring="disable"', "joint": 'damping="1"'}, "all passive forces"),
+        ({"flag": 'damper="disable"', "joint": 'stiffness="1"'}, "all passive forces"),
+        ({"flag": 'damper="disable"', "body": 'gravcomp="1"'}, "all passive forces"),
+        ({"flag": 'spring="disable"', "option": 'density="1"'}, "all passive forces"),
+        ({"flag": 'spring="disable" damper="disable"', "joint": 'damping="1"'}, "disable eulerdamp, too"),
+    ],
+)
+def test_what_mjx_would_leave_out_is_refused(parts: dict[str, str], message: str) -> None:
+    with pytest.raises(SceneError, match=f"MJX would leave out part of here: .*{message}"):
+        put_scene(joint(**parts), "here")
+
+
+@pytest.mark.parametrize(
+    "parts",
+    [
+        {"option": 'actuatorgroupdisable="2"', "actuator": '<motor joint="j" group="3"/>'},
+        {"geom": 'fluidshape="ellipsoid"'},
+        {"actuator": MUSCLE},
+        {"flag": 'spring="disable"', "joint": 'stiffness="1"'},
+        {"flag": 'damper="disable"', "option": 'integrator="implicitfast"', "joint": 'damping="1"'},
+        {"flag": 'spring="disable" damper="disable" eulerdamp="disable"', "joint": 'stiffness="1" damping="1"'},
+        {"flag": 'gravity="disable" spring="disable"', "body": 'gravcomp="1"'},
+    ],
+)
+def test_what_has_no_effect_is_not_refused(parts: dict[str, str]) -> None:
+    put_scene(joint(**parts), "here")
 
 
 @pytest.mark.parametrize(
@@ -151,11 +269,6 @@ def test_models_that_mjx_lacks_are_refused(
     monkeypatch.chdir(tmp_path)  # MuJoCo logs a warning about the cloth to a file where it stands
     with pytest.raises(SceneError, match=message):
         put_scene(mujoco.MjModel.from_xml_string(text), "here")
-
-
-def test_rk4_with_constraints_is_refused() -> None:
-    with pytest.raises(SceneError, match="pusher combines RK4 with contacts"):
-        load_scene("pusher", integrator="rk4")
 
 
 def test_names_are_looked_up_and_choices_listed(pusher) -> None:

@@ -10,14 +10,16 @@ from mjx_study.cli.options import (
     add_command,
     add_contact_options,
     add_process_options,
+    add_scene_options,
     computing,
     configure_process,
     names,
     print_report,
+    scene_options,
     usage_errors,
 )
 from mjx_study.gradcheck.check import HORIZON, STATES, GradcheckPlan
-from mjx_study.scene import CONES, SOLVERS, load_scene
+from mjx_study.scene import CONES, load_scene
 from mjx_study.tasks import make_task, task_names
 
 EPILOG = """\
@@ -50,7 +52,7 @@ def add(commands: Commands) -> None:
     add_contact_options(command, f"{usual}, or the task's where that is stiffer")
     command.add_argument("--pair", type=names, metavar="GEOM,GEOM", help="contact of a file that a stiffness is for")
     command.add_argument("--cone", choices=list(CONES), help="friction cone (default: the MJCF's)")
-    command.add_argument("--solver", choices=list(SOLVERS), help="constraint solver (default: the MJCF's)")
+    add_scene_options(command)
     command.add_argument("--iterations", type=int, metavar="N", help="of the solver (default: the MJCF's)")
     command.add_argument("--ls-iterations", type=int, metavar="N", help="of its line search (default: the MJCF's)")
     command.add_argument("--horizon", type=int, metavar="H", help=f"steps (default: the task's; of a file {HORIZON})")
@@ -74,19 +76,18 @@ def run(options: argparse.Namespace) -> int:
 
 def _plan(options: argparse.Namespace) -> GradcheckPlan:
     common = {"seed": options.seed, "damping": options.damping, "states": options.states, "stock": options.stock}
-    scene_options = {name: getattr(options, name) for name in ("cone", "solver", "iterations", "ls_iterations")}
-    scene_options = {name: value for name, value in scene_options.items() if value is not None}
+    chosen = scene_options(options, "cone", "iterations", "ls_iterations")
     if Path(options.task).suffix.lower() != ".xml":
         if options.pair is not None:
             raise UsageError("--pair is for files; a task has its own")
-        chosen = {name: getattr(options, name) for name in ("horizon", "model") if getattr(options, name) is not None}
-        task = make_task(options.task, **chosen, **scene_options)
+        chosen |= {name: getattr(options, name) for name in ("horizon", "model") if getattr(options, name) is not None}
+        task = make_task(options.task, **chosen)
         return check.plan_gradcheck(task, options.contact, options.stiffness, **common)
     if options.model is not None:
         raise UsageError("--model replaces the MJCF of a task, and this is a file already")
     if options.pair is not None and len(options.pair) != 2:
         raise UsageError(f"--pair takes the names of two geoms, got {len(options.pair)}")
-    scene = load_scene(options.task, **scene_options)
+    scene = load_scene(options.task, **chosen)
     horizon = HORIZON if options.horizon is None else options.horizon
     return check.plan_scene_gradcheck(
         scene, options.contact, options.stiffness, pair=options.pair, horizon=horizon, **common

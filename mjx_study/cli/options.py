@@ -14,8 +14,9 @@ from estimators import BASELINES, NOISES
 from mjx_study.configuration import Progress
 from mjx_study.console import progress_bar, show_cursor
 from mjx_study.contact import FAMILIES
+from mjx_study.limitations import FLAGS
 from mjx_study.runtime import PRECISIONS, configure
-from mjx_study.scene import CONES
+from mjx_study.scene import CONES, INTEGRATORS, SOLVERS
 from mjx_study.task import Task
 from mjx_study.tasks import make_task, task_names
 
@@ -85,6 +86,24 @@ def add_contact_options(command: argparse.ArgumentParser, stiffness: str = "the 
     )
 
 
+def add_scene_options(command: argparse.ArgumentParser) -> None:
+    """What replaces an MJCF's own <option>: what MJX lacks can be changed without editing the file."""
+    command.add_argument("--integrator", choices=list(INTEGRATORS), help="default: the MJCF's")
+    command.add_argument("--solver", choices=list(SOLVERS), help="of the constraints (default: the MJCF's)")
+    command.add_argument(
+        "--disable-flag",
+        metavar="FLAG[,FLAG]",
+        dest="disable_flags",
+        help=f"as in the MJCF's <flag>; of: {', '.join(FLAGS)}",
+    )
+
+
+def scene_options(options: argparse.Namespace, *names: str) -> dict[str, Any]:
+    """Those of the options, and of `add_scene_options`, that are given, as `load_scene` takes them."""
+    given = {name: getattr(options, name, None) for name in ("integrator", "solver", "disable_flags", *names)}
+    return {name: value for name, value in given.items() if value is not None}
+
+
 def add_estimator_options(command: argparse.ArgumentParser) -> None:
     """The noise, and what estimators let one choose; see `estimators.EstimatorOptions`."""
     add_noise_option(command)
@@ -132,8 +151,7 @@ def configure_process(options: argparse.Namespace) -> None:
 
 def task_of(options: argparse.Namespace) -> Task:
     """The task that the options describe."""
-    chosen = {name: getattr(options, name) for name in ("cone", "horizon", "model")}
-    task = make_task(options.task, **{name: value for name, value in chosen.items() if value is not None})
+    task = make_task(options.task, **scene_options(options, "cone", "horizon", "model"))
     return task if options.sigma is None else task.replace(sigma=options.sigma)
 
 

@@ -18,10 +18,12 @@ from mjx_study.cli.options import (
     Commands,
     UsageError,
     add_command,
+    add_scene_options,
     add_task_options,
     computing,
     configure_process,
     print_report,
+    scene_options,
     task_of,
     usage_errors,
 )
@@ -104,6 +106,7 @@ def add(commands: Commands) -> None:
     """Register the command."""
     command = add_command(commands, "rollout", "show a rollout: pictures, a film and its numbers", run, EPILOG)
     add_task_options(command, contact=False, files="; or any MJCF")
+    add_scene_options(command)
     command.add_argument("--contact", metavar="FAMILY", help=f"one of: {', '.join(FAMILIES)} (default: the task's)")
     command.add_argument("--stiffness", type=float, metavar="K", help="contact stiffness in N/m (default: the task's)")
     command.add_argument("--damping", type=float, metavar="B", help="contact damping in N s/m")
@@ -155,7 +158,7 @@ def _plan(options: argparse.Namespace):
         raise ValueError(f"{', '.join(given)}: only for a task; {options.task} moves as its MJCF says")
     if options.horizon is not None and options.horizon < 1:
         raise ValueError(f"horizon must be at least 1 step, got {options.horizon}")
-    model = load_model(options.task, **({} if options.cone is None else {"cone": options.cone}))
+    model = load_model(options.task, **scene_options(options, "cone"))
     steps = options.horizon or max(1, round(PASSIVE_SECONDS / model.opt.timestep))
     return partial(_simulate_passive, model, Path(options.task).stem, steps), ()
 
