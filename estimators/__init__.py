@@ -9,13 +9,16 @@ Reference: Suh, Simchowitz, Zhang, Tedrake, "Do Differentiable Simulators Give B
 from estimators.alpha_order import alpha_order, constrained_alpha, interpolate, inverse_variance_alpha
 from estimators.baselines import BASELINES, leave_one_out, none, zero_noise
 from estimators.bias import BiasTest, EmpiricalBias, bias_test, empirical_bias, squared_bias_of_means
+from estimators.comparison import Comparison, compare
 from estimators.confidence import VARIANCE_PROXIES, bernstein_epsilon, coverage_interval, variance_upper_bound
 from estimators.ddcg import discontinuity_gated
+from estimators.effective import ENOUGH_EFFECTIVE, EffectiveSamples, effective_samples
 from estimators.first_order import clipped_first_order, first_order
+from estimators.intervals import variance_interval
 from estimators.noise import NOISES, NoiseDensity
 from estimators.propagation import total_propagation, truncated_first_order
 from estimators.registry import ESTIMATORS, ORACLES, Estimator, EstimatorOptions, Oracle, combine, draw, estimate
-from estimators.statistics import Comparison, compare, norm_quantiles, summarise, variance_interval
+from estimators.statistics import norm_quantiles, summarise
 from estimators.stepwise import antithetic_cost_to_go, cost_to_go, stepwise_inverse_variance
 from estimators.types import (
     AlphaChoice,
@@ -34,6 +37,7 @@ from estimators.zeroth_order import antithetic, delta_control_variate, zeroth_or
 
 __all__ = [
     "BASELINES",
+    "ENOUGH_EFFECTIVE",
     "ESTIMATORS",
     "NOISES",
     "ORACLES",
@@ -42,6 +46,7 @@ __all__ = [
     "BiasTest",
     "Comparison",
     "Differentiation",
+    "EffectiveSamples",
     "EmpiricalBias",
     "Estimator",
     "EstimatorOptions",
@@ -69,6 +74,7 @@ __all__ = [
     "delta_control_variate",
     "discontinuity_gated",
     "draw",
+    "effective_samples",
     "empirical_bias",
     "estimate",
     "first_order",

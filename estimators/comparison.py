@@ -1,0 +1,125 @@
+"""How far an estimate is from a reference, and how sure that is."""
+
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from estimators.pytree import register_pytree
+from estimators.statistics import summarise
+from estimators.types import GradientEstimate
+
+Scalar = Float[Array, ""]
+
+
+@register_pytree
+@dataclass(frozen=True)
+class Comparison:
+    """How far an estimate is from a reference, with standard errors. See `compare`.
+
+    Attributes:
+        error: ||gbar - gref||, [cost/param].
+        relative_error: r = ||gbar - gref|| / ||gref||, noise of both means included.
+        relative_error_se: Standard error of r about its own mean.
+        debiased_error: r_d, the same less what noise adds to it: ||E gbar - grad F|| / ||grad F||, estimated.
+        debiased_error_se: Standard error of that.
+        cosine: c = gbar . gref / (||gbar|| ||gref||).
+        cosine_se: Standard error of c about its own mean.
+        debiased_cosine: c_d, the cosine of the angle between E gbar and grad F, estimated.
+        debiased_cosine_se: Standard error of that.
+        reference_uncertainty: sqrt(tr Cov[gref]) / ||gref||, the relative error below which nothing can be
+            told.
+    """
+
+    error: Float[Array, ""]
+    relative_error: Float[Array, ""]
+    relative_error_se: Float[Array, ""]
+    debiased_error: Float[Array, ""]
+    debiased_error_se: Float[Array, ""]
+    cosine: Float[Array, ""]
+    cosine_se: Float[Array, ""]
+    debiased_cosine: Float[Array, ""]
+    debiased_cosine_se: Float[Array, ""]
+    reference_uncertainty: Float[Array, ""]
+
+
+def compare(estimate: GradientEstimate, reference: GradientEstimate) -> Comparison:
+    """Relative error and cosine against an independent reference, with delta-method standard errors.
+
+    With unit vectors u, v, a along d = gbar - gref, gref, gbar,
+
+        se(r)^2 = ( Var[u . g_i]/N + Var[(u + r v) . gref_j]/M ) / ||gref||^2
+        se(c)^2 = Var[(v - c a) . g_i]/(N ||gbar||^2) + Var[(a - c v) . gref_j]/(M ||gref||^2)
+
+    where the variances are those of the projected samples. Both are biased, since noise has a length too: r up and
+    |c| down, by many standard errors where there are many parameters. Without the noise of either mean,
+
+        r_d^2 = max(0, q),   q = (||d||^2 - s^2 - t^2) / m,   m = ||gref||^2 - t^2,
+        c_d = gbar . gref / sqrt((||gbar||^2 - s^2) m), cut off at -1 and 1,
+        s^2 = sum_k se_k(gbar)^2,   t^2 = sum_k se_k(gref)^2,
+        se(q)^2 = 4 ( Var[d . g_i]/N + Var[(d + q gref) . gref_j]/M ) / m^2,
+        se(r_d) = min( se(q) / (2 r_d), sqrt(se(q)) )
+
+    and se(c_d) as se(c) with the norms of c_d. First order in the noise; se(q) counts the second order twice, which
+    errs on the safe side near q = 0, where the root has no derivative and the second form of se(r_d) bounds its error.
+    An interpolated estimate enters with its weight taken as given.
+
+    Args:
+        estimate: The estimate to judge.
+        reference: An estimate from other samples.
+
+    Returns:
+        The comparison. A direction that does not exist (a mean or a difference of exactly zero) makes NaN of
+        what needs it; so does, for the debiased numbers, a mean that cannot be told from zero (m <= 0).
+    """
+    difference = estimate.mean - reference.mean
+    error = jnp.linalg.norm(difference)
+    size, reference_size = jnp.linalg.norm(estimate.mean), jnp.linalg.norm(reference.mean)
+    along_error, along_estimate = difference / error, estimate.mean / size
+    along_reference = reference.mean / reference_size
+    relative = error / reference_size
+    cosine = jnp.sum(along_estimate * along_reference)
+
+    def propagate(slope: Float[Array, " params"], slope_reference: Float[Array, " params"]) -> Float[Array, ""]:
+        return jnp.sqrt(_variance_along(estimate, slope) + _variance_along(reference, slope_reference))
+
+    def cosine_error(cosine: Scalar, size: Scalar, reference_size: Scalar) -> Scalar:
+        across = size * reference_size
+        return propagate(
+            reference.mean / across - cosine / size**2 * estimate.mean,
+            estimate.mean / across - cosine / reference_size**2 * reference.mean,
+        )
+
+    noise, reference_noise = (jnp.sum(each.standard_error**2) for each in (estimate, reference))
+    true_size, true_reference_size = _root(size**2 - noise), _root(reference_size**2 - reference_noise)
+    square = true_reference_size**2
+    quotient = (error**2 - noise - reference_noise) / square
+    quotient_se = 2.0 * propagate(difference / square, (difference + quotient * reference.mean) / square)
+    debiased, bound = jnp.sqrt(jnp.maximum(quotient, 0.0)), jnp.sqrt(quotient_se)
+    debiased_cosine = jnp.clip(cosine * (size / true_size) * (reference_size / true_reference_size), -1.0, 1.0)
+    return Comparison(
+        error=error,
+        relative_error=relative,
+        relative_error_se=propagate(
+            along_error / reference_size, (along_error + relative * along_reference) / reference_size
+        ),
+        debiased_error=debiased,
+        debiased_error_se=quotient_se / jnp.maximum(2.0 * debiased, bound),
+        cosine=cosine,
+        cosine_se=cosine_error(cosine, size, reference_size),
+        debiased_cosine=debiased_cosine,
+        debiased_cosine_se=cosine_error(debiased_cosine, true_size, true_reference_size),
+        reference_uncertainty=jnp.linalg.norm(reference.standard_error) / reference_size,
+    )
+
+
+def _root(square: Scalar) -> Scalar:
+    """NaN for what is not positive."""
+    return jnp.sqrt(jnp.where(square > 0, square, jnp.nan))
+
+
+def _variance_along(estimate: GradientEstimate, direction: Float[Array, " params"]) -> Float[Array, ""]:
+    """Variance of the mean's component along a direction."""
+    # A sum, since a matrix product of float32 may be rounded to fewer digits on an accelerator.
+    component = jnp.sum(estimate.per_sample * direction[None, :], axis=1)
+    return summarise(component[:, None]).standard_error[0] ** 2
