@@ -1,0 +1,163 @@
+"""Defects of objectives, estimators and references."""
+
+from typing import Final
+
+from tests.planted.defect import Defect
+
+UNBIASED, VARIANCES = "tests/estimators/test_unbiasedness.py", "tests/estimators/test_variances.py"
+STEPWISE, CHOICE = "tests/estimators/test_stepwise.py", "tests/estimators/test_alpha_order.py"
+
+OBJECTIVE: Final = (
+    Defect(
+        "cost-after-the-step",
+        "mjx_study/objective.py",
+        "return jax.tree.map(lambda leaf: leaf[:-1], states)",
+        "return jax.tree.map(lambda leaf: leaf[1:], states)",
+        "running costs of the states after the steps",
+        ("tests/test_objective.py",),
+    ),
+    Defect(
+        "baseline-with-noise",
+        "mjx_study/objective.py",
+        "np.concatenate([np.ones(samples), np.zeros(len(silent))])",
+        "np.ones(samples + len(silent))",
+        "still unbiased with one sample less, and no error anywhere",
+        ("tests/test_objective.py",),
+    ),
+    Defect(
+        "costs-so-far",
+        "mjx_study/objective.py",
+        "jnp.cumsum(running[::-1])[::-1] + self.task.final_cost",
+        "jnp.cumsum(running) + self.task.final_cost",
+        "costs up to a step in place of those from it on",
+        ("tests/test_batches.py",),
+    ),
+    Defect(
+        "score-without-its-scale",
+        "mjx_study/noise.py",
+        "NOISES[density].score(noise / sigma) / sigma",
+        "NOISES[density].score(noise / sigma)",
+        "the score of standard noise; right at sigma = 1",
+        ("tests/reference/test_objective.py", "tests/test_objective.py"),
+    ),
+)
+
+ESTIMATORS: Final = (
+    Defect(
+        "mean-of-all-as-baseline",
+        "estimators/baselines.py",
+        "(jnp.sum(value) - value) / jnp.maximum(num_others, 1.0)",
+        "jnp.sum(value) / (num_others + 1.0)",
+        "the batch's mean depends on the sample: biased by 1/N",
+        (UNBIASED,),
+    ),
+    Defect(
+        "weights-swapped",
+        "estimators/alpha_order.py",
+        "ratio = variance_first / jnp.where(variance_zeroth == 0, 1.0, variance_zeroth)",
+        "ratio = variance_zeroth / jnp.where(variance_first == 0, 1.0, variance_first)",
+        "each estimate weighed by its own variance",
+        (CHOICE,),
+    ),
+    Defect(
+        "variance-of-a-mixture",
+        "estimators/alpha_order.py",
+        "(1.0 - alpha, alpha), ((1.0 - alpha) ** 2, alpha**2)",
+        "(1.0 - alpha, alpha), (1.0 - alpha, alpha)",
+        "variances weighed as means are",
+        (VARIANCES, CHOICE),
+    ),
+    Defect(
+        "bound-without-dimension",
+        "estimators/confidence.py",
+        "jnp.asarray((estimate.mean.shape[0] + 1) / failure_probability, dtype)",
+        "jnp.asarray(2 / failure_probability, dtype)",
+        "the scalar inequality used for a vector",
+        ("tests/estimators/test_confidence.py", CHOICE),
+    ),
+    Defect(
+        "laplace-score",
+        "estimators/noise.py",
+        "score=lambda z: jnp.sign(z) / LAPLACE_SCALE",
+        "score=lambda z: jnp.sign(z)",
+        "the score at scale 1, where the variance is 2",
+        (STEPWISE,),
+    ),
+    Defect(
+        "control-variate-scale",
+        "estimators/zeroth_order.py",
+        "linear = scale**2 * jnp.sum",
+        "linear = scale * jnp.sum",
+        "sigma in place of its square: unbiased still, but no longer a control variate",
+        (VARIANCES, UNBIASED),
+    ),
+    Defect(
+        "pairs-as-samples",
+        "estimators/zeroth_order.py",
+        "return summarise((above + below) / 2.0)",
+        "return summarise(jnp.concatenate([above, below]))",
+        "the halves of a pair are not independent: the same mean, another standard error",
+        (VARIANCES, STEPWISE),
+    ),
+    Defect(
+        "cut-one-step-early",
+        "estimators/propagation.py",
+        "jnp.arange(1, horizon + 1) % window != 0",
+        "jnp.arange(horizon) % window != 0",
+        "windows counted from the wrong end",
+        (STEPWISE,),
+    ),
+)
+
+REFERENCES: Final = (
+    Defect(
+        "range-slope",
+        "mjx_study/reference/ball_wall.py",
+        "slope = 2 * self.speed**2 / self.gravity * np.cos(2 * angle)",
+        "slope = self.speed**2 / self.gravity * np.cos(2 * angle)",
+        "the inner derivative of sin(2 angle) forgotten",
+        ("tests/reference/test_functions.py",),
+    ),
+    Defect(
+        "adjoint-not-transposed",
+        "mjx_study/reference/adjoint.py",
+        'cost_state + np.einsum("...ij,...i->...j", over_state, adjoint)',
+        'cost_state + np.einsum("...ij,...j->...i", over_state, adjoint)',
+        "the Jacobian in place of its transpose",
+        ("tests/reference/test_gradients.py",),
+    ),
+    Defect(
+        "coriolis-term",
+        "mjx_study/reference/double_pendulum.py",
+        "sine * v2 * (2 * v1 + v2) - 2 * pull",
+        "sine * v2 * (v1 + v2) - 2 * pull",
+        "a factor of two in a velocity product",
+        ("tests/reference/test_double_pendulum.py",),
+    ),
+    Defect(
+        "impact-of-a-fixed-paddle",
+        "mjx_study/reference/paddle.py",
+        "slope[:, :2] - slope[:, 4:6]) - along[:, None] * slope[:, 6]",
+        "slope[:, :2] - slope[:, 4:6])",
+        "the time of impact without the paddle's turning",
+        ("tests/reference/test_gradients.py",),
+    ),
+    Defect(
+        "jump-term-density",
+        "mjx_study/reference/function.py",
+        "density.density(copies(jump.position)).sum() / sigma",
+        "density.density(copies(jump.position)).sum()",
+        "the density of standard noise; right at sigma = 1",
+        ("tests/reference/test_functions.py",),
+    ),
+    Defect(
+        "first-order-variance",
+        "mjx_study/reference/linear_quadratic.py",
+        "4 * sigma**2 * np.sum(square**2)",
+        "4 * sigma**2 * np.trace(square) ** 2",
+        "the square of a trace in place of the trace of a square",
+        ("tests/reference/test_linear_quadratic.py",),
+    ),
+)
+
+ESTIMATION: Final = (*OBJECTIVE, *ESTIMATORS, *REFERENCES)

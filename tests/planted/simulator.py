@@ -1,0 +1,269 @@
+"""Defects of the step, its repairs, its constraints and its contact models."""
+
+from typing import Final
+
+from tests.planted.defect import Defect
+
+STEP = "tests/test_dynamics.py"
+
+DYNAMICS: Final = (
+    Defect(
+        "frame-without-derivative",
+        "mjx_study/dynamics.py",
+        "        return mjx.fwd_position(model, data)\n",
+        """        data = mjx.fwd_position(model, data)
+        frame = jax.lax.stop_gradient(data._impl.contact.frame)
+        return data.tree_replace({"_impl.contact.frame": frame})
+""",
+        "the contact frame taken for a constant, as it is on a plane",
+        (STEP,),
+        "rolling",
+    ),
+    Defect(
+        "reference-at-rest",
+        "mjx_study/dynamics.py",
+        "        data = mjx.make_constraint(model, data)  # again: aref depends on qvel\n",
+        "",
+        "an apparently repeated call removed",
+        (STEP,),
+        "box",
+    ),
+    Defect(
+        "implicit-part-dropped",
+        "mjx_study/dynamics.py",
+        "return over_inputs[nv:] + over_qacc[nv:] @ response, response",
+        "return over_inputs[nv:], response",
+        "the step differentiated at a fixed acceleration",
+        (STEP,),
+        "slider",
+    ),
+    Defect(
+        "columns-swapped",
+        "mjx_study/dynamics.py",
+        """        (lambda x: equations(positioned, qvel, x, control, qacc), act),
+        (lambda x: equations(positioned, qvel, act, x, qacc), control),
+""",
+        """        (lambda x: equations(positioned, qvel, act, x, qacc), control),
+        (lambda x: equations(positioned, qvel, x, control, qacc), act),
+""",
+        "blocks of the Jacobian in another order than the inputs",
+        (STEP,),
+        "mechanism",
+    ),
+    Defect(
+        "always-euler",
+        "mjx_study/dynamics.py",
+        "mjx.implicit(model, data) if implicit else mjx.euler(model, data)",
+        "mjx.euler(model, data)",
+        "one integrator forgotten",
+        (STEP,),
+        "rolling",
+    ),
+    Defect(
+        "force-left-out-of-damping",
+        "mjx_study/dynamics.py",
+        "data.replace(qacc=qacc, qfrc_constraint=constraint.constraint_force(model, data, qacc))",
+        "data.replace(qacc=qacc)",
+        "Euler's implicit damping solves again, with the constraint force, which is easily forgotten",
+        (STEP,),
+        "mechanism",
+    ),
+    Defect(
+        "runge-kutta-weights",
+        "mjx_study/dynamics.py",
+        "(a + 2 * b + 2 * c + d) / 6",
+        "(a + 3 * b + 3 * c + d) / 8",
+        "the weights of the other rule of order four",
+        (STEP,),
+        "swing",
+    ),
+    Defect(
+        "runge-kutta-stage",
+        "mjx_study/dynamics.py",
+        "third = slopes(*moved(0.5, second))",
+        "third = slopes(*moved(0.5, first))",
+        "a stage started from the wrong slope",
+        (STEP,),
+        "swing",
+    ),
+)
+
+CONSTRAINT: Final = (
+    Defect(
+        "elliptic-sliding-direction",
+        "mjx_study/constraint.py",
+        "-magnitude * friction * tangent / safe_length",
+        "-magnitude * friction * jax.lax.stop_gradient(tangent / safe_length)",
+        "the direction of sliding held fixed; only a slide that turns shows it",
+        (STEP,),
+        "slider",
+    ),
+    Defect(
+        "elliptic-friction-scale",
+        "mjx_study/constraint.py",
+        "-magnitude * friction * tangent / safe_length",
+        "-magnitude * tangent / safe_length",
+        "the cone's scaling of its axes applied once in place of twice",
+        (STEP,),
+        "slider",
+    ),
+    Defect(
+        "impratio-forgotten",
+        "mjx_study/constraint.py",
+        "mu = friction[0] / jnp.sqrt(model.opt.impratio)",
+        "mu = friction[0]",
+        "right at the default impratio of 1",
+        (STEP,),
+        "slider",
+    ),
+    Defect(
+        "friction-loss-one-sided",
+        "mjx_study/constraint.py",
+        "jnp.clip(linear, -loss, loss)",
+        "jnp.clip(linear, 0.0, loss)",
+        "friction taken for a unilateral force",
+        ("tests/test_constraint.py",),
+        "mechanism",
+    ),
+    Defect(
+        "equality-only-pushes",
+        "mjx_study/constraint.py",
+        "kind[: rows.ne] = 2",
+        "kind[: rows.ne] = 0",
+        "an equality taken for a contact",
+        ("tests/test_constraint.py",),
+        "mechanism",
+    ),
+    Defect(
+        "cholesky-off-by-one",
+        "mjx_study/constraint.py",
+        "sum(lower[j, k] ** 2 for k in range(j))",
+        "sum(lower[j, k] ** 2 for k in range(1, j))",
+        "an index from 1",
+        ("tests/test_constraint.py",),
+        "slider",
+    ),
+)
+
+REPAIRS: Final = (
+    Defect(
+        "stiffness-over-d-width",
+        "mjx_study/repairs.py",
+        "1 / product**2) / high**2",
+        "1 / product**2) / high",
+        "k divided by d_width in place of its square",
+        ("tests/test_repairs.py",),
+        "slider",
+    ),
+    Defect(
+        "impedance-above-midpoint",
+        "mjx_study/repairs.py",
+        "** power / (1 - midpoint) ** (power - 1)",
+        "** power / midpoint ** (power - 1)",
+        "right at the default midpoint of 0.5",
+        ("tests/test_repairs.py",),
+        "slider",
+    ),
+    Defect(
+        "impedance-of-one-sign",
+        "mjx_study/repairs.py",
+        "depth = jnp.abs(position) / width",
+        "depth = -position / width",
+        "right for contacts, wrong for equalities, which err to both sides",
+        ("tests/test_repairs.py",),
+        "mechanism",
+    ),
+    Defect(
+        "refsafe-at-one-timestep",
+        "mjx_study/repairs.py",
+        "jnp.maximum(timeconst, 2 * model.opt.timestep)",
+        "jnp.maximum(timeconst, model.opt.timestep)",
+        "a factor of two forgotten",
+        ("tests/test_repairs.py",),
+    ),
+    Defect(
+        "rotation-difference-reversed",
+        "mjx_study/repairs.py",
+        "return rotation_between(start, end)",
+        "return rotation_between(end, start)",
+        "arguments in the order of MJX's own function",
+        ("tests/test_repairs.py",),
+        "ball",
+    ),
+    Defect(
+        "tendon-spring-sign",
+        "mjx_study/repairs.py",
+        "(stiffness * (shortest - data.ten_length))",
+        "(stiffness * (data.ten_length - shortest))",
+        "no effect on any value",
+        ("tests/test_repairs.py",),
+        "tendon",
+    ),
+)
+
+INTEGRATION: Final = (
+    Defect(
+        "sine-series-coefficient",
+        "mjx_study/integration.py",
+        "0.5 - square / 48 +",
+        "0.5 - square / 24 +",
+        "a wrong coefficient of a series, used below 0.01 rad",
+        ("tests/test_integration.py",),
+        "box",
+    ),
+    Defect(
+        "rotation-in-the-world-frame",
+        "mjx_study/integration.py",
+        "w * a + x * cosine + y * c - z * b",
+        "w * a + x * cosine - y * c + z * b",
+        "one entry of the product in the other order",
+        ("tests/test_integration.py",),
+        "box",
+    ),
+    Defect(
+        "long-way-round",
+        "mjx_study/integration.py",
+        "jnp.where(real < 0, -real, real), jnp.where(real < 0, -axis, axis)",
+        "jnp.where(real < 0, -real, real), axis",
+        "q and -q are one orientation, and both parts change sign",
+        ("tests/test_repairs.py", "tests/test_integration.py"),
+        "ball",
+    ),
+)
+
+CONTACT: Final = (
+    Defect(
+        "edges-of-the-pyramid",
+        "mjx_study/contact.py",
+        "return 2 * (condim - 1) * float(host.opt.impratio)",
+        "return (condim - 1) * float(host.opt.impratio)",
+        "a pyramid has two edges for each direction of friction",
+        ("tests/test_contact.py",),
+    ),
+    Defect(
+        "margin-twice",
+        "mjx_study/contact.py",
+        "fill(model.geom_margin, contact.margin / 2)",
+        "fill(model.geom_margin, contact.margin)",
+        "MuJoCo adds the margins of two geoms",
+        ("tests/test_contact.py",),
+    ),
+    Defect(
+        "friction-of-a-pair",
+        "mjx_study/contact.py",
+        "jnp.stack([sliding, sliding, torsional, rolling, rolling])",
+        "jnp.stack([sliding, torsional, torsional, rolling, rolling])",
+        "a pair has five numbers where a geom has three",
+        ("tests/test_contact.py",),
+    ),
+    Defect(
+        "half-critical-damping",
+        "mjx_study/contact.py",
+        "b = 2 * (dampratio or 0.0) * math.sqrt(k)",
+        "b = (dampratio or 0.0) * math.sqrt(k)",
+        "c = 2 zeta sqrt(k m) without its 2",
+        ("tests/test_contact.py",),
+    ),
+)
+
+SIMULATOR: Final = (*DYNAMICS, *CONSTRAINT, *REPAIRS, *INTEGRATION, *CONTACT)
