@@ -13,7 +13,7 @@ UV_VERSION := 0.13.8
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo figures study test test-all lint format lock clean
+.PHONY: help demo figures study test test-all defects lint format lock clean
 
 help: ## List the targets
 	@awk 'BEGIN { FS = ":.*## " } /^[a-z-]+:.*## / { printf "  %-10s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
@@ -37,6 +37,9 @@ test: $(STAMP) ## Run the tests, less the slow ones (PYTEST_ARGS='-k name' in pl
 
 test-all: $(STAMP) ## Run all the tests, the slow ones too
 	$(BIN)/python -m pytest -m '' $(PYTEST_ARGS)
+
+defects: $(STAMP) ## Plant defects one at a time; say what catches each, here and in docs/testing.md (half an hour)
+	$(BIN)/python -m tests.planted --everything --page docs/testing.md
 
 lint: $(STAMP) ## Check style, formatting and types
 	$(BIN)/ruff check .

@@ -5,6 +5,7 @@ The tests that are likely to see it run first; if they pass gradcheck runs, and 
 
 import argparse
 import dataclasses
+import json
 import os
 import shutil
 import subprocess
@@ -24,6 +25,7 @@ from tests.planted.models import MODELS
 ROOT = Path(__file__).resolve().parents[2]
 LEFT_OUT = (".git", ".venv*", ".*cache*", ".hypothesis", "__pycache__", "results", "build", "dist")
 LIMIT = 900.0  # [s] for one command
+MARK = "<!-- from here on: make defects -->\n"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -128,6 +130,14 @@ def judge(defect: Defect, *, everything: bool) -> Verdict:
     return Verdict(defect, test, checked, time.monotonic() - start)
 
 
+def read_results(path: Path | None) -> dict[str, Verdict]:
+    """Verdicts by the defect's name, of an earlier run over the same code."""
+    lines = path.read_text().splitlines() if path is not None and path.is_file() else []
+    documents = [json.loads(line) for line in lines]
+    defects = {each.name: each for each in DEFECTS}
+    return {d["defect"]: Verdict(defects[d["defect"]], d["test"], d["gradcheck"], d["seconds"]) for d in documents}
+
+
 def row(verdict: Verdict) -> list[str]:
     """Of the table: name, file, what caught it."""
     told = {None: "not run", "": "passes"}
@@ -136,9 +146,24 @@ def row(verdict: Verdict) -> list[str]:
     return [defect.name, defect.file, told.get(verdict.test, verdict.test or "").removeprefix("tests/"), checked]
 
 
+def summary(verdicts: Sequence[Verdict]) -> str:
+    """How many were caught, by what."""
+    tests, missed = (sum(map(bool, marks)) for marks in ([v.test for v in verdicts], [not v.caught for v in verdicts]))
+    checked = [verdict.gradcheck for verdict in verdicts if verdict.gradcheck is not None]
+    return (
+        f"{len(verdicts)} defects: {tests} caught by the fast tests, {sum(map(bool, checked))} of {len(checked)} by "
+        f"gradcheck, {missed} by nothing"
+    )
+
+
 def markdown(verdicts: Sequence[Verdict]) -> str:
     """The table of the page."""
-    lines = ["| defect | what it is | fast tests | gradcheck |", "| --- | --- | --- | --- |"]
+    lines = [
+        f"{summary(verdicts)}.",
+        "",
+        "| defect | what it is | fast tests | gradcheck |",
+        "| --- | --- | --- | --- |",
+    ]
     for verdict in verdicts:
         name, file, test, checked = row(verdict)
         test = test if test == "passes" else f"`{test.split('[')[0]}`"
@@ -152,25 +177,32 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--list", action="store_true", help="the defects, without planting any")
     parser.add_argument("--only", action="append", metavar="NAME", choices=[each.name for each in DEFECTS])
     parser.add_argument("--everything", action="store_true", help="gradcheck also where a test has caught the defect")
-    parser.add_argument("--markdown", type=Path, metavar="FILE", help="write the table there")
+    parser.add_argument(
+        "--results", type=Path, metavar="FILE", help="keep verdicts there, and plant only what it lacks"
+    )
+    parser.add_argument("--page", type=Path, metavar="FILE.md", help="put the table where the page has its mark")
     options = parser.parse_args(arguments)
     chosen = [each for each in DEFECTS if not options.only or each.name in options.only]
     if options.list:
         print("\n".join(format_table([[each.name, each.file, each.why] for each in chosen], ["defect", "file", "why"])))
         return 0
-    verdicts = []
+    verdicts, known = [], read_results(options.results)
     for index, defect in enumerate(chosen, 1):
-        verdicts.append(judge(defect, everything=options.everything))
+        verdict = known.get(defect.name) or judge(defect, everything=options.everything)
+        verdicts.append(verdict)
+        if options.results is not None and defect.name not in known:
+            with options.results.open("a") as file:
+                file.write(json.dumps(dataclasses.asdict(verdict) | {"defect": defect.name}) + "\n")
         found = "caught" if verdicts[-1].caught else "CAUGHT BY NOTHING"
         print(
             f"{index}/{len(chosen)} {defect.name}: {found}, {verdicts[-1].seconds:.0f} s", file=sys.stderr, flush=True
         )
     print("\n".join(format_table([row(each) for each in verdicts], ["defect", "file", "fast tests", "gradcheck"])))
-    tests, missed = sum(bool(each.test) for each in verdicts), [each for each in verdicts if not each.caught]
-    print(f"{len(verdicts)} defects, {tests} caught by the fast tests, {len(missed)} by nothing")
-    if options.markdown is not None:
-        options.markdown.write_text(markdown(verdicts))
-    return 1 if missed else 0
+    print(summary(verdicts))
+    if options.page is not None:
+        head = options.page.read_text().partition(MARK)[0]
+        options.page.write_text(f"{head}{MARK}\n{markdown(verdicts)}")
+    return 0 if all(each.caught for each in verdicts) else 1
 
 
 if __name__ == "__main__":
