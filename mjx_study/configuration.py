@@ -23,6 +23,7 @@ from mjx_study.contact import (
     stiffness_from_solref,
 )
 from mjx_study.objective import chunk_for
+from mjx_study.option import Checked
 from mjx_study.table import digits_to_tell_apart
 from mjx_study.task import Task
 from mjx_study.task_checks import check_shapes
@@ -37,7 +38,7 @@ Progress = Callable[[int, int, str], None]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class EstimatorConfig:
+class EstimatorConfig(Checked):
     """What decides how estimators run on a task; base of the configurations of studies.
 
     Attributes:
@@ -83,11 +84,8 @@ class EstimatorConfig:
     chunk_size: int | None = None
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         check_names("estimator", self.estimators, ESTIMATORS)
-        if self.chunk_size is not None and self.chunk_size < 1:
-            raise ValueError(f"chunk_size must be at least 1 sample, got {self.chunk_size}")
-        if self.seed < 0:
-            raise ValueError(f"seed must not be negative, got {self.seed}")
 
 
 def check_names(label: str, names: Sequence[str], choices: Collection[str]) -> None:

@@ -15,7 +15,7 @@ Reference: Suh et al. 2022, figure of simple systems, second row.
 import dataclasses
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, Final
+from typing import Any, ClassVar, Final
 
 import jax
 import jax.numpy as jnp
@@ -26,6 +26,7 @@ from estimators import GradientEstimate, Objective, first_order, zeroth_order
 from mjx_study.configuration import Cell, Progress, at_theta, plan_cells
 from mjx_study.contact import ContactModel
 from mjx_study.objective import Simulator, chunk_for
+from mjx_study.option import Checked
 from mjx_study.quadrature import Line, Means, applies, grid, means
 from mjx_study.reference import FunctionObjective, Reference, ScalarFunction, smoothed
 from mjx_study.runtime import environment
@@ -44,7 +45,7 @@ QUADRATURE: Final = 1500
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class LandscapeConfig:
+class LandscapeConfig(Checked):
     """Everything that decides a landscape.
 
     Attributes:
@@ -63,6 +64,8 @@ class LandscapeConfig:
         reference: whether the analytic reference is drawn beside the contact models, where there is one.
     """
 
+    ranges: ClassVar = {"samples": "[3, 1e7]"}
+
     task: str
     contact: tuple[str, ...] | None = None
     stiffness: tuple[float, ...] | None = None
@@ -78,12 +81,8 @@ class LandscapeConfig:
     reference: bool = True
 
     def __post_init__(self) -> None:
-        for label, count, least in (("points", self.points, 2), ("samples", self.samples, 3)):
-            if count < least:
-                raise ValueError(f"{label} must be at least {least}, got {count}")
+        super().__post_init__()
         check_span(self.span)
-        if self.seed < 0:
-            raise ValueError(f"seed must not be negative, got {self.seed}")
 
 
 @dataclasses.dataclass(frozen=True)

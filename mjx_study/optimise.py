@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, ClassVar, Final
 
 import jax
 import jax.numpy as jnp
@@ -60,6 +60,8 @@ class OptimiseConfig(EstimatorConfig):
         evaluation_samples: rollouts behind the cost of a final policy, the same for all.
     """
 
+    ranges: ClassVar = {"samples": "[2, 1e7]"}
+
     contact: str | None = None
     stiffness: float | None = None
     reference: bool = False
@@ -71,13 +73,6 @@ class OptimiseConfig(EstimatorConfig):
     optimizer: str = "sgd"
     seeds: int = 3
     evaluation_samples: int = 200
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for name, least in {"iterations": 1, "samples": 2, "seeds": 1, "evaluation_samples": 2}.items():
-            value = getattr(self, name)
-            if value is not None and value < least:
-                raise ValueError(f"{name.replace('_', ' ')} must be at least {least}, got {value}")
 
     @property
     def identity(self) -> dict[str, Any]:

@@ -2,7 +2,7 @@
 
 import dataclasses
 import itertools
-from typing import Final
+from typing import ClassVar, Final
 
 import jax
 
@@ -22,6 +22,7 @@ from mjx_study.contact import FAMILIES
 from mjx_study.landscape import check_span, line_of
 from mjx_study.objective import chunk_for
 from mjx_study.optimise import OptimiseConfig, OptimisePlan, plan_optimise
+from mjx_study.option import Checked
 from mjx_study.table import digits_to_tell_apart
 from mjx_study.task import Task, check_sigma
 from mjx_study.tasks import make_task
@@ -31,7 +32,7 @@ LARGEST_BATCH: Final = 20_000
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class SweepConfig:
+class SweepConfig(Checked):
     """Everything that decides a sweep.
 
     Attributes:
@@ -58,6 +59,8 @@ class SweepConfig:
         seed, noise, baseline, gamma, failure_probability, variance_proxy, radius, max_norm, window, tolerance,
             horizon, model, chunk_size: as in `EstimatorConfig`.
     """
+
+    ranges: ClassVar = {"samples": "[3, 1e7]"}
 
     tasks: tuple[str, ...]
     estimators: tuple[str, ...] = ("zobg", "fobg", "aobg")
@@ -95,6 +98,7 @@ class SweepConfig:
     chunk_size: int | None = None
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if not self.tasks:
             raise ValueError("no task given")
         check_names("estimator", self.estimators, ESTIMATORS)
@@ -108,28 +112,11 @@ class SweepConfig:
                 refuse_repeats(name, values)
             if values == () and name not in ("solref", "solimp"):
                 raise ValueError(f"no {name} given: give at least one, or leave it out")
-        counts = {
-            "seeds": 1,
-            "reference_samples": 3,
-            "evaluation_samples": 2,
-            "iterations": 1,
-            "points": 2,
-            "chunk_size": 1,
-        }
-        for name, least in counts.items():
-            value = getattr(self, name)
-            if value is not None and value < least:
-                raise ValueError(f"{name.replace('_', ' ')} must be at least {least}, got {value}")
         if self.iterations is not None and self.points is not None:
             raise ValueError("iterations are of descents and points of landscapes: give one of them")
         if self.points is None and (self.span is not None or self.direction is not None):
             raise ValueError("span and direction are of landscapes: give points as well")
         check_span(self.span)
-        if min(self.samples) < 3:
-            raise ValueError(f"samples must be at least 3, so that a variance has an error; got {min(self.samples)}")
-        for step in self.timestep or ():
-            if not 0 < step < 1:
-                raise ValueError(f"timestep must lie between 0 and 1 s, got {step:g}")
 
     @property
     def kind(self) -> str:

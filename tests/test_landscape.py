@@ -261,13 +261,13 @@ def test_the_command_prints_and_writes(
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (["--points", "1"], "points must be at least 2"),
-        (["--samples", "2"], "samples must be at least 3"),
+        (["--points", "1"], "--points: must be at least 2"),
+        (["--samples", "2"], "--samples: must be at least 3"),
         (["--span", "1,0"], "span must be two numbers, the lower one first"),
         (["--span", "1"], "span must be two numbers"),
-        (["--seed", "-1"], "seed must not be negative"),
+        (["--seed", "-1"], "--seed: must be at least 0"),
         (["--contact", ""], "no contact model"),
-        (["--sigma", "0"], "sigma must be positive"),
+        (["--sigma", "0"], "--sigma: must be positive"),
         (["--contact", "spring"], "unknown contact family"),
     ],
 )

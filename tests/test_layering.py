@@ -19,6 +19,8 @@ LAYERS = [
     "mjx_study.limitations",
     "mjx_study.scene",
     "mjx_study.contact",
+    "mjx_study.option",
+    "mjx_study.files",
     "mjx_study.engine",
     "mjx_study.integration",
     "mjx_study.repairs",

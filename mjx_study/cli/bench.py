@@ -6,6 +6,7 @@ from mjx_study import bench as benchmark
 from mjx_study.cli.options import (
     Commands,
     add_command,
+    add_option,
     add_task_options,
     computing,
     configure_process,
@@ -13,6 +14,7 @@ from mjx_study.cli.options import (
     task_of,
     usage_errors,
 )
+from mjx_study.option import OPTIONS
 
 EPILOG = """\
 Rates in one run on this machine: rollouts and gradients, against jax.grad through mjx.step (with the one solver
@@ -24,8 +26,8 @@ threads.
 def add(commands: Commands) -> None:
     """Register the command."""
     command = add_command(commands, "bench", "measure what rollouts and gradients cost here", run, EPILOG)
-    add_task_options(command, contact=False)
-    command.add_argument("--samples", type=int, default=1000, metavar="N", help="samples in a batch (default: 1000)")
+    add_task_options(command)
+    add_option(command, OPTIONS["samples"], 1000)
 
 
 def run(options: argparse.Namespace) -> int:

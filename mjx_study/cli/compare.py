@@ -10,11 +10,12 @@ from estimators import ESTIMATORS
 from mjx_study.cli.options import (
     Commands,
     add_command,
+    add_contact_options,
     add_estimator_options,
+    add_options,
     add_task_options,
     computing,
     configure_process,
-    names,
     usage_errors,
 )
 from mjx_study.cli.parameters import add_theta_option, theta_of
@@ -61,18 +62,12 @@ def add(commands: Commands) -> None:
         families="\n".join(f"  {item.name:<15} {item.description}" for item in FAMILIES.values()),
     )
     command = add_command(commands, "compare", "compare gradient estimators over contact models", run, epilog)
-    add_task_options(command)
+    add_task_options(command, CompareConfig)
+    add_contact_options(command, CompareConfig)
     add_theta_option(command, "parameters at which gradients are taken")
-    command.add_argument("--estimators", type=names, metavar="NAME[,NAME]", help="default: zobg,fobg,aobg")
-    command.add_argument("--samples", type=int, metavar="N", help="samples in each batch (default: 400)")
-    command.add_argument(
-        "--reference-samples", type=int, metavar="N", help="pairs of rollouts behind each reference (default: 600)"
-    )
-    add_estimator_options(command)
-    command.add_argument("--confidence", type=float, metavar="P", help="of the reported intervals (default: 0.95)")
-    command.add_argument(
-        "--chunk-size", type=int, metavar="N", help="samples per device and call (default: by --samples)"
-    )
+    add_options(command, CompareConfig, "estimators", "samples", "reference_samples")
+    add_estimator_options(command, CompareConfig)
+    add_options(command, CompareConfig, "confidence", "chunk_size")
     command.add_argument("--output", type=Path, metavar="DIR", help="write the figure and the numbers to this folder")
 
 

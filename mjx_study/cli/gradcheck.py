@@ -9,17 +9,19 @@ from mjx_study.cli.options import (
     UsageError,
     add_command,
     add_contact_options,
+    add_option,
     add_process_options,
     add_scene_options,
     computing,
     configure_process,
-    names,
     print_report,
     scene_options,
     usage_errors,
 )
+from mjx_study.comparison import CompareConfig
 from mjx_study.gradcheck.check import HORIZON, STATES, GradcheckPlan
-from mjx_study.scene import CONES, load_scene
+from mjx_study.option import OPTIONS, Option
+from mjx_study.scene import load_scene
 from mjx_study.tasks import make_task, task_names
 
 EPILOG = """\
@@ -39,6 +41,9 @@ and different contacts are no error of a derivative: they are reported, and do n
 """
 
 
+PAIR = Option("pair", str, "GEOM,GEOM", "contact of a file that a stiffness is for", many=True)
+
+
 def add(commands: Commands) -> None:
     """Register the command."""
     summary = "check derivatives against differences, the C engine and a closed form"
@@ -49,15 +54,15 @@ def add(commands: Commands) -> None:
         help=f"one of: {', '.join(task_names())}; module:name of your own; or any MJCF that MJX runs",
     )
     usual = ",".join(f"{each:g}" for each in check.STIFFNESS)
-    add_contact_options(command, f"{usual}, or the task's where that is stiffer")
-    command.add_argument("--pair", type=names, metavar="GEOM,GEOM", help="contact of a file that a stiffness is for")
-    command.add_argument("--cone", choices=list(CONES), help="friction cone (default: the MJCF's)")
+    add_contact_options(command, CompareConfig, f"{usual}, or the task's where that is stiffer")
+    add_option(command, PAIR)
+    add_option(command, OPTIONS["cone"])
     add_scene_options(command)
-    command.add_argument("--iterations", type=int, metavar="N", help="of the solver (default: the MJCF's)")
-    command.add_argument("--ls-iterations", type=int, metavar="N", help="of its line search (default: the MJCF's)")
-    command.add_argument("--horizon", type=int, metavar="H", help=f"steps (default: the task's; of a file {HORIZON})")
-    command.add_argument("--model", metavar="FILE.xml", help="an MJCF in place of the task's own")
-    command.add_argument("--states", type=int, default=STATES, metavar="N", help=f"states to check (default: {STATES})")
+    add_option(command, OPTIONS["iterations"], line="of the solver", unset="the MJCF's")
+    add_option(command, OPTIONS["ls_iterations"])
+    add_option(command, OPTIONS["horizon"], unset=f"the task's; of a file {HORIZON}")
+    add_option(command, OPTIONS["model"])
+    add_option(command, OPTIONS["states"], STATES)
     command.add_argument("--stock", action="store_true", help="check the derivative of mjx.step itself, too")
     command.add_argument("--verbose", action="store_true", help="every entry of every finding")
     add_process_options(command)

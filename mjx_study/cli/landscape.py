@@ -9,11 +9,11 @@ import numpy as np
 from mjx_study.cli.options import (
     Commands,
     add_command,
-    add_noise_option,
+    add_contact_options,
+    add_options,
     add_task_options,
     computing,
     configure_process,
-    numbers,
     print_report,
     task_of,
     usage_errors,
@@ -44,15 +44,10 @@ def add(commands: Commands) -> None:
     """Register the command."""
     summary = "draw a decision's cost, its smoothed cost and the slope that each estimator sees"
     command = add_command(commands, "landscape", summary, run, EPILOG)
-    add_task_options(command, stiffness="the middle one of the task's sweep")
+    add_task_options(command, LandscapeConfig)
+    add_contact_options(command, LandscapeConfig, "the middle one of the task's sweep")
     add_theta_option(command, "parameters that the line goes through")
-    add_noise_option(command)
-    command.add_argument("--samples", type=int, metavar="N", help="samples at each point (default: 100)")
-    command.add_argument("--points", type=int, metavar="N", help="points on the line (default: 41)")
-    command.add_argument("--span", type=numbers, metavar="LO,HI", help="range of the line (default: the task's)")
-    command.add_argument(
-        "--direction", metavar="DIR", help="random, or a parameter's index, where there are several (default: random)"
-    )
+    add_options(command, LandscapeConfig, "noise", "samples", "points", "span", "direction")
     command.add_argument("--no-reference", action="store_true", help="leave out the analytic reference")
     command.add_argument("--output", type=Path, metavar="DIR", help="write the figure and the numbers to this folder")
 

@@ -11,17 +11,17 @@ import numpy as np
 from mjx_study.cli.options import (
     Commands,
     add_command,
+    add_contact_options,
     add_estimator_options,
+    add_options,
     add_task_options,
     computing,
     configure_process,
-    names,
     print_report,
     usage_errors,
 )
 from mjx_study.cli.parameters import add_theta_option, theta_of
 from mjx_study.console import number
-from mjx_study.contact import FAMILIES
 from mjx_study.optimise import OptimiseConfig, OptimiseResult, Run, kept_runs, optimise, plan_optimise
 from mjx_study.plots import STYLE, plot_optimisation, save_figure
 from mjx_study.results import as_plain, prepare_folder, write_whole
@@ -60,33 +60,14 @@ FIELDS = (
 def add(commands: Commands) -> None:
     """Register the command."""
     command = add_command(commands, "optimise", "optimise a policy with any estimator", run, EPILOG)
-    add_task_options(command, contact=False)
+    add_task_options(command, OptimiseConfig)
     add_theta_option(command, "parameters to start from")
-    command.add_argument("--contact", metavar="FAMILY", help=f"one of: {', '.join(FAMILIES)} (default: the task's)")
-    command.add_argument("--stiffness", type=float, metavar="K", help="contact stiffness in N/m (default: the task's)")
-    command.add_argument("--damping", type=float, metavar="B", help="contact damping in N s/m")
+    add_contact_options(command, OptimiseConfig, "the middle one of the task's sweep")
     command.add_argument("--reference", action="store_true", help="on the analytic reference in place of MJX")
-    command.add_argument(
-        "--network", type=_widths, metavar="N[,N]", help="a tanh network of these hidden widths as policy, started at 0"
-    )
-    command.add_argument(
-        "--estimator",
-        dest="estimators",
-        type=names,
-        metavar="NAME[,NAME]",
-        help="default: zobg,fobg,aobg; `mjx-study estimators` lists them",
-    )
-    command.add_argument("--iterations", type=int, metavar="N", help="default: the task's")
-    command.add_argument("--samples", type=int, metavar="N", help="in each batch (default: the task's)")
-    command.add_argument("--seeds", type=int, metavar="N", help="runs of each estimator (default: 3)")
-    command.add_argument("--optimizer", metavar="NAME", help="of optax (default: sgd)")
-    command.add_argument("--learning-rate", type=float, metavar="R", help="default: the task's")
-    command.add_argument("--decay", type=float, metavar="A", help="learning rate / i^A (default: the task's)")
-    add_estimator_options(command)
-    command.add_argument(
-        "--evaluation-samples", type=int, metavar="N", help="rollouts behind a final cost (default: 200)"
-    )
-    command.add_argument("--chunk-size", type=int, metavar="N", help="samples per device and call")
+    add_options(command, OptimiseConfig, "network", "estimators", estimators={"flag": "--estimator"})
+    add_options(command, OptimiseConfig, "iterations", "samples", "seeds", "optimizer", "learning_rate", "decay")
+    add_estimator_options(command, OptimiseConfig)
+    add_options(command, OptimiseConfig, "evaluation_samples", "chunk_size")
     command.add_argument("--output", type=Path, metavar="DIR", help="write figure, numbers, policies and checkpoints")
 
 
@@ -211,10 +192,3 @@ def _mean_and_spread(values: np.ndarray, digits: int) -> str:
         return "nan"
     spread = f" ± {number(float(np.std(values, ddof=1)), 2)}" if len(values) > 1 else ""
     return number(float(np.mean(values)), digits) + spread
-
-
-def _widths(text: str) -> tuple[int, ...]:
-    try:
-        return tuple(int(part) for part in text.split(","))
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a list of widths such as 16,16") from None

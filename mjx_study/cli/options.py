@@ -1,6 +1,7 @@
 """What the commands share: options, their checks, one line for what is wrong, and a clean end when interrupted."""
 
 import argparse
+import dataclasses
 import json
 import os
 import signal
@@ -10,13 +11,11 @@ from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
 from typing import Any, NoReturn
 
-from estimators import BASELINES, NOISES
-from mjx_study.configuration import Progress
+from mjx_study.configuration import EstimatorConfig, Progress
 from mjx_study.console import progress_bar, show_cursor
-from mjx_study.contact import FAMILIES
 from mjx_study.limitations import FLAGS
+from mjx_study.option import OPTIONS, Checked, Option
 from mjx_study.runtime import PRECISIONS, configure
-from mjx_study.scene import CONES, INTEGRATORS, SOLVERS
 from mjx_study.task import Task
 from mjx_study.tasks import make_task, task_names
 
@@ -54,42 +53,74 @@ def add_command(
     return command
 
 
-def add_task_options(
+def add_option(
     command: argparse.ArgumentParser,
+    option: Option,
+    default: Any = None,
     *,
-    contact: bool = True,
-    stiffness: str = "the task's sweep",
-    files: str = "",
+    given: bool = True,
+    read: Callable[[str], Any] | None = None,
+    **changes: Any,
+) -> None:
+    """An option of a command.
+
+    Args:
+        command: that gets it.
+        option: its description.
+        default: where it is not given.
+        given: whether the command's namespace holds that default; otherwise None, and a configuration has it.
+        read: of text, in place of the option's own `parse`.
+        **changes: of the description.
+    """
+    option = dataclasses.replace(option, **changes)
+
+    def parse(text: str) -> Any:
+        try:
+            return (read or option.parse)(text)
+        except ValueError as error:
+            raise argparse.ArgumentTypeError(str(error)) from None
+
+    command.add_argument(
+        option.flag or f"--{option.name.replace('_', '-')}",
+        dest=option.name,
+        type=parse,
+        default=default if given else None,
+        metavar=f"{option.metavar}[,{option.metavar}]" if option.many and "," not in option.metavar else option.metavar,
+        help=option.describe(default).replace("%", "%%"),
+    )
+
+
+def add_options(command: argparse.ArgumentParser, owner: type[Checked], *names: str, **changes: dict[str, Any]) -> None:
+    """Options of a configuration, by name, with changes of their descriptions."""
+    for name in names:
+        add_option(command, owner.option(name), owner.default(name), given=False, **changes.get(name, {}))
+
+
+def add_task_options(
+    command: argparse.ArgumentParser, owner: type[Checked] = EstimatorConfig, *, files: str = ""
 ) -> None:
     """The task, what may replace its own settings, and how it is computed."""
     metavar = "TASK|FILE.xml" if files else "TASK"
     command.add_argument(
         "task", metavar=metavar, help=f"one of: {', '.join(task_names())}; or module:name of your own{files}"
     )
-    if contact:
-        add_contact_options(command, stiffness)
-    command.add_argument("--sigma", type=float, metavar="S", help="noise, in the unit of what it is added to")
-    command.add_argument("--cone", choices=list(CONES), help="friction cone (default: the MJCF's)")
-    command.add_argument("--horizon", type=int, metavar="H", help="steps (default: the task's)")
-    command.add_argument("--model", metavar="FILE.xml", help="an MJCF in place of the task's own")
+    add_options(command, owner, "sigma")
+    for name in ("cone", "horizon", "model"):
+        add_options(command, EstimatorConfig, name)
     add_process_options(command)
 
 
-def add_contact_options(command: argparse.ArgumentParser, stiffness: str = "the task's sweep") -> None:
+def add_contact_options(
+    command: argparse.ArgumentParser, owner: type[Checked], stiffness: str = "the task's sweep"
+) -> None:
     """The contact models."""
-    command.add_argument(
-        "--stiffness", type=numbers, metavar="K[,K]", help=f"contact stiffnesses in N/m (default: {stiffness})"
-    )
-    command.add_argument("--contact", type=names, metavar="FAMILY[,FAMILY]", help=f"of: {', '.join(FAMILIES)}")
-    command.add_argument(
-        "--damping", type=float, metavar="B", help="contact damping in N s/m, in place of the family's"
-    )
+    add_options(command, owner, "stiffness", "contact", "damping", stiffness={"unset": stiffness})
 
 
 def add_scene_options(command: argparse.ArgumentParser) -> None:
     """What replaces an MJCF's own <option>: what MJX lacks can be changed without editing the file."""
-    command.add_argument("--integrator", choices=list(INTEGRATORS), help="default: the MJCF's")
-    command.add_argument("--solver", choices=list(SOLVERS), help="of the constraints (default: the MJCF's)")
+    for name in ("integrator", "solver"):
+        add_option(command, OPTIONS[name])
     command.add_argument(
         "--disable-flag",
         metavar="FLAG[,FLAG]",
@@ -104,44 +135,19 @@ def scene_options(options: argparse.Namespace, *names: str) -> dict[str, Any]:
     return {name: value for name, value in given.items() if value is not None}
 
 
-def add_estimator_options(command: argparse.ArgumentParser) -> None:
+def add_estimator_options(command: argparse.ArgumentParser, owner: type[Checked]) -> None:
     """The noise, and what estimators let one choose; see `estimators.EstimatorOptions`."""
-    add_noise_option(command)
-    command.add_argument("--baseline", choices=list(BASELINES), help="of zeroth-order samples (default: zero_noise)")
-    command.add_argument(
-        "--gamma", type=float, metavar="G", help="AoBG's accuracy bound; inf for none (default: the task's)"
-    )
-    command.add_argument(
-        "--failure-probability", type=float, metavar="P", help="that epsilon's interval misses (default: 0.05)"
-    )
-    command.add_argument(
-        "--variance-proxy",
-        metavar="S2",
-        help="variance, second_moment or upper_bound, in epsilon (default: variance)",
-    )
-    command.add_argument(
-        "--radius",
-        type=number_or_name,
-        metavar="R",
-        help="max_deviation or a number, in epsilon (default: max_deviation)",
-    )
-    command.add_argument("--max-norm", type=float, metavar="G", help="of a sample of fobg_clipped")
-    command.add_argument("--window", type=int, metavar="H", help="steps between cuts of fobg_truncated")
-    command.add_argument("--tolerance", type=float, metavar="C", help="of ddcg's test (default: 0.3)")
+    add_options(
+        command, owner, "noise", "baseline", "gamma", "failure_probability", "variance_proxy", "radius", "max_norm",
+        "window", "tolerance",
+    )  # fmt: skip
 
 
-def add_noise_option(command: argparse.ArgumentParser) -> None:
-    """The density of the noise."""
-    command.add_argument("--noise", choices=list(NOISES), help="density of the noise (default: the task's)")
-
-
-def add_process_options(command: argparse.ArgumentParser) -> None:
-    """Randomness, precision, devices."""
-    command.add_argument("--seed", type=int, default=0, metavar="N", help="of all randomness (default: 0)")
+def add_process_options(command: argparse.ArgumentParser, seed: int | None = 0) -> None:
+    """Seed, precision, devices; the seed is None where a configuration has its default."""
+    add_option(command, OPTIONS["seed"], 0, given=seed is not None)
     command.add_argument("--precision", choices=PRECISIONS, default="float64", help="default: float64")
-    command.add_argument(
-        "--devices", type=int, metavar="N", help="CPU devices (default: one per core; with JAX 0.11 one)"
-    )
+    add_option(command, OPTIONS["devices"])
 
 
 def configure_process(options: argparse.Namespace) -> None:
@@ -196,24 +202,3 @@ def print_report(options: argparse.Namespace, document: dict[str, Any], lines: S
         print(json.dumps(document, allow_nan=False))
     else:
         print("\n".join(lines))
-
-
-def numbers(text: str) -> tuple[float, ...]:
-    """A list of numbers such as 10,100,1000."""
-    try:
-        return tuple(float(part) for part in text.split(",") if part.strip())
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a list of numbers such as 10,100,1000") from None
-
-
-def number_or_name(text: str) -> float | str:
-    """A number where it is one."""
-    try:
-        return float(text)
-    except ValueError:
-        return text
-
-
-def names(text: str) -> tuple[str, ...]:
-    """A list of names such as zobg,fobg."""
-    return tuple(part.strip() for part in text.split(",") if part.strip())

@@ -2,8 +2,6 @@
 
 import argparse
 import dataclasses
-import json
-import math
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,6 +16,8 @@ from mjx_study.cli.options import (
     Commands,
     UsageError,
     add_command,
+    add_contact_options,
+    add_option,
     add_scene_options,
     add_task_options,
     computing,
@@ -30,8 +30,10 @@ from mjx_study.cli.options import (
 from mjx_study.cli.parameters import add_theta_option, theta_of
 from mjx_study.configuration import Cell, at_theta, plan_cells
 from mjx_study.console import number
-from mjx_study.contact import FAMILIES
+from mjx_study.files import PolicyFile, read_json
 from mjx_study.network import with_network
+from mjx_study.optimise import OptimiseConfig
+from mjx_study.option import OPTIONS
 from mjx_study.plots import save_figure
 from mjx_study.render import (
     FORMATS,
@@ -105,19 +107,17 @@ class Rollout:
 def add(commands: Commands) -> None:
     """Register the command."""
     command = add_command(commands, "rollout", "show a rollout: pictures, a film and its numbers", run, EPILOG)
-    add_task_options(command, contact=False, files="; or any MJCF")
+    add_task_options(command, files="; or any MJCF")
     add_scene_options(command)
-    command.add_argument("--contact", metavar="FAMILY", help=f"one of: {', '.join(FAMILIES)} (default: the task's)")
-    command.add_argument("--stiffness", type=float, metavar="K", help="contact stiffness in N/m (default: the task's)")
-    command.add_argument("--damping", type=float, metavar="B", help="contact damping in N s/m")
+    add_contact_options(command, OptimiseConfig, "the middle one of the task's sweep")
     command.add_argument("--noise", action="store_true", help="with the noise of sample --seed (default: none)")
     add_theta_option(command, "parameters")
     command.add_argument("--policy", type=Path, metavar="FILE", help="a policy that optimise wrote, policy-NAME.json")
-    command.add_argument("--frames", type=int, default=6, metavar="N", help="pictures in the strip (default: 6)")
+    add_option(command, OPTIONS["frames"], 6)
     command.add_argument("--view", choices=["auto", *VIEWS], default="auto", help="default: where most happens")
     command.add_argument("--renderer", choices=RENDERERS, default="auto", help="default: auto, opengl where it works")
     command.add_argument("--format", choices=FORMATS, default="gif", help="of the film (default: gif)")
-    command.add_argument("--slow", type=float, default=1.0, metavar="FACTOR", help="slow motion (default: 1)")
+    add_option(command, OPTIONS["slow"], 1.0)
     command.add_argument("--output", type=Path, metavar="DIR", help="default: results/TASK-rollout")
 
 
@@ -126,11 +126,6 @@ def run(options: argparse.Namespace) -> int:
     with usage_errors():
         configure_process(options)
         check_format(options.format)
-        for name, least in (("frames", 1), ("seed", 0)):
-            if getattr(options, name) < least:
-                raise ValueError(f"{name} must be at least {least}, got {getattr(options, name)}")
-        if not (options.slow > 0 and math.isfinite(options.slow)):
-            raise ValueError(f"slow must be a positive number, got {options.slow}")
         if options.sigma is not None and not options.noise:
             raise ValueError("--sigma has an effect only with --noise")
         simulate, messages = _plan(options)
@@ -156,45 +151,37 @@ def _plan(options: argparse.Namespace):
     given = [f"--{name}" for name in unfit if getattr(options, name) not in (None, False)]
     if given:
         raise ValueError(f"{', '.join(given)}: only for a task; {options.task} moves as its MJCF says")
-    if options.horizon is not None and options.horizon < 1:
-        raise ValueError(f"horizon must be at least 1 step, got {options.horizon}")
     model = load_model(options.task, **scene_options(options, "cone"))
     steps = options.horizon or max(1, round(PASSIVE_SECONDS / model.opt.timestep))
     return partial(_simulate_passive, model, Path(options.task).stem, steps), ()
 
 
 def _plan_task(options: argparse.Namespace):
-    policy = {} if options.policy is None else _load_policy(options)
-    for name in ("contact", "stiffness", "damping", "cone", "horizon", "model"):
-        if getattr(options, name) is None and policy.get(name):
-            setattr(options, name, policy[name])
+    policy = None if options.policy is None else _load_policy(options)
+    if policy is not None:
+        for name in ("contact", "stiffness", "damping", "cone", "horizon", "model"):
+            if getattr(options, name) is None:
+                setattr(options, name, getattr(policy, name) or None)
     task = task_of(options)
-    if policy.get("network") is not None:
-        task = with_network(task, tuple(policy["network"]), jax.random.key(0))  # whose weights theta replaces
+    if policy is not None and policy.network is not None:
+        task = with_network(task, tuple(policy.network), jax.random.key(0))  # whose weights theta replaces
     stiffness = task.middle_stiffness if options.stiffness is None else options.stiffness
     cells, messages = plan_cells(task, (options.contact or task.main_family,), (stiffness,), options.damping)
-    task = at_theta(task, policy["theta"] if policy else theta_of(options))
+    task = at_theta(task, theta_of(options) if policy is None else policy.theta)
     return partial(_simulate_task, task, cells[0], options.seed, options.noise), messages
 
 
-def _load_policy(options: argparse.Namespace) -> dict[str, Any]:
+def _load_policy(options: argparse.Namespace) -> PolicyFile:
     """A policy that optimise wrote.
 
     Raises:
         ValueError: the file cannot be read, is no policy, or is one of another task; or theta is given too.
     """
-    path = options.policy
     if options.theta is not None:
         raise ValueError("--policy and --theta both say what theta is; give one of them")
-    try:
-        policy = json.loads(path.read_text())
-        task, policy["theta"] = policy["task"], tuple(map(float, policy["theta"]))
-    except OSError as error:
-        raise ValueError(f"cannot read {path}: {error.strerror or error}") from error
-    except (ValueError, TypeError, KeyError) as error:
-        raise ValueError(f"{path} is not a policy that optimise wrote") from error
-    if task != options.task:
-        raise ValueError(f"{path} is a policy of {task}, not of {options.task}")
+    policy = read_json(options.policy, PolicyFile)
+    if policy.task != options.task:
+        raise ValueError(f"{options.policy} is a policy of {policy.task}, not of {options.task}")
     return policy
 
 

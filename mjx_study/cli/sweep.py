@@ -2,26 +2,28 @@
 
 import argparse
 import dataclasses
-import math
-import tomllib
-from collections.abc import Iterable
+import itertools
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any, get_args, get_type_hints
+from typing import Annotated, Any
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, create_model
 
 from mjx_study.cli.options import (
     Commands,
     UsageError,
     add_command,
     add_estimator_options,
+    add_option,
+    add_options,
     add_process_options,
     computing,
     configure_process,
-    names,
     print_report,
     usage_errors,
 )
-from mjx_study.contact import FAMILIES
-from mjx_study.scene import CONES
+from mjx_study.files import read_toml
+from mjx_study.option import MOST_VALUES, OPTIONS, Interval, Option
 from mjx_study.store import StudyError
 from mjx_study.sweep import SweepConfig, SweepPlan, SweepResult, open_store, plan_sweep, run_sweep
 from mjx_study.table import digits_to_tell_apart
@@ -55,45 +57,28 @@ A TOML file holds the same options by the names of their flags, with _ for -:
   seeds = 10
 """
 RESUMABLE = "mjx-study: interrupted; the same command goes on where it stopped"
-LISTS = {"tasks": str, "estimators": str, "contact": str, "cone": str, "stiffness": float, "timestep": float,
-         "sigma": float, "samples": int, "span": float}  # fmt: skip
+NUMBERS = Option("numbers", float, "X", "", Interval("(-inf, inf)"), many=True)
+TASKS = Option("tasks", str, "TASK", "", many=True)
 
 
 def add(commands: Commands) -> None:
     """Register the command."""
     command = add_command(commands, "sweep", "sweep contact models, noise and samples; resumable", run, EPILOG)
-    command.add_argument(
-        "tasks", nargs="?", type=names, metavar="TASK[,TASK]", help=f"of: {', '.join(task_names())}, or module:name"
-    )
+    choices = f"of: {', '.join(task_names())}, or module:name"
+    command.add_argument("tasks", nargs="?", type=TASKS.parse, metavar="TASK[,TASK]", help=choices)
     command.add_argument("--config", type=Path, metavar="FILE.toml", help="options from a file; flags go before it")
-    command.add_argument("--contact", type=names, metavar="FAMILY[,FAMILY]", help=f"of: {', '.join(FAMILIES)}")
-    command.add_argument("--stiffness", metavar="K", help="contact stiffnesses in N/m (default: the task's)")
-    command.add_argument("--damping", type=float, metavar="B", help="contact damping in N s/m")
-    command.add_argument("--solref", metavar="A;B", help="contact models in MuJoCo's terms, every A with every B")
-    command.add_argument("--solimp", metavar="D0,D1,W,M,P", help="with them; several separated by ;")
-    command.add_argument("--timestep", metavar="H", help="in s (default: the MJCF's)")
-    command.add_argument("--cone", type=names, metavar="CONE[,CONE]", help=f"of: {', '.join(CONES)}")
-    command.add_argument("--sigma", metavar="S", help="noise, in the unit of what it is added to")
-    command.add_argument("--samples", metavar="N", help="in each batch (default: 100)")
-    command.add_argument(
-        "--seeds", type=int, metavar="N", help="batches, or descents, of each (default: 10; 1 of landscapes)"
-    )
-    command.add_argument("--estimators", type=names, metavar="NAME[,NAME]", help="default: zobg,fobg,aobg")
-    command.add_argument("--iterations", type=int, metavar="N", help="optimise policies, N steps each")
-    command.add_argument("--points", type=int, metavar="N", help="landscapes, on N points of a line through theta")
-    command.add_argument("--span", metavar="LO,HI", help="of that line (default: each task's)")
-    command.add_argument("--direction", metavar="DIR", help="of it: random, or a parameter's index (default: random)")
-    command.add_argument("--optimizer", metavar="NAME", help="of optax (default: sgd)")
-    command.add_argument("--learning-rate", type=float, metavar="R", help="default: the task's")
-    command.add_argument("--decay", type=float, metavar="A", help="learning rate / i^A (default: the task's)")
-    command.add_argument("--reference-samples", type=int, metavar="N", help="pairs behind a reference (default: 600)")
-    command.add_argument("--evaluation-samples", type=int, metavar="N", help="behind a final cost (default: 200)")
-    add_estimator_options(command)
-    command.add_argument("--horizon", type=int, metavar="H", help="steps (default: the task's)")
-    command.add_argument("--model", metavar="FILE.xml", help="an MJCF in place of the task's own")
-    command.add_argument("--chunk-size", type=int, metavar="N", help="samples per device and call")
-    add_process_options(command)
-    command.set_defaults(seed=None)  # so that a file may say it
+    add_options(command, SweepConfig, "contact", "stiffness", "damping")
+    add_option(command, OPTIONS["solref"], read=_solref)
+    add_option(command, OPTIONS["solimp"], read=_solimp)
+    add_options(command, SweepConfig, "timestep", "cone", "sigma", "samples")
+    add_options(command, SweepConfig, "seeds", "estimators", seeds={"unset": "10; 1 of landscapes"})
+    add_options(command, SweepConfig, "iterations", iterations={"line": "optimise policies, N steps each", "unset": ""})
+    add_options(command, SweepConfig, "points", points={"line": "landscapes, on N points of a line through theta"})
+    add_options(command, SweepConfig, "span", "direction", "optimizer", "learning_rate", "decay")
+    add_options(command, SweepConfig, "reference_samples", "evaluation_samples")
+    add_estimator_options(command, SweepConfig)
+    add_options(command, SweepConfig, "horizon", "model", "chunk_size")
+    add_process_options(command, seed=None)
     command.add_argument("--output", type=Path, required=True, metavar="DIR", help="folder of the study")
 
 
@@ -122,10 +107,9 @@ def run(options: argparse.Namespace) -> int:
 
 def _fields(options: argparse.Namespace) -> dict[str, Any]:
     """The configuration's fields: flags first, then the file's."""
-    fields = {field.name for field in dataclasses.fields(SweepConfig)}
-    given = {name: getattr(options, name) for name in fields if getattr(options, name, None) is not None}
-    kept = {} if options.config is None else _from_file(options.config, fields)
-    merged = {name: _value(name, value) for name, value in (kept | given).items()}
+    given = {field.name: getattr(options, field.name, None) for field in dataclasses.fields(SweepConfig)}
+    kept = {} if options.config is None else read_toml(options.config, _schema())
+    merged = kept | {name: value for name, value in given.items() if value is not None}
     if "tasks" not in merged:
         raise ValueError("no task: name one, or give --config")
     if merged.get("solref") or merged.get("solimp"):
@@ -133,100 +117,45 @@ def _fields(options: argparse.Namespace) -> dict[str, Any]:
     return merged
 
 
-def _from_file(path: Path, fields: set[str]) -> dict[str, Any]:
-    try:
-        found = tomllib.loads(path.read_text())
-    except OSError as error:
-        raise ValueError(f"cannot read {path}: {error.strerror or error}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path} is not TOML: {error}") from error
-    unknown = sorted(set(found) - fields)
-    if unknown:
-        raise ValueError(f"{path}: unknown option {', '.join(unknown)}; there are {', '.join(sorted(fields))}")
-    if isinstance(found.get("direction"), int):
-        found["direction"] = str(found["direction"])
-    for name, value in found.items():
-        _check_kind(path, name, value)
-    return found
+def _schema() -> type[BaseModel]:
+    """Of a TOML file: the configuration's fields as their options read them."""
+    own = {"tasks": TASKS.read, "direction": _direction, "solref": _solref, "solimp": _solimp}
+
+    def reader(name: str) -> Callable[[Any], Any]:
+        return own[name] if name in own else SweepConfig.option(name).read
+
+    fields = {
+        field.name: (Annotated[Any, BeforeValidator(reader(field.name))], None)
+        for field in dataclasses.fields(SweepConfig)
+    }
+    return create_model("Sweep", __config__=ConfigDict(extra="forbid"), **fields)  # type: ignore[call-overload]
 
 
-def _check_kind(path: Path, name: str, value: Any) -> None:
-    """Raises ValueError for a single value of a file that is of another kind than its option's."""
-    if name in LISTS or name in ("solref", "solimp"):
-        return
-    kinds = get_type_hints(SweepConfig)[name]
-    accepted = tuple(kind for kind in (*get_args(kinds), kinds) if kind in (int, float, str))
-    number = (int,) if float in accepted else ()
-    if isinstance(value, bool) or not isinstance(value, accepted + number):
-        told = "a whole number" if accepted == (int,) else "text" if accepted == (str,) else "a number"
-        raise ValueError(f"{path}: {name} must be {told}, got {value!r}")
+def _direction(value: Any) -> str:
+    return OPTIONS["direction"].read(str(value) if isinstance(value, int) and not isinstance(value, bool) else value)
 
 
-def _value(name: str, value: Any) -> Any:
-    """A field from what a flag or a file gave."""
-    try:
-        if name in ("solref", "solimp"):
-            return _solver_values(name, value)
-        if name in LISTS:
-            return _many(value, LISTS[name])
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{name}: {error}") from error
-    return value
-
-
-def _many(value: Any, kind: type) -> tuple[Any, ...]:
-    """A tuple from text, a number or a list; text may be a range."""
-    if isinstance(value, str) and kind is not str:
-        return tuple(_whole(each) if kind is int else each for part in value.split(",") for each in _range(part))
-    if isinstance(value, str | int | float):
-        value = [value]
-    for each in value:
-        if isinstance(each, bool) or not isinstance(each, (int, float) if kind is float else kind):
-            raise ValueError(f"{each!r} is no {'name' if kind is str else 'number'}")
-    return tuple(kind(each) for each in value)
-
-
-def _whole(value: float) -> int:
-    if value != round(value):
-        raise ValueError(f"{value:g} is not a whole number")
-    return round(value)
-
-
-def _range(text: str) -> list[float]:
-    """10, or 10:1000:3:log."""
-    parts = text.strip().split(":")
-    try:
-        if len(parts) == 1:
-            return [float(text)]
-        log = parts[3:] == ["log"]
-        if len(parts) not in (3, 4) or (len(parts) == 4 and not log):
-            raise ValueError
-        start, stop, count = float(parts[0]), float(parts[1]), int(parts[2])
-        if count < 2 or (log and start * stop <= 0):
-            raise ValueError
-    except ValueError:
-        raise ValueError(
-            f"{text!r} is neither a number nor a range FROM:TO:COUNT or FROM:TO:COUNT:log, COUNT at least 2"
-        ) from None
-    shares = [index / (count - 1) for index in range(count)]
-    if log:
-        ratio, sign = math.log(stop / start), math.copysign(1.0, start)
-        inner = [sign * float(f"{abs(start) * math.exp(share * ratio):.12g}") for share in shares]
-    else:
-        inner = [float(f"{start + share * (stop - start):.12g}") for share in shares]
-    return [start, *inner[1:-1], stop]
-
-
-def _solver_values(name: str, value: Any) -> tuple[tuple[float, ...], ...]:
-    """solref: the first numbers with every second one; solimp: as they are."""
+def _solref(value: Any) -> tuple[tuple[float, ...], ...]:
+    """Rows of numbers; of text, the first column's numbers with every one of the second."""
     if not isinstance(value, str):
-        return tuple(tuple(map(float, each)) for each in value)
-    if name == "solimp":
-        return tuple(tuple(float(number) for number in part.split(",")) for part in value.split(";"))
-    columns = [[each for part in column.split(",") for each in _range(part)] for column in value.split(";")]
+        return _rows(value)
+    columns = [NUMBERS.parse(column) for column in value.split(";")]
     if len(columns) != 2:
-        raise ValueError("two columns separated by ;, such as -1000,-10000;-5")
-    return tuple((first, second) for first in columns[0] for second in columns[1])
+        raise ValueError("must be two columns separated by ;, such as -1000,-10000;-5")
+    if len(columns[0]) * len(columns[1]) > MOST_VALUES:
+        raise ValueError(f"must be at most {MOST_VALUES} contact models, got {len(columns[0]) * len(columns[1])}")
+    return tuple(itertools.product(*columns))
+
+
+def _solimp(value: Any) -> tuple[tuple[float, ...], ...]:
+    """Rows of numbers; of text, separated by ;."""
+    return tuple(NUMBERS.parse(part) for part in value.split(";")) if isinstance(value, str) else _rows(value)
+
+
+def _rows(value: Any) -> tuple[tuple[float, ...], ...]:
+    if not isinstance(value, list):
+        raise ValueError(f"must be a list of lists of numbers, got {value!r:.60}")
+    return tuple(NUMBERS.read(row) for row in value)
 
 
 def _head(plan: SweepPlan, missing: int) -> list[str]:

@@ -1,0 +1,121 @@
+"""Files from outside, checked against a schema; an error names the file and the key in one line."""
+
+import stat
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, Final, TypeVar
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+
+MOST_BYTES: Final = 100_000_000
+"""Of a file that is read whole."""
+Schema = TypeVar("Schema", bound=BaseModel)
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+
+
+def read_bytes(path: Path) -> bytes:
+    """What a file holds.
+
+    Raises:
+        ValueError: it cannot be read, is no regular file, or is larger than `MOST_BYTES`.
+    """
+    try:
+        status = path.stat()
+        if not stat.S_ISREG(status.st_mode):
+            raise ValueError(f"{path} is not a regular file")
+        if status.st_size > MOST_BYTES:
+            raise ValueError(f"{path} has {status.st_size} bytes; the limit is {MOST_BYTES}")
+        return path.read_bytes()
+    except OSError as error:
+        raise ValueError(f"cannot read {path}: {error.strerror or error}") from error
+    except ValueError as error:  # a null character in the name, too
+        raise ValueError(f"cannot read {str(path)!r}: {error}" if "null" in str(error) else str(error)) from error
+
+
+def read_json(path: Path, schema: type[Schema]) -> Schema:
+    """A JSON file.
+
+    Raises:
+        ValueError: as `read_bytes`, or it does not satisfy the schema.
+    """
+    return _validated(path, read_bytes(path), TypeAdapter(schema))
+
+
+def _validated(path: Path, content: bytes, schema: TypeAdapter[Any]) -> Any:
+    try:
+        return schema.validate_json(content)
+    except ValidationError as error:
+        raise ValueError(f"{path}: {told(error)}") from None
+
+
+def read_toml(path: Path, schema: type[BaseModel]) -> dict[str, Any]:
+    """What a TOML file sets.
+
+    Raises:
+        ValueError: as `read_bytes`, or it is not TOML, or does not satisfy the schema.
+    """
+    content = read_bytes(path)
+    try:
+        found = schema.model_validate(tomllib.loads(content.decode()))
+    except ValidationError as error:
+        raise ValueError(f"{path}: {told(error)}") from None
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{path} is not TOML: {error}") from error
+    return {name: getattr(found, name) for name in found.model_fields_set}
+
+
+def told(error: ValidationError) -> str:
+    """The first thing that does not satisfy a schema, with its key, and how many more there are."""
+    found = error.errors(include_url=False, include_input=False)
+    first = found[0]
+    key = ".".join(map(str, first["loc"]))
+    reason = str(first.get("ctx", {}).get("error") or first["msg"])
+    if first["type"] == "extra_forbidden":
+        reason = "there is no such option"
+    more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
+    return f"{key}{': ' * bool(key)}{' '.join(reason.split())}{more}"
+
+
+class PolicyFile(BaseModel):
+    """A policy that optimise wrote: its parameters, and what they are for."""
+
+    model_config = ConfigDict(strict=True)
+
+    task: str
+    theta: list[Finite] = Field(min_length=1)
+    contact: str | None = None
+    stiffness: Finite | None = None
+    damping: Finite | None = None
+    cone: str | None = None
+    model: str | None = None
+    horizon: int | None = Field(None, ge=1)
+    network: list[Annotated[int, Field(ge=1)]] | None = None
+
+
+def read_theta(path: Path) -> tuple[tuple[float, ...], str | None]:
+    """Parameters from a policy, a .json list of numbers or a .npy array, and the task that a policy is of.
+
+    Raises:
+        ValueError: the file cannot be read, or is none of these.
+    """
+    if path.suffix != ".json":
+        return _read_array(path), None
+    content = read_bytes(path)
+    if content.lstrip().startswith(b"{"):
+        policy = _validated(path, content, TypeAdapter(PolicyFile))
+        return tuple(policy.theta), policy.task
+    return tuple(_validated(path, content, TypeAdapter(list[Finite]))), None
+
+
+def _read_array(path: Path) -> tuple[float, ...]:
+    magic = read_bytes(path)[:6]
+    try:
+        if magic != np.lib.format.MAGIC_PREFIX:
+            raise ValueError("not a .npy file")
+        array = np.load(path, mmap_mode="r", allow_pickle=False)  # nothing is allocated for an impossible shape
+        if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu" or not np.all(np.isfinite(array)):
+            raise ValueError("not an array of finite numbers")
+        return tuple(np.asarray(array, float).reshape(-1).tolist())
+    except Exception as error:  # numpy raises what it likes
+        raise ValueError(f"{path} is not a .npy array of finite numbers") from error

@@ -1,0 +1,321 @@
+"""What can be chosen, each option described once: name, type, range, unit, and a line about it.
+
+The command line, TOML files and the configurations of Python are checked against these descriptions. A configuration
+gives the default of each of its fields, and may narrow a range.
+"""
+
+import dataclasses
+import math
+from collections.abc import Iterable
+from numbers import Integral, Real
+from typing import Any, ClassVar, Final, get_type_hints
+
+from estimators import BASELINES, ESTIMATORS, NOISES
+from estimators.confidence import VARIANCE_PROXIES
+from mjx_study.contact import FAMILIES
+from mjx_study.scene import CONES, INTEGRATORS, SOLVERS
+
+MOST_VALUES: Final = 10_000
+"""Values of one list or range."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Interval:
+    """Numbers from low to high, as "(0, 1]" says it; an infinite end is in it only where its bracket is square."""
+
+    text: str
+
+    @property
+    def low(self) -> float:
+        """The lower end."""
+        return float(self.text[1:-1].split(",")[0])
+
+    @property
+    def high(self) -> float:
+        """The upper end."""
+        return float(self.text[1:-1].split(",")[1])
+
+    def __contains__(self, value: Any) -> bool:
+        above = value >= self.low if self.text[0] == "[" else value > self.low
+        return above and (value <= self.high if self.text[-1] == "]" else value < self.high)
+
+    def __str__(self) -> str:
+        bracket, low, high = self.text[0], _plain(self.low), _plain(self.high)
+        lower = f"at least {low}" if bracket == "[" else "positive" if self.low == 0 else f"greater than {low}"
+        upper = "finite" if self.high == math.inf else f"less than {high}"
+        upper = upper if self.text[-1] == ")" else f"at most {high}"
+        parts = [lower] * (self.low > -math.inf) + [upper] * (self.high < math.inf or self.text[-1] == ")")
+        return " and ".join(parts)
+
+
+@dataclasses.dataclass(frozen=True)
+class Option:
+    """One thing that can be chosen.
+
+    Attributes:
+        name: of the field of a configuration.
+        kind: int, float or str.
+        metavar: what stands for a value in the help.
+        line: about it, for the help.
+        interval: where its numbers lie.
+        unit: of its numbers.
+        choices: names that it takes; in place of a number where it has an interval as well.
+        label: of a value in messages, where that is not the name.
+        many: whether it is a list; what has it says so.
+        unset: what stands for it where it is not given.
+        flag: on the command line, where that is not the name.
+    """
+
+    name: str
+    kind: type
+    metavar: str
+    line: str
+    interval: Interval | None = None
+    unit: str = ""
+    choices: tuple[str, ...] = ()
+    label: str = ""
+    many: bool = False
+    unset: str = ""
+    flag: str = ""
+
+    def within(self, interval: str) -> "Option":
+        """The same with another range."""
+        return dataclasses.replace(self, interval=Interval(interval))
+
+    def check(self, value: Any) -> Any:
+        """The value as it came; of a list, every one of its values is checked.
+
+        Raises:
+            ValueError: one is of another type, or out of range; the message goes after the option's name.
+        """
+        if not self.many:
+            self._check_one(value)
+            return value
+        if not isinstance(value, tuple | list):
+            raise ValueError(f"must be a list, got {_short(value)}")
+        if len(value) > MOST_VALUES:
+            raise ValueError(f"must be at most {MOST_VALUES} values, got {len(value)}")
+        for each in value:
+            self._check_one(each)
+        return value
+
+    def parse(self, text: str) -> Any:
+        """What text says: a number or a name, or a list of them; numbers of a list may be ranges FROM:TO:COUNT[:log].
+
+        Raises:
+            ValueError: as `check`, or it is no number.
+        """
+        if not self.many:
+            return self.check(self._parse_one(text.strip() if self.kind is not str else text))
+        parts = [part.strip() for part in text.split(",") if part.strip()]
+        if self.kind is str:
+            return self.check(tuple(parts))
+        return self.check(tuple(each for part in parts for each in self._parse_range(part)))
+
+    def read(self, value: Any) -> Any:
+        """What a file says: a number, a name, a list of them, or, where it is a list, text as `parse` reads it.
+
+        Raises:
+            ValueError: as `parse`.
+        """
+        if not self.many:
+            return self._typed(self.check(value))
+        if isinstance(value, str):
+            return self.parse(value)
+        return tuple(self._typed(each) for each in self.check(value if isinstance(value, list) else [value]))
+
+    def describe(self, default: Any = None) -> str:
+        """For the help: the line, the unit, and the default or what stands for it."""
+        default = ",".join(map(str, default)) if isinstance(default, tuple) else default
+        told = self.unset if default is None else f"{default:g}" if isinstance(default, float) else str(default)
+        return self.line + (f" [{self.unit}]" if self.unit else "") + (f" (default: {told})" if told else "")
+
+    def _typed(self, value: Any) -> Any:
+        return self.kind(value) if self.kind is float and isinstance(value, Integral) else value
+
+    def _check_one(self, value: Any) -> None:
+        if self.kind is str or (self.choices and isinstance(value, str)):
+            if not isinstance(value, str):
+                raise ValueError(f"must be text, got {_short(value)}")
+            if self.choices and value not in self.choices:
+                label = self.label or self.name.replace("_", " ")
+                number = ", or give a number" if self.interval else ""
+                raise ValueError(f"unknown {label} {_short(value)}; choose from {', '.join(self.choices)}{number}")
+            return
+        whole = self.kind is int
+        if isinstance(value, bool) or not isinstance(value, Integral if whole else Real):
+            raise ValueError(f"must be a {'whole ' * whole}number, got {_short(value)}")
+        if self.interval is not None and value not in self.interval:
+            raise ValueError(f"must be {self.interval}, got {_plain(value)}")
+
+    def _parse_one(self, text: str) -> Any:
+        if self.kind is str or text in self.choices:
+            return text
+        try:
+            return int(text) if self.kind is int else float(text)
+        except ValueError:
+            return _whole(text) if self.kind is int else text
+
+    def _parse_range(self, text: str) -> list[Any]:
+        if ":" not in text:
+            return [self._parse_one(text)]
+        values = expand_range(text)
+        return [_whole(value) for value in values] if self.kind is int else values
+
+
+def _whole(value: str | float) -> Any:
+    """A whole number where it is one, such as 1e5."""
+    try:
+        return int(float(value)) if float(value).is_integer() else value
+    except ValueError:
+        return value
+
+
+def _plain(value: Any) -> str:
+    """A number in few characters."""
+    try:
+        return f"{int(value)}" if value == int(value) and abs(value) < 1e16 else f"{value:g}"
+    except (OverflowError, ValueError):
+        return _short(value)
+
+
+def _short(value: Any) -> str:
+    """A value as Python writes it, cut where it is long."""
+    try:
+        text = repr(value)
+    except ValueError:  # a whole number of more digits than Python prints
+        return "a number of thousands of digits"
+    return text if len(text) <= 60 else f"{text[:50]}..."
+
+
+def expand_range(text: str) -> list[float]:
+    """The numbers of FROM:TO:COUNT, evenly spaced, or of FROM:TO:COUNT:log, in equal ratios; of both ends exactly.
+
+    Raises:
+        ValueError: it is no such range, or of more than `MOST_VALUES` numbers.
+    """
+    parts = text.split(":")
+    log = parts[3:] == ["log"]
+    try:
+        if len(parts) not in (3, 4) or (len(parts) == 4 and not log):
+            raise ValueError
+        start, stop, count = float(parts[0]), float(parts[1]), int(parts[2])
+        if count < 2 or not math.isfinite(stop - start) or (log and not 0 < stop / start < math.inf):
+            raise ValueError
+    except (ValueError, ZeroDivisionError):
+        raise ValueError(
+            f"{_short(text)} is neither a number nor a range FROM:TO:COUNT or FROM:TO:COUNT:log, COUNT at least 2"
+        ) from None
+    if count > MOST_VALUES:
+        raise ValueError(f"the range {_short(text)} must be of at most {MOST_VALUES} values")
+    shares = [index / (count - 1) for index in range(count)]
+    if log:
+        ratio, sign = math.log(stop / start), math.copysign(1.0, start)
+        inner = [sign * float(f"{abs(start) * math.exp(share * ratio):.12g}") for share in shares]
+    else:
+        inner = [float(f"{start + share * (stop - start):.12g}") for share in shares]
+    return [start, *inner[1:-1], stop]
+
+
+def _number(name: str, kind: type, interval: str, metavar: str, line: str, **more: Any) -> Option:
+    return Option(name, kind, metavar, line, Interval(interval), **more)
+
+
+def _choice(name: str, choices: Iterable[str], metavar: str, line: str, **more: Any) -> Option:
+    return Option(name, str, metavar, line, choices=tuple(choices), **more)
+
+
+MOST_SAMPLES: Final = "10000000]"
+TASKS: Final = "the task's"
+OPTIONS: Final[dict[str, Option]] = {
+    option.name: option
+    for option in (
+        _number("seed", int, "[0, 4294967295]", "N", "seed of the random numbers"),
+        _number("devices", int, "[1, 256]", "N", "CPU devices", unset="one per core; with JAX 0.11 one"),
+        _number("sigma", float, "(0, inf)", "S", "noise, in the unit of what it is added to", unset=TASKS),
+        _choice("noise", NOISES, "NAME", "density of the noise", unset=TASKS),
+        _choice("baseline", BASELINES, "NAME", "baseline of zeroth-order samples"),
+        _number("gamma", float, "(0, inf]", "G", "AoBG's accuracy bound; inf for none", unset=TASKS),
+        _number("failure_probability", float, "(0, 1)", "P", "probability that epsilon's interval misses"),
+        _choice("variance_proxy", VARIANCE_PROXIES, "S2", f"in epsilon: {', '.join(VARIANCE_PROXIES)}"),
+        _number("radius", float, "[0, inf)", "R", "in epsilon: max_deviation or a number", choices=("max_deviation",)),
+        _number("max_norm", float, "(0, inf)", "G", "largest norm of a sample of fobg_clipped"),
+        _number("window", int, "[1, 1000000]", "H", "steps between cuts of fobg_truncated"),
+        _number("tolerance", float, "[0, 1)", "C", "of ddcg's test"),
+        _choice("estimators", ESTIMATORS, "NAME", "see `mjx-study estimators`", label="estimator"),
+        _choice("contact", FAMILIES, "FAMILY", f"of: {', '.join(FAMILIES)}", label="contact family", unset=TASKS),
+        _number("stiffness", float, "(0, inf)", "K", "contact stiffness", unit="N/m", unset=TASKS),
+        _number("damping", float, "[0, inf)", "B", "contact damping", unit="N s/m", unset="the family's"),
+        _choice("cone", CONES, "CONE", f"friction cone: {', '.join(CONES)}", unset="the MJCF's"),
+        _number("timestep", float, "(0, 1)", "H", "timestep", unit="s", unset="the MJCF's"),
+        _number("horizon", int, "[1, 1000000]", "H", "steps", unset=TASKS),
+        Option("model", str, "FILE.xml", "an MJCF in place of the task's own"),
+        _number("theta", float, "(-inf, inf)", "X", "parameters", unset=TASKS),
+        _number("samples", int, "[1, " + MOST_SAMPLES, "N", "samples in each batch", unset=TASKS),
+        _number("reference_samples", int, "[3, " + MOST_SAMPLES, "N", "pairs of rollouts behind each reference"),
+        _number("evaluation_samples", int, "[2, " + MOST_SAMPLES, "N", "rollouts behind a final cost"),
+        _number("chunk_size", int, "[1, " + MOST_SAMPLES, "N", "samples per device and call", unset="by the samples"),
+        _number("confidence", float, "(0, 1)", "P", "confidence of the reported intervals"),
+        _number("seeds", int, "[1, 100000]", "N", "batches, or descents, of each"),
+        _number("iterations", int, "[1, 10000000]", "N", "of the optimiser", unset=TASKS),
+        Option("optimizer", str, "NAME", "of optax"),
+        _number("learning_rate", float, "(0, inf)", "R", "learning rate", unset=TASKS),
+        _number("decay", float, "[0, 2]", "A", "learning rate / i^A", unset=TASKS),
+        _number("network", int, "[1, 100000]", "N", "hidden widths of a tanh network as policy"),
+        _number("points", int, "[2, 100000]", "N", "points on the line"),
+        _number("span", float, "(-inf, inf)", "LO,HI", "range of the line", unset=TASKS),
+        _number("solref", float, "(-inf, inf)", "A;B", "contact models in MuJoCo's terms, every A with every B"),
+        _number("solimp", float, "(-inf, inf)", "D0,D1,W,M,P", "with them; several separated by ;"),
+        Option("direction", str, "DIR", "random, or a parameter's index", unset="random"),
+        _number("states", int, "[1, 1000]", "N", "states to check"),
+        _choice("integrator", INTEGRATORS, "NAME", f"integrator: {', '.join(INTEGRATORS)}", unset="the MJCF's"),
+        _choice("solver", SOLVERS, "NAME", f"of the constraints: {', '.join(SOLVERS)}", unset="the MJCF's"),
+        _number("ls_iterations", int, "[1, 100000]", "N", "of its line search", unset="the MJCF's"),
+        _number("frames", int, "[1, 100]", "N", "pictures in the strip"),
+        _number("slow", float, "(0, 1000]", "FACTOR", "slow motion"),
+    )
+}  # fmt: skip
+"""Every option by its name."""
+
+
+class Checked:
+    """Base of a configuration, a frozen dataclass whose fields are options: each is checked when it is made.
+
+    Attributes:
+        ranges: of options that this configuration narrows.
+    """
+
+    ranges: ClassVar[dict[str, str]] = {}
+
+    @classmethod
+    def option(cls, name: str) -> Option:
+        """An option as this configuration has it: its range, and whether it is a list."""
+        option = OPTIONS[name].within(cls.ranges[name]) if name in cls.ranges else OPTIONS[name]
+        return dataclasses.replace(option, many="tuple" in str(get_type_hints(cls)[name]))
+
+    @classmethod
+    def default(cls, name: str) -> Any:
+        """What the configuration takes where an option is not given."""
+        return next(field.default for field in dataclasses.fields(cls) if field.name == name)  # type: ignore[arg-type]
+
+    def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):  # type: ignore[arg-type]
+            value = getattr(self, field.name)
+            if field.name in ("solref", "solimp"):
+                for row in value:
+                    check(self.option(field.name), row)
+            elif field.name in OPTIONS and not (value is None and field.default is None):
+                check(self.option(field.name), value)
+
+
+def check(option: Option, value: Any) -> Any:
+    """A value that an option takes.
+
+    Raises:
+        ValueError: with the option's name.
+    """
+    try:
+        return option.check(value)
+    except ValueError as error:
+        named = str(error) if str(error).startswith("unknown ") else f"{option.name} {error}"
+        raise ValueError(named) from None
