@@ -39,12 +39,12 @@ def read_json(path: Path, schema: type[Schema]) -> Schema:
     Raises:
         ValueError: as `read_bytes`, or it does not satisfy the schema.
     """
-    return _validated(path, read_bytes(path), TypeAdapter(schema))
+    return _validated(path, read_bytes(path), schema)
 
 
-def _validated(path: Path, content: bytes, schema: TypeAdapter[Any]) -> Any:
+def _validated(path: Path, content: bytes, schema: Any) -> Any:
     try:
-        return schema.validate_json(content)
+        return TypeAdapter(schema).validate_json(content)
     except ValidationError as error:
         raise ValueError(f"{path}: {told(error)}") from None
 
@@ -103,9 +103,9 @@ def read_theta(path: Path) -> tuple[tuple[float, ...], str | None]:
         return _read_array(path), None
     content = read_bytes(path)
     if content.lstrip().startswith(b"{"):
-        policy = _validated(path, content, TypeAdapter(PolicyFile))
+        policy = _validated(path, content, PolicyFile)
         return tuple(policy.theta), policy.task
-    return tuple(_validated(path, content, TypeAdapter(list[Finite]))), None
+    return tuple(_validated(path, content, list[Finite])), None
 
 
 def _read_array(path: Path) -> tuple[float, ...]:

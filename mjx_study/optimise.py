@@ -60,7 +60,7 @@ class OptimiseConfig(EstimatorConfig):
         evaluation_samples: rollouts behind the cost of a final policy, the same for all.
     """
 
-    ranges: ClassVar = {"samples": "[2, 1e7]"}
+    ranges: ClassVar = {"samples": "[2, 1e7]", "stiffness": "[0, inf)"}  # 0 where there is no contact
 
     contact: str | None = None
     stiffness: float | None = None
