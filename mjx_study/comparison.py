@@ -1,13 +1,17 @@
 """What a comparison is asked for, and what it answers: plain data, with every field explained."""
 
 import dataclasses
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Final
 
 import numpy as np
 from jaxtyping import Float
 
+from estimators import ENOUGH_EFFECTIVE
 from mjx_study.configuration import EstimatorConfig, check_names, refuse_repeats
 from mjx_study.contact import FAMILIES
+
+SURE: Final = 0.001
+"""p-value at which a mean is called biased: the least that the test's 999 draws can give."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -56,14 +60,20 @@ class Row:
         variance: empirical variance of one sample, the trace of the covariance.
         variance_lower, variance_upper: its confidence interval.
         norm_median, norm_90, norm_max: quantiles of the norms of single samples; heavy tails show here.
+        effective_samples, top_share: samples that the variance rests on, and what the largest carries of it; see
+            `estimators.effective_samples`.
         relative_error, relative_error_se: distance to the reference gradient over its norm, with standard error.
+        debiased_error, debiased_error_se: the same without what the noise of both means adds to it.
         cosine, cosine_se: of the angle to the reference gradient, with standard error.
+        debiased_cosine, debiased_cosine_se: the same without what the noise of both means takes from it.
         reference_norm: of the reference gradient.
+        reference_effective_samples: as above, of the reference.
         reference_uncertainty: its relative standard error; errors below it cannot be told from zero.
         alpha: weight of the first-order batch; None for an estimator of one batch.
         epsilon: confidence radius of the zeroth-order mean; None likewise.
         discrepancy: B, the distance between the two means; None likewise.
-        bias_p_value: that the mean's distance to the reference is chance; see `estimators.bias_test`.
+        bias_p_value: that the mean's distance to the reference is chance; NaN where the samples of either are all
+            equal. See `estimators.bias_test`, and `bias_verdict`.
         seconds_per_sample: of computing, compilation excluded.
         variance_seconds: variance times seconds per sample, the variance that a second of computing leaves.
         residual: largest relative solver residual in the batches.
@@ -84,11 +94,18 @@ class Row:
     norm_median: float
     norm_90: float
     norm_max: float
+    effective_samples: float
+    top_share: float
     relative_error: float
     relative_error_se: float
+    debiased_error: float
+    debiased_error_se: float
     cosine: float
     cosine_se: float
+    debiased_cosine: float
+    debiased_cosine_se: float
     reference_norm: float
+    reference_effective_samples: float
     reference_uncertainty: float
     alpha: float | None
     epsilon: float | None
@@ -99,6 +116,18 @@ class Row:
     residual: float
     unconverged: int
     nonfinite: int
+
+    @property
+    def believable(self) -> bool:
+        """Whether the batch has effective samples enough for its errors to mean something."""
+        return self.effective_samples >= ENOUGH_EFFECTIVE
+
+    @property
+    def bias_verdict(self) -> str:
+        """What the test for bias says: "biased", "none seen", or "too few effective samples" for either."""
+        if not min(self.effective_samples, self.reference_effective_samples) >= ENOUGH_EFFECTIVE:
+            return "too few effective samples"
+        return "biased" if self.bias_p_value <= SURE else "none seen"
 
 
 @dataclasses.dataclass(frozen=True)

@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
+from estimators import ENOUGH_EFFECTIVE
 from mjx_study.comparison import CompareResult, Row
 from mjx_study.contact import FAMILIES
 from mjx_study.findings import findings
@@ -32,7 +33,16 @@ def number(value: float | None, digits: int = 3) -> str:
 
 
 def _interval(row: Row) -> str:
-    return f"{number(row.variance)} ({number(row.variance_lower, 2)} to {number(row.variance_upper, 2)})"
+    return f"{number(row.variance)} ({number(row.variance_lower, 2)} to {number(row.variance_upper, 2)}){_doubt(row)}"
+
+
+def _doubt(row: Row) -> str:
+    """A mark behind a number that its batch is too small to say."""
+    return "" if row.believable else "?"
+
+
+def _effective(row: Row) -> str:
+    return number(row.effective_samples, 2) + (f" ({row.top_share:.0%})" if row.effective_samples else "")
 
 
 def _with_error(value: float, error: float) -> str:
@@ -43,30 +53,55 @@ def _with_error(value: float, error: float) -> str:
     return f"{value:.3f} ± {error:.3f}"
 
 
+def _debiased(row: Row, value: float, debiased: float, error: float) -> str:
+    """A figure as it is, and what is left of it without noise."""
+    plain = f"{value:.3f}" if value < 1000 else number(value, 2)
+    return f"{plain} -> {_with_error(debiased, error)}{_doubt(row)}"
+
+
 def columns(confidence: float) -> list[list[Column]]:
-    """The comparison's table in three parts, each narrow enough for 80 characters."""
-    identity: list[Column] = [
-        ("K [N/m]", lambda row: number(row.stiffness or None)),
-        ("estimator", lambda row: STYLE[row.estimator][0]),
+    """The comparison's columns: those that identify a row, then the parts of which a table may have one or more."""
+    return [
+        [
+            ("K [N/m]", lambda row: number(row.stiffness or None)),
+            ("estimator", lambda row: STYLE[row.estimator][0]),
+        ],
+        [
+            ("|gradient|", lambda row: number(row.gradient_norm)),
+            (f"variance ({confidence:.0%} interval)", _interval),
+            ("effective (top)", _effective),
+        ],
+        [
+            (
+                "relative error -> debiased",
+                lambda row: _debiased(row, row.relative_error, row.debiased_error, row.debiased_error_se),
+            ),
+            ("cosine -> debiased", lambda row: _debiased(row, row.cosine, row.debiased_cosine, row.debiased_cosine_se)),
+        ],
+        [
+            ("alpha", lambda row: "-" if row.alpha is None else f"{row.alpha:.3f}"),
+            ("epsilon", lambda row: number(row.epsilon)),
+            ("B", lambda row: number(row.discrepancy)),
+        ],
+        [
+            ("ms", lambda row: f"{1e3 * row.seconds_per_sample:.2f}"),
+            ("variance x s", lambda row: number(row.variance_seconds)),
+            ("residual", lambda row: number(row.residual, 2)),
+            ("lost", lambda row: str(row.nonfinite)),
+        ],
     ]
-    values: list[Column] = [
-        ("|gradient|", lambda row: number(row.gradient_norm)),
-        (f"variance ({confidence:.0%} interval)", _interval),
-        ("relative error", lambda row: _with_error(row.relative_error, row.relative_error_se)),
-    ]
-    details: list[Column] = [
-        ("cosine", lambda row: _with_error(row.cosine, row.cosine_se)),
-        ("alpha", lambda row: "-" if row.alpha is None else f"{row.alpha:.3f}"),
-        ("epsilon", lambda row: number(row.epsilon)),
-        ("B", lambda row: number(row.discrepancy)),
-    ]
-    computing: list[Column] = [
-        ("ms", lambda row: f"{1e3 * row.seconds_per_sample:.2f}"),
-        ("variance x s", lambda row: number(row.variance_seconds)),
-        ("residual", lambda row: number(row.residual, 2)),
-        ("lost", lambda row: str(row.nonfinite)),
-    ]
-    return [identity + values, identity + details, identity + computing]
+
+
+def _blocks(rows: Sequence[Row], confidence: float, width: int) -> list[list[str]]:
+    """As few tables as the width allows, each with the columns that identify its rows."""
+    identity, *parts = columns(confidence)
+    blocks: list[list[Column]] = []
+    for part in parts:
+        if blocks and len(_table(rows, identity + blocks[-1] + part)[0]) <= width:
+            blocks[-1] += part
+        else:
+            blocks.append(list(part))
+    return [_table(rows, identity + block) for block in blocks]
 
 
 def print_comparison(result: CompareResult, print_line: Callable[[str], None] = print) -> None:
@@ -76,18 +111,12 @@ def print_comparison(result: CompareResult, print_line: Callable[[str], None] = 
         f"{config.task}: {config.samples} samples in each batch, sigma {config.sigma:g}, {config.horizon} steps, "
         f"{config.cone} cone, seed {config.seed}, {result.environment['precision']}"
     )
-    parts = columns(config.confidence)
-    whole = parts[0] + [column for part in parts[1:] for column in part[2:]]
+    width = shutil.get_terminal_size((140, 24)).columns
     for family in result.families:
         rows = [row for row in result.rows if row.contact == family]
         print_line("")
         print_line(f"{family}: {FAMILIES[family].description}")
-        text = _table(rows, whole)
-        if max(map(len, text)) <= shutil.get_terminal_size((140, 24)).columns:
-            blocks = [text]
-        else:
-            blocks = [_table(rows, part) for part in parts]
-        for block in blocks:
+        for block in _blocks(rows, config.confidence, width):
             for line in block:
                 print_line(line)
     print_line("")
@@ -99,6 +128,11 @@ def print_comparison(result: CompareResult, print_line: Callable[[str], None] = 
             f"Errors and cosines are against an unbiased zeroth-order reference, {config.reference_samples} pairs of "
             f"rollouts with a control variate;\nits own relative uncertainty is {spread}, and smaller errors "
             "cannot be told from zero."
+        )
+    if not all(row.believable for row in result.rows):
+        print_line(
+            f"?: fewer than {ENOUGH_EFFECTIVE:g} effective samples carry the batch's variance; believe neither the "
+            "number nor its error."
         )
     for sentence in findings(result):
         print_line(sentence + ".")

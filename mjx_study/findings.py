@@ -4,12 +4,12 @@ import math
 from collections.abc import Sequence
 from typing import Final
 
-from mjx_study.comparison import CompareResult, Row
+from mjx_study.comparison import SURE, CompareResult, Row
 
 BIASED: Final = {"fobg": "FoBG", "aobg": "AoBG", "ivw": "IVW"}
 """Whose bias is told: first order, and the interpolations that follow it."""
-SURE: Final = 0.001
-"""p-value at which a bias is reported: the least that the test's 999 draws can give."""
+APART: Final = 4.0
+"""Standard errors beyond which a mean that gets no verdict is said to be off."""
 
 
 def findings(result: CompareResult) -> list[str]:
@@ -40,21 +40,29 @@ def _variance_finding(result: CompareResult, family: str) -> list[str]:
 
 
 def _bias_finding(result: CompareResult, family: str) -> list[str]:
-    """Where a mean is farther from the reference than any draw of the test for bias; what relies on FoBG follows it."""
-    biased = [
-        row for row in result.rows if row.contact == family and row.estimator in BIASED and row.bias_p_value <= SURE
-    ]
-    return [
-        f"{family}: {BIASED[row.estimator]}'s mean is biased by {_share(row)}{_at([row.stiffness])} "
-        f"(p <= {row.bias_p_value:.3f}){_advice(row, result)}"
-        for row in biased
-    ]
+    """Where a mean is farther from the reference than any draw of the test; what relies on FoBG follows it."""
+    rows = [row for row in result.rows if row.contact == family and row.estimator in BIASED]
+    return [sentence for row in rows if (sentence := _verdict(row, result))]
+
+
+def _verdict(row: Row, result: CompareResult) -> str:
+    """A sentence where a mean is biased, or is off and cannot be judged; empty otherwise."""
+    mean, where = f"{row.contact}: {BIASED[row.estimator]}'s mean is", _at([row.stiffness])
+    if row.bias_verdict == "biased":
+        return f"{mean} biased by {_share(row)}{where} (p <= {row.bias_p_value:.3f}){_advice(row, result)}"
+    off = row.bias_p_value <= SURE or row.debiased_error > APART * row.debiased_error_se
+    if row.bias_verdict == "none seen" or not off:
+        return ""
+    held = (
+        f"{min(row.effective_samples, row.reference_effective_samples):.1f}" if row.effective_samples else "all equal"
+    )
+    return f"{mean} off by {_share(row)}{where}, biased or for want of rare samples: too few effective samples ({held})"
 
 
 def _share(row: Row) -> str:
-    """Of the reference gradient, to the digits that its error leaves."""
-    error = max(row.relative_error_se, row.reference_uncertainty)
-    return f"{row.relative_error:.1%}" if error < 0.005 else f"{float(f'{100 * row.relative_error:.2g}'):g}%"
+    """Of the reference gradient, without what noise adds to it, to the digits that its error leaves."""
+    error = max(row.debiased_error_se, row.reference_uncertainty)
+    return f"{row.debiased_error:.1%}" if error < 0.005 else f"{float(f'{100 * row.debiased_error:.2g}'):g}%"
 
 
 def _advice(row: Row, result: CompareResult) -> str:

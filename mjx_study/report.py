@@ -45,7 +45,10 @@ PRESENT: Final = ("residual", "rollouts", "unconverged")
 """Of every kind of study a variable that is a number wherever a cell is computed."""
 COLUMNS: Final = {
     "variance": "variance",
+    "effective_samples": "effective samples",
+    "top_share": "top share",
     "relative_error": "relative error",
+    "debiased_error": "debiased",
     "squared_bias": "squared bias",
     "squared_bias_se": "± (standard error)",
     "alpha": "alpha",

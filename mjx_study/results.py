@@ -38,7 +38,7 @@ def as_json(result: CompareResult) -> dict[str, Any]:
         "environment": result.environment,
         "findings": findings(result),
         "warnings": list(result.warnings),
-        "rows": [dataclasses.asdict(row) for row in result.rows],
+        "rows": [dataclasses.asdict(row) | {"bias_verdict": row.bias_verdict} for row in result.rows],
     }
     return as_plain(document)
 

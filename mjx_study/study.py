@@ -191,10 +191,12 @@ def _summarise(
 def estimate_numbers(batches, reference, key, names, options, confidence):
     """The numbers of each estimator's row that are functions of the batches and the reference gradient alone."""
     result = []
+    reference_effective = estimators.effective_samples(reference).count
     for name in names:
         estimate = estimators.combine(name, batches, options)
         lower, upper = estimators.variance_interval(estimate, confidence)
         median, high, most = estimators.norm_quantiles(estimate, (0.5, 0.9, 1.0))
+        effective = estimators.effective_samples(estimate)
         against = estimators.compare(estimate, reference)
         test = estimators.bias_test(estimate, reference, jax.random.clone(key), num_draws=BIAS_DRAWS)
         choice = estimate.alpha
@@ -208,11 +210,18 @@ def estimate_numbers(batches, reference, key, names, options, confidence):
                 "norm_median": median,
                 "norm_90": high,
                 "norm_max": most,
+                "effective_samples": effective.count,
+                "top_share": effective.top_share,
                 "relative_error": against.relative_error,
                 "relative_error_se": against.relative_error_se,
+                "debiased_error": against.debiased_error,
+                "debiased_error_se": against.debiased_error_se,
                 "cosine": against.cosine,
                 "cosine_se": against.cosine_se,
+                "debiased_cosine": against.debiased_cosine,
+                "debiased_cosine_se": against.debiased_cosine_se,
                 "reference_norm": jnp.linalg.norm(reference.mean),
+                "reference_effective_samples": reference_effective,
                 "reference_uncertainty": against.reference_uncertainty,
                 "alpha": None if choice is None else choice.alpha,
                 "epsilon": None if choice is None else choice.epsilon,

@@ -12,6 +12,7 @@ from typing import Final
 
 import xarray as xr
 
+from estimators import ENOUGH_EFFECTIVE
 from mjx_study.configuration import Progress
 from mjx_study.results import prepare_folder
 from mjx_study.runtime import environment
@@ -156,6 +157,11 @@ def what_to_beware_of(dataset: xr.Dataset) -> tuple[str, ...]:
     ):
         if name in dataset and float(dataset[name].sum()) > 0:
             found.append(f"{int(dataset[name].sum())} {says}")
+    if "effective_samples" in dataset and (few := int((dataset["effective_samples"] < ENOUGH_EFFECTIVE).sum())):
+        found.append(
+            f"{few} batches rest on fewer than {ENOUGH_EFFECTIVE:g} effective samples: do not believe their errors, "
+            "p-values and variances (effective_samples says which)"
+        )
     if "stopped_at" in dataset and bool(dataset["stopped_at"].notnull().any()):
         found.append(f"{int(dataset['stopped_at'].notnull().sum())} descents stopped before their last iteration")
     return tuple(found)

@@ -33,7 +33,13 @@ GRADIENT_VARIABLES: Final[dict[str, tuple[tuple[str, ...], str, str]]] = {
     "gradient_norm": (("seed", "estimator"), "gradient", "norm of the mean"),
     "relative_error": (("seed", "estimator"), "1", "distance of the mean to the reference, over its norm"),
     "relative_error_se": (("seed", "estimator"), "1", "standard error of that"),
+    "debiased_error": (("seed", "estimator"), "1", "the same without what noise adds to it"),
+    "debiased_error_se": (("seed", "estimator"), "1", "standard error of that"),
     "cosine": (("seed", "estimator"), "1", "of the angle between mean and reference"),
+    "debiased_cosine": (("seed", "estimator"), "1", "the same without what noise takes from it"),
+    "debiased_cosine_se": (("seed", "estimator"), "1", "standard error of that"),
+    "effective_samples": (("seed", "estimator"), "1", "samples that the variance rests on"),
+    "top_share": (("seed", "estimator"), "1", "of the variance, the largest sample's"),
     "alpha": (("seed", "estimator"), "1", "weight of the first-order batch"),
     "epsilon": (("seed", "estimator"), "gradient", "confidence radius of the zeroth-order mean"),
     "discrepancy": (("seed", "estimator"), "gradient", "distance between the two means"),
@@ -44,6 +50,7 @@ GRADIENT_VARIABLES: Final[dict[str, tuple[tuple[str, ...], str, str]]] = {
     "squared_bias_se": (("estimator",), "1", "standard error of that"),
     "reference_norm": ((), "gradient", "norm of the reference gradient"),
     "reference_uncertainty": ((), "1", "standard error of the reference, over its norm"),
+    "reference_effective_samples": ((), "1", "samples that the reference's variance rests on"),
     "residual": ((), "1", "largest relative residual of the solver"),
     "unconverged": ((), "1", "rollouts whose solver residual is too large"),
     "seconds_per_sample": (("estimator",), "s", "computing time of one sample, measured; compilation excluded"),
@@ -119,7 +126,8 @@ def _of_seeds(numbers: Sequence[dict[str, Any]], seeds: int) -> dict[str, np.nda
         if dimensions == ("seed", "estimator")
     }
     first = numbers[0]  # every estimator's row has the reference's numbers, every seed the same
-    return arrays | {name: np.asarray(first[name][0]) for name in ("reference_norm", "reference_uncertainty")}
+    shared = ("reference_norm", "reference_uncertainty", "reference_effective_samples")
+    return arrays | {name: np.asarray(first[name][0]) for name in shared}
 
 
 def _bias(numbers: Sequence[dict[str, Any]], reference: GradientEstimate) -> dict[str, np.ndarray]:

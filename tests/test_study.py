@@ -31,7 +31,8 @@ def row(estimator: str, stiffness: float, variance: float, **changes: Any) -> Ro
     values |= {"solref": (-stiffness / 0.05, 0.0), "solimp": (1e-4, 1e-4, 1e-3, 0.5, 2.0), "unconverged": 0}
     values |= {"alpha": None, "epsilon": None, "discrepancy": None, "nonfinite": 0, "reference_norm": 10.0}
     values |= {"reference_uncertainty": 0.01, "relative_error": 0.01, "cosine": 1.0, "gradient_norm": 10.0}
-    values |= {"bias_p_value": 0.5}
+    values |= {"bias_p_value": 0.5, "effective_samples": 30.0, "top_share": 0.1, "reference_effective_samples": 300.0}
+    values |= {"debiased_error": changes.get("relative_error", 0.01), "debiased_cosine": 1.0}
     return Row(**(values | changes))
 
 
@@ -149,6 +150,41 @@ def test_bias_is_reported_only_beyond_what_noise_explains() -> None:
         dataclasses.replace(result(mixed), config=dataclasses.replace(result().config, gamma=math.inf))
     )
     assert sentence.endswith("(p <= 0.001): it has no accuracy bound; --gamma sets one")
+
+
+def test_nothing_is_called_biased_on_too_few_effective_samples() -> None:
+    loud: dict[str, Any] = {"relative_error": 0.44, "debiased_error_se": 0.03, "bias_p_value": 0.001}
+    assert row("fobg", 10, 1, **loud).bias_verdict == "biased"
+    few = row("fobg", 10, 1, **loud, effective_samples=1.9)
+    (sentence,) = findings(result(few))
+    assert sentence == (
+        "penalty: FoBG's mean is off by 44% at K = 10 N/m, biased or for want of rare samples: too few effective "
+        "samples (1.9)"
+    )
+    equal = row("fobg", 10, 1, **loud | {"bias_p_value": math.nan}, effective_samples=0.0, top_share=math.nan)
+    (sentence,) = findings(result(equal))
+    assert sentence.endswith("too few effective samples (all equal)")
+    unsure = row("fobg", 10, 1, **loud, reference_effective_samples=2.0)
+    for doubtful in (few, equal, unsure):
+        assert doubtful.bias_verdict == "too few effective samples"
+        assert results.as_json(result(doubtful))["rows"][0]["bias_verdict"] == "too few effective samples"
+    agrees = row("fobg", 10, 1, debiased_error=0.01, debiased_error_se=0.01, effective_samples=0.0)
+    assert findings(result(agrees)) == []
+    assert row("fobg", 10, 1).bias_verdict == "none seen"
+
+
+def test_doubtful_numbers_are_marked_in_the_table() -> None:
+    lines: list[str] = []
+    sure = row("zobg", 10, 1, relative_error=0.325, debiased_error=0.298, debiased_error_se=0.0098)
+    console.print_comparison(result(sure, row("fobg", 20, 1, effective_samples=1.2, top_share=0.9)), lines.append)
+    (above,) = [line for line in lines if "0.325 -> 0.298 ± 0.010" in line]
+    assert "30 (10%)" in above and "?" not in above
+    (below,) = [line for line in lines if "1.2 (90%)" in line]
+    assert "(0.5 to 2)?" in below
+    assert any(line.startswith("?: fewer than 3 effective samples") for line in lines)
+    lines.clear()
+    console.print_comparison(result(sure), lines.append)
+    assert not any("?" in line for line in lines)
 
 
 def test_alarms_name_what_must_not_be_overlooked() -> None:
