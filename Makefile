@@ -13,7 +13,7 @@ UV_VERSION := 0.13.8
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo figures study test test-all defects lint format lock clean
+.PHONY: help demo figures study coverage test test-all defects lint format lock clean
 
 help: ## List the targets
 	@awk 'BEGIN { FS = ":.*## " } /^[a-z-]+:.*## / { printf "  %-10s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
@@ -31,6 +31,9 @@ figures: $(STAMP) ## Make the figures of docs/ again
 
 study: $(STAMP) ## Sweep stiffness and draw the README's figures of it again (half an hour; resumable)
 	$(BIN)/python docs/make_study.py
+
+coverage: $(STAMP) ## Measure again what docs/coverage.md says of intervals and tests (a minute)
+	$(BIN)/python docs/make_coverage.py
 
 test: $(STAMP) ## Run the tests, less the slow ones (PYTEST_ARGS='-k name' in place of two workers)
 	$(BIN)/python -m pytest $(PYTEST_ARGS)

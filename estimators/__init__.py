@@ -11,6 +11,7 @@ from estimators.baselines import BASELINES, leave_one_out, none, zero_noise
 from estimators.bias import BiasTest, EmpiricalBias, bias_test, empirical_bias, squared_bias_of_means
 from estimators.comparison import Comparison, compare
 from estimators.confidence import VARIANCE_PROXIES, bernstein_epsilon, coverage_interval, variance_upper_bound
+from estimators.cross_fitting import WEIGHTS, weigh_batches
 from estimators.ddcg import discontinuity_gated
 from estimators.effective import ENOUGH_EFFECTIVE, EffectiveSamples, effective_samples
 from estimators.first_order import clipped_first_order, first_order
@@ -42,6 +43,7 @@ __all__ = [
     "NOISES",
     "ORACLES",
     "VARIANCE_PROXIES",
+    "WEIGHTS",
     "AlphaChoice",
     "BiasTest",
     "Comparison",
@@ -91,6 +93,7 @@ __all__ = [
     "truncated_first_order",
     "variance_interval",
     "variance_upper_bound",
+    "weigh_batches",
     "zero_noise",
     "zeroth_order",
 ]

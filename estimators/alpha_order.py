@@ -117,6 +117,20 @@ def interpolate(zeroth: GradientEstimate, first: GradientEstimate, alpha: float 
     )
 
 
+def choose_alpha(
+    zeroth: GradientEstimate, first: GradientEstimate, *, gamma: float | Scalar, epsilon: float | Scalar
+) -> AlphaChoice:
+    """The weight of `constrained_alpha` with what it was chosen by; arguments as in `alpha_order`."""
+    discrepancy = jnp.linalg.norm(first.mean - zeroth.mean)
+    return AlphaChoice(
+        alpha=constrained_alpha(zeroth.variance, first.variance, discrepancy, epsilon, gamma),
+        epsilon=jnp.asarray(epsilon, zeroth.per_sample.dtype),
+        discrepancy=discrepancy,
+        variance_zeroth=zeroth.variance,
+        variance_first=first.variance,
+    )
+
+
 def alpha_order(
     zeroth: GradientEstimate,
     first: GradientEstimate,
@@ -127,7 +141,8 @@ def alpha_order(
     """Alpha-order batched gradient (AoBG) with the weight of `constrained_alpha`.
 
     Assumes independent batches of the same size. The weight is chosen from the very samples that it weighs,
-    and the variance and standard errors take it as given.
+    which biases the mean by order 1/N (`weigh_batches` has the remedy), and the variance and standard errors take it
+    as given.
 
     Args:
         zeroth: Zeroth-order estimate.
@@ -143,17 +158,8 @@ def alpha_order(
 
     Reference: Suh et al. 2022, sec. "alpha-order gradient estimator".
     """
-    dtype = zeroth.per_sample.dtype
-    discrepancy = jnp.linalg.norm(first.mean - zeroth.mean)
-    alpha = constrained_alpha(zeroth.variance, first.variance, discrepancy, epsilon, gamma)
-    choice = AlphaChoice(
-        alpha=alpha,
-        epsilon=jnp.asarray(epsilon, dtype),
-        discrepancy=discrepancy,
-        variance_zeroth=zeroth.variance,
-        variance_first=first.variance,
-    )
-    return replace(interpolate(zeroth, first, alpha), alpha=choice)
+    choice = choose_alpha(zeroth, first, gamma=gamma, epsilon=epsilon)
+    return replace(interpolate(zeroth, first, choice.alpha), alpha=choice)
 
 
 def weigh(

@@ -24,11 +24,11 @@ def weigh_batches(
         plug-in:       mix(choose(b), b)
         cross-fitted:  (n_1 mix(choose(b_2), b_1) + n_2 mix(choose(b_1), b_2)) / n
 
-    with b_1 and b_2 the first n_1 = floor(n/2) and the last n_2 samples of every batch. A plug-in weight depends on the
-    samples that it weighs, which biases the mean by order 1/n even where both batches are unbiased. Cross-fitted weights
-    are independent of them, so that the mean is as unbiased as the batches are; choosing from half of the samples costs
-    variance. Everything that chooses comes from the other half, an accuracy bound's epsilon and B included, and so does a
-    baseline that looks at other samples.
+    with b_1 and b_2 the first n_1 = floor(n/2) and the last n_2 samples of every batch. A plug-in weight depends on
+    the samples that it weighs, which biases the mean by order 1/n even where both batches are unbiased. Cross-fitted
+    weights are independent of them, so that the mean is as unbiased as the batches are; choosing from half of the
+    samples costs variance. All that chooses comes from the other half, an accuracy bound's epsilon and B included; a
+    baseline that looks at other samples looks at those of its own half.
 
     Args:
         choose: Of batches, the weights.
@@ -37,9 +37,10 @@ def weigh_batches(
         weights: A name in `WEIGHTS`.
 
     Returns:
-        The estimate. Cross-fitted, a row is weighed by the other half's weights, the variance is the mean of those within the
-        halves, and what chose the weights is the mean of both choices. Variance and standard errors take the weights as
-        given, which for cross-fitted ones leaves out half of the squared bias that weights of n/2 plugged-in samples have.
+        The estimate. Cross-fitted, a row is weighed by the other half's weights, and `variance` is the mean of the
+        variances within the halves: n times the variance of the mean at given weights, as for one batch. That leaves
+        out the halves' covariance, the square of the bias that plug-in weights of n/2 samples would have had, and
+        half of it in the mean. `alpha` is the mean of both choices.
 
     Raises:
         ValueError: No weights have that name, or there are too few samples for two halves.

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from estimators.alpha_order import interpolate, inverse_variance_alpha
+from estimators.cross_fitting import PLUG_IN, weigh_batches
 from estimators.statistics import finite_rows, summarise
 from estimators.stepwise import node_variance
 from estimators.types import AlphaChoice, Evaluation, GradientEstimate, StepDifferentiation, pull_back
@@ -20,6 +21,7 @@ def discontinuity_gated(
     baseline: str,
     sigma: float | Float[Array, ""],
     tolerance: float = PUBLISHED_TOLERANCE,
+    weights: str = PLUG_IN,
 ) -> GradientEstimate:
     """Discontinuity detection by composite gradients (DDCG).
 
@@ -35,6 +37,7 @@ def discontinuity_gated(
         baseline: A name in `BASELINES`.
         sigma: Standard deviation of the Gaussian noise, [control].
         tolerance: c in [0, 1); 0.3 as published.
+        weights: A name in `WEIGHTS`; of cross-fitted ones the test is made in the other half as well.
 
     Returns:
         The estimate, its `alpha` filled in.
@@ -46,17 +49,31 @@ def discontinuity_gated(
     """
     if not 0.0 <= tolerance < 1.0:
         raise ValueError(f"the tolerance of the discontinuity test must lie in [0, 1); got {tolerance}")
-    zeroth = zeroth_order(evaluation, baseline)
-    noise_gradient = differentiation.noise_gradient.reshape(differentiation.value.shape[0], -1)
-    rows = pull_back(differentiation.noise_gradient, differentiation.policy_jacobian)
-    lost = ~jnp.isfinite(differentiation.value) | ~finite_rows(noise_gradient)
-    first = summarise(jnp.where(lost[:, None], jnp.nan, rows))
 
-    over_noise = summarise(jnp.where(lost[:, None], jnp.nan, noise_gradient))
-    value_variance = node_variance(evaluation.value, jnp.isfinite(evaluation.value))
-    scale = jnp.asarray(sigma, rows.dtype) ** 2
-    expected = 2.0 * (1.0 - tolerance) * value_variance / scale - 2.0 * jnp.sum(over_noise.mean**2)
-    continuous = over_noise.variance >= expected  # False where either is undefined
-    alpha = jnp.where(continuous, inverse_variance_alpha(zeroth.variance, first.variance), 0.0)
-    choice = AlphaChoice(alpha, None, None, zeroth.variance, first.variance)
-    return replace(interpolate(zeroth, first, alpha), alpha=choice)
+    def choose(evaluation: Evaluation, differentiation: StepDifferentiation) -> AlphaChoice:
+        zeroth, first = zeroth_order(evaluation, baseline), _first_order(differentiation)
+        over_noise = summarise(_noise_gradients(differentiation))
+        value_variance = node_variance(evaluation.value, jnp.isfinite(evaluation.value))
+        scale = jnp.asarray(sigma, over_noise.mean.dtype) ** 2
+        expected = 2.0 * (1.0 - tolerance) * value_variance / scale - 2.0 * jnp.sum(over_noise.mean**2)
+        continuous = over_noise.variance >= expected  # False where either is undefined
+        alpha = jnp.where(continuous, inverse_variance_alpha(zeroth.variance, first.variance), 0.0)
+        return AlphaChoice(alpha, None, None, zeroth.variance, first.variance)
+
+    def mix(choice: AlphaChoice, evaluation: Evaluation, differentiation: StepDifferentiation) -> GradientEstimate:
+        mixed = interpolate(zeroth_order(evaluation, baseline), _first_order(differentiation), choice.alpha)
+        return replace(mixed, alpha=choice)
+
+    return weigh_batches(choose, mix, (evaluation, differentiation), weights)
+
+
+def _noise_gradients(differentiation: StepDifferentiation) -> Float[Array, "samples noise"]:
+    """grad_w f of each sample; NaN where it or its value is not finite."""
+    gradients = differentiation.noise_gradient.reshape(differentiation.value.shape[0], -1)
+    kept = jnp.isfinite(differentiation.value) & finite_rows(gradients)
+    return jnp.where(kept[:, None], gradients, jnp.nan)
+
+
+def _first_order(differentiation: StepDifferentiation) -> GradientEstimate:
+    gradients = _noise_gradients(differentiation).reshape(differentiation.noise_gradient.shape)
+    return summarise(pull_back(gradients, differentiation.policy_jacobian))

@@ -8,12 +8,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from estimators.alpha_order import inverse_variance_alpha, weigh
+from estimators.cross_fitting import PLUG_IN, weigh_batches
 from estimators.statistics import finite_rows, summarise
 from estimators.stepwise import control_scores, node_variance
 from estimators.types import AlphaChoice, GradientEstimate, Linearisation, pull_back
 
 Controls = Float[Array, "samples inputs"]
 Adjoint = Float[Array, "samples states"]
+Weights = Float[Array, "*horizon"]
 
 
 def truncated_first_order(linearisation: Linearisation, window: int) -> GradientEstimate:
@@ -47,7 +49,7 @@ def truncated_first_order(linearisation: Linearisation, window: int) -> Gradient
     return summarise(_gradient(linearisation, adjoint, controls))
 
 
-def total_propagation(linearisation: Linearisation, baseline: str) -> GradientEstimate:
+def total_propagation(linearisation: Linearisation, baseline: str, weights: str = PLUG_IN) -> GradientEstimate:
     """First- and zeroth-order estimates mixed at every step of the backward recursion.
 
         g_h = alpha_h (c_u + phi_u^T lambda_{h+1}) + (1 - alpha_h) grad psi(w_h) (V_h - b_h)
@@ -61,6 +63,7 @@ def total_propagation(linearisation: Linearisation, baseline: str) -> GradientEs
     Args:
         linearisation: The batch.
         baseline: A name in `BASELINES`, applied step by step.
+        weights: A name in `WEIGHTS`.
 
     Returns:
         The estimate; its `alpha` holds the mean weight.
@@ -71,33 +74,48 @@ def total_propagation(linearisation: Linearisation, baseline: str) -> GradientEs
     Reference: Parmas, Rasmussen, Peters, Doya, "PIPPS: Flexible model-based policy search robust to the curse of
     chaos", ICML 2018, where noise acts on states; here it acts on controls.
     """
+
+    def choose(linearisation: Linearisation) -> Weights:
+        return _propagate(linearisation, baseline, None)[1]
+
+    def mix(alphas: Weights, linearisation: Linearisation) -> GradientEstimate:
+        rows, _ = _propagate(linearisation, baseline, alphas)
+        return replace(summarise(rows), alpha=AlphaChoice(jnp.mean(alphas), None, None, None, None))
+
+    return weigh_batches(choose, mix, (linearisation,), weights)
+
+
+def _propagate(
+    linearisation: Linearisation, baseline: str, given: Weights | None
+) -> tuple[Float[Array, "samples params"], Weights]:
+    """The gradient of each sample, and the weights of the steps: those given, or the batch's inverse-variance ones."""
     steps = linearisation.steps
     scores = control_scores(steps, baseline)
     finite = jnp.isfinite(steps.value_to_go[:, 0]) & finite_rows(scores.reshape(scores.shape[0], -1))
 
-    def mix(derivative: Controls, node: tuple[Controls, Array | None]) -> tuple[Controls, Float[Array, ""]]:
-        score, jacobian = node
-        usable = finite & finite_rows(derivative)
-        shares = [
-            pull_back(part[:, None], None if jacobian is None else jacobian[:, None]) for part in (score, derivative)
-        ]
-        alpha = inverse_variance_alpha(*(jnp.sum(node_variance(share, usable)) for share in shares))
+    def mix(derivative: Controls, node: tuple[Controls, Array | None, Array | None]) -> tuple[Controls, Array]:
+        score, jacobian, alpha = node
+        if alpha is None:
+            usable = finite & finite_rows(derivative)
+            shares = [
+                pull_back(part[:, None], None if jacobian is None else jacobian[:, None])
+                for part in (score, derivative)
+            ]
+            alpha = inverse_variance_alpha(*(jnp.sum(node_variance(share, usable)) for share in shares))
         return weigh((1.0 - alpha, alpha), score, derivative), alpha
 
     horizon = linearisation.cost_state.shape[1]
+    keeps = jnp.ones(horizon, bool)
     if linearisation.start_jacobian is None:
         jacobian = None if steps.policy_jacobian is None else jnp.moveaxis(steps.policy_jacobian, 1, 0)
-        nodes = (jnp.moveaxis(scores, 1, 0), jacobian)
-        adjoint, controls, alphas = _sweep(linearisation, mix, jnp.ones(horizon, bool), nodes)
+        adjoint, controls, alphas = _sweep(linearisation, mix, keeps, (jnp.moveaxis(scores, 1, 0), jacobian, given))
         rows = _gradient(linearisation, adjoint, controls)
     else:  # one decision, before the first step
         adjoint, controls, _ = _sweep(
-            linearisation, lambda derivative, _: (derivative, jnp.ones((), derivative.dtype)), jnp.ones(horizon, bool)
+            linearisation, lambda derivative, _: (derivative, jnp.ones((), derivative.dtype)), keeps
         )
-        rows, alphas = mix(_gradient(linearisation, adjoint, controls), (scores[:, 0], None))
-    rows = jnp.where(finite[:, None], rows, jnp.nan)
-    estimate = summarise(rows)
-    return replace(estimate, alpha=AlphaChoice(jnp.mean(alphas), None, None, None, None))
+        rows, alphas = mix(_gradient(linearisation, adjoint, controls), (scores[:, 0], None, given))
+    return jnp.where(finite[:, None], rows, jnp.nan), alphas
 
 
 def _sweep(

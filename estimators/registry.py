@@ -5,15 +5,16 @@ needs.
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import jax
 from jaxtyping import Array, Float, Key
 
-from estimators.alpha_order import alpha_order
+from estimators.alpha_order import choose_alpha, interpolate
 from estimators.baselines import find_baseline
 from estimators.confidence import bernstein_epsilon, check_confidence_arguments
+from estimators.cross_fitting import PLUG_IN, check_weights, weigh_batches
 from estimators.ddcg import PUBLISHED_TOLERANCE, discontinuity_gated
 from estimators.first_order import clipped_first_order, first_order
 from estimators.propagation import total_propagation, truncated_first_order
@@ -36,6 +37,7 @@ class EstimatorOptions:
         max_norm: Of a sample, > 0, [cost/param]; "fobg_clipped" only.
         window: Steps between cuts of the adjoint, >= 1; "fobg_truncated" only.
         tolerance: c of the discontinuity test, in [0, 1); "ddcg" only.
+        weights: Name in `WEIGHTS`, of the estimators that interpolate.
 
     Raises:
         ValueError: A field is outside its range.
@@ -50,6 +52,7 @@ class EstimatorOptions:
     max_norm: float | None = None
     window: int | None = None
     tolerance: float = PUBLISHED_TOLERANCE
+    weights: str = PLUG_IN
 
     def __post_init__(self):
         find_baseline(self.baseline)
@@ -63,6 +66,7 @@ class EstimatorOptions:
             raise ValueError(f"window must be at least 1 step; got {self.window}")
         if not 0.0 <= self.tolerance < 1.0:
             raise ValueError(f"tolerance must lie in [0, 1); got {self.tolerance}")
+        check_weights(self.weights)
         check_confidence_arguments(self.failure_probability, self.variance_proxy, self.radius)
 
 
@@ -126,14 +130,22 @@ class Estimator:
 
 
 def _alpha_order(evaluation, differentiation, options: EstimatorOptions, *, unlimited: bool = False):
-    zeroth, first = zeroth_order(evaluation, options.baseline), first_order(differentiation)
-    epsilon = bernstein_epsilon(
-        zeroth,
-        failure_probability=options.failure_probability,
-        variance_proxy=options.variance_proxy,
-        radius=options.radius,
-    )
-    return alpha_order(zeroth, first, gamma=float("inf") if unlimited else options.gamma, epsilon=epsilon)
+    def choose(evaluation, differentiation):
+        zeroth = zeroth_order(evaluation, options.baseline)
+        epsilon = bernstein_epsilon(
+            zeroth,
+            failure_probability=options.failure_probability,
+            variance_proxy=options.variance_proxy,
+            radius=options.radius,
+        )
+        gamma = float("inf") if unlimited else options.gamma
+        return choose_alpha(zeroth, first_order(differentiation), gamma=gamma, epsilon=epsilon)
+
+    def mix(choice, evaluation, differentiation):
+        mixed = interpolate(zeroth_order(evaluation, options.baseline), first_order(differentiation), choice.alpha)
+        return replace(mixed, alpha=choice)
+
+    return weigh_batches(choose, mix, (evaluation, differentiation), options.weights)
 
 
 def _delta(evaluation, differentiation, options: EstimatorOptions):
@@ -204,20 +216,20 @@ ESTIMATORS: dict[str, Estimator] = {
             "ivw_h",
             "inverse-variance weights for every step and control",
             ("steps", "step_differentiation"),
-            lambda zeroth, first, options: stepwise_inverse_variance(zeroth, first, options.baseline),
+            lambda zeroth, first, options: stepwise_inverse_variance(zeroth, first, options.baseline, options.weights),
         ),
         Estimator(
             "total_propagation",
             "inverse-variance weights inside the backward recursion",
             ("linearisation",),
-            lambda batch, options: total_propagation(batch, options.baseline),
+            lambda batch, options: total_propagation(batch, options.baseline, options.weights),
         ),
         Estimator(
             "ddcg",
             "inverse-variance weighting where a test finds no discontinuity, else zeroth order",
             ("evaluation", "step_differentiation"),
             lambda zeroth, first, options: discontinuity_gated(
-                zeroth, first, options.baseline, options.sigma, options.tolerance
+                zeroth, first, options.baseline, options.sigma, options.tolerance, options.weights
             ),
             ("sigma",),
         ),

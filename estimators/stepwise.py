@@ -8,6 +8,7 @@ from jaxtyping import Array, Bool, Float
 
 from estimators.alpha_order import inverse_variance_alpha
 from estimators.baselines import find_baseline
+from estimators.cross_fitting import PLUG_IN, weigh_batches
 from estimators.statistics import finite_rows, summarise
 from estimators.types import (
     AlphaChoice,
@@ -17,6 +18,8 @@ from estimators.types import (
     StepEvaluation,
     pull_back,
 )
+
+Controls = Float[Array, "samples steps controls"]
 
 
 def cost_to_go(steps: StepEvaluation, baseline: str) -> GradientEstimate:
@@ -73,7 +76,9 @@ def control_scores(steps: StepEvaluation, baseline: str) -> Float[Array, "sample
     return steps.noise_score * advantages[:, :, None]
 
 
-def stepwise_inverse_variance(zeroth: StepEvaluation, first: StepDifferentiation, baseline: str) -> GradientEstimate:
+def stepwise_inverse_variance(
+    zeroth: StepEvaluation, first: StepDifferentiation, baseline: str, weights: str = PLUG_IN
+) -> GradientEstimate:
     """Inverse-variance weights for every step and control (IVW-H).
 
         g_i = sum_h D_theta pi^T [ alpha_h * dV^i/du_h + (1 - alpha_h) * grad psi(w_h^i) (V_h^i - b_h^i) ]
@@ -86,6 +91,7 @@ def stepwise_inverse_variance(zeroth: StepEvaluation, first: StepDifferentiation
         zeroth: Batch of evaluations.
         first: Batch of differentiations from the same number of independent samples.
         baseline: A name in `BASELINES`, applied step by step.
+        weights: A name in `WEIGHTS`.
 
     Returns:
         The estimate; its `alpha` holds the mean weight.
@@ -95,24 +101,31 @@ def stepwise_inverse_variance(zeroth: StepEvaluation, first: StepDifferentiation
 
     Reference: Onoda, Parmas, Yaguchi, Matsuo, arXiv 2604.18161, ICLR 2026.
     """
-    from_values, from_gradients = control_scores(zeroth, baseline), first.noise_gradient
-    if from_values.shape != from_gradients.shape:
+    shapes = zeroth.noise_score.shape, first.noise_gradient.shape
+    if shapes[0] != shapes[1]:
         raise ValueError(
             "the two batches must have the same shape (samples, steps, controls); "
-            f"got {from_values.shape} zeroth-order and {from_gradients.shape} first-order"
+            f"got {shapes[0]} zeroth-order and {shapes[1]} first-order"
         )
-    from_gradients = jnp.where(jnp.isfinite(first.value)[:, None, None], from_gradients, jnp.nan)
-    variances = [_node_variances(samples) for samples in (from_values, from_gradients)]
-    alpha = inverse_variance_alpha(*variances)
-    lower, upper = (
-        summarise(pull_back(jnp.where(weight == 0, 0.0, weight[None] * samples), jacobian))
-        for weight, samples, jacobian in (
-            (1.0 - alpha, from_values, zeroth.policy_jacobian),
-            (alpha, from_gradients, first.policy_jacobian),
+
+    def parts(zeroth: StepEvaluation, first: StepDifferentiation) -> tuple[Controls, Controls]:
+        kept = jnp.isfinite(first.value)[:, None, None]
+        return control_scores(zeroth, baseline), jnp.where(kept, first.noise_gradient, jnp.nan)
+
+    def choose(zeroth: StepEvaluation, first: StepDifferentiation) -> Float[Array, "steps controls"]:
+        return inverse_variance_alpha(*(_node_variances(part) for part in parts(zeroth, first)))
+
+    def mix(
+        alpha: Float[Array, "steps controls"], zeroth: StepEvaluation, first: StepDifferentiation
+    ) -> GradientEstimate:
+        lower, upper = (
+            summarise(pull_back(jnp.where(weight == 0, 0.0, weight[None] * part), batch.policy_jacobian))
+            for weight, part, batch in zip((1.0 - alpha, alpha), parts(zeroth, first), (zeroth, first), strict=True)
         )
-    )
-    choice = AlphaChoice(jnp.mean(alpha), None, None, None, None)
-    return replace(sum_independent(lower, upper), alpha=choice)
+        choice = AlphaChoice(jnp.mean(alpha), None, None, None, None)
+        return replace(sum_independent(lower, upper), alpha=choice)
+
+    return weigh_batches(choose, mix, (zeroth, first), weights)
 
 
 def sum_independent(one: GradientEstimate, other: GradientEstimate) -> GradientEstimate:

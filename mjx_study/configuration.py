@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from estimators import ESTIMATORS, EstimatorOptions
+from estimators.cross_fitting import PLUG_IN, check_weights
 from estimators.ddcg import PUBLISHED_TOLERANCE
 from mjx_study.contact import (
     DEFAULT_SOLIMP,
@@ -56,6 +57,7 @@ class EstimatorConfig(Checked):
         max_norm: of a sample of the clipped first-order estimate, in the unit of the gradient.
         window: steps between cuts of the truncated first-order estimate.
         tolerance: of the discontinuity test of "ddcg".
+        weights: plug_in or cross_fitted, of the estimators that interpolate.
         damping: of the contact [N s/m]; None for each family's.
         cone: pyramidal or elliptic; None for the MJCF's.
         horizon: steps; None for the task's.
@@ -77,6 +79,7 @@ class EstimatorConfig(Checked):
     max_norm: float | None = None
     window: int | None = None
     tolerance: float = PUBLISHED_TOLERANCE
+    weights: str = PLUG_IN
     damping: float | None = None
     cone: str | None = None
     horizon: int | None = None
@@ -181,13 +184,19 @@ def configured_options(config: EstimatorConfig, task: Task) -> EstimatorOptions:
         max_norm=config.max_norm,
         window=config.window,
         tolerance=config.tolerance,
+        weights=config.weights,
     )
     check_estimators(config.estimators, task, options)
     return options
 
 
 def resolved_fields(config: EstimatorConfig, task: Task, samples: int) -> dict[str, Any]:
-    """Fields of a configuration that the task or the devices decide where it leaves them open."""
+    """Fields of a configuration that the task or the devices decide where it leaves them open.
+
+    Raises:
+        ValueError: there are too few samples for the weights.
+    """
+    check_weights(config.weights, samples)
     chunk = chunk_for(samples, jax.local_devices()) if config.chunk_size is None else config.chunk_size
     return {
         "sigma": task.sigma,

@@ -7,6 +7,7 @@ from typing import ClassVar, Final
 import jax
 
 from estimators import ESTIMATORS, EstimatorOptions
+from estimators.cross_fitting import PLUG_IN, check_weights
 from estimators.ddcg import PUBLISHED_TOLERANCE
 from mjx_study.configuration import (
     Cell,
@@ -57,7 +58,7 @@ class SweepConfig(Checked):
         reference_samples: pairs of rollouts behind each reference gradient.
         evaluation_samples: rollouts behind the cost of a final policy.
         seed, noise, baseline, gamma, failure_probability, variance_proxy, radius, max_norm, window, tolerance,
-            horizon, model, chunk_size: as in `EstimatorConfig`.
+            weights, horizon, model, chunk_size: as in `EstimatorConfig`.
     """
 
     ranges: ClassVar = {"samples": "[3, 1e7]"}
@@ -93,6 +94,7 @@ class SweepConfig(Checked):
     max_norm: float | None = None
     window: int | None = None
     tolerance: float = PUBLISHED_TOLERANCE
+    weights: str = PLUG_IN
     horizon: int | None = None
     model: str | None = None
     chunk_size: int | None = None
@@ -117,6 +119,7 @@ class SweepConfig(Checked):
         if self.points is None and (self.span is not None or self.direction is not None):
             raise ValueError("span and direction are of landscapes: give points as well")
         check_span(self.span)
+        check_weights(self.weights, min(self.samples))
 
     @property
     def kind(self) -> str:

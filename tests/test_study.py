@@ -262,6 +262,12 @@ def test_theta_and_sigma_reach_the_plan() -> None:
     assert jnp.all(plan.task.theta == 0.1)
 
 
+def test_weights_reach_the_estimators_and_are_refused_with_the_samples() -> None:
+    assert study.plan_compare(config(weights="cross_fitted")).options.weights == "cross_fitted"
+    with pytest.raises(ValueError, match="at least 4 samples, two in each half; got 3"):
+        study.plan_compare(config(weights="cross_fitted", samples=3))
+
+
 def test_gradients_are_taken_where_theta_says() -> None:
     plan = study.plan_compare(config(theta=(0.0, 1.0, 2.0, 3.0)))
     np.testing.assert_array_equal(plan.task.theta, np.arange(4))

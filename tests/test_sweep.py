@@ -599,12 +599,27 @@ def test_the_example_of_the_page_runs(undisturbed: Path, tmp_path: Path, monkeyp
 
 def test_the_configuration_is_that_of_the_flags() -> None:
     """Every option of an estimator reaches its cells."""
-    plan = plan_sweep(config(baseline="leave_one_out", gamma=3.0, tolerance=0.1, failure_probability=0.2))
+    plan = plan_sweep(
+        config(baseline="leave_one_out", gamma=3.0, tolerance=0.1, failure_probability=0.2, weights="cross_fitted")
+    )
     chosen = estimator_options(plan, plan.cells[0])
-    assert (chosen.baseline, chosen.gamma, chosen.tolerance, chosen.failure_probability) == (
+    assert (chosen.baseline, chosen.gamma, chosen.tolerance, chosen.failure_probability, chosen.weights) == (
         "leave_one_out",
         3.0,
         0.1,
         0.2,
+        "cross_fitted",
     )
+    with pytest.raises(ValueError, match="at least 4 samples, two in each half; got 3"):
+        config(samples=(3, 10), weights="cross_fitted")
     assert dataclasses.asdict(plan.config)["gamma"] == 3.0
+
+
+def test_a_study_warns_of_batches_that_are_too_small_to_tell(undisturbed: Path) -> None:
+    data = load_study(undisturbed)
+    enough = data.assign(effective_samples=data["effective_samples"] * 0 + 3.0)
+    assert not any("effective samples" in message for message in what_to_beware_of(enough))
+    few = enough.assign(effective_samples=enough["effective_samples"].where(enough["seed"] > 0, 2.9))
+    (message,) = [message for message in what_to_beware_of(few) if "effective samples" in message]
+    batches = few["effective_samples"].size // few.sizes["seed"]
+    assert message.startswith(f"{batches} batches rest on fewer than 3 effective samples")

@@ -54,7 +54,7 @@ columns of the table:
 """
 FIELDS = (
     "task stiffness contact estimators samples reference_samples sigma seed baseline gamma failure_probability "
-    "variance_proxy radius confidence damping cone horizon model chunk_size noise max_norm window tolerance"
+    "variance_proxy radius confidence damping cone horizon model chunk_size noise max_norm window tolerance weights"
 ).split()
 
 

@@ -139,7 +139,7 @@ def add_estimator_options(command: argparse.ArgumentParser, owner: type[Checked]
     """The noise, and what estimators let one choose; see `estimators.EstimatorOptions`."""
     add_options(
         command, owner, "noise", "baseline", "gamma", "failure_probability", "variance_proxy", "radius", "max_norm",
-        "window", "tolerance",
+        "window", "tolerance", "weights",
     )  # fmt: skip
 
 
