@@ -21,7 +21,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float, Key
 
 from estimators import ESTIMATORS, ORACLES, EstimatorOptions, Objective, draw
-from mjx_study.checkpoint import Checkpoint, checkpoint_path, load_checkpoint, save_checkpoint
+from mjx_study.checkpoint import Checkpoints
 from mjx_study.configuration import (
     Cell,
     EstimatorConfig,
@@ -34,6 +34,7 @@ from mjx_study.configuration import (
 )
 from mjx_study.contact import ContactModel
 from mjx_study.descent import REASONS, Descent, Record, advance, begin, going, make_optimizer
+from mjx_study.identity import contents
 from mjx_study.network import with_network
 from mjx_study.objective import Simulator, TracedObjective, simulate
 from mjx_study.runtime import environment
@@ -90,6 +91,14 @@ class OptimisePlan:
     cell: Cell
     options: EstimatorOptions
     warnings: tuple[str, ...]
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """What must not differ for a run to go on: its configuration, and what task and contact are made of."""
+        contact = self.cell.contact
+        arrays = () if contact is None else (contact.solref, contact.solimp)
+        parameters = [np.asarray(array).tolist() for array in arrays]
+        return contents({self.task.name: [self.task]}) | self.config.identity | {"contact_parameters": parameters}
 
 
 def plan_optimise(config: OptimiseConfig, task: Task | None = None, cell: Cell | None = None) -> OptimisePlan:
@@ -182,7 +191,8 @@ class OptimiseResult:
         runs: one per estimator.
         start_cost: mean cost of the start's policy over the evaluation samples, and its standard error.
         start_outcomes: what the start's policy comes to.
-        warnings: about the contact model.
+        warnings: about the contact model, and about runs that several versions computed.
+        unsaved: checkpoints that could not be written, and why.
     """
 
     config: OptimiseConfig
@@ -191,6 +201,7 @@ class OptimiseResult:
     start_cost: tuple[float, float]
     start_outcomes: dict[str, float]
     warnings: tuple[str, ...]
+    unsaved: tuple[str, ...] = ()
 
 
 def optimise(
@@ -198,6 +209,8 @@ def optimise(
     folder: Path | None = None,
     progress: Progress = lambda done, total, what: None,
     backend: "Backend | None" = None,
+    *,
+    accept_versions: bool = False,
 ) -> OptimiseResult:
     """Run every estimator; with a folder, from where runs in it stopped, and with checkpoints there.
 
@@ -207,31 +220,33 @@ def optimise(
         progress: called as it goes on.
         backend: of an earlier plan that differs from this one in its contact model alone, so that nothing is compiled
             again.
+        accept_versions: go on where other versions of JAX, MuJoCo or this package stopped.
 
     Raises:
-        ValueError: the folder holds a run of another configuration, or a file that is not one.
+        ValueError: the folder holds a run of another configuration, of more iterations or of other versions, or a file
+            that is not one.
     """
     config = plan.config
     assert config.iterations is not None and config.chunk_size is not None, "a plan's configuration is resolved"
     backend = Backend(plan) if backend is None else backend
-    kept = {} if folder is None else kept_runs(folder, config)
+    checkpoints = None if folder is None else open_checkpoints(folder, plan, accept_versions=accept_versions)
     iterations, runs = config.iterations, []
     total = len(config.estimators) * iterations
     for index, name in enumerate(config.estimators):
         report = lambda done, index=index, name=name: progress(index * iterations + done, total, name)  # noqa: E731
-        runs.append(_run(plan, backend, name, kept.get(name), folder, report))
+        runs.append(_run(plan, backend, name, checkpoints, report))
     start, came_to = backend.cost(plan.task.theta, plan.cell), backend.outcomes(plan.task.theta, plan.cell)
     progress(total, total, "done")
-    return OptimiseResult(config, environment(), tuple(runs), start, came_to, plan.warnings)
+    mixed, unsaved = ((), ()) if checkpoints is None else (checkpoints.mixed, tuple(checkpoints.unsaved.values()))
+    return OptimiseResult(config, environment(), tuple(runs), start, came_to, plan.warnings + mixed, unsaved)
 
 
-def kept_runs(folder: Path, config: OptimiseConfig) -> dict[str, Checkpoint | None]:
-    """By estimator, what a folder holds of its run.
-
-    Raises:
-        ValueError: a run of another configuration, or a file that is not one.
-    """
-    return {name: load_checkpoint(checkpoint_path(folder, name), config.identity) for name in config.estimators}
+def open_checkpoints(folder: Path, plan: OptimisePlan, *, accept_versions: bool = False) -> Checkpoints:
+    """The runs of a folder, checked against a plan; see `Checkpoints`."""
+    config = plan.config
+    return Checkpoints(
+        folder, config.estimators, plan.identity, config.iterations or 0, accept_versions=accept_versions
+    )
 
 
 class Backend:
@@ -323,22 +338,22 @@ def _run(
     plan: OptimisePlan,
     backend: Backend,
     name: str,
-    kept: Checkpoint | None,
-    folder: Path | None,
+    checkpoints: Checkpoints | None,
     report: Callable[[int], None],
 ) -> Run:
     config, task = plan.config, plan.task
     iterations: int = config.iterations  # type: ignore[assignment]
     optimizer = make_optimizer(config.optimizer, config.learning_rate, config.decay)  # type: ignore[arg-type]
     state, records, seconds = begin(optimizer, task.theta, config.seeds), [], []
+    kept = None if checkpoints is None else checkpoints.kept[name]
     if kept is not None:
         state, records, seconds = kept.restored(state)
     state = backend.place(state)
-    records, seconds = records[:iterations], seconds[:iterations]
     keys = jax.vmap(lambda seed: jax.random.fold_in(jax.random.key(config.seed), seed))(jnp.arange(config.seeds))
     keys_of = jax.jit(lambda index: jax.vmap(lambda key: jax.random.fold_in(key, index))(jax.random.clone(keys)))
     iterate = backend.iteration(name, plan.cell)
-    done, elapsed = len(records), seconds[-1] if seconds else 0.0
+    done = already = len(records)
+    elapsed = seconds[-1] if seconds else 0.0
     if done < iterations and bool(jnp.any(going(state))):
         jax.block_until_ready(iterate(state, keys_of(done)))  # compiles; what it gives is dropped
     saved = last = time.perf_counter()
@@ -363,12 +378,12 @@ def _run(
         collect(record)
         if not pending:
             report(done)
-            if folder is not None and time.perf_counter() - saved > SAVE_SECONDS:
-                save_checkpoint(checkpoint_path(folder, name), config.identity, state, records, seconds)
+            if checkpoints is not None and time.perf_counter() - saved > SAVE_SECONDS:
+                checkpoints.save(name, state, records, seconds)
                 saved = last = time.perf_counter()
     collect(None)
-    if folder is not None:
-        save_checkpoint(checkpoint_path(folder, name), config.identity, state, records, seconds)
+    if checkpoints is not None and done > already:
+        checkpoints.save(name, state, records, seconds)
     costs = [backend.cost(theta, plan.cell) for theta in state.theta]
     came_to = [backend.outcomes(theta, plan.cell) for theta in state.theta]
     history = {

@@ -12,9 +12,9 @@ from matplotlib.figure import Figure
 from estimators import ESTIMATORS
 from mjx_study.comparison import CompareResult, Row
 from mjx_study.contact import DEFAULT_SOLREF, FAMILIES
+from mjx_study.disk import write_whole
 from mjx_study.landscape import Curve, Landscape
 from mjx_study.optimise import OptimiseResult, Run
-from mjx_study.results import write_whole
 
 # Okabe and Ito's colours, told apart in print and by colour-blind eyes; markers repeat the distinction.
 STYLE: Final = {

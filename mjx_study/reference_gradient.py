@@ -5,8 +5,8 @@ it unbiased whatever the contact does:
 
 - only the part of the cost that is odd in the noise is used (two rollouts per sample);
 - a linear control variate w -> slope * w^T g is subtracted and its exact mean, slope * g, added back. Any vector g
-  that is independent of the sample will do. Candidates are medians of first-order gradients, here and at other
-  contact models, since beyond some stiffness the local ones are noise; a pilot batch picks candidate and slope.
+  that is independent of the sample will do. Candidates are medians of first-order gradients, here and at a soft
+  contact, since beyond some stiffness the local ones are noise; a pilot batch picks candidate and slope.
 """
 
 from collections.abc import Sequence

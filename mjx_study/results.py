@@ -1,34 +1,16 @@
-"""Results on disk: one folder, written file by file, each either complete or absent."""
+"""Results as plain data, and on disk."""
 
 import dataclasses
 import json
 import math
-import os
-import tempfile
-from collections.abc import Callable
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 
 from mjx_study.comparison import CompareResult
+from mjx_study.disk import write_whole
 from mjx_study.findings import findings
-
-
-def prepare_folder(folder: str | Path) -> Path:
-    """Make sure that results can be written to a folder, before anything is computed.
-
-    Raises:
-        ValueError: it cannot be created or written to, or is a file.
-    """
-    path = Path(folder)
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=path):
-            pass
-    except OSError as error:
-        raise ValueError(f"cannot write to the output folder {path}: {error.strerror or error}") from error
-    return path
 
 
 def as_json(result: CompareResult) -> dict[str, Any]:
@@ -59,22 +41,6 @@ def save(result: CompareResult, folder: Path) -> list[Path]:
         write_whole(folder / "results.json", lambda file: file.write(text.encode())),
         write_whole(folder / "gradients.npz", lambda file: np.savez_compressed(file, **arrays)),  # type: ignore[arg-type]
     ]
-
-
-def write_whole(path: Path, write: Callable[[IO[bytes]], Any]) -> Path:
-    """Write a file beside its place and move it there, so that it is never half there, after a loss of power either."""
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            write(file)
-            file.flush()
-            os.fsync(file.fileno())
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, path)
-    except BaseException:
-        os.unlink(temporary)
-        raise
-    return path
 
 
 def _finite(value: Any) -> Any:

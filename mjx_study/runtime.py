@@ -78,6 +78,11 @@ def processor_name() -> str:
     return names[0] if names else platform.machine()
 
 
+def precision() -> str:
+    """float64 or float32, as JAX is set."""
+    return "float64" if jax.config.read("jax_enable_x64") else "float32"
+
+
 def environment() -> dict[str, Any]:
     """What a result depends on besides its configuration: versions, machine, devices, precision."""
     names = ("mjx-study", "mujoco", "mujoco-mjx", "jax", "jaxlib", "numpy")
@@ -88,5 +93,5 @@ def environment() -> dict[str, Any]:
         "cores": available_cores(),
         "devices": [str(device) for device in jax.local_devices()],
         "backend": jax.default_backend(),
-        "precision": "float64" if jax.config.read("jax_enable_x64") else "float32",
+        "precision": precision(),
     }

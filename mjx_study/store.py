@@ -1,7 +1,7 @@
 """A study's folder: its configuration, one file per cell, and the labelled arrays that they make together.
 
-    study.json       configuration, versions, machine, and every cell's coordinates
-    cells/00042.npz  the numbers of one cell, with a digest of them and of the configuration
+    study.json       configuration, digests of what it is about, versions, machine, and every cell's coordinates
+    cells/00042.npz  the numbers of one cell, with digests of them, of the study and of the cell's place
     results.nc       all of them as one NetCDF file, written when the last cell is there
     study.lock       which cells are being computed, and by which process
 
@@ -11,7 +11,9 @@ operating system's and go with their process.
 
 import fcntl
 import hashlib
+import io
 import json
+import os
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -20,10 +22,18 @@ from typing import Any, Final
 import numpy as np
 import xarray as xr
 
-from mjx_study.results import as_plain, prepare_folder, write_whole
+from mjx_study.disk import open_regular, prepare_folder, read_whole, write_whole
+from mjx_study.identity import ACCEPT, differences
+from mjx_study.results import as_plain
 
-FORMAT: Final = 1
+FORMAT: Final = 2
 """Of the folder; a number that goes up when an older program could not read a newer folder."""
+
+
+IDENTITY: Final = ("contents", "config")
+"""Parts of study.json that must not differ for a study to go on."""
+VERSIONS: Final = "versions"
+"""Entry of a cell that says what computed it."""
 
 
 class StudyError(ValueError):
@@ -40,18 +50,21 @@ class Store:
 
     def __init__(self, folder: Path, document: dict[str, Any]):
         self.folder, self.document = folder, document
-        self._identity = _digest({"config": np.array(json.dumps(document["config"], sort_keys=True))})
+        self._versions: dict[str, str] = document.get("versions", {})
+        self._study = _digest_of_text({name: document.get(name) for name in IDENTITY})
 
     @classmethod
-    def create(cls, folder: Path, document: dict[str, Any]) -> "Store":
-        """A folder for a study, or the one that is there, which must be of the same configuration.
+    def create(cls, folder: Path, document: dict[str, Any], *, accept_versions: bool = False) -> "Store":
+        """A folder for a study, or the one that is there, which must be of the same configuration and contents.
 
         Args:
             folder: of the study.
-            document: `config`, `cells` and whatever else there is to keep; plain data.
+            document: `config`, `cells`, and where there are any `contents` (digests of what the numbers depend on) and
+                `versions` (of what computes them), and whatever else there is to keep; plain data.
+            accept_versions: go on with a study of other versions, each of whose cells says which computed it.
 
         Raises:
-            StudyError: another study is there, or a file that is not one.
+            StudyError: another study is there, or one of other versions, or a file that is not one.
             ValueError: the folder cannot be written to.
         """
         prepare_folder(folder)
@@ -60,11 +73,13 @@ class Store:
         path = folder / "study.json"
         if path.exists():
             kept = cls.open(folder)
-            theirs, ours = kept.document["config"], document["config"]
-            different = sorted(name for name in theirs | ours if theirs.get(name) != ours.get(name))
-            if different:
-                told = ", ".join(f"{name} {theirs.get(name)} there and {ours.get(name)} here" for name in different[:3])
+            theirs, ours = (_flat(each, IDENTITY) for each in (kept.document, document))
+            if told := differences(theirs, ours):
                 raise StudyError(f"{folder} holds another study ({told}); choose another folder")
+            told = differences(*(_flat(each, ("versions",)) for each in (kept.document, document)))
+            if told and kept.missing and not accept_versions:
+                raise StudyError(f"{folder} was computed with other versions ({told}); {ACCEPT}")
+            kept._versions = document.get("versions", {})
             return kept
         if any((folder / "cells").glob("*.npz")):
             raise StudyError(f"{folder} holds cells of a study without its study.json; choose another folder")
@@ -80,12 +95,12 @@ class Store:
         """
         path = folder / "study.json"
         try:
-            document = json.loads(path.read_text())
+            document = json.loads(read_whole(path))
             version, _, _ = document["format"], document["config"], document["cells"]
         except FileNotFoundError as error:
             raise StudyError(f"{folder} holds no study: there is no study.json") from error
         except OSError as error:
-            raise StudyError(f"cannot read {path}: {error.strerror or error}") from error
+            raise StudyError(f"cannot read {path}: {_told(error)}") from error
         except (ValueError, KeyError, TypeError) as error:
             raise StudyError(f"{path} is damaged; move the folder away to start again") from error
         if version != FORMAT:
@@ -102,39 +117,57 @@ class Store:
 
     def write(self, index: int, arrays: Mapping[str, np.ndarray]) -> None:
         """Keep the numbers of a cell."""
-        kept = dict(arrays)
-        digest = np.array(_digest(kept) + self._identity)
+        kept = dict(arrays) | {VERSIONS: np.array(json.dumps(self._versions))}
+        digest = np.array([_digest(kept), self._study, self._place(index)])
         write_whole(self.path(index), lambda file: np.savez(file, digest=digest, **kept))  # type: ignore[arg-type]
 
     def read(self, index: int) -> dict[str, np.ndarray]:
         """The numbers of a cell.
 
         Raises:
-            StudyError: the file is damaged, or of another configuration.
+            StudyError: the file is damaged, or of another study or place.
         """
+        return self.read_with_versions(index)[0]
+
+    def read_with_versions(self, index: int) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+        """The numbers of a cell, and the versions of what computed them; see `read`."""
         path = self.path(index)
         try:
-            with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
+            with np.load(io.BytesIO(read_whole(path)), allow_pickle=False) as stored:
                 arrays = {name: stored[name] for name in stored.files}
-            digest = str(arrays.pop("digest"))
+            content, study, place = arrays.pop("digest").tolist()
         except Exception as error:  # numpy, zipfile and zlib raise what they like
-            raise StudyError(f"{path} is damaged ({error}); move it away to compute it again") from error
-        if not digest.endswith(self._identity):
-            raise StudyError(f"{path} is a cell of another study; move it away to compute it again")
-        if digest != _digest(arrays) + self._identity:
-            raise StudyError(f"{path} is damaged (its digest does not match); move it away to compute it again")
-        return arrays
+            raise StudyError(f"{path} is damaged ({_told(error)}); move it away to compute it again") from error
+        for wrong, is_that in (
+            (study != self._study, "a cell of another study"),
+            (place != self._place(index), "another cell of this study"),
+            (content != _digest(arrays), "damaged (its digest does not match)"),
+        ):
+            if wrong:
+                raise StudyError(f"{path} is {is_that}; move it away to compute it again")
+        return arrays, json.loads(str(arrays.pop(VERSIONS)))
 
     @contextmanager
     def claim(self, index: int) -> Generator[bool]:
         """Whether this process may compute a cell: no other one does, until the block is left or this process dies."""
-        with (self.folder / "study.lock").open("ab") as file:
+        path = self.folder / "study.lock"
+        try:
+            descriptor = open_regular(path, os.O_RDWR | os.O_CREAT)
+        except OSError as error:
+            raise StudyError(f"cannot lock {path}: {_told(error)}") from error
+        with os.fdopen(descriptor, "r+b") as file:
             try:
                 fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB, 1, index)
             except (BlockingIOError, PermissionError):
                 yield False
             else:
                 yield True
+
+    def _place(self, index: int) -> str:
+        """Digest of a cell's index and coordinates."""
+        cell, axes = self.document["cells"][index], self.document.get("axes", {})
+        at = {name: axes[name][place] for name, place in cell.get("at", {}).items()}
+        return _digest_of_text({"index": index, "cell": cell, "at": at})
 
     @property
     def missing(self) -> list[int]:
@@ -150,14 +183,16 @@ def _digest(arrays: Mapping[str, np.ndarray]) -> str:
     return sha.hexdigest()
 
 
-def git_revision() -> str | None:
-    """Of the checkout that the program runs from; None where it is installed, or git is not there."""
-    git = Path(__file__).resolve().parents[1] / ".git"
-    try:
-        head = (git / "HEAD").read_text().strip()
-        return (git / head.removeprefix("ref: ")).read_text().strip() if head.startswith("ref: ") else head
-    except OSError:
-        return None
+def _digest_of_text(document: Mapping[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()
+
+
+def _flat(document: Mapping[str, Any], parts: Sequence[str]) -> dict[str, Any]:
+    return {name: value for part in parts for name, value in document.get(part, {}).items()}
+
+
+def _told(error: Exception) -> str:
+    return (error.strerror if isinstance(error, OSError) else None) or str(error)
 
 
 def assemble(
@@ -178,7 +213,8 @@ def assemble(
     """
     cells = store.document["cells"]
     outer = tuple(cells[0]["at"]) if cells else ()
-    found = {index: store.read(index) for index in range(len(cells)) if store.has(index)}
+    read = {index: store.read_with_versions(index) for index in range(len(cells)) if store.has(index)}
+    found = {index: arrays for index, (arrays, _) in read.items()}
     data: dict[str, Any] = {}
     for name, (inner, unit, description) in variables.items():
         held = {index: arrays[name] for index, arrays in found.items() if name in arrays}
@@ -204,7 +240,15 @@ def assemble(
         if key not in ("cells", "format") and value is not None
     }
     dataset.attrs["missing_cells"] = len(store.missing)
+    dataset.attrs["mixed_versions"] = _mixture([versions for _, versions in read.values()])
     return dataset
+
+
+def _mixture(versions: Sequence[Mapping[str, str]]) -> str:
+    """What was computed by more than one version, and by which; empty where nothing was."""
+    names = dict.fromkeys(name for each in versions for name in each)
+    by_name = {name: list(dict.fromkeys(each.get(name, "none") for each in versions)) for name in names}
+    return ", ".join(f"{name} {' and '.join(found)}" for name, found in by_name.items() if len(found) > 1)
 
 
 def write_dataset(dataset: xr.Dataset, path: Path) -> Path:

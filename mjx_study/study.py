@@ -92,7 +92,8 @@ def compare(plan: ComparePlan, progress: Progress = lambda done, total, what: No
         _compile(simulator, cell, oracles)
 
     rows: list[Row] = []
-    gradients, references, candidates = [], [], []
+    gradients, references = [], []
+    soft = soft_gradient(simulator, task.sigma, keys.candidate)
     for done, cell in enumerate(plan.cells, start=1):
         progress(done, total, cell.label)
         objective = simulator.objective(cell.contact)
@@ -101,7 +102,7 @@ def compare(plan: ComparePlan, progress: Progress = lambda done, total, what: No
             method = getattr(objective, ORACLES[name].method)
             drawn = jax.random.clone((keys.zeroth, keys.first)[ORACLES[name].order])  # shared on purpose
             batches[name], seconds[name] = _timed(method, task.theta, drawn)
-        reference = reference_of(objective, keys.odd, keys.candidate, batches["evaluation"], candidates)
+        reference = reference_of(objective, keys.odd, keys.candidate, batches["evaluation"], soft)
         summary = _summarise(batches, reference, keys.test, config.estimators, plan.options, config.confidence)
         for name, numbers, gradient in summary:
             rows.append(_row(cell, name, config.samples, numbers, seconds, batches))
@@ -137,32 +138,49 @@ def _timed(method: Callable[..., Any], *arguments: Any) -> tuple[Any, float]:
     return result, time.perf_counter() - start
 
 
+def soft_gradient(simulator: Simulator, sigma: float, keys: Key[Array, " samples"]) -> Float[Array, " params"] | None:
+    """The median first-order gradient under the softest contact that the task sweeps, whatever is compared.
+
+    A candidate for the reference's control variate at every contact model: beyond some stiffness first-order gradients
+    are noise, and this one still points where most of the gradient does. None where the reference takes none, or where
+    the task has no contact.
+    """
+    task = simulator.task
+    if task.contact_pair is None or not _takes_candidates(task):
+        return None
+    (cell,), _ = plan_cells(task, ("penalty",), (min(task.stiffnesses),))
+    objective = simulator.objective(cell.contact, sigma)
+    return jnp.median(objective.differentiate(task.theta, jax.random.clone(keys)).gradient, axis=0)
+
+
 def reference_of(
     objective: MjxObjective,
     odd_keys: Key[Array, " pairs"],
     candidate_keys: Key[Array, " samples"],
     pilot: Evaluation,
-    candidates: list[Float[Array, " params"]],
+    soft: Float[Array, " params"] | None,
 ) -> GradientEstimate:
-    """The reference gradient of a contact model.
+    """The reference gradient of a contact model; it does not depend on which others there are.
 
     Args:
         objective: the task under that contact model.
         odd_keys: of the pairs of rollouts.
         candidate_keys: of the first-order samples whose median is a candidate for the control variate.
         pilot: a batch from other keys, which picks among the candidates.
-        candidates: those of other contact models; this one's is added.
+        soft: another candidate, see `soft_gradient`.
     """
     task = objective.simulator.task
-    theta = task.theta
-    if not task.policy.additive or task.noise != "gaussian":
-        plus, minus = objective.evaluate_pair(theta, odd_keys)
+    if not _takes_candidates(task):
+        plus, minus = objective.evaluate_pair(task.theta, odd_keys)
         return _antithetic(plus, minus, "zero_noise")
-    gradients = objective.differentiate(theta, candidate_keys).gradient
-    candidates.append(jnp.median(gradients, axis=0))
-    newest = jnp.stack((candidates[-1:] + candidates[-2::-1])[:8])
-    padded = jnp.concatenate([newest, jnp.zeros((8 - len(newest), len(theta)), newest.dtype)])
-    return _reference_gradient(objective.evaluate_odd(theta, odd_keys), pilot, padded, objective.sigma)
+    own = jnp.median(objective.differentiate(task.theta, candidate_keys).gradient, axis=0)
+    candidates = jnp.stack([own, jnp.zeros_like(own) if soft is None else soft])
+    return _reference_gradient(objective.evaluate_odd(task.theta, odd_keys), pilot, candidates, objective.sigma)
+
+
+def _takes_candidates(task: Task) -> bool:
+    """Whether the reference is of odd parts and a control variate."""
+    return task.policy.additive and task.noise == "gaussian"
 
 
 _antithetic = jax.jit(estimators.antithetic, static_argnames="baseline")

@@ -14,12 +14,15 @@ import xarray as xr
 
 from estimators import ENOUGH_EFFECTIVE
 from mjx_study.configuration import Progress
-from mjx_study.results import prepare_folder
+from mjx_study.disk import prepare_folder
+from mjx_study.identity import contents, versions
+from mjx_study.revision import git_revision
 from mjx_study.runtime import environment
-from mjx_study.store import Store, StudyError, assemble, git_revision, write_dataset
+from mjx_study.store import Store, StudyError, assemble, write_dataset
 from mjx_study.sweep_axes import axes_of, solver_parameters
 from mjx_study.sweep_cells import COMPUTE, VARIABLES
 from mjx_study.sweep_plan import SweepConfig, SweepPlan, plan_sweep
+from mjx_study.task import Task
 
 WAIT_SECONDS: Final = 0.5
 """Between looks at cells that another process computes."""
@@ -44,13 +47,14 @@ class SweepResult:
     warnings: tuple[str, ...]
 
 
-def open_store(plan: SweepPlan, folder: Path, command: str | None = None) -> Store:
+def open_store(plan: SweepPlan, folder: Path, command: str | None = None, *, accept_versions: bool = False) -> Store:
     """The folder of a plan, new or begun; one that was begun keeps its chunk size unless the plan gives another.
 
     Args:
         plan: of the sweep.
         folder: where it is to be.
         command: that asked for it, to be kept; None where no command did.
+        accept_versions: go on with a study that other versions began.
 
     Raises:
         ValueError: it cannot be written to, or holds another study.
@@ -64,6 +68,8 @@ def open_store(plan: SweepPlan, folder: Path, command: str | None = None) -> Sto
     document = {
         "config": config,
         "warnings": list(plan.warnings),
+        "contents": contents(_forms(plan)),
+        "versions": versions(),
         "environment": environment(),
         "revision": git_revision(),
         "command": command,
@@ -74,7 +80,15 @@ def open_store(plan: SweepPlan, folder: Path, command: str | None = None) -> Sto
             for cell, at in zip(plan.cells, axes.places, strict=True)
         ],
     }
-    return Store.create(prepare_folder(folder), document)
+    return Store.create(prepare_folder(folder), document, accept_versions=accept_versions)
+
+
+def _forms(plan: SweepPlan) -> dict[str, list[Task]]:
+    """By the configuration's name of a task, what it is with every timestep and cone."""
+    forms: dict[str, list[Task]] = {}
+    for group in plan.groups:
+        forms.setdefault(group.name, []).append(group.task)
+    return forms
 
 
 def run_sweep(
@@ -83,6 +97,7 @@ def run_sweep(
     progress: Progress = lambda done, total, what: None,
     *,
     command: str | None = None,
+    accept_versions: bool = False,
 ) -> SweepResult:
     """Compute what is missing of a study, beside any other process that does the same.
 
@@ -91,6 +106,7 @@ def run_sweep(
         folder: of the study, new or begun.
         progress: called before every cell.
         command: that asked for it, to be kept with a new study.
+        accept_versions: go on with a study that other versions of JAX, MuJoCo or this package began.
 
     Raises:
         ValueError: the folder holds another study, or cannot be written to.
@@ -98,7 +114,7 @@ def run_sweep(
         OSError: a cell could not be written; what was written before is kept.
     """
     folder = Path(folder)
-    store = open_store(plan, folder, command)
+    store = open_store(plan, folder, command, accept_versions=accept_versions)
     chunk = store.document["config"]["chunk_size"]
     plan = dataclasses.replace(plan, config=dataclasses.replace(plan.config, chunk_size=chunk))
     for index in range(len(plan.cells)):
@@ -151,6 +167,8 @@ def what_to_beware_of(dataset: xr.Dataset) -> tuple[str, ...]:
     found = []
     if dataset.attrs["missing_cells"]:
         found.append(f"{dataset.attrs['missing_cells']} cells are not computed yet; the same command goes on")
+    if dataset.attrs.get("mixed_versions"):
+        found.append(f"cells were computed with different versions: {dataset.attrs['mixed_versions']}")
     for name, says in (
         ("nonfinite", "samples overflowed or became NaN and were left out"),
         ("unconverged", "rollouts in which the contact solver did not converge"),

@@ -16,8 +16,16 @@ from estimators import ESTIMATORS, ORACLES, GradientEstimate
 from mjx_study.landscape import line_of
 from mjx_study.objective import Simulator
 from mjx_study.optimise import Backend, optimise
-from mjx_study.study import UNCONVERGED, estimate_numbers, reference_of, residuals_of
-from mjx_study.sweep_plan import LARGEST_BATCH, SweepCell, SweepPlan, descent_plan, estimator_options
+from mjx_study.study import UNCONVERGED, estimate_numbers, reference_of, residuals_of, soft_gradient
+from mjx_study.sweep_plan import (
+    LARGEST_BATCH,
+    SweepCell,
+    SweepPlan,
+    descent_plan,
+    estimator_options,
+    oracles_of,
+    seeds_together,
+)
 
 CANDIDATES: Final = 100
 """First-order samples whose median is a candidate for the reference's control variate."""
@@ -83,9 +91,10 @@ MEASURED: Final = ("seconds", "seconds_per_sample")
 
 def compute_gradients(plan: SweepPlan) -> Callable[[SweepCell], dict[str, np.ndarray]]:
     """A function that computes a cell; it keeps what is compiled."""
-    config, oracles = plan.config, _oracles(plan)
+    config, oracles = plan.config, oracles_of(plan.config)
     compiled: dict[int, Simulator] = {}
     warm: set[tuple[int, bool]] = set()
+    soft: dict[tuple[int, float], Array | None] = {}
 
     def compute(cell: SweepCell) -> dict[str, np.ndarray]:
         if cell.group not in compiled:
@@ -97,17 +106,29 @@ def compute_gradients(plan: SweepPlan) -> Callable[[SweepCell], dict[str, np.nda
                 getattr(objective, ORACLES[name].method)(theta, jax.random.split(jax.random.key(0), 1))
             warm.add((cell.group, cell.model.contact is None))
         keys = _cell_keys(config.seed, config.batches)
-        drawn, seconds, residuals = _draw(objective, theta, keys, oracles, cell.samples, config.batches)
-        pilot = jax.tree.map(lambda leaf: leaf[0], drawn["evaluation"])
         odd, candidate = (
             jax.random.split(stream, size)
-            for stream, size in zip(keys["reference"], (config.reference_samples, CANDIDATES), strict=True)
+            for stream, size in zip(keys["reference"], (config.reference_samples or 0, CANDIDATES), strict=True)
         )
-        reference = reference_of(objective, odd, candidate, pilot, [])
-        tests = jax.random.split(keys["test"], config.batches)
-        numbers = jax.device_get(
-            _seed_numbers(drawn, reference, tests, config.estimators, estimator_options(plan, cell))
-        )
+        softened = cell.group, cell.sigma
+        if softened not in soft:
+            soft[softened] = soft_gradient(compiled[cell.group], cell.sigma, candidate)
+        tests, options = jax.random.split(keys["test"], config.batches), estimator_options(plan, cell)
+        together = seeds_together(plan, cell)
+        reference, parts, spent, residuals = None, [], [], []
+        for start in range(0, config.batches, together):
+            some = slice(start, start + together)
+            drawn, seconds, residual = _draw(objective, theta, keys, oracles, cell.samples, some)
+            if reference is None:
+                pilot = jax.tree.map(lambda leaf: leaf[0], drawn["evaluation"])
+                reference = reference_of(objective, odd, candidate, pilot, soft[softened])
+            parts.append(jax.device_get(_seed_numbers(drawn, reference, tests[some], config.estimators, options)))
+            spent.append(seconds)
+            residuals.append(residual)
+        assert reference is not None
+        numbers = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+        residuals = np.concatenate(residuals)
+        seconds = {name: sum(each[name] for each in spent) for name in oracles}
         arrays = _of_seeds(numbers, config.batches) | _bias(numbers, reference)
         arrays["residual"] = np.asarray(np.max(np.where(np.isfinite(residuals), residuals, np.inf)))
         arrays["unconverged"] = np.asarray(np.sum(~(residuals <= UNCONVERGED[str(residuals.dtype)])))
@@ -150,14 +171,14 @@ def _cell_keys(seed: int, seeds: int) -> dict[str, Any]:
     return {"order": by_order, "reference": (odd, candidate), "test": test}
 
 
-def _draw(objective: Any, theta: Array, keys: dict[str, Any], oracles: Sequence[str], samples: int, seeds: int):
+def _draw(objective: Any, theta: Array, keys: dict[str, Any], oracles: Sequence[str], samples: int, seeds: slice):
     """Batches of every oracle with an axis of seeds, the seconds that each took, and every rollout's residual."""
     together = max(1, LARGEST_BATCH // samples)
     drawn, seconds, residuals = {}, {}, []
     for name in oracles:
-        streams: Key[Array, " seeds"] = keys["order"][ORACLES[name].order]
+        streams: Key[Array, " seeds"] = keys["order"][ORACLES[name].order][seeds]
         parts, seconds[name] = [], 0.0
-        for start in range(0, seeds, together):
+        for start in range(0, len(streams), together):
             some = jax.random.clone(streams[start : start + together])
             flat = jax.vmap(lambda key: jax.random.split(key, samples))(some).reshape(-1)
             begun = time.perf_counter()
@@ -214,7 +235,7 @@ def _padded(values: np.ndarray, length: int) -> np.ndarray:
 
 def compute_landscapes(plan: SweepPlan) -> Compute:
     """A function that computes a cell; it keeps what is compiled."""
-    config, oracles = plan.config, _oracles(plan)
+    config, oracles = plan.config, oracles_of(plan.config)
     compiled: dict[int, Simulator] = {}
 
     def compute(cell: SweepCell) -> dict[str, np.ndarray]:
@@ -228,7 +249,7 @@ def compute_landscapes(plan: SweepPlan) -> Compute:
         )
         keys, columns, unconverged = _cell_keys(config.seed, config.batches), [], 0
         for theta in line.thetas:
-            drawn, _, residuals = _draw(objective, theta, keys, oracles, cell.samples, config.batches)
+            drawn, _, residuals = _draw(objective, theta, keys, oracles, cell.samples, slice(None))
             unconverged += np.sum(~(residuals <= UNCONVERGED[str(residuals.dtype)]))
             pooled = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), drawn)
             columns.append(jax.device_get(_slopes(pooled, line.direction, config.estimators, options)))
@@ -262,9 +283,3 @@ def _mean(sample: Float[Array, " samples"]) -> tuple[Float[Array, ""], Float[Arr
 
 
 COMPUTE: Final = {"gradients": compute_gradients, "descents": compute_descents, "landscapes": compute_landscapes}
-
-
-def _oracles(plan: SweepPlan) -> tuple[str, ...]:
-    """What the estimators need, and costs."""
-    needed = {"evaluation", *(oracle for name in plan.config.estimators for oracle in ESTIMATORS[name].needs)}
-    return tuple(name for name in ORACLES if name in needed)

@@ -2,11 +2,11 @@
 
 import dataclasses
 import itertools
-from typing import ClassVar, Final
+from typing import Any, ClassVar, Final
 
 import jax
 
-from estimators import ESTIMATORS, EstimatorOptions
+from estimators import ESTIMATORS, ORACLES, EstimatorOptions
 from estimators.cross_fitting import PLUG_IN, check_weights
 from estimators.ddcg import PUBLISHED_TOLERANCE
 from mjx_study.configuration import (
@@ -24,10 +24,18 @@ from mjx_study.landscape import check_span, line_of
 from mjx_study.objective import chunk_for
 from mjx_study.optimise import OptimiseConfig, OptimisePlan, plan_optimise
 from mjx_study.option import Checked
+from mjx_study.sweep_memory import bytes_per_sample, check_memory, seeds_at_once
 from mjx_study.table import digits_to_tell_apart
 from mjx_study.task import Task, check_sigma
 from mjx_study.tasks import make_task
 
+OF_KIND: Final[dict[str, dict[str, Any]]] = {
+    "gradients": {"reference_samples": 600},
+    "descents": {"optimizer": "sgd", "learning_rate": None, "decay": None, "evaluation_samples": 200},
+    "landscapes": {"span": None, "direction": None},
+}
+"""Options that one kind of sweep alone has, and what they are unless given."""
+ASKED_BY: Final = {"descents": "give iterations as well", "landscapes": "give points as well"}
 LARGEST_BATCH: Final = 20_000
 """Samples that are drawn at once; more seeds than fit are drawn in turn."""
 
@@ -54,9 +62,9 @@ class SweepConfig(Checked):
         iterations: of gradient descent; None to estimate gradients where each task starts.
         points: on a line through each task's theta, for landscapes; None for no landscapes.
         span, direction: of that line, as in `LandscapeConfig`; None for each task's range and a random direction.
-        optimizer, learning_rate, decay: of the descent, as in `OptimiseConfig`.
-        reference_samples: pairs of rollouts behind each reference gradient.
-        evaluation_samples: rollouts behind the cost of a final policy.
+        optimizer, learning_rate, decay: of a descent, as in `OptimiseConfig`.
+        reference_samples: pairs of rollouts behind each reference gradient; of gradients, None for 600.
+        evaluation_samples: rollouts behind the cost of a final policy; of descents, None for 200.
         seed, noise, baseline, gamma, failure_probability, variance_proxy, radius, max_norm, window, tolerance,
             weights, horizon, model, chunk_size: as in `EstimatorConfig`.
     """
@@ -79,11 +87,11 @@ class SweepConfig(Checked):
     points: int | None = None
     span: tuple[float, ...] | None = None
     direction: str | None = None
-    optimizer: str = "sgd"
+    optimizer: str | None = None
     learning_rate: float | None = None
     decay: float | None = None
-    reference_samples: int = 600
-    evaluation_samples: int = 200
+    reference_samples: int | None = None
+    evaluation_samples: int | None = None
     seed: int = 0
     noise: str | None = None
     baseline: str = "zero_noise"
@@ -106,8 +114,11 @@ class SweepConfig(Checked):
         check_names("estimator", self.estimators, ESTIMATORS)
         if self.contact:
             check_names("contact family", self.contact, FAMILIES)
-        if self.stiffness and self.contact and not any(FAMILIES[name].swept for name in self.contact):
-            raise ValueError(f"contact {', '.join(self.contact)} takes no stiffness; leave stiffness out")
+        if self.contact is not None and not any(FAMILIES[name].swept for name in self.contact):
+            for name in ("stiffness", "damping"):
+                if getattr(self, name) is not None:
+                    chosen = f"contact {', '.join(self.contact)}" if self.contact else "solref or solimp alone"
+                    raise ValueError(f"{chosen} takes no {name}; leave {name} out")
         for name in ("tasks", "stiffness", "solref", "solimp", "timestep", "cone", "sigma", "samples"):
             values = getattr(self, name)
             if values is not None:
@@ -116,10 +127,20 @@ class SweepConfig(Checked):
                 raise ValueError(f"no {name} given: give at least one, or leave it out")
         if self.iterations is not None and self.points is not None:
             raise ValueError("iterations are of descents and points of landscapes: give one of them")
-        if self.points is None and (self.span is not None or self.direction is not None):
-            raise ValueError("span and direction are of landscapes: give points as well")
+        self._settle()
         check_span(self.span)
         check_weights(self.weights, min(self.samples))
+
+    def _settle(self) -> None:
+        """Refuse options that have no effect in this kind of sweep, and give its own their defaults."""
+        for kind, options in OF_KIND.items():
+            given = [name for name in options if getattr(self, name) is not None]
+            if kind != self.kind and given:
+                listed = f"{' and '.join(given)} {'is' if len(given) == 1 else 'are'}"
+                raise ValueError(f"{listed} of {kind}: {ASKED_BY.get(kind, 'leave it out')}")
+            for name, default in options.items():
+                if kind == self.kind and getattr(self, name) is None:
+                    object.__setattr__(self, name, default)
 
     @property
     def kind(self) -> str:
@@ -194,6 +215,12 @@ class SweepPlan:
         settings = {(cell.group, cell.sigma, cell.samples) for cell in self.cells}
         return len(settings) * len(self.config.estimators)
 
+    @property
+    def memory(self) -> int:
+        """That batches and their statistics take at once in the largest cell, roughly [bytes]."""
+        cells = {(cell.group, cell.samples): cell for cell in self.cells}.values()
+        return max(memory_of_seed(self, cell) * seeds_together(self, cell) for cell in cells)
+
     def label(self, cell: SweepCell) -> str:
         """As messages name a cell."""
         group = self.groups[cell.group]
@@ -229,6 +256,7 @@ def plan_sweep(config: SweepConfig) -> SweepPlan:
     most = min(LARGEST_BATCH, max(config.samples) * (1 if config.iterations else config.batches))
     chunk = chunk_for(most, jax.local_devices()) if config.chunk_size is None else config.chunk_size
     plan = SweepPlan(config, tuple(groups), tuple(cells), chunk, tuple(dict.fromkeys(messages)))
+    check_memory(plan.memory)
     for cell in {cell.group: cell for cell in cells}.values():
         estimator_options(plan, cell)
         if config.kind == "descents":
@@ -236,6 +264,24 @@ def plan_sweep(config: SweepConfig) -> SweepPlan:
         elif config.kind == "landscapes":
             line_of(groups[cell.group].task, config.points or 0, config.span, config.direction, config.seed)
     return plan
+
+
+def oracles_of(config: SweepConfig) -> tuple[str, ...]:
+    """Kinds of batches that the estimators need, and costs."""
+    needed = {"evaluation", *(oracle for name in config.estimators for oracle in ESTIMATORS[name].needs)}
+    return tuple(name for name in ORACLES if name in needed)
+
+
+def memory_of_seed(plan: SweepPlan, cell: SweepCell) -> int:
+    """Memory of the batches of one seed of a cell, and of their statistics [bytes]."""
+    each = bytes_per_sample(plan.groups[cell.group].task, oracles_of(plan.config), len(plan.config.estimators))
+    return cell.samples * each
+
+
+def seeds_together(plan: SweepPlan, cell: SweepCell) -> int:
+    """How many seeds a cell draws at once: of gradients as many as fit, of others all."""
+    batches = plan.config.batches
+    return seeds_at_once(memory_of_seed(plan, cell), batches) if plan.config.kind == "gradients" else batches
 
 
 def _build(config: SweepConfig, name: str, timestep: float | None, cone: str | None) -> Task:

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_study import console, plots, results, study
+from mjx_study import console, disk, plots, results, study
 from mjx_study.comparison import CompareConfig, CompareResult, Row
 from mjx_study.findings import findings
 from mjx_study.objective import MjxObjective, Simulator
@@ -79,7 +79,8 @@ def test_a_sweep_compiles_each_program_once(spied) -> None:
 def test_batches_are_independent_and_the_same_in_every_cell(spied) -> None:
     _, _, keys = spied
     zeroth, first = keys["evaluate"][1:], keys["differentiate"][1:]  # the first call of each only compiles
-    assert len(zeroth) == 26 and len(first) == 52  # a cell differentiates for FoBG and for the control variate
+    assert len(zeroth) == 26 and len(first) == 53  # FoBG and control variate of each cell, and of the softest contact
+    first = first[1:]
     for batch in zeroth:
         np.testing.assert_array_equal(batch, zeroth[0])
     pools = [{tuple(key) for key in batch} for batch in (zeroth[0], first[0], first[1])]
@@ -110,6 +111,16 @@ def test_results_do_not_depend_on_the_chunk_size() -> None:
               for chunk in (2, 9)]  # fmt: skip
     np.testing.assert_allclose(chosen[0].gradients, chosen[1].gradients, rtol=1e-12)
     np.testing.assert_allclose(chosen[0].references, chosen[1].references, rtol=1e-12)
+
+
+def test_a_row_does_not_depend_on_the_rows_before_it(spied) -> None:
+    """The reference of a stiff contact, alone and after twelve softer ones."""
+    found, _, _ = spied
+    stiff = config(stiffness=(found.rows[36].stiffness,), contact=("penalty",), chunk_size=4)
+    alone = study.compare(study.plan_compare(stiff))
+    assert found.rows[36].contact == "penalty" and found.rows[36].stiffness == pytest.approx(1000)
+    np.testing.assert_array_equal(alone.references, found.references[36:39])
+    np.testing.assert_array_equal(alone.gradients, found.gradients[36:39])
 
 
 def test_a_second_run_gives_the_same_numbers(spied) -> None:
@@ -223,7 +234,7 @@ def test_a_file_is_whole_or_absent(tmp_path) -> None:
         raise RuntimeError("disk full")
 
     with pytest.raises(RuntimeError, match="disk full"):
-        results.write_whole(target, fail)
+        disk.write_whole(target, fail)
     assert target.read_text() == "before" and list(tmp_path.iterdir()) == [target]
 
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 import os
 import random
 import re
@@ -38,7 +39,6 @@ SMALL: dict[str, Any] = {
     "samples": (4, 8),
     "seeds": 3,
     "horizon": 20,
-    "reference_samples": 6,
     "chunk_size": 24,
 }
 
@@ -53,7 +53,8 @@ LINE: dict[str, Any] = {
 
 
 def config(**changes: Any) -> SweepConfig:
-    return SweepConfig(**(SMALL | changes))
+    of_gradients = {} if {"iterations", "points"} & changes.keys() else {"reference_samples": 6}
+    return SweepConfig(**(SMALL | of_gradients | changes))
 
 
 def same(one: xr.Dataset, other: xr.Dataset) -> bool:
@@ -310,7 +311,7 @@ def test_a_folder_of_another_study_is_refused(undisturbed: Path, tmp_path: Path)
     with pytest.raises(StudyError, match="holds no study"):
         load_study(tmp_path)
     (tmp_path / "study.json").write_text(json.dumps({"format": 99, "config": {}, "cells": []}))
-    with pytest.raises(StudyError, match="is of format 99; this program reads 1"):
+    with pytest.raises(StudyError, match="is of format 99; this program reads 2"):
         load_study(tmp_path)
 
 
@@ -330,7 +331,8 @@ def test_a_full_disk_leaves_what_is_complete(undisturbed: Path, tmp_path: Path) 
     command = [sys.executable, "-c", LIMITED, *ARGUMENTS, "--output", str(folder), "--json"]
     running = subprocess.run(command, capture_output=True, text=True, env=environment)
     error = running.stderr
-    assert running.returncode == 2, error
+    assert running.returncode == 1, error
+    assert json.loads(running.stdout)["computed"] == 0
     assert "cannot write to" in error and "the same command goes on" in error
     assert error.count("\n") == 1 and not list((folder / "cells").iterdir())
     assert run_sweep(plan_sweep(config()), folder).computed == 8
@@ -486,7 +488,19 @@ def test_a_file_with_a_value_of_another_kind_gets_one_line(tmp_path: Path, line:
         ({"stiffness": (10.0, 10.0)}, "stiffness given twice: 10.0"),
         ({"samples": (2,)}, "samples must be at least 3"),
         ({"iterations": 3, "points": 3}, "give one of them"),
-        ({"span": (0.0, 1.0)}, "span and direction are of landscapes: give points as well"),
+        ({"span": (0.0, 1.0)}, "span is of landscapes: give points as well"),
+        ({"learning_rate": math.nan}, "learning_rate must be positive and finite, got nan"),
+        ({"learning_rate": 0.1}, "learning_rate is of descents: give iterations as well"),
+        ({"optimizer": "adam", "decay": 0.5}, "optimizer and decay are of descents: give iterations as well"),
+        ({"points": 3, "evaluation_samples": 10}, "evaluation_samples is of descents"),
+        ({"iterations": 3, "learning_rate": math.nan}, "learning.rate must be positive and finite, got nan"),
+        ({"iterations": 3, "direction": "0"}, "direction is of landscapes"),
+        ({"iterations": 3, "reference_samples": 9}, "reference_samples is of gradients: leave it out"),
+        (
+            {"contact": (), "solref": ((-1000.0, -5.0),)},
+            "solref or solimp alone takes no stiffness; leave stiffness out",
+        ),
+        ({"contact": ("mjcf",), "stiffness": None, "damping": 1.0}, "contact mjcf takes no damping; leave damping out"),
         ({"points": 1}, "points must be at least 2 and at most 100000, got 1"),
         ({"points": 3, "span": (1.0, 0.0)}, "span must be two numbers, the lower one first"),
         ({"points": 3, "direction": "20"}, "direction must be random or a parameter's index, 0 to 19; got 20"),
@@ -515,7 +529,8 @@ def test_a_timestep_keeps_the_duration() -> None:
 
 
 def test_contact_models_in_mujocos_terms() -> None:
-    plan = plan_sweep(config(contact=(), solref=((-1000.0, -5.0), (0.02, 1.0)), solimp=((0.9, 0.95, 0.001, 0.5, 2.0),)))
+    solref, solimp = ((-1000.0, -5.0), (0.02, 1.0)), ((0.9, 0.95, 0.001, 0.5, 2.0),)
+    plan = plan_sweep(config(contact=(), stiffness=None, solref=solref, solimp=solimp))
     models = [cell.model for cell in plan.cells if cell.samples == 4]
     assert [model.family for model in models] == [
         "solref -1000 -5 solimp 0.9 0.95 0.001 0.5 2", "solref 0.02 1 solimp 0.9 0.95 0.001 0.5 2"

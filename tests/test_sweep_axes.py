@@ -57,7 +57,7 @@ def swept(folder: Path, **changes: Any):
 
 
 def test_stiffnesses_that_six_digits_do_not_tell_apart(tmp_path: Path) -> None:
-    data = swept(tmp_path / "log", stiffness=tuple(np.linspace(1000, 1000.1, 21)))
+    data = swept(tmp_path / "log", stiffness=tuple(np.linspace(1000, 1000.1, 21).tolist()))
     assert data.sizes["model"] == 21
     data = swept(tmp_path / "list", stiffness=(1e6, 1e6 + 1, 2e6))
     assert data["model"].values.tolist() == ["penalty 1000000", "penalty 1000001", "penalty 2000000"]

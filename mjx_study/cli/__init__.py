@@ -1,11 +1,13 @@
 """The command line: parse, check, call, print; exit codes.
 
-0 what was asked was done; 1 a check that was asked for failed; 2 a bad option or file, in one line, with nothing
-written; 130 interrupted. Each command has a module of its own, with `add` for its options and `run`.
+0 what was asked was done; 1 a check that was asked for failed, or a file could not be written, in one line after the
+numbers; 2 a bad option or file, in one line, with nothing written; 128 + N ended by signal N: 130 interrupted, 143
+terminated, 129 hung up. Each command has a module of its own, with `add` for its options and `run`.
 """
 
 import argparse
 import shlex
+import signal
 import sys
 from collections.abc import Sequence
 from importlib import metadata
@@ -23,8 +25,9 @@ from mjx_study.cli import (
     sweep,
     tasks,
 )
-from mjx_study.cli.options import INTERRUPTED, Parser, UsageError
+from mjx_study.cli.options import Parser, UsageError, ending
 
+ENDED = "files that are there are complete"
 EXAMPLES = """\
 start here:
   mjx-study compare pusher                       which estimator, at which contact stiffness? 20 s once compiled
@@ -45,12 +48,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         given = sys.argv[1:] if arguments is None else list(arguments)
         options = parser().parse_args(given)
         options.command_line = shlex.join(["mjx-study", *given])
-        return options.run(options)
+        with ending(ENDED, signal.SIGTERM, signal.SIGHUP):
+            return options.run(options)
     except UsageError as error:
         print(f"mjx-study: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        print(INTERRUPTED, file=sys.stderr)
+        print(f"mjx-study: interrupted; {ENDED}", file=sys.stderr)
         return 130
     except BrokenPipeError:
         sys.stderr.close()

@@ -14,16 +14,19 @@ from mjx_study.cli.options import (
     add_estimator_options,
     add_options,
     add_task_options,
+    attempt,
     computing,
     configure_process,
+    finish,
     usage_errors,
 )
 from mjx_study.cli.parameters import add_theta_option, theta_of
 from mjx_study.comparison import CompareConfig
 from mjx_study.console import alarms, print_comparison
 from mjx_study.contact import FAMILIES
+from mjx_study.disk import prepare_folder
 from mjx_study.plots import plot_comparison, save_figure
-from mjx_study.results import as_json, prepare_folder, save
+from mjx_study.results import as_json, save
 from mjx_study.study import compare, plan_compare
 
 EXAMPLES = """\
@@ -84,9 +87,8 @@ def run(options: argparse.Namespace) -> int:
         folder = None if options.output is None else prepare_folder(options.output)
     with computing() as progress:
         result = compare(plan, progress)
-    written = []
-    if folder is not None:
-        written = save(result, folder) + save_figure(plot_comparison(result), folder, "comparison")
+    write = lambda: save(result, folder) + save_figure(plot_comparison(result), folder, "comparison")  # noqa: E731
+    written, unwritten = ([], None) if folder is None else attempt(write)
     if options.json:
         print(json.dumps(as_json(result), allow_nan=False))
         for warning in alarms(result):
@@ -95,6 +97,6 @@ def run(options: argparse.Namespace) -> int:
         print_comparison(result)
         if written:
             print(f"written: {', '.join(map(str, written))}")
-        else:
+        elif folder is None:
             print("add --output DIR for a figure and the numbers on disk")
-    return 0
+    return finish(unwritten)

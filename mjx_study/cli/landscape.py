@@ -12,16 +12,18 @@ from mjx_study.cli.options import (
     add_contact_options,
     add_options,
     add_task_options,
+    attempt,
     computing,
     configure_process,
+    finish,
     print_report,
     task_of,
     usage_errors,
 )
 from mjx_study.cli.parameters import add_theta_option, theta_of
+from mjx_study.disk import prepare_folder, write_whole
 from mjx_study.landscape import Landscape, LandscapeConfig, landscape, plan_landscape
 from mjx_study.plots import plot_landscape, save_figure
-from mjx_study.results import prepare_folder, write_whole
 from mjx_study.table import format_table
 
 EPILOG = """\
@@ -63,9 +65,10 @@ def run(options: argparse.Namespace) -> int:
         folder = None if options.output is None else prepare_folder(options.output)
     with computing() as progress:
         result = landscape(plan, progress)
-    written = [] if folder is None else _save(result, folder)
-    print_report(options, result.as_json(), [*_lines(result), *_written(written)])
-    return 0
+    written, unwritten = ([], None) if folder is None else attempt(lambda: _save(result, folder))
+    hint = [] if unwritten else _written(written)
+    print_report(options, result.as_json(), [*_lines(result), *hint])
+    return finish(unwritten)
 
 
 def _save(result: Landscape, folder: Path) -> list[Path]:

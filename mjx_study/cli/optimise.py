@@ -15,16 +15,20 @@ from mjx_study.cli.options import (
     add_estimator_options,
     add_options,
     add_task_options,
+    add_versions_option,
+    attempt,
     computing,
     configure_process,
+    finish,
     print_report,
     usage_errors,
 )
 from mjx_study.cli.parameters import add_theta_option, theta_of
 from mjx_study.console import number
-from mjx_study.optimise import OptimiseConfig, OptimiseResult, Run, kept_runs, optimise, plan_optimise
+from mjx_study.disk import prepare_folder, write_whole
+from mjx_study.optimise import OptimiseConfig, OptimiseResult, Run, open_checkpoints, optimise, plan_optimise
 from mjx_study.plots import STYLE, plot_optimisation, save_figure
-from mjx_study.results import as_plain, prepare_folder, write_whole
+from mjx_study.results import as_plain
 from mjx_study.table import format_table
 
 EPILOG = """\
@@ -49,7 +53,7 @@ columns of the table:
   alpha       mean weight of first-order gradients in the last tenth of the iterations
   rollouts    simulated per seed, those that were differentiated and baselines included
 """
-RESUMABLE = "mjx-study: interrupted; the same command goes on from the last checkpoint, at most 20 s ago"
+RESUMABLE = "the same command goes on from the last checkpoint, at most 20 s ago"
 FIELDS = (
     "task estimators contact stiffness damping reference network iterations samples learning_rate decay optimizer "
     "seeds seed sigma noise baseline gamma failure_probability variance_proxy radius max_norm window tolerance weights "
@@ -69,6 +73,7 @@ def add(commands: Commands) -> None:
     add_estimator_options(command, OptimiseConfig)
     add_options(command, OptimiseConfig, "evaluation_samples", "chunk_size")
     command.add_argument("--output", type=Path, metavar="DIR", help="write figure, numbers, policies and checkpoints")
+    add_versions_option(command)
 
 
 def run(options: argparse.Namespace) -> int:
@@ -79,13 +84,13 @@ def run(options: argparse.Namespace) -> int:
         plan = plan_optimise(OptimiseConfig(**{name: value for name, value in fields.items() if value is not None}))
         folder = None if options.output is None else prepare_folder(options.output)
         if folder is not None:  # refused here, before anything is computed
-            kept_runs(folder, plan.config)
+            open_checkpoints(folder, plan, accept_versions=options.accept_versions)
     with computing(*([] if folder is None else [RESUMABLE])) as progress:
-        result = optimise(plan, folder, progress)
+        result = optimise(plan, folder, progress, accept_versions=options.accept_versions)
     document = as_document(result)
-    written = [] if folder is None else _save(result, document, folder)
-    print_report(options, document, _lines(result, written))
-    return 0
+    written, unwritten = ([], None) if folder is None else attempt(lambda: _save(result, document, folder))
+    print_report(options, document, _lines(result, written, hinted=folder is None))
+    return finish(*result.unsaved, unwritten)
 
 
 def as_document(result: OptimiseResult) -> dict[str, Any]:
@@ -142,7 +147,7 @@ def _save(result: OptimiseResult, document: dict[str, Any], folder: Path) -> lis
     return [*written, *save_figure(plot_optimisation(result), folder, "optimisation")]
 
 
-def _lines(result: OptimiseResult, written: list[Path]) -> list[str]:
+def _lines(result: OptimiseResult, written: list[Path], *, hinted: bool) -> list[str]:
     config = result.config
     where = "analytic reference" if config.reference else config.contact
     if not config.reference and config.stiffness:
@@ -167,7 +172,7 @@ def _lines(result: OptimiseResult, written: list[Path]) -> list[str]:
     lines += [f"warning: {message}" for message in result.warnings]
     hint = "add --output DIR for a figure, the policies, and to go on later"
     if not written:
-        return [*lines, hint]
+        return [*lines, hint] if hinted else lines
     return [*lines, f"written to {written[0].parent}: {', '.join(path.name for path in written)}"]
 
 

@@ -9,7 +9,8 @@ import sys
 import threading
 from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
-from typing import Any, NoReturn
+from pathlib import Path
+from typing import Any, Final, NoReturn
 
 from mjx_study.configuration import EstimatorConfig, Progress
 from mjx_study.console import progress_bar, show_cursor
@@ -19,7 +20,10 @@ from mjx_study.runtime import PRECISIONS, configure
 from mjx_study.task import Task
 from mjx_study.tasks import make_task, task_names
 
-INTERRUPTED = "mjx-study: interrupted; nothing was written"
+INTERRUPTED = "nothing was written"
+"""What is said after "interrupted" where a command has nothing better to say."""
+ENDINGS: Final = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated", signal.SIGHUP: "hung up"}
+"""Signals that end a command with one line and exit code 128 + their number."""
 
 
 class UsageError(ValueError):
@@ -150,6 +154,13 @@ def add_process_options(command: argparse.ArgumentParser, seed: int | None = 0) 
     add_option(command, OPTIONS["devices"])
 
 
+def add_versions_option(command: argparse.ArgumentParser) -> None:
+    """For commands that go on with what is in a folder."""
+    command.add_argument(
+        "--accept-versions", action="store_true", help="go on with a folder that other versions of the software began"
+    )
+
+
 def configure_process(options: argparse.Namespace) -> None:
     """Set JAX up as the options ask; a command without such options gets float64 and one device."""
     configure(precision=getattr(options, "precision", PRECISIONS[0]), cpu_devices=getattr(options, "devices", 1))
@@ -172,28 +183,50 @@ def usage_errors() -> Generator[None]:
 
 @contextmanager
 def computing(interrupted: str = INTERRUPTED) -> Generator[Progress]:
-    """A progress bar around computing; an interrupt ends the process at once, with one line and exit code 130.
+    """A progress bar around computing; a signal ends the process at once, see `ending`."""
+    with ending(interrupted, *ENDINGS), progress_bar() as progress:
+        yield progress
+
+
+@contextmanager
+def ending(told: str, *signals: signal.Signals) -> Generator[None]:
+    """While inside, any of some signals ends the process at once, with one line and exit code 128 + its number.
 
     An exception would not do: JAX calls back into Python while it traces, and what is raised there may be lost.
     Nothing is on disk yet, or only what is complete, so there is nothing to undo.
     """
-    previous = signal.getsignal(signal.SIGINT)
-    # Only the main thread may set a handler, and a background job that ignores interrupts goes on ignoring them.
-    ours = threading.current_thread() is threading.main_thread() and previous is not signal.SIG_IGN
-    if ours:
-        signal.signal(signal.SIGINT, lambda *_: _leave(interrupted))
+    previous = {number: signal.getsignal(number) for number in signals}
+    # Only the main thread may set a handler, and what a background job or nohup ignores is ignored still.
+    ours = threading.current_thread() is threading.main_thread()
+    caught = [number for number, handler in previous.items() if ours and handler is not signal.SIG_IGN]
+    for number in caught:
+        signal.signal(number, lambda code, _: _leave(f"mjx-study: {ENDINGS[signal.Signals(code)]}; {told}", code))
     try:
-        with progress_bar() as progress:
-            yield progress
+        yield
     finally:
-        if ours:
-            signal.signal(signal.SIGINT, previous)
+        for number in caught:
+            signal.signal(number, previous[number])
 
 
-def _leave(message: str) -> NoReturn:
+def _leave(message: str, code: int) -> NoReturn:
     show_cursor()
     print(message, file=sys.stderr, flush=True)
-    os._exit(130)
+    os._exit(128 + code)
+
+
+def attempt(write: Callable[[], list[Path]]) -> tuple[list[Path], str | None]:
+    """What a function wrote; or nothing, and why: a full disk must not cost the numbers, which are printed anyway."""
+    try:
+        return write(), None
+    except OSError as error:
+        return [], f"cannot write {error.filename or 'a file'}: {error.strerror or error}; what is there is complete"
+
+
+def finish(*unwritten: str | None) -> int:
+    """The exit code once the numbers are printed: 1 where something could not be written, with one line about it."""
+    if failures := [failure for failure in unwritten if failure]:
+        print(f"mjx-study: {failures[0]}", file=sys.stderr)
+    return int(bool(failures))
 
 
 def print_report(options: argparse.Namespace, document: dict[str, Any], lines: Sequence[str]) -> None:

@@ -3,9 +3,9 @@
 import argparse
 from pathlib import Path
 
-from mjx_study.cli.options import Commands, add_command, print_report, usage_errors
+from mjx_study.cli.options import Commands, add_command, attempt, finish, print_report, usage_errors
+from mjx_study.disk import prepare_folder
 from mjx_study.plots import save_figure
-from mjx_study.results import prepare_folder
 from mjx_study.study_plots import plot_study
 from mjx_study.sweep import load_study, what_to_beware_of
 
@@ -32,10 +32,17 @@ def run(options: argparse.Namespace) -> int:
     with usage_errors():
         dataset = load_study(options.folder)
         folder = prepare_folder(options.output or options.folder)
-    written = [path for name, figure in plot_study(dataset).items() for path in save_figure(figure, folder, name)]
+    figures = plot_study(dataset)
+    written, unwritten = attempt(
+        lambda: [path for name, figure in figures.items() for path in save_figure(figure, folder, name)]
+    )
     warnings = list(what_to_beware_of(dataset))
     document = {"written": [str(path) for path in written], "warnings": warnings}
     names = ", ".join(path.name for path in written if path.suffix == ".png")
-    lines = [f"warning: {message}" for message in warnings] + [f"written to {folder}: {names} (and as PDF)"]
-    print_report(options, document, lines if written else [*lines[:-1], "nothing to draw yet"])
-    return 0
+    lines = [f"warning: {message}" for message in warnings]
+    if not figures:
+        lines.append("nothing to draw yet")
+    elif written:
+        lines.append(f"written to {folder}: {names} (and as PDF)")
+    print_report(options, document, lines)
+    return finish(unwritten)

@@ -3,9 +3,9 @@
 import argparse
 from pathlib import Path
 
-from mjx_study.cli.options import Commands, add_command, print_report, usage_errors
+from mjx_study.cli.options import Commands, add_command, attempt, finish, print_report, usage_errors
+from mjx_study.disk import prepare_folder, write_whole
 from mjx_study.report import report
-from mjx_study.results import prepare_folder, write_whole
 from mjx_study.sweep import load_study, what_to_beware_of
 
 EPILOG = """\
@@ -31,8 +31,9 @@ def run(options: argparse.Namespace) -> int:
         path = options.output or options.folder / "report.html"
         prepare_folder(path.parent)
     page = report(dataset).encode()
-    write_whole(path, lambda file: file.write(page))
+    written, unwritten = attempt(lambda: [write_whole(path, lambda file: file.write(page))])
     warnings = list(what_to_beware_of(dataset))
-    lines = [f"warning: {message}" for message in warnings] + [f"written: {path} ({len(page) / 1e6:.1f} MB)"]
-    print_report(options, {"written": str(path), "warnings": warnings}, lines)
-    return 0
+    lines = [f"warning: {message}" for message in warnings]
+    lines += [f"written: {path} ({len(page) / 1e6:.1f} MB)"] if written else []
+    print_report(options, {"written": str(path) if written else None, "warnings": warnings}, lines)
+    return finish(unwritten)

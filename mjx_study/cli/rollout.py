@@ -20,8 +20,10 @@ from mjx_study.cli.options import (
     add_option,
     add_scene_options,
     add_task_options,
+    attempt,
     computing,
     configure_process,
+    finish,
     print_report,
     scene_options,
     task_of,
@@ -30,6 +32,7 @@ from mjx_study.cli.options import (
 from mjx_study.cli.parameters import add_theta_option, theta_of
 from mjx_study.configuration import Cell, at_theta, plan_cells
 from mjx_study.console import number
+from mjx_study.disk import prepare_folder, write_whole
 from mjx_study.files import PolicyFile, read_json
 from mjx_study.network import with_network
 from mjx_study.optimise import OptimiseConfig
@@ -47,7 +50,6 @@ from mjx_study.render import (
     strip,
     stroboscope,
 )
-from mjx_study.results import prepare_folder, write_whole
 from mjx_study.scene import load_model
 from mjx_study.table import format_table
 from mjx_study.task import Task
@@ -135,12 +137,12 @@ def run(options: argparse.Namespace) -> int:
         progress(0, 2, "simulating")
         rollout = simulate()
         progress(1, 2, "drawing")
-        written = _write(rollout, folder, options)
+        written, unwritten = attempt(lambda: _write(rollout, folder, options))
     if rollout.lasting < len(rollout.qpos):
         messages += (f"the state is not finite from {rollout.time[rollout.lasting]:g} s on; pictures end before",)
     document = rollout.facts | {"warnings": list(messages), "written": [str(path) for path in written]}
     print_report(options, document, _lines(rollout, messages, written))
-    return 0
+    return finish(unwritten)
 
 
 def _plan(options: argparse.Namespace):
@@ -269,7 +271,7 @@ def _lines(rollout: Rollout, messages: tuple[str, ...], written: list[Path]) -> 
     if len(rows) > MOST_BODIES:
         lines.append(f"and {len(rows) - MOST_BODIES} more bodies: --json lists them all")
     lines += [f"warning: {message}" for message in messages]
-    return [*lines, f"written to {written[0].parent}: {', '.join(path.name for path in written)}"]
+    return lines + [f"written to {path.parent}: {', '.join(each.name for each in written)}" for path in written[:1]]
 
 
 def _stem(task: str) -> str:

@@ -17,15 +17,26 @@ from mjx_study.cli.options import (
     add_option,
     add_options,
     add_process_options,
+    add_versions_option,
     computing,
     configure_process,
+    finish,
     print_report,
     usage_errors,
 )
 from mjx_study.files import read_toml
 from mjx_study.option import MOST_VALUES, OPTIONS, Interval, Option
 from mjx_study.store import StudyError
-from mjx_study.sweep import SweepConfig, SweepPlan, SweepResult, open_store, plan_sweep, run_sweep
+from mjx_study.sweep import (
+    SweepConfig,
+    SweepPlan,
+    SweepResult,
+    load_study,
+    open_store,
+    plan_sweep,
+    run_sweep,
+    what_to_beware_of,
+)
 from mjx_study.table import digits_to_tell_apart
 from mjx_study.tasks import task_names
 
@@ -56,7 +67,7 @@ A TOML file holds the same options by the names of their flags, with _ for -:
   samples = [30, 100]
   seeds = 10
 """
-RESUMABLE = "mjx-study: interrupted; the same command goes on where it stopped"
+RESUMABLE = "the same command goes on where it stopped"
 NUMBERS = Option("numbers", float, "X", "", Interval("(-inf, inf)"), many=True)
 TASKS = Option("tasks", str, "TASK", "", many=True)
 
@@ -74,12 +85,15 @@ def add(commands: Commands) -> None:
     add_options(command, SweepConfig, "seeds", "estimators", seeds={"unset": "10; 1 of landscapes"})
     add_options(command, SweepConfig, "iterations", iterations={"line": "optimise policies, N steps each", "unset": ""})
     add_options(command, SweepConfig, "points", points={"line": "landscapes, on N points of a line through theta"})
-    add_options(command, SweepConfig, "span", "direction", "optimizer", "learning_rate", "decay")
-    add_options(command, SweepConfig, "reference_samples", "evaluation_samples")
+    add_options(command, SweepConfig, "span", "direction")
+    add_options(command, SweepConfig, "optimizer", "learning_rate", "decay", optimizer={"unset": "sgd"})
+    add_options(command, SweepConfig, "reference_samples", reference_samples={"unset": "600"})
+    add_options(command, SweepConfig, "evaluation_samples", evaluation_samples={"unset": "200"})
     add_estimator_options(command, SweepConfig)
     add_options(command, SweepConfig, "horizon", "model", "chunk_size")
     add_process_options(command, seed=None)
     command.add_argument("--output", type=Path, required=True, metavar="DIR", help="folder of the study")
+    add_versions_option(command)
 
 
 def run(options: argparse.Namespace) -> int:
@@ -87,22 +101,27 @@ def run(options: argparse.Namespace) -> int:
     with usage_errors():
         configure_process(options)
         plan = plan_sweep(SweepConfig(**_fields(options)))
-        store = open_store(plan, options.output, options.command_line)
+        store = open_store(plan, options.output, options.command_line, accept_versions=options.accept_versions)
         missing = len(store.missing)
     if not options.json:
         print("\n".join(_head(plan, missing)), flush=True)
+    unwritten = None
     try:
         with computing(RESUMABLE) as progress:
-            result = run_sweep(plan, options.output, progress)
+            result = run_sweep(plan, options.output, progress, accept_versions=options.accept_versions)
     except StudyError as error:
         raise UsageError(str(error)) from error
     except OSError as error:
-        raise UsageError(
-            f"cannot write to {options.output}: {error.strerror or error}; what is there is complete, and the same "
-            "command goes on"
-        ) from error
-    print_report(options, _document(result), _tail(result, plan))
-    return 0
+        with usage_errors():
+            dataset = load_study(options.output)
+        computed = missing - dataset.attrs["missing_cells"]
+        result = SweepResult(options.output, dataset, computed, plan.warnings + what_to_beware_of(dataset))
+        reason = f"cannot write to {options.output}: {error.strerror or error}"
+        unwritten = f"{reason}; what is there is complete, and the same command goes on"
+    lines = _tail(result, plan)
+    drawn = f"written to {result.folder}: results.nc; mjx-study plot {result.folder} draws it"
+    print_report(options, _document(result), [*lines, drawn] if unwritten is None else lines)
+    return finish(unwritten)
 
 
 def _fields(options: argparse.Namespace) -> dict[str, Any]:
@@ -171,7 +190,12 @@ def _head(plan: SweepPlan, missing: int) -> list[str]:
         f"sigma {_listed(cell.sigma for cell in plan.cells)}, "
         f"{', '.join(map(str, config.samples))} samples",
         f"cells: {cells}, of which {missing} to compute"
-        + (f"; {plan.compilations} programs to compile, chunks of {plan.chunk_size} samples" if missing else ""),
+        + (
+            f"; {plan.compilations} programs to compile, chunks of {plan.chunk_size} samples, "
+            f"about {plan.memory / 1e9:.2g} GB for the batches of a cell"
+            if missing
+            else ""
+        ),
     ]
     return lines + [f"warning: {message}" for message in plan.warnings]
 
@@ -197,4 +221,4 @@ def _tail(result: SweepResult, plan: SweepPlan) -> list[str]:
     sizes = ", ".join(f"{name} {size}" for name, size in result.dataset.sizes.items())
     lines = [f"computed {result.computed} cells; {sizes}"]
     lines += [f"warning: {message}" for message in result.warnings if message not in plan.warnings]
-    return [*lines, f"written to {result.folder}: results.nc; mjx-study plot {result.folder} draws it"]
+    return lines

@@ -15,12 +15,12 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image, ImageDraw, ImageFont
 
+from mjx_study.disk import write_whole
 from mjx_study.render.drawing import Drawing
 from mjx_study.render.figures import time_label
 from mjx_study.render.framing import resolve_view
 from mjx_study.render.motion import Motion
 from mjx_study.render.opengl import RenderError, images
-from mjx_study.results import write_whole
 
 FORMATS: Final = ("gif", "mp4")
 MOST_FRAMES: Final = 120

@@ -1,0 +1,52 @@
+"""Memory of a sweep's batches: seeds are taken a few at a time, and a plan that needs too much is refused."""
+
+import math
+from collections.abc import Sequence
+from typing import Final
+
+from mjx_study.study import BIAS_DRAWS
+from mjx_study.task import Task
+
+AT_ONCE: Final = 512e6
+"""Memory that batches of several seeds may take together [bytes]; one seed's batches may take more."""
+MOST: Final = 16e9
+"""Memory that batches may take [bytes]; a plan that needs more is refused."""
+
+
+def numbers_per_sample(task: Task, oracle: str) -> int:
+    """Numbers that a sample of a batch holds."""
+    params, (steps, dimensions) = task.policy.num_params, task.policy.noise_shape
+    noise = steps * dimensions * (1 if task.policy.additive else 1 + params)  # scores, and the policy's Jacobian
+    states = task.scene.host.nq + task.scene.host.nv + task.scene.host.na
+    inputs = states + task.scene.host.nu
+    each = {
+        "evaluation": params + 3,
+        "pair": 2 * (params + 3),
+        "steps": 2 * steps + noise,
+        "step_pair": 2 * (2 * steps + noise),
+        "differentiation": params + 2,
+        "step_differentiation": noise + 2,
+        "linearisation": 2 * steps + noise + task.horizon * (inputs * (states + 1) + dimensions * states),
+    }
+    return each[oracle]
+
+
+def bytes_per_sample(task: Task, oracles: Sequence[str], estimators: int) -> int:
+    """Memory of a sample of every batch, of its gradients by every estimator, and of the draws of a test for bias."""
+    numbers = sum(numbers_per_sample(task, oracle) for oracle in oracles)
+    return 8 * (numbers + 3 * estimators * task.policy.num_params + 2 * BIAS_DRAWS)
+
+
+def seeds_at_once(memory_of_seed: int, seeds: int) -> int:
+    """How many seeds fit into `AT_ONCE`, in as few and as equal groups as possible; at least one."""
+    fitting = max(1, int(AT_ONCE / memory_of_seed))
+    return math.ceil(seeds / math.ceil(seeds / fitting))
+
+
+def check_memory(needed: int) -> None:
+    """Raises ValueError for a plan that needs more than `MOST`."""
+    if needed > MOST:
+        raise ValueError(
+            f"the batches of a cell would take about {needed / 1e9:.3g} GB of memory, and the limit is {MOST / 1e9:g} "
+            "GB: give fewer samples, and more seeds of them"
+        )

@@ -1,0 +1,177 @@
+"""Faults of the disk and of processes: nothing half written, nothing lost that was there, one line, no wait."""
+
+import errno
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mjx_study.checkpoint import Checkpoints
+from mjx_study.disk import TEMPORARY, prepare_folder, read_whole, write_whole
+from mjx_study.store import Store, StudyError, assemble, write_dataset
+from tests.faults import deadline, every_fault, from_the_future, put_no_file
+
+CELLS = 3
+DOCUMENT: dict[str, Any] = {
+    "config": {"kind": "test"},
+    "axes": {"model": [0, 1, 2]},
+    "cells": [{"at": {"model": index}} for index in range(CELLS)],
+}
+
+
+def numbers(index: int) -> dict[str, np.ndarray]:
+    return {"values": np.random.default_rng(index).normal(size=3000)}  # more than a buffer, so that a write is several
+
+
+def study(folder: Path) -> Store:
+    """Begin a study or go on with it, and write what is missing."""
+    store = Store.create(folder, DOCUMENT)
+    for index in store.missing:
+        with store.claim(index) as ours:
+            if ours:
+                store.write(index, numbers(index))
+    dataset = assemble(store, {"model": [0, 1, 2], "value": range(3000)}, {"values": (("value",), "1", "")}, {}, {})
+    write_dataset(dataset, folder / "results.nc")
+    return store
+
+
+def check_whole(folder: Path) -> int:
+    """How many cells there are; each has its own numbers, and every other file is complete."""
+    if not (folder / "study.json").exists():
+        return 0
+    store = Store.open(folder)
+    there = [index for index in range(CELLS) if store.has(index)]
+    for index in there:
+        np.testing.assert_array_equal(store.read(index)["values"], numbers(index)["values"])
+    return len(there)
+
+
+def leftovers(folder: Path) -> list[Path]:
+    return list(folder.rglob(f"*{TEMPORARY}"))
+
+
+@pytest.mark.parametrize(
+    ("code", "lasting"),
+    [(errno.ENOSPC, False), (errno.ENOSPC, True), (errno.EIO, False), (errno.EROFS, True)],
+    ids=["full once", "full", "broken once", "read-only"],
+)
+def test_a_fault_at_any_write_leaves_what_is_complete(tmp_path: Path, code: int, lasting: bool) -> None:
+    """A disk that is full, broken or read-only at the first write of a study, the second, and so on."""
+    folders = [tmp_path / "0"]
+    for at in every_fault(code, lambda: study(folders[-1]), lasting=lasting):
+        folder = folders[-1]
+        before = check_whole(folder)
+        assert leftovers(folder) == []  # the process lives, and removes what it began
+        study(folder)
+        assert check_whole(folder) == CELLS >= before
+        folders.append(tmp_path / str(at + 1))
+    assert len(folders) > 20
+
+
+def test_a_fault_at_any_write_leaves_the_file_before(tmp_path: Path) -> None:
+    path = write_whole(tmp_path / "file", lambda file: file.write(b"before"))
+    new = b"x" * 30_000
+    points = 0
+    for at in every_fault(errno.ENOSPC, lambda: write_whole(path, lambda file: file.write(new))):
+        assert path.read_bytes() == b"before" and list(tmp_path.iterdir()) == [path]
+        points = at + 1
+    assert points >= 4 and path.read_bytes() == new
+
+
+KILLED = """
+import sys
+from pathlib import Path
+import numpy as np
+from mjx_study.disk import TEMPORARY, prepare_folder, write_whole
+from tests.faults import killed_at_every_system_call
+
+folder = Path(sys.argv[1])
+path = folder / "file"
+old, new = b"o" * 20_000, b"n" * 30_000
+write_whole(path, lambda file: file.write(old))
+points = left = changed = 0
+for points, _ in enumerate(killed_at_every_system_call(lambda: write_whole(path, lambda file: file.write(new))), 1):
+    assert path.read_bytes() in (old, new), points
+    changed += path.read_bytes() == new
+    left += len(list(folder.glob(f".*{TEMPORARY}")))
+    prepare_folder(folder)
+    assert list(folder.iterdir()) == [path], points
+    write_whole(path, lambda file: file.write(old))
+assert path.read_bytes() == new
+print(points, left, changed)
+"""
+
+
+def run_alone(code: str, *arguments: str) -> str:
+    command = [sys.executable, "-c", code, *arguments]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=Path(__file__).parents[1])
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_killed_at_any_system_call_a_file_is_the_old_or_the_new_one(tmp_path: Path) -> None:
+    """And what the dead process began is removed when the folder is opened next."""
+    points, left, changed = map(int, run_alone(KILLED, str(tmp_path)).split())
+    assert points > 20 and left > 5 and changed >= 2
+
+
+def test_what_a_living_process_writes_stays(tmp_path: Path) -> None:
+    """Leftovers are known by their lock, not by their age; other programs' files are not touched."""
+    (tmp_path / ".hidden").write_text("another program's")
+    (tmp_path / f".old.abcdefgh{TEMPORARY}").write_text("a dead process's")
+
+    def opening(file: Any) -> None:
+        file.write(b"whole")
+        prepare_folder(tmp_path)
+        assert len(leftovers(tmp_path)) == 1
+
+    path = write_whole(tmp_path / "file", opening)
+    assert path.read_bytes() == b"whole" and {each.name for each in tmp_path.iterdir()} == {".hidden", "file"}
+
+
+@pytest.mark.parametrize("kind", ["fifo", "socket", "folder", "device"])
+def test_what_is_no_file_is_refused_at_once(tmp_path: Path, kind: str) -> None:
+    folder = tmp_path / "study"
+    study(folder)
+    with deadline(5):
+        put_no_file(folder / "cells" / "00001.npz", kind)
+        with pytest.raises(StudyError, match="00001.npz is damaged .*; move it away to compute it again"):
+            Store.open(folder).read(1)
+        put_no_file(folder / "study.lock", kind)
+        with pytest.raises(StudyError, match="cannot lock .*study.lock"), Store.open(folder).claim(0):
+            pass
+        put_no_file(folder / "study.json", kind)
+        with pytest.raises(StudyError, match="cannot read .*study.json"):
+            Store.open(folder)
+        with pytest.raises(StudyError, match="cannot read .*study.json"):
+            Store.create(folder, DOCUMENT)
+        put_no_file(tmp_path / "run-zobg.npz", kind)
+        with pytest.raises(ValueError, match="run-zobg.npz is damaged .*; move it away"):
+            Checkpoints(tmp_path, ("zobg",), {}, 3)
+        put_no_file(tmp_path / f".x.abcdefgh{TEMPORARY}", kind)
+        prepare_folder(tmp_path)
+
+
+def test_a_clock_in_the_future_changes_nothing(tmp_path: Path) -> None:
+    folder = tmp_path / "study"
+    study(folder)
+    (folder / "cells" / "00001.npz").unlink()
+    (folder / "cells" / f".00001.npz.abcdefgh{TEMPORARY}").write_text("of a dead process")
+    from_the_future(tmp_path)
+    assert Store.open(folder).missing == [1]
+    study(folder)
+    assert check_whole(folder) == CELLS and leftovers(folder) == []
+
+
+def test_a_read_only_disk_can_be_read(tmp_path: Path) -> None:
+    folder = tmp_path / "study"
+    study(folder)
+    for _ in every_fault(errno.EROFS, lambda: check_whole(folder), lasting=True):
+        pytest.fail("reading a study wrote")
+    assert json.loads(read_whole(folder / "study.json"))["config"] == {"kind": "test"}
+    assert os.access(folder, os.R_OK)

@@ -1,0 +1,131 @@
+"""How commands end: by a signal with one line and its exit code, on a full disk with their numbers and one line."""
+
+import errno
+import importlib
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mjx_study import cli, disk, sweep_cells
+from mjx_study.cli import options
+from mjx_study.sweep_plan import SweepCell, SweepPlan
+from tests.test_study import result, row
+
+SIGNALS = """
+import os, signal, sys, time
+from mjx_study.cli import options
+
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a background job's children ignore it
+signal.signal(signal.SIGHUP, signal.SIG_DFL)
+for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+    child = os.fork()
+    if child == 0:
+        with options.computing("the same command goes on"):
+            os.kill(os.getpid(), number)
+            time.sleep(5)
+        os._exit(1)
+    print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
+signal.signal(signal.SIGHUP, signal.SIG_IGN)  # nohup
+with options.computing():
+    os.kill(os.getpid(), signal.SIGHUP)
+print("goes on")
+"""
+
+
+def test_a_signal_ends_a_command_with_one_line_and_its_code() -> None:
+    done = subprocess.run([sys.executable, "-c", SIGNALS], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split("\n")[:4] == ["130", "143", "129", "goes on"]
+    words = ("interrupted", "terminated", "hung up")
+    said = [line for line in done.stderr.splitlines() if line.startswith("mjx-study: ")]
+    assert said == [f"mjx-study: {word}; the same command goes on" for word in words]
+
+
+@pytest.fixture
+def full(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
+    """Fills the disk: no file can be begun any more."""
+    monkeypatch.setattr(options, "configure", lambda **_: None)
+
+    def begin(path: Path) -> Any:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    return lambda: monkeypatch.setattr(disk, "_begin", begin)
+
+
+def ended(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    """Standard output of a command that could not write."""
+    capsys.readouterr()
+    assert cli.main(list(arguments)) == 1
+    out, error = capsys.readouterr()
+    assert error.count("\n") == 1 and error.startswith("mjx-study: cannot write"), error
+    assert "No space left on device" in error
+    return out
+
+
+def test_a_full_disk_costs_an_optimisation_no_number(
+    tmp_path: Path, full: Callable[[], None], capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["optimise", "pusher", "--reference", "--horizon", "8", "--iterations", "2", "--seeds", "2"]
+    arguments += ["--samples", "4", "--evaluation-samples", "5", "--estimator", "fobg", "--output", str(tmp_path)]
+    full()
+    out = ended(capsys, *arguments)
+    assert "FoBG" in out and "written" not in out and list(tmp_path.iterdir()) == []
+    document = json.loads(ended(capsys, *arguments, "--json"))
+    assert len(document["runs"][0]["theta"]) == 2
+
+
+def test_a_full_disk_costs_a_comparison_no_number(
+    tmp_path: Path, full: Callable[[], None], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    command = importlib.import_module("mjx_study.cli.compare")
+    monkeypatch.setattr(command, "compare", lambda plan, progress: result(row("zobg", 10, 1.5), row("fobg", 10, 0.5)))
+    full()
+    arguments = ["compare", "pusher", "--stiffness", "10", "--horizon", "2", "--output", str(tmp_path)]
+    assert "ZoBG" in ended(capsys, *arguments)
+    assert [each["variance"] for each in json.loads(ended(capsys, *arguments, "--json"))["rows"]] == [1.5, 0.5]
+
+
+def test_a_full_disk_costs_a_landscape_no_number(
+    tmp_path: Path, full: Callable[[], None], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    command = importlib.import_module("mjx_study.cli.landscape")
+    monkeypatch.setattr(command, "landscape", lambda plan, progress: SimpleNamespace(as_json=lambda: {"cost": 1.5}))
+    monkeypatch.setattr(command, "_lines", lambda found: ["cost 1.5"])
+    monkeypatch.setattr(command, "_save", lambda found, folder: [disk.write_whole(folder / "landscape.json", print)])
+    full()
+    arguments = ["landscape", "ball_wall", "--output", str(tmp_path)]
+    assert ended(capsys, *arguments) == "cost 1.5\n"
+
+
+def test_a_full_disk_costs_a_study_nothing_that_was_there(
+    tmp_path: Path, full: Callable[[], None], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def compute_of(plan: SweepPlan) -> Callable[[SweepCell], dict[str, np.ndarray]]:
+        seeds = plan.config.batches, len(plan.config.estimators)
+
+        def compute(cell: SweepCell) -> dict[str, np.ndarray]:
+            if cell.samples == 8:
+                full()
+            numbers = {name: np.ones(seeds) for name in ("variance", "alpha", "relative_error")}
+            return numbers | {"squared_bias": np.full(seeds[1], np.nan), "reference_uncertainty": np.ones(())}
+
+        return compute
+
+    monkeypatch.setitem(sweep_cells.COMPUTE, "gradients", compute_of)
+    folder = tmp_path / "out"
+    arguments = ["sweep", "pusher", "--stiffness", "10", "--contact", "penalty", "--samples", "4,8", "--horizon", "2"]
+    out = ended(capsys, *arguments, "--output", str(folder))
+    assert "computed 1 cells" in out and "1 cells are not computed yet" in out and "results.nc" not in out
+    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    assert len(before) == 3  # study.json, its lock, and a cell
+    assert ended(capsys, "plot", str(folder)) == "warning: 1 cells are not computed yet; the same command goes on\n"
+    assert "written" not in ended(capsys, "report", str(folder))
+    assert before == {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}

@@ -1,0 +1,321 @@
+"""Identity by content: what changes a number changes a digest, names and places do not; versions are told."""
+
+import dataclasses
+import importlib
+import re
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mjx_study import identity, sweep_cells
+from mjx_study.checkpoint import checkpoint_path
+from mjx_study.identity import contents, differences
+from mjx_study.optimise import OptimiseConfig, OptimiseResult, optimise, plan_optimise
+from mjx_study.revision import git_revision
+from mjx_study.scene import models_folder
+from mjx_study.store import Store, StudyError
+from mjx_study.sweep import load_study, run_sweep, what_to_beware_of
+from mjx_study.sweep_plan import SweepCell, SweepConfig, SweepPlan, plan_sweep
+from mjx_study.task import Task
+from mjx_study.tasks import make_task
+
+MODULE = """
+from functools import partial
+from mjx_study.tasks import pusher
+from helping import WEIGHT, weighed
+
+def cost(state, factor=1.0):
+    return factor * weighed(state.qpos[0])
+
+def hop(horizon=2, **options):
+    bias = {bias}
+    return pusher(horizon=horizon, **options).replace(final_cost=lambda state: cost(state) + bias)
+"""
+HELPER = "WEIGHT = {weight}\n\ndef weighed(x):\n    return WEIGHT * x\n"
+
+
+@pytest.fixture
+def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Task]:
+    """A task of a module here, built afresh with other contents."""
+    monkeypatch.chdir(tmp_path)
+
+    def build(bias: float = 1.0, weight: float = 2.0, text: str = "") -> Task:
+        (tmp_path / "hopping.py").write_text(MODULE.format(bias=bias) + text)
+        (tmp_path / "helping.py").write_text(HELPER.format(weight=weight))
+        for name in ("hopping", "helping"):
+            sys.modules.pop(name, None)
+        importlib.invalidate_caches()
+        sys.dont_write_bytecode = True
+        return make_task("hopping:hop")
+
+    return build
+
+
+def digest(task: Task) -> dict[str, str]:
+    return contents({"it": [task]})
+
+
+def changed(one: Task, other: Task) -> set[str]:
+    first, second = digest(one), digest(other)
+    return {name for name in first | second if first.get(name) != second.get(name)}
+
+
+def test_the_same_content_has_the_same_digest() -> None:
+    assert digest(make_task("tennis")) == digest(make_task("tennis"))
+    assert digest(make_task("tennis")).keys() == {"precision", "model of it", "task it"}
+
+
+def test_a_model_counts_by_what_it_simulates(tmp_path: Path) -> None:
+    text = (models_folder() / "pusher.xml").read_text()
+
+    def pusher(name: str, content: str) -> Task:
+        (tmp_path / name).write_text(content)
+        return make_task("pusher", horizon=2, model=str(tmp_path / name))
+
+    base = pusher("a.xml", text)
+    assert changed(base, pusher("b.xml", text.replace("<mujoco", "<!-- a remark --><mujoco"))) == set()
+    heavier = re.sub(r'timestep="[^"]*"', 'timestep="0.004"', text)
+    assert heavier != text
+    assert "model of it" in changed(base, pusher("a.xml", heavier))
+    scene = base.scene
+    model = scene.model.replace(body_mass=2 * scene.model.body_mass)
+    moved = base.replace(scene=dataclasses.replace(scene, model=model))
+    assert changed(base, moved) == {"model of it"}
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"theta": jnp.full(2, 0.3)},
+        {"gamma": 3.0},
+        {"final_cost": lambda state: state.qpos[0]},
+        {"stiffnesses": (1.0, 2.0)},
+        {"sigma": 0.2},
+    ],
+)
+def test_every_part_of_a_task_counts(changes: dict[str, Any]) -> None:
+    task = make_task("pusher", horizon=2)
+    assert "task it" in changed(task, task.replace(**changes))
+    assert changed(task, task.replace(description="other words")) == set()
+
+
+def test_a_module_counts_by_its_source_and_by_what_its_functions_hold(own: Callable[..., Task]) -> None:
+    base = digest(own())
+    assert base == digest(own()) and {"source of hopping.py", "source of helping.py"} <= base.keys()
+    for changes, what in (
+        ({"bias": 1.5}, {"task it", "source of hopping.py"}),
+        ({"weight": 2.5}, {"task it", "source of helping.py"}),
+        ({"text": "# a remark\n"}, {"source of hopping.py"}),
+    ):
+        other = digest(own(**changes))
+        assert {name for name in base if base[name] != other[name]} == what, changes
+
+
+def test_arrays_count_by_value_to_twelve_digits() -> None:
+    def of(value: Any) -> str:
+        found = identity._Digest()
+        found.add(value)
+        return found.hexdigest()
+
+    array = np.array([1.0, -0.3, 0.0, np.inf, np.nan])
+    assert of(array) == of(array * (1 + 1e-15)) != of(array * (1 + 1e-9))
+    assert len({of(array), of(-array), of(array[:4]), of(array.reshape(5, 1)), of([1.0, 2.0]), of((2.0, 1.0))}) == 6
+    cycle: list[Any] = [1]
+    cycle.append(cycle)
+    assert of(cycle) == of(cycle)
+
+
+# Studies.
+
+SMALL: dict[str, Any] = {
+    "tasks": ("pusher",),
+    "contact": ("penalty",),
+    "stiffness": (10.0, 100.0),
+    "samples": (4,),
+    "seeds": 1,
+    "horizon": 2,
+}
+
+
+@pytest.fixture
+def stubbed(monkeypatch: pytest.MonkeyPatch) -> None:
+    def compute_of(plan: SweepPlan) -> Callable[[SweepCell], dict[str, np.ndarray]]:
+        return lambda cell: {"residual": np.asarray(cell.model.stiffness)}
+
+    monkeypatch.setitem(sweep_cells.COMPUTE, "gradients", compute_of)
+
+
+def swept(folder: Path, **changes: Any):
+    accept = {name: changes.pop(name) for name in list(changes) if name == "accept_versions"}
+    return run_sweep(plan_sweep(SweepConfig(**(SMALL | changes))), folder, **accept)
+
+
+@pytest.mark.usefixtures("stubbed")
+def test_a_study_of_another_precision_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    swept(tmp_path / "out")
+    monkeypatch.setattr(identity, "precision", lambda: "float32")
+    with pytest.raises(StudyError, match="holds another study .precision float64 there and float32 here"):
+        swept(tmp_path / "out")
+
+
+@pytest.mark.usefixtures("stubbed")
+def test_a_study_whose_model_or_task_changed_is_refused(
+    tmp_path: Path, own: Callable[..., Task], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "own.xml"
+    text = (models_folder() / "pusher.xml").read_text()
+    path.write_text(text)
+    swept(tmp_path / "out", model=str(path))
+    path.write_text(re.sub(r'timestep="[^"]*"', 'timestep="0.004"', text))
+    with pytest.raises(StudyError, match="holds another study .model of pusher "):
+        swept(tmp_path / "out", model=str(path))
+    own()
+    swept(tmp_path / "hops", tasks=("hopping:hop",))
+    own(bias=3.0)
+    with pytest.raises(StudyError, match="another study .task hopping:hop .*, source of hopping.py "):
+        swept(tmp_path / "hops", tasks=("hopping:hop",))
+
+
+def other_jax(monkeypatch: pytest.MonkeyPatch) -> None:
+    version = identity.metadata.version
+    monkeypatch.setattr(identity.metadata, "version", lambda name: "99.0" if name == "jax" else version(name))
+
+
+@pytest.mark.usefixtures("stubbed")
+def test_other_versions_need_a_flag_and_are_remembered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = tmp_path / "out"
+    assert swept(folder).dataset.attrs["mixed_versions"] == ""
+    other_jax(monkeypatch)
+    assert swept(folder).computed == 0  # nothing is left to compute, so nothing is mixed
+    (folder / "cells" / "00001.npz").unlink()
+    with pytest.raises(StudyError, match="with other versions .jax .* there and 99.0 here.; .*--accept-versions"):
+        swept(folder)
+    result = swept(folder, accept_versions=True)
+    assert result.computed == 1
+    assert any("different versions: jax" in text and "99.0" in text for text in result.warnings)
+    assert any("different versions: jax" in text for text in what_to_beware_of(load_study(folder)))
+
+
+@pytest.mark.usefixtures("stubbed")
+def test_a_cell_counts_in_its_place_alone(tmp_path: Path) -> None:
+    folder = tmp_path / "out"
+    swept(folder)
+    cells = folder / "cells"
+    (cells / "00000.npz").write_bytes((cells / "00001.npz").read_bytes())
+    with pytest.raises(StudyError, match="00000.npz is another cell of this study; move it away to compute it again"):
+        load_study(folder)
+    (cells / "00000.npz").unlink()
+    swept(folder)
+    document = (folder / "study.json").read_text()
+    (folder / "study.json").write_text(document.replace('"penalty 10"', '"penalty 11"'))
+    with pytest.raises(StudyError, match="is another cell"):
+        load_study(folder)
+    (folder / "study.json").write_text(document)
+    kept = Store.open(folder)
+    assert [float(kept.read(index)["residual"]) for index in (0, 1)] == [10.0, 100.0]
+
+
+# Optimisations.
+
+
+DESCENT: dict[str, Any] = {
+    "task": "ball_wall",
+    "reference": True,
+    "estimators": ("zobg", "fobg"),
+    "seeds": 2,
+    "samples": 5,
+    "evaluation_samples": 5,
+}
+
+
+def descended(
+    folder: Path | None, iterations: int, task: Task | None = None, *, accept_versions: bool = False
+) -> OptimiseResult:
+    plan = plan_optimise(OptimiseConfig(**DESCENT, iterations=iterations), task)
+    return optimise(plan, folder, accept_versions=accept_versions)
+
+
+def test_a_longer_run_is_neither_cut_nor_lost(tmp_path: Path) -> None:
+    whole = descended(tmp_path, 6)
+    kept = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    with pytest.raises(ValueError, match="run-zobg.npz holds 6 iterations, and 4 are asked for: give --iterations 6"):
+        descended(tmp_path, 4)
+    assert kept == {path: path.read_bytes() for path in tmp_path.iterdir()}
+    longer, undisturbed = descended(tmp_path, 8), descended(None, 8)
+    for one, other in zip(longer.runs, undisturbed.runs, strict=True):
+        np.testing.assert_array_equal(one.theta, other.theta)
+        assert one.history["cost"].shape == (8, 2)
+    assert np.any(whole.runs[0].theta != longer.runs[0].theta)
+
+
+def test_a_run_of_other_contents_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    descended(tmp_path, 2)
+    zeroth, first = (checkpoint_path(tmp_path, name) for name in ("zobg", "fobg"))
+    kept = first.read_bytes()
+    first.write_bytes(zeroth.read_bytes())
+    with pytest.raises(ValueError, match="another run .estimator zobg there and fobg here"):
+        descended(tmp_path, 3)
+    first.write_bytes(kept)
+    other = make_task("ball_wall").replace(final_cost=lambda state: state.qpos[0])
+    with pytest.raises(ValueError, match="another run .task ball_wall "):
+        descended(tmp_path, 3, other)
+    monkeypatch.setattr(identity, "precision", lambda: "float32")
+    with pytest.raises(ValueError, match="another run .precision float64 there and float32 here"):
+        descended(tmp_path, 3)
+
+
+def test_a_run_of_other_versions_needs_a_flag_and_remembers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    descended(tmp_path, 2)
+    other_jax(monkeypatch)
+    assert descended(tmp_path, 2).warnings == ()
+    with pytest.raises(ValueError, match="run-zobg.npz was computed with other versions .jax .* --accept-versions"):
+        descended(tmp_path, 3)
+    for iterations in (3, 4):
+        found = descended(tmp_path, iterations, accept_versions=True)
+        assert sum("computed by different versions (jax" in text for text in found.warnings) == 2
+
+
+def test_what_differs_is_told() -> None:
+    assert differences({"a": 1, "b": 2}, {"b": 3, "c": 4}) == (
+        "a 1 there and None here, b 2 there and 3 here, c None there and 4 here"
+    )
+    assert differences({"a": [1]}, {"a": [1]}) is None
+
+
+# Git.
+
+
+@pytest.mark.parametrize("kind", ["loose", "packed", "detached", "worktree", "symbolic"])
+def test_the_revision_is_that_of_git(tmp_path: Path, kind: str) -> None:
+    """Folders as git lays them out."""
+    revision, git = "1234567890" * 4, tmp_path / "checkout" / ".git"
+    (git / "refs" / "heads").mkdir(parents=True)
+    (git / "HEAD").write_text("ref: refs/heads/main\n")
+    if kind in ("loose", "worktree"):
+        (git / "refs" / "heads" / "main").write_text(f"{revision}\n")
+    elif kind == "packed":
+        packed = f"# pack-refs with: peeled\n{'0' * 40} refs/tags/v1\n^{'1' * 40}\n{revision} refs/heads/main\n"
+        (git / "packed-refs").write_text(packed)
+    elif kind == "detached":
+        (git / "HEAD").write_text(f"{revision}\n")
+    else:
+        (git / "refs" / "heads" / "main").write_text("ref: refs/heads/other\n")
+        (git / "refs" / "heads" / "other").write_text(f"{revision}\n")
+    root = git.parent
+    if kind == "worktree":
+        root, own = tmp_path / "tree", git / "worktrees" / "tree"
+        root.mkdir()
+        own.mkdir(parents=True)
+        (root / ".git").write_text(f"gitdir: {own}\n")
+        (own / "commondir").write_text("../..\n")
+        (own / "HEAD").write_text("ref: refs/heads/main\n")
+    assert git_revision(root) == revision
+    assert git_revision(tmp_path) is None
+    (git / "refs" / "heads" / "main").unlink(missing_ok=True)
+    if kind not in ("detached", "packed"):
+        assert git_revision(root) is None

@@ -1,0 +1,109 @@
+"""Memory of a sweep: it is bounded, foreseen, and the numbers do not depend on how seeds are grouped."""
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from estimators import Differentiation, Evaluation
+from mjx_study import sweep_cells, sweep_memory
+from mjx_study.contact import ContactModel
+from mjx_study.objective import MjxObjective, Simulator
+from mjx_study.sweep_cells import MEASURED, compute_gradients
+from mjx_study.sweep_plan import SweepConfig, memory_of_seed, plan_sweep, seeds_together
+
+
+class Drawn(MjxObjective):
+    """An objective whose samples are drawn, in place of simulated ones."""
+
+    def evaluate(self, theta, keys) -> Evaluation:
+        score = jax.vmap(lambda key: jax.random.normal(key, theta.shape))(keys)
+        return Evaluation(score.sum(1), score, jnp.zeros(len(keys)), jnp.zeros(len(keys)))
+
+    evaluate_odd = evaluate
+
+    def differentiate(self, theta, keys) -> Differentiation:
+        gradient = 1 + jax.vmap(lambda key: jax.random.normal(key, theta.shape))(keys)
+        return Differentiation(gradient.sum(1), gradient, jnp.zeros(len(keys)))
+
+
+class Stub(Simulator):
+    """A simulator that compiles nothing."""
+
+    def __post_init__(self) -> None:
+        pass
+
+    def objective(self, contact: ContactModel | None, sigma: float | None = None) -> MjxObjective:
+        return Drawn(self, contact, self.task.sigma if sigma is None else sigma)
+
+
+def config(**changes: Any) -> SweepConfig:
+    common: dict[str, Any] = {
+        "contact": ("penalty",),
+        "stiffness": (10.0,),
+        "reference_samples": 9,
+        "horizon": 3,
+        "chunk_size": 8,
+    }
+    return SweepConfig(tasks=("pusher",), **(common | changes))
+
+
+def test_numbers_do_not_depend_on_how_seeds_are_grouped(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sweep_cells, "Simulator", Stub)
+    plan = plan_sweep(config(samples=(8,), seeds=5, estimators=("zobg",)))
+    found = []
+    for at_once, groups in ((1e9, 5), (1.0, 1), (2.5 * memory_of_seed(plan, plan.cells[0]), 2)):
+        monkeypatch.setattr(sweep_memory, "AT_ONCE", at_once)
+        assert seeds_together(plan, plan.cells[0]) == groups
+        found.append(compute_gradients(plan)(plan.cells[0]))
+    for other in found[1:]:
+        for name, values in found[0].items():
+            if name not in MEASURED:
+                np.testing.assert_allclose(other[name], values, rtol=1e-12, err_msg=name)
+
+
+@pytest.mark.parametrize("kind", [{}, {"iterations": 3}, {"points": 3}])
+def test_a_plan_that_needs_too_much_memory_is_refused(kind: dict[str, int]) -> None:
+    changes = {"reference_samples": None} if kind else {}
+    assert plan_sweep(config(samples=(100,), **kind, **changes)).memory < sweep_memory.AT_ONCE
+    with pytest.raises(ValueError, match="a cell would take about .* GB of memory, and the limit is 16 GB: give fewer"):
+        plan_sweep(config(samples=(100, 10_000_000), **kind, **changes))
+
+
+def test_of_gradients_seeds_cost_no_memory() -> None:
+    few, many = (plan_sweep(config(samples=(10_000,), seeds=seeds, horizon=200)).memory for seeds in (2, 2000))
+    assert few == many < 1e9
+
+
+PEAK = """
+import resource, sys
+from mjx_study.runtime import configure
+configure(cpu_devices=1)
+from mjx_study import sweep_cells
+from mjx_study.sweep_plan import plan_sweep
+from tests.test_sweep_memory import Stub, config
+
+sweep_cells.Simulator = Stub
+plan = plan_sweep(config(samples=(10_000,), seeds=int(sys.argv[1]), horizon=200))
+before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+sweep_cells.compute_gradients(plan)(plan.cells[0])
+print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1e6)
+"""
+
+
+@pytest.mark.slow
+def test_memory_does_not_grow_with_seeds() -> None:
+    """10,000 samples of 200 parameters: at most what the plan says, of two seeds as of eight."""
+    peak = []
+    for seeds in ("2", "8"):
+        command = [sys.executable, "-c", PEAK, seeds]
+        done = subprocess.run(command, capture_output=True, text=True, cwd=Path(__file__).parents[1])
+        assert done.returncode == 0, done.stderr
+        peak.append(float(done.stdout))
+    foreseen = plan_sweep(config(samples=(10_000,), seeds=2, horizon=200)).memory / 1e9
+    assert peak[1] < 1.15 * peak[0] and foreseen / 2 < peak[1] < 2 * foreseen, (peak, foreseen)
