@@ -26,7 +26,7 @@ START = np.array([0.0, 1.0, 0.0, 0.0])
 HORIZON = 200
 SIGMA = 0.1
 NO_NOISE = 1e-150  # as a sigma: added to any control it is rounded away, and its square is no underflow
-DATA = json.loads((Path(__file__).parent / "data" / "pusher_rollouts.json").read_text())
+DATA = json.loads((Path(__file__).parent / "data" / "published_rollouts.json").read_text())
 
 # Smooth controls (T, 1) [N] with different contact events, so results are stated for one of them by name.
 INPUTS = {

@@ -102,7 +102,7 @@ def test_rollout_matches_the_reference_at_the_rate_of_the_impedance(stiffness, n
 
 
 @pytest.mark.parametrize("case", ["k=10,u=0.1", "k=1000,u=0.1", "k=10,u=sin(0.05t)", "k=1000,u=sin(0.05t)"])
-def test_cost_and_gradient_match_the_independent_implementation(simulator, case):
+def test_cost_and_gradient_match_the_published_system(simulator, case):
     stiffness, label = case.removeprefix("k=").split(",u=")
     controls = INPUTS["constant" if label == "0.1" else "reversing"]
     value, gradient = cost_and_gradient(simulator, penalty(float(stiffness)), controls)

@@ -1,4 +1,4 @@
-"""The analytic pusher against an independent implementation, and its derivatives against differences.
+"""The analytic pusher: its derivatives against differences; see also `test_published`.
 
 Along any direction of the controls the cost is a quadratic as long as no contact event changes, because the dynamics
 are affine between events. Central differences then have no truncation error, only rounding, about
@@ -12,7 +12,6 @@ import pytest
 from estimators import first_order, variance_interval, zeroth_order
 from mjx_study.reference import Pusher, ReferenceObjective, System, roll_out, value_and_gradient
 from tests.pusher_fixtures import (
-    DATA,
     HORIZON,
     INPUTS,
     SIGMA,
@@ -23,40 +22,6 @@ from tests.pusher_fixtures import (
     relative,
     sample_keys,
 )
-
-CASES = DATA["pusher"]["cases"]
-CASE_INPUTS = {
-    "0.1": np.full((HORIZON, 1), 0.1),
-    "1.0": np.full((HORIZON, 1), 1.0),
-    "sin(0.05t)": np.sin(0.05 * np.arange(HORIZON))[:, None],
-}
-
-
-@pytest.mark.parametrize("case", CASES)
-def test_equals_an_independent_implementation(case):
-    stiffness, label = case.removeprefix("k=").split(",u=")
-    expected, controls = CASES[case], CASE_INPUTS[label]
-    system = Pusher(float(stiffness))
-    states = roll_out(system, START, controls).states
-    value, gradient = value_and_gradient(system, START, controls)
-    gradient = gradient.ravel()
-    # Two orders of the same additions, 200 steps of a map that amplifies rounding 30-fold at K = 1000.
-    np.testing.assert_allclose(states[HORIZON], expected["xT"], rtol=1e-12, atol=1e-13)
-    np.testing.assert_allclose(states[100], expected["x100"], rtol=1e-12, atol=1e-13)
-    np.testing.assert_allclose(value, expected["cost"], rtol=1e-12, atol=1e-13)
-    np.testing.assert_allclose(np.linalg.norm(gradient), expected["grad_norm"], rtol=1e-12, atol=1e-13)
-    least = 1e-13 * expected["grad_norm"]
-    np.testing.assert_allclose(gradient[:3], expected["grad_first3"], rtol=1e-12, atol=least)
-    entries = [expected[name] for name in ("grad_50", "grad_100", "grad_150", "grad_last")]
-    np.testing.assert_allclose(gradient[[50, 100, 150, -1]], entries, rtol=1e-12, atol=least)
-    np.testing.assert_allclose(gradient.sum(), expected["grad_sum"], rtol=1e-12, atol=1e-12 * expected["grad_norm"])
-
-
-def test_settings_are_those_of_the_independent_implementation():
-    settings, system = DATA["pusher"]["settings"], Pusher(10.0)
-    assert (system.timestep, system.mass, system.damping) == (settings["h"], settings["mass"], settings["damping"])
-    assert list(system.goal) == settings["xg"] and list(system.state_weight) == settings["Q"]
-    assert system.control_weight == settings["R"] and list(START) == settings["x0"] and settings["T"] == HORIZON
 
 
 def test_is_a_system():
