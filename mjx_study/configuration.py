@@ -51,6 +51,7 @@ class EstimatorConfig(Checked):
         noise: name of the noise's density; None for the task's.
         baseline: of zeroth-order estimates: zero_noise, leave_one_out or none.
         gamma: accuracy that the alpha-order estimate must keep, in the unit of the gradient; None for the task's.
+        published: whether gamma and what follows are the published example's, on the scale of the task's cost.
         failure_probability: of the confidence radius epsilon.
         variance_proxy: in epsilon: variance, second_moment or upper_bound.
         radius: R in epsilon: max_deviation, or a bound in the unit of the gradient.
@@ -73,6 +74,7 @@ class EstimatorConfig(Checked):
     noise: str | None = None
     baseline: str = "zero_noise"
     gamma: float | None = None
+    published: bool = False
     failure_probability: float = 0.05
     variance_proxy: str = "variance"
     radius: str | float = "max_deviation"
@@ -172,14 +174,12 @@ def configured_options(config: EstimatorConfig, task: Task) -> EstimatorOptions:
     """The options of a configuration's estimators, checked against the task.
 
     Raises:
-        ValueError: an option is out of range, or an estimator cannot run on the task.
+        ValueError: an option is out of range, or an estimator cannot run on the task; or published constants are asked
+            for where there are none, or beside others.
     """
     options = EstimatorOptions(
         baseline=config.baseline,
-        gamma=task.gamma if config.gamma is None else config.gamma,
-        failure_probability=config.failure_probability,
-        variance_proxy=config.variance_proxy,
-        radius=config.radius,
+        **bound_constants(config, task),
         sigma=task.sigma,
         max_norm=config.max_norm,
         window=config.window,
@@ -188,6 +188,24 @@ def configured_options(config: EstimatorConfig, task: Task) -> EstimatorOptions:
     )
     check_estimators(config.estimators, task, options)
     return options
+
+
+def bound_constants(config: EstimatorConfig, task: Task) -> dict[str, Any]:
+    """Constants of AoBG's bound: those of a configuration, or the published example's.
+
+    Raises:
+        ValueError: the published ones are asked for where there are none, or beside others.
+    """
+    names = ("gamma", "failure_probability", "variance_proxy", "radius")
+    given = {name: getattr(config, name) for name in names}
+    if not config.published:
+        return given | {"gamma": task.gamma if config.gamma is None else config.gamma}
+    if task.published is None:
+        raise ValueError(f"{task.name} has no published constants of the bound; leave published out")
+    defaults = {field.name: field.default for field in dataclasses.fields(EstimatorConfig)}
+    if others := [name for name in names if given[name] != defaults[name]]:
+        raise ValueError(f"published sets {', '.join(names)}: leave {', '.join(others)} out")
+    return dataclasses.asdict(task.published)
 
 
 def resolved_fields(config: EstimatorConfig, task: Task, samples: int) -> dict[str, Any]:
@@ -201,7 +219,7 @@ def resolved_fields(config: EstimatorConfig, task: Task, samples: int) -> dict[s
     return {
         "sigma": task.sigma,
         "noise": task.noise,
-        "gamma": task.gamma if config.gamma is None else config.gamma,
+        **bound_constants(config, task),
         "horizon": task.horizon,
         "cone": {0: "pyramidal", 1: "elliptic"}[int(task.scene.host.opt.cone)],
         "chunk_size": chunk,

@@ -54,7 +54,7 @@ class Option:
 
     Attributes:
         name: of the field of a configuration.
-        kind: int, float or str.
+        kind: int, float, str, or bool, a flag on the command line.
         metavar: what stands for a value in the help.
         line: about it, for the help.
         interval: where its numbers lie.
@@ -134,6 +134,10 @@ class Option:
         return self.kind(value) if self.kind is float and isinstance(value, Integral) else value
 
     def _check_one(self, value: Any) -> None:
+        if self.kind is bool:
+            if not isinstance(value, bool):
+                raise ValueError(f"must be true or false, got {_short(value)}")
+            return
         if self.kind is str or (self.choices and isinstance(value, str)):
             if not isinstance(value, str):
                 raise ValueError(f"must be text, got {_short(value)}")
@@ -235,6 +239,7 @@ OPTIONS: Final[dict[str, Option]] = {
         _number("sigma", float, "(0, inf)", "S", "noise, in the unit of what it is added to", unset=TASKS),
         _choice("noise", NOISES, "NAME", "density of the noise", unset=TASKS),
         _choice("baseline", BASELINES, "NAME", "baseline of zeroth-order samples"),
+        Option("published", bool, "", "the published example's gamma, P, S2 and R, in place of the next four"),
         _number("gamma", float, "(0, inf]", "G", "AoBG's accuracy bound; inf for none", unset=TASKS),
         _number("failure_probability", float, "(0, 1)", "P", "probability that epsilon's interval misses"),
         _choice("variance_proxy", VARIANCE_PROXIES, "S2", f"in epsilon: {', '.join(VARIANCE_PROXIES)}"),

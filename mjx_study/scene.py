@@ -159,24 +159,34 @@ def _find(source: str | Path) -> Path:
     return shipped
 
 
-def require(scene: Scene, *, joints: tuple[str, ...], geoms: tuple[str, ...], sizes: tuple[int, int, int]) -> None:
+def require(scene: Scene, *, joints: tuple[str, ...], geoms: tuple[str, ...], driven: tuple[str, ...] = ()) -> None:
     """Refuse a model that a task cannot use.
 
     Args:
         scene: the model.
-        joints, geoms: names that it must have.
-        sizes: its nq, nv and nu.
+        joints: all of its joints, of one coordinate each, in the order of the state.
+        geoms: names that it must have.
+        driven: the joint that each of its actuators drives, in the order of the control.
 
     Raises:
-        SceneError: a name is missing, or a size is another.
+        SceneError: a name is missing, a size is another, or the order is.
     """
-    for name in joints:
-        scene.joint(name)
+    host = scene.host
+    indices = [scene.joint(name) for name in joints]
     for name in geoms:
         scene.geom(name)
-    found = (scene.host.nq, scene.host.nv, scene.host.nu)
+    sizes, found = (len(joints), len(joints), len(driven)), (host.nq, host.nv, host.nu)
     if found != sizes:
         raise SceneError(f"{scene.name} has nq, nv, nu = {found}; the task needs {sizes}")
+    if indices != sorted(indices):
+        own = ", ".join(joints[indices.index(index)] for index in sorted(indices))
+        raise SceneError(f"the joints of {scene.name} must come in the order {', '.join(joints)}; they come as {own}")
+    targets = [mujoco.mj_id2name(host, mujoco.mjtObj.mjOBJ_JOINT, joint) for joint in host.actuator_trnid[:, 0]]
+    if targets != list(driven):
+        raise SceneError(
+            f"the actuators of {scene.name} must drive {', '.join(driven)} in this order; they drive "
+            f"{', '.join(map(str, targets))}"
+        )
 
 
 def _set_options(host: mujoco.MjModel, options: Mapping[str, SceneOption]) -> None:

@@ -65,8 +65,8 @@ class SweepConfig(Checked):
         optimizer, learning_rate, decay: of a descent, as in `OptimiseConfig`.
         reference_samples: pairs of rollouts behind each reference gradient; of gradients, None for 600.
         evaluation_samples: rollouts behind the cost of a final policy; of descents, None for 200.
-        seed, noise, baseline, gamma, failure_probability, variance_proxy, radius, max_norm, window, tolerance,
-            weights, horizon, model, chunk_size: as in `EstimatorConfig`.
+        seed, noise, baseline, gamma, published, failure_probability, variance_proxy, radius, max_norm, window,
+            tolerance, weights, horizon, model, chunk_size: as in `EstimatorConfig`.
     """
 
     ranges: ClassVar = {"samples": "[3, 1e7]"}
@@ -96,6 +96,7 @@ class SweepConfig(Checked):
     noise: str | None = None
     baseline: str = "zero_noise"
     gamma: float | None = None
+    published: bool = False
     failure_probability: float = 0.05
     variance_proxy: str = "variance"
     radius: str | float = "max_deviation"

@@ -36,6 +36,28 @@ class Recipe:
     decay: float = 0.0
 
 
+@dataclasses.dataclass(frozen=True)
+class Published:
+    """What the published example gives AoBG's bound epsilon + alpha B <= gamma, on the scale of this task's cost.
+
+    Its confidence 0.95 stands in the logarithm where the Bernstein inequality has the probability of failure; the
+    appendix bounds the variance by the second moment, whose printed sum must be a mean.
+
+    Attributes:
+        gamma: accuracy bound, in the unit of the gradient.
+        radius: R in epsilon, a constant of each example, in the unit of the gradient.
+        failure_probability: P in epsilon, as published.
+        variance_proxy: s2 in epsilon.
+
+    Reference: Suh et al. 2022, appendix "Empirical Bernstein confidence", with its published examples' numbers.
+    """
+
+    gamma: float
+    radius: float
+    failure_probability: float = 0.95
+    variance_proxy: str = "second_moment"
+
+
 def no_running_cost(state: State, control: Float[Array, " nu"]) -> Float[Array, ""]:
     """0: the steps cost nothing."""
     return jax.numpy.zeros((), state.qpos.dtype)
@@ -65,6 +87,7 @@ class Task:
         contact_pair: names of the two geoms whose contact is swept; None where there is no contact.
         gamma: AoBG's accuracy bound, in the unit of the gradient; infinite by default, which is inverse-variance
             weighting.
+        published: AoBG's constants in the published example; None where there are none.
         reference: the analytic system in place of the penalty family, as a function of the stiffness [N/m]; None where
             there is none. `analytic` gives it the task's noise.
         damping: of the contact in families without a damping ratio of their own [N s/m], or None; friction needs some,
@@ -90,6 +113,7 @@ class Task:
     final_cost: Callable[[State], Float[Array, ""]] = no_final_cost
     contact_pair: tuple[str, str] | None
     gamma: float = math.inf
+    published: Published | None = None
     reference: Callable[[float], Reference] | None = None
     damping: float | None = None
     stiffnesses: tuple[float, ...] = STIFFNESSES

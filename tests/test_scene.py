@@ -1,16 +1,20 @@
 """Finding, compiling and refusing MJCF files."""
 
+import dataclasses
+import re
 import subprocess
 import sys
 from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
 
 from mjx_study.cli.options import Parser, add_scene_options, scene_options
+from mjx_study.dynamics import State
 from mjx_study.limitations import FLAGS
 from mjx_study.scene import (
     CONES,
@@ -24,6 +28,7 @@ from mjx_study.scene import (
     num_constraint_rows,
     put_scene,
 )
+from mjx_study.tasks import make_task
 from tests.scenes import FREE_BOX, floor_scene, slider
 
 FREE = '<body pos="0 0 1"><freejoint/><geom type="{}" size=".1 .1 .1" condim="{}"/></body>'
@@ -295,3 +300,45 @@ def test_the_template_is_the_reference_pose_with_fixed_types(pusher) -> None:
     np.testing.assert_array_equal(pusher.template.qpos, [0.0, 1.0])  # the slider's ref is its place
     leaves = [leaf for leaf in jax.tree.leaves(pusher.template) if isinstance(leaf, jax.Array)]
     assert leaves and not any(leaf.weak_type for leaf in leaves)
+
+
+def shipped(name: str) -> str:
+    return (models_folder() / f"{name}.xml").read_text()
+
+
+def test_a_model_in_a_task_s_place_may_number_its_bodies_otherwise(tmp_path: Path) -> None:
+    """The cost is that of the ball's mass and the bar's inertia about its pivot, wherever they stand in the file."""
+    path, stand = tmp_path / "mine.xml", '<body name="stand"><geom size="0.01" pos="0 -1 0"/></body>'
+    source = shipped("momentum_transfer").replace("<worldbody>", f"<worldbody>{stand}")
+    moved = 'pos="0 0.35 0" mass="10" diaginertia="3.675 3.675 3.675"'  # and 10 kg (0.35 m)^2 about the pivot
+    path.write_text(source.replace('pos="0 0 0" mass="10" diaginertia="4.9 4.9 4.9"', moved))
+    task, own = make_task("momentum_transfer"), make_task("momentum_transfer", model=path)
+    assert isinstance(task.start, State)
+    turning = dataclasses.replace(task.start, qvel=jnp.array([0.0, 0.0, 0.3]))
+    assert own.final_cost(turning) == pytest.approx(float(task.final_cost(turning)), rel=1e-12) != 0
+
+
+@pytest.mark.parametrize(
+    ("task", "changes", "says"),
+    [
+        (
+            "momentum_transfer",
+            (('"x" type', '"y" type'), ('"y" type', '"x" type')),
+            "the joints of mine must come in the order x, y, pivot; they come as y, x, pivot",
+        ),
+        (
+            "tennis",
+            (('name="paddle_x" joint="paddle_x"', 'name="first" joint="paddle_angle"'),),
+            "must drive paddle_x, paddle_y, paddle_angle in this order; they drive paddle_angle, paddle_y",
+        ),
+        ("sliding_box", (('joint="block"', 'joint="box"'),), "must drive block in this order; they drive box"),
+    ],
+    ids=["joints", "actuators of a paddle", "a motor"],
+)
+def test_a_model_in_a_task_s_place_has_its_order(
+    tmp_path: Path, task: str, changes: tuple[tuple[str, str], ...], says: str
+) -> None:
+    path, new = tmp_path / "mine.xml", dict(changes)
+    path.write_text(re.sub("|".join(map(re.escape, new)), lambda found: new[found[0]], shipped(task)))
+    with pytest.raises(SceneError, match=says):
+        make_task(task, model=path)

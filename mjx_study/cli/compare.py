@@ -56,8 +56,9 @@ columns of the table:
   lost            samples that overflowed or became NaN; they are left out, and a warning says so
 """
 FIELDS = (
-    "task stiffness contact estimators samples reference_samples sigma seed baseline gamma failure_probability "
-    "variance_proxy radius confidence damping cone horizon model chunk_size noise max_norm window tolerance weights"
+    "task stiffness contact estimators samples reference_samples sigma seed baseline gamma published "
+    "failure_probability variance_proxy radius confidence damping cone horizon model chunk_size noise max_norm window "
+    "tolerance weights"
 ).split()
 
 

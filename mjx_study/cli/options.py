@@ -84,8 +84,12 @@ def add_option(
         except ValueError as error:
             raise argparse.ArgumentTypeError(str(error)) from None
 
+    flag = option.flag or f"--{option.name.replace('_', '-')}"
+    if option.kind is bool:
+        command.add_argument(flag, action="store_true", default=None, help=option.describe())
+        return
     command.add_argument(
-        option.flag or f"--{option.name.replace('_', '-')}",
+        flag,
         dest=option.name,
         type=parse,
         default=default if given else None,
@@ -142,8 +146,8 @@ def scene_options(options: argparse.Namespace, *names: str) -> dict[str, Any]:
 def add_estimator_options(command: argparse.ArgumentParser, owner: type[Checked]) -> None:
     """The noise, and what estimators let one choose; see `estimators.EstimatorOptions`."""
     add_options(
-        command, owner, "noise", "baseline", "gamma", "failure_probability", "variance_proxy", "radius", "max_norm",
-        "window", "tolerance", "weights",
+        command, owner, "noise", "baseline", "published", "gamma", "failure_probability", "variance_proxy", "radius",
+        "max_norm", "window", "tolerance", "weights",
     )  # fmt: skip
 
 

@@ -21,6 +21,7 @@ TASKS: Final[dict[str, Callable[..., Task]]] = {
     "momentum_transfer": momentum_transfer,
     "tennis": tennis,
     "double_pendulum": double_pendulum,
+    "double_pendulum:published": partial(double_pendulum, "published"),
 }
 """Builders by name; a variant of a system is a name of its own, such as `ball_wall:dome`."""
 

@@ -18,7 +18,7 @@ from mjx_study.dynamics import State, initial_state
 from mjx_study.policy import Launch
 from mjx_study.reference import BallWall, FunctionObjective
 from mjx_study.scene import SceneError, load_model, put_scene, require
-from mjx_study.task import Recipe, Task
+from mjx_study.task import Published, Recipe, Task
 
 HORIZON: Final = 400
 LENGTH_SCALE: Final = 10.0
@@ -27,6 +27,7 @@ ANGLE: Final = 0.1  # [rad]
 SIGMA: Final = 0.1  # [rad]
 DAMPING: Final = 100.0  # [N s/m]
 GAMMA: Final = 0.01
+RADIUS: Final = 1.0
 RECIPE: Final = Recipe(0.1, 1000, 50)
 VARIANTS: Final = ("box", "dome")
 
@@ -39,7 +40,8 @@ def ball_wall(
     Args:
         variant: of the wall: box or dome.
         horizon: number of 2 ms steps; the highest flight takes 330.
-        model: another MJCF in its place, with the slide joints `x`, `z` and the geoms `ball`, `wall`, `dome`.
+        model: another MJCF in its place, with the slide joints `x`, `z` in this order and the geoms `ball`, `wall`,
+            `dome`.
         **scene_options: see `load_scene`.
 
     Raises:
@@ -51,7 +53,7 @@ def ball_wall(
     if variant == "dome":
         _raise_dome(host)
     scene = put_scene(host, "ball_wall")
-    require(scene, joints=("x", "z"), geoms=("ball", "wall", "dome"), sizes=(2, 2, 0))
+    require(scene, joints=("x", "z"), geoms=("ball", "wall", "dome"))
     dtype = scene.template.qpos.dtype
     speed = SPEED * LENGTH_SCALE**0.5
 
@@ -72,6 +74,7 @@ def ball_wall(
         final_cost=lambda state: -((state.qpos[0] / LENGTH_SCALE) ** 2),
         contact_pair=("ball", "wall"),
         gamma=GAMMA,
+        published=Published(GAMMA, RADIUS),
         recipe=RECIPE,
         reference=lambda stiffness: FunctionObjective(BallWall(), SIGMA),
         damping=DAMPING,

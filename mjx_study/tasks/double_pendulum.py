@@ -2,9 +2,13 @@
 
 The gradient of where it ends with respect to the initial angles and velocities grows with the horizon as trajectories
 separate. No contact takes part, so contact families do not apply. The equations of motion are MuJoCo's, with RK4 of
-1 ms (Suh et al. 2022 print others, which do not conserve energy). The published start is kept; the goal is to hang.
+1 ms (Suh et al. 2022 print others, which do not conserve energy); the goal is to hang.
+
+Angles are relative here, the second rod's from the first; the published example's are absolute. Its start in these
+coordinates is the variant `published`; the default takes the same four numbers as relative ones.
 """
 
+import math
 from pathlib import Path
 from typing import Final
 
@@ -18,35 +22,48 @@ from mjx_study.scene import load_scene, require
 from mjx_study.task import Recipe, Task
 
 HORIZON: Final = 1000
-START: Final = (1.5707963267948966, 0.0, 5.0, -5.0)  # angles [rad], velocities [rad/s]
+STARTS: Final = {  # relative angles [rad], velocities [rad/s]
+    "default": (math.pi / 2, 0.0, 5.0, -5.0),
+    "published": (math.pi / 2, -math.pi / 2, 5.0, -10.0),
+}
 SIGMA: Final = 0.5  # on each entry of the initial state [rad or rad/s]
 RECIPE: Final = Recipe(1e-3, 200, 100)
 
 
 def double_pendulum(
-    *, horizon: int = HORIZON, model: str | Path = "double_pendulum", **scene_options: str | float
+    start: str = "default",
+    *,
+    horizon: int = HORIZON,
+    model: str | Path = "double_pendulum",
+    **scene_options: str | float,
 ) -> Task:
     """|q|^2 with q [rad] the angles at the end, not wrapped: wrapping would add jumps of its own.
 
     Args:
+        start: where it is let go: default or published.
         horizon: number of 1 ms steps.
-        model: another MJCF in its place, with the hinges `first` and `second`.
+        model: another MJCF in its place, with the hinges `first` and `second` in this order.
         **scene_options: see `load_scene`.
+
+    Raises:
+        ValueError: unknown start.
     """
+    if start not in STARTS:
+        raise ValueError(f"unknown start {start!r} of double_pendulum; choose from {', '.join(STARTS)}")
     scene = load_scene(model, **scene_options)
-    require(scene, joints=("first", "second"), geoms=(), sizes=(2, 2, 0))
+    require(scene, joints=("first", "second"), geoms=())
     dtype = scene.template.qpos.dtype
 
-    def launched(start: State, decision: Float[Array, " params"]) -> State:
-        return State(decision[:2], decision[2:], start.act, start.warmstart)
+    def launched(rest: State, decision: Float[Array, " params"]) -> State:
+        return State(decision[:2], decision[2:], rest.act, rest.warmstart)
 
     return Task(
-        name="double_pendulum",
-        description="chaos without contact; four numbers of the initial state",
+        name="double_pendulum" if start == "default" else f"double_pendulum:{start}",
+        description=f"chaos without contact; four numbers of the initial state ({start})",
         scene=scene,
         horizon=horizon,
         policy=Launch(4, horizon, scene.host.nu, launched),
-        theta=jnp.array(START, dtype),
+        theta=jnp.array(STARTS[start], dtype),
         sigma=SIGMA,
         start=initial_state(scene),
         running_cost=lambda state, control: jnp.zeros((), dtype),

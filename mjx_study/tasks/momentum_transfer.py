@@ -10,22 +10,23 @@ from pathlib import Path
 from typing import Final
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from mjx_study.dynamics import State, initial_state
 from mjx_study.policy import Launch
 from mjx_study.reference import FunctionObjective, MomentumTransfer
 from mjx_study.scene import load_scene, require
-from mjx_study.task import Recipe, Task
+from mjx_study.task import Published, Recipe, Task
 
 HORIZON: Final = 400
 SPEED: Final = 2.0  # [m/s]
 DISTANCE: Final = 0.7  # from the start to where the ball's centre meets the bar [m]
 ANGLE: Final = 0.1  # [rad]
 SIGMA: Final = 0.02  # [rad]
-GAMMA: Final = 0.2
+GAMMA: Final = 0.2  # per unit of the published cost, -sin^2
+RADIUS: Final = 1.0  # likewise
 RECIPE: Final = Recipe(0.01, 500, 50)
-BALL, BAR = 1, 2  # bodies
 
 
 def momentum_transfer(
@@ -35,22 +36,23 @@ def momentum_transfer(
 
     Args:
         horizon: number of 2 ms steps; the ball arrives within 250.
-        model: another MJCF in its place, with the slide joints `x`, `y`, the hinge `pivot` and the geoms `ball`, `bar`.
+        model: another MJCF in its place, with the slide joints `x`, `y` and the hinge `pivot` in this order, and the
+            geoms `ball`, `bar`; the cost is made of its own mass and inertia.
         **scene_options: see `load_scene`.
     """
     scene = load_scene(model, **scene_options)
-    require(scene, joints=("x", "y", "pivot"), geoms=("ball", "bar"), sizes=(3, 3, 0))
+    require(scene, joints=("x", "y", "pivot"), geoms=("ball", "bar"))
     dtype = scene.template.qpos.dtype
-    mass, inertia = float(scene.host.body_mass[BALL]), float(scene.host.body_inertia[BAR, 2])
+    mass, _, inertia = (float(entry) for entry in scene.host.dof_M0)  # [kg], [kg], about the pivot [kg m^2]
     unit = mass * SPEED * DISTANCE  # [kg m^2/s]
 
     def launched(start: State, decision: Float[Array, " params"]) -> State:
         velocity = SPEED * jnp.stack([jnp.cos(decision[0]), jnp.sin(decision[0]), jnp.zeros_like(decision[0])])
         return State(start.qpos, velocity, start.act, start.warmstart)
 
-    def reference(stiffness: float) -> FunctionObjective:
-        function = MomentumTransfer(restitution=1.0, inertia_ratio=mass * DISTANCE**2 / inertia)
-        return FunctionObjective(function, SIGMA)
+    elastic = MomentumTransfer(restitution=1.0, inertia_ratio=mass * DISTANCE**2 / inertia)
+    edge = np.array([elastic.edge])
+    scale = float(elastic.value(edge) / MomentumTransfer().value(edge))  # of this cost at its best, 4 / 1.1^2
 
     return Task(
         name="momentum_transfer",
@@ -64,9 +66,10 @@ def momentum_transfer(
         running_cost=lambda state, control: jnp.zeros((), dtype),
         final_cost=lambda state: -((inertia * state.qvel[2] / unit) ** 2),
         contact_pair=("ball", "bar"),
-        gamma=GAMMA,
+        gamma=scale * GAMMA,
+        published=Published(scale * GAMMA, scale * RADIUS),
         recipe=RECIPE,
-        reference=reference,
+        reference=lambda stiffness: FunctionObjective(elastic, SIGMA),
         span=(0.0, 1.0),
         stiffnesses=(3000.0, 10000.0, 30000.0),
     )

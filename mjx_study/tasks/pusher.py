@@ -16,7 +16,7 @@ from mjx_study.dynamics import State, initial_state
 from mjx_study.policy import OpenLoop
 from mjx_study.reference import Pusher, ReferenceObjective
 from mjx_study.scene import load_scene, require
-from mjx_study.task import Recipe, Task
+from mjx_study.task import Published, Recipe, Task
 
 HORIZON: Final = 200
 START: Final = (0.0, 1.0)  # positions [m]: touching, at rest
@@ -26,6 +26,7 @@ CONTROL_WEIGHT: Final = 1.0  # [1/N^2]
 FORCE: Final = 0.1  # [N] at every step
 SIGMA: Final = 0.1  # [N]
 GAMMA: Final = 1e8
+RADIUS: Final = 100.0
 RECIPE: Final = Recipe(1e-3, 500, 10)
 
 
@@ -34,11 +35,12 @@ def pusher(*, horizon: int = HORIZON, model: str | Path = "pusher", **scene_opti
 
     Args:
         horizon: number of 5 ms steps.
-        model: another MJCF in its place, with two slide joints and the geoms `pusher` and `slider`.
+        model: another MJCF in its place, with the slide joints `pusher`, `slider` in this order, geoms of these names,
+            and a motor on `pusher`.
         **scene_options: see `load_scene`.
     """
     scene = load_scene(model, **scene_options)
-    require(scene, joints=("pusher", "slider"), geoms=("pusher", "slider"), sizes=(2, 2, 1))
+    require(scene, joints=("pusher", "slider"), geoms=("pusher", "slider"), driven=("pusher",))
     weight, goal = np.array(STATE_WEIGHT), np.array(GOAL)
 
     def state_cost(state: State) -> Float[Array, ""]:
@@ -61,6 +63,7 @@ def pusher(*, horizon: int = HORIZON, model: str | Path = "pusher", **scene_opti
         final_cost=state_cost,
         contact_pair=("pusher", "slider"),
         gamma=GAMMA,
+        published=Published(GAMMA, RADIUS),
         recipe=RECIPE,
         reference=lambda stiffness: ReferenceObjective(
             Pusher(stiffness, timestep=scene.timestep), (*START, 0.0, 0.0), horizon, SIGMA

@@ -17,7 +17,7 @@ from mjx_study.dynamics import State, initial_state
 from mjx_study.policy import OpenLoop
 from mjx_study.reference import ReferenceObjective, SlidingBox
 from mjx_study.scene import load_scene, require
-from mjx_study.task import Recipe, Task
+from mjx_study.task import Published, Recipe, Task
 
 HORIZON: Final = 400
 GOAL: Final = (2.0, 2.0, 0.0, 0.0)  # block and box: positions [m], velocities [m/s]
@@ -26,6 +26,7 @@ CONTROL_WEIGHT: Final = 1.0  # [1/N^2]
 SIGMA: Final = 0.1  # [N]
 SLIP_DAMPING: Final = 1.8  # [N s/m]
 GAMMA: Final = 2e4
+RADIUS: Final = 100.0
 RECIPE: Final = Recipe(1e-4, 100, 10)
 BLOCK, BOX = 0, 2  # among the coordinates block, height, box
 
@@ -35,11 +36,12 @@ def sliding_box(*, horizon: int = HORIZON, model: str | Path = "sliding_box", **
 
     Args:
         horizon: number of 5 ms steps.
-        model: another MJCF in its place, with the slide joints `block`, `height`, `box` in this order.
+        model: another MJCF in its place, with the slide joints `block`, `height`, `box` in this order, the geoms
+            `foot`, `box`, and a motor on `block`.
         **scene_options: see `load_scene`.
     """
     scene = load_scene(model, **scene_options)
-    require(scene, joints=("block", "height", "box"), geoms=("foot", "box"), sizes=(3, 3, 1))
+    require(scene, joints=("block", "height", "box"), geoms=("foot", "box"), driven=("block",))
     dtype = scene.template.qpos.dtype
     edge = float(scene.host.geom_size[scene.geom("box")][0])
     weight, goal = np.array(STATE_WEIGHT, dtype), np.array(GOAL, dtype)
@@ -65,6 +67,7 @@ def sliding_box(*, horizon: int = HORIZON, model: str | Path = "sliding_box", **
         final_cost=state_cost,
         contact_pair=("foot", "box"),
         gamma=GAMMA,
+        published=Published(GAMMA, RADIUS),
         recipe=RECIPE,
         outcomes=lambda states: {
             "aboard": jnp.where(jnp.abs(states.qpos[-1, BLOCK] - states.qpos[-1, BOX]) < edge, 1.0, 0.0)

@@ -16,7 +16,7 @@ from mjx_study.dynamics import State, initial_state
 from mjx_study.policy import LinearFeedback
 from mjx_study.reference import ReferenceObjective, Tennis, draw_start, tennis_outcomes
 from mjx_study.scene import load_model, put_scene, require
-from mjx_study.task import Recipe, Task
+from mjx_study.task import Published, Recipe, Task
 
 HORIZON: Final = 200
 TIME_SCALE: Final = 10.0
@@ -25,6 +25,7 @@ TARGET: Final = (0.0, 2.5, 0.0, 0.0)  # position [m], velocity [m/s]
 CONTROL_WEIGHT: Final = 0.001
 SIGMA: Final = 0.01
 GAMMA: Final = 1000.0
+RADIUS: Final = 1000.0
 RECIPE: Final = Recipe(1e-6, 200, 1000, decay=0.1)
 FEATURES: Final = 7
 
@@ -35,7 +36,7 @@ def tennis(*, horizon: int = HORIZON, model: str | Path = "tennis", **scene_opti
     Args:
         horizon: number of 5 ms steps.
         model: another MJCF in its place, with the joints `ball_x`, `ball_y`, `paddle_x`, `paddle_y`, `paddle_angle` in
-            this order and a motor for each of the paddle's.
+            this order and a motor for each of the paddle's, in this order too.
         **scene_options: see `load_scene`.
     """
     host = load_model(model, **scene_options)
@@ -46,7 +47,7 @@ def tennis(*, horizon: int = HORIZON, model: str | Path = "tennis", **scene_opti
         host.actuator_biasprm[actuator, 2] = -gain
     scene = put_scene(host, "tennis")
     joints = ("ball_x", "ball_y", "paddle_x", "paddle_y", "paddle_angle")
-    require(scene, joints=joints, geoms=("ball", "paddle"), sizes=(5, 5, 3))
+    require(scene, joints=joints, geoms=("ball", "paddle"), driven=joints[2:])
     dtype = scene.template.qpos.dtype
     weight, target = np.array(FINAL_WEIGHT, dtype), np.array(TARGET, dtype)
 
@@ -73,6 +74,7 @@ def tennis(*, horizon: int = HORIZON, model: str | Path = "tennis", **scene_opti
         final_cost=lambda state: jnp.sum(weight * (features(state)[:4] - target) ** 2),
         contact_pair=("ball", "paddle"),
         gamma=GAMMA,
+        published=Published(GAMMA, RADIUS),
         recipe=RECIPE,
         outcomes=lambda states: tennis_outcomes(states.qpos[:, :2], states.qvel[:, :2]),
         reference=lambda stiffness: ReferenceObjective(

@@ -1,0 +1,132 @@
+"""What the published examples chose, offered beside the defaults: constants of AoBG's bound, and a pendulum's start."""
+
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+import estimators
+from mjx_study import cli
+from mjx_study.cli import options
+from mjx_study.comparison import CompareConfig
+from mjx_study.configuration import EstimatorConfig, configured_options
+from mjx_study.optimise import OptimiseConfig, plan_optimise
+from mjx_study.reference import DoublePendulum, roll_out
+from mjx_study.reference.adjoint import gradients_along
+from mjx_study.study import plan_compare
+from mjx_study.sweep_plan import SweepConfig, estimator_options, plan_sweep
+from mjx_study.tasks import make_task
+
+MOMENTUM = 4 / 1.1**2  # an elastic hit of a bar ten times as heavy, in units of the published cost
+CONSTANTS = {
+    "pusher": (1e8, 100.0),
+    "sliding_box": (2e4, 100.0),
+    "ball_wall": (0.01, 1.0),
+    "ball_wall:dome": (0.01, 1.0),
+    "momentum_transfer": (0.2 * MOMENTUM, MOMENTUM),
+    "tennis": (1000.0, 1000.0),
+}
+
+
+@pytest.fixture(autouse=True)
+def configured(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The tests' own settings stand: JAX takes its devices once per process."""
+    monkeypatch.setattr(options, "configure", lambda **_: None)
+
+
+@pytest.mark.parametrize("name", CONSTANTS)
+def test_published_constants_on_the_scale_of_the_task_s_cost(name: str) -> None:
+    """In the options that estimators get, and in the resolved configuration that is saved."""
+    plan = plan_optimise(OptimiseConfig(task=name, published=True))
+    gamma, radius = CONSTANTS[name]
+    for holder in (plan.options, plan.config):
+        assert (holder.gamma, holder.radius) == (pytest.approx(gamma), pytest.approx(radius))
+        assert (holder.failure_probability, holder.variance_proxy) == (0.95, "second_moment")
+    default = plan_optimise(OptimiseConfig(task=name)).options
+    assert (default.gamma, default.failure_probability) == (pytest.approx(gamma), 0.05)
+    assert (default.radius, default.variance_proxy) == ("max_deviation", "variance")
+
+
+def test_every_study_takes_them() -> None:
+    compared = plan_compare(CompareConfig(task="tennis", published=True)).options
+    swept = plan_sweep(SweepConfig(tasks=("tennis",), published=True))
+    assert compared == estimator_options(swept, swept.cells[0]) and compared.radius == 1000.0
+
+
+def test_published_constants_stand_alone() -> None:
+    task = make_task("pusher", horizon=3)
+    with pytest.raises(ValueError, match="published sets gamma, .*: leave gamma, radius out"):
+        configured_options(EstimatorConfig(task="pusher", published=True, gamma=1.0, radius=2.0), task)
+    with pytest.raises(ValueError, match="double_pendulum has no published constants of the bound"):
+        configured_options(EstimatorConfig(task="double_pendulum", published=True), make_task("double_pendulum"))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["compare", "pusher", "--published", "--gamma", "1"], "leave gamma out"),
+        (["optimise", "double_pendulum", "--published"], "has no published constants"),
+    ],
+)
+def test_one_line_where_they_cannot_be_had(capsys: pytest.CaptureFixture[str], arguments: list[str], says: str) -> None:
+    assert cli.main(arguments) == 2
+    printed = capsys.readouterr()
+    assert says in printed.err and printed.err.count("\n") == 1 and printed.out == ""
+
+
+@pytest.mark.parametrize(("value", "kept"), [("true", True), ("false", False)])
+def test_a_file_of_options_may_ask_for_them(tmp_path: Path, value: str, kept: bool) -> None:
+    path = tmp_path / "study.toml"
+    path.write_text(f'tasks = ["pusher"]\npublished = {value}\n')
+    parsed = cli.parser().parse_args(["sweep", "--config", str(path), "--output", "x"])
+    assert cli.sweep._fields(parsed)["published"] is kept
+
+
+def test_what_they_do_to_the_weight_of_first_order_gradients() -> None:
+    """More of it in momentum_transfer, whose bound is wider read so; none in ball_wall, whose R = 1 is far out."""
+    alphas = {}
+    for name in ("momentum_transfer", "ball_wall"):
+        task = make_task(name)
+        objective = task.analytic(task.middle_stiffness)
+        for published in (False, True):
+            chosen = configured_options(EstimatorConfig(task=name, published=published), task)
+            combine = jax.jit(lambda drawn, chosen=chosen: estimators.combine("aobg", drawn, chosen).alpha)
+            for seed in range(20):
+                keys = jax.random.split(jax.random.key(seed), 100)
+                batches = {
+                    "evaluation": objective.evaluate(task.theta, keys[:50]),
+                    "differentiation": objective.differentiate(task.theta, keys[50:]),
+                }
+                alphas.setdefault((name, published), []).append(float(combine(batches).alpha))
+    mean = {key: np.mean(values) for key, values in alphas.items()}
+    assert mean["momentum_transfer", True] > 0.3 + mean["momentum_transfer", False]
+    assert mean["ball_wall", False] > 0.1 and mean["ball_wall", True] == 0
+
+
+def test_the_published_pendulum_starts_where_its_absolute_angles_are() -> None:
+    default, published = (
+        np.asarray(make_task(name).theta) for name in ("double_pendulum", "double_pendulum:published")
+    )
+    absolute = np.array([[1, 0, 0, 0], [1, 1, 0, 0], [0, 0, 1, 0], [0, 0, 1, 1]])
+    np.testing.assert_allclose(absolute @ published, [np.pi / 2, 0, 5, -5], atol=1e-15)
+    np.testing.assert_allclose(default, [np.pi / 2, 0, 5, -5])
+    with pytest.raises(ValueError, match="unknown start 'upright' of double_pendulum; choose from default, published"):
+        make_task("double_pendulum", start="upright")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "before", "after"), [("", 850, 1200), (":published", 1050, 1450)])
+def test_where_chaos_overtakes(name: str, before: int, after: int) -> None:
+    """The horizon at which FoBG's variance passes ZoBG's: about 1050 steps, and 1250 from the published start."""
+    task, system = make_task(f"double_pendulum{name}"), DoublePendulum()
+    noise = 0.5 * np.random.default_rng(0).standard_normal((1000, 4))
+    start = np.asarray(task.theta)
+    ratios = []
+    for horizon in (before, after):
+        rollout = roll_out(system, start + noise, np.zeros((horizon, 0)))
+        silent = roll_out(system, start, np.zeros((horizon, 0)))
+        zeroth = (rollout.value - silent.value)[:, None] * noise / 0.5**2
+        first = gradients_along(system, rollout).start
+        ratios.append(np.var(first, axis=0).sum() / np.var(zeroth, axis=0).sum())
+    assert ratios[0] < 0.7 and ratios[1] > 1.4
