@@ -86,7 +86,7 @@ def add_option(
 
     flag = option.flag or f"--{option.name.replace('_', '-')}"
     if option.kind is bool:
-        command.add_argument(flag, action="store_true", default=None, help=option.describe())
+        command.add_argument(flag, dest=option.name, action="store_true", default=None, help=option.describe())
         return
     command.add_argument(
         flag,
