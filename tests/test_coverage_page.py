@@ -1,0 +1,69 @@
+"""docs/coverage.md says what its script computes: some rows again, and the shape of all of them."""
+
+import importlib.util
+import re
+from pathlib import Path
+from types import ModuleType
+
+import jax
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGE = (ROOT / "docs" / "coverage.md").read_text()
+
+
+@pytest.fixture(scope="module")
+def script() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("make_coverage", ROOT / "docs" / "make_coverage.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def rows(name: str) -> list[list[str]]:
+    """Of a table of the page, less its header."""
+    (text,) = re.findall(rf"<!-- table: {name} -->\n(.*?)\n<!-- end -->", PAGE, re.DOTALL)
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines()[2:]]
+
+
+def same(found: list[str], said: list[str]) -> None:
+    """Words as they are, numbers within the last digit and a trial or two that rounding turns."""
+    assert len(found) == len(said)
+    for one, other in zip(found, said, strict=True):
+        try:
+            assert float(one) == pytest.approx(float(other), abs=0.011), (found, said)
+        except ValueError:
+            assert one == other
+
+
+@pytest.mark.parametrize("kind", ["lognormal"])
+def test_intervals_and_the_test_for_bias(script: ModuleType, kind: str) -> None:
+    assert jax.config.read("jax_enable_x64")
+    intervals, test = script.coverage_rows(kind, 10)
+    for found, name in ((intervals, "intervals"), (test, "test")):
+        (said,) = [row for row in rows(name) if row[:2] == [kind, "10"]]
+        same(found, said)
+
+
+def test_rare_samples(script: ModuleType) -> None:
+    (said,) = [row for row in rows("rare") if row[:2] == ["0.4", "50"]]
+    same(script.rare_row(0.4, 50), said)
+
+
+def test_every_kind_and_size_is_there(script: ModuleType) -> None:
+    expected = [[kind, str(samples)] for kind in script.KINDS for samples in script.SAMPLES]
+    assert [row[:2] for row in rows("intervals")] == expected == [row[:2] for row in rows("test")]
+    assert all(len(row) == 2 + len(script.COLUMNS) for row in rows("intervals"))
+
+
+def test_what_the_page_says_of_its_tables() -> None:
+    """The sentences that a change of the estimators could make false."""
+    for row in rows("rare"):
+        assert float(row[3]) < 0.06  # rejects at 5 %, whether believable or not
+    for row in rows("dimensions"):
+        assert float(row[6]) > 0.9 and float(row[10]) > 0.9  # the debiased numbers
+    weights = [[float(cell.strip("%")) for cell in row[3:5]] for row in rows("weights") if row[2] == "10"]
+    assert max(plugged for plugged, _ in weights) > 4 and max(fitted for _, fitted in weights) < 2
+    assert np.mean([float(row[5]) for row in rows("weights")]) > 1
