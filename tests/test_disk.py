@@ -120,6 +120,28 @@ def test_killed_at_any_system_call_a_file_is_the_old_or_the_new_one(tmp_path: Pa
     assert points > 20 and left > 5 and changed >= 2
 
 
+KILLED_STUDY = """
+import sys
+from pathlib import Path
+from tests.faults import killed_at_every_system_call
+from tests.test_disk import CELLS, check_whole, leftovers, study
+
+root = Path(sys.argv[1])
+folders = [root / "0"]
+for at in killed_at_every_system_call(lambda: study(folders[-1])):
+    before = check_whole(folders[-1])
+    study(folders[-1])
+    assert check_whole(folders[-1]) == CELLS >= before and leftovers(folders[-1]) == [], at
+    folders.append(root / str(at + 1))
+print(len(folders) - 1)
+"""
+
+
+@pytest.mark.slow
+def test_killed_at_any_system_call_a_study_goes_on(tmp_path: Path) -> None:
+    assert int(run_alone(KILLED_STUDY, str(tmp_path))) > 200
+
+
 def test_what_a_living_process_writes_stays(tmp_path: Path) -> None:
     """Leftovers are known by their lock, not by their age; other programs' files are not touched."""
     (tmp_path / ".hidden").write_text("another program's")
