@@ -27,7 +27,7 @@ from mjx_study.contact import stiffness_from_solref
 from mjx_study.objective import Simulator, simulate
 from mjx_study.report import report
 from mjx_study.store import Store, StudyError
-from mjx_study.sweep import SweepConfig, load_study, plan_sweep, run_sweep, what_to_beware_of
+from mjx_study.sweep import SweepConfig, load_study, open_store, plan_sweep, run_sweep, what_to_beware_of
 from mjx_study.sweep_cells import MEASURED, compute_gradients
 from mjx_study.sweep_plan import estimator_options
 from mjx_study.tasks import make_task
@@ -318,15 +318,15 @@ def test_a_folder_of_another_study_is_refused(undisturbed: Path, tmp_path: Path)
 LIMITED = """
 import os, resource, signal, sys
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-resource.setrlimit(resource.RLIMIT_FSIZE, (5500, 5500))
+resource.setrlimit(resource.RLIMIT_FSIZE, (3000, 3000))
 os.execv(sys.executable, [sys.executable, "-m", "mjx_study", "sweep", *sys.argv[1:]])
 """
 
 
 def test_a_full_disk_leaves_what_is_complete(undisturbed: Path, tmp_path: Path) -> None:
-    """Files of more than 5 kB cannot be written by this process: a write that fails on its way, as on a full disk."""
+    """Files of more than 3 kB cannot be written by this process: a write that fails on its way, as on a full disk."""
     folder = tmp_path / "out"
-
+    open_store(plan_sweep(config()), folder)
     environment = os.environ | {"JAX_ENABLE_COMPILATION_CACHE": "false"}
     command = [sys.executable, "-c", LIMITED, *ARGUMENTS, "--output", str(folder), "--json"]
     running = subprocess.run(command, capture_output=True, text=True, env=environment)
