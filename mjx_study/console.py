@@ -185,6 +185,17 @@ def progress_bar() -> Generator[Callable[[int, int, str], None]]:
         yield report
 
 
+def stage_lines(progress: Callable[[int, int, str], None]) -> Callable[[int, int, str], None]:
+    """The progress, and a line on standard error for each of its stages where that is no terminal."""
+
+    def report(done: int, total: int, what: str) -> None:
+        progress(done, total, what)
+        if not sys.stderr.isatty():
+            print(f"[{done}/{total}] {what}", file=sys.stderr, flush=True)
+
+    return report
+
+
 def show_cursor() -> None:
     """Bring back the cursor that a progress bar hides, where standard error is a terminal."""
     if sys.stderr.isatty():

@@ -148,6 +148,12 @@ def _newton_step(model: mjx.Model, data: mjx.Data, qacc: Float[Array, " nv"]) ->
     return qacc - solve_positive_definite(jax.vmap(linear_map)(jnp.eye(model.nv, dtype=qacc.dtype)), gap)
 
 
+def with_generous_budget(model: mjx.Model) -> mjx.Model:
+    """The model with a budget that leaves MJX's solver to stop where its cost no longer falls."""
+    tolerance = jnp.full_like(model.opt.tolerance, 1e-15)
+    return model.replace(opt=model.opt.replace(iterations=GENEROUS[0], ls_iterations=GENEROUS[1], tolerance=tolerance))
+
+
 def solve_to_rounding(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]:
     """The constrained acceleration as exactly as numbers allow, whatever the model's own budgets; values only.
 
@@ -156,8 +162,7 @@ def solve_to_rounding(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]:
     """
     if num_constraint_rows(data) == 0:
         return data.qacc_smooth
-    budget = {"iterations": GENEROUS[0], "ls_iterations": GENEROUS[1], "tolerance": jnp.full_like(data.time, 1e-15)}
-    qacc = run_solver(model.replace(opt=model.opt.replace(**budget)), data)
+    qacc = run_solver(with_generous_budget(model), data)
 
     def newton(x):
         """The step from x, and how far x is from the solution in the norm of the stiffness, free of units."""

@@ -89,18 +89,18 @@ def step(scene: Scene, model: mjx.Model, state: State, control: Float[Array, " n
 
 def exact_step(
     scene: Scene, model: mjx.Model, state: State, control: Float[Array, " nu"]
-) -> tuple[State, Float[Array, ""]]:
-    """`step` with its constraints solved to rounding whatever the budgets; slow, and for values only.
+) -> tuple[State, Float[Array, ""], mjx.Data]:
+    """`step` with its constraints solved to rounding whatever the budgets, and its `smooth_stages`; for values only.
 
     What differences of the step are taken of: those of `step` itself would show where its solver stopped.
     """
-    if scene.host.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
-        return step(scene, model, state, control)
     data = smooth_stages(scene, model, state, control).replace(qacc_warmstart=state.warmstart)
+    if scene.host.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
+        return *step(scene, model, state, control), data
     qacc = constraint.solve_to_rounding(model, data)
     qvel, act = _finish(model, data, qacc)
     qpos = integrate_position(scene.host, state.qpos, qvel, model.opt.timestep)
-    return State(qpos, qvel, act, qacc), constraint.residual(model, data, qacc)
+    return State(qpos, qvel, act, qacc), constraint.residual(model, data, qacc), data
 
 
 def smooth_stages(scene: Scene, model: mjx.Model, state: State, control: Float[Array, " nu"]) -> mjx.Data:
@@ -308,9 +308,10 @@ def _runge_kutta(scene: Scene, model: mjx.Model, state: State, control: Float[Ar
     fourth = slopes(*moved(1.0, third))
     mean = jax.tree.map(lambda a, b, c, d: (a + 2 * b + 2 * c + d) / 6, first, second, third, fourth)
     qpos, qvel, _ = moved(1.0, mean)
+    qacc = jax.lax.stop_gradient(first[1])
     if state.act.size == 0:
-        return State(qpos, qvel, state.act, state.warmstart)
+        return State(qpos, qvel, state.act, qacc)
     # MJX's own advance of the activation, with its clamping
     data = _force_stage(model, _position_stage(scene, model, state.qpos), state.qvel, state.act, control)
     act = mjx.euler(model, data.replace(act_dot=mean[2], qacc=data.qacc_smooth)).act
-    return State(qpos, qvel, act, state.warmstart)
+    return State(qpos, qvel, act, qacc)

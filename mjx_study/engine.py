@@ -1,7 +1,9 @@
-"""The C engine as an independent implementation: the same model on the host, its step and its differences."""
+"""The C engine as an independent implementation: the same model on the host, and its states."""
 
+import contextlib
 import copy
 import dataclasses
+from collections.abc import Generator
 from typing import Any, Final
 
 import mujoco
@@ -73,24 +75,15 @@ def host_state(data: mujoco.MjData) -> HostState:
     return HostState(*(np.array(field) for field in fields))
 
 
-def transition_jacobian(
-    host: mujoco.MjModel, state: HostState, *, centred: bool, step: float = 1e-7
-) -> Float[np.ndarray, "rows columns"]:
-    """Derivatives of (position in the tangent space, qvel, act) after a step, by the engine's own differences.
-
-    Args:
-        host: the model.
-        state: where to differentiate.
-        centred: whether differences are centred or forward.
-        step: their size.
-
-    Returns:
-        Columns are (position in the tangent space, qvel, act, ctrl).
-    """
-    size = 2 * host.nv + host.na
-    over_state, over_control = np.zeros((size, size)), np.zeros((size, host.nu))
-    mujoco.mjd_transitionFD(host, host_data(host, state), step, centred, over_state, over_control, None, None)
-    return np.concatenate([over_state, over_control], axis=1)
+@contextlib.contextmanager
+def quiet_engine() -> Generator[None]:
+    """Keep the engine's warnings to `MjData.warning`, off standard error and out of MUJOCO_LOG.TXT."""
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(lambda message: None)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(before)
 
 
 def engine_model(scene: Scene, contact: ContactModel | None) -> mujoco.MjModel:

@@ -19,7 +19,8 @@ from mjx_study.cli.options import (
     usage_errors,
 )
 from mjx_study.comparison import CompareConfig
-from mjx_study.gradcheck.check import HORIZON, STATES, GradcheckPlan
+from mjx_study.console import stage_lines
+from mjx_study.gradcheck.plan import HORIZON, STATES, GradcheckPlan
 from mjx_study.option import OPTIONS, Option
 from mjx_study.scene import load_scene
 from mjx_study.tasks import make_task, task_names
@@ -28,17 +29,26 @@ EPILOG = """\
 Columns, all relative, each the worst over the states:
   modes        reverse mode against forward mode
   differences  the derivative over state and control against central differences
-  parameters   the same over solref, solimp and friction
+  parameters   the same over solref, solimp and friction, through the contact model
   one-sided    how far the two one-sided differences disagree: 0 where the map is smooth
   closed form  against a hand-derived gradient of the task's analytic counterpart, another model of the same system
-  C step       the acceleration against the C engine's; contacts may be placed differently
-  C engine     the Jacobian against mjd_transitionFD's, where the steps agree
+  mjx step     the state after a step against that of mjx.step, run to convergence
+  C step       the same against the C engine's; contacts may be placed differently
+  C engine     the Jacobian against differences of the C engine's step, where the steps agree
   mjx.step     the derivative of mjx.step itself, with --stock: what one would have without this project
   residual     what the solver leaves; the derivative is only as good as this
+  unresolved   entries of which differences, as large as their uncertainty, say nothing
 
-Exit code 1 where a derivative is wrong, NaN, silently zero or unconverged. Kinks and jumps are properties of the step,
-and different contacts are no error of a derivative: they are reported, and do not fail.
+Below it, what the states exercise: contacts that push, stick, slide or separate, limits, friction loss, equalities.
+Where a rollout does not reach one that the model has, faster ones and random poses are searched.
+
+Exit code 0: every derivative that exists is right. 1: one is wrong, NaN, silently zero or unconverged, or the step is
+another than that of mjx.step or, for no documented reason, of the C engine. 3: right, but something that the model has
+was never exercised. Kinks and jumps are properties of the step, and contacts placed differently are no error of a
+derivative: they are reported, and do not fail.
 """
+UNEXERCISED = 3
+"""Exit code where nothing is wrong and something was never exercised."""
 
 
 PAIR = Option("pair", str, "GEOM,GEOM", "contact of a file that a stiffness is for", many=True)
@@ -69,14 +79,14 @@ def add(commands: Commands) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Check and print; 1 where something is wrong."""
+    """Check and print; 1 where something is wrong, 3 where something was not exercised."""
     with usage_errors():
         configure_process(options)
         plan = _plan(options)
     with computing() as progress:
-        report = check.gradcheck(plan, progress)
+        report = check.gradcheck(plan, stage_lines(progress))
     print_report(options, report.as_json(), report.lines(verbose=options.verbose))
-    return 0 if report.passed else 1
+    return 1 if not report.passed else UNEXERCISED if report.unexercised else 0
 
 
 def _plan(options: argparse.Namespace) -> GradcheckPlan:

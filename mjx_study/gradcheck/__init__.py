@@ -5,14 +5,8 @@ converged the derivative is that of another point, and where MJX places a contac
 The check tells these apart, entry by entry of a step's Jacobian.
 """
 
-from mjx_study.gradcheck.check import (
-    CONTACT,
-    STIFFNESS,
-    GradcheckPlan,
-    gradcheck,
-    plan_gradcheck,
-    plan_scene_gradcheck,
-)
+from mjx_study.gradcheck.check import gradcheck
+from mjx_study.gradcheck.plan import CONTACT, STIFFNESS, GradcheckPlan, plan_gradcheck, plan_scene_gradcheck
 from mjx_study.gradcheck.report import Finding, GradcheckReport, StepCheck
 
 __all__ = [

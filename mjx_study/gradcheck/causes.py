@@ -2,25 +2,22 @@
 
 import dataclasses
 from collections.abc import Callable
+from functools import cached_property
 from typing import Any, Final
 
 import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from mjx_study.engine import HostState, host_data
-from mjx_study.gradcheck.coordinates import Coordinate, Coordinates, joint_name, quaternions
-from mjx_study.gradcheck.placement import geom_label
+from mjx_study.engine import HostState
+from mjx_study.gradcheck.coordinates import Coordinate, Coordinates, geom_label, joint_name, quaternions
+from mjx_study.gradcheck.degenerate import DegenerateContact, degenerate_contacts
 from mjx_study.scene import num_constraint_rows
 
 NEAR: Final = 2e-6
 """How close to a switch a distance must be to be its cause; about the shortest difference [m, rad, relative]."""
-PARALLEL: Final = 1e-5
-"""Angle [rad] or distance [m] below which two directions or points count as one; contact points turn within less."""
 UNKNOWN: Final = "unknown"
 _SLIDE, _HINGE = int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE)
-_PLANE, _SPHERE = int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_SPHERE)
-_CAPSULE, _CYLINDER = int(mujoco.mjtGeom.mjGEOM_CAPSULE), int(mujoco.mjtGeom.mjGEOM_CYLINDER)
 SINGULAR: Final = "the inertia matrix is singular (a body lacks mass, or joints do the same)"
 
 
@@ -48,6 +45,11 @@ class Place:
     def host(self) -> mujoco.MjModel:
         """The model."""
         return self.layout.scene.host
+
+    @cached_property
+    def degenerate(self) -> list[DegenerateContact]:
+        """Its contacts that are placed by a direction that vanishes."""
+        return degenerate_contacts(self.host, self.state, self.stages["geom"][self.touching()])
 
     def touching(self) -> np.ndarray:
         """Indices of active contacts."""
@@ -175,33 +177,8 @@ _FAULTS: tuple[Rule, ...] = (
 )
 
 
-def degenerate_contact(place: Place) -> str | None:
-    """A contact whose points are placed by a direction that vanishes, if there is one.
-
-    The step jumps there, and nearby it changes faster than differences can follow; likewise in C.
-    """
-    host, touching = place.host, place.touching()
-    if not len(touching):
-        return None
-    data = host_data(host, place.state)
-    mujoco.mj_kinematics(host, data)
-    axes, centres = data.geom_xmat.reshape(-1, 3, 3)[:, :, 2], data.geom_xpos
-    for geoms in place.stages["geom"][touching]:
-        kinds = {int(host.geom_type[geom]): int(geom) for geom in geoms}
-        parallel = float(np.linalg.norm(np.cross(axes[geoms[0]], axes[geoms[1]]))) < PARALLEL
-        labels = [geom_label(host, int(geom)) for geom in geoms]
-        if kinds.keys() == {_SPHERE} and np.linalg.norm(centres[geoms[0]] - centres[geoms[1]]) < PARALLEL:
-            return f"the centres of {' and '.join(labels)} coincide, and no direction is the contact's normal"
-        if parallel and kinds.keys() == {_PLANE, _CYLINDER}:
-            upright = geom_label(host, kinds[_CYLINDER])
-            return f"{upright} stands upright, and its contact points turn with the direction in which it tilts"
-        if parallel and kinds.keys() == {_CAPSULE}:
-            return f"{' and '.join(labels)} are parallel, and where they touch jumps with the direction of their angle"
-    return None
-
-
 def _degenerate(place: Place, output: Coordinate, source: Coordinate) -> str | None:
-    return degenerate_contact(place)
+    return next((each.cause for each in place.degenerate if each.concerns(output, source)), None)
 
 
 def _onset(place: Place, output: Coordinate, source: Coordinate) -> str | None:

@@ -26,6 +26,8 @@ PARAMETERS: Final = (
     *("friction[sliding]", "friction[torsional]", "friction[rolling]"),
 )
 LENGTH: Final = "quaternion length"
+PAIR_FRICTION: Final = np.array([0, 0, 1, 2, 2])
+"""Which of a geom's three coefficients of friction each of a pair's five is."""
 _BALL, _FREE = int(mujoco.mjtJoint.mjJNT_BALL), int(mujoco.mjtJoint.mjJNT_FREE)
 
 
@@ -92,21 +94,26 @@ class Coordinates:
     def model(
         self, contact: ContactModel | None, scales: Float[Array, " parameters"], change: Float[Array, " parameters"]
     ) -> mjx.Model:
-        """The model with a contact model and a change of its parameters, in units of `scales`."""
-        model = apply_contact(self.scene.model, contact)
+        """The model with a contact model, its parameters changed in units of `scales`.
+
+        What the contact model has changes there, so that derivatives pass through `apply_contact`; the rest changes in
+        every geom and pair.
+        """
+        model = self.scene.model
         if not len(scales):
-            return model
-        shift = change * scales
-        solref, solimp, friction = shift[:2], shift[2:7], shift[7:]
-        pair = friction[jnp.array([0, 0, 1, 2, 2])]
-        return model.replace(
-            geom_solref=model.geom_solref + solref,
-            geom_solimp=model.geom_solimp + solimp,
-            geom_friction=model.geom_friction + friction,
-            pair_solref=model.pair_solref + solref,
-            pair_solimp=model.pair_solimp + solimp,
-            pair_friction=model.pair_friction + pair,
-        )
+            return apply_contact(model, contact)
+        solref, solimp, friction = jnp.split(change * scales, [2, 7])
+        geoms = {"geom_friction": model.geom_friction + friction}
+        geoms["pair_friction"] = model.pair_friction + friction[PAIR_FRICTION]
+        if contact is None:
+            geoms |= {"geom_solref": model.geom_solref + solref, "geom_solimp": model.geom_solimp + solimp}
+            geoms |= {"pair_solref": model.pair_solref + solref, "pair_solimp": model.pair_solimp + solimp}
+        else:
+            own = None if contact.friction is None else contact.friction + friction
+            contact = dataclasses.replace(
+                contact, solref=contact.solref + solref, solimp=contact.solimp + solimp, friction=own
+            )
+        return apply_contact(model.replace(**geoms), contact)
 
 
 def coordinates(scene: Scene, contact: ContactModel | None) -> Coordinates:
@@ -154,6 +161,16 @@ def joint_name(host: mujoco.MjModel, joint: int) -> str:
         return name
     body = mujoco.mj_id2name(host, mujoco.mjtObj.mjOBJ_BODY, int(host.jnt_bodyid[joint]))
     return f"joint {joint} of {body}" if body else f"joint {joint}"
+
+
+def geom_label(host: mujoco.MjModel, geom: int) -> str:
+    """A geom's name, or its body's and its type."""
+    name = mujoco.mj_id2name(host, mujoco.mjtObj.mjOBJ_GEOM, geom)
+    if name:
+        return name
+    body = mujoco.mj_id2name(host, mujoco.mjtObj.mjOBJ_BODY, int(host.geom_bodyid[geom])) or "body"
+    kind = mujoco.mjtGeom(int(host.geom_type[geom])).name.removeprefix("mjGEOM_").lower()
+    return f"the {kind} of {body}"
 
 
 def _name(host: mujoco.MjModel, kind: mujoco.mjtObj, noun: str, index: int) -> str:

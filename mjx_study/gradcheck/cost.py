@@ -10,8 +10,8 @@ import numpy as np
 from mjx_study.configuration import Cell
 from mjx_study.contact import ContactModel
 from mjx_study.engine import HostState
+from mjx_study.gradcheck.compiling import Compiler
 from mjx_study.gradcheck.differences import differences, moves
-from mjx_study.gradcheck.programs import compile_quickly
 from mjx_study.noise import split_sample_key
 from mjx_study.objective import rollout_cost
 from mjx_study.task import Task
@@ -54,62 +54,52 @@ class CostCheck:
 class CostPrograms:
     """Noise-free cost of a task from the start that a key draws, as compiled programs of theta and contact model."""
 
-    def __init__(self, task: Task, seed: int):
+    def __init__(self, task: Task, seed: int, compiler: Compiler):
         self.task = task
+        self.compiler = compiler
         self.key = jax.random.key(seed)
         self.start = task.draw_start(split_sample_key(jax.random.clone(self.key))[0])
-        self._compiled: dict[Any, Any] = {}
 
-    def gradient(self, contact: ContactModel | None) -> Any:
-        """(cost, (states, controls, residual)), and the gradient, by reverse mode."""
-        return self._run("gradient", jax.value_and_grad(self._cost, has_aux=True), self._theta, contact)
+    def compile(self, contact: ContactModel | None) -> None:
+        """Begin to compile what the methods below need."""
+        self.compiler.start(self._both_modes, self.task.theta, contact, np.zeros((DIRECTIONS, len(self.task.theta))))
+        self.compiler.start(self._many, np.zeros((BATCH, len(self.task.theta))), contact)
 
-    def slopes(self, contact: ContactModel | None, directions: np.ndarray) -> np.ndarray:
-        """Derivatives along directions, by forward mode."""
-
-        def along(theta, contact, directions):
-            _, push = jax.linearize(lambda x: self._cost(x, contact)[0], theta)
-            return jax.lax.map(push, directions)
-
-        return np.asarray(self._run("slopes", along, self._theta, contact, directions))
+    def gradient(self, contact: ContactModel | None, directions: np.ndarray) -> Any:
+        """(states, controls, residual), the gradient by reverse mode, and slopes along directions by forward mode."""
+        return self.compiler.run(self._both_modes, self.task.theta, contact, directions)
 
     def costs(self, contact: ContactModel | None, changes: np.ndarray) -> np.ndarray:
         """Costs after changes of theta."""
-
-        def many(thetas, contact):
-            return jax.vmap(lambda theta: self._cost(theta, contact)[0])(thetas)
-
+        theta = np.asarray(self.task.theta)
         rows = -(-len(changes) // BATCH) * BATCH
-        thetas = np.broadcast_to(np.asarray(self._theta), (rows, len(self._theta))).copy()
+        thetas = np.broadcast_to(theta, (rows, len(theta))).copy()
         thetas[: len(changes)] += changes
-        chunks = [self._run("costs", many, part, contact) for part in thetas.reshape(-1, BATCH, thetas.shape[1])]
+        chunks = [self.compiler.run(self._many, part, contact) for part in thetas.reshape(-1, BATCH, len(theta))]
         return np.concatenate(chunks)[: len(changes)]
 
-    @property
-    def _theta(self):
-        return self.task.theta
+    def _both_modes(self, theta, contact, directions):
+        value, push, rollout = jax.linearize(lambda x: self._cost(x, contact), theta, has_aux=True)
+        (gradient,) = jax.linear_transpose(push, theta)(jnp.ones_like(value))
+        return rollout, gradient, jax.lax.map(push, directions)
+
+    def _many(self, thetas, contact):
+        return jax.vmap(lambda theta: self._cost(theta, contact)[0])(thetas)
 
     def _cost(self, theta, contact):
         silent = jnp.zeros(self.task.policy.noise_shape, theta.dtype)
         return rollout_cost(self.task, theta, contact, self.start, silent)
 
-    def _run(self, name: str, function: Any, *arguments: Any) -> Any:
-        key = (name, arguments[1] is None)
-        if key not in self._compiled:
-            self._compiled[key] = compile_quickly(function, *arguments)
-        return self._compiled[key](*arguments)
-
 
 def check_cost(programs: CostPrograms, cell: Cell, seed: int) -> tuple[CostCheck, list[HostState]]:
     """Check one contact model's gradient; also the states of its rollout, each with its control."""
     task = programs.task
-    (_, (states, controls, residual)), gradient = programs.gradient(cell.contact)
+    directions = np.random.default_rng(seed).normal(size=(DIRECTIONS, len(task.theta)))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    (states, controls, residual), gradient, slopes = programs.gradient(cell.contact, directions)
     gradient = np.asarray(gradient)
     norm = float(np.linalg.norm(gradient))
     scale = norm if norm > 0 else 1.0
-    directions = np.random.default_rng(seed).normal(size=(DIRECTIONS, len(task.theta)))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    slopes = programs.slopes(cell.contact, directions)
     modes = float(np.max(np.abs(slopes - directions @ gradient))) / scale
     truth = differences(programs.costs(cell.contact, moves(directions))[:, None])
     error = np.abs(directions @ gradient - truth.value[0])

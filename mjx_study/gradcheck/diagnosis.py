@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from mjx_study.gradcheck.coordinates import Coordinates
 from mjx_study.gradcheck.differences import Differences
@@ -22,9 +22,10 @@ STEEP: Final = 0.1
 RESOLVED: Final = 1e-5
 """Relative uncertainty above which a difference says nothing precise; such entries do not enter the worst error."""
 
-VERDICTS: Final = ("right", "kink", "jump", "unconverged", "zero", "nan", "wrong")
-RIGHT, KINK, JUMP, UNCONVERGED, ZERO, NAN, WRONG = range(7)
-FAILURES: Final = ("unconverged", "zero", "nan", "wrong")
+VERDICTS: Final = ("right", "unresolved", "kink", "jump", "unconverged", "zero", "nan", "engine", "wrong", "value")
+"""From right to the gravest; `engine` and `value` are of steps and not of entries."""
+RIGHT, UNRESOLVED, KINK, JUMP, UNCONVERGED, ZERO, NAN, ENGINE, WRONG, VALUE = range(10)
+FAILURES: Final = ("unconverged", "zero", "nan", "engine", "wrong", "value")
 MEANING: Final = {
     "kink": "the step's one-sided slopes disagree, however short: there is no derivative to compare with",
     "jump": "the step itself jumps here, which no derivative sees",
@@ -32,7 +33,9 @@ MEANING: Final = {
     "zero": "the derivative is exactly zero, silently, where the step does change",
     "nan": "the derivative is not a number",
     "wrong": "the derivative is not that of the step",
-    "placement": "MJX and the C engine compute another step",
+    "engine": "MJX's step is not the C engine's, and nothing documented explains it",
+    "value": "the step itself is not that of mjx.step",
+    "placement": "MJX computes another step than the C engine, as documented",
 }
 
 
@@ -56,7 +59,7 @@ def judge(
     converged: Float[np.ndarray, "outputs inputs"] | None = None,
     *,
     starved: bool = False,
-    degenerate: bool = False,
+    degenerate: Bool[np.ndarray, "outputs inputs"] | None = None,
 ) -> Judged:
     """Compare a derivative with differences.
 
@@ -67,7 +70,8 @@ def judge(
         converged: the derivative from a converged start of the solver, which tells an unconverged solve from a wrong
             derivative; None where the solver had converged.
         starved: whether so much is left of the solve that no entry can be called wrong.
-        degenerate: whether the step jumps so near that differences reach across it.
+        degenerate: entries that depend on a contact whose direction vanishes; where differences are not smooth either,
+            they reach across a jump.
     """
     scale = row_scales(layout, jacobian, truth)
     allowed = TOLERANCE * scale + 3 * truth.uncertainty
@@ -85,9 +89,14 @@ def judge(
     if starved:
         codes[:] = UNCONVERGED
     codes[right] = RIGHT
+    size = np.maximum(np.abs(jacobian), np.abs(truth.value))
+    vague = 3 * truth.uncertainty >= np.maximum(size, TOLERANCE * scale)
+    codes[right & vague & (size > 0)] = UNRESOLVED  # two zeros agree, whatever their uncertainty
     # The mean of two slopes agrees with central differences, and anything agrees with those over a jump.
     codes[truth.kink & within & ~outside & (~right | (truth.gap > FAINT * scale))] = KINK
-    codes[(truth.jump & (~right | (truth.gap > STEEP * scale))) | (degenerate & ~right)] = JUMP
+    codes[truth.jump & (~right | (truth.gap > STEEP * scale))] = JUMP
+    if degenerate is not None:
+        codes[degenerate & truth.rough & ~right] = JUMP
     codes[~np.isfinite(jacobian)] = NAN
     figures = np.where(right & resolved, error / scale, 0.0)
     return Judged(codes, float(figures.max(initial=0.0)))
@@ -116,15 +125,45 @@ def row_scales(
 
 
 def modes_apart(
-    layout: Coordinates, first: Float[np.ndarray, "outputs inputs"], second: Float[np.ndarray, "outputs inputs"]
+    layout: Coordinates,
+    first: Float[np.ndarray, "outputs inputs"],
+    second: Float[np.ndarray, "outputs inputs"],
+    excused: Bool[np.ndarray, "outputs inputs"] | None = None,
 ) -> float:
-    """Largest relative difference of two derivatives where neither is NaN.
+    """Largest relative difference of two derivatives where neither is NaN, and no jump excuses it.
 
     Entries far below the largest of all may differ by its rounding.
     """
     largest = np.nan_to_num(np.abs(first), nan=0.0, posinf=0.0).max(initial=0.0)
     error = np.abs(first - second) / np.maximum(row_scales(layout, first), 1e-6 * largest)
+    error = error if excused is None else np.where(excused, 0.0, error)
     return float(np.nan_to_num(error, nan=0.0).max(initial=0.0))
+
+
+def disagreements(ours: Judged, truth: Differences, engine: Judged, engine_truth: Differences) -> np.ndarray:
+    """Entries that this project's differences find right and the C engine's, as smooth, find wrong; boolean."""
+    rough = truth.rough | engine_truth.rough
+    return np.isin(ours.codes, (RIGHT, UNRESOLVED)) & np.isin(engine.codes, (ZERO, WRONG)) & ~rough
+
+
+def resolved_by(ours: Judged, engine: Judged) -> Judged:
+    """Verdicts whose unresolved entries are right where the C engine's differences resolve them."""
+    both = (ours.codes == UNRESOLVED) & (engine.codes == RIGHT)
+    return dataclasses.replace(ours, codes=np.where(both, RIGHT, ours.codes))
+
+
+def worst_error(
+    layout: Coordinates,
+    jacobian: Float[np.ndarray, "outputs inputs"],
+    truth: Differences,
+    judged: Judged,
+    columns: Sequence[int],
+) -> float:
+    """Worst relative error, right or wrong, of entries that have a derivative and that differences resolve."""
+    scale = row_scales(layout, jacobian, truth)
+    counted = ~np.isin(judged.codes, (KINK, JUMP)) & (truth.uncertainty <= RESOLVED * scale)
+    figures = np.where(counted, np.abs(jacobian - truth.value) / scale, 0.0)[:, list(columns)]
+    return float("inf") if np.isnan(figures).any() else float(figures.max(initial=0.0))
 
 
 def worst_verdict(verdicts: Sequence[str]) -> str:

@@ -32,6 +32,7 @@ class Differences:
             how steep the difference is.
         kink: where they disagree however small the step.
         jump: where the map itself jumps.
+        nearby: where it has a kink or a jump within the longer steps, but not here.
     """
 
     value: Float[np.ndarray, "outputs columns"]
@@ -39,6 +40,12 @@ class Differences:
     gap: Float[np.ndarray, "outputs columns"]
     kink: Bool[np.ndarray, "outputs columns"]
     jump: Bool[np.ndarray, "outputs columns"]
+    nearby: Bool[np.ndarray, "outputs columns"]
+
+    @property
+    def rough(self) -> Bool[np.ndarray, "outputs columns"]:
+        """Where the map is not smooth over the steps taken."""
+        return self.kink | self.jump | self.nearby
 
 
 def moves(columns: Float[np.ndarray, "columns inputs"]) -> Float[np.ndarray, "moves inputs"]:
@@ -81,7 +88,7 @@ def differences(
     nearby = (power < SMOOTH) & ~here_too
     value = np.where(nearby, central[-2], value)
     uncertainty = np.where(nearby, np.abs(central[-1] - central[-2]) + noise / SIZES[-1], uncertainty)
-    return Differences(value.T, uncertainty.T, gap.T, kink.T, jump.T)
+    return Differences(value.T, uncertainty.T, gap.T, kink.T, jump.T, nearby.T)
 
 
 def _falloff(amount: Float[np.ndarray, "sizes columns outputs"], noise: Float[np.ndarray, "..."]):

@@ -1,12 +1,11 @@
 """The compiled programs of a check: values to take differences of, and derivatives in both modes.
 
-Compiled with little optimisation: a check runs each program a few times, so that compiling is most of its cost. Steps
-and directions go one by one (`lax.map`), not as a batch: jaxlib's batched Cholesky factorisations share a pool of
-threads with the program that waits for them, and two at once wait for ever (seen with jaxlib 0.10.2 on two cores).
+Three or four small programs whatever the number of states, contact models and directions. Steps and directions go one
+by one (`lax.map`), not as a batch: jaxlib's batched Cholesky factorisations share a pool of threads with the program
+that waits for them, and two at once wait for ever (seen with jaxlib 0.10.2 on two cores).
 """
 
 import dataclasses
-from collections.abc import Callable
 from typing import Any, Final
 
 import jax
@@ -14,10 +13,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from mjx_study import constraint
 from mjx_study._mjx import mjx
 from mjx_study.contact import ContactModel
-from mjx_study.dynamics import State, exact_step, smooth_stages, step, uses_jacobian
+from mjx_study.dynamics import State, exact_step, step, uses_jacobian
 from mjx_study.engine import HostState
+from mjx_study.gradcheck.compiling import Compiler
 from mjx_study.gradcheck.coordinates import Coordinates
 from mjx_study.integration import difference_position
 
@@ -33,8 +34,6 @@ class Linear:
 
     Attributes:
         qpos: position after the step.
-        value: velocity and activation after the step.
-        qacc: the acceleration that the solver found [m/s^2 or rad/s^2].
         residual: relative, of the solver.
         forward: the Jacobian (outputs, inputs) by forward mode.
         reverse: the same by reverse mode.
@@ -42,12 +41,25 @@ class Linear:
     """
 
     qpos: Float[np.ndarray, " nq"]
-    value: Float[np.ndarray, " nv_na"]
-    qacc: Float[np.ndarray, " nv"]
     residual: float
     forward: Float[np.ndarray, "outputs inputs"]
     reverse: Float[np.ndarray, "outputs inputs"]
     tape: Float[np.ndarray, "outputs inputs"] | None
+
+
+@dataclasses.dataclass(frozen=True)
+class Exact:
+    """A step whose constraints are solved to rounding.
+
+    Attributes:
+        after: the state after it, with the constrained acceleration as its warm start.
+        stages: quantities of the step up to the constraint solve, for the comparison with the C engine.
+        outputs: (position relative to a reference, velocity, activation) after each change.
+    """
+
+    after: HostState
+    stages: dict[str, Any]
+    outputs: Float[np.ndarray, "batch outputs"]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -66,181 +78,166 @@ class Setting:
 class Programs:
     """What is compiled for one scene; contact models and states are arguments."""
 
-    def __init__(self, layout: Coordinates):
+    def __init__(self, layout: Coordinates, compiler: Compiler | None = None):
         self.layout = layout
-        self._compiled: dict[Any, Callable[..., Any]] = {}
+        self.compiler = compiler or Compiler()
 
-    def values(
-        self,
-        setting: Setting,
-        base: HostState,
-        reference: Array,
-        changes: Float[np.ndarray, "batch inputs"],
-    ) -> tuple[Float[np.ndarray, "batch outputs"], float, Float[np.ndarray, " nv"]]:
-        """The converged step after each change, positions relative to `reference`.
+    def start(self, setting: Setting, base: HostState, *, stock: bool) -> None:
+        """Begin to compile what `linear`, `exact`, `stock_step` and, if asked for, `stock` need."""
+        point, layout = _point(setting, base), self.layout
+        rows = [_unit_rows(0, len(layout.inputs)), _unit_rows(0, len(layout.outputs))]
+        if self._has_tape:
+            self.compiler.start(self._tape, *point, *rows)
+        if uses_jacobian(layout.scene):
+            self.compiler.start(self._jacobian, *point, _unit_rows(0, layout.num_state), rows[1])
+        self.compiler.start(self._exact, *point, jnp.asarray(base.qpos), np.zeros((BATCH, len(layout.inputs))))
+        self.compiler.start(self._stock_step, *point)
+        if stock:
+            self.compiler.start(self._stock, *point, rows[0])
 
-        Returns:
-            (position, velocity, activation) after each; the largest residual; the acceleration after the first change.
-        """
-        state, control = _device(base)
-        traced = (setting.contact, setting.scales)
-        padded = np.zeros((-(-len(changes) // BATCH) * BATCH, len(self.layout.inputs)))
+    def exact(
+        self, setting: Setting, base: HostState, reference: Array, changes: Float[np.ndarray, "batch inputs"]
+    ) -> Exact:
+        """The converged step after each change, the first of which is none; positions relative to `reference`."""
+        rows = -(-len(changes) // BATCH) * BATCH
+        padded = np.zeros((rows, len(self.layout.inputs)))
         padded[: len(changes)] = changes
-        outputs, residuals, accelerations = [], [], []
+        outputs, first = [], None
         for chunk in padded.reshape(-1, BATCH, padded.shape[1]):
-            program = self._compile(self._values, traced, state, control, reference, chunk)
-            output, residual, qacc = program(traced, state, control, reference, chunk)
+            output, after, stages = self.compiler.run(self._exact, *_point(setting, base), reference, chunk)
             outputs.append(np.asarray(output))
-            residuals.append(float(np.max(residual)))
-            accelerations.append(np.asarray(qacc))
-        return np.concatenate(outputs)[: len(changes)], max(residuals), accelerations[0][0]
+            first = first or (after, stages)
+        after, stages = jax.tree.map(lambda leaf: np.asarray(leaf)[0], first)
+        return Exact(_host(after, base), stages, np.concatenate(outputs)[: len(changes)])
 
     def linear(self, setting: Setting, base: HostState) -> Linear:
         """Value and derivatives of the project's own step at a state."""
-        state, control = _device(base)
-        traced = (setting.contact, setting.scales)
-        inputs, outputs, num_state = len(self.layout.inputs), len(self.layout.outputs), self.layout.num_state
-        parts: dict[str, list[np.ndarray]] = {}
-        value: Any = None
-        for first in range(0, max(num_state, outputs), DIRECTIONS):
-            push, pull = _unit_rows(first, num_state), _unit_rows(first, outputs)
-            program = self._compile(self._linear, traced, state, control, push, pull)
-            value, rows = program(traced, state, control, push, pull)
-            for name, array in rows.items():
-                parts.setdefault(name, []).append(np.asarray(array))
-        whole = {name: np.concatenate(arrays) for name, arrays in parts.items()}
-        forward = np.zeros((outputs, inputs))
-        forward[:, :num_state] = whole["forward"][:num_state].T
-        reverse, tape = whole["reverse"][:outputs], whole.get("tape")
-        if inputs > num_state:
-            forward[:, num_state:] = np.asarray(whole["over_parameters"])[: inputs - num_state].T
-        if tape is not None:
-            tape = tape[:outputs]
-            reverse = np.concatenate([reverse, tape[:, num_state:]], axis=1)
-        qpos, after, qacc, residual = (np.asarray(part) for part in value)
-        return Linear(qpos, after, qacc, float(residual), forward, reverse, tape)
+        num_state = self.layout.num_state
+        tape = self._derivatives(self._tape, setting, base) if self._has_tape else None
+        if not uses_jacobian(self.layout.scene):
+            assert tape is not None
+            return Linear(*tape, None)
+        qpos, residual, forward, reverse = self._derivatives(self._jacobian, setting, base)
+        if tape is None:
+            return Linear(qpos, residual, forward, reverse, None)
+        # over parameters both modes take the tape
+        forward, reverse = (
+            np.concatenate([part, whole[:, num_state:]], axis=1)
+            for part, whole in ((forward, tape[2]), (reverse, tape[3]))
+        )
+        return Linear(qpos, residual, forward, reverse, tape[3])
+
+    def stock_step(self, setting: Setting, base: HostState) -> HostState:
+        """The state after `mjx.step`, run to convergence from the warm start."""
+        return _host(self.compiler.run(self._stock_step, *_point(setting, base)), base)
 
     def stock(self, setting: Setting, base: HostState) -> Float[np.ndarray, "outputs inputs"]:
         """The derivative that `jax.jvp` takes through `mjx.step`."""
-        state, control = _device(base)
-        traced = (setting.contact, setting.scales)
-        inputs = len(self.layout.inputs)
-        rows = []
-        for first in range(0, inputs, DIRECTIONS):
-            push = _unit_rows(first, inputs)
-            program = self._compile(self._stock, traced, state, control, push)
-            rows.append(np.asarray(program(traced, state, control, push)))
+        inputs, point = len(self.layout.inputs), _point(setting, base)
+        pushes = [_unit_rows(first, inputs) for first in range(0, inputs, DIRECTIONS)]
+        rows = [np.asarray(self.compiler.run(self._stock, *point, push)) for push in pushes]
         return np.concatenate(rows)[:inputs].T
 
-    def stages(self, setting: Setting, base: HostState) -> dict[str, Any]:
-        """Quantities of a step up to the constraint solve, for the comparison with the C engine."""
-        state, control = _device(base)
-        traced = (setting.contact, setting.scales)
-        program = self._compile(self._stages, traced, state, control)
-        return jax.tree.map(np.asarray, program(traced, state, control))
+    @property
+    def _has_tape(self) -> bool:
+        """Whether derivatives are taken on the tape: of large scenes, and over contact parameters."""
+        return len(self.layout.scales) > 0 or not uses_jacobian(self.layout.scene)
 
-    def _compile(self, function: Callable[..., Any], *arguments: Any) -> Callable[..., Any]:
-        shapes = jax.tree.map(lambda leaf: (jnp.shape(leaf), str(jnp.result_type(leaf))), arguments)
-        key = (function.__name__, str(jax.tree.structure(arguments)), str(shapes))
-        if key not in self._compiled:
-            self._compiled[key] = compile_quickly(function, *arguments)
-        return self._compiled[key]
+    def _derivatives(self, program: Any, setting: Setting, base: HostState) -> tuple[Any, float, Any, Any]:
+        """Position after the step, residual, and the Jacobian in forward and in reverse mode."""
+        layout, point = self.layout, _point(setting, base)
+        inputs = len(layout.inputs) if program == self._tape else layout.num_state
+        outputs, forward, reverse = len(layout.outputs), [], []
+        qpos = residual = None
+        for first in range(0, max(inputs, outputs), DIRECTIONS):
+            rows = _unit_rows(first, inputs), _unit_rows(first, outputs)
+            qpos, residual, pushed, pulled = self.compiler.run(program, *point, *rows)
+            forward.append(np.asarray(pushed))
+            reverse.append(np.asarray(pulled))
+        forward, reverse = np.concatenate(forward)[:inputs].T, np.concatenate(reverse)[:outputs]
+        return np.asarray(qpos), float(np.asarray(residual)), forward, reverse
 
-    def _after(self, step_function, traced, state, control, reference, change, parameters=None):
-        """Outputs after a change; `parameters` apart, where a derivative is not to see them."""
+    def _after(self, step_function, setting, state, control, change, parameters, reference=None):
+        """Outputs after a change, relative to a position or to what it is after the step; and the state there."""
         layout = self.layout
         moved, moved_control = layout.state(state, control, change)
-        parameters = change[layout.num_state :] if parameters is None else parameters
-        model = layout.model(traced[0], traced[1], parameters)
-        after, residual = step_function(layout.scene, model, moved, moved_control)
+        after, *rest = step_function(layout.scene, layout.model(*setting, parameters), moved, moved_control)
+        reference = jax.lax.stop_gradient(after.qpos) if reference is None else reference
         tangent = difference_position(layout.scene.host, reference, after.qpos)
-        return jnp.concatenate([tangent, after.qvel, after.act]), after, residual
+        return jnp.concatenate([tangent, after.qvel, after.act]), (after, *rest)
 
-    def _values(self, traced, state, control, reference, changes):
+    def _exact(self, setting, state, control, reference, changes):
         def one(change):
-            output, after, residual = self._after(exact_step, traced, state, control, reference, change)
-            return output, residual, after.warmstart
+            parameters = change[self.layout.num_state :]
+            output, (after, _, data) = self._after(exact_step, setting, state, control, change, parameters, reference)
+            model = self.layout.model(*setting, parameters)
+            return output, after, _stages(model, data)
 
         return jax.lax.map(one, changes)
 
-    def _linear(self, traced, state, control, push_rows, pull_rows):
-        num_state = self.layout.num_state
+    def _jacobian(self, setting, state, control, push_rows, pull_rows):
         still = jnp.zeros(len(self.layout.inputs))
-        after, residual = step(
-            self.layout.scene, self.layout.model(traced[0], traced[1], still[num_state:]), state, control
+        own, parameters = jnp.split(still, [self.layout.num_state])
+        return _linearise(
+            lambda change: self._after(step, setting, state, control, change, parameters), own, push_rows, pull_rows
         )
 
-        def output(change, parameters=None):
-            return self._after(step, traced, state, control, after.qpos, change, parameters)[0]
+    def _tape(self, setting, state, control, push_rows, pull_rows):
+        num_state = self.layout.num_state
 
-        rows = {}
-        push, pull = _linearise(lambda change: output(change, still[num_state:]), still[:num_state])
-        rows["forward"] = jax.lax.map(push, push_rows)
-        if len(still) > num_state:
-            push, pull_all = _linearise(output, still)
-            over = jnp.eye(len(still))[num_state:]
-            rows["over_parameters"] = jax.lax.map(push, over)
-            if uses_jacobian(self.layout.scene):
-                rows["tape"] = jax.lax.map(pull_all, pull_rows)
-            else:
-                pull = pull_all
-        rows["reverse"] = jax.lax.map(pull, pull_rows)
-        value = (after.qpos, jnp.concatenate([after.qvel, after.act]), after.warmstart, residual)
-        return value, rows
-
-    def _stock(self, traced, state, control, push_rows):
         def output(change):
-            return self._after(_stock_step, traced, state, control, reference, change)[0]
+            return self._after(step, setting, state, control, change, change[num_state:])
 
-        still = jnp.zeros(len(self.layout.inputs))
-        model = self.layout.model(traced[0], traced[1], still[self.layout.num_state :])
-        reference = _stock_step(self.layout.scene, model, state, control)[0].qpos
-        _, push = jax.linearize(output, still)
+        return _linearise(output, jnp.zeros(len(self.layout.inputs)), push_rows, pull_rows)
+
+    def _stock(self, setting, state, control, push_rows):
+        num_state = self.layout.num_state
+
+        def output(change):
+            return self._after(_mjx_step, setting, state, control, change, change[num_state:])[0]
+
+        _, push = jax.linearize(output, jnp.zeros(len(self.layout.inputs)))
         return jax.lax.map(push, push_rows)
 
-    def _stages(self, traced, state, control):
-        scene = self.layout.scene
-        model = self.layout.model(traced[0], traced[1], jnp.zeros(len(traced[1])))
-        data = smooth_stages(scene, model, state, control)
-        rows: Any = data._impl
-        contacts = rows.contact
-        return {
-            "xpos": data.xpos,
-            "ten_length": data.ten_length,
-            "actuator_length": data.actuator_length,
-            "qM": mjx.full_m(model, data),
-            "qfrc_bias": data.qfrc_bias,
-            "qfrc_passive": data.qfrc_passive,
-            "qfrc_actuator": data.qfrc_actuator,
-            "act_dot": data.act_dot,
-            "qacc_smooth": data.qacc_smooth,
-            "dist": contacts.dist,
-            "margin": contacts.includemargin,
-            "pos": contacts.pos,
-            "normal": contacts.frame[:, 0],
-            "geom": jnp.asarray(contacts.geom),
-            "efc_J": rows.efc_J,
-            "efc_aref": rows.efc_aref,
-            "efc_D": rows.efc_D,
-            "efc_frictionloss": rows.efc_frictionloss,
-        }
+    def _stock_step(self, setting, state, control):
+        scene, parameters = self.layout.scene, jnp.zeros(len(self.layout.scales))
+        model = constraint.with_generous_budget(self.layout.model(*setting, parameters))
+        return _mjx_step(scene, model, state, control)[0]
 
 
-def compile_quickly(function: Callable[..., Any], *arguments: Any) -> Callable[..., Any]:
-    """The function compiled for these arguments with little optimisation where the backend is a CPU."""
-    lowered = jax.jit(function).lower(*arguments)
-    if jax.default_backend() != "cpu":
-        return lowered.compile()
-    return lowered.compile(compiler_options={"xla_backend_optimization_level": "0"})
+def _stages(model: mjx.Model, data: mjx.Data) -> dict[str, Any]:
+    rows: Any = data._impl
+    contacts = rows.contact
+    return {
+        "xpos": data.xpos,
+        "ten_length": data.ten_length,
+        "actuator_length": data.actuator_length,
+        "qM": mjx.full_m(model, data),
+        "qfrc_bias": data.qfrc_bias,
+        "qfrc_passive": data.qfrc_passive,
+        "qfrc_actuator": data.qfrc_actuator,
+        "act_dot": data.act_dot,
+        "qacc_smooth": data.qacc_smooth,
+        "dist": contacts.dist,
+        "margin": contacts.includemargin,
+        "pos": contacts.pos,
+        "normal": contacts.frame[:, 0],
+        "geom": jnp.asarray(contacts.geom),
+        "efc_J": rows.efc_J,
+        "efc_aref": rows.efc_aref,
+        "efc_D": rows.efc_D,
+        "efc_frictionloss": rows.efc_frictionloss,
+    }
 
 
-def _linearise(function, point):
-    _, push = jax.linearize(function, point)
+def _linearise(output, point, push_rows, pull_rows):
+    """Position after the step, residual, and derivatives along rows, forwards and backwards."""
+    _, push, (after, residual) = jax.linearize(output, point, has_aux=True)
     pull = jax.linear_transpose(push, point)
-    return push, lambda row: pull(row)[0]
+    return after.qpos, residual, jax.lax.map(push, push_rows), jax.lax.map(lambda row: pull(row)[0], pull_rows)
 
 
-def _stock_step(scene, model, state, control):
+def _mjx_step(scene, model, state, control):
     data = scene.template.replace(
         qpos=state.qpos, qvel=state.qvel, act=state.act, ctrl=control, qacc_warmstart=state.warmstart
     )
@@ -248,9 +245,14 @@ def _stock_step(scene, model, state, control):
     return State(data.qpos, data.qvel, data.act, data.qacc), jnp.zeros(())
 
 
-def _device(base: HostState) -> tuple[State, Array]:
+def _point(setting: Setting, base: HostState) -> tuple[Any, State, Array]:
     arrays = (jnp.asarray(part) for part in (base.qpos, base.qvel, base.act, base.warmstart))
-    return State(*arrays), jnp.asarray(base.control)
+    return (setting.contact, setting.scales), State(*arrays), jnp.asarray(base.control)
+
+
+def _host(after: State, base: HostState) -> HostState:
+    qpos, qvel, act, qacc = map(np.asarray, (after.qpos, after.qvel, after.act, after.warmstart))
+    return HostState(qpos, qvel, act, base.control, qacc)
 
 
 def _unit_rows(first: int, size: int) -> Float[np.ndarray, "directions size"]:

@@ -6,11 +6,14 @@ from collections.abc import Sequence
 from typing import Any, Final
 
 from mjx_study.gradcheck.cost import CostCheck
-from mjx_study.gradcheck.diagnosis import FAILURES, MEANING
+from mjx_study.gradcheck.coverage import Coverage
+from mjx_study.gradcheck.diagnosis import FAILURES, MEANING, VERDICTS
 from mjx_study.table import format_table
 
 SHOWN: Final = 12
 """Findings in the text unless all are asked for."""
+OTHERS: Final = {"value": "mjx.step", "engine": "the C engine", "placement": "the C engine"}
+"""What a number is compared with, where that is not differences."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -22,8 +25,8 @@ class Entry:
         index: steps since the start of the rollout.
         time: the same [s].
         name: as in d qvel[hinge] / d ctrl[motor].
-        derivative: by automatic differentiation, or MJX's value.
-        difference: by central differences, or the C engine's value; None where there is none.
+        derivative: by automatic differentiation; of a step that differs, what changes here.
+        difference: by central differences; of a step that differs, what changes there; None where there is none.
         gap: of the one-sided slopes.
     """
 
@@ -43,7 +46,7 @@ class Finding:
     Attributes:
         contact: label of the contact model.
         who: whose derivative: `project`, or `mjx.step` for MJX's own.
-        verdict: kink, jump, unconverged, zero, nan, wrong or placement.
+        verdict: kink, jump, unconverged, zero, nan, engine, wrong, value or placement.
         modes: of differentiation that show it: forward, reverse, tape.
         cause: one sentence.
         entries: all of them.
@@ -76,7 +79,8 @@ class Finding:
     def _numbers(self, entry: Entry) -> str:
         if self.verdict == "jump" and entry.gap:
             return f"= {entry.derivative:.6g}, but differences reach {entry.gap:.2g}"
-        there = "" if entry.difference is None else f", differences {entry.difference:.6g}"
+        other = OTHERS.get(self.verdict, "differences")
+        there = "" if entry.difference is None else f", {other} {entry.difference:.6g}"
         gap = f" (one-sided apart by {entry.gap:.2g})" if entry.gap else ""
         return f"= {entry.derivative:.6g}{there}{gap}"
 
@@ -90,13 +94,16 @@ class StepCheck:
         stiffness: K [N/m]; 0 where the contact model was not made from one.
         states: number of states.
         entries: of their Jacobians, in all.
+        unresolved: entries that differences are too uncertain to say anything of.
         modes: reverse against forward mode.
         differences: derivative over state and control against central differences.
         parameters: the same over contact parameters; None where there are no contacts.
-        engine_step: the step's acceleration against the C engine's.
+        stock_step: the state after the step against that of `mjx.step`, relative to what the step changes.
+        engine_step: the same against the C engine's.
         engine: the Jacobian against the C engine's, where the steps agree; None where they nowhere do.
         stock: the derivative of `mjx.step`, likewise; None where it was not asked for, infinite where it is NaN.
         residual: of the solver.
+        coverage: what the states exercise.
         verdict: the gravest of the findings on the project's own derivative.
     """
 
@@ -104,14 +111,22 @@ class StepCheck:
     stiffness: float
     states: int
     entries: int
+    unresolved: int
     modes: float
     differences: float
     parameters: float | None
+    stock_step: float
     engine_step: float
     engine: float | None
     stock: float | None
     residual: float
+    coverage: Coverage
     verdict: str
+
+    @property
+    def label(self) -> str:
+        """Contact model in words."""
+        return f"{self.contact}, K = {self.stiffness:g} N/m" if self.stiffness else self.contact
 
 
 @dataclasses.dataclass(frozen=True)
@@ -142,9 +157,14 @@ class GradcheckReport:
         verdicts = [check.verdict for check in (*self.costs, *self.steps)]
         return not any(verdict in FAILURES for verdict in verdicts)
 
+    @property
+    def unexercised(self) -> dict[str, tuple[str, ...]]:
+        """What the model has and no state exercised, by contact model."""
+        return {check.label: check.coverage.missing for check in self.steps if check.coverage.missing}
+
     def as_json(self) -> dict[str, Any]:
         """The report as plain data; figures that are not finite become None."""
-        return _plain(dataclasses.asdict(self) | {"passed": self.passed})
+        return _plain(dataclasses.asdict(self) | {"passed": self.passed, "unexercised": self.unexercised})
 
     def lines(self, *, verbose: bool = False) -> list[str]:
         """The report as text; `verbose` has every entry of every finding."""
@@ -152,10 +172,30 @@ class GradcheckReport:
         if self.costs:
             lines += ["gradient of the whole cost", *self._cost_table(), ""]
         lines += ["one step", *self._step_table(), ""]
+        lines += self._coverage_lines()
         lines += self._finding_lines(verbose)
-        lines += [f"warning: {text}" for text in self.warnings]
+        lines += [f"warning: {text}" for text in (*self.warnings, *self._gaps())]
         verdict = "every derivative that exists is right" if self.passed else "SOMETHING IS WRONG: see above"
-        return [*lines, verdict]
+        return [*lines, f"{verdict}, where it was checked" if self.passed and self.unexercised else verdict]
+
+    def _coverage_lines(self) -> list[str]:
+        """What the states exercise, contact models with the same line together."""
+        alike: dict[str, list[str]] = {}
+        for check in self.steps:
+            alike.setdefault(check.coverage.line(), []).append(check.label)
+        lines = [f"{', '.join(labels)}: {line}" if len(alike) > 1 else line for line, labels in alike.items() if line]
+        return ["exercised", *lines, ""] if lines else []
+
+    def _gaps(self) -> list[str]:
+        """A warning for each set of parts that no state exercises."""
+        alike: dict[tuple[str, ...], list[str]] = {}
+        for label, missing in self.unexercised.items():
+            alike.setdefault(missing, []).append(label)
+        return [
+            f"{', '.join(labels)}: no state exercises {' and '.join(missing)}, whose derivatives are unchecked; more "
+            "--states, a longer --horizon or another --seed may"
+            for missing, labels in alike.items()
+        ]
 
     def _cost_table(self) -> list[str]:
         header = ["contact", "K [N/m]", "|gradient|", "modes", "differences", "one-sided", "closed form", "residual"]
@@ -175,7 +215,7 @@ class GradcheckReport:
         return _without_empty(rows, [*header, "verdict"])
 
     def _step_table(self) -> list[str]:
-        header = ["contact", "K [N/m]", "states", "modes", "differences", "parameters", "C step", "C engine"]
+        header = ["contact", "K [N/m]", "states", "modes", "differences", "parameters", "mjx step", "C step"]
         rows = [
             [
                 check.contact,
@@ -187,17 +227,19 @@ class GradcheckReport:
                         check.modes,
                         check.differences,
                         check.parameters,
+                        check.stock_step,
                         check.engine_step,
                         check.engine,
                         check.stock,
                         check.residual,
                     ),
                 ),
+                str(check.unresolved),
                 _verdict(check.verdict),
             ]
             for check in self.steps
         ]
-        return _without_empty(rows, [*header, "mjx.step", "residual", "verdict"])
+        return _without_empty(rows, [*header, "C engine", "mjx.step", "residual", "unresolved", "verdict"])
 
     def _finding_lines(self, verbose: bool) -> list[str]:
         """Findings of one kind and cause once, whatever the number of contact models that show it."""
@@ -221,6 +263,12 @@ class GradcheckReport:
         verdicts = dict.fromkeys(finding.verdict for finding in self.findings)
         lines += [f"{verdict}: {MEANING[verdict]}" for verdict in verdicts if verdict in MEANING]
         return [*lines, ""] if lines else []
+
+
+def gravity(finding: Finding) -> tuple[bool, bool, int]:
+    """A key that sorts the gravest findings first."""
+    order = {name: rank for rank, name in enumerate((*reversed(VERDICTS), "placement"))}
+    return not finding.fails, finding.who != "project", order[finding.verdict]
 
 
 def _stiffness(value: float) -> str:

@@ -1,18 +1,36 @@
-"""Where a step is checked: states of a rollout, its start among them, and most of them in contact."""
+"""Where a step is checked: states of a rollout, its start among them, that exercise what the model has."""
 
 import dataclasses
+import itertools
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Final
 
 import mujoco
 import numpy as np
 
 from mjx_study.contact import ContactModel
 from mjx_study.engine import HostState, converged_host, host_data, host_state
+from mjx_study.gradcheck.coverage import OPTIONAL, Coverage, coverage, exercised, possible
 from mjx_study.scene import Scene
 
-SPEED = 0.1
+SPEED: Final = 0.1
 """Standard deviation of a sampled start's velocities [m/s or rad/s]: small, but nothing is at rest or at a tie."""
-CONTROL = 0.3
+FASTER: Final = (1.0, 5.0)
+"""The same of rollouts that look for what the first did not reach."""
+PUSHES: Final = 10
+"""How often such a rollout is pushed to other velocities and controls."""
+CONTROL: Final = 0.3
 """Of sampled controls, relative to half their range; absolute where they have none."""
+POSES: Final = 30
+"""Random poses tried for what no rollout reached."""
+FALL: Final = 50
+"""Steps of the rollout from each."""
+BEYOND: Final = 0.01
+"""How far beyond a limit a pose may be, relative to the range."""
+LOOK: Final = 200
+"""States looked at at once for one that exercises what is missing."""
+
+_SCALAR: Final = (int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -21,69 +39,160 @@ class Sample:
 
     Attributes:
         label: in words.
-        index: steps since the start of the rollout.
+        index: steps since the start of its rollout.
         state: the state and its control.
+        parts: what it exercises.
     """
 
     label: str
     index: int
     state: HostState
+    parts: frozenset[str]
 
 
-def sample_states(scene: Scene, contact: ContactModel | None, count: int, horizon: int, seed: int) -> list[Sample]:
-    """States of a rollout in the C engine.
+def start_of(scene: Scene) -> HostState:
+    """The model's own start: its first keyframe, or its reference pose at rest."""
+    data = mujoco.MjData(scene.host)
+    if scene.host.nkey:
+        mujoco.mj_resetDataKeyframe(scene.host, data, 0)
+    return host_state(data)
 
-    The first is the model's own: its first keyframe, or its reference pose at rest; a program's users start there, and
-    so do most faults of a derivative. The others come from a rollout with small random velocities and controls, evenly
-    spaced over its steps, those with active constraints first.
+
+def states_of(
+    scene: Scene,
+    contact: ContactModel | None,
+    count: int,
+    horizon: int,
+    seed: int,
+    visited: Sequence[HostState] | None = None,
+) -> tuple[list[Sample], Coverage]:
+    """`count` states, and what they exercise.
+
+    The first is the start: a program's users start there, and so do most faults of a derivative. The others come from
+    a rollout, the task's own or one with small random velocities and controls, evenly spaced over its steps, those with
+    active constraints first. Where these leave a part of the model unexercised, states take their places that do: of
+    rollouts that are faster and pushed about, and of random poses within the joints' limits.
 
     Args:
         scene: the scene.
         contact: its contact model, or None.
         count: number of states.
-        horizon: steps of the rollout.
-        seed: of velocities and controls.
+        horizon: steps of the rollouts.
+        seed: of velocities, controls and poses.
+        visited: states of a task's rollout; None for one in the C engine.
     """
     host = converged_host(scene, contact)
-    data = mujoco.MjData(host)
-    if host.nkey:
-        mujoco.mj_resetDataKeyframe(host, data, 0)
-    rest = Sample("start" if data.qvel.any() else "start, at rest", 0, host_state(data))
     random = np.random.default_rng(seed)
-    data.qvel[:] += SPEED * random.normal(size=host.nv)
-    data.ctrl[:] += _random_controls(host, random)
-    if host.na:
-        data.act[:] += 0.1 * np.abs(random.normal(size=host.na))
-    visited: list[tuple[HostState, int]] = []
-    for _ in range(horizon):
+    parts = possible(scene, host)
+    start = start_of(scene) if visited is None else visited[0]
+    at_rest = ", at rest" if visited is None and not start.qvel.any() else ""
+    first = Sample(f"start{at_rest}", 0, start, _parts(host, start))
+    if visited is None:
+        rollout = list(_rollout(host, _stirred(host, start, random, SPEED, CONTROL), horizon))
+    else:
+        rollout = [Sample(f"step {index}", index, state, _parts(host, state)) for index, state in enumerate(visited)]
+    chosen = _cover([first], rollout[1:], parts - OPTIONAL, count)
+    chosen = _cover(chosen, _elsewhere(host, start, horizon, random), parts - OPTIONAL, count)
+    chosen += _spaced([sample for sample in rollout[1:] if sample not in chosen], count - len(chosen))
+    for sample in _elsewhere(host, start, horizon, random):
+        if len(chosen) == count:
+            break
+        chosen.append(sample)
+    chosen[1:] = sorted(chosen[1:], key=lambda sample: (len(sample.label.split(",")), sample.index))
+    return chosen, coverage(parts, [sample.parts for sample in chosen])
+
+
+def _cover(chosen: list[Sample], pool: Iterable[Sample], wanted: frozenset[str], count: int) -> list[Sample]:
+    """Add samples of a pool, `count` in all at most, until they exercise what is wanted or all that the pool does."""
+    chosen, seen = list(chosen), []
+    iterator = iter(pool)
+    while len(chosen) < count and (missing := wanted.difference(*(sample.parts for sample in chosen))):
+        # a pool of one rollout is read to its end; one that goes on for long only while nothing helps
+        while not any(sample.parts & missing for sample in seen):
+            more = list(itertools.islice(iterator, LOOK))
+            if not more:
+                return chosen
+            seen += more
+        most = max(len(sample.parts & missing) for sample in seen)
+        best = [sample for sample in seen if len(sample.parts & missing) == most]
+        chosen.append(best[len(best) // 2])  # the middle one, far from where the part sets in
+    return chosen
+
+
+def _spaced(rollout: Sequence[Sample], count: int) -> list[Sample]:
+    """Up to `count` samples, evenly spaced over those with active constraints, then over the others."""
+    active = [sample for sample in rollout if sample.parts]
+    others = [sample for sample in rollout if not sample.parts]
+    if count > len(active):
+        return active + _even(others, count - len(active))
+    return _even(active, count)
+
+
+def _even(samples: list[Sample], count: int) -> list[Sample]:
+    if count >= len(samples):
+        return samples
+    return [samples[int(round(place))] for place in np.linspace(0, len(samples) - 1, count + 2)[1:-1]]
+
+
+def _elsewhere(host: mujoco.MjModel, start: HostState, horizon: int, random: np.random.Generator) -> Iterator[Sample]:
+    """States that a rollout from the start does not reach."""
+    for speed in FASTER:
+        every = max(horizon // PUSHES, 1)
+        yield from _rollout(
+            host, start, horizon, f", pushed to {speed:g}", lambda s, v=speed: _stirred(host, s, random, v), every
+        )
+    for number in range(POSES):
+        pose = _stirred(host, _posed(host, start, random), random, FASTER[number % len(FASTER)])
+        yield from _rollout(host, pose, FALL, f", from pose {number}")
+
+
+def _rollout(
+    host: mujoco.MjModel,
+    start: HostState,
+    horizon: int,
+    label: str = "",
+    push: Callable[[HostState], HostState] | None = None,
+    every: int = 1,
+) -> Iterator[Sample]:
+    """States of a rollout in the C engine, as long as it stays finite, pushed every so many steps."""
+    data = host_data(host, start)
+    for index in range(horizon):
+        if push is not None and index % every == 0:
+            data = host_data(host, push(host_state(data)))
         before = host_state(data)
         mujoco.mj_step(host, data)
         if not np.all(np.isfinite(data.qpos)) or data.warning[mujoco.mjtWarning.mjWARN_BADQACC].number:
-            break
-        visited.append((before, int(data.nefc)))
-    chosen = choose([active for _, active in visited], count - 1)
-    return [rest, *(Sample(f"step {index}", index, visited[index][0]) for index in chosen)]
+            return
+        yield Sample(f"step {index}{label}", index, before, exercised(data))
 
 
-def choose(active: list[int], count: int) -> list[int]:
-    """Indices of `count` steps, evenly spaced over those with active constraints, or over all where there are none."""
-    candidates = [index for index, rows in enumerate(active) if rows and index] or list(range(1, len(active)))
-    if not candidates or count < 1:
-        return []
-    picked = np.unique(np.linspace(0, len(candidates) - 1, count + 2)[1:-1].round().astype(int))
-    return [candidates[index] for index in picked]
+def _parts(host: mujoco.MjModel, state: HostState) -> frozenset[str]:
+    data = host_data(host, state)
+    mujoco.mj_forward(host, data)
+    return exercised(data)
 
 
-def reached(scene: Scene, contact: ContactModel | None, state: HostState) -> int:
-    """Active constraint rows of a state."""
-    data = host_data(converged_host(scene, contact), state)
-    mujoco.mj_forward(data.model, data)
-    return int(data.nefc)
-
-
-def _random_controls(host: mujoco.MjModel, random: np.random.Generator) -> np.ndarray:
+def _stirred(
+    host: mujoco.MjModel, state: HostState, random: np.random.Generator, speed: float, control: float = 1.0
+) -> HostState:
+    """The state with other velocities, controls and activations."""
     low, high = host.actuator_ctrlrange.T
     limited = host.actuator_ctrllimited.astype(bool)
-    half = np.where(limited, (high - low) / 2, 1.0)
-    centre = np.where(limited, (high + low) / 2, 0.0)
-    return centre + CONTROL * half * random.uniform(-1, 1, size=host.nu)
+    half, centre = np.where(limited, (high - low) / 2, 1.0), np.where(limited, (high + low) / 2, 0.0)
+    return dataclasses.replace(
+        state,
+        qvel=state.qvel + speed * random.normal(size=host.nv),
+        control=state.control + centre + control * half * random.uniform(-1, 1, size=host.nu),
+        act=state.act + 0.1 * np.abs(random.normal(size=host.na)),
+    )
+
+
+def _posed(host: mujoco.MjModel, state: HostState, random: np.random.Generator) -> HostState:
+    """The state with every limited slide and hinge somewhere in its range, or a little beyond an end of it."""
+    qpos = state.qpos.copy()
+    for joint in np.flatnonzero(host.jnt_limited):
+        if int(host.jnt_type[joint]) in _SCALAR:
+            low, high = host.jnt_range[joint]
+            share = random.choice([-BEYOND, 1 + BEYOND, random.uniform()])
+            qpos[host.jnt_qposadr[joint]] = low + share * (high - low)
+    return dataclasses.replace(state, qpos=qpos)

@@ -52,7 +52,8 @@ def test_the_pusher_is_right(capsys: pytest.CaptureFixture[str]) -> None:
         assert cost["modes"] < 1e-10 and cost["difference"] < 1e-6 and cost["residual"] < 1e-9
     for step in document["steps"]:
         assert step["modes"] < 1e-10 and step["differences"] < 1e-6 and step["parameters"] < 1e-6
-        assert step["engine_step"] < 1e-8 and step["engine"] < 1e-5
+        assert step["stock_step"] < 1e-6 and step["engine_step"] < 1e-8 and step["engine"] < 1e-5
+        assert step["coverage"]["counts"]["push"] and step["coverage"]["missing"] == []
 
 
 @pytest.mark.usefixtures("configured")
@@ -109,17 +110,45 @@ def test_a_joint_at_its_limit_is_named() -> None:
     assert report.passed and causes == {"x is at its limit"}
 
 
-def test_an_upright_cylinder_is_at_a_jump_that_differences_reach_across() -> None:
-    """Its three contact points turn with the direction in which it tilts, however little: here 1e-9 rad."""
+def test_an_upright_cylinder_excuses_its_own_entries_and_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its three contact points turn with the direction in which it tilts, however little; what stands beside does not.
+
+    The tilt is 1e-9 rad, which differences reach across. The planted fault is in a slider that touches nothing.
+    """
+    right = dynamics.step_jacobian
+
+    def wrong_beside(*arguments):
+        over_step, over_qacc = right(*arguments)
+        return over_step.at[3].multiply(1 + 1e-3), over_qacc  # the slider's velocity
+
+    monkeypatch.setattr(dynamics, "step_jacobian", wrong_beside)
     cylinder = (
-        '<body pos="0 0 .0999"><joint name="z" type="slide" axis="0 0 1"/><joint name="a"/>'
+        '<body pos="0 0 .0999"><joint name="z" type="slide" axis="0 0 1"/><joint name="a" axis="1 0 0"/>'
         '<joint name="b" axis="0 1 0"/><geom name="can" type="cylinder" size=".1 .1" mass="1"/></body>'
-    ).replace('name="a"', 'name="a" axis="1 0 0"')
-    key = '<keyframe><key qpos="0 1e-9 0"/></keyframe>'
+    )
+    beside = (
+        '<body pos="1 0 1"><joint name="slider" type="slide" axis="1 0 0" stiffness="30" damping="2"/>'
+        '<geom size=".1" mass="1" contype="0" conaffinity="0"/></body>'
+    )
+    key = '<keyframe><key qpos="0 1e-9 0 .1"/></keyframe>'
     floor = '<geom type="plane" size="1 1 1"/>'
-    report = check(f"<option {CONVERGED}/><worldbody>{floor}{cylinder}</worldbody>{key}")
-    assert report.passed and all("can stands upright" in f.cause for f in report.findings if f.verdict == "jump")
-    assert report.steps[0].verdict == "jump"
+    report = check(f"<option {CONVERGED}/><worldbody>{floor}{cylinder}{beside}</worldbody>{key}")
+    jumps = [finding for finding in report.findings if finding.verdict == "jump"]
+    assert jumps and any("can stands upright" in finding.cause for finding in jumps)
+    assert not any("slider" in entry.name for finding in jumps for entry in finding.entries)
+    wrong = {entry.name for f in report.findings if f.verdict == "wrong" for entry in f.entries if entry.name}
+    assert wrong == {"d qvel[slider] / d qpos[slider]", "d qvel[slider] / d qvel[slider]"}
+    assert not report.passed
+
+
+def test_runge_kutta_is_compared_with_the_engine() -> None:
+    rod = '<body><joint name="j" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0 0 -.3" size=".02" mass="1"/></body>'
+    motor = '<actuator><motor joint="j"/></actuator>'
+    report = check(f'<option integrator="RK4"/><worldbody>{rod}</worldbody>{motor}', states=2)
+    (step,) = report.steps
+    assert report.passed and report.findings == () and step.states == 2
+    assert step.engine_step <= 1e-8 and step.stock_step <= 1e-8
+    assert step.engine is not None and step.engine < 1e-6
 
 
 def test_a_silent_zero_fails() -> None:

@@ -1,5 +1,6 @@
 """Every verdict on an entry, and where each begins."""
 
+import dataclasses
 from functools import cache
 
 import mujoco
@@ -8,7 +9,14 @@ import pytest
 
 from mjx_study.gradcheck import diagnosis
 from mjx_study.gradcheck.coordinates import Coordinates, coordinates
-from mjx_study.gradcheck.diagnosis import VERDICTS, judge, modes_apart, worst_verdict
+from mjx_study.gradcheck.diagnosis import (
+    VERDICTS,
+    disagreements,
+    judge,
+    modes_apart,
+    resolved_by,
+    worst_verdict,
+)
 from mjx_study.gradcheck.differences import Differences
 from mjx_study.scene import put_scene
 
@@ -44,7 +52,7 @@ def verdict(
     if converged is not None:
         exact = TRUE.copy()
         exact[1, 0] = converged
-    found = Differences(truth, uncertainty * there, gap * there, (kink * there) > 0, (jump * there) > 0)
+    found = Differences(truth, uncertainty * there, gap * there, (kink * there) > 0, (jump * there) > 0, there < 0)
     codes = judge(layout(), derivative, found, exact).codes
     assert (np.delete(codes, 3) == diagnosis.RIGHT).all()
     return VERDICTS[codes[1, 0]]
@@ -60,6 +68,13 @@ def test_right_within_the_tolerance_and_the_uncertainty() -> None:
     assert verdict(0.5 * (1 + 0.9e-6)) == "right"
     assert verdict(0.5 * (1 + 1.1e-5)) == "wrong"
     assert verdict(0.51, uncertainty=0.004) == "right"
+
+
+def test_an_entry_as_small_as_its_uncertainty_is_unresolved() -> None:
+    assert verdict(0.5, uncertainty=0.1) == "right"
+    assert verdict(0.5, uncertainty=0.2) == "unresolved"
+    assert verdict(0.0, value=0.1, uncertainty=0.2) == "unresolved"
+    assert verdict(0.0, value=0.0, uncertainty=0.2) == "right"  # differences are zero as well
 
 
 def test_wrong() -> None:
@@ -90,6 +105,32 @@ def test_a_jump_excuses_any_derivative() -> None:
     assert verdict(0.0, jump=True) == "jump"
 
 
+def test_a_degenerate_contact_excuses_what_it_enters_and_what_jumps() -> None:
+    """Not an entry where differences are smooth, nor one that does not depend on it."""
+    derivative, rough = TRUE.copy(), TRUE < 0
+    derivative[1] *= 2
+    rough[1, :2] = True
+    none, never = np.zeros_like(TRUE), np.zeros(TRUE.shape, bool)
+    truth = Differences(TRUE, none, none, never, never, rough)
+    entered = np.array([[True, False, True], [True, False, True]])
+    codes = judge(layout(), derivative, truth, degenerate=entered).codes
+    assert [VERDICTS[code] for code in codes[1]] == ["jump", "wrong", "wrong"]
+
+
+def test_the_engine_is_a_judge() -> None:
+    none, never = np.zeros_like(TRUE), np.zeros(TRUE.shape, bool)
+    right = Differences(TRUE, none, none, never, never, never)
+    theirs = TRUE.copy()
+    theirs[1, 0] *= 1.01
+    ours, engine = (judge(layout(), TRUE, right), judge(layout(), TRUE, dataclasses.replace(right, value=theirs)))
+    found = disagreements(ours, right, engine, right)
+    assert np.argwhere(found).tolist() == [[1, 0]]
+    rough = dataclasses.replace(right, kink=found)
+    assert not disagreements(ours, right, engine, rough).any()
+    vague = judge(layout(), TRUE, dataclasses.replace(right, uncertainty=np.ones_like(TRUE)))
+    assert (vague.codes == diagnosis.UNRESOLVED).all() and (resolved_by(vague, ours).codes == diagnosis.RIGHT).all()
+
+
 def test_an_unconverged_solve_is_told_from_a_wrong_derivative() -> None:
     assert verdict(0.51, converged=0.5) == "unconverged"
     assert verdict(0.51, converged=0.51) == "wrong"
@@ -97,10 +138,10 @@ def test_an_unconverged_solve_is_told_from_a_wrong_derivative() -> None:
 
 def test_the_error_leaves_out_what_differences_do_not_resolve() -> None:
     none, never = np.zeros_like(TRUE), np.zeros(TRUE.shape, bool)
-    truth = Differences(TRUE * (1 + 1e-7), none, none, never, never)
+    truth = Differences(TRUE * (1 + 1e-7), none, none, never, never, never)
     assert judge(layout(), TRUE, truth).error == pytest.approx(1e-7, rel=1e-3)
     vague = np.full_like(TRUE, 1e-3)
-    assert judge(layout(), TRUE, Differences(truth.value, vague, none, never, never)).error == 0.0
+    assert judge(layout(), TRUE, Differences(truth.value, vague, none, never, never, never)).error == 0.0
 
 
 def test_modes_are_compared_by_rows_and_blocks() -> None:

@@ -1,0 +1,104 @@
+"""Which parts of a model's dynamics a state exercises: contact by zone, limits, friction loss, equalities."""
+
+import dataclasses
+from collections.abc import Collection, Sequence
+from typing import Any, Final
+
+import mujoco
+import numpy as np
+
+from mjx_study.scene import Scene
+
+ZONES: Final = ("push", "stick", "slide", "separate")
+"""Of a contact: push has no friction; stick and slide do; separate is within its margin and without force."""
+PARTS: Final = ("contact", *ZONES, "limit", "friction loss", "held", "slipping", "equality")
+"""What a state can exercise; friction loss holds, or slips at its bound."""
+_STATE, _KIND = mujoco.mjtConstraintState, mujoco.mjtConstraint
+_LIMITS = (int(_KIND.mjCNSTR_LIMIT_JOINT), int(_KIND.mjCNSTR_LIMIT_TENDON))
+_LOSSES = (int(_KIND.mjCNSTR_FRICTION_DOF), int(_KIND.mjCNSTR_FRICTION_TENDON))
+_SATISFIED, _QUADRATIC = int(_STATE.mjCNSTRSTATE_SATISFIED), int(_STATE.mjCNSTRSTATE_QUADRATIC)
+
+
+@dataclasses.dataclass(frozen=True)
+class Coverage:
+    """How many of some states exercise each part of a model.
+
+    Attributes:
+        states: how many there are.
+        counts: states by part; parts that the model lacks are left out.
+        missing: parts that the model has and no state exercises.
+    """
+
+    states: int
+    counts: dict[str, int]
+    missing: tuple[str, ...]
+
+    def line(self) -> str:
+        """In words; empty where the model has nothing to exercise."""
+        zones = [f"{zone} {self.counts[zone]}" for zone in (*ZONES, "held", "slipping") if zone in self.counts]
+        of_contact = ", ".join(zone for zone in zones if zone.split()[0] in ZONES)
+        of_loss = ", ".join(zone for zone in zones if zone.split()[0] not in ZONES)
+        details = {"contact": of_contact, "friction loss": of_loss}
+        parts = [
+            f"{part} in {self.counts[part]}{f' ({details[part]})' if part in details else ''}"
+            for part in ("contact", "limit", "friction loss", "equality")
+            if part in self.counts
+        ]
+        return f"of {self.states} states, {'; '.join(parts)}" if parts else ""
+
+
+def exercised(data: mujoco.MjData) -> frozenset[str]:
+    """The parts that act in a state of the C engine, after its forward pass."""
+    kinds, states = np.asarray(data.efc_type), np.asarray(data.efc_state)
+    parts = {
+        _zone(contact, kinds, states) for contact in data.contact if contact.exclude == 0 and contact.efc_address >= 0
+    }
+    if parts - {"separate"}:
+        parts.add("contact")
+    if np.any(np.isin(kinds, _LIMITS) & (states == _QUADRATIC)):
+        parts.add("limit")
+    losses = states[np.isin(kinds, _LOSSES)]
+    if len(losses):
+        parts |= {"friction loss"} | {"held" if state == _QUADRATIC else "slipping" for state in losses}
+    if np.any(kinds == int(_KIND.mjCNSTR_EQUALITY)):
+        parts.add("equality")
+    return frozenset(parts)
+
+
+def _zone(contact: Any, kinds: np.ndarray, states: np.ndarray) -> str:
+    """The zone of one contact: that of its row, or for a pyramid whether all of its edges push, or some."""
+    first, dim = int(contact.efc_address), int(contact.dim)
+    pyramid = kinds[first] == int(_KIND.mjCNSTR_CONTACT_PYRAMIDAL)
+    found = set(states[first : first + (2 * (dim - 1) if pyramid else 1)].tolist())
+    if found == {_SATISFIED}:
+        return "separate"
+    if found == {_QUADRATIC}:
+        return "push" if dim == 1 else "stick"
+    return "slide"
+
+
+def possible(scene: Scene, host: mujoco.MjModel) -> frozenset[str]:
+    """The parts that a model has, by the constraint rows that MJX allocates and the friction of its contacts."""
+    rows: Any = scene.template._impl
+    parts: set[str] = set()
+    dims = np.asarray(rows.contact.dim)
+    if len(dims):
+        rough = np.any(host.geom_friction[:, 0] > 0) and np.any(dims > 1)
+        parts |= {"contact", "separate"} | ({"stick", "slide"} if rough else {"push"})
+    parts |= {"limit"} if rows.nl else set()
+    parts |= {"friction loss", "held", "slipping"} if rows.nf else set()
+    parts |= {"equality"} if rows.ne else set()
+    return frozenset(parts)
+
+
+OPTIONAL: Final = frozenset({"separate", "contact", "friction loss"})
+"""Counted and not asked for: a contact without damping never separates within its margin; the others have parts."""
+
+
+def coverage(parts: frozenset[str], states: Sequence[Collection[str]]) -> Coverage:
+    """What some states exercise of the parts that a model has."""
+    counts = {part: sum(part in state for state in states) for part in PARTS if part in parts}
+    missing = [part for part, count in counts.items() if not count and part not in OPTIONAL]
+    if "contact" in counts and not counts["contact"]:
+        missing = ["contact", *(part for part in missing if part not in ZONES)]
+    return Coverage(len(states), counts, tuple(missing))

@@ -1,0 +1,88 @@
+"""Contacts whose points are placed by a direction that vanishes, in C as in MJX.
+
+The step jumps there, and nearby it changes faster than differences can follow.
+"""
+
+import dataclasses
+from typing import Final
+
+import mujoco
+import numpy as np
+from jaxtyping import Bool, Int
+
+from mjx_study.engine import HostState, host_data
+from mjx_study.gradcheck.coordinates import LENGTH, Coordinate, Coordinates, geom_label
+
+PARALLEL: Final = 1e-5
+"""Angle [rad] or distance [m] below which two directions or points count as one; contact points turn within less."""
+_PLANE, _SPHERE = int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_SPHERE)
+_CAPSULE, _CYLINDER = int(mujoco.mjtGeom.mjGEOM_CAPSULE), int(mujoco.mjtGeom.mjGEOM_CYLINDER)
+
+
+@dataclasses.dataclass(frozen=True)
+class DegenerateContact:
+    """One such contact, and the entries of a Jacobian that it can excuse.
+
+    Attributes:
+        cause: in words.
+        movers: joints that move one of its bodies; only over their positions does the step jump.
+        moved: joints of the same kinematic trees, which its force accelerates.
+    """
+
+    cause: str
+    movers: frozenset[int]
+    moved: frozenset[int]
+
+    def concerns(self, output: Coordinate, source: Coordinate) -> bool:
+        """Whether the contact's direction enters this entry."""
+        return source.block in ("qpos", LENGTH) and source.joint in self.movers and output.joint in self.moved
+
+    def entries(self, layout: Coordinates) -> Bool[np.ndarray, "outputs inputs"]:
+        """All entries that it enters."""
+        return np.array([[self.concerns(output, source) for source in layout.inputs] for output in layout.outputs])
+
+
+def degenerate_contacts(
+    host: mujoco.MjModel, state: HostState, touching: Int[np.ndarray, "contacts 2"]
+) -> list[DegenerateContact]:
+    """Those among contacts of pairs of geoms."""
+    if not len(touching):
+        return []
+    data = host_data(host, state)
+    mujoco.mj_kinematics(host, data)
+    found = {tuple(map(int, pair)): _cause(host, data, tuple(map(int, pair))) for pair in touching}
+    return [_contact(host, pair, cause) for pair, cause in found.items() if cause]
+
+
+def _cause(host: mujoco.MjModel, data: mujoco.MjData, geoms: tuple[int, ...]) -> str | None:
+    axes, centres = data.geom_xmat.reshape(-1, 3, 3)[:, :, 2], data.geom_xpos
+    kinds = {int(host.geom_type[geom]): geom for geom in geoms}
+    parallel = float(np.linalg.norm(np.cross(axes[geoms[0]], axes[geoms[1]]))) < PARALLEL
+    labels = " and ".join(geom_label(host, geom) for geom in geoms)
+    if kinds.keys() == {_SPHERE} and np.linalg.norm(centres[geoms[0]] - centres[geoms[1]]) < PARALLEL:
+        return f"the centres of {labels} coincide, and no direction is the contact's normal"
+    if parallel and kinds.keys() == {_PLANE, _CYLINDER}:
+        upright = geom_label(host, kinds[_CYLINDER])
+        return f"{upright} stands upright, and its contact points turn with the direction in which it tilts"
+    if parallel and kinds.keys() == {_CAPSULE}:
+        return f"{labels} are parallel, and where they touch jumps with the direction of their angle"
+    return None
+
+
+def _contact(host: mujoco.MjModel, geoms: tuple[int, ...], cause: str) -> DegenerateContact:
+    bodies = [int(host.geom_bodyid[geom]) for geom in geoms]
+    ancestors = {body for each in bodies for body in _ancestors(host, each)}
+    roots = {int(host.body_rootid[body]) for body in bodies} - {0}
+    joint_bodies = host.jnt_bodyid.tolist()
+    movers = frozenset(joint for joint, body in enumerate(joint_bodies) if body in ancestors)
+    moved = frozenset(joint for joint, body in enumerate(joint_bodies) if int(host.body_rootid[body]) in roots)
+    return DegenerateContact(cause, movers, moved)
+
+
+def _ancestors(host: mujoco.MjModel, body: int) -> list[int]:
+    """A body and those that carry it, without the world."""
+    chain = []
+    while body:
+        chain.append(body)
+        body = int(host.body_parentid[body])
+    return chain

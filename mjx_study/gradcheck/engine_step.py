@@ -1,0 +1,81 @@
+"""The C engine's step over the same flat vector of changes: another implementation, to take differences of."""
+
+from typing import Final
+
+import mujoco
+import numpy as np
+from jaxtyping import Float
+
+from mjx_study.contact import ContactModel
+from mjx_study.engine import HostState, converged_host, host_data
+from mjx_study.gradcheck.coordinates import PAIR_FRICTION, Coordinates, quaternions
+
+WARMSTARTS: Final = (0.0, 0.5, 1.001)
+"""Other starts of the solver, relative to its solution, from which it ends up as far away as rounding leaves it."""
+
+
+class EngineStep:
+    """The engine's step of one scene under one contact model, any integrator, its constraints solved to rounding."""
+
+    def __init__(self, layout: Coordinates, contact: ContactModel | None):
+        self.layout, self.contact = layout, contact
+        self.host = converged_host(layout.scene, contact)
+        self.host.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+        fields = ("geom_solref", "geom_solimp", "geom_friction", "pair_solref", "pair_solimp", "pair_friction")
+        self._geoms = {name: getattr(self.host, name).copy() for name in fields}
+
+    def after(self, base: HostState) -> HostState:
+        """The state after a step; its warm start is the acceleration at the beginning of the step."""
+        data = host_data(self.host, base)
+        mujoco.mj_forward(self.host, data)
+        qacc = data.qacc.copy()
+        mujoco.mj_step(self.host, data)
+        return HostState(data.qpos.copy(), data.qvel.copy(), data.act.copy(), base.control, qacc)
+
+    def outputs(
+        self, base: HostState, reference: Float[np.ndarray, " nq"], changes: Float[np.ndarray, "batch inputs"]
+    ) -> Float[np.ndarray, "batch outputs"]:
+        """(position relative to `reference`, velocity, activation) after a step from each changed state."""
+        host, layout = self.host, self.layout
+        data = host_data(host, base)
+        tangent = np.empty(host.nv)
+        rows = []
+        for change in changes:
+            self._place(data, base, change[: layout.num_state])
+            self._set_parameters(change[layout.num_state :] * layout.scales)
+            mujoco.mj_step(host, data)
+            mujoco.mj_differentiatePos(host, tangent, 1.0, reference, data.qpos)
+            rows.append(np.concatenate([tangent, data.qvel, data.act]))
+        self._set_parameters(np.zeros(len(layout.scales)))
+        return np.array(rows)
+
+    def noise(self, base: HostState, reference: Float[np.ndarray, " nq"]) -> Float[np.ndarray, " outputs"]:
+        """How far the outputs move with the start of the solver, which they should not depend on."""
+        still = np.zeros((1, len(self.layout.inputs)))
+        exact = self.outputs(base, reference, still)
+        starts = [
+            HostState(base.qpos, base.qvel, base.act, base.control, factor * base.warmstart) for factor in WARMSTARTS
+        ]
+        return np.max([np.abs(self.outputs(start, reference, still) - exact)[0] for start in starts], axis=0)
+
+    def _place(self, data: mujoco.MjData, base: HostState, change: Float[np.ndarray, " changes"]) -> None:
+        host = self.host
+        lengths = quaternions(host)
+        tangent, stretch, qvel, act, control = np.split(
+            change, np.cumsum([host.nv, len(lengths), host.nv, host.na]).tolist()
+        )
+        data.time = 0.0
+        data.qpos[:] = base.qpos
+        mujoco.mj_integratePos(host, data.qpos, tangent, 1.0)
+        for (_, first), factor in zip(lengths, stretch, strict=True):
+            data.qpos[first : first + 4] *= 1 + factor
+        data.qvel[:], data.act[:], data.ctrl[:] = base.qvel + qvel, base.act + act, base.control + control
+        data.qacc_warmstart[:] = base.warmstart
+
+    def _set_parameters(self, change: Float[np.ndarray, " parameters"]) -> None:
+        if not len(change):
+            return
+        solref, solimp, friction = np.split(change, [2, 7])
+        shifts = (solref, solimp, friction, solref, solimp, friction[PAIR_FRICTION])
+        for (name, value), shift in zip(self._geoms.items(), shifts, strict=True):
+            getattr(self.host, name)[:] = value + shift

@@ -1,0 +1,164 @@
+"""What is to be checked, itself checked."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Final
+
+import jax.numpy as jnp
+import mujoco
+
+from mjx_study.configuration import Cell, plan_cells
+from mjx_study.contact import FAMILIES
+from mjx_study.dynamics import initial_state
+from mjx_study.policy import OpenLoop
+from mjx_study.scene import Scene
+from mjx_study.task import Task
+
+STIFFNESS: Final = (10.0, 100.0, 1000.0)
+CONTACT: Final = ("penalty", "mujoco", "mujoco_default")
+STATES: Final = 4
+HORIZON: Final = 200
+"""Steps of the rollout that a file's states are taken from."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class GradcheckPlan:
+    """What to check, itself checked.
+
+    Attributes:
+        subject: the task; for a file one that has neither cost nor policy.
+        is_task: whether its cost is to be checked.
+        cells: contact models.
+        warnings: about them.
+        states: per contact model.
+        seed: of starts, states and directions.
+        stock: whether the derivative of `mjx.step` is checked too.
+    """
+
+    subject: Task
+    is_task: bool
+    cells: tuple[Cell, ...]
+    warnings: tuple[str, ...]
+    states: int
+    seed: int
+    stock: bool
+
+
+def plan_gradcheck(
+    task: Task,
+    families: Sequence[str] | None,
+    stiffnesses: Sequence[float] | None,
+    *,
+    seed: int,
+    damping: float | None = None,
+    states: int = STATES,
+    stock: bool = False,
+) -> GradcheckPlan:
+    """Check a task's gradient, and steps along its rollout.
+
+    Args:
+        task: the task.
+        families: contact families; None for the task's own where it has no contact, else for `CONTACT`.
+        stiffnesses: for families that take one [N/m]; None for `STIFFNESS`, or the task's where those lie elsewhere.
+        seed: of starts, states and directions.
+        damping: in place of each family's [N s/m].
+        states: per contact model.
+        stock: whether the derivative of `mjx.step` is checked too.
+
+    Raises:
+        ValueError: a family or stiffness that cannot be used, too few states, or float32.
+    """
+    _check(task, states)
+    if families is None:
+        families = ("mjcf",) if task.contact_pair is None else CONTACT
+    if stiffnesses is None:
+        stiffnesses = STIFFNESS if min(STIFFNESS) <= max(task.stiffnesses, default=0.0) else task.stiffnesses
+    cells, messages = plan_cells(task, families, stiffnesses, damping)
+    if not cells:
+        raise ValueError("no contact model to check: give at least one stiffness and one contact family")
+    return GradcheckPlan(task, True, cells, messages, states, seed, stock)
+
+
+def plan_scene_gradcheck(
+    scene: Scene,
+    families: Sequence[str] | None = None,
+    stiffnesses: Sequence[float] | None = None,
+    *,
+    seed: int,
+    pair: tuple[str, str] | None = None,
+    damping: float | None = None,
+    horizon: int = HORIZON,
+    states: int = STATES,
+    stock: bool = False,
+) -> GradcheckPlan:
+    """Check steps of any scene.
+
+    Args:
+        scene: the scene.
+        families: contact families; None for `mjcf`, or for `mujoco` where a stiffness is given.
+        stiffnesses: for families that take one [N/m].
+        seed: of states.
+        pair: names of the two geoms whose contact has this stiffness; every contact gets the same solref.
+        damping: in place of each family's [N s/m].
+        horizon: steps of the rollout that states are taken from.
+        states: per contact model.
+        stock: whether the derivative of `mjx.step` is checked too.
+
+    Raises:
+        ValueError: as `plan_gradcheck`, or a stiffness without a pair.
+    """
+    if families is None:
+        families = ("mjcf",) if stiffnesses is None else ("mujoco",)
+    swept = any(name in FAMILIES and FAMILIES[name].swept for name in families)
+    if swept and stiffnesses is None:
+        raise ValueError("a contact family with a stiffness needs one: give --stiffness in N/m, and --pair")
+    if (swept or stiffnesses is not None) and pair is None:
+        raise ValueError("a stiffness in N/m needs the mass that it acts on: give --pair GEOM,GEOM")
+    subject = _bare_task(scene, pair, horizon)
+    _check(subject, states)
+    if pair is None and families != ("mjcf",):
+        # single points of MuJoCo's parameters do not need the pair that a stiffness does
+        moving = _any_pair(scene)
+        subject = subject if moving is None else subject.replace(contact_pair=moving)
+    cells, messages = plan_cells(subject, families, stiffnesses or (), damping)
+    if pair is None:
+        cells = tuple(dataclasses.replace(cell, stiffness=0.0) for cell in cells)
+    return GradcheckPlan(subject, False, cells, messages, states, seed, stock)
+
+
+def _bare_task(scene: Scene, pair: tuple[str, str] | None, horizon: int) -> Task:
+    """A task that stands for a scene alone."""
+    zero = jnp.zeros((), scene.template.qpos.dtype)
+    policy = OpenLoop(horizon, scene.host.nu)
+    return Task(
+        name=scene.name,
+        description="an MJCF",
+        scene=scene,
+        horizon=horizon,
+        policy=policy,
+        theta=jnp.zeros(policy.num_params, zero.dtype),
+        sigma=1.0,
+        start=initial_state(scene),
+        running_cost=lambda state, control: zero,
+        final_cost=lambda state: zero,
+        contact_pair=pair,
+        gamma=float("inf"),
+    )
+
+
+def _any_pair(scene: Scene) -> tuple[str, str] | None:
+    host = scene.host
+    named = [(mujoco.mj_id2name(host, mujoco.mjtObj.mjOBJ_GEOM, geom), geom) for geom in range(host.ngeom)]
+    named = [(name, geom) for name, geom in named if name]
+    moving = [name for name, geom in named if host.body_invweight0[host.geom_bodyid[geom], 0] > 0]
+    others = [name for name, _ in named if name != moving[0]] if moving else []
+    return (moving[0], others[0]) if others else None
+
+
+def _check(task: Task, states: int) -> None:
+    if task.scene.template.qpos.dtype != jnp.float64:
+        raise ValueError("gradcheck compares with differences and needs float64; leave --precision at its default")
+    if task.scene.host.nv == 0:
+        raise ValueError(f"{task.scene.name} has no degree of freedom: there is nothing to differentiate")
+    if states < 1:
+        raise ValueError(f"states must be at least 1, got {states}")

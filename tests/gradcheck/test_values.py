@@ -1,0 +1,167 @@
+"""Whose step it is that differs: this project's, MJX's, or the C engine's as documented."""
+
+import dataclasses
+from collections.abc import Generator
+from functools import cache
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from mjx_study import integration, repairs
+from mjx_study.contact import contact_model
+from mjx_study.engine import HostState, host_data
+from mjx_study.gradcheck import coordinates as layouts
+from mjx_study.gradcheck.coordinates import Coordinates, coordinates
+from mjx_study.gradcheck.engine_step import EngineStep
+from mjx_study.gradcheck.programs import Programs, Setting
+from mjx_study.gradcheck.values import Values, compare_values
+from mjx_study.scene import put_scene
+from tests.scenes import scene_of
+
+SERVO = """<mujoco><option integrator="implicitfast"/><worldbody>
+<body><joint name="x" axis="0 1 0"/><geom size=".1" pos=".1 0 0" mass="1"/></body></worldbody>
+<actuator><velocity name="m" joint="x" kv="10" forcerange="-1 1"/></actuator></mujoco>"""
+PLAIN = SERVO.replace('forcerange="-1 1"', "")
+
+
+@cache
+def layout(xml: str = PLAIN) -> Coordinates:
+    return coordinates(put_scene(mujoco.MjModel.from_xml_string(xml), "scene"), None)
+
+
+def start(xml: str = PLAIN) -> HostState:
+    host = layout(xml).scene.host
+    return HostState(np.array([0.3]), np.array([0.7]), np.full(host.na, 0.4), np.array([0.2]), np.zeros(1))
+
+
+def stages_of(engine: EngineStep, state: HostState) -> dict[str, Any]:
+    """The engine's own quantities in the place of MJX's."""
+    data = host_data(engine.host, state)
+    mujoco.mj_forward(engine.host, data)
+    names = ("xpos", "ten_length", "actuator_length", "qfrc_bias", "qfrc_passive", "act_dot", "qfrc_actuator")
+    inertia = np.zeros((engine.host.nv, engine.host.nv))
+    mujoco.mj_fullM(engine.host, data, inertia)
+    empty = np.zeros((0, engine.host.nv))
+    rows = {"efc_J": empty, "efc_aref": np.zeros(0), "efc_D": np.zeros(0)}
+    contacts = {"dist": np.zeros(0), "margin": np.zeros(0)}
+    own = {name: np.array(getattr(data, name)) for name in (*names, "qacc_smooth")}
+    return own | {"qM": inertia} | rows | contacts
+
+
+def compare(ours: float, stock: float, xml: str = PLAIN, **stages: Any) -> Values:
+    """The verdict where velocities are off by these from the C engine's."""
+    engine, state = EngineStep(layout(xml), None), start(xml)
+    after = engine.after(state)
+    mine, theirs = (dataclasses.replace(after, qvel=after.qvel + off) for off in (ours, stock))
+    return compare_values(layout(xml), engine, state, mine, theirs, stages_of(engine, state) | stages)
+
+
+def test_three_equal_steps() -> None:
+    found = compare(0.0, 0.0)
+    assert found.verdict == "" and found.engine == found.stock == 0
+
+
+def test_a_defect_here() -> None:
+    found = compare(1e-3, 0.0)
+    assert found.verdict == "value" and found.cause.endswith("the C engine agrees with mjx.step")
+    assert str(layout().outputs[found.coordinate]) == "qvel[x]" and found.numbers[0] - found.numbers[
+        1
+    ] == pytest.approx(1e-3)
+
+
+def test_mjx_alone_differs() -> None:
+    assert compare(0.0, 1e-3).cause.endswith("the C engine agrees with this project")
+
+
+def test_mjx_differs_from_the_engine_for_no_known_reason() -> None:
+    found = compare(1e-3, 1e-3)
+    assert found.verdict == "engine" and "its acceleration does not" in found.cause
+    assert compare(1e-3, 1e-3, qfrc_bias=np.array([9.0])).cause.startswith("the bias force differs")
+
+
+def test_a_documented_difference() -> None:
+    found = compare(1e-3, 1e-3, SERVO)
+    assert found.verdict == "placement" and "as if no force or control were clamped" in found.cause
+
+
+def test_rounding_is_no_difference() -> None:
+    assert compare(1e-16, -1e-16).verdict == ""
+
+
+@pytest.mark.parametrize("index", range(7))
+def test_the_engines_step_changes_as_the_layout_says(index: int) -> None:
+    """Each entry of the flat vector is the same change in both engines: state, length, velocity, control."""
+    scene = scene_of("pusher")
+    both = coordinates(scene, contact_model((-100.0, -1.0), scene=scene))
+    contact = contact_model((-100.0, -1.0), scene=scene)
+    change = np.zeros(len(both.inputs))
+    change[both.num_state + index % 7] = 0.25
+    model = both.model(contact, jnp.asarray(both.scales), jnp.asarray(change[both.num_state :]))
+    engine = EngineStep(both, contact)
+    engine._set_parameters(change[both.num_state :] * both.scales)
+    for name in ("geom_solref", "geom_solimp", "geom_friction", "pair_solref", "pair_solimp", "pair_friction"):
+        np.testing.assert_allclose(getattr(engine.host, name), np.asarray(getattr(model, name)), atol=1e-15)
+
+
+def test_parameters_change_in_the_contact_model(monkeypatch: pytest.MonkeyPatch) -> None:
+    """So that their derivatives pass through `apply_contact`, where a planted fault shows."""
+    scene = scene_of("pusher")
+    contact = contact_model((-100.0, -1.0), scene=scene)
+    both, seen = coordinates(scene, contact), []
+    monkeypatch.setattr(layouts, "apply_contact", lambda model, contact: seen.append(contact) or model)
+    both.model(contact, jnp.asarray(both.scales), jnp.arange(len(both.scales), dtype=float))
+    (changed,) = seen
+    np.testing.assert_allclose(changed.solref, contact.solref + jnp.arange(2) * both.scales[:2])
+    np.testing.assert_allclose(changed.solimp, contact.solimp + jnp.arange(2, 7) * both.scales[2:7])
+
+
+def value_check(xml: str, qpos: list[float], qvel: list[float]) -> Values:
+    """The values of one step, with whatever is planted."""
+    scene = put_scene(mujoco.MjModel.from_xml_string(xml), "scene")
+    own = coordinates(scene, None)
+    programs, setting = Programs(own), Setting(None, own.scales)
+    state = HostState(np.array(qpos), np.array(qvel), np.zeros(0), np.zeros(0), np.zeros(scene.host.nv))
+    for _ in range(2):  # the second time from the solution
+        exact = programs.exact(setting, state, jnp.asarray(qpos), np.zeros((1, len(own.inputs))))
+        state = dataclasses.replace(state, warmstart=exact.after.warmstart)
+    stock = programs.stock_step(setting, state)
+    return compare_values(own, EngineStep(own, None), state, exact.after, stock, exact.stages)
+
+
+@pytest.fixture
+def planted(monkeypatch: pytest.MonkeyPatch) -> Generator[pytest.MonkeyPatch]:
+    """What is planted is traced anew, and leaves no trace."""
+    jax.clear_caches()
+    yield monkeypatch
+    jax.clear_caches()
+
+
+def test_a_wrong_repair_is_a_defect_here(planted: pytest.MonkeyPatch) -> None:
+    """k over d_width in place of its square: the derivative of the step is right, and the step is not MJX's."""
+    right = repairs.stiffness_damping_impedance
+
+    def wrong(model, solref, solimp, position):
+        k, b, impedance = right(model, solref, solimp, position)
+        return k * solimp[1], b, impedance
+
+    name = next(name for name, ours in repairs._REPLACED.items() if ours is right)
+    planted.setitem(repairs._REPLACED, name, wrong)
+    joint = '<joint type="slide" axis="1 0 0" limited="true" range="0 1"/>'
+    xml = f'<mujoco><worldbody><body>{joint}<geom size=".1" mass="1"/></body></worldbody></mujoco>'
+    found = value_check(xml, [-0.0101], [-0.1])
+    assert found.verdict == "value" and "the C engine agrees with mjx.step" in found.cause
+
+
+def test_a_wrong_series_of_the_rotation_is_a_defect_here(planted: pytest.MonkeyPatch) -> None:
+    """sin(x / 2) / x = 1 / 2 - x^2 / 24 in place of 1 / 2 - x^2 / 48: 5e-7 of the rotation."""
+    right = integration.rotate_quaternion
+    planted.setattr(
+        integration, "rotate_quaternion", lambda q, rotation: right(q, rotation * (1 - jnp.sum(rotation**2) / 24))
+    )
+    xml = '<mujoco><worldbody><body><joint type="ball"/><geom size=".1" mass="1"/></body></worldbody></mujoco>'
+    found = value_check(xml, [1.0, 0.0, 0.0, 0.0], [1.0, 0.5, -0.7])
+    assert found.verdict == "value" and "the C engine agrees with mjx.step" in found.cause
