@@ -10,6 +10,7 @@ import pytest
 
 from mjx_study import cli
 from mjx_study.cli import options
+from mjx_study.cli.gradcheck import UNEXERCISED
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -82,7 +83,8 @@ def test_every_command_runs(source: Path | None, here: Path, capsys: pytest.Capt
             shutil.rmtree(here / folder, ignore_errors=True)  # another study may be there, and would be kept
         code = cli.main(small(command))
         printed = capsys.readouterr()
-        assert code == 0, (command, printed.err, printed.out[-2000:])
+        codes = (0, UNEXERCISED) if command[0] == "gradcheck" else (0,)  # one state exercises little
+        assert code in codes, (command, printed.err, printed.out[-2000:])
         assert folder is None or any((here / folder).iterdir()), command
 
 

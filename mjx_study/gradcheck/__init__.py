@@ -6,8 +6,9 @@ The check tells these apart, entry by entry of a step's Jacobian.
 """
 
 from mjx_study.gradcheck.check import gradcheck
+from mjx_study.gradcheck.finding import Finding
 from mjx_study.gradcheck.plan import CONTACT, STIFFNESS, GradcheckPlan, plan_gradcheck, plan_scene_gradcheck
-from mjx_study.gradcheck.report import Finding, GradcheckReport, StepCheck
+from mjx_study.gradcheck.report import GradcheckReport, StepCheck
 
 __all__ = [
     "CONTACT",

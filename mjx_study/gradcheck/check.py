@@ -7,11 +7,12 @@ from mjx_study.engine import quiet_engine
 from mjx_study.gradcheck.collect import collect, step_check
 from mjx_study.gradcheck.compiling import Compiler
 from mjx_study.gradcheck.coordinates import coordinates
-from mjx_study.gradcheck.cost import CostCheck, CostPrograms, check_cost
+from mjx_study.gradcheck.cost import CostCheck, CostPrograms, check_cost, judge_closed_forms
 from mjx_study.gradcheck.engine_step import EngineStep
+from mjx_study.gradcheck.finding import Finding, gravity
 from mjx_study.gradcheck.plan import GradcheckPlan
 from mjx_study.gradcheck.programs import Programs, Setting
-from mjx_study.gradcheck.report import Finding, GradcheckReport, StepCheck, gravity
+from mjx_study.gradcheck.report import GradcheckReport, StepCheck
 from mjx_study.gradcheck.state_check import check_state
 from mjx_study.gradcheck.states import start_of, states_of
 from mjx_study.runtime import environment
@@ -53,6 +54,7 @@ def _gradcheck(plan: GradcheckPlan, progress: Progress) -> GradcheckReport:
         step_checks.append(step_check(cell, programs.layout, checks, found, coverage))
         findings += found
     work.end()
+    findings += judge_closed_forms(cost_checks)
     return GradcheckReport(
         subject=task.name,
         summary=_summary(plan),

@@ -10,7 +10,8 @@ from mjx_study.gradcheck.causes import SINGULAR, cause_of_fault, cause_of_kink, 
 from mjx_study.gradcheck.coordinates import Coordinates
 from mjx_study.gradcheck.coverage import Coverage
 from mjx_study.gradcheck.diagnosis import ENGINE, NAN, RIGHT, UNRESOLVED, VERDICTS, worst_error, worst_verdict
-from mjx_study.gradcheck.report import Entry, Finding, StepCheck
+from mjx_study.gradcheck.finding import Entry, Finding
+from mjx_study.gradcheck.report import StepCheck
 from mjx_study.gradcheck.state_check import STOCK, StateCheck
 
 _Key = tuple[str, str, tuple[str, ...], str]

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax.errors import JaxRuntimeError
 
 OPTIONS: Final = {"xla_backend_optimization_level": "0", "xla_cpu_use_fusion_emitters": False}
-"""Of XLA on a CPU: half the time of its usual code generator, a fifth of that with all optimisation."""
+"""Of XLA on a CPU: half the time of its usual code generator, and programs as fast as these checks need."""
 THREADS: Final = 2
 """Programs compiled at once; each takes a core, and up to a gigabyte for a large model."""
 

@@ -1,6 +1,7 @@
 """The gradient of a task's whole cost: reverse against forward mode, differences, and a closed form."""
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any, Final
 
 import jax
@@ -12,6 +13,7 @@ from mjx_study.contact import ContactModel
 from mjx_study.engine import HostState
 from mjx_study.gradcheck.compiling import Compiler
 from mjx_study.gradcheck.differences import differences, moves
+from mjx_study.gradcheck.finding import Entry, Finding
 from mjx_study.noise import split_sample_key
 from mjx_study.objective import rollout_cost
 from mjx_study.task import Task
@@ -21,6 +23,10 @@ BATCH: Final = 8
 """Rollouts in one call of the program of costs."""
 DIFFERENCE_TOLERANCE: Final = 1e-6
 MODES_TOLERANCE: Final = 1e-9
+CLOSED_FORM: Final = 1e-3
+"""Distance from the closed form's gradient, relative to it, below which the two agree."""
+GROWTH: Final = 2.0
+"""By how much the distance may grow with stiffness, which brings the two models together."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -127,6 +133,24 @@ def check_cost(programs: CostPrograms, cell: Cell, seed: int) -> tuple[CostCheck
         verdict,
     )
     return check, _host_states(states, controls)
+
+
+def judge_closed_forms(checks: Sequence[CostCheck]) -> list[Finding]:
+    """Findings on the distance from the closed form: it may be large, but must not grow as the contact stiffens."""
+    known = sorted(
+        (check.stiffness, check.closed_form, check.contact) for check in checks if check.closed_form is not None
+    )
+    findings = []
+    for stiffness, distance, contact in known:
+        softest, nearest = known[0][0], known[0][1]
+        grows = distance > max(CLOSED_FORM, GROWTH * nearest)
+        if not distance <= CLOSED_FORM:
+            text = f"the gradient is {distance:.1e} of its norm from the closed form's"
+            text += f", farther than at {softest:g} N/m ({nearest:.1e})" if grows else ""
+            entry = Entry("the whole rollout", 0, 0.0, "", distance, None)
+            label = f"{contact}, K = {stiffness:g} N/m"
+            findings.append(Finding(label, "project", "wrong" if grows else "apart", (), text, (entry,)))
+    return findings
 
 
 def cost_verdict(*, finite: bool, modes: float, residual: float, excused: list[str | None]) -> str:

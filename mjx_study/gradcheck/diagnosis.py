@@ -36,6 +36,7 @@ MEANING: Final = {
     "engine": "MJX's step is not the C engine's, and nothing documented explains it",
     "value": "the step itself is not that of mjx.step",
     "placement": "MJX computes another step than the C engine, as documented",
+    "apart": "the analytic counterpart is another model of the same system, approached as contact stiffens",
 }
 
 

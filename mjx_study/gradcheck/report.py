@@ -7,82 +7,12 @@ from typing import Any, Final
 
 from mjx_study.gradcheck.cost import CostCheck
 from mjx_study.gradcheck.coverage import Coverage
-from mjx_study.gradcheck.diagnosis import FAILURES, MEANING, VERDICTS
+from mjx_study.gradcheck.diagnosis import FAILURES, MEANING
+from mjx_study.gradcheck.finding import Finding
 from mjx_study.table import format_table
 
 SHOWN: Final = 12
 """Findings in the text unless all are asked for."""
-OTHERS: Final = {"value": "mjx.step", "engine": "the C engine", "placement": "the C engine"}
-"""What a number is compared with, where that is not differences."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Entry:
-    """One entry of one step's Jacobian that is not right.
-
-    Attributes:
-        state: in words.
-        index: steps since the start of the rollout.
-        time: the same [s].
-        name: as in d qvel[hinge] / d ctrl[motor].
-        derivative: by automatic differentiation; of a step that differs, what changes here.
-        difference: by central differences; of a step that differs, what changes there; None where there is none.
-        gap: of the one-sided slopes.
-    """
-
-    state: str
-    index: int
-    time: float
-    name: str
-    derivative: float
-    difference: float | None
-    gap: float | None = None
-
-
-@dataclasses.dataclass(frozen=True)
-class Finding:
-    """Entries that are not right for one reason.
-
-    Attributes:
-        contact: label of the contact model.
-        who: whose derivative: `project`, or `mjx.step` for MJX's own.
-        verdict: kink, jump, unconverged, zero, nan, engine, wrong, value or placement.
-        modes: of differentiation that show it: forward, reverse, tape.
-        cause: one sentence.
-        entries: all of them.
-    """
-
-    contact: str
-    who: str
-    verdict: str
-    modes: tuple[str, ...]
-    cause: str
-    entries: tuple[Entry, ...]
-
-    @property
-    def fails(self) -> bool:
-        """Whether it makes the check fail: the project's own derivative is not what it should be."""
-        return self.who == "project" and self.verdict in FAILURES
-
-    def line(self) -> str:
-        """The finding in a sentence, with one entry as example."""
-        example, states = self.entries[0], len({entry.state for entry in self.entries})
-        who = f"{self.who}: " if self.who != "project" else ""
-        where = example.state if states == 1 else f"{states} states"
-        count = where if len(self.entries) == 1 else f"{len(self.entries)} entries, {where}"
-        modes = f", {' and '.join(self.modes)} mode" if self.who == "project" and len(self.modes) in (1, 2) else ""
-        if not example.name:
-            return f"{who}{self.verdict} ({count}): {self.cause}"
-        numbers = self._numbers(example)
-        return f"{who}{self.verdict} ({count}{modes}), as {example.name} {numbers}: {self.cause}"
-
-    def _numbers(self, entry: Entry) -> str:
-        if self.verdict == "jump" and entry.gap:
-            return f"= {entry.derivative:.6g}, but differences reach {entry.gap:.2g}"
-        other = OTHERS.get(self.verdict, "differences")
-        there = "" if entry.difference is None else f", {other} {entry.difference:.6g}"
-        gap = f" (one-sided apart by {entry.gap:.2g})" if entry.gap else ""
-        return f"= {entry.derivative:.6g}{there}{gap}"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -139,7 +69,7 @@ class GradcheckReport:
         costs: of whole-horizon gradients, one per contact model; empty for a file.
         steps: of single steps, one per contact model.
         findings: what is not right, gravest first.
-        warnings: about contact models.
+        warnings: about contact models, and what has no derivative.
         environment: versions and machine.
     """
 
@@ -155,7 +85,7 @@ class GradcheckReport:
     def passed(self) -> bool:
         """Whether no derivative of the project is wrong, NaN, silently zero or unconverged."""
         verdicts = [check.verdict for check in (*self.costs, *self.steps)]
-        return not any(verdict in FAILURES for verdict in verdicts)
+        return not any(verdict in FAILURES for verdict in verdicts) and not any(f.fails for f in self.findings)
 
     @property
     def unexercised(self) -> dict[str, tuple[str, ...]]:
@@ -255,7 +185,7 @@ class GradcheckReport:
             for finding in group if verbose else ():
                 label = f"{finding.contact}, " if len(self.steps) > 1 else ""
                 lines += [
-                    f"    {label}{entry.state} ({entry.time:.4g} s)  {entry.name} {finding._numbers(entry)}"
+                    f"    {label}{entry.state} ({entry.time:.4g} s)  {entry.name} {finding.numbers(entry)}"
                     for entry in finding.entries
                 ]
         if len(shown) < len(alike):
@@ -263,12 +193,6 @@ class GradcheckReport:
         verdicts = dict.fromkeys(finding.verdict for finding in self.findings)
         lines += [f"{verdict}: {MEANING[verdict]}" for verdict in verdicts if verdict in MEANING]
         return [*lines, ""] if lines else []
-
-
-def gravity(finding: Finding) -> tuple[bool, bool, int]:
-    """A key that sorts the gravest findings first."""
-    order = {name: rank for rank, name in enumerate((*reversed(VERDICTS), "placement"))}
-    return not finding.fails, finding.who != "project", order[finding.verdict]
 
 
 def _stiffness(value: float) -> str:

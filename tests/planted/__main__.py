@@ -17,6 +17,7 @@ from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 
+from mjx_study.cli.gradcheck import UNEXERCISED
 from mjx_study.table import format_table
 from tests.planted import DEFECTS
 from tests.planted.defect import Defect, plant
@@ -97,7 +98,7 @@ def wrong_by_gradcheck(tree: Path, model: str) -> str:
     done = run(tree, "mjx_study", "gradcheck", str(path))
     if "Traceback" in done.stderr:
         return f"{model}: {done.stderr.strip().splitlines()[-1]}"
-    return f"{model}: exit code {done.returncode}" if done.returncode else ""
+    return "" if done.returncode in (0, UNEXERCISED) else f"{model}: exit code {done.returncode}"
 
 
 @cache

@@ -1,0 +1,85 @@
+"""What a check found not to be right, and for what reason."""
+
+import dataclasses
+from typing import Final
+
+from mjx_study.gradcheck.diagnosis import FAILURES, VERDICTS
+
+OTHERS: Final = {"value": "mjx.step", "engine": "the C engine", "placement": "the C engine"}
+"""What a number is compared with, where that is not differences."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Entry:
+    """One entry of one step's Jacobian that is not right.
+
+    Attributes:
+        state: in words.
+        index: steps since the start of the rollout.
+        time: the same [s].
+        name: as in d qvel[hinge] / d ctrl[motor].
+        derivative: by automatic differentiation; of a step that differs, what changes here.
+        difference: by central differences; of a step that differs, what changes there; None where there is none.
+        gap: of the one-sided slopes.
+    """
+
+    state: str
+    index: int
+    time: float
+    name: str
+    derivative: float
+    difference: float | None
+    gap: float | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Finding:
+    """Entries that are not right for one reason.
+
+    Attributes:
+        contact: label of the contact model.
+        who: whose derivative: `project`, or `mjx.step` for MJX's own.
+        verdict: kink, jump, unconverged, zero, nan, engine, wrong, value, placement or apart.
+        modes: of differentiation that show it: forward, reverse, tape.
+        cause: one sentence.
+        entries: all of them.
+    """
+
+    contact: str
+    who: str
+    verdict: str
+    modes: tuple[str, ...]
+    cause: str
+    entries: tuple[Entry, ...]
+
+    @property
+    def fails(self) -> bool:
+        """Whether it makes the check fail: the project's own derivative is not what it should be."""
+        return self.who == "project" and self.verdict in FAILURES
+
+    def line(self) -> str:
+        """The finding in a sentence, with one entry as example."""
+        example, states = self.entries[0], len({entry.state for entry in self.entries})
+        who = f"{self.who}: " if self.who != "project" else ""
+        where = example.state if states == 1 else f"{states} states"
+        count = where if len(self.entries) == 1 else f"{len(self.entries)} entries, {where}"
+        modes = f", {' and '.join(self.modes)} mode" if self.who == "project" and len(self.modes) in (1, 2) else ""
+        if not example.name:
+            return f"{who}{self.verdict} ({count}): {self.cause}"
+        numbers = self.numbers(example)
+        return f"{who}{self.verdict} ({count}{modes}), as {example.name} {numbers}: {self.cause}"
+
+    def numbers(self, entry: Entry) -> str:
+        """An entry's numbers, and what they are compared with."""
+        if self.verdict == "jump" and entry.gap:
+            return f"= {entry.derivative:.6g}, but differences reach {entry.gap:.2g}"
+        other = OTHERS.get(self.verdict, "differences")
+        there = "" if entry.difference is None else f", {other} {entry.difference:.6g}"
+        gap = f" (one-sided apart by {entry.gap:.2g})" if entry.gap else ""
+        return f"= {entry.derivative:.6g}{there}{gap}"
+
+
+def gravity(finding: Finding) -> tuple[bool, bool, int]:
+    """A key that sorts the gravest findings first."""
+    order = {name: rank for rank, name in enumerate((*reversed(VERDICTS), "placement", "apart"))}
+    return not finding.fails, finding.who != "project", order[finding.verdict]

@@ -1,0 +1,105 @@
+"""What a report says and how the command exits, without a computation."""
+
+import dataclasses
+
+import pytest
+
+from mjx_study import cli
+from mjx_study.cli import gradcheck as command
+from mjx_study.cli import options
+from mjx_study.gradcheck import Finding, GradcheckReport, StepCheck
+from mjx_study.gradcheck.cost import CostCheck, judge_closed_forms
+from mjx_study.gradcheck.coverage import coverage
+from mjx_study.gradcheck.finding import Entry
+
+PARTS = frozenset({"contact", "stick", "slide", "separate", "limit"})
+STICKING = coverage(PARTS, [{"contact", "stick"}, {"contact", "stick", "limit"}, {"separate"}])
+WHOLE = coverage(PARTS, [{"contact", "stick"}, {"contact", "slide", "limit"}])
+STEP = StepCheck(
+    contact="penalty",
+    stiffness=100.0,
+    states=3,
+    entries=30,
+    unresolved=7,
+    modes=1e-16,
+    differences=1e-9,
+    parameters=1e-8,
+    stock_step=0.0,
+    engine_step=0.0,
+    engine=1e-8,
+    stock=None,
+    residual=1e-16,
+    coverage=WHOLE,
+    verdict="right",
+)
+
+
+def report(*steps: StepCheck, findings: tuple[Finding, ...] = ()) -> GradcheckReport:
+    return GradcheckReport("scene", "2 degrees of freedom", (), steps, findings, (), {})
+
+
+def wrong(verdict: str) -> Finding:
+    return Finding("penalty", "project", verdict, (), "a reason", (Entry("start", 0, 0.0, "qvel[x]", 1.0, 2.0),))
+
+
+def test_what_is_never_exercised_is_a_warning_and_another_exit_code(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    unexercised = dataclasses.replace(STEP, coverage=STICKING)
+    failing = dataclasses.replace(unexercised, verdict="value")
+    monkeypatch.setattr(options, "configure", lambda **_: None)
+    for steps, code in (((STEP,), 0), ((STEP, unexercised), 3), ((STEP, failing), 1)):
+        monkeypatch.setattr(command.check, "gradcheck", lambda plan, progress, steps=steps: report(*steps))
+        assert cli.main(["gradcheck", "pusher", "--horizon", "2", "--stiffness", "100"]) == code
+    capsys.readouterr()
+    lines = report(unexercised).lines()
+    assert "of 3 states, contact in 2 (stick 2, slide 0, separate 1); limit in 1" in lines
+    assert any(line.startswith("warning: penalty, K = 100 N/m: no state exercises slide") for line in lines)
+    assert lines[-1] == "every derivative that exists is right, where it was checked"
+    assert report(unexercised).as_json()["unexercised"] == {"penalty, K = 100 N/m": ["slide"]}
+
+
+def test_each_stage_is_a_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    def stages(plan, progress):
+        progress(0, 2, "compiling")
+        progress(1, 2, "penalty: start")
+        return report(STEP)
+
+    monkeypatch.setattr(options, "configure", lambda **_: None)
+    monkeypatch.setattr(command.check, "gradcheck", stages)
+    assert cli.main(["gradcheck", "pusher", "--horizon", "2", "--stiffness", "100"]) == 0
+    assert capsys.readouterr().err.splitlines() == ["[0/2] compiling", "[1/2] penalty: start"]
+
+
+def test_unresolved_entries_are_counted() -> None:
+    header, row = report(STEP).lines()[3:5]
+    assert dict(zip(header.split()[-2:], row.split()[-2:], strict=True)) == {"unresolved": "7", "verdict": "right"}
+
+
+@pytest.mark.parametrize(
+    ("verdict", "fails", "said"),
+    [
+        ("value", True, "qvel[x] = 1, mjx.step 2"),
+        ("engine", True, "qvel[x] = 1, the C engine 2"),
+        ("placement", False, "qvel[x] = 1, the C engine 2"),
+        ("wrong", True, "qvel[x] = 1, differences 2"),
+    ],
+)
+def test_a_finding_says_what_it_is_compared_with(verdict: str, fails: bool, said: str) -> None:
+    assert wrong(verdict).fails is fails and said in wrong(verdict).line()
+    assert report(STEP, findings=(wrong(verdict),)).passed is not fails
+
+
+def closed_form(stiffness: float, distance: float) -> CostCheck:
+    return CostCheck("penalty", float(stiffness), 1.0, 0.0, 0.0, 0.0, distance, 0.0, "right")
+
+
+def test_a_closed_form_is_a_judge() -> None:
+    """It may be another model, but stiffness must not lead away from it."""
+    assert judge_closed_forms([closed_form(10, 1e-6), closed_form(1000, 1e-8)]) == []
+    (soft,) = judge_closed_forms([closed_form(10, 0.7), closed_form(1000, 1e-6)])
+    assert soft.verdict == "apart" and not soft.fails and soft.contact == "penalty, K = 10 N/m"
+    _, stiff = judge_closed_forms([closed_form(1000, 0.7), closed_form(10, 0.1)])
+    assert stiff.fails and "farther than at 10 N/m" in stiff.cause
+    (both,) = judge_closed_forms([closed_form(10, 1e-6), closed_form(1000, 0.5)])
+    assert both.fails
