@@ -137,7 +137,8 @@ def test_an_upright_cylinder_excuses_its_own_entries_and_no_other(monkeypatch: p
     assert jumps and any("can stands upright" in finding.cause for finding in jumps)
     assert not any("slider" in entry.name for finding in jumps for entry in finding.entries)
     wrong = {entry.name for f in report.findings if f.verdict == "wrong" for entry in f.entries if entry.name}
-    assert wrong == {"d qvel[slider] / d qpos[slider]", "d qvel[slider] / d qvel[slider]"}
+    assert {"d qvel[slider] / d qpos[slider]", "d qvel[slider] / d qvel[slider]"} <= wrong
+    assert all("slider" in name for name in wrong)
     assert not report.passed
 
 
