@@ -4,6 +4,7 @@ A study of gradient estimators through MuJoCo MJX: scenes, contact models in phy
 tasks as objectives, and comparisons of estimators over them. Call `configure` first for float64 and all cores.
 """
 
+from mjx_study import _matplotlib
 from mjx_study.comparison import CompareConfig, CompareResult
 from mjx_study.contact import (
     FAMILIES,
@@ -28,6 +29,7 @@ from mjx_study.task import Recipe, Task
 from mjx_study.tasks import TASKS, make_task
 
 __all__ = [
+    "_matplotlib",
     "CompareConfig",
     "CompareResult",
     "ContactModel",

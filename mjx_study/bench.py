@@ -25,6 +25,7 @@ from mjx_study.configuration import Cell, Progress, plan_cells
 from mjx_study.contact import ContactModel, apply_contact
 from mjx_study.dynamics import State
 from mjx_study.engine import engine_model
+from mjx_study.limits import check_memory
 from mjx_study.noise import split_sample_key, standard_noise
 from mjx_study.objective import Simulator, chunk_for, simulate
 from mjx_study.runtime import environment
@@ -129,6 +130,7 @@ def plan_bench(task: Task, samples: int) -> BenchPlan:
     """
     if samples < 1:
         raise ValueError(f"samples must be at least 1, got {samples}")
+    check_memory(task, ("zobg", "fobg"), samples)
     (cell,), _ = plan_cells(task, [task.main_family], [task.middle_stiffness])
     return BenchPlan(task, samples, cell)
 

@@ -23,6 +23,7 @@ from mjx_study.contact import (
     family_model,
     stiffness_from_solref,
 )
+from mjx_study.limits import MOST_MODELS, check_count
 from mjx_study.objective import chunk_for
 from mjx_study.option import Checked
 from mjx_study.table import digits_to_tell_apart
@@ -259,8 +260,10 @@ def plan_cells(
     """
     cells, messages = [], []
     stiffnesses = task.stiffnesses if stiffnesses is None else stiffnesses
+    families = task.families if families is None else families
+    check_count(len(families) * len(stiffnesses), "contact models", MOST_MODELS, "give fewer stiffnesses or families")
     digits = digits_to_tell_apart(stiffnesses)
-    for family in task.families if families is None else families:
+    for family in families:
         swept = family not in FAMILIES or FAMILIES[family].swept
         undamped = swept and family in FAMILIES and FAMILIES[family].dampratio == 0
         own = damping if damping is not None else task.damping if undamped else None
@@ -289,6 +292,8 @@ def solver_cells(
     """
     cells, messages = [], []
     digits = digits_to_tell_apart(itertools.chain(*solrefs, *solimps))
+    count = max(1, len(solrefs)) * max(1, len(solimps))
+    check_count(count, "contact models", MOST_MODELS, "give fewer solrefs or solimps")
     for solref, solimp in itertools.product(solrefs or (DEFAULT_SOLREF,), solimps or (DEFAULT_SOLIMP,)):
         if len(solref) != 2 or len(solimp) != 5:
             raise ValueError(f"solref takes 2 numbers and solimp 5, got {len(solref)} and {len(solimp)}")

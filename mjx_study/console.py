@@ -198,5 +198,5 @@ def stage_lines(progress: Callable[[int, int, str], None]) -> Callable[[int, int
 
 def show_cursor() -> None:
     """Bring back the cursor that a progress bar hides, where standard error is a terminal."""
-    if sys.stderr.isatty():
+    if sys.stderr is not None and sys.stderr.isatty():
         sys.stderr.write("\n\x1b[?25h")

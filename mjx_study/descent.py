@@ -1,6 +1,7 @@
 """One iteration of stochastic gradient descent for several seeds at once, and when a seed stops; pure functions."""
 
 import dataclasses
+import inspect
 from typing import Any, Final
 
 import jax
@@ -74,14 +75,24 @@ def make_optimizer(name: str, learning_rate: float, decay: float) -> optax.Gradi
         raise ValueError(f"the learning rate must be positive and finite, got {learning_rate}")
     if not 0 <= decay <= 2:
         raise ValueError(f"the decay of the learning rate must be a power from 0 to 2, got {decay}")
-    factory = getattr(optax, name, None)
-    try:
-        optimizer = factory(lambda count: learning_rate / (1.0 + count) ** decay)  # type: ignore[misc]
-    except TypeError:
-        optimizer = None
-    if not isinstance(optimizer, optax.GradientTransformation):
+    optimizer = _optimizer(name, lambda count: learning_rate / (1.0 + count) ** decay)
+    if optimizer is None:
         raise ValueError(f"optax has no optimiser {name!r} that takes a learning rate; sgd, adam and rmsprop are some")
     return optimizer
+
+
+def _optimizer(name: str, schedule: optax.Schedule) -> optax.GradientTransformation | None:
+    """The optimiser of a name in optax; None where it has no learning rate, or needs more than gradients."""
+    theta = jax.ShapeDtypeStruct((2,), float)
+    try:
+        factory = getattr(optax, name)
+        if "learning_rate" not in inspect.signature(factory).parameters:
+            return None
+        optimizer = factory(learning_rate=schedule)
+        jax.eval_shape(lambda theta: optimizer.update(theta, optimizer.init(theta), theta), theta)
+    except Exception:  # what optax has by this name raises what it likes
+        return None
+    return optimizer if isinstance(optimizer, optax.GradientTransformation) else None
 
 
 def begin(optimizer: optax.GradientTransformation, theta: Float[Array, " params"], seeds: int) -> Descent:

@@ -25,6 +25,7 @@ from jaxtyping import Array, Float, Key
 from estimators import GradientEstimate, Objective, first_order, zeroth_order
 from mjx_study.configuration import Cell, Progress, at_theta, plan_cells
 from mjx_study.contact import ContactModel
+from mjx_study.limits import check_memory
 from mjx_study.objective import Simulator, chunk_for
 from mjx_study.option import Checked
 from mjx_study.quadrature import Line, Means, applies, grid, means
@@ -256,6 +257,7 @@ def plan_landscape(config: LandscapeConfig, task: Task | None = None) -> Landsca
     cells, messages = plan_cells(task, config.contact, stiffness, config.damping)
     if not cells:
         raise ValueError("no contact model: give at least one contact family")
+    check_memory(task, ("zobg", "fobg"), config.samples, other=config.points * task.policy.num_params)
     line = line_of(task, config.points, config.span, config.direction, config.seed)
     resolved = dataclasses.replace(
         config,

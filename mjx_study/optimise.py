@@ -35,6 +35,7 @@ from mjx_study.configuration import (
 from mjx_study.contact import ContactModel
 from mjx_study.descent import REASONS, Descent, Record, advance, begin, going, make_optimizer
 from mjx_study.identity import contents
+from mjx_study.limits import check_memory
 from mjx_study.network import with_network
 from mjx_study.objective import Simulator, TracedObjective, simulate
 from mjx_study.runtime import environment
@@ -129,6 +130,9 @@ def plan_optimise(config: OptimiseConfig, task: Task | None = None, cell: Cell |
         numbers = {name: getattr(task.recipe, name) if value is None else value for name, value in numbers.items()}
     make_optimizer(config.optimizer, numbers["learning_rate"], numbers["decay"])
     options = configured_options(config, task)
+    history = 20 * config.seeds * numbers["iterations"]
+    check_memory(task, config.estimators, config.seeds * numbers["samples"], other=history)
+    check_memory(task, (), config.evaluation_samples)
     messages: tuple[str, ...] = ()
     if cell is None:
         stiffness = task.middle_stiffness if config.stiffness is None else config.stiffness

@@ -34,7 +34,8 @@ def configure(*, precision: str = "float64", cpu_devices: int | None = None, cac
     mujoco.set_mju_user_warning(lambda message: print(f"MuJoCo: {message}", file=sys.stderr))  # not a file in the cwd
     jax.config.update("jax_enable_x64", precision == "float64")
     jax.config.update("jax_num_cpu_devices", devices)
-    jax.config.update("jax_compilation_cache_dir", str(default_cache() if cache is None else cache))
+    folder = default_cache() if cache is None else cache
+    jax.config.update("jax_compilation_cache_dir", None if folder is None else str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
 
@@ -54,12 +55,15 @@ def default_cpu_devices() -> int:
     return available_cores() if jax.__version_info__ < (0, 11) else 1
 
 
-def default_cache() -> Path:
-    """Compiled programs of this kind of machine: `$XDG_CACHE_HOME/mjx-study/<processor>`.
+def default_cache() -> Path | None:
+    """Compiled programs of this kind of machine: `$XDG_CACHE_HOME/mjx-study/<processor>`; None without a home folder.
 
     A program compiled for one processor may use instructions that another lacks, so each has its own folder.
     """
-    root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    try:
+        root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    except RuntimeError:
+        return None
     return root / "mjx-study" / hashlib.sha256(_processor().encode()).hexdigest()[:12]
 
 

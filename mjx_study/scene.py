@@ -14,6 +14,7 @@ import numpy as np
 
 from mjx_study._mjx import mjx
 from mjx_study.limitations import FLAGS, ignored, lacking
+from mjx_study.mjcf_sizes import too_large
 
 CONES: Final = {"pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL, "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC}
 SOLVERS: Final = {"newton": mujoco.mjtSolver.mjSOL_NEWTON, "cg": mujoco.mjtSolver.mjSOL_CG}
@@ -110,11 +111,15 @@ def load_model(source: str | Path, **options: SceneOption) -> mujoco.MjModel:
         SceneError: the file is missing or does not parse, or an option is unknown or out of range.
     """
     path = _find(source)
+    if excess := too_large(path):
+        raise SceneError(f"{path} asks for {excess}")
     try:
         host = mujoco.MjModel.from_xml_path(str(path))
-    except ValueError as error:
+    except (ValueError, RuntimeError, mujoco.FatalError) as error:
         raise SceneError(f"{path} is not a valid MJCF: {' '.join(str(error).split())}") from error
     _set_options(host, options)
+    if not 0 < host.opt.timestep < math.inf:
+        raise SceneError(f"{path}: the timestep must be positive and finite, got {host.opt.timestep:g}")
     return host
 
 

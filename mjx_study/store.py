@@ -25,6 +25,7 @@ import xarray as xr
 from mjx_study.disk import open_regular, prepare_folder, read_whole, write_whole
 from mjx_study.identity import ACCEPT, differences
 from mjx_study.results import as_plain
+from mjx_study.study_document import read_document, read_format
 
 FORMAT: Final = 2
 """Of the folder; a number that goes up when an older program could not read a newer folder."""
@@ -95,14 +96,15 @@ class Store:
         """
         path = folder / "study.json"
         try:
-            document = json.loads(read_whole(path))
-            version, _, _ = document["format"], document["config"], document["cells"]
+            content = read_whole(path)
+            version = read_format(content)
+            document = read_document(content) if version == FORMAT else {}
         except FileNotFoundError as error:
             raise StudyError(f"{folder} holds no study: there is no study.json") from error
         except OSError as error:
             raise StudyError(f"cannot read {path}: {_told(error)}") from error
-        except (ValueError, KeyError, TypeError) as error:
-            raise StudyError(f"{path} is damaged; move the folder away to start again") from error
+        except ValueError as error:
+            raise StudyError(f"{path} is damaged ({error}); move the folder away to start again") from error
         if version != FORMAT:
             raise StudyError(f"{path} is of format {version}; this program reads {FORMAT}")
         return cls(folder, document)

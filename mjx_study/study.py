@@ -31,6 +31,7 @@ from mjx_study.configuration import (
     resolved_fields,
 )
 from mjx_study.contact import FAMILIES
+from mjx_study.limits import check_memory
 from mjx_study.objective import MjxObjective, Simulator
 from mjx_study.reference_gradient import reference_gradient
 from mjx_study.runtime import environment
@@ -65,6 +66,8 @@ def plan_compare(config: CompareConfig, task: Task | None = None) -> ComparePlan
     """
     task = at_theta(configured_task(config, task), config.theta)
     options = configured_options(config, task)
+    kept = config.reference_samples * 3 * task.policy.num_params
+    check_memory(task, config.estimators, config.samples, other=kept)
     cells, messages = plan_cells(task, config.contact, config.stiffness, config.damping)
     families = tuple(dict.fromkeys(cell.family for cell in cells))
     resolved = dataclasses.replace(

@@ -21,9 +21,10 @@ from mjx_study.configuration import (
 )
 from mjx_study.contact import FAMILIES
 from mjx_study.landscape import check_span, line_of
+from mjx_study.limits import MOST_CELLS, MOST_PROGRAMS, check_count
 from mjx_study.objective import chunk_for
 from mjx_study.optimise import OptimiseConfig, OptimisePlan, plan_optimise
-from mjx_study.option import Checked
+from mjx_study.option import OPTIONS, Checked, check
 from mjx_study.sweep_memory import bytes_per_sample, check_memory, seeds_at_once
 from mjx_study.table import digits_to_tell_apart
 from mjx_study.task import Task, check_sigma
@@ -235,6 +236,8 @@ def plan_sweep(config: SweepConfig) -> SweepPlan:
     Raises:
         ValueError: anything about the configuration that cannot be run; the message says what is accepted.
     """
+    programs = len(config.tasks) * len(config.timestep or (None,)) * len(config.cone or (None,))
+    check_count(programs, "programs", MOST_PROGRAMS, "give fewer tasks, timesteps or cones")
     groups: list[Group] = []
     cells: list[SweepCell] = []
     messages: list[str] = []
@@ -246,6 +249,9 @@ def plan_sweep(config: SweepConfig) -> SweepPlan:
             models, told = models + more, told + also
         if not models:
             raise ValueError("no contact model: give at least one contact family, solref or solimp")
+        each = len(models) * len(config.sigma or (None,)) * len(config.samples)
+        change = "give fewer contact models, timesteps, sigmas or sample counts"
+        check_count(programs * each, "cells", MOST_CELLS, change)
         host = task.scene.host
         group = Group(name, task, float(host.opt.timestep), {0: "pyramidal", 1: "elliptic"}[int(host.opt.cone)], models)
         at = f"h = {group.timestep!r} s: " if config.timestep is not None else ""
@@ -291,6 +297,7 @@ def _build(config: SweepConfig, name: str, timestep: float | None, cone: str | N
     if timestep is not None and config.horizon is None:
         own = make_task(name, **{key: value for key, value in chosen.items() if key != "timestep"})
         chosen["horizon"] = max(1, round(own.horizon * float(own.scene.host.opt.timestep) / timestep))
+        check(OPTIONS["horizon"], chosen["horizon"])
     task = make_task(name, **chosen)
     return task if config.noise is None else task.replace(noise=config.noise)
 

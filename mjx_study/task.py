@@ -186,5 +186,5 @@ class Task:
 
 def check_sigma(sigma: float) -> None:
     """Raises ValueError unless sigma is positive and finite."""
-    if not (sigma > 0 and jax.numpy.isfinite(sigma)):
+    if not 0 < sigma < math.inf:
         raise ValueError(f"sigma must be positive and finite, in the unit of what it is added to; got {sigma}")

@@ -53,7 +53,7 @@ def check_shapes(task: Task, name: str = "") -> None:
 def _traced(name: str, part: str, function: Callable[..., Any], *arguments: Any) -> Any:
     try:
         return jax.eval_shape(function, *arguments)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise ValueError(f"{name}: the {part} raised {described(error)}") from error
 
 

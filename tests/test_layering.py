@@ -11,6 +11,7 @@ ROOT = Path(__file__).resolve().parents[1]
 # From the bottom up; a module may import from its own layer and from those above it in this list.
 LAYERS = [
     "estimators",
+    "mjx_study._matplotlib",
     "mjx_study._mjx",
     "mjx_study.runtime",
     "mjx_study.revision",
@@ -19,6 +20,7 @@ LAYERS = [
     "mjx_study.disk",
     "mjx_study.reference",
     "mjx_study.limitations",
+    "mjx_study.mjcf_sizes",
     "mjx_study.scene",
     "mjx_study.contact",
     "mjx_study.option",
@@ -31,6 +33,7 @@ LAYERS = [
     "mjx_study.policy",
     "mjx_study.task",
     "mjx_study.task_checks",
+    "mjx_study.limits",
     "mjx_study.network",
     "mjx_study.tasks",
     "mjx_study.identity",
@@ -48,6 +51,7 @@ LAYERS = [
     "mjx_study.descent",
     "mjx_study.checkpoint",
     "mjx_study.optimise",
+    "mjx_study.study_document",
     "mjx_study.store",
     "mjx_study.sweep_memory",
     "mjx_study.sweep_plan",

@@ -25,7 +25,8 @@ from mjx_study.cli import (
     sweep,
     tasks,
 )
-from mjx_study.cli.options import Parser, UsageError, ending
+from mjx_study.cli.options import Parser, UsageError, ending, refuse_lone_dashes
+from mjx_study.cli.output import OutputError, complain, written_out
 
 ENDED = "files that are there are complete"
 EXAMPLES = """\
@@ -45,19 +46,22 @@ COMMANDS = (compare, optimise, sweep, plot, report, landscape, rollout, gradchec
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code."""
     try:
-        given = sys.argv[1:] if arguments is None else list(arguments)
-        options = parser().parse_args(given)
-        options.command_line = shlex.join(["mjx-study", *given])
-        with ending(ENDED, signal.SIGTERM, signal.SIGHUP):
+        with written_out(), ending(ENDED, signal.SIGTERM, signal.SIGHUP):
+            given = sys.argv[1:] if arguments is None else list(arguments)
+            refuse_lone_dashes(given)
+            options = parser().parse_args(given)
+            options.command_line = shlex.join(["mjx-study", *given])
             return options.run(options)
     except UsageError as error:
-        print(f"mjx-study: {' '.join(str(error).split())}", file=sys.stderr)
+        complain(f"mjx-study: {' '.join(str(error).split())}")
         return 2
     except KeyboardInterrupt:
-        print(f"mjx-study: interrupted; {ENDED}", file=sys.stderr)
+        complain(f"mjx-study: interrupted; {ENDED}")
         return 130
+    except OutputError as error:
+        complain(f"mjx-study: {error}")
+        return 1
     except BrokenPipeError:
-        sys.stderr.close()
         return 1
 
 

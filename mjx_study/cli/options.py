@@ -12,6 +12,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final, NoReturn
 
+import jax
+
 from mjx_study.configuration import EstimatorConfig, Progress
 from mjx_study.console import progress_bar, show_cursor
 from mjx_study.limitations import FLAGS
@@ -35,6 +37,13 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         raise UsageError(f"{message} (see {self.prog} --help)")
+
+
+def refuse_lone_dashes(given: Sequence[str]) -> None:
+    """Raises UsageError for an option whose value is --, which argparse drops."""
+    for text in given:
+        if text.startswith("-") and text.endswith("=--"):
+            raise UsageError(f"{text.removesuffix('=--')} needs a value, got --")
 
 
 Commands = Any
@@ -166,8 +175,16 @@ def add_versions_option(command: argparse.ArgumentParser) -> None:
 
 
 def configure_process(options: argparse.Namespace) -> None:
-    """Set JAX up as the options ask; a command without such options gets float64 and one device."""
+    """Set JAX up as the options ask; a command without such options gets float64 and one device.
+
+    Raises:
+        ValueError: JAX cannot be set up so, as where JAX_PLATFORMS names no platform.
+    """
     configure(precision=getattr(options, "precision", PRECISIONS[0]), cpu_devices=getattr(options, "devices", 1))
+    try:
+        jax.local_devices()
+    except RuntimeError as error:
+        raise ValueError(f"JAX has no device to compute on: {error}") from error
 
 
 def task_of(options: argparse.Namespace) -> Task:

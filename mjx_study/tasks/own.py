@@ -91,14 +91,14 @@ def _find(module: ModuleType, name: str) -> object:
 
 
 def _build(place: str, builder: object, options: dict[str, Any]) -> Task:
-    if not callable(builder):
+    if not callable(builder) or inspect.isbuiltin(builder):  # sys.exit and os.abort would be called for nothing
         raise ValueError(
             f"{place} is neither a Task nor a function that returns one, but of type {type(builder).__name__}"
         )
     _check_arguments(place, builder, options)
     try:
         task = builder(**options)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise ValueError(f"{place} raised {described(error)}") from error
     if not isinstance(task, Task):
         raise ValueError(f"{place} returned no Task, but something of type {type(task).__name__}")

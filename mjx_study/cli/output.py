@@ -1,0 +1,50 @@
+"""Standard output and standard error as they may be: full, closed, a pipe that nobody reads, of few characters."""
+
+import os
+import sys
+from collections.abc import Generator
+from contextlib import contextmanager, suppress
+
+
+class OutputError(Exception):
+    """Standard output cannot be written to."""
+
+
+@contextmanager
+def written_out() -> Generator[None]:
+    """Standard output around a command: characters that it lacks are escaped, and it is written out at the end.
+
+    Raises:
+        OutputError: it cannot be written to.
+        BrokenPipeError: nobody reads it any more.
+    """
+    if hasattr(sys.stdout, "reconfigure"):
+        sys.stdout.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
+    try:
+        try:
+            yield
+        finally:
+            if sys.stdout is not None:
+                sys.stdout.flush()
+    except OSError as error:
+        if error.filename is not None:
+            raise OutputError(f"cannot write {error.filename}: {error.strerror}") from error
+        _abandon()
+        if isinstance(error, BrokenPipeError):
+            raise
+        raise OutputError(f"cannot write to standard output: {error.strerror or error}") from error
+
+
+def complain(line: str) -> None:
+    """A line on standard error, where there is one."""
+    if sys.stderr is not None:
+        with suppress(OSError):
+            print(line, file=sys.stderr, flush=True)
+
+
+def _abandon() -> None:
+    """Nothing more is written to standard output: Python would try again when it ends."""
+    with suppress(OSError, AttributeError, ValueError):
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, sys.stdout.fileno())
+        os.close(nowhere)

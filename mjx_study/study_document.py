@@ -1,0 +1,113 @@
+"""What a study.json holds, as a schema: a file from elsewhere is checked before anything of it is used."""
+
+import json
+import math
+from typing import Annotated, Any, Final, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from estimators import ESTIMATORS
+from mjx_study.files import Finite, told
+from mjx_study.option import OPTIONS
+
+MOST_NUMBERS: Final = 500_000_000
+"""Of one variable of a study."""
+Name = Annotated[str, Field(min_length=1, max_length=1000)]
+Count = Annotated[int, Field(ge=1)]
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(strict=True, extra="ignore")
+
+
+class _Config(_Part):
+    kind: Literal["gradients", "descents", "landscapes"]
+    tasks: list[Name] = Field(min_length=1)
+    estimators: list[Literal[tuple(ESTIMATORS)]] = Field(min_length=1)  # type: ignore[valid-type]
+    seeds: int = Field(ge=1, le=int(OPTIONS["seeds"].interval.high))  # type: ignore[union-attr]
+    iterations: Count | None
+    points: Count | None = None
+
+
+class _Axes(_Part):
+    task: list[Name] = Field(min_length=1)
+    timestep: list[Finite] = Field(min_length=1)
+    cone: list[Name] = Field(min_length=1)
+    model: list[Name] = Field(min_length=1)
+    sigma: list[Finite] = Field(min_length=1)
+    samples: list[Count] = Field(min_length=1)
+
+
+class _Model(_Part):
+    contact: str
+    stiffness: Finite
+
+
+class _Cell(_Part):
+    label: str
+    at: dict[str, Annotated[int, Field(ge=0)]]
+
+
+class _Environment(_Part):
+    versions: dict[str, str]
+
+
+class StudyDocument(_Part):
+    """A study.json: only what is read of it; the rest may be anything."""
+
+    config: _Config
+    warnings: list[str]
+    environment: _Environment
+    revision: str | None = None
+    command: str | None = None
+    models: list[_Model]
+    axes: _Axes
+    cells: list[_Cell] = Field(min_length=1)
+
+    @model_validator(mode="after")
+    def _fits_together(self) -> "StudyDocument":
+        axes = {name: len(values) for name, values in vars(self.axes).items()}
+        for name, values in vars(self.axes).items():
+            if len(set(values)) < len(values):
+                raise ValueError(f"axes.{name} has a value twice")
+        if len(self.models) != axes["model"]:
+            raise ValueError(f"there are {len(self.models)} models, and {axes['model']} values of axes.model")
+        for index, cell in enumerate(self.cells):
+            if list(cell.at) != list(axes) or any(place >= axes[name] for name, place in cell.at.items()):
+                raise ValueError(f"cells.{index}.at is no place on the axes")
+        config = self.config
+        inner = config.seeds * len(config.estimators) * max(config.iterations or 1, config.points or 1)
+        if math.prod(axes.values()) * inner > MOST_NUMBERS:
+            raise ValueError(f"a variable would have more than {MOST_NUMBERS} numbers, which is the limit")
+        return self
+
+
+class _Format(BaseModel):
+    model_config = ConfigDict(strict=True)
+
+    format: int
+
+
+def read_format(content: bytes | str) -> int:
+    """The format that a study.json says it has.
+
+    Raises:
+        ValueError: it says none.
+    """
+    try:
+        return _Format.model_validate_json(content).format
+    except ValidationError as error:
+        raise ValueError(told(error)) from None
+
+
+def read_document(content: bytes | str) -> dict[str, Any]:
+    """A study.json as plain data.
+
+    Raises:
+        ValueError: it does not satisfy the schema; the message names the key.
+    """
+    try:
+        StudyDocument.model_validate_json(content)
+    except ValidationError as error:
+        raise ValueError(told(error)) from None
+    return json.loads(content)
