@@ -1,12 +1,13 @@
 """Files from outside, checked against a schema; an error names the file and the key in one line."""
 
-import stat
 import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Final, TypeVar
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+
+from mjx_study.disk import read_whole
 
 MOST_BYTES: Final = 100_000_000
 """Of a file that is read whole."""
@@ -21,16 +22,11 @@ def read_bytes(path: Path) -> bytes:
         ValueError: it cannot be read, is no regular file, or is larger than `MOST_BYTES`.
     """
     try:
-        status = path.stat()
-        if not stat.S_ISREG(status.st_mode):
-            raise ValueError(f"{path} is not a regular file")
-        if status.st_size > MOST_BYTES:
-            raise ValueError(f"{path} has {status.st_size} bytes; the limit is {MOST_BYTES}")
-        return path.read_bytes()
+        if (size := path.stat().st_size) > MOST_BYTES:
+            raise ValueError(f"{path} has {size} bytes; the limit is {MOST_BYTES}")
+        return read_whole(path)
     except OSError as error:
         raise ValueError(f"cannot read {path}: {error.strerror or error}") from error
-    except ValueError as error:  # a null character in the name, too
-        raise ValueError(f"cannot read {str(path)!r}: {error}" if "null" in str(error) else str(error)) from error
 
 
 def read_json(path: Path, schema: type[Schema]) -> Schema:
