@@ -55,6 +55,8 @@ def stub(monkeypatch: pytest.MonkeyPatch) -> None:
     ):  # fmt: skip
         for name in names:
             monkeypatch.setattr(module, name, planned)
+    for command in COMMANDS:
+        flags_of(command)  # outside of strategies: building a parser uses the random module
     built = functools.lru_cache(maxsize=256)(make_task)
     for module in (configuration, options, sweep_plan, gradcheck):
         monkeypatch.setattr(module, "make_task", built)

@@ -94,7 +94,7 @@ def run(kind: str, folder: Path, examples: int) -> Counter[int]:
 
 @pytest.mark.parametrize("kind", CASES)
 def test_a_few_inputs_get_an_answer(kind: str, folder: Path) -> None:
-    run(kind, folder, 15)
+    run(kind, folder, 8)
 
 
 @pytest.mark.slow
@@ -120,5 +120,5 @@ def test_the_fuzzer_finds_a_traceback_and_an_exit(folder: Path, monkeypatch: pyt
         with pytest.raises((KeyError, AssertionError, fuzzing.TooSlow)):
             fuzzing.answer(["compare", "pusher"], folder)
     monkeypatch.setattr(fuzzing.compare, "plan_compare", lambda *_: (folder / "policy.json").write_text("mine"))
-    with pytest.raises((AssertionError, AttributeError)):
+    with pytest.raises(AssertionError, match="a file was touched"):
         fuzzing.answer(["compare", "pusher"], folder)
