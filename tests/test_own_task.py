@@ -187,7 +187,7 @@ def test_packages_register_tasks(write, register) -> None:
     assert make_task("hop", horizon=5).horizon == 5
     assert make_task("hop:high").horizon == 3
     assert refused("hip").startswith("unknown task 'hip'; choose from pusher, ")
-    assert "double_pendulum, hop, hop:high, other, or module:name of your own" in refused("hip")
+    assert "double_pendulum:published, hop, hop:high, other, or module:name of your own" in refused("hip")
     assert refused("other") == "there is no module 'broken' here or installed"
 
 
