@@ -66,7 +66,8 @@ def told(error: ValidationError) -> str:
     found = error.errors(include_url=False, include_input=False)
     first = found[0]
     key = ".".join(map(str, first["loc"]))
-    reason = str(first.get("ctx", {}).get("error") or first["msg"])
+    raised = first.get("ctx", {}).get("error")  # by a validator of ours, to whose message pydantic adds words
+    reason = str(raised) if isinstance(raised, ValueError) else first["msg"]
     if first["type"] == "extra_forbidden":
         reason = "there is no such option"
     more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""

@@ -13,7 +13,7 @@ import json
 import signal
 import string
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Generator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -97,7 +97,7 @@ def digest(folder: Path) -> dict[str, str]:
 
 
 @contextlib.contextmanager
-def limited(seconds: int) -> Iterator[None]:
+def limited(seconds: int) -> Generator[None]:
     """Raises TooSlow inside where it takes longer."""
 
     def late(*_: Any) -> None:
@@ -267,7 +267,7 @@ ENDS = ("", "<actuator><motor/></actuator>", '<include file="mine.xml"/>', '<key
 def mjcf_files(draw: st.DrawFn) -> bytes:
     """An MJCF of a body or two, with numbers that it may not have."""
 
-    def some(names: list[str]) -> str:
+    def some(names: Sequence[str]) -> str:
         return " ".join(f'{name}="{{}}"' for name in draw(st.lists(st.sampled_from(names), max_size=1)))
 
     body = f"<body>{draw(st.sampled_from(JOINTS))}{draw(st.sampled_from(GEOMS))}</body>"

@@ -20,6 +20,9 @@ POLICY = {
 }  # fmt: skip
 
 
+UNCHECKED = (HealthCheck.too_slow, HealthCheck.data_too_large, HealthCheck.large_base_example)
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """The current directory of every case, with a study that is begun."""
@@ -80,9 +83,7 @@ def run(kind: str, folder: Path, examples: int) -> Counter[int]:
     codes: Counter[int] = Counter()
     kept = (folder / "study" / "study.json").read_bytes()
 
-    @settings(
-        max_examples=examples, deadline=None, database=None, derandomize=True, suppress_health_check=list(HealthCheck)
-    )
+    @settings(max_examples=examples, deadline=None, database=None, derandomize=True, suppress_health_check=UNCHECKED)
     @given(st.data())
     def cases(data: st.DataObject) -> None:
         (folder / "study" / "study.json").write_bytes(kept)

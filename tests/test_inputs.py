@@ -1,0 +1,198 @@
+"""Inputs that once ended in a traceback, in no answer or in exit code 0: each is refused in one line that says why."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mjx_study import cli
+from mjx_study.cli import options
+from mjx_study.descent import make_optimizer
+from mjx_study.files import PolicyFile, read_json, read_theta
+from mjx_study.limits import MOST_CELLS, MOST_MODELS, check_count
+from mjx_study.mjcf_sizes import too_large
+from mjx_study.option import OPTIONS, Interval
+from mjx_study.runtime import default_cache
+from mjx_study.scene import SceneError, load_model
+from mjx_study.study_document import read_document
+from mjx_study.sweep import SweepConfig, open_store, plan_sweep
+
+BODY = "<worldbody><body><freejoint/><geom size='0.1'/></body></worldbody>"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        ("compare pusher --seed 100000000000000000000000000", "--seed: must be at least 0 and at most 4294967295"),
+        ("compare pusher --seed 1e26", "--seed: must be at least 0 and at most 4294967295"),
+        ("compare pusher --samples inf", "--samples: must be a whole number, got 'inf'"),
+        ("compare pusher --samples 10000000", "GiB of memory, and the limit is 16 GiB: take fewer samples"),
+        ("compare pusher --horizon 1000000", "GiB of memory, and the limit is 16 GiB"),
+        ("compare pusher --horizon -1", "--horizon: must be at least 1 and at most 1000000, got -1"),
+        ("compare pusher --samples=--", "--samples needs a value, got --"),
+        ("compare pusher --theta=--", "--theta needs a value, got --"),
+        ("compare pusher --devices 1000000", "--devices: must be at least 1 and at most 256, got 1000000"),
+        ("compare pusher --stiffness 1:1e9:1000000000", "must be of at most 10000 values"),
+        ("compare pusher --stiffness 1:1e9:10000", "30000 contact models are planned, and the limit is 5000"),
+        ("compare sys:exit", "is neither a Task nor a function that returns one"),
+        ("compare os:abort", "is neither a Task nor a function that returns one"),
+        ("landscape pusher --points 1000000000000", "--points: must be at least 2 and at most 100000"),
+        ("optimise pusher --seeds 100000", "GiB of memory, and the limit is 16 GiB"),
+        ("optimise pusher --optimizer clip", "optax has no optimiser 'clip'"),
+        ("optimise pusher --network 10000000000000000000000", "--network: must be at least 1 and at most 100000"),
+        ("optimise pusher --network 100000,100000", "parameters of a network are planned, and the limit is 10000000"),
+        ("sweep pusher --samples 1000000000000 --output x", "--samples: must be at least 3 and at most 10000000"),
+        ("sweep pusher --sigma 1:10:3000 --output x", "54000 cells are planned, and the limit is 50000: give fewer"),
+        ("sweep pusher --timestep 1e-9 --output x", "horizon must be at least 1 and at most 1000000"),
+        ("sweep pusher --timestep 1e-3:1e-2:600 --output x", "600 programs are planned, and the limit is 500"),
+    ],
+)
+def test_one_line(
+    arguments: str, says: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(options, "configure", lambda **_: None)
+    assert cli.main(arguments.split()) == 2
+    printed = capsys.readouterr()
+    assert says in printed.err and printed.err.count("\n") == 1 and printed.out == ""
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_intervals_in_words() -> None:
+    said = {
+        text: str(Interval(text)) for text in ("(0, inf)", "(0, inf]", "[0, 1)", "[1, 1e6]", "(-inf, inf)", "(2, 3)")
+    }
+    assert list(said.values()) == [
+        "positive and finite", "positive", "at least 0 and less than 1", "at least 1 and at most 1000000", "finite",
+        "greater than 2 and less than 3",
+    ]  # fmt: skip
+    assert float("inf") in Interval("(0, inf]") and float("inf") not in Interval("(0, inf)")
+    assert not any(float("nan") in Interval(text) for text in said)
+
+
+def test_every_option_of_a_sweep_is_described() -> None:
+    """Of all that a configuration has but names of tasks, and switches."""
+    assert set(vars(SweepConfig(tasks=("pusher",)))) - set(OPTIONS) == {"tasks"}
+
+
+@pytest.mark.parametrize("name", ["clip", "freeze", "lbfgs", "polyak_sgd", "chain", "zero_nans", "__name__", "no such"])
+def test_no_optimiser(name: str) -> None:
+    with pytest.raises(ValueError, match="optax has no optimiser"):
+        make_optimizer(name, 0.1, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("body", "says"),
+    [
+        ("<asset><hfield name='h' nrow='1000000' ncol='1000000' size='1 1 1 1'/></asset>", "<hfield> with nrow x ncol"),
+        ("<asset><texture name='t' builtin='flat' width='1000000' height='1000000'/></asset>", "<texture> with w"),
+        ("<size memory='100T'/>", "<size> with memory of 1.1e+14"),
+        ("<size nuserdata='1000000000'/>", "<size> with nuserdata of 1e+09"),
+        ("<size nuser_body='1000000000'/>", "<size> with nuser_body of 1e+09"),
+        ("<worldbody><replicate count='500'><replicate count='500'><site/></replicate></replicate></worldbody>",
+         "<replicate> with count of 2.5e+05"),
+        ("<include file='other.xml'/>", "<size> with nkey of 1e+09 in other.xml"),
+        ("<option timestep='0'/>", "the timestep must be positive and finite, got 0"),
+        ("<option timestep='nan'/>", "the timestep must be positive and finite, got nan"),
+    ],
+)  # fmt: skip
+def test_sizes_of_an_mjcf(body: str, says: str, tmp_path: Path) -> None:
+    (tmp_path / "other.xml").write_text("<mujocoinclude><size nkey='1000000000'/></mujocoinclude>")
+    path = tmp_path / "mine.xml"
+    path.write_text(f"<mujoco>{body}{BODY}</mujoco>")
+    with pytest.raises(SceneError, match=says.replace("+", r"\+")):
+        load_model(path)
+    path.write_text(f"<mujoco>{BODY}</mujoco>")
+    assert too_large(path) is None and load_model(path).nbody == 2
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        ('{"task": "pusher", "theta": {"a": 1}}', "theta: Input should be a valid array"),
+        ('{"task": "pusher", "theta": [1, "2"]}', "theta.1: Input should be a valid number"),
+        ('{"task": 3, "theta": [1]}', "task: Input should be a valid string"),
+        ('{"task": "pusher", "theta": [1], "horizon": "x"}', "horizon: Input should be a valid integer"),
+        ('{"task": "pusher", "theta": [1], "network": [0]}', "network.0: Input should be greater than or equal to 1"),
+        ("[" * 100_000, "Invalid JSON: recursion limit exceeded"),
+    ],
+)
+def test_a_policy_that_is_none(content: str, says: str, tmp_path: Path) -> None:
+    path = tmp_path / "policy.json"
+    path.write_text(content)
+    with pytest.raises(ValueError, match=says) as error:
+        read_json(path, PolicyFile)
+    assert str(path) in str(error.value) and "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("shape", ["(1000000000000, 1000000)", "(-1,)", "(" * 90, "None"])
+def test_an_array_of_an_impossible_shape(shape: str, tmp_path: Path) -> None:
+    path = tmp_path / "theta.npy"
+    np.save(path, np.zeros(3))
+    header = f"{{'descr': '<f8', 'fortran_order': False, 'shape': {shape}, }}".ljust(117) + "\n"
+    path.write_bytes(path.read_bytes()[:8] + len(header).to_bytes(2, "little") + header.encode() + bytes(24))
+    with pytest.raises(ValueError, match="theta.npy is not a .npy array of finite numbers"):
+        read_theta(path)
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "says"),
+    [
+        (("config", "estimators"), ["gobg"], "config.estimators.0: Input should be 'zobg'"),
+        (("config", "seeds"), "ten", "config.seeds: Input should be a valid integer"),
+        (("config", "kind"), "poems", "config.kind: Input should be"),
+        (("config", "iterations"), 10**9, "a variable would have more than 500000000 numbers"),
+        (("axes", "sigma"), [], "axes.sigma: List should have at least 1 item"),
+        (("axes", "samples"), [100, 100], "axes.samples has a value twice"),
+        (("models",), [], "there are 0 models, and 2 values of axes.model"),
+        (("cells",), [{"label": "a", "at": {"task": 7}}], "cells.0.at is no place on the axes"),
+        (("environment",), None, "environment: Input should be"),
+        (("warnings",), "none", "warnings: Input should be a valid array"),
+    ],
+)  # fmt: skip
+def test_a_study_that_is_none(place: tuple[str, ...], value: Any, says: str, tmp_path: Path) -> None:
+    plan = plan_sweep(SweepConfig(tasks=("pusher",), horizon=4, stiffness=(10.0, 100.0), contact=("penalty",)))
+    document = json.loads(json.dumps(open_store(plan, tmp_path).document))
+    assert read_document(json.dumps(document)) == document
+    part = document
+    for key in place[:-1]:
+        part = part[key]
+    part[place[-1]] = value
+    with pytest.raises(ValueError, match=says):
+        read_document(json.dumps(document))
+
+
+def test_limits_are_named() -> None:
+    with pytest.raises(ValueError, match="50001 cells are planned, and the limit is 50000: give fewer"):
+        check_count(MOST_CELLS + 1, "cells", MOST_CELLS, "give fewer")
+    check_count(MOST_MODELS, "contact models", MOST_MODELS, "")
+
+
+def test_no_home_folder(monkeypatch: pytest.MonkeyPatch) -> None:
+    def homeless() -> Path:
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setattr(Path, "home", homeless)
+    assert default_cache() is None
+
+
+@pytest.mark.parametrize(
+    ("changes", "shell", "code", "says"),
+    [
+        ({"MPLBACKEND": "nonsense"}, "estimators > /dev/full", 1, "cannot write to standard output: No space left"),
+        ({"JAX_PLATFORMS": "nonsense"}, "tasks", 2, "JAX has no device to compute on: Unable to initialize backend"),
+        ({"PYTHONIOENCODING": "ascii"}, "estimators >&-", 0, ""),
+    ],
+)  # fmt: skip
+def test_the_surroundings(changes: dict[str, str], shell: str, code: int, says: str) -> None:
+    """A backend of matplotlib that is none has no effect; what else is wrong gets one line."""
+    command = f"{sys.executable} -m mjx_study {shell}"
+    done = subprocess.run(command, shell=True, capture_output=True, text=True, env=os.environ | changes, timeout=120)
+    assert done.returncode == code and done.stderr.count("\n") == bool(says), done.stderr
+    assert says in done.stderr
