@@ -91,6 +91,40 @@ def test_forces_and_imbalance_are_those_of_mjx(laws) -> None:
         np.testing.assert_allclose(saturated, [0.1, 0.02, 0.2], rtol=1e-15)  # of two joints, then of the tendon
 
 
+def test_the_elliptic_law_is_the_gradient_of_a_convex_cost() -> None:
+    """On the cone's side, in directions that turn: the law's Jacobian is symmetric and dissipative, and f = f' x.
+
+    The law alone, without a simulation: a term without its derivative, or scaled on one side, is not symmetric.
+    """
+    friction, impratio, mass = np.array([0.6, 0.4, 0.03]), 1.7, 0.8
+    scene = scene_of(floor_scene(slider(4), option(extra=f'cone="elliptic" impratio="{impratio}"'), 'condim="4"'))
+    mu = friction[0] / np.sqrt(impratio)
+    # of the normal row 1/R, and of each tangential row 1/R impratio-scaled so that the cone's two pieces meet smoothly
+    inverse = np.concatenate([[mass], mass * impratio * friction**2 / friction[0] ** 2])
+    rows: Any = scene.template._impl
+    limits = np.concatenate([friction, np.full(rows.contact.friction.shape[1] - 3, 0.01)])[None]
+    data = scene.template.tree_replace(
+        {"_impl.efc_D": jnp.asarray(inverse), "_impl.contact.friction": jnp.asarray(limits)}
+    )
+
+    def law(slack):
+        return constraint.row_force(scene.model, data, slack)
+
+    rng, sliding = np.random.default_rng(0), 0
+    for _ in range(12):
+        tangent = rng.normal(size=3) / friction
+        length = np.linalg.norm(friction * tangent)
+        slack = np.concatenate([[rng.uniform(-1 / mu, mu) * length / mu], tangent])
+        force, slope = np.asarray(law(jnp.asarray(slack))), np.asarray(jax.jacfwd(law)(jnp.asarray(slack)))
+        normal = mu * slack[0]
+        sliding += bool(mu * normal + length > 0 and normal < mu * length)
+        np.testing.assert_allclose(slope, slope.T, atol=1e-13)
+        np.testing.assert_allclose(slope @ slack, force, atol=1e-13)
+        assert np.linalg.eigvalsh(slope).max() < 1e-12
+        assert np.linalg.norm(force[1:] / friction) <= force[0] + 1e-12  # within the cone
+    assert sliding >= 4
+
+
 @pytest.fixture(scope="module")
 def resting():
     """A ball that presses on the plane, and the residual over acceleration and height."""

@@ -263,6 +263,23 @@ def test_without_contact_the_derivative_is_free_fall() -> None:
     np.testing.assert_allclose(free_fall, expected, atol=1e-15)
 
 
+def test_activation_and_control_each_have_their_column() -> None:
+    """A mass on a slide with a filter and a motor: v' = v + h (3 a + 5 u_2) / m, a' = a + h (u_1 - a) / tau."""
+    h, mass, tau = 0.01, 2.0, 0.05
+    scene = scene_of(
+        f"""<mujoco><option timestep="{h}" gravity="0 0 0"/><worldbody><body><joint name="x" type="slide" axis="1 0 0"/>
+        <geom size=".1" mass="{mass}" contype="0"/></body></worldbody><actuator>
+        <general joint="x" dyntype="filter" dynprm="{tau}" gainprm="3"/><motor joint="x" gear="5"/>
+        </actuator></mujoco>"""
+    )
+    assert dynamics.uses_jacobian(scene)
+    point = jnp.array([0.1, 0.2, 0.3, 0.4, 0.5])
+    after = compiled(jax.jacfwd(lambda x: step_flat(scene, scene.model, x, jnp.zeros(1))[0]), point)(point)
+    speed = np.array([0, 1, 3 * h / mass, 0, 5 * h / mass])
+    activation = np.array([0, 0, 1 - h / tau, h / tau, 0])
+    np.testing.assert_allclose(after, [np.eye(5)[0] + h * speed, speed, activation], atol=1e-15)
+
+
 # Derivatives with respect to contact parameters.
 
 PARAMETERS = ("stiffness", "damping", "d_0", "d_width", "width", "midpoint", "power", "sliding", "torsional", "rolling")

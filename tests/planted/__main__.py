@@ -108,27 +108,32 @@ def clean_gradcheck(model: str) -> str:
         return wrong_by_gradcheck(tree, model)
 
 
-def judge(defect: Defect, *, everything: bool) -> Verdict:
+def judge(defect: Defect, known: Verdict | None, *, everything: bool) -> Verdict:
     """Plant a defect and see what catches it.
 
     Args:
         defect: to plant.
+        known: what an earlier run found; only what it lacks is run.
         everything: whether to run gradcheck though a test has caught it.
 
     Raises:
         RuntimeError: gradcheck finds fault with the model as it is, or pytest cannot run.
     """
+    if known and (known.gradcheck is not None or defect.model is None or not everything):
+        return known
     start = time.monotonic()
+    test, checked, before = (known.test, known.gradcheck, known.seconds) if known else (None, None, 0.0)
     with copy_of_the_tree() as tree:
         plant(defect, tree)
-        test, checked = failing_test(tree, *defect.tests), None
-        if defect.model is not None and (everything or not test):
+        if test is None:
+            test = failing_test(tree, *defect.tests)
+        if checked is None and defect.model is not None and (everything or not test):
             if wrong := clean_gradcheck(defect.model):
                 raise RuntimeError(f"gradcheck must pass {defect.model} without a defect, and says {wrong}")
             checked = wrong_by_gradcheck(tree, defect.model)
         if not test and not checked:
             test = failing_test(tree, *(f"--deselect={name}" for name in defect.tests))
-    return Verdict(defect, test, checked, time.monotonic() - start)
+    return Verdict(defect, test, checked, before + time.monotonic() - start)
 
 
 def read_results(path: Path | None) -> dict[str, Verdict]:
@@ -189,15 +194,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0
     verdicts, known = [], read_results(options.results)
     for index, defect in enumerate(chosen, 1):
-        verdict = known.get(defect.name) or judge(defect, everything=options.everything)
+        verdict = judge(defect, known.get(defect.name), everything=options.everything)
         verdicts.append(verdict)
-        if options.results is not None and defect.name not in known:
+        if options.results is not None and verdict is not known.get(defect.name):
             with options.results.open("a") as file:
                 file.write(json.dumps(dataclasses.asdict(verdict) | {"defect": defect.name}) + "\n")
-        found = "caught" if verdicts[-1].caught else "CAUGHT BY NOTHING"
-        print(
-            f"{index}/{len(chosen)} {defect.name}: {found}, {verdicts[-1].seconds:.0f} s", file=sys.stderr, flush=True
-        )
+        found = "caught" if verdict.caught else "CAUGHT BY NOTHING"
+        note = f"{index}/{len(chosen)} {defect.name}: {found}, {verdict.seconds:.0f} s"
+        print(note, file=sys.stderr, flush=True)
     print("\n".join(format_table([row(each) for each in verdicts], ["defect", "file", "fast tests", "gradcheck"])))
     print(summary(verdicts))
     if options.page is not None:

@@ -14,7 +14,7 @@ OBJECTIVE: Final = (
         "return jax.tree.map(lambda leaf: leaf[:-1], states)",
         "return jax.tree.map(lambda leaf: leaf[1:], states)",
         "running costs of the states after the steps",
-        ("tests/test_objective.py",),
+        ("tests/test_objective.py::test_cart_in_closed_form",),
     ),
     Defect(
         "baseline-with-noise",
@@ -22,7 +22,7 @@ OBJECTIVE: Final = (
         "np.concatenate([np.ones(samples), np.zeros(len(silent))])",
         "np.ones(samples + len(silent))",
         "still unbiased with one sample less, and no error anywhere",
-        ("tests/test_objective.py",),
+        ("tests/test_objective.py::test_baseline_is_the_cost_without_noise",),
     ),
     Defect(
         "costs-so-far",
@@ -30,7 +30,7 @@ OBJECTIVE: Final = (
         "jnp.cumsum(running[::-1])[::-1] + self.task.final_cost",
         "jnp.cumsum(running) + self.task.final_cost",
         "costs up to a step in place of those from it on",
-        ("tests/test_batches.py",),
+        ("tests/test_batches.py::test_costs_to_go_are_sums_of_what_is_left",),
     ),
     Defect(
         "score-without-its-scale",
@@ -38,7 +38,7 @@ OBJECTIVE: Final = (
         "NOISES[density].score(noise / sigma) / sigma",
         "NOISES[density].score(noise / sigma)",
         "the score of standard noise; right at sigma = 1",
-        ("tests/reference/test_objective.py", "tests/test_objective.py"),
+        ("tests/reference/test_objective.py",),
     ),
 )
 

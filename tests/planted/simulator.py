@@ -5,6 +5,9 @@ from typing import Final
 from tests.planted.defect import Defect
 
 STEP = "tests/test_dynamics.py"
+VALUES, SLOPES = "test_the_step_is_mjxs", "test_reverse_mode_is_the_central_difference"
+LAWS = "tests/test_constraint.py::test_forces_and_imbalance_are_those_of_mjx"
+CONE = "tests/test_constraint.py::test_the_elliptic_law_is_the_gradient_of_a_convex_cost"
 
 DYNAMICS: Final = (
     Defect(
@@ -16,7 +19,7 @@ DYNAMICS: Final = (
         return data.tree_replace({"_impl.contact.frame": frame})
 """,
         "the contact frame taken for a constant, as it is on a plane",
-        (STEP,),
+        (f"{STEP}::{SLOPES}[sphere-sphere condim 6 elliptic implicitfast]",),
         "rolling",
     ),
     Defect(
@@ -25,7 +28,7 @@ DYNAMICS: Final = (
         "        data = mjx.make_constraint(model, data)  # again: aref depends on qvel\n",
         "",
         "an apparently repeated call removed",
-        (STEP,),
+        (f"{STEP}::{VALUES}[sphere-sphere condim 1]",),
         "box",
     ),
     Defect(
@@ -34,7 +37,7 @@ DYNAMICS: Final = (
         "return over_inputs[nv:] + over_qacc[nv:] @ response, response",
         "return over_inputs[nv:], response",
         "the step differentiated at a fixed acceleration",
-        (STEP,),
+        (f"{STEP}::{SLOPES}[sphere-sphere condim 1]",),
         "slider",
     ),
     Defect(
@@ -47,7 +50,7 @@ DYNAMICS: Final = (
         (lambda x: equations(positioned, qvel, x, control, qacc), act),
 """,
         "blocks of the Jacobian in another order than the inputs",
-        (STEP,),
+        (f"{STEP}::test_activation_and_control_each_have_their_column",),
         "mechanism",
     ),
     Defect(
@@ -56,7 +59,7 @@ DYNAMICS: Final = (
         "mjx.implicit(model, data) if implicit else mjx.euler(model, data)",
         "mjx.euler(model, data)",
         "one integrator forgotten",
-        (STEP,),
+        (f"{STEP}::{VALUES}[capsule-plane pyramidal CG implicitfast]",),
         "rolling",
     ),
     Defect(
@@ -65,7 +68,7 @@ DYNAMICS: Final = (
         "data.replace(qacc=qacc, qfrc_constraint=constraint.constraint_force(model, data, qacc))",
         "data.replace(qacc=qacc)",
         "Euler's implicit damping solves again, with the constraint force, which is easily forgotten",
-        (STEP,),
+        (f"{STEP}::{VALUES}[mechanism]",),
         "mechanism",
     ),
     Defect(
@@ -74,7 +77,7 @@ DYNAMICS: Final = (
         "(a + 2 * b + 2 * c + d) / 6",
         "(a + 3 * b + 3 * c + d) / 8",
         "the weights of the other rule of order four",
-        (STEP,),
+        (f"{STEP}::test_runge_kutta_is_mjxs",),
         "swing",
     ),
     Defect(
@@ -83,7 +86,7 @@ DYNAMICS: Final = (
         "third = slopes(*moved(0.5, second))",
         "third = slopes(*moved(0.5, first))",
         "a stage started from the wrong slope",
-        (STEP,),
+        (f"{STEP}::test_runge_kutta_is_mjxs",),
         "swing",
     ),
 )
@@ -95,7 +98,7 @@ CONSTRAINT: Final = (
         "-magnitude * friction * tangent / safe_length",
         "-magnitude * friction * jax.lax.stop_gradient(tangent / safe_length)",
         "the direction of sliding held fixed; only a slide that turns shows it",
-        (STEP,),
+        (CONE,),
         "slider",
     ),
     Defect(
@@ -104,7 +107,7 @@ CONSTRAINT: Final = (
         "-magnitude * friction * tangent / safe_length",
         "-magnitude * tangent / safe_length",
         "the cone's scaling of its axes applied once in place of twice",
-        (STEP,),
+        (CONE,),
         "slider",
     ),
     Defect(
@@ -113,7 +116,7 @@ CONSTRAINT: Final = (
         "mu = friction[0] / jnp.sqrt(model.opt.impratio)",
         "mu = friction[0]",
         "right at the default impratio of 1",
-        (STEP,),
+        (f"{LAWS}[elliptic-condim-3,-4,-6]",),
         "slider",
     ),
     Defect(
@@ -122,7 +125,7 @@ CONSTRAINT: Final = (
         "jnp.clip(linear, -loss, loss)",
         "jnp.clip(linear, 0.0, loss)",
         "friction taken for a unilateral force",
-        ("tests/test_constraint.py",),
+        (f"{LAWS}[mechanism]",),
         "mechanism",
     ),
     Defect(
@@ -131,7 +134,7 @@ CONSTRAINT: Final = (
         "kind[: rows.ne] = 2",
         "kind[: rows.ne] = 0",
         "an equality taken for a contact",
-        ("tests/test_constraint.py",),
+        (f"{LAWS}[mechanism]",),
         "mechanism",
     ),
     Defect(
@@ -140,7 +143,7 @@ CONSTRAINT: Final = (
         "sum(lower[j, k] ** 2 for k in range(j))",
         "sum(lower[j, k] ** 2 for k in range(1, j))",
         "an index from 1",
-        ("tests/test_constraint.py",),
+        ("tests/test_constraint.py::test_solve_positive_definite",),
         "slider",
     ),
 )
