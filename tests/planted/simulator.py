@@ -20,7 +20,7 @@ DYNAMICS: Final = (
 """,
         "the contact frame taken for a constant, as it is on a plane",
         (f"{STEP}::{SLOPES}[sphere-sphere condim 6 elliptic implicitfast]",),
-        "rolling",
+        "dome",
     ),
     Defect(
         "reference-at-rest",
@@ -29,7 +29,7 @@ DYNAMICS: Final = (
         "",
         "an apparently repeated call removed",
         (f"{STEP}::{VALUES}[sphere-sphere condim 1]",),
-        "box",
+        "slider",
     ),
     Defect(
         "implicit-part-dropped",
@@ -60,7 +60,7 @@ DYNAMICS: Final = (
         "mjx.euler(model, data)",
         "one integrator forgotten",
         (f"{STEP}::{VALUES}[capsule-plane pyramidal CG implicitfast]",),
-        "rolling",
+        "dome",
     ),
     Defect(
         "force-left-out-of-damping",
@@ -212,7 +212,7 @@ INTEGRATION: Final = (
         "0.5 - square / 24 +",
         "a wrong coefficient of a series, used below 0.01 rad",
         ("tests/test_integration.py",),
-        "box",
+        "ball",
     ),
     Defect(
         "rotation-in-the-world-frame",
@@ -221,7 +221,7 @@ INTEGRATION: Final = (
         "w * a + x * cosine - y * c + z * b",
         "one entry of the product in the other order",
         ("tests/test_integration.py",),
-        "box",
+        "ball",
     ),
     Defect(
         "long-way-round",
