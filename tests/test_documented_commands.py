@@ -17,12 +17,13 @@ PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 SMALL = {
     "compare": "--samples 4 --reference-samples 4 --horizon 4",
     "optimise": "--iterations 2 --samples 4 --evaluation-samples 4 --seeds 2 --horizon 4",
-    "sweep": "--samples 4 --reference-samples 4 --evaluation-samples 4 --seeds 2 --horizon 4",
+    "sweep": "--samples 4 --seeds 2 --horizon 4",
     "landscape": "--points 2 --samples 4 --horizon 4",
     "rollout": "--horizon 4 --frames 1",
     "gradcheck": "--horizon 4 --states 1",
     "bench": "--samples 4 --horizon 4",
 }
+OF_KIND = {"--iterations": "--iterations 2 --evaluation-samples 4", "--points": "--points 2"}
 # What a page takes for granted, or another one makes.
 MJCF = """<mujoco><worldbody><geom type="plane" size="1 1 0.1"/>
 <body pos="0 0 0.09"><freejoint/><geom size="0.1"/></body></worldbody></mujoco>"""
@@ -53,7 +54,8 @@ def small(command: list[str]) -> list[str]:
     name, *rest = ["pusher" if part == "TASK" else part for part in command]
     more = SMALL.get(name, "").split()
     if name == "sweep":
-        more += [part for flag in ("--iterations", "--points") if flag in rest for part in (flag, "2")]
+        flag = next((flag for flag in OF_KIND if flag in rest), None)
+        more += OF_KIND.get(flag, "--reference-samples 4").split()
     return [name, *rest, *more]
 
 
