@@ -56,6 +56,8 @@ class StudyDocument(_Part):
     """A study.json: only what is read of it; the rest may be anything."""
 
     config: _Config
+    contents: dict[str, str]
+    versions: dict[str, str]
     warnings: list[str]
     environment: _Environment
     revision: str | None = None

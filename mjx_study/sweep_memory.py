@@ -4,13 +4,12 @@ import math
 from collections.abc import Sequence
 from typing import Final
 
+from mjx_study.limits import MOST_GIB
 from mjx_study.study import BIAS_DRAWS
 from mjx_study.task import Task
 
 AT_ONCE: Final = 512e6
 """Memory that batches of several seeds may take together [bytes]; one seed's batches may take more."""
-MOST: Final = 16e9
-"""Memory that batches may take [bytes]; a plan that needs more is refused."""
 
 
 def numbers_per_sample(task: Task, oracle: str) -> int:
@@ -43,10 +42,11 @@ def seeds_at_once(memory_of_seed: int, seeds: int) -> int:
     return math.ceil(seeds / math.ceil(seeds / fitting))
 
 
-def check_memory(needed: int) -> None:
-    """Raises ValueError for a plan that needs more than `MOST`."""
-    if needed > MOST:
+def check_batches(needed: int) -> None:
+    """Raises ValueError for batches that need more bytes than `MOST_GIB` says."""
+    gib = needed / 2**30
+    if gib > MOST_GIB:
         raise ValueError(
-            f"the batches of a cell would take about {needed / 1e9:.3g} GB of memory, and the limit is {MOST / 1e9:g} "
-            "GB: give fewer samples, and more seeds of them"
+            f"the batches of a cell would take about {gib:.3g} GiB of memory, and the limit is {MOST_GIB:g} GiB: give "
+            "fewer samples, and more seeds of them"
         )

@@ -25,7 +25,7 @@ from mjx_study.limits import MOST_CELLS, MOST_PROGRAMS, check_count
 from mjx_study.objective import chunk_for
 from mjx_study.optimise import OptimiseConfig, OptimisePlan, plan_optimise
 from mjx_study.option import OPTIONS, Checked, check
-from mjx_study.sweep_memory import bytes_per_sample, check_memory, seeds_at_once
+from mjx_study.sweep_memory import bytes_per_sample, check_batches, seeds_at_once
 from mjx_study.table import digits_to_tell_apart
 from mjx_study.task import Task, check_sigma
 from mjx_study.tasks import make_task
@@ -263,7 +263,7 @@ def plan_sweep(config: SweepConfig) -> SweepPlan:
     most = min(LARGEST_BATCH, max(config.samples) * (1 if config.iterations else config.batches))
     chunk = chunk_for(most, jax.local_devices()) if config.chunk_size is None else config.chunk_size
     plan = SweepPlan(config, tuple(groups), tuple(cells), chunk, tuple(dict.fromkeys(messages)))
-    check_memory(plan.memory)
+    check_batches(plan.memory)
     for cell in {cell.group: cell for cell in cells}.values():
         estimator_options(plan, cell)
         if config.kind == "descents":

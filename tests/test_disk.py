@@ -14,14 +14,11 @@ import pytest
 from mjx_study.checkpoint import Checkpoints
 from mjx_study.disk import TEMPORARY, prepare_folder, read_whole, write_whole
 from mjx_study.store import Store, StudyError, assemble, write_dataset
+from tests.documents import study_document
 from tests.faults import deadline, every_fault, from_the_future, put_no_file
 
 CELLS = 3
-DOCUMENT: dict[str, Any] = {
-    "config": {"kind": "test"},
-    "axes": {"model": [0, 1, 2]},
-    "cells": [{"at": {"model": index}} for index in range(CELLS)],
-}
+DOCUMENT = study_document(CELLS)
 
 
 def numbers(index: int) -> dict[str, np.ndarray]:
@@ -35,7 +32,8 @@ def study(folder: Path) -> Store:
         with store.claim(index) as ours:
             if ours:
                 store.write(index, numbers(index))
-    dataset = assemble(store, {"model": [0, 1, 2], "value": range(3000)}, {"values": (("value",), "1", "")}, {}, {})
+    dimensions = store.document["axes"] | {"value": range(3000)}
+    dataset = assemble(store, dimensions, {"values": (("value",), "1", "")}, {}, {})
     write_dataset(dataset, folder / "results.nc")
     return store
 
@@ -195,5 +193,5 @@ def test_a_read_only_disk_can_be_read(tmp_path: Path) -> None:
     study(folder)
     for _ in every_fault(errno.EROFS, lambda: check_whole(folder), lasting=True):
         pytest.fail("reading a study wrote")
-    assert json.loads(read_whole(folder / "study.json"))["config"] == {"kind": "test"}
+    assert json.loads(read_whole(folder / "study.json"))["config"] == DOCUMENT["config"]
     assert os.access(folder, os.R_OK)

@@ -31,6 +31,7 @@ from mjx_study.sweep import SweepConfig, load_study, open_store, plan_sweep, run
 from mjx_study.sweep_cells import MEASURED, compute_gradients
 from mjx_study.sweep_plan import estimator_options
 from mjx_study.tasks import make_task
+from tests.documents import study_document
 
 SMALL: dict[str, Any] = {
     "tasks": ("pusher",),
@@ -182,9 +183,10 @@ import json, os, random, signal, sys, time
 from pathlib import Path
 import numpy as np
 from mjx_study.store import Store
+from tests.documents import study_document
 
 folder, cells = Path(sys.argv[1]), 40
-document = {"config": {"kind": "test"}, "cells": [{} for _ in range(cells)]}
+document = study_document(cells)
 
 def work():
     store = Store.create(folder, document)
@@ -212,7 +214,8 @@ work()
 
 def test_killed_at_any_moment_a_folder_is_whole(tmp_path: Path) -> None:
     """Kills by SIGKILL at random moments of writing; each cell is then there with its own numbers, or not at all."""
-    done = subprocess.run([sys.executable, "-c", ZYGOTE, str(tmp_path / "out")], capture_output=True, text=True)
+    command = [sys.executable, "-c", ZYGOTE, str(tmp_path / "out")]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=Path(__file__).parents[1])
     assert done.returncode == 0, done.stderr
     assert int(done.stdout) >= 5
     kept = Store.open(tmp_path / "out")
@@ -285,7 +288,7 @@ def test_a_damaged_cell_is_refused_and_left_alone(undisturbed: Path, tmp_path: P
     elif damage == "nonsense":
         path.write_bytes(b"nonsense")
     else:
-        other = Store.create(tmp_path / "other", {"config": {"kind": "other"}, "cells": [{}] * 3})
+        other = Store.create(tmp_path / "other", study_document(3))
         other.write(2, Store.open(undisturbed).read(2))
         path.write_bytes(other.path(2).read_bytes())
     damaged = path.read_bytes()

@@ -71,7 +71,7 @@ def test_numbers_do_not_depend_on_how_seeds_are_grouped(monkeypatch: pytest.Monk
 def test_a_plan_that_needs_too_much_memory_is_refused(kind: dict[str, int]) -> None:
     changes = {"reference_samples": None} if kind else {}
     assert plan_sweep(config(samples=(100,), **kind, **changes)).memory < sweep_memory.AT_ONCE
-    with pytest.raises(ValueError, match="a cell would take about .* GB of memory, and the limit is 16 GB: give fewer"):
+    with pytest.raises(ValueError, match="a cell would take about .* GiB of memory, and the limit is 16 GiB"):
         plan_sweep(config(samples=(100, 10_000_000), **kind, **changes))
 
 
