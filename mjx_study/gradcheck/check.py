@@ -61,7 +61,7 @@ def _gradcheck(plan: GradcheckPlan, progress: Progress) -> GradcheckReport:
         costs=tuple(cost_checks),
         steps=tuple(step_checks),
         findings=tuple(sorted(findings, key=gravity)),
-        warnings=(*plan.warnings, *_unoffered(task.scene.host)),
+        warnings=(*plan.warnings, *unoffered(task.scene.host)),
         environment=environment(),
     )
 
@@ -88,7 +88,7 @@ def _summary(plan: GradcheckPlan) -> str:
     return f"{', '.join(parts)}; {taken}"
 
 
-def _unoffered(host: mujoco.MjModel) -> list[str]:
+def unoffered(host: mujoco.MjModel) -> list[str]:
     """What the model has and a step has no derivative of or by."""
     notes = []
     if host.nsensor:

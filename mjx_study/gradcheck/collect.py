@@ -143,7 +143,8 @@ def _of_state(check: StateCheck, layout: Coordinates) -> list[tuple[_Key, Entry]
         found.append((("project", "wrong", (), cause), _entry(check, layout, "", (check.modes, None))))
     if values.verdict:
         name = f"change of {layout.outputs[values.coordinate]}"
-        found.append((("project", values.verdict, (), values.cause), _entry(check, layout, name, values.numbers)))
+        who = STOCK if values.verdict == "value" and values.agrees_with_engine else "project"
+        found.append(((who, values.verdict, (), values.cause), _entry(check, layout, name, values.numbers)))
     return found
 
 

@@ -85,7 +85,7 @@ def check_state(
     derivatives |= {} if linear.tape is None else {"tape": linear.tape}
     excused = degenerate & truth.rough
     apart = [modes_apart(layout, linear.forward, other, excused) for other in list(derivatives.values())[1:]]
-    engine = None if values.verdict else judge(layout, linear.forward, engine_truth)
+    engine = judge(layout, linear.forward, engine_truth) if values.agrees_with_engine else None
     converged = None if linear.residual <= 1e-10 else programs.linear(setting, solved).forward
     starved = not linear.residual <= diagnosis.RESIDUAL_TOLERANCE
     judged = {

@@ -50,8 +50,8 @@ class Values:
     Attributes:
         stock: this project's from that of `mjx.step`.
         engine: this project's from the C engine's.
-        verdict: value (this project's step is not MJX's), engine (MJX's is not the C engine's), placement (nor is it
-            documented to be), or empty.
+        verdict: value (this project's step and that of `mjx.step` differ), engine (they agree, and the C engine's is
+            another for no documented reason), placement (for a documented one), or empty.
         cause: what differs.
         coordinate: where it shows most, an index into the layout's outputs.
         numbers: the change of this coordinate here, and in the implementation that differs.
@@ -63,6 +63,11 @@ class Values:
     cause: str = ""
     coordinate: int = 0
     numbers: tuple[float, float] = (0.0, 0.0)
+
+    @property
+    def agrees_with_engine(self) -> bool:
+        """Whether the C engine computes the same step."""
+        return self.engine <= TOLERANCE
 
 
 def compare_values(
@@ -90,9 +95,11 @@ def compare_values(
         return Values(from_stock, from_engine)
     if not from_stock <= TOLERANCE:
         verdict = "value"
-        agrees = float(apart(layout, state, stock, theirs).max()) <= TOLERANCE
-        third = "with mjx.step" if agrees else "with neither" if from_engine > TOLERANCE else "with this project"
-        cause = f"this project's step is not that of mjx.step; the C engine agrees {third}"
+        if from_engine <= TOLERANCE:
+            cause = "mjx.step computes another step than this project and the C engine"
+        else:
+            third = "mjx.step" if float(apart(layout, state, stock, theirs).max()) <= TOLERANCE else "neither"
+            cause = f"this project's step is not that of mjx.step; the C engine agrees with {third}"
     elif not from_engine <= TOLERANCE:
         verdict, cause = _difference_of_engines(engine_step, state, ours, theirs, stages)
     other = stock if verdict == "value" else theirs
@@ -143,7 +150,7 @@ def _difference_of_engines(
     data = host_data(host, state)
     mujoco.mj_forward(host, data)
     moved = _contacts(host, data, stages)
-    found = {name: text for name, text in (*_stages(host, data, stages), *(("contact", text) for text in moved))}
+    found = dict(_stages(host, data, stages)) | ({"contact": "; ".join(moved)} if moved else {})
     if not found and _relative(ours.warmstart, theirs.warmstart) <= TOLERANCE:
         found[INTEGRATION] = "the state after the step differs, its acceleration does not"
     found = found or dict(_rows(data, stages)) or {"solution": "the solution of the constraints"}

@@ -2,12 +2,14 @@
 
 import dataclasses
 
+import mujoco
 import pytest
 
 from mjx_study import cli
 from mjx_study.cli import gradcheck as command
 from mjx_study.cli import options
 from mjx_study.gradcheck import Finding, GradcheckReport, StepCheck
+from mjx_study.gradcheck.check import unoffered
 from mjx_study.gradcheck.cost import CostCheck, judge_closed_forms
 from mjx_study.gradcheck.coverage import coverage
 from mjx_study.gradcheck.finding import Entry
@@ -88,6 +90,14 @@ def test_unresolved_entries_are_counted() -> None:
 def test_a_finding_says_what_it_is_compared_with(verdict: str, fails: bool, said: str) -> None:
     assert wrong(verdict).fails is fails and said in wrong(verdict).line()
     assert report(STEP, findings=(wrong(verdict),)).passed is not fails
+
+
+def test_what_has_no_derivative_is_said() -> None:
+    xml = """<mujoco><worldbody><body mocap="true"/><body><joint name="x"/><geom size=".1"/></body></worldbody>
+    <sensor><jointpos joint="x"/><jointvel joint="x"/></sensor></mujoco>"""
+    sensors, mocap = unoffered(mujoco.MjModel.from_xml_string(xml))
+    assert sensors.startswith("2 sensors: ") and mocap.startswith("1 mocap pose: ")
+    assert all("no derivative" in note for note in (sensors, mocap))
 
 
 def closed_form(stiffness: float, distance: float) -> CostCheck:

@@ -74,7 +74,9 @@ def test_a_defect_here() -> None:
 
 
 def test_mjx_alone_differs() -> None:
-    assert compare(0.0, 1e-3).cause.endswith("the C engine agrees with this project")
+    found = compare(0.0, 1e-3)
+    assert found.verdict == "value" and found.agrees_with_engine and found.cause.startswith("mjx.step computes another")
+    assert not compare(1e-3, 0.0).agrees_with_engine
 
 
 def test_mjx_differs_from_the_engine_for_no_known_reason() -> None:
