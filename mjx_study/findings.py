@@ -23,17 +23,19 @@ def findings(result: CompareResult) -> list[str]:
 
 def _variance_finding(result: CompareResult, family: str) -> list[str]:
     table = {(row.stiffness, row.estimator): row for row in result.rows if row.contact == family}
-    groups: dict[str, list[float]] = {
-        "below ZoBG's": [],
-        "above ZoBG's": [],
-        "not told apart from ZoBG's": [],
-    }
+    below, above, alike = "below ZoBG's", "above ZoBG's", "not told apart from ZoBG's"
+    unknown = "not to be told from so few effective samples"
+    groups: dict[str, list[float]] = {verdict: [] for verdict in (below, above, alike, unknown)}
     for stiffness in sorted({stiffness for stiffness, _ in table}):
         if (stiffness, "zobg") not in table or (stiffness, "fobg") not in table:
             return []
         zeroth, first = table[stiffness, "zobg"], table[stiffness, "fobg"]
-        below, above = first.variance_upper < zeroth.variance_lower, first.variance_lower > zeroth.variance_upper
-        verdict = "below ZoBG's" if below else "above ZoBG's" if above else "not told apart from ZoBG's"
+        if not (zeroth.believable and first.believable):
+            verdict = unknown
+        elif first.variance_upper < zeroth.variance_lower:
+            verdict = below
+        else:
+            verdict = above if first.variance_lower > zeroth.variance_upper else alike
         groups[verdict].append(stiffness)
     parts = [f"{verdict}{_at(group)}" for verdict, group in groups.items() if group]
     return [f"{family}: FoBG's variance is {'; '.join(parts)} ({result.config.confidence:.0%} intervals)"]

@@ -148,6 +148,16 @@ def test_findings_follow_the_intervals() -> None:
     )
 
 
+def test_no_variance_is_called_less_on_too_few_effective_samples() -> None:
+    """A batch without one of the rare samples that carry the gradient varies little, or not at all."""
+    for variance, effective in ((0, 0.0), (1, 2.0)):
+        doubtful = row("fobg", 10, variance, effective_samples=effective, debiased_error_se=0.01)
+        (sentence,) = findings(result(row("zobg", 10, 100), doubtful))
+        assert sentence == (
+            "penalty: FoBG's variance is not to be told from so few effective samples at K = 10 N/m (95% intervals)"
+        )
+
+
 def test_bias_is_reported_only_beyond_what_noise_explains() -> None:
     quiet = row("fobg", 10, 1, relative_error=0.044, bias_p_value=0.002)
     loud = row("fobg", 10, 1, relative_error=0.044, bias_p_value=0.001)
