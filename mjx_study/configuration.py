@@ -3,7 +3,9 @@
 import dataclasses
 import itertools
 import warnings
-from collections.abc import Callable, Collection, Sequence
+from collections import Counter
+from collections.abc import Callable, Collection, Generator, Sequence
+from contextlib import contextmanager
 from typing import Any, Final
 
 import jax
@@ -110,7 +112,7 @@ def check_names(label: str, names: Sequence[str], choices: Collection[str]) -> N
 
 def refuse_repeats(label: str, values: Sequence[object]) -> None:
     """Raises ValueError for a value that occurs twice."""
-    repeated = {str(value) for value in values if values.count(value) > 1}
+    repeated = {str(value) for value, count in Counter(values).items() if count > 1}
     if repeated:
         raise ValueError(f"{label} given twice: {', '.join(sorted(repeated))}")
 
@@ -268,10 +270,9 @@ def plan_cells(
         undamped = swept and family in FAMILIES and FAMILIES[family].dampratio == 0
         own = damping if damping is not None else task.damping if undamped else None
         for stiffness in stiffnesses if swept else (None,):
-            with warnings.catch_warnings(record=True) as caught:
-                warnings.simplefilter("always", ContactWarning)
+            with _warnings_of_contact() as caught:
                 contact = None if family == "mjcf" else _contact(task, family, stiffness, own if swept else None)
-            cell = Cell(family, stiffness or _stiffness(task, contact), contact, digits)
+                cell = Cell(family, stiffness or _stiffness(task, contact), contact, digits)
             cells.append(cell)
             messages += [f"{cell.label}: {warning.message}" for warning in caught]
     return tuple(cells), tuple(messages)
@@ -299,12 +300,26 @@ def solver_cells(
             raise ValueError(f"solref takes 2 numbers and solimp 5, got {len(solref)} and {len(solimp)}")
         parts = {"solref": solref} | ({"solimp": solimp} if solimps else {})
         name = " ".join(f"{key} {' '.join(f'{value:.{digits}g}' for value in part)}" for key, part in parts.items())
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always", ContactWarning)
+        with _warnings_of_contact() as caught:
             contact = contact_model(solref, solimp, scene=task.scene)
-        cells.append(Cell(name, _stiffness(task, contact), contact, digits))
+            cells.append(Cell(name, _stiffness(task, contact), contact, digits))
         messages += [f"{name}: {warning.message}" for warning in caught]
     return tuple(cells), tuple(messages)
+
+
+@contextmanager
+def _warnings_of_contact() -> Generator[list[warnings.WarningMessage]]:
+    """What there is to warn about contact models that are made inside.
+
+    Raises:
+        ValueError: their numbers are so large or small that arithmetic overflows.
+    """
+    try:
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always", ContactWarning)
+            yield caught
+    except ArithmeticError as error:
+        raise ValueError(f"a contact model's numbers are too large or too small: {error}") from error
 
 
 def _contact(task: Task, family: str, stiffness: float | None, damping: float | None) -> ContactModel:

@@ -5,9 +5,10 @@ from pathlib import Path
 from typing import Annotated, Any, Final, TypeVar
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from mjx_study.disk import read_whole
+from mjx_study.option import OPTIONS
 
 MOST_BYTES: Final = 100_000_000
 """Of a file that is read whole."""
@@ -74,6 +75,12 @@ def told(error: ValidationError) -> str:
     return f"{key}{': ' * bool(key)}{' '.join(reason.split())}{more}"
 
 
+def _option(name: str, kind: Any, interval: str = "") -> Any:
+    """What an option takes, or null."""
+    option = OPTIONS[name].within(interval) if interval else OPTIONS[name]
+    return Annotated[kind, AfterValidator(option.check)] | None
+
+
 class PolicyFile(BaseModel):
     """A policy that optimise wrote: its parameters, and what they are for."""
 
@@ -81,13 +88,13 @@ class PolicyFile(BaseModel):
 
     task: str
     theta: list[Finite] = Field(min_length=1)
-    contact: str | None = None
-    stiffness: Finite | None = None
-    damping: Finite | None = None
-    cone: str | None = None
+    contact: _option("contact", str) = None  # type: ignore[valid-type]
+    stiffness: _option("stiffness", float, "[0, inf)") = None  # type: ignore[valid-type]
+    damping: _option("damping", float) = None  # type: ignore[valid-type]
+    cone: _option("cone", str) = None  # type: ignore[valid-type]
     model: str | None = None
-    horizon: int | None = Field(None, ge=1)
-    network: list[Annotated[int, Field(ge=1)]] | None = None
+    horizon: _option("horizon", int) = None  # type: ignore[valid-type]
+    network: list[Annotated[int, Field(ge=1, le=OPTIONS["network"].interval.high)]] | None = None  # type: ignore[union-attr]
 
 
 def read_theta(path: Path) -> tuple[tuple[float, ...], str | None]:

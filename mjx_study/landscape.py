@@ -212,6 +212,7 @@ def line_of(task: Task, points: int, span: Sequence[float] | None, direction: st
     theta = np.asarray(task.theta, float)
     along = _direction(direction or "random", len(theta), seed)
     low, high = span or task.span or (-SPAN_SIGMAS * task.sigma, SPAN_SIGMAS * task.sigma)
+    check_span((low, high))
     position = np.linspace(low, high, points)
     origin = np.zeros(1) if len(theta) == 1 else theta
     return ThetaLine(position, along, tuple(jnp.asarray(origin + t * along, task.theta.dtype) for t in position))
@@ -219,7 +220,7 @@ def line_of(task: Task, points: int, span: Sequence[float] | None, direction: st
 
 def check_span(span: Sequence[float] | None) -> None:
     """Raises ValueError unless it is None or two numbers, the lower one first."""
-    if span is not None and not (len(span) == 2 and -math.inf < span[0] < span[1] < math.inf):
+    if span is not None and not (len(span) == 2 and 0 < span[1] - span[0] < math.inf):
         raise ValueError(f"span must be two numbers, the lower one first; got {span}")
 
 

@@ -14,6 +14,8 @@ MOST_PROGRAMS: Final = 500
 """Programs that a sweep compiles: a timestep, cone or task needs its own."""
 MOST_PARAMS: Final = 10_000_000
 """Parameters of a network."""
+MOST_LAYERS: Final = 100
+"""Hidden layers of a network."""
 MOST_STEPS: Final = 1_000_000
 """Of a rollout."""
 MOST_GIB: Final = 16.0

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
 from mjx_study.dynamics import State
-from mjx_study.limits import MOST_PARAMS, check_count
+from mjx_study.limits import MOST_LAYERS, MOST_PARAMS, check_count
 from mjx_study.policy import Feedback, LinearFeedback
 from mjx_study.task import Task
 
@@ -92,6 +92,7 @@ def with_network(task: Task, hidden: tuple[int, ...], key: Key[Array, ""]) -> Ta
     else:
         size = host.nq + host.nv + host.na
         features = lambda state: jnp.concatenate([state.qpos, state.qvel, state.act])  # noqa: E731
+    check_count(len(hidden), "hidden layers", MOST_LAYERS, "give fewer")
     network = Network(task.horizon, host.nu, size, features, hidden)
     check_count(network.num_params, "parameters of a network", MOST_PARAMS, "give narrower layers")
     return task.replace(policy=network, theta=network.initial(key, dtype), reference=None)

@@ -6,6 +6,7 @@ gives the default of each of its fields, and may narrow a range.
 
 import dataclasses
 import math
+import sys
 from collections.abc import Iterable
 from numbers import Integral, Real
 from typing import Any, ClassVar, Final, get_type_hints
@@ -36,6 +37,8 @@ class Interval:
         return float(self.text[1:-1].split(",")[1])
 
     def __contains__(self, value: Any) -> bool:
+        if abs(value) > sys.float_info.max and isinstance(value, Integral):  # which no float can hold
+            return False
         above = value >= self.low if self.text[0] == "[" else value > self.low
         return above and (value <= self.high if self.text[-1] == "]" else value < self.high)
 

@@ -13,7 +13,7 @@ from mjx_study.option import OPTIONS
 MOST_NUMBERS: Final = 500_000_000
 """Of one variable of a study."""
 Name = Annotated[str, Field(min_length=1, max_length=1000)]
-Count = Annotated[int, Field(ge=1)]
+Count = Annotated[int, Field(ge=1, le=10_000_000)]
 
 
 class _Part(BaseModel):

@@ -296,7 +296,8 @@ def _build(config: SweepConfig, name: str, timestep: float | None, cone: str | N
     chosen = {key: value for key, value in chosen.items() if value is not None}
     if timestep is not None and config.horizon is None:
         own = make_task(name, **{key: value for key, value in chosen.items() if key != "timestep"})
-        chosen["horizon"] = max(1, round(own.horizon * float(own.scene.host.opt.timestep) / timestep))
+        steps = own.horizon * float(own.scene.host.opt.timestep) / timestep
+        chosen["horizon"] = max(1, round(min(steps, 1e15)))
         check(OPTIONS["horizon"], chosen["horizon"])
     task = make_task(name, **chosen)
     return task if config.noise is None else task.replace(noise=config.noise)

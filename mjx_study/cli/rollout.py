@@ -34,6 +34,7 @@ from mjx_study.configuration import Cell, at_theta, plan_cells
 from mjx_study.console import number
 from mjx_study.disk import prepare_folder, write_whole
 from mjx_study.files import PolicyFile, read_json
+from mjx_study.limits import MOST_STEPS, check_count
 from mjx_study.network import with_network
 from mjx_study.optimise import OptimiseConfig
 from mjx_study.option import OPTIONS
@@ -154,7 +155,8 @@ def _plan(options: argparse.Namespace):
     if given:
         raise ValueError(f"{', '.join(given)}: only for a task; {options.task} moves as its MJCF says")
     model = load_model(options.task, **scene_options(options, "cone"))
-    steps = options.horizon or max(1, round(PASSIVE_SECONDS / model.opt.timestep))
+    steps = options.horizon or max(1, round(min(PASSIVE_SECONDS / model.opt.timestep, 1e15)))
+    check_count(steps, "steps", MOST_STEPS, "give --horizon, or a longer timestep")
     return partial(_simulate_passive, model, Path(options.task).stem, steps), ()
 
 
