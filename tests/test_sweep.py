@@ -92,11 +92,14 @@ def test_results_are_labelled(undisturbed: Path) -> None:
     }  # fmt: skip
     assert data["contact"].values.tolist() == ["penalty", "penalty", "mujoco", "mujoco"]
     assert data["stiffness"].attrs["units"] == "N/m" and data["timestep"].attrs["units"] == "s"
-    for name, variable in data.data_vars.items():
+    for name, variable in ((str(name), each) for name, each in data.data_vars.items()):
         assert variable.attrs["units"] and variable.attrs["long_name"], name
         alpha_only = name in ("alpha", "epsilon", "discrepancy")
         known = variable.sel(estimator="aobg") if alpha_only else variable
-        assert bool(known.notnull().all()), name
+        there = known.notnull()
+        assert bool(there.any() if name.startswith("debiased_cosine") else there.all()), (
+            name
+        )  # none where noise hides it
     config_kept = json.loads(data.attrs["config"])
     assert config_kept["stiffness"] == [10.0, 1000.0] and config_kept["kind"] == "gradients"
     assert json.loads(data.attrs["environment"])["precision"] == "float64" and data.attrs["missing_cells"] == 0
