@@ -21,6 +21,32 @@ def original(module: str, name: str) -> Any:
     return getattr(repairs._module(module), name)
 
 
+LEVEL = """<mujoco><option timestep=".002"><flag contact="disable"/></option>
+<worldbody><body><joint name="x" type="slide"/><geom size=".1" mass="1"/></body></worldbody>
+<equality><joint joint1="x" solref="{} {}" solimp="{} {} {} {} {}"/></equality></mujoco>"""
+
+
+@pytest.mark.parametrize("solref", [(-3000.0, -40.0), (-500.0, 0.0), (0.03, 0.8), (0.003, 1.0)])
+@pytest.mark.parametrize("solimp", [(0.3, 0.9, 0.01, 0.3, 3.0), (0.9, 0.95, 0.001, 0.5, 2.0)])
+def test_stiffness_damping_and_impedance_are_the_c_engines(solref, solimp) -> None:
+    """Of an equality, whose position has either sign; a time constant below two timesteps among them."""
+    host = mujoco.MjModel.from_xml_string(LEVEL.format(*solref, *solimp))
+    data, model = mujoco.MjData(host), mjx.put_model(host)
+    for position in (-0.02, -0.004, -0.0004, 0.0004, 0.002, 0.0095):
+        data.qpos[:] = position
+        mujoco.mj_forward(host, data)
+        arguments = model, jnp.array(solref), jnp.array(solimp), jnp.array(position)
+        ours = repairs.stiffness_damping_impedance(*arguments)
+        np.testing.assert_allclose(ours, data.efc_KBIP[0, :3], rtol=1e-12)
+
+
+def test_both_quaternions_of_an_orientation_are_one() -> None:
+    start, end = (jnp.array(part) / np.linalg.norm(part) for part in ([0.9, 0.1, -0.3, 0.2], [0.2, 0.7, 0.4, -0.1]))
+    expected = repairs.rotation_difference(end, start)
+    np.testing.assert_allclose(repairs.rotation_difference(-end, start), expected, atol=1e-15)
+    np.testing.assert_allclose(repairs.rotation_difference(end, -start), expected, atol=1e-15)
+
+
 @settings(deadline=None, max_examples=60, derandomize=True)
 @given(
     solref=st.one_of(

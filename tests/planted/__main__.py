@@ -26,7 +26,6 @@ from tests.planted.models import MODELS
 ROOT = Path(__file__).resolve().parents[2]
 LEFT_OUT = (".git", ".venv*", ".*cache*", ".hypothesis", "__pycache__", "results", "build", "dist")
 LIMIT = 900.0  # [s] for one command
-UNEXERCISED = 3  # gradcheck's exit code where nothing is wrong, but part of the model was not seen at work
 MARK = "<!-- from here on: make defects -->\n"
 
 

@@ -7,6 +7,7 @@ from tests.planted.defect import Defect
 STEP = "tests/test_dynamics.py"
 VALUES, SLOPES = "test_the_step_is_mjxs", "test_reverse_mode_is_the_central_difference"
 LAWS = "tests/test_constraint.py::test_forces_and_imbalance_are_those_of_mjx"
+IMPEDANCE = "tests/test_repairs.py::test_stiffness_damping_and_impedance_are_the_c_engines"
 CONE = "tests/test_constraint.py::test_the_elliptic_law_is_the_gradient_of_a_convex_cost"
 
 DYNAMICS: Final = (
@@ -155,7 +156,7 @@ REPAIRS: Final = (
         "1 / product**2) / high**2",
         "1 / product**2) / high",
         "k divided by d_width in place of its square",
-        ("tests/test_repairs.py",),
+        (IMPEDANCE,),
         "slider",
     ),
     Defect(
@@ -164,7 +165,7 @@ REPAIRS: Final = (
         "** power / (1 - midpoint) ** (power - 1)",
         "** power / midpoint ** (power - 1)",
         "right at the default midpoint of 0.5",
-        ("tests/test_repairs.py",),
+        (IMPEDANCE,),
         "slider",
     ),
     Defect(
@@ -173,7 +174,7 @@ REPAIRS: Final = (
         "depth = jnp.abs(position) / width",
         "depth = -position / width",
         "right for contacts, wrong for equalities, which err to both sides",
-        ("tests/test_repairs.py",),
+        (IMPEDANCE,),
         "mechanism",
     ),
     Defect(
@@ -182,7 +183,7 @@ REPAIRS: Final = (
         "jnp.maximum(timeconst, 2 * model.opt.timestep)",
         "jnp.maximum(timeconst, model.opt.timestep)",
         "a factor of two forgotten",
-        ("tests/test_repairs.py",),
+        (IMPEDANCE,),
     ),
     Defect(
         "rotation-difference-reversed",
@@ -190,7 +191,7 @@ REPAIRS: Final = (
         "return rotation_between(start, end)",
         "return rotation_between(end, start)",
         "arguments in the order of MJX's own function",
-        ("tests/test_repairs.py",),
+        ("tests/test_repairs.py::test_a_rotation_has_its_derivative_at_no_angle",),
         "ball",
     ),
     Defect(
@@ -199,7 +200,7 @@ REPAIRS: Final = (
         "(stiffness * (shortest - data.ten_length))",
         "(stiffness * (data.ten_length - shortest))",
         "no effect on any value",
-        ("tests/test_repairs.py",),
+        ("tests/test_repairs.py::test_tendon_springs_are_linear_at_rest",),
         "tendon",
     ),
 )
@@ -211,7 +212,7 @@ INTEGRATION: Final = (
         "0.5 - square / 48 +",
         "0.5 - square / 24 +",
         "a wrong coefficient of a series, used below 0.01 rad",
-        ("tests/test_integration.py",),
+        ("tests/test_integration.py::test_values_are_scipys_and_mjxs",),
         "ball",
     ),
     Defect(
@@ -220,7 +221,7 @@ INTEGRATION: Final = (
         "w * a + x * cosine + y * c - z * b",
         "w * a + x * cosine - y * c + z * b",
         "one entry of the product in the other order",
-        ("tests/test_integration.py",),
+        ("tests/test_integration.py::test_values_are_scipys_and_mjxs",),
         "ball",
     ),
     Defect(
@@ -229,7 +230,7 @@ INTEGRATION: Final = (
         "jnp.where(real < 0, -real, real), jnp.where(real < 0, -axis, axis)",
         "jnp.where(real < 0, -real, real), axis",
         "q and -q are one orientation, and both parts change sign",
-        ("tests/test_repairs.py", "tests/test_integration.py"),
+        ("tests/test_repairs.py::test_both_quaternions_of_an_orientation_are_one",),
         "ball",
     ),
 )
@@ -241,7 +242,7 @@ CONTACT: Final = (
         "return 2 * (condim - 1) * float(host.opt.impratio)",
         "return (condim - 1) * float(host.opt.impratio)",
         "a pyramid has two edges for each direction of friction",
-        ("tests/test_contact.py",),
+        ("tests/test_contact.py::test_effective_masses",),
     ),
     Defect(
         "margin-twice",
@@ -249,7 +250,7 @@ CONTACT: Final = (
         "fill(model.geom_margin, contact.margin / 2)",
         "fill(model.geom_margin, contact.margin)",
         "MuJoCo adds the margins of two geoms",
-        ("tests/test_contact.py",),
+        ("tests/test_contact.py::test_contact_parameters_reach_every_contact",),
     ),
     Defect(
         "friction-of-a-pair",
@@ -257,7 +258,7 @@ CONTACT: Final = (
         "jnp.stack([sliding, sliding, torsional, rolling, rolling])",
         "jnp.stack([sliding, torsional, torsional, rolling, rolling])",
         "a pair has five numbers where a geom has three",
-        ("tests/test_contact.py",),
+        ("tests/test_contact.py::test_contact_parameters_reach_every_contact",),
     ),
     Defect(
         "half-critical-damping",
@@ -265,7 +266,7 @@ CONTACT: Final = (
         "b = 2 * (dampratio or 0.0) * math.sqrt(k)",
         "b = (dampratio or 0.0) * math.sqrt(k)",
         "c = 2 zeta sqrt(k m) without its 2",
-        ("tests/test_contact.py",),
+        ("tests/test_contact.py::test_a_damping_ratio_of_one_is_critical",),
     ),
 )
 
