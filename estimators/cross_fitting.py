@@ -5,6 +5,7 @@ from typing import Any, Final
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array
 
 from estimators.types import GradientEstimate
 
@@ -80,8 +81,8 @@ def _pooled(parts: Sequence[GradientEstimate]) -> GradientEstimate:
     rows = jnp.concatenate([part.per_sample for part in parts])
     shares = [len(part.per_sample) / len(rows) for part in parts]
 
-    def average(*values):
-        return sum(share * value for share, value in zip(shares, values, strict=True))
+    def average(*values: Array) -> Array:
+        return jnp.asarray(sum(share * value for share, value in zip(shares, values, strict=True)))
 
     return GradientEstimate(
         per_sample=rows,

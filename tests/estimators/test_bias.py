@@ -59,7 +59,7 @@ def verdicts(share: float, samples: int, params: int = 1, trials: int = 1000) ->
     Returns:
         How often the 5 % test rejects, how often it has effective samples enough, and how often it rejects of those.
     """
-    gradient = np.ones(params)
+    gradient = jnp.ones(params)
 
     @jax.jit
     def batch(keys: Array) -> tuple[Array, Array]:
