@@ -40,7 +40,7 @@ class Interval:
         if abs(value) > sys.float_info.max and isinstance(value, Integral):  # which no float can hold
             return False
         above = value >= self.low if self.text[0] == "[" else value > self.low
-        return above and (value <= self.high if self.text[-1] == "]" else value < self.high)
+        return bool(above and (value <= self.high if self.text[-1] == "]" else value < self.high))  # of NumPy's, too
 
     def __str__(self) -> str:
         bracket, low, high = self.text[0], _plain(self.low), _plain(self.high)
