@@ -293,9 +293,10 @@ def test_gradients_are_taken_where_theta_says() -> None:
     plan = study.plan_compare(config(theta=(0.0, 1.0, 2.0, 3.0)))
     np.testing.assert_array_equal(plan.task.theta, np.arange(4))
     assert plan.task.theta.dtype == jnp.float64
-    for theta in ((1.0,), (float("nan"),) * 4):
-        with pytest.raises(ValueError, match=f"theta has {len(theta)} numbers; pusher needs 4, all of them"):
-            study.plan_compare(config(theta=theta))
+    with pytest.raises(ValueError, match="theta has 1 numbers; pusher needs 4, all of them"):
+        study.plan_compare(config(theta=(1.0,)))
+    with pytest.raises(ValueError, match="theta must be finite, got nan"):
+        study.plan_compare(config(theta=(float("nan"),) * 4))
 
 
 def test_a_task_in_place_of_a_name() -> None:
