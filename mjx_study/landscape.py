@@ -278,7 +278,7 @@ def _direction(direction: str, params: int, seed: int) -> Float[np.ndarray, " pa
     if direction == "random":
         drawn = np.random.default_rng(seed).normal(size=params)
         return drawn / np.linalg.norm(drawn)
-    if not direction.isdigit() or int(direction) >= params:
+    if not direction.isdecimal() or int(direction) >= params:
         raise ValueError(f"direction must be random or a parameter's index, 0 to {params - 1}; got {direction}")
     return np.eye(params)[int(direction)]
 

@@ -12,11 +12,13 @@ import io
 import json
 import signal
 import string
+import sys
 from collections import Counter
 from collections.abc import Generator, Sequence
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 import pytest
 from hypothesis import strategies as st
@@ -48,6 +50,7 @@ def stub(monkeypatch: pytest.MonkeyPatch) -> None:
         raise Planned
 
     monkeypatch.setattr(options, "configure", lambda **_: None)
+    mujoco.set_mju_user_warning(lambda message: print(f"MuJoCo: {message}", file=sys.stderr))  # as `configure` does
     for module, names in (
         (compare, ("compare",)), (optimise, ("optimise",)), (sweep, ("open_store", "run_sweep")),
         (landscape, ("landscape",)), (gradcheck.check, ("gradcheck",)), (bench.benchmark, ("bench",)),
