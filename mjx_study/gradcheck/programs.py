@@ -112,7 +112,6 @@ class Programs:
 
     def linear(self, setting: Setting, base: HostState) -> Linear:
         """Value and derivatives of the project's own step at a state."""
-        num_state = self.layout.num_state
         tape = self._derivatives(self._tape, setting, base) if self._has_tape else None
         if not uses_jacobian(self.layout.scene):
             assert tape is not None
@@ -121,10 +120,9 @@ class Programs:
         if tape is None:
             return Linear(qpos, residual, forward, reverse, None)
         # over parameters both modes take the tape
-        forward, reverse = (
-            np.concatenate([part, whole[:, num_state:]], axis=1)
-            for part, whole in ((forward, tape[2]), (reverse, tape[3]))
-        )
+        parameters = self.layout.columns("contact")
+        forward = np.concatenate([forward, tape[2][:, parameters]], axis=1)
+        reverse = np.concatenate([reverse, tape[3][:, parameters]], axis=1)
         return Linear(qpos, residual, forward, reverse, tape[3])
 
     def stock_step(self, setting: Setting, base: HostState) -> HostState:
@@ -161,7 +159,9 @@ class Programs:
         """Outputs after a change, relative to a position or to what it is after the step; and the state there."""
         layout = self.layout
         moved, moved_control = layout.state(state, control, change)
-        after, *rest = step_function(layout.scene, layout.model(*setting, parameters), moved, moved_control)
+        after, *rest = step_function(
+            layout.scene, layout.model(setting[0], setting[1], parameters), moved, moved_control
+        )
         reference = jax.lax.stop_gradient(after.qpos) if reference is None else reference
         tangent = difference_position(layout.scene.host, reference, after.qpos)
         return jnp.concatenate([tangent, after.qvel, after.act]), (after, *rest)
@@ -170,7 +170,7 @@ class Programs:
         def one(change):
             parameters = change[self.layout.num_state :]
             output, (after, _, data) = self._after(exact_step, setting, state, control, change, parameters, reference)
-            model = self.layout.model(*setting, parameters)
+            model = self.layout.model(setting[0], setting[1], parameters)
             return output, after, _stages(model, data)
 
         return jax.lax.map(one, changes)
@@ -201,7 +201,7 @@ class Programs:
 
     def _stock_step(self, setting, state, control):
         scene, parameters = self.layout.scene, jnp.zeros(len(self.layout.scales))
-        model = constraint.with_generous_budget(self.layout.model(*setting, parameters))
+        model = constraint.with_generous_budget(self.layout.model(setting[0], setting[1], parameters))
         return _mjx_step(scene, model, state, control)[0]
 
 
