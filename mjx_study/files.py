@@ -78,7 +78,7 @@ def told(error: ValidationError) -> str:
 def _option(name: str, kind: Any, interval: str = "") -> Any:
     """What an option takes, or null."""
     option = OPTIONS[name].within(interval) if interval else OPTIONS[name]
-    return Annotated[kind, AfterValidator(option.check)] | None
+    return Annotated[kind, AfterValidator(option.check)] | None  # type: ignore[operator]
 
 
 class PolicyFile(BaseModel):

@@ -54,7 +54,7 @@ LINE: dict[str, Any] = {
 
 
 def config(**changes: Any) -> SweepConfig:
-    of_gradients = {} if {"iterations", "points"} & changes.keys() else {"reference_samples": 6}
+    of_gradients: dict[str, Any] = {} if {"iterations", "points"} & changes.keys() else {"reference_samples": 6}
     return SweepConfig(**(SMALL | of_gradients | changes))
 
 
