@@ -19,9 +19,10 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from mjx_study._mjx import mjx
+from mjx_study.repairs import repaired
 from mjx_study.scene import num_constraint_rows
 
 _ELLIPTIC = mujoco.mjtCone.mjCONE_ELLIPTIC
@@ -204,6 +205,58 @@ def solve(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]:
         initial_guess=data.qacc_warmstart,
         solve=lambda _, __: jax.lax.stop_gradient(run_solver(model, data)),
         tangent_solve=tangent_solve,
+    )
+
+
+def guard_rows(model: mjx.Model, data: mjx.Data) -> tuple[np.ndarray, np.ndarray]:
+    """Which constraint rows belong to each guard, limits first and then contacts; static.
+
+    Returns:
+        Weights `(guards, rows)` that make the guard's normal row of them, the mean of two opposite edges of a pyramid;
+        and which rows switch on with it, `(guards, rows)` of 0 and 1.
+    """
+    rows: Any = data._impl
+    spans = [(rows.ne + rows.nf + index, 1, 1) for index in range(rows.nl)]
+    for condim, address in zip(rows.contact.dim, rows.contact.efc_address, strict=True):
+        pyramid = condim > 1 and model.opt.cone != _ELLIPTIC
+        spans.append((int(address), 2 if pyramid else 1, 2 * (int(condim) - 1) if pyramid else int(condim)))
+    weights, members = (np.zeros((len(spans), num_constraint_rows(data))) for _ in range(2))
+    for index, (first, normals, count) in enumerate(spans):
+        weights[index, first : first + normals] = 1 / normals
+        members[index, first : first + count] = 1.0
+    return weights, members
+
+
+def guards(model: mjx.Model, data: mjx.Data) -> tuple[Float[Array, " guards"], Float[Array, " guards"]]:
+    """Distance less margin [m or rad] and its rate [m/s or rad/s] of every limit and contact that acts; else zeros."""
+    weights, members = guard_rows(model, data)
+    rows: Any = data._impl
+    first = members.argmax(axis=1) if len(members) else np.zeros(0, int)
+    return (rows.efc_pos - rows.efc_margin)[first], jnp.asarray(weights, rows.efc_J.dtype) @ (rows.efc_J @ data.qvel)
+
+
+def at_onset(
+    model: mjx.Model, data: mjx.Data, members: Float[Array, " rows"], on: Bool[Array, ""]
+) -> mjx.Data:
+    """The state with some constraint rows just touching (no penetration, impedance d_0), or gone.
+
+    Args:
+        model: the model on the device.
+        data: a state with its constraint rows.
+        members: 1 for these rows, 0 for those that stay as they are.
+        on: whether they act.
+    """
+    with repaired(touching=True):
+        touching: Any = mjx.make_constraint(model, data)._impl
+    rows: Any = data._impl
+    chosen, acts = members > 0, jnp.where(on, 1.0, 0.0).astype(rows.efc_J.dtype)
+    keep = jnp.where(chosen, acts, 1.0)
+    return data.tree_replace(
+        {
+            "_impl.efc_J": rows.efc_J * keep[:, None],
+            "_impl.efc_D": jnp.where(chosen, touching.efc_D, rows.efc_D),
+            "_impl.efc_aref": jnp.where(chosen, touching.efc_aref, rows.efc_aref) * keep,
+        }
     )
 
 

@@ -98,14 +98,25 @@ def exact_step(
     if scene.host.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
         return *step(scene, model, state, control), data
     qacc = constraint.solve_to_rounding(model, data)
-    qvel, act = _finish(model, data, qacc)
+    qvel, act = advance_velocity(model, data, qacc)
     qpos = integrate_position(scene.host, state.qpos, qvel, model.opt.timestep)
     return State(qpos, qvel, act, qacc), constraint.residual(model, data, qacc), data
 
 
 def smooth_stages(scene: Scene, model: mjx.Model, state: State, control: Float[Array, " nu"]) -> mjx.Data:
     """All of a step that comes before the constraint solve: kinematics, contacts, forces, constraint rows."""
-    return _force_stage(model, _position_stage(scene, model, state.qpos), state.qvel, state.act, control)
+    return force_stage(model, position_stage(scene, model, state.qpos), state.qvel, state.act, control)
+
+
+def solved_step(
+    scene: Scene, model: mjx.Model, state: State, control: Float[Array, " nu"]
+) -> tuple[State, Float[Array, ""], tuple[Float[Array, " guards"], Float[Array, " guards"]]]:
+    """`step` without a derivative, and what its contacts and limits do: `constraint.guards` at the state before."""
+    data = smooth_stages(scene, model, state, control)
+    qacc = constraint.run_solver(model, data.replace(qacc_warmstart=state.warmstart))
+    qvel, act = advance_velocity(model, data, qacc)
+    qpos = integrate_position(scene.host, state.qpos, qvel, model.opt.timestep)
+    return State(qpos, qvel, act, qacc), constraint.residual(model, data, qacc), constraint.guards(model, data)
 
 
 ControlLaw = Callable[[Int[Array, ""], State], Float[Array, " nu"]]
@@ -155,7 +166,7 @@ def uses_jacobian(scene: Scene) -> bool:
 # jitted so that JAX traces MJX's many operations once and not for every direction; XLA inlines them again.
 
 
-def _position_stage(scene: Scene, model: mjx.Model, qpos: Float[Array, " nq"]) -> mjx.Data:
+def position_stage(scene: Scene, model: mjx.Model, qpos: Float[Array, " nq"]) -> mjx.Data:
     return _fwd_position(model, scene.template.replace(qpos=qpos))
 
 
@@ -166,7 +177,7 @@ def _fwd_position(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 
 
 @jax.jit
-def _force_stage(
+def force_stage(
     model: mjx.Model,
     data: mjx.Data,
     qvel: Float[Array, " nv"],
@@ -184,7 +195,7 @@ def _force_stage(
 
 
 @jax.jit
-def _finish(
+def advance_velocity(
     model: mjx.Model, data: mjx.Data, qacc: Float[Array, " nv"]
 ) -> tuple[Float[Array, " nv"], Float[Array, " na"]]:
     """Velocity and activation after the step, from the constrained acceleration; MJX's own integrators."""
@@ -196,9 +207,9 @@ def _finish(
 
 @jax.jit
 def _constrained_update(model: mjx.Model, data: mjx.Data, qvel: Array, act: Array, control: Array, warmstart: Array):
-    data = _force_stage(model, _fwd_position(model, data), qvel, act, control)
+    data = force_stage(model, _fwd_position(model, data), qvel, act, control)
     qacc = checkpoint_name(constraint.solve(model, data.replace(qacc_warmstart=warmstart)), "qacc")
-    return *_finish(model, data, qacc), qacc, constraint.residual(model, data, qacc)
+    return *advance_velocity(model, data, qacc), qacc, constraint.residual(model, data, qacc)
 
 
 def _update(scene: Scene):
@@ -268,8 +279,8 @@ def _jacobian(model: mjx.Model, template: mjx.Data, qpos: Array, qvel: Array, ac
         return _fwd_position(model, template.replace(qpos=qpos))
 
     def equations(data, qvel, act, control, qacc):
-        data = _force_stage(model, data, qvel, act, control)
-        return jnp.concatenate([constraint.imbalance(model, data, qacc), *_finish(model, data, qacc)])
+        data = force_stage(model, data, qvel, act, control)
+        return jnp.concatenate([constraint.imbalance(model, data, qacc), *advance_velocity(model, data, qacc)])
 
     def columns(function, point):
         push = lambda direction: jax.jvp(function, (point,), (direction,))[1]  # noqa: E731
@@ -294,7 +305,7 @@ def _runge_kutta(scene: Scene, model: mjx.Model, state: State, control: Float[Ar
     timestep = model.opt.timestep
 
     def slopes(qpos, qvel, act):
-        data = _force_stage(model, _position_stage(scene, model, qpos), qvel, act, control)
+        data = force_stage(model, position_stage(scene, model, qpos), qvel, act, control)
         return qvel, data.qacc_smooth, data.act_dot
 
     def moved(fraction, slope):
@@ -312,6 +323,6 @@ def _runge_kutta(scene: Scene, model: mjx.Model, state: State, control: Float[Ar
     if state.act.size == 0:
         return State(qpos, qvel, state.act, qacc)
     # MJX's own advance of the activation, with its clamping
-    data = _force_stage(model, _position_stage(scene, model, state.qpos), state.qvel, state.act, control)
+    data = force_stage(model, position_stage(scene, model, state.qpos), state.qvel, state.act, control)
     act = mjx.euler(model, data.replace(act_dot=mean[2], qacc=data.qacc_smooth)).act
     return State(qpos, qvel, act, qacc)

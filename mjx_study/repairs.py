@@ -61,6 +61,14 @@ def stiffness_damping_impedance(
     return k, b, impedance
 
 
+def _touching(
+    model: mjx.Model, solref: Float[Array, " 2"], solimp: Float[Array, " 5"], position: Float[Array, ""]
+) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
+    """The same of a row without penetration, whose spring has no force yet."""
+    k, b, impedance = stiffness_damping_impedance(model, solref, solimp, jnp.zeros_like(position))
+    return jnp.zeros_like(k), b, impedance
+
+
 def rotation_vector(quaternion: Float[Array, " 4"]) -> tuple[Float[Array, " 3"], Float[Array, ""]]:
     """(rotation vector [rad], 1) in place of MJX's (axis, angle), of which it only ever takes the product."""
     still = jnp.zeros_like(quaternion).at[0].set(1.0)
@@ -119,8 +127,11 @@ _REPLACED: Final[dict[tuple[str, str], Callable[..., Any]]] = {
 
 
 @contextlib.contextmanager
-def repaired() -> Generator[None]:
+def repaired(*, touching: bool = False) -> Generator[None]:
     """What is traced inside has MJX call the functions of this module in place of its own.
+
+    Args:
+        touching: have every constraint row that acts be that of bodies which only just touch.
 
     MJX offers no other place for them: they are called deep inside its pipeline. A version of MJX that no longer has
     one is an error here, not a silent return of its faults.
@@ -129,7 +140,8 @@ def repaired() -> Generator[None]:
         RuntimeError: MJX has no function of such a name.
     """
     with _LOCK, contextlib.ExitStack() as undo:
-        for (module_name, name), ours in _REPLACED.items():
+        replaced = _REPLACED | ({("constraint", "_kbi"): _touching} if touching else {})
+        for (module_name, name), ours in replaced.items():
             module = _module(module_name)
             original = getattr(module, name, None)
             if original is None:

@@ -43,8 +43,8 @@ def laws(request):
 
     def evaluate(qacc):
         qpos, qvel, act, control = split(scene, jnp.asarray(point))
-        positioned = dynamics._position_stage(scene, scene.model, qpos)
-        data = dynamics._force_stage(scene.model, positioned, qvel, act, control)
+        positioned = dynamics.position_stage(scene, scene.model, qpos)
+        data = dynamics.force_stage(scene.model, positioned, qvel, act, control)
         context = solver.Context.create(scene.model, data.replace(qacc=qacc))
         rows: Any = data._impl
         slack = rows.efc_J @ qacc - rows.efc_aref
@@ -131,8 +131,8 @@ def resting():
     scene = scene_of(floor_scene(slider(3), option(extra='cone="elliptic"')))
 
     def evaluate(height, qacc):
-        data = dynamics._position_stage(scene, scene.model, jnp.zeros(3).at[2].set(height))
-        data = dynamics._force_stage(scene.model, data, jnp.asarray([0.3, 0.0, -0.1]), jnp.zeros(0), jnp.zeros(0))
+        data = dynamics.position_stage(scene, scene.model, jnp.zeros(3).at[2].set(height))
+        data = dynamics.force_stage(scene.model, data, jnp.asarray([0.3, 0.0, -0.1]), jnp.zeros(0), jnp.zeros(0))
         solved = constraint.solve(scene.model, data)
         return solved, constraint.residual(scene.model, data, solved), constraint.residual(scene.model, data, qacc)
 
@@ -167,8 +167,8 @@ def test_the_residual_of_nothing_is_zero() -> None:
     scene = scene_of(floor_scene(slider(1, height=0.5), option(extra='gravity="0 0 0"'), 'condim="1"'))
 
     def residual(qpos):
-        data = dynamics._position_stage(scene, scene.model, qpos)
-        data = dynamics._force_stage(scene.model, data, jnp.zeros(3), jnp.zeros(0), jnp.zeros(0))
+        data = dynamics.position_stage(scene, scene.model, qpos)
+        data = dynamics.force_stage(scene.model, data, jnp.zeros(3), jnp.zeros(0), jnp.zeros(0))
         return constraint.residual(scene.model, data, jnp.zeros(3))
 
     assert float(jax.jit(residual)(jnp.zeros(3))) == 0.0

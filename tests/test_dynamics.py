@@ -86,14 +86,14 @@ def polished_step(scene: Scene, model, point: jax.Array) -> jax.Array:
     harmless, but not to differences of 3e-6. Newton's method on the equation itself has no such floor.
     """
     qpos, qvel, act, control = split(scene, point)
-    data = dynamics._force_stage(model, dynamics._position_stage(scene, model, qpos), qvel, act, control)
+    data = dynamics.force_stage(model, dynamics.position_stage(scene, model, qpos), qvel, act, control)
 
     def newton(qacc, _):
         gap = lambda qacc: constraint.imbalance(model, data, qacc)  # noqa: E731
         return qacc - jnp.linalg.solve(jax.jacfwd(gap)(qacc), gap(qacc)), None
 
     qacc, _ = jax.lax.scan(newton, constraint.run_solver(model, data), length=3)
-    qvel, act = dynamics._finish(model, data, qacc)
+    qvel, act = dynamics.advance_velocity(model, data, qacc)
     return jnp.concatenate([integrate_position(scene.host, qpos, qvel, model.opt.timestep), qvel, act])
 
 
@@ -122,7 +122,7 @@ def test_the_step_is_mjxs(name: str) -> None:
 
     def compare(model, point, warmstart, qacc):
         qpos, qvel, act, control = split(scene, point)
-        data = dynamics._force_stage(model, dynamics._position_stage(scene, model, qpos), qvel, act, control)
+        data = dynamics.force_stage(model, dynamics.position_stage(scene, model, qpos), qvel, act, control)
 
         inertia = mjx.full_m(model, data)
 
