@@ -43,11 +43,13 @@ class Differentiation:
         value: f_i, the total cost, [cost].
         gradient: grad_theta f_i at fixed noise, [cost/param].
         residual: How far sample i's own numerical solve was from converged, relative; None for closed forms.
+        events: Discontinuities that the gradient allows for: found, bounded, and left out; None if it allows for none.
     """
 
     value: Float[Array, " samples"]
     gradient: Float[Array, "samples params"]
     residual: Float[Array, " samples"] | None = None
+    events: Float[Array, "samples 3"] | None = None
 
 
 @register_pytree
@@ -83,13 +85,14 @@ class StepDifferentiation:
         value: V_1^i, the total cost, [cost].
         noise_gradient: dV_1^i / dw_h, which is dV_1^i / du_h, [cost/control].
         policy_jacobian: As in `StepEvaluation`.
-        residual: As in `Differentiation`.
+        residual, events: As in `Differentiation`.
     """
 
     value: Float[Array, " samples"]
     noise_gradient: Float[Array, "samples steps controls"]
     policy_jacobian: Float[Array, "samples steps controls params"] | None
     residual: Float[Array, " samples"] | None = None
+    events: Float[Array, "samples 3"] | None = None
 
 
 @register_pytree

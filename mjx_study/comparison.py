@@ -79,6 +79,8 @@ class Row:
         residual: largest relative solver residual in the batches.
         unconverged: samples whose residual is above the threshold.
         nonfinite: samples left out because they were not finite.
+        onsets, onsets_bounded, onsets_missed: of contact that the first-order batch met, those at grazing speed whose
+            term was bounded, and those without a term; None without the onset term.
     """
 
     contact: str
@@ -116,6 +118,9 @@ class Row:
     residual: float
     unconverged: int
     nonfinite: int
+    onsets: int | None = None
+    onsets_bounded: int | None = None
+    onsets_missed: int | None = None
 
     @property
     def believable(self) -> bool:

@@ -62,6 +62,7 @@ class EstimatorConfig(Checked):
         window: steps between cuts of the truncated first-order estimate.
         tolerance: of the discontinuity test of "ddcg".
         weights: plug_in or cross_fitted, of the estimators that interpolate.
+        onset: none, or linear for first-order gradients with the term of contact that begins; see `mjx_study.onset`.
         damping: of the contact [N s/m]; None for each family's.
         cone: pyramidal or elliptic; None for the MJCF's.
         horizon: steps; None for the task's.
@@ -85,6 +86,7 @@ class EstimatorConfig(Checked):
     window: int | None = None
     tolerance: float = PUBLISHED_TOLERANCE
     weights: str = PLUG_IN
+    onset: str = "none"
     damping: float | None = None
     cone: str | None = None
     horizon: int | None = None
@@ -154,7 +156,7 @@ def configured_task(config: EstimatorConfig, task: Task | None = None) -> Task:
     else:
         check_shapes(task)
     changes = {"sigma": config.sigma, "noise": config.noise}
-    return task.replace(**{name: value for name, value in changes.items() if value is not None})
+    return task.replace(onset=config.onset, **{name: value for name, value in changes.items() if value is not None})
 
 
 def at_theta(task: Task, theta: Sequence[float] | None) -> Task:
@@ -241,6 +243,10 @@ def check_estimators(names: Sequence[str], task: Task, options: EstimatorOptions
             raise ValueError(f"{name!r} holds for Gaussian noise only; the noise is {task.noise}")
         if name in ADDITIVE_ONLY and not task.policy.additive:
             raise ValueError(f"{name!r} needs noise that is added to theta itself; {task.name} has a feedback policy")
+        if task.onset != "none" and "linearisation" in ESTIMATORS[name].needs:
+            raise ValueError(
+                f"{name!r} needs the derivatives of single steps, which have no onset term; leave onset out"
+            )
 
 
 def plan_cells(

@@ -152,6 +152,14 @@ def alarms(result: CompareResult) -> list[str]:
             messages.append(
                 f"{where}: {row.unconverged} samples have an unconverged solve (residual {row.residual:.1e})"
             )
+        if row.onsets_missed:
+            messages.append(
+                f"{where}: {row.onsets_missed} of {row.onsets} onsets of contact have no term: there are too many"
+            )
+        if row.onsets_bounded:
+            messages.append(
+                f"{where}: {row.onsets_bounded} of {row.onsets} onsets are grazing, and their terms bounded"
+            )
     return messages + list(result.warnings)
 
 

@@ -235,9 +235,7 @@ def guards(model: mjx.Model, data: mjx.Data) -> tuple[Float[Array, " guards"], F
     return (rows.efc_pos - rows.efc_margin)[first], jnp.asarray(weights, rows.efc_J.dtype) @ (rows.efc_J @ data.qvel)
 
 
-def at_onset(
-    model: mjx.Model, data: mjx.Data, members: Float[Array, " rows"], on: Bool[Array, ""]
-) -> mjx.Data:
+def at_onset(model: mjx.Model, data: mjx.Data, members: Float[Array, " rows"], on: Bool[Array, ""]) -> mjx.Data:
     """The state with some constraint rows just touching (no penetration, impedance d_0), or gone.
 
     Args:

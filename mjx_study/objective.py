@@ -21,6 +21,7 @@ from estimators import Differentiation, Evaluation, Linearisation, StepDifferent
 from mjx_study.contact import ContactModel, apply_contact
 from mjx_study.dynamics import State, rollout, step
 from mjx_study.noise import noise_score, split_sample_key, standard_noise
+from mjx_study.onset import OnsetCounts, as_row, corrected_rollout
 from mjx_study.task import Task, check_sigma
 
 MAX_CHUNK: Final = {"cpu": 512, "gpu": 2**15 + 1, "tpu": 2**15 + 1}
@@ -35,7 +36,8 @@ def rollout_cost(
     contact: ContactModel | None,
     start: State,
     noise: Float[Array, "steps dimensions"],
-) -> tuple[Float[Array, ""], tuple[State, Float[Array, "horizon nu"], Float[Array, ""]]]:
+    onset: str = "none",
+) -> tuple[Float[Array, ""], tuple[State, Float[Array, "horizon nu"], Float[Array, ""], OnsetCounts | None]]:
     """Total cost V_1 of one rollout, a pure function of everything that may be traced or differentiated.
 
     Args:
@@ -44,10 +46,11 @@ def rollout_cost(
         contact: the contact model; None for the MJCF's own.
         start: the start state, before the policy acts on it.
         noise: of the policy's `noise_shape`.
+        onset: "none", or "linear" for a derivative with the onset term (see `mjx_study.onset`).
 
     Returns:
-        The cost; and the states `(horizon + 1, ...)` with the start first, the controls, and the largest relative
-        solver residual.
+        The cost; and the states `(horizon + 1, ...)` with the start first, the controls, the largest relative
+        solver residual, and what the onset term met (None without it).
     """
     feedforward = task.policy.feedforward(theta, noise)
 
@@ -57,9 +60,13 @@ def rollout_cost(
 
     model = apply_contact(task.scene.model, contact)
     first = task.policy.place(theta, noise, start)
-    states, controls, residuals = rollout(task.scene, model, first, control_law, task.horizon)
+    simulated, counts = (task.scene, model, first, control_law, task.horizon), None
+    if onset == "none":
+        states, controls, residuals = rollout(*simulated)
+    else:
+        states, controls, residuals, counts = corrected_rollout(*simulated)
     cost = jnp.sum(jax.vmap(task.running_cost)(_before_each_step(states), controls)) + task.final_cost(_last(states))
-    return cost, (states, controls, jnp.max(residuals))
+    return cost, (states, controls, jnp.max(residuals), counts)
 
 
 def simulate(
@@ -80,7 +87,7 @@ def simulate(
     """
     start_key, noise_key = split_sample_key(key)
     noise = noise_scale * task.sigma * standard_noise(noise_key, task.policy.noise_shape, theta.dtype, task.noise)
-    cost, (states, controls, residual) = rollout_cost(task, theta, contact, task.draw_start(start_key), noise)
+    cost, (states, controls, residual, _) = rollout_cost(task, theta, contact, task.draw_start(start_key), noise)
     return states, controls, cost, residual
 
 
@@ -173,38 +180,38 @@ class Simulator:
         standard = standard_noise(noise_key, task.policy.noise_shape, dtype, task.noise)
         return task.draw_start(start_key), noise_scale * sigma * standard
 
-    def _cost(self, theta, contact, sigma, key_data, noise_scale):
-        """Cost of one rollout, and its states, controls, noise and largest solver residual."""
+    def _cost(self, theta, contact, sigma, key_data, noise_scale, onset="none"):
+        """Cost of one rollout, and its states, controls, noise, largest solver residual and onsets."""
         start, noise = self._draw(sigma, key_data, noise_scale)
-        cost, (states, controls, residual) = rollout_cost(self.task, theta, contact, start, noise)
-        return cost, (states, controls, noise, residual)
+        cost, (states, controls, residual, counts) = rollout_cost(self.task, theta, contact, start, noise, onset)
+        return cost, (states, controls, noise, residual, counts)
 
     def _sample_value(self, theta, contact, sigma, key_data, noise_scale):
-        value, (states, _, noise, residual) = self._cost(theta, contact, sigma, key_data, noise_scale)
+        value, (states, _, noise, residual, _) = self._cost(theta, contact, sigma, key_data, noise_scale)
         scores = noise_score(noise, sigma, self.task.noise)
         return value, self.task.policy.score(theta, _before_each_step(states), scores), residual
 
     def _sample_gradient(self, theta, contact, sigma, key_data, noise_scale):
-        (value, (*_, residual)), gradient = jax.value_and_grad(self._cost, has_aux=True)(
-            theta, contact, sigma, key_data, noise_scale
+        (value, (*_, residual, counts)), gradient = jax.value_and_grad(self._cost, has_aux=True)(
+            theta, contact, sigma, key_data, noise_scale, self.task.onset
         )
-        return value, gradient, residual
+        return value, gradient, residual, as_row(counts)
 
     def _sample_steps(self, theta, contact, sigma, key_data, noise_scale):
-        _, (states, controls, noise, residual) = self._cost(theta, contact, sigma, key_data, noise_scale)
+        _, (states, controls, noise, residual, _) = self._cost(theta, contact, sigma, key_data, noise_scale)
         return self._step_terms(theta, states, controls, noise, sigma), residual
 
     def _sample_step_gradient(self, theta, contact, sigma, key_data, noise_scale):
         start, noise = self._draw(sigma, key_data, noise_scale)
-        (value, (states, _, residual)), gradient = jax.value_and_grad(
-            lambda noise: rollout_cost(self.task, theta, contact, start, noise), has_aux=True
+        (value, (states, _, residual, counts)), gradient = jax.value_and_grad(
+            lambda noise: rollout_cost(self.task, theta, contact, start, noise, self.task.onset), has_aux=True
         )(noise)
-        return value, gradient, self._policy_jacobian(theta, states), residual
+        return value, gradient, self._policy_jacobian(theta, states), residual, as_row(counts)
 
     def _sample_linearisation(self, theta, contact, sigma, key_data, noise_scale):
         task = self.task
         start, noise = self._draw(sigma, key_data, noise_scale)
-        _, (states, controls, residual) = rollout_cost(task, theta, contact, start, noise)
+        _, (states, controls, residual, _) = rollout_cost(task, theta, contact, start, noise)
         model, before, last = apply_contact(task.scene.model, contact), _before_each_step(states), _last(states)
         sizes = np.cumsum([states.qpos.shape[1], states.qvel.shape[1]])
 
@@ -343,7 +350,7 @@ class MjxObjective:
 
     def differentiate(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> Differentiation:
         """Values and exact gradients of each sample's cost with respect to theta."""
-        return Differentiation(*map(jnp.asarray, self._run("gradient", theta, keys)))
+        return Differentiation(*jax.tree.map(jnp.asarray, self._run("gradient", theta, keys)))
 
     def evaluate_steps(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> StepEvaluation:
         """The rollouts of `evaluate`, step by step."""

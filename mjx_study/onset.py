@@ -1,26 +1,30 @@
-r"""First-order derivatives of rollouts that know that contact begins at a step, and that the step can change.
+r"""Derivatives of rollouts that allow for the step at which contact begins to change.
 
-Where a guard phi (the distance of a contact or a limit, less its margin) falls below zero, MuJoCo's force sets in with a
-jump. The derivative of a rollout holds the step at which that happens fixed. With noise of a smooth density the gradient of the
-mean cost has a second part, carried by the rollouts at which the step changes,
+Where a guard phi (the distance of a contact or a limit, less its margin) falls below zero, MuJoCo's force sets in with
+a jump. The derivative of a rollout holds the step at which that happens fixed. With noise of a smooth density the
+gradient of the mean cost has a second part, carried by the rollouts at which the step changes:
 
     grad F = E[grad f] - sum_k E[delta(phi_k) J_k grad phi_k],     J_k = V_{k+1}(on) - V_{k+1}(off) at phi_k = 0,
 
-with V the cost to go. A rollout in which contact begins at step k has phi_k in (D, 0], where D = phi_k - phi_{k-1} = h n^T v_k and
-n = d phi / dq. It lies between two such rollouts: one at which contact begins just so at step k (phi_k = 0), and one at which it would
-have begun at step k - 1 (phi_{k-1} = 0). Where phi is spread evenly over the cell, linear interpolation between the two gives
-both their weights, and every term belongs to a rollout that is there anyway. With s = phi_k / D and Delta_k the jump of the velocity after step k,
+with V the cost to go. A rollout in which contact begins at step k has phi_k in (D, 0], D = phi_k - phi_{k-1} = h n^T v_k
+with n = d phi / dq. It lies between two others: one in which contact only just begins at step k (phi_k = 0), and one in
+which it would have begun at step k - 1 (phi_{k-1} = 0). If phi is spread evenly over this cell, linear interpolation gives
+the weights of both, and every term belongs to a rollout that exists anyway. With s = phi_k / D and Delta_k the jump of
+the velocity after step k,
 
-    dx_{k+1} = A_k dx_k  +  (1 - s) Delta_k (n^T dq_k) / D  +  s A_k (h Delta_{k-1}, Delta_{k-1}) (n^T dq_{k-1}) / D,
+    dx_{k+1} = A_k dx_k + (1 - s) Delta_k (n^T dq_k) / D + s A_k (h Delta_{k-1}, Delta_{k-1}) (n^T dq_{k-1}) / D,
 
-n^T dq_{k-1} = n^T (dq_k - h dv_k). This is the saltation matrix of a time-stepping scheme, of second order in the timestep: with the first
-weight alone (s = 0) the error is of first order in h b, b the contact's damping. What is not covered: contact at the start, a
-force that jumps when contact ends (impedance and a force that presses), and the edges of features, where the contact point itself jumps.
+n^T dq_{k-1} = n^T (dq_k - h dv_k). This is the saltation matrix of a time-stepping scheme. Its error falls with h^2; the
+first weight alone (s = 0) leaves an error of h b, where b is the contact's damping [1/s].
 
-A cell narrower than `h |a|`, a the acceleration of the guard, is taken as that wide: there the speed of the guard is not
-constant over the step, and without a bound grazing contacts have no finite variance. Each such onset is counted.
+Not covered: contact at the start; a force that jumps where contact ends (impedance and a force that presses); edges of
+features, where the contact point itself jumps.
 
-Reference: Suh et al. 2022 leave it open; for the continuous-time limit see Kong et al., "Saltation Matrices" (2023).
+A cell narrower than h^2 |a|, with a the acceleration of the guard, counts as that wide: the guard's speed is not
+constant over such a step, and without a bound grazing contacts have no finite variance. These onsets are counted.
+
+Reference: Kong, Payne, Zhu, Johnson, "Saltation Matrices: The Essential Tool for Linearizing Hybrid Dynamical Systems"
+(arXiv 2306.06862), for the limit of continuous time.
 """
 
 import dataclasses
@@ -51,8 +55,16 @@ from mjx_study.scene import Scene
 
 SLOTS: Final = 8
 """Onsets of one rollout that are corrected; later ones are left out and counted."""
+ONSETS: Final = ("none", "linear")
+"""How a first-order derivative takes the onset of contact."""
 TOUCHING: Final = 1e-6
 """Share of a cell: a body that was nearer than this before the step had touched already, and its onset is no event."""
+
+
+def check_onset(onset: str) -> None:
+    """Raises ValueError, with the choices, for an unknown treatment of the onset."""
+    if onset not in ONSETS:
+        raise ValueError(f"unknown onset {onset!r}; choose from {', '.join(ONSETS)}")
 
 
 @register_pytree
@@ -69,6 +81,11 @@ class OnsetCounts:
     found: Int[Array, "*batch"]
     bounded: Int[Array, "*batch"]
     missed: Int[Array, "*batch"]
+
+
+def as_row(counts: OnsetCounts | None) -> Float[Array, "*batch 3"] | None:
+    """The counts as numbers in one array, as batches keep them."""
+    return None if counts is None else jnp.stack([counts.found, counts.bounded, counts.missed], axis=-1).astype(float)
 
 
 def corrected_rollout(
@@ -103,9 +120,7 @@ def corrected_rollout(
         following, residual, guards = solved_step(scene, model, state, control)
         over_step = None
         if jacobian:
-            over_step, _ = step_jacobian(
-                scene, model, state.qpos, state.qvel, state.act, control, following.warmstart
-            )
+            over_step, _ = step_jacobian(scene, model, state.qpos, state.qvel, state.act, control, following.warmstart)
         return following, (state, control, following, residual, guards, over_step)
 
     _, (before, controls, after, residuals, guards, jacobians) = jax.lax.scan(
@@ -196,8 +211,8 @@ def jump_of_velocity(
         guard: index of the contact or limit, as in `constraint.guard_rows`.
 
     Returns:
-        v'(on) - v'(off) of each case; the first case's acceleration without the contact; the guard's derivative over the
-        velocity coordinates.
+        v'(on) - v'(off) of each case; the first case's acceleration without the contact; the derivative of the guard
+        over the velocity coordinates.
     """
     positioned = position_stage(scene, model, states.qpos[0])
     normal_rows, members = constraint.guard_rows(model, positioned)

@@ -121,6 +121,8 @@ def plan_optimise(config: OptimiseConfig, task: Task | None = None, cell: Cell |
     task = at_theta(task, config.theta)
     if config.reference and task.reference is None:
         raise ValueError(f"{task.name} has no analytic reference")
+    if config.reference and config.onset != "none":
+        raise ValueError("the analytic references have no onset term; leave onset out")
     numbers = {name: getattr(config, name) for name in ("iterations", "samples", "learning_rate", "decay")}
     if task.recipe is None:
         numbers["decay"] = numbers["decay"] or 0.0

@@ -14,6 +14,7 @@ from typing import Any, ClassVar, Final, get_type_hints
 from estimators import BASELINES, ESTIMATORS, NOISES, WEIGHTS
 from estimators.confidence import VARIANCE_PROXIES
 from mjx_study.contact import FAMILIES
+from mjx_study.onset import ONSETS
 from mjx_study.scene import CONES, INTEGRATORS, SOLVERS
 
 MOST_VALUES: Final = 10_000
@@ -251,6 +252,7 @@ OPTIONS: Final[dict[str, Option]] = {
         _number("window", int, "[1, 1000000]", "H", "steps between cuts of fobg_truncated"),
         _number("tolerance", float, "[0, 1)", "C", "of ddcg's test"),
         _choice("weights", WEIGHTS, "NAME", "of interpolations: by the samples that they weigh, or the other half"),
+        _choice("onset", ONSETS, "NAME", "of contact, in first-order gradients: none, or linear"),
         _choice("estimators", ESTIMATORS, "NAME", "see `mjx-study estimators`", label="estimator"),
         _choice("contact", FAMILIES, "FAMILY", f"of: {', '.join(FAMILIES)}", label="contact family", unset=TASKS),
         _number("stiffness", float, "(0, inf)", "K", "contact stiffness", unit="N/m", unset=TASKS),

@@ -73,7 +73,7 @@ class Line:
 
         def cost(theta, contact):
             start = task.draw_start(split_sample_key(jax.random.key(0))[0])
-            return rollout_cost(task, theta[None], contact, start, jnp.zeros(shape, dtype))[0]
+            return rollout_cost(task, theta[None], contact, start, jnp.zeros(shape, dtype), task.onset)[0]
 
         batched = jax.vmap(jax.value_and_grad(cost), in_axes=(0, None))
         mesh, split = Mesh(np.array(self.devices), ("points",)), PartitionSpec("points")

@@ -8,7 +8,7 @@ two. The same keys are used in every cell, so differences between contact models
 import dataclasses
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
@@ -279,8 +279,16 @@ def _row(
         residual=float(np.max(np.where(np.isfinite(residuals), residuals, math.inf))),
         unconverged=int(np.sum(~(residuals <= threshold))),
         nonfinite=nonfinite,
+        **_onsets(batches[oracle] for oracle in needs),
         **{key: None if value is None else float(value) for key, value in numbers.items()},  # type: ignore[arg-type]
     )
+
+
+def _onsets(batches: Iterable[Any]) -> dict[str, int]:
+    """What the onset term met in all samples, by field of a row; empty without the term."""
+    events = [batch.events for batch in batches if getattr(batch, "events", None) is not None]
+    names = ("onsets", "onsets_bounded", "onsets_missed")
+    return dict(zip(names, map(int, np.sum(np.concatenate(events), axis=0)), strict=True)) if events else {}
 
 
 def residuals_of(batch: Any) -> Float[np.ndarray, " rollouts"]:

@@ -67,7 +67,7 @@ class SweepConfig(Checked):
         reference_samples: pairs of rollouts behind each reference gradient; of gradients, None for 600.
         evaluation_samples: rollouts behind the cost of a final policy; of descents, None for 200.
         seed, noise, baseline, gamma, published, failure_probability, variance_proxy, radius, max_norm, window,
-            tolerance, weights, horizon, model, chunk_size: as in `EstimatorConfig`.
+            tolerance, weights, onset, horizon, model, chunk_size: as in `EstimatorConfig`.
     """
 
     ranges: ClassVar = {"samples": "[3, 1e7]"}
@@ -105,6 +105,7 @@ class SweepConfig(Checked):
     window: int | None = None
     tolerance: float = PUBLISHED_TOLERANCE
     weights: str = PLUG_IN
+    onset: str = "none"
     horizon: int | None = None
     model: str | None = None
     chunk_size: int | None = None
@@ -300,7 +301,7 @@ def _build(config: SweepConfig, name: str, timestep: float | None, cone: str | N
         chosen["horizon"] = max(1, round(min(steps, 1e15)))
         check(OPTIONS["horizon"], chosen["horizon"])
     task = make_task(name, **chosen)
-    return task if config.noise is None else task.replace(noise=config.noise)
+    return task.replace(onset=config.onset, noise=task.noise if config.noise is None else config.noise)
 
 
 def estimator_options(plan: SweepPlan, cell: SweepCell) -> EstimatorOptions:

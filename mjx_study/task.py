@@ -11,6 +11,7 @@ from jaxtyping import Array, Float, Key
 from mjx_study.contact import effective_mass
 from mjx_study.dynamics import State
 from mjx_study.noise import check_density
+from mjx_study.onset import check_onset
 from mjx_study.policy import Policy
 from mjx_study.reference import Reference
 from mjx_study.scene import Scene
@@ -96,6 +97,8 @@ class Task:
         families: contact families that a sweep takes unless told otherwise.
         span: range of a decision of one number that a landscape shows; None for a range about theta.
         noise: name of the noise's density in `estimators.NOISES`.
+        onset: how first-order gradients take the onset of contact: "none", exact derivatives of the steps, or "linear",
+            with what those miss (see `mjx_study.onset`).
         recipe: how it is optimised unless told otherwise; None where every number has to be given.
         outcomes: what a rollout came to, by name, from its states with the start first; what is reported of a policy
             beside its cost. None where the cost says it all.
@@ -120,6 +123,7 @@ class Task:
     families: tuple[str, ...] = FAMILIES
     span: tuple[float, float] | None = None
     noise: str = "gaussian"
+    onset: str = "none"
     recipe: Recipe | None = None
     outcomes: Callable[[State], dict[str, Float[Array, ""]]] | None = None
 
@@ -130,6 +134,7 @@ class Task:
             raise ValueError(f"horizon must be at least 1 step, got {self.horizon}")
         check_sigma(self.sigma)
         check_density(self.noise)
+        check_onset(self.onset)
         if not self.stiffnesses:
             raise ValueError(
                 f"{self.name} needs at least one stiffness [N/m] to sweep; leave stiffnesses out otherwise"

@@ -58,7 +58,7 @@ columns of the table:
 FIELDS = (
     "task stiffness contact estimators samples reference_samples sigma seed baseline gamma published "
     "failure_probability variance_proxy radius confidence damping cone horizon model chunk_size noise max_norm window "
-    "tolerance weights"
+    "tolerance weights onset"
 ).split()
 
 

@@ -57,7 +57,7 @@ RESUMABLE = "the same command goes on from the last checkpoint, at most 20 s ago
 FIELDS = (
     "task estimators contact stiffness damping reference network iterations samples learning_rate decay optimizer "
     "seeds seed sigma noise baseline gamma published failure_probability variance_proxy radius max_norm window "
-    "tolerance weights cone horizon model evaluation_samples chunk_size"
+    "tolerance weights onset cone horizon model evaluation_samples chunk_size"
 ).split()
 
 

@@ -156,7 +156,7 @@ def add_estimator_options(command: argparse.ArgumentParser, owner: type[Checked]
     """The noise, and what estimators let one choose; see `estimators.EstimatorOptions`."""
     add_options(
         command, owner, "noise", "baseline", "published", "gamma", "failure_probability", "variance_proxy", "radius",
-        "max_norm", "window", "tolerance", "weights",
+        "max_norm", "window", "tolerance", "weights", "onset",
     )  # fmt: skip
 
 
