@@ -123,13 +123,14 @@ def test_the_error_of_the_mean_falls_with_the_square_of_the_timestep() -> None:
     assert errors[0] < 0.05 and errors[2] < 0.01 and errors[2] < 0.4 * errors[0]
 
 
-@pytest.mark.parametrize("cone", [pytest.param("pyramidal", marks=pytest.mark.slow), "elliptic"])
-def test_both_programs_agree_for_a_tumbling_box(cone: str, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.slow
+@pytest.mark.parametrize("cone", ["pyramidal", "elliptic"])
+def test_both_programs_agree_where_four_corners_land(cone: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Friction rows, several corners, a free joint: the Jacobian program and the tape, values as without the term."""
     scene = scene_of(floor_scene(BOX, option(2e-3, f'cone="{cone}"'), ""))
-    pose = jnp.array([0, 0, 0.17, 0.95, 0.3, 0.05, 0.0])
-    start = initial_state(scene, pose, jnp.array([0.4, 0.1, -1.0, 0.5, 2.0, 0.3]))
-    steps, law = 70, lambda index, state: jnp.zeros(0)
+    pose = jnp.array([0.0, 0.0, 0.15, 1.0, 0.0, 0.0, 0.0])
+    start = initial_state(scene, pose, jnp.array([0.4, 0.1, -1.0, 0.01, 0.02, 0.3]))
+    steps, law = 32, lambda index, state: jnp.zeros(0)
 
     def last(velocity):
         state = dataclasses.replace(start, qvel=velocity)
@@ -139,7 +140,7 @@ def test_both_programs_agree_for_a_tumbling_box(cone: str, monkeypatch: pytest.M
     by_jacobian, (value, counts) = compiled(jax.jacfwd(last, has_aux=True), start.qvel)
     plain = compiled(lambda: rollout(scene, scene.model, start, law, steps)[0].qvel[-1])
     np.testing.assert_allclose(value, plain, rtol=1e-9)
-    assert counts.found >= 2 and counts.missed == 0
+    assert counts.found >= 4 and counts.missed == 0
     monkeypatch.setattr("mjx_study.onset.uses_jacobian", lambda scene: False)
     monkeypatch.setattr("mjx_study.dynamics.JACOBIAN_COLUMNS", 0)
     by_tape, _ = compiled(jax.jacrev(last, has_aux=True), start.qvel)
@@ -147,23 +148,17 @@ def test_both_programs_agree_for_a_tumbling_box(cone: str, monkeypatch: pytest.M
 
 
 def test_the_mean_has_the_slope_where_plain_first_order_has_the_wrong_sign() -> None:
-    """MuJoCo's default contact, where the mean of plain first-order gradients is +0.75 at 0.5 rad, not -0.95."""
-    task = make_task("momentum_transfer", timestep=1e-3, horizon=800).replace(onset="linear")
+    """MuJoCo's default contact, h b = 0.2: the mean of plain first-order gradients is +0.78 at 0.5 rad, not -0.945."""
+    task = make_task("momentum_transfer").replace(onset="linear")
     position, points = np.array([0.5]), grid(0.5, 0.5, task.sigma, 400)
     (cell,), _ = plan_cells(task, ("mujoco_default",))
-    found = means(points, *Line(task)(points, cell.contact), position, task.sigma)
+    found = means(points, *Line(task)(points, cell.contact), position, task.sigma, task.noise)
     assert found.slope_error + found.first_error < 0.02
     assert found.slope < -0.9
-    assert found.first == pytest.approx(found.slope, abs=0.035 + 2 * (found.slope_error + found.first_error)[0])
+    assert np.abs(found.first - found.slope) < 0.04 + 2 * (found.slope_error + found.first_error)
 
 
-def test_overflow_and_the_objective_count(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A batch carries what the term met; without slots every onset is missed, and the gradient is the plain one."""
-    task = make_task("momentum_transfer").replace(onset="linear")
-    (cell,), _ = plan_cells(task, ("mujoco_default",))
-    keys = jax.random.split(jax.random.key(0), 4)
-    batch = Simulator(task, chunk_size=2).objective(cell.contact).differentiate(task.theta, keys)
-    assert batch.events is not None and batch.events.tolist() == [[1.0, 0.0, 0.0]] * 4
+def test_onsets_beyond_the_slots_are_counted_and_left_out() -> None:
     scene = scene_of(floor_scene(BODY, option(2e-3, "", 'refsafe="disable"'), 'condim="1"'))
     start = initial_state(scene, jnp.array([0.05]), jnp.array([SPEED]))
     law = lambda index, state: jnp.zeros(0)  # noqa: E731
@@ -180,6 +175,15 @@ def test_overflow_and_the_objective_count(monkeypatch: pytest.MonkeyPatch) -> No
     ((_, counts), gradient), expected = compiled(both, start.qpos)
     assert (counts.found, counts.missed) == (1, 1)
     np.testing.assert_allclose(gradient, expected, rtol=1e-9)
+
+
+@pytest.mark.slow
+def test_a_batch_says_what_the_term_met() -> None:
+    task = make_task("momentum_transfer").replace(onset="linear")
+    (cell,), _ = plan_cells(task, ("mujoco_default",))
+    keys = jax.random.split(jax.random.key(0), 4)
+    batch = Simulator(task, chunk_size=2).objective(cell.contact).differentiate(task.theta, keys)
+    assert batch.events is not None and batch.events.tolist() == [[1.0, 0.0, 0.0]] * 4
 
 
 def test_what_has_no_meaning_is_refused() -> None:
