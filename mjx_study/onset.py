@@ -7,10 +7,10 @@ gradient of the mean cost has a second part, carried by the rollouts at which th
     grad F = E[grad f] - sum_k E[delta(phi_k) J_k grad phi_k],     J_k = V_{k+1}(on) - V_{k+1}(off) at phi_k = 0,
 
 with V the cost to go. A rollout in which contact begins at step k has phi_k in (D, 0], where n = d phi / dq and
-D = phi_k - phi_{k-1} = h n^T v_k. It lies between two others: one in which contact only just begins at step k (phi_k = 0),
-and one in which it would have begun at step k - 1 (phi_{k-1} = 0). If phi is spread evenly over this cell, linear
-interpolation gives the weights of both, and every term belongs to a rollout that exists anyway. With s = phi_k / D and
-Delta_k the jump of the velocity after step k,
+D = phi_k - phi_{k-1} = h n^T v_k. It lies between two others: one in which contact only just begins at step k, that is
+phi_k = 0, and one in which it would have begun at step k - 1, phi_{k-1} = 0. If phi is spread evenly over this cell,
+linear interpolation gives the weights of both, and every term belongs to a rollout that exists anyway. With s = phi_k/D
+and Delta_k the jump of the velocity after step k,
 
     dx_{k+1} = A_k dx_k + (1 - s) Delta_k (n^T dq_k) / D + s A_k (h Delta_{k-1}, Delta_{k-1}) (n^T dq_{k-1}) / D,
 

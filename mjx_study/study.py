@@ -267,6 +267,7 @@ def _row(
     residuals = np.concatenate([residuals_of(batches[oracle]) for oracle in needs])
     threshold = UNCONVERGED[str(residuals.dtype)]
     nonfinite = int(numbers.pop("nonfinite"))
+    figures: dict[str, Any] = {key: None if value is None else float(value) for key, value in numbers.items()}
     return Row(
         contact=cell.family,
         stiffness=cell.stiffness,
@@ -280,7 +281,7 @@ def _row(
         unconverged=int(np.sum(~(residuals <= threshold))),
         nonfinite=nonfinite,
         **_onsets(batches[oracle] for oracle in needs),
-        **{key: None if value is None else float(value) for key, value in numbers.items()},  # type: ignore[arg-type]
+        **figures,
     )
 
 

@@ -150,7 +150,7 @@ def test_both_programs_agree_where_four_corners_land(cone: str, monkeypatch: pyt
 def test_the_mean_has_the_slope_where_plain_first_order_has_the_wrong_sign() -> None:
     """MuJoCo's default contact, h b = 0.2: the mean of plain first-order gradients is +0.78 at 0.5 rad, not -0.945."""
     task = make_task("momentum_transfer").replace(onset="linear")
-    position, points = np.array([0.5]), grid(0.5, 0.5, task.sigma, 400)
+    position, points = np.array([0.5]), grid(0.5, 0.5, task.sigma, 400, task.noise)
     (cell,), _ = plan_cells(task, ("mujoco_default",))
     found = means(points, *Line(task)(points, cell.contact), position, task.sigma, task.noise)
     assert found.slope_error + found.first_error < 0.02
