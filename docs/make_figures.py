@@ -76,7 +76,7 @@ def program(task: Task) -> Callable[..., Runs]:
     """Compiled rollouts of a batch of (theta, start); the contact model is an argument too."""
 
     def one(theta, start, contact):
-        cost, (states, _, _) = rollout_cost(task, theta, contact, start, jnp.zeros(task.policy.noise_shape))
+        cost, (states, *_) = rollout_cost(task, theta, contact, start, jnp.zeros(task.policy.noise_shape))
         return Runs(states.qpos, states.qvel, cost)
 
     return jax.jit(jax.vmap(one, in_axes=(0, 0, None)), compiler_options={"xla_backend_optimization_level": "0"})

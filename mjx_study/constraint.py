@@ -249,13 +249,14 @@ def at_onset(model: mjx.Model, data: mjx.Data, members: Float[Array, " rows"], o
     rows: Any = data._impl
     chosen, acts = members > 0, jnp.where(on, 1.0, 0.0).astype(rows.efc_J.dtype)
     keep = jnp.where(chosen, acts, 1.0)
-    return data.tree_replace(
+    changed: Any = data.tree_replace(
         {
             "_impl.efc_J": rows.efc_J * keep[:, None],
             "_impl.efc_D": jnp.where(chosen, touching.efc_D, rows.efc_D),
             "_impl.efc_aref": jnp.where(chosen, touching.efc_aref, rows.efc_aref) * keep,
         }
     )
+    return changed
 
 
 def solve_positive_definite(

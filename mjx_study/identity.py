@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 
@@ -146,7 +147,7 @@ class _Digest:
 
     def _array(self, value: Any) -> None:
         """By value: a mantissa of 40 bits and an exponent, since the last bits depend on the processor."""
-        if isinstance(value, jax.Array) and jax.dtypes.issubdtype(value.dtype, jax.dtypes.prng_key):
+        if isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jax.dtypes.prng_key):
             value = jax.random.key_data(value)
         array = np.asarray(value)
         self._note("array", array.dtype.kind, str(array.shape))
@@ -161,8 +162,9 @@ class _Digest:
     def _scene(self, scene: Scene) -> None:
         """MuJoCo's model, and those of its arrays that someone changed in MJX's."""
         self._model(scene.host)
-        for field in dataclasses.fields(scene.model):
-            theirs, ours = getattr(scene.host, field.name, None), getattr(scene.model, field.name, None)
+        on_device: Any = scene.model
+        for field in dataclasses.fields(on_device):
+            theirs, ours = getattr(scene.host, field.name, None), getattr(on_device, field.name, None)
             if isinstance(theirs, np.ndarray) and isinstance(ours, np.ndarray | jax.Array) and theirs.size == ours.size:
                 if not np.allclose(theirs.ravel(), np.ravel(ours), rtol=1e-6, equal_nan=True):
                     self._all(f"mjx.{field.name}", (ours,))

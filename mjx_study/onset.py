@@ -29,7 +29,7 @@ Reference: Kong, Payne, Zhu, Johnson, "Saltation Matrices: The Essential Tool fo
 
 import dataclasses
 from functools import partial
-from typing import Final
+from typing import Any, Final
 
 import jax
 import jax.numpy as jnp
@@ -217,7 +217,8 @@ def jump_of_velocity(
     positioned = position_stage(scene, model, states.qpos[0])
     normal_rows, members = constraint.guard_rows(model, positioned)
     mask = jnp.asarray(members)[guard]
-    normal = jnp.asarray(normal_rows)[guard] @ positioned._impl.efc_J
+    rows: Any = positioned._impl
+    normal = jnp.asarray(normal_rows, rows.efc_J.dtype)[guard] @ rows.efc_J
 
     def advanced(qvel, act, control, warmstart, on):
         data = force_stage(model, positioned, qvel, act, control)

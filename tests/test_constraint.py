@@ -103,7 +103,7 @@ def test_the_elliptic_law_is_the_gradient_of_a_convex_cost() -> None:
     inverse = np.concatenate([[mass], mass * impratio * friction**2 / friction[0] ** 2])
     rows: Any = scene.template._impl
     limits = np.concatenate([friction, np.full(rows.contact.friction.shape[1] - 3, 0.01)])[None]
-    data = scene.template.tree_replace(
+    data: Any = scene.template.tree_replace(
         {"_impl.efc_D": jnp.asarray(inverse), "_impl.contact.friction": jnp.asarray(limits)}
     )
 

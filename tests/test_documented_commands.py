@@ -54,8 +54,7 @@ def small(command: list[str]) -> list[str]:
     name, *rest = ["pusher" if part == "TASK" else part for part in command]
     more = SMALL.get(name, "").split()
     if name == "sweep":
-        flag = next((flag for flag in OF_KIND if flag in rest), None)
-        more += OF_KIND.get(flag, "--reference-samples 4").split()
+        more += next((own for flag, own in OF_KIND.items() if flag in rest), "--reference-samples 4").split()
     return [name, *rest, *more]
 
 

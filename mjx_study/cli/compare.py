@@ -88,8 +88,11 @@ def run(options: argparse.Namespace) -> int:
         folder = None if options.output is None else prepare_folder(options.output)
     with computing() as progress:
         result = compare(plan, progress)
-    write = lambda: save(result, folder) + save_figure(plot_comparison(result), folder, "comparison")  # noqa: E731
-    written, unwritten = ([], None) if folder is None else attempt(write)
+    written, unwritten = [], None
+    if folder is not None:
+        written, unwritten = attempt(
+            lambda folder=folder: save(result, folder) + save_figure(plot_comparison(result), folder, "comparison")
+        )
     if options.json:
         print(json.dumps(as_json(result), allow_nan=False))
         for warning in alarms(result):
