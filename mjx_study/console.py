@@ -54,9 +54,10 @@ def _with_error(value: float, error: float) -> str:
 
 
 def _debiased(row: Row, value: float, debiased: float, error: float) -> str:
-    """A figure as it is, and what is left of it without noise."""
+    """A figure as it is, and what is left of it without noise; "-" where noise is all there is."""
     plain = f"{value:.3f}" if value < 1000 else number(value, 2)
-    return f"{plain} -> {_with_error(debiased, error)}{_doubt(row)}"
+    left = "-" if math.isnan(debiased) else _with_error(debiased, error)
+    return f"{plain} -> {left}{_doubt(row)}"
 
 
 def columns(confidence: float) -> list[list[Column]]:
