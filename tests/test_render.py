@@ -552,7 +552,7 @@ def test_an_interrupted_film_is_absent(tmp_path: Path, monkeypatch: pytest.Monke
     def stop(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("mjx_study.results.os.replace", stop)
+    monkeypatch.setattr("mjx_study.disk.os.replace", stop)
     with pytest.raises(KeyboardInterrupt):
         animate(throw(seconds=0.1), path, renderer="drawing")
     assert [item.name for item in tmp_path.iterdir()] == ["film.gif"] and path.read_bytes() == b"older"

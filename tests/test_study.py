@@ -25,7 +25,9 @@ def config(**changes: Any) -> CompareConfig:
 def row(estimator: str, stiffness: float, variance: float, **changes: Any) -> Row:
     """A row of a made-up result, with an interval of a factor of two either way."""
     variance, stiffness = float(variance), float(stiffness)
-    values: dict[str, Any] = {name.name: 0.0 for name in dataclasses.fields(Row)}
+    values: dict[str, Any] = {
+        field.name: 0.0 for field in dataclasses.fields(Row) if field.default is dataclasses.MISSING
+    }
     values |= {"contact": "penalty", "estimator": estimator, "stiffness": stiffness, "samples": 100, "residual": 1e-15}
     values |= {"variance": variance, "variance_lower": variance / 2, "variance_upper": 2 * variance}
     values |= {"solref": (-stiffness / 0.05, 0.0), "solimp": (1e-4, 1e-4, 1e-3, 0.5, 2.0), "unconverged": 0}

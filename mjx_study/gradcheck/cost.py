@@ -102,7 +102,7 @@ def check_cost(programs: CostPrograms, cell: Cell, seed: int) -> tuple[CostCheck
     task = programs.task
     directions = np.random.default_rng(seed).normal(size=(DIRECTIONS, len(task.theta)))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    (states, controls, residual), gradient, slopes = programs.gradient(cell.contact, directions)
+    (states, controls, residual, _), gradient, slopes = programs.gradient(cell.contact, directions)
     gradient = np.asarray(gradient)
     norm = float(np.linalg.norm(gradient))
     scale = norm if norm > 0 else 1.0
