@@ -196,7 +196,8 @@ def test_nothing_is_called_biased_on_too_few_effective_samples() -> None:
     assert row("fobg", 10, 1).bias_verdict == "none seen"
 
 
-def test_doubtful_numbers_are_marked_in_the_table() -> None:
+def test_doubtful_numbers_are_marked_in_the_table(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "200")
     lines: list[str] = []
     sure = row("zobg", 10, 1, relative_error=0.325, debiased_error=0.298, debiased_error_se=0.0098)
     console.print_comparison(result(sure, row("fobg", 20, 1, effective_samples=1.2, top_share=0.9)), lines.append)
