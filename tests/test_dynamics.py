@@ -110,6 +110,19 @@ def numeric_jacobian(name: str) -> np.ndarray:
     return central_jacobian(program, case.point, 3e-6)
 
 
+def test_a_velocity_servo_is_implicit_under_implicitfast() -> None:
+    """f = kv (u - v), taken at the end of the step: v' = v + h f / (m + h kv). Euler would leave h kv out."""
+    body = (
+        '<body><joint name="x" type="slide" axis="1 0 0"/><geom size=".1" mass="2" contype="0" conaffinity="0"/></body>'
+    )
+    servo = '<actuator><velocity joint="x" kv="300"/></actuator>'
+    options = option(0.01, 'integrator="implicitfast" gravity="0 0 0"')
+    scene = scene_of(f"<mujoco>{options}<worldbody>{body}</worldbody>{servo}</mujoco>")
+    start = dynamics.initial_state(scene, qvel=jnp.array([0.5]))
+    after, _ = dynamics.step(scene, scene.model, start, jnp.array([2.0]))
+    np.testing.assert_allclose(after.qvel, [0.5 + 0.01 * 300 * 1.5 / (2 + 0.01 * 300)], rtol=1e-12)
+
+
 @pytest.mark.parametrize("name", STEPPED)
 def test_the_step_is_mjxs(name: str) -> None:
     """Over 25 steps, each from the same state, so that each step is compared and not how errors grow.

@@ -60,7 +60,7 @@ DYNAMICS: Final = (
         "mjx.implicit(model, data) if implicit else mjx.euler(model, data)",
         "mjx.euler(model, data)",
         "one integrator forgotten",
-        (f"{STEP}::{VALUES}[capsule-plane pyramidal CG implicitfast]",),
+        (f"{STEP}::test_a_velocity_servo_is_implicit_under_implicitfast",),
         "dome",
     ),
     Defect(
