@@ -220,15 +220,15 @@ def jump_of_velocity(
     rows: Any = positioned._impl
     normal = jnp.asarray(normal_rows, rows.efc_J.dtype)[guard] @ rows.efc_J
 
-    def advanced(qvel, act, control, warmstart, on):
-        data = force_stage(model, positioned, qvel, act, control)
-        data = constraint.at_onset(model, data, mask, on)
-        qacc = constraint.run_solver(model, data.replace(qacc_warmstart=warmstart))
-        return advance_velocity(model, data, qacc)[0], qacc
-
     def both(qvel, act, control, warmstart):
-        with_it, without = (jnp.asarray(on) for on in (True, False))
-        after, qacc = jax.vmap(partial(advanced, qvel, act, control, warmstart))(jnp.stack([with_it, without]))
+        forced = force_stage(model, positioned, qvel, act, control).replace(qacc_warmstart=warmstart)
+
+        def advanced(on):
+            data = constraint.at_onset(model, forced, mask, on)
+            qacc = constraint.run_solver(model, data)
+            return advance_velocity(model, data, qacc)[0], qacc
+
+        after, qacc = jax.vmap(advanced)(jnp.array([True, False]))
         return after[0] - after[1], qacc[1]
 
     jumps, free = jax.vmap(both)(states.qvel, states.act, controls, states.warmstart)
