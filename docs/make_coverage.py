@@ -17,9 +17,9 @@ from jax import Array
 
 import estimators
 from estimators import ENOUGH_EFFECTIVE, ESTIMATORS, EstimatorOptions, summarise
-from mjx_study.landscape import DETECTED
 from mjx_study.reference import LinearQuadratic, ReferenceObjective
 from mjx_study.runtime import configure
+from mjx_study.study.landscapes import DETECTED
 
 PAGE: Final = Path(__file__).parent / "coverage.md"
 SAMPLES: Final = (10, 50, 400)

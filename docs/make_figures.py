@@ -25,9 +25,6 @@ from matplotlib.figure import Figure
 from matplotlib.transforms import Affine2D
 from PIL import Image
 
-from mjx_study.configuration import plan_cells
-from mjx_study.contact import ContactModel, contact_model, solref_from_stiffness
-from mjx_study.dynamics import State, initial_state
 from mjx_study.objective import rollout_cost
 from mjx_study.reference import (
     BallWall,
@@ -42,8 +39,11 @@ from mjx_study.reference import (
 from mjx_study.render import VIEWS, Motion
 from mjx_study.render.drawing import PALETTE, Drawing
 from mjx_study.runtime import configure
-from mjx_study.task import Task
+from mjx_study.simulation.contact import ContactModel, contact_model, solref_from_stiffness
+from mjx_study.simulation.dynamics import State, initial_state
 from mjx_study.tasks import make_task
+from mjx_study.tasks.contact_grid import contact_grid
+from mjx_study.tasks.task import Task
 
 HERE = Path(__file__).parent
 DPI = 130
@@ -92,7 +92,7 @@ def run(task: Task, thetas: np.ndarray, contact: ContactModel | None, starts: St
 
 def contact_of(task: Task, family: str, stiffness: float) -> ContactModel:
     """A contact model as `mjx-study compare` makes it."""
-    ((cell,), _) = plan_cells(task, [family], [stiffness])
+    ((cell,), _) = contact_grid(task, [family], [stiffness])
     assert cell.contact is not None
     return cell.contact
 

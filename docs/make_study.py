@@ -10,10 +10,10 @@ from typing import Final
 
 from make_figures import save
 
-from mjx_study.console import progress_bar
+from mjx_study.cli.console import progress_bar
+from mjx_study.plots.study import plot_study
 from mjx_study.runtime import configure
-from mjx_study.study_plots import plot_study
-from mjx_study.sweep import SweepConfig, load_study, plan_sweep, run_sweep
+from mjx_study.study.sweep import SweepConfig, load_study, plan_sweep, run_sweep
 
 HERE: Final = Path(__file__).parent
 

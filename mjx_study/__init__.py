@@ -5,8 +5,10 @@ tasks as objectives, and comparisons of estimators over them. Call `configure` f
 """
 
 from mjx_study import _matplotlib
-from mjx_study.comparison import CompareConfig, CompareResult
-from mjx_study.contact import (
+from mjx_study.objective import MjxObjective, Simulator, simulate
+from mjx_study.plots.study import plot_study
+from mjx_study.runtime import configure
+from mjx_study.simulation.contact import (
     FAMILIES,
     ContactModel,
     ContactWarning,
@@ -17,16 +19,14 @@ from mjx_study.contact import (
     solref_from_stiffness,
     stiffness_from_solref,
 )
-from mjx_study.dynamics import State, initial_state, rollout, step, step_jacobian
-from mjx_study.objective import MjxObjective, Simulator, simulate
-from mjx_study.policy import Launch, LinearFeedback, OpenLoop, Policy
-from mjx_study.runtime import configure
-from mjx_study.scene import Scene, SceneError, load_scene, put_scene
-from mjx_study.study import compare, plan_compare
-from mjx_study.study_plots import plot_study
-from mjx_study.sweep import SweepConfig, load_study, plan_sweep, run_sweep
-from mjx_study.task import Recipe, Task
+from mjx_study.simulation.dynamics import State, initial_state, rollout, step, step_jacobian
+from mjx_study.simulation.scene import Scene, SceneError, load_scene, put_scene
+from mjx_study.study.comparison import CompareConfig, CompareResult
+from mjx_study.study.gradients import compare, plan_compare
+from mjx_study.study.sweep import SweepConfig, load_study, plan_sweep, run_sweep
 from mjx_study.tasks import TASKS, make_task
+from mjx_study.tasks.policy import Launch, LinearFeedback, OpenLoop, Policy
+from mjx_study.tasks.task import Recipe, Task
 
 __all__ = [
     "_matplotlib",

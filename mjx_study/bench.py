@@ -20,16 +20,17 @@ import mujoco
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
-from mjx_study._mjx import mjx
-from mjx_study.configuration import Cell, Progress, plan_cells
-from mjx_study.contact import ContactModel, apply_contact
-from mjx_study.dynamics import State
-from mjx_study.engine import engine_model
-from mjx_study.limits import check_memory
-from mjx_study.noise import split_sample_key, standard_noise
 from mjx_study.objective import Simulator, chunk_for, simulate
+from mjx_study.reference.noise import split_sample_key, standard_noise
 from mjx_study.runtime import environment
-from mjx_study.task import Task
+from mjx_study.simulation._mjx import mjx
+from mjx_study.simulation.contact import ContactModel, apply_contact
+from mjx_study.simulation.dynamics import State
+from mjx_study.simulation.engine import engine_model
+from mjx_study.study.configuration import Progress
+from mjx_study.study.memory import check_memory
+from mjx_study.tasks.contact_grid import ContactPoint, contact_grid
+from mjx_study.tasks.task import Task
 
 REPEATS: Final = 5
 ENGINE_SAMPLES: Final = 5
@@ -119,7 +120,7 @@ class BenchPlan:
 
     task: Task
     samples: int
-    cell: Cell
+    cell: ContactPoint
 
 
 def plan_bench(task: Task, samples: int) -> BenchPlan:
@@ -131,7 +132,7 @@ def plan_bench(task: Task, samples: int) -> BenchPlan:
     if samples < 1:
         raise ValueError(f"samples must be at least 1, got {samples}")
     check_memory(task, ("zobg", "fobg"), samples)
-    (cell,), _ = plan_cells(task, [task.main_family], [task.middle_stiffness])
+    (cell,), _ = contact_grid(task, [task.main_family], [task.middle_stiffness])
     return BenchPlan(task, samples, cell)
 
 

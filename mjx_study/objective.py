@@ -18,11 +18,11 @@ from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Float, Key
 
 from estimators import Differentiation, Evaluation, Linearisation, StepDifferentiation, StepEvaluation
-from mjx_study.contact import ContactModel, apply_contact
-from mjx_study.dynamics import State, rollout, step
-from mjx_study.noise import noise_score, split_sample_key, standard_noise
-from mjx_study.onset import OnsetCounts, as_row, corrected_rollout
-from mjx_study.task import Task, check_sigma
+from mjx_study.reference.noise import noise_score, split_sample_key, standard_noise
+from mjx_study.simulation.contact import ContactModel, apply_contact
+from mjx_study.simulation.dynamics import State, rollout, step
+from mjx_study.simulation.onset import OnsetCounts, as_row, corrected_rollout
+from mjx_study.tasks.task import Task, check_sigma
 
 MAX_CHUNK: Final = {"cpu": 512, "gpu": 2**15 + 1, "tpu": 2**15 + 1}
 """Most samples per device in one call, by backend: a CPU gains nothing from larger batches, an accelerator needs them;
@@ -46,7 +46,7 @@ def rollout_cost(
         contact: the contact model; None for the MJCF's own.
         start: the start state, before the policy acts on it.
         noise: of the policy's `noise_shape`.
-        onset: "none", or "linear" for a derivative with the onset term (see `mjx_study.onset`).
+        onset: "none", or "linear" for a derivative with the onset term (see `mjx_study.simulation.onset`).
 
     Returns:
         The cost; and the states `(horizon + 1, ...)` with the start first, the controls, the largest relative

@@ -13,9 +13,9 @@ from typing import Any, ClassVar, Final, get_type_hints
 
 from estimators import BASELINES, ESTIMATORS, NOISES, WEIGHTS
 from estimators.confidence import VARIANCE_PROXIES
-from mjx_study.contact import FAMILIES
-from mjx_study.onset import ONSETS
-from mjx_study.scene import CONES, INTEGRATORS, SOLVERS
+from mjx_study.simulation.contact import FAMILIES
+from mjx_study.simulation.onset import ONSETS
+from mjx_study.simulation.scene import CONES, INTEGRATORS, SOLVERS
 
 MOST_VALUES: Final = 10_000
 """Values of one list or range."""

@@ -11,8 +11,8 @@ from typing import Any, Final
 import numpy as np
 import xarray as xr
 
-from mjx_study.study_plots import SWEPT, plot_study
-from mjx_study.sweep import what_to_beware_of
+from mjx_study.plots.study import SWEPT, plot_study
+from mjx_study.study.sweep import what_to_beware_of
 
 STYLE: Final = """
 body { font: 15px/1.5 system-ui, sans-serif; max-width: 70rem; margin: 2rem auto; padding: 0 1rem; color: #222; }

@@ -24,10 +24,12 @@ import pytest
 from hypothesis import strategies as st
 
 from estimators import ESTIMATORS
-from mjx_study import cli, configuration, sweep_plan
+from mjx_study import cli
 from mjx_study.cli import bench, compare, gradcheck, landscape, optimise, options, rollout, sweep
-from mjx_study.contact import FAMILIES
 from mjx_study.option import OPTIONS
+from mjx_study.simulation.contact import FAMILIES
+from mjx_study.study import configuration
+from mjx_study.study import plan as sweep_plan
 from mjx_study.tasks import TASKS, make_task
 
 SECONDS = 10

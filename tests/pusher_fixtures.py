@@ -16,11 +16,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_study.contact import ContactModel, ContactWarning, contact_model, family_model
 from mjx_study.objective import Simulator
 from mjx_study.reference import Pusher, roll_out
-from mjx_study.task import Task
+from mjx_study.simulation.contact import ContactModel, ContactWarning, contact_model, family_model
 from mjx_study.tasks import make_task
+from mjx_study.tasks.task import Task
 
 START = np.array([0.0, 1.0, 0.0, 0.0])
 HORIZON = 200

@@ -14,9 +14,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjx_study import constraint, dynamics, repairs
-from mjx_study._mjx import mjx
-from mjx_study.scene import Scene, load_scene, put_scene
+from mjx_study.simulation import constraint, dynamics, patches
+from mjx_study.simulation._mjx import mjx
+from mjx_study.simulation.scene import Scene, load_scene, put_scene
 
 # Budgets that leave MJX's solver to stop where its cost no longer falls: converged to rounding.
 OPTION: Final = 'tolerance="1e-30" iterations="100" ls_iterations="50"'
@@ -163,7 +163,7 @@ def plain_warm_start() -> Generator[None]:
     """
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(constraint, "PREDICTOR_STEPS", 0)
-        patch.setattr(repairs, "_REPLACED", {})
+        patch.setattr(patches, "_REPLACED", {})
         jax.clear_caches()  # a trace from before would be used again
         yield
     jax.clear_caches()

@@ -10,11 +10,12 @@ import pytest
 
 import estimators
 from estimators import ESTIMATORS, EstimatorOptions, pull_back, truncated_first_order
-from mjx_study import dynamics
-from mjx_study.configuration import check_estimators, plan_cells
 from mjx_study.objective import Simulator, simulate
-from mjx_study.task import Task
+from mjx_study.simulation import dynamics
+from mjx_study.study.configuration import check_estimators
 from mjx_study.tasks import make_task
+from mjx_study.tasks.contact_grid import contact_grid
+from mjx_study.tasks.task import Task
 
 # What each stands for: an open loop; feedback from random starts, five bodies; one decision before the simulation.
 TASKS = {"pusher": 12, "tennis": 8, "double_pendulum": 10}
@@ -40,7 +41,7 @@ def drawn(request: pytest.FixtureRequest) -> tuple[Task, Any, dict[str, Any]]:
     theta = task.theta + 0.05 * jax.random.normal(jax.random.key(1), task.theta.shape)
     task = task.replace(theta=theta)
     family = "penalty" if task.contact_pair else "mjcf"
-    (cell,), _ = plan_cells(task, [family], [task.stiffnesses[0]] if task.contact_pair else None)
+    (cell,), _ = contact_grid(task, [family], [task.stiffnesses[0]] if task.contact_pair else None)
     objective = Simulator(task, chunk_size=2).objective(cell.contact)
     keys = jax.random.split(jax.random.key(0), SAMPLES)
     batches = {
@@ -120,7 +121,7 @@ def test_a_formula_that_needs_gaussian_noise_refuses_another() -> None:
 def test_a_reference_draws_the_noise_that_mjx_draws(noise: str) -> None:
     """Same keys, same density: the pusher's two simulations differ by the contact's impedance and nothing else."""
     task = make_task("pusher", horizon=20).replace(noise=noise)
-    (cell,), _ = plan_cells(task, ["penalty"], [100.0])
+    (cell,), _ = contact_grid(task, ["penalty"], [100.0])
     assert task.reference is not None
     reference = dataclasses.replace(task.reference(100.0), noise=noise)  # type: ignore[type-var]
     keys = jax.random.split(jax.random.key(2), 4)
@@ -133,7 +134,7 @@ def test_a_reference_draws_the_noise_that_mjx_draws(noise: str) -> None:
 def test_linearising_a_large_model_uses_the_tape(monkeypatch: pytest.MonkeyPatch) -> None:
     """Forward mode through the tape program gives the Jacobians of the Jacobian program."""
     task = make_task("pusher", horizon=5)
-    (cell,), _ = plan_cells(task, ["penalty"], [100.0])
+    (cell,), _ = contact_grid(task, ["penalty"], [100.0])
     keys = jax.random.split(jax.random.key(4), 2)
     small = Simulator(task, chunk_size=1).objective(cell.contact).linearise(task.theta, keys)
     monkeypatch.setattr(dynamics, "JACOBIAN_COLUMNS", 0)

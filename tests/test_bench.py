@@ -10,10 +10,10 @@ import pytest
 
 from mjx_study import bench, cli
 from mjx_study.cli import options
-from mjx_study.configuration import plan_cells
-from mjx_study.engine import engine_model
 from mjx_study.objective import Simulator
+from mjx_study.simulation.engine import engine_model
 from mjx_study.tasks import make_task
+from mjx_study.tasks.contact_grid import contact_grid
 
 
 @pytest.fixture(autouse=True)
@@ -45,7 +45,7 @@ def test_bench_prints_its_ratios_and_the_machine(capsys: pytest.CaptureFixture[s
 def test_stock_mjx_runs_the_same_samples() -> None:
     """The rival's costs are ours: same starts, noise of the task's own density, policy and contact."""
     task = make_task("tennis", horizon=5).replace(noise="laplace")
-    (cell,), _ = plan_cells(task, ["mujoco"], [4000.0])
+    (cell,), _ = contact_grid(task, ["mujoco"], [4000.0])
     keys = jax.random.split(jax.random.key(0), 4)
     values, _ = bench._stock_programs(task, cell.contact, keys, jax.local_devices())
     ours = Simulator(task, chunk_size=2).objective(cell.contact).evaluate(task.theta, jax.random.clone(keys))
@@ -55,7 +55,7 @@ def test_stock_mjx_runs_the_same_samples() -> None:
 def test_the_engines_rival_computes_a_gradient() -> None:
     """Of the sum of the last state, by differences: the same as perturbing one control, or the start, by hand."""
     task = make_task("pusher", horizon=20)
-    (cell,), _ = plan_cells(task, ["mujoco"], [100.0])
+    (cell,), _ = contact_grid(task, ["mujoco"], [100.0])
     start, controls = (np.array([0.0, 1.0]), np.zeros(2)), np.full((20, 1), 0.1)
     over_start, over_controls = bench.engine_gradient(task, cell.contact, start, controls)
 

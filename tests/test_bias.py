@@ -3,15 +3,15 @@
 import numpy as np
 import pytest
 
-from mjx_study.configuration import plan_cells
-from mjx_study.quadrature import Line, Means, grid, means
+from mjx_study.study.quadrature import Line, Means, grid, means
 from mjx_study.tasks import make_task
+from mjx_study.tasks.contact_grid import contact_grid
 
 
 def measured(name: str, families: tuple[str, ...], position: np.ndarray, size: int) -> dict[str, Means]:
     task = make_task(name)
     line, points = Line(task), grid(position.min(), position.max(), task.sigma, size, task.noise)
-    cells, _ = plan_cells(task, families, [10000.0])
+    cells, _ = contact_grid(task, families, [10000.0])
     return {cell.family: means(points, *line(points, cell.contact), position, task.sigma, task.noise) for cell in cells}
 
 

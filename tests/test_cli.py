@@ -11,9 +11,10 @@ from pathlib import Path
 import jax.numpy as jnp
 import pytest
 
-from mjx_study import cli, study
+from mjx_study import cli
 from mjx_study.cli import compare as compare_command
 from mjx_study.cli import options
+from mjx_study.study import gradients as study
 from mjx_study.tasks import TASKS
 
 SMALL = ["--horizon", "4", "--samples", "8", "--reference-samples", "8"]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from mujoco.mjx._src import solver
 
-from mjx_study import constraint, dynamics
+from mjx_study.simulation import constraint, dynamics
 from tests.scenes import (
     CASES,
     compiled,

@@ -8,9 +8,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjx_study import constraint
-from mjx_study._mjx import mjx
-from mjx_study.contact import (
+from mjx_study.simulation import constraint
+from mjx_study.simulation._mjx import mjx
+from mjx_study.simulation.contact import (
     DEFAULT_SOLIMP,
     DEFAULT_SOLREF,
     FAMILIES,
@@ -24,7 +24,7 @@ from mjx_study.contact import (
     solref_from_stiffness,
     stiffness_from_solref,
 )
-from mjx_study.scene import SceneError, load_scene, put_scene
+from mjx_study.simulation.scene import SceneError, load_scene, put_scene
 from tests.scenes import compiled, floor_scene, option, scene_of, slider, step_flat
 
 PENETRATION = 0.002  # [m], beyond every width, so that the impedance is d_width

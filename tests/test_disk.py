@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mjx_study.checkpoint import Checkpoints
 from mjx_study.disk import TEMPORARY, prepare_folder, read_whole, write_whole
-from mjx_study.store import Store, StudyError, assemble, write_dataset
+from mjx_study.study.checkpoint import Checkpoints
+from mjx_study.study.store import Store, StudyError, assemble, write_dataset
 from tests.documents import study_document
 from tests.faults import deadline, every_fault, from_the_future, put_no_file
 

@@ -11,11 +11,11 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjx_study import constraint, dynamics
-from mjx_study._mjx import mjx
-from mjx_study.contact import ContactModel, apply_contact, contact_model
-from mjx_study.integration import integrate_position
-from mjx_study.scene import Scene
+from mjx_study.simulation import constraint, dynamics
+from mjx_study.simulation._mjx import mjx
+from mjx_study.simulation.contact import ContactModel, apply_contact, contact_model
+from mjx_study.simulation.integration import integrate_position
+from mjx_study.simulation.scene import Scene
 from tests.scenes import (
     CASES,
     assert_close_by_rows,

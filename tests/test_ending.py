@@ -14,9 +14,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mjx_study import cli, disk, sweep_cells
+from mjx_study import cli, disk
 from mjx_study.cli import options
-from mjx_study.sweep_plan import SweepCell, SweepPlan
+from mjx_study.study import cells as sweep_cells
+from mjx_study.study.plan import SweepCell, SweepPlan
 from tests.test_study import result, row
 
 SIGNALS = """

@@ -9,7 +9,7 @@ from typing import Any
 import jax
 import pytest
 
-from mjx_study import dynamics
+from mjx_study.simulation import dynamics
 
 PAGE = (Path(__file__).parents[1] / "docs" / "gradient-faults.md").read_text()
 SECTIONS = dict(re.findall(r"^## (\d+)\n(.*?)(?=^## |\Z)", PAGE, re.DOTALL | re.MULTILINE))

@@ -10,8 +10,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from mjx_study import sweep
-from mjx_study.sweep_plan import SweepConfig, plan_sweep
+from mjx_study.study import sweep
+from mjx_study.study.plan import SweepConfig, plan_sweep
 from tests import fuzzing
 
 POLICY = {

@@ -12,17 +12,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_study import identity, sweep_cells
-from mjx_study.checkpoint import checkpoint_path
-from mjx_study.identity import contents, differences
-from mjx_study.optimise import OptimiseConfig, OptimiseResult, optimise, plan_optimise
-from mjx_study.revision import git_revision
-from mjx_study.scene import models_folder
-from mjx_study.store import Store, StudyError
-from mjx_study.sweep import load_study, run_sweep, what_to_beware_of
-from mjx_study.sweep_plan import SweepCell, SweepConfig, SweepPlan, plan_sweep
-from mjx_study.task import Task
+from mjx_study.simulation.scene import models_folder
+from mjx_study.study import cells as sweep_cells
+from mjx_study.study import identity
+from mjx_study.study.checkpoint import checkpoint_path
+from mjx_study.study.descents import OptimiseConfig, OptimiseResult, optimise, plan_optimise
+from mjx_study.study.identity import contents, differences
+from mjx_study.study.plan import SweepCell, SweepConfig, SweepPlan, plan_sweep
+from mjx_study.study.revision import git_revision
+from mjx_study.study.store import Store, StudyError
+from mjx_study.study.sweep import load_study, run_sweep, what_to_beware_of
 from mjx_study.tasks import make_task
+from mjx_study.tasks.task import Task
 
 MODULE = """
 from functools import partial

@@ -12,15 +12,15 @@ import pytest
 
 from mjx_study import cli
 from mjx_study.cli import options
-from mjx_study.descent import make_optimizer
 from mjx_study.files import PolicyFile, read_json, read_theta
 from mjx_study.limits import MOST_CELLS, MOST_MODELS, check_count
-from mjx_study.mjcf_sizes import too_large
 from mjx_study.option import OPTIONS, Interval
 from mjx_study.runtime import default_cache
-from mjx_study.scene import SceneError, load_model
-from mjx_study.study_document import read_document
-from mjx_study.sweep import SweepConfig, open_store, plan_sweep
+from mjx_study.simulation.mjcf_sizes import too_large
+from mjx_study.simulation.scene import SceneError, load_model
+from mjx_study.study.document import read_document
+from mjx_study.study.iteration import make_optimizer
+from mjx_study.study.sweep import SweepConfig, open_store, plan_sweep
 
 BODY = "<worldbody><body><freejoint/><geom size='0.1'/></body></worldbody>"
 

@@ -8,9 +8,9 @@ import pytest
 from mujoco.mjx._src import math as mjx_math
 from scipy.spatial.transform import Rotation
 
-from mjx_study import dynamics, integration
-from mjx_study._mjx import mjx
-from mjx_study.integration import integrate_position, rotate_quaternion
+from mjx_study.simulation import dynamics, integration
+from mjx_study.simulation._mjx import mjx
+from mjx_study.simulation.integration import integrate_position, rotate_quaternion
 from tests.scenes import central_jacobian, compiled, scene_of, split, step_flat
 
 TIMESTEP = 0.004

@@ -13,15 +13,16 @@ from scipy import stats
 from scipy.integrate import quad
 
 from estimators import NOISES, Differentiation, Evaluation
-from mjx_study import cli, landscape
+from mjx_study import cli
 from mjx_study.cli import landscape as command
 from mjx_study.cli import options
-from mjx_study.landscape import LandscapeConfig, plan_landscape
-from mjx_study.policy import LinearFeedback
-from mjx_study.quadrature import Line, grid, means
 from mjx_study.reference import BallWall, FunctionObjective, Heaviside, Quadratic, smoothed
-from mjx_study.task import Task
+from mjx_study.study import landscapes as landscape
+from mjx_study.study.landscapes import LandscapeConfig, plan_landscape
+from mjx_study.study.quadrature import Line, grid, means
 from mjx_study.tasks import make_task
+from mjx_study.tasks.policy import LinearFeedback
+from mjx_study.tasks.task import Task
 
 
 @pytest.fixture(autouse=True)

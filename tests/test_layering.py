@@ -8,69 +8,33 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-# From the bottom up; a module may import from its own layer and from those above it in this list.
+# From the bottom up; a package or module may import from its own layer and from those above it in this list.
 LAYERS = [
     "estimators",
     "mjx_study._matplotlib",
-    "mjx_study._mjx",
     "mjx_study.runtime",
-    "mjx_study.revision",
-    "mjx_study.noise",
     "mjx_study.table",
     "mjx_study.disk",
+    "mjx_study.limits",
     "mjx_study.reference",
-    "mjx_study.limitations",
-    "mjx_study.mjcf_sizes",
-    "mjx_study.scene",
-    "mjx_study.contact",
-    "mjx_study.engine",
-    "mjx_study.integration",
-    "mjx_study.repairs",
-    "mjx_study.constraint",
-    "mjx_study.dynamics",
-    "mjx_study.onset",
+    "mjx_study.simulation",
     "mjx_study.option",
     "mjx_study.files",
-    "mjx_study.policy",
-    "mjx_study.task",
-    "mjx_study.task_checks",
-    "mjx_study.limits",
-    "mjx_study.network",
     "mjx_study.tasks",
-    "mjx_study.identity",
     "mjx_study.objective",
-    "mjx_study.reference_gradient",
-    "mjx_study.configuration",
-    "mjx_study.comparison",
     "mjx_study.study",
-    "mjx_study.findings",
-    "mjx_study.quadrature",
-    "mjx_study.landscape",
     "mjx_study.gradcheck",
     "mjx_study.bench",
-    "mjx_study.results",
-    "mjx_study.descent",
-    "mjx_study.checkpoint",
-    "mjx_study.optimise",
-    "mjx_study.study_document",
-    "mjx_study.store",
-    "mjx_study.sweep_memory",
-    "mjx_study.sweep_plan",
-    "mjx_study.sweep_axes",
-    "mjx_study.sweep_cells",
-    "mjx_study.sweep",
     "mjx_study.render",
     "mjx_study.plots",
-    "mjx_study.study_plots",
     "mjx_study.report",
-    "mjx_study.console",
     "mjx_study.cli",
     "mjx_study.__main__",
     "mjx_study",  # the package itself re-exports, so that nothing may import from it
 ]
 PACKAGES = ("estimators", "mjx_study")
-# The analytic systems are NumPy alone, and share with the simulator only how noise is drawn.
-REFERENCE_MAY_IMPORT = ("estimators", "mjx_study.noise", "mjx_study.reference")
+# The analytic systems are NumPy alone, and import nothing of the simulator.
+REFERENCE_MAY_IMPORT = ("estimators", "mjx_study.reference")
 FILES = sorted(path for package in PACKAGES for path in (ROOT / package).glob("**/*.py"))
 
 
@@ -131,19 +95,21 @@ def test_imports_point_down(path: Path) -> None:
 
 def test_every_layer_is_used_once_and_files_are_found() -> None:
     assert len(set(LAYERS)) == len(LAYERS)
-    assert {layer_of(module_of(path)) for path in FILES} >= {LAYERS.index(n) for n in ("estimators", "mjx_study.scene")}
+    assert {layer_of(module_of(path)) for path in FILES} >= {
+        LAYERS.index(n) for n in ("estimators", "mjx_study.simulation")
+    }
 
 
 @pytest.mark.parametrize(
     ("module", "source", "wrong"),
     [
-        ("estimators.types", "import mjx_study.noise", {"mjx_study.noise"}),
-        ("mjx_study.scene", "def f():\n    from mjx_study.dynamics import step", {"mjx_study.dynamics"}),
-        ("mjx_study.scene", "from .contact import ContactModel", {"mjx_study.contact"}),
-        ("mjx_study.scene", "from mjx_study import contact", {"mjx_study.contact"}),
-        ("mjx_study.contact", "from mjx_study import ContactModel", {"mjx_study"}),
-        ("mjx_study.reference.system", "from mjx_study.scene import Scene", {"mjx_study.scene"}),
-        ("mjx_study.contact", "from mjx_study.scene import Scene\nimport jax", set()),
+        ("estimators.types", "import mjx_study.reference.noise", {"mjx_study.reference.noise"}),
+        ("mjx_study.tasks.task", "def f():\n    from mjx_study.objective import Simulator", {"mjx_study.objective"}),
+        ("mjx_study.tasks.task", "from ..objective import Simulator", {"mjx_study.objective"}),
+        ("mjx_study.tasks.task", "from mjx_study import objective", {"mjx_study.objective"}),
+        ("mjx_study.simulation.contact", "from mjx_study import ContactModel", {"mjx_study"}),
+        ("mjx_study.reference.system", "from mjx_study.limits import check_count", {"mjx_study.limits"}),
+        ("mjx_study.simulation.contact", "from mjx_study.simulation.dynamics import step\nimport jax", set()),
     ],
 )
 def test_the_walk_sees(module: str, source: str, wrong: set[str]) -> None:

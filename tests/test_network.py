@@ -10,9 +10,9 @@ import pytest
 
 from mjx_study import cli
 from mjx_study.cli import options
-from mjx_study.dynamics import State
-from mjx_study.network import Network, with_network
+from mjx_study.simulation.dynamics import State
 from mjx_study.tasks import make_task
+from mjx_study.tasks.network import Network, with_network
 
 
 def network() -> Network:

@@ -152,9 +152,9 @@ def test_only_public_names_are_used(path: Path) -> None:
 @pytest.mark.parametrize(
     ("source", "found"),
     [
-        ("from mjx_study._mjx import mjx", ["mjx_study._mjx.mjx"]),
-        ("import mjx_study._mjx", ["mjx_study._mjx"]),
-        ("from mjx_study.study import _row", ["mjx_study.study._row"]),
+        ("from mjx_study.simulation._mjx import mjx", ["mjx_study.simulation._mjx.mjx"]),
+        ("import mjx_study.simulation._mjx", ["mjx_study.simulation._mjx"]),
+        ("from mjx_study.study.gradients import _row", ["mjx_study.study.gradients._row"]),
         ("task._hidden", ["_hidden"]),
         ("mjx_study.UNHEARD_OF", ["mjx_study.UNHEARD_OF"]),
         ("import mjx_study\nmjx_study.compare(plan).rows", []),

@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 
 from estimators import Differentiation, EstimatorOptions, Evaluation, Objective, estimate, first_order, zeroth_order
-from mjx_study import constraint, dynamics
-from mjx_study.contact import ContactModel, contact_model, family_model
-from mjx_study.dynamics import State, initial_state
 from mjx_study.objective import MAX_CHUNK, Simulator, chunk_for
-from mjx_study.policy import Launch, LinearFeedback, OpenLoop, Policy
-from mjx_study.scene import put_scene
-from mjx_study.task import Task
+from mjx_study.simulation import constraint, dynamics
+from mjx_study.simulation.contact import ContactModel, contact_model, family_model
+from mjx_study.simulation.dynamics import State, initial_state
+from mjx_study.simulation.scene import put_scene
 from mjx_study.tasks import make_task
+from mjx_study.tasks.policy import Launch, LinearFeedback, OpenLoop, Policy
+from mjx_study.tasks.task import Task
 from tests.estimators.statistics_helpers import assert_mean_is
 from tests.pusher_fixtures import (
     HORIZON,

@@ -19,8 +19,8 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from mjx_study.contact import ContactModel, apply_contact
-from mjx_study.dynamics import initial_state, rollout
+from mjx_study.simulation.contact import ContactModel, apply_contact
+from mjx_study.simulation.dynamics import initial_state, rollout
 from tests.scenes import floor_scene, option, scene_of
 
 STIFFNESS, SPEED, APPROACH, CONTACT = 1e4, 1.0, 0.01, 0.01  # [1/s^2], [m/s] at the onset, [s], [s]

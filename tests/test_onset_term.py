@@ -11,13 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_study.configuration import plan_cells
-from mjx_study.contact import ContactModel, apply_contact
-from mjx_study.dynamics import initial_state, rollout
 from mjx_study.objective import Simulator
-from mjx_study.onset import check_onset, corrected_rollout
-from mjx_study.quadrature import Line, grid, means
+from mjx_study.simulation.contact import ContactModel, apply_contact
+from mjx_study.simulation.dynamics import initial_state, rollout
+from mjx_study.simulation.onset import check_onset, corrected_rollout
+from mjx_study.study.quadrature import Line, grid, means
 from mjx_study.tasks import make_task
+from mjx_study.tasks.contact_grid import contact_grid
 from tests.scenes import floor_scene, option, scene_of
 
 TIMECONST, LOW, HIGH, WIDTH = 0.02, 0.9, 0.95, 0.001
@@ -141,8 +141,8 @@ def test_both_programs_agree_where_four_corners_land(cone: str, monkeypatch: pyt
     plain = compiled(lambda: rollout(scene, scene.model, start, law, steps)[0].qvel[-1])
     np.testing.assert_allclose(value, plain, rtol=1e-9)
     assert counts.found >= 4 and counts.missed == 0
-    monkeypatch.setattr("mjx_study.onset.uses_jacobian", lambda scene: False)
-    monkeypatch.setattr("mjx_study.dynamics.JACOBIAN_COLUMNS", 0)
+    monkeypatch.setattr("mjx_study.simulation.onset.uses_jacobian", lambda scene: False)
+    monkeypatch.setattr("mjx_study.simulation.dynamics.JACOBIAN_COLUMNS", 0)
     by_tape, _ = compiled(jax.jacrev(last, has_aux=True), start.qvel)
     np.testing.assert_allclose(by_jacobian, by_tape, rtol=1e-5, atol=1e-7)
 
@@ -151,7 +151,7 @@ def test_the_mean_has_the_slope_where_plain_first_order_has_the_wrong_sign() -> 
     """MuJoCo's default contact, h b = 0.2: the mean of plain first-order gradients is +0.78 at 0.5 rad, not -0.945."""
     task = make_task("momentum_transfer").replace(onset="linear")
     position, points = np.array([0.5]), grid(0.5, 0.5, task.sigma, 400, task.noise)
-    (cell,), _ = plan_cells(task, ("mujoco_default",))
+    (cell,), _ = contact_grid(task, ("mujoco_default",))
     found = means(points, *Line(task)(points, cell.contact), position, task.sigma, task.noise)
     assert found.slope_error + found.first_error < 0.02
     assert found.slope < -0.9
@@ -180,7 +180,7 @@ def test_onsets_beyond_the_slots_are_counted_and_left_out() -> None:
 @pytest.mark.slow
 def test_a_batch_says_what_the_term_met() -> None:
     task = make_task("momentum_transfer").replace(onset="linear")
-    (cell,), _ = plan_cells(task, ("mujoco_default",))
+    (cell,), _ = contact_grid(task, ("mujoco_default",))
     keys = jax.random.split(jax.random.key(0), 4)
     batch = Simulator(task, chunk_size=2).objective(cell.contact).differentiate(task.theta, keys)
     assert batch.events is not None and batch.events.tolist() == [[1.0, 0.0, 0.0]] * 4

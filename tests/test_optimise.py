@@ -14,13 +14,16 @@ from PIL import Image
 
 import estimators
 from estimators import ESTIMATORS, Differentiation
-from mjx_study import cli, configuration, descent, optimise
-from mjx_study.checkpoint import checkpoint_path
+from mjx_study import cli
 from mjx_study.cli import options
-from mjx_study.descent import REASONS, begin, make_optimizer
 from mjx_study.objective import Simulator
-from mjx_study.optimise import Backend, OptimiseConfig, plan_optimise
 from mjx_study.reference import ReferenceObjective, Tennis, roll_out
+from mjx_study.study import configuration
+from mjx_study.study import descents as optimise
+from mjx_study.study import iteration as descent
+from mjx_study.study.checkpoint import checkpoint_path
+from mjx_study.study.descents import Backend, OptimiseConfig, plan_optimise
+from mjx_study.study.iteration import REASONS, begin, make_optimizer
 from mjx_study.tasks import TASKS, make_task
 
 SHORT: dict[str, Any] = {

@@ -16,12 +16,12 @@ import pytest
 
 from mjx_study.cli.gradcheck import UNEXERCISED
 from mjx_study.gradcheck import plan_gradcheck
-from mjx_study.landscape import LandscapeConfig, plan_landscape
-from mjx_study.optimise import OptimiseConfig, plan_optimise
-from mjx_study.study import CompareConfig, plan_compare
-from mjx_study.task import Task
+from mjx_study.study.descents import OptimiseConfig, plan_optimise
+from mjx_study.study.gradients import CompareConfig, plan_compare
+from mjx_study.study.landscapes import LandscapeConfig, plan_landscape
 from mjx_study.tasks import make_task
 from mjx_study.tasks.own import GROUP
+from mjx_study.tasks.task import Task
 
 ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs" / "extending.md").read_text()

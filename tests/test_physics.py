@@ -15,13 +15,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_study.configuration import plan_cells
-from mjx_study.contact import ContactModel, ContactWarning
-from mjx_study.noise import split_sample_key
 from mjx_study.objective import simulate
 from mjx_study.reference import BallWall, MomentumTransfer, SlidingBox, Tennis, draw_start, roll_out
-from mjx_study.task import Task
+from mjx_study.reference.noise import split_sample_key
+from mjx_study.simulation.contact import ContactModel, ContactWarning
 from mjx_study.tasks import make_task
+from mjx_study.tasks.contact_grid import contact_grid
+from mjx_study.tasks.task import Task
 
 CRITICAL_RESTITUTION = math.exp(-2)
 """Of a critically damped spring that lets go when its force ends."""
@@ -38,7 +38,7 @@ def rollouts(task: Task) -> Callable[..., Any]:
 def contact(task: Task, family: str, stiffness: float) -> ContactModel:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ContactWarning)
-        ((cell,), _) = plan_cells(task, [family], [stiffness])
+        ((cell,), _) = contact_grid(task, [family], [stiffness])
     assert cell.contact is not None
     return cell.contact
 
@@ -171,7 +171,7 @@ def test_a_stiff_damper_creeps_less() -> None:
     task, run = dragged()
     slips = []
     for damping in (1.8, 3.6):
-        ((cell,), _) = plan_cells(task, ["penalty"], [1000.0], damping)
+        ((cell,), _) = contact_grid(task, ["penalty"], [1000.0], damping)
         states, *_ = run(jnp.asarray(FORCES["creeps"])[None], cell.contact)
         velocity = np.asarray(states.qvel)[0, -1]
         slips.append(velocity[0] - velocity[2])

@@ -9,13 +9,13 @@ import pytest
 import estimators
 from mjx_study import cli
 from mjx_study.cli import options
-from mjx_study.comparison import CompareConfig
-from mjx_study.configuration import EstimatorConfig, configured_options
-from mjx_study.optimise import OptimiseConfig, plan_optimise
 from mjx_study.reference import DoublePendulum, roll_out
 from mjx_study.reference.adjoint import gradients_along
-from mjx_study.study import plan_compare
-from mjx_study.sweep_plan import SweepConfig, estimator_options, plan_sweep
+from mjx_study.study.comparison import CompareConfig
+from mjx_study.study.configuration import EstimatorConfig, configured_options
+from mjx_study.study.descents import OptimiseConfig, plan_optimise
+from mjx_study.study.gradients import plan_compare
+from mjx_study.study.plan import SweepConfig, estimator_options, plan_sweep
 from mjx_study.tasks import make_task
 
 MOMENTUM = 4 / 1.1**2  # an elastic hit of a bar ten times as heavy, in units of the published cost

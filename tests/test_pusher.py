@@ -17,9 +17,9 @@ import numpy as np
 import pytest
 
 from estimators import first_order, variance_interval, zeroth_order
-from mjx_study.contact import ContactModel, ContactWarning, family_model
 from mjx_study.objective import Simulator
 from mjx_study.reference import Pusher, ReferenceObjective, roll_out, value_and_gradient
+from mjx_study.simulation.contact import ContactModel, ContactWarning, family_model
 from tests.pusher_fixtures import (
     DATA,
     HORIZON,

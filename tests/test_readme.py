@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from mjx_study import cli
-from mjx_study.contact import FAMILIES
+from mjx_study.simulation.contact import FAMILIES
 from mjx_study.tasks import TASKS
 
 ROOT = Path(__file__).parents[1]

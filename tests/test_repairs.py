@@ -10,15 +10,15 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from mjx_study import repairs
-from mjx_study._mjx import mjx
-from mjx_study.scene import load_scene
+from mjx_study.simulation import patches
+from mjx_study.simulation._mjx import mjx
+from mjx_study.simulation.scene import load_scene
 
 UNIT = st.floats(-1, 1)
 
 
 def original(module: str, name: str) -> Any:
-    return getattr(repairs._module(module), name)
+    return getattr(patches._module(module), name)
 
 
 LEVEL = """<mujoco><option timestep=".002"><flag contact="disable"/></option>
@@ -36,15 +36,15 @@ def test_stiffness_damping_and_impedance_are_the_c_engines(solref, solimp) -> No
         data.qpos[:] = position
         mujoco.mj_forward(host, data)
         arguments = model, jnp.array(solref), jnp.array(solimp), jnp.array(position)
-        ours = repairs.stiffness_damping_impedance(*arguments)
+        ours = patches.stiffness_damping_impedance(*arguments)
         np.testing.assert_allclose(ours, data.efc_KBIP[0, :3], rtol=1e-12)
 
 
 def test_both_quaternions_of_an_orientation_are_one() -> None:
     start, end = (jnp.array(part) / np.linalg.norm(part) for part in ([0.9, 0.1, -0.3, 0.2], [0.2, 0.7, 0.4, -0.1]))
-    expected = repairs.rotation_difference(end, start)
-    np.testing.assert_allclose(repairs.rotation_difference(-end, start), expected, atol=1e-15)
-    np.testing.assert_allclose(repairs.rotation_difference(end, -start), expected, atol=1e-15)
+    expected = patches.rotation_difference(end, start)
+    np.testing.assert_allclose(patches.rotation_difference(-end, start), expected, atol=1e-15)
+    np.testing.assert_allclose(patches.rotation_difference(end, -start), expected, atol=1e-15)
 
 
 @settings(deadline=None, max_examples=60, derandomize=True)
@@ -64,7 +64,7 @@ def test_stiffness_damping_and_impedance_are_mjxs(solref, low, high, width, midp
     model, solimp = load_scene("pusher").model, jnp.array([low, high, width, midpoint, power])
     arguments = model, jnp.array(solref), solimp, jnp.array(position)
     for ours, theirs in zip(
-        repairs.stiffness_damping_impedance(*arguments), original("constraint", "_kbi")(*arguments), strict=True
+        patches.stiffness_damping_impedance(*arguments), original("constraint", "_kbi")(*arguments), strict=True
     ):
         np.testing.assert_allclose(ours, theirs, rtol=1e-12)
 
@@ -83,10 +83,10 @@ def test_rotations_are_mjxs(numbers: list[float]) -> None:
     parts = np.array(numbers).reshape(2, 4) + np.array([[0.0, 1e-3, 0, 0], [1e-3, 0, 0, 0]])
     first, second = (jnp.array(part / np.linalg.norm(part)) for part in parts)
     axis, angle = original("math", "quat_to_axis_angle")(first)
-    ours, one = repairs.rotation_vector(first)
+    ours, one = patches.rotation_vector(first)
     np.testing.assert_allclose(turned(np.asarray(ours * one)), turned(np.asarray(axis * angle)), atol=1e-10)
     assert np.linalg.norm(ours) <= np.pi + 1e-12
-    difference = repairs.rotation_difference(second, first)
+    difference = patches.rotation_difference(second, first)
     theirs = original("math", "quat_sub")(second, first)
     np.testing.assert_allclose(turned(np.asarray(difference)), turned(np.asarray(theirs)), atol=1e-10)
 
@@ -94,22 +94,22 @@ def test_rotations_are_mjxs(numbers: list[float]) -> None:
 def test_a_rotation_has_its_derivative_at_no_angle() -> None:
     still = jnp.array([1.0, 0, 0, 0])
     right = np.concatenate([np.zeros((3, 1)), 2 * np.eye(3)], axis=1)  # sin(angle / 2) is half the angle
-    np.testing.assert_allclose(jax.jacfwd(lambda q: repairs.rotation_vector(q)[0])(still), right, atol=1e-15)
-    np.testing.assert_allclose(jax.jacrev(lambda q: repairs.rotation_difference(q, still))(still), right, atol=1e-15)
+    np.testing.assert_allclose(jax.jacfwd(lambda q: patches.rotation_vector(q)[0])(still), right, atol=1e-15)
+    np.testing.assert_allclose(jax.jacrev(lambda q: patches.rotation_difference(q, still))(still), right, atol=1e-15)
 
 
 def test_mjxs_own_functions_are_back_afterwards() -> None:
-    before = {key: original(*key) for key in repairs._REPLACED}
-    with pytest.raises(KeyError), repairs.repaired(), repairs.repaired():
-        assert all(original(*key) is repairs._REPLACED[key] for key in before)
+    before = {key: original(*key) for key in patches._REPLACED}
+    with pytest.raises(KeyError), patches.repaired(), patches.repaired():
+        assert all(original(*key) is patches._REPLACED[key] for key in before)
         raise KeyError
     assert all(original(*key) is function for key, function in before.items())
 
 
 def test_another_mjx_is_an_error_and_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     own = original("constraint", "_kbi")
-    monkeypatch.setattr(repairs, "_REPLACED", {**repairs._REPLACED, ("math", "no_such_function"): jnp.sin})
-    with pytest.raises(RuntimeError, match="no math.no_such_function"), repairs.repaired():
+    monkeypatch.setattr(patches, "_REPLACED", {**patches._REPLACED, ("math", "no_such_function"): jnp.sin})
+    with pytest.raises(RuntimeError, match="no math.no_such_function"), patches.repaired():
         pytest.fail("nothing may be traced")
     assert original("constraint", "_kbi") is own
 
@@ -124,10 +124,10 @@ def test_tendon_springs_are_linear_at_rest() -> None:
 
     def gap(x):
         moved = mjx.kinematics(model, data.replace(qpos=x[None]))
-        return repairs.tendon_spring_gap(model, mjx.tendon(model, mjx.com_pos(model, moved)))[0]
+        return patches.tendon_spring_gap(model, mjx.tendon(model, mjx.com_pos(model, moved)))[0]
 
     program = jax.jit(jax.value_and_grad(gap))
-    assert repairs.has_tendon_springs(model)
+    assert patches.has_tendon_springs(model)
     assert [float(part) for part in program(jnp.zeros(()))] == [0.0, -400.0]
     assert [float(part) for part in program(jnp.array(0.1))] == [0.0, 0.0]
-    assert not repairs.has_tendon_springs(load_scene("pusher").model)
+    assert not patches.has_tendon_springs(load_scene("pusher").model)

@@ -13,10 +13,10 @@ from PIL import Image, ImageSequence
 
 from mjx_study.cli import options as shared
 from mjx_study.cli import rollout
-from mjx_study.configuration import plan_cells
 from mjx_study.objective import Simulator
 from mjx_study.render import RenderError
 from mjx_study.tasks import make_task
+from mjx_study.tasks.contact_grid import contact_grid
 
 SHORT = ["pusher", "--horizon", "10", "--renderer", "drawing"]
 FILES = ["rollout.gif", "strip.pdf", "strip.png", "stroboscope.pdf", "stroboscope.png", "trajectory.npz"]
@@ -55,7 +55,7 @@ def test_the_cost_is_the_objectives(capsys: pytest.CaptureFixture[str], noise: l
     """The same sample as in a batch: the value with its key's noise, the baseline without."""
     facts = document(capsys, *SHORT, "--contact", "penalty", "--stiffness", "1000", *noise)
     task = make_task("pusher", horizon=10)
-    (cell,), _ = plan_cells(task, ("penalty",), (1000.0,))
+    (cell,), _ = contact_grid(task, ("penalty",), (1000.0,))
     batch = Simulator(task, chunk_size=1).objective(cell.contact).evaluate(task.theta, jax.random.key(3)[None])
     assert facts["cost"] == pytest.approx(float((batch.value if noise else batch.baseline)[0]), rel=1e-9)
     assert facts["contact"] == "penalty" and facts["stiffness"] == 1000 and facts["finite"]

@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 
 from mjx_study.cli.options import Parser, add_scene_options, scene_options
-from mjx_study.dynamics import State
-from mjx_study.limitations import FLAGS
-from mjx_study.scene import (
+from mjx_study.simulation.dynamics import State
+from mjx_study.simulation.limitations import FLAGS
+from mjx_study.simulation.scene import (
     CONES,
     INTEGRATORS,
     SOLVERS,
@@ -46,7 +46,7 @@ def test_shipped_models_load_by_name() -> None:
 
 
 def test_a_name_needs_no_particular_working_directory(tmp_path: Path) -> None:
-    code = "from mjx_study.scene import load_scene; print(load_scene('pusher').host.nq)"
+    code = "from mjx_study.simulation.scene import load_scene; print(load_scene('pusher').host.nq)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path)
     assert (done.returncode, done.stdout) == (0, "2\n"), done.stderr
 

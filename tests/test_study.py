@@ -9,10 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_study import console, disk, plots, results, study
-from mjx_study.comparison import CompareConfig, CompareResult, Row
-from mjx_study.findings import findings
+from mjx_study import disk
+from mjx_study.cli import console
 from mjx_study.objective import MjxObjective, Simulator
+from mjx_study.plots import comparison as plots
+from mjx_study.study import gradients as study
+from mjx_study.study import results
+from mjx_study.study.comparison import CompareConfig, CompareResult, Row
+from mjx_study.study.findings import findings
 from mjx_study.tasks import make_task
 
 SMALL: dict[str, Any] = {"horizon": 4, "samples": 8, "reference_samples": 8}

@@ -20,16 +20,19 @@ import pytest
 import xarray as xr
 
 import estimators
-from mjx_study import cli, store, study_plots, sweep_cells
+from mjx_study import cli
 from mjx_study.cli import options
 from mjx_study.cli.sweep import _fields, _solimp, _solref
-from mjx_study.contact import stiffness_from_solref
 from mjx_study.objective import Simulator, simulate
+from mjx_study.plots import study as study_plots
 from mjx_study.report import report
-from mjx_study.store import Store, StudyError
-from mjx_study.sweep import SweepConfig, load_study, open_store, plan_sweep, run_sweep, what_to_beware_of
-from mjx_study.sweep_cells import MEASURED, compute_gradients
-from mjx_study.sweep_plan import estimator_options
+from mjx_study.simulation.contact import stiffness_from_solref
+from mjx_study.study import cells as sweep_cells
+from mjx_study.study import store
+from mjx_study.study.cells import MEASURED, compute_gradients
+from mjx_study.study.plan import estimator_options
+from mjx_study.study.store import Store, StudyError
+from mjx_study.study.sweep import SweepConfig, load_study, open_store, plan_sweep, run_sweep, what_to_beware_of
 from mjx_study.tasks import make_task
 from tests.documents import study_document
 
@@ -185,7 +188,7 @@ ZYGOTE = """
 import json, os, random, signal, sys, time
 from pathlib import Path
 import numpy as np
-from mjx_study.store import Store
+from mjx_study.study.store import Store
 from tests.documents import study_document
 
 folder, cells = Path(sys.argv[1]), 40

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mjx_study import sweep_cells
-from mjx_study.study_plots import plot_study
-from mjx_study.sweep import load_study, run_sweep
-from mjx_study.sweep_plan import SweepCell, SweepConfig, SweepPlan, plan_sweep
+from mjx_study.plots.study import plot_study
+from mjx_study.study import cells as sweep_cells
+from mjx_study.study.plan import SweepCell, SweepConfig, SweepPlan, plan_sweep
+from mjx_study.study.sweep import load_study, run_sweep
 from mjx_study.table import digits_to_tell_apart
 
 SMALL: dict[str, Any] = {"tasks": ("pusher",), "contact": ("penalty",), "samples": (4,), "seeds": 1, "horizon": 2}

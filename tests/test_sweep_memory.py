@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 
 from estimators import Differentiation, Evaluation
-from mjx_study import sweep_cells, sweep_memory
-from mjx_study.contact import ContactModel
 from mjx_study.objective import MjxObjective, Simulator
-from mjx_study.sweep_cells import MEASURED, compute_gradients
-from mjx_study.sweep_plan import SweepConfig, memory_of_seed, plan_sweep, seeds_together
+from mjx_study.simulation.contact import ContactModel
+from mjx_study.study import cells as sweep_cells
+from mjx_study.study import memory as sweep_memory
+from mjx_study.study.cells import MEASURED, compute_gradients
+from mjx_study.study.plan import SweepConfig, memory_of_seed, plan_sweep, seeds_together
 
 
 class Drawn(MjxObjective):
@@ -84,8 +85,8 @@ PEAK = """
 import resource, sys
 from mjx_study.runtime import configure
 configure(cpu_devices=1)
-from mjx_study import sweep_cells
-from mjx_study.sweep_plan import plan_sweep
+from mjx_study.study import cells
+from mjx_study.study.plan import plan_sweep
 from tests.test_sweep_memory import Stub, config
 
 sweep_cells.Simulator = Stub

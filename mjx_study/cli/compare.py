@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from estimators import ESTIMATORS
+from mjx_study.cli.console import alarms, print_comparison
 from mjx_study.cli.options import (
     Commands,
     add_command,
@@ -21,13 +22,12 @@ from mjx_study.cli.options import (
     usage_errors,
 )
 from mjx_study.cli.parameters import add_theta_option, theta_of
-from mjx_study.comparison import CompareConfig
-from mjx_study.console import alarms, print_comparison
-from mjx_study.contact import FAMILIES
 from mjx_study.disk import prepare_folder
-from mjx_study.plots import plot_comparison, save_figure
-from mjx_study.results import as_json, save
-from mjx_study.study import compare, plan_compare
+from mjx_study.plots.comparison import plot_comparison, save_figure
+from mjx_study.simulation.contact import FAMILIES
+from mjx_study.study.comparison import CompareConfig
+from mjx_study.study.gradients import compare, plan_compare
+from mjx_study.study.results import as_json, save
 
 EXAMPLES = """\
 examples:

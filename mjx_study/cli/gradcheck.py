@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 
 from mjx_study import gradcheck as check
+from mjx_study.cli.console import stage_lines
 from mjx_study.cli.options import (
     Commands,
     UsageError,
@@ -18,11 +19,10 @@ from mjx_study.cli.options import (
     scene_options,
     usage_errors,
 )
-from mjx_study.comparison import CompareConfig
-from mjx_study.console import stage_lines
 from mjx_study.gradcheck.plan import HORIZON, STATES, GradcheckPlan
 from mjx_study.option import OPTIONS, Option
-from mjx_study.scene import load_scene
+from mjx_study.simulation.scene import load_scene
+from mjx_study.study.comparison import CompareConfig
 from mjx_study.tasks import make_task, task_names
 
 EPILOG = """\

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from mjx_study.cli.console import number
 from mjx_study.cli.options import (
     Commands,
     add_command,
@@ -24,11 +25,10 @@ from mjx_study.cli.options import (
     usage_errors,
 )
 from mjx_study.cli.parameters import add_theta_option, theta_of
-from mjx_study.console import number
 from mjx_study.disk import prepare_folder, write_whole
-from mjx_study.optimise import OptimiseConfig, OptimiseResult, Run, open_checkpoints, optimise, plan_optimise
-from mjx_study.plots import STYLE, plot_optimisation, save_figure
-from mjx_study.results import as_plain
+from mjx_study.plots.comparison import STYLE, plot_optimisation, save_figure
+from mjx_study.study.descents import OptimiseConfig, OptimiseResult, Run, open_checkpoints, optimise, plan_optimise
+from mjx_study.study.results import as_plain
 from mjx_study.table import format_table
 
 EPILOG = """\

@@ -14,13 +14,13 @@ from typing import Any, Final, NoReturn
 
 import jax
 
-from mjx_study.configuration import EstimatorConfig, Progress
-from mjx_study.console import progress_bar, show_cursor
-from mjx_study.limitations import FLAGS
+from mjx_study.cli.console import progress_bar, show_cursor
 from mjx_study.option import OPTIONS, Checked, Option
 from mjx_study.runtime import PRECISIONS, configure
-from mjx_study.task import Task
+from mjx_study.simulation.limitations import FLAGS
+from mjx_study.study.configuration import EstimatorConfig, Progress
 from mjx_study.tasks import make_task, task_names
+from mjx_study.tasks.task import Task
 
 INTERRUPTED = "nothing was written"
 """What is said after "interrupted" where a command has nothing better to say."""

@@ -5,9 +5,9 @@ from pathlib import Path
 
 from mjx_study.cli.options import Commands, add_command, attempt, finish, print_report, usage_errors
 from mjx_study.disk import prepare_folder
-from mjx_study.plots import save_figure
-from mjx_study.study_plots import plot_study
-from mjx_study.sweep import load_study, what_to_beware_of
+from mjx_study.plots.comparison import save_figure
+from mjx_study.plots.study import plot_study
+from mjx_study.study.sweep import load_study, what_to_beware_of
 
 EPILOG = """\
 Draws what the study has the numbers for, each as PNG and PDF: variance, bias and alpha against stiffness, error against

@@ -6,7 +6,7 @@ from pathlib import Path
 from mjx_study.cli.options import Commands, add_command, attempt, finish, print_report, usage_errors
 from mjx_study.disk import prepare_folder, write_whole
 from mjx_study.report import report
-from mjx_study.sweep import load_study, what_to_beware_of
+from mjx_study.study.sweep import load_study, what_to_beware_of
 
 EPILOG = """\
 Writes FOLDER/report.html: one page that needs no other file, with warnings, figures, a table, the whole configuration,

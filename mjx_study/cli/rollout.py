@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 
 from mjx_study import objective
+from mjx_study.cli.console import number
 from mjx_study.cli.options import (
     Commands,
     UsageError,
@@ -30,15 +31,11 @@ from mjx_study.cli.options import (
     usage_errors,
 )
 from mjx_study.cli.parameters import add_theta_option, theta_of
-from mjx_study.configuration import Cell, at_theta, plan_cells
-from mjx_study.console import number
 from mjx_study.disk import prepare_folder, write_whole
 from mjx_study.files import PolicyFile, read_json
 from mjx_study.limits import MOST_STEPS, check_count
-from mjx_study.network import with_network
-from mjx_study.optimise import OptimiseConfig
 from mjx_study.option import OPTIONS
-from mjx_study.plots import save_figure
+from mjx_study.plots.comparison import save_figure
 from mjx_study.render import (
     FORMATS,
     RENDERERS,
@@ -51,9 +48,13 @@ from mjx_study.render import (
     strip,
     stroboscope,
 )
-from mjx_study.scene import load_model
+from mjx_study.simulation.scene import load_model
+from mjx_study.study.configuration import at_theta
+from mjx_study.study.descents import OptimiseConfig
 from mjx_study.table import format_table
-from mjx_study.task import Task
+from mjx_study.tasks.contact_grid import ContactPoint, contact_grid
+from mjx_study.tasks.network import with_network
+from mjx_study.tasks.task import Task
 
 EPILOG = """\
 Simulates one rollout and shows it: strip.png (pictures at even times), stroboscope.png (one picture with ghosts),
@@ -170,7 +171,7 @@ def _plan_task(options: argparse.Namespace):
     if policy is not None and policy.network is not None:
         task = with_network(task, tuple(policy.network), jax.random.key(0))  # whose weights theta replaces
     stiffness = task.middle_stiffness if options.stiffness is None else options.stiffness
-    cells, messages = plan_cells(task, (options.contact or task.main_family,), (stiffness,), options.damping)
+    cells, messages = contact_grid(task, (options.contact or task.main_family,), (stiffness,), options.damping)
     task = at_theta(task, theta_of(options) if policy is None else policy.theta)
     return partial(_simulate_task, task, cells[0], options.seed, options.noise), messages
 
@@ -189,7 +190,7 @@ def _load_policy(options: argparse.Namespace) -> PolicyFile:
     return policy
 
 
-def _simulate_task(task: Task, cell: Cell, seed: int, noisy: bool) -> Rollout:
+def _simulate_task(task: Task, cell: ContactPoint, seed: int, noisy: bool) -> Rollout:
     theta = task.theta
     program = jax.jit(partial(objective.simulate, task))
     outputs = program(theta, cell.contact, jax.random.key(seed), jnp.asarray(float(noisy), theta.dtype))

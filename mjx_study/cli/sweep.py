@@ -26,8 +26,8 @@ from mjx_study.cli.options import (
 )
 from mjx_study.files import read_toml
 from mjx_study.option import MOST_VALUES, OPTIONS, Interval, Option
-from mjx_study.store import StudyError
-from mjx_study.sweep import (
+from mjx_study.study.store import StudyError
+from mjx_study.study.sweep import (
     SweepConfig,
     SweepPlan,
     SweepResult,

@@ -9,10 +9,10 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from mjx_study.engine import HostState
 from mjx_study.gradcheck.coordinates import Coordinate, Coordinates, geom_label, joint_name, quaternions
 from mjx_study.gradcheck.degenerate import DegenerateContact, degenerate_contacts
-from mjx_study.scene import num_constraint_rows
+from mjx_study.simulation.engine import HostState
+from mjx_study.simulation.scene import num_constraint_rows
 
 NEAR: Final = 2e-6
 """How close to a switch a distance must be to be its cause; about the shortest difference [m, rad, relative]."""

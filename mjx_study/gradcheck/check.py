@@ -2,8 +2,6 @@
 
 import mujoco
 
-from mjx_study.configuration import Progress
-from mjx_study.engine import quiet_engine
 from mjx_study.gradcheck.collect import collect, step_check
 from mjx_study.gradcheck.compiling import Compiler
 from mjx_study.gradcheck.coordinates import coordinates
@@ -16,6 +14,8 @@ from mjx_study.gradcheck.report import GradcheckReport, StepCheck
 from mjx_study.gradcheck.state_check import check_state
 from mjx_study.gradcheck.states import start_of, states_of
 from mjx_study.runtime import environment
+from mjx_study.simulation.engine import quiet_engine
+from mjx_study.study.configuration import Progress
 
 
 def gradcheck(plan: GradcheckPlan, progress: Progress = lambda done, total, what: None) -> GradcheckReport:

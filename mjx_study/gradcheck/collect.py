@@ -4,7 +4,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from mjx_study.configuration import Cell
 from mjx_study.gradcheck import diagnosis
 from mjx_study.gradcheck.causes import SINGULAR, cause_of_fault, cause_of_kink, singular
 from mjx_study.gradcheck.coordinates import Coordinates
@@ -13,12 +12,13 @@ from mjx_study.gradcheck.diagnosis import ENGINE, NAN, RIGHT, UNRESOLVED, VERDIC
 from mjx_study.gradcheck.finding import Entry, Finding
 from mjx_study.gradcheck.report import StepCheck
 from mjx_study.gradcheck.state_check import STOCK, StateCheck
+from mjx_study.tasks.contact_grid import ContactPoint
 
 _Key = tuple[str, str, tuple[str, ...], str]
 """Whose derivative, verdict, modes, cause."""
 
 
-def collect(cell: Cell, layout: Coordinates, checks: Sequence[StateCheck]) -> list[Finding]:
+def collect(cell: ContactPoint, layout: Coordinates, checks: Sequence[StateCheck]) -> list[Finding]:
     """Findings of all states, equal ones together."""
     groups: dict[_Key, list[Entry]] = {}
     for check in checks:
@@ -28,7 +28,7 @@ def collect(cell: Cell, layout: Coordinates, checks: Sequence[StateCheck]) -> li
 
 
 def step_check(
-    cell: Cell, layout: Coordinates, checks: Sequence[StateCheck], found: Sequence[Finding], coverage: Coverage
+    cell: ContactPoint, layout: Coordinates, checks: Sequence[StateCheck], found: Sequence[Finding], coverage: Coverage
 ) -> StepCheck:
     """The row of one contact model."""
 

@@ -14,11 +14,11 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Float
 
-from mjx_study._mjx import mjx
-from mjx_study.contact import ContactModel, apply_contact
-from mjx_study.dynamics import State
-from mjx_study.integration import integrate_position
-from mjx_study.scene import Scene
+from mjx_study.simulation._mjx import mjx
+from mjx_study.simulation.contact import ContactModel, apply_contact
+from mjx_study.simulation.dynamics import State
+from mjx_study.simulation.integration import integrate_position
+from mjx_study.simulation.scene import Scene
 
 PARAMETERS: Final = (
     *("solref[0]", "solref[1]"),

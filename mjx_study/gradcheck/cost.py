@@ -8,15 +8,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_study.configuration import Cell
-from mjx_study.contact import ContactModel
-from mjx_study.engine import HostState
 from mjx_study.gradcheck.compiling import Compiler
 from mjx_study.gradcheck.differences import differences, moves
 from mjx_study.gradcheck.finding import Entry, Finding
-from mjx_study.noise import split_sample_key
 from mjx_study.objective import rollout_cost
-from mjx_study.task import Task
+from mjx_study.reference.noise import split_sample_key
+from mjx_study.simulation.contact import ContactModel
+from mjx_study.simulation.engine import HostState
+from mjx_study.tasks.contact_grid import ContactPoint
+from mjx_study.tasks.task import Task
 
 DIRECTIONS: Final = 6
 BATCH: Final = 8
@@ -97,7 +97,7 @@ class CostPrograms:
         return rollout_cost(self.task, theta, contact, self.start, silent)
 
 
-def check_cost(programs: CostPrograms, cell: Cell, seed: int) -> tuple[CostCheck, list[HostState]]:
+def check_cost(programs: CostPrograms, cell: ContactPoint, seed: int) -> tuple[CostCheck, list[HostState]]:
     """Check one contact model's gradient; also the states of its rollout, each with its control."""
     task = programs.task
     directions = np.random.default_rng(seed).normal(size=(DIRECTIONS, len(task.theta)))
@@ -171,7 +171,7 @@ def cost_verdict(*, finite: bool, modes: float, residual: float, excused: list[s
     return max((name for name in excused if name), key=("kink", "jump").index, default="right")
 
 
-def _against_closed_form(task: Task, cell: Cell, gradient: np.ndarray, key: Any) -> float | None:
+def _against_closed_form(task: Task, cell: ContactPoint, gradient: np.ndarray, key: Any) -> float | None:
     if task.reference is None or cell.family != "penalty":
         return None
     exact = np.asarray(task.reference(cell.stiffness).value_and_gradient(task.theta, key)[1])

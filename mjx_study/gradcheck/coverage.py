@@ -7,7 +7,7 @@ from typing import Any, Final
 import mujoco
 import numpy as np
 
-from mjx_study.scene import Scene
+from mjx_study.simulation.scene import Scene
 
 ZONES: Final = ("push", "stick", "slide", "separate")
 """Of a contact: push has no friction; stick and slide do; separate is within its margin and without force."""

@@ -10,8 +10,8 @@ import mujoco
 import numpy as np
 from jaxtyping import Bool, Int
 
-from mjx_study.engine import HostState, host_data
 from mjx_study.gradcheck.coordinates import LENGTH, Coordinate, Coordinates, geom_label
+from mjx_study.simulation.engine import HostState, host_data
 
 PARALLEL: Final = 1e-5
 """Angle [rad] or distance [m] below which two directions or points count as one; contact points turn within less."""

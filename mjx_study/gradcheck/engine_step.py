@@ -6,9 +6,9 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from mjx_study.contact import ContactModel
-from mjx_study.engine import HostState, converged_host, host_data
 from mjx_study.gradcheck.coordinates import PAIR_FRICTION, Coordinates, quaternions
+from mjx_study.simulation.contact import ContactModel
+from mjx_study.simulation.engine import HostState, converged_host, host_data
 
 WARMSTARTS: Final = (0.0, 0.5, 1.001)
 """Other starts of the solver, relative to its solution, from which it ends up as far away as rounding leaves it."""

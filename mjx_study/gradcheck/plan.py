@@ -7,12 +7,12 @@ from typing import Final
 import jax.numpy as jnp
 import mujoco
 
-from mjx_study.configuration import Cell, plan_cells
-from mjx_study.contact import FAMILIES
-from mjx_study.dynamics import initial_state
-from mjx_study.policy import OpenLoop
-from mjx_study.scene import Scene
-from mjx_study.task import Task
+from mjx_study.simulation.contact import FAMILIES
+from mjx_study.simulation.dynamics import initial_state
+from mjx_study.simulation.scene import Scene
+from mjx_study.tasks.contact_grid import ContactPoint, contact_grid
+from mjx_study.tasks.policy import OpenLoop
+from mjx_study.tasks.task import Task
 
 STIFFNESS: Final = (10.0, 100.0, 1000.0)
 CONTACT: Final = ("penalty", "mujoco", "mujoco_default")
@@ -37,7 +37,7 @@ class GradcheckPlan:
 
     subject: Task
     is_task: bool
-    cells: tuple[Cell, ...]
+    cells: tuple[ContactPoint, ...]
     warnings: tuple[str, ...]
     states: int
     seed: int
@@ -73,7 +73,7 @@ def plan_gradcheck(
         families = ("mjcf",) if task.contact_pair is None else CONTACT
     if stiffnesses is None:
         stiffnesses = STIFFNESS if min(STIFFNESS) <= max(task.stiffnesses, default=0.0) else task.stiffnesses
-    cells, messages = plan_cells(task, families, stiffnesses, damping)
+    cells, messages = contact_grid(task, families, stiffnesses, damping)
     if not cells:
         raise ValueError("no contact model to check: give at least one stiffness and one contact family")
     return GradcheckPlan(task, True, cells, messages, states, seed, stock)
@@ -120,7 +120,7 @@ def plan_scene_gradcheck(
         # single points of MuJoCo's parameters do not need the pair that a stiffness does
         moving = _any_pair(scene)
         subject = subject if moving is None else subject.replace(contact_pair=moving)
-    cells, messages = plan_cells(subject, families, stiffnesses or (), damping)
+    cells, messages = contact_grid(subject, families, stiffnesses or (), damping)
     if pair is None:
         cells = tuple(dataclasses.replace(cell, stiffness=0.0) for cell in cells)
     return GradcheckPlan(subject, False, cells, messages, states, seed, stock)

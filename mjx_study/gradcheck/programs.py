@@ -13,14 +13,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from mjx_study import constraint
-from mjx_study._mjx import mjx
-from mjx_study.contact import ContactModel
-from mjx_study.dynamics import State, exact_step, step, uses_jacobian
-from mjx_study.engine import HostState
 from mjx_study.gradcheck.compiling import Compiler
 from mjx_study.gradcheck.coordinates import Coordinates
-from mjx_study.integration import difference_position
+from mjx_study.simulation import constraint
+from mjx_study.simulation._mjx import mjx
+from mjx_study.simulation.contact import ContactModel
+from mjx_study.simulation.dynamics import State, exact_step, step, uses_jacobian
+from mjx_study.simulation.engine import HostState
+from mjx_study.simulation.integration import difference_position
 
 BATCH: Final = 64
 """Steps in one call of the program of values."""

@@ -5,7 +5,6 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_study.contact import apply_contact
 from mjx_study.gradcheck import diagnosis
 from mjx_study.gradcheck.causes import Place
 from mjx_study.gradcheck.diagnosis import Judged, judge, modes_apart
@@ -15,6 +14,7 @@ from mjx_study.gradcheck.programs import Linear, Programs, Setting
 from mjx_study.gradcheck.rounding import solution_noise
 from mjx_study.gradcheck.states import Sample
 from mjx_study.gradcheck.values import Values, compare_values
+from mjx_study.simulation.contact import apply_contact
 
 STOCK = "mjx.step"
 

@@ -8,10 +8,10 @@ from typing import Final
 import mujoco
 import numpy as np
 
-from mjx_study.contact import ContactModel
-from mjx_study.engine import HostState, converged_host, host_data, host_state
 from mjx_study.gradcheck.coverage import OPTIONAL, Coverage, coverage, exercised, possible
-from mjx_study.scene import Scene
+from mjx_study.simulation.contact import ContactModel
+from mjx_study.simulation.engine import HostState, converged_host, host_data, host_state
+from mjx_study.simulation.scene import Scene
 
 SPEED: Final = 0.1
 """Standard deviation of a sampled start's velocities [m/s or rad/s]: small, but nothing is at rest or at a tie."""

@@ -8,9 +8,9 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from mjx_study.engine import HostState, host_data
 from mjx_study.gradcheck.coordinates import Coordinates, geom_label
 from mjx_study.gradcheck.engine_step import EngineStep
+from mjx_study.simulation.engine import HostState, host_data
 
 TOLERANCE: Final = 1e-8
 """Relative difference of a quantity above which two implementations differ."""

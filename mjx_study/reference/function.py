@@ -16,7 +16,7 @@ from typing import Final, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float
 
-from mjx_study.noise import check_density
+from mjx_study.reference.noise import check_density
 
 TAIL: Final = 1e-15
 """Probability of noise beyond what quadrature covers."""

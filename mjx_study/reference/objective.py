@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Array, Float, Key
 
 from estimators import Differentiation, Evaluation, Linearisation, Objective, StepDifferentiation, StepEvaluation
-from mjx_study.noise import check_density, noise_score, split_sample_key, standard_noise
 from mjx_study.reference.adjoint import gradients_along, roll_out, value_and_gradients
 from mjx_study.reference.function import Function, check_noise
+from mjx_study.reference.noise import check_density, noise_score, split_sample_key, standard_noise
 from mjx_study.reference.system import System
 
 DECISIONS: Final = ("controls", "feedback", "start")

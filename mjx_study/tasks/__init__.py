@@ -4,13 +4,13 @@ from collections.abc import Callable
 from functools import partial
 from typing import Final
 
-from mjx_study.task import Task
 from mjx_study.tasks.ball_wall import ball_wall
 from mjx_study.tasks.double_pendulum import double_pendulum
 from mjx_study.tasks.momentum_transfer import momentum_transfer
 from mjx_study.tasks.own import MissingModuleError, own_task, registered_names, registered_place
 from mjx_study.tasks.pusher import pusher
 from mjx_study.tasks.sliding_box import sliding_box
+from mjx_study.tasks.task import Task
 from mjx_study.tasks.tennis import tennis
 
 TASKS: Final[dict[str, Callable[..., Task]]] = {

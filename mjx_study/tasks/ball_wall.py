@@ -14,11 +14,11 @@ import jax.numpy as jnp
 import mujoco
 from jaxtyping import Array, Float
 
-from mjx_study.dynamics import State, initial_state
-from mjx_study.policy import Launch
 from mjx_study.reference import BallWall, FunctionObjective
-from mjx_study.scene import SceneError, load_model, put_scene, require
-from mjx_study.task import Published, Recipe, Task
+from mjx_study.simulation.dynamics import State, initial_state
+from mjx_study.simulation.scene import SceneError, load_model, put_scene, require
+from mjx_study.tasks.policy import Launch
+from mjx_study.tasks.task import Published, Recipe, Task
 
 HORIZON: Final = 400
 LENGTH_SCALE: Final = 10.0

@@ -15,11 +15,11 @@ from typing import Final
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from mjx_study.dynamics import State, initial_state
-from mjx_study.policy import Launch
 from mjx_study.reference import DoublePendulum, ReferenceObjective
-from mjx_study.scene import load_scene, require
-from mjx_study.task import Recipe, Task
+from mjx_study.simulation.dynamics import State, initial_state
+from mjx_study.simulation.scene import load_scene, require
+from mjx_study.tasks.policy import Launch
+from mjx_study.tasks.task import Recipe, Task
 
 HORIZON: Final = 1000
 STARTS: Final = {  # relative angles [rad], velocities [rad/s]

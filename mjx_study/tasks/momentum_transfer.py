@@ -13,11 +13,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from mjx_study.dynamics import State, initial_state
-from mjx_study.policy import Launch
 from mjx_study.reference import FunctionObjective, MomentumTransfer
-from mjx_study.scene import load_scene, require
-from mjx_study.task import Published, Recipe, Task
+from mjx_study.simulation.dynamics import State, initial_state
+from mjx_study.simulation.scene import load_scene, require
+from mjx_study.tasks.policy import Launch
+from mjx_study.tasks.task import Published, Recipe, Task
 
 HORIZON: Final = 400
 SPEED: Final = 2.0  # [m/s]

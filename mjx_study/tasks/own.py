@@ -11,8 +11,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, Final
 
-from mjx_study.task import Task
-from mjx_study.task_checks import check_shapes, described
+from mjx_study.tasks.task import Task
+from mjx_study.tasks.validation import check_shapes, described
 
 GROUP: Final = "mjx_study.tasks"
 """Entry point group in which installed packages register tasks."""

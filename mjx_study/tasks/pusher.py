@@ -12,11 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from mjx_study.dynamics import State, initial_state
-from mjx_study.policy import OpenLoop
 from mjx_study.reference import Pusher, ReferenceObjective
-from mjx_study.scene import load_scene, require
-from mjx_study.task import Published, Recipe, Task
+from mjx_study.simulation.dynamics import State, initial_state
+from mjx_study.simulation.scene import load_scene, require
+from mjx_study.tasks.policy import OpenLoop
+from mjx_study.tasks.task import Published, Recipe, Task
 
 HORIZON: Final = 200
 START: Final = (0.0, 1.0)  # positions [m]: touching, at rest

@@ -12,11 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
-from mjx_study.dynamics import State, initial_state
-from mjx_study.policy import LinearFeedback
 from mjx_study.reference import ReferenceObjective, Tennis, draw_start, tennis_outcomes
-from mjx_study.scene import load_model, put_scene, require
-from mjx_study.task import Published, Recipe, Task
+from mjx_study.simulation.dynamics import State, initial_state
+from mjx_study.simulation.scene import load_model, put_scene, require
+from mjx_study.tasks.policy import LinearFeedback
+from mjx_study.tasks.task import Published, Recipe, Task
 
 HORIZON: Final = 200
 TIME_SCALE: Final = 10.0

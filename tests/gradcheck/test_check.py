@@ -7,10 +7,11 @@ import jax
 import mujoco
 import pytest
 
-from mjx_study import cli, dynamics
+from mjx_study import cli
 from mjx_study.cli import options
 from mjx_study.gradcheck import Finding, GradcheckReport, gradcheck, plan_gradcheck, plan_scene_gradcheck
-from mjx_study.scene import load_scene, put_scene
+from mjx_study.simulation import dynamics
+from mjx_study.simulation.scene import load_scene, put_scene
 from mjx_study.tasks import make_task
 from tests.scenes import plain_warm_start
 

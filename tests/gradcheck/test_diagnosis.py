@@ -18,7 +18,7 @@ from mjx_study.gradcheck.diagnosis import (
     worst_verdict,
 )
 from mjx_study.gradcheck.differences import Differences
-from mjx_study.scene import put_scene
+from mjx_study.simulation.scene import put_scene
 
 CART = """<mujoco><worldbody><body name="cart"><joint name="x" type="slide" axis="1 0 0"/><geom size=".1"/></body>
 </worldbody><actuator><motor name="push" joint="x"/></actuator></mujoco>"""

@@ -7,7 +7,7 @@ import pytest
 from mujoco import mjx
 
 from mjx_study.gradcheck import gradcheck, plan_scene_gradcheck
-from mjx_study.scene import load_scene
+from mjx_study.simulation.scene import load_scene
 
 MODELS = Path(mjx.__file__).parent / "test_data"
 PAGE = (Path(__file__).parents[2] / "docs" / "gradient-faults.md").read_text()

@@ -4,10 +4,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjx_study.engine import host_state
 from mjx_study.gradcheck.coverage import Coverage
 from mjx_study.gradcheck.states import Sample, states_of
-from mjx_study.scene import Scene, load_scene, put_scene
+from mjx_study.simulation.engine import host_state
+from mjx_study.simulation.scene import Scene, load_scene, put_scene
 
 FLOOR = '<geom name="floor" type="plane" size="5 5 .1"/>'
 # A puck that rests on the floor and does not slide by itself; an arm that hangs far from its limits; dry friction.

@@ -11,15 +11,15 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjx_study import integration, repairs
-from mjx_study.contact import contact_model
-from mjx_study.engine import HostState, host_data
 from mjx_study.gradcheck import coordinates as layouts
 from mjx_study.gradcheck.coordinates import Coordinates, coordinates
 from mjx_study.gradcheck.engine_step import EngineStep
 from mjx_study.gradcheck.programs import Programs, Setting
 from mjx_study.gradcheck.values import Values, compare_values
-from mjx_study.scene import put_scene
+from mjx_study.simulation import integration, patches
+from mjx_study.simulation.contact import contact_model
+from mjx_study.simulation.engine import HostState, host_data
+from mjx_study.simulation.scene import put_scene
 from tests.scenes import scene_of
 
 SERVO = """<mujoco><option integrator="implicitfast"/><worldbody>
@@ -144,14 +144,14 @@ def planted(monkeypatch: pytest.MonkeyPatch) -> Generator[pytest.MonkeyPatch]:
 
 def test_a_wrong_repair_is_a_defect_here(planted: pytest.MonkeyPatch) -> None:
     """k over d_width in place of its square: the derivative of the step is right, and the step is not MJX's."""
-    right = repairs.stiffness_damping_impedance
+    right = patches.stiffness_damping_impedance
 
     def wrong(model, solref, solimp, position):
         k, b, impedance = right(model, solref, solimp, position)
         return k * solimp[1], b, impedance
 
-    name = next(name for name, ours in repairs._REPLACED.items() if ours is right)
-    planted.setitem(repairs._REPLACED, name, wrong)
+    name = next(name for name, ours in patches._REPLACED.items() if ours is right)
+    planted.setitem(patches._REPLACED, name, wrong)
     joint = '<joint type="slide" axis="1 0 0" limited="true" range="0 1"/>'
     xml = f'<mujoco><worldbody><body>{joint}<geom size=".1" mass="1"/></body></worldbody></mujoco>'
     found = value_check(xml, [-0.0101], [-0.1])

@@ -34,7 +34,7 @@ OBJECTIVE: Final = (
     ),
     Defect(
         "score-without-its-scale",
-        "mjx_study/noise.py",
+        "mjx_study/reference/noise.py",
         "NOISES[density].score(noise / sigma) / sigma",
         "NOISES[density].score(noise / sigma)",
         "the score of standard noise; right at sigma = 1",

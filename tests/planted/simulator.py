@@ -13,7 +13,7 @@ CONE = "tests/test_constraint.py::test_the_elliptic_law_is_the_gradient_of_a_con
 DYNAMICS: Final = (
     Defect(
         "frame-without-derivative",
-        "mjx_study/dynamics.py",
+        "mjx_study/simulation/dynamics.py",
         "        return mjx.fwd_position(model, data)\n",
         """        data = mjx.fwd_position(model, data)
         frame = jax.lax.stop_gradient(data._impl.contact.frame)
@@ -25,7 +25,7 @@ DYNAMICS: Final = (
     ),
     Defect(
         "reference-at-rest",
-        "mjx_study/dynamics.py",
+        "mjx_study/simulation/dynamics.py",
         "        data = mjx.make_constraint(model, data)  # again: aref depends on qvel\n",
         "",
         "an apparently repeated call removed",
@@ -34,7 +34,7 @@ DYNAMICS: Final = (
     ),
     Defect(
         "implicit-part-dropped",
-        "mjx_study/dynamics.py",
+        "mjx_study/simulation/dynamics.py",
         "return over_inputs[nv:] + over_qacc[nv:] @ response, response",
         "return over_inputs[nv:], response",
         "the step differentiated at a fixed acceleration",
@@ -43,7 +43,7 @@ DYNAMICS: Final = (
     ),
     Defect(
         "columns-swapped",
-        "mjx_study/dynamics.py",
+        "mjx_study/simulation/dynamics.py",
         """        (lambda x: equations(positioned, qvel, x, control, qacc), act),
         (lambda x: equations(positioned, qvel, act, x, qacc), control),
 """,
@@ -56,7 +56,7 @@ DYNAMICS: Final = (
     ),
     Defect(
         "always-euler",
-        "mjx_study/dynamics.py",
+        "mjx_study/simulation/dynamics.py",
         "mjx.implicit(model, data) if implicit else mjx.euler(model, data)",
         "mjx.euler(model, data)",
         "one integrator forgotten",
@@ -65,7 +65,7 @@ DYNAMICS: Final = (
     ),
     Defect(
         "force-left-out-of-damping",
-        "mjx_study/dynamics.py",
+        "mjx_study/simulation/dynamics.py",
         "data.replace(qacc=qacc, qfrc_constraint=constraint.constraint_force(model, data, qacc))",
         "data.replace(qacc=qacc)",
         "Euler's implicit damping solves again, with the constraint force, which is easily forgotten",
@@ -74,7 +74,7 @@ DYNAMICS: Final = (
     ),
     Defect(
         "runge-kutta-weights",
-        "mjx_study/dynamics.py",
+        "mjx_study/simulation/dynamics.py",
         "(a + 2 * b + 2 * c + d) / 6",
         "(a + 3 * b + 3 * c + d) / 8",
         "the weights of the other rule of order four",
@@ -83,7 +83,7 @@ DYNAMICS: Final = (
     ),
     Defect(
         "runge-kutta-stage",
-        "mjx_study/dynamics.py",
+        "mjx_study/simulation/dynamics.py",
         "third = slopes(*moved(0.5, second))",
         "third = slopes(*moved(0.5, first))",
         "a stage started from the wrong slope",
@@ -95,7 +95,7 @@ DYNAMICS: Final = (
 CONSTRAINT: Final = (
     Defect(
         "elliptic-sliding-direction",
-        "mjx_study/constraint.py",
+        "mjx_study/simulation/constraint.py",
         "-magnitude * friction * tangent / safe_length",
         "-magnitude * friction * jax.lax.stop_gradient(tangent / safe_length)",
         "the direction of sliding held fixed; only a slide that turns shows it",
@@ -104,7 +104,7 @@ CONSTRAINT: Final = (
     ),
     Defect(
         "elliptic-friction-scale",
-        "mjx_study/constraint.py",
+        "mjx_study/simulation/constraint.py",
         "-magnitude * friction * tangent / safe_length",
         "-magnitude * tangent / safe_length",
         "the cone's scaling of its axes applied once in place of twice",
@@ -113,7 +113,7 @@ CONSTRAINT: Final = (
     ),
     Defect(
         "impratio-forgotten",
-        "mjx_study/constraint.py",
+        "mjx_study/simulation/constraint.py",
         "mu = friction[0] / jnp.sqrt(model.opt.impratio)",
         "mu = friction[0]",
         "right at the default impratio of 1",
@@ -122,7 +122,7 @@ CONSTRAINT: Final = (
     ),
     Defect(
         "friction-loss-one-sided",
-        "mjx_study/constraint.py",
+        "mjx_study/simulation/constraint.py",
         "jnp.clip(linear, -loss, loss)",
         "jnp.clip(linear, 0.0, loss)",
         "friction taken for a unilateral force",
@@ -131,7 +131,7 @@ CONSTRAINT: Final = (
     ),
     Defect(
         "equality-only-pushes",
-        "mjx_study/constraint.py",
+        "mjx_study/simulation/constraint.py",
         "kind[: rows.ne] = 2",
         "kind[: rows.ne] = 0",
         "an equality taken for a contact",
@@ -140,7 +140,7 @@ CONSTRAINT: Final = (
     ),
     Defect(
         "cholesky-off-by-one",
-        "mjx_study/constraint.py",
+        "mjx_study/simulation/constraint.py",
         "sum(lower[j, k] ** 2 for k in range(j))",
         "sum(lower[j, k] ** 2 for k in range(1, j))",
         "an index from 1",
@@ -152,7 +152,7 @@ CONSTRAINT: Final = (
 REPAIRS: Final = (
     Defect(
         "stiffness-over-d-width",
-        "mjx_study/repairs.py",
+        "mjx_study/simulation/patches.py",
         "1 / product**2) / high**2",
         "1 / product**2) / high",
         "k divided by d_width in place of its square",
@@ -161,7 +161,7 @@ REPAIRS: Final = (
     ),
     Defect(
         "impedance-above-midpoint",
-        "mjx_study/repairs.py",
+        "mjx_study/simulation/patches.py",
         "** power / (1 - midpoint) ** (power - 1)",
         "** power / midpoint ** (power - 1)",
         "right at the default midpoint of 0.5",
@@ -170,7 +170,7 @@ REPAIRS: Final = (
     ),
     Defect(
         "impedance-of-one-sign",
-        "mjx_study/repairs.py",
+        "mjx_study/simulation/patches.py",
         "depth = jnp.abs(position) / width",
         "depth = -position / width",
         "right for contacts, wrong for equalities, which err to both sides",
@@ -179,7 +179,7 @@ REPAIRS: Final = (
     ),
     Defect(
         "refsafe-at-one-timestep",
-        "mjx_study/repairs.py",
+        "mjx_study/simulation/patches.py",
         "jnp.maximum(timeconst, 2 * model.opt.timestep)",
         "jnp.maximum(timeconst, model.opt.timestep)",
         "a factor of two forgotten",
@@ -187,7 +187,7 @@ REPAIRS: Final = (
     ),
     Defect(
         "rotation-difference-reversed",
-        "mjx_study/repairs.py",
+        "mjx_study/simulation/patches.py",
         "return rotation_between(start, end)",
         "return rotation_between(end, start)",
         "arguments in the order of MJX's own function",
@@ -196,7 +196,7 @@ REPAIRS: Final = (
     ),
     Defect(
         "tendon-spring-sign",
-        "mjx_study/repairs.py",
+        "mjx_study/simulation/patches.py",
         "(stiffness * (shortest - data.ten_length))",
         "(stiffness * (data.ten_length - shortest))",
         "no effect on any value",
@@ -208,7 +208,7 @@ REPAIRS: Final = (
 INTEGRATION: Final = (
     Defect(
         "sine-series-coefficient",
-        "mjx_study/integration.py",
+        "mjx_study/simulation/integration.py",
         "0.5 - square / 48 +",
         "0.5 - square / 24 +",
         "a wrong coefficient of a series, used below 0.01 rad",
@@ -217,7 +217,7 @@ INTEGRATION: Final = (
     ),
     Defect(
         "rotation-in-the-world-frame",
-        "mjx_study/integration.py",
+        "mjx_study/simulation/integration.py",
         "w * a + x * cosine + y * c - z * b",
         "w * a + x * cosine - y * c + z * b",
         "one entry of the product in the other order",
@@ -226,7 +226,7 @@ INTEGRATION: Final = (
     ),
     Defect(
         "long-way-round",
-        "mjx_study/integration.py",
+        "mjx_study/simulation/integration.py",
         "jnp.where(real < 0, -real, real), jnp.where(real < 0, -axis, axis)",
         "jnp.where(real < 0, -real, real), axis",
         "q and -q are one orientation, and both parts change sign",
@@ -238,7 +238,7 @@ INTEGRATION: Final = (
 CONTACT: Final = (
     Defect(
         "edges-of-the-pyramid",
-        "mjx_study/contact.py",
+        "mjx_study/simulation/contact.py",
         "return 2 * (condim - 1) * float(host.opt.impratio)",
         "return (condim - 1) * float(host.opt.impratio)",
         "a pyramid has two edges for each direction of friction",
@@ -246,7 +246,7 @@ CONTACT: Final = (
     ),
     Defect(
         "margin-twice",
-        "mjx_study/contact.py",
+        "mjx_study/simulation/contact.py",
         "fill(model.geom_margin, contact.margin / 2)",
         "fill(model.geom_margin, contact.margin)",
         "MuJoCo adds the margins of two geoms",
@@ -254,7 +254,7 @@ CONTACT: Final = (
     ),
     Defect(
         "friction-of-a-pair",
-        "mjx_study/contact.py",
+        "mjx_study/simulation/contact.py",
         "jnp.stack([sliding, sliding, torsional, rolling, rolling])",
         "jnp.stack([sliding, torsional, torsional, rolling, rolling])",
         "a pair has five numbers where a geom has three",
@@ -262,7 +262,7 @@ CONTACT: Final = (
     ),
     Defect(
         "half-critical-damping",
-        "mjx_study/contact.py",
+        "mjx_study/simulation/contact.py",
         "b = 2 * (dampratio or 0.0) * math.sqrt(k)",
         "b = (dampratio or 0.0) * math.sqrt(k)",
         "c = 2 zeta sqrt(k m) without its 2",

@@ -1,0 +1,211 @@
+"""What the command line prints: tables, numbers with their intervals, progress."""
+
+import math
+import shutil
+import sys
+from collections.abc import Callable, Generator, Sequence
+from contextlib import contextmanager
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+from estimators import ENOUGH_EFFECTIVE
+from mjx_study.plots.comparison import STYLE
+from mjx_study.simulation.contact import FAMILIES
+from mjx_study.study.comparison import CompareResult, Row
+from mjx_study.study.findings import findings
+from mjx_study.table import format_table
+
+Column = tuple[str, Callable[[Row], str]]
+
+
+def number(value: float | None, digits: int = 3) -> str:
+    """A number in few characters; `-` for none, `nan` and `inf` as they are."""
+    if value is None:
+        return "-"
+    if value == 0 or not math.isfinite(value):
+        return f"{value:g}"
+    if 1e-3 <= abs(value) < 1e4:
+        rounded = float(f"{value:.{digits}g}")
+        return f"{rounded:.0f}" if abs(rounded) >= 10 ** (digits - 1) else f"{rounded:.{digits}g}"
+    mantissa, exponent = f"{value:.1e}".split("e")
+    return f"{mantissa}e{int(exponent)}"
+
+
+def _interval(row: Row) -> str:
+    return f"{number(row.variance)} ({number(row.variance_lower, 2)} to {number(row.variance_upper, 2)}){_doubt(row)}"
+
+
+def _doubt(row: Row) -> str:
+    """A mark behind a number that its batch is too small to say."""
+    return "" if row.believable else "?"
+
+
+def _effective(row: Row) -> str:
+    return number(row.effective_samples, 2) + (f" ({row.top_share:.0%})" if row.effective_samples else "")
+
+
+def _with_error(value: float, error: float) -> str:
+    if not (math.isfinite(value) and math.isfinite(error)):
+        return number(value)
+    if value >= 1000:
+        return f"{number(value, 2)} ± {number(error, 2)}"
+    return f"{value:.3f} ± {error:.3f}"
+
+
+def _debiased(row: Row, value: float, debiased: float, error: float) -> str:
+    """A figure as it is, and what is left of it without noise; "-" where noise is all there is."""
+    plain = f"{value:.3f}" if value < 1000 else number(value, 2)
+    left = "-" if math.isnan(debiased) else _with_error(debiased, error)
+    return f"{plain} -> {left}{_doubt(row)}"
+
+
+def columns(confidence: float) -> list[list[Column]]:
+    """The comparison's columns: those that identify a row, then the parts of which a table may have one or more."""
+    return [
+        [
+            ("K [N/m]", lambda row: number(row.stiffness or None)),
+            ("estimator", lambda row: STYLE[row.estimator][0]),
+        ],
+        [
+            ("|gradient|", lambda row: number(row.gradient_norm)),
+            (f"variance ({confidence:.0%} interval)", _interval),
+            ("effective (top)", _effective),
+        ],
+        [
+            (
+                "relative error -> debiased",
+                lambda row: _debiased(row, row.relative_error, row.debiased_error, row.debiased_error_se),
+            ),
+            ("cosine -> debiased", lambda row: _debiased(row, row.cosine, row.debiased_cosine, row.debiased_cosine_se)),
+        ],
+        [
+            ("alpha", lambda row: "-" if row.alpha is None else f"{row.alpha:.3f}"),
+            ("epsilon", lambda row: number(row.epsilon)),
+            ("B", lambda row: number(row.discrepancy)),
+        ],
+        [
+            ("ms", lambda row: f"{1e3 * row.seconds_per_sample:.2f}"),
+            ("variance x s", lambda row: number(row.variance_seconds)),
+            ("residual", lambda row: number(row.residual, 2)),
+            ("lost", lambda row: str(row.nonfinite)),
+        ],
+    ]
+
+
+def _blocks(rows: Sequence[Row], confidence: float, width: int) -> list[list[str]]:
+    """As few tables as the width allows, each with the columns that identify its rows."""
+    identity, *parts = columns(confidence)
+    blocks: list[list[Column]] = []
+    for part in parts:
+        if blocks and len(_table(rows, identity + blocks[-1] + part)[0]) <= width:
+            blocks[-1] += part
+        else:
+            blocks.append(list(part))
+    return [_table(rows, identity + block) for block in blocks]
+
+
+def print_comparison(result: CompareResult, print_line: Callable[[str], None] = print) -> None:
+    """The whole result as text: configuration, a table for each contact family, what it says, what to beware of."""
+    config = result.config
+    print_line(
+        f"{config.task}: {config.samples} samples in each batch, sigma {config.sigma:g}, {config.horizon} steps, "
+        f"{config.cone} cone, seed {config.seed}, {result.environment['precision']}"
+    )
+    width = shutil.get_terminal_size((140, 24)).columns
+    for family in result.families:
+        rows = [row for row in result.rows if row.contact == family]
+        print_line("")
+        print_line(f"{family}: {FAMILIES[family].description}")
+        for block in _blocks(rows, config.confidence, width):
+            for line in block:
+                print_line(line)
+    print_line("")
+    uncertainty = [row.reference_uncertainty for row in result.rows if math.isfinite(row.reference_uncertainty)]
+    if uncertainty:
+        low, high = number(min(uncertainty), 2), number(max(uncertainty), 2)
+        spread = low if low == high else f"{low} to {high}"
+        print_line(
+            f"Errors and cosines are against an unbiased zeroth-order reference, {config.reference_samples} pairs of "
+            f"rollouts with a control variate;\nits own relative uncertainty is {spread}, and smaller errors "
+            "cannot be told from zero."
+        )
+    if not all(row.believable for row in result.rows):
+        print_line(
+            f"?: fewer than {ENOUGH_EFFECTIVE:g} effective samples carry the batch's variance; believe neither the "
+            "number nor its error."
+        )
+    for sentence in findings(result):
+        print_line(sentence + ".")
+    for warning in alarms(result):
+        print_line(f"warning: {warning}")
+
+
+def alarms(result: CompareResult) -> list[str]:
+    """What a reader must not overlook: samples left out, solves that did not converge, contact models at their edge."""
+    messages = []
+    for row in result.rows:
+        stiffness = f"K = {number(row.stiffness)} N/m, " if row.stiffness else ""
+        where = f"{row.contact}, {stiffness}{STYLE[row.estimator][0]}"
+        if row.nonfinite:
+            messages.append(f"{where}: {row.nonfinite} of {row.samples} samples are not finite and were left out")
+        if row.unconverged:
+            messages.append(
+                f"{where}: {row.unconverged} samples have an unconverged solve (residual {row.residual:.1e})"
+            )
+        if row.onsets_missed:
+            messages.append(
+                f"{where}: {row.onsets_missed} of {row.onsets} onsets of contact have no term: there are too many"
+            )
+        if row.onsets_bounded:
+            messages.append(
+                f"{where}: {row.onsets_bounded} of {row.onsets} onsets are grazing, and their terms bounded"
+            )
+    return messages + list(result.warnings)
+
+
+def _table(rows: Sequence[Row], table: Sequence[Column]) -> list[str]:
+    cells = [[show(row) for _, show in table] for row in rows]
+    for previous, current in reversed(list(zip(range(len(rows)), range(1, len(rows)), strict=False))):
+        if rows[previous].stiffness == rows[current].stiffness:
+            cells[current][0] = ""
+    return format_table(cells, [heading for heading, _ in table])
+
+
+@contextmanager
+def progress_bar() -> Generator[Callable[[int, int, str], None]]:
+    """A progress bar on standard error, shown only on a terminal and gone when the work is done."""
+    console = Console(stderr=True)
+    bar = Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        console=console,
+        transient=True,
+        disable=not console.is_terminal,
+    )
+    with bar:
+        task = bar.add_task("starting", total=None)
+
+        def report(done: int, total: int, what: str) -> None:
+            bar.update(task, completed=done, total=total, description=what)
+
+        yield report
+
+
+def stage_lines(progress: Callable[[int, int, str], None]) -> Callable[[int, int, str], None]:
+    """The progress, and a line on standard error for each of its stages where that is no terminal."""
+
+    def report(done: int, total: int, what: str) -> None:
+        progress(done, total, what)
+        if not sys.stderr.isatty():
+            print(f"[{done}/{total}] {what}", file=sys.stderr, flush=True)
+
+    return report
+
+
+def show_cursor() -> None:
+    """Bring back the cursor that a progress bar hides, where standard error is a terminal."""
+    if sys.stderr is not None and sys.stderr.isatty():
+        sys.stderr.write("\n\x1b[?25h")

@@ -1,0 +1,1 @@
+"""Figures from results; nothing here simulates."""

@@ -1,0 +1,282 @@
+r"""The constraint solve as a differentiable root.
+
+MuJoCo's constrained acceleration is the minimum of a convex function, that is the root `a` of
+
+    G(a) = M a - qfrc_smooth - J^T f(J a - aref) = 0,
+
+with `f` the force law of each constraint row. MJX finds it with a `while_loop`, which has no reverse mode, so
+`mjx.step` differentiates only one solver iteration and gets both the step and its gradient wrong. Here MJX's own
+loop runs to convergence and the derivative comes from the implicit function theorem: one symmetric positive
+definite system in `dG/da = M + J^T f' J`, whatever the solver and its budget. The derivative is as good as the
+solve has converged, so `residual` measures that and every result carries it.
+
+MJX's constraint rows are private (`Data._impl.efc_*`); their content is read here only.
+"""
+
+from typing import Any, Final
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from mjx_study.simulation._mjx import mjx
+from mjx_study.simulation.patches import repaired
+from mjx_study.simulation.scene import num_constraint_rows
+
+_ELLIPTIC = mujoco.mjtCone.mjCONE_ELLIPTIC
+
+SMALL: Final = 6
+"""Most degrees of freedom for which linear systems are unrolled and the solver's warm start is improved."""
+PREDICTOR_STEPS: Final = 2
+GENEROUS: Final = (100, 50)
+"""Iterations of the solver and of its line search that `solve_to_rounding` allows."""
+POLISHING_STEPS: Final = 4
+EPSILON: Final = 1e-14
+"""Relative rounding of a force in the solver's equation."""
+
+
+def row_force(model: mjx.Model, data: mjx.Data, slack: Float[Array, " rows"]) -> Float[Array, " rows"]:
+    """Force of each constraint row at the slack `J a - aref`, MuJoCo's force law f.
+
+    With D the inverse regularisation of a row and x its slack: equality -D x; friction loss -D x clipped to
+    +- frictionloss; limit, frictionless and pyramidal contact -D x where x < 0, else 0; elliptic contact by zone of
+    the cone (`_elliptic_force`).
+
+    Args:
+        model: the model on the device.
+        data: a state with its constraint rows, after `mjx.make_constraint`.
+        slack: J a - aref [m/s^2 or rad/s^2].
+
+    Returns:
+        Force of each row [N or N m].
+
+    Reference: MuJoCo documentation, Computation, "Constraint model".
+    """
+    rows: Any = data._impl
+    linear = -rows.efc_D * slack
+    unilateral = jnp.where(slack < 0, linear, 0.0)
+
+    loss = rows.efc_frictionloss
+    friction = jnp.where(loss > 0, jnp.clip(linear, -loss, loss), linear)
+
+    kind = np.zeros(slack.shape[0], dtype=int)
+    kind[: rows.ne] = 2
+    kind[rows.ne : rows.ne + rows.nf] = 1
+    force = jnp.where(kind == 2, linear, jnp.where(kind == 1, friction, unilateral))
+    if model.opt.cone == _ELLIPTIC:
+        force = _elliptic_force(model, rows, slack, linear, force)
+    return force
+
+
+def _elliptic_force(
+    model: mjx.Model,
+    rows: Any,
+    slack: Float[Array, " rows"],
+    linear: Float[Array, " rows"],
+    force: Float[Array, " rows"],
+) -> Float[Array, " rows"]:
+    """Replace the rows of elliptic contacts in `force`.
+
+    In the scaled slack u = (mu x_n, friction * x_t), N = u_n, T = |u_t|: separated (N >= mu T) no force; sticking
+    (mu N + T <= 0) linear; sliding in between, on the cone, with force -dm mu (N - mu T) along (1, -u_t / T).
+    The branch that is not taken is evaluated at a safe T, so T = 0 has a finite derivative.
+    """
+    contact = rows.contact
+    for index, (condim, address) in enumerate(zip(contact.dim, contact.efc_address, strict=True)):
+        if condim == 1:
+            continue
+        span = slice(int(address), int(address) + int(condim))
+        friction = contact.friction[index, : condim - 1]
+        mu = friction[0] / jnp.sqrt(model.opt.impratio)
+        normal = mu * slack[span][0]
+        tangent = friction * slack[span][1:]
+
+        square = jnp.sum(tangent**2)
+        moving = square > 0
+        length = jnp.where(moving, jnp.sqrt(jnp.where(moving, square, 1.0)), 0.0)
+        safe_length = jnp.where(moving, length, 1.0)
+        sticking = jnp.where(moving, mu * normal + length <= 0, normal < 0)
+        sliding = moving & (normal < mu * length) & (mu * normal + length > 0)
+
+        stiffness = rows.efc_D[span][0] / jnp.maximum(mu * mu * (1 + mu * mu), mujoco.mjMINVAL)
+        magnitude = -stiffness * mu * (normal - mu * length)
+        on_cone = jnp.concatenate([magnitude[None], -magnitude * friction * tangent / safe_length])
+        force = force.at[span].set(jnp.where(sticking, linear[span], jnp.where(sliding, on_cone, 0.0)))
+    return force
+
+
+def constraint_force(model: mjx.Model, data: mjx.Data, qacc: Float[Array, " nv"]) -> Float[Array, " nv"]:
+    """Joint-space constraint force J^T f(J a - aref) [N or N m] at the acceleration `qacc`."""
+    rows: Any = data._impl
+    return rows.efc_J.T @ row_force(model, data, rows.efc_J @ qacc - rows.efc_aref)
+
+
+def imbalance(model: mjx.Model, data: mjx.Data, qacc: Float[Array, " nv"]) -> Float[Array, " nv"]:
+    """The equation that the solver solves, G(a) = M a - qfrc_smooth - J^T f(J a - aref) [N or N m].
+
+    `data` needs its position, velocity and smooth-force stages and its constraint rows.
+    """
+    return mjx.mul_m(model, data, qacc) - data.qfrc_smooth - constraint_force(model, data, qacc)
+
+
+def residual(model: mjx.Model, data: mjx.Data, qacc: Float[Array, " nv"]) -> Float[Array, ""]:
+    """Relative imbalance |G(a)| / (|M a| + |qfrc_smooth| + |J^T f|), 0 where all are 0; no unit."""
+    inertial = mjx.mul_m(model, data, qacc)
+    constraint = constraint_force(model, data, qacc)
+    scale = sum(jnp.sum(jnp.abs(term)) for term in (inertial, data.qfrc_smooth, constraint))
+    gap = jnp.sum(jnp.abs(inertial - data.qfrc_smooth - constraint))
+    return jnp.where(scale > 0, gap / jnp.where(scale > 0, scale, 1.0), 0.0)
+
+
+def run_solver(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]:
+    """MJX's own converged solve; the constrained acceleration [m/s^2 or rad/s^2], without a reverse mode.
+
+    Where Newton steps are cheap, `PREDICTOR_STEPS` of them improve the warm start. MJX keeps it only if its cost is
+    below that of the unconstrained start, and its loop then does what is left, mostly nothing: twice the speed.
+    """
+    if num_constraint_rows(data) == 0:
+        return data.qacc_smooth
+    if model.nv <= SMALL:
+        for _ in range(PREDICTOR_STEPS):
+            data = data.replace(qacc_warmstart=_newton_step(model, data, data.qacc_warmstart))
+    return mjx.solve(model, data).qacc
+
+
+def _newton_step(model: mjx.Model, data: mjx.Data, qacc: Float[Array, " nv"]) -> Float[Array, " nv"]:
+    gap, linear_map = jax.linearize(lambda x: imbalance(model, data, x), qacc)
+    return qacc - solve_positive_definite(jax.vmap(linear_map)(jnp.eye(model.nv, dtype=qacc.dtype)), gap)
+
+
+def with_generous_budget(model: mjx.Model) -> mjx.Model:
+    """The model with a budget that leaves MJX's solver to stop where its cost no longer falls."""
+    tolerance = jnp.full_like(model.opt.tolerance, 1e-15)
+    return model.replace(opt=model.opt.replace(iterations=GENEROUS[0], ls_iterations=GENEROUS[1], tolerance=tolerance))
+
+
+def solve_to_rounding(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]:
+    """The constrained acceleration as exactly as numbers allow, whatever the model's own budgets; values only.
+
+    MJX stops where its cost no longer falls, the square root of rounding from the solution, which differences over
+    short steps see. Newton steps on the equation itself have no such floor; one that leads away is dropped.
+    """
+    if num_constraint_rows(data) == 0:
+        return data.qacc_smooth
+    qacc = run_solver(with_generous_budget(model), data)
+
+    def newton(x):
+        """The step from x, and how far x is from the solution in the norm of the stiffness, free of units."""
+        step = _newton_step(model, data, x) - x
+        return step, jnp.abs(jnp.vdot(imbalance(model, data, x), step))
+
+    terms = (mjx.mul_m(model, data, qacc), data.qfrc_smooth, constraint_force(model, data, qacc))
+    rounding = EPSILON * sum(jnp.abs(term) for term in terms)
+    floor = jnp.sum(rounding**2 / jnp.diag(mjx.full_m(model, data)))
+    step, distance = newton(qacc)
+    for _ in range(POLISHING_STEPS):
+        candidate = qacc + step
+        following, nearer = newton(candidate)
+        better = nearer < jnp.maximum(distance, floor)  # below the floor a step still follows small changes
+        qacc, step, distance = (
+            jnp.where(better, new, old) for new, old in ((candidate, qacc), (following, step), (nearer, distance))
+        )
+    return qacc
+
+
+def solve(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]:
+    """The constrained acceleration with its implicit derivative, exact in forward and reverse mode.
+
+    Args:
+        model: the model on the device; its array leaves may be traced and differentiated.
+        data: a state after `mjx.fwd_acceleration`; `qacc_warmstart` starts the loop and has no derivative.
+
+    Returns:
+        qacc [m/s^2 or rad/s^2].
+    """
+    if num_constraint_rows(data) == 0:
+        return data.qacc_smooth
+
+    def tangent_solve(linear_map, right_side):
+        return solve_positive_definite(jax.vmap(linear_map)(jnp.eye(model.nv, dtype=right_side.dtype)), right_side)
+
+    return jax.lax.custom_root(
+        f=lambda qacc: imbalance(model, data, qacc),
+        initial_guess=data.qacc_warmstart,
+        solve=lambda _, __: jax.lax.stop_gradient(run_solver(model, data)),
+        tangent_solve=tangent_solve,
+    )
+
+
+def guard_rows(model: mjx.Model, data: mjx.Data) -> tuple[np.ndarray, np.ndarray]:
+    """Which constraint rows belong to each guard, limits first and then contacts; static.
+
+    Returns:
+        Weights `(guards, rows)` that make the guard's normal row of them, the mean of two opposite edges of a pyramid;
+        and which rows switch on with it, `(guards, rows)` of 0 and 1.
+    """
+    rows: Any = data._impl
+    spans = [(rows.ne + rows.nf + index, 1, 1) for index in range(rows.nl)]
+    for condim, address in zip(rows.contact.dim, rows.contact.efc_address, strict=True):
+        pyramid = condim > 1 and model.opt.cone != _ELLIPTIC
+        spans.append((int(address), 2 if pyramid else 1, 2 * (int(condim) - 1) if pyramid else int(condim)))
+    weights, members = (np.zeros((len(spans), num_constraint_rows(data))) for _ in range(2))
+    for index, (first, normals, count) in enumerate(spans):
+        weights[index, first : first + normals] = 1 / normals
+        members[index, first : first + count] = 1.0
+    return weights, members
+
+
+def guards(model: mjx.Model, data: mjx.Data) -> tuple[Float[Array, " guards"], Float[Array, " guards"]]:
+    """Distance less margin [m or rad] and its rate [m/s or rad/s] of every limit and contact that acts; else zeros."""
+    weights, members = guard_rows(model, data)
+    rows: Any = data._impl
+    first = members.argmax(axis=1) if len(members) else np.zeros(0, int)
+    return (rows.efc_pos - rows.efc_margin)[first], jnp.asarray(weights, rows.efc_J.dtype) @ (rows.efc_J @ data.qvel)
+
+
+def at_onset(model: mjx.Model, data: mjx.Data, members: Float[Array, " rows"], on: Bool[Array, ""]) -> mjx.Data:
+    """The state with some constraint rows just touching (no penetration, impedance d_0), or gone.
+
+    Args:
+        model: the model on the device.
+        data: a state with its constraint rows.
+        members: 1 for these rows, 0 for those that stay as they are.
+        on: whether they act.
+    """
+    with repaired(touching=True):
+        touching: Any = mjx.make_constraint(model, data)._impl
+    rows: Any = data._impl
+    chosen, acts = members > 0, jnp.where(on, 1.0, 0.0).astype(rows.efc_J.dtype)
+    keep = jnp.where(chosen, acts, 1.0)
+    changed: Any = data.tree_replace(
+        {
+            "_impl.efc_J": rows.efc_J * keep[:, None],
+            "_impl.efc_D": jnp.where(chosen, touching.efc_D, rows.efc_D),
+            "_impl.efc_aref": jnp.where(chosen, touching.efc_aref, rows.efc_aref) * keep,
+        }
+    )
+    return changed
+
+
+def solve_positive_definite(
+    matrix: Float[Array, "nv nv"], right_side: Float[Array, "nv ..."]
+) -> Float[Array, "nv ..."]:
+    """Solve with a symmetric positive definite matrix by Cholesky.
+
+    Small systems are unrolled: under `vmap` their entries are whole batches, which a library would take one by one.
+    """
+    size = matrix.shape[0]
+    if size > SMALL:
+        return jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(matrix), right_side)
+    lower: dict[tuple[int, int], Array] = {}
+    for j in range(size):
+        lower[j, j] = jnp.sqrt(matrix[j, j] - sum(lower[j, k] ** 2 for k in range(j)))
+        for i in range(j + 1, size):
+            lower[i, j] = (matrix[i, j] - sum(lower[i, k] * lower[j, k] for k in range(j))) / lower[j, j]
+    solution = list(right_side)
+    for i in range(size):
+        solution[i] = (solution[i] - sum(lower[i, k] * solution[k] for k in range(i))) / lower[i, i]
+    for i in reversed(range(size)):
+        solution[i] = (solution[i] - sum(lower[k, i] * solution[k] for k in range(i + 1, size))) / lower[i, i]
+    return jnp.stack(solution)

@@ -1,0 +1,351 @@
+r"""Contact models: how MuJoCo's soft contact is parametrised, in MuJoCo's own terms and in N/m.
+
+MuJoCo's contact acts on acceleration. Along the normal, with impedance d, penetration r < 0 and unconstrained
+acceleration a_0, the acceleration becomes
+
+    a_1 = (1 - d) a_0 - s b v - s^2 k r,        s = d / d_width,    k [1/s^2], b [1/s].
+
+The impedance d = d(r) goes from d_0 at first touch to d_width at the depth `width` and beyond, where s = 1; with
+d_0 = d_width s is 1 throughout, and with d_0 near 0 spring and damper set in gradually.
+
+For two bodies of effective mass m_eff along the normal a spring of K [N/m] and a damper of B [N s/m] are k = K / m_eff,
+b = B / m_eff. One family holds both ends of the study's question: d -> 0 is the penalty method, a spring added to the
+other forces; d -> 1 is a constraint, which first cancels a_0. Under a static load the spring only carries the share
+1 - d, so a resting contact is K / (1 - d) stiff.
+
+MuJoCo writes (k, b) as `solref`: negative numbers are (-k, -b) directly; positive ones are a time constant and a
+damping ratio, k = 1 / (timeconst dampratio)^2, b = 2 / timeconst. All of these are array leaves of `mjx.Model`, so a
+sweep over them is one compiled program.
+
+Reference: MuJoCo documentation, Modeling, "Solver parameters".
+"""
+
+import dataclasses
+import math
+import warnings
+from collections.abc import Sequence
+from functools import partial
+from typing import Final
+
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jaxtyping import Array, Float
+
+from estimators.pytree import register_pytree
+from mjx_study.simulation._mjx import mjx
+from mjx_study.simulation.scene import Scene
+
+MIN_IMPEDANCE: Final = float(mujoco.mjMINIMP)
+MAX_IMPEDANCE: Final = float(mujoco.mjMAXIMP)
+DEFAULT_SOLREF: Final = (0.02, 1.0)
+DEFAULT_SOLIMP: Final = (0.9, 0.95, 0.001, 0.5, 2.0)
+STIFF_SOLIMP: Final = (0.99, 0.9999, 0.001, 0.5, 2.0)
+
+
+class ContactWarning(UserWarning):
+    """A contact model that MuJoCo would alter, or that the integrator cannot resolve."""
+
+
+@register_pytree
+@dataclasses.dataclass(frozen=True)
+class ContactModel:
+    """Parameters that every contact of a scene takes on; array leaves, so they can be traced and stacked.
+
+    Attributes:
+        solref: MuJoCo's reference: (-k [1/s^2], -b [1/s]) or (time constant [s], damping ratio).
+        solimp: MuJoCo's impedance: d_0, d_width, width [m], midpoint, power.
+        friction: sliding [1], torsional [m], rolling [m]; None keeps the MJCF's.
+        margin: distance at which contact begins [m]; None keeps the MJCF's.
+    """
+
+    solref: Float[Array, "*batch 2"]
+    solimp: Float[Array, "*batch 5"]
+    friction: Float[Array, "*batch 3"] | None = None
+    margin: Float[Array, "*batch"] | None = None
+
+
+def contact_model(
+    solref: Sequence[float],
+    solimp: Sequence[float] = DEFAULT_SOLIMP,
+    friction: Sequence[float] | None = None,
+    margin: float | None = None,
+    *,
+    scene: Scene,
+) -> ContactModel:
+    """A contact model in MuJoCo's own terms, checked against the scene that it is meant for.
+
+    Args:
+        solref: both negative or zero, (-k [1/s^2], -b [1/s]); or both positive, (time constant [s], damping ratio).
+        solimp: (d_0, d_width, width [m], midpoint, power), impedances in [1e-4, 0.9999].
+        friction: (sliding, torsional [m], rolling [m]), not negative, or None for the MJCF's.
+        margin: [m], not negative, or None for the MJCF's.
+        scene: gives timestep, integrator and flags.
+
+    Raises:
+        ValueError: a value that MuJoCo would replace or clip without an error.
+
+    Warns:
+        ContactWarning: `refsafe` would clip the time constant, or h^2 k is beyond what the integrator keeps stable.
+    """
+    solref, solimp = tuple(map(float, solref)), tuple(map(float, solimp))
+    _check_solref(solref)
+    _check_solimp(solimp)
+    if friction is not None and (len(friction) != 3 or not all(value >= 0 for value in friction)):
+        raise ValueError(f"friction must be three numbers >= 0 (sliding, torsional, rolling), got {tuple(friction)}")
+    if margin is not None and not margin >= 0:
+        raise ValueError(f"margin must be >= 0 m, got {margin}")
+    _warn_if_clipped(solref, scene)
+    _warn_if_unstable(solref, scene.timestep)
+    as_array = partial(jnp.asarray, dtype=scene.template.qpos.dtype)
+    return ContactModel(
+        as_array(solref),
+        as_array(solimp),
+        None if friction is None else as_array(friction),
+        None if margin is None else as_array(margin),
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class Family:
+    """A line of contact models over stiffness, or a single point of MuJoCo's parameters.
+
+    Attributes:
+        name: as the command line takes it.
+        description: one line for tables and help.
+        solimp: the impedance of all its members; None for what the MJCF says.
+        dampratio: damping ratio that goes with a stiffness, where no damping is given.
+        solref: the fixed reference of a single point; None for a line over stiffness, or for what the MJCF says.
+    """
+
+    name: str
+    description: str
+    solimp: tuple[float, float, float, float, float] | None
+    dampratio: float = 0.0
+    solref: tuple[float, float] | None = None
+
+    @property
+    def swept(self) -> bool:
+        """Whether the family takes a stiffness."""
+        return self.solref is None and self.solimp is not None
+
+
+def _constant(impedance: float) -> tuple[float, float, float, float, float]:
+    return (impedance, impedance, 0.001, 0.5, 2.0)
+
+
+FAMILIES: Final = {
+    family.name: family
+    for family in (
+        Family(
+            "penalty",
+            "spring K without damping, impedance 1e-4: the penalty method",
+            _constant(MIN_IMPEDANCE),
+        ),
+        Family(
+            "impedance",
+            "spring K without damping, impedance 0.5: half penalty, half constraint",
+            _constant(0.5),
+        ),
+        Family("mujoco", "MuJoCo's default impedance (0.9 to 0.95), K critically damped", DEFAULT_SOLIMP, 1.0),
+        Family("mujoco_stiff", "impedance 0.99 to 0.9999, K critically damped", STIFF_SOLIMP, 1.0),
+        Family(
+            "smooth_onset",
+            "impedance rising from 1e-4 to 0.95 over 1 mm, K critically damped: force without a jump",
+            (MIN_IMPEDANCE, 0.95, 0.001, 0.5, 2.0),
+            1.0,
+        ),
+        Family("mujoco_default", "MuJoCo's defaults: solref (0.02, 1)", DEFAULT_SOLIMP, 1.0, DEFAULT_SOLREF),
+        Family("mjcf", "each contact as the MJCF has it", None),
+    )
+}
+
+
+def family_model(
+    name: str,
+    scene: Scene,
+    *,
+    stiffness: float | None = None,
+    damping: float | None = None,
+    effective_mass: float,
+) -> ContactModel:
+    """The member of a family at a physical stiffness.
+
+    Args:
+        name: one of `FAMILIES`, but "mjcf".
+        scene: the scene that it is meant for.
+        stiffness: K [N/m], positive; None for a family that is a single point.
+        damping: B [N s/m], not negative; None for the family's damping ratio.
+        effective_mass: of the contact along its normal [kg]; see `effective_mass`.
+
+    Raises:
+        ValueError: unknown name, a stiffness that is missing or not wanted, a value out of range, or the family "mjcf",
+            which stands for no contact model at all.
+    """
+    if name not in FAMILIES:
+        raise ValueError(f"unknown contact family {name!r}; choose from {', '.join(FAMILIES)}")
+    family = FAMILIES[name]
+    if not family.swept and (stiffness is not None or damping is not None):
+        raise ValueError(f"contact family {name!r} is a single point and takes no stiffness or damping")
+    if family.solimp is None:
+        raise ValueError(f"contact family {name!r} leaves the model as it is: use None in place of a contact model")
+    if family.solref is not None:
+        return contact_model(family.solref, family.solimp, scene=scene)
+    if stiffness is None:
+        raise ValueError(f"contact family {name!r} needs a stiffness in N/m")
+    solref = solref_from_stiffness(
+        stiffness,
+        damping,
+        effective_mass=effective_mass,
+        dampratio=family.dampratio if damping is None else None,
+    )
+    return contact_model(solref, family.solimp, scene=scene)
+
+
+def solref_from_stiffness(
+    stiffness: float, damping: float | None = None, *, effective_mass: float, dampratio: float | None = None
+) -> tuple[float, float]:
+    """The direct solref (-k, -b) of a spring K [N/m] and a damper B [N s/m], or a damping ratio in its place.
+
+    k = K / m_eff, b = B / m_eff, and with a damping ratio b = 2 dampratio sqrt(k).
+
+    Raises:
+        ValueError: stiffness or effective mass not positive, damping negative, or damping given twice.
+    """
+    if not (stiffness > 0 and math.isfinite(stiffness)):
+        raise ValueError(f"stiffness must be positive and finite, in N/m; got {stiffness}")
+    if not (effective_mass > 0 and math.isfinite(effective_mass)):
+        raise ValueError(f"effective mass must be positive and finite, in kg; got {effective_mass}")
+    if damping is not None and dampratio is not None:
+        raise ValueError("give damping in N s/m or a damping ratio, not both")
+    if damping is not None and not (damping >= 0 and math.isfinite(damping)):
+        raise ValueError(f"damping must be >= 0 and finite, in N s/m; got {damping}")
+    if dampratio is not None and not (dampratio >= 0 and math.isfinite(dampratio)):
+        raise ValueError(f"damping ratio must be >= 0 and finite; got {dampratio}")
+    k = stiffness / effective_mass
+    b = 2 * (dampratio or 0.0) * math.sqrt(k) if damping is None else damping / effective_mass
+    return -k, -b
+
+
+def stiffness_from_solref(solref: Sequence[float], *, effective_mass: float) -> tuple[float, float]:
+    """Spring K [N/m] and damper B [N s/m] of a solref of either sign, at full penetration (impedance d_width).
+
+    The inverse of `solref_from_stiffness`; for positive solref K = m_eff / (timeconst dampratio)^2,
+    B = 2 m_eff / timeconst.
+
+    Raises:
+        ValueError: mixed signs.
+    """
+    _check_solref(solref)
+    first, second = map(float, solref)
+    if first <= 0:
+        return -first * effective_mass, -second * effective_mass
+    return effective_mass / (first * second) ** 2, 2 * effective_mass / first
+
+
+def effective_mass(scene: Scene, geom1: str, geom2: str) -> float:
+    """Effective mass of the contact of two geoms along its normal, in the reference pose [kg].
+
+    MuJoCo scales a contact's force by the inverse weights of its two bodies, m_eff = 1 / (w_1 + w_2). A pyramidal cone
+    has 2 (condim - 1) edges of weight 2 mu^2 (1 + mu^2) (w_1 + w_2) / impratio each, which together act like
+
+        m_eff = 2 (condim - 1) impratio / (2 mu^2 (1 + mu^2) (w_1 + w_2))
+
+    in the penalty limit. It is that of the MJCF's friction, larger of the two; explicit pairs and priorities are not
+    looked at.
+
+    Raises:
+        SceneError: unknown geom name.
+        ValueError: neither body can move.
+    """
+    host = scene.host
+    geoms = [scene.geom(geom1), scene.geom(geom2)]
+    weight = float(sum(host.body_invweight0[host.geom_bodyid[geom], 0] for geom in geoms))
+    if not weight > 0:
+        raise ValueError(f"geoms {geom1!r} and {geom2!r} are both fixed: their contact has no effective mass")
+    condim = int(max(host.geom_condim[geom] for geom in geoms))
+    if condim == 1 or host.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC:
+        return 1 / weight
+    mu = float(np.max(host.geom_friction[geoms, 0]))
+    return 2 * (condim - 1) * float(host.opt.impratio) / (2 * mu**2 * (1 + mu**2) * weight)
+
+
+def apply_contact(model: mjx.Model, contact: ContactModel | None) -> mjx.Model:
+    """The model with every geom and explicit pair set to the contact model; pure, for traced values too.
+
+    Both geoms of a pair are set, so MuJoCo's mixing by `solmix` and `priority` has nothing to mix. None leaves the
+    model as the MJCF has it.
+    """
+    if contact is None:
+        return model
+
+    def fill(leaf, value):
+        return jnp.broadcast_to(value, leaf.shape).astype(jnp.result_type(leaf))
+
+    changes = {
+        "geom_solref": fill(model.geom_solref, contact.solref),
+        "geom_solimp": fill(model.geom_solimp, contact.solimp),
+        "pair_solref": fill(model.pair_solref, contact.solref),
+        "pair_solimp": fill(model.pair_solimp, contact.solimp),
+    }
+    if contact.friction is not None:
+        sliding, torsional, rolling = contact.friction
+        changes["geom_friction"] = fill(model.geom_friction, contact.friction)
+        pair = jnp.stack([sliding, sliding, torsional, rolling, rolling])
+        changes["pair_friction"] = fill(model.pair_friction, pair)
+    if contact.margin is not None:
+        changes["geom_margin"] = fill(model.geom_margin, contact.margin / 2)  # MuJoCo adds the margins of two geoms
+        changes["pair_margin"] = fill(model.pair_margin, contact.margin)
+    return model.replace(**changes)
+
+
+def _check_solref(solref: Sequence[float]) -> None:
+    if len(solref) != 2 or not all(math.isfinite(value) for value in solref):
+        raise ValueError(f"solref must be two finite numbers, got {tuple(solref)}")
+    first, second = solref
+    if not ((first > 0 and second > 0) or (first <= 0 and second <= 0)):
+        raise ValueError(
+            f"solref {tuple(solref)} mixes signs and MuJoCo would fall back on its default: give (time constant, "
+            "damping ratio), both positive, or (-k, -b), both negative or zero"
+        )
+
+
+def _check_solimp(solimp: Sequence[float]) -> None:
+    if len(solimp) != 5 or not all(math.isfinite(value) for value in solimp):
+        raise ValueError(f"solimp must be five finite numbers, got {tuple(solimp)}")
+    for label, value in (("d_0", solimp[0]), ("d_width", solimp[1]), ("midpoint", solimp[3])):
+        if not MIN_IMPEDANCE <= value <= MAX_IMPEDANCE:
+            raise ValueError(
+                f"solimp's {label} is {value}, and MuJoCo would clip it: it must lie in "
+                f"[{MIN_IMPEDANCE}, {MAX_IMPEDANCE}]"
+            )
+    if not solimp[2] > 0:
+        raise ValueError(f"solimp's width must be positive, in m; got {solimp[2]}")
+    if not solimp[4] >= 1:
+        raise ValueError(f"solimp's power must be at least 1, got {solimp[4]}")
+
+
+def _warn_if_clipped(solref: Sequence[float], scene: Scene) -> None:
+    refsafe = not scene.host.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_REFSAFE
+    if refsafe and 0 < solref[0] < 2 * scene.timestep:
+        warnings.warn(
+            f"refsafe clips the time constant {solref[0]:g} s at two timesteps, {2 * scene.timestep:g} s; disable the "
+            "flag refsafe in the MJCF, or give a negative solref (-k, -b), which is never clipped",
+            ContactWarning,
+            stacklevel=3,
+        )
+
+
+def _warn_if_unstable(solref: Sequence[float], timestep: float) -> None:
+    """Semi-implicit Euler with a spring k and a damper b is stable while h^2 k < 4 - 2 h b."""
+    k, b = stiffness_from_solref(solref, effective_mass=1.0)
+    limit = 4 - 2 * timestep * b
+    if timestep**2 * k >= limit:
+        dampratio = b / (2 * math.sqrt(k)) if k > 0 else 0.0
+        stable = (2 * (math.sqrt(dampratio**2 + 1) - dampratio)) ** 2 / (timestep**2 * k) if k > 0 else 0.0
+        warnings.warn(
+            f"h^2 k = {timestep**2 * k:.3g} is not below 4 - 2 h b = {limit:.3g}: the step makes energy while in "
+            f"contact; it is stable up to {stable:.0%} of this stiffness at h = {timestep:g} s",
+            ContactWarning,
+            stacklevel=3,
+        )

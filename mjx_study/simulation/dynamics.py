@@ -1,0 +1,328 @@
+r"""One simulation step and whole rollouts, differentiable through contact.
+
+A step is MJX's own pipeline with the solve of `constraint` in its middle: it agrees with `mjx.step` to what either
+leaves unconverged, while its derivative is that of the converged step. Two programs compute the derivative:
+
+- the *Jacobian* program, for models of few coordinates: the Jacobian of the velocity update over state and control
+  by the implicit function theorem, once per step, and nothing else stored. Reverse mode then keeps nv (nq + nv + nu)
+  numbers per step for it and replays neither the solver nor the kinematics.
+- the *tape* program, for larger models and for derivatives with respect to model parameters: ordinary automatic
+  differentiation around the implicit solve, each step recomputed in the backward pass (`jax.checkpoint`) with the
+  solver's result saved, so that the recomputation has no solver in it.
+
+`step` chooses by the number of columns and by what is differentiated; both give the same numbers.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import mujoco
+from jax.ad_checkpoint import checkpoint_name
+from jax.custom_derivatives import SymbolicZero, zero_from_primal
+from jaxtyping import Array, Float, Int
+
+from estimators.pytree import register_pytree
+from mjx_study.simulation import constraint
+from mjx_study.simulation._mjx import mjx
+from mjx_study.simulation.integration import integrate_position
+from mjx_study.simulation.patches import has_tendon_springs, repaired, tendon_spring_gap
+from mjx_study.simulation.scene import Scene
+
+JACOBIAN_COLUMNS = 32
+"""Most columns (nq + nv + na + nu) for which a step's Jacobian is formed; more use the tape."""
+
+
+@register_pytree
+@dataclasses.dataclass(frozen=True)
+class State:
+    """What one step hands to the next.
+
+    Attributes:
+        qpos: generalised positions [m or rad; unit quaternions].
+        qvel: generalised velocities [m/s or rad/s].
+        act: actuator activations.
+        warmstart: last acceleration, where the solver starts [m/s^2 or rad/s^2]; it has no derivative.
+    """
+
+    qpos: Float[Array, "*batch nq"]
+    qvel: Float[Array, "*batch nv"]
+    act: Float[Array, "*batch na"]
+    warmstart: Float[Array, "*batch nv"]
+
+
+def initial_state(
+    scene: Scene, qpos: Float[Array, " nq"] | None = None, qvel: Float[Array, " nv"] | None = None
+) -> State:
+    """A state at rest in the MJCF's reference pose, or at the given `qpos` [m or rad] and `qvel` [m/s or rad/s]."""
+    like = scene.template
+    return State(
+        qpos=like.qpos if qpos is None else jnp.asarray(qpos, like.qpos.dtype),
+        qvel=like.qvel if qvel is None else jnp.asarray(qvel, like.qvel.dtype),
+        act=like.act,
+        warmstart=jnp.zeros_like(like.qvel),
+    )
+
+
+def step(scene: Scene, model: mjx.Model, state: State, control: Float[Array, " nu"]) -> tuple[State, Float[Array, ""]]:
+    """Advance by one timestep.
+
+    Args:
+        scene: gives what is static; its own contact parameters are not used.
+        model: the model to step, `scene.model` with any contact model applied; may be traced.
+        state: the state before the step.
+        control: actuator controls, in the unit that the MJCF gives them.
+
+    Returns:
+        The state after the step, and the solver's relative residual (see `constraint.residual`).
+    """
+    if scene.host.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
+        return _runge_kutta(scene, model, state, control), jnp.zeros_like(state.qpos, shape=())
+    qvel, act, qacc, residual = _update(scene)(
+        model, state.qpos, state.qvel, state.act, control, jax.lax.stop_gradient(state.warmstart)
+    )
+    qpos = integrate_position(scene.host, state.qpos, qvel, model.opt.timestep)
+    return State(qpos, qvel, act, jax.lax.stop_gradient(qacc)), jax.lax.stop_gradient(residual)
+
+
+def exact_step(
+    scene: Scene, model: mjx.Model, state: State, control: Float[Array, " nu"]
+) -> tuple[State, Float[Array, ""], mjx.Data]:
+    """`step` with its constraints solved to rounding whatever the budgets, and its `smooth_stages`; for values only.
+
+    What differences of the step are taken of: those of `step` itself would show where its solver stopped.
+    """
+    data = smooth_stages(scene, model, state, control).replace(qacc_warmstart=state.warmstart)
+    if scene.host.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
+        return *step(scene, model, state, control), data
+    qacc = constraint.solve_to_rounding(model, data)
+    qvel, act = advance_velocity(model, data, qacc)
+    qpos = integrate_position(scene.host, state.qpos, qvel, model.opt.timestep)
+    return State(qpos, qvel, act, qacc), constraint.residual(model, data, qacc), data
+
+
+def smooth_stages(scene: Scene, model: mjx.Model, state: State, control: Float[Array, " nu"]) -> mjx.Data:
+    """All of a step that comes before the constraint solve: kinematics, contacts, forces, constraint rows."""
+    return force_stage(model, position_stage(scene, model, state.qpos), state.qvel, state.act, control)
+
+
+def solved_step(
+    scene: Scene, model: mjx.Model, state: State, control: Float[Array, " nu"]
+) -> tuple[State, Float[Array, ""], tuple[Float[Array, " guards"], Float[Array, " guards"]]]:
+    """`step` without a derivative, and what its contacts and limits do: `constraint.guards` at the state before."""
+    data = smooth_stages(scene, model, state, control)
+    qacc = constraint.run_solver(model, data.replace(qacc_warmstart=state.warmstart))
+    qvel, act = advance_velocity(model, data, qacc)
+    qpos = integrate_position(scene.host, state.qpos, qvel, model.opt.timestep)
+    return State(qpos, qvel, act, qacc), constraint.residual(model, data, qacc), constraint.guards(model, data)
+
+
+ControlLaw = Callable[[Int[Array, ""], State], Float[Array, " nu"]]
+
+
+def rollout(
+    scene: Scene, model: mjx.Model, start: State, control_law: ControlLaw, horizon: int
+) -> tuple[State, Float[Array, "horizon nu"], Float[Array, " horizon"]]:
+    """Simulate `horizon` steps in closed loop.
+
+    Args:
+        scene: gives what is static.
+        model: the model to step; may be traced.
+        start: the first state.
+        control_law: maps (step index, state) to the control of that step.
+        horizon: number of steps, at least 1.
+
+    Returns:
+        States `(horizon + 1, ...)` with the start first, controls `(horizon, nu)`, residuals `(horizon,)`.
+
+    Raises:
+        ValueError: the horizon is not positive.
+    """
+    if horizon < 1:
+        raise ValueError(f"horizon must be at least 1 step, got {horizon}")
+
+    def advance(state: State, index: Int[Array, ""]):
+        control = control_law(index, state)
+        following, residual = step(scene, model, state, control)
+        return following, (following, control, residual)
+
+    if not uses_jacobian(scene):
+        advance = jax.checkpoint(advance, policy=jax.checkpoint_policies.save_only_these_names("qacc"))
+    _, (states, controls, residuals) = jax.lax.scan(advance, start, jnp.arange(horizon))
+    trajectory = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), start, states)
+    return trajectory, controls, residuals
+
+
+def uses_jacobian(scene: Scene) -> bool:
+    """Whether steps of this scene form their Jacobian (few coordinates) or leave a tape."""
+    host = scene.host
+    explicit = host.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
+    return not explicit and host.nq + host.nv + host.na + host.nu <= JACOBIAN_COLUMNS
+
+
+# The stages of a step. A Jacobian over qvel, act or ctrl enters after the position stage, so it costs little. Each is
+# jitted so that JAX traces MJX's many operations once and not for every direction; XLA inlines them again.
+
+
+def position_stage(scene: Scene, model: mjx.Model, qpos: Float[Array, " nq"]) -> mjx.Data:
+    return _fwd_position(model, scene.template.replace(qpos=qpos))
+
+
+@jax.jit
+def _fwd_position(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    with repaired():
+        return mjx.fwd_position(model, data)
+
+
+@jax.jit
+def force_stage(
+    model: mjx.Model,
+    data: mjx.Data,
+    qvel: Float[Array, " nv"],
+    act: Float[Array, " na"],
+    control: Float[Array, " nu"],
+) -> mjx.Data:
+    data = data.replace(qvel=qvel, act=act, ctrl=control)
+    with repaired():
+        data = mjx.make_constraint(model, data)  # again: aref depends on qvel
+        data = mjx.fwd_velocity(model, data)
+        if has_tendon_springs(model):
+            data = data.replace(qfrc_passive=data.qfrc_passive + tendon_spring_gap(model, data))
+        data = mjx.fwd_actuation(model, data)
+        return mjx.fwd_acceleration(model, data)
+
+
+@jax.jit
+def advance_velocity(
+    model: mjx.Model, data: mjx.Data, qacc: Float[Array, " nv"]
+) -> tuple[Float[Array, " nv"], Float[Array, " na"]]:
+    """Velocity and activation after the step, from the constrained acceleration; MJX's own integrators."""
+    data = data.replace(qacc=qacc, qfrc_constraint=constraint.constraint_force(model, data, qacc))
+    implicit = model.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    data = mjx.implicit(model, data) if implicit else mjx.euler(model, data)
+    return data.qvel, data.act
+
+
+@jax.jit
+def _constrained_update(model: mjx.Model, data: mjx.Data, qvel: Array, act: Array, control: Array, warmstart: Array):
+    data = force_stage(model, _fwd_position(model, data), qvel, act, control)
+    qacc = checkpoint_name(constraint.solve(model, data.replace(qacc_warmstart=warmstart)), "qacc")
+    return *advance_velocity(model, data, qacc), qacc, constraint.residual(model, data, qacc)
+
+
+def _update(scene: Scene):
+    """The velocity update (model, qpos, qvel, act, control, warmstart) -> (qvel, act, qacc, residual).
+
+    Differentiating it with respect to state and control takes the Jacobian program where the scene is small
+    enough; any derivative with respect to the model takes the tape.
+    """
+
+    def tape(model, qpos, qvel, act, control, warmstart):
+        return _constrained_update(model, scene.template.replace(qpos=qpos), qvel, act, control, warmstart)
+
+    if not uses_jacobian(scene):
+        return tape
+
+    update = jax.custom_jvp(tape)
+
+    @partial(update.defjvp, symbolic_zeros=True)
+    def _(primals, tangents):
+        model, qpos, qvel, act, control, _ = primals
+        model_tangents, *inputs, _ = tangents
+        if any(not isinstance(leaf, SymbolicZero) for leaf in jax.tree.leaves(model_tangents)):
+            return jax.jvp(tape, primals, jax.tree.map(_instantiate, primals, tangents))
+        value = update(*primals)
+        inputs = [_instantiate(*pair) for pair in zip(primals[1:5], inputs, strict=True)]
+        over_step, over_qacc = step_jacobian(scene, model, qpos, qvel, act, control, value[2])
+        direction = jnp.concatenate(inputs)
+        out, qacc_out = over_step @ direction, over_qacc @ direction
+        nv = qvel.shape[0]
+        # The tangent of qacc is for derivatives of this derivative: the Jacobian is a function of qacc.
+        return value, (out[:nv], out[nv:], qacc_out, jnp.zeros_like(value[3]))
+
+    return update
+
+
+def _instantiate(primal, tangent):
+    return zero_from_primal(primal) if isinstance(tangent, SymbolicZero) else tangent
+
+
+def step_jacobian(
+    scene: Scene,
+    model: mjx.Model,
+    qpos: Float[Array, " nq"],
+    qvel: Float[Array, " nv"],
+    act: Float[Array, " na"],
+    control: Float[Array, " nu"],
+    qacc: Float[Array, " nv"],
+) -> tuple[Float[Array, "nv_na inputs"], Float[Array, "nv inputs"]]:
+    r"""Jacobians of (qvel', act') and of qacc with respect to (qpos, qvel, act, control), columns in that order.
+
+    With S the step at a given acceleration a and G(x, a) = 0 the solver's equation,
+
+        da/dx = -G_a^{-1} G_x,   dS/dx = S_x + S_a da/dx.
+
+    Args:
+        scene: gives what is static.
+        model: the model to step.
+        qpos, qvel, act, control: where to linearise.
+        qacc: the constrained acceleration there, converged.
+    """
+    return _jacobian(model, scene.template, qpos, qvel, act, control, qacc)
+
+
+@jax.jit
+def _jacobian(model: mjx.Model, template: mjx.Data, qpos: Array, qvel: Array, act: Array, control: Array, qacc: Array):
+    def position_stage(qpos):
+        return _fwd_position(model, template.replace(qpos=qpos))
+
+    def equations(data, qvel, act, control, qacc):
+        data = force_stage(model, data, qvel, act, control)
+        return jnp.concatenate([constraint.imbalance(model, data, qacc), *advance_velocity(model, data, qacc)])
+
+    def columns(function, point):
+        push = lambda direction: jax.jvp(function, (point,), (direction,))[1]  # noqa: E731
+        return jax.vmap(push, out_axes=-1)(jnp.eye(point.shape[0], dtype=point.dtype))
+
+    positioned = position_stage(qpos)
+    blocks = [
+        (lambda x: equations(position_stage(x), qvel, act, control, qacc), qpos),
+        (lambda x: equations(positioned, x, act, control, qacc), qvel),
+        (lambda x: equations(positioned, qvel, x, control, qacc), act),
+        (lambda x: equations(positioned, qvel, act, x, qacc), control),
+    ]
+    over_inputs = jnp.concatenate([columns(*block) for block in blocks if block[1].size], axis=1)
+    over_qacc = columns(lambda x: equations(positioned, qvel, act, control, x), qacc)
+    nv = qvel.shape[0]
+    response = -constraint.solve_positive_definite(over_qacc[:nv], over_inputs[:nv])
+    return over_inputs[nv:] + over_qacc[nv:] @ response, response
+
+
+def _runge_kutta(scene: Scene, model: mjx.Model, state: State, control: Float[Array, " nu"]) -> State:
+    """Classical Runge-Kutta of order 4 (a scene with constraints is refused when it is loaded)."""
+    timestep = model.opt.timestep
+
+    def slopes(qpos, qvel, act):
+        data = force_stage(model, position_stage(scene, model, qpos), qvel, act, control)
+        return qvel, data.qacc_smooth, data.act_dot
+
+    def moved(fraction, slope):
+        velocity, acceleration, activation = (fraction * timestep * part for part in slope)
+        qpos = integrate_position(scene.host, state.qpos, velocity, 1.0)
+        return qpos, state.qvel + acceleration, state.act + activation
+
+    first = slopes(state.qpos, state.qvel, state.act)
+    second = slopes(*moved(0.5, first))
+    third = slopes(*moved(0.5, second))
+    fourth = slopes(*moved(1.0, third))
+    mean = jax.tree.map(lambda a, b, c, d: (a + 2 * b + 2 * c + d) / 6, first, second, third, fourth)
+    qpos, qvel, _ = moved(1.0, mean)
+    qacc = jax.lax.stop_gradient(first[1])
+    if state.act.size == 0:
+        return State(qpos, qvel, state.act, qacc)
+    # MJX's own advance of the activation, with its clamping
+    data = force_stage(model, position_stage(scene, model, state.qpos), state.qvel, state.act, control)
+    act = mjx.euler(model, data.replace(act_dot=mean[2], qacc=data.qacc_smooth)).act
+    return State(qpos, qvel, act, qacc)

@@ -1,0 +1,93 @@
+"""The C engine as an independent implementation: the same model on the host, and its states."""
+
+import contextlib
+import copy
+import dataclasses
+from collections.abc import Generator
+from typing import Any, Final
+
+import mujoco
+import numpy as np
+from jaxtyping import Float
+
+from mjx_study.simulation.contact import ContactModel
+from mjx_study.simulation.scene import Scene
+
+CONVERGED: Final = {"tolerance": 0.0, "iterations": 200, "ls_iterations": 100}
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class HostState:
+    """One state on the host, with the control that acts on it.
+
+    Attributes:
+        qpos: [m or rad; unit quaternions].
+        qvel: [m/s or rad/s].
+        act: activations.
+        control: controls.
+        warmstart: the acceleration of the step before [m/s^2 or rad/s^2].
+    """
+
+    qpos: Float[np.ndarray, " nq"]
+    qvel: Float[np.ndarray, " nv"]
+    act: Float[np.ndarray, " na"]
+    control: Float[np.ndarray, " nu"]
+    warmstart: Float[np.ndarray, " nv"]
+
+
+def apply_to_host(host: mujoco.MjModel, contact: ContactModel | None) -> None:
+    """Set every geom and pair of a host model to a contact model, in place, as `apply_contact` does on the device."""
+    if contact is None:
+        return
+    for leaf in (host.geom_solref, host.pair_solref):
+        leaf[:] = np.asarray(contact.solref)
+    for leaf in (host.geom_solimp, host.pair_solimp):
+        leaf[:] = np.asarray(contact.solimp)
+    if contact.friction is not None:
+        friction = np.asarray(contact.friction)
+        host.geom_friction[:] = friction
+        host.pair_friction[:] = friction[[0, 0, 1, 2, 2]]
+    if contact.margin is not None:
+        host.geom_margin[:] = float(contact.margin) / 2  # MuJoCo adds the margins of two geoms
+        host.pair_margin[:] = float(contact.margin)
+
+
+def converged_host(scene: Scene, contact: ContactModel | None) -> mujoco.MjModel:
+    """A copy of the scene's host model with a contact model, and budgets that leave nothing unconverged."""
+    host = copy.copy(scene.host)
+    apply_to_host(host, contact)
+    for name, value in CONVERGED.items():
+        setattr(host.opt, name, value)
+    return host
+
+
+def host_data(host: mujoco.MjModel, state: HostState) -> mujoco.MjData:
+    """Data of the engine in a state."""
+    data = mujoco.MjData(host)
+    data.qpos[:], data.qvel[:], data.act[:] = state.qpos, state.qvel, state.act
+    data.ctrl[:], data.qacc_warmstart[:] = state.control, state.warmstart
+    return data
+
+
+def host_state(data: mujoco.MjData) -> HostState:
+    """The state that data are in, before a step."""
+    fields: tuple[Any, ...] = (data.qpos, data.qvel, data.act, data.ctrl, data.qacc_warmstart)
+    return HostState(*(np.array(field) for field in fields))
+
+
+@contextlib.contextmanager
+def quiet_engine() -> Generator[None]:
+    """Keep the engine's warnings to `MjData.warning`, off standard error and out of MUJOCO_LOG.TXT."""
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(lambda message: None)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(before)
+
+
+def engine_model(scene: Scene, contact: ContactModel | None) -> mujoco.MjModel:
+    """A copy of the scene's host model with a contact model, and the scene's own budgets."""
+    host = copy.copy(scene.host)
+    apply_to_host(host, contact)
+    return host

@@ -1,0 +1,252 @@
+r"""Derivatives of rollouts that allow for the step at which contact begins to change.
+
+Where a guard phi (the distance of a contact or a limit, less its margin) falls below zero, MuJoCo's force sets in with
+a jump. The derivative of a rollout holds the step at which that happens fixed. With noise of a smooth density the
+gradient of the mean cost has a second part, carried by the rollouts at which the step changes:
+
+    grad F = E[grad f] - sum_k E[delta(phi_k) J_k grad phi_k],     J_k = V_{k+1}(on) - V_{k+1}(off) at phi_k = 0,
+
+with V the cost to go. A rollout in which contact begins at step k has phi_k in (D, 0], where n = d phi / dq and
+D = phi_k - phi_{k-1} = h n^T v_k. It lies between two others: one in which contact only just begins at step k, that is
+phi_k = 0, and one in which it would have begun at step k - 1, phi_{k-1} = 0. If phi is spread evenly over this cell,
+linear interpolation gives the weights of both, and every term belongs to a rollout that exists anyway. With s = phi_k/D
+and Delta_k the jump of the velocity after step k,
+
+    dx_{k+1} = A_k dx_k + (1 - s) Delta_k (n^T dq_k) / D + s A_k (h Delta_{k-1}, Delta_{k-1}) (n^T dq_{k-1}) / D,
+
+n^T dq_{k-1} = n^T (dq_k - h dv_k). This is the saltation matrix of a time-stepping scheme. Its error falls with h^2;
+the first weight alone (s = 0) leaves an error of h b, where b is the contact's damping [1/s].
+
+Not covered: contact at the start; a force that jumps where contact ends (impedance and a force that presses); edges of
+features, where the contact point itself jumps.
+
+A cell narrower than h^2 |a|, with a the acceleration of the guard, counts as that wide: the guard's speed is not
+constant over such a step, and without a bound grazing contacts have no finite variance. These onsets are counted.
+
+Reference: Kong, Payne, Zhu, Johnson, "Saltation Matrices: The Essential Tool for Linearizing Hybrid Dynamical Systems"
+(arXiv 2306.06862), for the limit of continuous time.
+"""
+
+import dataclasses
+from functools import partial
+from typing import Any, Final
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from estimators.pytree import register_pytree
+from mjx_study.simulation import constraint
+from mjx_study.simulation._mjx import mjx
+from mjx_study.simulation.dynamics import (
+    ControlLaw,
+    State,
+    advance_velocity,
+    force_stage,
+    position_stage,
+    rollout,
+    solved_step,
+    step,
+    step_jacobian,
+    uses_jacobian,
+)
+from mjx_study.simulation.integration import difference_position, integrate_position
+from mjx_study.simulation.scene import Scene
+
+SLOTS: Final = 8
+"""Onsets of one rollout that are corrected; later ones are left out and counted."""
+ONSETS: Final = ("none", "linear")
+"""How a first-order derivative takes the onset of contact."""
+TOUCHING: Final = 1e-6
+"""Share of a cell: a body that was nearer than this before the step had touched already, and its onset is no event."""
+
+
+def check_onset(onset: str) -> None:
+    """Raises ValueError, with the choices, for an unknown treatment of the onset."""
+    if onset not in ONSETS:
+        raise ValueError(f"unknown onset {onset!r}; choose from {', '.join(ONSETS)}")
+
+
+@register_pytree
+@dataclasses.dataclass(frozen=True)
+class OnsetCounts:
+    """What a corrected derivative met.
+
+    Attributes:
+        found: onsets of contacts and limits.
+        bounded: of these, how many had a cell so narrow that their term was bounded.
+        missed: of these, how many are not corrected, for want of slots.
+    """
+
+    found: Int[Array, "*batch"]
+    bounded: Int[Array, "*batch"]
+    missed: Int[Array, "*batch"]
+
+
+def as_row(counts: OnsetCounts | None) -> Float[Array, "*batch 3"] | None:
+    """The counts as numbers in one array, as batches keep them."""
+    return None if counts is None else jnp.stack([counts.found, counts.bounded, counts.missed], axis=-1).astype(float)
+
+
+def corrected_rollout(
+    scene: Scene, model: mjx.Model, start: State, control_law: ControlLaw, horizon: int, slots: int = SLOTS
+) -> tuple[State, Float[Array, "horizon nu"], Float[Array, " horizon"], OnsetCounts]:
+    """`dynamics.rollout`, with the same values and derivatives that have the onset term.
+
+    The derivatives are of first order, over start and controls; both modes.
+
+    Args:
+        scene: gives what is static.
+        model: the model to step; may be traced, and has no derivative.
+        start: the first state.
+        control_law: maps (step index, state) to the control of that step.
+        horizon: number of steps, at least 1.
+        slots: onsets of one rollout that are corrected, the first ones.
+
+    Returns:
+        States `(horizon + 1, ...)` with the start first, controls `(horizon, nu)`, residuals `(horizon,)`, and counts.
+
+    Raises:
+        TypeError: it is differentiated with respect to the model.
+    """
+    if not scene.has_constraints:
+        none = jnp.zeros((), int)
+        return *rollout(scene, model, start, control_law, horizon), OnsetCounts(none, none, none)
+    model = _without_derivative(model)
+    jacobian = uses_jacobian(scene)
+
+    def observe(state: State, index: Int[Array, ""]):
+        control = jax.lax.stop_gradient(control_law(index, state))
+        following, residual, guards = solved_step(scene, model, state, control)
+        over_step = None
+        if jacobian:
+            over_step, _ = step_jacobian(scene, model, state.qpos, state.qvel, state.act, control, following.warmstart)
+        return following, (state, control, following, residual, guards, over_step)
+
+    _, (before, controls, after, residuals, guards, jacobians) = jax.lax.scan(
+        observe, jax.lax.stop_gradient(start), jnp.arange(horizon)
+    )
+    spread, shift, counts = _corrections(scene, model, before, controls, *guards, slots)
+
+    def follow(state: State, known):
+        index, fixed, fixed_control, fixed_after, over_step, spread, shift = known
+        control = control_law(index, state)
+        moved = difference_position(scene.host, fixed.qpos, state.qpos)
+        velocity = shift @ (moved - scene.timestep * (state.qvel - fixed.qvel))
+        carried = integrate_position(scene.host, fixed.qpos, velocity, scene.timestep)
+        shifted = State(state.qpos + _tangent(carried), state.qvel + _tangent(velocity), state.act, fixed.warmstart)
+        if jacobian:
+            pairs = (
+                (shifted.qpos, fixed.qpos),
+                (shifted.qvel, fixed.qvel),
+                (shifted.act, fixed.act),
+                (control, fixed_control),
+            )
+            change = over_step @ jnp.concatenate([ours - theirs for ours, theirs in pairs])
+            qvel, act = fixed_after.qvel + change[: scene.host.nv], fixed_after.act + change[scene.host.nv :]
+        else:
+            stepped, _ = step(scene, model, shifted, control)
+            qvel, act = fixed_after.qvel + _tangent(stepped.qvel), fixed_after.act + _tangent(stepped.act)
+        qvel = qvel + _tangent(spread @ moved)
+        qpos = fixed_after.qpos + _tangent(integrate_position(scene.host, shifted.qpos, qvel, scene.timestep))
+        following = State(qpos, qvel, act, fixed_after.warmstart)
+        return following, (following, control)
+
+    if not jacobian:
+        follow = jax.checkpoint(follow, policy=jax.checkpoint_policies.save_only_these_names("qacc"))
+    known = (jnp.arange(horizon), before, controls, after, jacobians, spread, shift)
+    _, (states, controls) = jax.lax.scan(follow, start, known)
+    trajectory = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), start, states)
+    return trajectory, controls, residuals, counts
+
+
+def _corrections(
+    scene: Scene,
+    model: mjx.Model,
+    before: State,
+    controls: Float[Array, "horizon nu"],
+    distance: Float[Array, "horizon guards"],
+    speed: Float[Array, "horizon guards"],
+    slots: int,
+) -> tuple[Float[Array, "horizon nv nv"], Float[Array, "horizon nv nv"], OnsetCounts]:
+    """(1 - s) Delta_k n^T / D and s Delta_{k-1} n^T / D of every step, zero where nothing begins, and counts."""
+    horizon, num_guards = distance.shape
+    timestep = scene.timestep
+    travel = timestep * speed
+    begins = (distance < 0) & (travel < 0) & (distance - travel > -TOUCHING * travel)
+    begins = begins.at[0].set(False)
+    found = jnp.sum(begins)
+    (flat,) = jnp.nonzero(begins.reshape(-1), size=slots, fill_value=horizon * num_guards)
+    used = flat < horizon * num_guards
+    steps, guards = jnp.divmod(jnp.where(used, flat, num_guards), num_guards)
+
+    def term(index, guard):
+        pick = lambda leaf: jnp.stack([leaf[index], leaf[index - 1]])  # noqa: E731
+        states, inputs = jax.tree.map(pick, before), pick(controls)
+        jumps, free, normal = jump_of_velocity(scene, model, states, inputs, guard)
+        share = distance[index, guard] / travel[index, guard]
+        least = timestep**2 * jnp.abs(normal @ free)
+        cell = jnp.minimum(travel[index, guard], -least)
+        here, previous = (jnp.outer(jump, normal) / cell for jump in jumps)
+        return (1 - share) * here, share * previous, travel[index, guard] > -least
+
+    here, previous, narrow = jax.vmap(term)(steps, guards)
+    keep = used[:, None, None]
+    empty = jnp.zeros((horizon, *here.shape[1:]), here.dtype)
+    spread, shift = (empty.at[steps].add(jnp.where(keep, terms, 0.0)) for terms in (here, previous))
+    counts = OnsetCounts(found, jnp.sum(narrow & used), found - jnp.sum(used))
+    return spread, shift, counts
+
+
+def jump_of_velocity(
+    scene: Scene, model: mjx.Model, states: State, controls: Float[Array, "cases nu"], guard: Int[Array, ""]
+) -> tuple[Float[Array, "cases nv"], Float[Array, " nv"], Float[Array, " nv"]]:
+    """What the onset of one contact or limit does to the velocity after a step, with bodies just touching.
+
+    Args:
+        scene: gives what is static.
+        model: the model to step.
+        states: with the velocities and activations to take; where things are is the first one's affair.
+        controls: that go with them.
+        guard: index of the contact or limit, as in `constraint.guard_rows`.
+
+    Returns:
+        v'(on) - v'(off) of each case; the first case's acceleration without the contact; the derivative of the guard
+        over the velocity coordinates.
+    """
+    positioned = position_stage(scene, model, states.qpos[0])
+    normal_rows, members = constraint.guard_rows(model, positioned)
+    mask = jnp.asarray(members)[guard]
+    rows: Any = positioned._impl
+    normal = jnp.asarray(normal_rows, rows.efc_J.dtype)[guard] @ rows.efc_J
+
+    def both(qvel, act, control, warmstart):
+        forced = force_stage(model, positioned, qvel, act, control).replace(qacc_warmstart=warmstart)
+
+        def advanced(on):
+            data = constraint.at_onset(model, forced, mask, on)
+            qacc = constraint.run_solver(model, data)
+            return advance_velocity(model, data, qacc)[0], qacc
+
+        after, qacc = jax.vmap(advanced)(jnp.array([True, False]))
+        return after[0] - after[1], qacc[1]
+
+    jumps, free = jax.vmap(both)(states.qvel, states.act, controls, states.warmstart)
+    return jumps, free[0], normal
+
+
+def _tangent(value: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Zero, with the derivative of the value."""
+    return value - jax.lax.stop_gradient(value)
+
+
+@jax.custom_jvp
+def _without_derivative(model: mjx.Model) -> mjx.Model:
+    return model
+
+
+@partial(_without_derivative.defjvp, symbolic_zeros=True)
+def _(primals, tangents):
+    if any(not isinstance(leaf, jax.custom_derivatives.SymbolicZero) for leaf in jax.tree.leaves(tangents)):
+        raise TypeError("with the onset term a rollout has derivatives over states and controls, none over the model")
+    return primals[0], tangents[0]

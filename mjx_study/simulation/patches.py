@@ -1,0 +1,151 @@
+"""Terms of MJX whose derivative fails where their value does not, evaluated here with safe branches.
+
+A branch that is not taken still takes part in a derivative: where it is infinite or NaN, so is the result. And a norm
+has no derivative at zero, where MJX puts zero, though a rotation vector made from it is smooth. Values agree with MJX
+to rounding; see `docs/gradient-faults.md`.
+"""
+
+import contextlib
+import sys
+import threading
+from collections.abc import Callable, Generator
+from typing import Any, Final
+
+import jax.numpy as jnp
+import mujoco
+from jaxtyping import Array, Float
+
+from mjx_study.simulation._mjx import mjx
+from mjx_study.simulation.integration import rotation_between
+
+_REFSAFE: Final = int(mujoco.mjtDisableBit.mjDSBL_REFSAFE)
+_LOCK: Final = threading.RLock()
+_UNSEEN: Final = 1e-30  # [m]; its square is still a normal number
+
+
+def stiffness_damping_impedance(
+    model: mjx.Model, solref: Float[Array, " 2"], solimp: Float[Array, " 5"], position: Float[Array, ""]
+) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
+    """Stiffness k [1/s^2], damping b [1/s] and impedance d of a constraint row, as MuJoCo derives them.
+
+    Where MJX is not differentiable and MuJoCo is: a direct solref (-k, 0); a power of solimp beyond the width; a power
+    that is no whole number; d_0 equal to d_width.
+
+    Args:
+        model: gives timestep and flags.
+        solref: (time constant [s], damping ratio) or (-k, -b).
+        solimp: (d_0, d_width, width, midpoint, power).
+        position: of the row [m or rad].
+
+    Reference: MuJoCo documentation, Modeling, "Solver parameters".
+    """
+    low, high, width, midpoint, power = solimp
+    low, high, midpoint = (jnp.clip(value, mujoco.mjMINIMP, mujoco.mjMAXIMP) for value in (low, high, midpoint))
+    width, power = jnp.maximum(width, mujoco.mjMINVAL), jnp.maximum(power, 1.0)
+
+    timeconst, dampratio = solref
+    if not model.opt.disableflags & _REFSAFE:
+        timeconst = jnp.maximum(timeconst, 2 * model.opt.timestep)
+    direct_k, direct_b = solref[0] <= 0, solref[1] <= 0
+    product = jnp.where(direct_k, 1.0, timeconst * dampratio)
+    k = jnp.where(direct_k, -solref[0], 1 / product**2) / high**2
+    b = jnp.where(direct_b, -solref[1], 2 / jnp.where(direct_b, 1.0, timeconst)) / high
+
+    depth = jnp.abs(position) / width
+    within, below = depth < 1, depth < midpoint
+    rise = jnp.where(below, depth, midpoint) ** power / midpoint ** (power - 1)
+    fall = jnp.where(within & ~below, 1 - depth, 1 - midpoint) ** power / (1 - midpoint) ** (power - 1)
+    share = jnp.where(below, rise, 1 - fall)
+    # MuJoCo clips to [d_0, d_width], which between the two changes nothing
+    impedance = jnp.where(within & (low < high), low + share * (high - low), high)
+    return k, b, impedance
+
+
+def _touching(
+    model: mjx.Model, solref: Float[Array, " 2"], solimp: Float[Array, " 5"], position: Float[Array, ""]
+) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
+    """The same of a row without penetration, whose spring has no force yet."""
+    k, b, impedance = stiffness_damping_impedance(model, solref, solimp, jnp.zeros_like(position))
+    return jnp.zeros_like(k), b, impedance
+
+
+def rotation_vector(quaternion: Float[Array, " 4"]) -> tuple[Float[Array, " 3"], Float[Array, ""]]:
+    """(rotation vector [rad], 1) in place of MJX's (axis, angle), of which it only ever takes the product."""
+    still = jnp.zeros_like(quaternion).at[0].set(1.0)
+    return rotation_between(still, quaternion), jnp.ones_like(quaternion[0])
+
+
+def rotation_difference(end: Float[Array, " 4"], start: Float[Array, " 4"]) -> Float[Array, " 3"]:
+    """The rotation vector [rad] from `start` to `end`; MJX's `quat_sub`."""
+    return rotation_between(start, end)
+
+
+def tendon_spring_gap(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]:
+    """What MJX's tendon springs lack, [N or N m]: zero in value, not in derivative.
+
+    A spring whose rest is one length, not a range, is linear; MJX composes it of two halves that both have derivative
+    zero where they meet. Added to the passive force this gives it the linear spring's.
+    """
+    shortest, longest = model.tendon_lengthspring.T
+    linear = (shortest == longest) & (data.ten_length == shortest)
+    stiffness = jnp.where(linear, model.tendon_stiffness, 0.0)
+    rows: Any = data._impl
+    return rows.ten_J.T @ (stiffness * (shortest - data.ten_length))
+
+
+def has_tendon_springs(model: mjx.Model) -> bool:
+    """Whether there are tendons with springs that act; static."""
+    off = mujoco.mjtDisableBit.mjDSBL_SPRING | mujoco.mjtDisableBit.mjDSBL_DAMPER
+    return model.ntendon > 0 and not model.opt.disableflags & int(off)
+
+
+def _module(name: str) -> Any:
+    """A module of MJX's implementation."""
+    return sys.modules[f"{mjx.make_constraint.__module__.rpartition('.')[0]}.{name}"]
+
+
+_mjx_wrap_inside = getattr(_module("support"), "wrap_inside", None)
+
+
+def wrap_inside(*arguments: Any) -> tuple[Float[Array, " 1"], Float[Array, " 4"]]:
+    """MJX's path of a tendon inside a sphere or cylinder: (length along it or -1, points where it touches).
+
+    The length is always 0; MJX takes the square root of its square, which has no derivative at 0. Here it is too short
+    to be seen and has one.
+    """
+    assert _mjx_wrap_inside is not None, "`repaired` has checked that MJX has it"
+    length, points = _mjx_wrap_inside(*arguments)
+    return jnp.where(length < 0, length, _UNSEEN), points
+
+
+_REPLACED: Final[dict[tuple[str, str], Callable[..., Any]]] = {
+    ("constraint", "_kbi"): stiffness_damping_impedance,
+    ("math", "quat_to_axis_angle"): rotation_vector,
+    ("math", "quat_sub"): rotation_difference,
+    ("support", "wrap_inside"): wrap_inside,
+}
+
+
+@contextlib.contextmanager
+def repaired(*, touching: bool = False) -> Generator[None]:
+    """What is traced inside has MJX call the functions of this module in place of its own.
+
+    Args:
+        touching: have every constraint row that acts be that of bodies which only just touch.
+
+    MJX offers no other place for them: they are called deep inside its pipeline. A version of MJX that no longer has
+    one is an error here, not a silent return of its faults.
+
+    Raises:
+        RuntimeError: MJX has no function of such a name.
+    """
+    with _LOCK, contextlib.ExitStack() as undo:
+        replaced = _REPLACED | ({("constraint", "_kbi"): _touching} if touching else {})
+        for (module_name, name), ours in replaced.items():
+            module = _module(module_name)
+            original = getattr(module, name, None)
+            if original is None:
+                raise RuntimeError(f"this version of MJX has no {module_name}.{name}: adapt mjx_study.repairs to it")
+            undo.callback(setattr, module, name, original)
+            setattr(module, name, ours)
+        yield

@@ -1,0 +1,238 @@
+"""A scene: one MJCF, compiled by MuJoCo and put on the device for MJX."""
+
+import copy
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+from importlib import resources
+from pathlib import Path
+from typing import Any, Final
+
+import jax
+import mujoco
+import numpy as np
+
+from mjx_study.simulation._mjx import mjx
+from mjx_study.simulation.limitations import FLAGS, ignored, lacking
+from mjx_study.simulation.mjcf_sizes import too_large
+
+CONES: Final = {"pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL, "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC}
+SOLVERS: Final = {"newton": mujoco.mjtSolver.mjSOL_NEWTON, "cg": mujoco.mjtSolver.mjSOL_CG}
+INTEGRATORS: Final = {
+    "euler": mujoco.mjtIntegrator.mjINT_EULER,
+    "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
+    "rk4": mujoco.mjtIntegrator.mjINT_RK4,
+}
+_ENUMERATED: Final = {"cone": CONES, "solver": SOLVERS, "integrator": INTEGRATORS}
+SceneOption = str | float | int | Sequence[str]
+_POSITIVE: Final = ("timestep", "iterations", "ls_iterations", "tolerance")
+
+
+class SceneError(ValueError):
+    """An MJCF that cannot be found, compiled, or run by MJX."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Scene:
+    """A compiled model on the host and on the device, with an empty `mjx.Data` as template for each step.
+
+    What is static in MJX (cone, solver, integrator, budgets) is fixed here; contact parameters are array leaves
+    of `model` and are swept without recompiling (see `mjx_study.simulation.contact`).
+    """
+
+    name: str
+    host: mujoco.MjModel
+    model: mjx.Model
+    template: mjx.Data
+
+    @property
+    def timestep(self) -> float:
+        """Time per step [s]."""
+        return float(self.host.opt.timestep)
+
+    @property
+    def has_constraints(self) -> bool:
+        """Whether MJX allocates any constraint row (contact, limit, equality or friction loss)."""
+        return num_constraint_rows(self.template) > 0
+
+    def geom(self, name: str) -> int:
+        """Index of a geom by name. Raises SceneError, listing the choices, for an unknown name."""
+        return self._index(mujoco.mjtObj.mjOBJ_GEOM, "geom", name, self.host.ngeom)
+
+    def joint(self, name: str) -> int:
+        """Index of a joint by name. Raises SceneError, listing the choices, for an unknown name."""
+        return self._index(mujoco.mjtObj.mjOBJ_JOINT, "joint", name, self.host.njnt)
+
+    def _index(self, kind: mujoco.mjtObj, noun: str, name: str, count: int) -> int:
+        index = mujoco.mj_name2id(self.host, kind, name)
+        if index < 0:
+            names = [mujoco.mj_id2name(self.host, kind, i) for i in range(count)]
+            raise SceneError(f"{self.name} has no {noun} {name!r}; it has {', '.join(map(str, names)) or 'none'}")
+        return index
+
+
+def num_constraint_rows(data: mjx.Data) -> int:
+    """Constraint rows that MJX allocates, active or not; static."""
+    rows: Any = data._impl
+    return rows.efc_J.shape[0]
+
+
+def models_folder() -> Path:
+    """Folder of the MJCF files that ship with the package (beside it in a checkout)."""
+    package = Path(str(resources.files("mjx_study")))
+    packaged = package / "models"
+    return packaged if packaged.is_dir() else package.parent / "models"
+
+
+def model_names() -> list[str]:
+    """Names of the MJCF files that ship with the package."""
+    return sorted(path.stem for path in models_folder().glob("*.xml"))
+
+
+def load_scene(source: str | Path, **options: SceneOption) -> Scene:
+    """Compile an MJCF and put it on the device; see `load_model` for the arguments.
+
+    Raises:
+        SceneError: as `load_model`, or MJX cannot run the model; the message says why.
+    """
+    return put_scene(load_model(source, **options), Path(source).stem)
+
+
+def load_model(source: str | Path, **options: SceneOption) -> mujoco.MjModel:
+    """Compile an MJCF.
+
+    Args:
+        source: the name of a shipped model (`"pusher"`) or the path of an MJCF file.
+        **options: replace what the file says: `cone` (pyramidal, elliptic), `solver` (newton, cg), `integrator`
+            (euler, implicitfast, rk4), `timestep` [s], `iterations`, `ls_iterations`, `tolerance`; and
+            `disable_flags`, names of MJCF's flags to disable, as a sequence or with commas between them.
+
+    Raises:
+        SceneError: the file is missing or does not parse, or an option is unknown or out of range.
+    """
+    path = _find(source)
+    if excess := too_large(path):
+        raise SceneError(f"{path} asks for {excess}")
+    try:
+        host = mujoco.MjModel.from_xml_path(str(path))
+    except (ValueError, RuntimeError, mujoco.FatalError) as error:
+        raise SceneError(f"{path} is not a valid MJCF: {' '.join(str(error).split())}") from error
+    _set_options(host, options)
+    if not 0 < host.opt.timestep < math.inf:
+        raise SceneError(f"{path}: the timestep must be positive and finite, got {host.opt.timestep:g}")
+    return host
+
+
+def put_scene(host: mujoco.MjModel, name: str, **options: SceneOption) -> Scene:
+    """Put a compiled model, or a copy with `options` as `load_model` takes them, on the device.
+
+    Raises:
+        SceneError: MJX cannot run the model, or would leave out part of it; or an option is unknown or out of range.
+    """
+    if options:
+        host = copy.copy(host)
+        _set_options(host, options)
+    _refuse_unsupported(host, name)
+    try:
+        model = mjx.put_model(host)
+        template = mjx.make_data(host)
+    except (NotImplementedError, ValueError, AssertionError) as error:
+        reason = str(error) or type(error).__name__
+        raise SceneError(f"MJX cannot run {name}: {reason}") from error
+    # `make_data` on a shared host leaves weakly typed leaves; fix their types once so that loops carry them.
+    template = jax.tree.map(lambda leaf: leaf if isinstance(leaf, np.ndarray) else jax.numpy.asarray(leaf), template)
+    scene = Scene(name, host, model, template)
+    if host.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4 and scene.has_constraints:
+        raise SceneError(
+            f"{name} combines RK4 with contacts, limits, equalities or friction loss: RK4's stages would solve the "
+            "constraints four times per step without an order to gain; use euler or implicitfast (--integrator)"
+        )
+    return scene
+
+
+def _find(source: str | Path) -> Path:
+    path = Path(source)
+    if path.is_dir():
+        raise SceneError(f"{path} is a folder, not an MJCF file")
+    if path.suffix.lower() == ".xml":
+        if not path.is_file():
+            raise SceneError(f"no MJCF file at {path}")
+        return path
+    shipped = models_folder() / f"{source}.xml"
+    if not shipped.is_file():
+        raise SceneError(f"no model named {source!r}; there are {', '.join(model_names())}, or give a path to an .xml")
+    return shipped
+
+
+def require(scene: Scene, *, joints: tuple[str, ...], geoms: tuple[str, ...], driven: tuple[str, ...] = ()) -> None:
+    """Refuse a model that a task cannot use.
+
+    Args:
+        scene: the model.
+        joints: all of its joints, of one coordinate each, in the order of the state.
+        geoms: names that it must have.
+        driven: the joint that each of its actuators drives, in the order of the control.
+
+    Raises:
+        SceneError: a name is missing, a size is another, or the order is.
+    """
+    host = scene.host
+    indices = [scene.joint(name) for name in joints]
+    for name in geoms:
+        scene.geom(name)
+    sizes, found = (len(joints), len(joints), len(driven)), (host.nq, host.nv, host.nu)
+    if found != sizes:
+        raise SceneError(f"{scene.name} has nq, nv, nu = {found}; the task needs {sizes}")
+    if indices != sorted(indices):
+        own = ", ".join(joints[indices.index(index)] for index in sorted(indices))
+        raise SceneError(f"the joints of {scene.name} must come in the order {', '.join(joints)}; they come as {own}")
+    targets = [mujoco.mj_id2name(host, mujoco.mjtObj.mjOBJ_JOINT, joint) for joint in host.actuator_trnid[:, 0]]
+    if targets != list(driven):
+        raise SceneError(
+            f"the actuators of {scene.name} must drive {', '.join(driven)} in this order; they drive "
+            f"{', '.join(map(str, targets))}"
+        )
+
+
+def _set_options(host: mujoco.MjModel, options: Mapping[str, SceneOption]) -> None:
+    for name, value in options.items():
+        if name in _ENUMERATED:
+            choices = _ENUMERATED[name]
+            if value not in choices:
+                raise SceneError(f"unknown {name} {value!r}; choose from {', '.join(choices)}")
+            setattr(host.opt, name, choices[str(value)])
+        elif name in _POSITIVE:
+            number_type = type(getattr(host.opt, name))
+            if not isinstance(value, float | int) or not (0 < value < math.inf and number_type(value) == value):
+                whole = "whole " if number_type is int else ""
+                raise SceneError(f"{name} must be a positive {whole}number, got {value!r}")
+            setattr(host.opt, name, number_type(value))
+        elif name == "disable_flags":
+            _disable_flags(host, value)
+        else:
+            known = ", ".join([*_ENUMERATED, *_POSITIVE, "disable_flags"])
+            raise SceneError(f"unknown option {name!r}; choose from {known}")
+
+
+def _disable_flags(host: mujoco.MjModel, names: SceneOption) -> None:
+    if isinstance(names, float | int):
+        raise SceneError(f"disable_flags must be names of flags, got {names!r}")
+    for name in names.split(",") if isinstance(names, str) else names:
+        if name not in FLAGS:
+            raise SceneError(f"unknown flag {name!r}; choose from {', '.join(FLAGS)}")
+        FLAGS[name].disable(host.opt)
+
+
+def _refuse_unsupported(host: mujoco.MjModel, name: str) -> None:
+    for option, choices in _ENUMERATED.items():
+        value = int(getattr(host.opt, option))
+        if value not in {int(choice) for choice in choices.values()}:
+            raise SceneError(
+                f"MJX lacks the {option} that {name} asks for; use one of {', '.join(choices)} (--{option})"
+            )
+    if flags := lacking(host):
+        raise SceneError(
+            f"MJX lacks {', '.join(flags)}, which {name} enables; disable them (--disable-flag {','.join(flags)})"
+        )
+    if features := ignored(host):
+        raise SceneError(f"MJX would leave out part of {name}: {'; '.join(features)}")

@@ -1,0 +1,77 @@
+"""Where a sweep's cells lie: the values along every dimension, and each cell's index along each of them."""
+
+import dataclasses
+from collections import Counter, defaultdict
+from typing import Any, Final
+
+import numpy as np
+
+from mjx_study.study.plan import SweepCell, SweepPlan
+from mjx_study.table import digits_to_tell_apart
+
+SORTED: Final = ("timestep", "sigma", "samples")
+"""Dimensions whose values ascend; the others keep the order of the configuration."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Axes:
+    """The grid of a sweep.
+
+    Attributes:
+        values: by dimension, its coordinates; names for tasks, cones and contact models, all different.
+        models: contact family and stiffness [N/m] of each contact model.
+        places: of each cell, its index along every dimension.
+    """
+
+    values: dict[str, list[Any]]
+    models: tuple[dict[str, Any], ...]
+    places: tuple[dict[str, int], ...]
+
+
+def axes_of(plan: SweepPlan) -> Axes:
+    """The grid of a plan. Values are told apart as they are, whatever their names look like."""
+    exact = [_exact(plan, cell) for cell in plan.cells]
+    values = {name: list(dict.fromkeys(each[name] for each in exact)) for name in exact[0]}
+    for name in SORTED:
+        values[name].sort()
+    index = {name: {value: place for place, value in enumerate(along)} for name, along in values.items()}
+    places = tuple({name: index[name][value] for name, value in each.items()} for each in exact)
+    models = tuple({"contact": family, "stiffness": stiffness} for family, stiffness in values["model"])
+    named = values | {"task": _task_names(plan, values["task"]), "model": _model_names(values["model"])}
+    return Axes(named, models, places)
+
+
+def solver_parameters(cell: SweepCell) -> dict[str, list[float] | None]:
+    """solref and solimp of a cell's contact; None where they are the MJCF's."""
+    contact = cell.model.contact
+    if contact is None:
+        return {"solref": None, "solimp": None}
+    return {"solref": np.asarray(contact.solref).tolist(), "solimp": np.asarray(contact.solimp).tolist()}
+
+
+def _exact(plan: SweepPlan, cell: SweepCell) -> dict[str, Any]:
+    group = plan.groups[cell.group]
+    return {
+        "task": group.name,
+        "timestep": group.timestep,
+        "cone": group.cone,
+        "model": (cell.model.family, cell.model.stiffness),
+        "sigma": cell.sigma,
+        "samples": cell.samples,
+    }
+
+
+def _task_names(plan: SweepPlan, configured: list[str]) -> list[str]:
+    """What tasks call themselves, or what the configuration calls those that share a name."""
+    own = {group.name: group.task.name for group in plan.groups}
+    shared = Counter(own[name] for name in configured)
+    return [name if shared[own[name]] > 1 else own[name] for name in configured]
+
+
+def _model_names(models: list[tuple[str, float]]) -> list[str]:
+    """Family and stiffness, in as many digits as tell a family's stiffnesses apart."""
+    by_family = defaultdict(list)
+    for family, stiffness in models:
+        by_family[family].append(stiffness)
+    digits = {family: digits_to_tell_apart(values) for family, values in by_family.items()}
+    return [f"{family} {stiffness:.{digits[family]}g}" if stiffness else family for family, stiffness in models]

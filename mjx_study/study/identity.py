@@ -1,0 +1,249 @@
+"""What numbers depend on, by content and not by name: the compiled model, the task's parts, and who computes them.
+
+Numbers and arrays enter a digest by value, to twelve digits; the model by MuJoCo's arrays, without names and colours.
+A function enters by its name, its closure and its defaults, and by the source file of its module; files beside that one
+which it imports count as well. Code of this package and of the libraries below it counts by version.
+"""
+
+import dataclasses
+import enum
+import functools
+import hashlib
+import inspect
+import re
+import sys
+import types
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
+from importlib import metadata
+from pathlib import Path
+from typing import Any, Final
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from mjx_study.runtime import precision
+from mjx_study.simulation.scene import Scene
+from mjx_study.tasks.task import Task
+
+VERSIONED: Final = ("mjx-study", "mujoco", "mujoco-mjx", "jax", "jaxlib", "numpy", "optax")
+"""Packages whose version may change a number."""
+BY_VERSION: Final = {"mjx_study", "estimators", "mujoco", "jax", "jaxlib", "numpy", "scipy", "optax", "builtins"}
+"""Modules whose code counts by version."""
+IRRELEVANT: Final = re.compile(r"_.*|.*name.*|.*path.*|.*rgba|(tex|mat|skin|light|cam|text)_.*|.*_matid")
+"""Fields of MjModel that no number depends on."""
+ACCEPT: Final = "choose another folder, or accept the mixture by --accept-versions"
+"""What a message about other versions ends with."""
+UNREAD: Final = ("description",)
+"""Fields of a task that no number depends on."""
+
+
+def versions() -> dict[str, str]:
+    """Of what computes, and a digest of this package's own code."""
+    return {name: metadata.version(name) for name in VERSIONED} | {"code of mjx-study": _own_code()}
+
+
+def contents(tasks: Mapping[str, Iterable[Task]]) -> dict[str, str]:
+    """Precision, and digests of what each task is made of.
+
+    Args:
+        tasks: by the name that messages give it, the task in all its forms (timesteps, cones).
+
+    Returns:
+        By what is digested: "model of NAME", "task NAME", and "source of FILE" for every source file of a task's own.
+    """
+    found, sources = {"precision": precision()}, {}
+    for name, forms in tasks.items():
+        models, rest = _Digest(), _Digest()
+        for task in forms:
+            models.add(task.scene)
+            for field in dataclasses.fields(task):
+                if field.name not in ("scene", *UNREAD):
+                    rest.add((field.name, getattr(task, field.name)))
+        found |= {f"model of {name}": models.hexdigest(), f"task {name}": rest.hexdigest()}
+        sources |= rest.sources
+    return found | {f"source of {name}": digest for name, digest in sorted(sources.items())}
+
+
+def differences(theirs: Mapping[str, Any], ours: Mapping[str, Any]) -> str | None:
+    """The first three entries that differ, as a message tells them; None where none does."""
+    different = [name for name in dict(theirs) | dict(ours) if theirs.get(name) != ours.get(name)]
+    told = ", ".join(f"{name} {theirs.get(name)} there and {ours.get(name)} here" for name in different[:3])
+    return told or None
+
+
+@functools.cache
+def _own_code() -> str:
+    package = Path(__file__).parents[1]
+    files = sorted([*package.rglob("*.py"), *(package.parent / "estimators").rglob("*.py")])
+    sha = hashlib.sha256()
+    for path in files:
+        sha.update(str(path.relative_to(package.parent)).encode() + b"\0" + path.read_bytes())
+    return sha.hexdigest()[:12]
+
+
+class _Digest:
+    """A digest of values, and of the source files of functions among them."""
+
+    def __init__(self) -> None:
+        self._sha = hashlib.sha256()
+        self._seen: dict[int, tuple[int, Any]] = {}
+        self.sources: dict[str, str] = {}
+
+    def hexdigest(self) -> str:
+        """Sixteen digits."""
+        return self._sha.hexdigest()[:16]
+
+    def add(self, value: Any) -> None:
+        """Enter a value and all that it holds."""
+        if value is None or isinstance(value, bool | int | str | bytes | enum.Enum):
+            self._note(type(value).__name__, repr(value))
+        elif isinstance(value, float | np.ndarray | np.generic | jax.Array):
+            self._array(value)
+        elif isinstance(value, type):
+            self._note("class", value.__module__, value.__qualname__)
+            self._source(value.__module__)
+        elif id(value) in self._seen:
+            self._note("again", str(self._seen[id(value)][0]))
+        else:
+            self._seen[id(value)] = len(self._seen), value  # kept, so that no other object gets its id
+            self._compound(value)
+
+    def _compound(self, value: Any) -> None:
+        if isinstance(value, Scene):
+            self._scene(value)
+        elif isinstance(value, mujoco.MjModel):
+            self._model(value)
+        elif isinstance(value, Mapping):
+            self._all("mapping", sorted(value.items(), key=lambda item: repr(item[0])))
+        elif isinstance(value, set | frozenset):
+            self._all("set", sorted(value, key=repr))
+        elif isinstance(value, tuple | list):
+            self._all("sequence", value)
+        elif isinstance(value, functools.partial):
+            self._all("partial", (value.func, value.args, value.keywords))
+        elif isinstance(value, types.MethodType):
+            self._all("method", (value.__self__, value.__func__))
+        elif isinstance(value, types.FunctionType):
+            self._function(value)
+        elif hasattr(value, "__wrapped__"):  # what jit and the like return
+            self.add(value.__wrapped__)
+        elif dataclasses.is_dataclass(value):
+            fields = [(field.name, getattr(value, field.name)) for field in dataclasses.fields(value)]
+            self._all("dataclass", (type(value), fields))
+        else:
+            self._all("object", (type(value), getattr(value, "__name__", None), getattr(value, "__dict__", {})))
+
+    def _note(self, *texts: str) -> None:
+        self._sha.update("\0".join((*texts, "\n")).encode())
+
+    def _all(self, kind: str, values: Iterable[Any]) -> None:
+        values = list(values)
+        self._note(kind, str(len(values)))
+        for value in values:
+            self.add(value)
+
+    def _array(self, value: Any) -> None:
+        """By value: a mantissa of 40 bits and an exponent, since the last bits depend on the processor."""
+        if isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jax.dtypes.prng_key):
+            value = jax.random.key_data(value)
+        array = np.asarray(value)
+        self._note("array", array.dtype.kind, str(array.shape))
+        if array.dtype.kind == "f":
+            finite = np.isfinite(array)
+            mantissa, exponent = np.frexp(np.where(finite, array, 0).astype(float))
+            kind = np.where(finite, 0, np.where(np.isnan(array), 1, np.where(array > 0, 2, 3)))
+            self._sha.update(np.rint(np.ldexp(mantissa, 40)).astype(np.int64).tobytes())
+            array = np.stack([exponent.astype(np.int32), kind.astype(np.int32)])
+        self._sha.update(repr(array.tolist()).encode() if array.dtype.kind == "O" else array.tobytes())
+
+    def _scene(self, scene: Scene) -> None:
+        """MuJoCo's model, and those of its arrays that someone changed in MJX's."""
+        self._model(scene.host)
+        on_device: Any = scene.model
+        for field in dataclasses.fields(on_device):
+            theirs, ours = getattr(scene.host, field.name, None), getattr(on_device, field.name, None)
+            if isinstance(theirs, np.ndarray) and isinstance(ours, np.ndarray | jax.Array) and theirs.size == ours.size:
+                if not np.allclose(theirs.ravel(), np.ravel(ours), rtol=1e-6, equal_nan=True):
+                    self._all(f"mjx.{field.name}", (ours,))
+
+    def _model(self, model: mujoco.MjModel) -> None:
+        """Arrays, options and statistics; what is zero is left out, as fields of a later MuJoCo are."""
+        for part, struct in (("", model), ("opt.", model.opt), ("stat.", model.stat)):
+            for name in sorted(set(dir(struct))):
+                value = None if IRRELEVANT.fullmatch(name) else getattr(struct, name)
+                counts = isinstance(value, np.ndarray) or (part and isinstance(value, int | float))
+                if counts and np.any(value):
+                    self._all(part + name, (np.asarray(value),))
+
+    def _function(self, function: types.FunctionType) -> None:
+        versioned = _by_version(function.__module__)
+        function = inspect.unwrap(function) if versioned else function
+        self._note("function", function.__module__, function.__qualname__)
+        self._all("holds", (function.__defaults__, function.__kwdefaults__, _closure(function)))
+        if versioned:
+            return
+        self._source(function.__module__)
+        if _file(function.__module__) is None:  # of an interactive session
+            self._code(function.__code__)
+        for name in sorted(_names(function.__code__)):
+            value = function.__globals__.get(name)
+            if isinstance(value, bool | int | float | str | tuple | np.ndarray | jax.Array | types.FunctionType):
+                self._all(f"global {name}", (value,))
+
+    def _code(self, code: types.CodeType) -> None:
+        self._note("code", code.co_code.hex())
+        for constant in code.co_consts:
+            self._code(constant) if isinstance(constant, types.CodeType) else self._note(repr(constant))
+
+    def _source(self, module: str) -> None:
+        """The source file of a module, and of those beside it that it imports."""
+        path = _file(module)
+        if _by_version(module) or path is None:
+            return
+        levels = module.count(".") + (path.name == "__init__.py")
+        root = path.parents[min(levels, len(path.parents) - 1)]
+        name = str(path.relative_to(root))
+        if name in self.sources:
+            return
+        self.sources[name] = hashlib.sha256(path.read_bytes()).hexdigest()[:16]
+        for value in list(vars(sys.modules[module]).values()):
+            other = value.__name__ if isinstance(value, types.ModuleType) else getattr(value, "__module__", None)
+            if isinstance(other, str) and _beside(other, module, root):
+                self._source(other)
+
+
+def _by_version(module: str) -> bool:
+    top = module.partition(".")[0]
+    return top in BY_VERSION or top in sys.stdlib_module_names - {"__main__"}
+
+
+def _file(module: str) -> Path | None:
+    """Where a module's source is; None for one of an interactive session, or that is compiled."""
+    file = getattr(sys.modules.get(module), "__file__", None)
+    return Path(file) if file is not None and Path(file).is_file() else None
+
+
+def _beside(other: str, module: str, root: Path) -> bool:
+    """Whether a module is of the same package as another, or a file of the same folder tree."""
+    path = _file(other)
+    if path is None or other.partition(".")[0] == module.partition(".")[0]:
+        return path is not None
+    return path.is_relative_to(root) and "site-packages" not in path.parts and "dist-packages" not in path.parts
+
+
+def _closure(function: types.FunctionType) -> dict[str, Any]:
+    """What a function holds of the scope that it was made in, by name."""
+    held = {}
+    for name, cell in zip(function.__code__.co_freevars, function.__closure__ or (), strict=True):
+        with suppress(ValueError):  # a cell that is empty still
+            held[name] = cell.cell_contents
+    return held
+
+
+def _names(code: types.CodeType) -> set[str]:
+    """Global names that a function uses, those of functions within it included."""
+    inner = (each for each in code.co_consts if isinstance(each, types.CodeType))
+    return set(code.co_names).union(*(_names(each) for each in inner))

@@ -1,0 +1,145 @@
+r"""Means over the noise of a decision of one number, without sampling.
+
+    F(theta) = E f(theta + w),   F'(theta) = E f(theta + w) psi'(w),   E[FoBG] = E f'(theta + w),
+
+with w of density p = exp(-psi), on one fine uniform grid that serves every theta. f counts as constant in each cell of
+the grid; since psi' p = -p', the cell's weight in F' is p(left end) - p(right end), whatever kink p has in between. The
+error is of second order in the spacing for smooth f, and a spacing times the jump where f jumps; the difference to the
+rule on every second point estimates it.
+"""
+
+import dataclasses
+import math
+from typing import Any, Final
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, PartitionSpec
+from jaxtyping import Float
+
+from estimators import NOISES
+from mjx_study.objective import rollout_cost
+from mjx_study.reference.noise import split_sample_key
+from mjx_study.simulation.contact import ContactModel
+from mjx_study.tasks.task import Task
+
+TAIL: Final = 1e-6
+"""Probability of noise beyond what the grid covers, from each end of the line."""
+CHUNK: Final = 256
+"""Points per device and call."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Means:
+    """Means at the points of a line, and how far they may be off.
+
+    Attributes:
+        smoothed: F.
+        slope: F', what an unbiased estimate has as its mean.
+        first: E[FoBG].
+        slope_error, first_error: difference to the rule with every second point.
+    """
+
+    smoothed: Float[np.ndarray, " points"]
+    slope: Float[np.ndarray, " points"]
+    first: Float[np.ndarray, " points"]
+    slope_error: Float[np.ndarray, " points"]
+    first_error: Float[np.ndarray, " points"]
+
+
+def applies(task: Task) -> bool:
+    """Whether a rollout depends on theta + w alone, and that is one number: no feedback, and no start that is drawn."""
+    return task.policy.num_params == 1 and task.policy.additive and not task.random_start
+
+
+class Line:
+    """Cost and derivative of a task with one parameter, as one compiled program of points and contact model.
+
+    Raises:
+        ValueError: quadrature does not apply to the task.
+    """
+
+    def __init__(self, task: Task):
+        if not applies(task):
+            raise ValueError(
+                "quadrature is for a decision of one number with the noise added to it and a fixed start; "
+                f"{task.name} has {task.policy.num_params}"
+                f"{'' if task.policy.additive else ', the noise on its controls'}"
+                f"{', its starts drawn' if task.random_start else ''}"
+            )
+        self.devices = jax.local_devices()
+        shape, dtype = task.policy.noise_shape, task.theta.dtype
+
+        def cost(theta, contact):
+            start = task.draw_start(split_sample_key(jax.random.key(0))[0])
+            return rollout_cost(task, theta[None], contact, start, jnp.zeros(shape, dtype), task.onset)[0]
+
+        batched = jax.vmap(jax.value_and_grad(cost), in_axes=(0, None))
+        mesh, split = Mesh(np.array(self.devices), ("points",)), PartitionSpec("points")
+        specs: dict[str, Any] = {"mesh": mesh, "in_specs": (split, PartitionSpec()), "out_specs": split}
+        self._program = jax.jit(jax.shard_map(batched, **specs, check_vma=False))
+        self._dtype = dtype
+
+    def __call__(
+        self, points: Float[np.ndarray, " points"], contact: ContactModel | None
+    ) -> tuple[Float[np.ndarray, " points"], Float[np.ndarray, " points"]]:
+        """Cost without noise and its derivative at each point."""
+        capacity = CHUNK * len(self.devices)
+        rows = np.minimum(np.arange(-(-len(points) // capacity) * capacity), len(points) - 1)
+        parts = [self._program(points[part].astype(self._dtype), contact) for part in rows.reshape(-1, capacity)]
+        values, slopes = (np.concatenate(leaves)[: len(points)] for leaves in zip(*jax.device_get(parts), strict=True))
+        return values, slopes
+
+
+def grid(low: float, high: float, sigma: float, size: int, noise: str) -> Float[np.ndarray, " size"]:
+    """Midpoints of the cells of a uniform grid that covers the line and the noise about it.
+
+    Args:
+        low, high: ends of the line.
+        sigma: standard deviation of the noise.
+        size: cells in the width that Gaussian noise needs; heavier tails get more of the same width.
+        noise: name of the noise's density.
+    """
+    needed, gaussian = (high - low + 2 * sigma * NOISES[name].reach(TAIL) for name in (noise, "gaussian"))
+    cells = math.ceil(size * needed / gaussian)
+    return (low + high - needed) / 2 + needed * (np.arange(cells) + 0.5) / cells
+
+
+def means(
+    points: Float[np.ndarray, " size"],
+    values: Float[np.ndarray, " size"],
+    slopes: Float[np.ndarray, " size"],
+    position: Float[np.ndarray, " points"],
+    sigma: float,
+    noise: str,
+) -> Means:
+    """Means over the noise at each position.
+
+    Args:
+        points: a uniform grid.
+        values, slopes: f and f' on it.
+        position: theta's.
+        sigma: standard deviation of the noise.
+        noise: name of the noise's density.
+
+    Raises:
+        ValueError: the grid is too coarse, or it does not cover the noise.
+    """
+    spacing, reach = points[1] - points[0], NOISES[noise].reach(TAIL)
+    gap = 0.51 * spacing - reach * sigma
+    if spacing > sigma / 8 or points[0] > position.min() + gap or points[-1] < position.max() - gap:
+        raise ValueError(
+            f"the grid must cover {reach:.2g} sigma to each side of the line, with a spacing of at most sigma / 8"
+        )
+    fine, coarse = (_means(points[::step], values[::step], slopes[::step], position, sigma, noise) for step in (1, 2))
+    return Means(*fine, slope_error=np.abs(fine[1] - coarse[1]), first_error=np.abs(fine[2] - coarse[2]))
+
+
+def _means(points, values, slopes, position, sigma, noise):
+    density, spacing = NOISES[noise].density, points[1] - points[0]
+    weight = density((points - position[:, None]) / sigma)
+    total = weight.sum(axis=1, keepdims=True)
+    edges = np.append(points - spacing / 2, points[-1] + spacing / 2)
+    score_weight = -np.diff(density((edges - position[:, None]) / sigma), axis=1) / (total * spacing)
+    return weight / total @ values, score_weight @ values, weight / total @ slopes

@@ -1,0 +1,139 @@
+"""The contact models of a study: families over stiffnesses, or MuJoCo's own parameters, and what to warn about."""
+
+import dataclasses
+import itertools
+import warnings
+from collections.abc import Generator, Sequence
+from contextlib import contextmanager
+
+import numpy as np
+
+from mjx_study.limits import MOST_MODELS, check_count
+from mjx_study.simulation.contact import (
+    DEFAULT_SOLIMP,
+    DEFAULT_SOLREF,
+    FAMILIES,
+    ContactModel,
+    ContactWarning,
+    contact_model,
+    family_model,
+    stiffness_from_solref,
+)
+from mjx_study.table import digits_to_tell_apart
+from mjx_study.tasks.task import Task
+
+
+@dataclasses.dataclass(frozen=True)
+class ContactPoint:
+    """One contact model of a comparison.
+
+    Attributes:
+        family: name of the contact family, or solref and solimp.
+        stiffness: K of its spring [N/m]; 0 where there is no contact.
+        contact: the model; None for the MJCF's own.
+        digits: of the stiffness in messages, as many as tell the models of a sweep apart.
+    """
+
+    family: str
+    stiffness: float
+    contact: ContactModel | None
+    digits: int = 6
+
+    @property
+    def label(self) -> str:
+        """As messages name it."""
+        return f"{self.family}, K = {self.stiffness:.{self.digits}g} N/m" if self.stiffness else self.family
+
+
+def contact_grid(
+    task: Task,
+    families: Sequence[str] | None = None,
+    stiffnesses: Sequence[float] | None = None,
+    damping: float | None = None,
+) -> tuple[tuple[ContactPoint, ...], tuple[str, ...]]:
+    """The contact models of a sweep, family by family, and what there is to warn about.
+
+    Args:
+        task: gives what is None, and the effective mass.
+        families: names of contact families.
+        stiffnesses: for families that take one [N/m].
+        damping: in place of each family's [N s/m].
+
+    Raises:
+        ValueError: a family is unknown, or a stiffness or damping is out of range.
+    """
+    cells, messages = [], []
+    stiffnesses = task.stiffnesses if stiffnesses is None else stiffnesses
+    families = task.families if families is None else families
+    check_count(len(families) * len(stiffnesses), "contact models", MOST_MODELS, "give fewer stiffnesses or families")
+    digits = digits_to_tell_apart(stiffnesses)
+    for family in families:
+        swept = family not in FAMILIES or FAMILIES[family].swept
+        undamped = swept and family in FAMILIES and FAMILIES[family].dampratio == 0
+        own = damping if damping is not None else task.damping if undamped else None
+        for stiffness in stiffnesses if swept else (None,):
+            with _warnings_of_contact() as caught:
+                contact = None if family == "mjcf" else _contact(task, family, stiffness, own if swept else None)
+                cell = ContactPoint(family, stiffness or _stiffness(task, contact), contact, digits)
+            cells.append(cell)
+            messages += [f"{cell.label}: {warning.message}" for warning in caught]
+    return tuple(cells), tuple(messages)
+
+
+def solver_grid(
+    task: Task, solrefs: Sequence[Sequence[float]], solimps: Sequence[Sequence[float]]
+) -> tuple[tuple[ContactPoint, ...], tuple[str, ...]]:
+    """Contact models in MuJoCo's own terms, every solref with every solimp, and what there is to warn about.
+
+    Args:
+        task: gives the scene, and the effective mass for the stiffness that is reported.
+        solrefs: pairs of numbers; none for MuJoCo's default.
+        solimps: of five numbers each; none for MuJoCo's default.
+
+    Raises:
+        ValueError: MuJoCo would alter a value without an error.
+    """
+    cells, messages = [], []
+    digits = digits_to_tell_apart(itertools.chain(*solrefs, *solimps))
+    count = max(1, len(solrefs)) * max(1, len(solimps))
+    check_count(count, "contact models", MOST_MODELS, "give fewer solrefs or solimps")
+    for solref, solimp in itertools.product(solrefs or (DEFAULT_SOLREF,), solimps or (DEFAULT_SOLIMP,)):
+        if len(solref) != 2 or len(solimp) != 5:
+            raise ValueError(f"solref takes 2 numbers and solimp 5, got {len(solref)} and {len(solimp)}")
+        parts = {"solref": solref} | ({"solimp": solimp} if solimps else {})
+        name = " ".join(f"{key} {' '.join(f'{value:.{digits}g}' for value in part)}" for key, part in parts.items())
+        with _warnings_of_contact() as caught:
+            contact = contact_model(solref, solimp, scene=task.scene)
+            cells.append(ContactPoint(name, _stiffness(task, contact), contact, digits))
+        messages += [f"{name}: {warning.message}" for warning in caught]
+    return tuple(cells), tuple(messages)
+
+
+@contextmanager
+def _warnings_of_contact() -> Generator[list[warnings.WarningMessage]]:
+    """What there is to warn about contact models that are made inside.
+
+    Raises:
+        ValueError: their numbers are so large or small that arithmetic overflows.
+    """
+    try:
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always", ContactWarning)
+            yield caught
+    except ArithmeticError as error:
+        raise ValueError(f"a contact model's numbers are too large or too small: {error}") from error
+
+
+def _contact(task: Task, family: str, stiffness: float | None, damping: float | None) -> ContactModel:
+    return family_model(family, task.scene, stiffness=stiffness, damping=damping, effective_mass=task.effective_mass)
+
+
+def _stiffness(task: Task, contact: ContactModel | None) -> float:
+    """Spring K [N/m] of a contact model that was not made from one; 0 where there is no contact."""
+    if task.contact_pair is None:
+        return 0.0
+    if contact is None:
+        solref = task.scene.host.geom_solref[task.scene.geom(task.contact_pair[0])]
+    else:
+        solref = np.asarray(contact.solref)
+    return stiffness_from_solref(solref.tolist(), effective_mass=task.effective_mass)[0]

@@ -1,0 +1,98 @@
+"""A neural network as policy: any task with controls can have one in place of its own."""
+
+import dataclasses
+from itertools import pairwise
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Key
+
+from mjx_study.limits import MOST_LAYERS, MOST_PARAMS, check_count
+from mjx_study.simulation.dynamics import State
+from mjx_study.tasks.policy import Feedback, LinearFeedback
+from mjx_study.tasks.task import Task
+
+
+@dataclasses.dataclass(frozen=True)
+class Network(Feedback):
+    """u_h = net(phi(x_h)) + w_h with tanh layers and a linear last one; theta is all weights and biases, flattened.
+
+    Attributes:
+        horizon: number of steps H.
+        controls: number of controls m.
+        num_features: length of phi.
+        features: phi, the state as the policy sees it.
+        hidden: width of each hidden layer.
+    """
+
+    hidden: tuple[int, ...]
+
+    def __post_init__(self) -> None:
+        if not self.hidden or min(self.hidden) < 1:
+            raise ValueError(f"a network needs hidden layers of at least 1 unit each, got {self.hidden}")
+
+    @property
+    def shapes(self) -> list[tuple[int, int]]:
+        """(inputs, outputs) of each layer."""
+        return list(pairwise((self.num_features, *self.hidden, self.controls)))
+
+    @property
+    def num_params(self) -> int:
+        """Weights and biases of all layers."""
+        return sum((inputs + 1) * outputs for inputs, outputs in self.shapes)
+
+    def initial(self, key: Key[Array, ""], dtype) -> Float[Array, " params"]:
+        """Normal weights of variance 1 / inputs; biases and the last layer 0, so that it starts without control."""
+        parts = []
+        for index, (inputs, outputs) in enumerate(self.shapes):
+            key, drawn = jax.random.split(key)
+            last = index == len(self.shapes) - 1
+            scale = 0.0 if last else inputs**-0.5
+            weights = scale * jax.random.normal(drawn, (inputs, outputs), dtype)
+            parts += [weights.reshape(-1), jnp.zeros(outputs, dtype)]
+        return jnp.concatenate(parts)
+
+    def feedback(self, theta: Float[Array, " params"], state: State) -> Float[Array, " nu"]:
+        """net(phi(x))."""
+        signal, used = self.features(state), 0
+        for index, (inputs, outputs) in enumerate(self.shapes):
+            weights = theta[used : used + inputs * outputs].reshape(inputs, outputs)
+            used += inputs * outputs
+            signal = signal @ weights + theta[used : used + outputs]
+            used += outputs
+            signal = signal if index == len(self.shapes) - 1 else jnp.tanh(signal)
+        return signal
+
+    def score(
+        self, theta: Float[Array, " params"], states: State, noise_gradient: Float[Array, "steps dimensions"]
+    ) -> Float[Array, " params"]:
+        """sum_h D_theta net(phi(x_h))^T noise_gradient_h, one backward pass through the network."""
+        _, pull = jax.vjp(lambda at: jax.vmap(lambda state: self.feedback(at, state))(states), theta)
+        return pull(noise_gradient)[0]
+
+
+def with_network(task: Task, hidden: tuple[int, ...], key: Key[Array, ""]) -> Task:
+    """A task with a network in place of its policy.
+
+    It sees what the task's linear feedback sees, or positions, velocities and activations where there is none.
+
+    Args:
+        task: with controls.
+        hidden: width of each hidden layer.
+        key: for the first weights; used up.
+
+    Raises:
+        ValueError: the task's decision is made before the simulation, or a layer has no unit.
+    """
+    if task.policy.at_start or task.scene.host.nu == 0:
+        raise ValueError(f"{task.name} has no control that a network could give: its decision is the start")
+    host, dtype = task.scene.host, task.scene.template.qpos.dtype
+    if isinstance(task.policy, LinearFeedback):
+        size, features = task.policy.num_features, task.policy.features
+    else:
+        size = host.nq + host.nv + host.na
+        features = lambda state: jnp.concatenate([state.qpos, state.qvel, state.act])  # noqa: E731
+    check_count(len(hidden), "hidden layers", MOST_LAYERS, "give fewer")
+    network = Network(task.horizon, host.nu, size, features, hidden)
+    check_count(network.num_params, "parameters of a network", MOST_PARAMS, "give narrower layers")
+    return task.replace(policy=network, theta=network.initial(key, dtype), reference=None)

@@ -1,0 +1,211 @@
+"""Policies: how parameters, noise and state become a start and controls.
+
+Noise w enters where exploration does: on each control, u_h = pi(x_h, theta) + w_h, or, for a decision that is made
+once, on the parameters themselves, theta + w. Keeping a control's feedforward and feedback apart lets an open loop
+skip its trivial derivative with respect to the state.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Protocol, runtime_checkable
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from mjx_study.simulation.dynamics import State
+
+
+@runtime_checkable
+class Policy(Protocol):
+    """A parametrised control law, with the place where noise enters it."""
+
+    @property
+    def num_params(self) -> int:
+        """Length of theta."""
+        ...
+
+    @property
+    def noise_shape(self) -> tuple[int, int]:
+        """Steps at which noise is drawn, and its dimensions at each."""
+        ...
+
+    @property
+    def additive(self) -> bool:
+        """Whether the noise is added to theta entry by entry, so that the score is w / sigma^2 and nothing else."""
+        ...
+
+    @property
+    def at_start(self) -> bool:
+        """Whether theta and the noise act on the start state and on nothing else."""
+        ...
+
+    def place(self, theta: Float[Array, " params"], noise: Float[Array, "steps dimensions"], start: State) -> State:
+        """The start state, where theta acts on it."""
+        ...
+
+    def feedforward(
+        self, theta: Float[Array, " params"], noise: Float[Array, "steps dimensions"]
+    ) -> Float[Array, "horizon nu"]:
+        """The part of the controls that does not depend on the state, noise included."""
+        ...
+
+    def feedback(self, theta: Float[Array, " params"], state: State) -> Float[Array, " nu"] | None:
+        """The part that depends on the state; None where there is none."""
+        ...
+
+    def score(
+        self, theta: Float[Array, " params"], states: State, noise_gradient: Float[Array, "steps dimensions"]
+    ) -> Float[Array, " params"]:
+        """sum_h D_theta u_h(x_h)^T noise_gradient_h, with the states held fixed; never touches the dynamics."""
+        ...
+
+
+@dataclasses.dataclass(frozen=True)
+class OpenLoop:
+    """The control sequence itself: theta is (horizon, controls), flattened.
+
+    Attributes:
+        horizon: number of steps H.
+        controls: number of controls m; theta has H m entries.
+    """
+
+    horizon: int
+    controls: int
+    additive: bool = dataclasses.field(default=True, init=False)
+    at_start: bool = dataclasses.field(default=False, init=False)
+
+    @property
+    def num_params(self) -> int:
+        """H m."""
+        return self.horizon * self.controls
+
+    @property
+    def noise_shape(self) -> tuple[int, int]:
+        """(H, m)."""
+        return self.horizon, self.controls
+
+    def place(self, theta: Float[Array, " params"], noise: Float[Array, "steps dimensions"], start: State) -> State:
+        """The start as it is."""
+        return start
+
+    def feedforward(
+        self, theta: Float[Array, " params"], noise: Float[Array, "steps dimensions"]
+    ) -> Float[Array, "horizon nu"]:
+        """theta, reshaped, and the noise."""
+        return theta.reshape(self.horizon, self.controls) + noise
+
+    def feedback(self, theta: Float[Array, " params"], state: State) -> None:
+        """None: an open loop does not look at the state."""
+        return None
+
+    def score(
+        self, theta: Float[Array, " params"], states: State, noise_gradient: Float[Array, "steps dimensions"]
+    ) -> Float[Array, " params"]:
+        """The noise gradient itself: D_theta u is the identity."""
+        return noise_gradient.reshape(-1)
+
+
+@dataclasses.dataclass(frozen=True)
+class Feedback:
+    """Base of the policies u_h = pi(phi(x_h), theta) + w_h.
+
+    Attributes:
+        horizon: number of steps H.
+        controls: number of controls m.
+        num_features: length of phi.
+        features: phi, the state as the policy sees it.
+    """
+
+    horizon: int
+    controls: int
+    num_features: int
+    features: Callable[[State], Float[Array, " features"]]
+    additive: bool = dataclasses.field(default=False, init=False)
+    at_start: bool = dataclasses.field(default=False, init=False)
+
+    @property
+    def noise_shape(self) -> tuple[int, int]:
+        """(H, m)."""
+        return self.horizon, self.controls
+
+    def place(self, theta: Float[Array, " params"], noise: Float[Array, "steps dimensions"], start: State) -> State:
+        """The start as it is."""
+        return start
+
+    def feedforward(
+        self, theta: Float[Array, " params"], noise: Float[Array, "steps dimensions"]
+    ) -> Float[Array, "horizon nu"]:
+        """The noise."""
+        return noise
+
+
+@dataclasses.dataclass(frozen=True)
+class LinearFeedback(Feedback):
+    """u_h = Theta phi(x_h) + w_h: theta is Theta (controls, features), flattened.
+
+    Attributes:
+        horizon: number of steps H.
+        controls: number of controls m.
+        num_features: length of phi.
+        features: phi, the state as the policy sees it.
+    """
+
+    @property
+    def num_params(self) -> int:
+        """m times the number of features."""
+        return self.controls * self.num_features
+
+    def feedback(self, theta: Float[Array, " params"], state: State) -> Float[Array, " nu"]:
+        """Theta phi(x)."""
+        return theta.reshape(self.controls, self.num_features) @ self.features(state)
+
+    def score(
+        self, theta: Float[Array, " params"], states: State, noise_gradient: Float[Array, "steps dimensions"]
+    ) -> Float[Array, " params"]:
+        """sum_h noise_gradient_h phi(x_h)^T."""
+        return jnp.sum(noise_gradient[:, :, None] * jax.vmap(self.features)(states)[:, None, :], axis=0).reshape(-1)
+
+
+@dataclasses.dataclass(frozen=True)
+class Launch:
+    """A decision that is made once, before the simulation: theta + w becomes the start state, and no control acts.
+
+    Attributes:
+        num_params: length of theta.
+        horizon: number of steps H.
+        controls: number of controls m, all zero.
+        launched: maps (start, theta + w) to the state that the simulation starts from.
+    """
+
+    num_params: int
+    horizon: int
+    controls: int
+    launched: Callable[[State, Float[Array, " params"]], State]
+    additive: bool = dataclasses.field(default=True, init=False)
+    at_start: bool = dataclasses.field(default=True, init=False)
+
+    @property
+    def noise_shape(self) -> tuple[int, int]:
+        """(1, params): one draw, before the first step."""
+        return 1, self.num_params
+
+    def place(self, theta: Float[Array, " params"], noise: Float[Array, "steps dimensions"], start: State) -> State:
+        """The state after the launch."""
+        return self.launched(start, theta + noise[0])
+
+    def feedforward(
+        self, theta: Float[Array, " params"], noise: Float[Array, "steps dimensions"]
+    ) -> Float[Array, "horizon nu"]:
+        """Nothing acts after the launch."""
+        return jnp.zeros((self.horizon, self.controls), theta.dtype)
+
+    def feedback(self, theta: Float[Array, " params"], state: State) -> None:
+        """None."""
+        return None
+
+    def score(
+        self, theta: Float[Array, " params"], states: State, noise_gradient: Float[Array, "steps dimensions"]
+    ) -> Float[Array, " params"]:
+        """The noise gradient itself."""
+        return noise_gradient[0]

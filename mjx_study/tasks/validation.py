@@ -1,0 +1,67 @@
+"""Whether the parts of a task fit together, and what is wrong with them in one line."""
+
+import importlib
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Final
+
+import jax
+import jax.numpy as jnp
+
+from mjx_study.tasks.task import Task
+
+OURS: Final = (str(Path(__file__).parents[1]), importlib.__file__, "<frozen importlib")
+
+
+def check_shapes(task: Task, name: str = "") -> None:
+    """Refuse what broadcasting and clamped indices would let pass; traces, and computes nothing.
+
+    Args:
+        task: to check.
+        name: in front of messages; the task's own by default.
+
+    Raises:
+        ValueError: a part raises, or has another shape or dtype than the simulation needs.
+    """
+    name = name or task.name
+    policy, dtype = task.policy, task.scene.template.qpos.dtype
+    steps, controls = task.horizon, task.scene.host.nu
+    if jnp.asarray(task.theta).dtype != dtype:
+        raise ValueError(f"{name}: theta is {task.theta.dtype}, and the simulation {dtype}")
+    start = _traced(name, "start", lambda: task.draw_start(jax.random.key(0)))
+    noise = jax.ShapeDtypeStruct(policy.noise_shape, dtype)
+    control = jax.ShapeDtypeStruct((controls,), dtype)
+    placed = _traced(name, "policy's place", policy.place, task.theta, noise, start)
+    for leaf in ("qpos", "qvel", "act"):
+        found, needed = getattr(placed, leaf).shape, getattr(task.scene.template, leaf).shape
+        if found != needed:
+            raise ValueError(f"{name}: {leaf} of the start has shape {found}; the scene needs {needed}")
+    parts = {
+        "policy's feedforward": (policy.feedforward, (task.theta, noise), (steps, controls)),
+        "policy's feedback": (policy.feedback, (task.theta, start), (controls,)),
+        "running_cost": (task.running_cost, (start, control), ()),
+        "final_cost": (task.final_cost, (start,), ()),
+    }
+    for part, (function, arguments, needed) in parts.items():
+        found = _traced(name, part, function, *arguments)
+        if found is not None and found.shape != needed:
+            fitting = f"; {steps} steps and {controls} controls need {needed}" if needed else ", and a cost is a scalar"
+            raise ValueError(f"{name}: the {part} has shape {found.shape}{fitting}")
+
+
+def _traced(name: str, part: str, function: Callable[..., Any], *arguments: Any) -> Any:
+    try:
+        return jax.eval_shape(function, *arguments)
+    except (Exception, SystemExit) as error:
+        raise ValueError(f"{name}: the {part} raised {described(error)}") from error
+
+
+def described(error: BaseException) -> str:
+    """Type and message in one line, and the innermost line of the user's file that it came through."""
+    text = f"{type(error).__name__}: {' '.join(str(error).split())}".removesuffix(": ")
+    frames = [frame for frame in traceback.extract_tb(error.__traceback__) if not frame.filename.startswith(OURS)]
+    if not frames:
+        return text
+    last = [frame for frame in frames if frame.filename == frames[0].filename][-1]
+    return f"{text} ({Path(last.filename).name}, line {last.lineno})"
