@@ -16,7 +16,7 @@ PAGE = (Path(__file__).parents[2] / "docs" / "estimators.md").read_text()
 
 
 def test_every_name_is_explained() -> None:
-    table, _ = PAGE.split("\n## What they see", 1)  # the tables of results name tasks as well
+    table, _ = PAGE.split("\n## Blind spots", 1)  # the tables of results name tasks as well
     assert re.findall(r"^\| `(\w+)` \|", table, re.MULTILINE) == list(ESTIMATORS)
     assert all(f"`{name}`" in PAGE for name in (*BASELINES, *NOISES))
 
