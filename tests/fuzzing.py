@@ -1,7 +1,8 @@
 """Inputs at random, and what every one of them must get: an exit code of 0, 1 or 2, a line, and files left alone.
 
 Computing is stubbed: each command plans what it is asked for, and where it would compute it ends with exit code 0.
-JAX's devices are those of the tests, and a task that was built once for some options is taken again.
+JAX's devices are those of the tests, the parser of the command line is built once, and a task that was built once for
+some options is taken again.
 """
 
 import contextlib
@@ -60,6 +61,7 @@ def stub(monkeypatch: pytest.MonkeyPatch) -> None:
     ):  # fmt: skip
         for name in names:
             monkeypatch.setattr(module, name, planned)
+    monkeypatch.setattr(cli, "parser", functools.cache(cli.parser))  # to build it takes longer than most answers
     for command in COMMANDS:
         flags_of(command)  # outside of strategies: building a parser uses the random module
     built = functools.lru_cache(maxsize=256)(make_task)

@@ -1,6 +1,7 @@
 """No input ends in a traceback or in no answer: thousands at random, of which the fast tests run a few."""
 
 import json
+import shutil
 from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -29,6 +30,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     path = tmp_path_factory.mktemp("fuzz")
     with pytest.MonkeyPatch.context() as monkeypatch:
         sweep.open_store(plan_sweep(SweepConfig(tasks=("pusher",), horizon=4, stiffness=(10.0, 100.0))), path / "study")
+        shutil.copy(path / "study" / "study.json", path / "kept.json")
         monkeypatch.chdir(path)
         fuzzing.stub(monkeypatch)
         yield path
@@ -81,7 +83,7 @@ CASES: dict[str, Callable[[Path, st.DataObject], list[str]]] = {
 def run(kind: str, folder: Path, examples: int) -> Counter[int]:
     """Every case of a kind gets an answer; how many ended with which exit code."""
     codes: Counter[int] = Counter()
-    kept = (folder / "study" / "study.json").read_bytes()
+    kept = (folder / "kept.json").read_bytes()
 
     @settings(max_examples=examples, deadline=None, database=None, derandomize=True, suppress_health_check=UNCHECKED)
     @given(st.data())
@@ -102,7 +104,7 @@ def test_a_few_inputs_get_an_answer(kind: str, folder: Path) -> None:
 @pytest.mark.parametrize("kind", CASES)
 def test_thousands_of_inputs_get_an_answer(kind: str, folder: Path) -> None:
     """Some are refused and, but for files that are seldom right, some are planned; figures with -rP."""
-    codes = run(kind, folder, 500)
+    codes = run(kind, folder, 2000)
     print(f"{kind}: {fuzzing.tally(codes)}")
     assert codes[2] > 100
 
