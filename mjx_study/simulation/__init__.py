@@ -1,1 +1,1 @@
-"""MuJoCo's step with its derivatives: scenes, contact models, the constraint solve, and what MJX gets wrong patched."""
+"""MuJoCo's step with its derivatives: scenes, contact models, the constraint solve, and patches for MJX's faults."""

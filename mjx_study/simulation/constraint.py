@@ -1,16 +1,16 @@
 r"""The constraint solve as a differentiable root.
 
-MuJoCo's constrained acceleration is the minimum of a convex function, that is the root `a` of
+MuJoCo's constrained acceleration minimises a convex function, that is, it is the root `a` of
 
     G(a) = M a - qfrc_smooth - J^T f(J a - aref) = 0,
 
 with `f` the force law of each constraint row. MJX finds it with a `while_loop`, which has no reverse mode, so
-`mjx.step` differentiates only one solver iteration and gets both the step and its gradient wrong. Here MJX's own
-loop runs to convergence and the derivative comes from the implicit function theorem: one symmetric positive
-definite system in `dG/da = M + J^T f' J`, whatever the solver and its budget. The derivative is as good as the
-solve has converged, so `residual` measures that and every result carries it.
+`mjx.step` can be differentiated only with one solver iteration, which gets both the step and its gradient wrong. Here
+MJX's own loop runs to convergence and the derivative comes from the implicit function theorem: one symmetric positive
+definite system in `dG/da = M + J^T f' J`, whatever the solver and its budget. The derivative is only as good as the
+solve has converged; `residual` measures that, and every result carries it.
 
-MJX's constraint rows are private (`Data._impl.efc_*`); their content is read here only.
+MJX's constraint rows are private (`Data._impl.efc_*`) and are read only here.
 """
 
 from typing import Any, Final
@@ -28,17 +28,17 @@ from mjx_study.simulation.scene import num_constraint_rows
 _ELLIPTIC = mujoco.mjtCone.mjCONE_ELLIPTIC
 
 SMALL: Final = 6
-"""Most degrees of freedom for which linear systems are unrolled and the solver's warm start is improved."""
+"""Largest number of degrees of freedom for which linear systems are unrolled and the warm start is improved."""
 PREDICTOR_STEPS: Final = 2
 GENEROUS: Final = (100, 50)
-"""Iterations of the solver and of its line search that `solve_to_rounding` allows."""
+"""Iterations of the solver and of its line search in `solve_to_rounding`."""
 POLISHING_STEPS: Final = 4
 EPSILON: Final = 1e-14
-"""Relative rounding of a force in the solver's equation."""
+"""Relative rounding error of a force in the solver's equation."""
 
 
 def row_force(model: mjx.Model, data: mjx.Data, slack: Float[Array, " rows"]) -> Float[Array, " rows"]:
-    """Force of each constraint row at the slack `J a - aref`, MuJoCo's force law f.
+    """Force of each constraint row at the slack `J a - aref`: MuJoCo's force law f.
 
     With D the inverse regularisation of a row and x its slack: equality -D x; friction loss -D x clipped to
     +- frictionloss; limit, frictionless and pyramidal contact -D x where x < 0, else 0; elliptic contact by zone of
@@ -46,7 +46,7 @@ def row_force(model: mjx.Model, data: mjx.Data, slack: Float[Array, " rows"]) ->
 
     Args:
         model: the model on the device.
-        data: a state with its constraint rows, after `mjx.make_constraint`.
+        data: state with its constraint rows, after `mjx.make_constraint`.
         slack: J a - aref [m/s^2 or rad/s^2].
 
     Returns:
@@ -81,7 +81,7 @@ def _elliptic_force(
 
     In the scaled slack u = (mu x_n, friction * x_t), N = u_n, T = |u_t|: separated (N >= mu T) no force; sticking
     (mu N + T <= 0) linear; sliding in between, on the cone, with force -dm mu (N - mu T) along (1, -u_t / T).
-    The branch that is not taken is evaluated at a safe T, so T = 0 has a finite derivative.
+    The branch not taken is evaluated at a safe T, so T = 0 has a finite derivative.
     """
     contact = rows.contact
     for index, (condim, address) in enumerate(zip(contact.dim, contact.efc_address, strict=True)):
@@ -114,7 +114,7 @@ def constraint_force(model: mjx.Model, data: mjx.Data, qacc: Float[Array, " nv"]
 
 
 def imbalance(model: mjx.Model, data: mjx.Data, qacc: Float[Array, " nv"]) -> Float[Array, " nv"]:
-    """The equation that the solver solves, G(a) = M a - qfrc_smooth - J^T f(J a - aref) [N or N m].
+    """Left side of the solver's equation, G(a) = M a - qfrc_smooth - J^T f(J a - aref) [N or N m].
 
     `data` needs its position, velocity and smooth-force stages and its constraint rows.
     """
@@ -122,7 +122,7 @@ def imbalance(model: mjx.Model, data: mjx.Data, qacc: Float[Array, " nv"]) -> Fl
 
 
 def residual(model: mjx.Model, data: mjx.Data, qacc: Float[Array, " nv"]) -> Float[Array, ""]:
-    """Relative imbalance |G(a)| / (|M a| + |qfrc_smooth| + |J^T f|), 0 where all are 0; no unit."""
+    """Relative imbalance |G(a)| / (|M a| + |qfrc_smooth| + |J^T f|), 0 where all are 0; dimensionless."""
     inertial = mjx.mul_m(model, data, qacc)
     constraint = constraint_force(model, data, qacc)
     scale = sum(jnp.sum(jnp.abs(term)) for term in (inertial, data.qfrc_smooth, constraint))
@@ -131,10 +131,10 @@ def residual(model: mjx.Model, data: mjx.Data, qacc: Float[Array, " nv"]) -> Flo
 
 
 def run_solver(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]:
-    """MJX's own converged solve; the constrained acceleration [m/s^2 or rad/s^2], without a reverse mode.
+    """The constrained acceleration [m/s^2 or rad/s^2] from MJX's own solver, converged; no reverse mode.
 
-    Where Newton steps are cheap, `PREDICTOR_STEPS` of them improve the warm start. MJX keeps it only if its cost is
-    below that of the unconstrained start, and its loop then does what is left, mostly nothing: twice the speed.
+    Where Newton steps are cheap, `PREDICTOR_STEPS` of them improve the warm start. MJX uses it only if its cost is
+    below that of the unconstrained acceleration; its loop then has little or nothing left to do: twice the speed.
     """
     if num_constraint_rows(data) == 0:
         return data.qacc_smooth
@@ -150,23 +150,23 @@ def _newton_step(model: mjx.Model, data: mjx.Data, qacc: Float[Array, " nv"]) ->
 
 
 def with_generous_budget(model: mjx.Model) -> mjx.Model:
-    """The model with a budget that leaves MJX's solver to stop where its cost no longer falls."""
+    """The model with a budget generous enough for MJX's solver to run until its cost no longer falls."""
     tolerance = jnp.full_like(model.opt.tolerance, 1e-15)
     return model.replace(opt=model.opt.replace(iterations=GENEROUS[0], ls_iterations=GENEROUS[1], tolerance=tolerance))
 
 
 def solve_to_rounding(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]:
-    """The constrained acceleration as exactly as numbers allow, whatever the model's own budgets; values only.
+    """The constrained acceleration to rounding, whatever the model's own budgets; values only.
 
-    MJX stops where its cost no longer falls, the square root of rounding from the solution, which differences over
-    short steps see. Newton steps on the equation itself have no such floor; one that leads away is dropped.
+    MJX stops where its cost no longer falls, which is the square root of rounding away from the solution and visible in
+    finite differences. Newton steps on the equation itself have no such floor; steps that lead away are rejected.
     """
     if num_constraint_rows(data) == 0:
         return data.qacc_smooth
     qacc = run_solver(with_generous_budget(model), data)
 
     def newton(x):
-        """The step from x, and how far x is from the solution in the norm of the stiffness, free of units."""
+        """Newton step from x, and the distance of x from the solution in the dimensionless stiffness norm."""
         step = _newton_step(model, data, x) - x
         return step, jnp.abs(jnp.vdot(imbalance(model, data, x), step))
 
@@ -189,7 +189,7 @@ def solve(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]:
 
     Args:
         model: the model on the device; its array leaves may be traced and differentiated.
-        data: a state after `mjx.fwd_acceleration`; `qacc_warmstart` starts the loop and has no derivative.
+        data: state after `mjx.fwd_acceleration`; `qacc_warmstart` starts the loop and is not differentiated.
 
     Returns:
         qacc [m/s^2 or rad/s^2].
@@ -209,11 +209,11 @@ def solve(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]:
 
 
 def guard_rows(model: mjx.Model, data: mjx.Data) -> tuple[np.ndarray, np.ndarray]:
-    """Which constraint rows belong to each guard, limits first and then contacts; static.
+    """Constraint rows of each guard, limits first and then contacts; static.
 
     Returns:
-        Weights `(guards, rows)` that make the guard's normal row of them, the mean of two opposite edges of a pyramid;
-        and which rows switch on with it, `(guards, rows)` of 0 and 1.
+        Weights `(guards, rows)` that combine rows into the guard's normal row (the mean of two opposite edges of a
+        pyramid), and a mask `(guards, rows)` of 0 and 1 for the rows that switch on with the guard.
     """
     rows: Any = data._impl
     spans = [(rows.ne + rows.nf + index, 1, 1) for index in range(rows.nl)]
@@ -228,7 +228,7 @@ def guard_rows(model: mjx.Model, data: mjx.Data) -> tuple[np.ndarray, np.ndarray
 
 
 def guards(model: mjx.Model, data: mjx.Data) -> tuple[Float[Array, " guards"], Float[Array, " guards"]]:
-    """Distance less margin [m or rad] and its rate [m/s or rad/s] of every limit and contact that acts; else zeros."""
+    """Distance less margin [m or rad] and its rate [m/s or rad/s] for every active limit and contact; else zeros."""
     weights, members = guard_rows(model, data)
     rows: Any = data._impl
     first = members.argmax(axis=1) if len(members) else np.zeros(0, int)
@@ -236,13 +236,13 @@ def guards(model: mjx.Model, data: mjx.Data) -> tuple[Float[Array, " guards"], F
 
 
 def at_onset(model: mjx.Model, data: mjx.Data, members: Float[Array, " rows"], on: Bool[Array, ""]) -> mjx.Data:
-    """The state with some constraint rows just touching (no penetration, impedance d_0), or gone.
+    """The state with some constraint rows at first touch (no penetration, impedance d_0), or removed.
 
     Args:
         model: the model on the device.
-        data: a state with its constraint rows.
-        members: 1 for these rows, 0 for those that stay as they are.
-        on: whether they act.
+        data: state with its constraint rows.
+        members: 1 for these rows, 0 for those left unchanged.
+        on: whether they are active.
     """
     with repaired(touching=True):
         touching: Any = mjx.make_constraint(model, data)._impl
@@ -264,7 +264,7 @@ def solve_positive_definite(
 ) -> Float[Array, "nv ..."]:
     """Solve with a symmetric positive definite matrix by Cholesky.
 
-    Small systems are unrolled: under `vmap` their entries are whole batches, which a library would take one by one.
+    Small systems are unrolled: under `vmap` their entries are whole batches, which a library routine would loop over.
     """
     size = matrix.shape[0]
     if size > SMALL:

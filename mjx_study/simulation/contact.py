@@ -5,13 +5,13 @@ acceleration a_0, the acceleration becomes
 
     a_1 = (1 - d) a_0 - s b v - s^2 k r,        s = d / d_width,    k [1/s^2], b [1/s].
 
-The impedance d = d(r) goes from d_0 at first touch to d_width at the depth `width` and beyond, where s = 1; with
+The impedance d = d(r) rises from d_0 at first touch to d_width at the depth `width` and beyond, where s = 1; with
 d_0 = d_width s is 1 throughout, and with d_0 near 0 spring and damper set in gradually.
 
-For two bodies of effective mass m_eff along the normal a spring of K [N/m] and a damper of B [N s/m] are k = K / m_eff,
-b = B / m_eff. One family holds both ends of the study's question: d -> 0 is the penalty method, a spring added to the
-other forces; d -> 1 is a constraint, which first cancels a_0. Under a static load the spring only carries the share
-1 - d, so a resting contact is K / (1 - d) stiff.
+For two bodies of effective mass m_eff along the normal, a spring of K [N/m] and a damper of B [N s/m] have
+k = K / m_eff, b = B / m_eff. One family spans the study's question: d -> 0 is the penalty method, a spring added to the
+other forces; d -> 1 is a constraint, which first cancels a_0. Under a static load the spring carries only the share
+1 - d, so a resting contact has stiffness K / (1 - d).
 
 MuJoCo writes (k, b) as `solref`: negative numbers are (-k, -b) directly; positive ones are a time constant and a
 damping ratio, k = 1 / (timeconst dampratio)^2, b = 2 / timeconst. All of these are array leaves of `mjx.Model`, so a
@@ -50,7 +50,7 @@ class ContactWarning(UserWarning):
 @register_pytree
 @dataclasses.dataclass(frozen=True)
 class ContactModel:
-    """Parameters that every contact of a scene takes on; array leaves, so they can be traced and stacked.
+    """Parameters applied to every contact of a scene; array leaves, so they can be traced and stacked.
 
     Attributes:
         solref: MuJoCo's reference: (-k [1/s^2], -b [1/s]) or (time constant [s], damping ratio).
@@ -73,7 +73,7 @@ def contact_model(
     *,
     scene: Scene,
 ) -> ContactModel:
-    """A contact model in MuJoCo's own terms, checked against the scene that it is meant for.
+    """A contact model in MuJoCo's own terms, checked against the scene it is meant for.
 
     Args:
         solref: both negative or zero, (-k [1/s^2], -b [1/s]); or both positive, (time constant [s], damping ratio).
@@ -86,7 +86,7 @@ def contact_model(
         ValueError: a value that MuJoCo would replace or clip without an error.
 
     Warns:
-        ContactWarning: `refsafe` would clip the time constant, or h^2 k is beyond what the integrator keeps stable.
+        ContactWarning: `refsafe` would clip the time constant, or h^2 k is past the integrator's stability limit.
     """
     solref, solimp = tuple(map(float, solref)), tuple(map(float, solimp))
     _check_solref(solref)
@@ -111,11 +111,11 @@ class Family:
     """A line of contact models over stiffness, or a single point of MuJoCo's parameters.
 
     Attributes:
-        name: as the command line takes it.
+        name: name on the command line.
         description: one line for tables and help.
-        solimp: the impedance of all its members; None for what the MJCF says.
-        dampratio: damping ratio that goes with a stiffness, where no damping is given.
-        solref: the fixed reference of a single point; None for a line over stiffness, or for what the MJCF says.
+        solimp: impedance of all its members; None for the MJCF's.
+        dampratio: damping ratio used with a stiffness when no damping is given.
+        solref: fixed reference of a single point; None for a line over stiffness, or for the MJCF's.
     """
 
     name: str
@@ -172,15 +172,15 @@ def family_model(
     """The member of a family at a physical stiffness.
 
     Args:
-        name: one of `FAMILIES`, but "mjcf".
-        scene: the scene that it is meant for.
+        name: one of `FAMILIES` except "mjcf".
+        scene: the scene it is meant for.
         stiffness: K [N/m], positive; None for a family that is a single point.
         damping: B [N s/m], not negative; None for the family's damping ratio.
-        effective_mass: of the contact along its normal [kg]; see `effective_mass`.
+        effective_mass: effective mass of the contact along its normal [kg]; see `effective_mass`.
 
     Raises:
-        ValueError: unknown name, a stiffness that is missing or not wanted, a value out of range, or the family "mjcf",
-            which stands for no contact model at all.
+        ValueError: unknown name, a missing or superfluous stiffness, a value out of range, or the family "mjcf",
+            which stands for no contact model.
     """
     if name not in FAMILIES:
         raise ValueError(f"unknown contact family {name!r}; choose from {', '.join(FAMILIES)}")
@@ -251,8 +251,8 @@ def effective_mass(scene: Scene, geom1: str, geom2: str) -> float:
 
         m_eff = 2 (condim - 1) impratio / (2 mu^2 (1 + mu^2) (w_1 + w_2))
 
-    in the penalty limit. It is that of the MJCF's friction, larger of the two; explicit pairs and priorities are not
-    looked at.
+    in the penalty limit, with mu the larger of the two geoms' friction in the MJCF; explicit pairs and priorities are
+    ignored.
 
     Raises:
         SceneError: unknown geom name.
@@ -271,7 +271,7 @@ def effective_mass(scene: Scene, geom1: str, geom2: str) -> float:
 
 
 def apply_contact(model: mjx.Model, contact: ContactModel | None) -> mjx.Model:
-    """The model with every geom and explicit pair set to the contact model; pure, for traced values too.
+    """The model with every geom and explicit pair set to the contact model; pure, and works on traced values.
 
     Both geoms of a pair are set, so MuJoCo's mixing by `solmix` and `priority` has nothing to mix. None leaves the
     model as the MJCF has it.
@@ -344,7 +344,7 @@ def _warn_if_unstable(solref: Sequence[float], timestep: float) -> None:
         dampratio = b / (2 * math.sqrt(k)) if k > 0 else 0.0
         stable = (2 * (math.sqrt(dampratio**2 + 1) - dampratio)) ** 2 / (timestep**2 * k) if k > 0 else 0.0
         warnings.warn(
-            f"h^2 k = {timestep**2 * k:.3g} is not below 4 - 2 h b = {limit:.3g}: the step makes energy while in "
+            f"h^2 k = {timestep**2 * k:.3g} is not below 4 - 2 h b = {limit:.3g}: the step gains energy while in "
             f"contact; it is stable up to {stable:.0%} of this stiffness at h = {timestep:g} s",
             ContactWarning,
             stacklevel=3,

@@ -1,16 +1,16 @@
 r"""One simulation step and whole rollouts, differentiable through contact.
 
-A step is MJX's own pipeline with the solve of `constraint` in its middle: it agrees with `mjx.step` to what either
-leaves unconverged, while its derivative is that of the converged step. Two programs compute the derivative:
+A step is MJX's own pipeline around the solve of `constraint`. It agrees with `mjx.step` up to the solver's convergence,
+and its derivative is that of the converged step. Two programs compute the derivative:
 
-- the *Jacobian* program, for models of few coordinates: the Jacobian of the velocity update over state and control
-  by the implicit function theorem, once per step, and nothing else stored. Reverse mode then keeps nv (nq + nv + nu)
-  numbers per step for it and replays neither the solver nor the kinematics.
+- the *Jacobian* program, for models of few coordinates: the Jacobian of the velocity update with respect to state and
+  control by the implicit function theorem, once per step. Reverse mode stores only these nv (nq + nv + nu) numbers per
+  step and replays neither the solver nor the kinematics.
 - the *tape* program, for larger models and for derivatives with respect to model parameters: ordinary automatic
   differentiation around the implicit solve, each step recomputed in the backward pass (`jax.checkpoint`) with the
-  solver's result saved, so that the recomputation has no solver in it.
+  solver's result saved, so that the solver is not run again.
 
-`step` chooses by the number of columns and by what is differentiated; both give the same numbers.
+`step` chooses by the number of columns and by the inputs being differentiated; both give the same numbers.
 """
 
 import dataclasses
@@ -32,19 +32,19 @@ from mjx_study.simulation.patches import has_tendon_springs, repaired, tendon_sp
 from mjx_study.simulation.scene import Scene
 
 JACOBIAN_COLUMNS = 32
-"""Most columns (nq + nv + na + nu) for which a step's Jacobian is formed; more use the tape."""
+"""Largest number of columns (nq + nv + na + nu) for which a step's Jacobian is formed; larger models use the tape."""
 
 
 @register_pytree
 @dataclasses.dataclass(frozen=True)
 class State:
-    """What one step hands to the next.
+    """The state carried from one step to the next.
 
     Attributes:
         qpos: generalised positions [m or rad; unit quaternions].
         qvel: generalised velocities [m/s or rad/s].
         act: actuator activations.
-        warmstart: last acceleration, where the solver starts [m/s^2 or rad/s^2]; it has no derivative.
+        warmstart: last acceleration, the solver's warm start [m/s^2 or rad/s^2]; not differentiated.
     """
 
     qpos: Float[Array, "*batch nq"]
@@ -70,10 +70,10 @@ def step(scene: Scene, model: mjx.Model, state: State, control: Float[Array, " n
     """Advance by one timestep.
 
     Args:
-        scene: gives what is static; its own contact parameters are not used.
+        scene: static part of the model; its own contact parameters are not used.
         model: the model to step, `scene.model` with any contact model applied; may be traced.
         state: the state before the step.
-        control: actuator controls, in the unit that the MJCF gives them.
+        control: actuator controls, in the MJCF's units.
 
     Returns:
         The state after the step, and the solver's relative residual (see `constraint.residual`).
@@ -90,9 +90,9 @@ def step(scene: Scene, model: mjx.Model, state: State, control: Float[Array, " n
 def exact_step(
     scene: Scene, model: mjx.Model, state: State, control: Float[Array, " nu"]
 ) -> tuple[State, Float[Array, ""], mjx.Data]:
-    """`step` with its constraints solved to rounding whatever the budgets, and its `smooth_stages`; for values only.
+    """`step` with its constraints solved to rounding, whatever the budgets, and its `smooth_stages`; values only.
 
-    What differences of the step are taken of: those of `step` itself would show where its solver stopped.
+    Finite differences use this step: differences of `step` itself would show where its solver stopped.
     """
     data = smooth_stages(scene, model, state, control).replace(qacc_warmstart=state.warmstart)
     if scene.host.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
@@ -104,14 +104,14 @@ def exact_step(
 
 
 def smooth_stages(scene: Scene, model: mjx.Model, state: State, control: Float[Array, " nu"]) -> mjx.Data:
-    """All of a step that comes before the constraint solve: kinematics, contacts, forces, constraint rows."""
+    """Everything in a step before the constraint solve: kinematics, contacts, forces, constraint rows."""
     return force_stage(model, position_stage(scene, model, state.qpos), state.qvel, state.act, control)
 
 
 def solved_step(
     scene: Scene, model: mjx.Model, state: State, control: Float[Array, " nu"]
 ) -> tuple[State, Float[Array, ""], tuple[Float[Array, " guards"], Float[Array, " guards"]]]:
-    """`step` without a derivative, and what its contacts and limits do: `constraint.guards` at the state before."""
+    """`step` without a derivative, and the `constraint.guards` of its contacts and limits before the step."""
     data = smooth_stages(scene, model, state, control)
     qacc = constraint.run_solver(model, data.replace(qacc_warmstart=state.warmstart))
     qvel, act = advance_velocity(model, data, qacc)
@@ -128,14 +128,14 @@ def rollout(
     """Simulate `horizon` steps in closed loop.
 
     Args:
-        scene: gives what is static.
+        scene: static part of the model.
         model: the model to step; may be traced.
-        start: the first state.
+        start: the initial state.
         control_law: maps (step index, state) to the control of that step.
         horizon: number of steps, at least 1.
 
     Returns:
-        States `(horizon + 1, ...)` with the start first, controls `(horizon, nu)`, residuals `(horizon,)`.
+        States `(horizon + 1, ...)` including the initial one, controls `(horizon, nu)`, residuals `(horizon,)`.
 
     Raises:
         ValueError: the horizon is not positive.
@@ -156,14 +156,14 @@ def rollout(
 
 
 def uses_jacobian(scene: Scene) -> bool:
-    """Whether steps of this scene form their Jacobian (few coordinates) or leave a tape."""
+    """Whether steps of this scene form their Jacobian (few coordinates) or use the tape."""
     host = scene.host
     explicit = host.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
     return not explicit and host.nq + host.nv + host.na + host.nu <= JACOBIAN_COLUMNS
 
 
-# The stages of a step. A Jacobian over qvel, act or ctrl enters after the position stage, so it costs little. Each is
-# jitted so that JAX traces MJX's many operations once and not for every direction; XLA inlines them again.
+# The stages of a step. A Jacobian over qvel, act or ctrl starts after the position stage, so it is cheap. Each stage is
+# jitted so that JAX traces MJX's many operations once rather than for every direction; XLA inlines them again.
 
 
 def position_stage(scene: Scene, model: mjx.Model, qpos: Float[Array, " nq"]) -> mjx.Data:
@@ -215,8 +215,8 @@ def _constrained_update(model: mjx.Model, data: mjx.Data, qvel: Array, act: Arra
 def _update(scene: Scene):
     """The velocity update (model, qpos, qvel, act, control, warmstart) -> (qvel, act, qacc, residual).
 
-    Differentiating it with respect to state and control takes the Jacobian program where the scene is small
-    enough; any derivative with respect to the model takes the tape.
+    Derivatives with respect to state and control use the Jacobian program where the scene is small enough; any
+    derivative with respect to the model uses the tape.
     """
 
     def tape(model, qpos, qvel, act, control, warmstart):
@@ -265,10 +265,10 @@ def step_jacobian(
         da/dx = -G_a^{-1} G_x,   dS/dx = S_x + S_a da/dx.
 
     Args:
-        scene: gives what is static.
+        scene: static part of the model.
         model: the model to step.
-        qpos, qvel, act, control: where to linearise.
-        qacc: the constrained acceleration there, converged.
+        qpos, qvel, act, control: point of linearisation.
+        qacc: the converged constrained acceleration there.
     """
     return _jacobian(model, scene.template, qpos, qvel, act, control, qacc)
 
@@ -301,7 +301,7 @@ def _jacobian(model: mjx.Model, template: mjx.Data, qpos: Array, qvel: Array, ac
 
 
 def _runge_kutta(scene: Scene, model: mjx.Model, state: State, control: Float[Array, " nu"]) -> State:
-    """Classical Runge-Kutta of order 4 (a scene with constraints is refused when it is loaded)."""
+    """Classical fourth-order Runge-Kutta (scenes with constraints are refused when they are loaded)."""
     timestep = model.opt.timestep
 
     def slopes(qpos, qvel, act):

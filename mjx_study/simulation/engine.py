@@ -1,4 +1,4 @@
-"""The C engine as an independent implementation: the same model on the host, and its states."""
+"""The C engine as an independent implementation: the same model and its states on the host."""
 
 import contextlib
 import copy
@@ -18,14 +18,14 @@ CONVERGED: Final = {"tolerance": 0.0, "iterations": 200, "ls_iterations": 100}
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class HostState:
-    """One state on the host, with the control that acts on it.
+    """A state on the host, with its control.
 
     Attributes:
-        qpos: [m or rad; unit quaternions].
-        qvel: [m/s or rad/s].
+        qpos: positions [m or rad; unit quaternions].
+        qvel: velocities [m/s or rad/s].
         act: activations.
         control: controls.
-        warmstart: the acceleration of the step before [m/s^2 or rad/s^2].
+        warmstart: acceleration of the previous step [m/s^2 or rad/s^2].
     """
 
     qpos: Float[np.ndarray, " nq"]
@@ -53,7 +53,7 @@ def apply_to_host(host: mujoco.MjModel, contact: ContactModel | None) -> None:
 
 
 def converged_host(scene: Scene, contact: ContactModel | None) -> mujoco.MjModel:
-    """A copy of the scene's host model with a contact model, and budgets that leave nothing unconverged."""
+    """A copy of the scene's host model with a contact model, and budgets for full convergence."""
     host = copy.copy(scene.host)
     apply_to_host(host, contact)
     for name, value in CONVERGED.items():
@@ -62,7 +62,7 @@ def converged_host(scene: Scene, contact: ContactModel | None) -> mujoco.MjModel
 
 
 def host_data(host: mujoco.MjModel, state: HostState) -> mujoco.MjData:
-    """Data of the engine in a state."""
+    """The engine's data at a state."""
     data = mujoco.MjData(host)
     data.qpos[:], data.qvel[:], data.act[:] = state.qpos, state.qvel, state.act
     data.ctrl[:], data.qacc_warmstart[:] = state.control, state.warmstart
@@ -70,14 +70,14 @@ def host_data(host: mujoco.MjModel, state: HostState) -> mujoco.MjData:
 
 
 def host_state(data: mujoco.MjData) -> HostState:
-    """The state that data are in, before a step."""
+    """The state of the engine's data, before a step."""
     fields: tuple[Any, ...] = (data.qpos, data.qvel, data.act, data.ctrl, data.qacc_warmstart)
     return HostState(*(np.array(field) for field in fields))
 
 
 @contextlib.contextmanager
 def quiet_engine() -> Generator[None]:
-    """Keep the engine's warnings to `MjData.warning`, off standard error and out of MUJOCO_LOG.TXT."""
+    """Keep the engine's warnings in `MjData.warning`, off standard error and out of MUJOCO_LOG.TXT."""
     before = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(lambda message: None)
     try:
@@ -87,7 +87,7 @@ def quiet_engine() -> Generator[None]:
 
 
 def engine_model(scene: Scene, contact: ContactModel | None) -> mujoco.MjModel:
-    """A copy of the scene's host model with a contact model, and the scene's own budgets."""
+    """A copy of the scene's host model with a contact model and the scene's own budgets."""
     host = copy.copy(scene.host)
     apply_to_host(host, contact)
     return host

@@ -1,8 +1,8 @@
-"""Position integration with the true derivative of free and ball joints at rest.
+"""Position integration with the true derivative for free and ball joints at rest.
 
-MJX normalises the angular velocity and branches at zero, so that its derivative of the orientation with respect to
-an angular velocity of zero is silently zero; it is half a timestep per component. Here the quaternion is a smooth
-function of the squared angle, with a series where the angle is small. Values agree with MJX to rounding.
+MJX normalises the angular velocity and branches at zero, so its derivative of the orientation with respect to a zero
+angular velocity is silently zero; the true one is half a timestep per component. Here the quaternion is a smooth
+function of the squared angle, with a series at small angles. Values agree with MJX to rounding.
 """
 
 import jax.numpy as jnp
@@ -24,8 +24,8 @@ def integrate_position(
     Args:
         host: the model, for its joints.
         qpos: positions [m or rad; unit quaternions].
-        qvel: velocities [m/s or rad/s], angular ones in the body's frame as MuJoCo has them.
-        timestep: [s].
+        qvel: velocities [m/s or rad/s], angular ones in the body frame as in MuJoCo.
+        timestep: time to move for [s].
     """
     parts = []
     for kind, start, velocity in zip(host.jnt_type, host.jnt_qposadr, host.jnt_dofadr, strict=True):
@@ -62,7 +62,7 @@ def difference_position(
 
 
 def rotation_between(start: Float[Array, " 4"], end: Float[Array, " 4"]) -> Float[Array, " 3"]:
-    """The rotation vector [rad], in the body's frame, that `rotate_quaternion` takes from `start` to `end`.
+    """The rotation vector [rad], in the body frame, with which `rotate_quaternion` turns `start` into `end`.
 
     With (w, u) = start^-1 end of sign w >= 0 it is 2 atan2(|u|, w) u / |u|, a smooth function of u / w below pi.
     """
@@ -80,7 +80,7 @@ def rotation_between(start: Float[Array, " 4"], end: Float[Array, " 4"]) -> Floa
 
 
 def rotate_quaternion(quaternion: Float[Array, " 4"], rotation: Float[Array, " 3"]) -> Float[Array, " 4"]:
-    """The unit quaternion after a rotation vector [rad] in the body's frame: q exp(rotation / 2), normalised."""
+    """The unit quaternion after a rotation vector [rad] in the body frame: q exp(rotation / 2), normalised."""
     square = jnp.sum(rotation**2)
     small = square < _SMALL
     angle = jnp.sqrt(jnp.where(small, 1.0, square))

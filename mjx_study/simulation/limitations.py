@@ -1,6 +1,6 @@
-"""What MJX 3.17 leaves out without an error, so that a model would move otherwise than in the C engine.
+"""Features that MJX 3.17 silently ignores, so that a model would move differently than in the C engine.
 
-Each of these was found by comparing one step of MJX with one of C; `docs/gradient-faults.md` shows them.
+Each was found by comparing one step of MJX with one of C; `docs/gradient-faults.md` shows them.
 """
 
 import dataclasses
@@ -11,13 +11,13 @@ import mujoco
 
 @dataclasses.dataclass(frozen=True)
 class Flag:
-    """One of MJCF's <flag>s: a bit of `enableflags`, or of `disableflags`, where it stands for "disabled"."""
+    """One of MJCF's <flag>s: a bit of `enableflags`, or of `disableflags`, where it means "disabled"."""
 
     bit: int
     optional: bool
 
     def disable(self, option: mujoco.MjOption) -> None:
-        """Do in place what `disable` does in an MJCF."""
+        """Disable the flag in place, as `disable` does in an MJCF."""
         if self.optional:
             option.enableflags &= ~self.bit
         else:
@@ -39,12 +39,12 @@ _IMPLICITFAST: Final = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
 
 
 def lacking(host: mujoco.MjModel) -> list[str]:
-    """The flags that are enabled and that MJX refuses or, as `sleep`, ignores."""
+    """Names of enabled flags that MJX refuses or, like `sleep`, ignores."""
     return [name for name in _LACKING if not FLAGS[name].disabled(host.opt)]
 
 
 def ignored(host: mujoco.MjModel) -> list[str]:
-    """What MJX would ignore of a model, each with what to do about it."""
+    """Features of a model that MJX would ignore, each with the remedy."""
     off = {name for name, flag in FLAGS.items() if flag.disabled(host.opt)}
     implicitfast = host.opt.integrator == _IMPLICITFAST
     drag = host.opt.density > 0 or host.opt.viscosity > 0
@@ -82,7 +82,7 @@ def ignored(host: mujoco.MjModel) -> list[str]:
 
 
 def _loses_passive_forces(host: mujoco.MjModel, off: set[str], drag: bool) -> bool:
-    """Without springs, or without dampers, MJX leaves out every passive force, and the C engine only these."""
+    """With springs or dampers disabled, MJX drops every passive force, the C engine only these."""
     springs = host.jnt_stiffness.any() or host.tendon_stiffness.any()
     dampers = host.dof_damping.any() or host.tendon_damping.any()
     others = drag or (host.body_gravcomp.any() and "gravity" not in off)

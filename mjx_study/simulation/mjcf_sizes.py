@@ -1,4 +1,4 @@
-"""Sizes that an MJCF asks for, read before MuJoCo allocates them: it may end the process, or fill the memory."""
+"""Sizes that an MJCF asks for, checked before MuJoCo allocates them: it may end the process or exhaust the memory."""
 
 import math
 from collections.abc import Iterator
@@ -21,16 +21,16 @@ MOST: Final[dict[tuple[str, ...], float]] = {
     ("size", "nconmax"): 1e6,
     ("size", "nstack"): 1e9,
 }
-"""Largest product of the numbers of an element's attributes; of nested `replicate`, the product over all of them."""
+"""Limit on the product of an element's attributes; for nested `replicate`, the product over all levels."""
 SAMPLES: Final = 1e5
-"""Largest `nsample` of any element."""
+"""Limit on `nsample` of any element."""
 USER: Final = 1e4
-"""Largest nuser_body, nuser_jnt, ... of <size>."""
+"""Limit on nuser_body, nuser_jnt, ... of <size>."""
 _UNITS: Final = {"K": 2.0**10, "M": 2.0**20, "G": 2.0**30, "T": 2.0**40, "P": 2.0**50, "E": 2.0**60}
 
 
 def too_large(path: Path) -> str | None:
-    """What an MJCF, or a file that it includes, asks too much of; None where it does not, or is no XML."""
+    """The first excessive size in an MJCF or a file that it includes; None if there is none, or it is not XML."""
     files, seen = [path], {path}
     while files:
         found, included = _scan(files.pop())
@@ -61,7 +61,7 @@ def _scan(path: Path) -> tuple[str | None, list[str]]:
 
 
 def _sizes(element: ElementTree.Element, repeats: float) -> Iterator[tuple[str, float, float]]:
-    """What each attribute of an element asks for, and the limit of that."""
+    """Description, size and limit of everything an element's attributes ask for."""
     tag = str(element.tag)
     for (of, *names), limit in MOST.items():
         if of == tag and all(name in element.attrib for name in names):
@@ -73,7 +73,7 @@ def _sizes(element: ElementTree.Element, repeats: float) -> Iterator[tuple[str, 
 
 
 def _product(text: str) -> float:
-    """Of the numbers of an attribute, such as 10 or 3 3 3 or 2G; 0 where it has none."""
+    """Product of an attribute's numbers, such as 10 or 3 3 3 or 2G; 0 if it has none."""
     try:
         numbers = [float(part.rstrip("KMGTPE")) * _UNITS.get(part[-1], 1.0) for part in text.split()]
     except ValueError:

@@ -1,27 +1,27 @@
-r"""Derivatives of rollouts that allow for the step at which contact begins to change.
+r"""Derivatives of rollouts that account for a change of the step at which contact begins.
 
 Where a guard phi (the distance of a contact or a limit, less its margin) falls below zero, MuJoCo's force sets in with
-a jump. The derivative of a rollout holds the step at which that happens fixed. With noise of a smooth density the
-gradient of the mean cost has a second part, carried by the rollouts at which the step changes:
+a jump. The derivative of a rollout holds the index of that step fixed. With noise of smooth density the gradient of the
+mean cost has a second part, from the rollouts at which the index changes:
 
     grad F = E[grad f] - sum_k E[delta(phi_k) J_k grad phi_k],     J_k = V_{k+1}(on) - V_{k+1}(off) at phi_k = 0,
 
 with V the cost to go. A rollout in which contact begins at step k has phi_k in (D, 0], where n = d phi / dq and
-D = phi_k - phi_{k-1} = h n^T v_k. It lies between two others: one in which contact only just begins at step k, that is
-phi_k = 0, and one in which it would have begun at step k - 1, phi_{k-1} = 0. If phi is spread evenly over this cell,
-linear interpolation gives the weights of both, and every term belongs to a rollout that exists anyway. With s = phi_k/D
-and Delta_k the jump of the velocity after step k,
+D = phi_k - phi_{k-1} = h n^T v_k. It lies between two others: one in which contact only just begins at step k
+(phi_k = 0), and one in which it would have begun at step k - 1 (phi_{k-1} = 0). If phi is uniform over this cell,
+linear interpolation gives the weights of both, and no additional rollout is needed. With s = phi_k/D and Delta_k the
+velocity jump after step k,
 
     dx_{k+1} = A_k dx_k + (1 - s) Delta_k (n^T dq_k) / D + s A_k (h Delta_{k-1}, Delta_{k-1}) (n^T dq_{k-1}) / D,
 
 n^T dq_{k-1} = n^T (dq_k - h dv_k). This is the saltation matrix of a time-stepping scheme. Its error falls with h^2;
 the first weight alone (s = 0) leaves an error of h b, where b is the contact's damping [1/s].
 
-Not covered: contact at the start; a force that jumps where contact ends (impedance and a force that presses); edges of
+Not covered: initial contact; a force that jumps where contact ends (impedance and a pressing force); edges of
 features, where the contact point itself jumps.
 
 A cell narrower than h^2 |a|, with a the acceleration of the guard, counts as that wide: the guard's speed is not
-constant over such a step, and without a bound grazing contacts have no finite variance. These onsets are counted.
+constant over such a step, and without a bound grazing contacts would have infinite variance. These onsets are counted.
 
 Reference: Kong, Payne, Zhu, Johnson, "Saltation Matrices: The Essential Tool for Linearizing Hybrid Dynamical Systems"
 (arXiv 2306.06862), for the limit of continuous time.
@@ -54,11 +54,11 @@ from mjx_study.simulation.integration import difference_position, integrate_posi
 from mjx_study.simulation.scene import Scene
 
 SLOTS: Final = 8
-"""Onsets of one rollout that are corrected; later ones are left out and counted."""
+"""Number of onsets corrected per rollout; later ones are only counted."""
 ONSETS: Final = ("none", "linear")
-"""How a first-order derivative takes the onset of contact."""
+"""Treatments of the onset of contact in first-order derivatives."""
 TOUCHING: Final = 1e-6
-"""Share of a cell: a body that was nearer than this before the step had touched already, and its onset is no event."""
+"""Share of a cell: a body closer than this before the step had touched already, so there is no onset."""
 
 
 def check_onset(onset: str) -> None:
@@ -70,12 +70,12 @@ def check_onset(onset: str) -> None:
 @register_pytree
 @dataclasses.dataclass(frozen=True)
 class OnsetCounts:
-    """What a corrected derivative met.
+    """Onsets in a corrected derivative.
 
     Attributes:
-        found: onsets of contacts and limits.
-        bounded: of these, how many had a cell so narrow that their term was bounded.
-        missed: of these, how many are not corrected, for want of slots.
+        found: number of onsets of contacts and limits.
+        bounded: number of these with a cell so narrow that the term was bounded.
+        missed: number of these left uncorrected for lack of slots.
     """
 
     found: Int[Array, "*batch"]
@@ -84,30 +84,30 @@ class OnsetCounts:
 
 
 def as_row(counts: OnsetCounts | None) -> Float[Array, "*batch 3"] | None:
-    """The counts as numbers in one array, as batches keep them."""
+    """The counts in one array, as batches store them."""
     return None if counts is None else jnp.stack([counts.found, counts.bounded, counts.missed], axis=-1).astype(float)
 
 
 def corrected_rollout(
     scene: Scene, model: mjx.Model, start: State, control_law: ControlLaw, horizon: int, slots: int = SLOTS
 ) -> tuple[State, Float[Array, "horizon nu"], Float[Array, " horizon"], OnsetCounts]:
-    """`dynamics.rollout`, with the same values and derivatives that have the onset term.
+    """`dynamics.rollout` with the same values, and derivatives that include the onset term.
 
-    The derivatives are of first order, over start and controls; both modes.
+    First derivatives with respect to initial state and controls; forward and reverse mode.
 
     Args:
-        scene: gives what is static.
-        model: the model to step; may be traced, and has no derivative.
-        start: the first state.
+        scene: static part of the model.
+        model: the model to step; may be traced, but not differentiated.
+        start: the initial state.
         control_law: maps (step index, state) to the control of that step.
         horizon: number of steps, at least 1.
-        slots: onsets of one rollout that are corrected, the first ones.
+        slots: number of onsets to correct, first ones first.
 
     Returns:
-        States `(horizon + 1, ...)` with the start first, controls `(horizon, nu)`, residuals `(horizon,)`, and counts.
+        States `(horizon + 1, ...)` including the initial one, controls `(horizon, nu)`, residuals `(horizon,)`; counts.
 
     Raises:
-        TypeError: it is differentiated with respect to the model.
+        TypeError: differentiation with respect to the model.
     """
     if not scene.has_constraints:
         none = jnp.zeros((), int)
@@ -169,7 +169,7 @@ def _corrections(
     speed: Float[Array, "horizon guards"],
     slots: int,
 ) -> tuple[Float[Array, "horizon nv nv"], Float[Array, "horizon nv nv"], OnsetCounts]:
-    """(1 - s) Delta_k n^T / D and s Delta_{k-1} n^T / D of every step, zero where nothing begins, and counts."""
+    """(1 - s) Delta_k n^T / D and s Delta_{k-1} n^T / D of every step, zero where no contact begins, and counts."""
     horizon, num_guards = distance.shape
     timestep = scene.timestep
     travel = timestep * speed
@@ -201,18 +201,18 @@ def _corrections(
 def jump_of_velocity(
     scene: Scene, model: mjx.Model, states: State, controls: Float[Array, "cases nu"], guard: Int[Array, ""]
 ) -> tuple[Float[Array, "cases nv"], Float[Array, " nv"], Float[Array, " nv"]]:
-    """What the onset of one contact or limit does to the velocity after a step, with bodies just touching.
+    """Jump that the onset of one contact or limit causes in the velocity after a step, at first touch.
 
     Args:
-        scene: gives what is static.
+        scene: static part of the model.
         model: the model to step.
-        states: with the velocities and activations to take; where things are is the first one's affair.
-        controls: that go with them.
+        states: velocities and activations of each case; positions are those of the first.
+        controls: controls of each case.
         guard: index of the contact or limit, as in `constraint.guard_rows`.
 
     Returns:
         v'(on) - v'(off) of each case; the first case's acceleration without the contact; the derivative of the guard
-        over the velocity coordinates.
+        with respect to the velocity coordinates.
     """
     positioned = position_stage(scene, model, states.qpos[0])
     normal_rows, members = constraint.guard_rows(model, positioned)
@@ -248,5 +248,5 @@ def _without_derivative(model: mjx.Model) -> mjx.Model:
 @partial(_without_derivative.defjvp, symbolic_zeros=True)
 def _(primals, tangents):
     if any(not isinstance(leaf, jax.custom_derivatives.SymbolicZero) for leaf in jax.tree.leaves(tangents)):
-        raise TypeError("with the onset term a rollout has derivatives over states and controls, none over the model")
+        raise TypeError("with the onset term a rollout is differentiable in states and controls, not in the model")
     return primals[0], tangents[0]

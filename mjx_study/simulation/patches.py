@@ -1,7 +1,7 @@
-"""Terms of MJX whose derivative fails where their value does not, evaluated here with safe branches.
+"""Patches for terms of MJX whose value is right but whose derivative is not, evaluated here with safe branches.
 
-A branch that is not taken still takes part in a derivative: where it is infinite or NaN, so is the result. And a norm
-has no derivative at zero, where MJX puts zero, though a rotation vector made from it is smooth. Values agree with MJX
+A branch not taken still contributes to a derivative: if it is infinite or NaN, so is the result. And a norm has no
+derivative at zero, where MJX sets it to zero, though a rotation vector made from it is smooth. Values agree with MJX
 to rounding; see `docs/gradient-faults.md`.
 """
 
@@ -28,14 +28,14 @@ def stiffness_damping_impedance(
 ) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
     """Stiffness k [1/s^2], damping b [1/s] and impedance d of a constraint row, as MuJoCo derives them.
 
-    Where MJX is not differentiable and MuJoCo is: a direct solref (-k, 0); a power of solimp beyond the width; a power
-    that is no whole number; d_0 equal to d_width.
+    Differentiable where MJX's is not: at a direct solref (-k, 0); in the power of solimp beyond the width; at a
+    non-integer power; at d_0 equal to d_width.
 
     Args:
-        model: gives timestep and flags.
+        model: timestep and flags.
         solref: (time constant [s], damping ratio) or (-k, -b).
         solimp: (d_0, d_width, width, midpoint, power).
-        position: of the row [m or rad].
+        position: position of the row [m or rad].
 
     Reference: MuJoCo documentation, Modeling, "Solver parameters".
     """
@@ -64,13 +64,13 @@ def stiffness_damping_impedance(
 def _touching(
     model: mjx.Model, solref: Float[Array, " 2"], solimp: Float[Array, " 5"], position: Float[Array, ""]
 ) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
-    """The same of a row without penetration, whose spring has no force yet."""
+    """The same for a row without penetration, whose spring has no force yet."""
     k, b, impedance = stiffness_damping_impedance(model, solref, solimp, jnp.zeros_like(position))
     return jnp.zeros_like(k), b, impedance
 
 
 def rotation_vector(quaternion: Float[Array, " 4"]) -> tuple[Float[Array, " 3"], Float[Array, ""]]:
-    """(rotation vector [rad], 1) in place of MJX's (axis, angle), of which it only ever takes the product."""
+    """(rotation vector [rad], 1) instead of MJX's (axis, angle), of which MJX only ever takes the product."""
     still = jnp.zeros_like(quaternion).at[0].set(1.0)
     return rotation_between(still, quaternion), jnp.ones_like(quaternion[0])
 
@@ -81,10 +81,10 @@ def rotation_difference(end: Float[Array, " 4"], start: Float[Array, " 4"]) -> F
 
 
 def tendon_spring_gap(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]:
-    """What MJX's tendon springs lack, [N or N m]: zero in value, not in derivative.
+    """Term missing from MJX's tendon springs [N or N m]: zero in value, not in derivative.
 
-    A spring whose rest is one length, not a range, is linear; MJX composes it of two halves that both have derivative
-    zero where they meet. Added to the passive force this gives it the linear spring's.
+    A spring with a single rest length rather than a range is linear; MJX composes it of two halves that both have
+    derivative zero where they meet. Adding this to the passive force restores the linear spring's derivative.
     """
     shortest, longest = model.tendon_lengthspring.T
     linear = (shortest == longest) & (data.ten_length == shortest)
@@ -94,7 +94,7 @@ def tendon_spring_gap(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]:
 
 
 def has_tendon_springs(model: mjx.Model) -> bool:
-    """Whether there are tendons with springs that act; static."""
+    """Whether there are tendons whose springs are enabled; static."""
     off = mujoco.mjtDisableBit.mjDSBL_SPRING | mujoco.mjtDisableBit.mjDSBL_DAMPER
     return model.ntendon > 0 and not model.opt.disableflags & int(off)
 
@@ -108,10 +108,10 @@ _mjx_wrap_inside = getattr(_module("support"), "wrap_inside", None)
 
 
 def wrap_inside(*arguments: Any) -> tuple[Float[Array, " 1"], Float[Array, " 4"]]:
-    """MJX's path of a tendon inside a sphere or cylinder: (length along it or -1, points where it touches).
+    """MJX's path of a tendon inside a sphere or cylinder: (length along it or -1, points of contact).
 
-    The length is always 0; MJX takes the square root of its square, which has no derivative at 0. Here it is too short
-    to be seen and has one.
+    The length is always 0; MJX takes the square root of its square, which has no derivative at 0. Here it is
+    negligibly small instead, and differentiable.
     """
     assert _mjx_wrap_inside is not None, "`repaired` has checked that MJX has it"
     length, points = _mjx_wrap_inside(*arguments)
@@ -128,13 +128,13 @@ _REPLACED: Final[dict[tuple[str, str], Callable[..., Any]]] = {
 
 @contextlib.contextmanager
 def repaired(*, touching: bool = False) -> Generator[None]:
-    """What is traced inside has MJX call the functions of this module in place of its own.
+    """Patch MJX with the functions of this module in whatever is traced inside.
 
     Args:
-        touching: have every constraint row that acts be that of bodies which only just touch.
+        touching: give every active constraint row the values of first touch.
 
-    MJX offers no other place for them: they are called deep inside its pipeline. A version of MJX that no longer has
-    one is an error here, not a silent return of its faults.
+    MJX has no hook for them: they are called deep inside its pipeline. If a version of MJX lacks one of them, that is
+    an error here rather than a silent return of the fault.
 
     Raises:
         RuntimeError: MJX has no function of such a name.
@@ -145,7 +145,7 @@ def repaired(*, touching: bool = False) -> Generator[None]:
             module = _module(module_name)
             original = getattr(module, name, None)
             if original is None:
-                raise RuntimeError(f"this version of MJX has no {module_name}.{name}: adapt mjx_study.repairs to it")
+                raise RuntimeError(f"this version of MJX has no {module_name}.{name}: adapt patches.py to it")
             undo.callback(setattr, module, name, original)
             setattr(module, name, ours)
         yield

@@ -36,8 +36,8 @@ class SceneError(ValueError):
 class Scene:
     """A compiled model on the host and on the device, with an empty `mjx.Data` as template for each step.
 
-    What is static in MJX (cone, solver, integrator, budgets) is fixed here; contact parameters are array leaves
-    of `model` and are swept without recompiling (see `mjx_study.simulation.contact`).
+    Options that are static in MJX (cone, solver, integrator, iteration budgets) are fixed here; contact parameters are
+    array leaves of `model` and are swept without recompiling (see `mjx_study.simulation.contact`).
     """
 
     name: str
@@ -72,20 +72,20 @@ class Scene:
 
 
 def num_constraint_rows(data: mjx.Data) -> int:
-    """Constraint rows that MJX allocates, active or not; static."""
+    """Number of constraint rows that MJX allocates, active or not; static."""
     rows: Any = data._impl
     return rows.efc_J.shape[0]
 
 
 def models_folder() -> Path:
-    """Folder of the MJCF files that ship with the package (beside it in a checkout)."""
+    """Folder of the shipped MJCF files (beside the package in a checkout)."""
     package = Path(str(resources.files("mjx_study")))
     packaged = package / "models"
     return packaged if packaged.is_dir() else package.parent / "models"
 
 
 def model_names() -> list[str]:
-    """Names of the MJCF files that ship with the package."""
+    """Names of the shipped MJCF files."""
     return sorted(path.stem for path in models_folder().glob("*.xml"))
 
 
@@ -102,10 +102,10 @@ def load_model(source: str | Path, **options: SceneOption) -> mujoco.MjModel:
     """Compile an MJCF.
 
     Args:
-        source: the name of a shipped model (`"pusher"`) or the path of an MJCF file.
-        **options: replace what the file says: `cone` (pyramidal, elliptic), `solver` (newton, cg), `integrator`
+        source: name of a shipped model (`"pusher"`) or path of an MJCF file.
+        **options: override the file's options: `cone` (pyramidal, elliptic), `solver` (newton, cg), `integrator`
             (euler, implicitfast, rk4), `timestep` [s], `iterations`, `ls_iterations`, `tolerance`; and
-            `disable_flags`, names of MJCF's flags to disable, as a sequence or with commas between them.
+            `disable_flags`, names of MJCF flags to disable, as a sequence or separated by commas.
 
     Raises:
         SceneError: the file is missing or does not parse, or an option is unknown or out of range.
@@ -124,10 +124,10 @@ def load_model(source: str | Path, **options: SceneOption) -> mujoco.MjModel:
 
 
 def put_scene(host: mujoco.MjModel, name: str, **options: SceneOption) -> Scene:
-    """Put a compiled model, or a copy with `options` as `load_model` takes them, on the device.
+    """Put a compiled model on the device; with `options` (see `load_model`), a copy of it.
 
     Raises:
-        SceneError: MJX cannot run the model, or would leave out part of it; or an option is unknown or out of range.
+        SceneError: MJX cannot run the model or would ignore part of it, or an option is unknown or out of range.
     """
     if options:
         host = copy.copy(host)
@@ -169,12 +169,12 @@ def require(scene: Scene, *, joints: tuple[str, ...], geoms: tuple[str, ...], dr
 
     Args:
         scene: the model.
-        joints: all of its joints, of one coordinate each, in the order of the state.
-        geoms: names that it must have.
-        driven: the joint that each of its actuators drives, in the order of the control.
+        joints: names of all its joints, of one coordinate each, in state order.
+        geoms: names of geoms that it must have.
+        driven: name of the joint that each actuator drives, in control order.
 
     Raises:
-        SceneError: a name is missing, a size is another, or the order is.
+        SceneError: a name is missing, or a size or the order is different.
     """
     host = scene.host
     indices = [scene.joint(name) for name in joints]
