@@ -16,7 +16,7 @@ import numpy as np
 from jax import Array
 
 import estimators
-from estimators import ENOUGH_EFFECTIVE, ESTIMATORS, EstimatorOptions, summarise
+from estimators import ENOUGH_EFFECTIVE, ESTIMATORS, make_estimator, summarise
 from mjx_study.reference import LinearQuadratic, ReferenceObjective
 from mjx_study.runtime import configure
 from mjx_study.study.landscapes import DETECTED
@@ -214,7 +214,7 @@ def weights_rows(samples: int, count: int = 20_000) -> list[list[str]]:
     }
     rows = []
     for problem, (objective, theta) in problems.items():
-        needed = tuple(dict.fromkeys(oracle for name in WEIGHED for oracle in ESTIMATORS[name].needs))
+        needed = estimators.oracles_of(ESTIMATORS[name] for name in WEIGHED)
         drawn = estimators.draw(needed, objective, jnp.asarray(theta), jax.random.key(3), samples * count)
         many = jax.random.split(jax.random.key(4), 400_000)
         exact = np.mean(np.asarray(objective.differentiate(jnp.asarray(theta), many).gradient), axis=0)
@@ -223,15 +223,8 @@ def weights_rows(samples: int, count: int = 20_000) -> list[list[str]]:
             mine = {oracle: drawn[oracle] for oracle in ESTIMATORS[name].needs}
             row, errors = [problem, name, str(samples)], []
             for weights in estimators.WEIGHTS:
-                options = EstimatorOptions(
-                    gamma=float("inf"),
-                    failure_probability=0.05,
-                    variance_proxy="variance",
-                    radius="max_deviation",
-                    sigma=objective.sigma,
-                    weights=weights,
-                )
-                program = jax.jit(jax.vmap(lambda batch, o=options, n=name: estimators.combine(n, batch, o).mean))
+                estimator = make_estimator(name, sigma=objective.sigma, weights=weights)
+                program = jax.jit(jax.vmap(lambda batch, estimator=estimator: estimator(batch).mean))
                 means = np.asarray(program(mine))
                 bias = np.linalg.norm(np.mean(means, axis=0) - exact) / np.linalg.norm(exact)
                 errors.append(np.sum(np.var(means, axis=0)))

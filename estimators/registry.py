@@ -1,326 +1,129 @@
-"""The estimators by name, and one way to run any of them.
+"""The estimators, each a formula with its options, by name; and one way to run any of them."""
 
-To add one: a function from batches to a `GradientEstimate`, and an entry in `ESTIMATORS` that says which batches it
-needs.
-"""
-
-from collections.abc import Callable, Mapping
+import dataclasses
+from abc import abstractmethod
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import Any, TypeVar
 
-import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
-from estimators.alpha_order import choose_alpha, interpolate
+from estimators.alpha_order import choose_alpha, interpolate, inverse_variance_alpha
 from estimators.baselines import find_baseline
-from estimators.confidence import bernstein_epsilon, check_confidence_arguments
+from estimators.confidence import MAX_DEVIATION, bernstein_epsilon, check_confidence_arguments
 from estimators.cross_fitting import PLUG_IN, check_weights, weigh_batches
 from estimators.ddcg import PUBLISHED_TOLERANCE, discontinuity_gated
+from estimators.estimator import ORACLES, Estimator, draw
 from estimators.first_order import clipped_first_order, first_order
+from estimators.places import MissingModuleError, find_attribute, importable_here
 from estimators.propagation import total_propagation, truncated_first_order
 from estimators.stepwise import antithetic_cost_to_go, cost_to_go, stepwise_inverse_variance
-from estimators.types import GradientEstimate, Objective
+from estimators.types import (
+    AlphaChoice,
+    Differentiation,
+    Evaluation,
+    GradientEstimate,
+    Linearisation,
+    Objective,
+    StepDifferentiation,
+    StepEvaluation,
+)
 from estimators.zeroth_order import antithetic, delta_control_variate, zeroth_order
 
+ESTIMATORS: dict[str, type[Estimator]] = {}
+"""By name."""
+EstimatorClass = TypeVar("EstimatorClass", bound=type[Estimator])
 
-@dataclass(frozen=True, kw_only=True)
-class EstimatorOptions:
-    """What an estimate depends on beside its samples; hashable, so that it can be static under `jit`.
 
-    Attributes:
-        baseline: Name in `BASELINES`, for the zeroth-order batch.
-        gamma: Largest error to accept, > 0 or infinity, [cost/param]; "aobg" only.
-        failure_probability: Of the confidence radius, in (0, 1).
-        variance_proxy: "variance", "second_moment" or "upper_bound"; see `bernstein_epsilon`.
-        radius: "max_deviation" or a bound >= 0 on ||g_i - E g||, [cost/param].
-        sigma: Standard deviation of the noise, > 0, [control]; "ddcg" and "delta" only.
-        max_norm: Of a sample, > 0, [cost/param]; "fobg_clipped" only.
-        window: Steps between cuts of the adjoint, >= 1; "fobg_truncated" only.
-        tolerance: c of the discontinuity test, in [0, 1); "ddcg" only.
-        weights: Name in `WEIGHTS`, of the estimators that interpolate.
+def register(estimator: EstimatorClass) -> EstimatorClass:
+    """Enter a class into `ESTIMATORS`; for use as a decorator, above that of the dataclass.
 
     Raises:
-        ValueError: A field is outside its range.
+        ValueError: It needs an oracle that there is not, or another class has its name.
     """
-
-    baseline: str = "zero_noise"
-    gamma: float
-    failure_probability: float
-    variance_proxy: str
-    radius: str | float
-    sigma: float | None = None
-    max_norm: float | None = None
-    window: int | None = None
-    tolerance: float = PUBLISHED_TOLERANCE
-    weights: str = PLUG_IN
-
-    def __post_init__(self):
-        find_baseline(self.baseline)
-        if not self.gamma > 0.0:
-            raise ValueError(f"gamma must be positive; got {self.gamma}; float('inf') sets no limit")
-        for name in ("sigma", "max_norm"):
-            value = getattr(self, name)
-            if value is not None and not 0.0 < value < float("inf"):
-                raise ValueError(f"{name} must be positive and finite; got {value}")
-        if self.window is not None and self.window < 1:
-            raise ValueError(f"window must be at least 1 step; got {self.window}")
-        if not 0.0 <= self.tolerance < 1.0:
-            raise ValueError(f"tolerance must lie in [0, 1); got {self.tolerance}")
-        check_weights(self.weights)
-        check_confidence_arguments(self.failure_probability, self.variance_proxy, self.radius)
+    _check_class(estimator, estimator.__name__)
+    if estimator.name in ESTIMATORS:
+        raise ValueError(f"there is an estimator {estimator.name!r} already: give this one another name")
+    ESTIMATORS[estimator.name] = estimator
+    return estimator
 
 
-@dataclass(frozen=True)
-class Oracle:
-    """A kind of batch.
-
-    Attributes:
-        name: As estimators ask for it.
-        order: 0 if only values are needed, 1 if derivatives; batches of one order share their samples.
-        method: Of the objective, called with theta and keys.
-        phrase: For a message.
-    """
-
-    name: str
-    order: int
-    method: str
-    phrase: str
-
-
-ORACLES: Final[dict[str, Oracle]] = {
-    oracle.name: oracle
-    for oracle in (
-        Oracle("evaluation", 0, "evaluate", "a zeroth-order batch"),
-        Oracle("pair", 0, "evaluate_pair", "a zeroth-order batch of pairs"),
-        Oracle("steps", 0, "evaluate_steps", "a zeroth-order batch step by step"),
-        Oracle("step_pair", 0, "evaluate_step_pair", "a zeroth-order batch of pairs step by step"),
-        Oracle("differentiation", 1, "differentiate", "a first-order batch"),
-        Oracle("step_differentiation", 1, "differentiate_steps", "a first-order batch step by step"),
-        Oracle("linearisation", 1, "linearise", "a first-order batch with the derivatives of its steps"),
-    )
-}
-
-Batches = Mapping[str, Any]
-"""Batches by the name of their oracle."""
-
-
-@dataclass(frozen=True)
-class Estimator:
-    """An estimator's name, needs and formula.
-
-    Attributes:
-        name: Key in `ESTIMATORS`.
-        description: One line for a legend or a help text.
-        needs: Oracles in `ORACLES`, in the order in which `combine` takes their batches.
-        combine: From those batches and the options to the estimate.
-        requires: Options that must be set.
-    """
-
-    name: str
-    description: str
-    needs: tuple[str, ...]
-    combine: Callable[..., GradientEstimate]
-    requires: tuple[str, ...] = ()
-
-    def check(self, options: EstimatorOptions) -> None:
-        """Raises ValueError if an option that it requires is not set."""
-        for name in self.requires:
-            if getattr(options, name) is None:
-                raise ValueError(f"{self.name!r} needs the option {name}; set it")
-
-
-def _alpha_order(evaluation, differentiation, options: EstimatorOptions, *, unlimited: bool = False):
-    def choose(evaluation, differentiation):
-        zeroth = zeroth_order(evaluation, options.baseline)
-        epsilon = bernstein_epsilon(
-            zeroth,
-            failure_probability=options.failure_probability,
-            variance_proxy=options.variance_proxy,
-            radius=options.radius,
-        )
-        gamma = float("inf") if unlimited else options.gamma
-        return choose_alpha(zeroth, first_order(differentiation), gamma=gamma, epsilon=epsilon)
-
-    def mix(choice, evaluation, differentiation):
-        mixed = interpolate(zeroth_order(evaluation, options.baseline), first_order(differentiation), choice.alpha)
-        return replace(mixed, alpha=choice)
-
-    return weigh_batches(choose, mix, (evaluation, differentiation), options.weights)
-
-
-def _delta(evaluation, differentiation, options: EstimatorOptions):
-    assert options.sigma is not None
-    return delta_control_variate(evaluation, first_order(differentiation).mean, options.sigma)
-
-
-ESTIMATORS: dict[str, Estimator] = {
-    estimator.name: estimator
-    for estimator in (
-        Estimator(
-            "zobg",
-            "zeroth order: values times scores",
-            ("evaluation",),
-            lambda batch, options: zeroth_order(batch, options.baseline),
-        ),
-        Estimator(
-            "zobg_antithetic",
-            "zeroth order over pairs of opposite noise",
-            ("pair",),
-            lambda pair, options: antithetic(pair[0], pair[1], options.baseline),
-        ),
-        Estimator(
-            "zobg_to_go",
-            "zeroth order: costs to go times the scores of single steps",
-            ("steps",),
-            lambda batch, options: cost_to_go(batch, options.baseline),
-        ),
-        Estimator(
-            "zobg_to_go_antithetic",
-            "costs to go over pairs of opposite noise",
-            ("step_pair",),
-            lambda pair, options: antithetic_cost_to_go(pair[0], pair[1], options.baseline),
-        ),
-        Estimator(
-            "fobg",
-            "first order: gradients of the samples",
-            ("differentiation",),
-            lambda batch, options: first_order(batch),
-        ),
-        Estimator(
-            "fobg_clipped",
-            "first order, the norm of every sample bounded",
-            ("differentiation",),
-            lambda batch, options: clipped_first_order(batch, options.max_norm),
-            ("max_norm",),
-        ),
-        Estimator(
-            "fobg_truncated",
-            "first order, the adjoint cut every few steps",
-            ("linearisation",),
-            lambda batch, options: truncated_first_order(batch, options.window),
-            ("window",),
-        ),
-        Estimator(
-            "aobg",
-            "alpha order: the two interpolated within an error of gamma",
-            ("evaluation", "differentiation"),
-            _alpha_order,
-        ),
-        Estimator(
-            "ivw",
-            "inverse-variance weighting: alpha order with gamma infinite",
-            ("evaluation", "differentiation"),
-            lambda zeroth, first, options: _alpha_order(zeroth, first, options, unlimited=True),
-        ),
-        Estimator(
-            "ivw_h",
-            "inverse-variance weights for every step and control",
-            ("steps", "step_differentiation"),
-            lambda zeroth, first, options: stepwise_inverse_variance(zeroth, first, options.baseline, options.weights),
-        ),
-        Estimator(
-            "total_propagation",
-            "inverse-variance weights inside the backward recursion",
-            ("linearisation",),
-            lambda batch, options: total_propagation(batch, options.baseline, options.weights),
-        ),
-        Estimator(
-            "ddcg",
-            "inverse-variance weighting where a test finds no discontinuity, else zeroth order",
-            ("evaluation", "step_differentiation"),
-            lambda zeroth, first, options: discontinuity_gated(
-                zeroth, first, options.baseline, options.sigma, options.tolerance, options.weights
-            ),
-            ("sigma",),
-        ),
-        Estimator(
-            "delta",
-            "first-order mean and a zeroth-order estimate of what it leaves over; noise on theta itself",
-            ("evaluation", "differentiation"),
-            _delta,
-            ("sigma",),
-        ),
-    )
-}
-
-
-def combine(name: str, batches: Batches, options: EstimatorOptions) -> GradientEstimate:
-    """Make an estimate of batches already drawn, so that several estimators can share them.
+def find_estimator(name: str) -> Estimator | type[Estimator]:
+    """What a name stands for.
 
     Args:
-        name: Key in `ESTIMATORS`.
-        batches: By the names in `ORACLES`; those of order 0 independent of those of order 1 and of the same size. What
-            the estimator does not need is not looked at.
-        options: See `EstimatorOptions`.
-
-    Returns:
-        The estimate.
+        name: Key in `ESTIMATORS`, or `module:attribute` of a class or an object of one's own. The current directory
+            counts as importable.
 
     Raises:
-        ValueError: The name is unknown, a batch or an option that it needs is missing, or batches differ in shape.
+        ValueError: There is no such estimator.
     """
-    estimator = _find(name)
-    estimator.check(options)
-    for oracle in estimator.needs:
-        if batches.get(oracle) is None:
-            method, phrase = ORACLES[oracle].method, ORACLES[oracle].phrase
-            raise ValueError(f"{name!r} needs {phrase}; got none; pass what objective.{method} returns as {oracle!r}")
-    return estimator.combine(*(batches[oracle] for oracle in estimator.needs), options)
+    if name in ESTIMATORS:
+        return ESTIMATORS[name]
+    reason = ""
+    if ":" in name:
+        try:
+            with importable_here():
+                found = find_attribute(name, "estimator", Estimator)
+        except MissingModuleError as error:
+            reason = f" ({error})"
+        else:
+            return _check_class(found, name)
+    raise ValueError(
+        f"estimator must be one of {', '.join(ESTIMATORS)}, or module:name of your own{reason}; got {name!r}"
+    )
 
 
-def draw(
-    oracles: tuple[str, ...],
-    objective: Objective,
-    theta: Float[Array, " params"],
-    key: Key[Array, ""],
-    num_samples: int,
-) -> dict[str, Any]:
-    """Draw batches, those of order 0 from one set of keys and those of order 1 from another.
+def _check_class(found: Any, place: str) -> Any:
+    if not isinstance(found, Estimator) and not (isinstance(found, type) and issubclass(found, Estimator)):
+        raise ValueError(f"{place} is neither an Estimator nor a class of them, but of type {type(found).__name__}")
+    missing = [part for part in ("name", "needs") if not getattr(found, part, None)]
+    missing += sorted(getattr(found, "__abstractmethods__", ()))
+    if missing:
+        raise ValueError(f"{place} has no {' and no '.join(missing)}: an Estimator needs them")
+    if unknown := set(found.needs) - set(ORACLES):
+        raise ValueError(f"{place} needs {', '.join(sorted(unknown))}; the oracles are {', '.join(ORACLES)}")
+    return found
+
+
+def make_estimator(which: str | Estimator, **options: Any) -> Estimator:
+    """An estimator with its options.
 
     Args:
-        oracles: Names in `ORACLES`; all of one order share their samples.
-        objective: What to draw from.
-        theta: Where, [param].
-        key: Source of all randomness; used up.
-        num_samples: Samples in each batch, >= 1.
-
-    Returns:
-        The batches by name.
+        which: As for `find_estimator`; or an object, which is returned as it is.
+        **options: Of this estimator or of others. Those that it does not have, and those that are None, are left out.
 
     Raises:
-        ValueError: The objective lacks what an oracle calls.
+        ValueError: There is no such estimator, or an option that it requires is missing or out of range.
     """
-    keys = [jax.random.split(order_key, num_samples) for order_key in jax.random.split(key)]
-    batches = {}
-    for name in oracles:
-        oracle = ORACLES[name]
-        method = getattr(objective, oracle.method, None)
-        if method is None:
-            raise ValueError(f"{type(objective).__name__} has no {oracle.method}, which {oracle.phrase} comes from")
-        batches[name] = method(theta, jax.random.clone(keys[oracle.order]))  # shared on purpose
-    return batches
+    found = find_estimator(which) if isinstance(which, str) else which
+    if isinstance(found, Estimator):
+        return found
+    own = {field.name for field in dataclasses.fields(found)}
+    given = {name: value for name, value in options.items() if name in own and value is not None}
+    for name in found.required():
+        if name not in given:
+            raise ValueError(f"{found.name!r} needs the option {name}; set it")
+    return found(**given)
 
 
 def estimate(
-    name: str,
+    estimator: str | Estimator,
     objective: Objective,
     theta: Float[Array, " params"],
     key: Key[Array, ""],
     num_samples: int,
-    *,
-    options: EstimatorOptions,
 ) -> GradientEstimate:
     """Draw the batches that an estimator needs, and no others, and estimate grad F(theta).
 
     The two orders come from independent keys, and each is the same for every estimator given the same key.
 
     Args:
-        name: Key in `ESTIMATORS`.
+        estimator: One with its options, or a name for one with all of them at their defaults.
         objective: What to differentiate.
         theta: Where, [param].
         key: Source of all randomness; used up.
         num_samples: Samples in each batch, >= 1.
-        options: See `EstimatorOptions`.
 
     Returns:
         The estimate.
@@ -329,16 +132,267 @@ def estimate(
         ValueError: The name is unknown, an option or a method of the objective is missing, there is no sample to draw,
             or theta has the wrong length.
     """
-    estimator = _find(name)
-    estimator.check(options)
+    estimator = make_estimator(estimator)
     if num_samples < 1:
         raise ValueError(f"num_samples must be at least 1, and at least 2 for a variance; got {num_samples}")
     if theta.shape != (objective.num_params,):
         raise ValueError(f"theta must have shape ({objective.num_params},), the objective's; got {theta.shape}")
-    return combine(name, draw(estimator.needs, objective, theta, key, num_samples), options)
+    return estimator(draw(estimator.needs, objective, theta, key, num_samples))
 
 
-def _find(name: str) -> Estimator:
-    if name not in ESTIMATORS:
-        raise ValueError(f"estimator must be one of {', '.join(ESTIMATORS)}; got {name!r}")
-    return ESTIMATORS[name]
+def _check_positive(name: str, value: float) -> None:
+    if not 0.0 < value < float("inf"):
+        raise ValueError(f"{name} must be positive and finite; got {value}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Baselined(Estimator):
+    """Base of those with a zeroth-order batch; `baseline` is a name in `BASELINES`."""
+
+    baseline: str = "zero_noise"
+
+    def __post_init__(self) -> None:
+        find_baseline(self.baseline)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Interpolation(_Baselined):
+    """Base of those that weigh two batches; `weights` is a name in `WEIGHTS`."""
+
+    weights: str = PLUG_IN
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_weights(self.weights)
+
+
+@register
+class ZerothOrder(_Baselined):
+    """See `zeroth_order`."""
+
+    name, label = "zobg", "ZoBG"
+    description = "zeroth order: values times scores"
+    needs = ("evaluation",)
+
+    def combine(self, evaluation: Evaluation) -> GradientEstimate:
+        return zeroth_order(evaluation, self.baseline)
+
+
+@register
+class Antithetic(_Baselined):
+    """See `antithetic`."""
+
+    name, label = "zobg_antithetic", "ZoBG, antithetic"
+    description = "zeroth order over pairs of opposite noise"
+    needs = ("pair",)
+
+    def combine(self, pair: tuple[Evaluation, Evaluation]) -> GradientEstimate:
+        return antithetic(*pair, self.baseline)
+
+
+@register
+class CostToGo(_Baselined):
+    """See `cost_to_go`."""
+
+    name, label = "zobg_to_go", "ZoBG, costs to go"
+    description = "zeroth order: costs to go times the scores of single steps"
+    needs = ("steps",)
+
+    def combine(self, steps: StepEvaluation) -> GradientEstimate:
+        return cost_to_go(steps, self.baseline)
+
+
+@register
+class AntitheticCostToGo(_Baselined):
+    """See `antithetic_cost_to_go`."""
+
+    name, label = "zobg_to_go_antithetic", "ZoBG, to go, antithetic"
+    description = "costs to go over pairs of opposite noise"
+    needs = ("step_pair",)
+
+    def combine(self, pair: tuple[StepEvaluation, StepEvaluation]) -> GradientEstimate:
+        return antithetic_cost_to_go(*pair, self.baseline)
+
+
+@register
+class FirstOrder(Estimator):
+    """See `first_order`."""
+
+    name, label = "fobg", "FoBG"
+    description = "first order: gradients of the samples"
+    needs = ("differentiation",)
+
+    def combine(self, differentiation: Differentiation) -> GradientEstimate:
+        return first_order(differentiation)
+
+
+@register
+@dataclass(frozen=True, kw_only=True)
+class ClippedFirstOrder(Estimator):
+    """See `clipped_first_order`; `max_norm` of a sample, > 0, [cost/param]."""
+
+    name, label = "fobg_clipped", "FoBG, clipped"
+    description = "first order, the norm of every sample bounded"
+    needs = ("differentiation",)
+
+    max_norm: float
+
+    def __post_init__(self) -> None:
+        _check_positive("max_norm", self.max_norm)
+
+    def combine(self, differentiation: Differentiation) -> GradientEstimate:
+        return clipped_first_order(differentiation, self.max_norm)
+
+
+@register
+@dataclass(frozen=True, kw_only=True)
+class TruncatedFirstOrder(Estimator):
+    """See `truncated_first_order`; `window` of steps between cuts of the adjoint, >= 1."""
+
+    name, label = "fobg_truncated", "FoBG, truncated"
+    description = "first order, the adjoint cut every few steps"
+    needs = ("linearisation",)
+
+    window: int
+
+    def __post_init__(self) -> None:
+        if self.window < 1:
+            raise ValueError(f"window must be at least 1 step; got {self.window}")
+
+    def combine(self, linearisation: Linearisation) -> GradientEstimate:
+        return truncated_first_order(linearisation, self.window)
+
+
+class _OneWeight(_Interpolation):
+    """Base of those with one weight for two whole batches."""
+
+    needs = ("evaluation", "differentiation")
+
+    @abstractmethod
+    def choose(self, zeroth: GradientEstimate, first: GradientEstimate) -> AlphaChoice:
+        """The weight."""
+
+    def combine(self, evaluation: Evaluation, differentiation: Differentiation) -> GradientEstimate:
+        def choose(evaluation: Evaluation, differentiation: Differentiation) -> AlphaChoice:
+            return self.choose(zeroth_order(evaluation, self.baseline), first_order(differentiation))
+
+        def mix(choice: AlphaChoice, evaluation: Evaluation, differentiation: Differentiation) -> GradientEstimate:
+            mixed = interpolate(zeroth_order(evaluation, self.baseline), first_order(differentiation), choice.alpha)
+            return replace(mixed, alpha=choice)
+
+        return weigh_batches(choose, mix, (evaluation, differentiation), self.weights)
+
+
+@register
+@dataclass(frozen=True, kw_only=True)
+class AlphaOrder(_OneWeight):
+    """See `alpha_order`, and `bernstein_epsilon` for what decides epsilon.
+
+    Attributes:
+        gamma: Largest error to accept, > 0 or infinity, [cost/param].
+        failure_probability: Of the confidence radius, in (0, 1).
+        variance_proxy: "variance", "second_moment" or "upper_bound".
+        radius: "max_deviation" or a bound >= 0 on ||g_i - E g||, [cost/param].
+    """
+
+    name, label = "aobg", "AoBG"
+    description = "alpha order: the two interpolated within an error of gamma"
+
+    gamma: float = float("inf")
+    failure_probability: float = 0.05
+    variance_proxy: str = "variance"
+    radius: str | float = MAX_DEVIATION
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.gamma > 0.0:
+            raise ValueError(f"gamma must be positive; got {self.gamma}; float('inf') sets no limit")
+        check_confidence_arguments(self.failure_probability, self.variance_proxy, self.radius)
+
+    def choose(self, zeroth: GradientEstimate, first: GradientEstimate) -> AlphaChoice:
+        epsilon = bernstein_epsilon(
+            zeroth,
+            failure_probability=self.failure_probability,
+            variance_proxy=self.variance_proxy,
+            radius=self.radius,
+        )
+        return choose_alpha(zeroth, first, gamma=self.gamma, epsilon=epsilon)
+
+
+@register
+class InverseVariance(_OneWeight):
+    """See `inverse_variance_alpha`."""
+
+    name, label = "ivw", "IVW"
+    description = "inverse-variance weighting: alpha order with gamma infinite"
+
+    def choose(self, zeroth: GradientEstimate, first: GradientEstimate) -> AlphaChoice:
+        alpha = inverse_variance_alpha(zeroth.variance, first.variance)
+        discrepancy = jnp.linalg.norm(first.mean - zeroth.mean)
+        return AlphaChoice(alpha, None, discrepancy, zeroth.variance, first.variance)
+
+
+@register
+class StepwiseInverseVariance(_Interpolation):
+    """See `stepwise_inverse_variance`."""
+
+    name, label = "ivw_h", "IVW-H"
+    description = "inverse-variance weights for every step and control"
+    needs = ("steps", "step_differentiation")
+
+    def combine(self, steps: StepEvaluation, differentiation: StepDifferentiation) -> GradientEstimate:
+        return stepwise_inverse_variance(steps, differentiation, self.baseline, self.weights)
+
+
+@register
+class TotalPropagation(_Interpolation):
+    """See `total_propagation`."""
+
+    name, label = "total_propagation", "total propagation"
+    description = "inverse-variance weights inside the backward recursion"
+    needs = ("linearisation",)
+
+    def combine(self, linearisation: Linearisation) -> GradientEstimate:
+        return total_propagation(linearisation, self.baseline, self.weights)
+
+
+@register
+@dataclass(frozen=True, kw_only=True)
+class DiscontinuityGated(_Interpolation):
+    """See `discontinuity_gated`; `sigma` of the noise, > 0, [control], and `tolerance` c of the test, in [0, 1)."""
+
+    name, label = "ddcg", "DDCG"
+    description = "inverse-variance weighting where a test finds no discontinuity, else zeroth order"
+    needs = ("evaluation", "step_differentiation")
+    gaussian = True
+
+    sigma: float
+    tolerance: float = PUBLISHED_TOLERANCE
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _check_positive("sigma", self.sigma)
+        if not 0.0 <= self.tolerance < 1.0:
+            raise ValueError(f"tolerance must lie in [0, 1); got {self.tolerance}")
+
+    def combine(self, evaluation: Evaluation, differentiation: StepDifferentiation) -> GradientEstimate:
+        return discontinuity_gated(evaluation, differentiation, self.baseline, self.sigma, self.tolerance, self.weights)
+
+
+@register
+@dataclass(frozen=True, kw_only=True)
+class DeltaMethod(Estimator):
+    """See `delta_control_variate`; `sigma` of the noise, > 0, [param]."""
+
+    name, label = "delta", "delta"
+    description = "first-order mean and a zeroth-order estimate of what it leaves over; noise on theta itself"
+    needs = ("evaluation", "differentiation")
+    gaussian = additive = True
+
+    sigma: float
+
+    def __post_init__(self) -> None:
+        _check_positive("sigma", self.sigma)
+
+    def combine(self, evaluation: Evaluation, differentiation: Differentiation) -> GradientEstimate:
+        return delta_control_variate(evaluation, first_order(differentiation).mean, self.sigma)

@@ -20,6 +20,7 @@ import mujoco
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
+from estimators import FirstOrder, ZerothOrder
 from mjx_study.objective import Simulator, chunk_for, simulate
 from mjx_study.reference.noise import split_sample_key, standard_noise
 from mjx_study.runtime import environment
@@ -131,7 +132,7 @@ def plan_bench(task: Task, samples: int) -> BenchPlan:
     """
     if samples < 1:
         raise ValueError(f"samples must be at least 1, got {samples}")
-    check_memory(task, ("zobg", "fobg"), samples)
+    check_memory(task, (ZerothOrder(), FirstOrder()), samples)
     (cell,), _ = contact_grid(task, [task.main_family], [task.middle_stiffness])
     return BenchPlan(task, samples, cell)
 

@@ -7,7 +7,7 @@ gives the default of each of its fields, and may narrow a range.
 import dataclasses
 import math
 import sys
-from collections.abc import Iterable
+from collections.abc import Collection
 from numbers import Integral, Real
 from typing import Any, ClassVar, Final, get_type_hints
 
@@ -64,6 +64,7 @@ class Option:
         interval: where its numbers lie.
         unit: of its numbers.
         choices: names that it takes; in place of a number where it has an interval as well.
+        own: whether it takes `module:name` of one's own beside them.
         label: of a value in messages, where that is not the name.
         many: whether it is a list; what has it says so.
         unset: what stands for it where it is not given.
@@ -76,7 +77,8 @@ class Option:
     line: str
     interval: Interval | None = None
     unit: str = ""
-    choices: tuple[str, ...] = ()
+    choices: Collection[str] = ()
+    own: bool = False
     label: str = ""
     many: bool = False
     unset: str = ""
@@ -145,10 +147,10 @@ class Option:
         if self.kind is str or (self.choices and isinstance(value, str)):
             if not isinstance(value, str):
                 raise ValueError(f"must be text, got {_short(value)}")
-            if self.choices and value not in self.choices:
+            if self.choices and value not in self.choices and not (self.own and ":" in value):
                 label = self.label or self.name.replace("_", " ")
-                number = ", or give a number" if self.interval else ""
-                raise ValueError(f"unknown {label} {_short(value)}; choose from {', '.join(self.choices)}{number}")
+                other = ", or give a number" if self.interval else ", or module:name of your own" if self.own else ""
+                raise ValueError(f"unknown {label} {_short(value)}; choose from {', '.join(self.choices)}{other}")
             return
         whole = self.kind is int
         if isinstance(value, bool) or not isinstance(value, Integral if whole else Real):
@@ -229,8 +231,8 @@ def _number(name: str, kind: type, interval: str, metavar: str, line: str, **mor
     return Option(name, kind, metavar, line, Interval(interval), **more)
 
 
-def _choice(name: str, choices: Iterable[str], metavar: str, line: str, **more: Any) -> Option:
-    return Option(name, str, metavar, line, choices=tuple(choices), **more)
+def _choice(name: str, choices: Collection[str], metavar: str, line: str, **more: Any) -> Option:
+    return Option(name, str, metavar, line, choices=choices, **more)
 
 
 MOST_SAMPLES: Final = "10000000]"
@@ -253,7 +255,7 @@ OPTIONS: Final[dict[str, Option]] = {
         _number("tolerance", float, "[0, 1)", "C", "of ddcg's test"),
         _choice("weights", WEIGHTS, "NAME", "of interpolations: by the samples that they weigh, or the other half"),
         _choice("onset", ONSETS, "NAME", "of contact, in first-order gradients: none, or linear"),
-        _choice("estimators", ESTIMATORS, "NAME", "see `mjx-study estimators`", label="estimator"),
+        _choice("estimators", ESTIMATORS, "NAME", "see `mjx-study estimators`", label="estimator", own=True),
         _choice("contact", FAMILIES, "FAMILY", f"of: {', '.join(FAMILIES)}", label="contact family", unset=TASKS),
         _number("stiffness", float, "(0, inf)", "K", "contact stiffness", unit="N/m", unset=TASKS),
         _number("damping", float, "[0, inf)", "B", "contact damping", unit="N s/m", unset="the family's"),

@@ -171,7 +171,7 @@ def fitting(name: str) -> st.SearchStrategy[str]:
     if option is None or (option.kind is str and not option.choices):
         return NAMES
     if option.kind is str:
-        return st.lists(st.sampled_from(option.choices), min_size=1, max_size=3).map(",".join)
+        return st.lists(st.sampled_from(list(option.choices)), min_size=1, max_size=3).map(",".join)
     return st.one_of(NUMBERS, RANGES, st.lists(NUMBERS, max_size=4).map(",".join))
 
 

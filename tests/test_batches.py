@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import estimators
-from estimators import ESTIMATORS, EstimatorOptions, pull_back, truncated_first_order
+from estimators import ESTIMATORS, DiscontinuityGated, ZerothOrder, make_estimator, pull_back, truncated_first_order
 from mjx_study.objective import Simulator, simulate
 from mjx_study.simulation import dynamics
 from mjx_study.study.configuration import check_estimators
@@ -20,18 +20,6 @@ from mjx_study.tasks.task import Task
 # What each stands for: an open loop; feedback from random starts, five bodies; one decision before the simulation.
 TASKS = {"pusher": 12, "tennis": 8, "double_pendulum": 10}
 SAMPLES = 6
-
-
-def options(task: Task) -> EstimatorOptions:
-    return EstimatorOptions(
-        gamma=task.gamma,
-        failure_probability=0.1,
-        variance_proxy="variance",
-        radius="max_deviation",
-        sigma=task.sigma,
-        max_norm=1e9,
-        window=task.horizon,
-    )
 
 
 @pytest.fixture(scope="module", params=TASKS)
@@ -97,14 +85,15 @@ def test_costs_to_go_are_sums_of_what_is_left(drawn) -> None:
 @pytest.mark.parametrize("name", ESTIMATORS)
 def test_every_estimator_runs_on_every_kind_of_task(drawn, name: str) -> None:
     task, _, batches = drawn
+    estimator = make_estimator(name, gamma=task.gamma, sigma=task.sigma, max_norm=1e9, window=task.horizon)
     if name == "delta" and not task.policy.additive:
         with pytest.raises(
             ValueError, match="'delta' needs noise that is added to theta itself; tennis has a feedback"
         ):
-            check_estimators([name], task, options(task))
+            check_estimators([estimator], task)
         return
-    check_estimators([name], task, options(task))
-    estimate = estimators.combine(name, batches, options(task))
+    check_estimators([estimator], task)
+    estimate = estimator(batches)
     assert estimate.mean.shape == task.theta.shape and np.all(np.isfinite(estimate.mean))
     assert estimate.num_finite == SAMPLES
 
@@ -112,7 +101,7 @@ def test_every_estimator_runs_on_every_kind_of_task(drawn, name: str) -> None:
 def test_a_formula_that_needs_gaussian_noise_refuses_another() -> None:
     task = make_task("pusher", horizon=3).replace(noise="laplace")
     with pytest.raises(ValueError, match="'ddcg' holds for Gaussian noise only; the noise is laplace"):
-        check_estimators(["zobg", "ddcg"], task, options(task))
+        check_estimators([ZerothOrder(), DiscontinuityGated(sigma=1.0)], task)
     with pytest.raises(ValueError, match="one of gaussian, logistic, laplace, student; got 'cauchy'"):
         task.replace(noise="cauchy")
 

@@ -124,7 +124,7 @@ def test_one_nan_sample_does_not_poison_the_table(
             return jnp.where(state.qpos[0] > threshold, cost(state), jnp.nan)
 
         return study.ComparePlan(
-            plan.config, plan.task.replace(final_cost=final_cost), plan.cells, plan.options, plan.warnings
+            plan.config, plan.task.replace(final_cost=final_cost), plan.cells, plan.estimators, plan.warnings
         )
 
     planned = study.plan_compare

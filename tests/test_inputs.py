@@ -143,7 +143,7 @@ def test_an_array_of_an_impossible_shape(shape: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("place", "value", "says"),
     [
-        (("config", "estimators"), ["gobg"], "config.estimators.0: Input should be 'zobg'"),
+        (("config", "estimators"), ["gobg"], "config.estimators.0: unknown estimator 'gobg'"),
         (("config", "seeds"), "ten", "config.seeds: Input should be a valid integer"),
         (("config", "kind"), "poems", "config.kind: Input should be"),
         (("config", "iterations"), 10**7, "a variable would have more than 500000000 numbers"),

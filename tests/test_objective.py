@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from estimators import Differentiation, EstimatorOptions, Evaluation, Objective, estimate, first_order, zeroth_order
+from estimators import AlphaOrder, Differentiation, Evaluation, Objective, estimate, first_order, zeroth_order
 from mjx_study.objective import MAX_CHUNK, Simulator, chunk_for
 from mjx_study.simulation import constraint, dynamics
 from mjx_study.simulation.contact import ContactModel, contact_model, family_model
@@ -199,10 +199,7 @@ class Recorded:
 def test_batches_of_an_interpolated_estimate_are_independent(simulator):
     """Noise of the zeroth-order batch against that of the first-order batch: 50 x 200 pairs, correlation 0 +- 1e-2."""
     task, recorded = pusher_task(), Recorded(simulator.objective(penalty(10.0)))
-    options = EstimatorOptions(
-        gamma=task.gamma, failure_probability=0.05, variance_proxy="variance", radius="max_deviation"
-    )
-    estimate("aobg", recorded, task.theta, jax.random.key(0), 50, options=options)
+    estimate(AlphaOrder(gamma=task.gamma), recorded, task.theta, jax.random.key(0), 50)
     ((zeroth_keys, zeroth),), ((first_keys, first),) = recorded.evaluated, recorded.differentiated
     assert not {tuple(key) for key in zeroth_keys} & {tuple(key) for key in first_keys}
     replayed = recorded.inner.evaluate(task.theta, jax.random.wrap_key_data(jnp.asarray(first_keys)))

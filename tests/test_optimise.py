@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 
 import estimators
-from estimators import ESTIMATORS, Differentiation
+from estimators import ESTIMATORS, Differentiation, FirstOrder
 from mjx_study import cli
 from mjx_study.cli import options
 from mjx_study.objective import Simulator
@@ -82,7 +82,7 @@ def test_an_iteration_is_gradient_descent_on_the_estimate(short: optimise.Optimi
     plan = plan_optimise(config(estimators=("aobg",), iterations=1))
     objective = Simulator(plan.task, chunk_size=3).objective(plan.cell.contact)
     key = jax.random.fold_in(jax.random.fold_in(jax.random.key(0), 1), 0)
-    estimate = estimators.estimate("aobg", objective, plan.task.theta, key, 5, options=plan.options)
+    estimate = estimators.estimate(plan.estimators[0], objective, plan.task.theta, key, 5)
     run = optimise.optimise(plan).runs[0]
     np.testing.assert_allclose(run.theta[1], plan.task.theta - 0.01 * estimate.mean, rtol=1e-10)
     assert run.history["gradient_norm"][0, 1] == pytest.approx(float(jnp.linalg.norm(estimate.mean)), rel=1e-9)
@@ -130,12 +130,10 @@ def test_a_seed_that_diverges_stops_and_the_others_go_on() -> None:
     state = dataclasses.replace(state, reason=jnp.array([0, 0, 3, 0]), first_cost=jnp.array([1.0, 1.0, 1.0, 1e-3]))
     value = jnp.ones((4, 5)).at[3].set(1e6)
     gradient = jnp.ones((4, 5, 2)).at[1].set(jnp.nan)
-    chosen = plan_optimise(config(reference=True)).options
     after, record = descent.advance(
         state,
         {"differentiation": jax.vmap(lambda f, g: Differentiation(f, g))(value, gradient)},
-        "fobg",
-        chosen,
+        FirstOrder(),
         optimizer,
     )
     np.testing.assert_allclose(after.theta, [[0.9, 1.9], [1, 2], [1, 2], [1, 2]])

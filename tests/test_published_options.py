@@ -1,21 +1,21 @@
 """What the published examples chose, offered beside the defaults: constants of AoBG's bound, and a pendulum's start."""
 
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
 import pytest
 
-import estimators
 from mjx_study import cli
 from mjx_study.cli import options
 from mjx_study.reference import DoublePendulum, roll_out
 from mjx_study.reference.adjoint import gradients_along
 from mjx_study.study.comparison import CompareConfig
-from mjx_study.study.configuration import EstimatorConfig, configured_options
+from mjx_study.study.configuration import EstimatorConfig, configured_estimators
 from mjx_study.study.descents import OptimiseConfig, plan_optimise
 from mjx_study.study.gradients import plan_compare
-from mjx_study.study.plan import SweepConfig, estimator_options, plan_sweep
+from mjx_study.study.plan import SweepConfig, estimators_of, plan_sweep
 from mjx_study.tasks import make_task
 
 MOMENTUM = 4 / 1.1**2  # an elastic hit of a bar ten times as heavy, in units of the published cost
@@ -40,26 +40,27 @@ def test_published_constants_on_the_scale_of_the_task_s_cost(name: str) -> None:
     """In the options that estimators get, and in the resolved configuration that is saved."""
     plan = plan_optimise(OptimiseConfig(task=name, published=True))
     gamma, radius = CONSTANTS[name]
-    for holder in (plan.options, plan.config):
+    holders: tuple[Any, Any] = plan.estimators[2], plan.config
+    for holder in holders:
         assert (holder.gamma, holder.radius) == (pytest.approx(gamma), pytest.approx(radius))
         assert (holder.failure_probability, holder.variance_proxy) == (0.95, "second_moment")
-    default = plan_optimise(OptimiseConfig(task=name)).options
+    default: Any = plan_optimise(OptimiseConfig(task=name)).estimators[2]
     assert (default.gamma, default.failure_probability) == (pytest.approx(gamma), 0.05)
     assert (default.radius, default.variance_proxy) == ("max_deviation", "variance")
 
 
 def test_every_study_takes_them() -> None:
-    compared = plan_compare(CompareConfig(task="tennis", published=True)).options
+    compared: Any = plan_compare(CompareConfig(task="tennis", published=True)).estimators
     swept = plan_sweep(SweepConfig(tasks=("tennis",), published=True))
-    assert compared == estimator_options(swept, swept.cells[0]) and compared.radius == 1000.0
+    assert compared == estimators_of(swept, swept.cells[0]) and compared[2].radius == 1000.0
 
 
 def test_published_constants_stand_alone() -> None:
     task = make_task("pusher", horizon=3)
     with pytest.raises(ValueError, match="published sets gamma, .*: leave gamma, radius out"):
-        configured_options(EstimatorConfig(task="pusher", published=True, gamma=1.0, radius=2.0), task)
+        configured_estimators(EstimatorConfig(task="pusher", published=True, gamma=1.0, radius=2.0), task)
     with pytest.raises(ValueError, match="double_pendulum has no published constants of the bound"):
-        configured_options(EstimatorConfig(task="double_pendulum", published=True), make_task("double_pendulum"))
+        configured_estimators(EstimatorConfig(task="double_pendulum", published=True), make_task("double_pendulum"))
 
 
 @pytest.mark.parametrize(
@@ -90,8 +91,9 @@ def test_what_they_do_to_the_weight_of_first_order_gradients() -> None:
         task = make_task(name)
         objective = task.analytic(task.middle_stiffness)
         for published in (False, True):
-            chosen = configured_options(EstimatorConfig(task=name, published=published), task)
-            combine = jax.jit(lambda drawn, chosen=chosen: estimators.combine("aobg", drawn, chosen).alpha)
+            config = EstimatorConfig(task=name, estimators=("aobg",), published=published)
+            (estimator,) = configured_estimators(config, task)
+            combine = jax.jit(lambda drawn, estimator=estimator: estimator(drawn).alpha)
             for seed in range(20):
                 keys = jax.random.split(jax.random.key(seed), 100)
                 batches = {

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from estimators import AlphaOrder, InverseVariance
 from mjx_study import disk
 from mjx_study.cli import console
 from mjx_study.objective import MjxObjective, Simulator
@@ -285,13 +286,15 @@ def test_the_table_fits_the_terminal(monkeypatch: pytest.MonkeyPatch, columns: i
 
 
 def test_theta_and_sigma_reach_the_plan() -> None:
-    plan = study.plan_compare(config(sigma=0.3, gamma=5.0))
-    assert (plan.task.sigma, plan.options.gamma, plan.config.cone) == (0.3, 5.0, "pyramidal")
+    plan = study.plan_compare(config(estimators=("aobg",), sigma=0.3, gamma=5.0))
+    assert plan.estimators == (AlphaOrder(gamma=5.0),)
+    assert (plan.task.sigma, plan.config.cone) == (0.3, "pyramidal")
     assert jnp.all(plan.task.theta == 0.1)
 
 
 def test_weights_reach_the_estimators_and_are_refused_with_the_samples() -> None:
-    assert study.plan_compare(config(weights="cross_fitted")).options.weights == "cross_fitted"
+    plan = study.plan_compare(config(estimators=("ivw",), weights="cross_fitted"))
+    assert plan.estimators == (InverseVariance(weights="cross_fitted"),)
     with pytest.raises(ValueError, match="at least 4 samples, two in each half; got 3"):
         study.plan_compare(config(weights="cross_fitted", samples=3))
 
@@ -311,7 +314,7 @@ def test_a_task_in_place_of_a_name() -> None:
     task = make_task("pusher", horizon=7).replace(name="mine", gamma=3.0)
     plan = study.plan_compare(study.CompareConfig(task="mine", sigma=0.3, stiffness=(10.0,)), task)
     assert plan.task.scene is task.scene and plan.config.horizon == 7
-    assert (plan.task.sigma, plan.options.gamma, plan.config.task) == (0.3, 3.0, "mine")
+    assert (plan.task.sigma, plan.estimators[2], plan.config.task) == (0.3, AlphaOrder(gamma=3.0), "mine")
     with pytest.raises(ValueError, match="cone, horizon: only for a task that is built by its name"):
         study.plan_compare(study.CompareConfig(task="mine", cone="elliptic", horizon=3), task)
     wrong = task.replace(final_cost=lambda state: state.qpos)

@@ -20,6 +20,7 @@ import pytest
 import xarray as xr
 
 import estimators
+from estimators import AlphaOrder, DiscontinuityGated
 from mjx_study import cli
 from mjx_study.cli import options
 from mjx_study.cli.sweep import _fields, _solimp, _solref
@@ -30,7 +31,7 @@ from mjx_study.simulation.contact import stiffness_from_solref
 from mjx_study.study import cells as sweep_cells
 from mjx_study.study import store
 from mjx_study.study.cells import MEASURED, compute_gradients
-from mjx_study.study.plan import estimator_options
+from mjx_study.study.plan import estimators_of
 from mjx_study.study.store import Store, StudyError
 from mjx_study.study.sweep import SweepConfig, load_study, open_store, plan_sweep, run_sweep, what_to_beware_of
 from mjx_study.tasks import make_task
@@ -398,10 +399,9 @@ def test_landscapes_are_labelled_and_right(landscapes: Path) -> None:
     along = np.asarray(low.per_sample)[:, 3]
     assert float(slopes[0]) == pytest.approx(np.mean(along), rel=1e-8)
     assert float(slopes[1]) == pytest.approx(np.std(along, ddof=1) / 8**0.5, rel=1e-8)
-    options = estimator_options(plan, plan.cells[0])
-    mixed = estimators.combine(
-        "aobg", {"evaluation": objective.evaluate(theta, jax.random.clone(keys[0])),
-                 "differentiation": objective.differentiate(theta, jax.random.clone(keys[1]))}, options
+    mixed = estimators_of(plan, plan.cells[0])[plan.config.estimators.index("aobg")](
+        {"evaluation": objective.evaluate(theta, jax.random.clone(keys[0])),
+         "differentiation": objective.differentiate(theta, jax.random.clone(keys[1]))}
     )  # fmt: skip
     assert float(found["slope"].sel(estimator="aobg")) == pytest.approx(float(mixed.mean[3]), rel=1e-8)
     assert abs(float(mixed.mean[3]) - float(high.mean[3])) < abs(np.mean(along) - float(high.mean[3]))
@@ -624,15 +624,19 @@ def test_the_example_of_the_page_runs(undisturbed: Path, tmp_path: Path, monkeyp
 def test_the_configuration_is_that_of_the_flags() -> None:
     """Every option of an estimator reaches its cells."""
     plan = plan_sweep(
-        config(baseline="leave_one_out", gamma=3.0, tolerance=0.1, failure_probability=0.2, weights="cross_fitted")
+        config(
+            estimators=("aobg", "ddcg"),
+            baseline="leave_one_out",
+            gamma=3.0,
+            tolerance=0.1,
+            failure_probability=0.2,
+            weights="cross_fitted",
+        )
     )
-    chosen = estimator_options(plan, plan.cells[0])
-    assert (chosen.baseline, chosen.gamma, chosen.tolerance, chosen.failure_probability, chosen.weights) == (
-        "leave_one_out",
-        3.0,
-        0.1,
-        0.2,
-        "cross_fitted",
+    shared: Any = {"baseline": "leave_one_out", "weights": "cross_fitted"}
+    assert estimators_of(plan, plan.cells[0]) == (
+        AlphaOrder(gamma=3.0, failure_probability=0.2, **shared),
+        DiscontinuityGated(sigma=plan.cells[0].sigma, tolerance=0.1, **shared),
     )
     with pytest.raises(ValueError, match="at least 4 samples, two in each half; got 3"):
         config(samples=(3, 10), weights="cross_fitted")

@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from estimators import ENOUGH_EFFECTIVE
-from mjx_study.plots.comparison import STYLE
+from mjx_study.plots.comparison import style_of
 from mjx_study.simulation.contact import FAMILIES
 from mjx_study.study.comparison import CompareResult, Row
 from mjx_study.study.findings import findings
@@ -65,7 +65,7 @@ def columns(confidence: float) -> list[list[Column]]:
     return [
         [
             ("K [N/m]", lambda row: number(row.stiffness or None)),
-            ("estimator", lambda row: STYLE[row.estimator][0]),
+            ("estimator", lambda row: style_of(row.estimator)[0]),
         ],
         [
             ("|gradient|", lambda row: number(row.gradient_norm)),
@@ -146,7 +146,7 @@ def alarms(result: CompareResult) -> list[str]:
     messages = []
     for row in result.rows:
         stiffness = f"K = {number(row.stiffness)} N/m, " if row.stiffness else ""
-        where = f"{row.contact}, {stiffness}{STYLE[row.estimator][0]}"
+        where = f"{row.contact}, {stiffness}{style_of(row.estimator)[0]}"
         if row.nonfinite:
             messages.append(f"{where}: {row.nonfinite} of {row.samples} samples are not finite and were left out")
         if row.unconverged:

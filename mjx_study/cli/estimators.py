@@ -32,7 +32,7 @@ def run(options: argparse.Namespace) -> int:
             "name": item.name,
             "description": item.description,
             "needs": list(item.needs),
-            "requires": [f"--{name.replace('_', '-')}" for name in item.requires if name != "sigma"],
+            "requires": [f"--{name.replace('_', '-')}" for name in item.required() if name != "sigma"],
         }
         for item in ESTIMATORS.values()
     ]

@@ -26,7 +26,7 @@ from mjx_study.cli.options import (
 )
 from mjx_study.cli.parameters import add_theta_option, theta_of
 from mjx_study.disk import prepare_folder, write_whole
-from mjx_study.plots.comparison import STYLE, plot_optimisation, save_figure
+from mjx_study.plots.comparison import plot_optimisation, save_figure, style_of
 from mjx_study.study.descents import OptimiseConfig, OptimiseResult, Run, open_checkpoints, optimise, plan_optimise
 from mjx_study.study.results import as_plain
 from mjx_study.table import format_table
@@ -141,9 +141,8 @@ def _save(result: OptimiseResult, document: dict[str, Any], folder: Path) -> lis
             "theta": run.theta[run.best].tolist(),
         }
         content = (json.dumps(as_plain(policy)) + "\n").encode()
-        written.append(
-            write_whole(folder / f"policy-{run.estimator}.json", lambda file, data=content: file.write(data))
-        )
+        name = f"policy-{run.estimator.replace(':', '.')}.json"
+        written.append(write_whole(folder / name, lambda file, data=content: file.write(data)))
     return [*written, *save_figure(plot_optimisation(result), folder, "optimisation")]
 
 
@@ -168,7 +167,7 @@ def _lines(result: OptimiseResult, written: list[Path], *, hinted: bool) -> list
     ]
     for run in result.runs:
         for seed, (iteration, reason) in run.stopped.items():
-            lines.append(f"{STYLE[run.estimator][0]}, seed {seed}: stopped at iteration {iteration}, {reason}")
+            lines.append(f"{style_of(run.estimator)[0]}, seed {seed}: stopped at iteration {iteration}, {reason}")
     lines += [f"warning: {message}" for message in result.warnings]
     hint = "add --output DIR for a figure, the policies, and to go on later"
     if not written:
@@ -181,7 +180,7 @@ def _row(run: Run) -> list[str]:
     tail = run.history["alpha"][-max(1, len(run.seconds) // 10) :]
     alpha = float(np.nanmean(tail)) if np.any(np.isfinite(tail)) else math.nan
     return [
-        STYLE[run.estimator][0],
+        style_of(run.estimator)[0],
         _mean_and_spread(costs, 4),
         number(float(np.min(costs)), 4) if len(costs) else "nan",
         *(_mean_and_spread(values, 3) for values in run.outcomes.values()),

@@ -153,7 +153,7 @@ def scene_options(options: argparse.Namespace, *names: str) -> dict[str, Any]:
 
 
 def add_estimator_options(command: argparse.ArgumentParser, owner: type[Checked]) -> None:
-    """The noise, and what estimators let one choose; see `estimators.EstimatorOptions`."""
+    """The noise, and what estimators let one choose; see `estimators.ESTIMATORS`."""
     add_options(
         command, owner, "noise", "baseline", "published", "gamma", "failure_probability", "variance_proxy", "radius",
         "max_norm", "window", "tolerance", "weights", "onset",

@@ -1,5 +1,6 @@
 """Figures from results; nothing here simulates."""
 
+import zlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -18,20 +19,22 @@ from mjx_study.study.landscapes import Curve, Landscape
 
 # Okabe and Ito's colours, told apart in print and by colour-blind eyes; markers repeat the distinction.
 STYLE: Final = {
-    "zobg": ("ZoBG", "#0072B2", "o"),
-    "zobg_antithetic": ("ZoBG, antithetic", "#56B4E9", "v"),
-    "zobg_to_go": ("ZoBG, costs to go", "#56B4E9", "P"),
-    "zobg_to_go_antithetic": ("ZoBG, to go, antithetic", "#0072B2", "X"),
-    "fobg": ("FoBG", "#D55E00", "s"),
-    "fobg_clipped": ("FoBG, clipped", "#E69F00", "<"),
-    "fobg_truncated": ("FoBG, truncated", "#E69F00", ">"),
-    "aobg": ("AoBG", "#009E73", "D"),
-    "ivw": ("IVW", "#CC79A7", "^"),
-    "ivw_h": ("IVW-H", "#CC79A7", "p"),
-    "total_propagation": ("total propagation", "#000000", "*"),
-    "ddcg": ("DDCG", "#009E73", "h"),
-    "delta": ("delta", "#777777", "d"),
+    "zobg": ("#0072B2", "o"),
+    "zobg_antithetic": ("#56B4E9", "v"),
+    "zobg_to_go": ("#56B4E9", "P"),
+    "zobg_to_go_antithetic": ("#0072B2", "X"),
+    "fobg": ("#D55E00", "s"),
+    "fobg_clipped": ("#E69F00", "<"),
+    "fobg_truncated": ("#E69F00", ">"),
+    "aobg": ("#009E73", "D"),
+    "ivw": ("#CC79A7", "^"),
+    "ivw_h": ("#CC79A7", "p"),
+    "total_propagation": ("#000000", "*"),
+    "ddcg": ("#009E73", "h"),
+    "delta": ("#777777", "d"),
 }
+OTHERS: Final = (("#E69F00", "#56B4E9", "#009E73", "#F0E442", "#0072B2", "#D55E00", "#CC79A7"), "1234+x|_")
+"""Colours and markers of estimators of one's own."""
 NO_CONTACT: Final = 1.0
 """Place on a stiffness axis of a task without contact."""
 TITLES: Final = {
@@ -43,7 +46,15 @@ TITLES: Final = {
     "mujoco_default": "MuJoCo default",
     "mjcf": "as in the MJCF",
 }
-assert set(STYLE) >= set(ESTIMATORS) and set(TITLES) >= set(FAMILIES)
+assert set(TITLES) >= set(FAMILIES)
+
+
+def style_of(name: str) -> tuple[str, str, str]:
+    """Label, colour and marker of an estimator; those of one's own depend on the name alone."""
+    label = (ESTIMATORS[name].label if name in ESTIMATORS else "") or name.rpartition(":")[2]
+    colours, markers = OTHERS
+    drawn = zlib.crc32(name.encode())
+    return label, *STYLE.get(name, (colours[drawn % len(colours)], markers[drawn // 7 % len(markers)]))
 
 
 def plot_comparison(result: CompareResult) -> Figure:
@@ -89,12 +100,12 @@ def plot_landscape(result: Landscape) -> Figure:
             ("zobg", curve.zeroth, curve.zeroth_se),
             ("fobg", curve.first, curve.first_se),
         ):
-            label, colour, _ = STYLE[name]
+            label, colour, _ = style_of(name)
             mean_with_band(below, t, mean, error, colour, f"mean of {label}")
         if curve.exact is not None:
             style = {"color": "black", "linestyle": ":", "linewidth": 1.2}
             below.plot(t, curve.exact.slope, **style, label="slope of the mean cost, quadrature")
-            below.plot(t, curve.exact.first, **style | {"color": STYLE["fobg"][1]}, label="mean of FoBG, quadrature")
+            below.plot(t, curve.exact.first, **style | {"color": STYLE["fobg"][0]}, label="mean of FoBG, quadrature")
         above.set_title(_curve_title(curve), fontsize="medium")
         below.axhline(0, color="0.7", linewidth=0.8)
         below.set_xlabel("theta" if len(result.direction) == 1 else f"t along direction {result.config.direction}")
@@ -155,7 +166,7 @@ def plot_optimisation(result: OptimiseResult) -> Figure:
 
 def _seeds(axes: Axes, x: np.ndarray, values: np.ndarray, run: Run) -> None:
     """Median over the seeds that go on, and their range."""
-    label, colour, _ = STYLE[run.estimator]
+    label, colour, _ = style_of(run.estimator)
     going = np.any(np.isfinite(values), axis=1)
     x, values = x[going], values[going]
     if len(x):
@@ -195,7 +206,7 @@ def save_figure(figure: Figure, folder: Path, name: str) -> list[Path]:
 
 def _variance_panel(axes: Axes, rows: Sequence[Row], estimators: Sequence[str]) -> None:
     for name in estimators:
-        label, colour, marker = STYLE[name]
+        label, colour, marker = style_of(name)
         mine = [row for row in rows if row.estimator == name]
         x, y, lower, upper = _columns(mine, "stiffness", "variance", "variance_lower", "variance_upper")
         line_with_band(axes, x, y, lower, upper, label=label, color=colour, marker=marker)
@@ -206,7 +217,7 @@ def _variance_panel(axes: Axes, rows: Sequence[Row], estimators: Sequence[str]) 
 
 def _error_panel(axes: Axes, rows: Sequence[Row], estimators: Sequence[str]) -> None:
     for name in estimators:
-        _, colour, marker = STYLE[name]
+        _, colour, marker = style_of(name)
         mine = [row for row in rows if row.estimator == name]
         x, y, error = _columns(mine, "stiffness", "relative_error", "relative_error_se")
         line_with_band(axes, x, y, np.maximum(y - 1.96 * error, y / 10), y + 1.96 * error, color=colour, marker=marker)

@@ -13,7 +13,7 @@ from matplotlib.colors import TwoSlopeNorm
 from matplotlib.figure import Figure
 from scipy import stats
 
-from mjx_study.plots.comparison import NO_CONTACT, STYLE, TITLES, line_with_band, mean_with_band, robust_limits
+from mjx_study.plots.comparison import NO_CONTACT, TITLES, line_with_band, mean_with_band, robust_limits, style_of
 from mjx_study.table import digits_to_tell_apart
 
 SWEPT: Final = {
@@ -168,7 +168,7 @@ def _against_stiffness(
 
 def _estimators(rows: xr.Dataset) -> Iterator[tuple[xr.Dataset, dict[str, Any]]]:
     for name in rows["estimator"].values.tolist():
-        label, colour, marker = STYLE.get(name, (name, "#444444", "."))
+        label, colour, marker = style_of(name)
         yield rows.sel(estimator=name), {"label": label, "color": colour, "marker": marker}
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float, Key
 
 import estimators
-from estimators import ESTIMATORS, ORACLES, GradientEstimate
+from estimators import ORACLES, Estimator, GradientEstimate
 from mjx_study.objective import Simulator
 from mjx_study.study.descents import Backend, optimise
 from mjx_study.study.gradients import UNCONVERGED, estimate_numbers, reference_of, residuals_of, soft_gradient
@@ -22,7 +22,7 @@ from mjx_study.study.plan import (
     SweepCell,
     SweepPlan,
     descent_plan,
-    estimator_options,
+    estimators_of,
     oracles_of,
     seeds_together,
 )
@@ -113,7 +113,7 @@ def compute_gradients(plan: SweepPlan) -> Callable[[SweepCell], dict[str, np.nda
         softened = cell.group, cell.sigma
         if softened not in soft:
             soft[softened] = soft_gradient(compiled[cell.group], cell.sigma, candidate)
-        tests, options = jax.random.split(keys["test"], config.batches), estimator_options(plan, cell)
+        tests, chosen = jax.random.split(keys["test"], config.batches), estimators_of(plan, cell)
         together = seeds_together(plan, cell)
         reference, parts, spent, residuals = None, [], [], []
         for start in range(0, config.batches, together):
@@ -122,7 +122,7 @@ def compute_gradients(plan: SweepPlan) -> Callable[[SweepCell], dict[str, np.nda
             if reference is None:
                 pilot = jax.tree.map(lambda leaf: leaf[0], drawn["evaluation"])
                 reference = reference_of(objective, odd, candidate, pilot, soft[softened])
-            parts.append(jax.device_get(_seed_numbers(drawn, reference, tests[some], config.estimators, options)))
+            parts.append(jax.device_get(_seed_numbers(drawn, reference, tests[some], chosen)))
             spent.append(seconds)
             residuals.append(residual)
         assert reference is not None
@@ -132,7 +132,7 @@ def compute_gradients(plan: SweepPlan) -> Callable[[SweepCell], dict[str, np.nda
         arrays = _of_seeds(numbers, config.batches) | _bias(numbers, reference)
         arrays["residual"] = np.asarray(np.max(np.where(np.isfinite(residuals), residuals, np.inf)))
         arrays["unconverged"] = np.asarray(np.sum(~(residuals <= UNCONVERGED[str(residuals.dtype)])))
-        per_sample = [sum(seconds[oracle] for oracle in ESTIMATORS[name].needs) for name in config.estimators]
+        per_sample = [sum(seconds[oracle] for oracle in each.needs) for each in chosen]
         arrays["seconds_per_sample"] = np.array(per_sample) / (cell.samples * config.batches)
         return {name: np.asarray(array, float) for name, array in arrays.items()}
 
@@ -190,12 +190,10 @@ def _draw(objective: Any, theta: Array, keys: dict[str, Any], oracles: Sequence[
     return drawn, seconds, np.concatenate(residuals)
 
 
-@partial(jax.jit, static_argnames=("names", "options"))
-def _seed_numbers(drawn: dict[str, Any], reference: Any, keys: Key[Array, " seeds"], names: Any, options: Any):
+@partial(jax.jit, static_argnames="chosen")
+def _seed_numbers(drawn: dict[str, Any], reference: Any, keys: Key[Array, " seeds"], chosen: tuple[Estimator, ...]):
     """The numbers of every estimator, with an axis of seeds."""
-    return jax.vmap(lambda batches, key: estimate_numbers(batches, reference, key, names, options, CONFIDENCE))(
-        drawn, keys
-    )
+    return jax.vmap(lambda batches, key: estimate_numbers(batches, reference, key, chosen, CONFIDENCE))(drawn, keys)
 
 
 def compute_descents(plan: SweepPlan) -> Callable[[SweepCell], dict[str, np.ndarray]]:
@@ -243,16 +241,14 @@ def compute_landscapes(plan: SweepPlan) -> Compute:
         if cell.group not in compiled:
             compiled[cell.group] = Simulator(task, chunk_size=config.chunk_size)  # type: ignore[arg-type]
         objective = dataclasses.replace(compiled[cell.group].objective(cell.model.contact), sigma=cell.sigma)
-        line, options = (
-            line_of(task, config.points or 0, config.span, config.direction, config.seed),
-            estimator_options(plan, cell),
-        )
+        line = line_of(task, config.points or 0, config.span, config.direction, config.seed)
+        chosen = estimators_of(plan, cell)
         keys, columns, unconverged = _cell_keys(config.seed, config.batches), [], 0
         for theta in line.thetas:
             drawn, _, residuals = _draw(objective, theta, keys, oracles, cell.samples, slice(None))
             unconverged += np.sum(~(residuals <= UNCONVERGED[str(residuals.dtype)]))
             pooled = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), drawn)
-            columns.append(jax.device_get(_slopes(pooled, line.direction, config.estimators, options)))
+            columns.append(jax.device_get(_slopes(pooled, line.direction, chosen)))
         arrays = {name: np.stack([column[name] for column in columns], axis=-1) for name in columns[0]}
         arrays |= {"position": line.position, "unconverged": np.asarray(unconverged)}
         return {name: np.asarray(array, float) for name, array in arrays.items()}
@@ -260,14 +256,14 @@ def compute_landscapes(plan: SweepPlan) -> Compute:
     return compute
 
 
-@partial(jax.jit, static_argnames=("names", "options"))
-def _slopes(batches: dict[str, Any], direction: Array, names: tuple[str, ...], options: Any):
+@partial(jax.jit, static_argnames="chosen")
+def _slopes(batches: dict[str, Any], direction: Array, chosen: tuple[Estimator, ...]):
     """Costs at a point, and every estimator's slope along the line; what is not finite is left out."""
     evaluation = batches["evaluation"]
     smoothed, smoothed_se = _mean(evaluation.value)
     along = {"slope": [], "slope_se": [], "nonfinite": []}
-    for name in names:
-        estimate = estimators.combine(name, batches, options)
+    for estimator in chosen:
+        estimate = estimator(batches)
         mean, error = _mean(estimate.per_sample @ direction)
         for key, value in zip(along, (mean, error, estimate.num_nonfinite), strict=True):
             along[key].append(value)

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_study.disk import read_whole, write_whole
-from mjx_study.study.identity import ACCEPT, differences, versions
+from mjx_study.study.identity import ACCEPT, differences, estimator_contents, versions
 from mjx_study.study.iteration import Descent, Record
 
 Versions = dict[str, str]
@@ -43,7 +43,7 @@ class Checkpoint:
 
 def checkpoint_path(folder: Path, name: str) -> Path:
     """Where a run of an estimator is kept."""
-    return folder / f"run-{name}.npz"
+    return folder / f"run-{name.replace(':', '.')}.npz"
 
 
 def save_checkpoint(
@@ -134,7 +134,7 @@ class Checkpoints:
         accept_versions: bool = False,
     ):
         self._paths = {name: checkpoint_path(folder, name) for name in estimators}
-        self._identities = {name: identity | {"estimator": name} for name in estimators}
+        self._identities = {name: identity | {"estimator": name} | estimator_contents(name) for name in estimators}
         self._versions = versions()
         self.kept = {
             name: load_checkpoint(

@@ -9,7 +9,7 @@ undisturbed one does; all estimators share these keys.
 import dataclasses
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Final
@@ -20,7 +20,7 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float, Key
 
-from estimators import ESTIMATORS, ORACLES, EstimatorOptions, Objective, draw
+from estimators import ORACLES, Estimator, Objective, draw
 from mjx_study.objective import Simulator, TracedObjective, simulate
 from mjx_study.runtime import environment
 from mjx_study.simulation.contact import ContactModel
@@ -29,7 +29,7 @@ from mjx_study.study.configuration import (
     EstimatorConfig,
     Progress,
     at_theta,
-    configured_options,
+    configured_estimators,
     configured_task,
     resolved_fields,
 )
@@ -89,7 +89,7 @@ class OptimisePlan:
     config: OptimiseConfig
     task: Task
     cell: ContactPoint
-    options: EstimatorOptions
+    estimators: tuple[Estimator, ...]
     warnings: tuple[str, ...]
 
     @property
@@ -130,9 +130,9 @@ def plan_optimise(config: OptimiseConfig, task: Task | None = None, cell: Contac
     else:
         numbers = {name: getattr(task.recipe, name) if value is None else value for name, value in numbers.items()}
     make_optimizer(config.optimizer, numbers["learning_rate"], numbers["decay"])
-    options = configured_options(config, task)
+    chosen = configured_estimators(config, task)
     history = 20 * config.seeds * numbers["iterations"]
-    check_memory(task, config.estimators, config.seeds * numbers["samples"], other=history)
+    check_memory(task, chosen, config.seeds * numbers["samples"], other=history)
     check_memory(task, (), config.evaluation_samples)
     messages: tuple[str, ...] = ()
     if cell is None:
@@ -145,7 +145,7 @@ def plan_optimise(config: OptimiseConfig, task: Task | None = None, cell: Contac
         **resolved_fields(config, task, numbers["samples"]),
         **numbers,
     )
-    return OptimisePlan(resolved, task, cell, options, () if config.reference else messages)
+    return OptimisePlan(resolved, task, cell, chosen, () if config.reference else messages)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -237,9 +237,9 @@ def optimise(
     checkpoints = None if folder is None else open_checkpoints(folder, plan, accept_versions=accept_versions)
     iterations, runs = config.iterations, []
     total = len(config.estimators) * iterations
-    for index, name in enumerate(config.estimators):
+    for index, (name, estimator) in enumerate(zip(config.estimators, plan.estimators, strict=True)):
         report = lambda done, index=index, name=name: progress(index * iterations + done, total, name)  # noqa: E731
-        runs.append(_run(plan, backend, name, checkpoints, report))
+        runs.append(_run(plan, backend, name, estimator, checkpoints, report))
     start, came_to = backend.cost(plan.task.theta, plan.cell), backend.outcomes(plan.task.theta, plan.cell)
     progress(total, total, "done")
     mixed, unsaved = ((), ()) if checkpoints is None else (checkpoints.mixed, tuple(checkpoints.unsaved.values()))
@@ -258,9 +258,9 @@ class Backend:
     """Where rollouts come from: MJX in compiled programs that serve every contact model, or a reference on the host."""
 
     def __init__(self, plan: OptimisePlan):
-        self.config, self.task, self.options = plan.config, plan.task, plan.options
+        self.config, self.task = plan.config, plan.task
         self.simulator = None if plan.config.reference else Simulator(plan.task, chunk_size=plan.config.chunk_size)  # type: ignore[arg-type]
-        self._iterations: dict[str, Callable[..., tuple[Descent, Record]]] = {}
+        self._iterations: dict[Estimator, Callable[..., tuple[Descent, Record]]] = {}
 
     def place(self, state: Descent) -> Descent:
         """The state where an iteration leaves it, on all devices, so that the first one compiles for all."""
@@ -270,27 +270,27 @@ class Backend:
         return jax.device_put(state, NamedSharding(mesh, PartitionSpec()))
 
     def iteration(
-        self, name: str, cell: ContactPoint
+        self, estimator: Estimator, cell: ContactPoint
     ) -> Callable[[Descent, Key[Array, " seeds"]], tuple[Descent, Record]]:
         """An iteration of all seeds under one contact model; compiled once for all of them."""
-        config, needs = self.config, ESTIMATORS[name].needs
+        config = self.config
         optimizer = make_optimizer(config.optimizer, config.learning_rate, config.decay)  # type: ignore[arg-type]
 
         def update(state: Descent, drawn: dict[str, Any]) -> tuple[Descent, Record]:
-            return advance(state, drawn, name, self.options, optimizer)
+            return advance(state, drawn, estimator, optimizer)
 
         def batches(objective: Objective, theta: Float[Array, " params"], key: Key[Array, ""]) -> dict[str, Any]:
-            return draw(needs, objective, theta, key, config.samples)  # type: ignore[arg-type]
+            return draw(estimator.needs, objective, theta, key, config.samples)  # type: ignore[arg-type]
 
         if self.simulator is not None:
-            if name not in self._iterations:
-                self._iterations[name] = jax.jit(
+            if estimator not in self._iterations:
+                self._iterations[estimator] = jax.jit(
                     lambda contact, state, keys: update(
                         state, jax.vmap(partial(batches, self._traced(contact)))(state.theta, keys)
                     )
                 )
-            return partial(self._iterations[name], cell.contact)
-        compiled = self._iterations.setdefault(name, jax.jit(update))
+            return partial(self._iterations[estimator], cell.contact)
+        compiled = self._iterations.setdefault(estimator, jax.jit(update))
         reference = self.task.analytic(cell.stiffness)
 
         def on_host(state: Descent, keys: Key[Array, " seeds"]) -> tuple[Descent, Record]:
@@ -345,6 +345,7 @@ def _run(
     plan: OptimisePlan,
     backend: Backend,
     name: str,
+    estimator: Estimator,
     checkpoints: Checkpoints | None,
     report: Callable[[int], None],
 ) -> Run:
@@ -358,7 +359,7 @@ def _run(
     state = backend.place(state)
     keys = jax.vmap(lambda seed: jax.random.fold_in(jax.random.key(config.seed), seed))(jnp.arange(config.seeds))
     keys_of = jax.jit(lambda index: jax.vmap(lambda key: jax.random.fold_in(key, index))(jax.random.clone(keys)))
-    iterate = backend.iteration(name, plan.cell)
+    iterate = backend.iteration(estimator, plan.cell)
     done = already = len(records)
     elapsed = seconds[-1] if seconds else 0.0
     if done < iterations and bool(jnp.any(going(state))):
@@ -406,14 +407,14 @@ def _run(
         final_cost=np.array([mean for mean, _ in costs]),
         final_cost_se=np.array([error for _, error in costs]),
         outcomes={what: np.array([each[what] for each in came_to]) for what in came_to[0]},
-        rollouts=_rollouts(name, config.samples, task.random_start),  # type: ignore[arg-type]
+        rollouts=_rollouts(estimator.needs, config.samples, task.random_start),  # type: ignore[arg-type]
     )
 
 
-def _rollouts(name: str, samples: int, random_start: bool) -> int:
+def _rollouts(needs: Sequence[str], samples: int, random_start: bool) -> int:
     """Rollouts in one iteration of one seed: a pair is two, and each batch of order 0 has its baselines."""
     count = 0
-    for oracle in ESTIMATORS[name].needs:
+    for oracle in needs:
         baselines = samples if random_start else 1
         count += samples * (2 if "pair" in oracle else 1)
         count += baselines if ORACLES[oracle].order == 0 or oracle == "linearisation" else 0

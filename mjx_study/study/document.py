@@ -4,9 +4,8 @@ import json
 import math
 from typing import Annotated, Any, Final, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from estimators import ESTIMATORS
 from mjx_study.files import Finite, told
 from mjx_study.option import OPTIONS
 
@@ -23,7 +22,7 @@ class _Part(BaseModel):
 class _Config(_Part):
     kind: Literal["gradients", "descents", "landscapes"]
     tasks: list[Name] = Field(min_length=1)
-    estimators: list[Literal[tuple(ESTIMATORS)]] = Field(min_length=1)  # type: ignore[valid-type]
+    estimators: list[Annotated[Name, AfterValidator(OPTIONS["estimators"].check)]] = Field(min_length=1)
     seeds: int = Field(ge=1, le=int(OPTIONS["seeds"].interval.high))  # type: ignore[union-attr]
     iterations: Count | None
     points: Count | None = None

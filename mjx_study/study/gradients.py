@@ -19,12 +19,12 @@ import numpy as np
 from jaxtyping import Array, Float, Key
 
 import estimators
-from estimators import ESTIMATORS, ORACLES, EstimatorOptions, Evaluation, GradientEstimate, Linearisation
+from estimators import ORACLES, Estimator, Evaluation, GradientEstimate, Linearisation
 from mjx_study.objective import MjxObjective, Simulator
 from mjx_study.runtime import environment
 from mjx_study.simulation.contact import FAMILIES
 from mjx_study.study.comparison import BIAS_DRAWS, CompareConfig, CompareResult, Row
-from mjx_study.study.configuration import Progress, at_theta, configured_options, configured_task, resolved_fields
+from mjx_study.study.configuration import Progress, at_theta, configured_estimators, configured_task, resolved_fields
 from mjx_study.study.memory import check_memory
 from mjx_study.study.reference_gradient import reference_gradient
 from mjx_study.tasks.contact_grid import ContactPoint, contact_grid
@@ -41,7 +41,7 @@ class ComparePlan:
     config: CompareConfig
     task: Task
     cells: tuple[ContactPoint, ...]
-    options: EstimatorOptions
+    estimators: tuple[Estimator, ...]
     warnings: tuple[str, ...]
 
 
@@ -56,9 +56,9 @@ def plan_compare(config: CompareConfig, task: Task | None = None) -> ComparePlan
         ValueError: anything about the configuration that cannot be run; the message says what is accepted.
     """
     task = at_theta(configured_task(config, task), config.theta)
-    options = configured_options(config, task)
+    chosen = configured_estimators(config, task)
     kept = config.reference_samples * 3 * task.policy.num_params
-    check_memory(task, config.estimators, config.samples, other=kept)
+    check_memory(task, chosen, config.samples, other=kept)
     cells, messages = contact_grid(task, config.contact, config.stiffness, config.damping)
     families = tuple(dict.fromkeys(cell.family for cell in cells))
     resolved = dataclasses.replace(
@@ -68,7 +68,7 @@ def plan_compare(config: CompareConfig, task: Task | None = None) -> ComparePlan
         model=None if config.model is None else str(Path(config.model)),
         **resolved_fields(config, task, config.samples),
     )
-    return ComparePlan(resolved, task, cells, options, messages)
+    return ComparePlan(resolved, task, cells, chosen, messages)
 
 
 def compare(plan: ComparePlan, progress: Progress = lambda done, total, what: None) -> CompareResult:
@@ -76,8 +76,7 @@ def compare(plan: ComparePlan, progress: Progress = lambda done, total, what: No
     config, task = plan.config, plan.task
     assert config.chunk_size is not None, "a plan's configuration is resolved"
     simulator = Simulator(task, chunk_size=config.chunk_size)
-    needed = {"evaluation", *(oracle for name in config.estimators for oracle in ESTIMATORS[name].needs)}
-    oracles = tuple(name for name in ORACLES if name in needed)
+    oracles = estimators.oracles_of(plan.estimators, "evaluation")
     keys = _Keys(config)
 
     total = len(plan.cells) + 1
@@ -97,10 +96,11 @@ def compare(plan: ComparePlan, progress: Progress = lambda done, total, what: No
             drawn = jax.random.clone((keys.zeroth, keys.first)[ORACLES[name].order])  # shared on purpose
             batches[name], seconds[name] = _timed(method, task.theta, drawn)
         reference = reference_of(objective, keys.odd, keys.candidate, batches["evaluation"], soft)
-        summary = _summarise(batches, reference, keys.test, config.estimators, plan.options, config.confidence)
-        for name, numbers, gradient in summary:
-            rows.append(_row(cell, name, config.samples, numbers, seconds, batches))
-            gradients.append(gradient)
+        test = jax.random.clone(keys.test)
+        summary = jax.device_get(estimate_numbers(batches, reference, test, plan.estimators, config.confidence))
+        for name, estimator, numbers in zip(config.estimators, plan.estimators, summary, strict=True):
+            gradients.append(numbers.pop("gradient"))
+            rows.append(_row(cell, name, estimator.needs, config.samples, numbers, seconds, batches))
             references.append(np.asarray(reference.mean))
     progress(total, total, "done")
     return CompareResult(config, environment(), tuple(rows), plan.warnings, np.stack(gradients), np.stack(references))
@@ -187,25 +187,13 @@ def _reference_gradient(
     return reference_gradient(odd, pilot, list(candidates), sigma)
 
 
-def _summarise(
-    batches: dict[str, Any],
-    reference: GradientEstimate,
-    key: Key[Array, ""],
-    names: tuple[str, ...],
-    options: EstimatorOptions,
-    confidence: float,
-) -> list[tuple[str, dict[str, Any], np.ndarray]]:
-    numbers = jax.device_get(estimate_numbers(batches, reference, jax.random.clone(key), names, options, confidence))
-    return [(name, values, values.pop("gradient")) for name, values in zip(names, numbers, strict=True)]
-
-
-@partial(jax.jit, static_argnames=("names", "options", "confidence"))
-def estimate_numbers(batches, reference, key, names, options, confidence):
+@partial(jax.jit, static_argnames=("chosen", "confidence"))
+def estimate_numbers(batches, reference, key, chosen, confidence):
     """The numbers of each estimator's row that are functions of the batches and the reference gradient alone."""
     result = []
     reference_effective = estimators.effective_samples(reference).count
-    for name in names:
-        estimate = estimators.combine(name, batches, options)
+    for estimator in chosen:
+        estimate = estimator(batches)
         lower, upper = estimators.variance_interval(estimate, confidence)
         median, high, most = estimators.norm_quantiles(estimate, (0.5, 0.9, 1.0))
         effective = estimators.effective_samples(estimate)
@@ -248,12 +236,12 @@ def estimate_numbers(batches, reference, key, names, options, confidence):
 def _row(
     cell: ContactPoint,
     name: str,
+    needs: Sequence[str],
     samples: int,
     numbers: dict[str, Any],
     batch_seconds: dict[str, float],
     batches: dict[str, Any],
 ) -> Row:
-    needs = ESTIMATORS[name].needs
     seconds = sum(batch_seconds[oracle] for oracle in needs)
     residuals = np.concatenate([residuals_of(batches[oracle]) for oracle in needs])
     threshold = UNCONVERGED[str(residuals.dtype)]

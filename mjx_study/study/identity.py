@@ -24,6 +24,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from estimators import find_estimator
 from mjx_study.runtime import precision
 from mjx_study.simulation.scene import Scene
 from mjx_study.tasks.task import Task
@@ -65,6 +66,18 @@ def contents(tasks: Mapping[str, Iterable[Task]]) -> dict[str, str]:
         found |= {f"model of {name}": models.hexdigest(), f"task {name}": rest.hexdigest()}
         sources |= rest.sources
     return found | {f"source of {name}": digest for name, digest in sorted(sources.items())}
+
+
+def estimator_contents(*names: str) -> dict[str, str]:
+    """Digests of those of some estimators that are from outside of this package, and of their source files."""
+    found: dict[str, str] = {}
+    for name in names:
+        digest = _Digest()
+        digest.add(find_estimator(name))
+        if digest.sources:
+            sources = {f"source of {file}": content for file, content in sorted(digest.sources.items())}
+            found |= {f"estimator {name}": digest.hexdigest()} | sources
+    return found
 
 
 def differences(theirs: Mapping[str, Any], ours: Mapping[str, Any]) -> str | None:

@@ -9,8 +9,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Int
 
-import estimators
-from estimators import ESTIMATORS, EstimatorOptions, Linearisation, StepEvaluation
+from estimators import Estimator, Linearisation, StepEvaluation
 from estimators.pytree import register_pytree
 
 DIVERGED: Final = 1e6
@@ -106,8 +105,7 @@ def begin(optimizer: optax.GradientTransformation, theta: Float[Array, " params"
 def advance(
     state: Descent,
     batches: dict[str, Any],
-    estimator: str,
-    options: EstimatorOptions,
+    estimator: Estimator,
     optimizer: optax.GradientTransformation,
 ) -> tuple[Descent, Record]:
     """One iteration of every seed that goes on.
@@ -115,19 +113,18 @@ def advance(
     Args:
         state: before it.
         batches: of the estimator's oracles, with an axis of seeds in front of each array.
-        estimator: name in `ESTIMATORS`.
-        options: of the estimate.
+        estimator: with its options.
         optimizer: of optax.
 
     Returns:
         The state after it, and what it tells.
     """
-    return jax.vmap(lambda state, batches: _advance_one(state, batches, estimator, options, optimizer))(state, batches)
+    return jax.vmap(lambda state, batches: _advance_one(state, batches, estimator, optimizer))(state, batches)
 
 
-def _advance_one(state: Descent, batches, estimator, options, optimizer):
-    estimate = estimators.combine(estimator, batches, options)
-    value, residual = _values(batches[ESTIMATORS[estimator].needs[0]])
+def _advance_one(state: Descent, batches, estimator, optimizer):
+    estimate = estimator(batches)
+    value, residual = _values(batches[estimator.needs[0]])
     finite = jnp.isfinite(value)
     cost = jnp.sum(jnp.where(finite, value, 0.0)) / jnp.sum(finite)
     first_cost = jnp.where(jnp.isnan(state.first_cost), jnp.abs(cost), state.first_cost)

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
-from estimators import GradientEstimate, Objective, first_order, zeroth_order
+from estimators import FirstOrder, GradientEstimate, Objective, ZerothOrder, first_order, zeroth_order
 from mjx_study.objective import Simulator, chunk_for
 from mjx_study.option import Checked
 from mjx_study.reference import FunctionObjective, Reference, ScalarFunction, smoothed
@@ -259,7 +259,7 @@ def plan_landscape(config: LandscapeConfig, task: Task | None = None) -> Landsca
     cells, messages = contact_grid(task, config.contact, stiffness, config.damping)
     if not cells:
         raise ValueError("no contact model: give at least one contact family")
-    check_memory(task, ("zobg", "fobg"), config.samples, other=config.points * task.policy.num_params)
+    check_memory(task, (ZerothOrder(), FirstOrder()), config.samples, other=config.points * task.policy.num_params)
     line = line_of(task, config.points, config.span, config.direction, config.seed)
     resolved = dataclasses.replace(
         config,

@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 from typing import Final
 
-from estimators import ESTIMATORS
+from estimators import Estimator
 from mjx_study.limits import MOST_GIB
 from mjx_study.study.comparison import BIAS_DRAWS
 from mjx_study.tasks.task import Task
@@ -53,12 +53,12 @@ def check_batches(needed: int) -> None:
         )
 
 
-def check_memory(task: Task, estimators: Sequence[str], samples: int, *, other: int = 0) -> None:
+def check_memory(task: Task, estimators: Sequence[Estimator], samples: int, *, other: int = 0) -> None:
     """Refuse a plan whose arrays do not fit into `MOST_GIB`.
 
     Args:
         task: gives the parameters P, steps H, controls m and the size n of the state.
-        estimators: names; each keeps about three numbers for each of the N samples and P parameters, those that work
+        estimators: each keeps about three numbers for each of the N samples and P parameters, those that work
             step by step N H m (P with feedback) more, and those that linearise N H n (n + m).
         samples: N, those of all batches that are kept at once.
         other: numbers that are kept beside them.
@@ -68,7 +68,7 @@ def check_memory(task: Task, estimators: Sequence[str], samples: int, *, other: 
     """
     host, params = task.scene.host, task.policy.num_params
     controls, state = host.nu, host.nq + host.nv + host.na
-    needs = {oracle for name in estimators for oracle in ESTIMATORS[name].needs}
+    needs = {oracle for estimator in estimators for oracle in estimator.needs}
     each = params * (1 + 3 * len(estimators)) + task.horizon * controls
     if any("step" in oracle or oracle == "linearisation" for oracle in needs):
         each += task.horizon * controls * (1 if task.policy.additive else params)

@@ -6,20 +6,15 @@ from typing import Any, ClassVar, Final
 
 import jax
 
-from estimators import ESTIMATORS, ORACLES, EstimatorOptions
+import estimators
+from estimators import ESTIMATORS, Estimator, find_estimator
 from estimators.cross_fitting import PLUG_IN, check_weights
 from estimators.ddcg import PUBLISHED_TOLERANCE
 from mjx_study.limits import MOST_CELLS, MOST_PROGRAMS, check_count
 from mjx_study.objective import chunk_for
 from mjx_study.option import OPTIONS, Checked, check
 from mjx_study.simulation.contact import FAMILIES
-from mjx_study.study.configuration import (
-    EstimatorConfig,
-    check_estimators,
-    check_names,
-    configured_options,
-    refuse_repeats,
-)
+from mjx_study.study.configuration import EstimatorConfig, check_names, configured_estimators, refuse_repeats
 from mjx_study.study.descents import OptimiseConfig, OptimisePlan, plan_optimise
 from mjx_study.study.landscapes import check_span, line_of
 from mjx_study.study.memory import bytes_per_sample, check_batches, seeds_at_once
@@ -264,7 +259,7 @@ def plan_sweep(config: SweepConfig) -> SweepPlan:
     plan = SweepPlan(config, tuple(groups), tuple(cells), chunk, tuple(dict.fromkeys(messages)))
     check_batches(plan.memory)
     for cell in {cell.group: cell for cell in cells}.values():
-        estimator_options(plan, cell)
+        estimators_of(plan, cell)
         if config.kind == "descents":
             descent_plan(plan, cell)
         elif config.kind == "landscapes":
@@ -274,8 +269,7 @@ def plan_sweep(config: SweepConfig) -> SweepPlan:
 
 def oracles_of(config: SweepConfig) -> tuple[str, ...]:
     """Kinds of batches that the estimators need, and costs."""
-    needed = {"evaluation", *(oracle for name in config.estimators for oracle in ESTIMATORS[name].needs)}
-    return tuple(name for name in ORACLES if name in needed)
+    return estimators.oracles_of(map(find_estimator, config.estimators), "evaluation")
 
 
 def memory_of_seed(plan: SweepPlan, cell: SweepCell) -> int:
@@ -302,12 +296,10 @@ def _build(config: SweepConfig, name: str, timestep: float | None, cone: str | N
     return task.replace(onset=config.onset, noise=task.noise if config.noise is None else config.noise)
 
 
-def estimator_options(plan: SweepPlan, cell: SweepCell) -> EstimatorOptions:
-    """Those of a cell's estimators, checked against its task."""
-    config, task = plan.config, plan.groups[cell.group].task.replace(sigma=cell.sigma)
-    options = configured_options(_shared(config, task), task)
-    check_estimators(config.estimators, task, options)
-    return options
+def estimators_of(plan: SweepPlan, cell: SweepCell) -> tuple[Estimator, ...]:
+    """A cell's estimators with their options, checked against its task."""
+    task = plan.groups[cell.group].task.replace(sigma=cell.sigma)
+    return configured_estimators(_shared(plan.config, task), task)
 
 
 def _shared(config: SweepConfig, task: Task) -> EstimatorConfig:

@@ -18,7 +18,7 @@ from mjx_study.runtime import environment
 from mjx_study.study.axes import axes_of, solver_parameters
 from mjx_study.study.cells import COMPUTE, VARIABLES
 from mjx_study.study.configuration import Progress
-from mjx_study.study.identity import contents, versions
+from mjx_study.study.identity import contents, estimator_contents, versions
 from mjx_study.study.plan import SweepConfig, SweepPlan, plan_sweep
 from mjx_study.study.revision import git_revision
 from mjx_study.study.store import Store, StudyError, assemble, write_dataset
@@ -68,7 +68,7 @@ def open_store(plan: SweepPlan, folder: Path, command: str | None = None, *, acc
     document = {
         "config": config,
         "warnings": list(plan.warnings),
-        "contents": contents(_forms(plan)),
+        "contents": contents(_forms(plan)) | estimator_contents(*plan.config.estimators),
         "versions": versions(),
         "environment": environment(),
         "revision": git_revision(),

@@ -4,10 +4,11 @@ from collections.abc import Callable
 from functools import partial
 from typing import Final
 
+from estimators.places import MissingModuleError
 from mjx_study.tasks.ball_wall import ball_wall
 from mjx_study.tasks.double_pendulum import double_pendulum
 from mjx_study.tasks.momentum_transfer import momentum_transfer
-from mjx_study.tasks.own import MissingModuleError, own_task, registered_names, registered_place
+from mjx_study.tasks.own import own_task, registered_names, registered_place
 from mjx_study.tasks.pusher import pusher
 from mjx_study.tasks.sliding_box import sliding_box
 from mjx_study.tasks.task import Task

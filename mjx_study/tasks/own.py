@@ -1,25 +1,16 @@
 """Tasks from outside this package: `module:name` of a module that Python can import, or registered by a package."""
 
-import importlib
 import inspect
-import sys
-from collections.abc import Callable, Generator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Sequence
 from importlib import metadata
-from operator import attrgetter
-from pathlib import Path
-from types import ModuleType
 from typing import Any, Final
 
+from estimators.places import described, find_attribute, importable_here
 from mjx_study.tasks.task import Task
-from mjx_study.tasks.validation import check_shapes, described
+from mjx_study.tasks.validation import check_shapes
 
 GROUP: Final = "mjx_study.tasks"
 """Entry point group in which installed packages register tasks."""
-
-
-class MissingModuleError(ValueError):
-    """The module of a `module:name` is nowhere to be found."""
 
 
 def registered_names() -> list[str]:
@@ -53,9 +44,8 @@ def own_task(place: str, options: dict[str, Any]) -> Task:
         ValueError: the module raises, there is no Task nor a function that takes the options and returns one, or parts
             of the Task do not fit together.
     """
-    module, _, name = place.partition(":")
-    with _importable_here():
-        found = _find(_load(module), name)
+    with importable_here():
+        found = find_attribute(place, "task", Task)
         if isinstance(found, Task) and options:
             raise ValueError(
                 f"{place} is a Task that is made already, and {_listed(options)} cannot change it: "
@@ -64,30 +54,6 @@ def own_task(place: str, options: dict[str, Any]) -> Task:
         task = found if isinstance(found, Task) else _build(place, found, options)
         check_shapes(task, place)
     return task
-
-
-def _load(name: str) -> ModuleType:
-    if not all(part.isidentifier() for part in name.split(".")) or name.endswith(".py"):
-        raise MissingModuleError(f"{name!r} is no module: write it as in an import, without a folder or .py")
-    importlib.invalidate_caches()
-    try:
-        return importlib.import_module(name)
-    except (Exception, SystemExit) as error:
-        if isinstance(error, ModuleNotFoundError) and f"{name}.".startswith(f"{error.name}."):
-            raise MissingModuleError(f"there is no module {error.name!r} here or installed") from error
-        raise ValueError(f"importing {name} raised {described(error)}") from error
-
-
-def _find(module: ModuleType, name: str) -> object:
-    try:
-        return attrgetter(name)(module)
-    except AttributeError:
-        own = [
-            label
-            for label, value in vars(module).items()
-            if isinstance(value, Task) or (inspect.isfunction(value) and value.__module__ == module.__name__)
-        ]
-        raise ValueError(f"{module.__name__} has no {name!r}; it has {', '.join(own) or 'no task'}") from None
 
 
 def _build(place: str, builder: object, options: dict[str, Any]) -> Task:
@@ -122,18 +88,3 @@ def _check_arguments(place: str, builder: Callable[..., object], options: dict[s
 
 def _listed(names: Sequence[str] | dict[str, Any]) -> str:
     return " and ".join(names)
-
-
-@contextmanager
-def _importable_here() -> Generator[None]:
-    """The current directory in front of where Python looks for modules, as for `python -m`."""
-    here = str(Path.cwd())
-    if here in sys.path or "" in sys.path:
-        yield
-        return
-    sys.path.insert(0, here)
-    try:
-        yield
-    finally:
-        with suppress(ValueError):
-            sys.path.remove(here)

@@ -1,17 +1,13 @@
 """Whether the parts of a task fit together, and what is wrong with them in one line."""
 
-import importlib
-import traceback
 from collections.abc import Callable
-from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 
+from estimators.places import described
 from mjx_study.tasks.task import Task
-
-OURS: Final = (str(Path(__file__).parents[1]), importlib.__file__, "<frozen importlib")
 
 
 def check_shapes(task: Task, name: str = "") -> None:
@@ -55,13 +51,3 @@ def _traced(name: str, part: str, function: Callable[..., Any], *arguments: Any)
         return jax.eval_shape(function, *arguments)
     except (Exception, SystemExit) as error:
         raise ValueError(f"{name}: the {part} raised {described(error)}") from error
-
-
-def described(error: BaseException) -> str:
-    """Type and message in one line, and the innermost line of the user's file that it came through."""
-    text = f"{type(error).__name__}: {' '.join(str(error).split())}".removesuffix(": ")
-    frames = [frame for frame in traceback.extract_tb(error.__traceback__) if not frame.filename.startswith(OURS)]
-    if not frames:
-        return text
-    last = [frame for frame in frames if frame.filename == frames[0].filename][-1]
-    return f"{text} ({Path(last.filename).name}, line {last.lineno})"

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import estimators
-from estimators import ESTIMATORS, ORACLES, EstimatorOptions
+from estimators import ESTIMATORS, Estimator, InverseVariance, make_estimator
 from tests.estimators import objectives
 from tests.estimators.statistics_helpers import assert_mean_is
 
@@ -31,11 +31,11 @@ def exact(case: str) -> np.ndarray:
 def batches() -> dict[str, dict[str, object]]:
     """Batches of ten samples of each case, with an axis of trials."""
     found = {}
-    needed = {oracle for name in WEIGHED for oracle in ESTIMATORS[name].needs}
+    needed = estimators.oracles_of(ESTIMATORS[name] for name in WEIGHED)
     for case, (objective, theta) in CASES.items():
         draw = jax.jit(
             lambda key, objective=objective, theta=theta: estimators.draw(
-                tuple(name for name in ORACLES if name in needed), objective, jnp.asarray(theta), key, SAMPLES * TRIALS
+                needed, objective, jnp.asarray(theta), key, SAMPLES * TRIALS
             )
         )
         drawn = draw(jax.random.key(20))
@@ -43,22 +43,15 @@ def batches() -> dict[str, dict[str, object]]:
     return found
 
 
-def options(case: str, weights: str) -> EstimatorOptions:
+def made(case: str, name: str, weights: str) -> Estimator:
     """Of a gamma that binds in some trials and not in others."""
-    return EstimatorOptions(
-        gamma=8.0 if case == "feedback" else 6.0,
-        failure_probability=0.5,
-        variance_proxy="variance",
-        radius="max_deviation",
-        sigma=CASES[case][0].sigma,
-        weights=weights,
-    )
+    gamma = 8.0 if case == "feedback" else 6.0
+    return make_estimator(name, gamma=gamma, failure_probability=0.5, sigma=CASES[case][0].sigma, weights=weights)
 
 
 def combined(batches, case: str, name: str, weights: str) -> estimators.GradientEstimate:
-    chosen = options(case, weights)
-    needed = {oracle: batches[case][oracle] for oracle in ESTIMATORS[name].needs}
-    return jax.jit(jax.vmap(lambda drawn: estimators.combine(name, drawn, chosen)))(needed)
+    estimator = made(case, name, weights)
+    return jax.jit(jax.vmap(estimator))({oracle: batches[case][oracle] for oracle in estimator.needs})
 
 
 @pytest.mark.parametrize("name", WEIGHED)
@@ -87,10 +80,10 @@ def test_plugged_in_weights_are_biased(batches, case: str, name: str) -> None:
 @pytest.mark.parametrize("name", WEIGHED)
 def test_a_row_does_not_depend_on_the_weights_of_its_own_half(batches, name: str) -> None:
     """What changes in the first half leaves the weights of its rows as they were, and changes those of the second."""
-    chosen = options("feedback", "cross_fitted")
-    one = jax.tree.map(lambda leaf: leaf[0], {oracle: batches["feedback"][oracle] for oracle in ESTIMATORS[name].needs})
+    estimator = made("feedback", name, "cross_fitted")
+    one = jax.tree.map(lambda leaf: leaf[0], {oracle: batches["feedback"][oracle] for oracle in estimator.needs})
     other = jax.tree.map(lambda leaf: leaf.at[2].set(leaf[7]), one)
-    before, after = (np.asarray(estimators.combine(name, drawn, chosen).per_sample) for drawn in (one, other))
+    before, after = (np.asarray(estimator(drawn).per_sample) for drawn in (one, other))
     unchanged = [0, 1, 3, 4]
     np.testing.assert_allclose(after[unchanged], before[unchanged], rtol=1e-12)
     assert np.all(np.any(after[5:] != before[5:], axis=1))
@@ -102,20 +95,17 @@ def test_halves_may_differ_by_one_and_lost_rows_are_counted() -> None:
     value = drawn["evaluation"].value.at[2].set(jnp.nan)
     lossy = drawn | {"evaluation": replace(drawn["evaluation"], value=value)}
     for batch, lost in ((drawn, 0), (lossy, 1)):
-        found = estimators.combine("ivw", batch, options("open loop", "cross_fitted"))
+        found = InverseVariance(weights="cross_fitted")(batch)
         assert found.per_sample.shape == (11, 3) and found.num_nonfinite == lost
         assert np.all(np.isfinite(found.mean)) and np.all(np.isfinite(found.standard_error))
-    np.testing.assert_allclose(
-        estimators.combine("ivw", drawn, options("open loop", "cross_fitted")).mean,
-        np.mean(estimators.combine("ivw", drawn, options("open loop", "cross_fitted")).per_sample, 0),
-        rtol=1e-12,
-    )
+    found = InverseVariance(weights="cross_fitted")(drawn)
+    np.testing.assert_allclose(found.mean, np.mean(found.per_sample, 0), rtol=1e-12)
 
 
 def test_too_few_samples_and_unknown_weights_are_refused() -> None:
     objective, theta = CASES["open loop"]
     drawn = estimators.draw(("evaluation", "differentiation"), objective, jnp.asarray(theta), jax.random.key(3), 3)
     with pytest.raises(ValueError, match="cross-fitted weights need at least 4 samples, two in each half; got 3"):
-        estimators.combine("ivw", drawn, options("open loop", "cross_fitted"))
+        InverseVariance(weights="cross_fitted")(drawn)
     with pytest.raises(ValueError, match="weights must be one of plug_in, cross_fitted; got 'split'"):
-        options("open loop", "split")
+        InverseVariance(weights="split")

@@ -13,34 +13,30 @@ import estimators
 from estimators import (
     ESTIMATORS,
     ORACLES,
+    AlphaOrder,
     Differentiation,
     Estimator,
-    EstimatorOptions,
     Evaluation,
     GradientEstimate,
     Objective,
     draw,
     estimate,
+    make_estimator,
     zeroth_order,
 )
 from tests.estimators import objectives
 
 # Compiled whole: a fraction of the time of compiling operation by operation.
-combine = jax.jit(estimators.combine, static_argnums=(0, 2))
 leave_one_out = jax.jit(estimators.leave_one_out)
 
 HESSIAN = np.array([[1.0, 0.4], [0.4, 0.5]])
 OBJECTIVE = objectives.quadratic(HESSIAN, 0.5)
 THETA = np.array([1.5, -2.0])
-OPTIONS = EstimatorOptions(
-    gamma=50.0,
-    failure_probability=0.1,
-    variance_proxy="variance",
-    radius="max_deviation",
-    sigma=0.5,
-    max_norm=3.0,
-    window=1,
-)
+OPTIONS: dict[str, Any] = {"gamma": 50.0, "failure_probability": 0.1, "sigma": 0.5, "max_norm": 3.0, "window": 1}
+
+
+def made(name: str, **changes: Any) -> Estimator:
+    return make_estimator(name, **OPTIONS | changes)
 
 
 @dataclass
@@ -63,22 +59,23 @@ class Spy:
 @pytest.mark.parametrize("name", ESTIMATORS)
 def test_every_estimator_calls_the_oracles_that_it_names_with_independent_keys(name: str):
     spy = Spy()
-    estimate(name, cast(Objective, spy), jnp.asarray(THETA), jax.random.key(0), 20, options=OPTIONS)
+    estimate(made(name), cast(Objective, spy), jnp.asarray(THETA), jax.random.key(0), 20)
     needs = [ORACLES[oracle] for oracle in ESTIMATORS[name].needs]
     assert [called for called, _ in spy.calls] == [oracle.method for oracle in needs]
     keys = np.concatenate([drawn for _, drawn in spy.calls])
     assert len(np.unique(keys, axis=0)) == 20 * len({oracle.order for oracle in needs})
     batches = draw(tuple(oracle.name for oracle in needs), OBJECTIVE, jnp.asarray(THETA), jax.random.key(0), 20)
     np.testing.assert_array_equal(
-        estimators.combine(name, batches, OPTIONS).mean,
-        estimate(name, OBJECTIVE, jnp.asarray(THETA), jax.random.key(0), 20, options=OPTIONS).mean,
+        made(name)(batches).mean,
+        estimate(made(name), OBJECTIVE, jnp.asarray(THETA), jax.random.key(0), 20).mean,
     )
 
 
 def test_the_table_is_keyed_by_name():
     assert len(ESTIMATORS) == 13 and len(ORACLES) == 7
     for name, entry in ESTIMATORS.items():
-        assert isinstance(entry, Estimator) and entry.name == name and entry.description and entry.needs
+        assert issubclass(entry, Estimator) and entry.name == name and entry.description and entry.label
+        assert isinstance(made(name), entry) and made(name) == made(name) and hash(made(name)) == hash(made(name))
     for name, oracle in ORACLES.items():
         assert oracle.name == name and oracle.order in (0, 1)
 
@@ -90,14 +87,12 @@ def test_sample_i_depends_on_key_i_alone():
     np.testing.assert_array_equal(whole.value[3:5], part.value)
 
 
-def drawn(name: str, options: EstimatorOptions) -> GradientEstimate:
-    return jax.jit(lambda theta: estimate(name, OBJECTIVE, theta, jax.random.key(2), 200, options=options))(
-        jnp.asarray(THETA)
-    )
+def drawn(estimator: Estimator) -> GradientEstimate:
+    return jax.jit(lambda theta: estimate(estimator, OBJECTIVE, theta, jax.random.key(2), 200))(jnp.asarray(THETA))
 
 
 def shared() -> dict[str, GradientEstimate]:
-    return {name: drawn(name, OPTIONS) for name in ESTIMATORS}
+    return {name: drawn(made(name)) for name in ESTIMATORS}
 
 
 def test_estimators_share_batches_given_the_same_key():
@@ -112,13 +107,11 @@ def test_estimators_share_batches_given_the_same_key():
 
 
 def test_ivw_is_aobg_without_a_limit():
-    options = replace(OPTIONS, gamma=float("inf"))
-    unlimited = drawn("aobg", options)
-    strict = replace(OPTIONS, gamma=1e-9)
-    ivw = drawn("ivw", strict)
+    unlimited = drawn(AlphaOrder())
+    ivw = drawn(made("ivw", gamma=1e-9))
     np.testing.assert_array_equal(unlimited.mean, ivw.mean)
     assert unlimited.alpha is not None and unlimited.alpha.alpha > 0.5
-    zeroth = drawn("aobg", strict)
+    zeroth = drawn(AlphaOrder(gamma=1e-9))
     np.testing.assert_array_equal(zeroth.mean, shared()["zobg"].mean)
 
 
@@ -128,10 +121,8 @@ def test_ivw_is_aobg_without_a_limit():
 )
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 def test_precision_is_the_callers_under_jit(name: str, baseline: str, dtype: type):
-    options = replace(OPTIONS, baseline=baseline)
-
     def run(theta: Array, key: Array) -> GradientEstimate:
-        return estimate(name, OBJECTIVE, theta, key, 50, options=options)
+        return estimate(made(name, baseline=baseline), OBJECTIVE, theta, key, 50)
 
     compiled = jax.jit(run)(jnp.asarray(THETA, dtype), jax.random.key(3))
     for leaf in jax.tree.leaves(compiled):
@@ -144,7 +135,7 @@ def test_estimates_can_be_mapped_over_parameters():
     keys = jax.random.split(jax.random.key(4), 3)
 
     def run(theta: Array, key: Array) -> GradientEstimate:
-        return estimate("aobg", OBJECTIVE, theta, key, 30, options=OPTIONS)
+        return estimate(AlphaOrder(gamma=50.0), OBJECTIVE, theta, key, 30)
 
     mapped = jax.jit(jax.vmap(run))(thetas, jax.random.clone(keys))
     assert mapped.per_sample.shape == (3, 30, 2)
@@ -155,16 +146,18 @@ def test_estimates_can_be_mapped_over_parameters():
     assert jax.tree.map(lambda leaf: None, mapped).alpha.alpha is None
 
 
-def test_options_are_static_arguments():
+def test_estimators_are_static_arguments():
+    aobg = AlphaOrder(gamma=50.0)
+
     @jax.jit
     def through_closure(theta: Array) -> Array:
-        return estimate("aobg", OBJECTIVE, theta, jax.random.key(5), 10, options=OPTIONS).mean
+        return estimate(aobg, OBJECTIVE, theta, jax.random.key(5), 10).mean
 
-    def through_argument(theta: Array, options: EstimatorOptions) -> Array:
-        return estimate("aobg", OBJECTIVE, theta, jax.random.key(5), 10, options=options).mean
+    def through_argument(theta: Array, estimator: Estimator) -> Array:
+        return estimate(estimator, OBJECTIVE, theta, jax.random.key(5), 10).mean
 
     theta = jnp.asarray(THETA)
-    static = jax.jit(through_argument, static_argnums=1)(theta, OPTIONS)
+    static = jax.jit(through_argument, static_argnums=1)(theta, aobg)
     np.testing.assert_array_equal(through_closure(theta), static)
 
 
@@ -186,7 +179,7 @@ def lossy_batches() -> tuple[Evaluation, Differentiation]:
 def test_lost_samples_are_counted_and_do_not_spoil_the_rest(name: str, lost: int, baseline: str):
     zeroth, first = lossy_batches()
     batches = {"evaluation": zeroth, "differentiation": first}
-    result = combine(name, batches, replace(OPTIONS, baseline=baseline))
+    result = jax.jit(made(name, baseline=baseline))(batches)
     assert result.num_nonfinite == lost
     for leaf in (result.mean, result.variance, result.standard_error):
         assert np.all(np.isfinite(leaf))
@@ -203,11 +196,9 @@ def test_leave_one_out_is_the_mean_of_the_other_finite_values():
 
 
 def test_unknown_names_are_refused_with_the_choices():
-    zeroth, first = lossy_batches()
+    zeroth, _ = lossy_batches()
     with pytest.raises(ValueError, match="one of zobg, .*, aobg, .*; got 'zo'"):
-        combine("zo", {"evaluation": zeroth, "differentiation": first}, OPTIONS)
-    with pytest.raises(ValueError, match="one of zobg, .*, aobg, .*; got 'zo'"):
-        estimate("zo", OBJECTIVE, jnp.asarray(THETA), jax.random.key(0), 10, options=OPTIONS)
+        estimate("zo", OBJECTIVE, jnp.asarray(THETA), jax.random.key(0), 10)
     with pytest.raises(ValueError, match="one of none, zero_noise, leave_one_out; got 'mean'"):
         zeroth_order(zeroth, "mean")
 
@@ -223,39 +214,39 @@ def test_missing_batches_and_impossible_sizes_are_refused():
     zeroth, first = lossy_batches()
     for name in ("zobg", "aobg", "ivw"):
         with pytest.raises(ValueError, match=f"'{name}' needs a zeroth-order batch; .*evaluate.*'evaluation'"):
-            combine(name, {"differentiation": first}, OPTIONS)
+            made(name)({"differentiation": first})
     for name in ("fobg", "aobg", "ivw"):
         with pytest.raises(ValueError, match=f"'{name}' needs a first-order batch"):
-            combine(name, {"evaluation": zeroth, "differentiation": None}, OPTIONS)
+            made(name)({"evaluation": zeroth, "differentiation": None})
     for name, option in (("fobg_clipped", "max_norm"), ("fobg_truncated", "window"), ("ddcg", "sigma")):
-        with pytest.raises(ValueError, match=f"'{name}' needs the option {option}"):
-            estimate(
-                name, OBJECTIVE, jnp.asarray(THETA), jax.random.key(0), 9, options=replace(OPTIONS, **{option: None})
-            )
+        with pytest.raises(ValueError, match=f"'{name}' needs the option {option}; set it"):
+            made(name, **{option: None})
+        with pytest.raises(ValueError, match=f"'{name}' needs the option {option}; set it"):
+            estimate(name, OBJECTIVE, jnp.asarray(THETA), jax.random.key(0), 9)
     with pytest.raises(ValueError, match="_Bare has no evaluate_pair, which a zeroth-order batch of pairs comes from"):
-        estimate("zobg_antithetic", _Bare(), jnp.asarray(THETA), jax.random.key(0), 9, options=OPTIONS)
+        estimate("zobg_antithetic", _Bare(), jnp.asarray(THETA), jax.random.key(0), 9)
     with pytest.raises(ValueError, match="at least 1, .* got 0"):
-        estimate("zobg", OBJECTIVE, jnp.asarray(THETA), jax.random.key(0), 0, options=OPTIONS)
+        estimate("zobg", OBJECTIVE, jnp.asarray(THETA), jax.random.key(0), 0)
     with pytest.raises(ValueError, match=r"shape \(2,\), the objective's; got \(3,\)"):
-        estimate("zobg", OBJECTIVE, jnp.ones(3), jax.random.key(0), 10, options=OPTIONS)
+        estimate("zobg", OBJECTIVE, jnp.ones(3), jax.random.key(0), 10)
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("name", "change", "message"),
     [
-        ({"baseline": "mean"}, "one of none, zero_noise, leave_one_out; got 'mean'"),
-        ({"gamma": 0.0}, "gamma must be positive; got 0.0"),
-        ({"gamma": float("nan")}, "gamma must be positive; got nan"),
-        ({"failure_probability": 1.5}, "strictly between 0 and 1; got 1.5"),
-        ({"variance_proxy": "sum"}, "one of variance, second_moment, upper_bound; got 'sum'"),
-        ({"variance_proxy": "upper_bound"}, "'upper_bound' needs a bound .* got 'max_deviation'"),
-        ({"sigma": 0.0}, "sigma must be positive and finite; got 0.0"),
-        ({"max_norm": float("inf")}, "max_norm must be positive and finite; got inf"),
-        ({"window": 0}, "window must be at least 1 step; got 0"),
-        ({"tolerance": 1.0}, r"tolerance must lie in \[0, 1\); got 1.0"),
-        ({"radius": -0.1}, "not negative; got -0.1"),
+        ("zobg", {"baseline": "mean"}, "one of none, zero_noise, leave_one_out; got 'mean'"),
+        ("aobg", {"gamma": 0.0}, "gamma must be positive; got 0.0"),
+        ("aobg", {"gamma": float("nan")}, "gamma must be positive; got nan"),
+        ("aobg", {"failure_probability": 1.5}, "strictly between 0 and 1; got 1.5"),
+        ("aobg", {"variance_proxy": "sum"}, "one of variance, second_moment, upper_bound; got 'sum'"),
+        ("aobg", {"variance_proxy": "upper_bound"}, "'upper_bound' needs a bound .* got 'max_deviation'"),
+        ("delta", {"sigma": 0.0}, "sigma must be positive and finite; got 0.0"),
+        ("fobg_clipped", {"max_norm": float("inf")}, "max_norm must be positive and finite; got inf"),
+        ("fobg_truncated", {"window": 0}, "window must be at least 1 step; got 0"),
+        ("ddcg", {"tolerance": 1.0}, r"tolerance must lie in \[0, 1\); got 1.0"),
+        ("aobg", {"radius": -0.1}, "not negative; got -0.1"),
     ],
 )
-def test_options_out_of_range_are_refused(change: dict[str, Any], message: str):
+def test_options_out_of_range_are_refused(name: str, change: dict[str, Any], message: str):
     with pytest.raises(ValueError, match=message):
-        replace(OPTIONS, **change)
+        made(name, **change)

@@ -13,7 +13,6 @@ from estimators import (
     ESTIMATORS,
     NOISES,
     Differentiation,
-    EstimatorOptions,
     Evaluation,
     GradientEstimate,
     Linearisation,
@@ -37,23 +36,10 @@ HESSIAN = np.array([[1.0, 0.4, 0.0], [0.4, -0.5, 0.3], [0.0, 0.3, 0.8]])
 UNBIASED = [name for name in ESTIMATORS if name not in ("fobg_clipped", "fobg_truncated")]
 
 
-def options(sigma: float) -> EstimatorOptions:
-    return EstimatorOptions(
-        gamma=float("inf"),
-        failure_probability=0.1,
-        variance_proxy="variance",
-        radius="max_deviation",
-        sigma=sigma,
-        max_norm=1e9,
-        window=99,
-    )
-
-
 def run(name: str, objective, theta, *, samples: int = SAMPLES, seed: int = 3, **changes) -> GradientEstimate:
-    chosen = replace(options(objective.sigma), **changes)
-    program = jax.jit(
-        lambda key: estimators.estimate(name, objective, jnp.asarray(theta), key, samples, options=chosen)
-    )
+    options = {"failure_probability": 0.1, "sigma": objective.sigma, "max_norm": 1e9, "window": 99} | changes
+    estimator = estimators.make_estimator(name, **options)
+    program = jax.jit(lambda key: estimators.estimate(estimator, objective, jnp.asarray(theta), key, samples))
     return program(jax.random.key(seed))
 
 

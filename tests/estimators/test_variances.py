@@ -8,18 +8,16 @@ from jax import Array
 from scipy.stats import norm
 
 from estimators import (
-    ESTIMATORS,
     Differentiation,
-    EstimatorOptions,
     Evaluation,
     StepEvaluation,
     antithetic,
-    combine,
     cost_to_go,
     delta_control_variate,
     draw,
     first_order,
     interpolate,
+    make_estimator,
     summarise,
     zeroth_order,
 )
@@ -125,21 +123,13 @@ def test_costs_to_go_drop_what_came_before():
 def test_variance_of_the_mean_falls_as_one_over_n(name: str):
     """Over 2000 batches each of 10 and of 40 samples; a factor 4 within 5 standard errors of the two variances."""
     objective = FunctionObjective(Quadratic(HESSIAN, np.zeros(3)), SIGMA)
-    options = EstimatorOptions(
-        baseline="zero_noise",
-        gamma=1.0,
-        failure_probability=0.1,
-        variance_proxy="variance",
-        radius="max_deviation",
-        sigma=SIGMA,
-        window=5,
-    )
+    estimator = make_estimator(name, sigma=SIGMA, window=5)
     batches = 2000
     spread = {}
     for size in (10, 40):
-        drawn = draw(ESTIMATORS[name].needs, objective, jnp.asarray(THETA), jax.random.key(size), batches * size)
+        drawn = draw(estimator.needs, objective, jnp.asarray(THETA), jax.random.key(size), batches * size)
         parts = jax.tree.map(lambda leaf, size=size: leaf.reshape(batches, size, *leaf.shape[1:]), drawn)
-        means = np.asarray(jax.vmap(lambda part: combine(name, part, options).mean)(parts))
+        means = np.asarray(jax.vmap(lambda part: estimator(part).mean)(parts))
         squares = np.sum((means - np.mean(means, axis=0)) ** 2, axis=1)
         spread[size] = float(np.mean(squares)), float(np.std(squares)) / batches**0.5
     ratio = spread[10][0] / spread[40][0]

@@ -1,0 +1,86 @@
+"""What users write outside of these packages, by `module:name` of a module that Python can import."""
+
+import importlib
+import inspect
+import sys
+import traceback
+from collections.abc import Generator
+from contextlib import contextmanager, suppress
+from operator import attrgetter
+from pathlib import Path
+from types import ModuleType
+
+
+class MissingModuleError(ValueError):
+    """The module of a `module:name` is nowhere to be found."""
+
+
+def load_module(name: str) -> ModuleType:
+    """Import a module by its dotted name.
+
+    Raises:
+        MissingModuleError: There is no such module.
+        ValueError: The module raises.
+    """
+    if not all(part.isidentifier() for part in name.split(".")) or name.endswith(".py"):
+        raise MissingModuleError(f"{name!r} is no module: write it as in an import, without a folder or .py")
+    importlib.invalidate_caches()
+    try:
+        return importlib.import_module(name)
+    except (Exception, SystemExit) as error:
+        if isinstance(error, ModuleNotFoundError) and f"{name}.".startswith(f"{error.name}."):
+            raise MissingModuleError(f"there is no module {error.name!r} here or installed") from error
+        raise ValueError(f"importing {name} raised {described(error)}") from error
+
+
+def find_attribute(place: str, noun: str, kind: type) -> object:
+    """What is at a `module:name`.
+
+    Args:
+        place: `module:name`.
+        noun: Of what is looked for, for a message.
+        kind: Of what is looked for; a module's own functions and classes may be it as well.
+
+    Raises:
+        MissingModuleError: There is no such module.
+        ValueError: The module raises, or has no such name; the message lists what it has.
+    """
+    module, _, name = place.partition(":")
+    loaded = load_module(module)
+    try:
+        return attrgetter(name)(loaded)
+    except AttributeError:
+        own = [
+            label
+            for label, value in vars(loaded).items()
+            if isinstance(value, kind)
+            or ((inspect.isfunction(value) or inspect.isclass(value)) and value.__module__ == loaded.__name__)
+        ]
+        raise ValueError(f"{module} has no {name!r}; it has {', '.join(own) or f'no {noun}'}") from None
+
+
+def described(error: BaseException) -> str:
+    """Type and message in one line, and the innermost line of the user's file that it came through."""
+    text = f"{type(error).__name__}: {' '.join(str(error).split())}".removesuffix(": ")
+    caught, *frames = traceback.extract_tb(error.__traceback__)
+    ours = (str(Path(caught.filename).parent), importlib.__file__, "<frozen importlib")
+    frames = [frame for frame in frames if not frame.filename.startswith(ours)]
+    if not frames:
+        return text
+    last = [frame for frame in frames if frame.filename == frames[0].filename][-1]
+    return f"{text} ({Path(last.filename).name}, line {last.lineno})"
+
+
+@contextmanager
+def importable_here() -> Generator[None]:
+    """The current directory in front of where Python looks for modules, as for `python -m`."""
+    here = str(Path.cwd())
+    if here in sys.path or "" in sys.path:
+        yield
+        return
+    sys.path.insert(0, here)
+    try:
+        yield
+    finally:
+        with suppress(ValueError):
+            sys.path.remove(here)
