@@ -64,8 +64,14 @@ def small(command: list[str]) -> list[str]:
 def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder with the files that the pages speak of."""
     extending = (ROOT / "docs" / "extending.md").read_text()
-    for name, language in (("hopper.xml", "xml"), ("my_tasks.py", "python")):
-        (tmp_path / name).write_text(re.findall(rf"```{language}\n(.*?)```", extending, re.DOTALL)[0])
+    adding = (ROOT / "docs" / "estimators.md").read_text()
+    files = (
+        ("hopper.xml", "xml", extending),
+        ("my_tasks.py", "python", extending),
+        ("my_estimators.py", "python", adding),
+    )
+    for name, language, page in files:
+        (tmp_path / name).write_text(re.findall(rf"```{language}\n(.*?)```", page, re.DOTALL)[0])
     for name in ("my_model.xml", "humanoid.xml"):
         (tmp_path / name).write_text(MJCF)
     np.save(tmp_path / "learnt.npy", np.zeros(21))
