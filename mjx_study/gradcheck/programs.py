@@ -223,6 +223,7 @@ def _stages(model: mjx.Model, data: mjx.Data) -> dict[str, Any]:
         "pos": contacts.pos,
         "normal": contacts.frame[:, 0],
         "geom": jnp.asarray(contacts.geom),
+        "efc_type": jnp.asarray(rows.efc_type),
         "efc_J": rows.efc_J,
         "efc_aref": rows.efc_aref,
         "efc_D": rows.efc_D,

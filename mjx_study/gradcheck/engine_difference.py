@@ -1,0 +1,204 @@
+"""Where and why the C engine computes another step than MJX: stage by stage, contact by contact, row by row."""
+
+import copy
+from typing import Any, Final
+
+import mujoco
+import numpy as np
+from jaxtyping import Float
+from scipy.optimize import linear_sum_assignment
+from scipy.spatial.distance import cdist
+
+from mjx_study.gradcheck.coordinates import geom_label
+from mjx_study.simulation.engine import HostState, host_data
+
+TOLERANCE: Final = 1e-8
+"""Relative difference of a quantity above which two implementations differ."""
+TINY: Final = 1e-12
+"""Below it a constraint row is zero."""
+STAGES: Final = {
+    "xpos": "body positions",
+    "ten_length": "tendon lengths",
+    "actuator_length": "actuator lengths",
+    "qM": "the inertia matrix",
+    "qfrc_bias": "the bias force",
+    "qfrc_passive": "passive forces",
+    "act_dot": "the rate of activation",
+    "qfrc_actuator": "actuator forces",
+    "qacc_smooth": "the unconstrained acceleration",
+}
+ROWS: Final = {"efc_J": "Jacobians", "efc_aref": "reference accelerations", "efc_D": "stiffnesses"}
+
+Found = tuple[str, bool]
+"""What differs, in words, and whether it is documented that it does."""
+
+
+def difference_of_engines(
+    host: mujoco.MjModel,
+    state: HostState,
+    stages: dict[str, Any],
+    ours: Float[np.ndarray, " nv"],
+    theirs: Float[np.ndarray, " nv"],
+) -> tuple[str, bool]:
+    """What differs, and whether all of it is known that MJX computes in another way than C.
+
+    Args:
+        host: the engine's model.
+        state: where.
+        stages: MJX's quantities there.
+        ours: the constrained acceleration by MJX [m/s^2 or rad/s^2].
+        theirs: by the engine.
+    """
+    found, host, data = _kinematics_and_forces(host, state, stages)
+    contacts = _contacts(host, data, stages)
+    if not found and not contacts and relative(ours, theirs) <= TOLERANCE:
+        found = [_integration(host)]
+    elif all(documented for _, documented in found):
+        found += contacts + _rows(host, data, stages, contacts=not contacts)
+    found = found or [("the solution of the constraints", False)]
+    return "; ".join(text for text, _ in found), all(documented for _, documented in found)
+
+
+def largest(values: np.ndarray) -> float:
+    """The largest magnitude, 0 of nothing."""
+    return float(np.abs(values).max(initial=0.0))
+
+
+def relative(ours: np.ndarray, theirs: np.ndarray) -> float:
+    """The largest difference, relative to the largest magnitude."""
+    return largest(ours - theirs) / max(largest(theirs), largest(ours), 1e-10)
+
+
+def _kinematics_and_forces(
+    host: mujoco.MjModel, state: HostState, stages: dict[str, Any]
+) -> tuple[list[Found], mujoco.MjModel, mujoco.MjData]:
+    """The first quantity that differs; and what to compare the rest with."""
+    data = _forward(host, state)
+    text = _stage(host, data, stages)
+    if not text:
+        return [], host, data
+    full = copy.copy(host)
+    for kind in ("body", "geom", "site"):
+        getattr(full, f"{kind}_sameframe")[:] = int(mujoco.mjtSameFrame.mjSAMEFRAME_NONE)
+    in_full = _forward(full, state)
+    if remains := _stage(full, in_full, stages):
+        return [(remains, False)], full, in_full
+    return [(f"{text} (C takes frames less than 1e-6 apart for the same, MJX does not)", True)], full, in_full
+
+
+def _forward(host: mujoco.MjModel, state: HostState) -> mujoco.MjData:
+    data = host_data(host, state)
+    mujoco.mj_forward(host, data)
+    return data
+
+
+def _stage(host: mujoco.MjModel, data: mujoco.MjData, stages: dict[str, Any]) -> str:
+    """The first quantity that differs, from which those after it follow; empty where none does."""
+    inertia = np.zeros((host.nv, host.nv))
+    mujoco.mj_fullM(host, data, inertia)
+    for name, words in STAGES.items():
+        theirs = inertia if name == "qM" else np.asarray(getattr(data, name))
+        gap = relative(np.asarray(stages[name]).reshape(theirs.shape), theirs)
+        if gap > TOLERANCE:
+            return f"{words} differ by {gap:.1e}" if words.endswith("s") else f"{words} differs by {gap:.1e}"
+    return ""
+
+
+def _integration(host: mujoco.MjModel) -> Found:
+    text = "the integration: the state after the step differs, its acceleration does not"
+    fast = host.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    if fast and np.any(host.actuator_forcelimited | host.actuator_ctrllimited):
+        return f"{text} (MJX's implicitfast damps as if no force or control were clamped)", True
+    return text, False
+
+
+def _contacts(host: mujoco.MjModel, data: mujoco.MjData, stages: dict[str, Any]) -> list[Found]:
+    """Pairs of geoms whose contacts are not as many, or not in the same place."""
+    ours: dict[tuple[int, ...], list[np.ndarray]] = {}
+    theirs: dict[tuple[int, ...], list[np.ndarray]] = {}
+    for index in np.flatnonzero(stages["dist"] < stages["margin"]):
+        place = np.concatenate([stages["dist"][[index]], stages["pos"][index], stages["normal"][index]])
+        ours.setdefault(tuple(sorted(map(int, stages["geom"][index]))), []).append(place)
+    for contact in data.contact:
+        if contact.exclude == 0:
+            place = np.concatenate([[contact.dist], contact.pos, contact.frame[:3]])
+            theirs.setdefault(tuple(sorted(map(int, contact.geom))), []).append(place)
+    texts = []
+    for pair in sorted(ours.keys() | theirs.keys()):
+        here, there = ours.get(pair, []), theirs.get(pair, [])
+        label = " and ".join(geom_label(host, geom) for geom in pair)
+        if len(here) != len(there):
+            texts.append(f"{label} touch at {len(here)} points in MJX, {len(there)} in C")
+            continue
+        mine, its = np.array(here), np.array(there)
+        order, match = linear_sum_assignment(cdist(mine[:, 1:4], its[:, 1:4]))
+        gaps = np.abs(mine[order] - its[match]).max(axis=0)
+        if gaps.max() > TOLERANCE:
+            texts.append(
+                f"contacts of {label} lie {gaps[1:4].max():.1e} m apart, their depths differ by {gaps[0]:.1e} m and "
+                f"their normals by {gaps[4:].max():.1e}"
+            )
+    return [(text, True) for text in texts]
+
+
+def _rows(host: mujoco.MjModel, data: mujoco.MjData, stages: dict[str, Any], *, contacts: bool) -> list[Found]:
+    """Kinds of constraint rows that differ, those of contacts if asked for.
+
+    MJX sorts its rows by kind and its contacts by dimension, the C engine by objects and pairs of bodies; so rows are
+    matched by their Jacobians, and those with equal ones by the rest. Rows that are zero count in neither.
+    """
+    here = {name: stages[name] for name in ROWS}
+    there = {"efc_J": _jacobian(host, data), "efc_aref": data.efc_aref, "efc_D": data.efc_D}
+    live, alive = (np.abs(rows["efc_J"]).max(axis=1, initial=0.0) > TINY for rows in (here, there))
+    kinds, labels = stages["efc_type"], _labels(host, data)
+    found: list[Found] = []
+    for kind in np.union1d(kinds[live], data.efc_type[alive]):
+        if "contact" in _kind(kind) and not contacts:
+            continue
+        ours, theirs = np.flatnonzero(live & (kinds == kind)), np.flatnonzero(alive & (data.efc_type == kind))
+        if len(ours) != len(theirs):
+            text = f"there are {len(ours)} active {_kind(kind)} rows in MJX, {len(theirs)} in C"
+            found.append((text, False))
+            continue
+        far, *rest = (_distances(here[name][ours], there[name][theirs]) for name in ROWS)
+        order, match = linear_sum_assignment(far + 1e-3 * sum(rest))
+        ours, theirs = ours[order], theirs[match]
+        for label in dict.fromkeys(labels[theirs]):
+            chosen = labels[theirs] == label
+            for name, words in ROWS.items():
+                gap = relative(here[name][ours[chosen]], there[name][theirs[chosen]])
+                if gap > TOLERANCE:
+                    found.append(_row(name, label, f"{words} of {label} rows differ by {gap:.1e}"))
+    return found
+
+
+def _row(name: str, label: str, text: str) -> Found:
+    if name == "efc_aref" and label in ("connect equality", "weld equality"):
+        return f"{text} (MJX leaves out -dJ/dt qvel, which the turning of the Jacobian adds)", True
+    return text, False
+
+
+def _distances(ours: np.ndarray, theirs: np.ndarray) -> Float[np.ndarray, "ours theirs"]:
+    """How far each is from each, relative to the largest."""
+    mine, its = (rows.reshape(len(rows), -1) for rows in (ours, theirs))
+    return cdist(mine, its, "chebyshev") / max(largest(mine), largest(its), TINY)
+
+
+def _jacobian(host: mujoco.MjModel, data: mujoco.MjData) -> Float[np.ndarray, "rows nv"]:
+    dense = np.zeros((data.nefc, host.nv))
+    if not mujoco.mj_isSparse(host):
+        return data.efc_J.reshape(dense.shape)
+    mujoco.mju_sparse2dense(dense, data.efc_J, data.efc_J_rownnz, data.efc_J_rowadr, data.efc_J_colind)
+    return dense
+
+
+def _kind(kind: int | np.integer) -> str:
+    return mujoco.mjtConstraint(int(kind)).name.removeprefix("mjCNSTR_").lower()
+
+
+def _labels(host: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
+    """The kind of each of the engine's rows, and of an equality its type."""
+    labels = np.array([_kind(kind) for kind in data.efc_type], dtype=object)
+    for row in np.flatnonzero(labels == "equality"):
+        labels[row] = f"{mujoco.mjtEq(int(host.eq_type[data.efc_id[row]])).name.removeprefix('mjEQ_').lower()} equality"
+    return labels
