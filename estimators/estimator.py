@@ -55,7 +55,7 @@ class Estimator(ABC):
     Attributes:
         name: In messages, and in `ESTIMATORS`.
         label: For a legend, where that is not the name.
-        description: One line.
+        description: One line, the first of the docstring.
         needs: Oracles in `ORACLES`, in the order in which `combine` takes their batches.
         gaussian: Whether the formula holds for Gaussian noise only.
         additive: Whether it holds for noise on theta itself only.
@@ -67,6 +67,10 @@ class Estimator(ABC):
     needs: ClassVar[tuple[str, ...]]
     gaussian: ClassVar[bool] = False
     additive: ClassVar[bool] = False
+
+    def __init_subclass__(cls) -> None:
+        line = (cls.__doc__ or "").partition("\n")[0].removesuffix(".")
+        cls.description = line[:1].lower() + line[1:]
 
     @abstractmethod
     def combine(self, *args: Any, **kwargs: Any) -> GradientEstimate:

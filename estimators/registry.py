@@ -168,11 +168,9 @@ class _Interpolation(_Baselined):
 
 @register
 class ZerothOrder(_Baselined):
-    """See `zeroth_order`."""
+    """Zeroth order: values times scores."""
 
-    name, label = "zobg", "ZoBG"
-    description = "zeroth order: values times scores"
-    needs = ("evaluation",)
+    name, label, needs = "zobg", "ZoBG", ("evaluation",)
 
     def combine(self, evaluation: Evaluation) -> GradientEstimate:
         return zeroth_order(evaluation, self.baseline)
@@ -180,11 +178,9 @@ class ZerothOrder(_Baselined):
 
 @register
 class Antithetic(_Baselined):
-    """See `antithetic`."""
+    """Zeroth order over pairs of opposite noise."""
 
-    name, label = "zobg_antithetic", "ZoBG, antithetic"
-    description = "zeroth order over pairs of opposite noise"
-    needs = ("pair",)
+    name, label, needs = "zobg_antithetic", "ZoBG, antithetic", ("pair",)
 
     def combine(self, pair: tuple[Evaluation, Evaluation]) -> GradientEstimate:
         return antithetic(*pair, self.baseline)
@@ -192,11 +188,9 @@ class Antithetic(_Baselined):
 
 @register
 class CostToGo(_Baselined):
-    """See `cost_to_go`."""
+    """Zeroth order: costs to go times the scores of single steps."""
 
-    name, label = "zobg_to_go", "ZoBG, costs to go"
-    description = "zeroth order: costs to go times the scores of single steps"
-    needs = ("steps",)
+    name, label, needs = "zobg_to_go", "ZoBG, costs to go", ("steps",)
 
     def combine(self, steps: StepEvaluation) -> GradientEstimate:
         return cost_to_go(steps, self.baseline)
@@ -204,11 +198,9 @@ class CostToGo(_Baselined):
 
 @register
 class AntitheticCostToGo(_Baselined):
-    """See `antithetic_cost_to_go`."""
+    """Costs to go over pairs of opposite noise."""
 
-    name, label = "zobg_to_go_antithetic", "ZoBG, to go, antithetic"
-    description = "costs to go over pairs of opposite noise"
-    needs = ("step_pair",)
+    name, label, needs = "zobg_to_go_antithetic", "ZoBG, to go, antithetic", ("step_pair",)
 
     def combine(self, pair: tuple[StepEvaluation, StepEvaluation]) -> GradientEstimate:
         return antithetic_cost_to_go(*pair, self.baseline)
@@ -216,11 +208,9 @@ class AntitheticCostToGo(_Baselined):
 
 @register
 class FirstOrder(Estimator):
-    """See `first_order`."""
+    """First order: gradients of the samples."""
 
-    name, label = "fobg", "FoBG"
-    description = "first order: gradients of the samples"
-    needs = ("differentiation",)
+    name, label, needs = "fobg", "FoBG", ("differentiation",)
 
     def combine(self, differentiation: Differentiation) -> GradientEstimate:
         return first_order(differentiation)
@@ -229,11 +219,12 @@ class FirstOrder(Estimator):
 @register
 @dataclass(frozen=True, kw_only=True)
 class ClippedFirstOrder(Estimator):
-    """See `clipped_first_order`; `max_norm` of a sample, > 0, [cost/param]."""
+    """First order, the norm of every sample bounded.
 
-    name, label = "fobg_clipped", "FoBG, clipped"
-    description = "first order, the norm of every sample bounded"
-    needs = ("differentiation",)
+    `max_norm` of a sample, > 0, [cost/param].
+    """
+
+    name, label, needs = "fobg_clipped", "FoBG, clipped", ("differentiation",)
 
     max_norm: float
 
@@ -247,11 +238,12 @@ class ClippedFirstOrder(Estimator):
 @register
 @dataclass(frozen=True, kw_only=True)
 class TruncatedFirstOrder(Estimator):
-    """See `truncated_first_order`; `window` of steps between cuts of the adjoint, >= 1."""
+    """First order, the adjoint cut every few steps.
 
-    name, label = "fobg_truncated", "FoBG, truncated"
-    description = "first order, the adjoint cut every few steps"
-    needs = ("linearisation",)
+    `window` of steps between cuts of the adjoint, >= 1.
+    """
+
+    name, label, needs = "fobg_truncated", "FoBG, truncated", ("linearisation",)
 
     window: int
 
@@ -286,17 +278,16 @@ class _OneWeight(_Interpolation):
 @register
 @dataclass(frozen=True, kw_only=True)
 class AlphaOrder(_OneWeight):
-    """See `alpha_order`, and `bernstein_epsilon` for what decides epsilon.
+    """Alpha order: the two interpolated within an error of gamma.
 
     Attributes:
         gamma: Largest error to accept, > 0 or infinity, [cost/param].
-        failure_probability: Of the confidence radius, in (0, 1).
+        failure_probability: Of the confidence radius, in (0, 1); see `bernstein_epsilon`.
         variance_proxy: "variance", "second_moment" or "upper_bound".
         radius: "max_deviation" or a bound >= 0 on ||g_i - E g||, [cost/param].
     """
 
     name, label = "aobg", "AoBG"
-    description = "alpha order: the two interpolated within an error of gamma"
 
     gamma: float = float("inf")
     failure_probability: float = 0.05
@@ -321,10 +312,9 @@ class AlphaOrder(_OneWeight):
 
 @register
 class InverseVariance(_OneWeight):
-    """See `inverse_variance_alpha`."""
+    """Inverse-variance weighting: alpha order with gamma infinite."""
 
     name, label = "ivw", "IVW"
-    description = "inverse-variance weighting: alpha order with gamma infinite"
 
     def choose(self, zeroth: GradientEstimate, first: GradientEstimate) -> AlphaChoice:
         alpha = inverse_variance_alpha(zeroth.variance, first.variance)
@@ -334,11 +324,9 @@ class InverseVariance(_OneWeight):
 
 @register
 class StepwiseInverseVariance(_Interpolation):
-    """See `stepwise_inverse_variance`."""
+    """Inverse-variance weights for every step and control."""
 
-    name, label = "ivw_h", "IVW-H"
-    description = "inverse-variance weights for every step and control"
-    needs = ("steps", "step_differentiation")
+    name, label, needs = "ivw_h", "IVW-H", ("steps", "step_differentiation")
 
     def combine(self, steps: StepEvaluation, differentiation: StepDifferentiation) -> GradientEstimate:
         return stepwise_inverse_variance(steps, differentiation, self.baseline, self.weights)
@@ -346,11 +334,9 @@ class StepwiseInverseVariance(_Interpolation):
 
 @register
 class TotalPropagation(_Interpolation):
-    """See `total_propagation`."""
+    """Inverse-variance weights inside the backward recursion."""
 
-    name, label = "total_propagation", "total propagation"
-    description = "inverse-variance weights inside the backward recursion"
-    needs = ("linearisation",)
+    name, label, needs = "total_propagation", "total propagation", ("linearisation",)
 
     def combine(self, linearisation: Linearisation) -> GradientEstimate:
         return total_propagation(linearisation, self.baseline, self.weights)
@@ -359,11 +345,12 @@ class TotalPropagation(_Interpolation):
 @register
 @dataclass(frozen=True, kw_only=True)
 class DiscontinuityGated(_Interpolation):
-    """See `discontinuity_gated`; `sigma` of the noise, > 0, [control], and `tolerance` c of the test, in [0, 1)."""
+    """Inverse-variance weighting where a test finds no discontinuity, else zeroth order.
 
-    name, label = "ddcg", "DDCG"
-    description = "inverse-variance weighting where a test finds no discontinuity, else zeroth order"
-    needs = ("evaluation", "step_differentiation")
+    `sigma` of the noise, > 0, [control], and `tolerance` c of the test, in [0, 1).
+    """
+
+    name, label, needs = "ddcg", "DDCG", ("evaluation", "step_differentiation")
     gaussian = True
 
     sigma: float
@@ -382,11 +369,12 @@ class DiscontinuityGated(_Interpolation):
 @register
 @dataclass(frozen=True, kw_only=True)
 class DeltaMethod(Estimator):
-    """See `delta_control_variate`; `sigma` of the noise, > 0, [param]."""
+    """First-order mean and a zeroth-order estimate of what it leaves over; noise on theta itself.
 
-    name, label = "delta", "delta"
-    description = "first-order mean and a zeroth-order estimate of what it leaves over; noise on theta itself"
-    needs = ("evaluation", "differentiation")
+    `sigma` of the noise, > 0, [param].
+    """
+
+    name, label, needs = "delta", "delta", ("evaluation", "differentiation")
     gaussian = additive = True
 
     sigma: float
