@@ -1,11 +1,11 @@
-"""What rollouts and gradients cost, against what one would use otherwise; rates and ratios of one run.
+"""Cost of rollouts and gradients against the alternatives; rates and ratios of one run.
 
-The rivals get the same policy, starts, noise, devices and precision:
+The baselines get the same policy, initial states, noise, devices and precision:
 
-- stock MJX: `jax.grad` through `mjx.step` with the one solver iteration that reverse mode allows (its gradient is then
-  not that of the converged step), in batches that its memory allows;
-- the C engine: centred `mjd_transitionFD` at every step and an adjoint sweep, one thread measured and multiplied by the
-  number of devices, as if threads cost nothing; not with quaternions, nor with RK4, which it does not differentiate.
+- stock MJX: `jax.grad` through `mjx.step` with the one solver iteration that reverse mode allows (so its gradient is
+  not that of the converged step), in batches that fit in memory;
+- the C engine: centred `mjd_transitionFD` at every step and an adjoint sweep, one thread measured and scaled by the
+  number of devices, as if threading were free; not with quaternions, nor with RK4, which it does not differentiate.
 """
 
 import dataclasses
@@ -36,7 +36,7 @@ from mjx_study.tasks.task import Task
 REPEATS: Final = 5
 ENGINE_SAMPLES: Final = 5
 STOCK_BATCH: Final = {"cpu": 125, "gpu": 32768, "tpu": 32768}
-"""Most samples per device that stock MJX gets at once: its gradients keep every intermediate of every step."""
+"""Largest batch per device for stock MJX, whose gradients store every intermediate of every step."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,14 +44,14 @@ class BenchReport:
     """Seconds per sample, memory, and the ratios that follow.
 
     Attributes:
-        task, samples, horizon: what was run.
+        task, samples, horizon: name of the task, number of samples, number of steps.
         contact: family and stiffness of the contact.
-        value_seconds: a zeroth-order sample, one rollout and its share of baselines [s].
-        gradient_seconds: a first-order sample, one rollout and its gradient [s].
-        rollout_seconds: one rollout [s].
-        stock_value_seconds: a rollout through stock MJX with the same solver budget [s].
-        stock_gradient_seconds: a gradient through stock MJX with one solver iteration [s].
-        engine_gradient_seconds: a gradient by the C engine's differences on as many threads [s]; None where it has
+        value_seconds: time of a zeroth-order sample, one rollout and its share of the baselines [s].
+        gradient_seconds: time of a first-order sample, one rollout and its gradient [s].
+        rollout_seconds: time of one rollout [s].
+        stock_value_seconds: time of a rollout through stock MJX with the same solver budget [s].
+        stock_gradient_seconds: time of a gradient through stock MJX with one solver iteration [s].
+        engine_gradient_seconds: time of a gradient by the C engine's differences on as many threads [s]; None if it has
             none.
         gradient_memory: temporary memory of all samples' gradients at once [MiB].
         environment: versions and machine.
@@ -72,7 +72,7 @@ class BenchReport:
 
     @property
     def ratios(self) -> dict[str, float]:
-        """The figures that can be compared between machines."""
+        """Ratios, which can be compared between machines."""
         ratios = {
             "gradient_per_value": self.gradient_seconds / self.value_seconds,
             "rollouts_over_stock": self.stock_value_seconds / self.rollout_seconds,
@@ -117,7 +117,7 @@ class BenchReport:
 
 @dataclasses.dataclass(frozen=True)
 class BenchPlan:
-    """What to measure, checked."""
+    """A validated benchmark configuration."""
 
     task: Task
     samples: int
@@ -125,7 +125,7 @@ class BenchPlan:
 
 
 def plan_bench(task: Task, samples: int) -> BenchPlan:
-    """Check what is to be measured.
+    """Plan a benchmark.
 
     Raises:
         ValueError: fewer than one sample.
@@ -138,14 +138,14 @@ def plan_bench(task: Task, samples: int) -> BenchPlan:
 
 
 def bench(plan: BenchPlan, progress: Progress = lambda done, total, what: None) -> BenchReport:
-    """Measure everything, ours and the rivals' interleaved; medians of repeats."""
+    """Measure everything, interleaved with the baselines; medians of repeats."""
     task, samples, cell = plan.task, plan.samples, plan.cell
     devices = jax.local_devices()
     keys = jax.random.split(jax.random.key(0), samples)
     simulator = Simulator(task, chunk_size=chunk_for(samples, devices))
     objective = simulator.objective(cell.contact)
     full = -(-samples // (simulator.chunk_size * len(devices))) * simulator.chunk_size * len(devices)
-    key_data = np.resize(jax.random.key_data(keys), (full, 2))  # chunks without padding, which stock has not either
+    key_data = np.resize(jax.random.key_data(keys), (full, 2))  # no padded chunks, as in stock
     noisy = np.ones(full, task.scene.template.qpos.dtype)
     progress(0, 8, f"{task.name}: compiling stock")
     stock_samples = min(samples, STOCK_BATCH[devices[0].platform] * len(devices))
@@ -187,7 +187,7 @@ def _seconds(call: Callable[[], Any]) -> float:
 
 
 def _fitting_stock(task: Task, contact: ContactModel | None, keys: Any, samples: int, devices: Any):
-    """How many samples' gradients through `mjx.step` fit in memory, halved until they do, and the programs."""
+    """Largest batch, by halving, whose gradients through `mjx.step` fit in memory, and the programs."""
     while True:
         value, gradient = _stock_programs(task, contact, keys[:samples], devices)
         try:
@@ -201,7 +201,7 @@ def _fitting_stock(task: Task, contact: ContactModel | None, keys: Any, samples:
 
 
 def _stock_programs(task: Task, contact: ContactModel | None, keys: Any, devices: Any) -> tuple[Callable[[], Any], ...]:
-    """Costs and gradients of the same samples through `mjx.step`, sharded like ours."""
+    """Programs for costs and gradients of the same samples through `mjx.step`, sharded like ours."""
     scene, policy = task.scene, task.policy
     dtype = scene.template.qpos.dtype
 
@@ -254,9 +254,9 @@ def _engine_seconds(task: Task, contact: ContactModel | None) -> float | None:
 def engine_gradient(
     task: Task, contact: ContactModel | None, start: tuple[np.ndarray, np.ndarray], controls: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Gradient of the sum of the last state with respect to start state and controls.
+    """Gradient of the sum of the final state with respect to initial state and controls, by the C engine.
 
-    By the C engine: centred differences of each step, and one adjoint sweep.
+    Centred differences of each step, and one adjoint sweep.
     """
     host = engine_model(task.scene, contact)
     data = mujoco.MjData(host)

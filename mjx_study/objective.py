@@ -1,9 +1,9 @@
 """(Task, ContactModel) -> the Objective that estimators see.
 
-Batching, chunks and devices live here and nowhere else. A `Simulator` holds the compiled programs of a task, one for
-each kind of batch that estimators ask for; contact parameters, theta, sigma and keys are arguments, so a sweep over
+Batching, chunks and devices are handled here and nowhere else. A `Simulator` holds the compiled programs of a task, one
+for each kind of batch that estimators ask for; contact parameters, theta, sigma and keys are arguments, so a sweep over
 them compiles nothing new. Samples are spread over the devices with `jax.shard_map`, where each device leaves the
-solver's loop on its own, in chunks of fixed size that bound memory.
+solver's loop independently, in chunks of fixed size that bound memory.
 """
 
 import dataclasses
@@ -25,8 +25,8 @@ from mjx_study.simulation.onset import OnsetCounts, as_row, corrected_rollout
 from mjx_study.tasks.task import Task, check_sigma
 
 MAX_CHUNK: Final = {"cpu": 512, "gpu": 2**15 + 1, "tpu": 2**15 + 1}
-"""Most samples per device in one call, by backend: a CPU gains nothing from larger batches, an accelerator needs them;
-and this bounds memory (about 40 kB for each gradient of 200 steps of a two-joint model). One more than a power of two,
+"""Largest number of samples per device and call, by backend: a CPU gains nothing from larger batches, an accelerator
+needs them. It bounds memory (about 40 kB per gradient of 200 steps of a two-joint model). One more than a power of two,
 for the baseline."""
 
 
@@ -41,16 +41,16 @@ def rollout_cost(
     """Total cost V_1 of one rollout, a pure function of everything that may be traced or differentiated.
 
     Args:
-        task: what is simulated.
+        task: the task to simulate.
         theta: parameters of its policy.
         contact: the contact model; None for the MJCF's own.
-        start: the start state, before the policy acts on it.
-        noise: of the policy's `noise_shape`.
+        start: the initial state, before the policy acts on it.
+        noise: noise of the policy's `noise_shape`.
         onset: "none", or "linear" for a derivative with the onset term (see `mjx_study.simulation.onset`).
 
     Returns:
-        The cost; and the states `(horizon + 1, ...)` with the start first, the controls, the largest relative
-        solver residual, and what the onset term met (None without it).
+        The cost; and the states `(horizon + 1, ...)` including the initial one, the controls, the largest relative
+        solver residual, and the counts of onsets (None without the onset term).
     """
     feedforward = task.policy.feedforward(theta, noise)
 
@@ -76,14 +76,14 @@ def simulate(
     key: Key[Array, ""],
     noise_scale: float | Float[Array, ""],
 ) -> tuple[State, Float[Array, "horizon nu"], Float[Array, ""], Float[Array, ""]]:
-    """One sample's rollout: its states with the start first, controls, cost and largest solver residual.
+    """One sample's rollout: states including the initial one, controls, cost and largest solver residual.
 
     Args:
-        task: what is simulated.
+        task: the task to simulate.
         theta: parameters of its policy.
         contact: the contact model; None for the MJCF's own.
-        key: of the sample; draws start and noise as in a batch.
-        noise_scale: factor on the noise; 0 for a rollout without.
+        key: key of the sample; draws initial state and noise as in a batch.
+        noise_scale: factor on the noise; 0 for a zero-noise rollout.
     """
     start_key, noise_key = split_sample_key(key)
     noise = noise_scale * task.sigma * standard_noise(noise_key, task.policy.noise_shape, theta.dtype, task.noise)
@@ -100,7 +100,7 @@ def _last(states: State) -> State:
 
 
 def _coordinates(state: State) -> Float[Array, " states"]:
-    """The state as a vector; the solver's warm start is no part of it."""
+    """The state as a vector, without the solver's warm start."""
     return jnp.concatenate([state.qpos, state.qvel, state.act])
 
 
@@ -109,9 +109,9 @@ class Simulator:
     """The compiled programs of a task.
 
     Attributes:
-        task: what is simulated; its scene's contact parameters are replaced by those of each call.
+        task: the task to simulate; each call replaces its scene's contact parameters.
         chunk_size: samples per device and call; `chunk_for` chooses one.
-        devices: where samples are spread; by default all local devices.
+        devices: devices over which samples are spread; by default all local ones.
     """
 
     task: Task
@@ -127,17 +127,17 @@ class Simulator:
         object.__setattr__(self, "_programs", programs)
 
     def objective(self, contact: ContactModel | None, sigma: float | None = None) -> "MjxObjective":
-        """Bind a contact model, and a noise level other than the task's."""
+        """The objective under a contact model, with the task's noise level or another."""
         return MjxObjective(self, contact, self.task.sigma if sigma is None else sigma)
 
     @property
     def num_compilations(self) -> int:
-        """How many programs this simulator has compiled so far."""
+        """Number of programs that this simulator has compiled so far."""
         return sum(program._cache_size() for program in self._programs.values())  # type: ignore[attr-defined]
 
     @property
     def sample_programs(self) -> dict[str, Callable[..., Any]]:
-        """What one sample's rollout gives for each kind of batch, as pure functions to be batched.
+        """One-sample programs for each kind of batch, as pure functions to be batched.
 
         Each takes (theta, contact, sigma, key data, factor on the noise).
         """
@@ -150,7 +150,7 @@ class Simulator:
         }
 
     def gradient_memory(self, contact: ContactModel | None, samples: int) -> int:
-        """Temporary memory of the gradients of a batch, all chunks at once on all devices [bytes], as XLA plans it."""
+        """XLA's planned temporary memory for the gradients of a batch, all chunks at once on all devices [bytes]."""
         capacity = self.chunk_size * len(self.devices)
         dtype = self.task.scene.template.qpos.dtype
         keys = np.asarray(jax.random.key_data(jax.random.split(jax.random.key(0), capacity)))
@@ -173,7 +173,7 @@ class Simulator:
         )
 
     def _draw(self, sigma, key_data, noise_scale) -> tuple[State, Float[Array, "steps dimensions"]]:
-        """Start and noise of a sample."""
+        """Initial state and noise of a sample."""
         task = self.task
         start_key, noise_key = split_sample_key(jax.random.wrap_key_data(key_data))
         dtype = task.scene.template.qpos.dtype
@@ -181,7 +181,7 @@ class Simulator:
         return task.draw_start(start_key), noise_scale * sigma * standard
 
     def _cost(self, theta, contact, sigma, key_data, noise_scale, onset="none"):
-        """Cost of one rollout, and its states, controls, noise, largest solver residual and onsets."""
+        """Cost of one rollout, and its states, controls, noise, largest solver residual and onset counts."""
         start, noise = self._draw(sigma, key_data, noise_scale)
         cost, (states, controls, residual, counts) = rollout_cost(self.task, theta, contact, start, noise, onset)
         return cost, (states, controls, noise, residual, counts)
@@ -236,7 +236,7 @@ class Simulator:
         return terms, residual, (*over_cost, over_final, *over_step, over_policy, over_start)
 
     def _step_terms(self, theta, states, controls, noise, sigma):
-        """Costs to go from each step at which there is noise, the noise's scores, and the policy's Jacobian."""
+        """Costs to go from each step with noise, the noise's scores, and the policy's Jacobian."""
         running = jax.vmap(self.task.running_cost)(_before_each_step(states), controls)
         to_go = jnp.cumsum(running[::-1])[::-1] + self.task.final_cost(_last(states))
         return to_go[: len(noise)], noise_score(noise, sigma, self.task.noise), self._policy_jacobian(theta, states)
@@ -253,7 +253,7 @@ class Simulator:
         """Run one of `sample_programs` chunk by chunk; the last chunk is padded by repeating its last sample.
 
         Args:
-            name: of the program.
+            name: name of the program.
             theta: parameters, (params,).
             contact: the contact model; None for the MJCF's own.
             sigma: standard deviation of the noise.
@@ -261,10 +261,10 @@ class Simulator:
             noise_scale: factor on each sample's noise.
 
         Returns:
-            What the program gives, with an axis of samples in front; NumPy arrays.
+            The program's outputs with a leading axis of samples; NumPy arrays.
 
         Raises:
-            ValueError: sigma or theta is unfit, or there is no sample.
+            ValueError: sigma or theta is invalid, or there is no sample.
         """
         check_sigma(sigma)
         if theta.shape != (self.task.policy.num_params,):
@@ -303,10 +303,10 @@ class MjxObjective:
         return self.simulator.task.policy.num_params
 
     def evaluate(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> Evaluation:
-        """Values and scores by rollouts alone; the dynamics are not differentiated.
+        """Values and scores from rollouts alone; the dynamics are not differentiated.
 
-        The baseline, the zero-noise rollout from the same start, rides along as samples whose noise is scaled by 0: one
-        for all where the start is fixed, otherwise one each.
+        The baseline, the zero-noise rollout from the same initial state, is run as extra samples whose noise is scaled
+        by 0: a single one if the initial state is fixed, otherwise one per sample.
         """
         samples = len(keys)
         silent = np.arange(samples if self.simulator.task.random_start else min(samples, 1))
@@ -316,13 +316,13 @@ class MjxObjective:
         return Evaluation(*map(jnp.asarray, (values[:samples], scores[:samples], baseline, residuals[:samples])))
 
     def evaluate_odd(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> Evaluation:
-        """The part of the objective that is odd in the noise, (f(w) - f(-w)) / 2, by two rollouts per sample.
+        """The part of the objective that is odd in the noise, (f(w) - f(-w)) / 2, from two rollouts per sample.
 
-        Only the odd part correlates with the score of noise that is added to theta, so it has the same gradient; the
-        even part, most of the variance of a zeroth-order sample, is gone.
+        Only the odd part correlates with the score of noise added to theta, so it has the same gradient; the even part,
+        most of the variance of a zeroth-order sample, drops out.
 
         Raises:
-            ValueError: the policy has feedback; then the score is not odd in the noise.
+            ValueError: the policy has feedback, so that the score is not odd in the noise.
         """
         if not self.simulator.task.policy.additive:
             raise ValueError("the odd part of an objective needs a policy whose noise is added to theta")
@@ -336,7 +336,7 @@ class MjxObjective:
     def evaluate_pair(
         self, theta: Float[Array, " params"], keys: Key[Array, " samples"]
     ) -> tuple[Evaluation, Evaluation]:
-        """Two evaluations whose noises are opposite, sample by sample, from the same starts; three rollouts each."""
+        """Two evaluations with opposite noise, sample by sample, from the same initial states; three rollouts each."""
         samples = len(keys)
         scale = np.repeat([1.0, -1.0, 0.0], samples)
         values, scores, residuals = self._run("value", theta, keys, np.tile(np.arange(samples), 3), scale)
@@ -365,13 +365,13 @@ class MjxObjective:
         return plus, minus
 
     def differentiate_steps(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> StepDifferentiation:
-        """The rollouts of `differentiate`, with the derivative of each sample's cost by its noise."""
+        """The rollouts of `differentiate`, with the derivative of each sample's cost with respect to its noise."""
         return StepDifferentiation(*jax.tree.map(jnp.asarray, self._run("step_gradient", theta, keys)))
 
     def linearise(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> Linearisation:
         """The rollouts of `differentiate`, with the derivatives of every step.
 
-        The state is (qpos, qvel, act), so that a quaternion counts four.
+        The state is (qpos, qvel, act), so a quaternion counts four.
         """
         (terms, residual, derivatives), silent = (
             self._run("linearisation", theta, keys),
@@ -397,16 +397,16 @@ class MjxObjective:
         return [half(slice(index * samples, (index + 1) * samples)) for index in range(len(signs))]
 
     def _silent_to_go(self, theta, keys):
-        """Costs to go of the rollouts without noise, one where all samples share it."""
+        """Costs to go of the zero-noise rollouts, a single one if all samples share it."""
         rows = np.arange(len(keys) if self.simulator.task.random_start else min(len(keys), 1))
         (to_go, *_), _ = self._run("steps", theta, keys, rows, np.zeros(len(rows)))
         return _for_all(to_go, len(keys))
 
     def _run(self, name: str, theta, keys, rows=None, noise_scale=None):
-        """A program on rows of the keys, all of them once unless told otherwise."""
+        """Run a program on rows of the keys, by default each once."""
         rows = np.arange(len(keys)) if rows is None else rows
         scale = np.ones(len(rows)) if noise_scale is None else noise_scale
-        # The bare key data: one noise is drawn on purpose for several rollouts, which is no reuse of a key.
+        # Bare key data: drawing the same noise for several rollouts is intended, not a reused key.
         key_data = np.asarray(jax.random.key_data(keys))[rows]
         dtype = self.simulator.task.scene.template.qpos.dtype
         return self.simulator.run(name, theta, self.contact, self.sigma, key_data, scale.astype(dtype))
@@ -438,12 +438,12 @@ class TracedObjective(MjxObjective):
 
 
 def _for_all(rows, samples: int):
-    """Rows that are one for each sample, or one for all of them; on the host without a compilation for each size."""
+    """Broadcast rows, one per sample or one for all; on the host without a compilation per size."""
     numpy = np if isinstance(rows, np.ndarray) else jnp
     return numpy.broadcast_to(rows, (samples, *rows.shape[1:]))
 
 
 def chunk_for(samples: int, devices: Sequence[Any]) -> int:
-    """The chunk size that runs `samples` and their baseline in the fewest, evenly filled calls on these devices."""
+    """The chunk size that runs `samples` and their baseline in the fewest evenly filled calls on these devices."""
     per_device, most = math.ceil((samples + 1) / len(devices)), MAX_CHUNK[devices[0].platform]
     return math.ceil(per_device / math.ceil(per_device / most))

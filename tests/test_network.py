@@ -52,7 +52,7 @@ def test_it_starts_without_control_and_sees_what_linear_feedback_sees() -> None:
 
 
 def test_what_cannot_be_a_network_is_refused() -> None:
-    with pytest.raises(ValueError, match="ball_wall has no control that a network could give"):
+    with pytest.raises(ValueError, match="ball_wall has no control for a network to set"):
         with_network(make_task("ball_wall", horizon=3), (8,), jax.random.key(7))
     with pytest.raises(ValueError, match=r"at least 1 unit each, got \(4, 0\)"):
         with_network(make_task("pusher", horizon=3), (4, 0), jax.random.key(8))

@@ -251,7 +251,7 @@ def test_options_that_a_function_does_not_take(write) -> None:
 def test_a_task_takes_no_options(write) -> None:
     write(TINY + "\nmade = hop()\n")
     assert refused("mine:made", horizon=3, cone="elliptic") == (
-        "mine:made is a Task that is made already, and horizon and cone cannot change it: "
+        "mine:made is a ready-made Task, which horizon and cone cannot change: "
         "give a function that takes this and returns the Task"
     )
 

@@ -1,4 +1,4 @@
-r"""Rollouts of an analytic system and their gradient by one adjoint sweep.
+r"""Rollouts of an analytic system and their gradients by one adjoint sweep.
 
 The control is u_h = c_h + K x_h, with an optional feedback matrix K. With A_h, B_h the Jacobians of a step,
 
@@ -20,10 +20,10 @@ class Rollout:
     """A simulated batch.
 
     Attributes:
-        states: with the start first.
-        controls: as applied, feedback included.
-        value: total cost of each member.
-        costs: of each step, and the final one.
+        states: states, including the initial one.
+        controls: controls as applied, feedback included.
+        value: total cost of each rollout.
+        costs: running costs, followed by the final cost.
     """
 
     states: Float[np.ndarray, "*batch steps states"]
@@ -33,18 +33,18 @@ class Rollout:
 
     @property
     def value_to_go(self) -> Float[np.ndarray, "*batch horizon"]:
-        """Cost from each step on."""
+        """Cost to go from each step."""
         return np.cumsum(self.costs[..., ::-1], axis=-1)[..., :0:-1]
 
 
 @dataclasses.dataclass(frozen=True)
 class Gradients:
-    """Derivatives of the total cost, for each member of the batch by itself.
+    """Gradients of the total cost of each rollout in a batch.
 
     Attributes:
-        start: with respect to the start state.
-        controls: with respect to the control sequence c.
-        feedback: with respect to the feedback matrix K; None where there is none.
+        start: gradient with respect to the initial state.
+        controls: gradient with respect to the control sequence c.
+        feedback: gradient with respect to the feedback matrix K; None if there is none.
     """
 
     start: Float[np.ndarray, "*batch states"]
@@ -58,10 +58,10 @@ def roll_out(
     controls: Float[np.ndarray, "... horizon controls"],
     feedback: Float[np.ndarray, "_ _"] | None = None,
 ) -> Rollout:
-    """Simulate u_h = controls_h + feedback x_h from `start`; the batches of start and controls are broadcast.
+    """Simulate u_h = controls_h + feedback x_h from `start`; the batch axes of start and controls are broadcast.
 
     Raises:
-        ValueError: a start, a control sequence or a feedback matrix that does not fit the system.
+        ValueError: the initial state, controls or feedback matrix do not fit the system.
     """
     start, controls = np.asarray(start, float), np.asarray(controls, float)
     _check(system, start, controls, feedback)
@@ -87,7 +87,7 @@ def value_and_gradients(
     controls: Float[np.ndarray, "... horizon controls"],
     feedback: Float[np.ndarray, "_ _"] | None = None,
 ) -> tuple[Float[np.ndarray, "..."], Gradients]:
-    """Total cost and its exact gradients with respect to start, control sequence and feedback matrix.
+    """Total cost and its exact gradients with respect to initial state, control sequence and feedback matrix.
 
     Raises:
         ValueError: as `roll_out`.

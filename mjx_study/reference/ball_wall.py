@@ -20,15 +20,15 @@ class BallWall:
 
     For every angle, with period 2 pi: launched into the ground (sin <= 0) it stays at 0; launched backwards (cos < 0 <
     sin) it lands at its range R < 0, where no wall stands; launched forwards it lands at R if that is short of the wall
-    (where y < 0: it never gets there above ground) or if it clears the top (y >= height); otherwise the inelastic
+    (there y < 0: it never reaches it above ground) or if it clears the top (y >= height); otherwise the inelastic
     impact drops it at the foot of the wall. The wall has no thickness, so a ball that clears it cannot hit it later.
 
     Where R reaches d the cost is continuous, because y = 0 there; where y = height it jumps.
 
     Attributes:
-        speed: v [m/s].
-        distance: d, of the wall [m].
-        height: of the wall [m].
+        speed: launch speed v [m/s].
+        distance: distance d of the wall [m].
+        height: height of the wall [m].
         gravity: g [m/s^2].
 
     Reference: Suh et al. 2022, "Ball with wall", with its published example's numbers.
@@ -52,19 +52,19 @@ class BallWall:
         return np.asarray(-(self.landing(x) ** 2))
 
     def gradient(self, x: Float[np.ndarray, "*batch 1"]) -> Float[np.ndarray, "*batch 1"]:
-        """-2 R dR/dangle in free flight, 0 where the ball stays on the ground or falls at the wall."""
+        """-2 R dR/dangle in free flight, 0 where the ball stays on the ground or drops at the wall."""
         angle = x[..., 0]
         flies = (np.sin(angle) > 0) & ~self.meets_wall(x)
         slope = 2 * self.speed**2 / self.gravity * np.cos(2 * angle)
         return np.where(flies, -2 * self.landing(x) * slope, 0.0)[..., None]
 
     def landing(self, x: Float[np.ndarray, "*batch 1"]) -> Float[np.ndarray, "*batch"]:
-        """Where the ball lands [m]."""
+        """Landing position [m]."""
         free = np.where(np.sin(x[..., 0]) > 0, self._range(x[..., 0]), 0.0)
         return np.where(self.meets_wall(x), self.distance, free)
 
     def meets_wall(self, x: Float[np.ndarray, "*batch 1"]):
-        """Whether the ball gets to the wall and does not clear its top."""
+        """Whether the ball reaches the wall and does not clear its top."""
         angle = x[..., 0]
         # y < height, multiplied by cos^2 > 0.
         drop = self.gravity * self.distance**2 / (2 * self.speed**2)
@@ -72,7 +72,7 @@ class BallWall:
         return (np.sin(angle) > 0) & (self._range(angle) >= self.distance) & low
 
     def jumps(self) -> tuple[Jump, ...]:
-        """Where the ball just clears the top; none if it never does."""
+        """Jumps where the ball just clears the top; none if it never does."""
         gains = [float(self._range(np.asarray(angle))) ** 2 - self.distance**2 for angle in self._clearing()]
         signs = (-1, 1)[: len(gains)]  # the cost falls where the ball begins to clear the wall, and rises where it ends
         return tuple(Jump(angle, sign * gain) for angle, sign, gain in zip(self._clearing(), signs, gains, strict=True))

@@ -1,11 +1,11 @@
-r"""Two point masses on massless rods, without friction or actuation; chaotic, and smooth.
+r"""Two point masses on massless rods, without friction or actuation; chaotic but smooth.
 
 With c, s = cos q_2, sin q_2 and k = g / l (the masses are equal and cancel),
 
     [3 + 2 c, 1 + c; 1 + c, 1] a = (s v_2 (2 v_1 + v_2) - k (2 sin q_1 + sin(q_1 + q_2)),
                                     -s v_1^2 - k sin(q_1 + q_2)),
 
-integrated by the classical Runge-Kutta method of order 4.
+integrated by the classical fourth-order Runge-Kutta method.
 
 Reference: Suh et al. 2022, chaos example; equations of motion from the Lagrangian, so that energy is conserved.
 """
@@ -18,17 +18,17 @@ from jaxtyping import Float
 
 @dataclasses.dataclass(frozen=True)
 class DoublePendulum:
-    """State (q1, q2, v1, v2) [rad, rad/s]; no control; cost |(q1, q2) - goal|^2 at the end.
+    """State (q1, q2, v1, v2) [rad, rad/s]; no control; final cost |(q1, q2) - goal|^2.
 
     q1 is the first rod's angle from hanging straight down, q2 the second's relative to the first (MuJoCo's joint
-    coordinate), so that both are 0 at rest. Angles are never wrapped: the final state depends smoothly on the start.
+    coordinate), so both are 0 at rest. Angles are never wrapped: the final state is smooth in the initial state.
 
     Attributes:
         timestep: h [s].
-        mass: of each point [kg].
-        length: of each rod [m].
+        mass: mass of each point [kg].
+        length: length of each rod [m].
         gravity: g [m/s^2].
-        goal: angles that the cost pulls to [rad].
+        goal: target angles [rad].
     """
 
     timestep: float = 0.001
@@ -65,7 +65,7 @@ class DoublePendulum:
         return identity + h / 6 * total, np.zeros((*state.shape, 0))
 
     def energy(self, state: Float[np.ndarray, "*batch 4"]) -> Float[np.ndarray, "*batch"]:
-        """Kinetic and potential energy, 0 at height 0 of the pivot [J]."""
+        """Kinetic plus potential energy, the latter 0 at the pivot's height [J]."""
         first, second, mixed = self._inertia(state)
         v1, v2 = state[..., 2], state[..., 3]
         kinetic = 0.5 * self.mass * self.length**2 * (first * v1**2 + 2 * mixed * v1 * v2 + second * v2**2)
@@ -96,7 +96,7 @@ class DoublePendulum:
     def cost(
         self, state: Float[np.ndarray, "*batch 4"], control: Float[np.ndarray, "*batch 0"]
     ) -> Float[np.ndarray, "*batch"]:
-        """0: only the last state counts."""
+        """Zero: only the final state has a cost."""
         return np.zeros(state.shape[:-1])
 
     def cost_gradients(

@@ -1,4 +1,4 @@
-r"""Scalar functions of a few parameters with jumps and kinks, and what noise makes of them.
+r"""Scalar functions of a few parameters, with jumps and kinks, and their smoothing by noise.
 
     F(theta) = E f(theta + w),   w = sigma z, the entries of z independent with density p = exp(-psi) of variance 1
 
@@ -6,7 +6,7 @@ In one dimension, with jumps f(t_j+) - f(t_j-),
 
     grad F = E f'(theta + w) + sum_j [f(t_j+) - f(t_j-)] p((t_j - theta) / sigma) / sigma,
 
-so the sum, the jump term, is exactly what a first-order estimate misses: E[FoBG] = grad F - jump term.
+so a first-order estimate misses exactly the sum, the jump term: E[FoBG] = grad F - jump term.
 """
 
 import dataclasses
@@ -19,16 +19,16 @@ from jaxtyping import Float
 from mjx_study.reference.noise import check_density
 
 TAIL: Final = 1e-15
-"""Probability of noise beyond what quadrature covers."""
+"""Probability of noise outside the range of the quadrature."""
 NODES: Final = np.polynomial.legendre.leggauss(64)
-"""Of the rule of Gauss and Legendre between neighbouring cuts: on (-1, 1), and their weights."""
+"""Nodes on (-1, 1) and weights of the Gauss-Legendre rule between neighbouring cuts."""
 CORE, PANEL, GROWTH = 8.0, 0.5, 1.25
-"""Standard deviations between which cuts are evenly spaced; their spacing; the ratio of those beyond."""
+"""Range of evenly spaced cuts [standard deviations]; their spacing; the growth ratio of the spacing beyond."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Jump:
-    """A discontinuity: where, and f just above it minus f just below."""
+    """A discontinuity: its position, and f just above it minus f just below."""
 
     position: float
     size: float
@@ -36,7 +36,7 @@ class Jump:
 
 @dataclasses.dataclass(frozen=True)
 class Smoothed:
-    """F at a point, its gradient, and the part of the gradient that is due to jumps."""
+    """F at a point, its gradient, and the part of the gradient due to jumps."""
 
     value: float
     gradient: Float[np.ndarray, " params"]
@@ -45,7 +45,7 @@ class Smoothed:
 
 @runtime_checkable
 class Function(Protocol):
-    """A function of the parameters alone, with its gradient by hand; leading axes are a batch."""
+    """A function of the parameters alone, with a hand-written gradient; leading axes are a batch."""
 
     @property
     def num_params(self) -> int:
@@ -57,17 +57,17 @@ class Function(Protocol):
         ...
 
     def gradient(self, x: Float[np.ndarray, "*batch params"]) -> Float[np.ndarray, "*batch params"]:
-        """Gradient of f; on a kink or a jump, of the branch that `value` takes."""
+        """Gradient of f; at a kink or a jump, that of the branch that `value` takes."""
         ...
 
 
 @runtime_checkable
 class ScalarFunction(Function, Protocol):
-    """A function of one parameter that knows its jumps and kinks."""
+    """A function of one parameter with known jumps and kinks."""
 
     @property
     def period(self) -> float:
-        """Period of f; infinity where it has none."""
+        """Period of f; infinity if it has none."""
         ...
 
     def jumps(self) -> tuple[Jump, ...]:
@@ -75,17 +75,17 @@ class ScalarFunction(Function, Protocol):
         ...
 
     def breakpoints(self) -> tuple[float, ...]:
-        """Where f is not smooth, jumps included; all such points, or those of one period."""
+        """All points where f is not smooth, jumps included, or those of one period."""
         ...
 
 
 @runtime_checkable
 class ClosedForm(Protocol):
-    """A function whose smoothing needs no quadrature."""
+    """A function smoothed in closed form, without quadrature."""
 
     @property
     def any_noise(self) -> bool:
-        """Whether that holds for every density of variance sigma^2, not for Gaussian noise alone."""
+        """Whether the closed form holds for every density of variance sigma^2, not only for Gaussian noise."""
         ...
 
     def smoothed(self, theta: Float[np.ndarray, " params"], sigma: float) -> Smoothed:
@@ -96,20 +96,20 @@ class ClosedForm(Protocol):
 def smoothed(
     function: Function, theta: Float[np.ndarray, " params"], sigma: float, noise: str = "gaussian"
 ) -> Smoothed:
-    """F, grad F and the jump term: in closed form where there is one, else by quadrature to about 1e-12.
+    """F, grad F and the jump term: in closed form if there is one, else by quadrature to about 1e-12.
 
     Quadrature integrates f p and f psi' p / sigma between the breakpoints, where f is smooth. It uses neither the
-    gradient nor the jumps' sizes, so that the jump formula above can be checked with it.
+    gradient nor the jumps' sizes, so it can be used to check the jump formula above.
 
     Args:
         function: f.
-        theta: where.
+        theta: point of evaluation.
         sigma: standard deviation of the noise.
-        noise: name of its density in `estimators.NOISES`.
+        noise: name of the noise density in `estimators.NOISES`.
 
     Raises:
         TypeError: the function has neither a closed form for this noise nor a list of breakpoints.
-        ValueError: theta does not have num_params entries, sigma is not positive and finite, or there is no such noise.
+        ValueError: theta does not have num_params entries, sigma is not positive and finite, or the noise is unknown.
     """
     check_noise(sigma)
     density = check_density(noise)
@@ -136,14 +136,14 @@ def smoothed(
 
 
 def _cuts(reach: float) -> Float[np.ndarray, " cuts"]:
-    """Where panels end whatever the function is: 0, where a density may have a kink, among them."""
+    """Ends of the panels for any function, among them 0, where a density may have a kink."""
     even = np.arange(0.0, min(CORE, reach), PANEL)
     tail = np.geomspace(even[-1], reach, 1 + math.ceil(math.log(reach / even[-1], GROWTH)))
     return np.concatenate([-tail, -even, even, tail])
 
 
 def _nodes(cuts: Float[np.ndarray, " cuts"]) -> tuple[Float[np.ndarray, " nodes"], Float[np.ndarray, " nodes"]]:
-    """Nodes and weights of the rule between all neighbouring cuts."""
+    """Nodes and weights of the rule between neighbouring cuts."""
     edges = np.unique(cuts)
     half, (node, weight) = np.diff(edges)[:, None] / 2, NODES
     return (edges[:-1, None] + half * (1 + node)).ravel(), (half * weight).ravel()
@@ -156,7 +156,7 @@ def check_noise(sigma: float) -> None:
 
 
 def _copies(point: float, period: float, centre: float, reach: float) -> Float[np.ndarray, " copies"]:
-    """The point and its repetitions within reach."""
+    """The point and its periodic copies within reach."""
     if math.isinf(period):
         candidates = np.array([point])
     else:

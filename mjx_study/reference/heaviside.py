@@ -1,4 +1,4 @@
-r"""The step, and Coulomb friction's ramp in its place: both smoothed in closed form by Gaussian noise.
+r"""The step function, and Coulomb friction's ramp in its place: both smoothed in closed form by Gaussian noise.
 
 With Phi, phi the standard normal distribution and density,
 
@@ -32,11 +32,11 @@ class Heaviside:
         return np.asarray(x[..., 0] >= 0, float)
 
     def gradient(self, x: Float[np.ndarray, "*batch 1"]) -> Float[np.ndarray, "*batch 1"]:
-        """0 everywhere."""
+        """Zero everywhere."""
         return np.zeros(x.shape)
 
     def jumps(self) -> tuple[Jump, ...]:
-        """One, of size 1 at 0."""
+        """One jump, of size 1 at 0."""
         return (Jump(0.0, 1.0),)
 
     def breakpoints(self) -> tuple[float, ...]:
@@ -85,7 +85,7 @@ class RelaxedHeaviside:
         return (-self.width / 2, self.width / 2)
 
     def smoothed(self, theta: Float[np.ndarray, " 1"], sigma: float) -> Smoothed:
-        """F and grad F by differences over the ramp: rounding of about 1e-16 / nu."""
+        """F and grad F by differences over the ramp, with rounding errors of about 1e-16 / nu."""
         ends = theta + np.array([self.width / 2, -self.width / 2])
         density = NOISES["gaussian"].density
         upper, lower = (end * ndtr(end / sigma) + sigma * density(end / sigma) for end in ends)

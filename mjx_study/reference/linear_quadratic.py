@@ -17,7 +17,7 @@ from mjx_study.reference.function import Smoothed, check_noise
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class LinearQuadratic:
-    """State and control of any size, in any unit.
+    """A linear-quadratic problem with state and control of any size, in any unit.
 
     Attributes:
         transition: A, (states, states).
@@ -109,7 +109,7 @@ class LinearQuadratic:
         return Smoothed(float(value), 2 * (square @ theta + linear), np.zeros(len(theta)))
 
     def first_order_variance(self, horizon: int, sigma: float) -> float:
-        """E|g - E g|^2 = 4 sigma^2 tr(M^2) of a first-order sample of an open loop; the same for every theta and start.
+        """Variance E|g - E g|^2 = 4 sigma^2 tr(M^2) of an open loop's first-order sample, for any theta and start.
 
         Raises:
             ValueError: sigma is not positive and finite.

@@ -1,4 +1,4 @@
-r"""A ball shot at a bar on a pivot, as a function of the launch angle.
+r"""A ball shot at a pivoting bar, as a function of the launch angle.
 
 A ball of mass m and speed v at angle theta meets the upright bar, a distance d away, at height d tan(theta). With
 restitution e and the bar's inertia I about its foot, the impulse is (1 + e) m v cos / (1 + m (d tan)^2 / I), and the
@@ -23,7 +23,7 @@ class MomentumTransfer:
     Attributes:
         edge: largest angle at which the bar is hit [rad].
         restitution: e; 0 is inelastic.
-        inertia_ratio: m d^2 / I of a bar that gives way; 0 is an infinitely heavy one.
+        inertia_ratio: m d^2 / I of the bar; 0 is an infinitely heavy one.
 
     Reference: Suh et al. 2022, "Momentum transfer": -sin^2 up to 45 degrees.
     """
@@ -58,7 +58,7 @@ class MomentumTransfer:
         return np.where(hit, -2 * gain * sine / yielding * slope, 0.0)[..., None]
 
     def jumps(self) -> tuple[Jump, ...]:
-        """At both edges of the bar."""
+        """Jumps at both edges of the bar."""
         size = -float(self.value(np.array([self.edge])))
         return (Jump(-self.edge, -size), Jump(self.edge, size))
 

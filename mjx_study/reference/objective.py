@@ -16,23 +16,23 @@ from mjx_study.reference.noise import check_density, noise_score, split_sample_k
 from mjx_study.reference.system import System
 
 DECISIONS: Final = ("controls", "feedback", "start")
-"""What theta may be in a `ReferenceObjective`."""
+"""Possible meanings of theta in a `ReferenceObjective`."""
 
 Start = tuple[float, ...] | Callable[[Key[Array, ""]], Float[Array, " states"]]
 
 
 @runtime_checkable
 class Reference(Objective, Protocol):
-    """An Objective with derivatives by hand, which can also be had without noise."""
+    """An Objective with hand-written derivatives, which can also be evaluated without noise."""
 
     def value_and_gradient(
         self, theta: Float[Array, " params"], key: Key[Array, ""]
     ) -> tuple[float, Float[np.ndarray, " params"]]:
-        """Noise-free cost and its gradient, from the start that `key` draws."""
+        """Zero-noise cost and its gradient, from the initial state that `key` draws."""
         ...
 
     def observe(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> dict[str, np.ndarray]:
-        """What rollouts came to, by name and sample; empty where there is nothing but the cost."""
+        """Metrics of rollouts beside the cost, by name and sample; empty if there are none."""
         ...
 
 
@@ -40,23 +40,22 @@ class Reference(Objective, Protocol):
 class ReferenceObjective:
     """F(theta) = E V_1 of a policy on an analytic system, with noise w of standard deviation sigma.
 
-    What theta is, and where the noise goes:
+    `decision` sets the meaning of theta and the place of the noise:
 
     - "controls": u_h = theta_h + w_h; theta is (horizon, controls), flattened.
     - "feedback": u_h = Theta x_h + w_h; theta is the matrix Theta, (controls, states), flattened. Score
       sum_h w_h x_h^T / sigma^2.
-    - "start": x_1 = theta + w, all controls 0; theta is the start state.
+    - "start": x_1 = theta + w, all controls 0; theta is the initial state.
 
     Attributes:
         system: the system, with its cost.
-        start: the start state; or its distribution, as a function of a key, and then each sample draws its own and has
-            its own zero-noise rollout as baseline. None if theta is the start.
+        start: the initial state, or its distribution as a function of a key; then each sample draws its own and has its
+            own zero-noise rollout as baseline. None if theta is the initial state.
         horizon: number of steps.
         sigma: standard deviation of the noise, in the unit of what it is added to.
-        decision: what theta is, see above.
-        noise: name of the noise's density in `estimators.NOISES`.
-        outcomes: what rollouts came to, by name, from their states with the start first; None where the cost says it
-            all.
+        decision: meaning of theta, see above.
+        noise: name of the noise density in `estimators.NOISES`.
+        outcomes: metrics of rollouts by name, as a function of their states including the initial one; None for none.
     """
 
     system: System
@@ -86,13 +85,13 @@ class ReferenceObjective:
         return {"controls": self.horizon * controls, "feedback": controls * states, "start": states}[self.decision]
 
     def evaluate(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> Evaluation:
-        """Values and scores by rollouts alone."""
+        """Values and scores from rollouts alone."""
         return self._evaluation(theta, *self._draw(keys))
 
     def evaluate_pair(
         self, theta: Float[Array, " params"], keys: Key[Array, " samples"]
     ) -> tuple[Evaluation, Evaluation]:
-        """Two evaluations whose noises are opposite, sample by sample, from the same starts."""
+        """Two evaluations with opposite noise, sample by sample, from the same initial states."""
         starts, noise = self._draw(keys)
         return self._evaluation(theta, starts, noise), self._evaluation(theta, starts, -noise)
 
@@ -108,13 +107,13 @@ class ReferenceObjective:
         return self._steps(theta, starts, noise)[0], self._steps(theta, starts, -noise)[0]
 
     def differentiate(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> Differentiation:
-        """Values and hand-derived gradients."""
+        """Values and hand-written gradients."""
         starts, noise = self._draw(keys)
         value, gradient = self._differentiate(theta, starts, noise)
         return Differentiation(jnp.asarray(value), jnp.asarray(gradient.reshape(len(noise), -1)))
 
     def differentiate_steps(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> StepDifferentiation:
-        """The rollouts of `differentiate`, with the derivative of each sample's cost by its noise."""
+        """The rollouts of `differentiate`, with the derivative of each sample's cost with respect to its noise."""
         starts, noise = self._draw(keys)
         start, controls, *feedback = self._policy(theta, starts, noise)
         rollout = roll_out(self.system, start, controls, *feedback)
@@ -147,7 +146,7 @@ class ReferenceObjective:
         )
 
     def observe(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> dict[str, np.ndarray]:
-        """The outcomes of the rollouts of `evaluate`."""
+        """Metrics of the rollouts of `evaluate`."""
         if self.outcomes is None:
             return {}
         return self.outcomes(roll_out(self.system, *self._policy(theta, *self._draw(keys))).states)
@@ -155,7 +154,7 @@ class ReferenceObjective:
     def value_and_gradient(
         self, theta: Float[Array, " params"], key: Key[Array, ""]
     ) -> tuple[float, Float[np.ndarray, " params"]]:
-        """Noise-free cost and its gradient, from the start that `key` draws for a sample (if it draws one)."""
+        """Zero-noise cost and its gradient, from the initial state that `key` draws for a sample (if it is random)."""
         start = np.asarray(self.start(split_sample_key(key)[0])) if callable(self.start) else self._fixed_start()
         value, gradient = self._differentiate(theta, start, np.zeros(self._noise_shape))
         return float(value), gradient.reshape(-1)
@@ -176,7 +175,7 @@ class ReferenceObjective:
         return Evaluation(jnp.asarray(rollout.value), jnp.asarray(score.reshape(len(noise), -1)), jnp.asarray(baseline))
 
     def _steps(self, theta, starts, noise):
-        """What each step cost; the rollout; the feedback matrix, or None."""
+        """Step evaluation; rollout; feedback matrix, or None."""
         rollout = roll_out(self.system, *self._policy(theta, starts, noise))
         silent = roll_out(self.system, *self._policy(theta, starts, np.zeros(noise.shape[1:])))
         to_go = (part.value_to_go[..., : noise.shape[1]] for part in (rollout, silent))
@@ -187,7 +186,7 @@ class ReferenceObjective:
         return steps, rollout, gains
 
     def _policy_jacobian(self, states):
-        """D_theta (Theta x) of every step; None where theta is the noise's own place."""
+        """D_theta (Theta x) of every step; None if the noise is added to theta itself."""
         if self.decision != "feedback":
             return None
         controls = self.system.num_controls
@@ -198,7 +197,7 @@ class ReferenceObjective:
         return np.zeros(self.system.num_states) if self.start is None else np.array(self.start, float)
 
     def _draw(self, keys):
-        """Start states, one for all where it is fixed, and noise of a batch of samples."""
+        """Initial states (a single one if it is fixed) and noise of a batch of samples."""
 
         def one(key):
             start_key, noise_key = split_sample_key(key)
@@ -209,7 +208,7 @@ class ReferenceObjective:
         return np.asarray(start) if callable(self.start) else self._fixed_start(), self.sigma * np.asarray(noise)
 
     def _policy(self, theta, start, noise):
-        """Start, open-loop part of the control, and feedback matrix, as `roll_out` takes them."""
+        """Initial state, open-loop controls, and feedback matrix, as arguments of `roll_out`."""
         theta = np.asarray(theta)
         if theta.shape != (self.num_params,):
             raise ValueError(f"theta must have shape ({self.num_params},), got {theta.shape}")
@@ -232,7 +231,7 @@ class FunctionObjective:
     Attributes:
         function: f.
         sigma: standard deviation of the noise, in the unit of theta.
-        noise: name of the noise's density in `estimators.NOISES`.
+        noise: name of the noise density in `estimators.NOISES`.
     """
 
     function: Function
@@ -255,7 +254,7 @@ class FunctionObjective:
     def evaluate_pair(
         self, theta: Float[Array, " params"], keys: Key[Array, " samples"]
     ) -> tuple[Evaluation, Evaluation]:
-        """Two evaluations whose noises are opposite, sample by sample."""
+        """Two evaluations with opposite noise, sample by sample."""
         noise = self._noise(keys)
         return self._evaluation(theta, noise), self._evaluation(theta, -noise)
 
@@ -271,7 +270,7 @@ class FunctionObjective:
         return _one_step(plus), _one_step(minus)
 
     def differentiate(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> Differentiation:
-        """Values and hand-derived gradients."""
+        """Values and hand-written gradients."""
         points = self._point(theta) + self._noise(keys)
         return Differentiation(jnp.asarray(self.function.value(points)), jnp.asarray(self.function.gradient(points)))
 
@@ -281,7 +280,7 @@ class FunctionObjective:
         return StepDifferentiation(batch.value, batch.gradient[:, None], None)
 
     def linearise(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> Linearisation:
-        """f as the final cost of a rollout without steps, whose start is theta + w."""
+        """f as the final cost of a rollout without steps, whose initial state is theta + w."""
         noise = self._noise(keys)
         samples, size = noise.shape
         none = jnp.zeros((samples, 0, size))
@@ -300,12 +299,12 @@ class FunctionObjective:
     def value_and_gradient(
         self, theta: Float[Array, " params"], key: Key[Array, ""]
     ) -> tuple[float, Float[np.ndarray, " params"]]:
-        """f(theta) and its gradient; a function has no start to draw, so the key is not used."""
+        """f(theta) and its gradient; a function has no initial state to draw, so the key is not used."""
         point = self._point(theta)
         return float(self.function.value(point)), self.function.gradient(point)
 
     def observe(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> dict[str, np.ndarray]:
-        """Nothing: a function's value is all there is."""
+        """Empty: a function has no metric but its value."""
         return {}
 
     def _evaluation(self, theta, noise) -> Evaluation:

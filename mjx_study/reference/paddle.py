@@ -1,11 +1,11 @@
-r"""The collision of a ball with a flat, moving, turning paddle: when, and what then.
+r"""Time and effect of the collision of a ball with a flat, moving, turning paddle.
 
 Paddle centre p, angle a, tangent t = (cos a, sin a), normal n = (-sin a, cos a). In a step the paddle moves with
 constant velocity u and spin w, the ball with constant velocity v. With q the ball's centre relative to p, the ball
 touches the face on side s = +-1 when the clearance s n.q - reach falls to 0, where reach = half-height + radius, and
-|t.q| is at most the half-width. Both faces are solid. Edges and corners are not: a ball that comes past them is not
+|t.q| is at most the half-width. Both faces are solid; edges and corners are not: a ball that comes past them is not
 hit, and one that gets between the planes of the faces that way passes through. The paddle is infinitely heavy and
-smooth, so the velocity relative to its surface at the point of contact is mirrored:
+smooth, so the ball's velocity relative to its surface at the point of contact is mirrored:
 
     m = n.(v - u) - w t.q,   v' = v - 2 m n,   and the clearance changes at the rate s m before, -s m after.
 """
@@ -16,11 +16,11 @@ import numpy as np
 from jaxtyping import Float, Int
 
 SUBDIVISIONS: Final = 8
-"""A flight is searched for a crossing in this many parts; an entry and exit within one part (a graze) is not seen."""
+"""Number of parts in which a flight is searched for a crossing; entry and exit within one part (a graze) are missed."""
 BISECTIONS: Final = 60
-"""Halvings of such a part: down to neighbouring floating-point numbers."""
+"""Bisections of such a part, down to neighbouring floating-point numbers."""
 TOUCHING: Final = 1e-9
-"""A ball this deep inside a face still counts as outside: rounding, after an impact at the end of a step [m]."""
+"""Depth inside a face that still counts as outside, for rounding after an impact at the end of a step [m]."""
 
 
 def frame(angle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -41,10 +41,10 @@ def first_impact(
     reach: float,
     half_width: float,
 ) -> tuple[Int[np.ndarray, " hits"], Float[np.ndarray, " hits"], Float[np.ndarray, " hits"]]:
-    """The first time within `duration` at which a ball crosses the plane of a face from outside, if within its width.
+    """The first time within `duration` at which a ball crosses the plane of a face from outside, within its width.
 
     Returns:
-        Rows of the balls that are hit, time until the impact [s], and the side that is hit, +-1.
+        Row indices of the balls that are hit, time until impact [s], and the side that is hit, +-1.
     """
     offset, velocity = state[:, :2] - state[:, 4:6], state[:, 2:4] - control[:, :2]
     nearest = np.hypot(*offset.T) - duration * np.hypot(*velocity.T)
@@ -83,7 +83,7 @@ def first_impact(
 def reflected(
     state: Float[np.ndarray, "samples 7"], control: Float[np.ndarray, "samples 3"]
 ) -> Float[np.ndarray, "samples 2"]:
-    """The ball's velocity after an impact in this state, v - 2 m n."""
+    """The ball's velocity after an impact at this state, v - 2 m n."""
     _, normal = frame(state[:, 6])
     return state[:, 2:4] - 2 * approach(state, control)[:, None] * normal
 
@@ -102,7 +102,7 @@ def time_slope(
     control: Float[np.ndarray, "samples 3"],
     slope: Float[np.ndarray, "samples 7 inputs"],
 ) -> Float[np.ndarray, "samples inputs"]:
-    """Derivative of the time of impact, where `state` at that time has the derivative `slope` at a fixed time.
+    """Derivative of the time of impact, given the derivative `slope` of `state` at that time held fixed.
 
     The clearance stays 0: m dT + n.dq - (t.q) da = 0.
     """

@@ -15,15 +15,15 @@ from mjx_study.reference.quadratic_cost import QuadraticCost
 
 @dataclasses.dataclass(frozen=True)
 class Pusher(QuadraticCost):
-    """State (x1, x2, v1, v2) [m, m/s], control: the force on the first mass [N].
+    """State (x1, x2, v1, v2) [m, m/s]; control: force on the first mass [N].
 
     Attributes:
-        stiffness: K of the contact spring [N/m].
+        stiffness: contact stiffness K [N/m].
         timestep: h [s].
-        mass: of each body [kg].
+        mass: mass of each body [kg].
         damping: factor on the velocities per step.
-        distance: of the centres at first touch [m].
-        goal: state that the cost pulls to.
+        distance: distance of the centres at first touch [m].
+        goal: target state.
         state_weight: diagonal of Q.
         control_weight: R [1/N^2].
     """

@@ -26,9 +26,7 @@ class Quadratic:
     def __post_init__(self) -> None:
         size = len(self.linear)
         if self.matrix.shape != (size, size) or not np.array_equal(self.matrix, self.matrix.T):
-            raise ValueError(
-                f"matrix must be symmetric of shape ({size}, {size}), as many as linear has; got {self.matrix}"
-            )
+            raise ValueError(f"matrix must be symmetric of shape ({size}, {size}), to match linear; got {self.matrix}")
 
     @property
     def num_params(self) -> int:

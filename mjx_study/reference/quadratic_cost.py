@@ -1,14 +1,14 @@
-"""The cost that several systems share: quadratic in the distance from a goal and in the control."""
+"""A cost shared by several systems: quadratic in the distance from a goal and in the control."""
 
 import numpy as np
 from jaxtyping import Float
 
 
 class QuadraticCost:
-    """c(x, u) = e^T Q e + R |u|^2 with e = x - goal, and e^T Q e at the end.
+    """c(x, u) = e^T Q e + R |u|^2 with e = x - goal, and final cost e^T Q e.
 
     Attributes:
-        goal: state that the cost pulls to.
+        goal: target state.
         state_weight: diagonal of Q.
         control_weight: R.
     """

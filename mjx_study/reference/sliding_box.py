@@ -3,7 +3,7 @@ r"""A driven block on a box, coupled by regularised friction until it slides off
     f = clip(mu (v_2 - v_1), -mu v_s, mu v_s) while |x_2 - x_1| < width, else 0,
     v' = v + (h / m) (u + f, -f),   x' = x + h v'
 
-The friction is continuous, with slope mu within the slip tolerance v_s; leaving the box is a true jump of the dynamics.
+Friction is continuous, with slope mu within the slip tolerance v_s; leaving the box is a true jump of the dynamics.
 
 Reference: Suh et al. 2022, friction example, with its published example's numbers.
 """
@@ -18,15 +18,15 @@ from mjx_study.reference.quadratic_cost import QuadraticCost
 
 @dataclasses.dataclass(frozen=True)
 class SlidingBox(QuadraticCost):
-    """State (x1, x2, v1, v2) of block and box [m, m/s], control: the force on the block [N].
+    """State (x1, x2, v1, v2) of block and box [m, m/s]; control: force on the block [N].
 
     Attributes:
-        viscosity: mu, slope of the friction within the slip tolerance [N s/m].
-        slip_tolerance: v_s, slip at which the friction saturates at mu v_s [m/s].
-        width: distance of the centres from which on the block has left the box [m].
+        viscosity: slope mu of the friction within the slip tolerance [N s/m].
+        slip_tolerance: slip v_s at which the friction saturates at mu v_s [m/s].
+        width: distance of the centres at which the block leaves the box [m].
         timestep: h [s].
-        mass: of each body [kg].
-        goal: state that the cost pulls to.
+        mass: mass of each body [kg].
+        goal: target state.
         state_weight: diagonal of Q.
         control_weight: R [1/N^2].
     """

@@ -1,4 +1,4 @@
-"""What an analytic system must provide: a step, a cost, and their derivatives by hand."""
+"""Interface of an analytic system: a step, a cost, and their hand-written derivatives."""
 
 from typing import Protocol, runtime_checkable
 
@@ -45,7 +45,7 @@ class System(Protocol):
         ...
 
     def final_cost(self, state: Float[np.ndarray, "*batch states"]) -> Float[np.ndarray, "*batch"]:
-        """Cost of the last state."""
+        """Cost of the final state."""
         ...
 
     def final_gradient(self, state: Float[np.ndarray, "*batch states"]) -> Float[np.ndarray, "*batch states"]:

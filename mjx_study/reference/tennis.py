@@ -1,15 +1,15 @@
 r"""A ball in the plane and a paddle moved by commanded velocities; impacts at their exact times inside the step.
 
-In a step of h the ball flies straight and the paddle moves with its commanded velocity; at an impact the ball's
-velocity relative to the paddle's surface is mirrored (see `paddle`), and both go on for the rest of the step. Then the
-ball's velocity is multiplied by `damping`. No gravity.
+During a step of h the ball flies straight and the paddle moves with its commanded velocity; at an impact the ball's
+velocity relative to the paddle's surface is mirrored (see `paddle`), and both continue for the rest of the step. Then
+the ball's velocity is multiplied by `damping`. There is no gravity.
 
-A step that meets an impact has the derivative of the impact time in its Jacobian. With the motion y' = f before and
-f_+ after, the reflection R and the clearance g, that is the saltation matrix DR + (f_+ - DR f) Dg / (Dg f).
+The Jacobian of a step with an impact includes the derivative of the impact time. With the motion y' = f before and f_+
+after, the reflection R and the clearance g, it is the saltation matrix DR + (f_+ - DR f) Dg / (Dg f).
 
-The rollout jumps where an impact passes from one step to the next: the paddle's command changes there at once, and the
+The rollout jumps where an impact moves from one step to the next: the paddle's command changes there abruptly, and the
 ball's velocity with it, by twice the change along the normal (and by twice 1 - damping of the paddle's speed, because
-the damping then comes on the other side of the impact). With the edges, that is what a first-order estimate misses.
+the damping then acts on the other side of the impact). A first-order estimate misses this, and the paddle's edges.
 
 Reference: Suh et al. 2022, tennis example, with its published numbers; the impact there is elastic too.
 """
@@ -23,26 +23,26 @@ from jaxtyping import Float
 from mjx_study.reference.paddle import first_impact, reflected, reflected_slope, time_slope
 
 TURNED: Final = 1e-3
-"""Angle by which a velocity that was not reflected is never off [rad]."""
+"""Bound on the deviation of a velocity that was not reflected [rad]."""
 MAX_IMPACTS: Final = 4
-"""Within one step; a ball that still approaches the paddle after so many passes through."""
+"""Maximum number of impacts per step; a ball that still approaches the paddle after that passes through."""
 CONTROL_SLOPE: Final = np.eye(3, 10, 7)
 """Derivative of the control with respect to (state, control)."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Tennis:
-    """State (ball x, y, vx, vy, paddle x, y, angle) [m, m/s, rad], control: the paddle's velocities [m/s, rad/s].
+    """State (ball x, y, vx, vy, paddle x, y, angle) [m, m/s, rad]; control: the paddle's velocities [m/s, rad/s].
 
-    Cost: R |u|^2 per step and e^T Q e at the end, e = x - goal.
+    Running cost R |u|^2, final cost e^T Q e with e = x - goal.
 
     Attributes:
         timestep: h [s].
-        radius: of the ball [m].
-        half_width: of the paddle's faces [m].
-        half_height: from the paddle's middle to its faces [m].
+        radius: radius of the ball [m].
+        half_width: half-width of the paddle's faces [m].
+        half_height: distance of the paddle's middle from its faces [m].
         damping: factor on the ball's velocity per step.
-        goal: state that the cost pulls to.
+        goal: target state.
         final_weight: diagonal of Q.
         control_weight: R.
     """
@@ -68,7 +68,7 @@ class Tennis:
     def jacobians(
         self, state: Float[np.ndarray, "*batch 7"], control: Float[np.ndarray, "*batch 3"]
     ) -> tuple[Float[np.ndarray, "*batch 7 7"], Float[np.ndarray, "*batch 7 3"]]:
-        """Derivatives of `step` at fixed events, the derivatives of impact times included."""
+        """Derivatives of `step` for a fixed sequence of impacts, including the derivatives of impact times."""
         _, slope, _ = self._move(state, control, differentiate=True)
         assert slope is not None
         return slope[..., :7], slope[..., 7:]
@@ -138,9 +138,9 @@ class Tennis:
 def tennis_outcomes(
     position: Float[Any, "*batch steps 2"], velocity: Float[Any, "*batch steps 2"]
 ) -> dict[str, Float[Any, "*batch"]]:
-    """Whether the ball was hit, and its distance from the target at the end [m], from its motion; NumPy or JAX arrays.
+    """Whether the ball was hit, and its final distance from the target [m], from its motion; NumPy or JAX arrays.
 
-    Nothing but the paddle turns the ball's velocity.
+    Only the paddle turns the ball's velocity.
     """
     first = velocity[..., :1, :]
     across = first[..., 0] * velocity[..., 1] - first[..., 1] * velocity[..., 0]
@@ -156,7 +156,7 @@ def _motion(state, control):
 
 
 def _motion_slope(slope):
-    """Derivative of `_motion` where the state has the derivative `slope`."""
+    """Derivative of `_motion`, given the derivative `slope` of the state."""
     still = np.zeros((len(slope), 2, 10))
     commanded = np.broadcast_to(CONTROL_SLOPE, (len(slope), 3, 10))
     return np.concatenate([slope[:, 2:4], still, commanded], axis=-2)

@@ -1,4 +1,4 @@
-"""Where a game of tennis starts; shared with the simulated task, so that samples agree key by key."""
+"""Initial states of tennis; shared with the simulated task, so that samples agree key by key."""
 
 import jax
 import jax.numpy as jnp

@@ -1,7 +1,7 @@
 """Pictures and films of a motion; nothing here simulates.
 
-A drawing needs no OpenGL: every geom is projected along a coordinate axis. Where OpenGL works, MuJoCo's own renderer
-takes its place, in a process of its own.
+A drawing needs no OpenGL: every geom is projected along a coordinate axis. Where OpenGL works, MuJoCo's own renderer is
+used instead, in a separate process.
 """
 
 from mjx_study.render.animation import FORMATS, animate, check_format

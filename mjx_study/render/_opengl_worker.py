@@ -1,7 +1,7 @@
-"""Runs MuJoCo's renderer in a process of its own: `python _opengl_worker.py FOLDER`.
+"""Runs MuJoCo's renderer in a separate process: `python _opengl_worker.py FOLDER`.
 
-An OpenGL library may abort the process, print, or fail at exit; and MuJoCo takes its backend (MUJOCO_GL) when it is
-imported. So this file is executed by path, and imports nothing of this package.
+An OpenGL library may abort the process, print, or fail at exit, and MuJoCo chooses its backend (MUJOCO_GL) on import.
+So this file is executed by path and imports nothing from this package.
 
 Reads model.mjb and request.npz (qpos, camera: lookat, distance, azimuth, elevation; width, height), writes images.npy.
 """

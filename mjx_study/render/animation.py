@@ -1,4 +1,4 @@
-"""A motion as a film: a GIF by Pillow, or an MP4 by ffmpeg where there is one."""
+"""A motion as a film: a GIF by Pillow, or an MP4 by ffmpeg if it is installed."""
 
 import io
 import math
@@ -26,7 +26,7 @@ FORMATS: Final = ("gif", "mp4")
 MOST_FRAMES: Final = 120
 FRAMES_PER_SECOND: Final = 25
 LAST_FRAME: Final = 0.5
-"""How much longer the last frame stands [s], so that a loop has an end."""
+"""Extra time for the last frame [s], so that a loop has a visible end."""
 MOST_BYTES: Final = 1_000_000
 _WIDTH, _TALLEST, _DPI = 6.4, 6.4, 100
 _LABEL: Final = 22  # pixels above a rendered frame; an even number
@@ -43,9 +43,9 @@ def check_format(name: str) -> None:
 
 
 def frame_times(motion: Motion, slow: float = 1.0) -> tuple[Int[np.ndarray, " frames"], Int[np.ndarray, " frames"]]:
-    """Which times become frames, and for how long each stands [ms], in whole hundredths of a second as GIF has them.
+    """Indices of the times that become frames, and the duration of each [ms], in GIF's whole hundredths of a second.
 
-    In all they take `slow` times the motion's duration, and the last one half a second more.
+    Together they last `slow` times the motion's duration, plus half a second for the last one.
 
     Raises:
         ValueError: `slow` is not a positive number.
@@ -61,13 +61,13 @@ def frame_times(motion: Motion, slow: float = 1.0) -> tuple[Int[np.ndarray, " fr
 
 
 def animate(motion: Motion, path: Path, *, slow: float = 1.0, view: str = "auto", renderer: str = "auto") -> Path:
-    """Write a film of a motion, in real time unless `slow` is not 1; the file is complete or absent.
+    """Write a film of a motion, in real time if `slow` is 1; the file is complete or absent.
 
     Args:
-        motion: what to show.
-        path: ends in .gif or .mp4.
-        slow: how many times slower than real time.
-        view: xz, xy, yz, or auto for the one in which most happens.
+        motion: the motion to show.
+        path: file name that ends in .gif or .mp4.
+        slow: slow-motion factor.
+        view: xz, xy, yz, or auto for the one that shows most of the motion.
         renderer: drawing, opengl, or auto for opengl where it works.
 
     Returns:
@@ -89,7 +89,7 @@ def animate(motion: Motion, path: Path, *, slow: float = 1.0, view: str = "auto"
 
 
 def _drawn(drawing: Drawing, indices: np.ndarray) -> np.ndarray:
-    """Frames of the drawing; what stays is drawn once."""
+    """Frames of the drawing; fixed parts are drawn once."""
     motion, label = drawing.motion, time_label(drawing.motion.time[indices])
     left, right, bottom, top = 0.68, 0.12, 0.5, 0.3
     ratio = float(drawing.bounds.size[0] / drawing.bounds.size[1])
@@ -130,7 +130,7 @@ def _labelled(drawing: Drawing, indices: np.ndarray, rendered: np.ndarray) -> np
 
 
 def _gif(frames: np.ndarray, lengths: np.ndarray, colours: int) -> bytes:
-    """An endless GIF with one palette; made smaller as long as it is too large."""
+    """A looping GIF with one palette; scaled down until it is small enough."""
     images = [Image.fromarray(frame) for frame in frames]
     while True:
         content = _encode(images, lengths, colours)
@@ -157,7 +157,7 @@ def _encode(images: Sequence[Image.Image], lengths: np.ndarray, colours: int) ->
 
 
 def _mp4(frames: np.ndarray, lengths: np.ndarray) -> bytes:
-    """H.264, or what ffmpeg has for MP4 instead, at a constant rate; the sides are made even."""
+    """MP4 at a constant frame rate, in H.264 or ffmpeg's default codec; width and height are made even."""
     repeated = np.repeat(frames, np.maximum(np.round(lengths / np.median(lengths)).astype(int), 1), axis=0)
     rate = len(repeated) * 1000 / lengths.sum()
     height, width = 2 * (frames.shape[1] // 2), 2 * (frames.shape[2] // 2)

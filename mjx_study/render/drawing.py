@@ -26,9 +26,9 @@ _FIXED_LAYER, _TRACE_LAYER, _MOVING_LAYER = 1, 2, 3
 
 
 def geom_colours(motion: Motion) -> Float[np.ndarray, "ngeom 4"]:
-    """Colours as MuJoCo shows them; geoms left in its default grey get one by the body, or the mechanism, they move on.
+    """Colours as in MuJoCo; geoms in its default grey get one by the body, or the mechanism, that they move with.
 
-    A texture counts with its mean colour.
+    A texture is replaced by its mean colour.
     """
     model = motion.model
     colours = np.array(model.geom_rgba, float)
@@ -49,11 +49,11 @@ def geom_colours(motion: Motion) -> Float[np.ndarray, "ngeom 4"]:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Drawing:
-    """Draws a motion, seen in one view, onto Matplotlib axes.
+    """Draws one view of a motion onto Matplotlib axes.
 
     Attributes:
-        motion: what is drawn.
-        view: along which axis it is seen.
+        motion: the motion to draw.
+        view: the projection.
     """
 
     motion: Motion
@@ -61,7 +61,7 @@ class Drawing:
 
     @cached_property
     def bounds(self) -> Bounds:
-        """The part of the plane that is shown."""
+        """The visible part of the plane."""
         return bounds(self.motion, self.view)
 
     @cached_property
@@ -88,7 +88,7 @@ class Drawing:
 
     @cached_property
     def _spokes(self) -> dict[int, np.ndarray]:
-        """A radius, in its own frame, of every sphere that turns: without it nobody could see that."""
+        """A radius, in its own frame, of every sphere that turns, to make the rotation visible."""
         model, rotation = self.motion.model, self.motion.poses.rotation
         spheres = [geom for geom in self._split[1] if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_SPHERE]
         found = {}
@@ -100,7 +100,7 @@ class Drawing:
 
     @cached_property
     def _paths(self) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Path (times, 2) and colour of what is traced: each moving body, or each mechanism where bodies are many."""
+        """Path (times, 2) and colour of each moving body, or of each mechanism if there are many bodies."""
         model, poses = self.motion.model, self.motion.poses
         bodies = np.flatnonzero(self.motion.moving)
         centres = poses.centre
@@ -117,7 +117,7 @@ class Drawing:
         return paths
 
     def scenery(self, axes: Axes, index: int = 0) -> None:
-        """Limits, labels in metres, planes and whatever cannot move."""
+        """Limits, labels in metres, planes and fixed geoms."""
         low, high = self.bounds.low, self.bounds.high
         axes.set_xlim(low[0], high[0])
         axes.set_ylim(low[1], high[1])
@@ -139,18 +139,18 @@ class Drawing:
         self._draw(axes, self._split[0], index, 1.0, _FIXED_LAYER)
 
     def pose(self, axes: Axes, index: int, strength: float = 1.0) -> list[PolyCollection | LineCollection]:
-        """What moves, at one time; `strength` from 0 to 1 fades it to white.
+        """Draw the moving geoms at one time; `strength` from 0 to 1 fades them from white.
 
         Returns:
-            What was added to the axes.
+            The artists added to the axes.
         """
         return self._draw(axes, self._split[1], index, strength, _MOVING_LAYER)
 
     def trace(self, axes: Axes, indices: Sequence[int] | slice = slice(None), strength: float = 1.0) -> list[Line2D]:
-        """Paths of the centres of mass over some of the times.
+        """Draw paths of the centres of mass over some of the times.
 
         Returns:
-            What was added to the axes.
+            The artists added to the axes.
         """
         lines = []
         for path, colour in self._paths:
@@ -187,7 +187,7 @@ class Drawing:
 
 
 def _ticks(axes: Axes, part: int) -> int:
-    """How many intervals between labels fit an axis: one per 0.42 inch across and up."""
+    """Number of label intervals that fit an axis: one per 0.42 inch."""
     figure = axes.get_figure(root=True)
     inches = figure.get_size_inches()[part] * axes.get_position().size[part] if figure else 3.0
     return int(np.clip(inches / 0.42, 2, 8))
@@ -202,7 +202,7 @@ def _faded(colour: np.ndarray, strength: float) -> np.ndarray:
 
 
 def _rim(colour: np.ndarray) -> np.ndarray:
-    """A darker tone for outlines and paths; a lighter one of what is dark already."""
+    """A darker tone for outlines and paths; a lighter one for dark colours."""
     return 0.55 * colour if colour @ (0.3, 0.6, 0.1) > 0.22 else _faded(colour, 0.65)
 
 

@@ -1,4 +1,4 @@
-"""A motion on paper: as a strip of pictures, or as one picture with ghosts."""
+"""A motion as a still: a strip of pictures, or one stroboscopic picture."""
 
 import math
 from typing import Final
@@ -22,13 +22,13 @@ def strip(motion: Motion, *, frames: int = 6, view: str = "auto", renderer: str 
     """Pictures of a motion at evenly spaced times, first and last included, each labelled with its time.
 
     Args:
-        motion: what to show.
-        frames: how many pictures; a motion with fewer times has fewer.
-        view: xz, xy, yz, or auto for the one in which most happens.
+        motion: the motion to show.
+        frames: number of pictures; fewer if the motion has fewer times.
+        view: xz, xy, yz, or auto for the one that shows most of the motion.
         renderer: drawing, opengl, or auto for opengl where it works.
 
     Raises:
-        ValueError: fewer than one picture, an unknown view or renderer.
+        ValueError: fewer than one picture, or an unknown view or renderer.
         RenderError: opengl where it does not work.
     """
     if frames < 1:
@@ -69,12 +69,12 @@ def strip(motion: Motion, *, frames: int = 6, view: str = "auto", renderer: str 
 
 
 def stroboscope(motion: Motion, *, poses: int = 9, view: str = "auto") -> Figure:
-    """One drawing with the path and evenly spaced poses, the earlier the fainter.
+    """One drawing with the path and evenly spaced poses, earlier ones fainter.
 
     Args:
-        motion: what to show.
-        poses: how many, first and last included.
-        view: xz, xy, yz, or auto for the one in which most happens.
+        motion: the motion to show.
+        poses: number of poses, first and last included.
+        view: xz, xy, yz, or auto for the one that shows most of the motion.
 
     Raises:
         ValueError: fewer than one pose, or an unknown view.
@@ -105,7 +105,7 @@ def stroboscope(motion: Motion, *, poses: int = 9, view: str = "auto") -> Figure
 
 
 def time_label(times: np.ndarray):
-    """A function that writes a time with as many decimals as tell these times apart: `t = 0.25 s`."""
+    """A formatter of times with enough decimals to tell these apart: `t = 0.25 s`."""
     step = float(np.min(np.diff(times))) if len(times) > 1 else 0.01
     decimals = next((n for n in (1, 2, 3) if abs(step - round(step, n)) < 0.02 * step), 3)
     decimals = max(decimals, min(6, math.ceil(-math.log10(step))))
@@ -117,7 +117,7 @@ def _ratio(drawing: Drawing) -> float:
 
 
 def _columns(count: int, ratio: float) -> int:
-    """Pictures in a row such that all of them make a page of a pleasant shape without gaps."""
+    """Number of pictures per row for a page of pleasant shape without gaps."""
 
     def badness(columns: int) -> float:
         rows = math.ceil(count / columns)

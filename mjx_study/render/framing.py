@@ -1,4 +1,4 @@
-"""Which way to look at a motion, and how much of its scene to show."""
+"""The view of a motion, and the part of its scene to show."""
 
 import dataclasses
 import functools
@@ -20,7 +20,7 @@ _EDGE_ON: Final = 0.05  # a plane is seen as a line where its normal is this nea
 
 @dataclasses.dataclass(frozen=True)
 class Bounds:
-    """A rectangle of the picture's plane [m]."""
+    """A rectangle in the picture's plane [m]."""
 
     low: Float[np.ndarray, " axes"]
     high: Float[np.ndarray, " axes"]
@@ -35,15 +35,15 @@ class Bounds:
         return Bounds(np.minimum(self.low, other.low), np.maximum(self.high, other.high))
 
     def cut(self, other: "Bounds") -> "Bounds":
-        """The part inside another one, which this one must overlap."""
+        """Intersection with another rectangle, which must overlap."""
         return Bounds(np.maximum(self.low, other.low), np.minimum(self.high, other.high))
 
     def grown(self, distance: float) -> "Bounds":
-        """With a margin on every side [m]."""
+        """The rectangle with a margin on every side [m]."""
         return Bounds(self.low - distance, self.high + distance)
 
     def overlaps(self, other: "Bounds") -> bool:
-        """Whether the two have a point in common."""
+        """Whether the two intersect."""
         return bool(np.all(self.low <= other.high) and np.all(other.low <= self.high))
 
 
@@ -57,11 +57,11 @@ def resolve_view(motion: Motion, name: str) -> View:
 
 
 def choose_view(motion: Motion) -> View:
-    """The view in whose plane most happens.
+    """The view whose plane shows most of the motion.
 
-    Along each axis: the room that the moving geoms take up plus the way that their farthest moved corner goes. What
-    is vertical counts twice, since a view from above hides contact with the ground. The axis with least is looked
-    along; of equal ones the one that keeps the vertical, and then y.
+    Each axis is scored by the extent of the moving geoms plus the travel of their farthest-moving corner. The vertical
+    counts twice, since a view from above hides contact with the ground. The view is along the axis with the lowest
+    score; ties go to the one that keeps the vertical, then to y.
     """
     shown = motion.visible & motion.moving[motion.model.geom_bodyid] & ~_planes(motion.model)
     corners = _corners(motion, shown) if shown.any() else motion.poses.centre[:, motion.moving]
@@ -77,7 +77,7 @@ def choose_view(motion: Motion) -> View:
 
 
 def bounds(motion: Motion, view: View) -> Bounds:
-    """What a picture of the whole motion shows: all that moves, with the fixed things around it."""
+    """Bounds of a picture of the whole motion: everything that moves, and the fixed geoms around it."""
     model, geoms, wanted = motion.model, motion.visible & ~_planes(motion.model), _wanted(motion)
     fixed = [_swept(motion, np.arange(model.ngeom) == geom, view.plane) for geom in np.flatnonzero(geoms & ~wanted)]
     if (geoms & wanted).any():
@@ -102,7 +102,7 @@ def bounds(motion: Motion, view: View) -> Bounds:
 
 
 def depths(motion: Motion, view: View) -> tuple[float, float]:
-    """The farthest and the nearest point, towards the viewer, of what a picture must show [m]."""
+    """Smallest and largest depth, towards the viewer, that a picture must show [m]."""
     along, geoms = int(np.argmax(np.abs(view.towards))), motion.visible & ~_planes(motion.model) & _wanted(motion)
     if not geoms.any():
         return 0.0, 0.0
@@ -112,7 +112,7 @@ def depths(motion: Motion, view: View) -> tuple[float, float]:
 
 
 def edges(motion: Motion, view: View) -> list[tuple[Float[np.ndarray, " 2"], Float[np.ndarray, " 2"]]]:
-    """A point and the unit normal of every visible plane that is seen edge on; MuJoCo's planes have no end."""
+    """A point and the unit normal of every visible plane seen edge-on; MuJoCo's planes are infinite."""
     found = []
     for geom in np.flatnonzero(motion.visible & _planes(motion.model)):
         position, normal = motion.poses.position[0, geom], motion.poses.rotation[0, geom, :, 2]
@@ -137,12 +137,12 @@ def _corners(motion: Motion, geoms: np.ndarray) -> np.ndarray:
 
 
 def _wanted(motion: Motion) -> np.ndarray:
-    """Geoms that a picture must show: those that can move, and those in focus."""
+    """Geoms that a picture must show: movable ones and those in focus."""
     return motion.moving[motion.model.geom_bodyid] | np.isin(np.arange(motion.model.ngeom), motion.focus)
 
 
 def _swept(motion: Motion, geoms: np.ndarray, axes: list[int]) -> Bounds:
-    """What some geoms, at least one, cover over the whole motion."""
+    """Bounds of some geoms, at least one, over the whole motion."""
     model, poses = motion.model, motion.poses
     rotation = poses.rotation[:, geoms][:, :, axes]
     shift = np.einsum("tgij,gj->tgi", rotation, model.geom_aabb[geoms, :3])

@@ -1,4 +1,4 @@
-"""What is drawn: a compiled model and its configuration at each time."""
+"""A motion to draw: a compiled model and its configuration at each time."""
 
 import dataclasses
 from functools import cached_property
@@ -9,21 +9,21 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 VISIBLE_GROUPS = 3
-"""MuJoCo's viewers show geoms of groups 0, 1 and 2 unless told otherwise; collision geometry is kept in 3 and above."""
+"""Geom groups that MuJoCo's viewers show by default (0, 1 and 2); collision geometry is usually in 3 and above."""
 
 DEFAULT_RGBA: Final = np.array([0.5, 0.5, 0.5, 1.0], np.float32)
-"""MuJoCo's colour of a geom that has none; only then does its material's colour count."""
+"""MuJoCo's default colour of a geom; only with it does the material's colour count."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Poses:
-    """Where everything is at each time, in the world frame [m].
+    """Positions and orientations at each time, in the world frame [m].
 
     Attributes:
         position: centres of the geoms.
         rotation: axes of the geoms, as columns.
         centre: centres of mass of the bodies.
-        subtree: centres of mass of the bodies with all that hangs on them.
+        subtree: centres of mass of the bodies' subtrees.
     """
 
     position: Float[np.ndarray, "times ngeom 3"]
@@ -37,10 +37,10 @@ class Motion:
     """A model's motion.
 
     Attributes:
-        model: as MuJoCo compiled it.
+        model: the compiled model.
         time: increasing times [s].
         qpos: generalised positions at these times [m or rad; unit quaternions].
-        focus: geoms that every picture shows, however far they are from what moves.
+        focus: geoms that every picture shows, however far they are from the motion.
     """
 
     model: mujoco.MjModel
@@ -62,12 +62,12 @@ class Motion:
 
     @property
     def duration(self) -> float:
-        """From the first time to the last [s]."""
+        """Time from first to last [s]."""
         return float(self.time[-1] - self.time[0])
 
     @cached_property
     def visible(self) -> Bool[np.ndarray, " ngeom"]:
-        """Which geoms MuJoCo's viewers show by default."""
+        """Mask of the geoms that MuJoCo's viewers show by default."""
         model = self.model
         alpha = np.array(model.geom_rgba[:, 3])
         default = np.all(model.geom_rgba == DEFAULT_RGBA, axis=1)
@@ -77,7 +77,7 @@ class Motion:
 
     @cached_property
     def moving(self) -> Bool[np.ndarray, " nbody"]:
-        """Which bodies can move: those not welded to the world."""
+        """Mask of the bodies that can move: those not welded to the world."""
         return self.model.body_weldid != 0
 
     @cached_property
@@ -96,7 +96,7 @@ class Motion:
         return Poses(position, rotation.reshape(count, model.ngeom, 3, 3), centre, subtree)
 
     def at(self, count: int) -> Int[np.ndarray, " count"]:
-        """Indices of `count` times spread evenly from the first to the last; fewer where there are not so many."""
+        """Indices of `count` times spread evenly from the first to the last, or of all if there are fewer."""
         wanted = np.linspace(self.time[0], self.time[-1], count)
         after = np.clip(np.searchsorted(self.time, wanted), 1, max(len(self.time) - 1, 1))
         if len(self.time) == 1:

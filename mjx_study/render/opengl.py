@@ -1,4 +1,4 @@
-"""A motion rendered by MuJoCo itself, in a process of its own, where OpenGL works."""
+"""A motion rendered by MuJoCo itself, in a separate process, where OpenGL works."""
 
 import copy
 import functools
@@ -41,14 +41,14 @@ renderer.close()
 
 
 class RenderError(ValueError):
-    """A picture that cannot be made on this machine, or in this way."""
+    """A picture that cannot be made on this machine or in this way."""
 
 
 def resolve_renderer(name: str) -> str:
     """`drawing` or `opengl`; auto is opengl where it works.
 
     Raises:
-        ValueError: an unknown name.
+        ValueError: unknown name.
         RenderError: opengl where it does not work.
     """
     if name not in RENDERERS:
@@ -64,10 +64,10 @@ def resolve_renderer(name: str) -> str:
 def images(
     drawing: Drawing, indices: Int[np.ndarray, " frames"], renderer: str
 ) -> UInt8[np.ndarray, "frames height width 3"] | None:
-    """MuJoCo's images at some of a motion's times, or None where it is to be drawn.
+    """MuJoCo's images at some of a motion's times, or None if the renderer is `drawing`.
 
     Raises:
-        ValueError: an unknown renderer.
+        ValueError: unknown renderer.
         RenderError: opengl was asked for by name and does not work here, or fails on this model.
     """
     if resolve_renderer(renderer) == "drawing":
@@ -81,7 +81,7 @@ def images(
 
 
 def _render(drawing: Drawing, indices: np.ndarray) -> np.ndarray:
-    """Images from a free camera that looks the same way as the drawing."""
+    """Images from a free camera with the same view as the drawing."""
     backend, _ = _backend(_chosen())
     assert backend is not None, "the renderer has been resolved"
     motion, view, shown = drawing.motion, drawing.view, drawing.bounds
@@ -118,13 +118,13 @@ def _render(drawing: Drawing, indices: np.ndarray) -> np.ndarray:
 
 
 def _chosen() -> str:
-    """The backend that the user asks for, or nothing."""
+    """The backend set by the user, or an empty string."""
     return os.environ.get("MUJOCO_GL", "").strip().lower()
 
 
 @functools.cache
 def _backend(chosen: str) -> tuple[str | None, str]:
-    """The first backend that renders a small scene, and why there is none; `chosen` is the user's MUJOCO_GL."""
+    """The first backend that renders a small scene, or the reason for none; `chosen` is the user's MUJOCO_GL."""
     reasons = []
     for backend in [chosen] if chosen else _candidates(os.environ):
         failure = _run(["-c", _PROBE], backend, timeout=_PROBE_SECONDS)
@@ -143,7 +143,7 @@ def _candidates(environment: Mapping[str, str]) -> list[str]:
 
 
 def _run(arguments: list[str], backend: str, timeout: float | None) -> str | None:
-    """Run Python with an OpenGL backend, quietly; returns what went wrong, in one line, or None."""
+    """Run Python with an OpenGL backend, quietly; returns a one-line error, or None."""
     command = [sys.executable, "-P", *arguments]
     try:
         done = subprocess.run(

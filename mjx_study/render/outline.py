@@ -1,4 +1,4 @@
-"""Outlines of geoms, as seen from afar along a coordinate axis."""
+"""Outlines of geoms, projected along a coordinate axis."""
 
 import dataclasses
 from typing import Final
@@ -10,7 +10,7 @@ from jaxtyping import Float
 Geom = mujoco.mjtGeom
 _ANGLE: Final = np.linspace(0, 2 * np.pi, 97)[:-1]
 CIRCLE: Final = np.stack([np.cos(_ANGLE), np.sin(_ANGLE)], axis=1)
-"""Points of a unit circle; a drawn circle is this polygon."""
+"""Points of a unit circle; circles are drawn as this polygon."""
 _MESH_POINTS: Final = 400
 
 
@@ -45,14 +45,14 @@ VIEWS: Final = {view.name: view for view in (View("xz", 0, 2), View("xy", 0, 1),
 
 @dataclasses.dataclass(frozen=True)
 class Shape:
-    """A geom in its own frame: the convex hull of points, every one with a ball of some radius around it [m].
+    """A geom in its own frame: the convex hull of balls of some radius around points [m].
 
     Attributes:
         points: corners, ends of an axis, or vertices.
-        radius: of the balls: 0 for a polyhedron.
-        semi_axes: of an ellipsoid, which is not such a hull; None for all others.
-        cell: largest distance between neighbouring points of a height field [m], which is seen as a profile and not as
-            its hull; None for all others.
+        radius: radius of the balls; 0 for a polyhedron.
+        semi_axes: semi-axes of an ellipsoid, which is not such a hull; None for all others.
+        cell: largest distance between neighbouring points of a height field [m], which is drawn as a profile rather
+            than its hull; None for all others.
     """
 
     points: Float[np.ndarray, "points 3"]
@@ -63,7 +63,7 @@ class Shape:
     def outline(
         self, position: Float[np.ndarray, " 3"], rotation: Float[np.ndarray, "3 3"], view: View
     ) -> Float[np.ndarray, "corners 2"]:
-        """Corners of the projection [m], counter-clockwise; curves are polygons inscribed in them."""
+        """Corners of the projection [m], counter-clockwise; curves become inscribed polygons."""
         centre, projection = position[view.plane], rotation[view.plane]
         if self.semi_axes is not None:
             # The point of an ellipsoid A S^2 that is farthest along u is A A^T u / |A^T u|.
@@ -79,7 +79,7 @@ class Shape:
     def slice(
         self, position: Float[np.ndarray, " 3"], rotation: Float[np.ndarray, "3 3"], view: View, depth: float
     ) -> "Shape":
-        """A height field cut where something stands: only the points near a depth, towards the viewer [m]."""
+        """A height field cut at the depth of the motion, towards the viewer [m]: only the points near it."""
         if self.cell is None:
             return self
         distance = np.abs((position + self.points @ rotation.T) @ view.towards - depth)
@@ -130,7 +130,7 @@ def convex_hull(points: Float[np.ndarray, "points 2"]) -> Float[np.ndarray, "cor
 
 
 def _extreme(points: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, "kept 3"]:
-    """The points that are farthest in some direction, of a sample of directions where there are many points."""
+    """The points farthest in some direction; with many points, only a sample of directions is searched."""
     if len(points) <= _MESH_POINTS:
         return points
     height = np.linspace(-1, 1, _MESH_POINTS)
@@ -141,7 +141,7 @@ def _extreme(points: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, "kept 3
 
 
 def _terrain(model: mujoco.MjModel, field: int) -> Float[np.ndarray, "points 3"]:
-    """Vertices of a height field, with a base under each."""
+    """Vertices of a height field, each with its base."""
     rows, columns, start = (int(part[field]) for part in (model.hfield_nrow, model.hfield_ncol, model.hfield_adr))
     x, y, height, base = model.hfield_size[field]
     data = model.hfield_data[start : start + rows * columns]
@@ -151,7 +151,7 @@ def _terrain(model: mujoco.MjModel, field: int) -> Float[np.ndarray, "points 3"]
 
 
 def _profile(points: Float[np.ndarray, "points 2"]) -> Float[np.ndarray, "corners 2"]:
-    """The highest point at each place along the horizontal, closed below."""
+    """The highest point at each position along the horizontal, closed below."""
     places = np.unique(np.round(points[:, 0], 6))
     places = places[:: max(1, len(places) // 400)]
     index = np.argmin(np.abs(points[:, :1] - places), axis=1)

@@ -1,4 +1,4 @@
-"""The systems of the study, each in a short file of the same parts in the same order."""
+"""The systems of the study, one short file each, with the same parts in the same order."""
 
 from collections.abc import Callable
 from functools import partial
@@ -24,7 +24,7 @@ TASKS: Final[dict[str, Callable[..., Task]]] = {
     "double_pendulum": double_pendulum,
     "double_pendulum:published": partial(double_pendulum, "published"),
 }
-"""Builders by name; a variant of a system is a name of its own, such as `ball_wall:dome`."""
+"""Builders by name; each variant of a system has its own name, such as `ball_wall:dome`."""
 
 
 def task_names() -> list[str]:
@@ -36,13 +36,13 @@ def make_task(name: str, **options) -> Task:
     """Build a task by name; `options` go to its builder (`cone`, `horizon`, ...).
 
     Args:
-        name: of a task of this package, then of one that an installed package registers (entry point group
-            `mjx_study.tasks`), then `module:attribute` of a Task or of a function of the options that returns one.
-        **options: those that are given; a Task that is made already takes none.
+        name: name of a task of this package, else of one registered by an installed package (entry point group
+            `mjx_study.tasks`), else `module:attribute` of a Task or of a function of the options that returns one.
+        **options: arguments for the builder; a ready-made Task takes none.
 
     Raises:
-        ValueError: unknown name; the message lists the choices. Or a task of one's own cannot be had: its module or
-            function raises, is not there, does not take an option, or gives no Task.
+        ValueError: unknown name; the message lists the choices. Or a user's task cannot be built: its module or
+            function is missing, raises, does not take an option, or returns no Task.
     """
     if name in TASKS:
         return TASKS[name](**options)

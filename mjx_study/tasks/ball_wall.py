@@ -1,10 +1,10 @@
 """Throwing a ball as far as possible, with a wall in its way: one launch angle.
 
-Lengths are ten times those of Suh et al. 2022 and speeds sqrt(10) times, which leaves the flight's shape alone; the
-cost is in the paper's lengths. In the paper the ball drops at the wall and stays where it lands; here floor and wall
-have friction 5, and the contact is well damped in the families without a damping ratio of their own. The wall is a
-`box`, or a box with a round top, the `dome`, on which the angle of the bounce varies without a jump; where the ball
-ends still jumps there, since friction holds one that grazes the top.
+Lengths are ten times those of Suh et al. 2022 and speeds sqrt(10) times, which keeps the flight's shape; the cost is in
+the paper's lengths. In the paper the ball drops at the wall and stays where it lands; here floor and wall have friction
+5, and the contact is well damped in the families without a damping ratio. The wall is a `box`, or a box with a round
+top, the `dome`, on which the bounce angle varies continuously; the landing point still jumps there, since friction
+holds a ball that grazes the top.
 """
 
 from pathlib import Path
@@ -35,13 +35,13 @@ VARIANTS: Final = ("box", "dome")
 def ball_wall(
     variant: str = "box", *, horizon: int = HORIZON, model: str | Path = "ball_wall", **scene_options: str | float
 ) -> Task:
-    """-(x / 10)^2 with x [m] where the ball ends.
+    """Cost -(x / 10)^2, with x [m] the ball's final position.
 
     Args:
-        variant: of the wall: box or dome.
+        variant: shape of the wall: box or dome.
         horizon: number of 2 ms steps; the highest flight takes 330.
-        model: another MJCF in its place, with the slide joints `x`, `z` in this order and the geoms `ball`, `wall`,
-            `dome`.
+        model: name or path of a replacement MJCF, with the slide joints `x`, `z` in this order and the geoms `ball`,
+            `wall`, `dome`.
         **scene_options: see `load_scene`.
 
     Raises:
@@ -84,7 +84,7 @@ def ball_wall(
 
 
 def _raise_dome(host: mujoco.MjModel) -> None:
-    """Lower the wall by the dome's radius and let the dome collide and be seen."""
+    """Lower the wall by the dome's radius and make the dome solid and visible."""
     wall, dome = (mujoco.mj_name2id(host, mujoco.mjtObj.mjOBJ_GEOM, name) for name in ("wall", "dome"))
     if min(wall, dome) < 0:
         raise SceneError("the model of ball_wall needs the geoms wall and dome")

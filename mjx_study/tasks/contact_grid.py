@@ -1,4 +1,4 @@
-"""The contact models of a study: families over stiffnesses, or MuJoCo's own parameters, and what to warn about."""
+"""The contact models of a study: families over stiffnesses, or MuJoCo's own parameters, with their warnings."""
 
 import dataclasses
 import itertools
@@ -29,9 +29,9 @@ class ContactPoint:
 
     Attributes:
         family: name of the contact family, or solref and solimp.
-        stiffness: K of its spring [N/m]; 0 where there is no contact.
-        contact: the model; None for the MJCF's own.
-        digits: of the stiffness in messages, as many as tell the models of a sweep apart.
+        stiffness: spring stiffness K [N/m]; 0 if there is no contact.
+        contact: the contact model; None for the MJCF's own.
+        digits: significant digits of the stiffness in messages, enough to tell the models of a sweep apart.
     """
 
     family: str
@@ -41,7 +41,7 @@ class ContactPoint:
 
     @property
     def label(self) -> str:
-        """As messages name it."""
+        """Name in messages."""
         return f"{self.family}, K = {self.stiffness:.{self.digits}g} N/m" if self.stiffness else self.family
 
 
@@ -51,13 +51,13 @@ def contact_grid(
     stiffnesses: Sequence[float] | None = None,
     damping: float | None = None,
 ) -> tuple[tuple[ContactPoint, ...], tuple[str, ...]]:
-    """The contact models of a sweep, family by family, and what there is to warn about.
+    """The contact models of a sweep, family by family, and their warnings.
 
     Args:
-        task: gives what is None, and the effective mass.
+        task: source of the effective mass, and of defaults for arguments that are None.
         families: names of contact families.
-        stiffnesses: for families that take one [N/m].
-        damping: in place of each family's [N s/m].
+        stiffnesses: stiffnesses for families that take one [N/m].
+        damping: override of each family's damping [N s/m].
 
     Raises:
         ValueError: a family is unknown, or a stiffness or damping is out of range.
@@ -83,15 +83,15 @@ def contact_grid(
 def solver_grid(
     task: Task, solrefs: Sequence[Sequence[float]], solimps: Sequence[Sequence[float]]
 ) -> tuple[tuple[ContactPoint, ...], tuple[str, ...]]:
-    """Contact models in MuJoCo's own terms, every solref with every solimp, and what there is to warn about.
+    """Contact models in MuJoCo's own terms, every solref with every solimp, and their warnings.
 
     Args:
-        task: gives the scene, and the effective mass for the stiffness that is reported.
-        solrefs: pairs of numbers; none for MuJoCo's default.
-        solimps: of five numbers each; none for MuJoCo's default.
+        task: source of the scene, and of the effective mass for the reported stiffness.
+        solrefs: pairs of numbers; empty for MuJoCo's default.
+        solimps: tuples of five numbers; empty for MuJoCo's default.
 
     Raises:
-        ValueError: MuJoCo would alter a value without an error.
+        ValueError: MuJoCo would silently alter a value.
     """
     cells, messages = [], []
     digits = digits_to_tell_apart(itertools.chain(*solrefs, *solimps))
@@ -111,7 +111,7 @@ def solver_grid(
 
 @contextmanager
 def _warnings_of_contact() -> Generator[list[warnings.WarningMessage]]:
-    """What there is to warn about contact models that are made inside.
+    """Collect the warnings of contact models built inside.
 
     Raises:
         ValueError: their numbers are so large or small that arithmetic overflows.
@@ -129,7 +129,7 @@ def _contact(task: Task, family: str, stiffness: float | None, damping: float | 
 
 
 def _stiffness(task: Task, contact: ContactModel | None) -> float:
-    """Spring K [N/m] of a contact model that was not made from one; 0 where there is no contact."""
+    """Spring stiffness K [N/m] of a contact model not defined by one; 0 if there is no contact."""
     if task.contact_pair is None:
         return 0.0
     if contact is None:

@@ -1,11 +1,11 @@
-"""A double pendulum let go from an initial state: chaos in place of contact.
+"""A double pendulum released from an initial state: chaos instead of contact.
 
-The gradient of where it ends with respect to the initial angles and velocities grows with the horizon as trajectories
-separate. No contact takes part, so contact families do not apply. The equations of motion are MuJoCo's, with RK4 of
-1 ms (Suh et al. 2022 print others, which do not conserve energy); the goal is to hang.
+The gradient of the final state with respect to the initial angles and velocities grows with the horizon as trajectories
+separate. There is no contact, so contact families do not apply. The equations of motion are MuJoCo's, integrated by RK4
+with 1 ms steps (those printed by Suh et al. 2022 do not conserve energy); the goal is to hang.
 
-Angles are relative here, the second rod's from the first; the published example's are absolute. Its start in these
-coordinates is the variant `published`; the default takes the same four numbers as relative ones.
+Angles are relative here, the second rod's to the first; the published example's are absolute. Its initial state in
+these coordinates is the variant `published`; the default takes the same four numbers as relative ones.
 """
 
 import math
@@ -37,12 +37,12 @@ def double_pendulum(
     model: str | Path = "double_pendulum",
     **scene_options: str | float,
 ) -> Task:
-    """|q|^2 with q [rad] the angles at the end, not wrapped: wrapping would add jumps of its own.
+    """Cost |q|^2, with q [rad] the final angles, not wrapped: wrapping would add jumps of its own.
 
     Args:
-        start: where it is let go: default or published.
+        start: initial state: default or published.
         horizon: number of 1 ms steps.
-        model: another MJCF in its place, with the hinges `first` and `second` in this order.
+        model: name or path of a replacement MJCF, with the hinges `first` and `second` in this order.
         **scene_options: see `load_scene`.
 
     Raises:

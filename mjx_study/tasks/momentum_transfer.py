@@ -1,9 +1,9 @@
 """Hitting a pivoting bar with a ball so that it turns as fast as possible: one launch angle.
 
 The lever arm grows with the angle up to 45 degrees, past which the ball misses: the best angle lies at the edge of a
-cliff. The bar's angular momentum is measured in units of m v d, so a bar that does not give way and an inelastic hit
-give the -sin^2 theta of Suh et al. 2022. An undamped spring is elastic, which doubles the momentum, and the real bar
-gives way a little: `MomentumTransfer` has both. The bar points up only, so below 0 the ball misses here and not there.
+cliff. The bar's angular momentum is measured in units of m v d, so a rigid bar and an inelastic hit give the
+-sin^2 theta of Suh et al. 2022. An undamped spring is elastic, which doubles the momentum, and the simulated bar yields
+a little: `MomentumTransfer` has both. The bar points up only, so below 0 the ball misses here but not there.
 """
 
 from pathlib import Path
@@ -21,7 +21,7 @@ from mjx_study.tasks.task import Published, Recipe, Task
 
 HORIZON: Final = 400
 SPEED: Final = 2.0  # [m/s]
-DISTANCE: Final = 0.7  # from the start to where the ball's centre meets the bar [m]
+DISTANCE: Final = 0.7  # travel of the ball's centre to the bar [m]
 ANGLE: Final = 0.1  # [rad]
 SIGMA: Final = 0.02  # [rad]
 GAMMA: Final = 0.2  # per unit of the published cost, -sin^2
@@ -32,12 +32,12 @@ RECIPE: Final = Recipe(0.01, 500, 50)
 def momentum_transfer(
     *, horizon: int = HORIZON, model: str | Path = "momentum_transfer", **scene_options: str | float
 ) -> Task:
-    """-(I omega / (m v d))^2 with I omega the bar's angular momentum at the end.
+    """Cost -(I omega / (m v d))^2, with I omega the bar's final angular momentum.
 
     Args:
         horizon: number of 2 ms steps; the ball arrives within 250.
-        model: another MJCF in its place, with the slide joints `x`, `y` and the hinge `pivot` in this order, and the
-            geoms `ball`, `bar`; the cost is made of its own mass and inertia.
+        model: name or path of a replacement MJCF, with the slide joints `x`, `y` and the hinge `pivot` in this order,
+            and the geoms `ball`, `bar`; the cost uses its mass and inertia.
         **scene_options: see `load_scene`.
     """
     scene = load_scene(model, **scene_options)

@@ -1,4 +1,4 @@
-"""A neural network as policy: any task with controls can have one in place of its own."""
+"""Neural-network policies, for any task with controls."""
 
 import dataclasses
 from itertools import pairwise
@@ -15,13 +15,13 @@ from mjx_study.tasks.task import Task
 
 @dataclasses.dataclass(frozen=True)
 class Network(Feedback):
-    """u_h = net(phi(x_h)) + w_h with tanh layers and a linear last one; theta is all weights and biases, flattened.
+    """u_h = net(phi(x_h)) + w_h with tanh layers and a linear output; theta is all weights and biases, flattened.
 
     Attributes:
         horizon: number of steps H.
         controls: number of controls m.
         num_features: length of phi.
-        features: phi, the state as the policy sees it.
+        features: feature map phi of the state.
         hidden: width of each hidden layer.
     """
 
@@ -42,7 +42,7 @@ class Network(Feedback):
         return sum((inputs + 1) * outputs for inputs, outputs in self.shapes)
 
     def initial(self, key: Key[Array, ""], dtype) -> Float[Array, " params"]:
-        """Normal weights of variance 1 / inputs; biases and the last layer 0, so that it starts without control."""
+        """Normal weights of variance 1 / inputs; biases and output layer 0, so that the initial control is zero."""
         parts = []
         for index, (inputs, outputs) in enumerate(self.shapes):
             key, drawn = jax.random.split(key)
@@ -72,20 +72,20 @@ class Network(Feedback):
 
 
 def with_network(task: Task, hidden: tuple[int, ...], key: Key[Array, ""]) -> Task:
-    """A task with a network in place of its policy.
+    """A task with a network as its policy.
 
-    It sees what the task's linear feedback sees, or positions, velocities and activations where there is none.
+    Its input is that of the task's linear feedback, or positions, velocities and activations if there is none.
 
     Args:
-        task: with controls.
+        task: task with controls.
         hidden: width of each hidden layer.
-        key: for the first weights; used up.
+        key: random key for the initial weights; consumed.
 
     Raises:
-        ValueError: the task's decision is made before the simulation, or a layer has no unit.
+        ValueError: the task has an initial-state policy or no control, or a layer has no unit.
     """
     if task.policy.at_start or task.scene.host.nu == 0:
-        raise ValueError(f"{task.name} has no control that a network could give: its decision is the start")
+        raise ValueError(f"{task.name} has no control for a network to set: its policy chooses the initial state")
     host, dtype = task.scene.host, task.scene.template.qpos.dtype
     if isinstance(task.policy, LinearFeedback):
         size, features = task.policy.num_features, task.policy.features

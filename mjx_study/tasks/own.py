@@ -1,4 +1,4 @@
-"""Tasks from outside this package: `module:name` of a module that Python can import, or registered by a package."""
+"""Tasks from outside this package: `module:name` in an importable module, or registered by an installed package."""
 
 import inspect
 from collections.abc import Callable, Sequence
@@ -19,7 +19,7 @@ def registered_names() -> list[str]:
 
 
 def registered_place(name: str) -> str | None:
-    """Where a registered task is, as `module:name`; None for a name that no package registers.
+    """The `module:name` of a registered task; None for a name that no package registers.
 
     Raises:
         ValueError: packages register different tasks by this name.
@@ -37,18 +37,18 @@ def own_task(place: str, options: dict[str, Any]) -> Task:
 
     Args:
         place: `module:name`.
-        options: those that are given, for the function; a Task takes none.
+        options: arguments for the function; a ready-made Task takes none.
 
     Raises:
         MissingModuleError: there is no such module.
-        ValueError: the module raises, there is no Task nor a function that takes the options and returns one, or parts
+        ValueError: the module raises, has neither a Task nor a function of these options that returns one, or the parts
             of the Task do not fit together.
     """
     with importable_here():
         found = find_attribute(place, "task", Task)
         if isinstance(found, Task) and options:
             raise ValueError(
-                f"{place} is a Task that is made already, and {_listed(options)} cannot change it: "
+                f"{place} is a ready-made Task, which {_listed(options)} cannot change: "
                 "give a function that takes this and returns the Task"
             )
         task = found if isinstance(found, Task) else _build(place, found, options)

@@ -1,8 +1,8 @@
-"""Policies: how parameters, noise and state become a start and controls.
+"""Policies: from parameters, noise and state to an initial state and controls.
 
-Noise w enters where exploration does: on each control, u_h = pi(x_h, theta) + w_h, or, for a decision that is made
-once, on the parameters themselves, theta + w. Keeping a control's feedforward and feedback apart lets an open loop
-skip its trivial derivative with respect to the state.
+Noise w enters where exploration does: on each control, u_h = pi(x_h, theta) + w_h, or, for an initial-state policy, on
+the parameters themselves, theta + w. Keeping feedforward and feedback apart lets an open loop skip its trivial
+derivative with respect to the state.
 """
 
 import dataclasses
@@ -18,7 +18,7 @@ from mjx_study.simulation.dynamics import State
 
 @runtime_checkable
 class Policy(Protocol):
-    """A parametrised control law, with the place where noise enters it."""
+    """A parametrised control law, and where noise enters it."""
 
     @property
     def num_params(self) -> int:
@@ -27,21 +27,21 @@ class Policy(Protocol):
 
     @property
     def noise_shape(self) -> tuple[int, int]:
-        """Steps at which noise is drawn, and its dimensions at each."""
+        """Number of steps at which noise is drawn, and its dimension at each."""
         ...
 
     @property
     def additive(self) -> bool:
-        """Whether the noise is added to theta entry by entry, so that the score is w / sigma^2 and nothing else."""
+        """Whether the noise is added to theta entry by entry, so that the score is simply w / sigma^2."""
         ...
 
     @property
     def at_start(self) -> bool:
-        """Whether theta and the noise act on the start state and on nothing else."""
+        """Whether theta and the noise act only on the initial state."""
         ...
 
     def place(self, theta: Float[Array, " params"], noise: Float[Array, "steps dimensions"], start: State) -> State:
-        """The start state, where theta acts on it."""
+        """The initial state, after theta and the noise have acted on it."""
         ...
 
     def feedforward(
@@ -51,7 +51,7 @@ class Policy(Protocol):
         ...
 
     def feedback(self, theta: Float[Array, " params"], state: State) -> Float[Array, " nu"] | None:
-        """The part that depends on the state; None where there is none."""
+        """The state-dependent part of the control; None if there is none."""
         ...
 
     def score(
@@ -86,17 +86,17 @@ class OpenLoop:
         return self.horizon, self.controls
 
     def place(self, theta: Float[Array, " params"], noise: Float[Array, "steps dimensions"], start: State) -> State:
-        """The start as it is."""
+        """The initial state unchanged."""
         return start
 
     def feedforward(
         self, theta: Float[Array, " params"], noise: Float[Array, "steps dimensions"]
     ) -> Float[Array, "horizon nu"]:
-        """theta, reshaped, and the noise."""
+        """theta, reshaped, plus the noise."""
         return theta.reshape(self.horizon, self.controls) + noise
 
     def feedback(self, theta: Float[Array, " params"], state: State) -> None:
-        """None: an open loop does not look at the state."""
+        """None: an open loop ignores the state."""
         return None
 
     def score(
@@ -108,13 +108,13 @@ class OpenLoop:
 
 @dataclasses.dataclass(frozen=True)
 class Feedback:
-    """Base of the policies u_h = pi(phi(x_h), theta) + w_h.
+    """Base of the feedback policies u_h = pi(phi(x_h), theta) + w_h.
 
     Attributes:
         horizon: number of steps H.
         controls: number of controls m.
         num_features: length of phi.
-        features: phi, the state as the policy sees it.
+        features: feature map phi of the state.
     """
 
     horizon: int
@@ -130,7 +130,7 @@ class Feedback:
         return self.horizon, self.controls
 
     def place(self, theta: Float[Array, " params"], noise: Float[Array, "steps dimensions"], start: State) -> State:
-        """The start as it is."""
+        """The initial state unchanged."""
         return start
 
     def feedforward(
@@ -148,7 +148,7 @@ class LinearFeedback(Feedback):
         horizon: number of steps H.
         controls: number of controls m.
         num_features: length of phi.
-        features: phi, the state as the policy sees it.
+        features: feature map phi of the state.
     """
 
     @property
@@ -169,7 +169,7 @@ class LinearFeedback(Feedback):
 
 @dataclasses.dataclass(frozen=True)
 class Launch:
-    """A decision that is made once, before the simulation: theta + w becomes the start state, and no control acts.
+    """Initial-state policy: theta + w determines the initial state, and no control acts.
 
     Attributes:
         num_params: length of theta.

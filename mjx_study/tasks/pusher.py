@@ -1,8 +1,8 @@
-"""Pushing through stiff contact: an open-loop force on the first of two bodies that touch.
+"""Pushing through stiff contact: an open-loop force on the first of two touching bodies.
 
 The numbers are those of Suh et al. 2022 and its published example: two bodies of 0.1 kg, 5 ms, velocity factor 0.99
-per step, 200 forces; only the contact model varies. At K = 10 N/m first-order gradients win, from about 1000 N/m on
-they lose.
+per step, 200 forces; only the contact model varies. First-order gradients win at K = 10 N/m and lose from about
+1000 N/m on.
 """
 
 from pathlib import Path
@@ -31,12 +31,12 @@ RECIPE: Final = Recipe(1e-3, 500, 10)
 
 
 def pusher(*, horizon: int = HORIZON, model: str | Path = "pusher", **scene_options: str | float) -> Task:
-    """sum_h e_h^T Q e_h + R u_h^2 + e_{H+1}^T Q e_{H+1}, e the state minus the goal.
+    """Cost sum_h e_h^T Q e_h + R u_h^2 + e_{H+1}^T Q e_{H+1}, with e the state minus the goal.
 
     Args:
         horizon: number of 5 ms steps.
-        model: another MJCF in its place, with the slide joints `pusher`, `slider` in this order, geoms of these names,
-            and a motor on `pusher`.
+        model: name or path of a replacement MJCF, with the slide joints `pusher`, `slider` in this order, geoms of
+            these names, and a motor on `pusher`.
         **scene_options: see `load_scene`.
     """
     scene = load_scene(model, **scene_options)

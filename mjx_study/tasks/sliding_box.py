@@ -1,9 +1,9 @@
 """Dragging a box by friction: an open-loop force on a block that stands on it.
 
-Suh et al. 2022 write the friction as clip(1.8 v, +-0.18) N of the slip v while the block is above the box, and nothing
-past the edge. Here it is MuJoCo's Coulomb cone with the same limit, mu m g = 0.18 N, and the contact's damping in place
-of the slope: 1.8 N s/m in the families without a damping ratio. The block's height is a coordinate, so it is pressed on
-the box by its weight alone and really falls past the edge. Numbers and horizon are the published example's.
+In Suh et al. 2022 friction is clip(1.8 v, +-0.18) N of the slip v while the block is above the box, and zero past the
+edge. Here it is MuJoCo's Coulomb cone with the same limit, mu m g = 0.18 N, and the contact's damping as the slope:
+1.8 N s/m in the families without a damping ratio. The block's height is a coordinate, so the block rests on the box by
+its weight alone and really falls past the edge. Numbers and horizon are the published example's.
 """
 
 from pathlib import Path
@@ -28,16 +28,16 @@ SLIP_DAMPING: Final = 1.8  # [N s/m]
 GAMMA: Final = 2e4
 RADIUS: Final = 100.0
 RECIPE: Final = Recipe(1e-4, 100, 10)
-BLOCK, BOX = 0, 2  # among the coordinates block, height, box
+BLOCK, BOX = 0, 2  # indices among the coordinates block, height, box
 
 
 def sliding_box(*, horizon: int = HORIZON, model: str | Path = "sliding_box", **scene_options: str | float) -> Task:
-    """sum_h e_h^T Q e_h + R u_h^2 + e_{H+1}^T Q e_{H+1}, e the horizontal state minus the goal.
+    """Cost sum_h e_h^T Q e_h + R u_h^2 + e_{H+1}^T Q e_{H+1}, with e the horizontal state minus the goal.
 
     Args:
         horizon: number of 5 ms steps.
-        model: another MJCF in its place, with the slide joints `block`, `height`, `box` in this order, the geoms
-            `foot`, `box`, and a motor on `block`.
+        model: name or path of a replacement MJCF, with the slide joints `block`, `height`, `box` in this order, the
+            geoms `foot`, `box`, and a motor on `block`.
         **scene_options: see `load_scene`.
     """
     scene = load_scene(model, **scene_options)

@@ -1,4 +1,4 @@
-"""A task: a scene, where it starts, a policy, its noise, and a cost."""
+"""A task: a scene, an initial state, a policy, its noise, and a cost."""
 
 import dataclasses
 import math
@@ -22,12 +22,12 @@ FAMILIES: Final = ("penalty", "mujoco", "mujoco_stiff")
 
 @dataclasses.dataclass(frozen=True)
 class Recipe:
-    """How a task is optimised unless told otherwise.
+    """Default settings for optimising a task.
 
     Attributes:
-        learning_rate: of plain gradient descent.
-        iterations: number of steps.
-        samples: in each batch.
+        learning_rate: learning rate of plain gradient descent.
+        iterations: number of descent steps.
+        samples: batch size.
         decay: power a of the learning rate's decay, learning_rate / i^a at iteration i = 1, 2, ...
     """
 
@@ -39,14 +39,14 @@ class Recipe:
 
 @dataclasses.dataclass(frozen=True)
 class Published:
-    """What the published example gives AoBG's bound epsilon + alpha B <= gamma, on the scale of this task's cost.
+    """The published example's constants in AoBG's bound epsilon + alpha B <= gamma, on the scale of this task's cost.
 
-    Its confidence 0.95 stands in the logarithm where the Bernstein inequality has the probability of failure; the
-    appendix bounds the variance by the second moment, whose printed sum must be a mean.
+    The example uses its confidence 0.95 in the logarithm in place of the Bernstein inequality's probability of failure.
+    The appendix bounds the variance by the second moment, whose printed sum must be a mean.
 
     Attributes:
         gamma: accuracy bound, in the unit of the gradient.
-        radius: R in epsilon, a constant of each example, in the unit of the gradient.
+        radius: R in epsilon, a constant per example, in the unit of the gradient.
         failure_probability: P in epsilon, as published.
         variance_proxy: s2 in epsilon.
 
@@ -60,12 +60,12 @@ class Published:
 
 
 def no_running_cost(state: State, control: Float[Array, " nu"]) -> Float[Array, ""]:
-    """0: the steps cost nothing."""
+    """Zero running cost."""
     return jax.numpy.zeros((), state.qpos.dtype)
 
 
 def no_final_cost(state: State) -> Float[Array, ""]:
-    """0: the last state costs nothing."""
+    """Zero final cost."""
     return jax.numpy.zeros((), state.qpos.dtype)
 
 
@@ -74,34 +74,34 @@ class Task:
     """Everything that defines F(theta) = E V_1 except the contact model.
 
     Attributes:
-        name: as the command line takes it.
+        name: name on the command line.
         description: one line.
         scene: the compiled model.
         horizon: number of steps H.
-        policy: maps theta, noise and state to start and controls.
-        theta: where gradients are taken unless told otherwise, (params,). A weakly typed array is made a strong one:
-            otherwise what is compiled for it would be compiled again for the theta of a descent.
+        policy: maps theta, noise and state to initial state and controls.
+        theta: default parameters, where gradients are taken, (params,). A weakly typed array is made a strong one;
+            otherwise programs compiled for it would be compiled again for the theta of a descent.
         sigma: standard deviation of the noise, in the unit of what it is added to.
-        start: the start state, or a distribution over start states as a function of a key.
-        running_cost: c(state, control) of each step before it is taken; none by default, where there is a final one.
-        final_cost: c(state) after the last step; none by default, where there is a running one.
-        contact_pair: names of the two geoms whose contact is swept; None where there is no contact.
+        start: initial state, or a distribution over initial states as a function of a key.
+        running_cost: c(state, control) at each step, before it is taken; may be omitted if there is a final cost.
+        final_cost: c(state) after the last step; may be omitted if there is a running cost.
+        contact_pair: names of the two geoms whose contact is swept; None if there is no contact.
         gamma: AoBG's accuracy bound, in the unit of the gradient; infinite by default, which is inverse-variance
             weighting.
-        published: AoBG's constants in the published example; None where there are none.
-        reference: the analytic system in place of the penalty family, as a function of the stiffness [N/m]; None where
-            there is none. `analytic` gives it the task's noise.
-        damping: of the contact in families without a damping ratio of their own [N s/m], or None; friction needs some,
-            since it is the resistance to slip.
-        stiffnesses: that a sweep takes unless told otherwise [N/m].
-        families: contact families that a sweep takes unless told otherwise.
-        span: range of a decision of one number that a landscape shows; None for a range about theta.
-        noise: name of the noise's density in `estimators.NOISES`.
-        onset: how first-order gradients take the onset of contact: "none", exact derivatives of the steps, or "linear",
-            with what those miss (see `mjx_study.simulation.onset`).
-        recipe: how it is optimised unless told otherwise; None where every number has to be given.
-        outcomes: what a rollout came to, by name, from its states with the start first; what is reported of a policy
-            beside its cost. None where the cost says it all.
+        published: AoBG's constants in the published example; None if there are none.
+        reference: analytic counterpart of the penalty family, as a function of the stiffness [N/m]; None if there is
+            none. `analytic` gives it the task's noise.
+        damping: contact damping in families without a damping ratio [N s/m], or None; friction needs some, since it is
+            the resistance to slip.
+        stiffnesses: default stiffnesses of a sweep [N/m].
+        families: default contact families of a sweep.
+        span: range that a landscape over a scalar parameter shows; None for a range about theta.
+        noise: name of the noise density in `estimators.NOISES`.
+        onset: treatment of the onset of contact in first-order gradients: "none" for exact derivatives of the steps, or
+            "linear" to add what those miss (see `mjx_study.simulation.onset`).
+        recipe: default settings of an optimisation; None if all of them must be given.
+        outcomes: metrics of a rollout by name, as a function of its states including the initial one, to report beside
+            the cost; None for none.
     """
 
     name: str
@@ -146,7 +146,7 @@ class Task:
 
     @property
     def random_start(self) -> bool:
-        """Whether the start is drawn per sample."""
+        """Whether every sample draws its own initial state."""
         return not isinstance(self.start, State)
 
     def analytic(self, stiffness: float) -> Reference:
@@ -161,17 +161,17 @@ class Task:
 
     @property
     def main_family(self) -> str:
-        """The contact family of a single run unless told otherwise: MuJoCo's impedance where the task sweeps it."""
+        """Default contact family of a single run: MuJoCo's impedance if the task sweeps it."""
         return "mujoco" if "mujoco" in self.families else self.families[0]
 
     @property
     def middle_stiffness(self) -> float:
-        """The stiffness of a single run unless told otherwise, the middle one of the sweep [N/m]."""
+        """Default stiffness of a single run: the middle one of the sweep [N/m]."""
         return self.stiffnesses[len(self.stiffnesses) // 2]
 
     @property
     def effective_mass(self) -> float:
-        """Of the swept contact along its normal [kg].
+        """Effective mass of the swept contact along its normal [kg].
 
         Raises:
             ValueError: the task has no contact.
@@ -181,7 +181,7 @@ class Task:
         return effective_mass(self.scene, *self.contact_pair)
 
     def draw_start(self, key: Key[Array, ""]) -> State:
-        """The start state of one sample."""
+        """The initial state of one sample."""
         return self.start if isinstance(self.start, State) else self.start(key)
 
     def replace(self, **changes) -> "Task":

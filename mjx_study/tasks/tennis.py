@@ -1,8 +1,8 @@
-"""Returning balls to a target with a paddle: linear feedback from many starts.
+"""Returning balls to a target with a paddle: linear feedback from many initial states.
 
 Numbers are those of Suh et al. 2022 and its published example, with time running ten times as fast: 200 steps of 5 ms
-in place of 50 ms resolve the contact. Policy, commands, noise and cost are in the paper's slow time, so parameters and
-costs can be compared. A paddle of 1000 times the ball's mass stands for one that nothing can stop.
+instead of 50 ms resolve the contact. Policy, commands, noise and cost are in the paper's slow time, so that parameters
+and costs can be compared. A paddle of 1000 times the ball's mass stands for an unstoppable one.
 """
 
 from pathlib import Path
@@ -20,7 +20,7 @@ from mjx_study.tasks.task import Published, Recipe, Task
 
 HORIZON: Final = 200
 TIME_SCALE: Final = 10.0
-FINAL_WEIGHT: Final = (100.0, 100.0, 10.0, 10.0)  # of the ball's position and velocity
+FINAL_WEIGHT: Final = (100.0, 100.0, 10.0, 10.0)  # on the ball's position and velocity
 TARGET: Final = (0.0, 2.5, 0.0, 0.0)  # position [m], velocity [m/s]
 CONTROL_WEIGHT: Final = 0.001
 SIGMA: Final = 0.01
@@ -31,17 +31,17 @@ FEATURES: Final = 7
 
 
 def tennis(*, horizon: int = HORIZON, model: str | Path = "tennis", **scene_options: str | float) -> Task:
-    """0.001 sum_h |u_h|^2 + 100 (|position - target|^2 + |velocity|^2 / 10) of the ball at the end.
+    """Cost 0.001 sum_h |u_h|^2 + 100 (|position - target|^2 + |velocity|^2 / 10), the latter of the ball at the end.
 
     Args:
         horizon: number of 5 ms steps.
-        model: another MJCF in its place, with the joints `ball_x`, `ball_y`, `paddle_x`, `paddle_y`, `paddle_angle` in
-            this order and a motor for each of the paddle's, in this order too.
+        model: name or path of a replacement MJCF, with the joints `ball_x`, `ball_y`, `paddle_x`, `paddle_y`,
+            `paddle_angle` in this order and a motor for each of the paddle's, in the same order.
         **scene_options: see `load_scene`.
     """
     host = load_model(model, **scene_options)
     for actuator, joint in enumerate(host.actuator_trnid[:, 0]):
-        # The velocity is reached in one step, and commands are in slow time.
+        # The commanded velocity is reached in one step; commands are in slow time.
         gain = host.dof_M0[host.jnt_dofadr[joint]] / host.opt.timestep
         host.actuator_gainprm[actuator, 0] = TIME_SCALE * gain
         host.actuator_biasprm[actuator, 2] = -gain

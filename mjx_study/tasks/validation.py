@@ -1,4 +1,4 @@
-"""Whether the parts of a task fit together, and what is wrong with them in one line."""
+"""Check that the parts of a task fit together, with one-line errors."""
 
 from collections.abc import Callable
 from typing import Any
@@ -11,14 +11,14 @@ from mjx_study.tasks.task import Task
 
 
 def check_shapes(task: Task, name: str = "") -> None:
-    """Refuse what broadcasting and clamped indices would let pass; traces, and computes nothing.
+    """Refuse mismatches that broadcasting and clamped indices would let pass; traces only, computes nothing.
 
     Args:
-        task: to check.
-        name: in front of messages; the task's own by default.
+        task: the task to check.
+        name: prefix of messages; by default the task's name.
 
     Raises:
-        ValueError: a part raises, or has another shape or dtype than the simulation needs.
+        ValueError: a part raises, or its shape or dtype is not what the simulation needs.
     """
     name = name or task.name
     policy, dtype = task.policy, task.scene.template.qpos.dtype
