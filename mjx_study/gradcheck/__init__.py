@@ -1,8 +1,8 @@
-"""Are the derivatives right? Automatic differentiation against differences, the C engine and a closed form.
+"""Are the derivatives right? Automatic differentiation against finite differences, the C engine and a closed form.
 
-A mismatch is not yet a wrong derivative: where a step has a kink or a jump there is none, where the solver has not
-converged the derivative is that of another point, and where MJX places a contact elsewhere the C engine has another.
-The check tells these apart, entry by entry of a step's Jacobian.
+A mismatch need not be a wrong derivative: at a kink or a jump of the step there is none, with an unconverged solver it
+is taken at another point, and where MJX places a contact elsewhere the C engine has a different one. The check tells
+these cases apart, for every entry of a step's Jacobian.
 """
 
 from mjx_study.gradcheck.check import gradcheck

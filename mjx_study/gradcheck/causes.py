@@ -1,4 +1,4 @@
-"""The likely cause of a finding, in one sentence, from the model and the state that it was found in."""
+"""The likely cause of a finding, in one sentence, from the model and the state."""
 
 import dataclasses
 from collections.abc import Callable
@@ -15,7 +15,7 @@ from mjx_study.simulation.engine import HostState
 from mjx_study.simulation.scene import num_constraint_rows
 
 NEAR: Final = 2e-6
-"""How close to a switch a distance must be to be its cause; about the shortest difference [m, rad, relative]."""
+"""Distance from a switch below which it counts as the cause; about the shortest difference step [m, rad, relative]."""
 UNKNOWN: Final = "unknown"
 _SLIDE, _HINGE = int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE)
 SINGULAR: Final = "the inertia matrix is singular (a body lacks mass, or joints do the same)"
@@ -23,15 +23,15 @@ SINGULAR: Final = "the inertia matrix is singular (a body lacks mass, or joints 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Place:
-    """Where a finding is.
+    """The place of a finding.
 
     Attributes:
         layout: the scene and the names of its coordinates.
         state: the state.
-        stages: MJX's quantities in it.
+        stages: MJX's quantities at the state.
         qacc: its constrained acceleration.
-        solref: of all geoms under the contact model, (geoms, 2).
-        solimp: of all geoms, (geoms, 5).
+        solref: solref of all geoms under the contact model, (geoms, 2).
+        solimp: solimp of all geoms, (geoms, 5).
     """
 
     layout: Coordinates
@@ -48,7 +48,7 @@ class Place:
 
     @cached_property
     def degenerate(self) -> list[DegenerateContact]:
-        """Its contacts that are placed by a direction that vanishes."""
+        """Contacts placed by a direction that vanishes."""
         return degenerate_contacts(self.host, self.state, self.stages["geom"][self.touching()])
 
     def touching(self) -> np.ndarray:
@@ -60,13 +60,13 @@ Rule = Callable[[Place, Coordinate, Coordinate], str | None]
 
 
 def cause_of_fault(place: Place, output: Coordinate, source: Coordinate, *, stock: bool = False) -> str:
-    """Why a derivative may be wrong, zero or NaN here."""
+    """The likely reason why a derivative is wrong, zero or NaN here."""
     rules = [*_FAULTS, _unrolled_solver] if stock else _FAULTS
     return next((text for rule in rules if (text := rule(place, output, source))), UNKNOWN)
 
 
 def cause_of_kink(place: Place, output: Coordinate, source: Coordinate) -> str:
-    """What switches here."""
+    """The switch that makes the step non-smooth here."""
     rules = (_control_bound, _parameter_bound, _onset, _limit, _row_switch, _friction_loss, _muscle, _degenerate)
     if output.block == "act":  # which nothing that touches moves
         rules = (_control_bound, _muscle)
@@ -75,7 +75,7 @@ def cause_of_kink(place: Place, output: Coordinate, source: Coordinate) -> str:
 
 
 def singular(place: Place) -> bool:
-    """Whether the inertia matrix cannot be solved with."""
+    """Whether the inertia matrix is singular."""
     inertia = place.stages["qM"]
     return not np.all(np.isfinite(inertia)) or bool(np.linalg.cond(inertia) > 1e12)
 

@@ -89,7 +89,7 @@ def _summary(plan: GradcheckPlan) -> str:
 
 
 def unoffered(host: mujoco.MjModel) -> list[str]:
-    """What the model has and a step has no derivative of or by."""
+    """Features of the model that a step's derivative does not cover."""
     notes = []
     if host.nsensor:
         notes.append(f"{_count(host.nsensor, 'sensor')}: a step does not compute them, and has no derivative of them")

@@ -1,4 +1,4 @@
-"""Findings of one contact model, equal ones together, and the row that sums them up."""
+"""Findings for one contact model, grouped, and its row in the table."""
 
 from collections.abc import Sequence
 
@@ -15,11 +15,11 @@ from mjx_study.gradcheck.state_check import STOCK, StateCheck
 from mjx_study.tasks.contact_grid import ContactPoint
 
 _Key = tuple[str, str, tuple[str, ...], str]
-"""Whose derivative, verdict, modes, cause."""
+"""Owner of the derivative, verdict, modes, cause."""
 
 
 def collect(cell: ContactPoint, layout: Coordinates, checks: Sequence[StateCheck]) -> list[Finding]:
-    """Findings of all states, equal ones together."""
+    """Findings of all states, grouped."""
     groups: dict[_Key, list[Entry]] = {}
     for check in checks:
         for key, entry in [*_of_entries(check, layout), *_of_engine(check, layout), *_of_state(check, layout)]:
@@ -83,7 +83,7 @@ def _codes(check: StateCheck, modes: Sequence[str]) -> np.ndarray:
 
 
 def _of_entries(check: StateCheck, layout: Coordinates) -> list[tuple[_Key, Entry]]:
-    """What derivatives are not, entry by entry."""
+    """Findings on single entries of the derivatives."""
     found: list[tuple[_Key, Entry]] = []
     for who, modes in (("project", _own_modes(check)), (STOCK, [STOCK] if STOCK in check.judged else [])):
         if not modes:
@@ -111,7 +111,7 @@ def _of_entries(check: StateCheck, layout: Coordinates) -> list[tuple[_Key, Entr
 
 
 def _of_engine(check: StateCheck, layout: Coordinates) -> list[tuple[_Key, Entry]]:
-    """Where the C engine's step, equal in value, has another derivative."""
+    """Findings where the C engine's step has the same value but another derivative."""
     if check.engine is None:
         return []
     apart = diagnosis.disagreements(check.judged["forward"], check.truth, check.engine, check.engine_truth)
@@ -131,7 +131,7 @@ def _of_engine(check: StateCheck, layout: Coordinates) -> list[tuple[_Key, Entry
 
 
 def _of_state(check: StateCheck, layout: Coordinates) -> list[tuple[_Key, Entry]]:
-    """What concerns a state and not an entry."""
+    """Findings on a state as a whole."""
     found: list[tuple[_Key, Entry]] = []
     residual, values = check.linear.residual, check.values
     if not residual <= diagnosis.RESIDUAL_TOLERANCE:

@@ -1,4 +1,4 @@
-"""Programs that run a few times only, so that compiling is most of their cost: little optimisation, several at once."""
+"""Compilation of programs that run only a few times and cost mostly compiling: little optimisation, in parallel."""
 
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -9,20 +9,20 @@ import jax.numpy as jnp
 from jax.errors import JaxRuntimeError
 
 OPTIONS: Final = {"xla_backend_optimization_level": "0", "xla_cpu_use_fusion_emitters": False}
-"""Of XLA on a CPU: half the time of its usual code generator, and programs as fast as these checks need."""
+"""XLA's options on a CPU: half the compile time of its usual code generator, and fast enough for these checks."""
 THREADS: Final = 2
-"""Programs compiled at once; each takes a core, and up to a gigabyte for a large model."""
+"""Number of programs compiled at once; each takes a core, and up to a gigabyte for a large model."""
 
 
 class Compiler:
-    """Compiled programs by function and shapes of arguments; `start` compiles ahead, in a thread of its own."""
+    """Compiled programs by function and argument shapes; `start` compiles ahead in a separate thread."""
 
     def __init__(self) -> None:
         self._pool = ThreadPoolExecutor(THREADS, thread_name_prefix="compile")
         self._programs: dict[Any, Future[Callable[..., Any]]] = {}
 
     def start(self, function: Callable[..., Any], *arguments: Any) -> Future[Callable[..., Any]]:
-        """Trace now, and compile meanwhile, the function for arguments of these shapes."""
+        """Trace the function for arguments of these shapes, and compile it in the background."""
         shapes = jax.tree.map(lambda leaf: (jnp.shape(leaf), str(jnp.result_type(leaf))), arguments)
         key = (function, str(jax.tree.structure(arguments)), str(shapes))
         if key not in self._programs:
@@ -31,7 +31,7 @@ class Compiler:
         return self._programs[key]
 
     def run(self, function: Callable[..., Any], *arguments: Any) -> Any:
-        """The function's result, by its compiled program."""
+        """The function's result, from its compiled program."""
         return self.start(function, *arguments).result()(*arguments)
 
 

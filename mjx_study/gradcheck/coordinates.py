@@ -1,7 +1,7 @@
-"""What a step is differentiated by: one flat vector of small changes of state, control and contact parameters.
+"""The inputs of a step's derivative: one flat vector of small changes of state, control and contact parameters.
 
-Positions change in the tangent space, so that quaternions stay what they are; their length is a coordinate of its own,
-which together with the tangent space is all that a raw quaternion can do. Parameters are those of every geom and pair
+Positions change in the tangent space, so quaternions stay unit quaternions; their length is a separate coordinate,
+which together with the tangent space covers every change of a raw quaternion. Parameters change in every geom and pair
 at once, each in units of its own size.
 """
 
@@ -27,18 +27,18 @@ PARAMETERS: Final = (
 )
 LENGTH: Final = "quaternion length"
 PAIR_FRICTION: Final = np.array([0, 0, 1, 2, 2])
-"""Which of a geom's three coefficients of friction each of a pair's five is."""
+"""Index of the geom's friction coefficient (of three) for each of a pair's five."""
 _BALL, _FREE = int(mujoco.mjtJoint.mjJNT_BALL), int(mujoco.mjtJoint.mjJNT_FREE)
 
 
 @dataclasses.dataclass(frozen=True)
 class Coordinate:
-    """One entry of the flat vector, or of what a step returns.
+    """One entry of the flat vector, or of a step's output.
 
     Attributes:
         block: qpos, quaternion length, qvel, act, ctrl or contact.
-        name: within the block.
-        joint: index of the joint that it belongs to, or -1.
+        name: name within the block.
+        joint: index of its joint, or -1.
     """
 
     block: str
@@ -56,9 +56,9 @@ class Coordinates:
     Attributes:
         scene: the scene.
         inputs: names of its entries, in the order position, quaternion lengths, velocity, activation, control, and
-            contact parameters where the scene has contacts.
-        outputs: names of what a step returns: position, velocity, activation.
-        scales: size of each contact parameter, empty where there are none.
+            contact parameters if the scene has contacts.
+        outputs: names of a step's outputs: position, velocity, activation.
+        scales: size of each contact parameter; empty if there are none.
     """
 
     scene: Scene
@@ -68,7 +68,7 @@ class Coordinates:
 
     @property
     def num_state(self) -> int:
-        """How many inputs are no contact parameters."""
+        """Number of inputs other than contact parameters."""
         return len(self.inputs) - len(self.scales)
 
     def columns(self, *blocks: str) -> list[int]:
@@ -76,7 +76,7 @@ class Coordinates:
         return [index for index, coordinate in enumerate(self.inputs) if coordinate.block in blocks]
 
     def blocks(self) -> list[str]:
-        """The blocks of inputs that are not empty, in order."""
+        """The non-empty blocks of inputs, in order."""
         return list(dict.fromkeys(coordinate.block for coordinate in self.inputs))
 
     def state(
@@ -96,8 +96,8 @@ class Coordinates:
     ) -> mjx.Model:
         """The model with a contact model, its parameters changed in units of `scales`.
 
-        What the contact model has changes there, so that derivatives pass through `apply_contact`; the rest changes in
-        every geom and pair.
+        Parameters that the contact model sets are changed in it, so that derivatives pass through `apply_contact`; the
+        others are changed in every geom and pair.
         """
         model = self.scene.model
         if not len(scales):
@@ -137,7 +137,7 @@ def coordinates(scene: Scene, contact: ContactModel | None) -> Coordinates:
 
 
 def quaternions(host: mujoco.MjModel) -> list[tuple[int, int]]:
-    """Joint and first index in qpos of each quaternion."""
+    """Joint and first qpos index of each quaternion."""
     pairs = enumerate(zip(host.jnt_type.tolist(), host.jnt_qposadr.tolist(), strict=True))
     return [(joint, first + 3 * (kind == _FREE)) for joint, (kind, first) in pairs if kind in (_FREE, _BALL)]
 
@@ -155,7 +155,7 @@ def dof_names(host: mujoco.MjModel) -> list[tuple[str, int]]:
 
 
 def joint_name(host: mujoco.MjModel, joint: int) -> str:
-    """A joint's name; where it has none, that of its body."""
+    """A joint's name, or its body's if it has none."""
     name = mujoco.mj_id2name(host, mujoco.mjtObj.mjOBJ_JOINT, joint)
     if name:
         return name

@@ -1,4 +1,4 @@
-"""The gradient of a task's whole cost: reverse against forward mode, differences, and a closed form."""
+"""The gradient of a task's whole cost: reverse mode against forward mode, finite differences, and a closed form."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -20,28 +20,28 @@ from mjx_study.tasks.task import Task
 
 DIRECTIONS: Final = 6
 BATCH: Final = 8
-"""Rollouts in one call of the program of costs."""
+"""Rollouts per call of the cost program."""
 DIFFERENCE_TOLERANCE: Final = 1e-6
 MODES_TOLERANCE: Final = 1e-9
 CLOSED_FORM: Final = 1e-3
-"""Distance from the closed form's gradient, relative to it, below which the two agree."""
+"""Relative distance from the closed form's gradient below which the two agree."""
 GROWTH: Final = 2.0
-"""By how much the distance may grow with stiffness, which brings the two models together."""
+"""Factor by which the distance may grow with stiffness, which should bring the two models together."""
 
 
 @dataclasses.dataclass(frozen=True)
 class CostCheck:
-    """The checks of one contact model's whole-horizon gradient; figures are relative to its norm.
+    """The checks of one contact model's whole-horizon gradient; errors are relative to its norm.
 
     Attributes:
-        contact: family.
+        contact: contact family.
         stiffness: K [N/m].
-        gradient_norm: in cost per unit of theta.
-        modes: reverse mode against forward mode, along some directions.
-        difference: against central differences, along the same directions.
-        one_sided: how far the two one-sided differences disagree at the shortest step.
-        closed_form: against the reference system's hand-derived gradient; another model of the same system, so that it
-            measures how far apart the two are. None where the contact model has none.
+        gradient_norm: norm of the gradient, in cost per unit of theta.
+        modes: difference of reverse and forward mode, along some directions.
+        difference: difference from central differences, along the same directions.
+        one_sided: disagreement of the two one-sided differences at the shortest step.
+        closed_form: distance from the reference system's hand-written gradient, which is of another model of the same
+            system, so that it measures the distance of the two models. None if the contact model has none.
         residual: largest relative solver residual of the rollout.
         verdict: right, kink, jump, unconverged, nan or wrong.
     """
@@ -58,7 +58,7 @@ class CostCheck:
 
 
 class CostPrograms:
-    """Noise-free cost of a task from the start that a key draws, as compiled programs of theta and contact model."""
+    """Zero-noise cost of a task from the initial state that a key draws, compiled for any theta and contact model."""
 
     def __init__(self, task: Task, seed: int, compiler: Compiler):
         self.task = task
@@ -67,7 +67,7 @@ class CostPrograms:
         self.start = task.draw_start(split_sample_key(jax.random.clone(self.key))[0])
 
     def compile(self, contact: ContactModel | None) -> None:
-        """Begin to compile what the methods below need."""
+        """Start compiling the programs of the methods below."""
         self.compiler.start(self._both_modes, self.task.theta, contact, np.zeros((DIRECTIONS, len(self.task.theta))))
         self.compiler.start(self._many, np.zeros((BATCH, len(self.task.theta))), contact)
 
@@ -98,7 +98,7 @@ class CostPrograms:
 
 
 def check_cost(programs: CostPrograms, cell: ContactPoint, seed: int) -> tuple[CostCheck, list[HostState]]:
-    """Check one contact model's gradient; also the states of its rollout, each with its control."""
+    """Check one contact model's gradient; also returns the states of its rollout, each with its control."""
     task = programs.task
     directions = np.random.default_rng(seed).normal(size=(DIRECTIONS, len(task.theta)))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
@@ -136,7 +136,7 @@ def check_cost(programs: CostPrograms, cell: ContactPoint, seed: int) -> tuple[C
 
 
 def judge_closed_forms(checks: Sequence[CostCheck]) -> list[Finding]:
-    """Findings on the distance from the closed form: it may be large, but must not grow as the contact stiffens."""
+    """Findings on the distance from the closed form, which may be large but must not grow as the contact stiffens."""
     known = sorted(
         (check.stiffness, check.closed_form, check.contact) for check in checks if check.closed_form is not None
     )
@@ -157,10 +157,10 @@ def cost_verdict(*, finite: bool, modes: float, residual: float, excused: list[s
     """The verdict on a gradient.
 
     Args:
-        finite: whether it is.
+        finite: whether the gradient is finite.
         modes: relative difference of the two modes.
-        residual: of the solver.
-        excused: for each direction whose difference disagrees, kink or jump, or None where there is no excuse.
+        residual: residual of the solver.
+        excused: kink or jump for each direction whose difference disagrees, or None if nothing excuses it.
     """
     if not finite:
         return "nan"

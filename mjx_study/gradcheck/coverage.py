@@ -1,4 +1,4 @@
-"""Which parts of a model's dynamics a state exercises: contact by zone, limits, friction loss, equalities."""
+"""The parts of a model's dynamics that a state exercises: contact by zone, limits, friction loss, equalities."""
 
 import dataclasses
 from collections.abc import Collection, Sequence
@@ -10,9 +10,9 @@ import numpy as np
 from mjx_study.simulation.scene import Scene
 
 ZONES: Final = ("push", "stick", "slide", "separate")
-"""Of a contact: push has no friction; stick and slide do; separate is within its margin and without force."""
+"""Zones of a contact: push is frictionless; stick and slide have friction; separate is within margin, without force."""
 PARTS: Final = ("contact", *ZONES, "limit", "friction loss", "held", "slipping", "equality")
-"""What a state can exercise; friction loss holds, or slips at its bound."""
+"""Parts that a state can exercise; friction loss holds, or slips at its bound."""
 _STATE, _KIND = mujoco.mjtConstraintState, mujoco.mjtConstraint
 _LIMITS = (int(_KIND.mjCNSTR_LIMIT_JOINT), int(_KIND.mjCNSTR_LIMIT_TENDON))
 _LOSSES = (int(_KIND.mjCNSTR_FRICTION_DOF), int(_KIND.mjCNSTR_FRICTION_TENDON))
@@ -21,12 +21,12 @@ _SATISFIED, _QUADRATIC = int(_STATE.mjCNSTRSTATE_SATISFIED), int(_STATE.mjCNSTRS
 
 @dataclasses.dataclass(frozen=True)
 class Coverage:
-    """How many of some states exercise each part of a model.
+    """Counts of the states that exercise each part of a model.
 
     Attributes:
-        states: how many there are.
-        counts: states by part; parts that the model lacks are left out.
-        missing: parts that the model has and no state exercises.
+        states: number of states.
+        counts: number of states by part, for parts that the model has.
+        missing: parts that the model has but no state exercises.
     """
 
     states: int
@@ -34,7 +34,7 @@ class Coverage:
     missing: tuple[str, ...]
 
     def line(self) -> str:
-        """In words; empty where the model has nothing to exercise."""
+        """The coverage in words; empty if the model has nothing to exercise."""
         zones = [f"{zone} {self.counts[zone]}" for zone in (*ZONES, "held", "slipping") if zone in self.counts]
         of_contact = ", ".join(zone for zone in zones if zone.split()[0] in ZONES)
         of_loss = ", ".join(zone for zone in zones if zone.split()[0] not in ZONES)
@@ -48,7 +48,7 @@ class Coverage:
 
 
 def exercised(data: mujoco.MjData) -> frozenset[str]:
-    """The parts that act in a state of the C engine, after its forward pass."""
+    """The parts that are active in a state of the C engine, after its forward pass."""
     kinds, states = np.asarray(data.efc_type), np.asarray(data.efc_state)
     parts = {
         _zone(contact, kinds, states) for contact in data.contact if contact.exclude == 0 and contact.efc_address >= 0
@@ -66,7 +66,7 @@ def exercised(data: mujoco.MjData) -> frozenset[str]:
 
 
 def _zone(contact: Any, kinds: np.ndarray, states: np.ndarray) -> str:
-    """The zone of one contact: that of its row, or for a pyramid whether all of its edges push, or some."""
+    """The zone of one contact: that of its row, or for a pyramid by whether all or some of its edges push."""
     first, dim = int(contact.efc_address), int(contact.dim)
     pyramid = kinds[first] == int(_KIND.mjCNSTR_CONTACT_PYRAMIDAL)
     found = set(states[first : first + (2 * (dim - 1) if pyramid else 1)].tolist())
@@ -78,7 +78,7 @@ def _zone(contact: Any, kinds: np.ndarray, states: np.ndarray) -> str:
 
 
 def possible(scene: Scene, host: mujoco.MjModel) -> frozenset[str]:
-    """The parts that a model has, by the constraint rows that MJX allocates and the friction of its contacts."""
+    """The parts that a model has, from the constraint rows that MJX allocates and the friction of its contacts."""
     rows: Any = scene.template._impl
     parts: set[str] = set()
     dims = np.asarray(rows.contact.dim)
@@ -92,11 +92,11 @@ def possible(scene: Scene, host: mujoco.MjModel) -> frozenset[str]:
 
 
 OPTIONAL: Final = frozenset({"separate", "contact", "friction loss"})
-"""Counted and not asked for: a contact without damping never separates within its margin; the others have parts."""
+"""Parts counted but not required: an undamped contact never separates within its margin; the others have parts."""
 
 
 def coverage(parts: frozenset[str], states: Sequence[Collection[str]]) -> Coverage:
-    """What some states exercise of the parts that a model has."""
+    """Coverage of a model's parts by some states."""
     counts = {part: sum(part in state for state in states) for part in PARTS if part in parts}
     missing = [part for part, count in counts.items() if not count and part not in OPTIONAL]
     if "contact" in counts and not counts["contact"]:

@@ -24,8 +24,8 @@ class DegenerateContact:
     """One such contact, and the entries of a Jacobian that it can excuse.
 
     Attributes:
-        cause: in words.
-        movers: joints that move one of its bodies; only over their positions does the step jump.
+        cause: one sentence.
+        movers: joints that move one of its bodies; the step jumps only in their positions.
         moved: joints of the same kinematic trees, which its force accelerates.
     """
 
@@ -38,14 +38,14 @@ class DegenerateContact:
         return source.block in ("qpos", LENGTH) and source.joint in self.movers and output.joint in self.moved
 
     def entries(self, layout: Coordinates) -> Bool[np.ndarray, "outputs inputs"]:
-        """All entries that it enters."""
+        """Mask of all entries that the contact's direction enters."""
         return np.array([[self.concerns(output, source) for source in layout.inputs] for output in layout.outputs])
 
 
 def degenerate_contacts(
     host: mujoco.MjModel, state: HostState, touching: Int[np.ndarray, "contacts 2"]
 ) -> list[DegenerateContact]:
-    """Those among contacts of pairs of geoms."""
+    """Degenerate contacts among pairs of geoms."""
     if not len(touching):
         return []
     data = host_data(host, state)
@@ -80,7 +80,7 @@ def _contact(host: mujoco.MjModel, geoms: tuple[int, ...], cause: str) -> Degene
 
 
 def _ancestors(host: mujoco.MjModel, body: int) -> list[int]:
-    """A body and those that carry it, without the world."""
+    """A body and its ancestors, except the world."""
     chain = []
     while body:
         chain.append(body)

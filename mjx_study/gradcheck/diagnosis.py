@@ -1,4 +1,4 @@
-"""A verdict on each entry of a Jacobian: right, or what is wrong with it, or why there is no derivative to be right."""
+"""A verdict on each entry of a Jacobian: right, or what is wrong with it, or why there is no derivative."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -11,19 +11,19 @@ from mjx_study.gradcheck.coordinates import Coordinates
 from mjx_study.gradcheck.differences import Differences
 
 TOLERANCE: Final = 1e-6
-"""Of an entry, relative to the largest in its row and block, beyond three uncertainties of the difference."""
+"""Tolerance of an entry relative to the largest in its row and block, plus three uncertainties of the difference."""
 MODES_TOLERANCE: Final = 1e-6
-"""Relative difference of forward and reverse mode; rounding alone comes to 1e-7 where the solve is ill-conditioned."""
+"""Tolerated relative difference of forward and reverse mode; rounding alone reaches 1e-7 in ill-conditioned solves."""
 RESIDUAL_TOLERANCE: Final = 1e-6
 FAINT: Final = 1e-3
-"""Size of a row's entries relative to the largest of its kind below which it counts as that large."""
+"""Smallest scale of a row's entries, relative to the largest row of its kind."""
 STEEP: Final = 0.1
-"""One-sided slopes that differ by more than this, relative to the largest of a row, are not the rounding of a step."""
+"""Difference of one-sided slopes, relative to the largest of a row, that rounding cannot explain."""
 RESOLVED: Final = 1e-5
-"""Relative uncertainty above which a difference says nothing precise; such entries do not enter the worst error."""
+"""Relative uncertainty above which a difference is not precise; such entries are left out of the worst error."""
 
 VERDICTS: Final = ("right", "unresolved", "kink", "jump", "unconverged", "zero", "nan", "engine", "wrong", "value")
-"""From right to the gravest; `engine` and `value` are of steps and not of entries."""
+"""From right to the gravest; `engine` and `value` concern steps, not entries."""
 RIGHT, UNRESOLVED, KINK, JUMP, UNCONVERGED, ZERO, NAN, ENGINE, WRONG, VALUE = range(10)
 FAILURES: Final = ("unconverged", "zero", "nan", "engine", "wrong", "value")
 MEANING: Final = {
@@ -45,8 +45,8 @@ class Judged:
     """Verdicts of one derivative of one step.
 
     Attributes:
-        codes: index into VERDICTS of each entry.
-        error: worst relative error of the entries that are right and that differences resolve.
+        codes: index into VERDICTS for each entry.
+        error: worst relative error of the right entries that differences resolve.
     """
 
     codes: Int[np.ndarray, "outputs inputs"]
@@ -65,13 +65,13 @@ def judge(
     """Compare a derivative with differences.
 
     Args:
-        layout: names the blocks, within which entries of a row are compared in size.
+        layout: layout with the blocks within which entries of a row are compared in size.
         jacobian: the derivative.
-        truth: what differences found.
-        converged: the derivative from a converged start of the solver, which tells an unconverged solve from a wrong
-            derivative; None where the solver had converged.
-        starved: whether so much is left of the solve that no entry can be called wrong.
-        degenerate: entries that depend on a contact whose direction vanishes; where differences are not smooth either,
+        truth: result of the finite differences.
+        converged: derivative from a converged start of the solver, which tells an unconverged solve from a wrong
+            derivative; None if the solver had converged.
+        starved: whether the solve is so far from converged that no entry can be called wrong.
+        degenerate: entries that depend on a contact whose direction vanishes; if differences are not smooth either,
             they reach across a jump.
     """
     scale = row_scales(layout, jacobian, truth)
@@ -106,9 +106,9 @@ def judge(
 def row_scales(
     layout: Coordinates, jacobian: Float[np.ndarray, "outputs inputs"], truth: Differences | None = None
 ) -> Float[np.ndarray, "outputs inputs"]:
-    """What an entry's error is relative to: the largest of its row, among derivatives and differences by one block.
+    """Scale of an entry's error: the largest of its row, among derivatives and differences with respect to one block.
 
-    Rows that hardly depend on a block, and so hold rounding alone, count as `FAINT` of the largest row of their kind.
+    Rows that hardly depend on a block, and so contain only rounding, get `FAINT` of the largest row of their kind.
     """
     scale = np.empty(jacobian.shape)
     size = np.where(np.isfinite(jacobian), np.abs(jacobian), 0.0)
@@ -131,9 +131,9 @@ def modes_apart(
     second: Float[np.ndarray, "outputs inputs"],
     excused: Bool[np.ndarray, "outputs inputs"] | None = None,
 ) -> float:
-    """Largest relative difference of two derivatives where neither is NaN, and no jump excuses it.
+    """Largest relative difference of two derivatives where neither is NaN and no jump excuses it.
 
-    Entries far below the largest of all may differ by its rounding.
+    Entries far below the largest one may differ by its rounding.
     """
     largest = np.nan_to_num(np.abs(first), nan=0.0, posinf=0.0).max(initial=0.0)
     error = np.abs(first - second) / np.maximum(row_scales(layout, first), 1e-6 * largest)
@@ -142,13 +142,13 @@ def modes_apart(
 
 
 def disagreements(ours: Judged, truth: Differences, engine: Judged, engine_truth: Differences) -> np.ndarray:
-    """Entries that this project's differences find right and the C engine's, as smooth, find wrong; boolean."""
+    """Mask of entries right by this project's differences and wrong by the C engine's, both smooth."""
     rough = truth.rough | engine_truth.rough
     return np.isin(ours.codes, (RIGHT, UNRESOLVED)) & np.isin(engine.codes, (ZERO, WRONG)) & ~rough
 
 
 def resolved_by(ours: Judged, engine: Judged) -> Judged:
-    """Verdicts whose unresolved entries are right where the C engine's differences resolve them."""
+    """Verdicts in which unresolved entries count as right if the C engine's differences confirm them."""
     both = (ours.codes == UNRESOLVED) & (engine.codes == RIGHT)
     return dataclasses.replace(ours, codes=np.where(both, RIGHT, ours.codes))
 
@@ -160,7 +160,7 @@ def worst_error(
     judged: Judged,
     columns: Sequence[int],
 ) -> float:
-    """Worst relative error, right or wrong, of entries that have a derivative and that differences resolve."""
+    """Worst relative error of all entries, right or wrong, that have a derivative and that differences resolve."""
     scale = row_scales(layout, jacobian, truth)
     counted = ~np.isin(judged.codes, (KINK, JUMP)) & (truth.uncertainty <= RESOLVED * scale)
     figures = np.where(counted, np.abs(jacobian - truth.value) / scale, 0.0)[:, list(columns)]
@@ -168,5 +168,5 @@ def worst_error(
 
 
 def worst_verdict(verdicts: Sequence[str]) -> str:
-    """The gravest of some verdicts; right where there is none."""
+    """The gravest of some verdicts; right if there are none."""
     return max(verdicts, key=VERDICTS.index, default="right")

@@ -1,7 +1,7 @@
-"""Differences over a ladder of step sizes: the derivative where there is one, and what there is in its place.
+"""Finite differences over a ladder of step sizes: the derivative where there is one, else the kind of non-smoothness.
 
 Central differences of a smooth map settle as the step shrinks, until rounding takes over; the plateau between is the
-derivative, and how flat it is its uncertainty. The second difference |f(x + h) - 2 f(x) + f(x - h)| tells the rest: it
+derivative, and its flatness the uncertainty. The second difference |f(x + h) - 2 f(x) + f(x - h)| shows the rest: it
 falls like h^2 where the map is smooth, like h at a kink, whose two one-sided slopes disagree at every step, and not at
 all at a jump; nor does |f(x + h) - f(x - h)|, which alone shows a jump that is odd about x.
 """
@@ -16,23 +16,23 @@ RATIO: Final = 4.0
 SIZES: Final = tuple(2.5e-4 / RATIO**power for power in range(8))
 """Step sizes [m, rad, ...], down to 1.5e-8; the finest smooth structure of MuJoCo's contact is 1 mm."""
 ROUNDING: Final = 1e-13
-"""Noise of a step's output relative to its size, solved to rounding."""
+"""Relative noise of a step's output, solved to rounding."""
 SMOOTH, KINK = 1.5, 0.5
-"""Powers of h between which the second difference is a kink's, 1."""
+"""Powers of h between which the second difference counts as that of a kink, whose power is 1."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Differences:
-    """What differences say of a Jacobian, entry by entry.
+    """Jacobian by finite differences, entry by entry.
 
     Attributes:
-        value: the derivative by central differences where there is one, else the mean of the one-sided slopes.
-        uncertainty: of the value.
-        gap: by how much the one-sided slopes disagree at the smallest step that rounding leaves alone; at an odd jump
-            how steep the difference is.
-        kink: where they disagree however small the step.
-        jump: where the map itself jumps.
-        nearby: where it has a kink or a jump within the longer steps, but not here.
+        value: derivative by central differences if there is one, else the mean of the one-sided slopes.
+        uncertainty: uncertainty of the value.
+        gap: disagreement of the one-sided slopes at the smallest step not dominated by rounding; at an odd jump, the
+            slope of the central difference.
+        kink: entries whose one-sided slopes disagree however small the step.
+        jump: entries where the map itself jumps.
+        nearby: entries with a kink or a jump within the longer steps, but not here.
     """
 
     value: Float[np.ndarray, "outputs columns"]
@@ -44,12 +44,12 @@ class Differences:
 
     @property
     def rough(self) -> Bool[np.ndarray, "outputs columns"]:
-        """Where the map is not smooth over the steps taken."""
+        """Entries where the map is not smooth over the steps taken."""
         return self.kink | self.jump | self.nearby
 
 
 def moves(columns: Float[np.ndarray, "columns inputs"]) -> Float[np.ndarray, "moves inputs"]:
-    """All changes that `differences` needs the outputs of: none, then every step size forwards and backwards."""
+    """All changes at which `differences` needs outputs: none, then every step size forwards and backwards."""
     steps = (np.array(SIZES)[:, None, None] * columns).reshape(-1, columns.shape[1])
     return np.concatenate([np.zeros((1, columns.shape[1])), steps, -steps])
 
@@ -57,11 +57,11 @@ def moves(columns: Float[np.ndarray, "columns inputs"]) -> Float[np.ndarray, "mo
 def differences(
     outputs: Float[np.ndarray, "moves outputs"], noise_floor: Float[np.ndarray, " outputs"] | None = None
 ) -> Differences:
-    """Read the outputs after `moves`.
+    """Evaluate the outputs at `moves`.
 
     Args:
-        outputs: one row for each change.
-        noise_floor: how far rounding may move each output, beyond `ROUNDING`.
+        outputs: outputs, one row per change.
+        noise_floor: rounding noise of each output, in addition to `ROUNDING`.
     """
     sizes = np.array(SIZES)[:, None, None]
     here, rest = outputs[0], outputs[1:].reshape(2, len(SIZES), -1, outputs.shape[1])

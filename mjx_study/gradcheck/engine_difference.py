@@ -1,4 +1,4 @@
-"""Where and why the C engine computes another step than MJX: stage by stage, contact by contact, row by row."""
+"""Where and why the C engine's step differs from MJX's: by stage, contact and constraint row."""
 
 import copy
 from typing import Any, Final
@@ -13,9 +13,9 @@ from mjx_study.gradcheck.coordinates import geom_label
 from mjx_study.simulation.engine import HostState, host_data
 
 TOLERANCE: Final = 1e-8
-"""Relative difference of a quantity above which two implementations differ."""
+"""Relative difference of a quantity above which two implementations count as different."""
 TINY: Final = 1e-12
-"""Below it a constraint row is zero."""
+"""Size below which a constraint row counts as zero."""
 STAGES: Final = {
     "xpos": "body positions",
     "ten_length": "tendon lengths",
@@ -30,7 +30,7 @@ STAGES: Final = {
 ROWS: Final = {"efc_J": "Jacobians", "efc_aref": "reference accelerations", "efc_D": "stiffnesses"}
 
 Found = tuple[str, bool]
-"""What differs, in words, and whether it is documented that it does."""
+"""Description of a difference, and whether it is documented."""
 
 
 def difference_of_engines(
@@ -40,14 +40,14 @@ def difference_of_engines(
     ours: Float[np.ndarray, " nv"],
     theirs: Float[np.ndarray, " nv"],
 ) -> tuple[str, bool]:
-    """What differs, and whether all of it is known that MJX computes in another way than C.
+    """The differences, and whether all of them are documented.
 
     Args:
         host: the engine's model.
-        state: where.
+        state: state of the comparison.
         stages: MJX's quantities there.
-        ours: the constrained acceleration by MJX [m/s^2 or rad/s^2].
-        theirs: by the engine.
+        ours: MJX's constrained acceleration [m/s^2 or rad/s^2].
+        theirs: the engine's.
     """
     found, host, data = _kinematics_and_forces(host, state, stages)
     contacts = _contacts(host, data, stages)
@@ -60,7 +60,7 @@ def difference_of_engines(
 
 
 def largest(values: np.ndarray) -> float:
-    """The largest magnitude, 0 of nothing."""
+    """The largest magnitude; 0 if empty."""
     return float(np.abs(values).max(initial=0.0))
 
 
@@ -72,7 +72,7 @@ def relative(ours: np.ndarray, theirs: np.ndarray) -> float:
 def _kinematics_and_forces(
     host: mujoco.MjModel, state: HostState, stages: dict[str, Any]
 ) -> tuple[list[Found], mujoco.MjModel, mujoco.MjData]:
-    """The first quantity that differs; and what to compare the rest with."""
+    """The first quantity that differs, and the engine's model and data to compare the rest with."""
     data = _forward(host, state)
     text = _stage(host, data, stages)
     if not text:
@@ -93,7 +93,7 @@ def _forward(host: mujoco.MjModel, state: HostState) -> mujoco.MjData:
 
 
 def _stage(host: mujoco.MjModel, data: mujoco.MjData, stages: dict[str, Any]) -> str:
-    """The first quantity that differs, from which those after it follow; empty where none does."""
+    """The first quantity that differs, and so explains later ones; empty if none does."""
     inertia = np.zeros((host.nv, host.nv))
     mujoco.mj_fullM(host, data, inertia)
     for name, words in STAGES.items():
@@ -113,7 +113,7 @@ def _integration(host: mujoco.MjModel) -> Found:
 
 
 def _contacts(host: mujoco.MjModel, data: mujoco.MjData, stages: dict[str, Any]) -> list[Found]:
-    """Pairs of geoms whose contacts are not as many, or not in the same place."""
+    """Pairs of geoms whose contacts differ in number or place."""
     ours: dict[tuple[int, ...], list[np.ndarray]] = {}
     theirs: dict[tuple[int, ...], list[np.ndarray]] = {}
     for index in np.flatnonzero(stages["dist"] < stages["margin"]):
@@ -142,10 +142,10 @@ def _contacts(host: mujoco.MjModel, data: mujoco.MjData, stages: dict[str, Any])
 
 
 def _rows(host: mujoco.MjModel, data: mujoco.MjData, stages: dict[str, Any], *, contacts: bool) -> list[Found]:
-    """Kinds of constraint rows that differ, those of contacts if asked for.
+    """Kinds of constraint rows that differ, optionally with those of contacts.
 
     MJX sorts its rows by kind and its contacts by dimension, the C engine by objects and pairs of bodies; so rows are
-    matched by their Jacobians, and those with equal ones by the rest. Rows that are zero count in neither.
+    matched by their Jacobians, and those with equal Jacobians by the rest. Zero rows count in neither.
     """
     here = {name: stages[name] for name in ROWS}
     there = {"efc_J": _jacobian(host, data), "efc_aref": data.efc_aref, "efc_D": data.efc_D}
@@ -179,7 +179,7 @@ def _row(name: str, label: str, text: str) -> Found:
 
 
 def _distances(ours: np.ndarray, theirs: np.ndarray) -> Float[np.ndarray, "ours theirs"]:
-    """How far each is from each, relative to the largest."""
+    """Pairwise distances, relative to the largest magnitude."""
     mine, its = (rows.reshape(len(rows), -1) for rows in (ours, theirs))
     return cdist(mine, its, "chebyshev") / max(largest(mine), largest(its), TINY)
 
@@ -197,7 +197,7 @@ def _kind(kind: int | np.integer) -> str:
 
 
 def _labels(host: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
-    """The kind of each of the engine's rows, and of an equality its type."""
+    """The kind of each of the engine's rows, with the type of equalities."""
     labels = np.array([_kind(kind) for kind in data.efc_type], dtype=object)
     for row in np.flatnonzero(labels == "equality"):
         labels[row] = f"{mujoco.mjtEq(int(host.eq_type[data.efc_id[row]])).name.removeprefix('mjEQ_').lower()} equality"

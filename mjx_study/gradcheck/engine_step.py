@@ -1,4 +1,4 @@
-"""The C engine's step over the same flat vector of changes: another implementation, to take differences of."""
+"""The C engine's step as a function of the same flat vector of changes: an independent map to take differences of."""
 
 from typing import Final
 
@@ -11,7 +11,7 @@ from mjx_study.simulation.contact import ContactModel
 from mjx_study.simulation.engine import HostState, converged_host, host_data
 
 WARMSTARTS: Final = (0.0, 0.5, 1.001)
-"""Other starts of the solver, relative to its solution, from which it ends up as far away as rounding leaves it."""
+"""Other warm starts, relative to the solution, whose results differ only by rounding."""
 
 
 class EngineStep:
@@ -50,7 +50,7 @@ class EngineStep:
         return np.array(rows)
 
     def noise(self, base: HostState, reference: Float[np.ndarray, " nq"]) -> Float[np.ndarray, " outputs"]:
-        """How far the outputs move with the start of the solver, which they should not depend on."""
+        """Change of the outputs with the solver's warm start, on which they should not depend."""
         still = np.zeros((1, len(self.layout.inputs)))
         exact = self.outputs(base, reference, still)
         starts = [

@@ -1,4 +1,4 @@
-"""What a check found not to be right, and for what reason."""
+"""Findings of a check: entries that are not right, grouped by reason."""
 
 import dataclasses
 from typing import Final
@@ -6,7 +6,7 @@ from typing import Final
 from mjx_study.gradcheck.diagnosis import FAILURES, VERDICTS
 
 OTHERS: Final = {"value": "mjx.step", "engine": "the C engine", "placement": "the C engine"}
-"""What a number is compared with, where that is not differences."""
+"""Source of the compared number, if not finite differences."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -14,13 +14,13 @@ class Entry:
     """One entry of one step's Jacobian that is not right.
 
     Attributes:
-        state: in words.
+        state: description of the state.
         index: steps since the start of the rollout.
-        time: the same [s].
-        name: as in d qvel[hinge] / d ctrl[motor].
-        derivative: by automatic differentiation; of a step that differs, what changes here.
-        difference: by central differences; of a step that differs, what changes there; None where there is none.
-        gap: of the one-sided slopes.
+        time: time since the start of the rollout [s].
+        name: name of the entry, as in d qvel[hinge] / d ctrl[motor].
+        derivative: derivative by automatic differentiation; for a step that differs, the change here.
+        difference: central difference; for a step that differs, the change there; None if there is none.
+        gap: gap of the one-sided slopes.
     """
 
     state: str
@@ -38,11 +38,11 @@ class Finding:
 
     Attributes:
         contact: label of the contact model.
-        who: whose derivative: `project`, or `mjx.step` for MJX's own.
+        who: owner of the derivative: `project`, or `mjx.step` for MJX's own.
         verdict: kink, jump, unconverged, zero, nan, engine, wrong, value, placement or apart.
-        modes: of differentiation that show it: forward, reverse, tape.
+        modes: modes of differentiation that show it: forward, reverse, tape.
         cause: one sentence.
-        entries: all of them.
+        entries: all entries concerned.
     """
 
     contact: str
@@ -70,7 +70,7 @@ class Finding:
         return f"{who}{self.verdict} ({count}{modes}), as {example.name} {numbers}: {self.cause}"
 
     def numbers(self, entry: Entry) -> str:
-        """An entry's numbers, and what they are compared with."""
+        """An entry's numbers, with those they are compared with."""
         if self.verdict == "jump" and entry.gap:
             return f"= {entry.derivative:.6g}, but differences reach {entry.gap:.2g}"
         other = OTHERS.get(self.verdict, "differences")
@@ -80,6 +80,6 @@ class Finding:
 
 
 def gravity(finding: Finding) -> tuple[bool, bool, int]:
-    """A key that sorts the gravest findings first."""
+    """Sort key that puts the gravest findings first."""
     order = {name: rank for rank, name in enumerate((*reversed(VERDICTS), "placement", "apart"))}
     return not finding.fails, finding.who != "project", order[finding.verdict]

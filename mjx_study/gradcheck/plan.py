@@ -1,4 +1,4 @@
-"""What is to be checked, itself checked."""
+"""A validated plan of what to check."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -18,21 +18,21 @@ STIFFNESS: Final = (10.0, 100.0, 1000.0)
 CONTACT: Final = ("penalty", "mujoco", "mujoco_default")
 STATES: Final = 4
 HORIZON: Final = 200
-"""Steps of the rollout that a file's states are taken from."""
+"""Number of steps of the rollout that a file's states come from."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class GradcheckPlan:
-    """What to check, itself checked.
+    """A validated plan of what to check.
 
     Attributes:
-        subject: the task; for a file one that has neither cost nor policy.
-        is_task: whether its cost is to be checked.
+        subject: the task; for a file, one without cost or policy.
+        is_task: whether to check its cost.
         cells: contact models.
-        warnings: about them.
-        states: per contact model.
-        seed: of starts, states and directions.
-        stock: whether the derivative of `mjx.step` is checked too.
+        warnings: warnings about the contact models.
+        states: number of states per contact model.
+        seed: random seed of initial states, states and directions.
+        stock: whether to check the derivative of `mjx.step` too.
     """
 
     subject: Task
@@ -58,15 +58,16 @@ def plan_gradcheck(
 
     Args:
         task: the task.
-        families: contact families; None for the task's own where it has no contact, else for `CONTACT`.
-        stiffnesses: for families that take one [N/m]; None for `STIFFNESS`, or the task's where those lie elsewhere.
-        seed: of starts, states and directions.
-        damping: in place of each family's [N s/m].
-        states: per contact model.
-        stock: whether the derivative of `mjx.step` is checked too.
+        families: contact families; None for the task's own if it has no contact, else for `CONTACT`.
+        stiffnesses: stiffnesses for families that take one [N/m]; None for `STIFFNESS`, or the task's if those are in
+            another range.
+        seed: random seed of initial states, states and directions.
+        damping: override of each family's damping [N s/m].
+        states: number of states per contact model.
+        stock: whether to check the derivative of `mjx.step` too.
 
     Raises:
-        ValueError: a family or stiffness that cannot be used, too few states, or float32.
+        ValueError: an unusable family or stiffness, too few states, or float32.
     """
     _check(task, states)
     if families is None:
@@ -95,14 +96,14 @@ def plan_scene_gradcheck(
 
     Args:
         scene: the scene.
-        families: contact families; None for `mjcf`, or for `mujoco` where a stiffness is given.
-        stiffnesses: for families that take one [N/m].
-        seed: of states.
+        families: contact families; None for `mjcf`, or for `mujoco` if a stiffness is given.
+        stiffnesses: stiffnesses for families that take one [N/m].
+        seed: random seed of the states.
         pair: names of the two geoms whose contact has this stiffness; every contact gets the same solref.
-        damping: in place of each family's [N s/m].
-        horizon: steps of the rollout that states are taken from.
-        states: per contact model.
-        stock: whether the derivative of `mjx.step` is checked too.
+        damping: override of each family's damping [N s/m].
+        horizon: number of steps of the rollout that the states come from.
+        states: number of states per contact model.
+        stock: whether to check the derivative of `mjx.step` too.
 
     Raises:
         ValueError: as `plan_gradcheck`, or a stiffness without a pair.
@@ -127,7 +128,7 @@ def plan_scene_gradcheck(
 
 
 def _bare_task(scene: Scene, pair: tuple[str, str] | None, horizon: int) -> Task:
-    """A task that stands for a scene alone."""
+    """A placeholder task for a bare scene."""
     zero = jnp.zeros((), scene.template.qpos.dtype)
     policy = OpenLoop(horizon, scene.host.nu)
     return Task(

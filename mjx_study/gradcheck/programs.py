@@ -1,8 +1,8 @@
-"""The compiled programs of a check: values to take differences of, and derivatives in both modes.
+"""The compiled programs of a check: values for finite differences, and derivatives in both modes.
 
-Three or four small programs whatever the number of states, contact models and directions. Steps and directions go one
-by one (`lax.map`), not as a batch: jaxlib's batched Cholesky factorisations share a pool of threads with the program
-that waits for them, and two at once wait for ever (seen with jaxlib 0.10.2 on two cores).
+Three or four small programs, whatever the number of states, contact models and directions. Steps and directions run one
+by one (`lax.map`), not as a batch: jaxlib's batched Cholesky factorisations share a thread pool with the program that
+waits for them, and two at once deadlock (seen with jaxlib 0.10.2 on two cores).
 """
 
 import dataclasses
@@ -23,9 +23,9 @@ from mjx_study.simulation.engine import HostState
 from mjx_study.simulation.integration import difference_position
 
 BATCH: Final = 64
-"""Steps in one call of the program of values."""
+"""Steps per call of the program of values."""
 DIRECTIONS: Final = 96
-"""Most directions, forwards or backwards, in one call of a program of derivatives."""
+"""Largest number of directions, forwards or backwards, per call of a program of derivatives."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,10 +34,10 @@ class Linear:
 
     Attributes:
         qpos: position after the step.
-        residual: relative, of the solver.
-        forward: the Jacobian (outputs, inputs) by forward mode.
-        reverse: the same by reverse mode.
-        tape: the same by reverse mode on the tape, where `reverse` is that of the Jacobian program; else None.
+        residual: relative residual of the solver.
+        forward: Jacobian (outputs, inputs) by forward mode.
+        reverse: Jacobian by reverse mode.
+        tape: Jacobian by reverse mode on the tape, if `reverse` is that of the Jacobian program; else None.
     """
 
     qpos: Float[np.ndarray, " nq"]
@@ -52,8 +52,8 @@ class Exact:
     """A step whose constraints are solved to rounding.
 
     Attributes:
-        after: the state after it, with the constrained acceleration as its warm start.
-        stages: quantities of the step up to the constraint solve, for the comparison with the C engine.
+        after: state after the step, with the constrained acceleration as its warm start.
+        stages: quantities of the step up to the constraint solve, for comparison with the C engine.
         outputs: (position relative to a reference, velocity, activation) after each change.
     """
 
@@ -64,7 +64,7 @@ class Exact:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Setting:
-    """What is varied between contact models; all arguments of the compiled programs.
+    """A contact model's arguments to the compiled programs.
 
     Attributes:
         contact: the contact model, or None for the MJCF's own.
@@ -76,14 +76,14 @@ class Setting:
 
 
 class Programs:
-    """What is compiled for one scene; contact models and states are arguments."""
+    """The compiled programs of one scene; contact models and states are arguments."""
 
     def __init__(self, layout: Coordinates, compiler: Compiler | None = None):
         self.layout = layout
         self.compiler = compiler or Compiler()
 
     def start(self, setting: Setting, base: HostState, *, stock: bool) -> None:
-        """Begin to compile what `linear`, `exact`, `stock_step` and, if asked for, `stock` need."""
+        """Start compiling the programs of `linear`, `exact`, `stock_step` and, if asked for, `stock`."""
         point, layout = _point(setting, base), self.layout
         rows = [_unit_rows(0, len(layout.inputs)), _unit_rows(0, len(layout.outputs))]
         if self._has_tape:
@@ -98,7 +98,7 @@ class Programs:
     def exact(
         self, setting: Setting, base: HostState, reference: Array, changes: Float[np.ndarray, "batch inputs"]
     ) -> Exact:
-        """The converged step after each change, the first of which is none; positions relative to `reference`."""
+        """The converged step after each change, the first of which is zero; positions relative to `reference`."""
         rows = -(-len(changes) // BATCH) * BATCH
         padded = np.zeros((rows, len(self.layout.inputs)))
         padded[: len(changes)] = changes
@@ -130,7 +130,7 @@ class Programs:
         return _host(self.compiler.run(self._stock_step, *_point(setting, base)), base)
 
     def stock(self, setting: Setting, base: HostState) -> Float[np.ndarray, "outputs inputs"]:
-        """The derivative that `jax.jvp` takes through `mjx.step`."""
+        """The derivative of `mjx.step` by `jax.jvp`."""
         inputs, point = len(self.layout.inputs), _point(setting, base)
         pushes = [_unit_rows(first, inputs) for first in range(0, inputs, DIRECTIONS)]
         rows = [np.asarray(self.compiler.run(self._stock, *point, push)) for push in pushes]
@@ -138,7 +138,7 @@ class Programs:
 
     @property
     def _has_tape(self) -> bool:
-        """Whether derivatives are taken on the tape: of large scenes, and over contact parameters."""
+        """Whether derivatives use the tape: for large scenes, and with respect to contact parameters."""
         return len(self.layout.scales) > 0 or not uses_jacobian(self.layout.scene)
 
     def _derivatives(self, program: Any, setting: Setting, base: HostState) -> tuple[Any, float, Any, Any]:
@@ -156,7 +156,7 @@ class Programs:
         return np.asarray(qpos), float(np.asarray(residual)), forward, reverse
 
     def _after(self, step_function, setting, state, control, change, parameters, reference=None):
-        """Outputs after a change, relative to a position or to what it is after the step; and the state there."""
+        """Outputs after a change, relative to a given position or to that after the step; and the state there."""
         layout = self.layout
         moved, moved_control = layout.state(state, control, change)
         after, *rest = step_function(
@@ -257,7 +257,7 @@ def _host(after: State, base: HostState) -> HostState:
 
 
 def _unit_rows(first: int, size: int) -> Float[np.ndarray, "directions size"]:
-    """Rows of the identity from `first` on, `DIRECTIONS` of them or as many as there are in all, padded by zeros."""
+    """Rows of the identity from `first` on, `DIRECTIONS` of them or `size` if fewer, padded with zeros."""
     count = min(DIRECTIONS, size)
     rows = np.zeros((count, size))
     for row in range(min(count, max(size - first, 0))):

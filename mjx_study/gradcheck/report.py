@@ -1,4 +1,4 @@
-"""What a gradient check found, as data and as text."""
+"""Results of a gradient check, as data and as text."""
 
 import dataclasses
 import math
@@ -12,28 +12,28 @@ from mjx_study.gradcheck.finding import Finding
 from mjx_study.table import format_table
 
 SHOWN: Final = 12
-"""Findings in the text unless all are asked for."""
+"""Number of findings in the text, unless all are asked for."""
 
 
 @dataclasses.dataclass(frozen=True)
 class StepCheck:
-    """The checks of single steps under one contact model; every figure is relative, the worst over the states.
+    """The checks of single steps under one contact model; errors are relative, the worst over the states.
 
     Attributes:
-        contact: family.
-        stiffness: K [N/m]; 0 where the contact model was not made from one.
+        contact: contact family.
+        stiffness: K [N/m]; 0 if the contact model is not defined by one.
         states: number of states.
-        entries: of their Jacobians, in all.
-        unresolved: entries that differences are too uncertain to say anything of.
-        modes: reverse against forward mode.
-        differences: derivative over state and control against central differences.
-        parameters: the same over contact parameters; None where there are no contacts.
-        stock_step: the state after the step against that of `mjx.step`, relative to what the step changes.
-        engine_step: the same against the C engine's.
-        engine: the Jacobian against the C engine's, where the steps agree; None where they nowhere do.
-        stock: the derivative of `mjx.step`, likewise; None where it was not asked for, infinite where it is NaN.
-        residual: of the solver.
-        coverage: what the states exercise.
+        entries: total number of Jacobian entries.
+        unresolved: number of entries that differences are too uncertain to judge.
+        modes: difference of reverse and forward mode.
+        differences: error of derivatives with respect to state and control, by central differences.
+        parameters: error of derivatives with respect to contact parameters; None if there are no contacts.
+        stock_step: difference of the next state from that of `mjx.step`, relative to the step's change.
+        engine_step: difference of the next state from the C engine's, likewise.
+        engine: difference of the Jacobian from the C engine's where the steps agree; None if they never do.
+        stock: error of the derivative of `mjx.step`; None if not asked for, infinite if it is NaN.
+        residual: residual of the solver.
+        coverage: parts of the model that the states exercise.
         verdict: the gravest of the findings on the project's own derivative.
     """
 
@@ -55,21 +55,21 @@ class StepCheck:
 
     @property
     def label(self) -> str:
-        """Contact model in words."""
+        """Label of the contact model."""
         return f"{self.contact}, K = {self.stiffness:g} N/m" if self.stiffness else self.contact
 
 
 @dataclasses.dataclass(frozen=True)
 class GradcheckReport:
-    """All checks and findings, with what they depended on.
+    """All checks and findings, with the environment.
 
     Attributes:
-        subject: the task or file.
-        summary: what was checked, one line.
-        costs: of whole-horizon gradients, one per contact model; empty for a file.
-        steps: of single steps, one per contact model.
-        findings: what is not right, gravest first.
-        warnings: about contact models, and what has no derivative.
+        subject: name of the task or file.
+        summary: one-line summary of what was checked.
+        costs: checks of whole-horizon gradients, one per contact model; empty for a file.
+        steps: checks of single steps, one per contact model.
+        findings: findings, gravest first.
+        warnings: warnings about contact models and about features without a derivative.
         environment: versions and machine.
     """
 
@@ -89,15 +89,15 @@ class GradcheckReport:
 
     @property
     def unexercised(self) -> dict[str, tuple[str, ...]]:
-        """What the model has and no state exercised, by contact model."""
+        """Parts of the model that no state exercised, by contact model."""
         return {check.label: check.coverage.missing for check in self.steps if check.coverage.missing}
 
     def as_json(self) -> dict[str, Any]:
-        """The report as plain data; figures that are not finite become None."""
+        """The report as plain data; non-finite numbers become None."""
         return _plain(dataclasses.asdict(self) | {"passed": self.passed, "unexercised": self.unexercised})
 
     def lines(self, *, verbose: bool = False) -> list[str]:
-        """The report as text; `verbose` has every entry of every finding."""
+        """The report as text; `verbose` lists every entry of every finding."""
         lines = [f"{self.subject}: {self.summary}", ""]
         if self.costs:
             lines += ["gradient of the whole cost", *self._cost_table(), ""]
@@ -109,7 +109,7 @@ class GradcheckReport:
         return [*lines, f"{verdict}, where it was checked" if self.passed and self.unexercised else verdict]
 
     def _coverage_lines(self) -> list[str]:
-        """What the states exercise, contact models with the same line together."""
+        """Coverage, with contact models that have the same line grouped."""
         alike: dict[str, list[str]] = {}
         for check in self.steps:
             alike.setdefault(check.coverage.line(), []).append(check.label)
@@ -172,7 +172,7 @@ class GradcheckReport:
         return _without_empty(rows, [*header, "C engine", "mjx.step", "residual", "unresolved", "verdict"])
 
     def _finding_lines(self, verbose: bool) -> list[str]:
-        """Findings of one kind and cause once, whatever the number of contact models that show it."""
+        """Findings, once per kind and cause, however many contact models show it."""
         alike: dict[tuple[str, str, str], list[Finding]] = {}
         for finding in self.findings:
             alike.setdefault((finding.who, finding.verdict, finding.cause), []).append(finding)
@@ -208,7 +208,7 @@ def _figure(value: float | None) -> str:
 
 
 def _without_empty(rows: Sequence[Sequence[str]], header: Sequence[str]) -> list[str]:
-    """The table without columns that say nothing."""
+    """The table without empty columns."""
     kept = [index for index in range(len(header)) if any(row[index] != "-" for row in rows)]
     return format_table([[row[index] for index in kept] for row in rows], [header[index] for index in kept])
 

@@ -1,4 +1,4 @@
-"""How precisely a step can be computed at all, which limits what differences of it can tell."""
+"""Rounding error of a step, which limits the accuracy of its finite differences."""
 
 from typing import Any, Final
 
@@ -8,13 +8,13 @@ from jaxtyping import Float
 from mjx_study.gradcheck.coordinates import Coordinates
 
 EPSILON: Final = 1e-15
-"""A few roundings of a float64."""
+"""A few rounding errors of a float64."""
 
 
 def solution_noise(
     layout: Coordinates, stages: dict[str, Any], qacc: Float[np.ndarray, " nv"]
 ) -> Float[np.ndarray, " outputs"]:
-    """How far rounding may move the outputs of a step whose equation M a - q - J^T f(J a) = 0 is solved exactly.
+    """Rounding error of the outputs of a step whose equation M a - q - J^T f(J a) = 0 is solved exactly.
 
     Each term is rounded, by EPSILON of its size, and the equation's inverse carries that into the acceleration.
     """

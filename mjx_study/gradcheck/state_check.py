@@ -21,19 +21,19 @@ STOCK = "mjx.step"
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class StateCheck:
-    """All that was computed at one state.
+    """All results at one state.
 
     Attributes:
         sample: the state.
         linear: value and derivatives.
-        derivatives: by mode: forward, reverse, tape, or mjx.step.
-        truth: differences of this project's step.
+        derivatives: derivatives by mode: forward, reverse, tape, or mjx.step.
+        truth: finite differences of this project's step.
         judged: verdicts on the derivatives.
-        modes: reverse against forward mode, where no jump excuses that they differ.
-        values: the step against that of `mjx.step` and of the C engine.
-        engine_truth: differences of the C engine's step.
-        engine: verdicts on the derivative in forward mode by these; None where the two steps differ.
-        place: what causes are looked up in.
+        modes: difference of reverse and forward mode where no jump excuses it.
+        values: comparison of the step with those of `mjx.step` and of the C engine.
+        engine_truth: finite differences of the C engine's step.
+        engine: verdicts of these on the forward-mode derivative; None if the two steps differ.
+        place: place for looking up causes.
     """
 
     sample: Sample
@@ -51,10 +51,10 @@ class StateCheck:
 def check_state(
     programs: Programs, engine_step: EngineStep, setting: Setting, sample: Sample, *, stock: bool = False
 ) -> StateCheck:
-    """Compare a step and its derivatives with everything there is to compare them with.
+    """Run all comparisons of a step and its derivatives.
 
     Args:
-        programs: of the scene.
+        programs: compiled programs of the scene.
         engine_step: the C engine's step under the contact model.
         setting: the contact model, and the units of its parameters.
         sample: the state.

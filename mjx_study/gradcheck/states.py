@@ -1,4 +1,4 @@
-"""Where a step is checked: states of a rollout, its start among them, that exercise what the model has."""
+"""States at which a step is checked: from a rollout, its initial state included, chosen to exercise the whole model."""
 
 import dataclasses
 import itertools
@@ -14,21 +14,21 @@ from mjx_study.simulation.engine import HostState, converged_host, host_data, ho
 from mjx_study.simulation.scene import Scene
 
 SPEED: Final = 0.1
-"""Standard deviation of a sampled start's velocities [m/s or rad/s]: small, but nothing is at rest or at a tie."""
+"""Standard deviation of sampled initial velocities [m/s or rad/s]: small, but nothing is at rest or at a tie."""
 FASTER: Final = (1.0, 5.0)
-"""The same of rollouts that look for what the first did not reach."""
+"""Standard deviations in rollouts that look for parts the first did not reach."""
 PUSHES: Final = 10
-"""How often such a rollout is pushed to other velocities and controls."""
+"""Number of times such a rollout gets new velocities and controls."""
 CONTROL: Final = 0.3
-"""Of sampled controls, relative to half their range; absolute where they have none."""
+"""Standard deviation of sampled controls, relative to half their range; absolute if they have none."""
 POSES: Final = 30
-"""Random poses tried for what no rollout reached."""
+"""Number of random poses tried for parts that no rollout reached."""
 FALL: Final = 50
-"""Steps of the rollout from each."""
+"""Number of steps of the rollout from each pose."""
 BEYOND: Final = 0.01
-"""How far beyond a limit a pose may be, relative to the range."""
+"""Largest excess of a pose beyond a limit, relative to the range."""
 LOOK: Final = 200
-"""States looked at at once for one that exercises what is missing."""
+"""Number of states searched at once for one that exercises a missing part."""
 
 _SCALAR: Final = (int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE))
 
@@ -38,10 +38,10 @@ class Sample:
     """A state to check.
 
     Attributes:
-        label: in words.
+        label: description of the state.
         index: steps since the start of its rollout.
         state: the state and its control.
-        parts: what it exercises.
+        parts: parts of the model that it exercises.
     """
 
     label: str
@@ -51,7 +51,7 @@ class Sample:
 
 
 def start_of(scene: Scene) -> HostState:
-    """The model's own start: its first keyframe, or its reference pose at rest."""
+    """The model's own initial state: its first keyframe, or its reference pose at rest."""
     data = mujoco.MjData(scene.host)
     if scene.host.nkey:
         mujoco.mj_resetDataKeyframe(scene.host, data, 0)
@@ -66,20 +66,20 @@ def states_of(
     seed: int,
     visited: Sequence[HostState] | None = None,
 ) -> tuple[list[Sample], Coverage]:
-    """`count` states, and what they exercise.
+    """`count` states, and the parts of the model that they exercise.
 
-    The first is the start: a program's users start there, and so do most faults of a derivative. The others come from
+    The first is the initial state: users start there, and most faults of a derivative show there. The others come from
     a rollout, the task's own or one with small random velocities and controls, evenly spaced over its steps, those with
-    active constraints first. Where these leave a part of the model unexercised, states take their places that do: of
-    rollouts that are faster and pushed about, and of random poses within the joints' limits.
+    active constraints first. If they leave a part of the model unexercised, they are replaced by states that exercise
+    it, from faster rollouts with repeated pushes and from random poses within the joints' limits.
 
     Args:
         scene: the scene.
         contact: its contact model, or None.
         count: number of states.
-        horizon: steps of the rollouts.
-        seed: of velocities, controls and poses.
-        visited: states of a task's rollout; None for one in the C engine.
+        horizon: number of steps of the rollouts.
+        seed: random seed of velocities, controls and poses.
+        visited: states of a task's rollout; None for a rollout in the C engine.
     """
     host = converged_host(scene, contact)
     random = np.random.default_rng(seed)
@@ -103,7 +103,7 @@ def states_of(
 
 
 def _cover(chosen: list[Sample], pool: Iterable[Sample], wanted: frozenset[str], count: int) -> list[Sample]:
-    """Add samples of a pool, `count` in all at most, until they exercise what is wanted or all that the pool does."""
+    """Add samples of a pool, up to `count` in all, until they exercise what is wanted or all that the pool offers."""
     chosen, seen = list(chosen), []
     iterator = iter(pool)
     while len(chosen) < count and (missing := wanted.difference(*(sample.parts for sample in chosen))):
@@ -120,7 +120,7 @@ def _cover(chosen: list[Sample], pool: Iterable[Sample], wanted: frozenset[str],
 
 
 def _spaced(rollout: Sequence[Sample], count: int) -> list[Sample]:
-    """Up to `count` samples, evenly spaced over those with active constraints, then over the others."""
+    """Up to `count` samples, evenly spaced, first among those with active constraints, then among the others."""
     active = [sample for sample in rollout if sample.parts]
     others = [sample for sample in rollout if not sample.parts]
     if count > len(active):
@@ -135,7 +135,7 @@ def _even(samples: list[Sample], count: int) -> list[Sample]:
 
 
 def _elsewhere(host: mujoco.MjModel, start: HostState, horizon: int, random: np.random.Generator) -> Iterator[Sample]:
-    """States that a rollout from the start does not reach."""
+    """States that a rollout from the initial state does not reach."""
     for speed in FASTER:
         every = max(horizon // PUSHES, 1)
         yield from _rollout(
@@ -154,7 +154,7 @@ def _rollout(
     push: Callable[[HostState], HostState] | None = None,
     every: int = 1,
 ) -> Iterator[Sample]:
-    """States of a rollout in the C engine, as long as it stays finite, pushed every so many steps."""
+    """States of a rollout in the C engine while it stays finite, with pushes at regular intervals."""
     data = host_data(host, start)
     for index in range(horizon):
         if push is not None and index % every == 0:

@@ -14,21 +14,21 @@ from mjx_study.simulation.engine import HostState
 
 ROUNDING: Final = 1e-14
 STILL: Final = 1e-8
-"""Angular velocity [rad/s] that MJX takes as zero in every component, where it is the step of an orientation."""
+"""Angular velocity [rad/s] below which, in every component, MJX treats the step of an orientation as zero."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Values:
-    """How far apart the states after one step are, all solved to rounding, relative to the step's change.
+    """Differences of the states after one step, all solved to rounding, relative to the step's change.
 
     Attributes:
-        stock: this project's from that of `mjx.step`.
-        engine: this project's from the C engine's.
-        verdict: value (this project's step and that of `mjx.step` differ), engine (they agree, and the C engine's is
-            another for no documented reason), placement (for a documented one), or empty.
-        cause: what differs.
-        coordinate: where it shows most, an index into the layout's outputs.
-        numbers: the change of this coordinate here, and in the implementation that differs.
+        stock: difference of this project's state from that of `mjx.step`.
+        engine: difference of this project's state from the C engine's.
+        verdict: value (this project's step and that of `mjx.step` differ), engine (they agree, and the C engine's
+            differs for no documented reason), placement (for a documented one), or empty.
+        cause: description of the difference.
+        coordinate: output that differs most, an index into the layout's outputs.
+        numbers: change of this coordinate here, and in the implementation that differs.
     """
 
     stock: float
@@ -55,11 +55,11 @@ def compare_values(
     """Compare one step.
 
     Args:
-        layout: the scene.
+        layout: the scene and its coordinates.
         engine_step: the C engine's step.
-        state: where.
-        ours: this project's state after it; like the others with the acceleration that led there as warm start.
-        stock: that of `mjx.step`.
+        state: state before the step.
+        ours: this project's state after it; like the others, with the step's acceleration as warm start.
+        stock: state after `mjx.step`.
         stages: MJX's quantities at `state`.
     """
     theirs = engine_step.after(state)
@@ -84,7 +84,7 @@ def compare_values(
 
 
 def change(layout: Coordinates, before: HostState, after: HostState) -> Float[np.ndarray, " outputs"]:
-    """What a step changes: position in the tangent space, velocity, activation."""
+    """The change over a step: position in the tangent space, velocity, activation."""
     tangent = np.empty(layout.scene.host.nv)
     mujoco.mj_differentiatePos(layout.scene.host, tangent, 1.0, before.qpos, after.qpos)
     return np.concatenate([tangent, after.qvel - before.qvel, after.act - before.act])
@@ -111,7 +111,7 @@ def apart(layout: Coordinates, before: HostState, ours: HostState, theirs: HostS
 
 
 def _stillness(host: mujoco.MjModel, qvel: Float[np.ndarray, " nv"]) -> Float[np.ndarray, " nv"]:
-    """Angular velocities of free and ball joints that MJX takes as zero; 0 elsewhere."""
+    """Angular velocities of free and ball joints that MJX treats as zero; 0 elsewhere."""
     still = np.zeros_like(qvel)
     for joint, _ in quaternions(host):
         first = host.jnt_dofadr[joint] + 3 * (host.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE)
