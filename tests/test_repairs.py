@@ -131,3 +131,27 @@ def test_tendon_springs_are_linear_at_rest() -> None:
     assert [float(part) for part in program(jnp.zeros(()))] == [0.0, -400.0]
     assert [float(part) for part in program(jnp.array(0.1))] == [0.0, 0.0]
     assert not patches.has_tendon_springs(load_scene("pusher").model)
+
+
+@pytest.mark.parametrize("place", ["inside", "outside", "edge", "above", "axis", "middle"])
+def test_contacts_of_cylinders(place: str) -> None:
+    """The distance and its gradient are MJX's, and the gradient has a derivative in reverse mode."""
+    places = {
+        "inside": (0.1, 0.05, 0.1),
+        "outside": (0.5, 0.1, 0.1),
+        "edge": (0.5, -0.2, 0.4),
+        "above": (0.1, 0.1, 0.4),
+    }
+    point, size = jnp.array(places.get(place, (0, 0, 0.1 * (place == "axis")))), jnp.array([0.3, 0.25, 0])
+    mjx_distance = original("collision_sdf", "_cylinder")
+    ours, theirs = (jax.value_and_grad(distance) for distance in (patches.cylinder_distance, mjx_distance))
+    for mine, its in zip(ours(point, size), theirs(point, size), strict=True):
+        np.testing.assert_allclose(mine, its, atol=1e-16)
+    second, reverse = (mode(jax.grad(patches.cylinder_distance))(point, size) for mode in (jax.jacfwd, jax.jacrev))
+    np.testing.assert_allclose(reverse, second, atol=1e-12)
+    stock = jax.jacrev(jax.grad(mjx_distance))(point, size)
+    assert np.isnan(stock).any() == (place in ("inside", "axis", "middle"))
+    if place not in ("axis", "middle"):  # where the gradient jumps
+        moved = [jax.grad(mjx_distance)(point + h, size) for h in 1e-6 * jnp.concatenate([jnp.eye(3), -jnp.eye(3)])]
+        truth = (np.array(moved[:3]) - np.array(moved[3:])).T / 2e-6
+        np.testing.assert_allclose(second, truth, atol=1e-8)

@@ -11,6 +11,7 @@ import threading
 from collections.abc import Callable, Generator
 from typing import Any, Final
 
+import jax
 import jax.numpy as jnp
 import mujoco
 from jaxtyping import Array, Float
@@ -118,11 +119,51 @@ def wrap_inside(*arguments: Any) -> tuple[Float[Array, " 1"], Float[Array, " 4"]
     return jnp.where(length < 0, length, _UNSEEN), points
 
 
+_mjx_cylinder = getattr(_module("collision_sdf"), "_cylinder", None)
+
+
+@jax.custom_jvp
+def cylinder_distance(position: Float[Array, " 3"], size: Float[Array, " 3"]) -> Float[Array, ""]:
+    """MJX's signed distance [m] of a point from a cylinder along z, with size (radius, half length, 0) [m].
+
+    MJX places contacts by its gradient. Where the point is inside, the square root of the branch for points outside is
+    at 0, so that the gradient has no derivative in reverse mode.
+    """
+    assert _mjx_cylinder is not None, "`repaired` has checked that MJX has it"
+    return _mjx_cylinder(position, size)
+
+
+@cylinder_distance.defjvp
+def _cylinder_jvp(primals: Any, tangents: Any) -> Any:
+    position, size = primals
+    square = position[0] ** 2 + position[1] ** 2
+    radius, height = _root(square), jnp.abs(position[2])
+    gaps = jnp.stack([radius - size[0], height - size[1]])
+    outside = jnp.maximum(gaps, 0)
+    length = _root(jnp.sum(outside**2))
+    across, along = position[:2] / _positive(radius), position[2] / _positive(height)
+    inward = jnp.where(jnp.argmax(gaps) == 0, jnp.append(across, 0), jnp.zeros(3).at[2].set(along))
+    outward = jnp.append(across * outside[0], along * outside[1]) / _positive(length)
+    gradient = jnp.where(gaps.max() < 0, inward, outward)
+    return cylinder_distance(position, size), jnp.dot(gradient, tangents[0])
+
+
+def _root(square: Float[Array, ""]) -> Float[Array, ""]:
+    """The square root, with derivative 0 at 0."""
+    return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
+
+
+def _positive(length: Float[Array, ""]) -> Float[Array, ""]:
+    """What MJX divides by in place of a length: not 0."""
+    return length + 1e-12 * (length <= 1e-8)
+
+
 _REPLACED: Final[dict[tuple[str, str], Callable[..., Any]]] = {
     ("constraint", "_kbi"): stiffness_damping_impedance,
     ("math", "quat_to_axis_angle"): rotation_vector,
     ("math", "quat_sub"): rotation_difference,
     ("support", "wrap_inside"): wrap_inside,
+    ("collision_sdf", "_cylinder"): cylinder_distance,
 }
 
 
