@@ -1,11 +1,19 @@
 """Differences over a ladder of steps find the derivative, or what is there in its place."""
 
+import dataclasses
 from collections.abc import Callable
 
+import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 
+from mjx_study.gradcheck.coordinates import coordinates
 from mjx_study.gradcheck.differences import RATIO, SIZES, Differences, differences, moves
+from mjx_study.gradcheck.programs import Programs, Setting
+from mjx_study.gradcheck.rounding import solution_noise
+from mjx_study.simulation.engine import HostState
+from mjx_study.simulation.scene import put_scene
 
 
 def read(function: Callable[[np.ndarray], np.ndarray], noise: float = 0.0) -> Differences:
@@ -87,3 +95,19 @@ def test_rounding_is_no_jump() -> None:
 
 def test_the_ladder_ends_below_what_a_contact_can_show() -> None:
     assert SIZES[-1] < 1e-6 and SIZES[0] / SIZES[1] == pytest.approx(RATIO)
+
+
+def test_forces_that_cancel_are_rounded() -> None:
+    """Two constraints pull a slider apart: its velocity follows from their difference, which is no jump."""
+    pull = '<joint joint1="x" polycoef="{} 0 0 0 0"/>'
+    xml = f"""<mujoco><worldbody><body><joint name="x" type="slide"/><geom size=".1" mass="1"/></body></worldbody>
+    <equality>{pull.format(1e5)}{pull.format(1 - 1e5)}</equality><actuator><motor joint="x"/></actuator></mujoco>"""
+    layout = coordinates(put_scene(mujoco.MjModel.from_xml_string(xml), "scene"), None)
+    programs, setting, ladder = Programs(layout), Setting(None, layout.scales), moves(np.eye(3)[2:])
+    nothing, zero = np.zeros(0), np.zeros(1)
+    state = HostState(zero, zero, nothing, zero, zero)
+    for _ in range(2):  # the second time from the solution
+        exact = programs.exact(setting, state, jnp.zeros(1), ladder)
+        state = dataclasses.replace(state, warmstart=exact.after.warmstart)
+    assert differences(exact.outputs).rough.any()
+    assert not differences(exact.outputs, solution_noise(layout, exact.stages, state.warmstart)).rough.any()
