@@ -69,14 +69,14 @@ def roll_out(
     state = np.broadcast_to(start, (*batch, system.num_states))
     states = np.empty((*batch, horizon + 1, system.num_states))
     applied = np.array(np.broadcast_to(controls, (*batch, *controls.shape[-2:])))
-    costs = np.empty((*batch, horizon + 1))
     states[..., 0, :] = state
     for step in range(horizon):
         if feedback is not None:
             applied[..., step, :] += state @ feedback.T
-        costs[..., step] = system.cost(state, applied[..., step, :])
         state = system.step(state, applied[..., step, :])
         states[..., step + 1, :] = state
+    costs = np.empty((*batch, horizon + 1))
+    costs[..., :-1] = system.cost(states[..., :-1, :], applied)
     costs[..., horizon] = system.final_cost(state)
     return Rollout(states, applied, np.asarray(np.sum(costs, axis=-1)), costs)
 
@@ -99,13 +99,12 @@ def value_and_gradients(
 def gradients_along(system: System, rollout: Rollout, feedback: Float[np.ndarray, "_ _"] | None = None) -> Gradients:
     """Exact gradients of a rollout's total cost."""
     adjoint = system.final_gradient(rollout.states[..., -1, :])
+    cost_states, cost_controls = system.cost_gradients(rollout.states[..., :-1, :], rollout.controls)
     gradient = np.empty(rollout.controls.shape)
     for step in reversed(range(rollout.controls.shape[-2])):
-        state, control = rollout.states[..., step, :], rollout.controls[..., step, :]
-        over_state, over_control = system.jacobians(state, control)
-        cost_state, cost_control = system.cost_gradients(state, control)
-        gradient[..., step, :] = cost_control + np.einsum("...ij,...i->...j", over_control, adjoint)
-        adjoint = cost_state + np.einsum("...ij,...i->...j", over_state, adjoint)
+        over_state, over_control = system.jacobians(rollout.states[..., step, :], rollout.controls[..., step, :])
+        gradient[..., step, :] = cost_controls[..., step, :] + np.einsum("...ij,...i->...j", over_control, adjoint)
+        adjoint = cost_states[..., step, :] + np.einsum("...ij,...i->...j", over_state, adjoint)
         if feedback is not None:
             adjoint = adjoint + gradient[..., step, :] @ feedback
     over_feedback = None

@@ -1,6 +1,9 @@
 """From a sample's key to its initial state and noise; the same for MJX and for the reference systems."""
 
+from functools import partial
+
 import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
 from estimators import NOISES, NoiseDensity
@@ -17,6 +20,19 @@ def standard_noise(
 ) -> Float[Array, "steps dimensions"]:
     """Unit-variance noise of a whole rollout, (steps, dimensions); a policy adds it times sigma."""
     return NOISES[density].draw(noise_key, shape, dtype)
+
+
+@partial(jax.jit, static_argnames=("shape", "density"))
+def batch_noise(
+    keys: Key[Array, " samples"], shape: tuple[int, int], density: str
+) -> tuple[Key[Array, " samples"], Float[Array, "samples steps dimensions"]]:
+    """Keys of the initial states of a batch of samples, and their noise of unit variance."""
+
+    def one(key: Key[Array, ""]) -> tuple[Key[Array, ""], Float[Array, "steps dimensions"]]:
+        start_key, noise_key = split_sample_key(key)
+        return start_key, standard_noise(noise_key, shape, jnp.float64, density)
+
+    return jax.vmap(one)(keys)
 
 
 def noise_score(

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Key
 from estimators import Differentiation, Evaluation, Linearisation, Objective, StepDifferentiation, StepEvaluation
 from mjx_study.reference.adjoint import gradients_along, roll_out, value_and_gradients
 from mjx_study.reference.function import Function, check_noise
-from mjx_study.reference.noise import check_density, noise_score, split_sample_key, standard_noise
+from mjx_study.reference.noise import batch_noise, check_density, noise_score, split_sample_key
 from mjx_study.reference.system import System
 
 DECISIONS: Final = ("controls", "feedback", "start")
@@ -198,14 +198,9 @@ class ReferenceObjective:
 
     def _draw(self, keys):
         """Initial states (a single one if it is fixed) and noise of a batch of samples."""
-
-        def one(key):
-            start_key, noise_key = split_sample_key(key)
-            start = self.start(start_key) if callable(self.start) else ()
-            return start, standard_noise(noise_key, self._noise_shape, jnp.float64, self.noise)
-
-        start, noise = jax.vmap(one)(keys)
-        return np.asarray(start) if callable(self.start) else self._fixed_start(), self.sigma * np.asarray(noise)
+        start_keys, noise = batch_noise(keys, self._noise_shape, self.noise)
+        start = np.asarray(jax.vmap(self.start)(start_keys)) if callable(self.start) else self._fixed_start()
+        return start, self.sigma * np.asarray(noise)
 
     def _policy(self, theta, start, noise):
         """Initial state, open-loop controls, and feedback matrix, as arguments of `roll_out`."""
@@ -314,9 +309,7 @@ class FunctionObjective:
         return Evaluation(*map(jnp.asarray, (self.function.value(point + noise), score, baseline)))
 
     def _noise(self, keys) -> np.ndarray:
-        shape = (1, self.num_params)
-        draw = jax.vmap(lambda key: standard_noise(split_sample_key(key)[1], shape, jnp.float64, self.noise))
-        return self.sigma * np.asarray(draw(keys))[:, 0]
+        return self.sigma * np.asarray(batch_noise(keys, (1, self.num_params), self.noise)[1])[:, 0]
 
     def _point(self, theta) -> np.ndarray:
         point = np.asarray(theta, float)
