@@ -374,7 +374,7 @@ def test_bad_options_get_one_line(capsys: pytest.CaptureFixture[str], monkeypatc
 def test_the_descent_costs_little_beside_its_rollouts() -> None:
     """An iteration takes at most 1.15 times its rollouts and gradients; ten seeds under half of ten runs.
 
-    Measured in turn, and the least of five: what else the machine does only adds.
+    Measured in turn, the least iteration of all and the least run of five: what else the machine does only adds.
     """
     plan = plan_optimise(config(estimators=("aobg",), samples=100, horizon=100, iterations=30, seeds=1))
     backend = Backend(plan)
@@ -389,10 +389,9 @@ def test_the_descent_costs_little_beside_its_rollouts() -> None:
         return time.perf_counter() - start
 
     def iteration() -> float:
-        return float(np.median(np.diff(optimise.optimise(plan, backend=backend).runs[0].seconds)))
+        return float(np.min(np.diff(optimise.optimise(plan, backend=backend).runs[0].seconds)))
 
-    batch()
-    pairs = [(iteration(), float(np.median([batch() for _ in range(30)]))) for _ in range(5)]
+    pairs = [(iteration(), min(batch() for _ in range(30))) for _ in range(5)]
     least, bare = np.min(pairs, axis=0)
     assert least <= 1.15 * bare, pairs
     small: dict[str, Any] = {"estimators": ("fobg",), "samples": 10, "horizon": 100, "iterations": 30}
