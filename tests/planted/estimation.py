@@ -121,8 +121,8 @@ REFERENCES: Final = (
     Defect(
         "adjoint-not-transposed",
         "mjx_study/reference/adjoint.py",
-        'cost_state + np.einsum("...ij,...i->...j", over_state, adjoint)',
-        'cost_state + np.einsum("...ij,...j->...i", over_state, adjoint)',
+        'cost_states[..., step, :] + np.einsum("...ij,...i->...j", over_state, adjoint)',
+        'cost_states[..., step, :] + np.einsum("...ij,...j->...i", over_state, adjoint)',
         "the Jacobian in place of its transpose",
         ("tests/reference/test_gradients.py",),
     ),
