@@ -126,7 +126,7 @@ def _power(place: Place, output: Coordinate, source: Coordinate) -> str | None:
     whole = np.all(place.solimp[:, 4] == np.round(place.solimp[:, 4]))
     if source.name == "solimp[power]" and beyond:
         return "penetration beyond solimp's width: MJX takes the logarithm of 1 - |r| / width, which is negative there"
-    return None if whole else "a power in solimp that is no whole number: MJX raises a negative number to it"
+    return None if whole else "a non-integer power in solimp: MJX raises a negative number to it"
 
 
 def _wrapped_tendon(place: Place, output: Coordinate, source: Coordinate) -> str | None:
@@ -139,7 +139,7 @@ def _zero_length(place: Place, output: Coordinate, source: Coordinate) -> str | 
     lengths, kinds = place.stages["ten_length"], place.host.wrap_type[place.host.tendon_adr]
     fixed = int(mujoco.mjtWrap.mjWRAP_JOINT)
     if np.any((lengths < mujoco.mjMINVAL) & (kinds != fixed)):
-        return "a spatial tendon of no length: the direction in which it pulls has no derivative"
+        return "a spatial tendon of zero length: the direction of its pull has no derivative"
     return None
 
 
@@ -246,7 +246,7 @@ def _parameter_bound(place: Place, output: Coordinate, source: Coordinate) -> st
     if source.name == "solimp[power]" and np.any(place.solimp[:, 4] == 1):
         return "solimp's power is 1, the least that MuJoCo takes"
     if source.name == "solref[1]" and np.any((place.solref[:, 0] <= 0) & (np.abs(place.solref[:, 1]) < NEAR)):
-        return "solref's damping is 0, and MuJoCo reads a positive number there in another way"
+        return "solref's damping is 0, and MuJoCo interprets a positive number there differently"
     if source.name == "solref[0]" and not place.host.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_REFSAFE:
         if np.any(np.abs(place.solref[:, 0] - 2 * place.host.opt.timestep) < NEAR):
             return "solref's time constant is two timesteps, where MuJoCo clips it"

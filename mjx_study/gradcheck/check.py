@@ -92,9 +92,9 @@ def unoffered(host: mujoco.MjModel) -> list[str]:
     """Features of the model that a step's derivative does not cover."""
     notes = []
     if host.nsensor:
-        notes.append(f"{_count(host.nsensor, 'sensor')}: a step does not compute them, and has no derivative of them")
+        notes.append(f"{_count(host.nsensor, 'sensor')}: not computed by a step, so without a derivative")
     if host.nmocap:
-        notes.append(f"{_count(host.nmocap, 'mocap pose')}: no input of a step, which has no derivative by them")
+        notes.append(f"{_count(host.nmocap, 'mocap pose')}: not an input of a step, so without a derivative")
     return notes
 
 

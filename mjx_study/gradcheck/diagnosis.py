@@ -29,13 +29,13 @@ FAILURES: Final = ("unconverged", "zero", "nan", "engine", "wrong", "value")
 MEANING: Final = {
     "kink": "the step's one-sided slopes disagree, however short: there is no derivative to compare with",
     "jump": "the step itself jumps here, which no derivative sees",
-    "unconverged": "the derivative is that of another point, because the solver stopped early",
+    "unconverged": "the derivative is taken at another point, because the solver stopped early",
     "zero": "the derivative is exactly zero, silently, where the step does change",
     "nan": "the derivative is not a number",
     "wrong": "the derivative is not that of the step",
     "engine": "MJX's step is not the C engine's, and nothing documented explains it",
     "value": "the step itself is not that of mjx.step",
-    "placement": "MJX computes another step than the C engine, as documented",
+    "placement": "the step of MJX differs from that of the C engine, as documented",
     "apart": "the analytic counterpart is another model of the same system, approached as contact stiffens",
 }
 

@@ -70,7 +70,7 @@ def compare_values(
     if not from_stock <= TOLERANCE:
         verdict = "value"
         if from_engine <= TOLERANCE:
-            cause = "mjx.step computes another step than this project and the C engine"
+            cause = "mjx.step differs from the step of this project and the C engine"
         else:
             third = "mjx.step" if float(apart(layout, state, stock, theirs).max()) <= TOLERANCE else "neither"
             cause = f"this project's step is not that of mjx.step; the C engine agrees with {third}"
