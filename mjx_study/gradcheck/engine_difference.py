@@ -117,11 +117,11 @@ def _contacts(host: mujoco.MjModel, data: mujoco.MjData, stages: dict[str, Any])
     ours: dict[tuple[int, ...], list[np.ndarray]] = {}
     theirs: dict[tuple[int, ...], list[np.ndarray]] = {}
     for index in np.flatnonzero(stages["dist"] < stages["margin"]):
-        place = np.concatenate([stages["dist"][[index]], stages["pos"][index], stages["normal"][index]])
+        place = np.concatenate([stages["dist"][[index]], stages["pos"][index], stages["frame"][index].ravel()])
         ours.setdefault(tuple(sorted(map(int, stages["geom"][index]))), []).append(place)
     for contact in data.contact:
         if contact.exclude == 0:
-            place = np.concatenate([[contact.dist], contact.pos, contact.frame[:3]])
+            place = np.concatenate([[contact.dist], contact.pos, contact.frame])
             theirs.setdefault(tuple(sorted(map(int, contact.geom))), []).append(place)
     texts = []
     for pair in sorted(ours.keys() | theirs.keys()):
@@ -135,8 +135,8 @@ def _contacts(host: mujoco.MjModel, data: mujoco.MjData, stages: dict[str, Any])
         gaps = np.abs(mine[order] - its[match]).max(axis=0)
         if gaps.max() > TOLERANCE:
             texts.append(
-                f"contacts of {label} lie {gaps[1:4].max():.1e} m apart, their depths differ by {gaps[0]:.1e} m and "
-                f"their normals by {gaps[4:].max():.1e}"
+                f"contacts of {label} lie {gaps[1:4].max():.1e} m apart, their depths differ by {gaps[0]:.1e} m, their "
+                f"normals by {gaps[4:7].max():.1e} and their tangents by {gaps[7:].max():.1e}"
             )
     return [(text, True) for text in texts]
 

@@ -221,7 +221,7 @@ def _stages(model: mjx.Model, data: mjx.Data) -> dict[str, Any]:
         "dist": contacts.dist,
         "margin": contacts.includemargin,
         "pos": contacts.pos,
-        "normal": contacts.frame[:, 0],
+        "frame": contacts.frame,
         "geom": jnp.asarray(contacts.geom),
         "efc_type": jnp.asarray(rows.efc_type),
         "efc_J": rows.efc_J,

@@ -67,11 +67,12 @@ def check_state(
     qacc = programs.exact(setting, sample.state, reference, ladder[:1]).after.warmstart
     solved = dataclasses.replace(sample.state, warmstart=qacc)
     exact = programs.exact(setting, solved, reference, ladder)
-    truth = differences(exact.outputs, solution_noise(layout, exact.stages, qacc))
+    noise = solution_noise(layout, exact.stages, qacc)
+    truth = differences(exact.outputs, noise)
     engine_outputs = engine_step.outputs(solved, linear.qpos, ladder)
     engine_truth = differences(engine_outputs, engine_step.noise(solved, linear.qpos))
     values = compare_values(
-        layout, engine_step, solved, exact.after, programs.stock_step(setting, solved), exact.stages
+        layout, engine_step, solved, exact.after, programs.stock_step(setting, solved), exact.stages, noise
     )
 
     model = apply_contact(layout.scene.model, setting.contact)

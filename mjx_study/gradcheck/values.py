@@ -51,6 +51,7 @@ def compare_values(
     ours: HostState,
     stock: HostState,
     stages: dict[str, Any],
+    noise: Float[np.ndarray, " outputs"] | float = 0.0,
 ) -> Values:
     """Compare one step.
 
@@ -61,9 +62,10 @@ def compare_values(
         ours: this project's state after it; like the others, with the step's acceleration as warm start.
         stock: state after `mjx.step`.
         stages: MJX's quantities at `state`.
+        noise: how far rounding may move each output; at rest that is all there is.
     """
     theirs = engine_step.after(state)
-    from_stock, from_engine = (float(apart(layout, state, ours, other).max()) for other in (stock, theirs))
+    from_stock, from_engine = (float(apart(layout, state, ours, other, noise).max()) for other in (stock, theirs))
     verdict = cause = ""
     if not np.all(np.isfinite(ours.warmstart)):
         return Values(from_stock, from_engine)
@@ -72,13 +74,13 @@ def compare_values(
         if from_engine <= TOLERANCE:
             cause = "mjx.step differs from the step of this project and the C engine"
         else:
-            third = "mjx.step" if float(apart(layout, state, stock, theirs).max()) <= TOLERANCE else "neither"
+            third = "mjx.step" if float(apart(layout, state, stock, theirs, noise).max()) <= TOLERANCE else "neither"
             cause = f"this project's step is not that of mjx.step; the C engine agrees with {third}"
     elif not from_engine <= TOLERANCE:
         cause, documented = difference_of_engines(engine_step.host, state, stages, ours.warmstart, theirs.warmstart)
         verdict = "placement" if documented else "engine"
     other = stock if verdict == "value" else theirs
-    worst = int(np.argmax(np.nan_to_num(apart(layout, state, ours, other), nan=np.inf)))
+    worst = int(np.argmax(np.nan_to_num(apart(layout, state, ours, other, noise), nan=np.inf)))
     numbers = (float(change(layout, state, ours)[worst]), float(change(layout, state, other)[worst]))
     return Values(from_stock, from_engine, verdict, cause, worst, numbers)
 
@@ -90,7 +92,13 @@ def change(layout: Coordinates, before: HostState, after: HostState) -> Float[np
     return np.concatenate([tangent, after.qvel - before.qvel, after.act - before.act])
 
 
-def apart(layout: Coordinates, before: HostState, ours: HostState, theirs: HostState) -> Float[np.ndarray, " outputs"]:
+def apart(
+    layout: Coordinates,
+    before: HostState,
+    ours: HostState,
+    theirs: HostState,
+    noise: Float[np.ndarray, " outputs"] | float,
+) -> Float[np.ndarray, " outputs"]:
     """Difference of two next states beyond rounding, relative to the largest velocity, acceleration, activation."""
     timestep = layout.scene.timestep
     tangent = np.empty(layout.scene.host.nv)
@@ -105,9 +113,9 @@ def apart(layout: Coordinates, before: HostState, ours: HostState, theirs: HostS
         (ours.qvel - theirs.qvel, ROUNDING * speed, timestep * force),
         (ours.act - theirs.act, ROUNDING, max(largest(ours.act), largest(theirs.act))),
     )
-    return np.concatenate(
-        [np.maximum(np.abs(gap) - unseen, 0.0) / max(scale, 1e-10 * timestep) for gap, unseen, scale in parts]
-    )
+    gaps = np.concatenate([np.abs(gap) - unseen for gap, unseen, _ in parts])
+    scales = np.concatenate([np.full(len(gap), max(scale, 1e-10 * timestep)) for gap, _, scale in parts])
+    return np.maximum(gaps - noise, 0.0) / scales
 
 
 def _stillness(host: mujoco.MjModel, qvel: Float[np.ndarray, " nv"]) -> Float[np.ndarray, " nv"]:
