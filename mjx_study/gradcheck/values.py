@@ -62,7 +62,7 @@ def compare_values(
         ours: this project's state after it; like the others, with the step's acceleration as warm start.
         stock: state after `mjx.step`.
         stages: MJX's quantities at `state`.
-        noise: how far rounding may move each output; at rest that is all there is.
+        noise: rounding noise of each output; at rest, all of its change.
     """
     theirs = engine_step.after(state)
     from_stock, from_engine = (float(apart(layout, state, ours, other, noise).max()) for other in (stock, theirs))
