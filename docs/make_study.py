@@ -13,7 +13,8 @@ from make_figures import save
 from mjx_study.cli.console import progress_bar
 from mjx_study.plots.study import plot_study
 from mjx_study.runtime import configure
-from mjx_study.study.sweep import SweepConfig, load_study, plan_sweep, run_sweep
+from mjx_study.study.plan import StudyConfig, plan_study
+from mjx_study.study.run import load_study, run_study
 
 HERE: Final = Path(__file__).parent
 
@@ -24,18 +25,18 @@ def decades(first: int, last: int, count: int) -> tuple[float, ...]:
 
 
 SWEEPS: Final = {
-    "variance": SweepConfig(
+    "variance": StudyConfig(
         tasks=("pusher",),
         contact=("penalty", "mujoco", "mujoco_stiff"),
         stiffness=decades(1, 4, 13),
     ),
-    "bias": SweepConfig(
+    "bias": StudyConfig(
         tasks=("momentum_transfer",),
         contact=("penalty", "mujoco", "smooth_onset"),
         stiffness=decades(3, 5, 5),
         reference_samples=3000,
     ),
-    "achieved": SweepConfig(
+    "achieved": StudyConfig(
         tasks=("pusher",),
         contact=("penalty", "mujoco", "mujoco_stiff"),
         stiffness=decades(1, 4, 7),
@@ -43,7 +44,7 @@ SWEEPS: Final = {
         samples=(10,),
         seeds=5,
     ),
-    "map": SweepConfig(
+    "map": StudyConfig(
         tasks=("pusher",),
         contact=("penalty", "mujoco", "mujoco_stiff"),
         stiffness=decades(1, 4, 9),
@@ -60,7 +61,7 @@ def main() -> None:
     for name, config in SWEEPS.items():
         folder = HERE.parent / "results" / "study" / name
         with progress_bar() as progress:
-            run_sweep(plan_sweep(config), folder, progress)
+            run_study(plan_study(config), folder, progress)
         path = HERE / f"{name}.png"
         save(plot_study(load_study(folder))[FIGURES.get(name, name)], path)
         print(f"written: {path}")

@@ -21,17 +21,14 @@ from mjx_study.simulation.contact import (
 )
 from mjx_study.simulation.dynamics import State, initial_state, rollout, step, step_jacobian
 from mjx_study.simulation.scene import Scene, SceneError, load_scene, put_scene
-from mjx_study.study.comparison import CompareConfig, CompareResult
-from mjx_study.study.gradients import compare, plan_compare
-from mjx_study.study.sweep import SweepConfig, load_study, plan_sweep, run_sweep
+from mjx_study.study.plan import StudyConfig, plan_study
+from mjx_study.study.run import load_study, run_study
 from mjx_study.tasks import TASKS, make_task
 from mjx_study.tasks.policy import Launch, LinearFeedback, OpenLoop, Policy
 from mjx_study.tasks.task import Recipe, Task
 
 __all__ = [
     "_matplotlib",
-    "CompareConfig",
-    "CompareResult",
     "ContactModel",
     "ContactWarning",
     "FAMILIES",
@@ -45,11 +42,10 @@ __all__ = [
     "SceneError",
     "Simulator",
     "State",
-    "SweepConfig",
+    "StudyConfig",
     "TASKS",
     "Task",
     "apply_contact",
-    "compare",
     "configure",
     "contact_model",
     "effective_mass",
@@ -58,12 +54,11 @@ __all__ = [
     "load_scene",
     "load_study",
     "make_task",
-    "plan_compare",
-    "plan_sweep",
+    "plan_study",
     "plot_study",
     "put_scene",
     "rollout",
-    "run_sweep",
+    "run_study",
     "simulate",
     "solref_from_stiffness",
     "step",

@@ -12,7 +12,7 @@ import numpy as np
 import xarray as xr
 
 from mjx_study.plots.study import SWEPT, plot_study
-from mjx_study.study.sweep import what_to_beware_of
+from mjx_study.study.run import warnings_of
 
 STYLE: Final = """
 body { font: 15px/1.5 system-ui, sans-serif; max-width: 70rem; margin: 2rem auto; padding: 0 1rem; color: #222; }
@@ -25,6 +25,7 @@ figure { margin: 1.5rem 0; } figure img { max-width: 100%; } figcaption { color:
 code, pre { background: #f4f4f4; padding: 0.1rem 0.3rem; } pre { padding: 0.6rem; overflow-x: auto; }
 """
 CAPTIONS: Final = {
+    "comparison": "Variance of one gradient sample, and relative error of the mean against the reference.",
     "variance": "Variance of one gradient sample; geometric mean over the seeds.",
     "bias": "Bias of each estimator against an unbiased zeroth-order reference; a triangle is an upper bound where "
     "none can be told from zero.",
@@ -66,7 +67,7 @@ def report(dataset: xr.Dataset) -> str:
     config = json.loads(dataset.attrs["config"])
     tasks = ", ".join(config["tasks"])
     kind = KINDS[config["kind"]]
-    warnings = [*json.loads(dataset.attrs["warnings"]), *what_to_beware_of(dataset)]
+    warnings = warnings_of(dataset)
     parts = [
         f"<h1>{_text(tasks)}: {kind} through {dataset.sizes['model']} contact models</h1>",
         *_paragraphs("warning", warnings),

@@ -55,7 +55,7 @@ def stub(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(options, "configure", lambda **_: None)
     mujoco.set_mju_user_warning(lambda message: print(f"MuJoCo: {message}", file=sys.stderr))  # as `configure` does
     for module, names in (
-        (compare, ("compare",)), (optimise, ("optimise",)), (sweep, ("open_store", "run_sweep")),
+        (compare, ("compare",)), (optimise, ("optimise",)), (sweep, ("open_store", "run_study")),
         (landscape, ("landscape",)), (gradcheck.check, ("gradcheck",)), (bench.benchmark, ("bench",)),
         (rollout, ("_simulate_task", "_simulate_passive")),
     ):  # fmt: skip
@@ -234,7 +234,7 @@ def arrays(draw: st.DrawFn) -> bytes:
 @st.composite
 def toml_files(draw: st.DrawFn) -> bytes:
     """A TOML file of sweep's options."""
-    names = [*(field.name for field in dataclasses.fields(sweep_plan.SweepConfig)), "colour"]
+    names = [*(field.name for field in dataclasses.fields(sweep_plan.StudyConfig)), "colour"]
     lines = ['tasks = ["pusher"]'] * draw(st.integers(0, 1))
     for name in draw(st.lists(st.sampled_from(names), max_size=5, unique=draw(st.integers(0, 9)) > 0)):
         lines.append(f"{name} = {toml_of(draw(st.one_of(fitting(name), values(5))))}")

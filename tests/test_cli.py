@@ -1,5 +1,6 @@
 """The command line as a user meets it: figures that are true, one line for what is wrong, nothing written then."""
 
+import dataclasses
 import json
 import os
 import signal
@@ -14,7 +15,9 @@ import pytest
 from mjx_study import cli
 from mjx_study.cli import compare as compare_command
 from mjx_study.cli import options
-from mjx_study.study import gradients as study
+from mjx_study.study.findings import rows_of
+from mjx_study.study.plan import StudyConfig, StudyPlan, plan_study
+from mjx_study.study.run import load_study
 from mjx_study.tasks import TASKS
 
 SMALL = ["--horizon", "4", "--samples", "8", "--reference-samples", "8"]
@@ -57,44 +60,47 @@ def small_run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
 
 def test_compare_reports_every_column_for_every_cell(small_run: tuple[Path, str]) -> None:
     folder, printed = small_run
-    document = json.loads((folder / "results.json").read_text())
-    cells = [(row["contact"], row["stiffness"], row["estimator"]) for row in document["rows"]]
+    rows = rows_of(load_study(folder))
+    cells = [(row.contact, row.stiffness, row.estimator) for row in rows]
     names = ["zobg", "fobg", "aobg", "ivw"]
     swept = [("penalty", stiffness, name) for stiffness in (10.0, 1000.0) for name in names]
     assert cells == swept + [("mujoco_default", pytest.approx(125.0), name) for name in names]
-    for row in document["rows"]:
-        assert row["variance_lower"] <= row["variance"] <= row["variance_upper"]
-        assert row["seconds_per_sample"] > 0 and row["residual"] < 1e-6 and row["nonfinite"] == 0
-        assert (row["alpha"] is None) == (row["estimator"] in ("zobg", "fobg"))
+    for row in rows:
+        assert row.variance_lower <= row.variance <= row.variance_upper
+        assert row.seconds_per_sample > 0 and row.residual < 1e-6 and row.nonfinite == 0
+        assert (row.alpha is None) == (row.estimator in ("zobg", "fobg"))
     for heading in ("|gradient|", "variance", "relative error", "cosine", "alpha", "epsilon", "B", "ms"):
         assert heading in printed
     assert "residual" in printed and "lost" in printed
 
 
-def test_a_result_holds_its_whole_configuration(small_run: tuple[Path, str]) -> None:
-    document = json.loads((small_run[0] / "results.json").read_text())
-    config = document["config"]
-    assert None not in [
-        value for name, value in config.items() if name not in ("damping", "model", "max_norm", "window", "theta")
-    ]
-    assert (
-        config["horizon"] == 4 and config["sigma"] == 0.1 and config["gamma"] == 1e8 and config["cone"] == "pyramidal"
-    )
-    assert document["environment"]["versions"]["mujoco"].startswith("3.17")
-    assert document["environment"]["precision"] == "float64"
+def test_a_result_holds_what_decided_it(small_run: tuple[Path, str]) -> None:
+    data = load_study(small_run[0])
+    config, (resolved,) = (json.loads(data.attrs[name]) for name in ("config", "resolved"))
+    assert config["horizon"] == 4 and resolved["horizon"] == [4] and resolved["estimators"]["aobg"]["gamma"] == 1e8
+    assert data["sigma"].item() == 0.1 and data["cone"].item() == "pyramidal"
+    environment = json.loads(data.attrs["environment"])
+    assert environment["versions"]["mujoco"].startswith("3.17") and environment["precision"] == "float64"
+    assert data["gradient"].sizes["param"] == 4 and data["reference"].notnull().all()
 
 
 def test_figures_are_written_whole(small_run: tuple[Path, str]) -> None:
     folder, printed = small_run
-    assert sorted(path.name for path in folder.iterdir()) == [
-        "comparison.pdf",
-        "comparison.png",
-        "gradients.npz",
-        "results.json",
-    ]
+    kept = ["cells", "comparison.pdf", "comparison.png", "results.nc", "study.json", "study.lock"]
+    assert sorted(path.name for path in folder.iterdir()) == kept
     assert (folder / "comparison.png").read_bytes().startswith(b"\x89PNG")
     assert (folder / "comparison.pdf").read_bytes().rstrip().endswith(b"%%EOF")
     assert "comparison.png" in printed
+
+
+def test_what_compare_wrote_can_be_drawn_and_reported(
+    small_run: tuple[Path, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder, _ = small_run
+    assert cli.main(["plot", str(folder), "--output", str(tmp_path)]) == 0
+    assert cli.main(["report", str(folder), "--output", str(tmp_path / "page.html")]) == 0
+    assert "comparison.png" in capsys.readouterr().out
+    assert "relative error" in (tmp_path / "page.html").read_text()
 
 
 def test_compare_prints_json_and_nothing_else(capsys: pytest.CaptureFixture[str]) -> None:
@@ -114,21 +120,19 @@ def test_warnings_about_the_contact_reach_the_reader(capsys: pytest.CaptureFixtu
 def test_one_nan_sample_does_not_poison_the_table(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def with_a_nan(config: study.CompareConfig) -> study.ComparePlan:
-        plan = planned(config)
-        cost = plan.task.final_cost
+    def with_a_nan(config: StudyConfig) -> StudyPlan:
+        plan = plan_study(config)
+        (group,) = plan.groups
         # A cost that is undefined for about one rollout in four.
-        threshold = float(plan.task.theta[0]) * 0.75e-5
+        threshold = float(group.task.theta[0]) * 0.75e-5
 
         def final_cost(state):
-            return jnp.where(state.qpos[0] > threshold, cost(state), jnp.nan)
+            return jnp.where(state.qpos[0] > threshold, group.task.final_cost(state), jnp.nan)
 
-        return study.ComparePlan(
-            plan.config, plan.task.replace(final_cost=final_cost), plan.cells, plan.estimators, plan.warnings
-        )
+        task = group.task.replace(final_cost=final_cost)
+        return dataclasses.replace(plan, groups=(dataclasses.replace(group, task=task),))
 
-    planned = study.plan_compare
-    monkeypatch.setattr(compare_command, "plan_compare", with_a_nan)
+    monkeypatch.setattr(compare_command, "plan_study", with_a_nan)
     arguments = ["compare", "pusher", *SMALL, "--samples", "32", "--stiffness", "10", "--contact", "penalty"]
     assert cli.main(arguments) == 0
     printed = capsys.readouterr().out

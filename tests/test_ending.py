@@ -17,7 +17,7 @@ import pytest
 from mjx_study import cli, disk
 from mjx_study.cli import options
 from mjx_study.study import cells as sweep_cells
-from mjx_study.study.plan import SweepCell, SweepPlan
+from mjx_study.study.plan import StudyCell, StudyPlan
 from tests.test_study import result, row
 
 SIGNALS = """
@@ -109,10 +109,10 @@ def test_a_full_disk_costs_a_landscape_no_number(
 def test_a_full_disk_costs_a_study_nothing_that_was_there(
     tmp_path: Path, full: Callable[[], None], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def compute_of(plan: SweepPlan) -> Callable[[SweepCell], dict[str, np.ndarray]]:
+    def compute_of(plan: StudyPlan) -> Callable[[StudyCell], dict[str, np.ndarray]]:
         seeds = plan.config.batches, len(plan.config.estimators)
 
-        def compute(cell: SweepCell) -> dict[str, np.ndarray]:
+        def compute(cell: StudyCell) -> dict[str, np.ndarray]:
             if cell.samples == 8:
                 full()
             numbers = {name: np.ones(seeds) for name in ("variance", "alpha", "relative_error")}

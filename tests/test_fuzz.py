@@ -11,8 +11,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from mjx_study.study import sweep
-from mjx_study.study.plan import SweepConfig, plan_sweep
+from mjx_study.study import run as sweep
+from mjx_study.study.plan import StudyConfig, plan_study
 from tests import fuzzing
 
 POLICY = {
@@ -29,7 +29,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """The current directory of every case, with a study that is begun."""
     path = tmp_path_factory.mktemp("fuzz")
     with pytest.MonkeyPatch.context() as monkeypatch:
-        sweep.open_store(plan_sweep(SweepConfig(tasks=("pusher",), horizon=4, stiffness=(10.0, 100.0))), path / "study")
+        sweep.open_store(plan_study(StudyConfig(tasks=("pusher",), horizon=4, stiffness=(10.0, 100.0))), path / "study")
         shutil.copy(path / "study" / "study.json", path / "kept.json")
         monkeypatch.chdir(path)
         fuzzing.stub(monkeypatch)

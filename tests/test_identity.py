@@ -18,10 +18,10 @@ from mjx_study.study import identity
 from mjx_study.study.checkpoint import checkpoint_path
 from mjx_study.study.descents import OptimiseConfig, OptimiseResult, optimise, plan_optimise
 from mjx_study.study.identity import contents, differences
-from mjx_study.study.plan import SweepCell, SweepConfig, SweepPlan, plan_sweep
+from mjx_study.study.plan import StudyCell, StudyConfig, StudyPlan, plan_study
 from mjx_study.study.revision import git_revision
+from mjx_study.study.run import load_study, run_study, warnings_of
 from mjx_study.study.store import Store, StudyError
-from mjx_study.study.sweep import load_study, run_sweep, what_to_beware_of
 from mjx_study.tasks import make_task
 from mjx_study.tasks.task import Task
 
@@ -145,15 +145,15 @@ SMALL: dict[str, Any] = {
 
 @pytest.fixture
 def stubbed(monkeypatch: pytest.MonkeyPatch) -> None:
-    def compute_of(plan: SweepPlan) -> Callable[[SweepCell], dict[str, np.ndarray]]:
-        return lambda cell: {"residual": np.asarray(cell.model.stiffness)}
+    def compute_of(plan: StudyPlan) -> Callable[[StudyCell], dict[str, np.ndarray]]:
+        return lambda cell: {"residual": np.full(len(plan.config.estimators), cell.model.stiffness)}
 
     monkeypatch.setitem(sweep_cells.COMPUTE, "gradients", compute_of)
 
 
 def swept(folder: Path, **changes: Any):
     accept = {name: changes.pop(name) for name in list(changes) if name == "accept_versions"}
-    return run_sweep(plan_sweep(SweepConfig(**(SMALL | changes))), folder, **accept)
+    return run_study(plan_study(StudyConfig(**(SMALL | changes))), folder, **accept)
 
 
 @pytest.mark.usefixtures("stubbed")
@@ -190,16 +190,16 @@ def other_jax(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.usefixtures("stubbed")
 def test_other_versions_need_a_flag_and_are_remembered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = tmp_path / "out"
-    assert swept(folder).dataset.attrs["mixed_versions"] == ""
+    assert swept(folder).attrs["mixed_versions"] == ""
     other_jax(monkeypatch)
-    assert swept(folder).computed == 0  # nothing is left to compute, so nothing is mixed
+    assert swept(folder).attrs["computed_cells"] == 0  # nothing is left to compute, so nothing is mixed
     (folder / "cells" / "00001.npz").unlink()
     with pytest.raises(StudyError, match="with other versions .jax .* there and 99.0 here.; .*--accept-versions"):
         swept(folder)
     result = swept(folder, accept_versions=True)
-    assert result.computed == 1
-    assert any("different versions: jax" in text and "99.0" in text for text in result.warnings)
-    assert any("different versions: jax" in text for text in what_to_beware_of(load_study(folder)))
+    assert result.attrs["computed_cells"] == 1
+    assert any("different versions: jax" in text and "99.0" in text for text in warnings_of(result))
+    assert any("different versions: jax" in text for text in warnings_of(load_study(folder)))
 
 
 @pytest.mark.usefixtures("stubbed")
@@ -218,7 +218,7 @@ def test_a_cell_counts_in_its_place_alone(tmp_path: Path) -> None:
         load_study(folder)
     (folder / "study.json").write_text(document)
     kept = Store.open(folder)
-    assert [float(kept.read(index)["residual"]) for index in (0, 1)] == [10.0, 100.0]
+    assert [float(kept.read(index)["residual"][0]) for index in (0, 1)] == [10.0, 100.0]
 
 
 # Optimisations.

@@ -20,7 +20,8 @@ from mjx_study.simulation.mjcf_sizes import too_large
 from mjx_study.simulation.scene import SceneError, load_model
 from mjx_study.study.document import read_document
 from mjx_study.study.iteration import make_optimizer
-from mjx_study.study.sweep import SweepConfig, open_store, plan_sweep
+from mjx_study.study.plan import StudyConfig, plan_study
+from mjx_study.study.run import open_store
 
 BODY = "<worldbody><body><freejoint/><geom size='0.1'/></body></worldbody>"
 
@@ -77,7 +78,7 @@ def test_intervals_in_words() -> None:
 
 def test_every_option_of_a_sweep_is_described() -> None:
     """Of all that a configuration has but names of tasks, and switches."""
-    assert set(vars(SweepConfig(tasks=("pusher",)))) - set(OPTIONS) == {"tasks"}
+    assert set(vars(StudyConfig(tasks=("pusher",)))) - set(OPTIONS) == {"tasks"}
 
 
 @pytest.mark.parametrize("name", ["clip", "freeze", "lbfgs", "polyak_sgd", "chain", "zero_nans", "__name__", "no such"])
@@ -156,7 +157,7 @@ def test_an_array_of_an_impossible_shape(shape: str, tmp_path: Path) -> None:
     ],
 )  # fmt: skip
 def test_a_study_that_is_none(place: tuple[str, ...], value: Any, says: str, tmp_path: Path) -> None:
-    plan = plan_sweep(SweepConfig(tasks=("pusher",), horizon=4, stiffness=(10.0, 100.0), contact=("penalty",)))
+    plan = plan_study(StudyConfig(tasks=("pusher",), horizon=4, stiffness=(10.0, 100.0), contact=("penalty",)))
     document = json.loads(json.dumps(open_store(plan, tmp_path).document))
     assert read_document(json.dumps(document)) == document
     part = document

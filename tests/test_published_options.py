@@ -11,11 +11,9 @@ from mjx_study import cli
 from mjx_study.cli import options
 from mjx_study.reference import DoublePendulum, roll_out
 from mjx_study.reference.adjoint import gradients_along
-from mjx_study.study.comparison import CompareConfig
 from mjx_study.study.configuration import EstimatorConfig, configured_estimators
 from mjx_study.study.descents import OptimiseConfig, plan_optimise
-from mjx_study.study.gradients import plan_compare
-from mjx_study.study.plan import SweepConfig, estimators_of, plan_sweep
+from mjx_study.study.plan import StudyConfig, estimators_of, plan_study
 from mjx_study.tasks import make_task
 
 MOMENTUM = 4 / 1.1**2  # an elastic hit of a bar ten times as heavy, in units of the published cost
@@ -50,9 +48,9 @@ def test_published_constants_on_the_scale_of_the_task_s_cost(name: str) -> None:
 
 
 def test_every_study_takes_them() -> None:
-    compared: Any = plan_compare(CompareConfig(task="tennis", published=True)).estimators
-    swept = plan_sweep(SweepConfig(tasks=("tennis",), published=True))
-    assert compared == estimators_of(swept, swept.cells[0]) and compared[2].radius == 1000.0
+    descended: Any = plan_optimise(OptimiseConfig(task="tennis", published=True)).estimators
+    swept = plan_study(StudyConfig(tasks=("tennis",), published=True))
+    assert descended == estimators_of(swept, swept.cells[0]) and descended[2].radius == 1000.0
 
 
 def test_published_constants_stand_alone() -> None:

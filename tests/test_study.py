@@ -1,6 +1,5 @@
 """Comparisons: what is shared, what is compiled, what the findings say, what a plan refuses."""
 
-import dataclasses
 import math
 from typing import Any
 
@@ -8,49 +7,87 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import xarray as xr
 
 from estimators import AlphaOrder, InverseVariance
 from mjx_study import disk
 from mjx_study.cli import console
 from mjx_study.objective import MjxObjective, Simulator
-from mjx_study.plots import comparison as plots
-from mjx_study.study import gradients as study
-from mjx_study.study import results
-from mjx_study.study.comparison import CompareConfig, CompareResult, Row
-from mjx_study.study.findings import findings
+from mjx_study.plots.study import plot_study
+from mjx_study.plots.style import save_figure
+from mjx_study.study import sampling
+from mjx_study.study.dataset import dataset_of
+from mjx_study.study.findings import Row, findings, rows_of
+from mjx_study.study.plan import StudyConfig, estimators_of, plan_study
+from mjx_study.study.run import run_study
+from mjx_study.study.variables import GRADIENTS
 from mjx_study.tasks import make_task
+from mjx_study.tasks.task import Task
 
-SMALL: dict[str, Any] = {"horizon": 4, "samples": 8, "reference_samples": 8}
-
-
-def config(**changes: Any) -> CompareConfig:
-    return CompareConfig(task="pusher", **(SMALL | changes))
+SMALL: dict[str, Any] = {"horizon": 4, "samples": (8,), "reference_samples": 8, "seeds": 1}
 
 
-def row(estimator: str, stiffness: float, variance: float, **changes: Any) -> Row:
-    """A row of a made-up result, with an interval of a factor of two either way."""
-    variance, stiffness = float(variance), float(stiffness)
-    values: dict[str, Any] = {
-        field.name: 0.0 for field in dataclasses.fields(Row) if field.default is dataclasses.MISSING
-    }
-    values |= {"contact": "penalty", "estimator": estimator, "stiffness": stiffness, "samples": 100, "residual": 1e-15}
+def config(**changes: Any) -> StudyConfig:
+    chosen: dict[str, Any] = {"tasks": ("pusher",)} | SMALL | changes
+    return StudyConfig(**chosen)
+
+
+def compare(**changes: Any) -> xr.Dataset:
+    return run_study(config(**changes))
+
+
+def row(estimator: str, stiffness: float, variance: float, **changes: Any) -> dict[str, Any]:
+    """Numbers of a made-up study, with an interval of a factor of two either way."""
+    values: dict[str, Any] = {name: 0.0 for name in GRADIENTS if name not in ("gradient", "reference")}
+    values |= {"alpha": math.nan, "epsilon": math.nan, "discrepancy": math.nan, "residual": 1e-15}
     values |= {"variance": variance, "variance_lower": variance / 2, "variance_upper": 2 * variance}
-    values |= {"solref": (-stiffness / 0.05, 0.0), "solimp": (1e-4, 1e-4, 1e-3, 0.5, 2.0), "unconverged": 0}
-    values |= {"alpha": None, "epsilon": None, "discrepancy": None, "nonfinite": 0, "reference_norm": 10.0}
     values |= {"reference_uncertainty": 0.01, "relative_error": 0.01, "cosine": 1.0, "gradient_norm": 10.0}
     values |= {"bias_p_value": 0.5, "effective_samples": 30.0, "top_share": 0.1, "reference_effective_samples": 300.0}
-    values |= {"debiased_error": changes.get("relative_error", 0.01), "debiased_cosine": 1.0}
-    return Row(**(values | changes))
+    values |= {"debiased_error": changes.get("relative_error", 0.01), "debiased_cosine": 1.0, "reference_norm": 10.0}
+    return {"estimator": estimator, "stiffness": float(stiffness)} | values | changes
 
 
-def result(*rows: Row, **changes: Any) -> CompareResult:
-    resolved = config(contact=("penalty",), sigma=0.1, gamma=1e8, cone="pyramidal", chunk_size=4, **changes)
-    gradients = np.zeros((len(rows), 4))
-    return CompareResult(resolved, {"precision": "float64"}, rows, (), gradients, gradients)
+def result(*rows: dict[str, Any], gamma: float | str = 1e8) -> xr.Dataset:
+    """A study of those rows, under penalty contact."""
+    names = list(dict.fromkeys(each["estimator"] for each in rows))
+    stiffnesses = list(dict.fromkeys(each["stiffness"] for each in rows))
+    at = {"task": 0, "timestep": 0, "cone": 0, "sigma": 0, "samples": 0}
+    axes = {"task": ["pusher"], "timestep": [0.01], "cone": ["pyramidal"]}
+    axes |= {"model": [f"penalty {stiffness:g}" for stiffness in stiffnesses], "sigma": [0.1], "samples": [100]}
+    document: dict[str, Any] = {
+        "config": {"kind": "gradients", "tasks": ["pusher"], "estimators": names, "seeds": 1, "iterations": None}
+        | {"confidence": 0.95, "samples": [100], "seed": 0, "reference_samples": 600},
+        "environment": {"precision": "float64"},
+        "warnings": [],
+        "axes": axes,
+        "models": [{"contact": "penalty", "stiffness": stiffness} for stiffness in stiffnesses],
+        "resolved": [{"horizon": [4], "noise": "gaussian", "estimators": {"aobg": {"gamma": gamma}}}],
+        "cells": [
+            {"at": at | {"model": index}} | {key: at[key] for key in ("sigma", "samples")}
+            for index in range(len(stiffnesses))
+        ],
+    }
+    for cell in document["cells"]:
+        cell["at"] = {name: cell["at"][name] for name in axes}
+    cells = {}
+    for index, stiffness in enumerate(stiffnesses):
+        here = {each["estimator"]: each for each in rows if each["stiffness"] == stiffness}
+        arrays = {"solref": np.array([-stiffness / 0.05, 0.0])}
+        for name, variable in GRADIENTS.items():
+            values = np.array([here[each][name] if each in here else math.nan for each in names if name in rows[0]])
+            if name in rows[0]:
+                wanted = {(): values[:1].reshape(()), ("estimator",): values}
+                arrays[name] = wanted.get(variable.dims, values[None])
+        cells[index] = (arrays, {})
+    return dataset_of(document, cells)
+
+
+def one(*rows: dict[str, Any]) -> Row:
+    return rows_of(result(*rows))[0]
 
 
 @pytest.fixture(scope="module")
-def spied() -> tuple[CompareResult, int, dict[str, list[np.ndarray]]]:
+def spied() -> tuple[xr.Dataset, int, dict[str, list[np.ndarray]]]:
     """A sweep over 13 stiffness values in two families: its result, compilations, and the keys of each batch."""
     keys: dict[str, list[np.ndarray]] = {"evaluate": [], "differentiate": []}
     simulators: list[Simulator] = []
@@ -69,10 +106,7 @@ def spied() -> tuple[CompareResult, int, dict[str, list[np.ndarray]]]:
     with pytest.MonkeyPatch.context() as patch:
         for name in keys:
             patch.setattr(MjxObjective, name, spy(name))
-        plan = study.plan_compare(
-            config(stiffness=tuple(np.geomspace(10, 1000, 13)), contact=("penalty", "mujoco"), chunk_size=4)
-        )
-        found = study.compare(plan)
+        found = compare(stiffness=tuple(np.geomspace(10, 1000, 13)), contact=("penalty", "mujoco"), chunk_size=4)
     (simulator,) = simulators
     return found, simulator.num_compilations, keys
 
@@ -80,7 +114,7 @@ def spied() -> tuple[CompareResult, int, dict[str, list[np.ndarray]]]:
 def test_a_sweep_compiles_each_program_once(spied) -> None:
     found, compilations, _ = spied
     assert compilations == 2
-    assert len(found.rows) == 13 * 2 * 3
+    assert len(rows_of(found)) == 13 * 2 * 3
 
 
 def test_batches_are_independent_and_the_same_in_every_cell(spied) -> None:
@@ -97,52 +131,47 @@ def test_batches_are_independent_and_the_same_in_every_cell(spied) -> None:
 
 def test_an_alpha_order_row_follows_from_the_other_two(spied) -> None:
     found, _, _ = spied
-    table = {(row.contact, row.stiffness, row.estimator): row for row in found.rows}
-    means = {
-        (row.contact, row.stiffness, row.estimator): mean for row, mean in zip(found.rows, found.gradients, strict=True)
-    }
-    for family, stiffness, name in table:
-        if name != "aobg":
-            continue
+    table = {(row.contact, row.stiffness, row.estimator): row for row in rows_of(found)}
+    means = found["gradient"].isel(task=0, timestep=0, cone=0, sigma=0, samples=0, seed=0)
+    for index, (family, stiffness) in enumerate(dict.fromkeys(key[:2] for key in table)):
         zeroth, first, both = (table[family, stiffness, which] for which in ("zobg", "fobg", "aobg"))
         assert both.alpha == pytest.approx(zeroth.variance / (zeroth.variance + first.variance), rel=1e-9)
         mixed = both.alpha**2 * first.variance + (1 - both.alpha) ** 2 * zeroth.variance
         assert both.variance == pytest.approx(mixed, rel=1e-9)
-        expected = both.alpha * means[family, stiffness, "fobg"] + (1 - both.alpha) * means[family, stiffness, "zobg"]
-        np.testing.assert_allclose(means[family, stiffness, "aobg"], expected, rtol=1e-9, atol=1e-12)
+        mean = {name: means.isel(model=index).sel(estimator=name).values for name in ("zobg", "fobg", "aobg")}
+        expected = both.alpha * mean["fobg"] + (1 - both.alpha) * mean["zobg"]
+        np.testing.assert_allclose(mean["aobg"], expected, rtol=1e-9, atol=1e-12)
         assert both.seconds_per_sample == pytest.approx(zeroth.seconds_per_sample + first.seconds_per_sample)
 
 
 def test_results_do_not_depend_on_the_chunk_size() -> None:
-    chosen = [study.compare(study.plan_compare(config(stiffness=(100.0,), contact=("mujoco",), chunk_size=chunk)))
-              for chunk in (2, 9)]  # fmt: skip
-    np.testing.assert_allclose(chosen[0].gradients, chosen[1].gradients, rtol=1e-12)
-    np.testing.assert_allclose(chosen[0].references, chosen[1].references, rtol=1e-12)
+    chosen = [compare(stiffness=(100.0,), contact=("mujoco",), chunk_size=chunk) for chunk in (2, 9)]
+    for name in ("gradient", "reference"):
+        np.testing.assert_allclose(chosen[0][name], chosen[1][name], rtol=1e-12)
 
 
-def test_a_row_does_not_depend_on_the_rows_before_it(spied) -> None:
+def test_a_cell_does_not_depend_on_the_cells_before_it(spied) -> None:
     """The reference of a stiff contact, alone and after twelve softer ones."""
     found, _, _ = spied
-    stiff = config(stiffness=(found.rows[36].stiffness,), contact=("penalty",), chunk_size=4)
-    alone = study.compare(study.plan_compare(stiff))
-    assert found.rows[36].contact == "penalty" and found.rows[36].stiffness == pytest.approx(1000)
-    np.testing.assert_array_equal(alone.references, found.references[36:39])
-    np.testing.assert_array_equal(alone.gradients, found.gradients[36:39])
+    stiffness = float(found["stiffness"][12])
+    alone = compare(stiffness=(stiffness,), contact=("penalty",), chunk_size=4)
+    assert found["contact"].values[12] == "penalty" and stiffness == pytest.approx(1000)
+    for name in ("gradient", "reference"):
+        np.testing.assert_array_equal(alone[name].isel(model=0), found[name].isel(model=12))
 
 
 def test_a_second_run_gives_the_same_numbers(spied) -> None:
     found, _, _ = spied
-    again = study.compare(study.plan_compare(config(stiffness=(10.0,), contact=("penalty",), chunk_size=4)))
-    np.testing.assert_array_equal(again.gradients, found.gradients[:3])
-    other = study.compare(study.plan_compare(config(stiffness=(10.0,), contact=("penalty",), chunk_size=4, seed=1)))
-    assert np.all(other.gradients != found.gradients[:3])
+    again = compare(stiffness=(10.0,), contact=("penalty",), chunk_size=4)
+    np.testing.assert_array_equal(again["gradient"].isel(model=0), found["gradient"].isel(model=0))
+    other = compare(stiffness=(10.0,), contact=("penalty",), chunk_size=4, seed=1)
+    assert np.all(other["gradient"].values != again["gradient"].values)
 
 
 def test_zeroth_order_alone_does_not_differentiate_for_itself() -> None:
-    plan = study.plan_compare(config(stiffness=(10.0,), contact=("penalty",), estimators=("zobg",)))
-    found = study.compare(plan)
-    assert [row.estimator for row in found.rows] == ["zobg"]
-    assert found.rows[0].alpha is None
+    found = compare(stiffness=(10.0,), contact=("penalty",), estimators=("zobg",))
+    assert [row.estimator for row in rows_of(found)] == ["zobg"]
+    assert rows_of(found)[0].alpha is None
 
 
 def test_findings_follow_the_intervals() -> None:
@@ -174,15 +203,13 @@ def test_bias_is_reported_only_beyond_what_noise_explains() -> None:
     mixed = row("aobg", 10, 1, relative_error=16.95, bias_p_value=0.001)
     (sentence,) = findings(result(mixed))
     assert sentence == "penalty: AoBG's mean is biased by 1700% at K = 10 N/m (p <= 0.001)"
-    (sentence,) = findings(
-        dataclasses.replace(result(mixed), config=dataclasses.replace(result().config, gamma=math.inf))
-    )
+    (sentence,) = findings(result(mixed, gamma="inf"))
     assert sentence.endswith("(p <= 0.001): it has no accuracy bound; --gamma sets one")
 
 
 def test_nothing_is_called_biased_on_too_few_effective_samples() -> None:
     loud: dict[str, Any] = {"relative_error": 0.44, "debiased_error_se": 0.03, "bias_p_value": 0.001}
-    assert row("fobg", 10, 1, **loud).bias_verdict == "biased"
+    assert one(row("fobg", 10, 1, **loud)).bias_verdict == "biased"
     few = row("fobg", 10, 1, **loud, effective_samples=1.9)
     (sentence,) = findings(result(few))
     assert sentence == (
@@ -194,25 +221,25 @@ def test_nothing_is_called_biased_on_too_few_effective_samples() -> None:
     assert sentence.endswith("too few effective samples (all equal)")
     unsure = row("fobg", 10, 1, **loud, reference_effective_samples=2.0)
     for doubtful in (few, equal, unsure):
-        assert doubtful.bias_verdict == "too few effective samples"
-        assert results.as_json(result(doubtful))["rows"][0]["bias_verdict"] == "too few effective samples"
+        assert one(doubtful).bias_verdict == "too few effective samples"
+        assert console.gradients_as_json(result(doubtful))["rows"][0]["bias_verdict"] == "too few effective samples"
     agrees = row("fobg", 10, 1, debiased_error=0.01, debiased_error_se=0.01, effective_samples=0.0)
     assert findings(result(agrees)) == []
-    assert row("fobg", 10, 1).bias_verdict == "none seen"
+    assert one(row("fobg", 10, 1)).bias_verdict == "none seen"
 
 
 def test_doubtful_numbers_are_marked_in_the_table(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "200")
     lines: list[str] = []
     sure = row("zobg", 10, 1, relative_error=0.325, debiased_error=0.298, debiased_error_se=0.0098)
-    console.print_comparison(result(sure, row("fobg", 20, 1, effective_samples=1.2, top_share=0.9)), lines.append)
+    console.print_gradients(result(sure, row("fobg", 20, 1, effective_samples=1.2, top_share=0.9)), lines.append)
     (above,) = [line for line in lines if "0.325 -> 0.298 ± 0.010" in line]
     assert "30 (10%)" in above and "?" not in above
     (below,) = [line for line in lines if "1.2 (90%)" in line]
     assert "(0.5 to 2)?" in below
     assert any(line.startswith("?: fewer than 3 effective samples") for line in lines)
     lines.clear()
-    console.print_comparison(result(sure), lines.append)
+    console.print_gradients(result(sure), lines.append)
     assert not any("?" in line for line in lines)
 
 
@@ -225,21 +252,21 @@ def test_alarms_name_what_must_not_be_overlooked() -> None:
 
 
 def test_an_unconverged_solve_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(study.UNCONVERGED, "float64", 1e-30)
-    found = study.compare(study.plan_compare(config(stiffness=(10.0,), contact=("penalty",))))
-    assert all(row.unconverged > 0 for row in found.rows)
+    monkeypatch.setitem(sampling.UNCONVERGED, "float64", 1e-30)
+    found = compare(stiffness=(10.0,), contact=("penalty",))
+    assert all(row.unconverged > 0 for row in rows_of(found))
     assert any("unconverged solve" in alarm for alarm in console.alarms(found))
 
 
 def test_numbers_that_are_not_finite_become_null_in_json() -> None:
-    document = results.as_json(result(row("fobg", 10, math.inf, cosine=math.nan)))
+    document = console.gradients_as_json(result(row("fobg", 10, math.inf, cosine=math.nan)))
     assert document["rows"][0]["variance"] is None and document["rows"][0]["cosine"] is None
 
 
 def test_figures_survive_what_cannot_be_drawn(tmp_path) -> None:
     made_up = result(row("zobg", 10, math.nan), row("fobg", 10, 0.0), row("zobg", 20, 1.0), row("fobg", 20, math.inf))
-    made_up = dataclasses.replace(made_up, config=dataclasses.replace(made_up.config, estimators=("zobg", "fobg")))
-    for path in plots.save_figure(plots.plot_comparison(made_up), tmp_path, "figure"):
+    (figure,) = plot_study(made_up).values()
+    for path in save_figure(figure, tmp_path, "figure"):
         assert path.stat().st_size > 1000
 
 
@@ -279,44 +306,52 @@ def test_the_table_fits_the_terminal(monkeypatch: pytest.MonkeyPatch, columns: i
     monkeypatch.setenv("COLUMNS", str(columns))
     lines: list[str] = []
     full = row("aobg", 1000, 6.4e20, alpha=0.5, epsilon=641.0, discrepancy=1.2e11, relative_error=4.1e9)
-    console.print_comparison(result(full), lines.append)
+    console.print_gradients(result(full), lines.append)
     table = [line for line in lines if "K [N/m]" in line or "AoBG" in line]
     assert sum("K [N/m]" in line for line in table) == tables
     assert max(map(len, table)) <= columns
 
 
+def built(**changes: Any) -> Task:
+    (group,) = plan_study(config(**changes)).groups
+    return group.task
+
+
 def test_theta_and_sigma_reach_the_plan() -> None:
-    plan = study.plan_compare(config(estimators=("aobg",), sigma=0.3, gamma=5.0))
-    assert plan.estimators == (AlphaOrder(gamma=5.0),)
-    assert (plan.task.sigma, plan.config.cone) == (0.3, "pyramidal")
-    assert jnp.all(plan.task.theta == 0.1)
+    plan = plan_study(config(estimators=("aobg",), sigma=(0.3,), gamma=5.0))
+    assert {cell.sigma for cell in plan.cells} == {0.3} and plan.groups[0].cone == "pyramidal"
+    assert estimators_of(plan, plan.cells[0]) == (AlphaOrder(gamma=5.0),)
+    assert jnp.all(plan.groups[0].task.theta == 0.1)
 
 
 def test_weights_reach_the_estimators_and_are_refused_with_the_samples() -> None:
-    plan = study.plan_compare(config(estimators=("ivw",), weights="cross_fitted"))
-    assert plan.estimators == (InverseVariance(weights="cross_fitted"),)
+    plan = plan_study(config(estimators=("ivw",), weights="cross_fitted"))
+    assert estimators_of(plan, plan.cells[0]) == (InverseVariance(weights="cross_fitted"),)
     with pytest.raises(ValueError, match="at least 4 samples, two in each half; got 3"):
-        study.plan_compare(config(weights="cross_fitted", samples=3))
+        plan_study(config(weights="cross_fitted", samples=(3,)))
 
 
 def test_gradients_are_taken_where_theta_says() -> None:
-    plan = study.plan_compare(config(theta=(0.0, 1.0, 2.0, 3.0)))
-    np.testing.assert_array_equal(plan.task.theta, np.arange(4))
-    assert plan.task.theta.dtype == jnp.float64
+    task = built(theta=(0.0, 1.0, 2.0, 3.0))
+    np.testing.assert_array_equal(task.theta, np.arange(4))
+    assert task.theta.dtype == jnp.float64
     with pytest.raises(ValueError, match="theta has 1 numbers; pusher needs 4, all of them"):
-        study.plan_compare(config(theta=(1.0,)))
+        built(theta=(1.0,))
     with pytest.raises(ValueError, match="theta must be finite, got nan"):
-        study.plan_compare(config(theta=(float("nan"),) * 4))
+        built(theta=(float("nan"),) * 4)
+    with pytest.raises(ValueError, match="theta is of a single task"):
+        built(theta=(1.0,), tasks=("pusher", "ball_wall"))
 
 
 def test_a_task_in_place_of_a_name() -> None:
     """What a notebook builds runs as it is, with the configuration's noise; what does not fit is refused."""
     task = make_task("pusher", horizon=7).replace(name="mine", gamma=3.0)
-    plan = study.plan_compare(study.CompareConfig(task="mine", sigma=0.3, stiffness=(10.0,)), task)
-    assert plan.task.scene is task.scene and plan.config.horizon == 7
-    assert (plan.task.sigma, plan.estimators[2], plan.config.task) == (0.3, AlphaOrder(gamma=3.0), "mine")
+    plan = plan_study(StudyConfig(tasks=(task,), sigma=(0.3,), stiffness=(10.0,)))
+    assert plan.groups[0].task.scene is task.scene and plan.groups[0].task.horizon == 7
+    assert {cell.sigma for cell in plan.cells} == {0.3}
+    assert (estimators_of(plan, plan.cells[0])[2], plan.config.task_names) == (AlphaOrder(gamma=3.0), ["mine"])
     with pytest.raises(ValueError, match="cone, horizon: only for a task that is built by its name"):
-        study.plan_compare(study.CompareConfig(task="mine", cone="elliptic", horizon=3), task)
+        plan_study(StudyConfig(tasks=(task,), cone=("elliptic",), horizon=3))
     wrong = task.replace(final_cost=lambda state: state.qpos)
     with pytest.raises(ValueError, match="mine: the final_cost has shape .2,., and a cost is a scalar"):
-        study.plan_compare(study.CompareConfig(task="mine"), wrong)
+        plan_study(StudyConfig(tasks=(wrong,)))

@@ -9,8 +9,8 @@ import pytest
 
 from mjx_study.plots.study import plot_study
 from mjx_study.study import cells as sweep_cells
-from mjx_study.study.plan import SweepCell, SweepConfig, SweepPlan, plan_sweep
-from mjx_study.study.sweep import load_study, run_sweep
+from mjx_study.study.plan import StudyCell, StudyConfig, StudyPlan, plan_study
+from mjx_study.study.run import load_study, run_study
 from mjx_study.table import digits_to_tell_apart
 
 SMALL: dict[str, Any] = {"tasks": ("pusher",), "contact": ("penalty",), "samples": (4,), "seeds": 1, "horizon": 2}
@@ -20,12 +20,12 @@ SMALL: dict[str, Any] = {"tasks": ("pusher",), "contact": ("penalty",), "samples
 def stubbed(monkeypatch: pytest.MonkeyPatch) -> None:
     """Cells whose numbers say what they were computed with."""
 
-    def compute_of(plan: SweepPlan) -> Callable[[SweepCell], dict[str, np.ndarray]]:
-        def compute(cell: SweepCell) -> dict[str, np.ndarray]:
+    def compute_of(plan: StudyPlan) -> Callable[[StudyCell], dict[str, np.ndarray]]:
+        def compute(cell: StudyCell) -> dict[str, np.ndarray]:
             seeds = plan.config.batches, len(plan.config.estimators)
             return {
-                "residual": np.asarray(cell.model.stiffness),
-                "unconverged": np.asarray(cell.sigma),
+                "residual": np.full(seeds[1], cell.model.stiffness),
+                "unconverged": np.full(seeds[1], cell.sigma),
                 "reference_norm": np.asarray(plan.groups[cell.group].timestep),
                 "reference_uncertainty": np.asarray(float(plan.groups[cell.group].task.gamma)),
                 "variance": np.full(seeds, float(cell.samples)),
@@ -41,15 +41,16 @@ def stubbed(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def swept(folder: Path, **changes: Any):
     """The dataset of a stubbed sweep, where each number must be the coordinate that it stands under."""
-    plan = plan_sweep(SweepConfig(**(SMALL | changes)))
-    data = run_sweep(plan, folder).dataset
+    plan = plan_study(StudyConfig(**(SMALL | changes)))
+    data = run_study(plan, folder)
     assert data.equals(load_study(folder))
     for variable, coordinate in (("residual", "stiffness"), ("unconverged", "sigma"), ("reference_norm", "timestep")):
         held = data[variable].transpose(..., "model" if coordinate == "stiffness" else coordinate)
         values = np.broadcast_to(np.asarray(data[coordinate]), held.shape)
         known = np.asarray(held.notnull())  # tasks of different timesteps leave places empty
         np.testing.assert_array_equal(np.asarray(held)[known], values[known], err_msg=variable)
-        assert np.sum(known) == len(plan.cells), variable
+        each = len(plan.config.estimators) if "estimator" in held.dims else 1
+        assert np.sum(known) == each * len(plan.cells), variable
     for dimension in data.dims:
         names = data[dimension].values.tolist()
         assert len({str(name) for name in names}) == len(names), dimension

@@ -13,10 +13,11 @@ import pytest
 from estimators import Differentiation, Evaluation
 from mjx_study.objective import MjxObjective, Simulator
 from mjx_study.simulation.contact import ContactModel
-from mjx_study.study import cells as sweep_cells
+from mjx_study.study import gradients
 from mjx_study.study import memory as sweep_memory
-from mjx_study.study.cells import MEASURED, compute_gradients
-from mjx_study.study.plan import SweepConfig, memory_of_seed, plan_sweep, seeds_together
+from mjx_study.study.gradients import compute_gradients
+from mjx_study.study.plan import StudyConfig, memory_of_seed, plan_study, seeds_together
+from mjx_study.study.variables import MEASURED
 
 
 class Drawn(MjxObjective):
@@ -43,7 +44,7 @@ class Stub(Simulator):
         return Drawn(self, contact, self.task.sigma if sigma is None else sigma)
 
 
-def config(**changes: Any) -> SweepConfig:
+def config(**changes: Any) -> StudyConfig:
     common: dict[str, Any] = {
         "contact": ("penalty",),
         "stiffness": (10.0,),
@@ -51,12 +52,12 @@ def config(**changes: Any) -> SweepConfig:
         "horizon": 3,
         "chunk_size": 8,
     }
-    return SweepConfig(tasks=("pusher",), **(common | changes))
+    return StudyConfig(tasks=("pusher",), **(common | changes))
 
 
 def test_numbers_do_not_depend_on_how_seeds_are_grouped(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sweep_cells, "Simulator", Stub)
-    plan = plan_sweep(config(samples=(8,), seeds=5, estimators=("zobg",)))
+    monkeypatch.setattr(gradients, "Simulator", Stub)
+    plan = plan_study(config(samples=(8,), seeds=5, estimators=("zobg",)))
     found = []
     for at_once, groups in ((1e9, 5), (1.0, 1), (2.5 * memory_of_seed(plan, plan.cells[0]), 2)):
         monkeypatch.setattr(sweep_memory, "AT_ONCE", at_once)
@@ -71,13 +72,13 @@ def test_numbers_do_not_depend_on_how_seeds_are_grouped(monkeypatch: pytest.Monk
 @pytest.mark.parametrize("kind", [{}, {"iterations": 3}, {"points": 3}])
 def test_a_plan_that_needs_too_much_memory_is_refused(kind: dict[str, int]) -> None:
     changes = {"reference_samples": None} if kind else {}
-    assert plan_sweep(config(samples=(100,), **kind, **changes)).memory < sweep_memory.AT_ONCE
+    assert plan_study(config(samples=(100,), **kind, **changes)).memory < sweep_memory.AT_ONCE
     with pytest.raises(ValueError, match="a cell would take about .* GiB of memory, and the limit is 16 GiB"):
-        plan_sweep(config(samples=(100, 10_000_000), **kind, **changes))
+        plan_study(config(samples=(100, 10_000_000), **kind, **changes))
 
 
 def test_of_gradients_seeds_cost_no_memory() -> None:
-    few, many = (plan_sweep(config(samples=(10_000,), seeds=seeds, horizon=200)).memory for seeds in (2, 2000))
+    few, many = (plan_study(config(samples=(10_000,), seeds=seeds, horizon=200)).memory for seeds in (2, 2000))
     assert few == many < 1e9
 
 
@@ -85,14 +86,14 @@ PEAK = """
 import resource, sys
 from mjx_study.runtime import configure
 configure(cpu_devices=1)
-from mjx_study.study import cells
-from mjx_study.study.plan import plan_sweep
+from mjx_study.study import gradients
+from mjx_study.study.plan import plan_study
 from tests.test_sweep_memory import Stub, config
 
-sweep_cells.Simulator = Stub
-plan = plan_sweep(config(samples=(10_000,), seeds=int(sys.argv[1]), horizon=200))
+gradients.Simulator = Stub
+plan = plan_study(config(samples=(10_000,), seeds=int(sys.argv[1]), horizon=200))
 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-sweep_cells.compute_gradients(plan)(plan.cells[0])
+gradients.compute_gradients(plan)(plan.cells[0])
 print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1e6)
 """
 
@@ -106,5 +107,5 @@ def test_memory_does_not_grow_with_seeds() -> None:
         done = subprocess.run(command, capture_output=True, text=True, cwd=Path(__file__).parents[1])
         assert done.returncode == 0, done.stderr
         peak.append(float(done.stdout))
-    foreseen = plan_sweep(config(samples=(10_000,), seeds=2, horizon=200)).memory / 1e9
+    foreseen = plan_study(config(samples=(10_000,), seeds=2, horizon=200)).memory / 1e9
     assert peak[1] < 1.15 * peak[0] and foreseen / 2 < peak[1] < 2 * foreseen, (peak, foreseen)

@@ -3,32 +3,28 @@
 import argparse
 import json
 import sys
-from pathlib import Path
-from typing import Any
 
 from estimators import ESTIMATORS
-from mjx_study.cli.console import alarms, print_comparison
+from mjx_study.cli.console import alarms, gradients_as_json, print_gradients
 from mjx_study.cli.options import (
     Commands,
     add_command,
     add_contact_options,
     add_estimator_options,
+    add_option,
     add_options,
-    add_task_options,
-    attempt,
-    computing,
+    add_process_options,
+    add_task_argument,
     configure_process,
     finish,
     usage_errors,
 )
 from mjx_study.cli.parameters import add_theta_option, theta_of
-from mjx_study.disk import prepare_folder
-from mjx_study.plots.comparison import plot_comparison, save_figure
+from mjx_study.cli.studies import add_folder_options, compute, draw, study_fields
 from mjx_study.simulation.contact import FAMILIES
-from mjx_study.study.comparison import CompareConfig
-from mjx_study.study.gradients import compare, plan_compare
-from mjx_study.study.results import as_json, save
+from mjx_study.study.plan import StudyConfig, plan_study
 
+SAMPLES = (400,)
 EXAMPLES = """\
 examples:
   mjx-study compare pusher --stiffness 10,1000 --contact penalty,mujoco_default
@@ -56,11 +52,6 @@ columns of the table:
   variance x s    variance times that time: the variance that a second of computing leaves
   lost            samples that overflowed or became NaN; they are left out, and a warning says so
 """
-FIELDS = (
-    "task stiffness contact estimators samples reference_samples sigma seed baseline gamma published "
-    "failure_probability variance_proxy radius confidence damping cone horizon model chunk_size noise max_norm window "
-    "tolerance weights onset"
-).split()
 
 
 def add(commands: Commands) -> None:
@@ -70,38 +61,33 @@ def add(commands: Commands) -> None:
         families="\n".join(f"  {item.name:<15} {item.description}" for item in FAMILIES.values()),
     )
     command = add_command(commands, "compare", "compare gradient estimators over contact models", run, epilog)
-    add_task_options(command, CompareConfig)
-    add_contact_options(command, CompareConfig)
+    add_task_argument(command)
+    add_options(command, StudyConfig, "sigma", "cone", "horizon", "model", "timestep")
+    add_process_options(command)
+    add_contact_options(command, StudyConfig)
     add_theta_option(command, "parameters at which gradients are taken")
-    add_options(command, CompareConfig, "estimators", "samples", "reference_samples")
-    add_estimator_options(command, CompareConfig)
-    add_options(command, CompareConfig, "confidence", "chunk_size")
-    command.add_argument("--output", type=Path, metavar="DIR", help="write the figure and the numbers to this folder")
+    add_options(command, StudyConfig, "estimators", "reference_samples", reference_samples={"unset": "600"})
+    add_option(command, StudyConfig.option("samples"), SAMPLES)
+    add_estimator_options(command, StudyConfig)
+    add_options(command, StudyConfig, "confidence", "chunk_size")
+    add_folder_options(command)
 
 
 def run(options: argparse.Namespace) -> int:
     """Compare, print, and write where an output folder is given."""
     with usage_errors():
         configure_process(options)
-        fields: dict[str, Any] = {name: getattr(options, name) for name in FIELDS} | {"theta": theta_of(options)}
-        config = CompareConfig(**{name: value for name, value in fields.items() if value is not None})
-        plan = plan_compare(config)
-        folder = None if options.output is None else prepare_folder(options.output)
-    with computing() as progress:
-        result = compare(plan, progress)
-    written, unwritten = [], None
-    if folder is not None:
-        written, unwritten = attempt(
-            lambda folder=folder: save(result, folder) + save_figure(plot_comparison(result), folder, "comparison")
-        )
+        plan = plan_study(StudyConfig(**study_fields(options), tasks=(options.task,), theta=theta_of(options), seeds=1))
+    dataset, unwritten = compute(plan, options)
+    written, undrawn = draw(dataset, options.output, unwritten)
     if options.json:
-        print(json.dumps(as_json(result), allow_nan=False))
-        for warning in alarms(result):
+        print(json.dumps(gradients_as_json(dataset), allow_nan=False))
+        for warning in alarms(dataset):
             print(f"warning: {warning}", file=sys.stderr)
     else:
-        print_comparison(result)
+        print_gradients(dataset)
         if written:
-            print(f"written: {', '.join(map(str, written))}")
-        elif folder is None:
-            print("add --output DIR for a figure and the numbers on disk")
-    return finish(unwritten)
+            print(f"written to {options.output}: {', '.join(path.name for path in written)}")
+        elif options.output is None:
+            print("add --output DIR for figures and the numbers on disk")
+    return finish(unwritten, undrawn)

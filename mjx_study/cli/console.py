@@ -1,19 +1,22 @@
 """What the command line prints: tables, numbers with their intervals, progress."""
 
+import json
 import math
 import shutil
 import sys
 from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
+from typing import Any
 
+import xarray as xr
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from estimators import ENOUGH_EFFECTIVE
-from mjx_study.plots.comparison import style_of
+from mjx_study.plots.style import style_of
 from mjx_study.simulation.contact import FAMILIES
-from mjx_study.study.comparison import CompareResult, Row
-from mjx_study.study.findings import findings
+from mjx_study.study.dataset import as_plain
+from mjx_study.study.findings import Row, findings, rows_of
 from mjx_study.table import format_table
 
 Column = tuple[str, Callable[[Row], str]]
@@ -105,46 +108,48 @@ def _blocks(rows: Sequence[Row], confidence: float, width: int) -> list[list[str
     return [_table(rows, identity + block) for block in blocks]
 
 
-def print_comparison(result: CompareResult, print_line: Callable[[str], None] = print) -> None:
-    """The whole result as text: configuration, a table for each contact family, what it says, what to beware of."""
-    config = result.config
-    print_line(
-        f"{config.task}: {config.samples} samples in each batch, sigma {config.sigma:g}, {config.horizon} steps, "
-        f"{config.cone} cone, seed {config.seed}, {result.environment['precision']}"
-    )
+def print_gradients(dataset: xr.Dataset, print_line: Callable[[str], None] = print) -> None:
+    """A study of gradients as text: configuration, a table for each contact family, findings, warnings."""
+    config, rows = json.loads(dataset.attrs["config"]), rows_of(dataset)
+    for resolved, task in zip(json.loads(dataset.attrs["resolved"]), dataset["task"].values.tolist(), strict=True):
+        print_line(
+            f"{task}: {', '.join(map(str, config['samples']))} samples in each batch, "
+            f"sigma {', '.join(f'{sigma:g}' for sigma in dataset['sigma'].values)}, "
+            f"{', '.join(map(str, resolved['horizon']))} steps, {', '.join(dataset['cone'].values)} cone, "
+            f"seed {config['seed']}, {json.loads(dataset.attrs['environment'])['precision']}"
+        )
     width = shutil.get_terminal_size((140, 24)).columns
-    for family in result.families:
-        rows = [row for row in result.rows if row.contact == family]
+    for family in dict.fromkeys(row.contact for row in rows):
         print_line("")
-        print_line(f"{family}: {FAMILIES[family].description}")
-        for block in _blocks(rows, config.confidence, width):
+        print_line(f"{family}: {FAMILIES[family].description}" if family in FAMILIES else family)
+        for block in _blocks([row for row in rows if row.contact == family], config["confidence"], width):
             for line in block:
                 print_line(line)
     print_line("")
-    uncertainty = [row.reference_uncertainty for row in result.rows if math.isfinite(row.reference_uncertainty)]
+    uncertainty = [row.reference_uncertainty for row in rows if math.isfinite(row.reference_uncertainty)]
     if uncertainty:
         low, high = number(min(uncertainty), 2), number(max(uncertainty), 2)
         spread = low if low == high else f"{low} to {high}"
         print_line(
-            f"Errors and cosines are against an unbiased zeroth-order reference, {config.reference_samples} pairs of "
-            f"rollouts with a control variate;\nits own relative uncertainty is {spread}, and smaller errors "
+            f"Errors and cosines are against an unbiased zeroth-order reference, {config['reference_samples']} pairs "
+            f"of rollouts with a control variate;\nits own relative uncertainty is {spread}, and smaller errors "
             "cannot be told from zero."
         )
-    if not all(row.believable for row in result.rows):
+    if not all(row.believable for row in rows):
         print_line(
             f"?: fewer than {ENOUGH_EFFECTIVE:g} effective samples carry the batch's variance; believe neither the "
             "number nor its error."
         )
-    for sentence in findings(result):
+    for sentence in findings(dataset):
         print_line(sentence + ".")
-    for warning in alarms(result):
+    for warning in alarms(dataset):
         print_line(f"warning: {warning}")
 
 
-def alarms(result: CompareResult) -> list[str]:
+def alarms(dataset: xr.Dataset) -> list[str]:
     """What a reader must not overlook: samples left out, solves that did not converge, contact models at their edge."""
     messages = []
-    for row in result.rows:
+    for row in rows_of(dataset):
         stiffness = f"K = {number(row.stiffness)} N/m, " if row.stiffness else ""
         where = f"{row.contact}, {stiffness}{style_of(row.estimator)[0]}"
         if row.nonfinite:
@@ -161,7 +166,16 @@ def alarms(result: CompareResult) -> list[str]:
             messages.append(
                 f"{where}: {row.onsets_bounded} of {row.onsets} onsets are grazing, and their terms bounded"
             )
-    return messages + list(result.warnings)
+    return messages + json.loads(dataset.attrs["warnings"])
+
+
+def gradients_as_json(dataset: xr.Dataset) -> dict[str, Any]:
+    """A study of gradients as plain data: a row for each estimate."""
+    rows = [vars(row) | {"variance_seconds": row.variance_seconds, "bias_verdict": row.bias_verdict}
+            for row in rows_of(dataset)]  # fmt: skip
+    names = ("config", "resolved", "environment")
+    document = {name: json.loads(dataset.attrs[name]) for name in names}
+    return as_plain(document | {"findings": findings(dataset), "warnings": alarms(dataset), "rows": rows})
 
 
 def _table(rows: Sequence[Row], table: Sequence[Column]) -> list[str]:

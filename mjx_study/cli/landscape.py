@@ -22,7 +22,8 @@ from mjx_study.cli.options import (
 )
 from mjx_study.cli.parameters import add_theta_option, theta_of
 from mjx_study.disk import prepare_folder, write_whole
-from mjx_study.plots.comparison import plot_landscape, save_figure
+from mjx_study.plots.curves import plot_landscape
+from mjx_study.plots.style import save_figure
 from mjx_study.study.landscapes import Landscape, LandscapeConfig, landscape, plan_landscape
 from mjx_study.table import format_table
 

@@ -26,9 +26,10 @@ from mjx_study.cli.options import (
 )
 from mjx_study.cli.parameters import add_theta_option, theta_of
 from mjx_study.disk import prepare_folder, write_whole
-from mjx_study.plots.comparison import plot_optimisation, save_figure, style_of
+from mjx_study.plots.curves import plot_optimisation
+from mjx_study.plots.style import save_figure, style_of
+from mjx_study.study.dataset import as_plain
 from mjx_study.study.descents import OptimiseConfig, OptimiseResult, Run, open_checkpoints, optimise, plan_optimise
-from mjx_study.study.results import as_plain
 from mjx_study.table import format_table
 
 EPILOG = """\

@@ -117,14 +117,19 @@ def add_task_options(
     command: argparse.ArgumentParser, owner: type[Checked] = EstimatorConfig, *, files: str = ""
 ) -> None:
     """The task, what may replace its own settings, and how it is computed."""
-    metavar = "TASK|FILE.xml" if files else "TASK"
-    command.add_argument(
-        "task", metavar=metavar, help=f"one of: {', '.join(task_names())}; or module:name of your own{files}"
-    )
+    add_task_argument(command, files)
     add_options(command, owner, "sigma")
     for name in ("cone", "horizon", "model"):
         add_options(command, EstimatorConfig, name)
     add_process_options(command)
+
+
+def add_task_argument(command: argparse.ArgumentParser, files: str = "") -> None:
+    """The task, by its name."""
+    metavar = "TASK|FILE.xml" if files else "TASK"
+    command.add_argument(
+        "task", metavar=metavar, help=f"one of: {', '.join(task_names())}; or module:name of your own{files}"
+    )
 
 
 def add_contact_options(

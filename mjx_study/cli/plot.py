@@ -5,9 +5,9 @@ from pathlib import Path
 
 from mjx_study.cli.options import Commands, add_command, attempt, finish, print_report, usage_errors
 from mjx_study.disk import prepare_folder
-from mjx_study.plots.comparison import save_figure
 from mjx_study.plots.study import plot_study
-from mjx_study.study.sweep import load_study, what_to_beware_of
+from mjx_study.plots.style import save_figure
+from mjx_study.study.run import load_study, warnings_of
 
 EPILOG = """\
 Draws what the study has the numbers for, each as PNG and PDF: variance, bias and alpha against stiffness, error against
@@ -36,7 +36,7 @@ def run(options: argparse.Namespace) -> int:
     written, unwritten = attempt(
         lambda: [path for name, figure in figures.items() for path in save_figure(figure, folder, name)]
     )
-    warnings = list(what_to_beware_of(dataset))
+    warnings = list(warnings_of(dataset))
     document = {"written": [str(path) for path in written], "warnings": warnings}
     names = ", ".join(path.name for path in written if path.suffix == ".png")
     lines = [f"warning: {message}" for message in warnings]

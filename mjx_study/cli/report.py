@@ -6,7 +6,7 @@ from pathlib import Path
 from mjx_study.cli.options import Commands, add_command, attempt, finish, print_report, usage_errors
 from mjx_study.disk import prepare_folder, write_whole
 from mjx_study.report import report
-from mjx_study.study.sweep import load_study, what_to_beware_of
+from mjx_study.study.run import load_study, warnings_of
 
 EPILOG = """\
 Writes FOLDER/report.html: one page that needs no other file, with warnings, figures, a table, the whole configuration,
@@ -32,7 +32,7 @@ def run(options: argparse.Namespace) -> int:
         prepare_folder(path.parent)
     page = report(dataset).encode()
     written, unwritten = attempt(lambda: [write_whole(path, lambda file: file.write(page))])
-    warnings = list(what_to_beware_of(dataset))
+    warnings = list(warnings_of(dataset))
     lines = [f"warning: {message}" for message in warnings]
     lines += [f"written: {path} ({len(page) / 1e6:.1f} MB)"] if written else []
     print_report(options, {"written": str(path) if written else None, "warnings": warnings}, lines)

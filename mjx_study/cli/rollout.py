@@ -35,7 +35,7 @@ from mjx_study.disk import prepare_folder, write_whole
 from mjx_study.files import PolicyFile, read_json
 from mjx_study.limits import MOST_STEPS, check_count
 from mjx_study.option import OPTIONS
-from mjx_study.plots.comparison import save_figure
+from mjx_study.plots.style import save_figure
 from mjx_study.render import (
     FORMATS,
     RENDERERS,

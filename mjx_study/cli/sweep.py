@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Annotated, Any
 
+import xarray as xr
 from pydantic import BaseModel, BeforeValidator, ConfigDict, create_model
 
 from mjx_study.cli.options import (
@@ -24,19 +25,19 @@ from mjx_study.cli.options import (
     print_report,
     usage_errors,
 )
+from mjx_study.cli.studies import RESUMABLE
 from mjx_study.files import read_toml
 from mjx_study.option import MOST_VALUES, OPTIONS, Interval, Option
-from mjx_study.study.store import StudyError
-from mjx_study.study.sweep import (
-    SweepConfig,
-    SweepPlan,
-    SweepResult,
+from mjx_study.study.run import (
+    StudyConfig,
+    StudyPlan,
     load_study,
     open_store,
-    plan_sweep,
-    run_sweep,
-    what_to_beware_of,
+    plan_study,
+    run_study,
+    warnings_of,
 )
+from mjx_study.study.store import StudyError
 from mjx_study.table import digits_to_tell_apart
 from mjx_study.tasks import task_names
 
@@ -67,7 +68,6 @@ A TOML file holds the same options by the names of their flags, with _ for -:
   samples = [30, 100]
   seeds = 10
 """
-RESUMABLE = "the same command goes on where it stopped"
 NUMBERS = Option("numbers", float, "X", "", Interval("(-inf, inf)"), many=True)
 TASKS = Option("tasks", str, "TASK", "", many=True)
 
@@ -78,19 +78,19 @@ def add(commands: Commands) -> None:
     choices = f"of: {', '.join(task_names())}, or module:name"
     command.add_argument("tasks", nargs="?", type=TASKS.parse, metavar="TASK[,TASK]", help=choices)
     command.add_argument("--config", type=Path, metavar="FILE.toml", help="options from a file; flags go before it")
-    add_options(command, SweepConfig, "contact", "stiffness", "damping")
+    add_options(command, StudyConfig, "contact", "stiffness", "damping")
     add_option(command, OPTIONS["solref"], read=_solref)
     add_option(command, OPTIONS["solimp"], read=_solimp)
-    add_options(command, SweepConfig, "timestep", "cone", "sigma", "samples")
-    add_options(command, SweepConfig, "seeds", "estimators", seeds={"unset": "10; 1 of landscapes"})
-    add_options(command, SweepConfig, "iterations", iterations={"line": "optimise policies, N steps each", "unset": ""})
-    add_options(command, SweepConfig, "points", points={"line": "landscapes, on N points of a line through theta"})
-    add_options(command, SweepConfig, "span", "direction")
-    add_options(command, SweepConfig, "optimizer", "learning_rate", "decay", optimizer={"unset": "sgd"})
-    add_options(command, SweepConfig, "reference_samples", reference_samples={"unset": "600"})
-    add_options(command, SweepConfig, "evaluation_samples", evaluation_samples={"unset": "200"})
-    add_estimator_options(command, SweepConfig)
-    add_options(command, SweepConfig, "horizon", "model", "chunk_size")
+    add_options(command, StudyConfig, "timestep", "cone", "sigma", "samples")
+    add_options(command, StudyConfig, "seeds", "estimators", seeds={"unset": "10; 1 of landscapes"})
+    add_options(command, StudyConfig, "iterations", iterations={"line": "optimise policies, N steps each", "unset": ""})
+    add_options(command, StudyConfig, "points", points={"line": "landscapes, on N points of a line through theta"})
+    add_options(command, StudyConfig, "span", "direction")
+    add_options(command, StudyConfig, "optimizer", "learning_rate", "decay", optimizer={"unset": "sgd"})
+    add_options(command, StudyConfig, "reference_samples", reference_samples={"unset": "600"})
+    add_options(command, StudyConfig, "evaluation_samples", evaluation_samples={"unset": "200"})
+    add_estimator_options(command, StudyConfig)
+    add_options(command, StudyConfig, "horizon", "model", "chunk_size")
     add_process_options(command, seed=None)
     command.add_argument("--output", type=Path, required=True, metavar="DIR", help="folder of the study")
     add_versions_option(command)
@@ -100,7 +100,7 @@ def run(options: argparse.Namespace) -> int:
     """Plan, compute what is missing, print."""
     with usage_errors():
         configure_process(options)
-        plan = plan_sweep(SweepConfig(**_fields(options)))
+        plan = plan_study(StudyConfig(**_fields(options)))
         store = open_store(plan, options.output, options.command_line, accept_versions=options.accept_versions)
         missing = len(store.missing)
     if not options.json:
@@ -108,25 +108,24 @@ def run(options: argparse.Namespace) -> int:
     unwritten = None
     try:
         with computing(RESUMABLE) as progress:
-            result = run_sweep(plan, options.output, progress, accept_versions=options.accept_versions)
+            dataset = run_study(plan, options.output, progress, accept_versions=options.accept_versions)
     except StudyError as error:
         raise UsageError(str(error)) from error
     except OSError as error:
         with usage_errors():
             dataset = load_study(options.output)
-        computed = missing - dataset.attrs["missing_cells"]
-        result = SweepResult(options.output, dataset, computed, plan.warnings + what_to_beware_of(dataset))
         reason = f"cannot write to {options.output}: {error.strerror or error}"
         unwritten = f"{reason}; what is there is complete, and the same command goes on"
-    lines = _tail(result, plan)
-    drawn = f"written to {result.folder}: results.nc; mjx-study plot {result.folder} draws it"
-    print_report(options, _document(result), [*lines, drawn] if unwritten is None else lines)
+    computed = dataset.attrs.get("computed_cells", missing - dataset.attrs["missing_cells"])
+    drawn = f"written to {options.output}: results.nc; mjx-study plot {options.output} draws it"
+    lines = [*_tail(dataset, computed, plan), *([drawn] if unwritten is None else [])]
+    print_report(options, _document(dataset, computed, options.output), lines)
     return finish(unwritten)
 
 
 def _fields(options: argparse.Namespace) -> dict[str, Any]:
     """The configuration's fields: flags first, then the file's."""
-    given = {field.name: getattr(options, field.name, None) for field in dataclasses.fields(SweepConfig)}
+    given = {field.name: getattr(options, field.name, None) for field in dataclasses.fields(StudyConfig)}
     kept = {} if options.config is None else read_toml(options.config, _schema())
     merged = kept | {name: value for name, value in given.items() if value is not None}
     if "tasks" not in merged:
@@ -141,11 +140,11 @@ def _schema() -> type[BaseModel]:
     own = {"tasks": TASKS.read, "direction": _direction, "solref": _solref, "solimp": _solimp}
 
     def reader(name: str) -> Callable[[Any], Any]:
-        return own[name] if name in own else SweepConfig.option(name).read
+        return own[name] if name in own else StudyConfig.option(name).read
 
     fields = {
         field.name: (Annotated[Any, BeforeValidator(reader(field.name))], None)
-        for field in dataclasses.fields(SweepConfig)
+        for field in dataclasses.fields(StudyConfig)
     }
     return create_model("Sweep", __config__=ConfigDict(extra="forbid"), **fields)  # type: ignore[call-overload]
 
@@ -177,12 +176,12 @@ def _rows(value: Any) -> tuple[tuple[float, ...], ...]:
     return tuple(NUMBERS.read(row) for row in value)
 
 
-def _head(plan: SweepPlan, missing: int) -> list[str]:
+def _head(plan: StudyPlan, missing: int) -> list[str]:
     """The configuration as it was resolved."""
     config, cells = plan.config, len(plan.cells)
     kind = {"descents": f"descents of {config.iterations} iterations", "landscapes": f"{config.points} points"}
     lines = [
-        f"{', '.join(config.tasks)}: {kind.get(config.kind, config.kind)}, {', '.join(config.estimators)}, "
+        f"{', '.join(config.task_names)}: {kind.get(config.kind, config.kind)}, {', '.join(config.estimators)}, "
         f"seeds {config.batches}",
         f"contact models: {len({(c.model.family, c.model.stiffness) for c in plan.cells})}, "
         f"timestep {_listed(group.timestep for group in plan.groups)} s, "
@@ -206,19 +205,19 @@ def _listed(values: Iterable[float]) -> str:
     return ", ".join(f"{value:.{digits}g}" for value in distinct)
 
 
-def _document(result: SweepResult) -> dict[str, Any]:
+def _document(dataset: xr.Dataset, computed: int, folder: Path) -> dict[str, Any]:
     return {
-        "folder": str(result.folder),
-        "computed": result.computed,
-        "cells": {name: int(size) for name, size in result.dataset.sizes.items()},
-        "variables": [str(name) for name in result.dataset.data_vars],
-        "warnings": list(result.warnings),
+        "folder": str(folder),
+        "computed": computed,
+        "cells": {name: int(size) for name, size in dataset.sizes.items()},
+        "variables": [str(name) for name in dataset.data_vars],
+        "warnings": list(warnings_of(dataset)),
     }
 
 
-def _tail(result: SweepResult, plan: SweepPlan) -> list[str]:
+def _tail(dataset: xr.Dataset, computed: int, plan: StudyPlan) -> list[str]:
     """What was computed, and what there is to warn about beyond what the head said."""
-    sizes = ", ".join(f"{name} {size}" for name, size in result.dataset.sizes.items())
-    lines = [f"computed {result.computed} cells; {sizes}"]
-    lines += [f"warning: {message}" for message in result.warnings if message not in plan.warnings]
+    sizes = ", ".join(f"{name} {size}" for name, size in dataset.sizes.items())
+    lines = [f"computed {computed} cells; {sizes}"]
+    lines += [f"warning: {message}" for message in warnings_of(dataset) if message not in plan.warnings]
     return lines

@@ -1,6 +1,7 @@
 """Figures of a study from its labelled arrays alone."""
 
 import itertools
+import json
 import re
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Final
@@ -13,7 +14,8 @@ from matplotlib.colors import TwoSlopeNorm
 from matplotlib.figure import Figure
 from scipy import stats
 
-from mjx_study.plots.comparison import NO_CONTACT, TITLES, line_with_band, mean_with_band, robust_limits, style_of
+from mjx_study.plots.style import NO_CONTACT, TITLES, line_with_band, mean_with_band, robust_limits, style_of
+from mjx_study.simulation.contact import DEFAULT_SOLREF
 from mjx_study.table import digits_to_tell_apart
 
 SWEPT: Final = {
@@ -38,7 +40,9 @@ def plot_study(dataset: xr.Dataset) -> dict[str, Figure]:
     quantity = _quantity(dataset)
     kinds: dict[str, Callable[[xr.Dataset, str], Figure | None]] = {
         "final_cost": {"achieved": _achieved, "descent": _descent},
-        "variance": {"variance": _variance, "bias": _bias, "alpha": _alpha},
+        "variance": {"variance": _variance, "bias": _bias, "alpha": _alpha}
+        if dataset.sizes["seed"] > 1
+        else {"comparison": _comparison},
         "smoothed": {"landscape": _landscape},
     }[quantity]
     for kind, draw in kinds.items():
@@ -200,6 +204,61 @@ def _geometric(values: xr.DataArray) -> tuple[np.ndarray, np.ndarray, np.ndarray
     half[several] = np.nanstd(logs[several], axis=1, ddof=1) / np.sqrt(count[several])
     half[several] *= stats.t.ppf(0.975, count[several] - 1)
     return np.exp(mean), np.exp(mean - half), np.exp(mean + half)
+
+
+def _comparison(part: xr.Dataset, title: str) -> Figure:
+    """Of one batch: variance above, relative error below; a column for each contact family."""
+    families = [(family, part.isel(model=np.flatnonzero(part["contact"].values == family)).sortby("stiffness"))
+                for family in dict.fromkeys(part["contact"].values.tolist())]  # fmt: skip
+    figure = Figure(figsize=(1.2 + 3.4 * len(families), 6.2), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(2, len(families), sharex="col", sharey="row", squeeze=False)
+    for (above, below), (family, rows) in zip(axes.T, families, strict=True):
+        x = np.where(rows["stiffness"].values > 0, rows["stiffness"].values, NO_CONTACT)
+        for mine, style in _estimators(rows.isel(seed=0)):
+            line_with_band(above, x, *(_positive(mine["variance" + end]) for end in ("", "_lower", "_upper")), **style)
+            y, error = _positive(mine["relative_error"]), np.asarray(mine["relative_error_se"], float)
+            lower, upper = _positive(np.maximum(y - 1.96 * error, y / 10)), _positive(y + 1.96 * error)
+            line_with_band(below, x, y, lower, upper, color=style["color"], marker=style["marker"])
+        floor = _positive(rows["reference_uncertainty"])
+        below.plot(x, floor, color="0.4", linestyle=":", marker="_", label="uncertainty of the reference")
+        below.axhline(1, color="0.7", linewidth=0.8)
+        for panel in (above, below):
+            panel.set(xscale="log", yscale="log")
+            panel.grid(alpha=0.25)
+        above.set_title(TITLES.get(family, family))
+        below.set_xlabel(SWEPT["stiffness"])
+        if not np.any(rows["stiffness"].values):
+            below.set_xlabel("")
+            below.set_xticks([NO_CONTACT], ["no contact"])
+            below.set_xticks([], minor=True)
+        _mark_default(above, family, rows)
+    samples, config = int(part["samples"]), json.loads(part.attrs["config"])
+    axes[0, 0].set_ylabel("variance of one sample")
+    axes[1, 0].set_ylabel(f"relative error of the mean\nof {samples} samples")
+    axes[0, 0].legend(frameon=False)
+    axes[1, 0].legend(frameon=False)
+    percent = f"{100 * config['confidence']:.0f} %"
+    figure.suptitle(f"{title}\ngradient estimates (bands: {percent} intervals)", fontsize="medium")
+    return figure
+
+
+def _mark_default(axes: Axes, family: str, rows: xr.Dataset) -> None:
+    """Where MuJoCo's default time constant lies among the stiffnesses of its own family."""
+    if family != "mujoco" or "solref" not in rows:
+        return
+    mass = float(rows["stiffness"][0]) / -float(rows["solref"].isel(model=0, solref_entry=0))
+    axes.axvline(mass / (DEFAULT_SOLREF[0] * DEFAULT_SOLREF[1]) ** 2, color="0.4", linestyle="--", linewidth=0.8)
+    axes.annotate(
+        "default solref",
+        (mass / (DEFAULT_SOLREF[0] * DEFAULT_SOLREF[1]) ** 2, 0.98),
+        xycoords=("data", "axes fraction"),
+        rotation=90,
+        ha="right",
+        va="top",
+        fontsize="small",
+        color="0.3",
+    )
 
 
 def _variance(part: xr.Dataset, title: str) -> Figure:

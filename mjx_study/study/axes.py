@@ -6,7 +6,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from mjx_study.study.plan import SweepCell, SweepPlan
+from mjx_study.study.plan import StudyCell, StudyPlan
 from mjx_study.table import digits_to_tell_apart
 
 SORTED: Final = ("timestep", "sigma", "samples")
@@ -28,7 +28,7 @@ class Axes:
     places: tuple[dict[str, int], ...]
 
 
-def axes_of(plan: SweepPlan) -> Axes:
+def axes_of(plan: StudyPlan) -> Axes:
     """The grid of a plan. Values are told apart as they are, whatever their names look like."""
     exact = [_exact(plan, cell) for cell in plan.cells]
     values = {name: list(dict.fromkeys(each[name] for each in exact)) for name in exact[0]}
@@ -41,7 +41,7 @@ def axes_of(plan: SweepPlan) -> Axes:
     return Axes(named, models, places)
 
 
-def solver_parameters(cell: SweepCell) -> dict[str, list[float] | None]:
+def solver_parameters(cell: StudyCell) -> dict[str, list[float] | None]:
     """solref and solimp of a cell's contact; None where they are the MJCF's."""
     contact = cell.model.contact
     if contact is None:
@@ -49,7 +49,15 @@ def solver_parameters(cell: SweepCell) -> dict[str, list[float] | None]:
     return {"solref": np.asarray(contact.solref).tolist(), "solimp": np.asarray(contact.solimp).tolist()}
 
 
-def _exact(plan: SweepPlan, cell: SweepCell) -> dict[str, Any]:
+def solver_arrays(cell: dict[str, Any]) -> dict[str, np.ndarray]:
+    """solref and solimp of a cell of a study.json; NaN where they are the MJCF's."""
+    sizes = {"solref": 2, "solimp": 5}
+    return {
+        name: np.full(size, np.nan) if cell.get(name) is None else np.array(cell[name]) for name, size in sizes.items()
+    }
+
+
+def _exact(plan: StudyPlan, cell: StudyCell) -> dict[str, Any]:
     group = plan.groups[cell.group]
     return {
         "task": group.name,
@@ -61,7 +69,7 @@ def _exact(plan: SweepPlan, cell: SweepCell) -> dict[str, Any]:
     }
 
 
-def _task_names(plan: SweepPlan, configured: list[str]) -> list[str]:
+def _task_names(plan: StudyPlan, configured: list[str]) -> list[str]:
     """What tasks call themselves, or what the configuration calls those that share a name."""
     own = {group.name: group.task.name for group in plan.groups}
     shared = Counter(own[name] for name in configured)

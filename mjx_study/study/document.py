@@ -26,6 +26,7 @@ class _Config(_Part):
     seeds: int = Field(ge=1, le=int(OPTIONS["seeds"].interval.high))  # type: ignore[union-attr]
     iterations: Count | None
     points: Count | None = None
+    confidence: Annotated[float, Field(gt=0, lt=1)] = 0.95
 
 
 class _Axes(_Part):
@@ -45,6 +46,14 @@ class _Model(_Part):
 class _Cell(_Part):
     label: str
     at: dict[str, Annotated[int, Field(ge=0)]]
+    solref: Annotated[list[Finite], Field(min_length=2, max_length=2)] | None = None
+    solimp: Annotated[list[Finite], Field(min_length=5, max_length=5)] | None = None
+
+
+class _Resolved(_Part):
+    horizon: list[Count]
+    noise: Name
+    estimators: dict[str, dict[str, Any]]
 
 
 class _Environment(_Part):
@@ -63,6 +72,7 @@ class StudyDocument(_Part):
     command: str | None = None
     models: list[_Model]
     axes: _Axes
+    resolved: list[_Resolved]
     cells: list[_Cell] = Field(min_length=1)
 
     @model_validator(mode="after")
@@ -71,6 +81,8 @@ class StudyDocument(_Part):
         for name, values in vars(self.axes).items():
             if len(set(values)) < len(values):
                 raise ValueError(f"axes.{name} has a value twice")
+        if len(self.resolved) != axes["task"]:
+            raise ValueError(f"there are {len(self.resolved)} entries of resolved, and {axes['task']} tasks")
         if len(self.models) != axes["model"]:
             raise ValueError(f"there are {len(self.models)} models, and {axes['model']} values of axes.model")
         for index, cell in enumerate(self.cells):

@@ -1,28 +1,93 @@
-"""What a comparison says, in sentences, each backed by intervals."""
+"""What a study of gradients says: a row for each estimate, and sentences that intervals back."""
 
+import itertools
+import json
 import math
 from collections.abc import Sequence
-from typing import Final
+from types import SimpleNamespace
+from typing import Any, Final
 
-from mjx_study.study.comparison import SURE, CompareResult, Row
+import numpy as np
+import xarray as xr
 
+from estimators import ENOUGH_EFFECTIVE
+from mjx_study.study.variables import GRADIENTS
+
+SURE: Final = 0.001
+"""p-value at which a mean is called biased: the least that the test's 999 draws can give."""
 BIASED: Final = {"fobg": "FoBG", "aobg": "AoBG", "ivw": "IVW"}
 """Whose bias is told: first order, and the interpolations that follow it."""
 APART: Final = 4.0
 """Standard errors beyond which a mean that gets no verdict is said to be off."""
+VECTORS: Final = ("gradient", "reference")
+COUNTS: Final = ("unconverged", "nonfinite", "onsets", "onsets_bounded", "onsets_missed")
 
 
-def findings(result: CompareResult) -> list[str]:
+class Row(SimpleNamespace):
+    """One estimate of a study: its place, and every scalar variable of `GRADIENTS`; None for what it does not have."""
+
+    def __getattr__(self, name: str) -> Any:
+        raise AttributeError(f"a row has no {name}")
+
+    @property
+    def believable(self) -> bool:
+        """Whether the batch has effective samples enough for its errors to mean something."""
+        return self.effective_samples >= ENOUGH_EFFECTIVE
+
+    @property
+    def bias_verdict(self) -> str:
+        """What the test for bias says: "biased", "none seen", or "too few effective samples" for either."""
+        if not min(self.effective_samples, self.reference_effective_samples) >= ENOUGH_EFFECTIVE:
+            return "too few effective samples"
+        return "biased" if self.bias_p_value <= SURE else "none seen"
+
+    @property
+    def variance_seconds(self) -> float:
+        """Variance times seconds per sample: the variance that a second of computing leaves."""
+        return self.variance * self.seconds_per_sample
+
+
+def rows_of(dataset: xr.Dataset) -> list[Row]:
+    """A row for each estimate that is computed, contact models outermost among what the table compares."""
+    outer = ("task", "timestep", "cone", "sigma", "samples", "model", "seed", "estimator")
+    rows = []
+    scalars = [name for name in GRADIENTS if name in dataset and name not in VECTORS]
+    for place in itertools.product(*(range(dataset.sizes[name]) for name in outer)):
+        one = dataset.isel(dict(zip(outer, place, strict=True)))
+        if not np.isfinite(one["residual"].item()) and np.isnan(one["residual"].item()):
+            continue  # not computed
+        numbers: dict[str, Any] = {name: one[name].item() for name in scalars}
+        for name in ("alpha", "epsilon", "discrepancy", "onsets", "onsets_bounded", "onsets_missed"):
+            if name not in numbers or math.isnan(numbers[name]):
+                numbers[name] = None
+        numbers |= {name: int(numbers[name]) for name in COUNTS if numbers[name] is not None}
+        at = {name: one[name].item() for name in (*outer, "contact", "stiffness")}
+        solver = {name: tuple(one[name].values.tolist()) for name in ("solref", "solimp") if name in one}
+        rows.append(Row(**at, **solver, **numbers))
+    return rows
+
+
+def findings(dataset: xr.Dataset) -> list[str]:
     """What the intervals say, in sentences: where FoBG's variance is above ZoBG's, and whose mean is biased."""
+    rows = rows_of(dataset)
+    confidence = json.loads(dataset.attrs["config"])["confidence"]
     return [
         sentence
-        for family in result.families
-        for sentence in (*_variance_finding(result, family), *_bias_finding(result, family))
+        for family in dict.fromkeys(row.contact for row in rows)
+        for part in [[row for row in rows if row.contact == family]]
+        for sentence in (*_variance_finding(family, part, confidence), *_bias_finding(part, unbounded(dataset)))
     ]
 
 
-def _variance_finding(result: CompareResult, family: str) -> list[str]:
-    table = {(row.stiffness, row.estimator): row for row in result.rows if row.contact == family}
+def unbounded(dataset: xr.Dataset) -> list[str]:
+    """Tasks on which AoBG has no accuracy bound."""
+    options = [entry["estimators"].get("aobg", {}) for entry in json.loads(dataset.attrs["resolved"])]
+    names = dataset["task"].values.tolist()
+    return [name for name, given in zip(names, options, strict=True) if given.get("gamma") == "inf"]
+
+
+def _variance_finding(family: str, rows: Sequence[Row], confidence: float) -> list[str]:
+    table = {(row.stiffness, row.estimator): row for row in rows}
     below, above, alike = "below ZoBG's", "above ZoBG's", "not told apart from ZoBG's"
     unknown = "not to be told from so few effective samples"
     groups: dict[str, list[float]] = {verdict: [] for verdict in (below, above, alike, unknown)}
@@ -38,20 +103,21 @@ def _variance_finding(result: CompareResult, family: str) -> list[str]:
             verdict = above if first.variance_lower > zeroth.variance_upper else alike
         groups[verdict].append(stiffness)
     parts = [f"{verdict}{_at(group)}" for verdict, group in groups.items() if group]
-    return [f"{family}: FoBG's variance is {'; '.join(parts)} ({result.config.confidence:.0%} intervals)"]
+    return [f"{family}: FoBG's variance is {'; '.join(parts)} ({confidence:.0%} intervals)"]
 
 
-def _bias_finding(result: CompareResult, family: str) -> list[str]:
+def _bias_finding(rows: Sequence[Row], unbounded: Sequence[str]) -> list[str]:
     """Where a mean is farther from the reference than any draw of the test; what relies on FoBG follows it."""
-    rows = [row for row in result.rows if row.contact == family and row.estimator in BIASED]
-    return [sentence for row in rows if (sentence := _verdict(row, result))]
+    return [sentence for row in rows if row.estimator in BIASED and (sentence := _verdict(row, unbounded))]
 
 
-def _verdict(row: Row, result: CompareResult) -> str:
+def _verdict(row: Row, unbounded: Sequence[str]) -> str:
     """A sentence where a mean is biased, or is off and cannot be judged; empty otherwise."""
     mean, where = f"{row.contact}: {BIASED[row.estimator]}'s mean is", _at([row.stiffness])
     if row.bias_verdict == "biased":
-        return f"{mean} biased by {_share(row)}{where} (p <= {row.bias_p_value:.3f}){_advice(row, result)}"
+        free = row.estimator == "aobg" and row.task in unbounded
+        advice = ": it has no accuracy bound; --gamma sets one" if free else ""
+        return f"{mean} biased by {_share(row)}{where} (p <= {row.bias_p_value:.3f}){advice}"
     off = row.bias_p_value <= SURE or row.debiased_error > APART * row.debiased_error_se
     if row.bias_verdict == "none seen" or not off:
         return ""
@@ -65,12 +131,6 @@ def _share(row: Row) -> str:
     """Of the reference gradient, without what noise adds to it, to the digits that its error leaves."""
     error = max(row.debiased_error_se, row.reference_uncertainty)
     return f"{row.debiased_error:.1%}" if error < 0.005 else f"{float(f'{100 * row.debiased_error:.2g}'):g}%"
-
-
-def _advice(row: Row, result: CompareResult) -> str:
-    """What keeps an interpolation from following a biased batch."""
-    unbounded = row.estimator == "aobg" and math.isinf(result.config.gamma or math.inf)
-    return ": it has no accuracy bound; --gamma sets one" if unbounded else ""
 
 
 def _at(stiffnesses: Sequence[float]) -> str:

@@ -1,16 +1,13 @@
-"""The comparison of estimators over contact models: planning it, running it, and one row per estimate.
+"""Gradient estimates of a cell: every estimator on every seed's batches, against a reference gradient.
 
-A plan is checked completely before anything is computed. In each cell (one contact model) the estimators share their
-batches: those of values and those of derivatives, drawn from independent keys; interpolated estimates combine the
-two. The same keys are used in every cell, so differences between contact models are not sampling noise.
+The estimators of a seed share its batches: those of values and those of derivatives, drawn from independent keys;
+interpolated estimates combine the two. The same keys are used in every cell, so differences between contact models are
+not sampling noise.
 """
 
 import dataclasses
-import math
-import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
-from pathlib import Path
 from typing import Any, Final
 
 import jax
@@ -19,117 +16,127 @@ import numpy as np
 from jaxtyping import Array, Float, Key
 
 import estimators
-from estimators import ORACLES, Estimator, Evaluation, GradientEstimate, Linearisation
+from estimators import ORACLES, Estimator, Evaluation, GradientEstimate
 from mjx_study.objective import MjxObjective, Simulator
-from mjx_study.runtime import environment
-from mjx_study.simulation.contact import FAMILIES
-from mjx_study.study.comparison import BIAS_DRAWS, CompareConfig, CompareResult, Row
-from mjx_study.study.configuration import Progress, at_theta, configured_estimators, configured_task, resolved_fields
-from mjx_study.study.memory import check_memory
+from mjx_study.runtime import precision
+from mjx_study.study.memory import BIAS_DRAWS
+from mjx_study.study.plan import StudyCell, StudyPlan, estimators_of, oracles_of, seeds_together
 from mjx_study.study.reference_gradient import reference_gradient
-from mjx_study.tasks.contact_grid import ContactPoint, contact_grid
+from mjx_study.study.sampling import cell_keys, draw_batches, unconverged
+from mjx_study.study.variables import BATCH, GRADIENTS
+from mjx_study.tasks.contact_grid import contact_grid
 from mjx_study.tasks.task import Task
 
-UNCONVERGED: Final = {"float64": 1e-6, "float32": 1e-3}
-"""Relative solver residual above which a sample is reported as unconverged."""
+CANDIDATES: Final = 100
+"""First-order samples whose median is a candidate for the reference's control variate."""
+MOST_KEPT: Final = 1_000_000
+"""Numbers of the mean gradients of a cell; where there are more, they are left out."""
 
 
-@dataclasses.dataclass(frozen=True)
-class ComparePlan:
-    """A comparison that has been checked: its task is built and its contact models are valid."""
+def compute_gradients(plan: StudyPlan) -> Callable[[StudyCell], dict[str, np.ndarray]]:
+    """A function that computes a cell; it keeps what is compiled."""
+    config, oracles = plan.config, oracles_of(plan.config)
+    compiled: dict[int, Simulator] = {}
+    warm: set[tuple[int, bool]] = set()
+    soft: dict[tuple[int, float], Array | None] = {}
 
-    config: CompareConfig
-    task: Task
-    cells: tuple[ContactPoint, ...]
-    estimators: tuple[Estimator, ...]
-    warnings: tuple[str, ...]
-
-
-def plan_compare(config: CompareConfig, task: Task | None = None) -> ComparePlan:
-    """Check a configuration and resolve its defaults, computing nothing.
-
-    Args:
-        config: what to compare.
-        task: in place of the one that the configuration names.
-
-    Raises:
-        ValueError: anything about the configuration that cannot be run; the message says what is accepted.
-    """
-    task = at_theta(configured_task(config, task), config.theta)
-    chosen = configured_estimators(config, task)
-    kept = config.reference_samples * 3 * task.policy.num_params
-    check_memory(task, chosen, config.samples, other=kept)
-    cells, messages = contact_grid(task, config.contact, config.stiffness, config.damping)
-    families = tuple(dict.fromkeys(cell.family for cell in cells))
-    resolved = dataclasses.replace(
-        config,
-        contact=families,
-        stiffness=config.stiffness or (task.stiffnesses if any(FAMILIES[name].swept for name in families) else None),
-        model=None if config.model is None else str(Path(config.model)),
-        **resolved_fields(config, task, config.samples),
-    )
-    return ComparePlan(resolved, task, cells, chosen, messages)
-
-
-def compare(plan: ComparePlan, progress: Progress = lambda done, total, what: None) -> CompareResult:
-    """Run a comparison."""
-    config, task = plan.config, plan.task
-    assert config.chunk_size is not None, "a plan's configuration is resolved"
-    simulator = Simulator(task, chunk_size=config.chunk_size)
-    oracles = estimators.oracles_of(plan.estimators, "evaluation")
-    keys = _Keys(config)
-
-    total = len(plan.cells) + 1
-    progress(0, total, "compiling")
-    for cell in {cell.contact is None: cell for cell in plan.cells}.values():
-        _compile(simulator, cell, oracles)
-
-    rows: list[Row] = []
-    gradients, references = [], []
-    soft = soft_gradient(simulator, task.sigma, keys.candidate)
-    for done, cell in enumerate(plan.cells, start=1):
-        progress(done, total, cell.label)
-        objective = simulator.objective(cell.contact)
-        batches, seconds = {}, {}
-        for name in oracles:
-            method = getattr(objective, ORACLES[name].method)
-            drawn = jax.random.clone((keys.zeroth, keys.first)[ORACLES[name].order])  # shared on purpose
-            batches[name], seconds[name] = _timed(method, task.theta, drawn)
-        reference = reference_of(objective, keys.odd, keys.candidate, batches["evaluation"], soft)
-        test = jax.random.clone(keys.test)
-        summary = jax.device_get(estimate_numbers(batches, reference, test, plan.estimators, config.confidence))
-        for name, estimator, numbers in zip(config.estimators, plan.estimators, summary, strict=True):
-            gradients.append(numbers.pop("gradient"))
-            rows.append(_row(cell, name, estimator.needs, config.samples, numbers, seconds, batches))
-            references.append(np.asarray(reference.mean))
-    progress(total, total, "done")
-    return CompareResult(config, environment(), tuple(rows), plan.warnings, np.stack(gradients), np.stack(references))
-
-
-class _Keys:
-    """Independent keys of the batches; the same in every cell."""
-
-    def __init__(self, config: CompareConfig):
-        names = ("zeroth", "first", "odd", "candidate", "test")
-        sizes = (config.samples, config.samples, config.reference_samples, max(64, config.samples // 4))
-        *streams, self.test = jax.random.split(jax.random.key(config.seed), len(names))
-        self.zeroth, self.first, self.odd, self.candidate = (
-            jax.random.split(stream, size) for stream, size in zip(streams, sizes, strict=True)
+    def compute(cell: StudyCell) -> dict[str, np.ndarray]:
+        if cell.group not in compiled:
+            compiled[cell.group] = Simulator(plan.groups[cell.group].task, chunk_size=plan.chunk_size)
+        objective = dataclasses.replace(compiled[cell.group].objective(cell.model.contact), sigma=cell.sigma)
+        theta = plan.groups[cell.group].task.theta
+        if (cell.group, cell.model.contact is None) not in warm:  # so that no cell's time holds a compilation
+            for name in dict.fromkeys([*oracles, "differentiation"]):  # the reference's control variate needs it
+                getattr(objective, ORACLES[name].method)(theta, jax.random.split(jax.random.key(0), 1))
+            warm.add((cell.group, cell.model.contact is None))
+        keys = cell_keys(config.seed, config.batches)
+        odd, candidate = (
+            jax.random.split(stream, size)
+            for stream, size in zip(keys["reference"], (config.reference_samples or 0, CANDIDATES), strict=True)
         )
+        softened = cell.group, cell.sigma
+        if softened not in soft:
+            soft[softened] = soft_gradient(compiled[cell.group], cell.sigma, candidate)
+        tests, chosen = jax.random.split(keys["test"], config.batches), estimators_of(plan, cell)
+        together = seeds_together(plan, cell)
+        reference, parts, spent, residuals, events = None, [], [], [], []
+        for start in range(0, config.batches, together):
+            some = slice(start, start + together)
+            drawn, seconds, residual = draw_batches(objective, theta, keys, oracles, cell.samples, some)
+            if reference is None:
+                pilot = jax.tree.map(lambda leaf: leaf[0], drawn["evaluation"])
+                reference = reference_of(objective, odd, candidate, pilot, soft[softened])
+            numbers = _seed_numbers(drawn, reference, tests[some], chosen, config.confidence)
+            parts.append(jax.device_get(numbers))
+            spent.append(seconds)
+            residuals.append(residual)
+            events.append({name: _events(batch) for name, batch in drawn.items()})
+        assert reference is not None
+        numbers = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+        arrays = _of_seeds(numbers, config.batches) | _bias(numbers, reference)
+        arrays |= _of_batches(chosen, spent, residuals, events, cell.samples * config.batches)
+        if arrays["gradient"].size > MOST_KEPT:
+            del arrays["gradient"]
+        else:
+            arrays["reference"] = np.asarray(reference.mean)
+        return {name: np.asarray(array, float) for name, array in arrays.items()}
+
+    return compute
 
 
-def _compile(simulator: Simulator, cell: ContactPoint, oracles: Sequence[str]) -> None:
-    """Compile what is needed, so that no cell's time holds it; in turn, since tracing in two threads can crash JAX."""
-    objective, theta = simulator.objective(cell.contact), simulator.task.theta
-    keys = jax.random.split(jax.random.key(0), 1)
-    for name in dict.fromkeys([*oracles, "differentiation"]):  # the reference's control variate needs it
-        getattr(objective, ORACLES[name].method)(theta, jax.random.clone(keys))
+def _events(batch: Any) -> np.ndarray | None:
+    """Onsets of contact in a batch: found, bounded and missed; None where none are looked for."""
+    events = getattr(batch, "events", None)
+    return None if events is None else np.asarray(events).reshape(-1, 3).sum(0)
 
 
-def _timed(method: Callable[..., Any], *arguments: Any) -> tuple[Any, float]:
-    start = time.perf_counter()
-    result = jax.block_until_ready(method(*arguments))
-    return result, time.perf_counter() - start
+def _of_batches(
+    chosen: Sequence[Estimator],
+    seconds: Sequence[dict[str, float]],
+    residuals: Sequence[dict[str, np.ndarray]],
+    events: Sequence[dict[str, np.ndarray | None]],
+    samples: int,
+) -> dict[str, np.ndarray]:
+    """What the batches of each estimator's oracles tell: times, residuals, onsets."""
+    arrays: dict[str, list[Any]] = {"seconds_per_sample": [], "residual": [], "unconverged": [], "events": []}
+    for estimator in chosen:
+        needs = estimator.needs
+        arrays["seconds_per_sample"].append(sum(each[oracle] for each in seconds for oracle in needs) / samples)
+        all_of = np.concatenate([each[oracle] for each in residuals for oracle in needs])
+        arrays["residual"].append(np.max(np.where(np.isfinite(all_of), all_of, np.inf)))
+        arrays["unconverged"].append(unconverged(all_of, precision()))
+        found = [met for each in events for oracle in needs if (met := each[oracle]) is not None]
+        arrays["events"].append(np.sum(found, axis=0) if found else np.full(3, np.nan))
+    counts = np.stack(arrays.pop("events"), axis=-1)
+    if np.any(np.isfinite(counts)):
+        arrays |= dict(zip(("onsets", "onsets_bounded", "onsets_missed"), counts, strict=True))
+    return {name: np.array(values) for name, values in arrays.items()}
+
+
+def _of_seeds(numbers: Sequence[dict[str, Any]], seeds: int) -> dict[str, np.ndarray]:
+    """Numbers by seed and estimator, NaN for what an estimator does not have; and those of the reference."""
+    arrays = {
+        name: np.stack([np.full(seeds, np.nan) if row[name] is None else row[name] for row in numbers], axis=1)
+        for name, variable in GRADIENTS.items()
+        if variable.dims == BATCH
+    }
+    first = numbers[0]  # every estimator's row has the reference's numbers, every seed the same
+    shared = ("reference_norm", "reference_uncertainty", "reference_effective_samples")
+    arrays["gradient"] = np.stack([row["gradient"] for row in numbers], axis=1)
+    return arrays | {name: np.asarray(first[name][0]) for name in shared}
+
+
+def _bias(numbers: Sequence[dict[str, Any]], reference: GradientEstimate) -> dict[str, np.ndarray]:
+    """Each estimator's bias over the norm of the reference, from the means of its seeds."""
+    means = [jnp.asarray(row["gradient"]) for row in numbers]
+    square = float(jnp.sum(reference.mean**2))
+    squared, errors = zip(*(estimators.squared_bias_of_means(each, reference) for each in means), strict=True)
+    gaps = [jnp.linalg.norm(jnp.mean(each, axis=0) - reference.mean) for each in means]
+    return {
+        "squared_bias": np.array(squared, float) / square,
+        "squared_bias_se": np.array(errors, float) / square,
+        "pooled_error": np.array(gaps, float) / square**0.5,
+    }
 
 
 def soft_gradient(simulator: Simulator, sigma: float, keys: Key[Array, " samples"]) -> Float[Array, " params"] | None:
@@ -188,8 +195,13 @@ def _reference_gradient(
 
 
 @partial(jax.jit, static_argnames=("chosen", "confidence"))
+def _seed_numbers(drawn, reference: GradientEstimate, keys: Key[Array, " seeds"], chosen, confidence: float):
+    """The numbers of every estimator, with an axis of seeds."""
+    return jax.vmap(lambda batches, key: estimate_numbers(batches, reference, key, chosen, confidence))(drawn, keys)
+
+
 def estimate_numbers(batches, reference, key, chosen, confidence):
-    """The numbers of each estimator's row that are functions of the batches and the reference gradient alone."""
+    """The numbers of each estimator that are functions of the batches and the reference gradient alone."""
     result = []
     reference_effective = estimators.effective_samples(reference).count
     for estimator in chosen:
@@ -231,48 +243,3 @@ def estimate_numbers(batches, reference, key, chosen, confidence):
             }
         )
     return result
-
-
-def _row(
-    cell: ContactPoint,
-    name: str,
-    needs: Sequence[str],
-    samples: int,
-    numbers: dict[str, Any],
-    batch_seconds: dict[str, float],
-    batches: dict[str, Any],
-) -> Row:
-    seconds = sum(batch_seconds[oracle] for oracle in needs)
-    residuals = np.concatenate([residuals_of(batches[oracle]) for oracle in needs])
-    threshold = UNCONVERGED[str(residuals.dtype)]
-    nonfinite = int(numbers.pop("nonfinite"))
-    figures: dict[str, Any] = {key: None if value is None else float(value) for key, value in numbers.items()}
-    return Row(
-        contact=cell.family,
-        stiffness=cell.stiffness,
-        solref=() if cell.contact is None else tuple(np.asarray(cell.contact.solref).tolist()),
-        solimp=() if cell.contact is None else tuple(np.asarray(cell.contact.solimp).tolist()),
-        estimator=name,
-        samples=samples,
-        seconds_per_sample=seconds / samples,
-        variance_seconds=float(numbers["variance"]) * seconds / samples,
-        residual=float(np.max(np.where(np.isfinite(residuals), residuals, math.inf))),
-        unconverged=int(np.sum(~(residuals <= threshold))),
-        nonfinite=nonfinite,
-        **_onsets(batches[oracle] for oracle in needs),
-        **figures,
-    )
-
-
-def _onsets(batches: Iterable[Any]) -> dict[str, int]:
-    """What the onset term met in all samples, by field of a row; empty without the term."""
-    events = [batch.events for batch in batches if getattr(batch, "events", None) is not None]
-    names = ("onsets", "onsets_bounded", "onsets_missed")
-    return dict(zip(names, map(int, np.sum(np.concatenate(events), axis=0)), strict=True)) if events else {}
-
-
-def residuals_of(batch: Any) -> Float[np.ndarray, " rollouts"]:
-    """The solver's residual of every rollout of a batch, whatever its kind."""
-    parts = batch if isinstance(batch, tuple) else (batch,)
-    steps = [part.steps if isinstance(part, Linearisation) else part for part in parts]
-    return np.concatenate([np.asarray(part.residual) for part in steps])

@@ -1,4 +1,4 @@
-"""What a sweep is asked for, and the cells that it comes to."""
+"""The configuration of a study, and its plan: checked, resolved into cells, nothing computed."""
 
 import dataclasses
 import itertools
@@ -14,14 +14,22 @@ from mjx_study.limits import MOST_CELLS, MOST_PROGRAMS, check_count
 from mjx_study.objective import chunk_for
 from mjx_study.option import OPTIONS, Checked, check
 from mjx_study.simulation.contact import FAMILIES
-from mjx_study.study.configuration import EstimatorConfig, check_names, configured_estimators, refuse_repeats
+from mjx_study.study.configuration import (
+    EstimatorConfig,
+    at_theta,
+    check_names,
+    configured_estimators,
+    refuse_repeats,
+)
 from mjx_study.study.descents import OptimiseConfig, OptimisePlan, plan_optimise
 from mjx_study.study.landscapes import check_span, line_of
 from mjx_study.study.memory import bytes_per_sample, check_batches, seeds_at_once
+from mjx_study.study.sampling import LARGEST_BATCH
 from mjx_study.table import digits_to_tell_apart
 from mjx_study.tasks import make_task
 from mjx_study.tasks.contact_grid import ContactPoint, contact_grid, solver_grid
 from mjx_study.tasks.task import Task, check_sigma
+from mjx_study.tasks.validation import check_shapes
 
 OF_KIND: Final[dict[str, dict[str, Any]]] = {
     "gradients": {"reference_samples": 600},
@@ -30,17 +38,16 @@ OF_KIND: Final[dict[str, dict[str, Any]]] = {
 }
 """Options that one kind of sweep alone has, and what they are unless given."""
 ASKED_BY: Final = {"descents": "give iterations as well", "landscapes": "give points as well"}
-LARGEST_BATCH: Final = 20_000
-"""Samples that are drawn at once; more seeds than fit are drawn in turn."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class SweepConfig(Checked):
-    """Everything that decides a sweep.
+class StudyConfig(Checked):
+    """Everything that decides a study: gradient estimates, or descents, or landscapes.
 
     Attributes:
-        tasks: names of tasks.
+        tasks: names of tasks, or tasks.
         estimators: names of estimators.
+        theta: parameters at which gradients are taken, of a single task; None for the task's.
         contact: contact families; None for each task's. Empty for none but those of `solref`.
         stiffness: of the families that take one [N/m]; None for each task's.
         damping: of the contact [N s/m]; None for each family's.
@@ -51,6 +58,7 @@ class SweepConfig(Checked):
         cone: pyramidal, elliptic; None for the MJCF's.
         sigma: standard deviations of the noise; None for each task's.
         samples: sizes of a batch.
+        confidence: of the intervals within a batch.
         seeds: batches of each size, or descents; of landscapes, batches that are taken together at each point. None for
             10, of landscapes 1.
         iterations: of gradient descent; None to estimate gradients where each task starts.
@@ -65,8 +73,9 @@ class SweepConfig(Checked):
 
     ranges: ClassVar = {"samples": "[3, 1e7]"}
 
-    tasks: tuple[str, ...]
+    tasks: tuple[str | Task, ...]
     estimators: tuple[str, ...] = ("zobg", "fobg", "aobg")
+    theta: tuple[float, ...] | None = None
     contact: tuple[str, ...] | None = None
     stiffness: tuple[float, ...] | None = None
     damping: float | None = None
@@ -76,6 +85,7 @@ class SweepConfig(Checked):
     cone: tuple[str, ...] | None = None
     sigma: tuple[float, ...] | None = None
     samples: tuple[int, ...] = (100,)
+    confidence: float = 0.95
     seeds: int | None = None
     iterations: int | None = None
     points: int | None = None
@@ -107,6 +117,8 @@ class SweepConfig(Checked):
         super().__post_init__()
         if not self.tasks:
             raise ValueError("no task given")
+        if self.theta is not None and len(self.tasks) > 1:
+            raise ValueError("theta is of a single task; give one task, or leave theta out")
         check_names("estimator", self.estimators, ESTIMATORS)
         if self.contact:
             check_names("contact family", self.contact, FAMILIES)
@@ -139,6 +151,11 @@ class SweepConfig(Checked):
                     object.__setattr__(self, name, default)
 
     @property
+    def task_names(self) -> list[str]:
+        """Names of the tasks."""
+        return [which if isinstance(which, str) else which.name for which in self.tasks]
+
+    @property
     def kind(self) -> str:
         """What is computed: gradients, descents or landscapes."""
         return "descents" if self.iterations is not None else "gradients" if self.points is None else "landscapes"
@@ -154,7 +171,7 @@ class Group:
     """What one compilation serves.
 
     Attributes:
-        name: of the task, as the configuration has it; two tasks may call themselves the same.
+        name: name of the task, as the configuration has it; two tasks may call themselves the same.
         task: as it is built.
         timestep: [s].
         cone: pyramidal or elliptic.
@@ -169,7 +186,7 @@ class Group:
 
 
 @dataclasses.dataclass(frozen=True)
-class SweepCell:
+class StudyCell:
     """One file of a study.
 
     Attributes:
@@ -186,7 +203,7 @@ class SweepCell:
 
 
 @dataclasses.dataclass(frozen=True)
-class SweepPlan:
+class StudyPlan:
     """A sweep that has been checked.
 
     Attributes:
@@ -197,9 +214,9 @@ class SweepPlan:
         warnings: about contact models.
     """
 
-    config: SweepConfig
+    config: StudyConfig
     groups: tuple[Group, ...]
-    cells: tuple[SweepCell, ...]
+    cells: tuple[StudyCell, ...]
     chunk_size: int
     warnings: tuple[str, ...]
 
@@ -217,14 +234,14 @@ class SweepPlan:
         cells = {(cell.group, cell.samples): cell for cell in self.cells}.values()
         return max(memory_of_seed(self, cell) * seeds_together(self, cell) for cell in cells)
 
-    def label(self, cell: SweepCell) -> str:
+    def label(self, cell: StudyCell) -> str:
         """As messages name a cell."""
         group = self.groups[cell.group]
         digits = digits_to_tell_apart(each.timestep for each in self.groups)
         return f"{group.name}, {cell.model.label}, h = {group.timestep:.{digits}g} s, N = {cell.samples}"
 
 
-def plan_sweep(config: SweepConfig) -> SweepPlan:
+def plan_study(config: StudyConfig) -> StudyPlan:
     """Check a configuration and resolve its defaults, computing nothing.
 
     Raises:
@@ -233,10 +250,11 @@ def plan_sweep(config: SweepConfig) -> SweepPlan:
     programs = len(config.tasks) * len(config.timestep or (None,)) * len(config.cone or (None,))
     check_count(programs, "programs", MOST_PROGRAMS, "give fewer tasks, timesteps or cones")
     groups: list[Group] = []
-    cells: list[SweepCell] = []
+    cells: list[StudyCell] = []
     messages: list[str] = []
-    for name, timestep, cone in itertools.product(config.tasks, config.timestep or (None,), config.cone or (None,)):
-        task = _build(config, name, timestep, cone)
+    for which, timestep, cone in itertools.product(config.tasks, config.timestep or (None,), config.cone or (None,)):
+        task = at_theta(_build(config, which, timestep, cone), config.theta)
+        name = which if isinstance(which, str) else which.name
         models, told = contact_grid(task, config.contact, config.stiffness, config.damping)
         if config.solref or config.solimp:
             more, also = solver_grid(task, config.solref, config.solimp)
@@ -252,11 +270,11 @@ def plan_sweep(config: SweepConfig) -> SweepPlan:
         messages += [f"{at}{message}" for message in told]
         for model, sigma, samples in itertools.product(models, config.sigma or (task.sigma,), config.samples):
             check_sigma(sigma)
-            cells.append(SweepCell(len(groups), model, sigma, samples))
+            cells.append(StudyCell(len(groups), model, sigma, samples))
         groups.append(group)
     most = min(LARGEST_BATCH, max(config.samples) * (1 if config.iterations else config.batches))
     chunk = chunk_for(most, jax.local_devices()) if config.chunk_size is None else config.chunk_size
-    plan = SweepPlan(config, tuple(groups), tuple(cells), chunk, tuple(dict.fromkeys(messages)))
+    plan = StudyPlan(config, tuple(groups), tuple(cells), chunk, tuple(dict.fromkeys(messages)))
     check_batches(plan.memory)
     for cell in {cell.group: cell for cell in cells}.values():
         estimators_of(plan, cell)
@@ -267,54 +285,61 @@ def plan_sweep(config: SweepConfig) -> SweepPlan:
     return plan
 
 
-def oracles_of(config: SweepConfig) -> tuple[str, ...]:
+def oracles_of(config: StudyConfig) -> tuple[str, ...]:
     """Kinds of batches that the estimators need, and costs."""
     return estimators.oracles_of(map(find_estimator, config.estimators), "evaluation")
 
 
-def memory_of_seed(plan: SweepPlan, cell: SweepCell) -> int:
+def memory_of_seed(plan: StudyPlan, cell: StudyCell) -> int:
     """Memory of the batches of one seed of a cell, and of their statistics [bytes]."""
     each = bytes_per_sample(plan.groups[cell.group].task, oracles_of(plan.config), len(plan.config.estimators))
     return cell.samples * each
 
 
-def seeds_together(plan: SweepPlan, cell: SweepCell) -> int:
+def seeds_together(plan: StudyPlan, cell: StudyCell) -> int:
     """How many seeds a cell draws at once: of gradients as many as fit, of others all."""
     batches = plan.config.batches
     return seeds_at_once(memory_of_seed(plan, cell), batches) if plan.config.kind == "gradients" else batches
 
 
-def _build(config: SweepConfig, name: str, timestep: float | None, cone: str | None) -> Task:
+def _build(config: StudyConfig, which: str | Task, timestep: float | None, cone: str | None) -> Task:
     chosen = {"timestep": timestep, "cone": cone, "horizon": config.horizon, "model": config.model}
     chosen = {key: value for key, value in chosen.items() if value is not None}
+    changes = {"onset": config.onset} | ({} if config.noise is None else {"noise": config.noise})
+    if isinstance(which, Task):
+        if chosen:
+            raise ValueError(f"{', '.join(chosen)}: only for a task that is built by its name; build this one so")
+        check_shapes(which)
+        return which.replace(**changes)
     if timestep is not None and config.horizon is None:
-        own = make_task(name, **{key: value for key, value in chosen.items() if key != "timestep"})
+        own = make_task(which, **{key: value for key, value in chosen.items() if key != "timestep"})
         steps = own.horizon * float(own.scene.host.opt.timestep) / timestep
         chosen["horizon"] = max(1, round(min(steps, 1e15)))
         check(OPTIONS["horizon"], chosen["horizon"])
-    task = make_task(name, **chosen)
-    return task.replace(onset=config.onset, noise=task.noise if config.noise is None else config.noise)
+    return make_task(which, **chosen).replace(**changes)
 
 
-def estimators_of(plan: SweepPlan, cell: SweepCell) -> tuple[Estimator, ...]:
+def estimators_of(plan: StudyPlan, cell: StudyCell) -> tuple[Estimator, ...]:
     """A cell's estimators with their options, checked against its task."""
     task = plan.groups[cell.group].task.replace(sigma=cell.sigma)
     return configured_estimators(_shared(plan.config, task), task)
 
 
-def _shared(config: SweepConfig, task: Task) -> EstimatorConfig:
+def _shared(config: StudyConfig, task: Task) -> EstimatorConfig:
     names = {field.name for field in dataclasses.fields(EstimatorConfig)} & {
-        field.name for field in dataclasses.fields(SweepConfig)
+        field.name for field in dataclasses.fields(StudyConfig)
     }
-    kept = {name: getattr(config, name) for name in names - {"sigma", "cone", "horizon", "model"}}  # the task has them
+    built = {"sigma", "cone", "horizon", "model", "theta"}  # the task has them
+    kept = {name: getattr(config, name) for name in names - built}
     return EstimatorConfig(task=task.name, **kept)
 
 
-def descent_plan(plan: SweepPlan, cell: SweepCell) -> OptimisePlan:
+def descent_plan(plan: StudyPlan, cell: StudyCell) -> OptimisePlan:
     """A cell's descents."""
     config, task = plan.config, plan.groups[cell.group].task.replace(sigma=cell.sigma)
     names = ("iterations", "optimizer", "learning_rate", "decay", "evaluation_samples")
     chosen = {field.name: getattr(_shared(config, task), field.name) for field in dataclasses.fields(EstimatorConfig)}
-    chosen |= {name: getattr(config, name) for name in names} | {"seeds": config.batches, "samples": cell.samples}
+    chosen |= {name: getattr(config, name) for name in names}
+    chosen |= {"seeds": config.batches, "samples": cell.samples, "chunk_size": plan.chunk_size}
     descent = OptimiseConfig(**chosen)
     return plan_optimise(descent, task, cell.model)

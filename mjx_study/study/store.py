@@ -20,14 +20,13 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-import xarray as xr
 
 from mjx_study.disk import open_regular, prepare_folder, read_whole, write_whole
+from mjx_study.study.dataset import as_plain
 from mjx_study.study.document import read_document, read_format
 from mjx_study.study.identity import ACCEPT, differences
-from mjx_study.study.results import as_plain
 
-FORMAT: Final = 2
+FORMAT: Final = 3
 """Of the folder; a number that goes up when an older program could not read a newer folder."""
 
 
@@ -70,7 +69,7 @@ class Store:
         """
         prepare_folder(folder)
         prepare_folder(folder / "cells")
-        document = json.loads(json.dumps(as_plain({"format": FORMAT} | document), allow_nan=False))
+        document = as_plain({"format": FORMAT} | document)
         path = folder / "study.json"
         if path.exists():
             kept = cls.open(folder)
@@ -171,6 +170,11 @@ class Store:
         at = {name: axes[name][place] for name, place in cell.get("at", {}).items()}
         return _digest_of_text({"index": index, "cell": cell, "at": at})
 
+    def read_all(self) -> dict[int, tuple[dict[str, np.ndarray], dict[str, str]]]:
+        """Every cell that is there, with the versions of what computed it; see `read`."""
+        there = [index for index in range(len(self.document["cells"])) if self.has(index)]
+        return {index: self.read_with_versions(index) for index in there}
+
     @property
     def missing(self) -> list[int]:
         """Cells that are not there yet."""
@@ -195,65 +199,3 @@ def _flat(document: Mapping[str, Any], parts: Sequence[str]) -> dict[str, Any]:
 
 def _told(error: Exception) -> str:
     return (error.strerror if isinstance(error, OSError) else None) or str(error)
-
-
-def assemble(
-    store: Store,
-    dimensions: Mapping[str, Sequence[Any]],
-    variables: Mapping[str, tuple[tuple[str, ...], str, str]],
-    along: Mapping[str, tuple[str, Sequence[Any], str]],
-    units: Mapping[str, str],
-) -> xr.Dataset:
-    """All cells of a study as labelled arrays; NaN for what is not there yet.
-
-    Args:
-        store: the folder; each cell of its document has the key "at", its index along every dimension of cells.
-        dimensions: coordinates of each dimension; those of cells first, then those within a cell.
-        variables: dimensions within a cell, unit and description of each variable.
-        along: more coordinates: name to (dimension, values, unit).
-        units: of the dimensions.
-    """
-    cells = store.document["cells"]
-    outer = tuple(cells[0]["at"]) if cells else ()
-    read = {index: store.read_with_versions(index) for index in range(len(cells)) if store.has(index)}
-    found = {index: arrays for index, (arrays, _) in read.items()}
-    data: dict[str, Any] = {}
-    for name, (inner, unit, description) in variables.items():
-        held = {index: arrays[name] for index, arrays in found.items() if name in arrays}
-        if not held:
-            continue
-        inner_shape = np.broadcast_shapes(*(array.shape for array in held.values()))
-        values = np.full([len(dimensions[dimension]) for dimension in outer] + list(inner_shape), np.nan)
-        for index, array in held.items():
-            values[tuple(cells[index]["at"][dimension] for dimension in outer)] = array
-        data[name] = ((*outer, *inner), values, {"units": unit, "long_name": description})
-    used = {dimension for dims, *_ in data.values() for dimension in dims} | set(outer)
-    coordinates: dict[str, Any] = {
-        dimension: (dimension, list(values), {"units": units[dimension]} if units.get(dimension) else {})
-        for dimension, values in dimensions.items()
-        if dimension in used
-    }
-    for name, (dimension, values, unit) in along.items():
-        coordinates[name] = (dimension, list(values), {"units": unit} if unit else {})
-    dataset = xr.Dataset(data, coordinates)
-    dataset.attrs = {
-        key: json.dumps(value) if isinstance(value, dict | list) else value
-        for key, value in store.document.items()
-        if key not in ("cells", "format") and value is not None
-    }
-    dataset.attrs["missing_cells"] = len(store.missing)
-    dataset.attrs["mixed_versions"] = _mixture([versions for _, versions in read.values()])
-    return dataset
-
-
-def _mixture(versions: Sequence[Mapping[str, str]]) -> str:
-    """What was computed by more than one version, and by which; empty where nothing was."""
-    names = dict.fromkeys(name for each in versions for name in each)
-    by_name = {name: list(dict.fromkeys(each.get(name, "none") for each in versions)) for name in names}
-    return ", ".join(f"{name} {' and '.join(found)}" for name, found in by_name.items() if len(found) > 1)
-
-
-def write_dataset(dataset: xr.Dataset, path: Path) -> Path:
-    """A dataset as NetCDF 3, which every tool reads."""
-    content = dataset.to_netcdf(engine="scipy")
-    return write_whole(path, lambda file: file.write(bytes(content)))

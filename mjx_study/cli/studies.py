@@ -1,0 +1,69 @@
+"""What the commands that run studies share: fields from options, the folder, and what is drawn of the result."""
+
+import argparse
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import xarray as xr
+
+from mjx_study.cli.options import UsageError, add_versions_option, attempt, computing, usage_errors
+from mjx_study.disk import prepare_folder
+from mjx_study.plots.study import plot_study
+from mjx_study.plots.style import save_figure
+from mjx_study.study.plan import StudyConfig, StudyPlan
+from mjx_study.study.run import open_store, run_study
+from mjx_study.study.store import StudyError
+
+RESUMABLE = "the same command goes on where it stopped"
+
+
+def add_folder_options(command: argparse.ArgumentParser) -> None:
+    """The folder of a study."""
+    command.add_argument(
+        "--output", type=Path, metavar="DIR", help="folder of the study: the numbers and the figures; resumable"
+    )
+    add_versions_option(command)
+
+
+def study_fields(options: argparse.Namespace) -> dict[str, Any]:
+    """Fields of a `StudyConfig` that are given as options."""
+    given = {field.name: getattr(options, field.name, None) for field in dataclasses.fields(StudyConfig)}
+    return {name: value for name, value in given.items() if value is not None and name not in ("tasks", "theta")}
+
+
+def compute(plan: StudyPlan, options: argparse.Namespace) -> tuple[xr.Dataset, str | None]:
+    """Run a study, in its folder where one is given; what a full disk refuses is computed in memory.
+
+    Returns:
+        The numbers, and why they could not be written, if so.
+
+    Raises:
+        UsageError: the folder holds another study, or a damaged one, or cannot be used.
+    """
+    folder, unwritten = options.output, None
+    try:
+        if folder is not None:
+            with usage_errors():
+                open_store(plan, folder, options.command_line, accept_versions=options.accept_versions)
+            with computing(RESUMABLE) as progress:
+                return run_study(plan, folder, progress, accept_versions=options.accept_versions), None
+    except StudyError as error:
+        raise UsageError(str(error)) from error
+    except OSError as error:
+        unwritten = f"cannot write {error.filename or folder}: {error.strerror or error}; what is there is complete"
+    with computing() as progress:
+        return run_study(plan, progress=progress), unwritten
+
+
+def draw(dataset: xr.Dataset, folder: Path | None, unwritten: str | None) -> tuple[list[Path], str | None]:
+    """The figures of a study in its folder; what was written, and why something was not."""
+    if folder is None or unwritten:
+        return [], None
+    return attempt(
+        lambda: [
+            path
+            for name, figure in plot_study(dataset).items()
+            for path in save_figure(figure, prepare_folder(folder), name)
+        ]
+    )

@@ -1,0 +1,83 @@
+"""What figures share: colours and names, lines with bands, and files."""
+
+import zlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from estimators import ESTIMATORS
+from mjx_study.disk import write_whole
+from mjx_study.simulation.contact import FAMILIES
+
+# Okabe and Ito's colours, told apart in print and by colour-blind eyes; markers repeat the distinction.
+STYLE: Final = {
+    "zobg": ("#0072B2", "o"),
+    "zobg_antithetic": ("#56B4E9", "v"),
+    "zobg_to_go": ("#56B4E9", "P"),
+    "zobg_to_go_antithetic": ("#0072B2", "X"),
+    "fobg": ("#D55E00", "s"),
+    "fobg_clipped": ("#E69F00", "<"),
+    "fobg_truncated": ("#E69F00", ">"),
+    "aobg": ("#009E73", "D"),
+    "ivw": ("#CC79A7", "^"),
+    "ivw_h": ("#CC79A7", "p"),
+    "total_propagation": ("#000000", "*"),
+    "ddcg": ("#009E73", "h"),
+    "delta": ("#777777", "d"),
+}
+OTHERS: Final = (("#E69F00", "#56B4E9", "#009E73", "#F0E442", "#0072B2", "#D55E00", "#CC79A7"), "1234+x|_")
+"""Colours and markers of estimators of one's own."""
+NO_CONTACT: Final = 1.0
+"""Place on a stiffness axis of a task without contact."""
+TITLES: Final = {
+    "penalty": "penalty (impedance 1e-4)",
+    "impedance": "impedance 0.5",
+    "mujoco": "MuJoCo, default impedance",
+    "mujoco_stiff": "MuJoCo, impedance 0.99 to 0.9999",
+    "smooth_onset": "smooth onset",
+    "mujoco_default": "MuJoCo default",
+    "mjcf": "as in the MJCF",
+}
+assert set(TITLES) >= set(FAMILIES)
+
+
+def style_of(name: str) -> tuple[str, str, str]:
+    """Label, colour and marker of an estimator; those of one's own depend on the name alone."""
+    label = (ESTIMATORS[name].label if name in ESTIMATORS else "") or name.rpartition(":")[2]
+    colours, markers = OTHERS
+    drawn = zlib.crc32(name.encode())
+    return label, *STYLE.get(name, (colours[drawn % len(colours)], markers[drawn // 7 % len(markers)]))
+
+
+def mean_with_band(axes: Axes, x, mean, error, color: str, label: str) -> None:
+    axes.plot(x, mean, color=color, linewidth=1.6, label=label)
+    axes.fill_between(x, mean - 1.96 * error, mean + 1.96 * error, color=color, alpha=0.2, linewidth=0)
+
+
+def robust_limits(curves: Sequence[np.ndarray]) -> tuple[float, float]:
+    """Limits that hold all but the wildest hundredth of the values."""
+    values = np.concatenate(curves)
+    values = values[np.isfinite(values)]
+    low, high = np.quantile(values, [0.005, 0.995]) if len(values) else (-1.0, 1.0)
+    room = 0.08 * (high - low) or 1.0
+    return float(low - room), float(high + room)
+
+
+def save_figure(figure: Figure, folder: Path, name: str) -> list[Path]:
+    """Write a figure as PNG and PDF; returns their paths."""
+    return [
+        write_whole(folder / f"{name}.{kind}", lambda file, kind=kind: figure.savefig(file, format=kind, dpi=150))
+        for kind in ("png", "pdf")
+    ]
+
+
+def line_with_band(axes: Axes, x, y, lower, upper, *, color: str, marker: str, label: str | None = None) -> None:
+    axes.plot(x, y, color=color, marker=marker, markersize=4.5, label=label)
+    if len(x) > 1:
+        axes.fill_between(x, lower, upper, color=color, alpha=0.2, linewidth=0)
+    else:
+        axes.errorbar(x, y, yerr=[y - lower, upper - y], color=color, capsize=3)

@@ -1,0 +1,91 @@
+"""The numbers of a study as labelled arrays, from the study's document and its cells."""
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import xarray as xr
+
+from mjx_study.disk import write_whole
+from mjx_study.study.variables import CELL, VARIABLES
+
+UNITS: Final = {"timestep": "s", "sigma": "unit of what the noise is added to", "samples": "1", "stiffness": "N/m"}
+Cells = Mapping[int, tuple[Mapping[str, np.ndarray], Mapping[str, str]]]
+"""By index, the arrays of a cell by variable, and the versions of what computed them."""
+
+
+def as_plain(document: Any) -> Any:
+    """A document as JSON can hold it: arrays and tuples as lists, numbers that are not finite null, an infinite gamma
+    "inf"."""
+    if isinstance(document, Mapping):
+        infinite = {"gamma": "inf"} if document.get("gamma") == math.inf else {}
+        return {str(key): as_plain(item) for key, item in {**document, **infinite}.items()}
+    if isinstance(document, np.ndarray):
+        return as_plain(document.tolist())
+    if isinstance(document, list | tuple):
+        return [as_plain(item) for item in document]
+    return None if isinstance(document, float) and not math.isfinite(document) else document
+
+
+def dataset_of(document: Mapping[str, Any], cells: Cells) -> xr.Dataset:
+    """All cells of a study as labelled arrays; NaN for what is not there.
+
+    Args:
+        document: what a study.json holds; each cell has the key "at", its index along every dimension of cells.
+        cells: those that are computed.
+    """
+    config, places = document["config"], document["cells"]
+    outer = tuple(places[0]["at"])
+    dimensions: dict[str, Sequence[Any]] = dict(document["axes"]) | {
+        "estimator": config["estimators"],
+        "seed": range(config["seeds"]),
+        "iteration": range(1, (config["iterations"] or 0) + 1),
+        "point": range(config.get("points") or 0),
+    }
+    shape = tuple(len(dimensions[name]) for name in outer)
+    data: dict[str, Any] = {}
+    for name, variable in (VARIABLES[config["kind"]] | CELL).items():
+        held = {index: arrays[name] for index, (arrays, _) in cells.items() if name in arrays}
+        if not held:
+            continue
+        inner = np.max([array.shape for array in held.values()], axis=0, initial=0).astype(int)  # params may differ
+        values = np.full((*shape, *inner), np.nan)
+        for index, array in held.items():
+            place = tuple(places[index]["at"][dimension] for dimension in outer)
+            values[(*place, *(slice(size) for size in array.shape))] = array
+        attributes = {"units": variable.unit, "long_name": variable.description}
+        data[name] = ((*outer, *variable.dims), values, attributes)
+    used = {dimension for dims, *_ in data.values() for dimension in dims} | set(outer)
+    coordinates: dict[str, Any] = {
+        name: (name, list(values), {"units": UNITS[name]} if name in UNITS else {})
+        for name, values in dimensions.items()
+        if name in used
+    }
+    for name in ("contact", "stiffness"):
+        along = [model[name] for model in document["models"]]
+        coordinates[name] = ("model", along, {"units": UNITS[name]} if name in UNITS else {})
+    dataset = xr.Dataset(data, coordinates)
+    dataset.attrs = {
+        key: json.dumps(value) if isinstance(value, dict | list) else value
+        for key, value in document.items()
+        if key not in ("cells", "format") and value is not None
+    }
+    dataset.attrs["missing_cells"] = len(places) - len(cells)
+    dataset.attrs["mixed_versions"] = _mixture([versions for _, versions in cells.values()])
+    return dataset
+
+
+def _mixture(versions: Sequence[Mapping[str, str]]) -> str:
+    """What was computed by more than one version, and by which; empty where nothing was."""
+    names = dict.fromkeys(name for each in versions for name in each)
+    by_name = {name: list(dict.fromkeys(each.get(name, "none") for each in versions)) for name in names}
+    return ", ".join(f"{name} {' and '.join(found)}" for name, found in by_name.items() if len(found) > 1)
+
+
+def write_dataset(dataset: xr.Dataset, path: Path) -> Path:
+    """A dataset as NetCDF 3, which every tool reads."""
+    content = dataset.to_netcdf(engine="scipy")
+    return write_whole(path, lambda file: file.write(bytes(content)))

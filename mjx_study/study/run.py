@@ -1,0 +1,212 @@
+"""Running studies, in memory or cell by cell into a folder that survives being killed.
+
+A cell is one task, timestep, cone, contact model, sigma and sample count, with all seeds and estimators. It depends on
+the configuration alone, not on which cells were computed before it or by whom. Timestep and cone need a compilation of
+their own; everything else is traced.
+"""
+
+import dataclasses
+import json
+import time
+from pathlib import Path
+from typing import Any, Final
+
+import xarray as xr
+
+from estimators import ENOUGH_EFFECTIVE
+from mjx_study.disk import prepare_folder
+from mjx_study.runtime import environment
+from mjx_study.study.axes import Axes, axes_of, solver_arrays, solver_parameters
+from mjx_study.study.cells import COMPUTE
+from mjx_study.study.configuration import Progress
+from mjx_study.study.dataset import as_plain, dataset_of, write_dataset
+from mjx_study.study.identity import contents, estimator_contents, versions
+from mjx_study.study.plan import StudyCell, StudyConfig, StudyPlan, estimators_of, plan_study
+from mjx_study.study.revision import git_revision
+from mjx_study.study.store import Store
+from mjx_study.tasks.task import Task
+
+WAIT_SECONDS: Final = 0.5
+"""Between looks at cells that another process computes."""
+
+
+def _document(plan: StudyPlan, command: str | None) -> dict[str, Any]:
+    """What study.json says."""
+    fields = {field.name: getattr(plan.config, field.name) for field in dataclasses.fields(plan.config)}
+    axes = axes_of(plan)
+    return {
+        "config": fields | {"tasks": plan.config.task_names, "kind": plan.config.kind, "seeds": plan.config.batches},
+        "warnings": list(plan.warnings),
+        "contents": contents(_forms(plan)) | estimator_contents(*plan.config.estimators),
+        "versions": versions(),
+        "environment": environment(),
+        "revision": git_revision(),
+        "command": command,
+        "models": list(axes.models),
+        "axes": axes.values,
+        "resolved": _resolved(plan, axes),
+        "cells": [
+            {"label": plan.label(cell), "at": at} | solver_parameters(cell)
+            for cell, at in zip(plan.cells, axes.places, strict=True)
+        ],
+    }
+
+
+def _resolved(plan: StudyPlan, axes: Axes) -> list[dict[str, Any]]:
+    """What the configuration leaves to each task: its noise, horizons and the options of its estimators."""
+    found: list[dict[str, Any]] = [{} for _ in axes.values["task"]]
+    for cell, at in zip(plan.cells, axes.places, strict=True):
+        task, entry = plan.groups[cell.group].task, found[at["task"]]
+        entry.setdefault("horizon", [])
+        if task.horizon not in entry["horizon"]:
+            entry["horizon"].append(task.horizon)
+        if "noise" not in entry:
+            entry |= {"noise": task.noise, "estimators": _options(plan, cell)}
+    return found
+
+
+def _options(plan: StudyPlan, cell: StudyCell) -> dict[str, dict[str, Any]]:
+    """Options of a cell's estimators, by name."""
+    chosen = zip(plan.config.estimators, estimators_of(plan, cell), strict=True)
+    return {name: dataclasses.asdict(estimator) for name, estimator in chosen}
+
+
+def open_store(plan: StudyPlan, folder: Path, command: str | None = None, *, accept_versions: bool = False) -> Store:
+    """The folder of a plan, new or begun; one that was begun keeps its chunk size unless the plan gives another.
+
+    Args:
+        plan: plan of the study.
+        folder: where it is to be.
+        command: command that asked for it, to be kept; None where no command did.
+        accept_versions: go on with a study that other versions began.
+
+    Raises:
+        ValueError: it cannot be written to, or holds another study.
+    """
+    document = _document(plan, command)
+    if plan.config.chunk_size is None:
+        begun = (folder / "study.json").exists()
+        stored = Store.open(folder).document["config"]["chunk_size"] if begun else plan.chunk_size
+        document["config"]["chunk_size"] = stored
+    return Store.create(prepare_folder(folder), document, accept_versions=accept_versions)
+
+
+def _forms(plan: StudyPlan) -> dict[str, list[Task]]:
+    """By the configuration's name of a task, what it is with every timestep and cone."""
+    forms: dict[str, list[Task]] = {}
+    for group in plan.groups:
+        forms.setdefault(group.name, []).append(group.task)
+    return forms
+
+
+def run_study(
+    study: StudyConfig | StudyPlan,
+    folder: str | Path | None = None,
+    progress: Progress = lambda done, total, what: None,
+    *,
+    command: str | None = None,
+    accept_versions: bool = False,
+) -> xr.Dataset:
+    """Run a study in memory; or with a folder compute what is missing there, beside any process that does the same.
+
+    Args:
+        study: what to run.
+        folder: folder of the study, new or begun; None to keep it in memory.
+        progress: called before every cell.
+        command: command that asked for it, to be kept with a new study.
+        accept_versions: go on with a study that other versions of JAX, MuJoCo or this package began.
+
+    Returns:
+        All numbers of the study, labelled; the attribute `computed_cells` says how many cells this call computed.
+
+    Raises:
+        ValueError: the configuration cannot be run, or the folder holds another study or cannot be written to.
+        StudyError: a file of the study is damaged.
+        OSError: a cell could not be written; what was written before is kept.
+    """
+    plan = plan_study(study) if isinstance(study, StudyConfig) else study
+    if folder is not None:
+        computed = _fill(plan, Path(folder), progress, command, accept_versions)
+        dataset = load_study(folder)
+        write_dataset(dataset, Path(folder) / "results.nc")
+        return dataset.assign_attrs(computed_cells=computed)
+    document, compute, total = as_plain(_document(plan, command)), COMPUTE[plan.config.kind](plan), len(plan.cells)
+    cells: dict[int, Any] = {}
+    document["config"]["chunk_size"] = plan.chunk_size
+    for index, cell in enumerate(plan.cells):
+        progress(index, total, plan.label(cell))
+        cells[index] = compute(cell) | solver_arrays(document["cells"][index]), document["versions"]
+    progress(total, total, "done")
+    return dataset_of(document, cells).assign_attrs(computed_cells=total)
+
+
+def _fill(plan: StudyPlan, folder: Path, progress: Progress, command: str | None, accept_versions: bool) -> int:
+    """Compute the cells of a folder that are missing; how many those were."""
+    store = open_store(plan, folder, command, accept_versions=accept_versions)
+    plan = dataclasses.replace(plan, chunk_size=store.document["config"]["chunk_size"])
+    for index in range(len(plan.cells)):
+        if store.has(index):
+            store.read(index)  # a damaged file is refused before anything is computed
+    compute, total, computed = COMPUTE[plan.config.kind](plan), len(plan.cells), 0
+    while missing := store.missing:
+        claimed = False
+        for index in missing:
+            progress(total - len(store.missing), total, plan.label(plan.cells[index]))
+            with store.claim(index) as ours:
+                if not ours or store.has(index):
+                    continue
+                store.write(index, compute(plan.cells[index]))
+                claimed, computed = True, computed + 1
+        if not claimed and store.missing:
+            progress(total - len(store.missing), total, "another process computes the rest")
+            time.sleep(WAIT_SECONDS)
+    progress(total, total, "done")
+    return computed
+
+
+def load_study(folder: str | Path) -> xr.Dataset:
+    """The numbers of a study as labelled arrays, those of an unfinished one too; NaN for what is missing.
+
+    Dimensions: task, timestep, cone, model (a contact model, with its family as coordinate `contact` and its
+    `stiffness`), sigma, samples, then seed, estimator, iteration, point and param, those that the variables have.
+
+    Raises:
+        StudyError: there is no study, or a file of it is damaged.
+    """
+    store = Store.open(Path(folder))
+    found = {
+        index: (arrays | solver_arrays(store.document["cells"][index]), written_by)
+        for index, (arrays, written_by) in store.read_all().items()
+    }
+    return dataset_of(store.document, found)
+
+
+def warnings_of(dataset: xr.Dataset) -> tuple[str, ...]:
+    """Warnings about a study: of its plan, and about its numbers."""
+    found = json.loads(dataset.attrs.get("warnings", "[]"))
+    if dataset.attrs["missing_cells"]:
+        found.append(f"{dataset.attrs['missing_cells']} cells are not computed yet; the same command goes on")
+    if dataset.attrs.get("mixed_versions"):
+        found.append(f"cells were computed with different versions: {dataset.attrs['mixed_versions']}")
+    for name, says in (
+        ("nonfinite", "samples overflowed or became NaN and were left out"),
+        ("unconverged", "rollouts in which the contact solver did not converge"),
+        ("onsets_missed", "onsets of contact have no onset term: there are too many in a rollout"),
+        ("onsets_bounded", "onsets of contact are grazing, and their terms bounded"),
+    ):
+        if name in dataset and (count := _count(dataset[name])):
+            found.append(f"{count} {says}")
+    if "effective_samples" in dataset and (few := int((dataset["effective_samples"] < ENOUGH_EFFECTIVE).sum())):
+        found.append(
+            f"{few} batches rest on fewer than {ENOUGH_EFFECTIVE:g} effective samples: do not believe their errors, "
+            "p-values and variances (effective_samples says which)"
+        )
+    if "stopped_at" in dataset and bool(dataset["stopped_at"].notnull().any()):
+        found.append(f"{int(dataset['stopped_at'].notnull().sum())} descents stopped before their last iteration")
+    return tuple(found)
+
+
+def _count(counts: xr.DataArray) -> int:
+    """The total; of rollouts that estimators share, that of the estimator with most."""
+    shared = counts.dims and "seed" not in counts.dims and "estimator" in counts.dims and "point" not in counts.dims
+    return int(counts.max("estimator").sum() if shared else counts.sum())

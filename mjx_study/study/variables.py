@@ -1,0 +1,104 @@
+"""Every quantity of a study: its dimensions within a cell, unit, heading and description.
+
+Datasets, tables, JSON and reports are made from these.
+"""
+
+import dataclasses
+from typing import Final
+
+
+@dataclasses.dataclass(frozen=True)
+class Variable:
+    """A quantity of a study.
+
+    Attributes:
+        dims: dimensions within a cell.
+        unit: "gradient" is cost per unit of theta.
+        description: one line, from which a heading is made where `heading` is empty.
+        heading: short, for tables.
+    """
+
+    dims: tuple[str, ...]
+    unit: str
+    description: str
+    heading: str = ""
+
+
+BATCH: Final = ("seed", "estimator")
+GRADIENTS: Final = {
+    "gradient_norm": Variable(BATCH, "gradient", "norm of the mean", "|gradient|"),
+    "variance": Variable(BATCH, "gradient^2", "variance of one sample, the trace of the covariance", "variance"),
+    "variance_lower": Variable(BATCH, "gradient^2", "lower end of the variance's confidence interval"),
+    "variance_upper": Variable(BATCH, "gradient^2", "upper end of the variance's confidence interval"),
+    "norm_median": Variable(BATCH, "gradient", "median of the samples' norms"),
+    "norm_90": Variable(BATCH, "gradient", "90 % quantile of the samples' norms"),
+    "norm_max": Variable(BATCH, "gradient", "largest norm of a sample"),
+    "effective_samples": Variable(BATCH, "1", "samples that the variance rests on", "effective samples"),
+    "top_share": Variable(BATCH, "1", "share of the variance that the largest sample carries", "top share"),
+    "relative_error": Variable(
+        BATCH, "1", "distance of the mean to the reference, over the norm of the reference", "relative error"
+    ),
+    "relative_error_se": Variable(BATCH, "1", "standard error of relative_error"),
+    "debiased_error": Variable(BATCH, "1", "relative_error without what noise adds to it", "debiased"),
+    "debiased_error_se": Variable(BATCH, "1", "standard error of debiased_error"),
+    "cosine": Variable(BATCH, "1", "cosine of the angle between mean and reference", "cosine"),
+    "cosine_se": Variable(BATCH, "1", "standard error of cosine"),
+    "debiased_cosine": Variable(BATCH, "1", "cosine without what noise takes from it"),
+    "debiased_cosine_se": Variable(BATCH, "1", "standard error of debiased_cosine"),
+    "alpha": Variable(BATCH, "1", "weight of the first-order batch", "alpha"),
+    "epsilon": Variable(BATCH, "gradient", "confidence radius of the zeroth-order mean", "epsilon"),
+    "discrepancy": Variable(BATCH, "gradient", "distance between the two means", "B"),
+    "bias_p_value": Variable(BATCH, "1", "p-value of no bias against the reference"),
+    "nonfinite": Variable(BATCH, "1", "samples that are not finite and were left out", "lost"),
+    "pooled_error": Variable(
+        ("estimator",), "1", "distance of the mean over all seeds to the reference, over the norm of the reference"
+    ),
+    "squared_bias": Variable(
+        ("estimator",), "1", "unbiased estimate of the squared bias, over the reference's squared norm", "squared bias"
+    ),
+    "squared_bias_se": Variable(("estimator",), "1", "standard error of squared_bias", "± (standard error)"),
+    "residual": Variable(("estimator",), "1", "largest relative residual of the constraint solver", "residual"),
+    "unconverged": Variable(("estimator",), "1", "rollouts whose solver residual is too large"),
+    "seconds_per_sample": Variable(
+        ("estimator",), "s", "computing time of one sample, measured; compilation excluded", "ms"
+    ),
+    "onsets": Variable(("estimator",), "1", "onsets of contact in the first-order batches"),
+    "onsets_bounded": Variable(("estimator",), "1", "onsets at grazing speed, whose term is bounded"),
+    "onsets_missed": Variable(("estimator",), "1", "onsets without a term"),
+    "reference_norm": Variable((), "gradient", "norm of the reference gradient"),
+    "reference_uncertainty": Variable((), "1", "standard error of the reference, over its norm"),
+    "reference_effective_samples": Variable((), "1", "samples that the reference's variance rests on"),
+    "gradient": Variable((*BATCH, "param"), "gradient", "mean gradient"),
+    "reference": Variable(("param",), "gradient", "reference gradient"),
+}
+DESCENTS: Final = {
+    "final_cost": Variable(BATCH, "cost", "mean cost of the final policy", "final cost, median"),
+    "final_cost_se": Variable(BATCH, "cost", "standard error of final_cost"),
+    "start_cost": Variable((), "cost", "mean cost of the start's policy"),
+    "stopped_at": Variable(
+        BATCH, "1", "iteration at which a seed stopped before the end; NaN for none", "stopped seeds"
+    ),
+    "cost": Variable(("iteration", *BATCH), "cost", "mean cost of the batch, before the update"),
+    "alpha": Variable(("iteration", *BATCH), "1", "weight of the first-order batch", "alpha"),
+    "rollouts": Variable(("estimator",), "1", "rollouts simulated in one iteration of one seed", "rollouts"),
+    "seconds": Variable(("iteration", "estimator"), "s", "time since the start, measured; compilation excluded"),
+}
+LANDSCAPES: Final = {
+    "position": Variable(("point",), "unit of theta", "t, of the point theta_0 + t direction"),
+    "cost": Variable(("point",), "cost", "cost without noise; the mean over starts where they are drawn"),
+    "smoothed": Variable(("point",), "cost", "mean cost with noise"),
+    "smoothed_se": Variable(("point",), "cost", "standard error of smoothed"),
+    "slope": Variable(("estimator", "point"), "gradient", "mean of the estimator along the line"),
+    "slope_se": Variable(("estimator", "point"), "gradient", "standard error of slope"),
+    "nonfinite": Variable(("estimator", "point"), "1", "samples that are not finite and were left out", "lost"),
+    "unconverged": Variable((), "1", "rollouts whose solver residual is too large"),
+}
+CELL: Final = {
+    "solref": Variable(("solref_entry",), "", "MuJoCo's solref of the contact; NaN where it is the MJCF's"),
+    "solimp": Variable(("solimp_entry",), "", "MuJoCo's solimp of the contact; NaN where it is the MJCF's"),
+}
+"""Of every kind."""
+VARIABLES: Final = {"gradients": GRADIENTS, "descents": DESCENTS, "landscapes": LANDSCAPES}
+"""By kind of study."""
+MEASURED: Final = ("seconds", "seconds_per_sample")
+"""Variables that are times, and so the only ones that differ from run to run."""
