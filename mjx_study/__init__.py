@@ -5,6 +5,7 @@ tasks as objectives, and comparisons of estimators over them. Call `configure` f
 """
 
 from mjx_study import _matplotlib
+from mjx_study.accessor import StudyAccessor
 from mjx_study.objective import MjxObjective, Simulator, simulate
 from mjx_study.plots.study import plot_study
 from mjx_study.runtime import configure
@@ -21,7 +22,7 @@ from mjx_study.simulation.contact import (
 )
 from mjx_study.simulation.dynamics import State, initial_state, rollout, step, step_jacobian
 from mjx_study.simulation.scene import Scene, SceneError, load_scene, put_scene
-from mjx_study.study.plan import StudyConfig, plan_study
+from mjx_study.study.plan import StudyConfig, estimators_of, plan_study
 from mjx_study.study.run import load_study, run_study
 from mjx_study.tasks import TASKS, make_task
 from mjx_study.tasks.policy import Launch, LinearFeedback, OpenLoop, Policy
@@ -42,6 +43,7 @@ __all__ = [
     "SceneError",
     "Simulator",
     "State",
+    "StudyAccessor",
     "StudyConfig",
     "TASKS",
     "Task",
@@ -49,6 +51,7 @@ __all__ = [
     "configure",
     "contact_model",
     "effective_mass",
+    "estimators_of",
     "family_model",
     "initial_state",
     "load_scene",

@@ -92,7 +92,7 @@ def report(dataset: xr.Dataset) -> str:
 def _again(dataset: xr.Dataset) -> str:
     if command := dataset.attrs.get("command"):
         return f"<pre>{_text(command)}</pre>"
-    return "<p>It was run from Python: <code>run_sweep</code> with the configuration above.</p>"
+    return "<p>It was run from Python: <code>run_study</code> with the configuration above.</p>"
 
 
 def _figures(dataset: xr.Dataset) -> list[str]:

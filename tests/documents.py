@@ -17,5 +17,6 @@ def study_document(cells: int, **changes: Any) -> dict[str, Any]:
         "environment": {"versions": {}},
         "models": [{"contact": "model", "stiffness": float(index)} for index in range(cells)],
         "axes": axes,
+        "resolved": [{"horizon": [1], "noise": "gaussian", "estimators": {}}],
         "cells": [{"label": str(index), "at": at} for index, at in enumerate(places)],
     }

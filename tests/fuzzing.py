@@ -55,7 +55,7 @@ def stub(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(options, "configure", lambda **_: None)
     mujoco.set_mju_user_warning(lambda message: print(f"MuJoCo: {message}", file=sys.stderr))  # as `configure` does
     for module, names in (
-        (compare, ("compare",)), (optimise, ("optimise",)), (sweep, ("open_store", "run_study")),
+        (compare, ("compute",)), (optimise, ("optimise",)), (sweep, ("open_store", "run_study")),
         (landscape, ("landscape",)), (gradcheck.check, ("gradcheck",)), (bench.benchmark, ("bench",)),
         (rollout, ("_simulate_task", "_simulate_passive")),
     ):  # fmt: skip

@@ -119,9 +119,9 @@ def test_the_fuzzer_finds_a_traceback_and_an_exit(folder: Path, monkeypatch: pyt
         return plan
 
     for error in (KeyError("theta"), SystemExit(0), fuzzing.TooSlow()):
-        monkeypatch.setattr(fuzzing.compare, "plan_compare", broken(error))
+        monkeypatch.setattr(fuzzing.compare, "plan_study", broken(error))
         with pytest.raises((KeyError, AssertionError, fuzzing.TooSlow)):
             fuzzing.answer(["compare", "pusher"], folder)
-    monkeypatch.setattr(fuzzing.compare, "plan_compare", lambda *_: (folder / "policy.json").write_text("mine"))
+    monkeypatch.setattr(fuzzing.compare, "plan_study", lambda *_: (folder / "policy.json").write_text("mine"))
     with pytest.raises(AssertionError, match="a file was touched"):
         fuzzing.answer(["compare", "pusher"], folder)

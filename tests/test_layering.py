@@ -28,6 +28,7 @@ LAYERS = [
     "mjx_study.render",
     "mjx_study.plots",
     "mjx_study.report",
+    "mjx_study.accessor",
     "mjx_study.cli",
     "mjx_study.__main__",
     "mjx_study",  # the package itself re-exports, so that nothing may import from it

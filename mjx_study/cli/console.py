@@ -171,8 +171,7 @@ def alarms(dataset: xr.Dataset) -> list[str]:
 
 def gradients_as_json(dataset: xr.Dataset) -> dict[str, Any]:
     """A study of gradients as plain data: a row for each estimate."""
-    rows = [vars(row) | {"variance_seconds": row.variance_seconds, "bias_verdict": row.bias_verdict}
-            for row in rows_of(dataset)]  # fmt: skip
+    rows = [row.as_dict() for row in rows_of(dataset)]
     names = ("config", "resolved", "environment")
     document = {name: json.loads(dataset.attrs[name]) for name in names}
     return as_plain(document | {"findings": findings(dataset), "warnings": alarms(dataset), "rows": rows})

@@ -41,6 +41,10 @@ class Row(SimpleNamespace):
             return "too few effective samples"
         return "biased" if self.bias_p_value <= SURE else "none seen"
 
+    def as_dict(self) -> dict[str, Any]:
+        """All of it by name, with what follows from it."""
+        return vars(self) | {"variance_seconds": self.variance_seconds, "bias_verdict": self.bias_verdict}
+
     @property
     def variance_seconds(self) -> float:
         """Variance times seconds per sample: the variance that a second of computing leaves."""
