@@ -8,7 +8,7 @@ from pathlib import Path
 
 import jax
 import pytest
-from mjx_study.plots.comparison import STYLE, style_of
+from mjx_study.plots.style import STYLE, style_of
 
 from estimators import ESTIMATORS, Estimator, FirstOrder, ZerothOrder, find_estimator, make_estimator, register
 from mjx_study import cli

@@ -31,7 +31,9 @@ def stubbed(monkeypatch: pytest.MonkeyPatch) -> None:
                 "variance": np.full(seeds, float(cell.samples)),
                 "alpha": np.full(seeds, 0.5),
                 "squared_bias": np.full(seeds[1], np.nan),
-                "relative_error": np.ones(seeds),
+                "variance_lower": np.full(seeds, cell.samples / 2),
+                "variance_upper": np.full(seeds, 2.0 * cell.samples),
+                **{name: np.ones(seeds) for name in ("relative_error", "relative_error_se")},
             }
 
         return compute
@@ -75,8 +77,8 @@ def test_noises_and_timesteps_that_six_digits_do_not_tell_apart(tmp_path: Path) 
     data = swept(tmp_path / "out", stiffness=(100.0,), sigma=(0.1, 0.1 + 1e-9), timestep=(0.005, 0.005 + 1e-10))
     assert data.sizes["sigma"] == data.sizes["timestep"] == 2
     figures = plot_study(data)
-    assert len([name for name in figures if name.startswith("variance")]) == 4
-    assert len({figure.get_suptitle() for name, figure in figures.items() if name.startswith("variance")}) == 4
+    assert len([name for name in figures if name.startswith("comparison")]) == 4
+    assert len({figure.get_suptitle() for name, figure in figures.items() if name.startswith("comparison")}) == 4
 
 
 MODULE = """
@@ -95,9 +97,9 @@ def test_two_tasks_of_one_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.chdir(tmp_path)
     data = swept(tmp_path / "out", tasks=("twins:stern", "twins:mild", "tennis"), stiffness=(100.0,), samples=(4, 8))
     assert data["task"].values.tolist() == ["twins:stern", "twins:mild", "tennis"]
-    gammas = data["reference_uncertainty"].max([name for name in data["residual"].dims if name != "task"])
+    gammas = data["reference_uncertainty"].max([name for name in data["reference_uncertainty"].dims if name != "task"])
     assert gammas.values.tolist()[:2] == [1.0, 2.0]
-    assert len([name for name in plot_study(data) if name.startswith("variance")]) == 3
+    assert len([name for name in plot_study(data) if name.startswith("comparison")]) == 3
 
 
 def test_a_study_from_elsewhere_names_no_file_outside_a_folder(tmp_path: Path) -> None:
@@ -106,7 +108,7 @@ def test_a_study_from_elsewhere_names_no_file_outside_a_folder(tmp_path: Path) -
     for name in plot_study(data):
         assert "/" not in name and "\0" not in name, name
     long = data.assign_coords(task=["x" * 300, "x" * 300 + "y"])
-    names = [name for name in plot_study(long) if name.startswith("variance")]
+    names = [name for name in plot_study(long) if name.startswith("comparison")]
     assert len(names) == 2 and max(map(len, names)) < 200
 
 
