@@ -13,7 +13,8 @@ from make_figures import save
 from mjx_study.cli.console import progress_bar
 from mjx_study.plots.study import plot_study
 from mjx_study.runtime import configure
-from mjx_study.study.plan import StudyConfig, plan_study
+from mjx_study.study.configuration import StudyConfig
+from mjx_study.study.plan import plan_study
 from mjx_study.study.run import load_study, run_study
 
 HERE: Final = Path(__file__).parent

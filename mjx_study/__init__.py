@@ -22,7 +22,8 @@ from mjx_study.simulation.contact import (
 )
 from mjx_study.simulation.dynamics import State, initial_state, rollout, step, step_jacobian
 from mjx_study.simulation.scene import Scene, SceneError, load_scene, put_scene
-from mjx_study.study.plan import StudyConfig, estimators_of, plan_study
+from mjx_study.study.configuration import StudyConfig
+from mjx_study.study.plan import estimators_of, plan_study
 from mjx_study.study.run import load_study, run_study
 from mjx_study.tasks import TASKS, make_task
 from mjx_study.tasks.policy import Launch, LinearFeedback, OpenLoop, Policy

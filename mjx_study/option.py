@@ -237,6 +237,8 @@ def _choice(name: str, choices: Collection[str], metavar: str, line: str, **more
 
 MOST_SAMPLES: Final = "10000000]"
 TASKS: Final = "the task's"
+CONTACTS: Final = (*FAMILIES, "reference")
+"""What a study may have in the place of a contact model."""
 OPTIONS: Final[dict[str, Option]] = {
     option.name: option
     for option in (
@@ -256,7 +258,7 @@ OPTIONS: Final[dict[str, Option]] = {
         _choice("weights", WEIGHTS, "NAME", "of interpolations: by the samples that they weigh, or the other half"),
         _choice("onset", ONSETS, "NAME", "of contact, in first-order gradients: none, or linear"),
         _choice("estimators", ESTIMATORS, "NAME", "see `mjx-study estimators`", label="estimator", own=True),
-        _choice("contact", FAMILIES, "FAMILY", f"of: {', '.join(FAMILIES)}", label="contact family", unset=TASKS),
+        _choice("contact", CONTACTS, "FAMILY", f"of: {', '.join(CONTACTS)}", label="contact family", unset=TASKS),
         _number("stiffness", float, "(0, inf)", "K", "contact stiffness", unit="N/m", unset=TASKS),
         _number("damping", float, "[0, inf)", "B", "contact damping", unit="N s/m", unset="the family's"),
         _choice("cone", CONES, "CONE", f"friction cone: {', '.join(CONES)}", unset="the MJCF's"),

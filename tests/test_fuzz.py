@@ -12,7 +12,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from mjx_study.study import run as sweep
-from mjx_study.study.plan import StudyConfig, plan_study
+from mjx_study.study.configuration import StudyConfig
+from mjx_study.study.plan import plan_study
 from tests import fuzzing
 
 POLICY = {

@@ -18,7 +18,8 @@ from mjx_study.study import identity
 from mjx_study.study.checkpoint import checkpoint_path
 from mjx_study.study.descents import OptimiseConfig, OptimiseResult, optimise, plan_optimise
 from mjx_study.study.identity import contents, differences
-from mjx_study.study.plan import StudyCell, StudyConfig, StudyPlan, plan_study
+from mjx_study.study.configuration import StudyConfig
+from mjx_study.study.plan import StudyCell, StudyPlan, plan_study
 from mjx_study.study.revision import git_revision
 from mjx_study.study.run import load_study, run_study, warnings_of
 from mjx_study.study.store import Store, StudyError

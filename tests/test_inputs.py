@@ -20,7 +20,8 @@ from mjx_study.simulation.mjcf_sizes import too_large
 from mjx_study.simulation.scene import SceneError, load_model
 from mjx_study.study.document import read_document
 from mjx_study.study.iteration import make_optimizer
-from mjx_study.study.plan import StudyConfig, plan_study
+from mjx_study.study.configuration import StudyConfig
+from mjx_study.study.plan import plan_study
 from mjx_study.study.run import open_store
 
 BODY = "<worldbody><body><freejoint/><geom size='0.1'/></body></worldbody>"

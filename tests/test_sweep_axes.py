@@ -9,7 +9,8 @@ import pytest
 
 from mjx_study.plots.study import plot_study
 from mjx_study.study import cells as sweep_cells
-from mjx_study.study.plan import StudyCell, StudyConfig, StudyPlan, plan_study
+from mjx_study.study.configuration import StudyConfig
+from mjx_study.study.plan import StudyCell, StudyPlan, plan_study
 from mjx_study.study.run import load_study, run_study
 from mjx_study.table import digits_to_tell_apart
 

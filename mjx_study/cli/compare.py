@@ -22,7 +22,8 @@ from mjx_study.cli.options import (
 from mjx_study.cli.parameters import add_theta_option, theta_of
 from mjx_study.cli.studies import add_folder_options, compute, draw, study_fields
 from mjx_study.simulation.contact import FAMILIES
-from mjx_study.study.plan import StudyConfig, plan_study
+from mjx_study.study.configuration import StudyConfig
+from mjx_study.study.plan import plan_study
 
 SAMPLES = (400,)
 EXAMPLES = """\
@@ -64,7 +65,7 @@ def add(commands: Commands) -> None:
     add_task_argument(command)
     add_options(command, StudyConfig, "sigma", "cone", "horizon", "model", "timestep")
     add_process_options(command)
-    add_contact_options(command, StudyConfig)
+    add_contact_options(command)
     add_theta_option(command, "parameters at which gradients are taken")
     add_options(command, StudyConfig, "estimators", "reference_samples", reference_samples={"unset": "600"})
     add_option(command, StudyConfig.option("samples"), SAMPLES)

@@ -22,7 +22,6 @@ from mjx_study.cli.options import (
 from mjx_study.gradcheck.plan import HORIZON, STATES, GradcheckPlan
 from mjx_study.option import OPTIONS, Option
 from mjx_study.simulation.scene import load_scene
-from mjx_study.study.plan import StudyConfig
 from mjx_study.tasks import make_task, task_names
 
 EPILOG = """\
@@ -64,7 +63,7 @@ def add(commands: Commands) -> None:
         help=f"one of: {', '.join(task_names())}; module:name of your own; or any MJCF that MJX runs",
     )
     usual = ",".join(f"{each:g}" for each in check.STIFFNESS)
-    add_contact_options(command, StudyConfig, f"{usual}, or the task's where that is stiffer")
+    add_contact_options(command, analytic=False, stiffness=f"{usual}, or the task's where that is stiffer")
     add_option(command, PAIR)
     add_option(command, OPTIONS["cone"])
     add_scene_options(command)

@@ -47,8 +47,8 @@ def add(commands: Commands) -> None:
     """Register the command."""
     summary = "draw a decision's cost, its smoothed cost and the slope that each estimator sees"
     command = add_command(commands, "landscape", summary, run, EPILOG)
-    add_task_options(command, LandscapeConfig)
-    add_contact_options(command, LandscapeConfig, "the middle one of the task's sweep")
+    add_task_options(command)
+    add_contact_options(command, analytic=False, stiffness="the middle one of the task's sweep")
     add_theta_option(command, "parameters that the line goes through")
     add_options(command, LandscapeConfig, "noise", "samples", "points", "span", "direction")
     command.add_argument("--no-reference", action="store_true", help="leave out the analytic reference")

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import xarray as xr
 
 from mjx_study.cli.console import number
 from mjx_study.cli.options import (
@@ -14,36 +15,42 @@ from mjx_study.cli.options import (
     add_command,
     add_contact_options,
     add_estimator_options,
+    add_option,
     add_options,
     add_task_options,
-    add_versions_option,
     attempt,
-    computing,
     configure_process,
     finish,
     print_report,
+    task_of,
     usage_errors,
 )
 from mjx_study.cli.parameters import add_theta_option, theta_of
-from mjx_study.disk import prepare_folder, write_whole
-from mjx_study.plots.curves import plot_optimisation
-from mjx_study.plots.style import save_figure, style_of
+from mjx_study.cli.studies import add_folder_options, compute, draw, study_fields
+from mjx_study.disk import write_whole
+from mjx_study.option import OPTIONS
+from mjx_study.plots.style import style_of
+from mjx_study.study.configuration import StudyConfig
 from mjx_study.study.dataset import as_plain
-from mjx_study.study.descents import OptimiseConfig, OptimiseResult, Run, open_checkpoints, optimise, plan_optimise
+from mjx_study.study.iteration import REASONS
+from mjx_study.study.plan import plan_study
+from mjx_study.study.run import warnings_of
+from mjx_study.study.variables import HISTORY, METRIC, START
 from mjx_study.table import format_table
+from mjx_study.tasks.contact_grid import REFERENCE
 
 EPILOG = """\
 Every estimator starts from the task's theta, or from --theta, and draws the same noise. Without --learning-rate,
 --iterations and --samples the task's own are taken, which are the paper's: plain gradient descent.
 
-With --output DIR: optimisation.png and .pdf (cost against iterations, rollouts and seconds; alpha), optimisation.json,
-the best seed's policy of each estimator (policy-NAME.json, for rollout --policy), and run-NAME.npz, from which the same
-command goes on where it was stopped, or with more --iterations.
+With --output DIR, a study: its numbers (for plot, report, load_study), descent.png and .pdf (cost against iterations,
+rollouts and seconds; alpha), and the best seed's policy of each estimator (policy-NAME.json, for rollout --policy). The
+same command goes on where it was stopped, at most 20 s before, or with more --iterations.
 
 examples:
   mjx-study optimise pusher --contact penalty --stiffness 1000 --output out
-  mjx-study optimise ball_wall --reference --estimator zobg,fobg,aobg --seeds 5
-  mjx-study optimise pusher --estimator ivw_h --optimizer adam --learning-rate 0.01
+  mjx-study optimise ball_wall --reference --estimators zobg,fobg,aobg --seeds 5
+  mjx-study optimise pusher --estimators ivw_h --optimizer adam --learning-rate 0.01
   mjx-study optimise tennis --network 16,16 --optimizer adam --learning-rate 0.003 --contact penalty
   mjx-study rollout pusher --policy out/policy-aobg.json
 
@@ -54,145 +61,162 @@ columns of the table:
   alpha       mean weight of first-order gradients in the last tenth of the iterations
   rollouts    simulated per seed, those that were differentiated and baselines included
 """
-RESUMABLE = "the same command goes on from the last checkpoint, at most 20 s ago"
-FIELDS = (
-    "task estimators contact stiffness damping reference network iterations samples learning_rate decay optimizer "
-    "seeds seed sigma noise baseline gamma published failure_probability variance_proxy radius max_norm window "
-    "tolerance weights onset cone horizon model evaluation_samples chunk_size"
-).split()
+SEEDS = 3
+WRAPPED = ("contact", "stiffness", "sigma", "cone", "samples")
+"""Options that are one value here, and a list in a study."""
 
 
 def add(commands: Commands) -> None:
     """Register the command."""
-    command = add_command(commands, "optimise", "optimise a policy with any estimator", run, EPILOG)
-    add_task_options(command, OptimiseConfig)
+    command = add_command(commands, "optimise", "optimise a policy with any estimator", run, EPILOG, ("optimize",))
+    add_task_options(command)
     add_theta_option(command, "parameters to start from")
-    add_contact_options(command, OptimiseConfig, "the middle one of the task's sweep")
+    add_contact_options(command, "the middle one of the task's sweep", many=False)
     command.add_argument("--reference", action="store_true", help="on the analytic reference in place of MJX")
-    add_options(command, OptimiseConfig, "network", "estimators", estimators={"flag": "--estimator"})
-    add_options(command, OptimiseConfig, "iterations", "samples", "seeds", "optimizer", "learning_rate", "decay")
-    add_estimator_options(command, OptimiseConfig)
-    add_options(command, OptimiseConfig, "evaluation_samples", "chunk_size")
-    command.add_argument("--output", type=Path, metavar="DIR", help="write figure, numbers, policies and checkpoints")
-    add_versions_option(command)
+    add_options(command, StudyConfig, "network", "estimators", "iterations")
+    add_option(command, OPTIONS["samples"].within("[3, 1e7]"))
+    add_option(command, OPTIONS["seeds"], SEEDS)
+    add_options(command, StudyConfig, "optimizer", "learning_rate", "decay", optimizer={"unset": "sgd"})
+    add_estimator_options(command, StudyConfig)
+    add_options(command, StudyConfig, "evaluation_samples", "chunk_size", evaluation_samples={"unset": "200"})
+    add_folder_options(command)
 
 
 def run(options: argparse.Namespace) -> int:
     """Optimise, print, and write where an output folder is given."""
     with usage_errors():
         configure_process(options)
-        fields: dict[str, Any] = {name: getattr(options, name) for name in FIELDS} | {"theta": theta_of(options)}
-        plan = plan_optimise(OptimiseConfig(**{name: value for name, value in fields.items() if value is not None}))
-        folder = None if options.output is None else prepare_folder(options.output)
-        if folder is not None:  # refused here, before anything is computed
-            open_checkpoints(folder, plan, accept_versions=options.accept_versions)
-    with computing(*([] if folder is None else [RESUMABLE])) as progress:
-        result = optimise(plan, folder, progress, accept_versions=options.accept_versions)
-    document = as_document(result)
-    written, unwritten = ([], None) if folder is None else attempt(lambda: _save(result, document, folder))
-    print_report(options, document, _lines(result, written, hinted=folder is None))
-    return finish(*result.unsaved, unwritten)
+        plan = plan_study(_configuration(options))
+    dataset, unwritten = compute(plan, options)
+    document = as_document(dataset)
+    written, undrawn = draw(dataset, options.output, unwritten)
+    if options.output is not None and not unwritten:
+        policies, unsaved = attempt(lambda: _save_policies(document, options.output))
+        written, undrawn = [*policies, *written], undrawn or unsaved
+    lines = _lines(document)
+    if options.output is None:
+        lines.append("add --output DIR for a figure, the policies, and to go on later")
+    elif written:
+        lines.append(f"written to {options.output}: {', '.join(path.name for path in written)}")
+    print_report(options, document, lines)
+    return finish(unwritten, undrawn)
 
 
-def as_document(result: OptimiseResult) -> dict[str, Any]:
-    """A result as plain data; histories by iteration and seed."""
-    runs = [
-        {
-            "estimator": run.estimator,
-            "final_cost": run.final_cost.tolist(),
-            "final_cost_se": run.final_cost_se.tolist(),
-            "outcomes": {name: values.tolist() for name, values in run.outcomes.items()},
-            "best_seed": run.best,
-            "stopped": [{"seed": seed, "iteration": at, "reason": why} for seed, (at, why) in run.stopped.items()],
-            "rollouts_per_iteration": run.rollouts,
-            "seconds": run.seconds.tolist(),
-            "history": {name: values.tolist() for name, values in run.history.items()},
-            "theta": run.theta.tolist(),
-        }
-        for run in result.runs
-    ]
+def _configuration(options: argparse.Namespace) -> StudyConfig:
+    """One contact model, that of the options or the task's own."""
+    fields = study_fields(options)
+    if options.reference:
+        if options.contact not in (None, REFERENCE):
+            raise ValueError(f"--reference is in the place of --contact {options.contact}; leave one of them out")
+        fields["contact"] = REFERENCE
+    task = task_of(options)
+    fields.setdefault("contact", task.main_family)
+    if task.contact_pair is not None or "stiffness" in fields:
+        fields.setdefault("stiffness", task.middle_stiffness)
+    fields |= {name: (fields[name],) for name in WRAPPED if name in fields}
+    return StudyConfig(**fields, tasks=(options.task,), kind="descents", theta=theta_of(options))
+
+
+def as_document(dataset: xr.Dataset) -> dict[str, Any]:
+    """A study of one descent as plain data; histories by iteration and seed."""
+    config, resolved = json.loads(dataset.attrs["config"]), json.loads(dataset.attrs["resolved"])[0]
+    one = dataset.isel({name: 0 for name in ("task", "timestep", "cone", "model", "sigma", "samples")})
+    place = {name: one[name].item() for name in ("contact", "stiffness", "cone", "sigma", "samples")}
+    place["stiffness"] = place["stiffness"] or None
     return as_plain(
         {
-            "config": vars(result.config),
-            "environment": result.environment,
-            "start_cost": result.start_cost,
-            "start_outcomes": result.start_outcomes,
-            "warnings": list(result.warnings),
-            "runs": runs,
+            "config": config | resolved["recipe"] | place | {"task": config["tasks"][0], "noise": resolved["noise"]},
+            "environment": json.loads(dataset.attrs["environment"]),
+            "start_cost": [one["start_cost"].item(), one["start_cost_se"].item()],
+            "start_metrics": {str(name)[len(START) :]: one[name].item() for name in one if str(name).startswith(START)},
+            "warnings": list(warnings_of(dataset)),
+            "runs": [_run(one.sel(estimator=name)) for name in config["estimators"]],
         }
     )
 
 
-def _save(result: OptimiseResult, document: dict[str, Any], folder: Path) -> list[Path]:
-    text = json.dumps(document, allow_nan=False) + "\n"
-    written = [write_whole(folder / "optimisation.json", lambda file: file.write(text.encode()))]
-    for run in result.runs:
-        policy = {
-            "task": result.config.task,
-            "estimator": run.estimator,
-            "seed": run.best,
-            "cost": float(run.final_cost[run.best]),
-            "contact": result.config.contact,
-            "stiffness": result.config.stiffness,
-            "damping": result.config.damping,
-            "cone": result.config.cone,
-            "model": result.config.model,
-            "horizon": result.config.horizon,
-            "network": result.config.network,
-            "theta": run.theta[run.best].tolist(),
-        }
-        content = (json.dumps(as_plain(policy)) + "\n").encode()
-        name = f"policy-{run.estimator.replace(':', '.')}.json"
+def _run(one: xr.Dataset) -> dict[str, Any]:
+    """One estimator's descents."""
+    final, stopped_at = one["final_cost"].values, one["stopped_at"].values
+    known = np.flatnonzero(np.isfinite(one["seconds"].values))
+    length = int(known[-1]) + 1 if len(known) else 0
+    stopped = [
+        {"seed": seed, "iteration": int(stopped_at[seed]), "reason": REASONS[int(one["reason"].values[seed])]}
+        for seed in np.flatnonzero(np.isfinite(stopped_at)).tolist()
+    ]
+    return {
+        "estimator": one["estimator"].item(),
+        "final_cost": final,
+        "final_cost_se": one["final_cost_se"].values,
+        "metrics": {str(name)[len(METRIC) :]: one[name].values for name in one if str(name).startswith(METRIC)},
+        "best_seed": int(np.nanargmin(final)) if np.any(np.isfinite(final)) else 0,
+        "stopped": stopped,
+        "rollouts_per_iteration": int(one["rollouts"]),
+        "seconds": one["seconds"].values[:length],
+        "history": {name: one[name].transpose("iteration", "seed").values[:length] for name in HISTORY},
+        "theta": one["theta"].transpose("seed", "param").values,
+    }
+
+
+def _save_policies(document: dict[str, Any], folder: Path) -> list[Path]:
+    config, written = document["config"], []
+    kept = {name: config[name] for name in ("task", "stiffness", "damping", "cone", "model", "network")}
+    kept |= {"contact": None if config["contact"] == REFERENCE else config["contact"], "horizon": config["horizon"]}
+    for run in document["runs"]:
+        best = run["best_seed"]
+        policy = kept | {"estimator": run["estimator"], "seed": best, "cost": run["final_cost"][best]}
+        content = (json.dumps(policy | {"theta": run["theta"][best]}) + "\n").encode()
+        name = f"policy-{run['estimator'].replace(':', '.')}.json"
         written.append(write_whole(folder / name, lambda file, data=content: file.write(data)))
-    return [*written, *save_figure(plot_optimisation(result), folder, "optimisation")]
+    return written
 
 
-def _lines(result: OptimiseResult, written: list[Path], *, hinted: bool) -> list[str]:
-    config = result.config
-    where = "analytic reference" if config.reference else config.contact
-    if not config.reference and config.stiffness:
-        where = f"{where}, K = {config.stiffness:g} N/m"
-    outcomes = "".join(f", {name} {value:.3f}" for name, value in result.start_outcomes.items())
-    decay = f" / i^{config.decay:g}" if config.decay else ""
-    mean, error = result.start_cost
+def _lines(document: dict[str, Any]) -> list[str]:
+    config = document["config"]
+    where = "analytic reference" if config["contact"] == REFERENCE else config["contact"]
+    if config["contact"] != REFERENCE and config["stiffness"]:
+        where = f"{where}, K = {config['stiffness']:g} N/m"
+    metrics = "".join(f", {name} {number(value, 3)}" for name, value in document["start_metrics"].items())
+    decay = f" / i^{config['decay']:g}" if config["decay"] else ""
+    mean, error = document["start_cost"]
     lines = [
-        f"{config.task}: {where}; {config.optimizer}, learning rate {config.learning_rate:g}{decay}, "
-        f"{config.iterations} iterations",
-        f"{config.samples} samples in each batch, {config.seeds} seeds from {config.seed}, sigma {config.sigma:g}; "
-        f"cost at the start {number(mean, 4)} ± {number(error, 2)}{outcomes}",
+        f"{config['task']}: {where}; {config['optimizer']}, learning rate {config['learning_rate']:g}{decay}, "
+        f"{config['iterations']} iterations",
+        f"{config['samples']} samples in each batch, {config['seeds']} seeds from {config['seed']}, "
+        f"sigma {config['sigma']:g}; cost at the start {number(mean, 4)} ± {number(error, 2)}{metrics}",
         "",
         *format_table(
-            [_row(run) for run in result.runs],
-            ["estimator", "cost", "best", *result.start_outcomes, "alpha", "rollouts", "seconds"],
+            [_row(run) for run in document["runs"]],
+            ["estimator", "cost", "best", *document["start_metrics"], "alpha", "rollouts", "seconds"],
         ),
     ]
-    for run in result.runs:
-        for seed, (iteration, reason) in run.stopped.items():
-            lines.append(f"{style_of(run.estimator)[0]}, seed {seed}: stopped at iteration {iteration}, {reason}")
-    lines += [f"warning: {message}" for message in result.warnings]
-    hint = "add --output DIR for a figure, the policies, and to go on later"
-    if not written:
-        return [*lines, hint] if hinted else lines
-    return [*lines, f"written to {written[0].parent}: {', '.join(path.name for path in written)}"]
+    for run in document["runs"]:
+        for stop in run["stopped"]:
+            label, _, _ = style_of(run["estimator"])
+            lines.append(f"{label}, seed {stop['seed']}: stopped at iteration {stop['iteration']}, {stop['reason']}")
+    return lines + [f"warning: {message}" for message in document["warnings"]]
 
 
-def _row(run: Run) -> list[str]:
-    costs = run.final_cost[np.isfinite(run.final_cost)]
-    tail = run.history["alpha"][-max(1, len(run.seconds) // 10) :]
-    alpha = float(np.nanmean(tail)) if np.any(np.isfinite(tail)) else math.nan
+def _row(run: dict[str, Any]) -> list[str]:
+    costs = _finite(run["final_cost"])
+    length = len(run["seconds"])
+    weights = _finite([weight for row in run["history"]["alpha"][-max(1, length // 10) :] for weight in row])
     return [
-        style_of(run.estimator)[0],
+        style_of(run["estimator"])[0],
         _mean_and_spread(costs, 4),
         number(float(np.min(costs)), 4) if len(costs) else "nan",
-        *(_mean_and_spread(values, 3) for values in run.outcomes.values()),
-        "-" if math.isnan(alpha) else f"{alpha:.3f}",
-        str(run.rollouts * len(run.seconds)),
-        f"{run.seconds[-1]:.1f}" if len(run.seconds) else "-",
+        *(_mean_and_spread(_finite(values), 3) for values in run["metrics"].values()),
+        f"{np.mean(weights):.3f}" if len(weights) else "-",
+        str(run["rollouts_per_iteration"] * length),
+        f"{run['seconds'][-1]:.1f}" if length else "-",
     ]
+
+
+def _finite(values: list[float | None]) -> np.ndarray:
+    return np.array([value for value in values if value is not None and math.isfinite(value)])
 
 
 def _mean_and_spread(values: np.ndarray, digits: int) -> str:
-    values = values[np.isfinite(values)]
     if len(values) == 0:
         return "nan"
     spread = f" ± {number(float(np.std(values, ddof=1)), 2)}" if len(values) > 1 else ""

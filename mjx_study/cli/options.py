@@ -17,8 +17,9 @@ import jax
 from mjx_study.cli.console import progress_bar, show_cursor
 from mjx_study.option import OPTIONS, Checked, Option
 from mjx_study.runtime import PRECISIONS, configure
+from mjx_study.simulation.contact import FAMILIES
 from mjx_study.simulation.limitations import FLAGS
-from mjx_study.study.configuration import EstimatorConfig, Progress
+from mjx_study.study.configuration import Progress
 from mjx_study.tasks import make_task, task_names
 from mjx_study.tasks.task import Task
 
@@ -51,11 +52,17 @@ Commands = Any
 
 
 def add_command(
-    commands: Commands, name: str, summary: str, run: Callable[[argparse.Namespace], int], epilog: str = ""
+    commands: Commands,
+    name: str,
+    summary: str,
+    run: Callable[[argparse.Namespace], int],
+    epilog: str = "",
+    aliases: Sequence[str] = (),
 ) -> argparse.ArgumentParser:
     """A subcommand with `--json`."""
     command = commands.add_parser(
         name,
+        aliases=aliases,
         help=summary,
         description=summary[0].upper() + summary[1:] + ".",
         epilog=epilog,
@@ -113,14 +120,11 @@ def add_options(command: argparse.ArgumentParser, owner: type[Checked], *names: 
         add_option(command, owner.option(name), owner.default(name), given=False, **changes.get(name, {}))
 
 
-def add_task_options(
-    command: argparse.ArgumentParser, owner: type[Checked] = EstimatorConfig, *, files: str = ""
-) -> None:
+def add_task_options(command: argparse.ArgumentParser, *, files: str = "") -> None:
     """The task, what may replace its own settings, and how it is computed."""
     add_task_argument(command, files)
-    add_options(command, owner, "sigma")
-    for name in ("cone", "horizon", "model"):
-        add_options(command, EstimatorConfig, name)
+    for name in ("sigma", "cone", "horizon", "model"):
+        add_option(command, OPTIONS[name])
     add_process_options(command)
 
 
@@ -133,10 +137,13 @@ def add_task_argument(command: argparse.ArgumentParser, files: str = "") -> None
 
 
 def add_contact_options(
-    command: argparse.ArgumentParser, owner: type[Checked], stiffness: str = "the task's sweep"
+    command: argparse.ArgumentParser, stiffness: str = "the task's sweep", *, many: bool = True, analytic: bool = True
 ) -> None:
-    """The contact models."""
-    add_options(command, owner, "stiffness", "contact", "damping", stiffness={"unset": stiffness})
+    """The contact models; one or many, the analytic reference among them or not."""
+    add_option(command, dataclasses.replace(OPTIONS["stiffness"], many=many), unset=stiffness)
+    contact = dataclasses.replace(OPTIONS["contact"], many=many)
+    add_option(command, contact if analytic else dataclasses.replace(contact, choices=tuple(FAMILIES)))
+    add_option(command, OPTIONS["damping"])
 
 
 def add_scene_options(command: argparse.ArgumentParser) -> None:

@@ -50,7 +50,6 @@ from mjx_study.render import (
 )
 from mjx_study.simulation.scene import load_model
 from mjx_study.study.configuration import at_theta
-from mjx_study.study.descents import OptimiseConfig
 from mjx_study.table import format_table
 from mjx_study.tasks.contact_grid import ContactPoint, contact_grid
 from mjx_study.tasks.network import with_network
@@ -113,7 +112,7 @@ def add(commands: Commands) -> None:
     command = add_command(commands, "rollout", "show a rollout: pictures, a film and its numbers", run, EPILOG)
     add_task_options(command, files="; or any MJCF")
     add_scene_options(command)
-    add_contact_options(command, OptimiseConfig, "the middle one of the task's sweep")
+    add_contact_options(command, "the middle one of the task's sweep", many=False, analytic=False)
     command.add_argument("--noise", action="store_true", help="with the noise of sample --seed (default: none)")
     add_theta_option(command, "parameters")
     command.add_argument("--policy", type=Path, metavar="FILE", help="a policy that optimise wrote, policy-NAME.json")

@@ -11,7 +11,8 @@ from mjx_study.cli.options import UsageError, add_versions_option, attempt, comp
 from mjx_study.disk import prepare_folder
 from mjx_study.plots.study import plot_study
 from mjx_study.plots.style import save_figure
-from mjx_study.study.plan import StudyConfig, StudyPlan
+from mjx_study.study.configuration import StudyConfig
+from mjx_study.study.plan import StudyPlan
 from mjx_study.study.run import open_store, run_study
 from mjx_study.study.store import StudyError
 
@@ -33,7 +34,7 @@ def study_fields(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def compute(plan: StudyPlan, options: argparse.Namespace) -> tuple[xr.Dataset, str | None]:
-    """Run a study, in its folder where one is given; what a full disk refuses is computed in memory.
+    """Run a study, in its folder where one is given; what a full disk refuses is kept in memory.
 
     Returns:
         The numbers, and why they could not be written, if so.
@@ -41,19 +42,19 @@ def compute(plan: StudyPlan, options: argparse.Namespace) -> tuple[xr.Dataset, s
     Raises:
         UsageError: the folder holds another study, or a damaged one, or cannot be used.
     """
-    folder, unwritten = options.output, None
+    if options.output is None:
+        with computing() as progress:
+            return run_study(plan, progress=progress), None
     try:
-        if folder is not None:
-            with usage_errors():
-                open_store(plan, folder, options.command_line, accept_versions=options.accept_versions)
-            with computing(RESUMABLE) as progress:
-                return run_study(plan, folder, progress, accept_versions=options.accept_versions), None
+        with usage_errors():
+            open_store(plan, options.output, options.command_line, accept_versions=options.accept_versions)
+        with computing(RESUMABLE) as progress:
+            accept = options.accept_versions
+            dataset = run_study(plan, options.output, progress, accept_versions=accept, keep_going=True)
     except StudyError as error:
         raise UsageError(str(error)) from error
-    except OSError as error:
-        unwritten = f"cannot write {error.filename or folder}: {error.strerror or error}; what is there is complete"
-    with computing() as progress:
-        return run_study(plan, progress=progress), unwritten
+    reason = dataset.attrs.pop("unwritten", None)
+    return dataset, reason and f"{reason}; what is there is complete, and the same command goes on"
 
 
 def draw(dataset: xr.Dataset, folder: Path | None, unwritten: str | None) -> tuple[list[Path], str | None]:

@@ -179,15 +179,16 @@ def _rows(value: Any) -> tuple[tuple[float, ...], ...]:
 def _head(plan: StudyPlan, missing: int) -> list[str]:
     """The configuration as it was resolved."""
     config, cells = plan.config, len(plan.cells)
-    kind = {"descents": f"descents of {config.iterations} iterations", "landscapes": f"{config.points} points"}
+    lengths = _listed(group.recipe.iterations for group in plan.groups if group.recipe)
+    kind = {"descents": f"descents of {lengths} iterations", "landscapes": f"{config.points} points"}
     lines = [
-        f"{', '.join(config.task_names)}: {kind.get(config.kind, config.kind)}, {', '.join(config.estimators)}, "
+        f"{', '.join(config.task_names)}: {kind.get(str(config.kind), config.kind)}, {', '.join(config.estimators)}, "
         f"seeds {config.batches}",
         f"contact models: {len({(c.model.family, c.model.stiffness) for c in plan.cells})}, "
         f"timestep {_listed(group.timestep for group in plan.groups)} s, "
         f"{', '.join(dict.fromkeys(group.cone for group in plan.groups))} cone, "
         f"sigma {_listed(cell.sigma for cell in plan.cells)}, "
-        f"{', '.join(map(str, config.samples))} samples",
+        f"{_listed(cell.samples for cell in plan.cells)} samples",
         f"cells: {cells}, of which {missing} to compute"
         + (
             f"; {plan.compilations} programs to compile, chunks of {plan.chunk_size} samples, "

@@ -2,13 +2,10 @@
 
 from typing import Any
 
-import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from mjx_study.plots.style import STYLE, TITLES, mean_with_band, robust_limits, style_of
-from mjx_study.study.descents import OptimiseResult, Run
 from mjx_study.study.landscapes import Curve, Landscape
 
 
@@ -51,54 +48,6 @@ def plot_landscape(result: Landscape) -> Figure:
         fontsize="medium",
     )
     return figure
-
-
-def plot_optimisation(result: OptimiseResult) -> Figure:
-    """Cost against iterations, rollouts and seconds, and alpha: a line for each estimator, a band over its seeds."""
-    weighed = [run for run in result.runs if np.any(np.isfinite(run.history["alpha"]))]
-    figure = Figure(figsize=(3.4 * (4 if weighed else 3) + 0.6, 3.8), layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.subplots(1, 4 if weighed else 3)
-    for run in result.runs:
-        iterations = np.arange(1, len(run.seconds) + 1)
-        for panel, x in zip(axes, (iterations, run.rollouts * iterations, run.seconds), strict=False):
-            _seeds(panel, x, run.history["cost"], run)
-    for panel, label in zip(axes, ("iteration", "rollouts of one seed", "seconds, all seeds"), strict=False):
-        panel.set_xlabel(label)
-        panel.grid(alpha=0.25)
-        values = np.concatenate([run.history["cost"].ravel() for run in result.runs])
-        low, high = robust_limits([values])
-        panel.set_ylim(low, high)
-    axes[0].set_ylabel("mean cost of the batch")
-    if weighed:
-        for run in weighed:
-            _seeds(axes[3], np.arange(1, len(run.seconds) + 1), run.history["alpha"], run)
-        axes[3].set_xlabel("iteration")
-        axes[3].set_ylabel("alpha, weight of first-order gradients")
-        axes[3].set_ylim(-0.03, 1.03)
-        axes[3].grid(alpha=0.25)
-    axes[0].legend(frameon=False, fontsize="small")
-    config = result.config
-    where = "analytic reference" if config.reference else TITLES[config.contact or "mjcf"]
-    stiffness = f", K = {config.stiffness:g} N/m" if config.stiffness and not config.reference else ""
-    figure.suptitle(
-        f"{config.task}: {where}{stiffness}; {config.optimizer}, {config.samples} samples "
-        f"({config.seeds} seeds: median, and from least to greatest)",
-        fontsize="medium",
-    )
-    return figure
-
-
-def _seeds(axes: Axes, x: np.ndarray, values: np.ndarray, run: Run) -> None:
-    """Median over the seeds that go on, and their range."""
-    label, colour, _ = style_of(run.estimator)
-    going = np.any(np.isfinite(values), axis=1)
-    x, values = x[going], values[going]
-    if len(x):
-        axes.plot(x, np.nanmedian(values, axis=1), color=colour, linewidth=1.4, label=label)
-        axes.fill_between(
-            x, np.nanmin(values, axis=1), np.nanmax(values, axis=1), color=colour, alpha=0.15, linewidth=0
-        )
 
 
 def _curve_title(curve: Curve) -> str:

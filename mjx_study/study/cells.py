@@ -13,49 +13,14 @@ from jaxtyping import Array, Float
 from estimators import Estimator
 from mjx_study.objective import Simulator
 from mjx_study.runtime import precision
-from mjx_study.study.descents import Backend, optimise
+from mjx_study.study.descents import compute_descents
 from mjx_study.study.gradients import compute_gradients
 from mjx_study.study.landscapes import line_of
-from mjx_study.study.plan import StudyCell, StudyPlan, descent_plan, estimators_of, oracles_of
+from mjx_study.study.plan import StudyCell, StudyPlan, estimators_of, oracles_of
 from mjx_study.study.sampling import cell_keys, draw_batches, unconverged
 
 Compute = Callable[[StudyCell], dict[str, np.ndarray]]
 """Gives the numbers of a cell by variable."""
-
-
-def compute_descents(plan: StudyPlan) -> Callable[[StudyCell], dict[str, np.ndarray]]:
-    """A function that computes a cell; it keeps what is compiled."""
-    backends: dict[tuple[int, float, int], Backend] = {}
-
-    def compute(cell: StudyCell) -> dict[str, np.ndarray]:
-        ready = descent_plan(plan, cell)
-        key = (cell.group, cell.sigma, cell.samples)
-        if key not in backends:
-            backends[key] = Backend(ready)
-        found = optimise(ready, backend=backends[key])
-        iterations, seeds = ready.config.iterations or 0, ready.config.seeds
-        arrays = {
-            "final_cost": np.stack([run.final_cost for run in found.runs], 1),
-            "final_cost_se": np.stack([run.final_cost_se for run in found.runs], 1),
-            "start_cost": np.array(found.start_cost[0]),
-            "stopped_at": np.full((seeds, len(found.runs)), np.nan),
-            "rollouts": np.array([run.rollouts for run in found.runs]),
-        }
-        for column, run in enumerate(found.runs):
-            for seed, (iteration, _) in run.stopped.items():
-                arrays["stopped_at"][seed, column] = iteration
-        for name in ("cost", "alpha"):
-            arrays[name] = np.stack([_padded(run.history[name], iterations) for run in found.runs], -1)
-        arrays["seconds"] = np.stack([_padded(run.seconds, iterations) for run in found.runs], -1)
-        return {name: np.asarray(array, float) for name, array in arrays.items()}
-
-    return compute
-
-
-def _padded(values: np.ndarray, length: int) -> np.ndarray:
-    """With NaN after its end, along the first axis."""
-    missing = [(0, length - len(values))] + [(0, 0)] * (values.ndim - 1)
-    return np.pad(np.asarray(values, float), missing, constant_values=np.nan)
 
 
 def compute_landscapes(plan: StudyPlan) -> Compute:

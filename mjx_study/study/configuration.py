@@ -1,62 +1,120 @@
-"""What every study is asked for, checked and resolved: the task, its contact models, its estimators."""
+"""What a study is asked for, and what of it concerns a task: its estimators, its recipe, its parameters."""
 
 import dataclasses
+import math
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Sequence
-from typing import Any
+from typing import Any, ClassVar, Final
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 from estimators import ESTIMATORS, Estimator, make_estimator
 from estimators.cross_fitting import PLUG_IN, check_weights
 from estimators.ddcg import PUBLISHED_TOLERANCE
-from mjx_study.objective import chunk_for
-from mjx_study.option import Checked
-from mjx_study.tasks import make_task
-from mjx_study.tasks.task import Task
-from mjx_study.tasks.validation import check_shapes
+from mjx_study.option import CONTACTS, Checked
+from mjx_study.simulation.contact import FAMILIES
+from mjx_study.tasks.task import Recipe, Task
 
 Progress = Callable[[int, int, str], None]
 """Called with (work done, work in all, what is being done)."""
+OF_KIND: Final[dict[str, dict[str, Any]]] = {
+    "gradients": {"reference_samples": 600},
+    "descents": {
+        "iterations": None,
+        "optimizer": "sgd",
+        "learning_rate": None,
+        "decay": None,
+        "evaluation_samples": 200,
+        "network": None,
+    },
+    "landscapes": {"span": None, "direction": None},
+}
+"""Options that one kind of sweep alone has, and what they are unless given."""
+ASKED_BY: Final = {"descents": "give iterations as well", "landscapes": "give points as well"}
+KINDS: Final = tuple(OF_KIND)
+"""Of studies."""
+SAMPLES: Final = 100
+"""In each batch, where neither the configuration nor a recipe says."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class EstimatorConfig(Checked):
-    """What decides how estimators run on a task; base of the configurations of studies.
+class StudyConfig(Checked):
+    """Everything that decides a study: gradient estimates, or descents, or landscapes.
 
     Attributes:
-        task: name of a task.
-        estimators: names of estimators, or `module:name` of one's own.
-        theta: parameters at which gradients are taken or a descent begins; None for the task's.
-        seed: of all randomness.
-        sigma: standard deviation of the noise, in the unit of what it is added to; None for the task's.
-        noise: name of the noise's density; None for the task's.
-        baseline: of zeroth-order estimates: zero_noise, leave_one_out or none.
-        gamma: accuracy that the alpha-order estimate must keep, in the unit of the gradient; None for the task's.
+        tasks: names of tasks, or tasks.
+        kind: gradients, descents or landscapes; None for what iterations and points say.
+        estimators: names of estimators.
+        theta: parameters at which gradients are taken or a descent begins, of a single task; None for the task's.
+        network: widths of the hidden layers of a network in place of the task's policy, in descents; None for that.
+        contact: contact families, and "reference" for the analytic system; None for each task's. Empty for none but
+            those of `solref`.
+        stiffness: of the families that take one [N/m]; None for each task's.
+        damping: of the contact [N s/m]; None for each family's.
+        solref, solimp: contact models in MuJoCo's own terms, every solref with every solimp, beside the families;
+            either alone goes with MuJoCo's default of the other.
+        timestep: [s]; None for the MJCF's. Each gets as many steps as take as long as the task's own, unless horizon is
+            given.
+        cone: pyramidal, elliptic; None for the MJCF's.
+        sigma: standard deviations of the noise; None for each task's.
+        samples: sizes of a batch; None for 100, in descents for each task's recipe.
+        confidence: of the intervals within a batch.
+        seeds: batches of each size, or descents; of landscapes, batches that are taken together at each point. None for
+            10, of landscapes 1.
+        iterations: steps of a descent; None for each task's recipe.
+        points: on a line through each task's theta, for landscapes; None for no landscapes.
+        span, direction: of that line, None for each task's range and a random direction.
+        optimizer: name of an optimiser of optax, "sgd" by default.
+        learning_rate, decay: learning_rate / i^decay at iteration i; None for each task's recipe.
+        reference_samples: pairs of rollouts behind each reference gradient; of gradients, None for 600.
+        evaluation_samples: rollouts behind the cost of a final policy; of descents, None for 200.
+        seed: random seed.
+        noise: name of the noise's density; None for each task's.
+        baseline: baseline of zeroth-order estimates: zero_noise, leave_one_out or none.
+        gamma: accuracy that the alpha-order estimate must keep, in the unit of the gradient; None for each task's.
         published: whether gamma and what follows are the published example's, on the scale of the task's cost.
         failure_probability: of the confidence radius epsilon.
         variance_proxy: in epsilon: variance, second_moment or upper_bound.
         radius: R in epsilon: max_deviation, or a bound in the unit of the gradient.
-        max_norm: of a sample of the clipped first-order estimate, in the unit of the gradient.
+        max_norm: largest norm of a sample of the clipped first-order estimate, in the unit of the gradient.
         window: steps between cuts of the truncated first-order estimate.
-        tolerance: of the discontinuity test of "ddcg".
+        tolerance: tolerance of the discontinuity test of "ddcg".
         weights: plug_in or cross_fitted, of the estimators that interpolate.
-        onset: none, or linear for first-order gradients with the term of contact that begins; see
-            `mjx_study.simulation.onset`.
-        damping: of the contact [N s/m]; None for each family's.
-        cone: pyramidal or elliptic; None for the MJCF's.
-        horizon: steps; None for the task's.
+        onset: none, or linear for first-order gradients with the onset term; see `mjx_study.simulation.onset`.
+        horizon: steps; None for each task's.
         model: an MJCF in place of the task's own; None for that.
         chunk_size: samples per device and call; None to choose by the number of samples.
     """
 
-    task: str
+    ranges: ClassVar = {"samples": "[3, 1e7]"}
+
+    tasks: tuple[str | Task, ...]
+    kind: str | None = None
     estimators: tuple[str, ...] = ("zobg", "fobg", "aobg")
     theta: tuple[float, ...] | None = None
+    network: tuple[int, ...] | None = None
+    contact: tuple[str, ...] | None = None
+    stiffness: tuple[float, ...] | None = None
+    damping: float | None = None
+    solref: tuple[tuple[float, ...], ...] = ()
+    solimp: tuple[tuple[float, ...], ...] = ()
+    timestep: tuple[float, ...] | None = None
+    cone: tuple[str, ...] | None = None
+    sigma: tuple[float, ...] | None = None
+    samples: tuple[int, ...] | None = None
+    confidence: float = 0.95
+    seeds: int | None = None
+    iterations: int | None = None
+    points: int | None = None
+    span: tuple[float, ...] | None = None
+    direction: str | None = None
+    optimizer: str | None = None
+    learning_rate: float | None = None
+    decay: float | None = None
+    reference_samples: int | None = None
+    evaluation_samples: int | None = None
     seed: int = 0
-    sigma: float | None = None
     noise: str | None = None
     baseline: str = "zero_noise"
     gamma: float | None = None
@@ -69,15 +127,62 @@ class EstimatorConfig(Checked):
     tolerance: float = PUBLISHED_TOLERANCE
     weights: str = PLUG_IN
     onset: str = "none"
-    damping: float | None = None
-    cone: str | None = None
     horizon: int | None = None
     model: str | None = None
     chunk_size: int | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if not self.tasks:
+            raise ValueError("no task given")
+        if self.theta is not None and len(self.tasks) > 1:
+            raise ValueError("theta is of a single task; give one task, or leave theta out")
         check_names("estimator", self.estimators, ESTIMATORS)
+        if self.contact:
+            check_names("contact family", self.contact, CONTACTS)
+        if self.contact is not None and not any(_swept(name) for name in self.contact):
+            for name in ("stiffness", "damping"):
+                if getattr(self, name) is not None:
+                    chosen = f"contact {', '.join(self.contact)}" if self.contact else "solref or solimp alone"
+                    raise ValueError(f"{chosen} takes no {name}; leave {name} out")
+        for name in ("tasks", "stiffness", "solref", "solimp", "timestep", "cone", "sigma", "samples"):
+            values = getattr(self, name)
+            if values is not None:
+                refuse_repeats(name, values)
+            if values == () and name not in ("solref", "solimp"):
+                raise ValueError(f"no {name} given: give at least one, or leave it out")
+        if self.iterations is not None and self.points is not None:
+            raise ValueError("iterations are of descents and points of landscapes: give one of them")
+        if self.kind not in (None, *KINDS):
+            raise ValueError(f"unknown kind {self.kind!r}; choose from {', '.join(KINDS)}")
+        if self.kind is None:
+            of_points = "gradients" if self.points is None else "landscapes"
+            object.__setattr__(self, "kind", of_points if self.iterations is None else "descents")
+        self._settle()
+        check_span(self.span)
+        if self.samples is not None:
+            check_weights(self.weights, min(self.samples))
+
+    def _settle(self) -> None:
+        """Refuse options that have no effect in this kind of sweep, and give its own their defaults."""
+        for kind, options in OF_KIND.items():
+            given = [name for name in options if getattr(self, name) is not None]
+            if kind != self.kind and given:
+                listed = f"{' and '.join(given)} {'is' if len(given) == 1 else 'are'}"
+                raise ValueError(f"{listed} of {kind}: {ASKED_BY.get(kind, 'leave it out')}")
+            for name, default in options.items():
+                if kind == self.kind and getattr(self, name) is None:
+                    object.__setattr__(self, name, default)
+
+    @property
+    def task_names(self) -> list[str]:
+        """Names of the tasks."""
+        return [which if isinstance(which, str) else which.name for which in self.tasks]
+
+    @property
+    def batches(self) -> int:
+        """The number of seeds, given or not."""
+        return self.seeds or (1 if self.kind == "landscapes" else 10)
 
 
 def check_names(label: str, names: Sequence[str], choices: Collection[str]) -> None:
@@ -98,22 +203,31 @@ def refuse_repeats(label: str, values: Sequence[object]) -> None:
         raise ValueError(f"{label} given twice: {', '.join(sorted(repeated))}")
 
 
-def configured_task(config: EstimatorConfig, task: Task | None = None) -> Task:
-    """The task that a configuration names, or the one that is given, with what the configuration changes of it.
+def check_span(span: Sequence[float] | None) -> None:
+    """Raises ValueError unless it is None or two numbers, the lower one first."""
+    if span is not None and not (len(span) == 2 and 0 < span[1] - span[0] < math.inf):
+        raise ValueError(f"span must be two numbers, the lower one first; got {span}")
+
+
+def _swept(family: str) -> bool:
+    """Whether a contact family takes stiffnesses."""
+    return family not in FAMILIES or FAMILIES[family].swept
+
+
+def recipe_of(config: StudyConfig, task: Task) -> Recipe:
+    """Settings of a task's descents: the configuration's, and its recipe's where that leaves them open.
 
     Raises:
-        ValueError: there is no such task, or it cannot be changed so; or parts of the given one do not fit together.
+        ValueError: a setting is missing.
     """
-    building = {name: getattr(config, name) for name in ("cone", "horizon", "model")}
-    building = {name: value for name, value in building.items() if value is not None}
-    if task is None:
-        task = make_task(config.task, **building)
-    elif building:
-        raise ValueError(f"{', '.join(building)}: only for a task that is built by its name; build this one so")
-    else:
-        check_shapes(task)
-    changes = {"sigma": config.sigma, "noise": config.noise}
-    return task.replace(onset=config.onset, **{name: value for name, value in changes.items() if value is not None})
+    given = {name: getattr(config, name) for name in ("iterations", "learning_rate", "decay")}
+    given |= {"samples": None if config.samples is None else max(config.samples)}
+    if task.recipe is not None:
+        return dataclasses.replace(task.recipe, **{name: value for name, value in given.items() if value is not None})
+    given["decay"] = given["decay"] or 0.0
+    if missing := [name.replace("_", " ") for name, value in given.items() if value is None]:
+        raise ValueError(f"{task.name} has no recipe: give {', '.join(missing)}")
+    return Recipe(**given)
 
 
 def at_theta(task: Task, theta: Sequence[float] | None) -> Task:
@@ -132,7 +246,7 @@ def at_theta(task: Task, theta: Sequence[float] | None) -> Task:
     return task.replace(theta=jnp.asarray(values, task.theta.dtype))
 
 
-def configured_estimators(config: EstimatorConfig, task: Task) -> tuple[Estimator, ...]:
+def configured_estimators(config: StudyConfig, task: Task) -> tuple[Estimator, ...]:
     """A configuration's estimators with their options, checked against the task.
 
     Raises:
@@ -146,7 +260,7 @@ def configured_estimators(config: EstimatorConfig, task: Task) -> tuple[Estimato
     return found
 
 
-def bound_constants(config: EstimatorConfig, task: Task) -> dict[str, Any]:
+def bound_constants(config: StudyConfig, task: Task) -> dict[str, Any]:
     """Constants of AoBG's bound: those of a configuration, or the published example's.
 
     Raises:
@@ -158,28 +272,10 @@ def bound_constants(config: EstimatorConfig, task: Task) -> dict[str, Any]:
         return given | {"gamma": task.gamma if config.gamma is None else config.gamma}
     if task.published is None:
         raise ValueError(f"{task.name} has no published constants of the bound; leave published out")
-    defaults = {field.name: field.default for field in dataclasses.fields(EstimatorConfig)}
+    defaults = {field.name: field.default for field in dataclasses.fields(StudyConfig)}
     if others := [name for name in names if given[name] != defaults[name]]:
         raise ValueError(f"published sets {', '.join(names)}: leave {', '.join(others)} out")
     return dataclasses.asdict(task.published)
-
-
-def resolved_fields(config: EstimatorConfig, task: Task, samples: int) -> dict[str, Any]:
-    """Fields of a configuration that the task or the devices decide where it leaves them open.
-
-    Raises:
-        ValueError: there are too few samples for the weights.
-    """
-    check_weights(config.weights, samples)
-    chunk = chunk_for(samples, jax.local_devices()) if config.chunk_size is None else config.chunk_size
-    return {
-        "sigma": task.sigma,
-        "noise": task.noise,
-        **bound_constants(config, task),
-        "horizon": task.horizon,
-        "cone": {0: "pyramidal", 1: "elliptic"}[int(task.scene.host.opt.cone)],
-        "chunk_size": chunk,
-    }
 
 
 def check_estimators(estimators: Iterable[Estimator], task: Task) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 
 from mjx_study.disk import write_whole
-from mjx_study.study.variables import CELL, VARIABLES
+from mjx_study.study.variables import variables_of
 
 UNITS: Final = {"timestep": "s", "sigma": "unit of what the noise is added to", "samples": "1", "stiffness": "N/m"}
 Cells = Mapping[int, tuple[Mapping[str, np.ndarray], Mapping[str, str]]]
@@ -47,11 +47,13 @@ def dataset_of(document: Mapping[str, Any], cells: Cells) -> xr.Dataset:
     }
     shape = tuple(len(dimensions[name]) for name in outer)
     data: dict[str, Any] = {}
-    for name, variable in (VARIABLES[config["kind"]] | CELL).items():
+    names = sorted({name for arrays, _ in cells.values() for name in arrays})
+    for name, variable in variables_of(config["kind"], names).items():
         held = {index: arrays[name] for index, (arrays, _) in cells.items() if name in arrays}
         if not held:
             continue
-        inner = np.max([array.shape for array in held.values()], axis=0, initial=0).astype(int)  # params may differ
+        sizes = np.max([array.shape for array in held.values()], axis=0, initial=0).astype(int)  # params may differ
+        inner = [len(dimensions.get(dim, range(size))) for dim, size in zip(variable.dims, sizes, strict=True)]
         values = np.full((*shape, *inner), np.nan)
         for index, array in held.items():
             place = tuple(places[index]["at"][dimension] for dimension in outer)
@@ -81,7 +83,8 @@ def dataset_of(document: Mapping[str, Any], cells: Cells) -> xr.Dataset:
 def _mixture(versions: Sequence[Mapping[str, str]]) -> str:
     """What was computed by more than one version, and by which; empty where nothing was."""
     names = dict.fromkeys(name for each in versions for name in each)
-    by_name = {name: list(dict.fromkeys(each.get(name, "none") for each in versions)) for name in names}
+    split = {name: [part for each in versions for part in each.get(name, "none").split(" and ")] for name in names}
+    by_name = {name: list(dict.fromkeys(parts)) for name, parts in split.items()}
     return ", ".join(f"{name} {' and '.join(found)}" for name, found in by_name.items() if len(found) > 1)
 
 

@@ -28,7 +28,7 @@ from mjx_study.option import Checked
 from mjx_study.reference import FunctionObjective, Reference, ScalarFunction, smoothed
 from mjx_study.runtime import environment
 from mjx_study.simulation.contact import ContactModel
-from mjx_study.study.configuration import Progress, at_theta
+from mjx_study.study.configuration import Progress, at_theta, check_span
 from mjx_study.study.memory import check_memory
 from mjx_study.study.quadrature import Line, Means, applies, grid, means
 from mjx_study.tasks import make_task
@@ -217,12 +217,6 @@ def line_of(task: Task, points: int, span: Sequence[float] | None, direction: st
     position = np.linspace(low, high, points)
     origin = np.zeros(1) if len(theta) == 1 else theta
     return ThetaLine(position, along, tuple(jnp.asarray(origin + t * along, task.theta.dtype) for t in position))
-
-
-def check_span(span: Sequence[float] | None) -> None:
-    """Raises ValueError unless it is None or two numbers, the lower one first."""
-    if span is not None and not (len(span) == 2 and 0 < span[1] - span[0] < math.inf):
-        raise ValueError(f"span must be two numbers, the lower one first; got {span}")
 
 
 @dataclasses.dataclass(frozen=True)

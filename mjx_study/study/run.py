@@ -8,9 +8,12 @@ their own; everything else is traced.
 import dataclasses
 import json
 import time
+from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
 import xarray as xr
 
 from estimators import ENOUGH_EFFECTIVE
@@ -18,12 +21,12 @@ from mjx_study.disk import prepare_folder
 from mjx_study.runtime import environment
 from mjx_study.study.axes import Axes, axes_of, solver_arrays, solver_parameters
 from mjx_study.study.cells import COMPUTE
-from mjx_study.study.configuration import Progress
-from mjx_study.study.dataset import as_plain, dataset_of, write_dataset
+from mjx_study.study.configuration import Progress, StudyConfig
+from mjx_study.study.dataset import Cells, as_plain, dataset_of, write_dataset
 from mjx_study.study.identity import contents, estimator_contents, versions
-from mjx_study.study.plan import StudyCell, StudyConfig, StudyPlan, estimators_of, plan_study
+from mjx_study.study.plan import StudyCell, StudyPlan, estimators_of, plan_study
 from mjx_study.study.revision import git_revision
-from mjx_study.study.store import Store
+from mjx_study.study.store import Part, Store
 from mjx_study.tasks.task import Task
 
 WAIT_SECONDS: Final = 0.5
@@ -34,8 +37,10 @@ def _document(plan: StudyPlan, command: str | None) -> dict[str, Any]:
     """What study.json says."""
     fields = {field.name: getattr(plan.config, field.name) for field in dataclasses.fields(plan.config)}
     axes = axes_of(plan)
+    fields |= {"tasks": plan.config.task_names, "seeds": plan.config.batches}
+    fields["iterations"] = max((group.recipe.iterations for group in plan.groups if group.recipe), default=None)
     return {
-        "config": fields | {"tasks": plan.config.task_names, "kind": plan.config.kind, "seeds": plan.config.batches},
+        "config": fields,
         "warnings": list(plan.warnings),
         "contents": contents(_forms(plan)) | estimator_contents(*plan.config.estimators),
         "versions": versions(),
@@ -61,7 +66,9 @@ def _resolved(plan: StudyPlan, axes: Axes) -> list[dict[str, Any]]:
         if task.horizon not in entry["horizon"]:
             entry["horizon"].append(task.horizon)
         if "noise" not in entry:
-            entry |= {"noise": task.noise, "estimators": _options(plan, cell)}
+            recipe = plan.groups[cell.group].recipe
+            settings = {} if recipe is None else dataclasses.asdict(recipe)
+            entry |= {"noise": task.noise, "estimators": _options(plan, cell), "recipe": settings}
     return found
 
 
@@ -106,15 +113,17 @@ def run_study(
     *,
     command: str | None = None,
     accept_versions: bool = False,
+    keep_going: bool = False,
 ) -> xr.Dataset:
     """Run a study in memory; or with a folder compute what is missing there, beside any process that does the same.
 
     Args:
         study: what to run.
         folder: folder of the study, new or begun; None to keep it in memory.
-        progress: called before every cell.
+        progress: called before every cell, and within descents.
         command: command that asked for it, to be kept with a new study.
         accept_versions: go on with a study that other versions of JAX, MuJoCo or this package began.
+        keep_going: where a file cannot be written, compute the rest in memory; the attribute `unwritten` says why.
 
     Returns:
         All numbers of the study, labelled; the attribute `computed_cells` says how many cells this call computed.
@@ -125,43 +134,90 @@ def run_study(
         OSError: a cell could not be written; what was written before is kept.
     """
     plan = plan_study(study) if isinstance(study, StudyConfig) else study
-    if folder is not None:
-        computed = _fill(plan, Path(folder), progress, command, accept_versions)
-        dataset = load_study(folder)
-        write_dataset(dataset, Path(folder) / "results.nc")
+    run = _Run(plan, progress)
+    if folder is None:
+        return run.in_memory(as_plain(_document(plan, command)))
+    return run.in_folder(open_store(plan, Path(folder), command, accept_versions=accept_versions), keep_going)
+
+
+class _Run:
+    """A plan that is carried out."""
+
+    def __init__(self, plan: StudyPlan, progress: Progress):
+        self._plan, self._progress, self._total = plan, progress, len(plan.cells)
+
+    def in_memory(self, document: dict[str, Any]) -> xr.Dataset:
+        """All cells, none of them written."""
+        document["config"]["chunk_size"] = self._plan.chunk_size
+        compute, cells = COMPUTE[self._plan.config.kind](self._plan), {}  # type: ignore[index]
+        for index in range(self._total):
+            cells[index] = (self._numbers(compute, index, index, Part()), document["versions"])
+        self._progress(self._total, self._total, "done")
+        return _labelled(document, cells).assign_attrs(computed_cells=self._total)
+
+    def in_folder(self, store: Store, keep_going: bool) -> xr.Dataset:
+        """The cells that a folder lacks, written there; what cannot be written is kept in memory or ends the run."""
+        self._plan = dataclasses.replace(self._plan, chunk_size=store.document["config"]["chunk_size"])
+        for index in range(self._total):
+            if store.has(index):
+                store.read(index)  # a damaged file is refused before anything is computed
+            else:
+                store.read_part(index)
+        compute, computed, held = COMPUTE[self._plan.config.kind](self._plan), 0, {}  # type: ignore[index]
+        unwritten: OSError | None = None
+        while missing := [index for index in store.missing if index not in held]:
+            claimed = False
+            for index in missing:
+                with store.claim(index) as ours:
+                    if not ours or store.has(index):
+                        continue
+                    done = self._total - len(store.missing) + len(held)
+                    part = Part(store.read_part(index), partial(_keep, store, index))
+                    arrays = self._numbers(compute, index, done, part)
+                    claimed, computed = True, computed + 1
+                    try:
+                        store.write(index, arrays)
+                    except OSError as error:
+                        if not keep_going:
+                            raise
+                        unwritten = error
+                        held[index] = (arrays, store.document["versions"])
+            if not claimed:
+                self._progress(self._total - len(missing), self._total, "another process computes the rest")
+                time.sleep(WAIT_SECONDS)
+        self._progress(self._total, self._total, "done")
+        dataset = _labelled(store.document, store.read_all() | held)
+        try:
+            write_dataset(dataset, store.folder / "results.nc")
+        except OSError as error:
+            if not keep_going:
+                raise
+            unwritten = error
+        if unwritten is not None:
+            dataset.attrs["unwritten"] = f"cannot write to {store.folder}: {unwritten.strerror or unwritten}"
         return dataset.assign_attrs(computed_cells=computed)
-    document, compute, total = as_plain(_document(plan, command)), COMPUTE[plan.config.kind](plan), len(plan.cells)
-    cells: dict[int, Any] = {}
-    document["config"]["chunk_size"] = plan.chunk_size
-    for index, cell in enumerate(plan.cells):
-        progress(index, total, plan.label(cell))
-        cells[index] = compute(cell) | solver_arrays(document["cells"][index]), document["versions"]
-    progress(total, total, "done")
-    return dataset_of(document, cells).assign_attrs(computed_cells=total)
+
+    def _numbers(self, compute: Any, index: int, done: int, part: Part) -> dict[str, np.ndarray]:
+        """A cell's numbers, with progress in whole cells, or where there is a single one within it."""
+        cell = self._plan.cells[index]
+        label = self._plan.label(cell)
+        self._progress(done, self._total, label)
+        if self._plan.config.kind != "descents":
+            return compute(cell)
+        within = self._progress if self._total == 1 else lambda *_: self._progress(done, self._total, label)
+        return compute(cell, dataclasses.replace(part, report=within))
 
 
-def _fill(plan: StudyPlan, folder: Path, progress: Progress, command: str | None, accept_versions: bool) -> int:
-    """Compute the cells of a folder that are missing; how many those were."""
-    store = open_store(plan, folder, command, accept_versions=accept_versions)
-    plan = dataclasses.replace(plan, chunk_size=store.document["config"]["chunk_size"])
-    for index in range(len(plan.cells)):
-        if store.has(index):
-            store.read(index)  # a damaged file is refused before anything is computed
-    compute, total, computed = COMPUTE[plan.config.kind](plan), len(plan.cells), 0
-    while missing := store.missing:
-        claimed = False
-        for index in missing:
-            progress(total - len(store.missing), total, plan.label(plan.cells[index]))
-            with store.claim(index) as ours:
-                if not ours or store.has(index):
-                    continue
-                store.write(index, compute(plan.cells[index]))
-                claimed, computed = True, computed + 1
-        if not claimed and store.missing:
-            progress(total - len(store.missing), total, "another process computes the rest")
-            time.sleep(WAIT_SECONDS)
-    progress(total, total, "done")
-    return computed
+def _keep(store: Store, index: int, arrays: dict[str, np.ndarray]) -> None:
+    """Keep a part of a cell, if it can be; the cell itself is worth more than its part."""
+    with suppress(OSError):
+        store.write_part(index, arrays)
+
+
+def _labelled(document: dict[str, Any], cells: Cells) -> xr.Dataset:
+    """The Dataset, with the parameters of each cell's contact model."""
+    solver = [solver_arrays(cell) for cell in document["cells"]]
+    return dataset_of(document, {at: ({**arrays, **solver[at]}, by) for at, (arrays, by) in cells.items()})
 
 
 def load_study(folder: str | Path) -> xr.Dataset:
@@ -174,11 +230,7 @@ def load_study(folder: str | Path) -> xr.Dataset:
         StudyError: there is no study, or a file of it is damaged.
     """
     store = Store.open(Path(folder))
-    found = {
-        index: (arrays | solver_arrays(store.document["cells"][index]), written_by)
-        for index, (arrays, written_by) in store.read_all().items()
-    }
-    return dataset_of(store.document, found)
+    return _labelled(store.document, store.read_all())
 
 
 def warnings_of(dataset: xr.Dataset) -> tuple[str, ...]:

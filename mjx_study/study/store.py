@@ -2,6 +2,7 @@
 
     study.json       configuration, digests of what it is about, versions, machine, and every cell's coordinates
     cells/00042.npz  the numbers of one cell, with digests of them, of the study and of the cell's place
+    cells/00042.part.npz  a descent that is not at its end yet, from which it goes on
     results.nc       all of them as one NetCDF file, written when the last cell is there
     study.lock       which cells are being computed, and by which process
 
@@ -9,12 +10,13 @@ Every file is moved into place when it is complete, so that a process may be kil
 operating system's and go with their process.
 """
 
+import dataclasses
 import fcntl
 import hashlib
 import io
 import json
 import os
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
@@ -40,6 +42,21 @@ class StudyError(ValueError):
     """A folder that holds no study, another study, or a damaged file."""
 
 
+@dataclasses.dataclass(frozen=True)
+class Part:
+    """What a cell that takes long may keep of itself before it is complete.
+
+    Attributes:
+        kept: what was kept when it stopped.
+        save: keeps arrays.
+        report: tells progress within the cell: done, in all, and of what.
+    """
+
+    kept: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
+    save: Callable[[dict[str, np.ndarray]], None] = lambda arrays: None
+    report: Callable[[int, int, str], None] = lambda done, total, what: None
+
+
 class Store:
     """The folder of one study; `Store.create` and `Store.open` make one.
 
@@ -51,7 +68,7 @@ class Store:
     def __init__(self, folder: Path, document: dict[str, Any]):
         self.folder, self.document = folder, document
         self._versions: dict[str, str] = document.get("versions", {})
-        self._study = _digest_of_text({name: document.get(name) for name in IDENTITY})
+        self._study = _digest_of_text(_identity(document))
 
     @classmethod
     def create(cls, folder: Path, document: dict[str, Any], *, accept_versions: bool = False) -> "Store":
@@ -73,18 +90,36 @@ class Store:
         path = folder / "study.json"
         if path.exists():
             kept = cls.open(folder)
-            theirs, ours = (_flat(each, IDENTITY) for each in (kept.document, document))
+            theirs, ours = (_flat(_identity(each)) for each in (kept.document, document))
             if told := differences(theirs, ours):
                 raise StudyError(f"{folder} holds another study ({told}); choose another folder")
-            told = differences(*(_flat(each, ("versions",)) for each in (kept.document, document)))
-            if told and kept.missing and not accept_versions:
+            there, asked = (each["config"].get("iterations") or 0 for each in (kept.document, document))
+            if asked < there:
+                raise StudyError(
+                    f"{folder} holds {there} iterations, and {asked} are asked for: give --iterations {there} or more, "
+                    "or another folder"
+                )
+            told = differences(*(each.get("versions", {}) for each in (kept.document, document)))
+            if told and (kept.missing or asked > there) and not accept_versions:
                 raise StudyError(f"{folder} was computed with other versions ({told}); {ACCEPT}")
+            if asked > there:
+                kept._extend(document)
             kept._versions = document.get("versions", {})
             return kept
         if any((folder / "cells").glob("*.npz")):
             raise StudyError(f"{folder} holds cells of a study without its study.json; choose another folder")
-        write_whole(path, lambda file: file.write((json.dumps(document, indent=1) + "\n").encode()))
+        _write_document(path, document)
         return cls(folder, document)
+
+    def _extend(self, document: dict[str, Any]) -> None:
+        """Make descents that ended parts of longer ones; killed in between, it is done again."""
+        for index in range(len(self.document["cells"])):
+            if self.has(index):
+                arrays, written_by = self.read_with_versions(index)
+                self._write(self.part_path(index), arrays, written_by, self._place(index, part=True))
+                self.path(index).unlink()
+        self.document |= {"config": document["config"], "resolved": document["resolved"]}
+        _write_document(self.folder / "study.json", self.document)
 
     @classmethod
     def open(cls, folder: Path) -> "Store":
@@ -116,11 +151,32 @@ class Store:
         """Whether a cell is there; `read` says whether it is sound."""
         return self.path(index).exists()
 
+    def part_path(self, index: int) -> Path:
+        """Where a cell that is not complete is kept."""
+        return self.folder / "cells" / f"{index:05d}.part.npz"
+
     def write(self, index: int, arrays: Mapping[str, np.ndarray]) -> None:
         """Keep the numbers of a cell."""
-        kept = dict(arrays) | {VERSIONS: np.array(json.dumps(self._versions))}
-        digest = np.array([_digest(kept), self._study, self._place(index)])
-        write_whole(self.path(index), lambda file: np.savez(file, digest=digest, **kept))  # type: ignore[arg-type]
+        self._write(self.path(index), arrays, self._authors(index), self._place(index))
+        self.part_path(index).unlink(missing_ok=True)
+
+    def write_part(self, index: int, arrays: Mapping[str, np.ndarray]) -> None:
+        """Keep what there is of a cell."""
+        self._write(self.part_path(index), arrays, self._authors(index), self._place(index, part=True))
+
+    def _write(self, path: Path, arrays: Mapping[str, np.ndarray], versions: dict[str, str], place: str) -> None:
+        kept = dict(arrays) | {VERSIONS: np.array(json.dumps(versions))}
+        digest = np.array([_digest(kept), self._study, place])
+        write_whole(path, lambda file: np.savez(file, digest=digest, **kept))  # type: ignore[arg-type]
+
+    def _authors(self, index: int) -> dict[str, str]:
+        """Versions of what computes a cell, and of what computed a part of it."""
+        if not self.part_path(index).exists():
+            return self._versions
+        before = self._read(self.part_path(index), self._place(index, part=True))[1]
+        names = dict.fromkeys([*before, *self._versions])
+        told = {name: [*before.get(name, "none").split(" and "), self._versions.get(name, "none")] for name in names}
+        return {name: " and ".join(dict.fromkeys(each)) for name, each in told.items()}
 
     def read(self, index: int) -> dict[str, np.ndarray]:
         """The numbers of a cell.
@@ -132,7 +188,14 @@ class Store:
 
     def read_with_versions(self, index: int) -> tuple[dict[str, np.ndarray], dict[str, str]]:
         """The numbers of a cell, and the versions of what computed them; see `read`."""
-        path = self.path(index)
+        return self._read(self.path(index), self._place(index))
+
+    def read_part(self, index: int) -> dict[str, np.ndarray]:
+        """What there is of a cell that is not complete; empty for nothing. Raises as `read`."""
+        path = self.part_path(index)
+        return self._read(path, self._place(index, part=True))[0] if path.exists() else {}
+
+    def _read(self, path: Path, expected: str) -> tuple[dict[str, np.ndarray], dict[str, str]]:
         try:
             with np.load(io.BytesIO(read_whole(path)), allow_pickle=False) as stored:
                 arrays = {name: stored[name] for name in stored.files}
@@ -141,7 +204,7 @@ class Store:
             raise StudyError(f"{path} is damaged ({_told(error)}); move it away to compute it again") from error
         for wrong, is_that in (
             (study != self._study, "a cell of another study"),
-            (place != self._place(index), "another cell of this study"),
+            (place != expected, "another cell of this study"),
             (content != _digest(arrays), "damaged (its digest does not match)"),
         ):
             if wrong:
@@ -164,11 +227,12 @@ class Store:
             else:
                 yield True
 
-    def _place(self, index: int) -> str:
-        """Digest of a cell's index and coordinates."""
+    def _place(self, index: int, *, part: bool = False) -> str:
+        """Digest of a cell's index and coordinates, and of how long its descents are unless it is a part."""
         cell, axes = self.document["cells"][index], self.document.get("axes", {})
         at = {name: axes[name][place] for name, place in cell.get("at", {}).items()}
-        return _digest_of_text({"index": index, "cell": cell, "at": at})
+        iterations = None if part else self.document["config"].get("iterations")
+        return _digest_of_text({"index": index, "cell": cell, "at": at, "iterations": iterations})
 
     def read_all(self) -> dict[int, tuple[dict[str, np.ndarray], dict[str, str]]]:
         """Every cell that is there, with the versions of what computed it; see `read`."""
@@ -193,8 +257,19 @@ def _digest_of_text(document: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()
 
 
-def _flat(document: Mapping[str, Any], parts: Sequence[str]) -> dict[str, Any]:
-    return {name: value for part in parts for name, value in document.get(part, {}).items()}
+def _identity(document: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """What must not differ for a study to go on: all that it depends on but the length of descents."""
+    found = {name: dict(document.get(name, {})) for name in IDENTITY}
+    found["config"].pop("iterations", None)
+    return found
+
+
+def _flat(parts: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    return {name: value for part in parts.values() for name, value in part.items()}
+
+
+def _write_document(path: Path, document: Mapping[str, Any]) -> None:
+    write_whole(path, lambda file: file.write((json.dumps(document, indent=1) + "\n").encode()))
 
 
 def _told(error: Exception) -> str:

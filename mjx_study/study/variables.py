@@ -4,6 +4,7 @@ Datasets, tables, JSON and reports are made from these.
 """
 
 import dataclasses
+from collections.abc import Iterable
 from typing import Final
 
 
@@ -71,17 +72,30 @@ GRADIENTS: Final = {
     "gradient": Variable((*BATCH, "param"), "gradient", "mean gradient"),
     "reference": Variable(("param",), "gradient", "reference gradient"),
 }
+HISTORY: Final = ("cost", "gradient_norm", "variance", "alpha", "nonfinite", "residual")
+"""What each iteration of a descent records; see `mjx_study.study.iteration.Record`."""
+METRIC: Final = "metric_"
+START: Final = "start_metric_"
+"""Prefixes of the variables of what a task counts beside its cost, of final policies and of the start's."""
+STEP: Final = ("iteration", *BATCH)
 DESCENTS: Final = {
     "final_cost": Variable(BATCH, "cost", "mean cost of the final policy", "final cost, median"),
     "final_cost_se": Variable(BATCH, "cost", "standard error of final_cost"),
     "start_cost": Variable((), "cost", "mean cost of the start's policy"),
+    "start_cost_se": Variable((), "cost", "standard error of start_cost"),
     "stopped_at": Variable(
         BATCH, "1", "iteration at which a seed stopped before the end; NaN for none", "stopped seeds"
     ),
-    "cost": Variable(("iteration", *BATCH), "cost", "mean cost of the batch, before the update"),
-    "alpha": Variable(("iteration", *BATCH), "1", "weight of the first-order batch", "alpha"),
+    "reason": Variable(BATCH, "1", "why it stopped, an index into `mjx_study.study.iteration.REASONS`; NaN for none"),
+    "cost": Variable(STEP, "cost", "mean cost of the batch, before the update"),
+    "gradient_norm": Variable(STEP, "gradient", "norm of the estimate"),
+    "variance": Variable(STEP, "gradient^2", "variance of one sample, the trace of the covariance"),
+    "alpha": Variable(STEP, "1", "weight of the first-order batch", "alpha"),
+    "nonfinite": Variable(STEP, "1", "samples that are not finite and were left out", "lost"),
+    "residual": Variable(STEP, "1", "largest relative residual of the constraint solver"),
     "rollouts": Variable(("estimator",), "1", "rollouts simulated in one iteration of one seed", "rollouts"),
     "seconds": Variable(("iteration", "estimator"), "s", "time since the start, measured; compilation excluded"),
+    "theta": Variable((*BATCH, "param"), "unit of theta", "parameters of the final policy"),
 }
 LANDSCAPES: Final = {
     "position": Variable(("point",), "unit of theta", "t, of the point theta_0 + t direction"),
@@ -102,3 +116,11 @@ VARIABLES: Final = {"gradients": GRADIENTS, "descents": DESCENTS, "landscapes": 
 """By kind of study."""
 MEASURED: Final = ("seconds", "seconds_per_sample")
 """Variables that are times, and so the only ones that differ from run to run."""
+
+
+def variables_of(kind: str, names: Iterable[str]) -> dict[str, Variable]:
+    """The variables of a kind of study, with the metrics that are among some names."""
+    told = {name: f"{name.partition('metric_')[2]}, mean over the rollouts of a final cost" for name in names}
+    metrics = {name: Variable(BATCH, "", told[name]) for name in told if name.startswith(METRIC)}
+    metrics |= {name: Variable((), "", told[name]) for name in told if name.startswith(START)}
+    return VARIABLES[kind] | metrics | CELL

@@ -5,6 +5,7 @@ import itertools
 import warnings
 from collections.abc import Generator, Sequence
 from contextlib import contextmanager
+from typing import Final
 
 import numpy as np
 
@@ -22,15 +23,18 @@ from mjx_study.simulation.contact import (
 from mjx_study.table import digits_to_tell_apart
 from mjx_study.tasks.task import Task
 
+REFERENCE: Final = "reference"
+"""In the place of a contact family: the task's analytic system, without MJX."""
+
 
 @dataclasses.dataclass(frozen=True)
 class ContactPoint:
-    """One contact model of a comparison.
+    """One contact model of a study.
 
     Attributes:
-        family: name of the contact family, or solref and solimp.
+        family: name of the contact family, "reference", or solref and solimp.
         stiffness: spring stiffness K [N/m]; 0 if there is no contact.
-        contact: the contact model; None for the MJCF's own.
+        contact: the contact model; None for the MJCF's own, and for the reference.
         digits: significant digits of the stiffness in messages, enough to tell the models of a sweep apart.
     """
 
@@ -38,6 +42,11 @@ class ContactPoint:
     stiffness: float
     contact: ContactModel | None
     digits: int = 6
+
+    @property
+    def analytic(self) -> bool:
+        """Whether it is the task's analytic system."""
+        return self.family == REFERENCE
 
     @property
     def label(self) -> str:
@@ -55,7 +64,7 @@ def contact_grid(
 
     Args:
         task: source of the effective mass, and of defaults for arguments that are None.
-        families: names of contact families.
+        families: names of contact families; "reference" for the analytic system.
         stiffnesses: stiffnesses for families that take one [N/m].
         damping: override of each family's damping [N s/m].
 
@@ -68,6 +77,11 @@ def contact_grid(
     check_count(len(families) * len(stiffnesses), "contact models", MOST_MODELS, "give fewer stiffnesses or families")
     digits = digits_to_tell_apart(stiffnesses)
     for family in families:
+        if family == REFERENCE:
+            check_reference(task)
+            found = stiffnesses if task.contact_pair is not None else (0.0,)
+            cells += [ContactPoint(family, stiffness, None, digits) for stiffness in found]
+            continue
         swept = family not in FAMILIES or FAMILIES[family].swept
         undamped = swept and family in FAMILIES and FAMILIES[family].dampratio == 0
         own = damping if damping is not None else task.damping if undamped else None
@@ -78,6 +92,14 @@ def contact_grid(
             cells.append(cell)
             messages += [f"{cell.label}: {warning.message}" for warning in caught]
     return tuple(cells), tuple(messages)
+
+
+def check_reference(task: Task) -> None:
+    """Raises ValueError unless the task has an analytic system that first-order gradients of its kind can run on."""
+    if task.reference is None:
+        raise ValueError(f"{task.name} has no analytic reference")
+    if task.onset != "none":
+        raise ValueError("the analytic references have no onset term; leave onset out")
 
 
 def solver_grid(
