@@ -15,8 +15,8 @@ import pytest
 from mjx_study import cli
 from mjx_study.cli import compare as compare_command
 from mjx_study.cli import options
-from mjx_study.study.findings import rows_of
 from mjx_study.study.configuration import StudyConfig
+from mjx_study.study.findings import rows_of
 from mjx_study.study.plan import StudyPlan, plan_study
 from mjx_study.study.run import load_study
 from mjx_study.tasks import TASKS

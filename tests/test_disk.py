@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 import xarray as xr
+from mjx_study.study.checkpoint import Checkpoints
 
 from mjx_study.disk import TEMPORARY, prepare_folder, read_whole, write_whole
-from mjx_study.study.checkpoint import Checkpoints
 from mjx_study.study.dataset import write_dataset
 from mjx_study.study.store import Store, StudyError
 from tests.documents import study_document

@@ -11,14 +11,14 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from mjx_study.study.checkpoint import checkpoint_path
 
 from mjx_study.simulation.scene import models_folder
 from mjx_study.study import cells as sweep_cells
 from mjx_study.study import identity
-from mjx_study.study.checkpoint import checkpoint_path
+from mjx_study.study.configuration import StudyConfig
 from mjx_study.study.descents import OptimiseConfig, OptimiseResult, optimise, plan_optimise
 from mjx_study.study.identity import contents, differences
-from mjx_study.study.configuration import StudyConfig
 from mjx_study.study.plan import StudyCell, StudyPlan, plan_study
 from mjx_study.study.revision import git_revision
 from mjx_study.study.run import load_study, run_study, warnings_of

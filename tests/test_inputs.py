@@ -18,9 +18,9 @@ from mjx_study.option import OPTIONS, Interval
 from mjx_study.runtime import default_cache
 from mjx_study.simulation.mjcf_sizes import too_large
 from mjx_study.simulation.scene import SceneError, load_model
+from mjx_study.study.configuration import StudyConfig
 from mjx_study.study.document import read_document
 from mjx_study.study.iteration import make_optimizer
-from mjx_study.study.configuration import StudyConfig
 from mjx_study.study.plan import plan_study
 from mjx_study.study.run import open_store
 

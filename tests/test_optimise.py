@@ -10,116 +10,161 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import xarray as xr
 from PIL import Image
 
 import estimators
 from estimators import ESTIMATORS, Differentiation, FirstOrder
-from mjx_study import cli
+from mjx_study import cli, disk
 from mjx_study.cli import options
 from mjx_study.objective import Simulator
 from mjx_study.reference import ReferenceObjective, Tennis, roll_out
-from mjx_study.study import configuration
-from mjx_study.study import descents as optimise
+from mjx_study.study import descents, plan, store
 from mjx_study.study import iteration as descent
-from mjx_study.study.checkpoint import checkpoint_path
-from mjx_study.study.descents import Backend, OptimiseConfig, plan_optimise
+from mjx_study.study.configuration import StudyConfig
+from mjx_study.study.descents import Backend
 from mjx_study.study.iteration import REASONS, begin, make_optimizer
+from mjx_study.study.plan import StudyPlan, estimators_of, plan_study
+from mjx_study.study.run import load_study, run_study
+from mjx_study.study.store import StudyError
+from mjx_study.study.variables import HISTORY, METRIC
 from mjx_study.tasks import TASKS, make_task
 
 SHORT: dict[str, Any] = {
     "horizon": 60,
     "iterations": 6,
     "seeds": 2,
-    "samples": 5,
+    "samples": (5,),
     "evaluation_samples": 8,
     "learning_rate": 0.01,
 }
+OUTER = ("task", "timestep", "cone", "model", "sigma", "samples")
 
 
-def config(task: str = "pusher", **changes: Any) -> OptimiseConfig:
-    return OptimiseConfig(task=task, **({"contact": "penalty", "stiffness": 100.0} | SHORT | changes))
+def config(task: str = "pusher", **changes: Any) -> StudyConfig:
+    chosen: dict[str, Any] = {"contact": ("penalty",), "stiffness": (100.0,), "kind": "descents"} | SHORT | changes
+    return StudyConfig(tasks=(task,), **chosen)
 
 
-def on_reference(task: str, **changes: Any) -> OptimiseConfig:
-    return OptimiseConfig(task=task, reference=True, **changes)
+def on_reference(task: str, **changes: Any) -> StudyConfig:
+    chosen: dict[str, Any] = {"stiffness": (make_task(task).middle_stiffness,), "seeds": 3} | changes
+    return StudyConfig(tasks=(task,), kind="descents", contact=("reference",), **chosen)
+
+
+def descend(study: StudyConfig | StudyPlan, folder: Path | None = None) -> xr.Dataset:
+    """The single cell of a study."""
+    return run_study(study, folder).isel(dict.fromkeys(OUTER, 0))
+
+
+def final(study: StudyConfig) -> dict[str, np.ndarray]:
+    """Final costs of the seeds, by estimator."""
+    data = descend(study)
+    return {name: data["final_cost"].sel(estimator=name).values for name in data["estimator"].values.tolist()}
 
 
 @pytest.fixture(scope="module")
-def short() -> optimise.OptimiseResult:
+def short() -> xr.Dataset:
     """Two estimators through MJX, six iterations of two seeds."""
-    return optimise.optimise(plan_optimise(config(estimators=("zobg", "aobg"))))
+    return descend(config(estimators=("zobg", "aobg")))
 
 
-def test_a_run_has_its_whole_history(short: optimise.OptimiseResult) -> None:
-    zeroth, alpha = short.runs
-    for run in short.runs:
-        assert run.theta.shape == (2, 60) and run.seconds.shape == (6,)
-        assert all(values.shape == (6, 2) for values in run.history.values())
-        assert np.all(np.diff(run.seconds) > 0) and not run.stopped
-        assert np.all(run.history["cost"][-1] < run.history["cost"][0])
-        assert np.all(run.final_cost < short.start_cost[0] - 4 * short.start_cost[1])
-    assert np.all(np.isnan(zeroth.history["alpha"])) and np.all(alpha.history["alpha"] > 0.5)
-    assert (zeroth.rollouts, alpha.rollouts) == (6, 11)
-    assert short.config.sigma == 0.1 and short.config.decay == 0.0
+def test_a_run_has_its_whole_history(short: xr.Dataset) -> None:
+    assert short["theta"].transpose("estimator", "seed", "param").shape == (2, 2, 60)
+    assert all(short[name].transpose("iteration", "seed", "estimator").shape == (6, 2, 2) for name in HISTORY)
+    assert np.all(np.diff(short["seconds"].values, axis=0) > 0) and bool(short["stopped_at"].isnull().all())
+    cost = short["cost"]
+    assert bool((cost.isel(iteration=-1) < cost.isel(iteration=0)).all())
+    assert bool((short["final_cost"] < short["start_cost"] - 4 * short["start_cost_se"]).all())
+    alpha = short["alpha"]
+    assert bool(alpha.sel(estimator="zobg").isnull().all()) and bool((alpha.sel(estimator="aobg") > 0.5).all())
+    assert short["rollouts"].values.tolist() == [6, 11]
+    assert short["sigma"].item() == 0.1
 
 
 def test_a_descent_starts_where_theta_says() -> None:
-    plan = plan_optimise(config(horizon=2, theta=(0.5, -0.5)))
-    assert plan.task.theta.tolist() == [0.5, -0.5]
+    (group,) = plan_study(config(horizon=2, theta=(0.5, -0.5))).groups
+    assert group.task.theta.tolist() == [0.5, -0.5]
     with pytest.raises(ValueError, match="theta has 2 numbers; pusher needs 13, all of them finite"):
-        plan_optimise(config(horizon=2, theta=(0.5, -0.5), network=(2,)))
+        plan_study(config(horizon=2, theta=(0.5, -0.5), network=(2,)))
 
 
-def test_seeds_are_those_of_runs_of_one(short: optimise.OptimiseResult) -> None:
+def test_seeds_are_those_of_runs_of_one(short: xr.Dataset) -> None:
     """The first seed's run does not depend on how many there are beside it."""
-    alone = optimise.optimise(plan_optimise(config(estimators=("zobg",), seeds=1)))
-    np.testing.assert_allclose(alone.runs[0].theta[0], short.runs[0].theta[0], rtol=1e-10)
-    assert not np.allclose(short.runs[0].theta[0], short.runs[0].theta[1], rtol=1e-6)
+    alone = descend(config(estimators=("zobg",), seeds=1))["theta"].sel(estimator="zobg")
+    both = short["theta"].sel(estimator="zobg")
+    np.testing.assert_allclose(alone.sel(seed=0), both.sel(seed=0), rtol=1e-10)
+    assert not np.allclose(both.sel(seed=0), both.sel(seed=1), rtol=1e-6)
 
 
-def test_an_iteration_is_gradient_descent_on_the_estimate(short: optimise.OptimiseResult) -> None:
+def test_an_iteration_is_gradient_descent_on_the_estimate() -> None:
     """The first step by hand: theta minus the learning rate times the estimate with the same keys."""
-    plan = plan_optimise(config(estimators=("aobg",), iterations=1))
-    objective = Simulator(plan.task, chunk_size=3).objective(plan.cell.contact)
+    planned = plan_study(config(estimators=("aobg",), iterations=1))
+    (group,), (cell,) = planned.groups, planned.cells
+    objective = Simulator(group.task, chunk_size=3).objective(cell.model.contact)
     key = jax.random.fold_in(jax.random.fold_in(jax.random.key(0), 1), 0)
-    estimate = estimators.estimate(plan.estimators[0], objective, plan.task.theta, key, 5)
-    run = optimise.optimise(plan).runs[0]
-    np.testing.assert_allclose(run.theta[1], plan.task.theta - 0.01 * estimate.mean, rtol=1e-10)
-    assert run.history["gradient_norm"][0, 1] == pytest.approx(float(jnp.linalg.norm(estimate.mean)), rel=1e-9)
+    estimate = estimators.estimate(estimators_of(planned, cell)[0], objective, group.task.theta, key, 5)
+    run = descend(planned).sel(estimator="aobg", seed=1)
+    np.testing.assert_allclose(run["theta"], group.task.theta - 0.01 * estimate.mean, rtol=1e-10)
+    assert run["gradient_norm"].values[0] == pytest.approx(float(jnp.linalg.norm(estimate.mean)), rel=1e-9)
 
 
 @pytest.mark.parametrize("reference", [False, True], ids=["MJX", "reference"])
 def test_a_stopped_run_goes_on_to_the_same_end(tmp_path: Path, reference: bool) -> None:
-    """Bit for bit, with an optimiser that has a memory."""
-    common: dict[str, Any] = {
-        "optimizer": "adam",
-        "learning_rate": 0.01,
-        "estimators": ("fobg",),
-        "reference": reference,
-    }
-    whole = optimise.optimise(plan_optimise(config(**common, iterations=5)))
-    optimise.optimise(plan_optimise(config(**common, iterations=2)), tmp_path)
-    resumed = optimise.optimise(plan_optimise(config(**common, iterations=5)), tmp_path)
-    np.testing.assert_array_equal(resumed.runs[0].theta, whole.runs[0].theta)
-    for name, values in whole.runs[0].history.items():
-        np.testing.assert_array_equal(resumed.runs[0].history[name], values)
+    """Bit for bit, with an optimiser that has a memory: with more iterations, and from a part of a cell."""
+    common: dict[str, Any] = {"optimizer": "adam", "learning_rate": 0.01, "estimators": ("fobg", "zobg")}
+    common |= {"contact": ("reference",)} if reference else {}
+    whole = descend(config(**common, iterations=5))
+    descend(config(**common, iterations=2), tmp_path)
+    resumed = descend(config(**common, iterations=5), tmp_path)
+    for name in ("theta", "final_cost", *HISTORY):
+        np.testing.assert_array_equal(resumed[name], whole[name])
     # a finished run is read, not computed
-    again = optimise.optimise(plan_optimise(config(**common, iterations=5)), tmp_path)
-    np.testing.assert_array_equal(again.runs[0].seconds, resumed.runs[0].seconds)
+    again = run_study(config(**common, iterations=5), tmp_path)
+    assert again.attrs["computed_cells"] == 0
+    np.testing.assert_array_equal(again.isel(dict.fromkeys(OUTER, 0))["seconds"], resumed["seconds"])
+
+
+def test_a_run_killed_in_its_middle_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What was kept last is what it goes on from, and no iteration before it is computed again."""
+    study = config(estimators=("zobg", "fobg"), contact=("reference",), iterations=30)
+    whole = descend(study)
+
+    class Killed(BaseException):
+        pass
+
+    def killed(path: Path, write: Any) -> Path:
+        written = disk.write_whole(path, write)
+        if path.name == "00000.part.npz":
+            raise Killed
+        return written
+
+    with monkeypatch.context() as patch:
+        patch.setattr(store, "write_whole", killed)
+        patch.setattr(descents, "SAVE_SECONDS", 0.0)
+        with pytest.raises(Killed):
+            run_study(study, tmp_path)
+    assert len(store.Store.open(tmp_path).read_part(0)["seconds_0"]) == descents.REPORT_EVERY
+    assert load_study(tmp_path).attrs["missing_cells"] == 1
+    reports: list[int] = []
+    resumed = run_study(study, tmp_path, lambda done, total, what: reports.append(done))
+    for name in ("theta", *HISTORY):
+        np.testing.assert_array_equal(resumed.isel(dict.fromkeys(OUTER, 0))[name], whole[name])
+    assert min(reports[1:-1]) > descents.REPORT_EVERY  # nothing before it is computed again
+    assert not store.Store.open(tmp_path).part_path(0).exists()
 
 
 def test_a_folder_of_another_run_or_a_damaged_file_is_refused(tmp_path: Path) -> None:
-    plan = plan_optimise(config(estimators=("zobg",), iterations=1, reference=True))
-    optimise.optimise(plan, tmp_path)
-    path = checkpoint_path(tmp_path, "zobg")
+    study = config(estimators=("zobg",), iterations=1, contact=("reference",))
+    descend(study, tmp_path)
+    path = tmp_path / "cells" / "00000.npz"
     kept = path.read_bytes()
-    other = plan_optimise(config(estimators=("zobg",), iterations=1, reference=True, sigma=0.2))
-    with pytest.raises(ValueError, match="holds another run .sigma 0.1 there and 0.2 here, .*; choose another folder"):
-        optimise.optimise(other, tmp_path)
+    other = config(estimators=("zobg",), iterations=1, contact=("reference",), sigma=(0.2,))
+    with pytest.raises(StudyError, match="holds another study .sigma .* there and .*; choose another folder"):
+        descend(other, tmp_path)
     for damaged in (kept[: len(kept) // 2], b"nonsense", kept[:200] + bytes([kept[200] ^ 1]) + kept[201:]):
         path.write_bytes(damaged)
-        with pytest.raises(ValueError, match="is damaged .*; move it away to start again"):
-            optimise.optimise(plan, tmp_path)
+        with pytest.raises(StudyError, match="is damaged .*; move it away to compute it again"):
+            descend(study, tmp_path)
         assert path.read_bytes() == damaged
 
 
@@ -144,25 +189,25 @@ def test_a_seed_that_diverges_stops_and_the_others_go_on() -> None:
 
 def test_a_diverging_run_keeps_its_history_and_says_why() -> None:
     """A learning rate that is far too large, on the analytic pusher."""
-    plan = plan_optimise(config(estimators=("fobg",), learning_rate=1.0, iterations=400, reference=True, seeds=2))
-    run = optimise.optimise(plan).runs[0]
-    assert set(run.stopped) == {0, 1}
-    for iteration, reason in run.stopped.values():
-        assert 1 < iteration < 400 and reason in REASONS[1:]
-    assert len(run.seconds) < 400 and np.isfinite(run.history["cost"][0]).all()
+    study = config(estimators=("fobg",), learning_rate=1.0, iterations=400, contact=("reference",), seeds=2)
+    run = descend(study).isel(estimator=0)
+    assert bool(((run["stopped_at"] > 1) & (run["stopped_at"] < 400)).all())
+    assert all(REASONS[int(code)] for code in run["reason"].values)
+    assert bool(run["cost"].isel(iteration=-1).isnull().all()) and bool(run["cost"].isel(iteration=0).notnull().all())
 
 
 @pytest.mark.parametrize("name", ESTIMATORS)
 def test_every_estimator_optimises(name: str) -> None:
     changes: dict[str, Any] = {"max_norm": 1e3, "window": 40}
-    run = optimise.optimise(plan_optimise(config(estimators=(name,), reference=True, **changes))).runs[0]
-    assert np.all(run.history["cost"][-1] < run.history["cost"][0])
+    cost = descend(config(estimators=(name,), contact=("reference",), **changes))["cost"]
+    assert bool((cost.isel(iteration=-1) < cost.isel(iteration=0)).all())
 
 
 @pytest.mark.parametrize("task", TASKS)
 def test_every_task_has_a_recipe_that_plans(task: str) -> None:
-    plan = plan_optimise(OptimiseConfig(task=task))
-    assert plan.task.recipe is not None and plan.config.iterations == plan.task.recipe.iterations
+    planned = plan_study(StudyConfig(tasks=(task,), kind="descents"))
+    (group,) = planned.groups
+    assert group.recipe == group.task.recipe and planned.cells[0].samples == group.task.recipe.samples  # type: ignore[union-attr]
 
 
 @pytest.mark.parametrize("name", ["sgd", "adam", "rmsprop", "adamw"])
@@ -180,7 +225,7 @@ def test_any_optimiser_of_optax(name: str) -> None:
         ({"estimators": ("gobg",)}, "unknown estimator 'gobg'"),
         ({"estimators": ("zobg", "zobg")}, "given twice: zobg"),
         ({"seeds": 0}, "seeds must be at least 1 and at most 100000, got 0"),
-        ({"samples": 1}, "samples must be at least 2 and at most 10000000, got 1"),
+        ({"samples": (1,)}, "samples must be at least 3 and at most 10000000, got 1"),
         ({"seed": -1}, "seed must be at least 0"),
         ({"optimizer": "ascent"}, "optax has no optimiser 'ascent'"),
         ({"optimizer": "apply_updates"}, "optax has no optimiser 'apply_updates'"),
@@ -192,17 +237,18 @@ def test_any_optimiser_of_optax(name: str) -> None:
 )
 def test_what_cannot_be_run_is_refused(changes: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        plan_optimise(config(**changes))
+        plan_study(config(**changes))
 
 
 def test_a_task_without_recipe_or_reference_says_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     bare = make_task("pusher", horizon=3).replace(recipe=None, reference=None)
-    monkeypatch.setattr(configuration, "make_task", lambda *_, **__: bare)
-    with pytest.raises(ValueError, match="pusher has no recipe: give samples, learning rate$"):
-        plan_optimise(config(horizon=3, samples=None, learning_rate=None))
-    assert plan_optimise(config(horizon=3)).config.decay == 0.0
+    monkeypatch.setattr(plan, "make_task", lambda *_, **__: bare)
+    with pytest.raises(ValueError, match="pusher has no recipe: give learning rate, samples$"):
+        plan_study(config(horizon=3, samples=None, learning_rate=None))
+    (group,) = plan_study(config(horizon=3)).groups
+    assert group.recipe is not None and group.recipe.decay == 0.0
     with pytest.raises(ValueError, match="pusher has no analytic reference"):
-        plan_optimise(config(horizon=3, reference=True))
+        plan_study(config(horizon=3, contact=("reference",)))
 
 
 def test_one_compilation_for_all_iterations(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -213,9 +259,10 @@ def test_one_compilation_for_all_iterations(monkeypatch: pytest.MonkeyPatch) -> 
         compiled.append(jit(function, *args, **kwargs))
         return compiled[-1]
 
-    monkeypatch.setattr(optimise.jax, "jit", spy)
+    monkeypatch.setattr(descents.jax, "jit", spy)
     weak = make_task("pusher", horizon=3).replace(theta=jnp.full(3, 0.1))  # a type that JAX calls weak
-    optimise.optimise(plan_optimise(config(estimators=("zobg",), horizon=None), weak))
+    chosen: dict[str, Any] = {"contact": ("penalty",), "stiffness": (100.0,)} | SHORT | {"horizon": None}
+    run_study(StudyConfig(tasks=(weak,), estimators=("zobg",), **chosen))
     steps = [program for program in compiled if program.__wrapped__.__name__ == "<lambda>"]
     assert [program._cache_size() for program in steps] == [1, 1]  # the keys of an iteration, and the iteration
 
@@ -226,9 +273,7 @@ def test_one_compilation_for_all_iterations(monkeypatch: pytest.MonkeyPatch) -> 
 @pytest.mark.slow
 def test_ball_wall_first_order_stays_in_the_flat_region() -> None:
     """Zeroth and alpha order clear the wall; first order, and inverse variances, stay short of it."""
-    names = ("zobg", "fobg", "aobg", "ivw")
-    result = optimise.optimise(plan_optimise(on_reference("ball_wall", estimators=names)))
-    cost = {run.estimator: run.final_cost for run in result.runs}
+    cost = final(on_reference("ball_wall", estimators=("zobg", "fobg", "aobg", "ivw")))
     assert np.all(cost["zobg"] < -0.009) and np.all(cost["aobg"] < -0.009)
     assert np.all(cost["fobg"] > -0.005) and np.all(cost["ivw"] > -0.005)
 
@@ -236,14 +281,13 @@ def test_ball_wall_first_order_stays_in_the_flat_region() -> None:
 @pytest.mark.slow
 def test_momentum_transfer_first_order_goes_over_the_edge() -> None:
     """The others stop inside, where there is momentum to be had."""
-    names = ("zobg", "fobg", "aobg")
-    result = optimise.optimise(plan_optimise(on_reference("momentum_transfer", estimators=names)))
-    runs = {run.estimator: run for run in result.runs}
-    assert np.all(runs["fobg"].theta > np.pi / 4) and np.all(runs["fobg"].final_cost > -0.2)
+    data = descend(on_reference("momentum_transfer", estimators=("zobg", "fobg", "aobg")))
+    first = data.sel(estimator="fobg")
+    assert bool((first["theta"] > np.pi / 4).all()) and bool((first["final_cost"] > -0.2).all())
     for name in ("zobg", "aobg"):
-        assert np.all(runs[name].theta < np.pi / 4) and np.all(
-            runs[name].final_cost < 2 * runs["fobg"].final_cost.min()
-        )
+        other = data.sel(estimator=name)
+        assert bool((other["theta"] < np.pi / 4).all())
+        assert bool((other["final_cost"] < 2 * first["final_cost"].min()).all())
 
 
 @pytest.mark.slow
@@ -254,9 +298,7 @@ def test_pusher_stiffness_decides_which_is_ahead(stiffness: float, ahead: str) -
     Means over five seeds, by more than two standard errors of their difference; at 1000 N/m first-order descent is
     thrown off by rare batches, so there the worst seeds are compared.
     """
-    names = ("zobg", "fobg", "aobg")
-    plan = plan_optimise(on_reference("pusher", estimators=names, stiffness=stiffness, seeds=5))
-    cost = {run.estimator: run.final_cost for run in optimise.optimise(plan).runs}
+    cost = final(on_reference("pusher", estimators=("zobg", "fobg", "aobg"), stiffness=(stiffness,), seeds=5))
     behind = "zobg" if ahead == "fobg" else "fobg"
     if ahead == "fobg":
         difference = cost[behind] - cost[ahead]  # the same evaluation samples
@@ -269,8 +311,7 @@ def test_pusher_stiffness_decides_which_is_ahead(stiffness: float, ahead: str) -
 @pytest.mark.slow
 def test_sliding_box_first_order_degrades() -> None:
     """First order is behind; alpha order is within the noise of zeroth order, or better."""
-    result = optimise.optimise(plan_optimise(on_reference("sliding_box", estimators=("zobg", "fobg", "aobg"), seeds=5)))
-    cost = {run.estimator: run.final_cost for run in result.runs}
+    cost = final(on_reference("sliding_box", estimators=("zobg", "fobg", "aobg"), seeds=5))
     assert np.min(cost["fobg"]) > np.max(cost["zobg"])
     error = float(np.var(cost["zobg"], ddof=1) / 5 + np.var(cost["aobg"], ddof=1) / 5) ** 0.5
     assert np.mean(cost["aobg"]) < np.mean(cost["zobg"]) + 3 * error
@@ -291,18 +332,21 @@ def test_outcomes_of_tennis_are_what_happened() -> None:
     assert 0.5 < np.mean(found["hit"]) < 1
     away = np.linalg.norm(rollout.states[:, -1, :2] - [0.0, 2.5], axis=1)
     np.testing.assert_allclose(found["distance [m]"], away, rtol=1e-12)
-    plan = plan_optimise(OptimiseConfig(task="tennis", contact="penalty", evaluation_samples=100))
-    hit = np.asarray(Backend(plan)._observe(task.theta, plan.cell.contact, jax.random.clone(keys))["hit"])
+    chosen: dict[str, Any] = {"contact": ("penalty",), "stiffness": (task.middle_stiffness,)}
+    planned = plan_study(StudyConfig(tasks=("tennis",), kind="descents", **chosen))
+    backend, (cell,) = Backend(planned, planned.cells[0]), planned.cells
+    hit = np.asarray(backend._observe(task.theta, cell.model.contact, jax.random.clone(keys))["hit"])
     assert np.mean(hit[found["hit"] == 1]) > 0.97 and np.mean(hit) < np.mean(found["hit"]) + 0.15
 
 
 def test_outcomes_of_the_sliding_box_tell_who_is_aboard() -> None:
     """Pushed gently the block stays on the box, pushed hard it falls; MJX and the reference agree."""
     for force, aboard in ((0.05, 1.0), (1.0, 0.0)):
-        for reference in (False, True):
-            plan = plan_optimise(OptimiseConfig(task="sliding_box", reference=reference, evaluation_samples=3))
-            theta = jnp.full(400, force)
-            assert Backend(plan).outcomes(theta, plan.cell) == {"aboard": aboard}
+        for contact in ("mujoco", "reference"):
+            chosen: dict[str, Any] = {"contact": (contact,), "stiffness": (1000.0,), "evaluation_samples": 3}
+            planned = plan_study(StudyConfig(tasks=("sliding_box",), kind="descents", **chosen))
+            (cell,) = planned.cells
+            assert Backend(planned, cell).metrics(jnp.full(400, force), cell.model) == {"aboard": aboard}
 
 
 @pytest.fixture(scope="module")
@@ -321,16 +365,16 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     return folder, "\n".join(lines)
 
 
-def test_the_command_writes_figure_numbers_policies_and_checkpoints(written: tuple[Path, str]) -> None:
+def test_the_command_writes_a_study_a_figure_and_policies(written: tuple[Path, str]) -> None:
     folder, printed = written
     names = ("zobg", "fobg", "aobg")
-    expected = {"optimisation.json", "optimisation.png", "optimisation.pdf"}
-    expected |= {f"policy-{name}.json" for name in names} | {f"run-{name}.npz" for name in names}
-    assert {path.name for path in folder.iterdir()} == expected
-    document = json.loads((folder / "optimisation.json").read_text())
-    assert [run["estimator"] for run in document["runs"]] == list(names)
-    assert np.shape(document["runs"][0]["history"]["cost"]) == (4, 2)
-    with Image.open(folder / "optimisation.png") as picture:
+    expected = {"study.json", "study.lock", "cells", "results.nc", "descent.png", "descent.pdf"}
+    expected |= {f"policy-{name}.json" for name in names}
+    assert {path.name for path in folder.iterdir()} >= expected
+    data = load_study(folder)
+    assert data["estimator"].values.tolist() == list(names) and data["cost"].sizes["iteration"] == 4
+    assert not [name for name in data if str(name).startswith(METRIC)]
+    with Image.open(folder / "descent.png") as picture:
         assert picture.width > 1000
     for words in ("analytic reference; sgd, learning rate 0.001", "2 seeds from 0", "ZoBG", "rollouts", "seconds"):
         assert words in printed
@@ -350,8 +394,8 @@ def test_a_policy_is_replayed(
         (["rollout", "sliding_box", "--policy", str(policy)], "is a policy of pusher, not of sliding_box"),
         (["rollout", "pusher", "--policy", str(policy), "--theta", "1"], "both say what theta is"),
         (
-            ["rollout", "pusher", "--policy", str(written[0] / "optimisation.json")],
-            "optimisation.json: task: Field required",
+            ["rollout", "pusher", "--policy", str(written[0] / "study.json")],
+            "study.json: task: Field required",
         ),
         (["rollout", "pusher", "--policy", "nowhere.json"], "cannot read nowhere.json"),
     ):
@@ -362,8 +406,8 @@ def test_a_policy_is_replayed(
 def test_bad_options_get_one_line(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, written) -> None:
     monkeypatch.setattr(options, "configure", lambda **_: None)
     for arguments, says in (
-        (["pusher", "--estimator", "gobg"], "unknown estimator 'gobg'"),
-        (["pusher", "--reference", "--sigma", "0.3", "--output", str(written[0])], "holds another run"),
+        (["pusher", "--estimators", "gobg"], "unknown estimator 'gobg'"),
+        (["pusher", "--reference", "--sigma", "0.3", "--output", str(written[0])], "holds another study"),
     ):
         assert cli.main(["optimise", *arguments]) == 2
         error = capsys.readouterr().err
@@ -376,33 +420,29 @@ def test_the_descent_costs_little_beside_its_rollouts() -> None:
 
     Measured in turn, the least iteration of all and the least run of five: what else the machine does only adds.
     """
-    plan = plan_optimise(config(estimators=("aobg",), samples=100, horizon=100, iterations=30, seeds=1))
-    backend = Backend(plan)
-    simulator = Simulator(plan.task, chunk_size=plan.config.chunk_size or 1)
-    objective = simulator.objective(plan.cell.contact)
+    planned = plan_study(config(estimators=("aobg",), samples=(100,), horizon=100, iterations=30, seeds=1))
+    (group,), (cell,) = planned.groups, planned.cells
+    compute = descents.compute_descents(planned)
+    objective = Simulator(group.task, chunk_size=planned.chunk_size).objective(cell.model.contact)
 
     def batch() -> float:
         keys = jax.random.split(jax.random.key(0), 100)
         start = time.perf_counter()
-        objective.evaluate(plan.task.theta, keys)
-        objective.differentiate(plan.task.theta, jax.random.clone(keys))
+        objective.evaluate(group.task.theta, keys)
+        objective.differentiate(group.task.theta, jax.random.clone(keys))
         return time.perf_counter() - start
 
     def iteration() -> float:
-        return float(np.min(np.diff(optimise.optimise(plan, backend=backend).runs[0].seconds)))
+        return float(np.min(np.diff(compute(cell)["seconds"][:, 0])))
 
     pairs = [(iteration(), min(batch() for _ in range(30))) for _ in range(5)]
     least, bare = np.min(pairs, axis=0)
     assert least <= 1.15 * bare, pairs
-    small: dict[str, Any] = {"estimators": ("fobg",), "samples": 10, "horizon": 100, "iterations": 30}
-    plans = [plan_optimise(config(**small, seeds=count)) for count in (1, 10)]
-    backends = [Backend(each) for each in plans]
+    small: dict[str, Any] = {"estimators": ("fobg",), "samples": (10,), "horizon": 100, "iterations": 30}
+    plans = [plan_study(config(**small, seeds=count)) for count in (1, 10)]
+    computes = [descents.compute_descents(each) for each in plans]
     seconds = [
-        [
-            optimise.optimise(each, backend=ready).runs[0].seconds[-1]
-            for each, ready in zip(plans, backends, strict=True)
-        ]
-        for _ in range(5)
+        [ready(each.cells[0])["seconds"][-1, 0] for each, ready in zip(plans, computes, strict=True)] for _ in range(5)
     ]
     one, ten = np.min(seconds, axis=0)
     assert ten < 0.5 * 10 * one, seconds

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import jax
 import pytest
-from mjx_study.plots.style import STYLE, style_of
 
 from estimators import ESTIMATORS, Estimator, FirstOrder, ZerothOrder, find_estimator, make_estimator, register
 from mjx_study import cli
 from mjx_study.cli import options
+from mjx_study.plots.style import STYLE, style_of
 
 PAGE = (Path(__file__).parents[1] / "docs" / "estimators.md").read_text()
 (CODE,) = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)

@@ -16,9 +16,9 @@ import pytest
 
 from mjx_study.cli.gradcheck import UNEXERCISED
 from mjx_study.gradcheck import plan_gradcheck
+from mjx_study.study.configuration import StudyConfig
 from mjx_study.study.descents import OptimiseConfig, plan_optimise
 from mjx_study.study.landscapes import LandscapeConfig, plan_landscape
-from mjx_study.study.configuration import StudyConfig
 from mjx_study.study.plan import plan_study
 from mjx_study.tasks import make_task
 from mjx_study.tasks.own import GROUP

@@ -11,9 +11,8 @@ from mjx_study import cli
 from mjx_study.cli import options
 from mjx_study.reference import DoublePendulum, roll_out
 from mjx_study.reference.adjoint import gradients_along
-from mjx_study.study.configuration import EstimatorConfig, configured_estimators
+from mjx_study.study.configuration import EstimatorConfig, StudyConfig, configured_estimators
 from mjx_study.study.descents import OptimiseConfig, plan_optimise
-from mjx_study.study.configuration import StudyConfig
 from mjx_study.study.plan import estimators_of, plan_study
 from mjx_study.tasks import make_task
 

@@ -16,9 +16,9 @@ from mjx_study.objective import MjxObjective, Simulator
 from mjx_study.plots.study import plot_study
 from mjx_study.plots.style import save_figure
 from mjx_study.study import sampling
+from mjx_study.study.configuration import StudyConfig
 from mjx_study.study.dataset import dataset_of
 from mjx_study.study.findings import Row, findings, rows_of
-from mjx_study.study.configuration import StudyConfig
 from mjx_study.study.plan import estimators_of, plan_study
 from mjx_study.study.run import run_study
 from mjx_study.study.variables import GRADIENTS

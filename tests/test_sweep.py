@@ -29,8 +29,8 @@ from mjx_study.plots import study as study_plots
 from mjx_study.report import report
 from mjx_study.simulation.contact import stiffness_from_solref
 from mjx_study.study import gradients, store
-from mjx_study.study.gradients import compute_gradients
 from mjx_study.study.configuration import StudyConfig
+from mjx_study.study.gradients import compute_gradients
 from mjx_study.study.plan import estimators_of, plan_study
 from mjx_study.study.run import load_study, open_store, run_study, warnings_of
 from mjx_study.study.store import Store, StudyError

@@ -15,8 +15,8 @@ from mjx_study.objective import MjxObjective, Simulator
 from mjx_study.simulation.contact import ContactModel
 from mjx_study.study import gradients
 from mjx_study.study import memory as sweep_memory
-from mjx_study.study.gradients import compute_gradients
 from mjx_study.study.configuration import StudyConfig
+from mjx_study.study.gradients import compute_gradients
 from mjx_study.study.plan import memory_of_seed, plan_study, seeds_together
 from mjx_study.study.variables import MEASURED
 
