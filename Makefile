@@ -26,7 +26,7 @@ figures: $(STAMP) ## Make the figures of docs/ again
 	$(BIN)/mjx-study landscape momentum_transfer --contact penalty,mujoco_default,smooth_onset --output results/onset
 	cp results/onset/landscape.png docs/onset.png
 	$(BIN)/mjx-study optimise pusher --contact penalty --stiffness 1000 --output results/optimisation
-	cp results/optimisation/optimisation.png docs/optimisation.png
+	cp results/optimisation/descent.png docs/optimisation.png
 	$(BIN)/python docs/make_figures.py
 
 study: $(STAMP) ## Sweep stiffness and draw the README's figures of it again (half an hour; resumable)

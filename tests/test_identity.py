@@ -11,13 +11,13 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from mjx_study.study.checkpoint import checkpoint_path
+import xarray as xr
 
+from mjx_study.disk import write_whole
 from mjx_study.simulation.scene import models_folder
 from mjx_study.study import cells as sweep_cells
-from mjx_study.study import identity
+from mjx_study.study import identity, store
 from mjx_study.study.configuration import StudyConfig
-from mjx_study.study.descents import OptimiseConfig, OptimiseResult, optimise, plan_optimise
 from mjx_study.study.identity import contents, differences
 from mjx_study.study.plan import StudyCell, StudyPlan, plan_study
 from mjx_study.study.revision import git_revision
@@ -222,64 +222,86 @@ def test_a_cell_counts_in_its_place_alone(tmp_path: Path) -> None:
     assert [float(kept.read(index)["residual"][0]) for index in (0, 1)] == [10.0, 100.0]
 
 
-# Optimisations.
+# Descents.
 
 
 DESCENT: dict[str, Any] = {
-    "task": "ball_wall",
-    "reference": True,
+    "kind": "descents",
+    "contact": ("reference",),
+    "stiffness": (1000.0,),
     "estimators": ("zobg", "fobg"),
     "seeds": 2,
-    "samples": 5,
+    "samples": (5,),
     "evaluation_samples": 5,
 }
 
 
 def descended(
-    folder: Path | None, iterations: int, task: Task | None = None, *, accept_versions: bool = False
-) -> OptimiseResult:
-    plan = plan_optimise(OptimiseConfig(**DESCENT, iterations=iterations), task)
-    return optimise(plan, folder, accept_versions=accept_versions)
+    folder: Path | None, iterations: int, task: str | Task = "ball_wall", *, accept_versions: bool = False
+) -> xr.Dataset:
+    return run_study(
+        StudyConfig(tasks=(task,), **DESCENT, iterations=iterations), folder, accept_versions=accept_versions
+    )
+
+
+def content(folder: Path) -> dict[Path, bytes]:
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 def test_a_longer_run_is_neither_cut_nor_lost(tmp_path: Path) -> None:
     whole = descended(tmp_path, 6)
-    kept = {path: path.read_bytes() for path in tmp_path.iterdir()}
-    with pytest.raises(ValueError, match="run-zobg.npz holds 6 iterations, and 4 are asked for: give --iterations 6"):
+    kept = content(tmp_path)
+    with pytest.raises(StudyError, match="holds 6 iterations, and 4 are asked for: give --iterations 6 or more, or"):
         descended(tmp_path, 4)
-    assert kept == {path: path.read_bytes() for path in tmp_path.iterdir()}
+    assert kept == content(tmp_path)
     longer, undisturbed = descended(tmp_path, 8), descended(None, 8)
-    for one, other in zip(longer.runs, undisturbed.runs, strict=True):
-        np.testing.assert_array_equal(one.theta, other.theta)
-        assert one.history["cost"].shape == (8, 2)
-    assert np.any(whole.runs[0].theta != longer.runs[0].theta)
+    assert longer.drop_vars("seconds").equals(undisturbed.drop_vars("seconds")) and longer.sizes["iteration"] == 8
+    assert np.any(whole["theta"].values != longer["theta"].values)
+    assert load_study(tmp_path).equals(longer)
+
+
+@pytest.mark.parametrize("moment", range(1, 4))
+def test_a_run_made_longer_survives_a_kill(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, moment: int) -> None:
+    """Killed at each write of the step from six iterations to eight, it is done again, to the same numbers."""
+    descended(tmp_path, 6)
+    count = [0]
+
+    class Killed(BaseException):
+        pass
+
+    def killed(path: Path, write: Any) -> Path:
+        count[0] += 1
+        written = write_whole(path, write)
+        if count[0] == moment:
+            raise Killed
+        return written
+
+    with monkeypatch.context() as patch:
+        patch.setattr(store, "write_whole", killed)
+        with pytest.raises(Killed):
+            descended(tmp_path, 8)
+    assert descended(tmp_path, 8).drop_vars("seconds").equals(descended(None, 8).drop_vars("seconds"))
 
 
 def test_a_run_of_other_contents_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     descended(tmp_path, 2)
-    zeroth, first = (checkpoint_path(tmp_path, name) for name in ("zobg", "fobg"))
-    kept = first.read_bytes()
-    first.write_bytes(zeroth.read_bytes())
-    with pytest.raises(ValueError, match="another run .estimator zobg there and fobg here"):
-        descended(tmp_path, 3)
-    first.write_bytes(kept)
     other = make_task("ball_wall").replace(final_cost=lambda state: state.qpos[0])
-    with pytest.raises(ValueError, match="another run .task ball_wall "):
+    with pytest.raises(StudyError, match="another study .task ball_wall "):
         descended(tmp_path, 3, other)
     monkeypatch.setattr(identity, "precision", lambda: "float32")
-    with pytest.raises(ValueError, match="another run .precision float64 there and float32 here"):
+    with pytest.raises(StudyError, match="another study .precision float64 there and float32 here"):
         descended(tmp_path, 3)
 
 
 def test_a_run_of_other_versions_needs_a_flag_and_remembers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     descended(tmp_path, 2)
     other_jax(monkeypatch)
-    assert descended(tmp_path, 2).warnings == ()
-    with pytest.raises(ValueError, match="run-zobg.npz was computed with other versions .jax .* --accept-versions"):
+    assert descended(tmp_path, 2).attrs["mixed_versions"] == ""
+    with pytest.raises(StudyError, match="was computed with other versions .jax .* --accept-versions"):
         descended(tmp_path, 3)
     for iterations in (3, 4):
-        found = descended(tmp_path, iterations, accept_versions=True)
-        assert sum("computed by different versions (jax" in text for text in found.warnings) == 2
+        found = warnings_of(descended(tmp_path, iterations, accept_versions=True))
+        assert any("different versions: jax" in text and "and 99.0" in text for text in found)
 
 
 def test_what_differs_is_told() -> None:

@@ -157,7 +157,7 @@ def test_only_public_names_are_used(path: Path) -> None:
         ("from mjx_study.study.gradients import _row", ["mjx_study.study.gradients._row"]),
         ("task._hidden", ["_hidden"]),
         ("mjx_study.UNHEARD_OF", ["mjx_study.UNHEARD_OF"]),
-        ("import mjx_study\nmjx_study.compare(plan).rows", []),
+        ("import mjx_study\nmjx_study.run_study(plan).sizes", []),
     ],
 )
 def test_the_walk_sees(source: str, found: list[str]) -> None:

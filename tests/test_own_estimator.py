@@ -1,6 +1,5 @@
 """An estimator of the user's own, one file outside the package, through the commands; and one line for each mistake."""
 
-import json
 import re
 import sys
 from collections.abc import Iterator
@@ -13,6 +12,8 @@ from estimators import ESTIMATORS, Estimator, FirstOrder, ZerothOrder, find_esti
 from mjx_study import cli
 from mjx_study.cli import options
 from mjx_study.plots.style import STYLE, style_of
+from mjx_study.study.findings import rows_of
+from mjx_study.study.run import load_study
 
 PAGE = (Path(__file__).parents[1] / "docs" / "estimators.md").read_text()
 (CODE,) = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
@@ -36,8 +37,8 @@ def test_compare_and_sweep_take_it(folder: Path, capsys: pytest.CaptureFixture[s
     common = [*small, "--contact", "penalty", "--estimators", f"fobg,{OWN}"]
     assert cli.main(["compare", *common, "--baseline", "none", "--output", "out"]) == 0
     assert re.search(r"^ +SignAgreement  ", capsys.readouterr().out, re.MULTILINE)
-    first, mine, *_ = json.loads((folder / "out" / "results.json").read_text())["rows"]
-    assert mine["estimator"] == OWN and first["variance"] != mine["variance"] > 0
+    first, mine, *_ = rows_of(load_study(folder / "out"))
+    assert mine.estimator == OWN and first.variance != mine.variance > 0
     assert (folder / "out" / "comparison.pdf").exists()
     assert cli.main(["sweep", *common, "--seeds", "2", "--output", "study"]) == 0
     assert cli.main(["plot", "study"]) == 0 and cli.main(["report", "study"]) == 0
@@ -50,12 +51,12 @@ def test_optimise_takes_it_and_goes_on(folder: Path, capsys: pytest.CaptureFixtu
     assert cli.main([*arguments, "2"]) == 0 and cli.main([*arguments, "3"]) == 0
     capsys.readouterr()
     assert {path.name for path in (folder / "out").iterdir()} >= {
-        "policy-my_estimators.SignAgreement.json", "run-my_estimators.SignAgreement.npz", "optimisation.png",
+        "policy-my_estimators.SignAgreement.json", "descent.png", "results.nc",
     }  # fmt: skip
     sys.modules.pop("my_estimators")
     (folder / "my_estimators.py").write_text(CODE.replace("sign(low.mean) ==", "sign(low.mean) !="))
     assert cli.main([*arguments, "4"]) == 2
-    assert "holds another run (" in capsys.readouterr().err
+    assert "holds another study (" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -11,8 +11,7 @@ from mjx_study import cli
 from mjx_study.cli import options
 from mjx_study.reference import DoublePendulum, roll_out
 from mjx_study.reference.adjoint import gradients_along
-from mjx_study.study.configuration import EstimatorConfig, StudyConfig, configured_estimators
-from mjx_study.study.descents import OptimiseConfig, plan_optimise
+from mjx_study.study.configuration import StudyConfig, configured_estimators
 from mjx_study.study.plan import estimators_of, plan_study
 from mjx_study.tasks import make_task
 
@@ -35,30 +34,33 @@ def configured(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("name", CONSTANTS)
 def test_published_constants_on_the_scale_of_the_task_s_cost(name: str) -> None:
-    """In the options that estimators get, and in the resolved configuration that is saved."""
-    plan = plan_optimise(OptimiseConfig(task=name, published=True))
+    """In the options that estimators get."""
     gamma, radius = CONSTANTS[name]
-    holders: tuple[Any, Any] = plan.estimators[2], plan.config
-    for holder in holders:
-        assert (holder.gamma, holder.radius) == (pytest.approx(gamma), pytest.approx(radius))
-        assert (holder.failure_probability, holder.variance_proxy) == (0.95, "second_moment")
-    default: Any = plan_optimise(OptimiseConfig(task=name)).estimators[2]
+    holder = alpha_order(StudyConfig(tasks=(name,), published=True))
+    assert (holder.gamma, holder.radius) == (pytest.approx(gamma), pytest.approx(radius))
+    assert (holder.failure_probability, holder.variance_proxy) == (0.95, "second_moment")
+    default = alpha_order(StudyConfig(tasks=(name,)))
     assert (default.gamma, default.failure_probability) == (pytest.approx(gamma), 0.05)
     assert (default.radius, default.variance_proxy) == ("max_deviation", "variance")
 
 
-def test_every_study_takes_them() -> None:
-    descended: Any = plan_optimise(OptimiseConfig(task="tennis", published=True)).estimators
-    swept = plan_study(StudyConfig(tasks=("tennis",), published=True))
-    assert descended == estimators_of(swept, swept.cells[0]) and descended[2].radius == 1000.0
+def alpha_order(config: StudyConfig) -> Any:
+    plan = plan_study(config)
+    return estimators_of(plan, plan.cells[0])[2]
+
+
+@pytest.mark.parametrize("kind", ["gradients", "descents", "landscapes"])
+def test_every_study_takes_them(kind: str) -> None:
+    changes: dict[str, Any] = {"points": 3} if kind == "landscapes" else {}
+    assert alpha_order(StudyConfig(tasks=("tennis",), kind=kind, published=True, **changes)).radius == 1000.0
 
 
 def test_published_constants_stand_alone() -> None:
     task = make_task("pusher", horizon=3)
     with pytest.raises(ValueError, match="published sets gamma, .*: leave gamma, radius out"):
-        configured_estimators(EstimatorConfig(task="pusher", published=True, gamma=1.0, radius=2.0), task)
+        configured_estimators(StudyConfig(tasks=("pusher",), published=True, gamma=1.0, radius=2.0), task)
     with pytest.raises(ValueError, match="double_pendulum has no published constants of the bound"):
-        configured_estimators(EstimatorConfig(task="double_pendulum", published=True), make_task("double_pendulum"))
+        configured_estimators(StudyConfig(tasks=("double_pendulum",), published=True), make_task("double_pendulum"))
 
 
 @pytest.mark.parametrize(
@@ -89,7 +91,7 @@ def test_what_they_do_to_the_weight_of_first_order_gradients() -> None:
         task = make_task(name)
         objective = task.analytic(task.middle_stiffness)
         for published in (False, True):
-            config = EstimatorConfig(task=name, estimators=("aobg",), published=published)
+            config = StudyConfig(tasks=(name,), estimators=("aobg",), published=published)
             (estimator,) = configured_estimators(config, task)
             combine = jax.jit(lambda drawn, estimator=estimator: estimator(drawn).alpha)
             for seed in range(20):

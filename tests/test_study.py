@@ -175,6 +175,14 @@ def test_zeroth_order_alone_does_not_differentiate_for_itself() -> None:
     assert rows_of(found)[0].alpha is None
 
 
+def test_a_dataset_says_what_a_study_is_good_for(spied) -> None:
+    found, _, _ = spied
+    table = found.mjx_study.table()
+    assert len(table) == 78 and set(table["estimator"]) == {"zobg", "fobg", "aobg"}
+    assert table["variance_seconds"].notnull().all() and set(found.mjx_study.plot()) == {"comparison"}
+    assert found.mjx_study.findings() == findings(found) and found.mjx_study.report().startswith("<!doctype html>")
+
+
 def test_findings_follow_the_intervals() -> None:
     rows = (row("zobg", 10, 100), row("fobg", 10, 1), row("zobg", 100, 100), row("fobg", 100, 150))
     rows += (row("zobg", 1000, 100), row("fobg", 1000, 1e6))

@@ -34,7 +34,7 @@ from mjx_study.study.gradients import compute_gradients
 from mjx_study.study.plan import estimators_of, plan_study
 from mjx_study.study.run import load_study, open_store, run_study, warnings_of
 from mjx_study.study.store import Store, StudyError
-from mjx_study.study.variables import MEASURED
+from mjx_study.study.variables import MEASURED, VARIABLES, markdown_table
 from mjx_study.tasks import make_task
 from tests.documents import study_document
 
@@ -94,6 +94,7 @@ def test_results_are_labelled(undisturbed: Path) -> None:
     data = load_study(undisturbed)
     assert dict(data.sizes) == {
         "task": 1, "timestep": 1, "cone": 1, "model": 4, "sigma": 1, "samples": 2, "estimator": 3, "seed": 3,
+        "param": 20, "solref_entry": 2, "solimp_entry": 5,
     }  # fmt: skip
     assert data["contact"].values.tolist() == ["penalty", "penalty", "mujoco", "mujoco"]
     assert data["stiffness"].attrs["units"] == "N/m" and data["timestep"].attrs["units"] == "s"
@@ -608,7 +609,7 @@ def test_the_commands_write_figures_and_a_page(
 
 def test_the_example_of_the_page_runs(undisturbed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     page = (Path(__file__).parents[1] / "docs" / "studies.md").read_text()
-    (code,) = re.findall(r"```py\n(.*?)```", page, re.DOTALL)
+    _, code = re.findall(r"```py\n(.*?)```", page, re.DOTALL)
     (toml,) = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
     copy_of(undisturbed, tmp_path / "out")
     monkeypatch.chdir(tmp_path)
@@ -618,8 +619,8 @@ def test_the_example_of_the_page_runs(undisturbed: Path, tmp_path: Path, monkeyp
     (tmp_path / "study.toml").write_text(toml)
     parsed = cli.parser().parse_args(["sweep", "--config", "study.toml", "--output", "x"])
     assert len(plan_study(StudyConfig(**_fields(parsed))).cells) == 52
-    for name in load_study(tmp_path / "out").variables:
-        assert f"`{name}`" in page, name
+    assert all(f"`{name}`" in page for name in load_study(tmp_path / "out").variables)
+    assert all(markdown_table(kind) in page for kind in VARIABLES)
 
 
 def test_the_configuration_is_that_of_the_flags() -> None:

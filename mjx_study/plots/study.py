@@ -41,7 +41,7 @@ def plot_study(dataset: xr.Dataset) -> dict[str, Figure]:
     kinds: dict[str, Callable[[xr.Dataset, str], Figure | None]] = {
         "final_cost": {"achieved": _achieved, "descent": _descent},
         "variance": {"variance": _variance, "bias": _bias, "alpha": _alpha}
-        if dataset.sizes["seed"] > 1
+        if dataset.sizes.get("seed", 1) > 1
         else {"comparison": _comparison},
         "smoothed": {"landscape": _landscape},
     }[quantity]

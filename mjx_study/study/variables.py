@@ -108,8 +108,8 @@ LANDSCAPES: Final = {
     "unconverged": Variable((), "1", "rollouts whose solver residual is too large"),
 }
 CELL: Final = {
-    "solref": Variable(("solref_entry",), "", "MuJoCo's solref of the contact; NaN where it is the MJCF's"),
-    "solimp": Variable(("solimp_entry",), "", "MuJoCo's solimp of the contact; NaN where it is the MJCF's"),
+    "solref": Variable(("solref_entry",), "1", "MuJoCo's solref of the contact; NaN where it is the MJCF's"),
+    "solimp": Variable(("solimp_entry",), "1", "MuJoCo's solimp of the contact; NaN where it is the MJCF's"),
 }
 """Of every kind."""
 VARIABLES: Final = {"gradients": GRADIENTS, "descents": DESCENTS, "landscapes": LANDSCAPES}
@@ -121,6 +121,15 @@ MEASURED: Final = ("seconds", "seconds_per_sample")
 def variables_of(kind: str, names: Iterable[str]) -> dict[str, Variable]:
     """The variables of a kind of study, with the metrics that are among some names."""
     told = {name: f"{name.partition('metric_')[2]}, mean over the rollouts of a final cost" for name in names}
-    metrics = {name: Variable(BATCH, "", told[name]) for name in told if name.startswith(METRIC)}
-    metrics |= {name: Variable((), "", told[name]) for name in told if name.startswith(START)}
+    metrics = {name: Variable(BATCH, "1", told[name]) for name in told if name.startswith(METRIC)}
+    metrics |= {name: Variable((), "1", told[name]) for name in told if name.startswith(START)}
     return VARIABLES[kind] | metrics | CELL
+
+
+def markdown_table(kind: str) -> str:
+    """The variables of a kind of study, as docs/studies.md has them."""
+    rows = [
+        f"| `{name}` | {', '.join(variable.dims) or '-'} | {variable.unit} | {variable.description} |"
+        for name, variable in VARIABLES[kind].items()
+    ]
+    return "\n".join([f"| {kind} | within a cell | unit | meaning |", "| --- | --- | --- | --- |", *rows])
