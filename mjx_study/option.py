@@ -237,6 +237,8 @@ def _choice(name: str, choices: Collection[str], metavar: str, line: str, **more
 
 MOST_SAMPLES: Final = "10000000]"
 TASKS: Final = "the task's"
+KINDS: Final = ("gradients", "descents", "landscapes")
+"""Of studies."""
 CONTACTS: Final = (*FAMILIES, "reference")
 """What a study may have in the place of a contact model."""
 OPTIONS: Final[dict[str, Option]] = {
@@ -257,6 +259,7 @@ OPTIONS: Final[dict[str, Option]] = {
         _number("tolerance", float, "[0, 1)", "C", "of ddcg's test"),
         _choice("weights", WEIGHTS, "NAME", "of interpolations: by the samples that they weigh, or the other half"),
         _choice("onset", ONSETS, "NAME", "of contact, in first-order gradients: none, or linear"),
+        _choice("kind", KINDS, "KIND", "what is computed", unset="by --iterations and --points"),
         _choice("estimators", ESTIMATORS, "NAME", "see `mjx-study estimators`", label="estimator", own=True),
         _choice("contact", CONTACTS, "FAMILY", f"of: {', '.join(CONTACTS)}", label="contact family", unset=TASKS),
         _number("stiffness", float, "(0, inf)", "K", "contact stiffness", unit="N/m", unset=TASKS),

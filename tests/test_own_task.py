@@ -112,8 +112,9 @@ def test_the_example_is_short() -> None:
 def test_compare(folder: Path) -> None:
     """Of 4 samples, FoBG's are nearer to the reference and vary less than a tenth of ZoBG's; it is a seventieth."""
     document = run(folder, "compare", "my_tasks:hopper", "--samples", "4", "--reference-samples", "4")
-    assert document["config"]["task"] == "my_tasks:hopper"
-    assert document["config"]["horizon"] == 40 and document["config"]["gamma"] == "inf"
+    (resolved,) = document["resolved"]
+    assert document["config"]["tasks"] == ["my_tasks:hopper"]
+    assert resolved["horizon"] == [40] and resolved["estimators"]["aobg"]["gamma"] == "inf"
     rows = {row["estimator"]: row for row in document["rows"]}
     assert list(rows) == ["zobg", "fobg", "aobg"]
     assert all(row["nonfinite"] == 0 and row["residual"] < 1e-6 for row in rows.values())

@@ -83,6 +83,7 @@ def add(commands: Commands) -> None:
     add_option(command, OPTIONS["solimp"], read=_solimp)
     add_options(command, StudyConfig, "timestep", "cone", "sigma", "samples")
     add_options(command, StudyConfig, "seeds", "estimators", seeds={"unset": "10; 1 of landscapes"})
+    add_options(command, StudyConfig, "kind", "network", "confidence")
     add_options(command, StudyConfig, "iterations", iterations={"line": "optimise policies, N steps each", "unset": ""})
     add_options(command, StudyConfig, "points", points={"line": "landscapes, on N points of a line through theta"})
     add_options(command, StudyConfig, "span", "direction")

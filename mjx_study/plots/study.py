@@ -368,8 +368,10 @@ def _ratio_map(part: xr.Dataset, title: str, quantity: str, other: str) -> Figur
     return figure
 
 
-def _achieved(part: xr.Dataset, title: str) -> Figure:
+def _achieved(part: xr.Dataset, title: str) -> Figure | None:
     """Cost of the final policies above the best one at each contact model; what is far off is at the upper edge."""
+    if part.sizes["model"] < 2:
+        return None  # the table says it
     best = part["final_cost"].min(["seed", "estimator"])
     excess = part["final_cost"] - best
     middle = excess.median("seed").values
@@ -400,11 +402,12 @@ def _achieved(part: xr.Dataset, title: str) -> Figure:
 
 
 def _descent(part: xr.Dataset, title: str) -> Figure:
-    """Cost against iterations, rollouts and seconds; a row for each of a few contact models."""
+    """Cost against iterations, rollouts and seconds, and alpha; a row for each of a few contact models."""
     models = np.unique(np.linspace(0, part.sizes["model"] - 1, MOST_PANELS).round().astype(int))
-    figure = Figure(figsize=(11, 0.9 + 2.5 * len(models)), layout="constrained")
+    columns = 4 if bool(part["alpha"].notnull().any()) else 3
+    figure = Figure(figsize=(0.6 + 3.4 * columns, 1.3 + 2.5 * len(models)), layout="constrained")
     FigureCanvasAgg(figure)
-    grid = figure.subplots(len(models), 3, squeeze=False)
+    grid = figure.subplots(len(models), columns, squeeze=False)
     for row, model in zip(grid, models, strict=True):
         one = part.isel(model=model)
         curves = []
@@ -416,16 +419,27 @@ def _descent(part: xr.Dataset, title: str) -> Figure:
             cost, iteration = cost[going], mine["iteration"].values[going]
             curves.append(np.nanmedian(cost, 1))
             xs = iteration, iteration * float(mine["rollouts"]), mine["seconds"].values[going]
-            for axes, x in zip(row, xs, strict=True):
+            weight = mine["alpha"].transpose("iteration", "seed").values[going]
+            known = np.any(np.isfinite(weight), axis=1)
+            if known.any():
+                middle, low, high = (reduce(weight[known], 1) for reduce in (np.nanmedian, np.nanmin, np.nanmax))
+                row[3].plot(iteration[known], middle, color=style["color"], linewidth=1.4)
+                row[3].fill_between(iteration[known], low, high, color=style["color"], alpha=0.15, lw=0)
+            for axes, x in zip(row[:3], xs, strict=True):
                 axes.plot(x, np.nanmedian(cost, 1), color=style["color"], label=style["label"], linewidth=1.4)
                 axes.fill_between(x, np.nanmin(cost, 1), np.nanmax(cost, 1), color=style["color"], alpha=0.15, lw=0)
         for axes in row:
             axes.grid(alpha=0.25)
-            if curves:
-                axes.set_ylim(*_descent_limits(curves, float(one["start_cost"])))
-        row[0].set_ylabel(f"{one['model'].item()}\nmean cost of the batch", fontsize="small")
+        for axes in row[:3] if curves else ():
+            axes.set_ylim(*_descent_limits(curves, float(one["start_cost"])))
+        for axes in row[3:]:
+            axes.set_ylim(-0.03, 1.03)
+            axes.set_ylabel("alpha, weight of first order", fontsize="small")
+        row[0].set_ylabel("mean cost of the batch", fontsize="small")
+        row[0].set_title(one["model"].item(), loc="left", fontsize="medium")
     grid[0, 0].legend(frameon=False, fontsize="small")
-    for axes, label in zip(grid[-1], ("iteration", "rollouts of one seed", "seconds, all seeds"), strict=True):
+    labels = ("iteration", "rollouts of one seed", "seconds, all seeds", "iteration")
+    for axes, label in zip(grid[-1], labels, strict=False):
         axes.set_xlabel(label)
     figure.suptitle(f"{title} ({part.sizes['seed']} seeds: median, from least to greatest)", fontsize="medium")
     return figure

@@ -41,6 +41,7 @@ TITLES: Final = {
     "smooth_onset": "smooth onset",
     "mujoco_default": "MuJoCo default",
     "mjcf": "as in the MJCF",
+    "reference": "analytic reference",
 }
 assert set(TITLES) >= set(FAMILIES)
 

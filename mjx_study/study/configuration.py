@@ -32,8 +32,6 @@ OF_KIND: Final[dict[str, dict[str, Any]]] = {
 }
 """Options that one kind of sweep alone has, and what they are unless given."""
 ASKED_BY: Final = {"descents": "give iterations as well", "landscapes": "give points as well"}
-KINDS: Final = tuple(OF_KIND)
-"""Of studies."""
 SAMPLES: Final = 100
 """In each batch, where neither the configuration nor a recipe says."""
 
@@ -153,8 +151,6 @@ class StudyConfig(Checked):
                 raise ValueError(f"no {name} given: give at least one, or leave it out")
         if self.iterations is not None and self.points is not None:
             raise ValueError("iterations are of descents and points of landscapes: give one of them")
-        if self.kind not in (None, *KINDS):
-            raise ValueError(f"unknown kind {self.kind!r}; choose from {', '.join(KINDS)}")
         if self.kind is None:
             of_points = "gradients" if self.points is None else "landscapes"
             object.__setattr__(self, "kind", of_points if self.iterations is None else "descents")
