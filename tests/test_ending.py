@@ -15,10 +15,10 @@ import numpy as np
 import pytest
 
 from mjx_study import cli, disk
-from mjx_study.cli import options
+from mjx_study.cli import options, studies
 from mjx_study.study import cells as sweep_cells
 from mjx_study.study.plan import StudyCell, StudyPlan
-from tests.test_study import result, row
+from mjx_study.study.run import run_study
 
 SIGNALS = """
 import os, signal, sys, time
@@ -71,27 +71,43 @@ def ended(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
     return out
 
 
-def test_a_full_disk_costs_an_optimisation_no_number(
-    tmp_path: Path, full: Callable[[], None], capsys: pytest.CaptureFixture[str]
-) -> None:
+@pytest.fixture
+def filling(full: Callable[[], None], monkeypatch: pytest.MonkeyPatch) -> None:
+    """The disk is full once a study's folder is begun."""
+
+    def run(*arguments: Any, **options: Any) -> Any:
+        full()
+        return run_study(*arguments, **options)
+
+    monkeypatch.setattr(studies, "run_study", run)
+
+
+@pytest.mark.usefixtures("filling")
+def test_a_full_disk_costs_an_optimisation_no_number(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = ["optimise", "pusher", "--reference", "--horizon", "8", "--iterations", "2", "--seeds", "2"]
-    arguments += ["--samples", "4", "--evaluation-samples", "5", "--estimator", "fobg", "--output", str(tmp_path)]
-    full()
+    arguments += ["--samples", "4", "--evaluation-samples", "5", "--estimators", "fobg", "--output", str(tmp_path)]
     out = ended(capsys, *arguments)
-    assert "FoBG" in out and "written" not in out and list(tmp_path.iterdir()) == []
+    assert "FoBG" in out and "written" not in out and not list((tmp_path / "cells").iterdir())
     document = json.loads(ended(capsys, *arguments, "--json"))
     assert len(document["runs"][0]["theta"]) == 2
 
 
-def test_a_full_disk_costs_a_comparison_no_number(
-    tmp_path: Path, full: Callable[[], None], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    command = importlib.import_module("mjx_study.cli.compare")
-    monkeypatch.setattr(command, "compare", lambda plan, progress: result(row("zobg", 10, 1.5), row("fobg", 10, 0.5)))
-    full()
-    arguments = ["compare", "pusher", "--stiffness", "10", "--horizon", "2", "--output", str(tmp_path)]
+@pytest.mark.usefixtures("filling")
+def test_a_full_disk_costs_a_comparison_no_number(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["compare", "pusher", "--stiffness", "10", "--contact", "penalty", "--horizon", "4", "--samples", "8"]
+    arguments += ["--reference-samples", "8", "--output", str(tmp_path)]
     assert "ZoBG" in ended(capsys, *arguments)
-    assert [each["variance"] for each in json.loads(ended(capsys, *arguments, "--json"))["rows"]] == [1.5, 0.5]
+    rows = json.loads(ended(capsys, *arguments, "--json"))["rows"]
+    assert [each["estimator"] for each in rows] == ["zobg", "fobg", "aobg"] and rows[0]["variance"] > 0
+
+
+def test_a_full_disk_is_told_before_anything_is_computed(
+    tmp_path: Path, full: Callable[[], None], capsys: pytest.CaptureFixture[str]
+) -> None:
+    full()
+    assert cli.main(["compare", "pusher", "--horizon", "4", "--output", str(tmp_path)]) == 2
+    out, error = capsys.readouterr()
+    assert out == "" and error.count("\n") == 1 and "No space left on device" in error
 
 
 def test_a_full_disk_costs_a_landscape_no_number(
