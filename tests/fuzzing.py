@@ -29,7 +29,6 @@ from mjx_study import cli
 from mjx_study.cli import bench, compare, gradcheck, landscape, optimise, options, rollout, sweep
 from mjx_study.option import OPTIONS
 from mjx_study.simulation.contact import FAMILIES
-from mjx_study.study import configuration
 from mjx_study.study import plan as sweep_plan
 from mjx_study.tasks import TASKS, make_task
 
@@ -55,7 +54,7 @@ def stub(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(options, "configure", lambda **_: None)
     mujoco.set_mju_user_warning(lambda message: print(f"MuJoCo: {message}", file=sys.stderr))  # as `configure` does
     for module, names in (
-        (compare, ("compute",)), (optimise, ("optimise",)), (sweep, ("open_store", "run_study")),
+        (compare, ("compute",)), (optimise, ("compute",)), (sweep, ("open_store", "run_study")),
         (landscape, ("landscape",)), (gradcheck.check, ("gradcheck",)), (bench.benchmark, ("bench",)),
         (rollout, ("_simulate_task", "_simulate_passive")),
     ):  # fmt: skip
@@ -65,7 +64,7 @@ def stub(monkeypatch: pytest.MonkeyPatch) -> None:
     for command in COMMANDS:
         flags_of(command)  # outside of strategies: building a parser uses the random module
     built = functools.lru_cache(maxsize=256)(make_task)
-    for module in (configuration, options, sweep_plan, gradcheck):
+    for module in (options, sweep_plan, gradcheck):
         monkeypatch.setattr(module, "make_task", built)
 
 
