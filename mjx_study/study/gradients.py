@@ -5,7 +5,6 @@ interpolated estimates combine the two. The same keys are used in every cell, so
 not sampling noise.
 """
 
-import dataclasses
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, Final
@@ -18,11 +17,12 @@ from jaxtyping import Array, Float, Key
 import estimators
 from estimators import ORACLES, Estimator, Evaluation, GradientEstimate
 from mjx_study.objective import MjxObjective, Simulator
+from mjx_study.reference import Reference
 from mjx_study.runtime import precision
 from mjx_study.study.memory import BIAS_DRAWS
 from mjx_study.study.plan import StudyCell, StudyPlan, estimators_of, oracles_of, seeds_together
 from mjx_study.study.reference_gradient import reference_gradient
-from mjx_study.study.sampling import cell_keys, draw_batches, unconverged
+from mjx_study.study.sampling import Objectives, cell_keys, draw_batches, unconverged
 from mjx_study.study.variables import BATCH, GRADIENTS
 from mjx_study.tasks.contact_grid import contact_grid
 from mjx_study.tasks.task import Task
@@ -35,17 +35,16 @@ MOST_KEPT: Final = 1_000_000
 
 def compute_gradients(plan: StudyPlan) -> Callable[[StudyCell], dict[str, np.ndarray]]:
     """A function that computes a cell; it keeps what is compiled."""
-    config, oracles = plan.config, oracles_of(plan.config)
-    compiled: dict[int, Simulator] = {}
+    config, oracles, objectives = plan.config, oracles_of(plan.config), Objectives(plan)
     warm: set[tuple[int, bool]] = set()
     soft: dict[tuple[int, float], Array | None] = {}
 
     def compute(cell: StudyCell) -> dict[str, np.ndarray]:
-        if cell.group not in compiled:
-            compiled[cell.group] = Simulator(plan.groups[cell.group].task, chunk_size=plan.chunk_size)
-        objective = dataclasses.replace(compiled[cell.group].objective(cell.model.contact), sigma=cell.sigma)
-        theta = plan.groups[cell.group].task.theta
-        if (cell.group, cell.model.contact is None) not in warm:  # so that no cell's time holds a compilation
+        objective, task = objectives(cell), plan.groups[cell.group].task
+        theta = task.theta
+        if (
+            not cell.model.analytic and (cell.group, cell.model.contact is None) not in warm
+        ):  # so that no cell's time holds a compilation
             for name in dict.fromkeys([*oracles, "differentiation"]):  # the reference's control variate needs it
                 getattr(objective, ORACLES[name].method)(theta, jax.random.split(jax.random.key(0), 1))
             warm.add((cell.group, cell.model.contact is None))
@@ -55,8 +54,8 @@ def compute_gradients(plan: StudyPlan) -> Callable[[StudyCell], dict[str, np.nda
             for stream, size in zip(keys["reference"], (config.reference_samples or 0, CANDIDATES), strict=True)
         )
         softened = cell.group, cell.sigma
-        if softened not in soft:
-            soft[softened] = soft_gradient(compiled[cell.group], cell.sigma, candidate)
+        if softened not in soft and not cell.model.analytic:
+            soft[softened] = soft_gradient(objectives.simulator(cell.group), cell.sigma, candidate)
         tests, chosen = jax.random.split(keys["test"], config.batches), estimators_of(plan, cell)
         together = seeds_together(plan, cell)
         reference, parts, spent, residuals, events = None, [], [], [], []
@@ -65,7 +64,7 @@ def compute_gradients(plan: StudyPlan) -> Callable[[StudyCell], dict[str, np.nda
             drawn, seconds, residual = draw_batches(objective, theta, keys, oracles, cell.samples, some)
             if reference is None:
                 pilot = jax.tree.map(lambda leaf: leaf[0], drawn["evaluation"])
-                reference = reference_of(objective, odd, candidate, pilot, soft[softened])
+                reference = reference_of(task, objective, odd, candidate, pilot, soft.get(softened))
             numbers = _seed_numbers(drawn, reference, tests[some], chosen, config.confidence)
             parts.append(jax.device_get(numbers))
             spent.append(seconds)
@@ -103,7 +102,7 @@ def _of_batches(
         needs = estimator.needs
         arrays["seconds_per_sample"].append(sum(each[oracle] for each in seconds for oracle in needs) / samples)
         all_of = np.concatenate([each[oracle] for each in residuals for oracle in needs])
-        arrays["residual"].append(np.max(np.where(np.isfinite(all_of), all_of, np.inf)))
+        arrays["residual"].append(np.max(np.where(np.isfinite(all_of), all_of, np.inf), initial=0.0))
         arrays["unconverged"].append(unconverged(all_of, precision()))
         found = [met for each in events for oracle in needs if (met := each[oracle]) is not None]
         arrays["events"].append(np.sum(found, axis=0) if found else np.full(3, np.nan))
@@ -155,7 +154,8 @@ def soft_gradient(simulator: Simulator, sigma: float, keys: Key[Array, " samples
 
 
 def reference_of(
-    objective: MjxObjective,
+    task: Task,
+    objective: MjxObjective | Reference,
     odd_keys: Key[Array, " pairs"],
     candidate_keys: Key[Array, " samples"],
     pilot: Evaluation,
@@ -164,14 +164,14 @@ def reference_of(
     """The reference gradient of a contact model; it does not depend on which others there are.
 
     Args:
-        objective: the task under that contact model.
-        odd_keys: of the pairs of rollouts.
-        candidate_keys: of the first-order samples whose median is a candidate for the control variate.
+        task: the task.
+        objective: the task under that contact model, or its analytic system.
+        odd_keys: keys of the pairs of rollouts.
+        candidate_keys: keys of the first-order samples whose median is a candidate for the control variate.
         pilot: a batch from other keys, which picks among the candidates.
         soft: another candidate, see `soft_gradient`.
     """
-    task = objective.simulator.task
-    if not _takes_candidates(task):
+    if not isinstance(objective, MjxObjective) or not _takes_candidates(task):
         plus, minus = objective.evaluate_pair(task.theta, odd_keys)
         return _antithetic(plus, minus, "zero_noise")
     own = jnp.median(objective.differentiate(task.theta, candidate_keys).gradient, axis=0)

@@ -10,6 +10,8 @@ from mjx_study.tasks.task import Task
 
 BIAS_DRAWS: Final = 999
 """Draws of the test for bias; its least p-value is 0.001."""
+LARGEST_BATCH: Final = 20_000
+"""Samples that are drawn at once; more seeds than fit are drawn in turn."""
 AT_ONCE: Final = 512e6
 """Memory that batches of several seeds may take together [bytes]; one seed's batches may take more."""
 

@@ -12,9 +12,8 @@ from mjx_study.objective import chunk_for
 from mjx_study.option import OPTIONS, check
 from mjx_study.study.configuration import SAMPLES, StudyConfig, at_theta, configured_estimators, recipe_of
 from mjx_study.study.iteration import make_optimizer
-from mjx_study.study.landscapes import line_of
-from mjx_study.study.memory import bytes_per_sample, check_batches, check_memory, seeds_at_once
-from mjx_study.study.sampling import LARGEST_BATCH
+from mjx_study.study.line import line_of
+from mjx_study.study.memory import LARGEST_BATCH, bytes_per_sample, check_batches, check_memory, seeds_at_once
 from mjx_study.table import digits_to_tell_apart
 from mjx_study.tasks import make_task
 from mjx_study.tasks.contact_grid import ContactPoint, contact_grid, solver_grid
@@ -150,6 +149,8 @@ def plan_study(config: StudyConfig) -> StudyPlan:
             check_memory(groups[cell.group].task, chosen, config.batches * cell.samples, other=history)
             check_memory(groups[cell.group].task, (), config.evaluation_samples or 0)
         elif config.kind == "landscapes":
+            if config.theta is not None and groups[cell.group].task.policy.num_params == 1:
+                raise ValueError("theta has one entry, and the line is its range: give --span")
             line_of(groups[cell.group].task, config.points or 0, config.span, config.direction, config.seed)
     return plan
 

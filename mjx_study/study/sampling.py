@@ -10,11 +10,31 @@ import numpy as np
 from jaxtyping import Array, Float, Key
 
 from estimators import ORACLES, Linearisation
+from mjx_study.objective import MjxObjective, Simulator
+from mjx_study.reference import Reference
+from mjx_study.study.memory import LARGEST_BATCH
+from mjx_study.study.plan import StudyCell, StudyPlan
 
-LARGEST_BATCH: Final = 20_000
-"""Samples that are drawn at once; more seeds than fit are drawn in turn."""
 UNCONVERGED: Final = {"float64": 1e-6, "float32": 1e-3}
 """Relative solver residual above which a sample is reported as unconverged."""
+
+
+class Objectives:
+    """The objective of each cell of a plan; what is compiled serves every contact model and noise of its group."""
+
+    def __init__(self, plan: StudyPlan):
+        self._plan, self._compiled = plan, {}
+
+    def simulator(self, group: int) -> Simulator:
+        """The simulator of a group."""
+        if group not in self._compiled:
+            self._compiled[group] = Simulator(self._plan.groups[group].task, chunk_size=self._plan.chunk_size)
+        return self._compiled[group]
+
+    def __call__(self, cell: StudyCell) -> MjxObjective | Reference:
+        if cell.model.analytic:
+            return self._plan.groups[cell.group].task.replace(sigma=cell.sigma).analytic(cell.model.stiffness)
+        return self.simulator(cell.group).objective(cell.model.contact, cell.sigma)
 
 
 def cell_keys(seed: int, seeds: int) -> dict[str, Any]:
@@ -50,10 +70,10 @@ def draw_batches(
 
 
 def residuals_of(batch: Any) -> Float[np.ndarray, " rollouts"]:
-    """The solver's residual of every rollout of a batch, whatever its kind."""
+    """The solver's residual of every rollout of a batch, whatever its kind; none of a closed form."""
     parts = batch if isinstance(batch, tuple) else (batch,)
     steps = [part.steps if isinstance(part, Linearisation) else part for part in parts]
-    return np.concatenate([np.asarray(part.residual) for part in steps])
+    return np.concatenate([np.zeros(0) if part.residual is None else np.asarray(part.residual) for part in steps])
 
 
 def unconverged(residuals: np.ndarray, precision: str) -> int:

@@ -105,6 +105,12 @@ LANDSCAPES: Final = {
     "slope": Variable(("estimator", "point"), "gradient", "mean of the estimator along the line"),
     "slope_se": Variable(("estimator", "point"), "gradient", "standard error of slope"),
     "nonfinite": Variable(("estimator", "point"), "1", "samples that are not finite and were left out", "lost"),
+    "exact_smoothed": Variable(("point",), "cost", "smoothed without sampling error, where there is a quadrature"),
+    "exact_slope": Variable(("point",), "gradient", "slope of exact_smoothed, the mean of an unbiased estimator"),
+    "exact_first": Variable(("point",), "gradient", "mean of first-order gradients, without sampling error"),
+    "exact_slope_error": Variable(("point",), "gradient", "quadrature error of exact_slope"),
+    "exact_first_error": Variable(("point",), "gradient", "quadrature error of exact_first"),
+    "residual": Variable((), "1", "largest relative residual of the constraint solver"),
     "unconverged": Variable((), "1", "rollouts whose solver residual is too large"),
 }
 CELL: Final = {
