@@ -19,7 +19,7 @@ import estimators
 from estimators import ENOUGH_EFFECTIVE, ESTIMATORS, make_estimator, summarise
 from mjx_study.reference import LinearQuadratic, ReferenceObjective
 from mjx_study.runtime import configure
-from mjx_study.study.landscapes import DETECTED
+from mjx_study.study.findings import DETECTED
 
 PAGE: Final = Path(__file__).parent / "coverage.md"
 SAMPLES: Final = (10, 50, 400)

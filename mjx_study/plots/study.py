@@ -14,7 +14,7 @@ from matplotlib.colors import TwoSlopeNorm
 from matplotlib.figure import Figure
 from scipy import stats
 
-from mjx_study.plots.style import NO_CONTACT, TITLES, line_with_band, mean_with_band, robust_limits, style_of
+from mjx_study.plots.style import NO_CONTACT, STYLE, TITLES, line_with_band, mean_with_band, robust_limits, style_of
 from mjx_study.simulation.contact import DEFAULT_SOLREF
 from mjx_study.table import digits_to_tell_apart
 
@@ -459,19 +459,28 @@ def _landscape(part: xr.Dataset, title: str) -> Figure:
     FigureCanvasAgg(figure)
     grid = figure.subplots(2, len(models), sharex=True, sharey="row", squeeze=False)
     slopes, steepest = [], 0.0
+    direction = json.loads(part.attrs["config"])["direction"] or "random"
+    along = f"t, along direction {direction}" if part.attrs["many_parameters"] else "theta"
     for (above, below), model in zip(grid.T, models, strict=True):
         one = part.isel(model=model)
         t = one["position"].values
         steepest = max(steepest, float(np.nanmax(np.abs(np.gradient(one["smoothed"].values, t)), initial=0.0)))
         above.plot(t, one["cost"], color="0.55", linewidth=1.2, label="cost without noise")
         mean_with_band(above, t, one["smoothed"].values, one["smoothed_se"].values, "black", "mean cost with noise")
+        if "exact_slope" in one and bool(one["exact_slope"].notnull().any()):
+            dotted = {"linestyle": ":", "linewidth": 1.2}
+            below.plot(t, one["exact_slope"], color="black", **dotted, label="slope of the mean cost, quadrature")
+            first = STYLE["fobg"][0]
+            below.plot(t, one["exact_first"], color=first, **dotted, label="mean of FoBG, quadrature")
         for mine, style in _estimators(one):
             slopes.append(mine["slope"].values)
             mean, error = mine["slope"].values, mine["slope_se"].values
             mean_with_band(below, t, mean, error, style["color"], f"mean of {style['label']}")
-        above.set_title(one["model"].item(), fontsize="medium")
+        family, stiffness = one["contact"].item(), float(one["stiffness"])
+        spring = f"\nK = {stiffness:g} N/m" if stiffness else ""
+        above.set_title(f"{TITLES.get(family, family)}{spring}", fontsize="medium")
         below.axhline(0, color="0.7", linewidth=0.8)
-        below.set_xlabel("t, along the line")
+        below.set_xlabel(along)
         for axes in (above, below):
             axes.grid(alpha=0.25)
     low, high = robust_limits(slopes)  # and a slope that is wild beside that of the mean cost leaves the axes
@@ -480,7 +489,11 @@ def _landscape(part: xr.Dataset, title: str) -> Figure:
     grid[1, 0].set_ylim(low, high)
     grid[0, 0].set_ylabel("cost")
     grid[1, 0].set_ylabel("slope along the line")
-    handles = [handle for axes in grid[:, 0] for handle in axes.get_legend_handles_labels()[0]]
-    figure.legend(handles=handles, loc="outside lower center", ncols=5, frameon=False, fontsize="small")
+    legend: dict[str, Any] = {}
+    for axes in grid.flat:
+        found, labels = axes.get_legend_handles_labels()
+        legend |= dict(zip(labels, found, strict=True))
+    columns = max(2, min(len(legend), 2 * len(models)))
+    figure.legend(legend.values(), legend, loc="outside lower center", ncols=columns, frameon=False, fontsize="small")
     figure.suptitle(f"{title} at each point (bands: 95 %)", fontsize="medium")
     return figure

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
-from estimators import Differentiation, Evaluation, Linearisation, Objective, StepDifferentiation, StepEvaluation
+from estimators import Differentiation, Evaluation, Linearisation, PairedObjective, StepDifferentiation, StepEvaluation
 from mjx_study.reference.adjoint import gradients_along, roll_out, value_and_gradients
 from mjx_study.reference.function import Function, check_noise
 from mjx_study.reference.noise import batch_noise, check_density, noise_score, split_sample_key
@@ -22,7 +22,7 @@ Start = tuple[float, ...] | Callable[[Key[Array, ""]], Float[Array, " states"]]
 
 
 @runtime_checkable
-class Reference(Objective, Protocol):
+class Reference(PairedObjective, Protocol):
     """An Objective with hand-written derivatives, which can also be evaluated without noise."""
 
     def value_and_gradient(

@@ -75,6 +75,7 @@ def dataset_of(document: Mapping[str, Any], cells: Cells) -> xr.Dataset:
         for key, value in document.items()
         if key not in ("cells", "format") and value is not None
     }
+    dataset.attrs["many_parameters"] = int(any(entry.get("parameters", 1) > 1 for entry in document["resolved"]))
     dataset.attrs["missing_cells"] = len(places) - len(cells)
     dataset.attrs["mixed_versions"] = _mixture([versions for _, versions in cells.values()])
     return dataset

@@ -54,6 +54,7 @@ class _Resolved(_Part):
     horizon: list[Count]
     noise: Name
     estimators: dict[str, dict[str, Any]]
+    parameters: Count = 1
 
 
 class _Environment(_Part):

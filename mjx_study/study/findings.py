@@ -1,4 +1,4 @@
-"""What a study of gradients says: a row for each estimate, and sentences that intervals back."""
+"""What a study says: a row for each estimate of a gradient, and sentences that intervals back."""
 
 import itertools
 import json
@@ -19,6 +19,10 @@ BIASED: Final = {"fobg": "FoBG", "aobg": "AoBG", "ivw": "IVW"}
 """Whose bias is told: first order, and the interpolations that follow it."""
 APART: Final = 4.0
 """Standard errors beyond which a mean that gets no verdict is said to be off."""
+DETECTED: Final = 4.0
+"""Standard errors beyond which two means are called different."""
+NOTABLE: Final = 0.05
+"""Share of the largest slope beyond which a difference is mentioned, where there is no sampling error."""
 VECTORS: Final = ("gradient", "reference")
 COUNTS: Final = ("unconverged", "nonfinite", "onsets", "onsets_bounded", "onsets_missed")
 
@@ -72,7 +76,13 @@ def rows_of(dataset: xr.Dataset) -> list[Row]:
 
 
 def findings(dataset: xr.Dataset) -> list[str]:
-    """What the intervals say, in sentences: where FoBG's variance is above ZoBG's, and whose mean is biased."""
+    """What the intervals of a study say, in sentences."""
+    kind = json.loads(dataset.attrs["config"])["kind"]
+    return {"gradients": _of_gradients, "descents": lambda _: [], "landscapes": _of_landscapes}[kind](dataset)
+
+
+def _of_gradients(dataset: xr.Dataset) -> list[str]:
+    """Where FoBG's variance is above ZoBG's, and whose mean is biased."""
     rows = rows_of(dataset)
     confidence = json.loads(dataset.attrs["config"])["confidence"]
     return [
@@ -140,3 +150,41 @@ def _share(row: Row) -> str:
 def _at(stiffnesses: Sequence[float]) -> str:
     """Where, unless there is no contact."""
     return f" at K = {', '.join(f'{value:g}' for value in stiffnesses)} N/m" if any(stiffnesses) else ""
+
+
+def _of_landscapes(dataset: xr.Dataset) -> list[str]:
+    """Where the mean of first order is not the slope of the mean cost."""
+    return [
+        f"{label}: {_gap(one)}" for label, one in curves_of(dataset) if {"zobg", "fobg"} <= set(one["estimator"].values)
+    ]
+
+
+def curves_of(dataset: xr.Dataset) -> list[tuple[str, xr.Dataset]]:
+    """The computed cells of a study of landscapes: contact model, and its numbers along the line."""
+    outer = ("task", "timestep", "cone", "sigma", "samples", "model")
+    cells = (
+        dataset.isel(dict(zip(outer, place, strict=True)))
+        for place in itertools.product(*(range(dataset.sizes[name]) for name in outer))
+    )
+    return [(one["model"].item(), one) for one in cells if bool(one["position"].notnull().any())]
+
+
+def _gap(one: xr.Dataset) -> str:
+    """Where E[FoBG] differs from the slope of the mean cost, by quadrature where there is one."""
+    if "exact_slope" in one and bool(one["exact_slope"].notnull().all()):
+        first, slope = one["exact_first"].values, one["exact_slope"].values
+        largest = float(np.max(np.abs(slope)))
+        error = 3 * (one["exact_slope_error"].values + one["exact_first_error"].values) + NOTABLE * largest
+        source, uncertainty = "the mean cost's slope", f"more than {NOTABLE:.0%} of its largest value"
+    else:
+        first, slope = (one["slope"].sel(estimator=name).values for name in ("fobg", "zobg"))
+        error = DETECTED * np.hypot(*(one["slope_se"].sel(estimator=name).values for name in ("fobg", "zobg")))
+        source, uncertainty = "E[ZoBG]", f"more than {DETECTED:g} standard errors"
+    seen = np.abs(first - slope) > error
+    if not np.any(seen):
+        return f"E[FoBG] nowhere differs from {source} by {uncertainty}"
+    worst = int(np.argmax(np.where(seen, np.abs(first - slope), -np.inf)))
+    return (
+        f"E[FoBG] differs from {source} by {uncertainty} at {np.mean(seen):.0%} of the points, most at "
+        f"{one['position'].values[worst]:.3g}, where it is {first[worst]:.3g} in place of {slope[worst]:.3g}"
+    )

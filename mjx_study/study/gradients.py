@@ -42,9 +42,8 @@ def compute_gradients(plan: StudyPlan) -> Callable[[StudyCell], dict[str, np.nda
     def compute(cell: StudyCell) -> dict[str, np.ndarray]:
         objective, task = objectives(cell), plan.groups[cell.group].task
         theta = task.theta
-        if (
-            not cell.model.analytic and (cell.group, cell.model.contact is None) not in warm
-        ):  # so that no cell's time holds a compilation
+        # so that no cell's time holds a compilation
+        if not cell.model.analytic and (cell.group, cell.model.contact is None) not in warm:
             for name in dict.fromkeys([*oracles, "differentiation"]):  # the reference's control variate needs it
                 getattr(objective, ORACLES[name].method)(theta, jax.random.split(jax.random.key(0), 1))
             warm.add((cell.group, cell.model.contact is None))

@@ -58,7 +58,9 @@ def compute_landscapes(plan: StudyPlan) -> Callable[[StudyCell], dict[str, np.nd
         for theta in line.thetas:
             drawn, _, residuals = draw_batches(objective, theta, keys, oracles, cell.samples, slice(None))
             lost += sum(unconverged(each, precision()) for each in residuals.values())
-            largest = max(largest, *(float(np.max(np.nan_to_num(each, nan=np.inf))) for each in residuals.values()))
+            largest = max(
+                largest, *(float(np.max(np.nan_to_num(each, nan=np.inf), initial=0.0)) for each in residuals.values())
+            )
             pooled = jax.tree.map(lambda leaf: jnp.asarray(leaf).reshape(-1, *leaf.shape[2:]), drawn)
             columns.append(jax.device_get(_slopes(pooled, line.direction, chosen)))
         arrays = {name: np.stack([column[name] for column in columns], axis=-1) for name in columns[0]}

@@ -69,6 +69,7 @@ def _resolved(plan: StudyPlan, axes: Axes) -> list[dict[str, Any]]:
             recipe = plan.groups[cell.group].recipe
             settings = {} if recipe is None else dataclasses.asdict(recipe)
             entry |= {"noise": task.noise, "estimators": _options(plan, cell), "recipe": settings}
+            entry["parameters"] = task.policy.num_params
     return found
 
 
