@@ -55,7 +55,7 @@ def stub(monkeypatch: pytest.MonkeyPatch) -> None:
     mujoco.set_mju_user_warning(lambda message: print(f"MuJoCo: {message}", file=sys.stderr))  # as `configure` does
     for module, names in (
         (compare, ("compute",)), (optimise, ("compute",)), (sweep, ("open_store", "run_study")),
-        (landscape, ("landscape",)), (gradcheck.check, ("gradcheck",)), (bench.benchmark, ("bench",)),
+        (landscape, ("compute",)), (gradcheck.check, ("gradcheck",)), (bench.benchmark, ("bench",)),
         (rollout, ("_simulate_task", "_simulate_passive")),
     ):  # fmt: skip
         for name in names:
@@ -64,7 +64,7 @@ def stub(monkeypatch: pytest.MonkeyPatch) -> None:
     for command in COMMANDS:
         flags_of(command)  # outside of strategies: building a parser uses the random module
     built = functools.lru_cache(maxsize=256)(make_task)
-    for module in (options, sweep_plan, gradcheck):
+    for module in (options, sweep_plan, gradcheck, landscape):
         monkeypatch.setattr(module, "make_task", built)
 
 

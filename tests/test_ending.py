@@ -1,14 +1,12 @@
 """How commands end: by a signal with one line and its exit code, on a full disk with their numbers and one line."""
 
 import errno
-import importlib
 import json
 import os
 import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -110,16 +108,11 @@ def test_a_full_disk_is_told_before_anything_is_computed(
     assert out == "" and error.count("\n") == 1 and "No space left on device" in error
 
 
-def test_a_full_disk_costs_a_landscape_no_number(
-    tmp_path: Path, full: Callable[[], None], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    command = importlib.import_module("mjx_study.cli.landscape")
-    monkeypatch.setattr(command, "landscape", lambda plan, progress: SimpleNamespace(as_json=lambda: {"cost": 1.5}))
-    monkeypatch.setattr(command, "_lines", lambda found: ["cost 1.5"])
-    monkeypatch.setattr(command, "_save", lambda found, folder: [disk.write_whole(folder / "landscape.json", print)])
-    full()
-    arguments = ["landscape", "ball_wall", "--output", str(tmp_path)]
-    assert ended(capsys, *arguments) == "cost 1.5\n"
+@pytest.mark.usefixtures("filling")
+def test_a_full_disk_costs_a_landscape_no_number(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["landscape", "ball_wall", "--contact", "reference", "--points", "3", "--samples", "8"]
+    out = ended(capsys, *arguments, "--output", str(tmp_path))
+    assert "where the mean cost is least" in out and "written" not in out
 
 
 def test_a_full_disk_costs_a_study_nothing_that_was_there(

@@ -1,5 +1,6 @@
 """Landscapes: quadrature against closed forms, curves against each other, and what the command says and writes."""
 
+import dataclasses
 import json
 from functools import partial
 from pathlib import Path
@@ -9,17 +10,23 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import xarray as xr
 from scipy import stats
 from scipy.integrate import quad
 
 from estimators import NOISES, Differentiation, Evaluation
 from mjx_study import cli
-from mjx_study.cli import landscape as command
 from mjx_study.cli import options
+from mjx_study.cli.landscape import as_document
 from mjx_study.reference import BallWall, FunctionObjective, Heaviside, Quadratic, smoothed
-from mjx_study.study import landscapes as landscape
-from mjx_study.study.landscapes import LandscapeConfig, plan_landscape
-from mjx_study.study.quadrature import Line, grid, means
+from mjx_study.study import landscapes, sampling
+from mjx_study.study.configuration import StudyConfig
+from mjx_study.study.findings import curves_of, findings
+from mjx_study.study.landscapes import closed_form, compute_landscapes
+from mjx_study.study.line import line_of
+from mjx_study.study.plan import StudyPlan, plan_study
+from mjx_study.study.quadrature import Line, applies, grid, means
+from mjx_study.study.run import load_study, run_study
 from mjx_study.tasks import make_task
 from mjx_study.tasks.policy import LinearFeedback
 from mjx_study.tasks.task import Task
@@ -110,104 +117,107 @@ def test_quadrature_is_for_decisions_that_are_made_once_from_a_fixed_start() -> 
     ):
         with pytest.raises(ValueError, match=f"quadrature is for a decision of one number.*; {says}"):
             Line(task)
-        assert landscape._quadrature(task, POSITION)(None) is None
+        assert not applies(task)
+
+
+def config(task: str | Task, **changes: Any) -> StudyConfig:
+    chosen: dict[str, Any] = {"estimators": ("zobg", "fobg"), "seeds": 1} | changes
+    return StudyConfig(tasks=(task,), kind="landscapes", **chosen)
 
 
 @pytest.mark.slow
 def test_the_landscape_of_one_gain_is_sampled() -> None:
-    config = LandscapeConfig(task="pusher", contact=("penalty",), stiffness=(10.0,), points=2, samples=3)
-    (curve,) = landscape.landscape(plan_landscape(config, one_gain())).curves
-    assert curve.exact is None and np.all(np.isfinite(curve.first))
+    found = run_study(config(one_gain(), contact=("penalty",), stiffness=(10.0,), points=2, samples=(3,)))
+    assert "exact_slope" not in found and bool(found["slope"].notnull().all())
 
 
 def test_noise_reaches_quadrature_and_the_reference() -> None:
     """A task's own density, or one that is asked for, weighs; jump terms are its too."""
     task = make_task("momentum_transfer", horizon=2)
-    for asked, plan in (
-        (None, plan_landscape(LandscapeConfig(task=task.name), task.replace(noise="laplace"))),
-        ("laplace", plan_landscape(LandscapeConfig(task=task.name, noise="laplace"), task)),
-    ):
-        assert (asked or plan.task.noise) == plan.config.noise == plan.task.noise == "laplace"
-        reference = plan.task.analytic(0.0)
+    for study in (config(task.replace(noise="laplace"), points=2), config(task, points=2, noise="laplace")):
+        (group,) = plan_study(study).groups
+        assert group.task.noise == "laplace"
+        reference = group.task.analytic(0.0)
         assert isinstance(reference, FunctionObjective) and reference.noise == "laplace"
         edge = np.array([np.pi / 4])
-        found = landscape._closed_form(reference, edge)
+        found = closed_form(reference, edge)
         assert found is not None
         (jump,) = [jump.size for jump in reference.function.jumps() if jump.position > 0]  # type: ignore[attr-defined]
         peak = np.sqrt(0.5) / task.sigma  # of Laplace's density; a Gaussian's is 0.4 / sigma
         assert found.slope - found.first == pytest.approx(jump * peak, rel=1e-9)
 
 
-def flight(**options) -> landscape.LandscapePlan:
+def flight(**options: Any) -> StudyPlan:
     """40 steps of a shot ball, before it meets anything: x = v cos(theta) t, and everything is smooth."""
-    config = LandscapeConfig(task="momentum_transfer", contact=("mujoco",), span=(0.3, 1.2), **options)
     task = make_task("momentum_transfer", horizon=40)
-    return plan_landscape(config, task.replace(final_cost=lambda state: state.qpos[0] ** 2, sigma=0.1))
+    task = task.replace(final_cost=lambda state: state.qpos[0] ** 2, sigma=0.1)
+    return plan_study(config(task, contact=("reference", "mujoco"), stiffness=(10_000.0,), span=(0.3, 1.2), **options))
 
 
 @pytest.fixture(scope="module")
-def flown() -> landscape.Landscape:
+def flown() -> xr.Dataset:
     """The reference, and one contact model."""
-    return landscape.landscape(flight(points=5, samples=300))
+    return run_study(flight(points=5, samples=(300,)))
 
 
-def test_curves_agree_with_quadrature_and_with_each_other(flown: landscape.Landscape) -> None:
+def test_curves_agree_with_quadrature_and_with_each_other(flown: xr.Dataset) -> None:
     """Both estimators see the slope of the mean cost, each within its error."""
-    _, curve = flown.curves
-    np.testing.assert_allclose(curve.cost, (2 * np.cos(flown.position) * 40 * 0.002) ** 2, rtol=1e-10)
-    assert curve.exact is not None
-    for mean, error, exact in (
-        (curve.smoothed, curve.smoothed_se, curve.exact.smoothed),
-        (curve.zeroth, curve.zeroth_se, curve.exact.slope),
-        (curve.first, curve.first_se, curve.exact.first),
+    _, (label, curve) = curves_of(flown)
+    position = curve["position"].values
+    np.testing.assert_allclose(curve["cost"], (2 * np.cos(position) * 40 * 0.002) ** 2, rtol=1e-10)
+    slope, error = (curve[name].transpose("estimator", "point").values for name in ("slope", "slope_se"))
+    for mean, spread, exact in (
+        (curve["smoothed"].values, curve["smoothed_se"].values, curve["exact_smoothed"].values),
+        (slope[0], error[0], curve["exact_slope"].values),
+        (slope[1], error[1], curve["exact_first"].values),
     ):
-        assert np.all(np.abs(mean - exact) < 4.5 * error)
-        assert np.all(4.5 * error < np.abs(exact).max()), "no power"
-    np.testing.assert_allclose(curve.exact.first, curve.exact.slope, atol=1e-4 * np.abs(curve.exact.slope).max())
-    assert curve.nonfinite == 0 and curve.residual < 1e-8
-    assert curve.label == "mujoco, K = 10000 N/m" and "nowhere differs" in flown.findings()[1]
+        assert np.all(np.abs(mean - exact) < 4.5 * spread)
+        assert np.all(4.5 * spread < np.abs(exact).max()), "no power"
+    exact = curve["exact_slope"].values
+    np.testing.assert_allclose(curve["exact_first"], exact, atol=1e-4 * np.abs(exact).max())
+    assert float(curve["nonfinite"].sum()) == 0 and float(curve["residual"]) < 1e-8
+    assert label == "mujoco 10000" and "nowhere differs" in findings(flown)[1]
 
 
-def test_a_reference_that_jumps_is_found_out(flown: landscape.Landscape) -> None:
-    assert flown.curves[0].label == "reference"
-    assert "E[FoBG] differs from the mean cost's slope" in flown.findings()[0]
-    document = json.loads(json.dumps(flown.as_json(), allow_nan=False))
-    assert len(document["curves"][0]["exact"]["slope"]) == 5
+def test_a_reference_that_jumps_is_found_out(flown: xr.Dataset) -> None:
+    assert curves_of(flown)[0][0] == "reference 10000"
+    assert "E[FoBG] differs from the mean cost's slope" in findings(flown)[0]
+    document = json.loads(json.dumps(as_document(flown), allow_nan=False))
+    assert len(document["curves"][0]["exact_slope"]) == 5
 
 
 def test_a_direction_through_many_parameters() -> None:
     """Along one force of the pusher: both slopes are the gradient's entry, within their errors."""
     task = make_task("pusher", horizon=10)
-    config = LandscapeConfig(
-        task="pusher", contact=("penalty",), stiffness=(10.0,), direction="3", points=3, samples=400, reference=False
-    )
-    plan = plan_landscape(config, task)
-    np.testing.assert_array_equal(plan.line.direction, np.eye(10)[3])
-    assert plan.config.span == pytest.approx((-1.0, 1.0))
-    (curve,) = landscape.landscape(plan).curves
-    gap, error = curve.difference
-    assert curve.exact is None and np.all(np.abs(gap) < 4.5 * error)
+    study = config(task, contact=("penalty",), stiffness=(10.0,), direction="3", points=3, samples=(400,))
+    line = line_of(task, 3, None, "3", 0)
+    np.testing.assert_array_equal(line.direction, np.eye(10)[3])
+    assert (line.position[0], line.position[-1]) == pytest.approx((-1.0, 1.0))
+    found = run_study(study)
+    ((_, curve),) = curves_of(found)
+    zeroth, first = (curve["slope"].sel(estimator=name).values for name in ("zobg", "fobg"))
+    error = np.hypot(*(curve["slope_se"].sel(estimator=name).values for name in ("zobg", "fobg")))
+    assert "exact_slope" not in found and np.all(np.abs(first - zeroth) < 4.5 * error)
     # the cost is nearly 2 theta of control cost along this line
-    np.testing.assert_allclose(np.diff(curve.first) / np.diff([-1.0, 0.0, 1.0]), 2, rtol=0.05)
+    np.testing.assert_allclose(np.diff(first) / np.diff([-1.0, 0.0, 1.0]), 2, rtol=0.05)
 
 
 def test_the_line_goes_through_theta() -> None:
-    task = make_task("pusher", horizon=3)
-    common: dict[str, Any] = {"direction": "1", "points": 3, "span": (-1.0, 1.0)}
-    plan = plan_landscape(LandscapeConfig(task="pusher", theta=(1.0, 2.0, 3.0), **common), task)
-    np.testing.assert_allclose(plan.line.thetas, [[1, 1, 3], [1, 2, 3], [1, 3, 3]])
-    named = plan_landscape(LandscapeConfig(task="pusher", **common))
-    assert named.task.horizon == 200 and np.all(np.asarray(named.line.thetas[1]) == np.asarray(named.task.theta))
+    task = make_task("pusher", horizon=3).replace(theta=jnp.array([1.0, 2.0, 3.0]))
+    line = line_of(task, 3, (-1.0, 1.0), "1", 0)
+    np.testing.assert_allclose(line.thetas, [[1, 1, 3], [1, 2, 3], [1, 3, 3]])
+    (group,) = plan_study(config("pusher", horizon=3, theta=(1.0, 2.0, 3.0), points=3)).groups
+    assert group.task.theta.tolist() == [1.0, 2.0, 3.0]
     with pytest.raises(ValueError, match="theta has one entry, and the line is its range: give --span"):
-        plan_landscape(LandscapeConfig(task="ball_wall", theta=(1.0,)))
+        plan_study(config("ball_wall", theta=(1.0,), points=3))
 
 
 def test_random_directions_are_unit_vectors_of_the_seed() -> None:
     task = make_task("pusher", horizon=10)
-    plans = [plan_landscape(LandscapeConfig(task="pusher", seed=seed), task) for seed in (0, 0, 1)]
-    assert np.linalg.norm(plans[0].line.direction) == pytest.approx(1)
-    np.testing.assert_array_equal(plans[0].line.direction, plans[1].line.direction)
-    assert np.any(plans[0].line.direction != plans[2].line.direction)
+    lines = [line_of(task, 3, None, None, seed).direction for seed in (0, 0, 1)]
+    assert np.linalg.norm(lines[0]) == pytest.approx(1)
+    np.testing.assert_array_equal(lines[0], lines[1])
+    assert np.any(lines[0] != lines[2])
 
 
 class Broken:
@@ -227,36 +237,27 @@ class Broken:
         return jax.vmap(jax.random.normal)(keys)
 
 
-def test_samples_that_are_not_finite_are_left_out_and_counted() -> None:
-    keys = [jax.random.split(key, 50) for key in jax.random.split(jax.random.key(0))]
-    lost = sum(int(np.sum(Broken()._noise(jax.random.clone(batch)) > 0)) for batch in keys)
-    point = landscape._point(Broken(), jnp.zeros(1), np.ones(1), keys)
-    assert point["nonfinite"] == lost > 0
-    assert point["first"] < 0 and all(np.isfinite(value) for value in point.values())
+def test_samples_that_are_not_finite_are_left_out_and_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    plan = flight(points=2, samples=(50,))
+    plan = dataclasses.replace(plan, cells=plan.cells[:1])
+    monkeypatch.setattr(sampling.Objectives, "__call__", lambda *_: Broken())
+    monkeypatch.setattr(landscapes, "closed_form", lambda *_: None)
+    arrays = compute_landscapes(plan)(plan.cells[0])
+    streams = sampling.cell_keys(0, 1)["order"]
+    lost = [int(np.sum(Broken()._noise(jax.random.split(stream[0], 50)) > 0)) for stream in streams]
+    assert arrays["nonfinite"].tolist() == [[count] * 2 for count in lost] and min(lost) > 0
+    assert np.all(arrays["slope"][1] < 0) and all(np.isfinite(arrays[name]).all() for name in ("slope", "slope_se"))
 
 
-def test_the_command_prints_and_writes(
-    capsys: pytest.CaptureFixture[str],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    flown: landscape.Landscape,
-) -> None:
-    plans = []
-
-    def computed(plan, progress):
-        plans.append(plan)
-        return flown
-
-    monkeypatch.setattr(command, "landscape", computed)
+def test_the_command_prints_and_writes(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     arguments = ["landscape", "ball_wall", "--points", "3", "--samples", "8", "--contact", "penalty"]
-    assert cli.main([*arguments, "--output", str(tmp_path)]) == 0
-    (plan,) = plans
-    assert plan.config.span == (0.0, 1.5) and plan.config.points == 3 and plan.config.contact == ("penalty",)
+    assert cli.main([*arguments, "--horizon", "4", "--output", str(tmp_path)]) == 0
     printed = capsys.readouterr().out
-    assert "where the mean cost is least" in printed and "mujoco, K = 10000 N/m" in printed
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["landscape.json", "landscape.pdf", "landscape.png"]
-    document = json.loads((tmp_path / "landscape.json").read_text())
-    assert document["config"]["span"] == [0.3, 1.2] and document["environment"]["precision"] == "float64"
+    assert "where the mean cost is least" in printed and "theta from 0 to 1.5 in 3 points" in printed
+    assert {"landscape.pdf", "landscape.png", "study.json"} < {path.name for path in tmp_path.iterdir()}
+    data = load_study(tmp_path)
+    assert data["contact"].values.tolist() == ["reference", "penalty"] and data.sizes["point"] == 3
+    assert json.loads(data.attrs["environment"])["precision"] == "float64"
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,6 @@ import pytest
 from mjx_study.cli.gradcheck import UNEXERCISED
 from mjx_study.gradcheck import plan_gradcheck
 from mjx_study.study.configuration import StudyConfig
-from mjx_study.study.landscapes import LandscapeConfig, plan_landscape
 from mjx_study.study.plan import plan_study
 from mjx_study.tasks import make_task
 from mjx_study.tasks.own import GROUP
@@ -160,7 +159,8 @@ def test_every_command_plans_with_it(name: str, write, tmp_path: Path) -> None:
     assert built.horizon == 5 and built.name == "hopper" and built.scene.host.opt.cone == 0
     assert len(plan_study(StudyConfig(tasks=(task,))).cells) == 12
     assert plan_study(StudyConfig(tasks=(task,), kind="descents")).groups[0].recipe == built.recipe
-    assert plan_landscape(LandscapeConfig(task=task, direction="0", span=(-1.0, 1.0)), built)
+    line: dict[str, Any] = {"points": 3, "direction": "0", "span": (-1.0, 1.0)}
+    assert len(plan_study(StudyConfig(tasks=(task,), **line)).cells) == 12
     assert plan_gradcheck(built, None, None, seed=0, states=1).is_task
     assert built.policy.additive == (name != "feedback")
 

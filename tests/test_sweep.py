@@ -28,7 +28,7 @@ from mjx_study.objective import Simulator, simulate
 from mjx_study.plots import study as study_plots
 from mjx_study.report import report
 from mjx_study.simulation.contact import stiffness_from_solref
-from mjx_study.study import gradients, store
+from mjx_study.study import sampling, store
 from mjx_study.study.configuration import StudyConfig
 from mjx_study.study.gradients import compute_gradients
 from mjx_study.study.plan import estimators_of, plan_study
@@ -136,7 +136,7 @@ def test_numbers_are_those_of_the_estimators(undisturbed: Path) -> None:
 def test_one_compilation_serves_all_contact_models(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     made: list[Simulator] = []
     monkeypatch.setattr(
-        gradients, "Simulator", lambda *args, **kwargs: made.append(Simulator(*args, **kwargs)) or made[-1]
+        sampling, "Simulator", lambda *args, **kwargs: made.append(Simulator(*args, **kwargs)) or made[-1]
     )
     plan = plan_study(config(timestep=(0.005, 0.0025), samples=(4,), seeds=3, reference_samples=3))
     run_study(plan, tmp_path / "out")

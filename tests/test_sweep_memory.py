@@ -13,8 +13,8 @@ import pytest
 from estimators import Differentiation, Evaluation
 from mjx_study.objective import MjxObjective, Simulator
 from mjx_study.simulation.contact import ContactModel
-from mjx_study.study import gradients
 from mjx_study.study import memory as sweep_memory
+from mjx_study.study import sampling
 from mjx_study.study.configuration import StudyConfig
 from mjx_study.study.gradients import compute_gradients
 from mjx_study.study.plan import memory_of_seed, plan_study, seeds_together
@@ -57,7 +57,7 @@ def config(**changes: Any) -> StudyConfig:
 
 
 def test_numbers_do_not_depend_on_how_seeds_are_grouped(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(gradients, "Simulator", Stub)
+    monkeypatch.setattr(sampling, "Simulator", Stub)
     plan = plan_study(config(samples=(8,), seeds=5, estimators=("zobg",)))
     found = []
     for at_once, groups in ((1e9, 5), (1.0, 1), (2.5 * memory_of_seed(plan, plan.cells[0]), 2)):
@@ -87,14 +87,15 @@ PEAK = """
 import resource, sys
 from mjx_study.runtime import configure
 configure(cpu_devices=1)
-from mjx_study.study import gradients
+from mjx_study.study import sampling
+from mjx_study.study.gradients import compute_gradients
 from mjx_study.study.plan import plan_study
 from tests.test_sweep_memory import Stub, config
 
-gradients.Simulator = Stub
+sampling.Simulator = Stub
 plan = plan_study(config(samples=(10_000,), seeds=int(sys.argv[1]), horizon=200))
 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-gradients.compute_gradients(plan)(plan.cells[0])
+compute_gradients(plan)(plan.cells[0])
 print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1e6)
 """
 

@@ -90,7 +90,7 @@ def _configuration(options: argparse.Namespace) -> StudyConfig:
     fields.setdefault("contact", task.families)
     if not options.no_reference and task.reference is not None and fields.get("onset", "none") == "none":
         fields["contact"] = tuple(dict.fromkeys((REFERENCE, *fields["contact"]))) if fields["contact"] else ()
-    if task.contact_pair is not None:
+    if task.contact_pair is not None and fields["contact"]:
         fields.setdefault("stiffness", (task.middle_stiffness,))
     return StudyConfig(**fields, tasks=(options.task,), kind="landscapes", theta=theta_of(options), seeds=1)
 
