@@ -22,6 +22,7 @@ from mjx_study.simulation.contact import (
     effective_mass,
     family_model,
     solref_from_stiffness,
+    stable,
     stiffness_from_solref,
 )
 from mjx_study.simulation.scene import SceneError, load_scene, put_scene
@@ -84,6 +85,15 @@ def in_units(scene, impedance: float) -> ContactModel:
     mass = effective_mass(scene, "floor", "ball")
     solref = solref_from_stiffness(STIFFNESS, DAMPING, effective_mass=mass)
     return contact_model(solref, constant(impedance), scene=scene)
+
+
+@pytest.mark.parametrize(("k", "b"), [(50.0, 0.0), (400.0, 3.0), (0.0, 199.0), (1e4, 100.0)])
+def test_a_contact_is_stable_where_its_step_does_not_grow(k: float, b: float) -> None:
+    """Against the eigenvalues of x' = x + h v', v' = v - h (k x + b v), on both sides of the limit."""
+    for timestep in np.geomspace(1e-3, 1.0, 60):
+        step = np.array([[1 - timestep**2 * k, timestep - timestep**2 * b], [-timestep * k, 1 - timestep * b]])
+        grows = np.max(np.abs(np.linalg.eigvals(step))) > 1 + 1e-12
+        assert stable((-k, -b), float(timestep)) != grows, timestep
 
 
 def test_the_penalty_limit_is_a_spring_and_a_damper(normal_acceleration) -> None:

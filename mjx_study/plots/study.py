@@ -3,7 +3,7 @@
 import itertools
 import json
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -14,8 +14,17 @@ from matplotlib.colors import TwoSlopeNorm
 from matplotlib.figure import Figure
 from scipy import stats
 
-from mjx_study.plots.style import NO_CONTACT, STYLE, TITLES, line_with_band, mean_with_band, robust_limits, style_of
-from mjx_study.simulation.contact import DEFAULT_SOLREF
+from mjx_study.plots.style import (
+    HOLLOW,
+    NO_CONTACT,
+    STYLE,
+    TITLES,
+    line_with_band,
+    mean_with_band,
+    robust_limits,
+    style_of,
+)
+from mjx_study.simulation.contact import DEFAULT_SOLREF, stable
 from mjx_study.table import digits_to_tell_apart
 
 SWEPT: Final = {
@@ -161,6 +170,8 @@ def _against_stiffness(
             axes.set_xticks(x, labels, rotation=20, ha="right", fontsize="small")
             axes.set_xlim(-0.6, len(x) - 0.4)
         draw(axes, rows, x)
+        if family:
+            _shade_unstable((axes,), rows, x)
         if log:
             axes.set_yscale("log")
         axes.grid(alpha=0.25)
@@ -173,7 +184,8 @@ def _against_stiffness(
 def _estimators(rows: xr.Dataset) -> Iterator[tuple[xr.Dataset, dict[str, Any]]]:
     for name in rows["estimator"].values.tolist():
         label, colour, marker = style_of(name)
-        yield rows.sel(estimator=name), {"label": label, "color": colour, "marker": marker}
+        style = {"label": label, "color": colour, "marker": marker, "hollow": name in HOLLOW}
+        yield rows.sel(estimator=name), style
 
 
 def _line(axes: Axes, rows: xr.Dataset, x: np.ndarray, y, lower, upper, style: Mapping[str, Any]) -> None:
@@ -219,7 +231,7 @@ def _comparison(part: xr.Dataset, title: str) -> Figure:
             line_with_band(above, x, *(_positive(mine["variance" + end]) for end in ("", "_lower", "_upper")), **style)
             y, error = _positive(mine["relative_error"]), np.asarray(mine["relative_error_se"], float)
             lower, upper = _positive(np.maximum(y - 1.96 * error, y / 10)), _positive(y + 1.96 * error)
-            line_with_band(below, x, y, lower, upper, color=style["color"], marker=style["marker"])
+            line_with_band(below, x, y, lower, upper, **{**style, "label": None})
         floor = _positive(rows["reference_uncertainty"])
         below.plot(x, floor, color="0.4", linestyle=":", marker="_", label="uncertainty of the reference")
         below.axhline(1, color="0.7", linewidth=0.8)
@@ -233,7 +245,11 @@ def _comparison(part: xr.Dataset, title: str) -> Figure:
             below.set_xticks([NO_CONTACT], ["no contact"])
             below.set_xticks([], minor=True)
         _mark_default(above, family, rows)
+        _shade_unstable((above, below), rows, x)
     samples, config = int(part["samples"]), json.loads(part.attrs["config"])
+    known = _positive(part["variance"].isel(seed=0))
+    if np.any(np.isfinite(known)):  # of the variances: an interval may span thirty decades
+        axes[0, 0].set_ylim(np.nanmin(known) / 100, np.nanmax(known) * 100)
     axes[0, 0].set_ylabel("variance of one sample")
     axes[1, 0].set_ylabel(f"relative error of the mean\nof {samples} samples")
     axes[0, 0].legend(frameon=False)
@@ -241,6 +257,23 @@ def _comparison(part: xr.Dataset, title: str) -> Figure:
     percent = f"{100 * config['confidence']:.0f} %"
     figure.suptitle(f"{title}\ngradient estimates (bands: {percent} intervals)", fontsize="medium")
     return figure
+
+
+def _shade_unstable(panels: Sequence[Axes], rows: xr.Dataset, x: np.ndarray) -> None:
+    """Stiffnesses at which the step gains energy while in contact."""
+    if "solref" not in rows:
+        return
+    known = rows["solref"].transpose("model", "solref_entry").values
+    steady = np.array([np.isnan(each).any() or stable(each.tolist(), float(rows["timestep"])) for each in known])
+    if steady.all() or not np.any(rows["stiffness"].values):
+        return
+    first = int(np.argmin(steady))
+    left = x[first] if first == 0 else float(np.sqrt(x[first - 1] * x[first]))
+    for axes in panels:
+        axes.axvspan(left, x[-1] * 1.15, color="0.5", alpha=0.13, linewidth=0, zorder=0)
+    panels[0].annotate(
+        "unstable step", (left, 0.03), xycoords=("data", "axes fraction"), fontsize="x-small", color="0.35", rotation=90
+    )
 
 
 def _mark_default(axes: Axes, family: str, rows: xr.Dataset) -> None:
@@ -283,8 +316,10 @@ def _bias(part: xr.Dataset, title: str) -> Figure | None:
             seen = np.isfinite(low)
             y = np.where(seen, _positive(square) ** 0.5, np.nan)
             bars = np.nan_to_num([y - low, high - y])
-            joined = "-" if len(np.unique(rows["contact"].values)) == 1 else "none"
-            axes.errorbar(x, y, yerr=bars, **style, markersize=4.5, capsize=2.5, linestyle=joined)
+            joined = "-" if len(x) > 2 and len(np.unique(rows["contact"].values)) == 1 else "none"
+            shown = {name: style[name] for name in ("label", "color", "marker")}
+            shown |= {"markerfacecolor": "none", "markersize": 7.5} if style["hollow"] else {"markersize": 4.5}
+            axes.errorbar(x, y, yerr=bars, **shown, capsize=2.5, linestyle=joined)
             axes.plot(x[~seen], high[~seen], color=style["color"], marker="v", linestyle="none", alpha=0.45)
         axes.plot([], [], color="0.5", marker="v", linestyle="none", alpha=0.6, label="no bias seen: upper bound")
         axes.axhline(1, color="0.7", linewidth=0.8)

@@ -76,9 +76,25 @@ def save_figure(figure: Figure, folder: Path, name: str) -> list[Path]:
     ]
 
 
-def line_with_band(axes: Axes, x, y, lower, upper, *, color: str, marker: str, label: str | None = None) -> None:
-    axes.plot(x, y, color=color, marker=marker, markersize=4.5, label=label)
-    if len(x) > 1:
+def line_with_band(
+    axes: Axes, x, y, lower, upper, *, color: str, marker: str, label: str | None = None, hollow: bool = False
+) -> None:
+    """A line with its interval; what follows another curve is dashed with hollow markers, so that both are seen.
+
+    Two points are not joined: there is nothing between them that was measured.
+    """
+    joined = len(x) > 2
+    line = ("--" if hollow else "-") if joined else "none"
+    face, size = ("none", 7.5) if hollow else (color, 4.5)
+    axes.plot(
+        x, y, color=color, marker=marker, markersize=size, markerfacecolor=face, linestyle=line, label=label
+    )  # fmt: skip
+    if joined:
         axes.fill_between(x, lower, upper, color=color, alpha=0.2, linewidth=0)
     else:
-        axes.errorbar(x, y, yerr=[y - lower, upper - y], color=color, capsize=3)
+        bars = np.nan_to_num(np.maximum([y - lower, upper - y], 0))
+        axes.errorbar(x, y, yerr=bars, color=color, capsize=3, linestyle="none")
+
+
+HOLLOW: Final = ("aobg", "ivw", "ivw_h", "ddcg", "total_propagation")
+"""Estimators that interpolate, and so coincide with one of two others."""

@@ -336,16 +336,26 @@ def _warn_if_clipped(solref: Sequence[float], scene: Scene) -> None:
         )
 
 
+def stable(solref: Sequence[float], timestep: float) -> bool:
+    """Whether the step of a contact is stable: semi-implicit Euler with k and b is while h^2 k < 4 - 2 h b.
+
+    Args:
+        solref: as in `contact_model`.
+        timestep: h [s].
+    """
+    k, b = stiffness_from_solref(solref, effective_mass=1.0)
+    return bool(timestep**2 * k < 4 - 2 * timestep * b)
+
+
 def _warn_if_unstable(solref: Sequence[float], timestep: float) -> None:
-    """Semi-implicit Euler with a spring k and a damper b is stable while h^2 k < 4 - 2 h b."""
     k, b = stiffness_from_solref(solref, effective_mass=1.0)
     limit = 4 - 2 * timestep * b
-    if timestep**2 * k >= limit:
+    if not stable(solref, timestep):
         dampratio = b / (2 * math.sqrt(k)) if k > 0 else 0.0
-        stable = (2 * (math.sqrt(dampratio**2 + 1) - dampratio)) ** 2 / (timestep**2 * k) if k > 0 else 0.0
+        share = (2 * (math.sqrt(dampratio**2 + 1) - dampratio)) ** 2 / (timestep**2 * k) if k > 0 else 0.0
         warnings.warn(
             f"h^2 k = {timestep**2 * k:.3g} is not below 4 - 2 h b = {limit:.3g}: the step gains energy while in "
-            f"contact; it is stable up to {stable:.0%} of this stiffness at h = {timestep:g} s",
+            f"contact; it is stable up to {share:.0%} of this stiffness at h = {timestep:g} s",
             ContactWarning,
             stacklevel=3,
         )
