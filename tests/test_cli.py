@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -15,6 +16,7 @@ import pytest
 from mjx_study import cli
 from mjx_study.cli import compare as compare_command
 from mjx_study.cli import options
+from mjx_study.plots.style import PAGE
 from mjx_study.study.configuration import StudyConfig
 from mjx_study.study.findings import rows_of
 from mjx_study.study.plan import StudyPlan, plan_study
@@ -102,6 +104,10 @@ def test_what_compare_wrote_can_be_drawn_and_reported(
     assert cli.main(["report", str(folder), "--output", str(tmp_path / "page.html")]) == 0
     assert "comparison.png" in capsys.readouterr().out
     assert "relative error" in (tmp_path / "page.html").read_text()
+    assert cli.main(["plot", str(folder), "--output", str(tmp_path), "--style", "paper", "--format", "svg"]) == 0
+    picture = (tmp_path / "comparison.svg").read_text()
+    assert ">AoBG</text>" in picture and "bands:" not in picture  # text stays text, and the title is the caption's
+    assert float(re.search(r'width="([\d.]+)pt"', picture).group(1)) == pytest.approx(72 * PAGE)  # type: ignore[union-attr]
 
 
 def test_compare_prints_json_and_nothing_else(capsys: pytest.CaptureFixture[str]) -> None:

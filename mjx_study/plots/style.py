@@ -68,11 +68,35 @@ def robust_limits(curves: Sequence[np.ndarray]) -> tuple[float, float]:
     return float(low - room), float(high + room)
 
 
-def save_figure(figure: Figure, folder: Path, name: str) -> list[Path]:
-    """Write a figure as PNG and PDF; returns their paths."""
+FORMATS: Final = ("png", "pdf", "svg")
+STYLES: Final = {
+    "screen": {"pdf.fonttype": 42},
+    "paper": {
+        "font.size": 8.0,
+        "axes.linewidth": 0.6,
+        "lines.linewidth": 1.0,
+        "pdf.fonttype": 42,  # embedded, and text stays text
+        "svg.fonttype": "none",
+    },
+}
+"""Settings of matplotlib within which figures are drawn, by name."""
+COLUMN, PAGE = 3.4, 7.0  # [in] of a paper
+"""Widths of figures of one column of panels, and of more."""
+
+
+def fit_to_paper(figure: Figure) -> None:
+    """Make a figure as wide as a column or a page, without its title, which a caption has."""
+    width, height = figure.get_size_inches()
+    wanted = COLUMN if width < 5 else PAGE
+    figure.set_size_inches(wanted, height * wanted / width)
+    figure.suptitle("")
+
+
+def save_figure(figure: Figure, folder: Path, name: str, formats: Sequence[str] = ("png", "pdf")) -> list[Path]:
+    """Write a figure in some of `FORMATS`; returns the paths."""
     return [
         write_whole(folder / f"{name}.{kind}", lambda file, kind=kind: figure.savefig(file, format=kind, dpi=150))
-        for kind in ("png", "pdf")
+        for kind in formats
     ]
 
 
