@@ -216,6 +216,20 @@ def test_bias_is_reported_only_beyond_what_noise_explains() -> None:
     assert sentence.endswith("(p <= 0.001): it has no accuracy bound; --gamma sets one")
 
 
+def test_a_result_that_means_nothing_says_so() -> None:
+    """Contact that is never met, a reference as uncertain as the errors, a bound below ZoBG's own radius."""
+    same = (row("zobg", 10, 5.0), row("fobg", 10, 1.0), row("zobg", 100, 5.0), row("fobg", 100, 1.0))
+    assert findings(result(*same))[-1] == (
+        "penalty: nothing depends on K: the contact whose stiffness is swept was never met"
+    )
+    assert not any("never met" in each for each in findings(result(*same[:3], row("fobg", 100, 1.001))))
+    (sentence,) = findings(result(row("fobg", 10, 1.0, reference_uncertainty=0.25)))
+    assert sentence.startswith("penalty: the reference's own uncertainty is above 20% at K = 10 N/m: errors and")
+    (sentence,) = findings(result(row("aobg", 10, 1.0, alpha=0.0, epsilon=7.0, discrepancy=1.0), gamma=5.0))
+    assert sentence.startswith("penalty: AoBG is ZoBG at K = 10 N/m: its bound gamma is below epsilon")
+    assert findings(result(row("aobg", 10, 1.0, alpha=0.3, epsilon=7.0, discrepancy=1.0), gamma=9.0)) == []
+
+
 def test_nothing_is_called_biased_on_too_few_effective_samples() -> None:
     loud: dict[str, Any] = {"relative_error": 0.44, "debiased_error_se": 0.03, "bias_p_value": 0.001}
     assert one(row("fobg", 10, 1, **loud)).bias_verdict == "biased"

@@ -29,7 +29,7 @@ SAMPLES = (400,)
 EXAMPLES = """\
 examples:
   mjx-study compare pusher --stiffness 10,1000 --contact penalty,mujoco_default
-  mjx-study compare pusher --estimators zobg,fobg,aobg,ivw --gamma 50 --samples 1000
+  mjx-study compare pusher --estimators zobg,fobg,aobg,ivw --gamma 1000 --samples 1000
   mjx-study compare pusher --theta out/policy-aobg.json    where a descent ended, in place of where it begins
   mjx-study compare pusher --json > pusher.json
 

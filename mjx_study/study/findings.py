@@ -3,7 +3,7 @@
 import itertools
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from types import SimpleNamespace
 from typing import Any, Final
 
@@ -23,6 +23,8 @@ DETECTED: Final = 4.0
 """Standard errors beyond which two means are called different."""
 NOTABLE: Final = 0.05
 """Share of the largest slope beyond which a difference is mentioned, where there is no sampling error."""
+UNSURE: Final = 0.2
+"""Relative uncertainty of a reference beyond which errors against it say little."""
 VECTORS: Final = ("gradient", "reference")
 COUNTS: Final = ("unconverged", "nonfinite", "onsets", "onsets_bounded", "onsets_missed")
 
@@ -89,15 +91,46 @@ def _of_gradients(dataset: xr.Dataset) -> list[str]:
         sentence
         for family in dict.fromkeys(row.contact for row in rows)
         for part in [[row for row in rows if row.contact == family]]
-        for sentence in (*_variance_finding(family, part, confidence), *_bias_finding(part, unbounded(dataset)))
+        for sentence in (
+            *_variance_finding(family, part, confidence),
+            *_bias_finding(part, gammas_of(dataset)),
+            *_meaningless(family, part, gammas_of(dataset)),
+        )
     ]
 
 
-def unbounded(dataset: xr.Dataset) -> list[str]:
-    """Tasks on which AoBG has no accuracy bound."""
+def gammas_of(dataset: xr.Dataset) -> dict[str, float]:
+    """By task, AoBG's accuracy bound; infinite for none."""
     options = [entry["estimators"].get("aobg", {}) for entry in json.loads(dataset.attrs["resolved"])]
     names = dataset["task"].values.tolist()
-    return [name for name, given in zip(names, options, strict=True) if given.get("gamma") == "inf"]
+    return {name: float(given.get("gamma", math.inf)) for name, given in zip(names, options, strict=True)}
+
+
+def _meaningless(family: str, rows: Sequence[Row], gammas: Mapping[str, float]) -> list[str]:
+    """What makes a result mean nothing: contact that is never met, a reference as uncertain as the errors, a bound
+    that binds always."""
+    found = []
+    numbers = {(row.estimator, row.task, row.timestep, row.cone, row.sigma, row.samples, row.seed): [] for row in rows}
+    for row in rows:
+        key = (row.estimator, row.task, row.timestep, row.cone, row.sigma, row.samples, row.seed)
+        numbers[key].append((row.gradient_norm, row.variance))
+    several = [each for each in numbers.values() if len(each) > 1]
+    if several and all(np.allclose(each, each[0], rtol=1e-12, atol=0, equal_nan=True) for each in several):
+        found.append(f"{family}: nothing depends on K: the contact whose stiffness is swept was never met")
+    unsure = list(dict.fromkeys(row.stiffness for row in rows if row.reference_uncertainty > UNSURE))
+    if unsure:
+        found.append(
+            f"{family}: the reference's own uncertainty is above {UNSURE:.0%}{_at(unsure)}: errors and verdicts say "
+            "little there; --reference-samples makes it better"
+        )
+    bound = [row for row in rows if row.estimator == "aobg" and (row.epsilon or 0.0) > gammas[row.task]]
+    if bound:
+        stiffnesses = list(dict.fromkeys(row.stiffness for row in bound))
+        found.append(
+            f"{family}: AoBG is ZoBG{_at(stiffnesses)}: its bound gamma is below epsilon, the radius of ZoBG's mean; "
+            "a larger --gamma or more --samples changes that"
+        )
+    return found
 
 
 def _variance_finding(family: str, rows: Sequence[Row], confidence: float) -> list[str]:
@@ -120,16 +153,16 @@ def _variance_finding(family: str, rows: Sequence[Row], confidence: float) -> li
     return [f"{family}: FoBG's variance is {'; '.join(parts)} ({confidence:.0%} intervals)"]
 
 
-def _bias_finding(rows: Sequence[Row], unbounded: Sequence[str]) -> list[str]:
+def _bias_finding(rows: Sequence[Row], gammas: Mapping[str, float]) -> list[str]:
     """Where a mean is farther from the reference than any draw of the test; what relies on FoBG follows it."""
-    return [sentence for row in rows if row.estimator in BIASED and (sentence := _verdict(row, unbounded))]
+    return [sentence for row in rows if row.estimator in BIASED and (sentence := _verdict(row, gammas))]
 
 
-def _verdict(row: Row, unbounded: Sequence[str]) -> str:
+def _verdict(row: Row, gammas: Mapping[str, float]) -> str:
     """A sentence where a mean is biased, or is off and cannot be judged; empty otherwise."""
     mean, where = f"{row.contact}: {BIASED[row.estimator]}'s mean is", _at([row.stiffness])
     if row.bias_verdict == "biased":
-        free = row.estimator == "aobg" and row.task in unbounded
+        free = row.estimator == "aobg" and math.isinf(gammas[row.task])
         advice = ": it has no accuracy bound; --gamma sets one" if free else ""
         return f"{mean} biased by {_share(row)}{where} (p <= {row.bias_p_value:.3f}){advice}"
     off = row.bias_p_value <= SURE or row.debiased_error > APART * row.debiased_error_se
