@@ -1,6 +1,7 @@
 """Landscapes: quadrature against closed forms, curves against each other, and what the command says and writes."""
 
 import dataclasses
+import importlib
 import json
 from functools import partial
 from pathlib import Path
@@ -277,6 +278,22 @@ def test_bad_options_get_one_line(capsys: pytest.CaptureFixture[str], arguments:
     assert cli.main(["landscape", "ball_wall", *arguments]) == 2
     printed = capsys.readouterr()
     assert says in printed.err and printed.err.count("\n") == 1 and printed.out == ""
+
+
+@pytest.mark.parametrize("command", ["optimise", "landscape", "compare"])
+def test_a_family_without_stiffness_is_taken_as_it_is(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The default stiffness is for families that take one."""
+
+    class Planned(Exception):
+        pass
+
+    def compute(plan: StudyPlan, options: Any) -> None:
+        assert [cell.model.family for cell in plan.cells][-1] == "mujoco_default"
+        raise Planned
+
+    monkeypatch.setattr(importlib.import_module(f"mjx_study.cli.{command}"), "compute", compute)
+    with pytest.raises(Planned):
+        cli.main([command, "momentum_transfer", "--contact", "mujoco_default", "--horizon", "4"])
 
 
 def test_directions_are_checked(capsys: pytest.CaptureFixture[str]) -> None:

@@ -23,7 +23,7 @@ SMALL = {
         "CONTACT, STIFFNESS, HORIZON = ('mujoco',), 1000.0, 100"
     ),
     "4_are_mjx_gradients_right": (
-        "STATES, STEPS, FORCES, POINTS = 1, 5, 3, 3\nCONTACT, HORIZON = ('mujoco_default',), 190"
+        "STATES, STEPS, FORCES, POINTS = 1, 5, 3, 3\nCONTACT, HORIZON = ('mujoco_default', 'smooth_onset'), 190"
     ),
 }
 """In place of the cell of parameters, so that a run is short."""

@@ -161,7 +161,7 @@ def test_a_theta_without_a_finite_cost(capsys: pytest.CaptureFixture[str], elsew
     [
         (["puhser"], "unknown task 'puhser'; choose from pusher"),
         (["pusher", "--contact", "spring"], "unknown contact family 'spring'; choose from"),
-        (["pusher", "--stiffness", "-5"], "--stiffness: must be at least 0"),
+        (["pusher", "--stiffness", "-5"], "--stiffness: must be positive and finite"),
         (["pusher", "--frames", "0"], "--frames: must be at least 1 and at most 100, got 0"),
         (["pusher", "--seed", "-1"], "--seed: must be at least 0"),
         (["pusher", "--slow", "0"], "--slow: must be positive and at most 1000, got 0"),

@@ -24,7 +24,7 @@ from mjx_study.cli.options import (
 from mjx_study.cli.parameters import add_theta_option, theta_of
 from mjx_study.cli.studies import add_folder_options, compute, draw, study_fields
 from mjx_study.option import OPTIONS
-from mjx_study.study.configuration import StudyConfig
+from mjx_study.study.configuration import StudyConfig, takes_stiffness
 from mjx_study.study.dataset import as_plain
 from mjx_study.study.findings import curves_of, findings
 from mjx_study.study.plan import plan_study
@@ -90,7 +90,7 @@ def _configuration(options: argparse.Namespace) -> StudyConfig:
     fields.setdefault("contact", task.families)
     if not options.no_reference and task.reference is not None and fields.get("onset", "none") == "none":
         fields["contact"] = tuple(dict.fromkeys((REFERENCE, *fields["contact"]))) if fields["contact"] else ()
-    if task.contact_pair is not None and fields["contact"]:
+    if takes_stiffness(fields["contact"]):
         fields.setdefault("stiffness", (task.middle_stiffness,))
     return StudyConfig(**fields, tasks=(options.task,), kind="landscapes", theta=theta_of(options), seeds=1)
 

@@ -30,7 +30,7 @@ from mjx_study.cli.studies import add_folder_options, compute, draw, study_field
 from mjx_study.disk import write_whole
 from mjx_study.option import OPTIONS
 from mjx_study.plots.style import style_of
-from mjx_study.study.configuration import StudyConfig
+from mjx_study.study.configuration import StudyConfig, takes_stiffness
 from mjx_study.study.dataset import as_plain
 from mjx_study.study.iteration import REASONS
 from mjx_study.study.plan import plan_study
@@ -111,7 +111,7 @@ def _configuration(options: argparse.Namespace) -> StudyConfig:
         fields["contact"] = REFERENCE
     task = task_of(options)
     fields.setdefault("contact", task.main_family)
-    if task.contact_pair is not None or "stiffness" in fields:
+    if takes_stiffness((fields["contact"],)):
         fields.setdefault("stiffness", task.middle_stiffness)
     fields |= {name: (fields[name],) for name in WRAPPED if name in fields}
     return StudyConfig(**fields, tasks=(options.task,), kind="descents", theta=theta_of(options))

@@ -138,7 +138,7 @@ class StudyConfig(Checked):
         check_names("estimator", self.estimators, ESTIMATORS)
         if self.contact:
             check_names("contact family", self.contact, CONTACTS)
-        if self.contact is not None and not any(_swept(name) for name in self.contact):
+        if self.contact is not None and not takes_stiffness(self.contact):
             for name in ("stiffness", "damping"):
                 if getattr(self, name) is not None:
                     chosen = f"contact {', '.join(self.contact)}" if self.contact else "solref or solimp alone"
@@ -205,9 +205,9 @@ def check_span(span: Sequence[float] | None) -> None:
         raise ValueError(f"span must be two numbers, the lower one first; got {span}")
 
 
-def _swept(family: str) -> bool:
-    """Whether a contact family takes stiffnesses."""
-    return family not in FAMILIES or FAMILIES[family].swept
+def takes_stiffness(families: Sequence[str]) -> bool:
+    """Whether any of some contact families takes stiffnesses, the reference among them."""
+    return any(family not in FAMILIES or FAMILIES[family].swept for family in families)
 
 
 def recipe_of(config: StudyConfig, task: Task) -> Recipe:

@@ -16,7 +16,7 @@ from mjx_study.study.line import line_of
 from mjx_study.study.memory import LARGEST_BATCH, bytes_per_sample, check_batches, check_memory, seeds_at_once
 from mjx_study.table import digits_to_tell_apart
 from mjx_study.tasks import make_task
-from mjx_study.tasks.contact_grid import ContactPoint, contact_grid, solver_grid
+from mjx_study.tasks.contact_grid import REFERENCE, ContactPoint, contact_grid, solver_grid
 from mjx_study.tasks.network import with_network
 from mjx_study.tasks.task import Recipe, Task, check_sigma
 from mjx_study.tasks.validation import check_shapes
@@ -113,6 +113,8 @@ def plan_study(config: StudyConfig) -> StudyPlan:
     for which, timestep, cone in itertools.product(config.tasks, config.timestep or (None,), config.cone or (None,)):
         task = _build(config, which, timestep, cone)
         if config.network is not None:
+            if REFERENCE in (config.contact or ()):
+                raise ValueError("a network needs MJX: the analytic references take the task's own policy")
             task = with_network(task, config.network, jax.random.key(config.seed))
         task = at_theta(task, config.theta)
         recipe = recipe_of(config, task) if config.kind == "descents" else None
