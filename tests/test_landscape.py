@@ -284,7 +284,7 @@ def test_bad_options_get_one_line(capsys: pytest.CaptureFixture[str], arguments:
 def test_a_family_without_stiffness_is_taken_as_it_is(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """The default stiffness is for families that take one."""
 
-    class Planned(Exception):
+    class Planned(BaseException):
         pass
 
     def compute(plan: StudyPlan, options: Any) -> None:
