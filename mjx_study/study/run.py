@@ -23,7 +23,7 @@ from mjx_study.study.axes import Axes, axes_of, solver_arrays, solver_parameters
 from mjx_study.study.cells import COMPUTE
 from mjx_study.study.configuration import Progress, StudyConfig
 from mjx_study.study.dataset import Cells, as_plain, dataset_of, write_dataset
-from mjx_study.study.identity import contents, estimator_contents, versions
+from mjx_study.study.identity import contents, differences, estimator_contents, versions
 from mjx_study.study.plan import StudyCell, StudyPlan, estimators_of, plan_study
 from mjx_study.study.revision import git_revision
 from mjx_study.study.store import Part, Store
@@ -194,6 +194,8 @@ class _Run:
             if not keep_going:
                 raise
             unwritten = error
+        if computed == 0 and (told := differences(store.document["versions"], versions())):
+            dataset.attrs["other_versions"] = told
         if unwritten is not None:
             dataset.attrs["unwritten"] = f"cannot write to {store.folder}: {unwritten.strerror or unwritten}"
         return dataset.assign_attrs(computed_cells=computed)
@@ -241,6 +243,8 @@ def warnings_of(dataset: xr.Dataset) -> tuple[str, ...]:
         found.append(f"{dataset.attrs['missing_cells']} cells are not computed yet; the same command goes on")
     if dataset.attrs.get("mixed_versions"):
         found.append(f"cells were computed with different versions: {dataset.attrs['mixed_versions']}")
+    if told := dataset.attrs.get("other_versions"):
+        found.append(f"these numbers are of other versions ({told}); another folder computes them again")
     for name, says in (
         ("nonfinite", "samples overflowed or became NaN and were left out"),
         ("unconverged", "rollouts in which the contact solver did not converge"),
