@@ -8,7 +8,7 @@ from mjx_study.cli.options import Commands, add_command, add_option, attempt, fi
 from mjx_study.disk import prepare_folder
 from mjx_study.option import Option
 from mjx_study.plots.study import plot_study
-from mjx_study.plots.style import FORMATS, STYLES, fit_to_paper, save_figure
+from mjx_study.plots.style import FORMATS, STYLES, fit_to_paper, save_figures
 from mjx_study.study.run import load_study, warnings_of
 
 FORMAT = Option("format", str, "FORMAT", f"of: {', '.join(FORMATS)}", choices=FORMATS, many=True)
@@ -43,11 +43,7 @@ def run(options: argparse.Namespace) -> int:
         figures = plot_study(dataset)
         for figure in figures.values() if options.style == "paper" else ():
             fit_to_paper(figure)
-        written, unwritten = attempt(
-            lambda: [
-                path for name, figure in figures.items() for path in save_figure(figure, folder, name, options.format)
-            ]
-        )
+        written, unwritten = attempt(lambda: save_figures(figures, folder, options.format))
     warnings = list(warnings_of(dataset))
     document = {"written": [str(path) for path in written], "warnings": warnings}
     names = ", ".join(path.name for path in written if path.suffix == f".{options.format[0]}")

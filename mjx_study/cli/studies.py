@@ -8,9 +8,8 @@ from typing import Any
 import xarray as xr
 
 from mjx_study.cli.options import UsageError, add_versions_option, attempt, computing, usage_errors
-from mjx_study.disk import prepare_folder
 from mjx_study.plots.study import plot_study
-from mjx_study.plots.style import save_figure
+from mjx_study.plots.style import save_figures
 from mjx_study.study.configuration import StudyConfig
 from mjx_study.study.plan import StudyPlan
 from mjx_study.study.run import open_store, run_study
@@ -47,10 +46,9 @@ def compute(plan: StudyPlan, options: argparse.Namespace) -> tuple[xr.Dataset, s
             return run_study(plan, progress=progress), None
     try:
         with usage_errors():
-            open_store(plan, options.output, options.command_line, accept_versions=options.accept_versions)
+            store = open_store(plan, options.output, options.command_line, accept_versions=options.accept_versions)
         with computing(RESUMABLE) as progress:
-            accept = options.accept_versions
-            dataset = run_study(plan, options.output, progress, accept_versions=accept, keep_going=True)
+            dataset = run_study(plan, store, progress, keep_going=True)
     except StudyError as error:
         raise UsageError(str(error)) from error
     reason = dataset.attrs.pop("unwritten", None)
@@ -61,10 +59,4 @@ def draw(dataset: xr.Dataset, folder: Path | None, unwritten: str | None) -> tup
     """The figures of a study in its folder; what was written, and why something was not."""
     if folder is None or unwritten:
         return [], None
-    return attempt(
-        lambda: [
-            path
-            for name, figure in plot_study(dataset).items()
-            for path in save_figure(figure, prepare_folder(folder), name)
-        ]
-    )
+    return attempt(lambda: save_figures(plot_study(dataset), folder))

@@ -109,7 +109,7 @@ def run(options: argparse.Namespace) -> int:
     unwritten = None
     try:
         with computing(RESUMABLE) as progress:
-            dataset = run_study(plan, options.output, progress, accept_versions=options.accept_versions)
+            dataset = run_study(plan, store, progress)
     except StudyError as error:
         raise UsageError(str(error)) from error
     except OSError as error:

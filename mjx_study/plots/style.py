@@ -1,7 +1,7 @@
 """What figures share: colours and names, lines with bands, and files."""
 
 import zlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -98,6 +98,11 @@ def save_figure(figure: Figure, folder: Path, name: str, formats: Sequence[str] 
         write_whole(folder / f"{name}.{kind}", lambda file, kind=kind: figure.savefig(file, format=kind, dpi=150))
         for kind in formats
     ]
+
+
+def save_figures(figures: Mapping[str, Figure], folder: Path, formats: Sequence[str] = ("png", "pdf")) -> list[Path]:
+    """Write figures by name; see `save_figure`."""
+    return [path for name, figure in figures.items() for path in save_figure(figure, folder, name, formats)]
 
 
 def line_with_band(

@@ -3,6 +3,7 @@
 import itertools
 import json
 import math
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from types import SimpleNamespace
 from typing import Any, Final
@@ -25,6 +26,8 @@ NOTABLE: Final = 0.05
 """Share of the largest slope beyond which a difference is mentioned, where there is no sampling error."""
 UNSURE: Final = 0.2
 """Relative uncertainty of a reference beyond which errors against it say little."""
+PLACE: Final = ("task", "timestep", "cone", "sigma", "samples", "model", "seed", "estimator", "contact", "stiffness")
+"""What says where a row stands."""
 VECTORS: Final = ("gradient", "reference")
 COUNTS: Final = ("unconverged", "nonfinite", "onsets", "onsets_bounded", "onsets_missed")
 
@@ -60,19 +63,25 @@ class Row(SimpleNamespace):
 def rows_of(dataset: xr.Dataset) -> list[Row]:
     """A row for each estimate that is computed, contact models outermost among what the table compares."""
     outer = ("task", "timestep", "cone", "sigma", "samples", "model", "seed", "estimator")
-    rows = []
-    scalars = [name for name in GRADIENTS if name in dataset and name not in VECTORS]
-    for place in itertools.product(*(range(dataset.sizes[name]) for name in outer)):
-        one = dataset.isel(dict(zip(outer, place, strict=True)))
-        if not np.isfinite(one["residual"].item()) and np.isnan(one["residual"].item()):
+    rows, grid = [], dataset["gradient_norm"].transpose(*outer)
+    names = [name for name in GRADIENTS if name in dataset and name not in VECTORS]
+
+    def along(name: str, *last: str) -> np.ndarray:
+        return dataset[name].broadcast_like(grid).transpose(*outer, *last).values
+
+    scalars, coordinates = ({name: along(name) for name in each} for each in (names, PLACE))
+    vectors = {name: along(name, f"{name}_entry") for name in ("solref", "solimp") if name in dataset}
+    for place in np.ndindex(grid.shape):
+        if np.isnan(scalars["residual"][place]):
             continue  # not computed
-        numbers: dict[str, Any] = {name: one[name].item() for name in scalars}
+        numbers: dict[str, Any] = {name: values[place].item() for name, values in scalars.items()}
         for name in ("alpha", "epsilon", "discrepancy", "onsets", "onsets_bounded", "onsets_missed"):
             if name not in numbers or math.isnan(numbers[name]):
                 numbers[name] = None
         numbers |= {name: int(numbers[name]) for name in COUNTS if numbers[name] is not None}
-        at = {name: one[name].item() for name in (*outer, "contact", "stiffness")}
-        solver = {name: tuple(one[name].values.tolist()) for name in ("solref", "solimp") if name in one}
+        at = {name: values[place] for name, values in coordinates.items()}
+        at = {name: value.item() if isinstance(value, np.generic) else value for name, value in at.items()}
+        solver = {name: tuple(values[place].tolist()) for name, values in vectors.items()}
         rows.append(Row(**at, **solver, **numbers))
     return rows
 
@@ -85,18 +94,13 @@ def findings(dataset: xr.Dataset) -> list[str]:
 
 def _of_gradients(dataset: xr.Dataset) -> list[str]:
     """Where FoBG's variance is above ZoBG's, and whose mean is biased."""
-    rows = rows_of(dataset)
+    rows, gammas, sentences = rows_of(dataset), gammas_of(dataset), []
     confidence = json.loads(dataset.attrs["config"])["confidence"]
-    return [
-        sentence
-        for family in dict.fromkeys(row.contact for row in rows)
-        for part in [[row for row in rows if row.contact == family]]
-        for sentence in (
-            *_variance_finding(family, part, confidence),
-            *_bias_finding(part, gammas_of(dataset)),
-            *_meaningless(family, part, gammas_of(dataset)),
-        )
-    ]
+    for family in dict.fromkeys(row.contact for row in rows):
+        part = [row for row in rows if row.contact == family]
+        sentences += _variance_finding(family, part, confidence)
+        sentences += _bias_finding(part, gammas) + _meaningless(family, part, gammas)
+    return sentences
 
 
 def gammas_of(dataset: xr.Dataset) -> dict[str, float]:
@@ -110,7 +114,7 @@ def _meaningless(family: str, rows: Sequence[Row], gammas: Mapping[str, float]) 
     """What makes a result mean nothing: contact that is never met, a reference as uncertain as the errors, a bound
     that binds always."""
     found = []
-    numbers = {(row.estimator, row.task, row.timestep, row.cone, row.sigma, row.samples, row.seed): [] for row in rows}
+    numbers = defaultdict(list)
     for row in rows:
         key = (row.estimator, row.task, row.timestep, row.cone, row.sigma, row.samples, row.seed)
         numbers[key].append((row.gradient_norm, row.variance))

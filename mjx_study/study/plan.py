@@ -62,7 +62,7 @@ class StudyCell:
 
 @dataclasses.dataclass(frozen=True)
 class StudyPlan:
-    """A sweep that has been checked.
+    """A study that has been checked.
 
     Attributes:
         config: as given.

@@ -109,7 +109,7 @@ def _forms(plan: StudyPlan) -> dict[str, list[Task]]:
 
 def run_study(
     study: StudyConfig | StudyPlan,
-    folder: str | Path | None = None,
+    folder: str | Path | Store | None = None,
     progress: Progress = lambda done, total, what: None,
     *,
     command: str | None = None,
@@ -120,7 +120,7 @@ def run_study(
 
     Args:
         study: what to run.
-        folder: folder of the study, new or begun; None to keep it in memory.
+        folder: folder of the study, new or begun, or what `open_store` made of it; None to keep it in memory.
         progress: called before every cell, and within descents.
         command: command that asked for it, to be kept with a new study.
         accept_versions: go on with a study that other versions of JAX, MuJoCo or this package began.
@@ -138,7 +138,9 @@ def run_study(
     run = _Run(plan, progress)
     if folder is None:
         return run.in_memory(as_plain(_document(plan, command)))
-    return run.in_folder(open_store(plan, Path(folder), command, accept_versions=accept_versions), keep_going)
+    if not isinstance(folder, Store):
+        folder = open_store(plan, Path(folder), command, accept_versions=accept_versions)
+    return run.in_folder(folder, keep_going)
 
 
 class _Run:
