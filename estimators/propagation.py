@@ -110,7 +110,7 @@ def _propagate(
         jacobian = None if steps.policy_jacobian is None else jnp.moveaxis(steps.policy_jacobian, 1, 0)
         adjoint, controls, alphas = _sweep(linearisation, mix, keeps, (jnp.moveaxis(scores, 1, 0), jacobian, given))
         rows = _gradient(linearisation, adjoint, controls)
-    else:  # one decision, before the first step
+    else:  # theta acts once, before the first step
         adjoint, controls, _ = _sweep(
             linearisation, lambda derivative, _: (derivative, jnp.ones((), derivative.dtype)), keeps
         )

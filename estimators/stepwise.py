@@ -68,9 +68,9 @@ def control_scores(steps: StepEvaluation, baseline: str) -> Float[Array, "sample
     """
     found = find_baseline(baseline)
 
-    def advantage(value: Float[Array, " samples"], silent: Float[Array, " samples"]) -> Float[Array, " samples"]:
+    def advantage(value: Float[Array, " samples"], zero_noise: Float[Array, " samples"]) -> Float[Array, " samples"]:
         none = jnp.zeros((value.shape[0], 0), value.dtype)
-        return value - found(Evaluation(value, none, silent))
+        return value - found(Evaluation(value, none, zero_noise))
 
     advantages = jax.vmap(advantage, in_axes=1, out_axes=1)(steps.value_to_go, steps.baseline_to_go)
     return steps.noise_score * advantages[:, :, None]

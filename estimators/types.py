@@ -57,8 +57,8 @@ class Differentiation:
 class StepEvaluation:
     """A batch of rollouts that were evaluated and not differentiated, step by step.
 
-    Noise acts at S steps in m dimensions: at every step of a policy, or once (S = 1) where theta + w is a decision
-    made before the simulation.
+    Noise acts at S steps in m dimensions: at every step of a policy, or once (S = 1) where theta + w determines
+    the initial state.
 
     Attributes:
         value_to_go: V_h^i, the cost from step h on; V_1 is the total, [cost].

@@ -26,7 +26,7 @@ from mjx_study.study.configuration import StudyConfig
 from mjx_study.study.plan import estimators_of, plan_study
 from mjx_study.study.run import load_study, run_study
 from mjx_study.tasks import TASKS, make_task
-from mjx_study.tasks.policy import Launch, LinearFeedback, OpenLoop, Policy
+from mjx_study.tasks.policy import InitialStatePolicy, LinearFeedback, OpenLoop, Policy
 from mjx_study.tasks.task import Recipe, Task
 
 __all__ = [
@@ -34,7 +34,7 @@ __all__ = [
     "ContactModel",
     "ContactWarning",
     "FAMILIES",
-    "Launch",
+    "InitialStatePolicy",
     "LinearFeedback",
     "MjxObjective",
     "OpenLoop",

@@ -309,9 +309,9 @@ class MjxObjective:
         by 0: a single one if the initial state is fixed, otherwise one per sample.
         """
         samples = len(keys)
-        silent = np.arange(samples if self.simulator.task.random_start else min(samples, 1))
-        scale = np.concatenate([np.ones(samples), np.zeros(len(silent))])
-        values, scores, residuals = self._run("value", theta, keys, np.append(np.arange(samples), silent), scale)
+        zero_noise = np.arange(samples if self.simulator.task.random_start else min(samples, 1))
+        scale = np.concatenate([np.ones(samples), np.zeros(len(zero_noise))])
+        values, scores, residuals = self._run("value", theta, keys, np.append(np.arange(samples), zero_noise), scale)
         baseline = _for_all(values[samples:], samples)
         return Evaluation(*map(jnp.asarray, (values[:samples], scores[:samples], baseline, residuals[:samples])))
 
@@ -341,9 +341,9 @@ class MjxObjective:
         scale = np.repeat([1.0, -1.0, 0.0], samples)
         values, scores, residuals = self._run("value", theta, keys, np.tile(np.arange(samples), 3), scale)
         above, below = slice(samples), slice(samples, 2 * samples)
-        silent = jnp.asarray(values[2 * samples :])
+        zero_noise = jnp.asarray(values[2 * samples :])
         plus, minus = (
-            Evaluation(*map(jnp.asarray, (values[part], scores[part], silent, residuals[part])))
+            Evaluation(*map(jnp.asarray, (values[part], scores[part], zero_noise, residuals[part])))
             for part in (above, below)
         )
         return plus, minus
@@ -373,12 +373,12 @@ class MjxObjective:
 
         The state is (qpos, qvel, act), so a quaternion counts four.
         """
-        (terms, residual, derivatives), silent = (
+        (terms, residual, derivatives), zero_noise = (
             self._run("linearisation", theta, keys),
-            self._silent_to_go(theta, keys),
+            self._zero_noise_to_go(theta, keys),
         )
         to_go, scores, jacobian = terms
-        steps = StepEvaluation(*jax.tree.map(jnp.asarray, (to_go, silent, scores, jacobian, residual)))
+        steps = StepEvaluation(*jax.tree.map(jnp.asarray, (to_go, zero_noise, scores, jacobian, residual)))
         return Linearisation(steps, *jax.tree.map(jnp.asarray, derivatives))
 
     def _evaluate_steps(self, theta, keys, signs: tuple[float, ...]) -> list[StepEvaluation]:
@@ -387,16 +387,16 @@ class MjxObjective:
         (to_go, scores, jacobian), residual = self._run(
             "steps", theta, keys, np.tile(np.arange(samples), len(signs)), scale
         )
-        silent = self._silent_to_go(theta, keys)
+        zero_noise = self._zero_noise_to_go(theta, keys)
 
         def half(part: slice) -> StepEvaluation:
             pick = lambda leaf: jnp.asarray(leaf[part])  # noqa: E731
             terms = jax.tree.map(pick, (to_go, scores, jacobian, residual))
-            return StepEvaluation(terms[0], jnp.asarray(silent), *terms[1:])
+            return StepEvaluation(terms[0], jnp.asarray(zero_noise), *terms[1:])
 
         return [half(slice(index * samples, (index + 1) * samples)) for index in range(len(signs))]
 
-    def _silent_to_go(self, theta, keys):
+    def _zero_noise_to_go(self, theta, keys):
         """Costs to go of the zero-noise rollouts, a single one if all samples share it."""
         rows = np.arange(len(keys) if self.simulator.task.random_start else min(len(keys), 1))
         (to_go, *_), _ = self._run("steps", theta, keys, rows, np.zeros(len(rows)))

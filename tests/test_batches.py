@@ -17,7 +17,7 @@ from mjx_study.tasks import make_task
 from mjx_study.tasks.contact_grid import contact_grid
 from mjx_study.tasks.task import Task
 
-# What each stands for: an open loop; feedback from random starts, five bodies; one decision before the simulation.
+# What each stands for: an open loop; feedback from random starts, five bodies; one parameter before the simulation.
 TASKS = {"pusher": 12, "tennis": 8, "double_pendulum": 10}
 SAMPLES = 6
 

@@ -102,13 +102,13 @@ def test_quadrature_weighs_with_the_noise_s_own_density(noise: str, theta: float
 
 
 def one_gain(**changes) -> Task:
-    """A pusher of two steps whose force is one gain times a coordinate: one parameter, but no decision made once."""
+    """A pusher of two steps whose force is one gain times a coordinate: one parameter, which acts at every step."""
     task = make_task("pusher", horizon=2)
     policy = LinearFeedback(task.horizon, 1, 1, lambda state: state.qpos[:1])
     return task.replace(policy=policy, theta=jnp.zeros(1), reference=None, **changes)
 
 
-def test_quadrature_is_for_decisions_that_are_made_once_from_a_fixed_start() -> None:
+def test_quadrature_is_for_scalar_parameters_that_act_once_from_a_fixed_start() -> None:
     drawn = make_task("momentum_transfer", horizon=2)
     fixed = drawn.start
     for task, says in (
@@ -116,7 +116,7 @@ def test_quadrature_is_for_decisions_that_are_made_once_from_a_fixed_start() -> 
         (one_gain(), "pusher has 1, the noise on its controls$"),
         (drawn.replace(start=lambda key: fixed), "momentum_transfer has 1, its starts drawn$"),
     ):
-        with pytest.raises(ValueError, match=f"quadrature is for a decision of one number.*; {says}"):
+        with pytest.raises(ValueError, match=f"quadrature is for a scalar parameter.*; {says}"):
             Line(task)
         assert not applies(task)
 

@@ -18,7 +18,7 @@ from mjx_study.simulation.contact import ContactModel, contact_model, family_mod
 from mjx_study.simulation.dynamics import State, initial_state
 from mjx_study.simulation.scene import put_scene
 from mjx_study.tasks import make_task
-from mjx_study.tasks.policy import Launch, LinearFeedback, OpenLoop, Policy
+from mjx_study.tasks.policy import InitialStatePolicy, LinearFeedback, OpenLoop, Policy
 from mjx_study.tasks.task import Task
 from tests.estimators.statistics_helpers import assert_mean_is
 from tests.pusher_fixtures import (
@@ -281,7 +281,7 @@ def closed_loop() -> Simulator:
 
 
 def test_policies_are_policies():
-    launch = Launch(2, 3, 1, lambda start, decision: start)
+    launch = InitialStatePolicy(2, 3, 1, lambda start, theta: start)
     assert all(isinstance(policy, Policy) for policy in (OpenLoop(3, 2), LinearFeedback(3, 1, 5, features), launch))
 
 

@@ -322,7 +322,7 @@ def test_outcomes_of_tennis_are_what_happened() -> None:
     task = make_task("tennis")
     keys = jax.random.split(jax.random.key(4), 100)
     reference = task.reference(5000.0)  # type: ignore[misc]
-    assert isinstance(reference, ReferenceObjective) and task.outcomes is not None
+    assert isinstance(reference, ReferenceObjective) and task.metrics is not None
     starts, noise = reference._draw(keys)
     rollout = roll_out(reference.system, starts, noise, np.zeros((3, 7)))
     assert isinstance(reference.system, Tennis)

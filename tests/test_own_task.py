@@ -31,7 +31,7 @@ MJCF, PYTHON, OTHERS = (
 SMALL = ["--horizon", "40", "--stiffness", "3000", "--contact", "smooth_onset"]
 TINY = """
 import jax.numpy as jnp
-from mjx_study import Launch, OpenLoop, State, Task, initial_state, load_scene
+from mjx_study import InitialStatePolicy, OpenLoop, State, Task, initial_state, load_scene
 
 def hop(horizon=3, **options):
     scene, policy = load_scene("pusher", **options), OpenLoop(horizon, 1)
@@ -275,7 +275,7 @@ def test_a_task_takes_no_options(write) -> None:
             "mine:bad: the final_cost raised AttributeError: 'State' object has no attribute 'position' (mine.py, ",
         ),
         (
-            "policy=Launch(3, 0, 3, lambda start, theta: 1 / 0)",
+            "policy=InitialStatePolicy(3, 0, 3, lambda start, theta: 1 / 0)",
             "mine:bad: the policy's place raised ZeroDivisionError: division by zero (mine.py, ",
         ),
         (

@@ -43,8 +43,9 @@ Top row of the figure: the cost without noise, and the mean cost with noise (its
 Bottom row: the mean of ZoBG and of FoBG along the line, with theirs. Where the smoothed objective has a slope that the
 mean of FoBG does not have, the cost jumps: a first-order gradient does not see jumps.
 
-A decision of one number, made once from a fixed start, also gets both slopes without sampling error, by quadrature over
-1500 rollouts and gradients of each contact model (more where --noise has heavy tails), whatever --points and --samples.
+The scalar parameter of an initial-state policy with a fixed start also gets both slopes without sampling error, by
+quadrature over 1500 rollouts and gradients of each contact model (more where --noise has heavy tails), whatever
+--points and --samples.
 """
 POINTS, SAMPLES = 41, (100,)
 ESTIMATORS = ("zobg", "fobg")
@@ -52,7 +53,7 @@ ESTIMATORS = ("zobg", "fobg")
 
 def add(commands: Commands) -> None:
     """Register the command."""
-    summary = "draw a decision's cost, its smoothed cost and the slope that each estimator sees"
+    summary = "draw the cost along a line of parameters, its smoothed cost and the slope that each estimator sees"
     command = add_command(commands, "landscape", summary, run, EPILOG)
     add_task_argument(command)
     add_options(command, StudyConfig, "sigma", "cone", "horizon", "model", "noise")

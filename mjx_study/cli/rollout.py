@@ -205,8 +205,8 @@ def _simulate_task(task: Task, cell: ContactPoint, seed: int, noisy: bool) -> Ro
         "residual": float(residual) if np.isfinite(residual) else None,
     }
     noise = f"noise {task.sigma:g}, seed {seed}" if noisy else "no noise"
-    decision = f"theta {float(theta[0]):g}, " if theta.size == 1 else ""
-    title = f"{task.name}: {cell.label}, {decision}{noise}"
+    at = f"theta {float(theta[0]):g}, " if theta.size == 1 else ""
+    title = f"{task.name}: {cell.label}, {at}{noise}"
     rollout = _rollout(title, task.scene.host, states.qpos, states.qvel, controls, facts)
     return dataclasses.replace(rollout, focus=tuple(task.scene.geom(name) for name in task.contact_pair or ()))
 

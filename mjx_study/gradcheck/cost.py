@@ -93,8 +93,8 @@ class CostPrograms:
         return jax.vmap(lambda theta: self._cost(theta, contact)[0])(thetas)
 
     def _cost(self, theta, contact):
-        silent = jnp.zeros(self.task.policy.noise_shape, theta.dtype)
-        return rollout_cost(self.task, theta, contact, self.start, silent)
+        zero_noise = jnp.zeros(self.task.policy.noise_shape, theta.dtype)
+        return rollout_cost(self.task, theta, contact, self.start, zero_noise)
 
 
 def check_cost(programs: CostPrograms, cell: ContactPoint, seed: int) -> tuple[CostCheck, list[HostState]]:

@@ -35,7 +35,7 @@ MEANING: Final = {
     "wrong": "the derivative is not that of the step",
     "engine": "MJX's step is not the C engine's, and nothing documented explains it",
     "value": "the step itself is not that of mjx.step",
-    "placement": "the step of MJX differs from that of the C engine, as documented",
+    "engine_mismatch": "the step of MJX differs from that of the C engine, as documented",
     "apart": "the analytic counterpart is another model of the same system, approached as contact stiffens",
 }
 

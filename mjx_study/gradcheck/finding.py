@@ -5,7 +5,7 @@ from typing import Final
 
 from mjx_study.gradcheck.diagnosis import FAILURES, VERDICTS
 
-OTHERS: Final = {"value": "mjx.step", "engine": "the C engine", "placement": "the C engine"}
+OTHERS: Final = {"value": "mjx.step", "engine": "the C engine", "engine_mismatch": "the C engine"}
 """Source of the compared number, if not finite differences."""
 
 
@@ -39,7 +39,7 @@ class Finding:
     Attributes:
         contact: label of the contact model.
         who: owner of the derivative: `project`, or `mjx.step` for MJX's own.
-        verdict: kink, jump, unconverged, zero, nan, engine, wrong, value, placement or apart.
+        verdict: kink, jump, unconverged, zero, nan, engine, wrong, value, engine_mismatch or apart.
         modes: modes of differentiation that show it: forward, reverse, tape.
         cause: one sentence.
         entries: all entries concerned.
@@ -81,5 +81,5 @@ class Finding:
 
 def gravity(finding: Finding) -> tuple[bool, bool, int]:
     """Sort key that puts the gravest findings first."""
-    order = {name: rank for rank, name in enumerate((*reversed(VERDICTS), "placement", "apart"))}
+    order = {name: rank for rank, name in enumerate((*reversed(VERDICTS), "engine_mismatch", "apart"))}
     return not finding.fails, finding.who != "project", order[finding.verdict]

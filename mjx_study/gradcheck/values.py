@@ -25,7 +25,7 @@ class Values:
         stock: difference of this project's state from that of `mjx.step`.
         engine: difference of this project's state from the C engine's.
         verdict: value (this project's step and that of `mjx.step` differ), engine (they agree, and the C engine's
-            differs for no documented reason), placement (for a documented one), or empty.
+            differs for no documented reason), engine_mismatch (for a documented one), or empty.
         cause: description of the difference.
         coordinate: output that differs most, an index into the layout's outputs.
         numbers: change of this coordinate here, and in the implementation that differs.
@@ -78,7 +78,7 @@ def compare_values(
             cause = f"this project's step is not that of mjx.step; the C engine agrees with {third}"
     elif not from_engine <= TOLERANCE:
         cause, documented = difference_of_engines(engine_step.host, state, stages, ours.warmstart, theirs.warmstart)
-        verdict = "placement" if documented else "engine"
+        verdict = "engine_mismatch" if documented else "engine"
     other = stock if verdict == "value" else theirs
     worst = int(np.argmax(np.nan_to_num(apart(layout, state, ours, other, noise), nan=np.inf)))
     numbers = (float(change(layout, state, ours)[worst]), float(change(layout, state, other)[worst]))

@@ -7,17 +7,17 @@ from mjx_study.reference.function import ClosedForm, Function, Jump, ScalarFunct
 from mjx_study.reference.heaviside import Heaviside, RelaxedHeaviside
 from mjx_study.reference.linear_quadratic import LinearQuadratic
 from mjx_study.reference.momentum_transfer import MomentumTransfer
-from mjx_study.reference.objective import DECISIONS, FunctionObjective, Reference, ReferenceObjective
+from mjx_study.reference.objective import PARAMETRISATIONS, FunctionObjective, Reference, ReferenceObjective
 from mjx_study.reference.pusher import Pusher
 from mjx_study.reference.quadratic import Quadratic
 from mjx_study.reference.quadratic_cost import QuadraticCost
 from mjx_study.reference.sliding_box import SlidingBox
 from mjx_study.reference.system import System
-from mjx_study.reference.tennis import Tennis, tennis_outcomes
+from mjx_study.reference.tennis import Tennis, tennis_metrics
 from mjx_study.reference.tennis_start import draw_start
 
 __all__ = [
-    "DECISIONS",
+    "PARAMETRISATIONS",
     "BallWall",
     "ClosedForm",
     "DoublePendulum",
@@ -43,7 +43,7 @@ __all__ = [
     "draw_start",
     "roll_out",
     "smoothed",
-    "tennis_outcomes",
+    "tennis_metrics",
     "value_and_gradient",
     "value_and_gradients",
 ]

@@ -15,7 +15,7 @@ from mjx_study.reference.function import Function, check_noise
 from mjx_study.reference.noise import batch_noise, check_density, noise_score, split_sample_key
 from mjx_study.reference.system import System
 
-DECISIONS: Final = ("controls", "feedback", "start")
+PARAMETRISATIONS: Final = ("controls", "feedback", "start")
 """Possible meanings of theta in a `ReferenceObjective`."""
 
 Start = tuple[float, ...] | Callable[[Key[Array, ""]], Float[Array, " states"]]
@@ -40,7 +40,7 @@ class Reference(PairedObjective, Protocol):
 class ReferenceObjective:
     """F(theta) = E V_1 of a policy on an analytic system, with noise w of standard deviation sigma.
 
-    `decision` sets the meaning of theta and the place of the noise:
+    `parametrises` sets the meaning of theta and the place of the noise:
 
     - "controls": u_h = theta_h + w_h; theta is (horizon, controls), flattened.
     - "feedback": u_h = Theta x_h + w_h; theta is the matrix Theta, (controls, states), flattened. Score
@@ -53,27 +53,27 @@ class ReferenceObjective:
             own zero-noise rollout as baseline. None if theta is the initial state.
         horizon: number of steps.
         sigma: standard deviation of the noise, in the unit of what it is added to.
-        decision: meaning of theta, see above.
+        parametrises: meaning of theta, see above.
         noise: name of the noise density in `estimators.NOISES`.
-        outcomes: metrics of rollouts by name, as a function of their states including the initial one; None for none.
+        metrics: numbers of rollouts by name, as a function of their states including the initial one; None for none.
     """
 
     system: System
     start: Start | None
     horizon: int
     sigma: float
-    decision: str = "controls"
+    parametrises: str = "controls"
     noise: str = "gaussian"
-    outcomes: Callable[[Float[np.ndarray, "samples steps states"]], dict[str, np.ndarray]] | None = None
+    metrics: Callable[[Float[np.ndarray, "samples steps states"]], dict[str, np.ndarray]] | None = None
 
     def __post_init__(self) -> None:
         check_noise(self.sigma)
         check_density(self.noise)
-        if self.decision not in DECISIONS:
-            raise ValueError(f"unknown decision {self.decision!r}; choose from {', '.join(DECISIONS)}")
+        if self.parametrises not in PARAMETRISATIONS:
+            raise ValueError(f"parametrises is {self.parametrises!r}; choose from {', '.join(PARAMETRISATIONS)}")
         if self.horizon < 1:
             raise ValueError(f"horizon must be at least 1 step, got {self.horizon}")
-        if (self.start is None) != (self.decision == "start"):
+        if (self.start is None) != (self.parametrises == "start"):
             raise ValueError("give a start, except where theta is the start: then it must be None")
         if isinstance(self.start, tuple) and len(self.start) != self.system.num_states:
             raise ValueError(f"the start must have {self.system.num_states} entries, got {len(self.start)}")
@@ -82,7 +82,7 @@ class ReferenceObjective:
     def num_params(self) -> int:
         """Length of theta."""
         states, controls = self.system.num_states, self.system.num_controls
-        return {"controls": self.horizon * controls, "feedback": controls * states, "start": states}[self.decision]
+        return {"controls": self.horizon * controls, "feedback": controls * states, "start": states}[self.parametrises]
 
     def evaluate(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> Evaluation:
         """Values and scores from rollouts alone."""
@@ -118,7 +118,7 @@ class ReferenceObjective:
         start, controls, *feedback = self._policy(theta, starts, noise)
         rollout = roll_out(self.system, start, controls, *feedback)
         gradients = gradients_along(self.system, rollout, *feedback)
-        over_noise = gradients.start[:, None] if self.decision == "start" else gradients.controls
+        over_noise = gradients.start[:, None] if self.parametrises == "start" else gradients.controls
         return StepDifferentiation(
             jnp.asarray(rollout.value), jnp.asarray(over_noise), self._policy_jacobian(rollout.states)
         )
@@ -133,7 +133,7 @@ class ReferenceObjective:
         shape = (samples, self.horizon, self.system.num_controls, self.system.num_states)
         over_policy = None if feedback is None else jnp.broadcast_to(feedback, shape)
         size = self.system.num_states
-        over_start = jnp.broadcast_to(jnp.eye(size), (samples, size, size)) if self.decision == "start" else None
+        over_start = jnp.broadcast_to(jnp.eye(size), (samples, size, size)) if self.parametrises == "start" else None
         return Linearisation(
             steps=steps,
             cost_state=jnp.asarray(over_cost[0]),
@@ -147,9 +147,9 @@ class ReferenceObjective:
 
     def observe(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> dict[str, np.ndarray]:
         """Metrics of the rollouts of `evaluate`."""
-        if self.outcomes is None:
+        if self.metrics is None:
             return {}
-        return self.outcomes(roll_out(self.system, *self._policy(theta, *self._draw(keys))).states)
+        return self.metrics(roll_out(self.system, *self._policy(theta, *self._draw(keys))).states)
 
     def value_and_gradient(
         self, theta: Float[Array, " params"], key: Key[Array, ""]
@@ -161,33 +161,33 @@ class ReferenceObjective:
 
     @property
     def _noise_shape(self) -> tuple[int, int]:
-        if self.decision == "start":
+        if self.parametrises == "start":
             return (1, self.system.num_states)
         return (self.horizon, self.system.num_controls)
 
     def _evaluation(self, theta, starts, noise) -> Evaluation:
         rollout = roll_out(self.system, *self._policy(theta, starts, noise))
-        silent = roll_out(self.system, *self._policy(theta, starts, np.zeros(noise.shape[1:])))
+        zero_noise = roll_out(self.system, *self._policy(theta, starts, np.zeros(noise.shape[1:])))
         score = np.asarray(noise_score(jnp.asarray(noise), self.sigma, self.noise))
-        if self.decision == "feedback":
+        if self.parametrises == "feedback":
             score = np.einsum("shu,shx->sux", score, rollout.states[:, :-1])
-        baseline = np.broadcast_to(silent.value, len(noise))
+        baseline = np.broadcast_to(zero_noise.value, len(noise))
         return Evaluation(jnp.asarray(rollout.value), jnp.asarray(score.reshape(len(noise), -1)), jnp.asarray(baseline))
 
     def _steps(self, theta, starts, noise):
         """Step evaluation; rollout; feedback matrix, or None."""
         rollout = roll_out(self.system, *self._policy(theta, starts, noise))
-        silent = roll_out(self.system, *self._policy(theta, starts, np.zeros(noise.shape[1:])))
-        to_go = (part.value_to_go[..., : noise.shape[1]] for part in (rollout, silent))
+        zero_noise = roll_out(self.system, *self._policy(theta, starts, np.zeros(noise.shape[1:])))
+        to_go = (part.value_to_go[..., : noise.shape[1]] for part in (rollout, zero_noise))
         value, baseline = (jnp.asarray(np.broadcast_to(part, noise.shape[:2])) for part in to_go)
         score = jnp.asarray(noise_score(jnp.asarray(noise), self.sigma, self.noise))
         steps = StepEvaluation(value, baseline, score, self._policy_jacobian(rollout.states))
-        gains = np.asarray(theta).reshape(self.system.num_controls, -1) if self.decision == "feedback" else None
+        gains = np.asarray(theta).reshape(self.system.num_controls, -1) if self.parametrises == "feedback" else None
         return steps, rollout, gains
 
     def _policy_jacobian(self, states):
         """D_theta (Theta x) of every step; None if the noise is added to theta itself."""
-        if self.decision != "feedback":
+        if self.parametrises != "feedback":
             return None
         controls = self.system.num_controls
         jacobian = np.einsum("uv,shx->shuvx", np.eye(controls), states[:, :-1])
@@ -208,15 +208,15 @@ class ReferenceObjective:
         if theta.shape != (self.num_params,):
             raise ValueError(f"theta must have shape ({self.num_params},), got {theta.shape}")
         controls = (self.horizon, self.system.num_controls)
-        if self.decision == "start":
+        if self.parametrises == "start":
             return theta + noise[..., 0, :], np.zeros(controls)
-        if self.decision == "controls":
+        if self.parametrises == "controls":
             return start, theta.reshape(controls) + noise
         return start, noise, theta.reshape(self.system.num_controls, self.system.num_states)
 
     def _differentiate(self, theta, start, noise):
         value, gradients = value_and_gradients(self.system, *self._policy(theta, start, noise))
-        return value, getattr(gradients, self.decision)
+        return value, getattr(gradients, self.parametrises)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -135,7 +135,7 @@ class Tennis:
         return now.reshape(*batch, 7), slope, count.reshape(batch)
 
 
-def tennis_outcomes(
+def tennis_metrics(
     position: Float[Any, "*batch steps 2"], velocity: Float[Any, "*batch steps 2"]
 ) -> dict[str, Float[Any, "*batch"]]:
     """Whether the ball was hit, and its final distance from the target [m], from its motion; NumPy or JAX arrays.

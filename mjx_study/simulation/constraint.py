@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from mjx_study.simulation._mjx import mjx
-from mjx_study.simulation.patches import repaired
+from mjx_study.simulation.patches import patched
 from mjx_study.simulation.scene import num_constraint_rows
 
 _ELLIPTIC = mujoco.mjtCone.mjCONE_ELLIPTIC
@@ -244,7 +244,7 @@ def at_onset(model: mjx.Model, data: mjx.Data, members: Float[Array, " rows"], o
         members: 1 for these rows, 0 for those left unchanged.
         on: whether they are active.
     """
-    with repaired(touching=True):
+    with patched(touching=True):
         touching: Any = mjx.make_constraint(model, data)._impl
     rows: Any = data._impl
     chosen, acts = members > 0, jnp.where(on, 1.0, 0.0).astype(rows.efc_J.dtype)

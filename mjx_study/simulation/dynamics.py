@@ -28,7 +28,7 @@ from estimators.pytree import register_pytree
 from mjx_study.simulation import constraint
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.integration import integrate_position
-from mjx_study.simulation.patches import has_tendon_springs, repaired, tendon_spring_gap
+from mjx_study.simulation.patches import has_tendon_springs, patched, tendon_spring_gap
 from mjx_study.simulation.scene import Scene
 
 JACOBIAN_COLUMNS = 32
@@ -172,7 +172,7 @@ def position_stage(scene: Scene, model: mjx.Model, qpos: Float[Array, " nq"]) ->
 
 @jax.jit
 def _fwd_position(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    with repaired():
+    with patched():
         return mjx.fwd_position(model, data)
 
 
@@ -185,7 +185,7 @@ def force_stage(
     control: Float[Array, " nu"],
 ) -> mjx.Data:
     data = data.replace(qvel=qvel, act=act, ctrl=control)
-    with repaired():
+    with patched():
         data = mjx.make_constraint(model, data)  # again: aref depends on qvel
         data = mjx.fwd_velocity(model, data)
         if has_tendon_springs(model):

@@ -114,7 +114,7 @@ def wrap_inside(*arguments: Any) -> tuple[Float[Array, " 1"], Float[Array, " 4"]
     The length is always 0; MJX takes the square root of its square, which has no derivative at 0. Here it is
     negligibly small instead, and differentiable.
     """
-    assert _mjx_wrap_inside is not None, "`repaired` has checked that MJX has it"
+    assert _mjx_wrap_inside is not None, "`patched` has checked that MJX has it"
     length, points = _mjx_wrap_inside(*arguments)
     return jnp.where(length < 0, length, _UNSEEN), points
 
@@ -129,7 +129,7 @@ def cylinder_distance(position: Float[Array, " 3"], size: Float[Array, " 3"]) ->
     MJX places contacts by its gradient. Where the point is inside, the square root of the branch for points outside is
     at 0, so that the gradient has no derivative in reverse mode.
     """
-    assert _mjx_cylinder is not None, "`repaired` has checked that MJX has it"
+    assert _mjx_cylinder is not None, "`patched` has checked that MJX has it"
     return _mjx_cylinder(position, size)
 
 
@@ -168,7 +168,7 @@ _REPLACED: Final[dict[tuple[str, str], Callable[..., Any]]] = {
 
 
 @contextlib.contextmanager
-def repaired(*, touching: bool = False) -> Generator[None]:
+def patched(*, touching: bool = False) -> Generator[None]:
     """Patch MJX with the functions of this module in whatever is traced inside.
 
     Args:

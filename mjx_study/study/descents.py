@@ -117,7 +117,7 @@ class Backend:
         """What a task counts beside its cost in the rollouts of `cost`: means over those that are finite."""
         if self.simulator is None:
             found = self.task.analytic(model.stiffness).observe(theta, self._evaluation_keys())
-        elif self.task.outcomes is None:
+        elif self.task.metrics is None:
             return {}
         else:
             found = jax.device_get(self._observe(theta, model.contact, self._evaluation_keys()))
@@ -139,7 +139,7 @@ class Backend:
 
         def one(key: Key[Array, ""]) -> dict[str, Array]:
             states, *_ = simulate(self.task, theta, contact, key, 1.0)
-            return self.task.outcomes(states)  # type: ignore[misc]
+            return self.task.metrics(states)  # type: ignore[misc]
 
         return jax.vmap(one)(keys)
 

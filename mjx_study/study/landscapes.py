@@ -1,12 +1,12 @@
 r"""Landscapes of a cell: the cost along a line, what noise makes of it, and which slope each estimator sees.
 
-Along a line theta(t) = theta_0 + t * direction (for a decision of one number, theta = t) and at each point of a grid:
+Along a line theta(t) = theta_0 + t * direction (for a scalar parameter, theta = t) and at each point of a grid:
 
     the cost without noise,  F = E V_1,  E[ZoBG] . direction,  E[FoBG] . direction,
 
 each mean with its standard error. Where F has a slope that E[FoBG] does not see, the cost jumps. The same keys are used
 at every point and for every contact model, so curves are smooth and differences between them are not sampling noise;
-zeroth- and first-order means come from independent keys. For a decision of one number from a fixed start the means are
+zeroth- and first-order means come from independent keys. For a scalar parameter and a fixed start the means are
 also had without sampling, by quadrature.
 
 Reference: Suh et al. 2022, figure of simple systems, second row.
@@ -54,17 +54,21 @@ def compute_landscapes(plan: StudyPlan) -> Callable[[StudyCell], dict[str, np.nd
         task, objective = plan.groups[cell.group].task, objectives(cell)
         line = line_of(task, config.points or 0, config.span, config.direction, config.seed)
         chosen = estimators_of(plan, cell)
-        keys, columns, lost, largest = cell_keys(config.seed, config.batches), [], 0, 0.0
+        keys, columns, unconverged_solves, largest = cell_keys(config.seed, config.batches), [], 0, 0.0
         for theta in line.thetas:
             drawn, _, residuals = draw_batches(objective, theta, keys, oracles, cell.samples, slice(None))
-            lost += sum(unconverged(each, precision()) for each in residuals.values())
+            unconverged_solves += sum(unconverged(each, precision()) for each in residuals.values())
             largest = max(
                 largest, *(float(np.max(np.nan_to_num(each, nan=np.inf), initial=0.0)) for each in residuals.values())
             )
             pooled = jax.tree.map(lambda leaf: jnp.asarray(leaf).reshape(-1, *leaf.shape[2:]), drawn)
             columns.append(jax.device_get(_slopes(pooled, line.direction, chosen)))
         arrays = {name: np.stack([column[name] for column in columns], axis=-1) for name in columns[0]}
-        arrays |= {"position": line.position, "unconverged": np.asarray(lost), "residual": np.asarray(largest)}
+        arrays |= {
+            "position": line.position,
+            "unconverged": np.asarray(unconverged_solves),
+            "residual": np.asarray(largest),
+        }
         if (found := exact(cell, line.position, objective)) is not None:
             arrays |= {f"exact_{name}": values for name, values in vars(found).items()}
         return {name: np.asarray(array, float) for name, array in arrays.items()}

@@ -31,7 +31,7 @@ class ThetaLine:
 
 
 def line_of(task: Task, points: int, span: Sequence[float] | None, direction: str | None, seed: int) -> ThetaLine:
-    """The line through a task's theta; for a decision of one number, its range, whatever theta is.
+    """The line through a task's theta; for a scalar parameter, its range, whatever theta is.
 
     Args:
         task: whose parameters they are.

@@ -1,4 +1,4 @@
-r"""Means over the noise of a decision of one number, without sampling.
+r"""Means over the noise of a scalar parameter, without sampling.
 
     F(theta) = E f(theta + w),   F'(theta) = E f(theta + w) psi'(w),   E[FoBG] = E f'(theta + w),
 
@@ -63,7 +63,7 @@ class Line:
     def __init__(self, task: Task):
         if not applies(task):
             raise ValueError(
-                "quadrature is for a decision of one number with the noise added to it and a fixed start; "
+                "quadrature is for a scalar parameter with the noise added to it and a fixed start; "
                 f"{task.name} has {task.policy.num_params}"
                 f"{'' if task.policy.additive else ', the noise on its controls'}"
                 f"{', its starts drawn' if task.random_start else ''}"

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 from mjx_study.reference import BallWall, FunctionObjective
 from mjx_study.simulation.dynamics import State, initial_state
 from mjx_study.simulation.scene import SceneError, load_model, put_scene, require
-from mjx_study.tasks.policy import Launch
+from mjx_study.tasks.policy import InitialStatePolicy
 from mjx_study.tasks.task import Published, Recipe, Task
 
 HORIZON: Final = 400
@@ -57,8 +57,8 @@ def ball_wall(
     dtype = scene.template.qpos.dtype
     speed = SPEED * LENGTH_SCALE**0.5
 
-    def launched(start: State, decision: Float[Array, " params"]) -> State:
-        direction = jnp.stack([jnp.cos(decision[0]), jnp.sin(decision[0])])
+    def start_at(start: State, parameters: Float[Array, " params"]) -> State:
+        direction = jnp.stack([jnp.cos(parameters[0]), jnp.sin(parameters[0])])
         return State(start.qpos, speed * direction, start.act, start.warmstart)
 
     return Task(
@@ -66,7 +66,7 @@ def ball_wall(
         description=f"throw a ball far, with a wall ({variant}) in its way; one launch angle",
         scene=scene,
         horizon=horizon,
-        policy=Launch(1, horizon, scene.host.nu, launched),
+        policy=InitialStatePolicy(1, horizon, scene.host.nu, start_at),
         theta=jnp.full(1, ANGLE, dtype),
         sigma=SIGMA,
         start=initial_state(scene),

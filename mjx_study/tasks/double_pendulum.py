@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 from mjx_study.reference import DoublePendulum, ReferenceObjective
 from mjx_study.simulation.dynamics import State, initial_state
 from mjx_study.simulation.scene import load_scene, require
-from mjx_study.tasks.policy import Launch
+from mjx_study.tasks.policy import InitialStatePolicy
 from mjx_study.tasks.task import Recipe, Task
 
 HORIZON: Final = 1000
@@ -54,15 +54,15 @@ def double_pendulum(
     require(scene, joints=("first", "second"), geoms=())
     dtype = scene.template.qpos.dtype
 
-    def launched(rest: State, decision: Float[Array, " params"]) -> State:
-        return State(decision[:2], decision[2:], rest.act, rest.warmstart)
+    def start_at(rest: State, parameters: Float[Array, " params"]) -> State:
+        return State(parameters[:2], parameters[2:], rest.act, rest.warmstart)
 
     return Task(
         name="double_pendulum" if start == "default" else f"double_pendulum:{start}",
         description=f"chaos without contact; four numbers of the initial state ({start})",
         scene=scene,
         horizon=horizon,
-        policy=Launch(4, horizon, scene.host.nu, launched),
+        policy=InitialStatePolicy(4, horizon, scene.host.nu, start_at),
         theta=jnp.array(STARTS[start], dtype),
         sigma=SIGMA,
         start=initial_state(scene),
@@ -72,7 +72,7 @@ def double_pendulum(
         gamma=float("inf"),
         recipe=RECIPE,
         reference=lambda stiffness: ReferenceObjective(
-            DoublePendulum(timestep=scene.timestep), None, horizon, SIGMA, decision="start"
+            DoublePendulum(timestep=scene.timestep), None, horizon, SIGMA, parametrises="start"
         ),
         families=("mjcf",),
     )

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 from mjx_study.reference import FunctionObjective, MomentumTransfer
 from mjx_study.simulation.dynamics import State, initial_state
 from mjx_study.simulation.scene import load_scene, require
-from mjx_study.tasks.policy import Launch
+from mjx_study.tasks.policy import InitialStatePolicy
 from mjx_study.tasks.task import Published, Recipe, Task
 
 HORIZON: Final = 400
@@ -46,8 +46,8 @@ def momentum_transfer(
     mass, _, inertia = (float(entry) for entry in scene.host.dof_M0)  # [kg], [kg], about the pivot [kg m^2]
     unit = mass * SPEED * DISTANCE  # [kg m^2/s]
 
-    def launched(start: State, decision: Float[Array, " params"]) -> State:
-        velocity = SPEED * jnp.stack([jnp.cos(decision[0]), jnp.sin(decision[0]), jnp.zeros_like(decision[0])])
+    def start_at(start: State, parameters: Float[Array, " params"]) -> State:
+        velocity = SPEED * jnp.stack([jnp.cos(parameters[0]), jnp.sin(parameters[0]), jnp.zeros_like(parameters[0])])
         return State(start.qpos, velocity, start.act, start.warmstart)
 
     elastic = MomentumTransfer(restitution=1.0, inertia_ratio=mass * DISTANCE**2 / inertia)
@@ -59,7 +59,7 @@ def momentum_transfer(
         description="hit a pivoting bar as hard as possible with a ball; one launch angle",
         scene=scene,
         horizon=horizon,
-        policy=Launch(1, horizon, scene.host.nu, launched),
+        policy=InitialStatePolicy(1, horizon, scene.host.nu, start_at),
         theta=jnp.full(1, ANGLE, dtype),
         sigma=SIGMA,
         start=initial_state(scene),

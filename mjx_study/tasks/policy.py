@@ -168,20 +168,20 @@ class LinearFeedback(Feedback):
 
 
 @dataclasses.dataclass(frozen=True)
-class Launch:
+class InitialStatePolicy:
     """Initial-state policy: theta + w determines the initial state, and no control acts.
 
     Attributes:
         num_params: length of theta.
         horizon: number of steps H.
         controls: number of controls m, all zero.
-        launched: maps (start, theta + w) to the state that the simulation starts from.
+        start_at: maps (start, theta + w) to the state that the simulation starts from.
     """
 
     num_params: int
     horizon: int
     controls: int
-    launched: Callable[[State, Float[Array, " params"]], State]
+    start_at: Callable[[State, Float[Array, " params"]], State]
     additive: bool = dataclasses.field(default=True, init=False)
     at_start: bool = dataclasses.field(default=True, init=False)
 
@@ -192,7 +192,7 @@ class Launch:
 
     def place(self, theta: Float[Array, " params"], noise: Float[Array, "steps dimensions"], start: State) -> State:
         """The state after the launch."""
-        return self.launched(start, theta + noise[0])
+        return self.start_at(start, theta + noise[0])
 
     def feedforward(
         self, theta: Float[Array, " params"], noise: Float[Array, "steps dimensions"]

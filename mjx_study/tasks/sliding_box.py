@@ -69,7 +69,7 @@ def sliding_box(*, horizon: int = HORIZON, model: str | Path = "sliding_box", **
         gamma=GAMMA,
         published=Published(GAMMA, RADIUS),
         recipe=RECIPE,
-        outcomes=lambda states: {
+        metrics=lambda states: {
             "aboard": jnp.where(jnp.abs(states.qpos[-1, BLOCK] - states.qpos[-1, BOX]) < edge, 1.0, 0.0)
         },
         reference=lambda stiffness: ReferenceObjective(
@@ -77,7 +77,7 @@ def sliding_box(*, horizon: int = HORIZON, model: str | Path = "sliding_box", **
             (0.0, 0.0, 0.0, 0.0),
             horizon,
             SIGMA,
-            outcomes=lambda states: {"aboard": SlidingBox().on_box(states[..., -1, :]) * 1.0},
+            metrics=lambda states: {"aboard": SlidingBox().on_box(states[..., -1, :]) * 1.0},
         ),
         damping=SLIP_DAMPING,
         stiffnesses=(100.0, 200.0, 500.0, 1000.0),

@@ -100,7 +100,7 @@ class Task:
         onset: treatment of the onset of contact in first-order gradients: "none" for exact derivatives of the steps, or
             "linear" to add what those miss (see `mjx_study.simulation.onset`).
         recipe: default settings of an optimisation; None if all of them must be given.
-        outcomes: metrics of a rollout by name, as a function of its states including the initial one, to report beside
+        metrics: numbers of a rollout by name, as a function of its states including the initial one, to report beside
             the cost; None for none.
     """
 
@@ -125,7 +125,7 @@ class Task:
     noise: str = "gaussian"
     onset: str = "none"
     recipe: Recipe | None = None
-    outcomes: Callable[[State], dict[str, Float[Array, ""]]] | None = None
+    metrics: Callable[[State], dict[str, Float[Array, ""]]] | None = None
 
     def __post_init__(self) -> None:
         theta = jax.numpy.asarray(self.theta)

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
-from mjx_study.reference import ReferenceObjective, Tennis, draw_start, tennis_outcomes
+from mjx_study.reference import ReferenceObjective, Tennis, draw_start, tennis_metrics
 from mjx_study.simulation.dynamics import State, initial_state
 from mjx_study.simulation.scene import load_model, put_scene, require
 from mjx_study.tasks.policy import LinearFeedback
@@ -76,14 +76,14 @@ def tennis(*, horizon: int = HORIZON, model: str | Path = "tennis", **scene_opti
         gamma=GAMMA,
         published=Published(GAMMA, RADIUS),
         recipe=RECIPE,
-        outcomes=lambda states: tennis_outcomes(states.qpos[:, :2], states.qvel[:, :2]),
+        metrics=lambda states: tennis_metrics(states.qpos[:, :2], states.qvel[:, :2]),
         reference=lambda stiffness: ReferenceObjective(
             Tennis(),
             draw_start,
             horizon,
             SIGMA,
-            decision="feedback",
-            outcomes=lambda states: tennis_outcomes(states[..., :2], states[..., 2:4]),
+            parametrises="feedback",
+            metrics=lambda states: tennis_metrics(states[..., :2], states[..., 2:4]),
         ),
         stiffnesses=(1000.0, 2000.0, 5000.0, 10000.0),
     )

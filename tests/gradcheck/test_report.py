@@ -83,7 +83,7 @@ def test_unresolved_entries_are_counted() -> None:
     [
         ("value", True, "qvel[x] = 1, mjx.step 2"),
         ("engine", True, "qvel[x] = 1, the C engine 2"),
-        ("placement", False, "qvel[x] = 1, the C engine 2"),
+        ("engine_mismatch", False, "qvel[x] = 1, the C engine 2"),
         ("wrong", True, "qvel[x] = 1, differences 2"),
     ],
 )

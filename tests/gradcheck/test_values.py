@@ -93,7 +93,7 @@ def test_mjx_differs_from_the_engine_for_no_known_reason() -> None:
 
 def test_a_documented_difference() -> None:
     found = compare(1e-3, 1e-3, SERVO)
-    assert found.verdict == "placement" and "as if no force or control were clamped" in found.cause
+    assert found.verdict == "engine_mismatch" and "as if no force or control were clamped" in found.cause
 
 
 def test_rounding_is_no_difference() -> None:
@@ -266,7 +266,7 @@ def test_frames_that_c_takes_for_the_same() -> None:
     body = '<joint axis="0 1 0"/><inertial pos="9e-7 0 0" mass="1" diaginertia=".004 .004 .004"/>'
     xml = f"<mujoco><worldbody><body>{body}</body></worldbody></mujoco>"
     found = value_check(xml, [0.0], [0.1])
-    assert found.verdict == "placement" and "C takes frames less than 1e-6 apart for the same" in found.cause
+    assert found.verdict == "engine_mismatch" and "C takes frames less than 1e-6 apart for the same" in found.cause
     more = value_check(xml, [0.0], [0.1], qfrc_passive=np.ones(1))
     assert more.verdict == "engine" and more.cause.startswith("passive forces differ")
 

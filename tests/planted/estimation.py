@@ -19,8 +19,8 @@ OBJECTIVE: Final = (
     Defect(
         "baseline-with-noise",
         "mjx_study/objective.py",
-        "np.concatenate([np.ones(samples), np.zeros(len(silent))])",
-        "np.ones(samples + len(silent))",
+        "np.concatenate([np.ones(samples), np.zeros(len(zero_noise))])",
+        "np.ones(samples + len(zero_noise))",
         "still unbiased with one sample less, and no error anywhere",
         ("tests/test_objective.py::test_baseline_is_the_cost_without_noise",),
     ),

@@ -1,4 +1,4 @@
-"""Defects of the step, its repairs, its constraints and its contact models."""
+"""Defects of the step, the patches of MJX, its constraints and its contact models."""
 
 from typing import Final
 
@@ -7,7 +7,7 @@ from tests.planted.defect import Defect
 STEP = "tests/test_dynamics.py"
 VALUES, SLOPES = "test_the_step_is_mjxs", "test_reverse_mode_is_the_central_difference"
 LAWS = "tests/test_constraint.py::test_forces_and_imbalance_are_those_of_mjx"
-IMPEDANCE = "tests/test_repairs.py::test_stiffness_damping_and_impedance_are_the_c_engines"
+IMPEDANCE = "tests/test_patches.py::test_stiffness_damping_and_impedance_are_the_c_engines"
 CONE = "tests/test_constraint.py::test_the_elliptic_law_is_the_gradient_of_a_convex_cost"
 
 DYNAMICS: Final = (
@@ -191,7 +191,7 @@ REPAIRS: Final = (
         "return rotation_between(start, end)",
         "return rotation_between(end, start)",
         "arguments in the order of MJX's own function",
-        ("tests/test_repairs.py::test_a_rotation_has_its_derivative_at_no_angle",),
+        ("tests/test_patches.py::test_a_rotation_has_its_derivative_at_no_angle",),
         "ball",
     ),
     Defect(
@@ -200,7 +200,7 @@ REPAIRS: Final = (
         "(stiffness * (shortest - data.ten_length))",
         "(stiffness * (data.ten_length - shortest))",
         "no effect on any value",
-        ("tests/test_repairs.py::test_tendon_springs_are_linear_at_rest",),
+        ("tests/test_patches.py::test_tendon_springs_are_linear_at_rest",),
         "tendon",
     ),
 )
@@ -230,7 +230,7 @@ INTEGRATION: Final = (
         "jnp.where(real < 0, -real, real), jnp.where(real < 0, -axis, axis)",
         "jnp.where(real < 0, -real, real), axis",
         "q and -q are one orientation, and both parts change sign",
-        ("tests/test_repairs.py::test_both_quaternions_of_an_orientation_are_one",),
+        ("tests/test_patches.py::test_both_quaternions_of_an_orientation_are_one",),
         "ball",
     ),
 )

@@ -115,13 +115,15 @@ def test_value_and_gradient_is_the_noise_free_rollout_from_the_key_s_start(name:
             if callable(key_start):
                 key_start = key_start(split_sample_key(keys(3)[1])[0])
         matrix = (
-            np.asarray(theta).reshape(objective.system.num_controls, -1) if objective.decision == "feedback" else None
+            np.asarray(theta).reshape(objective.system.num_controls, -1)
+            if objective.parametrises == "feedback"
+            else None
         )
         controls = np.zeros((objective.horizon, objective.system.num_controls))
-        if objective.decision == "controls":
+        if objective.parametrises == "controls":
             controls = np.asarray(theta).reshape(controls.shape)
         _, gradients = value_and_gradients(objective.system, np.asarray(key_start), controls, matrix)
-        expected = getattr(gradients, objective.decision).ravel()
+        expected = getattr(gradients, objective.parametrises).ravel()
     else:
         expected = QUADRATIC.function.gradient(np.asarray(theta))
     np.testing.assert_allclose(gradient, expected, rtol=1e-12)
@@ -193,7 +195,7 @@ def test_feedback_with_random_starts_is_unbiased(order: str):
 
 
 @pytest.mark.parametrize("order", ["zeroth", "first"])
-def test_start_as_decision_is_unbiased(order: str):
+def test_start_as_parameter_is_unbiased(order: str):
     """Without control V = x_1^T S x_1, so F = theta^T S theta + sigma^2 tr S."""
     moment = SYSTEM.final_weight
     for _ in range(HORIZON):
@@ -212,9 +214,9 @@ def test_start_as_decision_is_unbiased(order: str):
     ("changes", "match"),
     [
         ({"sigma": 0.0}, "sigma must be positive and finite"),
-        ({"decision": "everything"}, "unknown decision 'everything'; choose from controls, feedback, start"),
+        ({"parametrises": "everything"}, "parametrises is 'everything'; choose from controls, feedback, start"),
         ({"horizon": 0}, "horizon must be at least 1 step, got 0"),
-        ({"decision": "start"}, "then it must be None"),
+        ({"parametrises": "start"}, "then it must be None"),
         ({"start": None}, "give a start"),
         ({"start": (0.0, 1.0)}, "the start must have 3 entries, got 2"),
     ],
@@ -239,7 +241,7 @@ def test_function_objective_refuses_no_noise():
 
 @table
 def test_all_kinds_of_batches_agree(name: str):
-    """With every decision that theta can be; and every estimator runs on them."""
+    """With everything that theta can parametrise; and every estimator runs on them."""
     objective = OBJECTIVES[name]
     theta = point(objective)
     batches = {kind: getattr(objective, oracle.method)(theta, keys(5, seed=3)) for kind, oracle in ORACLES.items()}

@@ -100,7 +100,7 @@ def test_a_rotation_has_its_derivative_at_no_angle() -> None:
 
 def test_mjxs_own_functions_are_back_afterwards() -> None:
     before = {key: original(*key) for key in patches._REPLACED}
-    with pytest.raises(KeyError), patches.repaired(), patches.repaired():
+    with pytest.raises(KeyError), patches.patched(), patches.patched():
         assert all(original(*key) is patches._REPLACED[key] for key in before)
         raise KeyError
     assert all(original(*key) is function for key, function in before.items())
@@ -109,7 +109,7 @@ def test_mjxs_own_functions_are_back_afterwards() -> None:
 def test_another_mjx_is_an_error_and_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     own = original("constraint", "_kbi")
     monkeypatch.setattr(patches, "_REPLACED", {**patches._REPLACED, ("math", "no_such_function"): jnp.sin})
-    with pytest.raises(RuntimeError, match="no math.no_such_function"), patches.repaired():
+    with pytest.raises(RuntimeError, match="no math.no_such_function"), patches.patched():
         pytest.fail("nothing may be traced")
     assert original("constraint", "_kbi") is own
 
