@@ -147,7 +147,7 @@ def scene_of(source: str, name: str = "test", **options: Any) -> Scene:
     """A scene from an MJCF string or a shipped model's name."""
     if not source.lstrip().startswith("<"):
         return load_scene(source, tolerance=1e-30, iterations=100, ls_iterations=50, **options)
-    return put_scene(mujoco.MjModel.from_xml_string(source), name)
+    return put_scene(mujoco.MjModel.from_xml_string(source), name, **options)
 
 
 def compiled(function: Callable[..., Any], *examples: Any) -> Callable[..., Any]:

@@ -70,7 +70,7 @@ def prepare(name: str) -> Prepared:
 def jacobian(name: str) -> np.ndarray:
     """The Jacobian program's, in reverse mode."""
     case = prepare(name)
-    assert dynamics.uses_jacobian(case.scene)
+    assert case.scene.uses_jacobian
 
     def after(model, point):
         return step_flat(case.scene, model, point, jnp.asarray(case.warmstart))[0]
@@ -189,14 +189,14 @@ def test_reverse_mode_is_the_central_difference(name: str) -> None:
         for name in CASES
     ],
 )
-def test_both_programs_and_both_modes_agree(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_both_programs_and_both_modes_agree(name: str) -> None:
     """The tape, forwards and backwards, equals the Jacobian program."""
     case, expected = prepare(name), jacobian(name)
-    monkeypatch.setattr(dynamics, "JACOBIAN_COLUMNS", 0)
-    assert not dynamics.uses_jacobian(case.scene)
+    scene = dataclasses.replace(case.scene, adjoint="tape")
+    assert not scene.uses_jacobian
 
     def both(model, point):
-        after, push = jax.linearize(lambda x: step_flat(case.scene, model, x, jnp.asarray(case.warmstart))[0], point)
+        after, push = jax.linearize(lambda x: step_flat(scene, model, x, jnp.asarray(case.warmstart))[0], point)
         pull = jax.linear_transpose(push, point)
         forward = jax.vmap(push, out_axes=-1)(jnp.eye(point.shape[0]))
         return forward, jax.vmap(lambda row: pull(row)[0])(jnp.eye(after.shape[0]))
@@ -211,8 +211,8 @@ def test_both_programs_and_both_modes_agree(name: str, monkeypatch: pytest.Monke
 SPEED = np.array([0.3, 0.2, -0.1])
 
 
-def sliding(extra: str = "", options: str | None = None) -> Scene:
-    return scene_of(floor_scene(slider(3), options or option(extra=extra)))
+def sliding(extra: str = "", options: str | None = None, **scene_options: str) -> Scene:
+    return scene_of(floor_scene(slider(3), options or option(extra=extra)), **scene_options)
 
 
 def at(height: float, qvel: np.ndarray = SPEED) -> np.ndarray:
@@ -285,7 +285,7 @@ def test_activation_and_control_each_have_their_column() -> None:
         <general joint="x" dyntype="filter" dynprm="{tau}" gainprm="3"/><motor joint="x" gear="5"/>
         </actuator></mujoco>"""
     )
-    assert dynamics.uses_jacobian(scene)
+    assert scene.uses_jacobian
     point = jnp.array([0.1, 0.2, 0.3, 0.4, 0.5])
     after = compiled(jax.jacfwd(lambda x: step_flat(scene, scene.model, x, jnp.zeros(1))[0]), point)(point)
     speed = np.array([0, 1, 3 * h / mass, 0, 5 * h / mass])
@@ -350,19 +350,18 @@ def test_derivative_over_stiffness_without_damping() -> None:
 
 
 @pytest.mark.slow
-def test_a_power_that_is_no_whole_number(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_power_that_is_no_whole_number() -> None:
     """In contact and out of it, by both programs; MJX's derivative on a tape is NaN."""
     scene = sliding()
     model = apply_contact(scene.model, contact_model((-3000.0, -40.0), (0.3, 0.9, 0.001, 0.4, 1.5), scene=scene))
     points = [at(height) for height in (-0.003, -0.0007, 0.05)]
 
-    def program():
+    def program(adjoint):
+        scene = sliding(adjoint=adjoint)
         return compiled(jax.jacrev(lambda point: step_flat(scene, model, point, jnp.zeros(3))[0]), jnp.zeros(6))
 
     step = compiled(lambda point: step_flat(scene, model, point, jnp.zeros(3))[0], jnp.zeros(6))
-    by_jacobian = program()
-    monkeypatch.setattr(dynamics, "JACOBIAN_COLUMNS", 0)
-    on_the_tape = program()
+    by_jacobian, on_the_tape = program("jacobian"), program("tape")
     for point in points:
         numeric = central_jacobian(step, point, 3e-6)
         assert_close_by_rows(by_jacobian(point), numeric, 1e-6)
@@ -409,7 +408,7 @@ PENDULUM = """
 def pendulum():
     """A pendulum with an activated motor: our step and MJX's at any timestep."""
     scene = scene_of(PENDULUM)
-    assert not scene.has_constraints and not dynamics.uses_jacobian(scene)
+    assert not scene.has_constraints and not scene.uses_jacobian
 
     def with_timestep(timestep):
         return scene.model.replace(opt=scene.model.opt.replace(timestep=timestep))
@@ -463,21 +462,16 @@ def test_initial_state_defaults() -> None:
     assert state.act.shape == (2,) and not np.any(state.qvel) and not np.any(state.warmstart)
 
 
-def test_second_derivatives_see_the_acceleration(monkeypatch):
+def test_second_derivatives_see_the_acceleration() -> None:
     """The step's Jacobian depends on qacc; its own derivative must follow that, as the tape's does by itself."""
-    scene = scene_of(floor_scene(slider(), option(extra='cone="elliptic"')))
 
-    def speed(height):
+    def speed(height, adjoint):
+        scene = scene_of(floor_scene(slider(), option(extra='cone="elliptic"')), adjoint=adjoint)
         qpos = scene.template.qpos.at[2].set(height)
         state = dynamics.initial_state(scene, qpos, jnp.array([0.5, -0.2, -0.1]))
         following, _ = dynamics.step(scene, scene.model, state, jnp.zeros(0))
         return following.qvel[0]
 
-    def second():
-        return float(jax.grad(jax.grad(lambda height: speed(height)))(-5e-4))
-
-    jacobian_program = second()
-    monkeypatch.setattr(dynamics, "JACOBIAN_COLUMNS", 0)
-    tape = second()
+    jacobian_program, tape = (float(jax.grad(jax.grad(speed))(-5e-4, name)) for name in ("jacobian", "tape"))
     assert abs(tape) > 1
     assert jacobian_program == pytest.approx(tape, rel=1e-8)

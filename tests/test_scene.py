@@ -17,6 +17,7 @@ from mjx_study.cli.options import Parser, add_scene_options, scene_options
 from mjx_study.simulation.dynamics import State
 from mjx_study.simulation.limitations import FLAGS
 from mjx_study.simulation.scene import (
+    ADJOINTS,
     CONES,
     INTEGRATORS,
     SOLVERS,
@@ -96,11 +97,22 @@ def test_numeric_options_reach_mjx() -> None:
         ({"iterations": 0}, "iterations must be a positive whole number, got 0"),
         ({"iterations": 0.5}, "iterations must be a positive whole number, got 0.5"),
         ({"ls_iterations": 2.5}, "ls_iterations must be a positive whole number, got 2.5"),
+        ({"adjoint": "unrolled"}, "unknown adjoint 'unrolled'; choose from auto, jacobian, tape"),
     ],
 )
 def test_bad_options_are_refused(options: dict[str, Any], message: str) -> None:
     with pytest.raises(SceneError, match=message):
         load_scene("pusher", **options)
+
+
+def test_the_adjoint_is_chosen_by_size_or_by_name() -> None:
+    body = '<body><joint type="slide"/><geom size=".1" contype="0"/></body>'
+    hosts = [mujoco.MjModel.from_xml_string(floor_scene(joints * body)) for joints in (16, 17)]
+    chosen = [[put_scene(host, "here", adjoint=name).uses_jacobian for name in ADJOINTS] for host in hosts]
+    assert chosen == [[True, True, False], [False, True, False]]
+    assert not make_task("tennis", adjoint="tape").scene.uses_jacobian
+    with pytest.raises(SceneError, match="double_pendulum: no Jacobian is formed of RK4's steps"):
+        load_scene("double_pendulum", adjoint="jacobian")
 
 
 def test_a_missing_file_or_name_is_refused(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from mjx_study.gradcheck.coordinates import Coordinates
 from mjx_study.simulation import constraint
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.contact import ContactModel
-from mjx_study.simulation.dynamics import State, exact_step, step, uses_jacobian
+from mjx_study.simulation.dynamics import State, exact_step, step
 from mjx_study.simulation.engine import HostState
 from mjx_study.simulation.integration import difference_position
 
@@ -88,7 +88,7 @@ class Programs:
         rows = [_unit_rows(0, len(layout.inputs)), _unit_rows(0, len(layout.outputs))]
         if self._has_tape:
             self.compiler.start(self._tape, *point, *rows)
-        if uses_jacobian(layout.scene):
+        if layout.scene.uses_jacobian:
             self.compiler.start(self._jacobian, *point, _unit_rows(0, layout.num_state), rows[1])
         self.compiler.start(self._exact, *point, jnp.asarray(base.qpos), np.zeros((BATCH, len(layout.inputs))))
         self.compiler.start(self._stock_step, *point)
@@ -113,7 +113,7 @@ class Programs:
     def linear(self, setting: Setting, base: HostState) -> Linear:
         """Value and derivatives of the project's own step at a state."""
         tape = self._derivatives(self._tape, setting, base) if self._has_tape else None
-        if not uses_jacobian(self.layout.scene):
+        if not self.layout.scene.uses_jacobian:
             assert tape is not None
             return Linear(*tape, None)
         qpos, residual, forward, reverse = self._derivatives(self._jacobian, setting, base)
@@ -139,7 +139,7 @@ class Programs:
     @property
     def _has_tape(self) -> bool:
         """Whether derivatives use the tape: for large scenes, and with respect to contact parameters."""
-        return len(self.layout.scales) > 0 or not uses_jacobian(self.layout.scene)
+        return len(self.layout.scales) > 0 or not self.layout.scene.uses_jacobian
 
     def _derivatives(self, program: Any, setting: Setting, base: HostState) -> tuple[Any, float, Any, Any]:
         """Position after the step, residual, and the Jacobian in forward and in reverse mode."""

@@ -3,14 +3,14 @@ r"""One simulation step and whole rollouts, differentiable through contact.
 A step is MJX's own pipeline around the solve of `constraint`. It agrees with `mjx.step` up to the solver's convergence,
 and its derivative is that of the converged step. Two programs compute the derivative:
 
-- the *Jacobian* program, for models of few coordinates: the Jacobian of the velocity update with respect to state and
-  control by the implicit function theorem, once per step. Reverse mode stores only these nv (nq + nv + nu) numbers per
-  step and replays neither the solver nor the kinematics.
+- the *Jacobian* program, by default for models of few coordinates: the Jacobian of the velocity update with respect to
+  state and control by the implicit function theorem, once per step. Reverse mode stores only these nv (nq + nv + nu)
+  numbers per step and replays neither the solver nor the kinematics.
 - the *tape* program, for larger models and for derivatives with respect to model parameters: ordinary automatic
   differentiation around the implicit solve, each step recomputed in the backward pass (`jax.checkpoint`) with the
   solver's result saved, so that the solver is not run again.
 
-`step` chooses by the number of columns and by the inputs being differentiated; both give the same numbers.
+`step` chooses by the scene's `adjoint` and by the inputs being differentiated; both give the same numbers.
 """
 
 import dataclasses
@@ -30,9 +30,6 @@ from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.integration import integrate_position
 from mjx_study.simulation.patches import has_tendon_springs, patched, tendon_spring_gap
 from mjx_study.simulation.scene import Scene
-
-JACOBIAN_COLUMNS = 32
-"""Largest number of columns (nq + nv + na + nu) for which a step's Jacobian is formed; larger models use the tape."""
 
 
 @register_pytree
@@ -148,18 +145,11 @@ def rollout(
         following, residual = step(scene, model, state, control)
         return following, (following, control, residual)
 
-    if not uses_jacobian(scene):
+    if not scene.uses_jacobian:
         advance = jax.checkpoint(advance, policy=jax.checkpoint_policies.save_only_these_names("qacc"))
     _, (states, controls, residuals) = jax.lax.scan(advance, start, jnp.arange(horizon))
     trajectory = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), start, states)
     return trajectory, controls, residuals
-
-
-def uses_jacobian(scene: Scene) -> bool:
-    """Whether steps of this scene form their Jacobian (few coordinates) or use the tape."""
-    host = scene.host
-    explicit = host.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
-    return not explicit and host.nq + host.nv + host.na + host.nu <= JACOBIAN_COLUMNS
 
 
 # The stages of a step. A Jacobian over qvel, act or ctrl starts after the position stage, so it is cheap. Each stage is
@@ -215,14 +205,14 @@ def _constrained_update(model: mjx.Model, data: mjx.Data, qvel: Array, act: Arra
 def _update(scene: Scene):
     """The velocity update (model, qpos, qvel, act, control, warmstart) -> (qvel, act, qacc, residual).
 
-    Derivatives with respect to state and control use the Jacobian program where the scene is small enough; any
-    derivative with respect to the model uses the tape.
+    Derivatives with respect to state and control use the scene's program; any derivative with respect to the model uses
+    the tape.
     """
 
     def tape(model, qpos, qvel, act, control, warmstart):
         return _constrained_update(model, scene.template.replace(qpos=qpos), qvel, act, control, warmstart)
 
-    if not uses_jacobian(scene):
+    if not scene.uses_jacobian:
         return tape
 
     update = jax.custom_jvp(tape)

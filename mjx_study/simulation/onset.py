@@ -48,7 +48,6 @@ from mjx_study.simulation.dynamics import (
     solved_step,
     step,
     step_jacobian,
-    uses_jacobian,
 )
 from mjx_study.simulation.integration import difference_position, integrate_position
 from mjx_study.simulation.scene import Scene
@@ -113,7 +112,7 @@ def corrected_rollout(
         none = jnp.zeros((), int)
         return *rollout(scene, model, start, control_law, horizon), OnsetCounts(none, none, none)
     model = _without_derivative(model)
-    jacobian = uses_jacobian(scene)
+    jacobian = scene.uses_jacobian
 
     def observe(state: State, index: Int[Array, ""]):
         control = jax.lax.stop_gradient(control_law(index, state))

@@ -25,6 +25,10 @@ INTEGRATORS: Final = {
 }
 _ENUMERATED: Final = {"cone": CONES, "solver": SOLVERS, "integrator": INTEGRATORS}
 SceneOption = str | float | int | Sequence[str]
+ADJOINTS: Final = ("auto", "jacobian", "tape")
+"""Ways to differentiate steps (see `Scene.adjoint`)."""
+JACOBIAN_COLUMNS: Final = 32
+"""Largest number of columns (nq + nv + na + nu) for which "auto" forms a step's Jacobian."""
 _POSITIVE: Final = ("timestep", "iterations", "ls_iterations", "tolerance")
 
 
@@ -38,12 +42,50 @@ class Scene:
 
     Options that are static in MJX (cone, solver, integrator, iteration budgets) are fixed here; contact parameters are
     array leaves of `model` and are swept without recompiling (see `mjx_study.simulation.contact`).
+
+    Attributes:
+        name: its name in messages.
+        host: the compiled model on the host.
+        model: the same for MJX.
+        template: an empty state.
+        adjoint: how its steps are differentiated; the derivatives are equal to rounding.
+
+            - "jacobian": each step forms its Jacobian, in forward mode, column by column. Reverse mode stores
+              nv (nq + nv + na + nu) numbers per step and replays nothing; the work grows with the number of columns.
+              Not for RK4.
+            - "tape": automatic differentiation around the implicit solve. The work hardly depends on the number of
+              columns; reverse mode runs each step again and, within it, is at the mercy of MJX's own operations
+              (fault 13 in `docs/gradient-faults.md`).
+            - "auto": the Jacobian up to `JACOBIAN_COLUMNS` columns, else the tape.
+
+            Derivatives with respect to the model always take the tape.
+
+    Raises:
+        SceneError: an unknown adjoint, or the Jacobian of RK4.
     """
 
     name: str
     host: mujoco.MjModel
     model: mjx.Model
     template: mjx.Data
+    adjoint: str = "auto"
+
+    def __post_init__(self) -> None:
+        if self.adjoint not in ADJOINTS:
+            raise SceneError(f"unknown adjoint {self.adjoint!r}; choose from {', '.join(ADJOINTS)}")
+        if self.adjoint == "jacobian" and self._explicit:
+            raise SceneError(f"{self.name}: no Jacobian is formed of RK4's steps; choose the adjoint auto or tape")
+
+    @property
+    def uses_jacobian(self) -> bool:
+        """Whether steps form their Jacobian; else they use the tape."""
+        host = self.host
+        small = host.nq + host.nv + host.na + host.nu <= JACOBIAN_COLUMNS
+        return self.adjoint == "jacobian" or (self.adjoint == "auto" and small and not self._explicit)
+
+    @property
+    def _explicit(self) -> bool:
+        return self.host.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
 
     @property
     def timestep(self) -> float:
@@ -89,13 +131,13 @@ def model_names() -> list[str]:
     return sorted(path.stem for path in models_folder().glob("*.xml"))
 
 
-def load_scene(source: str | Path, **options: SceneOption) -> Scene:
-    """Compile an MJCF and put it on the device; see `load_model` for the arguments.
+def load_scene(source: str | Path, *, adjoint: SceneOption = "auto", **options: SceneOption) -> Scene:
+    """Compile an MJCF and put it on the device; see `load_model` for the arguments, and `Scene` for `adjoint`.
 
     Raises:
-        SceneError: as `load_model`, or MJX cannot run the model; the message says why.
+        SceneError: as `load_model` and `Scene`, or MJX cannot run the model; the message says why.
     """
-    return put_scene(load_model(source, **options), Path(source).stem)
+    return put_scene(load_model(source, **options), Path(source).stem, adjoint=adjoint)
 
 
 def load_model(source: str | Path, **options: SceneOption) -> mujoco.MjModel:
@@ -123,8 +165,8 @@ def load_model(source: str | Path, **options: SceneOption) -> mujoco.MjModel:
     return host
 
 
-def put_scene(host: mujoco.MjModel, name: str, **options: SceneOption) -> Scene:
-    """Put a compiled model on the device; with `options` (see `load_model`), a copy of it.
+def put_scene(host: mujoco.MjModel, name: str, *, adjoint: SceneOption = "auto", **options: SceneOption) -> Scene:
+    """Put a compiled model on the device; with `options` (see `load_model`), a copy of it. `adjoint`: see `Scene`.
 
     Raises:
         SceneError: MJX cannot run the model or would ignore part of it, or an option is unknown or out of range.
@@ -141,7 +183,7 @@ def put_scene(host: mujoco.MjModel, name: str, **options: SceneOption) -> Scene:
         raise SceneError(f"MJX cannot run {name}: {reason}") from error
     # `make_data` on a shared host leaves weakly typed leaves; fix their types once so that loops carry them.
     template = jax.tree.map(lambda leaf: leaf if isinstance(leaf, np.ndarray) else jax.numpy.asarray(leaf), template)
-    scene = Scene(name, host, model, template)
+    scene = Scene(name, host, model, template, str(adjoint))
     if host.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4 and scene.has_constraints:
         raise SceneError(
             f"{name} combines RK4 with contacts, limits, equalities or friction loss: RK4's stages would solve the "

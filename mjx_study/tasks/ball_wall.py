@@ -33,7 +33,12 @@ VARIANTS: Final = ("box", "dome")
 
 
 def ball_wall(
-    variant: str = "box", *, horizon: int = HORIZON, model: str | Path = "ball_wall", **scene_options: str | float
+    variant: str = "box",
+    *,
+    horizon: int = HORIZON,
+    model: str | Path = "ball_wall",
+    adjoint: str = "auto",
+    **scene_options: str | float,
 ) -> Task:
     """Cost -(x / 10)^2, with x [m] the ball's final position.
 
@@ -42,7 +47,7 @@ def ball_wall(
         horizon: number of 2 ms steps; the highest flight takes 330.
         model: name or path of a replacement MJCF, with the slide joints `x`, `z` in this order and the geoms `ball`,
             `wall`, `dome`.
-        **scene_options: see `load_scene`.
+        adjoint, **scene_options: see `load_scene`.
 
     Raises:
         ValueError: unknown variant.
@@ -52,7 +57,7 @@ def ball_wall(
     host = load_model(model, **scene_options)
     if variant == "dome":
         _raise_dome(host)
-    scene = put_scene(host, "ball_wall")
+    scene = put_scene(host, "ball_wall", adjoint=adjoint)
     require(scene, joints=("x", "z"), geoms=("ball", "wall", "dome"))
     dtype = scene.template.qpos.dtype
     speed = SPEED * LENGTH_SCALE**0.5

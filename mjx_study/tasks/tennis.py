@@ -30,14 +30,16 @@ RECIPE: Final = Recipe(1e-6, 200, 1000, decay=0.1)
 FEATURES: Final = 7
 
 
-def tennis(*, horizon: int = HORIZON, model: str | Path = "tennis", **scene_options: str | float) -> Task:
+def tennis(
+    *, horizon: int = HORIZON, model: str | Path = "tennis", adjoint: str = "auto", **scene_options: str | float
+) -> Task:
     """Cost 0.001 sum_h |u_h|^2 + 100 (|position - target|^2 + |velocity|^2 / 10), the latter of the ball at the end.
 
     Args:
         horizon: number of 5 ms steps.
         model: name or path of a replacement MJCF, with the joints `ball_x`, `ball_y`, `paddle_x`, `paddle_y`,
             `paddle_angle` in this order and a motor for each of the paddle's, in the same order.
-        **scene_options: see `load_scene`.
+        adjoint, **scene_options: see `load_scene`.
     """
     host = load_model(model, **scene_options)
     for actuator, joint in enumerate(host.actuator_trnid[:, 0]):
@@ -45,7 +47,7 @@ def tennis(*, horizon: int = HORIZON, model: str | Path = "tennis", **scene_opti
         gain = host.dof_M0[host.jnt_dofadr[joint]] / host.opt.timestep
         host.actuator_gainprm[actuator, 0] = TIME_SCALE * gain
         host.actuator_biasprm[actuator, 2] = -gain
-    scene = put_scene(host, "tennis")
+    scene = put_scene(host, "tennis", adjoint=adjoint)
     joints = ("ball_x", "ball_y", "paddle_x", "paddle_y", "paddle_angle")
     require(scene, joints=joints, geoms=("ball", "paddle"), driven=joints[2:])
     dtype = scene.template.qpos.dtype
