@@ -27,7 +27,7 @@ from mjx_study.study.plan import estimators_of, plan_study
 from mjx_study.study.run import load_study, run_study
 from mjx_study.tasks import TASKS, make_task
 from mjx_study.tasks.policy import InitialStatePolicy, LinearFeedback, OpenLoop, Policy
-from mjx_study.tasks.task import Recipe, Task
+from mjx_study.tasks.task import Recipe, StudyDefaults, Task
 
 __all__ = [
     "_matplotlib",
@@ -46,6 +46,7 @@ __all__ = [
     "State",
     "StudyAccessor",
     "StudyConfig",
+    "StudyDefaults",
     "TASKS",
     "Task",
     "apply_contact",

@@ -133,7 +133,7 @@ def plan_bench(task: Task, samples: int) -> BenchPlan:
     if samples < 1:
         raise ValueError(f"samples must be at least 1, got {samples}")
     check_memory(task, (ZerothOrder(), FirstOrder()), samples)
-    (cell,), _ = contact_grid(task, [task.main_family], [task.middle_stiffness])
+    (cell,), _ = contact_grid(task, [task.defaults.main_family], [task.defaults.middle_stiffness])
     return BenchPlan(task, samples, cell)
 
 

@@ -53,7 +53,7 @@ COLUMNS: Final = {
     "squared_bias": "squared bias",
     "squared_bias_se": "± (standard error)",
     "alpha": "alpha",
-    "nonfinite": "nonfinite",
+    "nonfinite": "nan",
     "least_cost": "least mean cost",
     "least_at": "at t",
     "steepest": "steepest slope",

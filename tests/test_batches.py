@@ -28,7 +28,7 @@ def drawn(request: pytest.FixtureRequest) -> tuple[Task, Any, dict[str, Any]]:
     theta = task.theta + 0.05 * jax.random.normal(jax.random.key(1), task.theta.shape)
     task = task.replace(theta=theta)
     family = "penalty" if task.contact_pair else "mjcf"
-    (cell,), _ = contact_grid(task, [family], [task.stiffnesses[0]] if task.contact_pair else None)
+    (cell,), _ = contact_grid(task, [family], [task.defaults.stiffnesses[0]] if task.contact_pair else None)
     objective = Simulator(task, chunk_size=2).objective(cell.contact)
     keys = jax.random.split(jax.random.key(0), SAMPLES)
     batches = {
@@ -84,7 +84,7 @@ def test_costs_to_go_are_sums_of_what_is_left(drawn) -> None:
 @pytest.mark.parametrize("name", ESTIMATORS)
 def test_every_estimator_runs_on_every_kind_of_task(drawn, name: str) -> None:
     task, _, batches = drawn
-    estimator = make_estimator(name, gamma=task.gamma, sigma=task.sigma, max_norm=1e9, window=task.horizon)
+    estimator = make_estimator(name, gamma=task.defaults.gamma, sigma=task.sigma, max_norm=1e9, window=task.horizon)
     if name == "delta" and not task.policy.additive:
         with pytest.raises(
             ValueError, match="'delta' needs noise that is added to theta itself; tennis has a feedback"

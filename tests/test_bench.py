@@ -14,6 +14,7 @@ from mjx_study.objective import Simulator
 from mjx_study.simulation.engine import engine_model
 from mjx_study.tasks import make_task
 from mjx_study.tasks.contact_grid import contact_grid
+from mjx_study.tasks.task import StudyDefaults
 
 
 @pytest.fixture(autouse=True)
@@ -88,10 +89,10 @@ def test_plans_take_the_task_s_own_contact() -> None:
         ({"stiffnesses": (10.0, 20.0, 30.0), "families": ("penalty",)}, "penalty", 20.0),
     )
     for changes, family, stiffness in cases:
-        cell = bench.plan_bench(task.replace(**changes), 1).cell
+        cell = bench.plan_bench(task.replace(defaults=StudyDefaults(**changes)), 1).cell
         assert (cell.family, cell.stiffness) == (family, stiffness)
-    with pytest.raises(ValueError, match="pusher needs at least one stiffness"):
-        task.replace(stiffnesses=())
+    with pytest.raises(ValueError, match="give at least one stiffness"):
+        StudyDefaults(stiffnesses=())
 
 
 @pytest.mark.slow

@@ -19,7 +19,7 @@ from mjx_study.simulation.dynamics import State, initial_state
 from mjx_study.simulation.scene import put_scene
 from mjx_study.tasks import make_task
 from mjx_study.tasks.policy import InitialStatePolicy, LinearFeedback, OpenLoop, Policy
-from mjx_study.tasks.task import Task
+from mjx_study.tasks.task import StudyDefaults, Task
 from tests.estimators.statistics_helpers import assert_mean_is
 from tests.pusher_fixtures import (
     HORIZON,
@@ -57,7 +57,7 @@ def cart(running_cost=lambda state, control: jnp.sum(state.qpos**2) + jnp.sum(co
         running_cost=running_cost,
         final_cost=lambda state: jnp.sum(state.qvel**2),
         contact_pair=("cart", "cart"),
-        gamma=1.0,
+        defaults=StudyDefaults(gamma=1.0),
     )
 
 
@@ -199,7 +199,7 @@ class Recorded:
 def test_batches_of_an_interpolated_estimate_are_independent(simulator):
     """Noise of the zeroth-order batch against that of the first-order batch: 50 x 200 pairs, correlation 0 +- 1e-2."""
     task, recorded = pusher_task(), Recorded(simulator.objective(penalty(10.0)))
-    estimate(AlphaOrder(gamma=task.gamma), recorded, task.theta, jax.random.key(0), 50)
+    estimate(AlphaOrder(gamma=task.defaults.gamma), recorded, task.theta, jax.random.key(0), 50)
     ((zeroth_keys, zeroth),), ((first_keys, first),) = recorded.evaluated, recorded.differentiated
     assert not {tuple(key) for key in zeroth_keys} & {tuple(key) for key in first_keys}
     replayed = recorded.inner.evaluate(task.theta, jax.random.wrap_key_data(jnp.asarray(first_keys)))

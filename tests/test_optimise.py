@@ -29,6 +29,7 @@ from mjx_study.study.run import load_study, run_study
 from mjx_study.study.store import StudyError
 from mjx_study.study.variables import HISTORY, METRIC
 from mjx_study.tasks import TASKS, make_task
+from mjx_study.tasks.task import StudyDefaults
 
 SHORT: dict[str, Any] = {
     "horizon": 60,
@@ -47,7 +48,7 @@ def config(task: str = "pusher", **changes: Any) -> StudyConfig:
 
 
 def on_reference(task: str, **changes: Any) -> StudyConfig:
-    chosen: dict[str, Any] = {"stiffness": (make_task(task).middle_stiffness,), "seeds": 3} | changes
+    chosen: dict[str, Any] = {"stiffness": (make_task(task).defaults.middle_stiffness,), "seeds": 3} | changes
     return StudyConfig(tasks=(task,), kind="descents", contact=("reference",), **chosen)
 
 
@@ -207,7 +208,7 @@ def test_every_estimator_optimises(name: str) -> None:
 def test_every_task_has_a_recipe_that_plans(task: str) -> None:
     planned = plan_study(StudyConfig(tasks=(task,), kind="descents"))
     (group,) = planned.groups
-    assert group.recipe == group.task.recipe and planned.cells[0].samples == group.task.recipe.samples  # type: ignore[union-attr]
+    assert group.recipe == group.task.defaults.recipe and planned.cells[0].samples == group.task.defaults.recipe.samples  # type: ignore[union-attr]
 
 
 @pytest.mark.parametrize("name", ["sgd", "adam", "rmsprop", "adamw"])
@@ -241,7 +242,7 @@ def test_what_cannot_be_run_is_refused(changes: dict[str, Any], message: str) ->
 
 
 def test_a_task_without_recipe_or_reference_says_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
-    bare = make_task("pusher", horizon=3).replace(recipe=None, reference=None)
+    bare = make_task("pusher", horizon=3).replace(defaults=StudyDefaults(), reference=None)
     monkeypatch.setattr(plan, "make_task", lambda *_, **__: bare)
     with pytest.raises(ValueError, match="pusher has no recipe: give learning rate, samples$"):
         plan_study(config(horizon=3, samples=None, learning_rate=None))
@@ -332,7 +333,7 @@ def test_outcomes_of_tennis_are_what_happened() -> None:
     assert 0.5 < np.mean(found["hit"]) < 1
     away = np.linalg.norm(rollout.states[:, -1, :2] - [0.0, 2.5], axis=1)
     np.testing.assert_allclose(found["distance [m]"], away, rtol=1e-12)
-    chosen: dict[str, Any] = {"contact": ("penalty",), "stiffness": (task.middle_stiffness,)}
+    chosen: dict[str, Any] = {"contact": ("penalty",), "stiffness": (task.defaults.middle_stiffness,)}
     planned = plan_study(StudyConfig(tasks=("tennis",), kind="descents", **chosen))
     backend, (cell,) = Backend(planned, planned.cells[0]), planned.cells
     hit = np.asarray(backend._observe(task.theta, cell.model.contact, jax.random.clone(keys))["hit"])

@@ -158,7 +158,7 @@ def test_every_command_plans_with_it(name: str, write, tmp_path: Path) -> None:
     built = make_task(task, horizon=5, cone="pyramidal")
     assert built.horizon == 5 and built.name == "hopper" and built.scene.host.opt.cone == 0
     assert len(plan_study(StudyConfig(tasks=(task,))).cells) == 12
-    assert plan_study(StudyConfig(tasks=(task,), kind="descents")).groups[0].recipe == built.recipe
+    assert plan_study(StudyConfig(tasks=(task,), kind="descents")).groups[0].recipe == built.defaults.recipe
     line: dict[str, Any] = {"points": 3, "direction": "0", "span": (-1.0, 1.0)}
     assert len(plan_study(StudyConfig(tasks=(task,), **line)).cells) == 12
     assert plan_gradcheck(built, None, None, seed=0, states=1).is_task
@@ -297,7 +297,7 @@ def test_parts_that_do_not_fit(change: str, says: str, write) -> None:
 def test_defaults(write) -> None:
     write(TINY)
     task = make_task("mine:hop")
-    assert task.gamma == float("inf") and task.description == "" and task.recipe is None
+    assert task.defaults.gamma == float("inf") and task.description == "" and task.defaults.recipe is None
     cost = task.running_cost(task.draw_start(jax.random.key(0)), jnp.zeros(1))
     assert cost == 0 and cost.dtype == jnp.float64
     with pytest.raises(ValueError, match="a task needs a running_cost, a final_cost, or both"):

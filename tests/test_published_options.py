@@ -89,7 +89,7 @@ def test_what_they_do_to_the_weight_of_first_order_gradients() -> None:
     alphas = {}
     for name in ("momentum_transfer", "ball_wall"):
         task = make_task(name)
-        objective = task.analytic(task.middle_stiffness)
+        objective = task.analytic(task.defaults.middle_stiffness)
         for published in (False, True):
             config = StudyConfig(tasks=(name,), estimators=("aobg",), published=published)
             (estimator,) = configured_estimators(config, task)

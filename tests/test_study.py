@@ -23,7 +23,7 @@ from mjx_study.study.plan import estimators_of, plan_study
 from mjx_study.study.run import run_study
 from mjx_study.study.variables import GRADIENTS
 from mjx_study.tasks import make_task
-from mjx_study.tasks.task import Task
+from mjx_study.tasks.task import StudyDefaults, Task
 
 SMALL: dict[str, Any] = {"horizon": 4, "samples": (8,), "reference_samples": 8, "seeds": 1}
 
@@ -368,7 +368,7 @@ def test_gradients_are_taken_where_theta_says() -> None:
 
 def test_a_task_in_place_of_a_name() -> None:
     """What a notebook builds runs as it is, with the configuration's noise; what does not fit is refused."""
-    task = make_task("pusher", horizon=7).replace(name="mine", gamma=3.0)
+    task = make_task("pusher", horizon=7).replace(name="mine", defaults=StudyDefaults(gamma=3.0))
     plan = plan_study(StudyConfig(tasks=(task,), sigma=(0.3,), stiffness=(10.0,)))
     assert plan.groups[0].task.scene is task.scene and plan.groups[0].task.horizon == 7
     assert {cell.sigma for cell in plan.cells} == {0.3}

@@ -28,7 +28,7 @@ def stubbed(monkeypatch: pytest.MonkeyPatch) -> None:
                 "residual": np.full(seeds[1], cell.model.stiffness),
                 "unconverged": np.full(seeds[1], cell.sigma),
                 "reference_norm": np.asarray(plan.groups[cell.group].timestep),
-                "reference_uncertainty": np.asarray(float(plan.groups[cell.group].task.gamma)),
+                "reference_uncertainty": np.asarray(float(plan.groups[cell.group].task.defaults.gamma)),
                 "variance": np.full(seeds, float(cell.samples)),
                 "alpha": np.full(seeds, 0.5),
                 "squared_bias": np.full(seeds[1], np.nan),
@@ -84,12 +84,13 @@ def test_noises_and_timesteps_that_six_digits_do_not_tell_apart(tmp_path: Path) 
 
 MODULE = """
 from mjx_study.tasks import pusher
+from mjx_study.tasks.task import StudyDefaults
 
 def stern(horizon=2, **options):
-    return pusher(horizon=horizon, **options).replace(gamma=1.0)
+    return pusher(horizon=horizon, **options).replace(defaults=StudyDefaults(gamma=1.0))
 
 def mild(horizon=2, **options):
-    return pusher(horizon=horizon, **options).replace(gamma=2.0)
+    return pusher(horizon=horizon, **options).replace(defaults=StudyDefaults(gamma=2.0))
 """
 
 

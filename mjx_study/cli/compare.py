@@ -51,7 +51,7 @@ columns of the table:
   residual        largest relative imbalance left by MuJoCo's constraint solver
   ms              computing time of one sample in milliseconds, compilation excluded
   variance x s    variance times that time: the variance that a second of computing leaves
-  nonfinite       samples that overflowed or became NaN; they are left out, and a warning says so
+  nan             samples that overflowed or became NaN; they are left out, and a warning says so
 """
 
 

@@ -91,7 +91,7 @@ def columns(confidence: float) -> list[list[Column]]:
             ("ms", lambda row: f"{1e3 * row.seconds_per_sample:.2f}"),
             ("variance x s", lambda row: number(row.variance_seconds)),
             ("residual", lambda row: number(row.residual, 2)),
-            ("nonfinite", lambda row: str(row.nonfinite)),
+            ("nan", lambda row: str(row.nonfinite)),
         ],
     ]
 

@@ -88,11 +88,11 @@ def _configuration(options: argparse.Namespace) -> StudyConfig:
     """The task's contact models at the middle stiffness of its sweep, and its analytic reference beside them."""
     fields = study_fields(options)
     task = make_task(options.task)
-    fields.setdefault("contact", task.families)
+    fields.setdefault("contact", task.defaults.families)
     if not options.no_reference and task.reference is not None and fields.get("onset", "none") == "none":
         fields["contact"] = tuple(dict.fromkeys((REFERENCE, *fields["contact"]))) if fields["contact"] else ()
     if takes_stiffness(fields["contact"]):
-        fields.setdefault("stiffness", (task.middle_stiffness,))
+        fields.setdefault("stiffness", (task.defaults.middle_stiffness,))
     return StudyConfig(**fields, tasks=(options.task,), kind="landscapes", theta=theta_of(options), seeds=1)
 
 

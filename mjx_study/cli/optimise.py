@@ -110,9 +110,9 @@ def _configuration(options: argparse.Namespace) -> StudyConfig:
             raise ValueError(f"--reference is in the place of --contact {options.contact}; leave one of them out")
         fields["contact"] = REFERENCE
     task = task_of(options)
-    fields.setdefault("contact", task.main_family)
+    fields.setdefault("contact", task.defaults.main_family)
     if takes_stiffness((fields["contact"],)):
-        fields.setdefault("stiffness", task.middle_stiffness)
+        fields.setdefault("stiffness", task.defaults.middle_stiffness)
     fields |= {name: (fields[name],) for name in WRAPPED if name in fields}
     return StudyConfig(**fields, tasks=(options.task,), kind="descents", theta=theta_of(options))
 

@@ -169,8 +169,8 @@ def _plan_task(options: argparse.Namespace):
     task = task_of(options)
     if policy is not None and policy.network is not None:
         task = with_network(task, tuple(policy.network), jax.random.key(0))  # whose weights theta replaces
-    stiffness = task.middle_stiffness if options.stiffness is None else options.stiffness
-    cells, messages = contact_grid(task, (options.contact or task.main_family,), (stiffness,), options.damping)
+    stiffness = task.defaults.middle_stiffness if options.stiffness is None else options.stiffness
+    cells, messages = contact_grid(task, (options.contact or task.defaults.main_family,), (stiffness,), options.damping)
     task = at_theta(task, theta_of(options) if policy is None else policy.theta)
     return partial(_simulate_task, task, cells[0], options.seed, options.noise), messages
 

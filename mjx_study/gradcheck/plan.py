@@ -73,7 +73,8 @@ def plan_gradcheck(
     if families is None:
         families = ("mjcf",) if task.contact_pair is None else CONTACT
     if stiffnesses is None:
-        stiffnesses = STIFFNESS if min(STIFFNESS) <= max(task.stiffnesses, default=0.0) else task.stiffnesses
+        own = task.defaults.stiffnesses
+        stiffnesses = STIFFNESS if min(STIFFNESS) <= max(own) else own
     cells, messages = contact_grid(task, families, stiffnesses, damping)
     if not cells:
         raise ValueError("no contact model to check: give at least one stiffness and one contact family")
@@ -143,7 +144,6 @@ def _bare_task(scene: Scene, pair: tuple[str, str] | None, horizon: int) -> Task
         running_cost=lambda state, control: zero,
         final_cost=lambda state: zero,
         contact_pair=pair,
-        gamma=float("inf"),
     )
 
 

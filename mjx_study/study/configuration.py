@@ -218,8 +218,8 @@ def recipe_of(config: StudyConfig, task: Task) -> Recipe:
     """
     given = {name: getattr(config, name) for name in ("iterations", "learning_rate", "decay")}
     given |= {"samples": None if config.samples is None else max(config.samples)}
-    if task.recipe is not None:
-        return dataclasses.replace(task.recipe, **{name: value for name, value in given.items() if value is not None})
+    if (recipe := task.defaults.recipe) is not None:
+        return dataclasses.replace(recipe, **{name: value for name, value in given.items() if value is not None})
     given["decay"] = given["decay"] or 0.0
     if missing := [name.replace("_", " ") for name, value in given.items() if value is None]:
         raise ValueError(f"{task.name} has no recipe: give {', '.join(missing)}")
@@ -265,13 +265,13 @@ def bound_constants(config: StudyConfig, task: Task) -> dict[str, Any]:
     names = ("gamma", "failure_probability", "variance_proxy", "radius")
     given = {name: getattr(config, name) for name in names}
     if not config.published:
-        return given | {"gamma": task.gamma if config.gamma is None else config.gamma}
-    if task.published is None:
+        return given | {"gamma": task.defaults.gamma if config.gamma is None else config.gamma}
+    if task.defaults.published is None:
         raise ValueError(f"{task.name} has no published constants of the bound; leave published out")
     defaults = {field.name: field.default for field in dataclasses.fields(StudyConfig)}
     if others := [name for name in names if given[name] != defaults[name]]:
         raise ValueError(f"published sets {', '.join(names)}: leave {', '.join(others)} out")
-    return dataclasses.asdict(task.published)
+    return dataclasses.asdict(task.defaults.published)
 
 
 def check_estimators(estimators: Iterable[Estimator], task: Task) -> None:

@@ -147,7 +147,7 @@ def soft_gradient(simulator: Simulator, sigma: float, keys: Key[Array, " samples
     task = simulator.task
     if task.contact_pair is None or not _takes_candidates(task):
         return None
-    (cell,), _ = contact_grid(task, ("penalty",), (min(task.stiffnesses),))
+    (cell,), _ = contact_grid(task, ("penalty",), (min(task.defaults.stiffnesses),))
     objective = simulator.objective(cell.contact, sigma)
     return jnp.median(objective.differentiate(task.theta, jax.random.clone(keys)).gradient, axis=0)
 

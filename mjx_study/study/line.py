@@ -45,7 +45,7 @@ def line_of(task: Task, points: int, span: Sequence[float] | None, direction: st
     """
     theta = np.asarray(task.theta, float)
     along = _direction(direction or "random", len(theta), seed)
-    low, high = span or task.span or (-SPAN_SIGMAS * task.sigma, SPAN_SIGMAS * task.sigma)
+    low, high = span or task.defaults.span or (-SPAN_SIGMAS * task.sigma, SPAN_SIGMAS * task.sigma)
     check_span((low, high))
     position = np.linspace(low, high, points)
     origin = np.zeros(1) if len(theta) == 1 else theta

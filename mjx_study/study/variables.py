@@ -50,7 +50,7 @@ GRADIENTS: Final = {
     "epsilon": Variable(BATCH, "gradient", "confidence radius of the zeroth-order mean", "epsilon"),
     "discrepancy": Variable(BATCH, "gradient", "distance between the two means", "B"),
     "bias_p_value": Variable(BATCH, "1", "p-value of no bias against the reference"),
-    "nonfinite": Variable(BATCH, "1", "samples that are not finite and were left out", "nonfinite"),
+    "nonfinite": Variable(BATCH, "1", "samples that are not finite and were left out", "nan"),
     "pooled_error": Variable(
         ("estimator",), "1", "distance of the mean over all seeds to the reference, over the norm of the reference"
     ),
@@ -91,7 +91,7 @@ DESCENTS: Final = {
     "gradient_norm": Variable(STEP, "gradient", "norm of the estimate"),
     "variance": Variable(STEP, "gradient^2", "variance of one sample, the trace of the covariance"),
     "alpha": Variable(STEP, "1", "weight of the first-order batch", "alpha"),
-    "nonfinite": Variable(STEP, "1", "samples that are not finite and were left out", "nonfinite"),
+    "nonfinite": Variable(STEP, "1", "samples that are not finite and were left out", "nan"),
     "residual": Variable(STEP, "1", "largest relative residual of the constraint solver"),
     "rollouts": Variable(("estimator",), "1", "rollouts simulated in one iteration of one seed", "rollouts"),
     "seconds": Variable(("iteration", "estimator"), "s", "time since the start, measured; compilation excluded"),
@@ -104,7 +104,7 @@ LANDSCAPES: Final = {
     "smoothed_se": Variable(("point",), "cost", "standard error of smoothed"),
     "slope": Variable(("estimator", "point"), "gradient", "mean of the estimator along the line"),
     "slope_se": Variable(("estimator", "point"), "gradient", "standard error of slope"),
-    "nonfinite": Variable(("estimator", "point"), "1", "samples that are not finite and were left out", "nonfinite"),
+    "nonfinite": Variable(("estimator", "point"), "1", "samples that are not finite and were left out", "nan"),
     "exact_smoothed": Variable(("point",), "cost", "smoothed without sampling error, where there is a quadrature"),
     "exact_slope": Variable(("point",), "gradient", "slope of exact_smoothed, the mean of an unbiased estimator"),
     "exact_first": Variable(("point",), "gradient", "mean of first-order gradients, without sampling error"),

@@ -18,7 +18,7 @@ from mjx_study.reference import BallWall, FunctionObjective
 from mjx_study.simulation.dynamics import State, initial_state
 from mjx_study.simulation.scene import SceneError, load_model, put_scene, require
 from mjx_study.tasks.policy import InitialStatePolicy
-from mjx_study.tasks.task import Published, Recipe, Task
+from mjx_study.tasks.task import Published, Recipe, StudyDefaults, Task
 
 HORIZON: Final = 400
 LENGTH_SCALE: Final = 10.0
@@ -78,13 +78,15 @@ def ball_wall(
         running_cost=lambda state, control: jnp.zeros((), dtype),
         final_cost=lambda state: -((state.qpos[0] / LENGTH_SCALE) ** 2),
         contact_pair=("ball", "wall"),
-        gamma=GAMMA,
-        published=Published(GAMMA, RADIUS),
-        recipe=RECIPE,
         reference=lambda stiffness: FunctionObjective(BallWall(), SIGMA),
-        damping=DAMPING,
-        span=(0.0, 1.5),
-        stiffnesses=(1000.0, 3000.0, 10000.0),
+        defaults=StudyDefaults(
+            gamma=GAMMA,
+            published=Published(GAMMA, RADIUS),
+            recipe=RECIPE,
+            damping=DAMPING,
+            span=(0.0, 1.5),
+            stiffnesses=(1000.0, 3000.0, 10000.0),
+        ),
     )
 
 

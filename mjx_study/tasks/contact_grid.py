@@ -72,8 +72,8 @@ def contact_grid(
         ValueError: a family is unknown, or a stiffness or damping is out of range.
     """
     cells, messages = [], []
-    stiffnesses = task.stiffnesses if stiffnesses is None else stiffnesses
-    families = task.families if families is None else families
+    stiffnesses = task.defaults.stiffnesses if stiffnesses is None else stiffnesses
+    families = task.defaults.families if families is None else families
     check_count(len(families) * len(stiffnesses), "contact models", MOST_MODELS, "give fewer stiffnesses or families")
     digits = digits_to_tell_apart(stiffnesses)
     for family in families:
@@ -84,7 +84,7 @@ def contact_grid(
             continue
         swept = family not in FAMILIES or FAMILIES[family].swept
         undamped = swept and family in FAMILIES and FAMILIES[family].dampratio == 0
-        own = damping if damping is not None else task.damping if undamped else None
+        own = damping if damping is not None else task.defaults.damping if undamped else None
         for stiffness in stiffnesses if swept else (None,):
             with _warnings_of_contact() as caught:
                 contact = None if family == "mjcf" else _contact(task, family, stiffness, own if swept else None)

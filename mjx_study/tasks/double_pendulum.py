@@ -19,7 +19,7 @@ from mjx_study.reference import DoublePendulum, ReferenceObjective
 from mjx_study.simulation.dynamics import State, initial_state
 from mjx_study.simulation.scene import load_scene, require
 from mjx_study.tasks.policy import InitialStatePolicy
-from mjx_study.tasks.task import Recipe, Task
+from mjx_study.tasks.task import Recipe, StudyDefaults, Task
 
 HORIZON: Final = 1000
 STARTS: Final = {  # relative angles [rad], velocities [rad/s]
@@ -69,10 +69,11 @@ def double_pendulum(
         running_cost=lambda state, control: jnp.zeros((), dtype),
         final_cost=lambda state: jnp.sum(state.qpos**2),
         contact_pair=None,
-        gamma=float("inf"),
-        recipe=RECIPE,
         reference=lambda stiffness: ReferenceObjective(
             DoublePendulum(timestep=scene.timestep), None, horizon, SIGMA, parametrises="start"
         ),
-        families=("mjcf",),
+        defaults=StudyDefaults(
+            recipe=RECIPE,
+            families=("mjcf",),
+        ),
     )

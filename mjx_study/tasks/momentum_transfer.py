@@ -17,7 +17,7 @@ from mjx_study.reference import FunctionObjective, MomentumTransfer
 from mjx_study.simulation.dynamics import State, initial_state
 from mjx_study.simulation.scene import load_scene, require
 from mjx_study.tasks.policy import InitialStatePolicy
-from mjx_study.tasks.task import Published, Recipe, Task
+from mjx_study.tasks.task import Published, Recipe, StudyDefaults, Task
 
 HORIZON: Final = 400
 SPEED: Final = 2.0  # [m/s]
@@ -66,10 +66,12 @@ def momentum_transfer(
         running_cost=lambda state, control: jnp.zeros((), dtype),
         final_cost=lambda state: -((inertia * state.qvel[2] / unit) ** 2),
         contact_pair=("ball", "bar"),
-        gamma=scale * GAMMA,
-        published=Published(scale * GAMMA, scale * RADIUS),
-        recipe=RECIPE,
         reference=lambda stiffness: FunctionObjective(elastic, SIGMA),
-        span=(0.0, 1.0),
-        stiffnesses=(3000.0, 10000.0, 30000.0),
+        defaults=StudyDefaults(
+            gamma=scale * GAMMA,
+            published=Published(scale * GAMMA, scale * RADIUS),
+            recipe=RECIPE,
+            span=(0.0, 1.0),
+            stiffnesses=(3000.0, 10000.0, 30000.0),
+        ),
     )

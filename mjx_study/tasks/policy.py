@@ -62,23 +62,17 @@ class Policy(Protocol):
 
 
 @dataclasses.dataclass(frozen=True)
-class OpenLoop:
-    """The control sequence itself: theta is (horizon, controls), flattened.
+class NoisyControls:
+    """Base of the policies with noise on the controls.
 
     Attributes:
         horizon: number of steps H.
-        controls: number of controls m; theta has H m entries.
+        controls: number of controls m.
     """
 
     horizon: int
     controls: int
-    additive: bool = dataclasses.field(default=True, init=False)
     at_start: bool = dataclasses.field(default=False, init=False)
-
-    @property
-    def num_params(self) -> int:
-        """H m."""
-        return self.horizon * self.controls
 
     @property
     def noise_shape(self) -> tuple[int, int]:
@@ -88,6 +82,23 @@ class OpenLoop:
     def place(self, theta: Float[Array, " params"], noise: Float[Array, "steps dimensions"], start: State) -> State:
         """The initial state unchanged."""
         return start
+
+
+@dataclasses.dataclass(frozen=True)
+class OpenLoop(NoisyControls):
+    """The control sequence itself: theta is (horizon, controls), flattened.
+
+    Attributes:
+        horizon: number of steps H.
+        controls: number of controls m; theta has H m entries.
+    """
+
+    additive: bool = dataclasses.field(default=True, init=False)
+
+    @property
+    def num_params(self) -> int:
+        """H m."""
+        return self.horizon * self.controls
 
     def feedforward(
         self, theta: Float[Array, " params"], noise: Float[Array, "steps dimensions"]
@@ -107,7 +118,7 @@ class OpenLoop:
 
 
 @dataclasses.dataclass(frozen=True)
-class Feedback:
+class Feedback(NoisyControls):
     """Base of the feedback policies u_h = pi(phi(x_h), theta) + w_h.
 
     Attributes:
@@ -117,21 +128,9 @@ class Feedback:
         features: feature map phi of the state.
     """
 
-    horizon: int
-    controls: int
     num_features: int
     features: Callable[[State], Float[Array, " features"]]
     additive: bool = dataclasses.field(default=False, init=False)
-    at_start: bool = dataclasses.field(default=False, init=False)
-
-    @property
-    def noise_shape(self) -> tuple[int, int]:
-        """(H, m)."""
-        return self.horizon, self.controls
-
-    def place(self, theta: Float[Array, " params"], noise: Float[Array, "steps dimensions"], start: State) -> State:
-        """The initial state unchanged."""
-        return start
 
     def feedforward(
         self, theta: Float[Array, " params"], noise: Float[Array, "steps dimensions"]

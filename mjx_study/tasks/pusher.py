@@ -16,7 +16,7 @@ from mjx_study.reference import Pusher, ReferenceObjective
 from mjx_study.simulation.dynamics import State, initial_state
 from mjx_study.simulation.scene import load_scene, require
 from mjx_study.tasks.policy import OpenLoop
-from mjx_study.tasks.task import Published, Recipe, Task
+from mjx_study.tasks.task import Published, Recipe, StudyDefaults, Task
 
 HORIZON: Final = 200
 START: Final = (0.0, 1.0)  # positions [m]: touching, at rest
@@ -62,10 +62,12 @@ def pusher(*, horizon: int = HORIZON, model: str | Path = "pusher", **scene_opti
         running_cost=running_cost,
         final_cost=state_cost,
         contact_pair=("pusher", "slider"),
-        gamma=GAMMA,
-        published=Published(GAMMA, RADIUS),
-        recipe=RECIPE,
         reference=lambda stiffness: ReferenceObjective(
             Pusher(stiffness, timestep=scene.timestep), (*START, 0.0, 0.0), horizon, SIGMA
+        ),
+        defaults=StudyDefaults(
+            gamma=GAMMA,
+            published=Published(GAMMA, RADIUS),
+            recipe=RECIPE,
         ),
     )

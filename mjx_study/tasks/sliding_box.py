@@ -17,7 +17,7 @@ from mjx_study.reference import ReferenceObjective, SlidingBox
 from mjx_study.simulation.dynamics import State, initial_state
 from mjx_study.simulation.scene import load_scene, require
 from mjx_study.tasks.policy import OpenLoop
-from mjx_study.tasks.task import Published, Recipe, Task
+from mjx_study.tasks.task import Published, Recipe, StudyDefaults, Task
 
 HORIZON: Final = 400
 GOAL: Final = (2.0, 2.0, 0.0, 0.0)  # block and box: positions [m], velocities [m/s]
@@ -66,9 +66,6 @@ def sliding_box(*, horizon: int = HORIZON, model: str | Path = "sliding_box", **
         running_cost=running_cost,
         final_cost=state_cost,
         contact_pair=("foot", "box"),
-        gamma=GAMMA,
-        published=Published(GAMMA, RADIUS),
-        recipe=RECIPE,
         metrics=lambda states: {
             "aboard": jnp.where(jnp.abs(states.qpos[-1, BLOCK] - states.qpos[-1, BOX]) < edge, 1.0, 0.0)
         },
@@ -79,6 +76,11 @@ def sliding_box(*, horizon: int = HORIZON, model: str | Path = "sliding_box", **
             SIGMA,
             metrics=lambda states: {"aboard": SlidingBox().on_box(states[..., -1, :]) * 1.0},
         ),
-        damping=SLIP_DAMPING,
-        stiffnesses=(100.0, 200.0, 500.0, 1000.0),
+        defaults=StudyDefaults(
+            gamma=GAMMA,
+            published=Published(GAMMA, RADIUS),
+            recipe=RECIPE,
+            damping=SLIP_DAMPING,
+            stiffnesses=(100.0, 200.0, 500.0, 1000.0),
+        ),
     )

@@ -3,7 +3,6 @@
 import dataclasses
 import math
 from collections.abc import Callable
-from typing import Final
 
 import jax
 from jaxtyping import Array, Float, Key
@@ -15,9 +14,6 @@ from mjx_study.simulation.dynamics import State
 from mjx_study.simulation.onset import check_onset
 from mjx_study.simulation.scene import Scene
 from mjx_study.tasks.policy import Policy
-
-STIFFNESSES: Final = (10.0, 100.0, 300.0, 550.0, 1000.0, 1200.0)
-FAMILIES: Final = ("penalty", "mujoco", "mujoco_stiff")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,6 +55,45 @@ class Published:
     variance_proxy: str = "second_moment"
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class StudyDefaults:
+    """How a task is studied unless a study says otherwise.
+
+    Attributes:
+        families: contact families.
+        stiffnesses: contact stiffnesses [N/m].
+        damping: contact damping in families without a damping ratio [N s/m], or None; friction needs some, since it is
+            the resistance to slip.
+        gamma: AoBG's accuracy bound, in the unit of the gradient; infinite by default, which is inverse-variance
+            weighting.
+        published: AoBG's constants in the published example; None if there are none.
+        recipe: settings of gradient descent; None if all of them must be given.
+        span: range that a landscape over a scalar parameter shows; None for a range about theta.
+    """
+
+    families: tuple[str, ...] = ("penalty", "mujoco", "mujoco_stiff")
+    stiffnesses: tuple[float, ...] = (10.0, 100.0, 300.0, 550.0, 1000.0, 1200.0)
+    damping: float | None = None
+    gamma: float = math.inf
+    published: Published | None = None
+    recipe: Recipe | None = None
+    span: tuple[float, float] | None = None
+
+    def __post_init__(self) -> None:
+        if not self.stiffnesses:
+            raise ValueError("give at least one stiffness [N/m]; leave stiffnesses out otherwise")
+
+    @property
+    def main_family(self) -> str:
+        """Contact family of a single run: MuJoCo's impedance if it is among the families."""
+        return "mujoco" if "mujoco" in self.families else self.families[0]
+
+    @property
+    def middle_stiffness(self) -> float:
+        """Stiffness of a single run: the middle one [N/m]."""
+        return self.stiffnesses[len(self.stiffnesses) // 2]
+
+
 def no_running_cost(state: State, control: Float[Array, " nu"]) -> Float[Array, ""]:
     """Zero running cost."""
     return jax.numpy.zeros((), state.qpos.dtype)
@@ -86,22 +121,14 @@ class Task:
         running_cost: c(state, control) at each step, before it is taken; may be omitted if there is a final cost.
         final_cost: c(state) after the last step; may be omitted if there is a running cost.
         contact_pair: names of the two geoms whose contact is swept; None if there is no contact.
-        gamma: AoBG's accuracy bound, in the unit of the gradient; infinite by default, which is inverse-variance
-            weighting.
-        published: AoBG's constants in the published example; None if there are none.
         reference: analytic counterpart of the penalty family, as a function of the stiffness [N/m]; None if there is
             none. `analytic` gives it the task's noise.
-        damping: contact damping in families without a damping ratio [N s/m], or None; friction needs some, since it is
-            the resistance to slip.
-        stiffnesses: default stiffnesses of a sweep [N/m].
-        families: default contact families of a sweep.
-        span: range that a landscape over a scalar parameter shows; None for a range about theta.
         noise: name of the noise density in `estimators.NOISES`.
         onset: treatment of the onset of contact in first-order gradients: "none" for exact derivatives of the steps, or
             "linear" to add what those miss (see `mjx_study.simulation.onset`).
-        recipe: default settings of an optimisation; None if all of them must be given.
         metrics: numbers of a rollout by name, as a function of its states including the initial one, to report beside
             the cost; None for none.
+        defaults: how the task is studied unless a study says otherwise.
     """
 
     name: str
@@ -115,17 +142,11 @@ class Task:
     running_cost: Callable[[State, Float[Array, " nu"]], Float[Array, ""]] = no_running_cost
     final_cost: Callable[[State], Float[Array, ""]] = no_final_cost
     contact_pair: tuple[str, str] | None
-    gamma: float = math.inf
-    published: Published | None = None
     reference: Callable[[float], Reference] | None = None
-    damping: float | None = None
-    stiffnesses: tuple[float, ...] = STIFFNESSES
-    families: tuple[str, ...] = FAMILIES
-    span: tuple[float, float] | None = None
     noise: str = "gaussian"
     onset: str = "none"
-    recipe: Recipe | None = None
     metrics: Callable[[State], dict[str, Float[Array, ""]]] | None = None
+    defaults: StudyDefaults = StudyDefaults()
 
     def __post_init__(self) -> None:
         theta = jax.numpy.asarray(self.theta)
@@ -135,10 +156,6 @@ class Task:
         check_sigma(self.sigma)
         check_density(self.noise)
         check_onset(self.onset)
-        if not self.stiffnesses:
-            raise ValueError(
-                f"{self.name} needs at least one stiffness [N/m] to sweep; leave stiffnesses out otherwise"
-            )
         if self.running_cost is no_running_cost and self.final_cost is no_final_cost:
             raise ValueError("a task needs a running_cost, a final_cost, or both")
         if self.theta.shape != (self.policy.num_params,):
@@ -158,16 +175,6 @@ class Task:
         if self.reference is None:
             raise ValueError(f"{self.name} has no analytic reference")
         return dataclasses.replace(self.reference(stiffness), sigma=self.sigma, noise=self.noise)  # type: ignore[type-var]
-
-    @property
-    def main_family(self) -> str:
-        """Default contact family of a single run: MuJoCo's impedance if the task sweeps it."""
-        return "mujoco" if "mujoco" in self.families else self.families[0]
-
-    @property
-    def middle_stiffness(self) -> float:
-        """Default stiffness of a single run: the middle one of the sweep [N/m]."""
-        return self.stiffnesses[len(self.stiffnesses) // 2]
 
     @property
     def effective_mass(self) -> float:

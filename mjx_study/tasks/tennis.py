@@ -16,7 +16,7 @@ from mjx_study.reference import ReferenceObjective, Tennis, draw_start, tennis_m
 from mjx_study.simulation.dynamics import State, initial_state
 from mjx_study.simulation.scene import load_model, put_scene, require
 from mjx_study.tasks.policy import LinearFeedback
-from mjx_study.tasks.task import Published, Recipe, Task
+from mjx_study.tasks.task import Published, Recipe, StudyDefaults, Task
 
 HORIZON: Final = 200
 TIME_SCALE: Final = 10.0
@@ -75,9 +75,6 @@ def tennis(
         running_cost=lambda state, control: CONTROL_WEIGHT * jnp.sum(control**2),
         final_cost=lambda state: jnp.sum(weight * (features(state)[:4] - target) ** 2),
         contact_pair=("ball", "paddle"),
-        gamma=GAMMA,
-        published=Published(GAMMA, RADIUS),
-        recipe=RECIPE,
         metrics=lambda states: tennis_metrics(states.qpos[:, :2], states.qvel[:, :2]),
         reference=lambda stiffness: ReferenceObjective(
             Tennis(),
@@ -87,5 +84,10 @@ def tennis(
             parametrises="feedback",
             metrics=lambda states: tennis_metrics(states[..., :2], states[..., 2:4]),
         ),
-        stiffnesses=(1000.0, 2000.0, 5000.0, 10000.0),
+        defaults=StudyDefaults(
+            gamma=GAMMA,
+            published=Published(GAMMA, RADIUS),
+            recipe=RECIPE,
+            stiffnesses=(1000.0, 2000.0, 5000.0, 10000.0),
+        ),
     )
