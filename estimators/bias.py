@@ -146,7 +146,7 @@ class EmpiricalBias:
 
 
 def empirical_bias(estimate: GradientEstimate, reference: Float[Array, " params"], num_rare: int) -> EmpiricalBias:
-    """What a batch shows that by chance holds none of its rarest samples.
+    """How a batch that happens to lack its rarest samples looks.
 
     A random vector z has (beta, Delta, S)-empirical bias if there is an event of probability at least 1 - beta on which
     its mean is Delta or more from E z, though its variance is at most S: a batch of fewer than about 1 / beta samples

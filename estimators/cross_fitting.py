@@ -12,7 +12,7 @@ from estimators.types import GradientEstimate
 PLUG_IN: Final = "plug_in"
 CROSS_FITTED: Final = "cross_fitted"
 WEIGHTS: Final = (PLUG_IN, CROSS_FITTED)
-"""Where an interpolation's weights come from."""
+"""Sources of an interpolation's weights."""
 FEWEST_SAMPLES: Final = 4
 """Two in each half, for a variance."""
 

@@ -1,4 +1,4 @@
-"""What an estimator is, and the batches that estimators are made of."""
+"""The estimator protocol, and the batches that estimators use."""
 
 import dataclasses
 from abc import ABC, abstractmethod

@@ -1,4 +1,4 @@
-"""What users write outside of these packages, by `module:name` of a module that Python can import."""
+"""Users' own estimators and tasks, named `module:name`."""
 
 import importlib
 import inspect
@@ -34,7 +34,7 @@ def load_module(name: str) -> ModuleType:
 
 
 def find_attribute(place: str, noun: str, kind: type) -> object:
-    """What is at a `module:name`.
+    """The object at a `module:name`.
 
     Args:
         place: `module:name`.

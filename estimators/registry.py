@@ -31,7 +31,7 @@ from estimators.types import (
 from estimators.zeroth_order import antithetic, delta_control_variate, zeroth_order
 
 ESTIMATORS: dict[str, type[Estimator]] = {}
-"""By name."""
+"""Estimators by name."""
 EstimatorClass = TypeVar("EstimatorClass", bound=type[Estimator])
 
 
@@ -49,7 +49,7 @@ def register(estimator: EstimatorClass) -> EstimatorClass:
 
 
 def find_estimator(name: str) -> Estimator | type[Estimator]:
-    """What a name stands for.
+    """The estimator that a name stands for.
 
     Args:
         name: Key in `ESTIMATORS`, or `module:attribute` of a class or an object of one's own. The current directory

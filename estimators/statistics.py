@@ -1,4 +1,4 @@
-"""What a set of per-sample gradients says: mean, spread, and how large the samples are."""
+"""Statistics of per-sample gradients: mean, variance, and quantiles of the norms."""
 
 from collections.abc import Sequence
 

@@ -1,4 +1,4 @@
-"""What goes into an estimator (an objective and its batches) and what comes out (an estimate)."""
+"""Inputs of an estimator (an objective and its batches) and its output (an estimate)."""
 
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable

@@ -1,4 +1,4 @@
-"""What a study's Dataset can do: `data.mjx_study.table()`, `.findings()`, `.warnings()`, `.plot()`, `.report()`."""
+"""Methods of a study's Dataset: `data.mjx_study.table()`, `.findings()`, `.warnings()`, `.plot()`, `.report()`."""
 
 import pandas as pd
 import xarray as xr
@@ -12,13 +12,13 @@ from mjx_study.study.run import warnings_of
 
 @xr.register_dataset_accessor("mjx_study")
 class StudyAccessor:
-    """A study, by what one does with it."""
+    """Tables, findings, figures and reports of a study's Dataset."""
 
     def __init__(self, dataset: xr.Dataset):
         self._dataset = dataset
 
     def table(self) -> pd.DataFrame:
-        """A row for each contact model, seed and estimator, without what runs along iterations, points or theta."""
+        """A row for each contact model, seed and estimator; no variables along iterations, points or theta."""
         if "variance" in self._dataset:
             return pd.DataFrame([row.as_dict() for row in rows_of(self._dataset)])
         long = {"iteration", "point", "param", "solref_entry", "solimp_entry"}
@@ -26,15 +26,15 @@ class StudyAccessor:
         return self._dataset[short].to_dataframe().reset_index()
 
     def findings(self) -> list[str]:
-        """What the intervals say, in sentences."""
+        """Findings backed by the intervals, as sentences."""
         return findings(self._dataset)
 
     def warnings(self) -> tuple[str, ...]:
-        """What a reader must not overlook."""
+        """Warnings that belong with any use of the numbers."""
         return warnings_of(self._dataset)
 
     def plot(self) -> dict[str, Figure]:
-        """Every figure that the study has the numbers for, by name."""
+        """All figures that the study has data for, by name."""
         return plot_study(self._dataset)
 
     def report(self) -> str:

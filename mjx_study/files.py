@@ -1,4 +1,4 @@
-"""Files from outside, checked against a schema; an error names the file and the key in one line."""
+"""Reading files that users supply, checked against a schema; errors name the file and the key in one line."""
 
 import tomllib
 from pathlib import Path
@@ -11,13 +11,13 @@ from mjx_study.disk import read_whole
 from mjx_study.option import OPTIONS
 
 MOST_BYTES: Final = 100_000_000
-"""Of a file that is read whole."""
+"""Largest file that is read [bytes]."""
 Schema = TypeVar("Schema", bound=BaseModel)
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 
 def read_bytes(path: Path) -> bytes:
-    """What a file holds.
+    """The contents of a file.
 
     Raises:
         ValueError: it cannot be read, is no regular file, or is larger than `MOST_BYTES`.
@@ -47,7 +47,7 @@ def _validated(path: Path, content: bytes, schema: Any) -> Any:
 
 
 def read_toml(path: Path, schema: type[BaseModel]) -> dict[str, Any]:
-    """What a TOML file sets.
+    """The options that a TOML file sets.
 
     Raises:
         ValueError: as `read_bytes`, or it is not TOML, or does not satisfy the schema.
@@ -63,7 +63,7 @@ def read_toml(path: Path, schema: type[BaseModel]) -> dict[str, Any]:
 
 
 def told(error: ValidationError) -> str:
-    """The first thing that does not satisfy a schema, with its key, and how many more there are."""
+    """The first violation of a schema, with its key, and the number of further ones."""
     found = error.errors(include_url=False, include_input=False)
     first = found[0]
     key = ".".join(map(str, first["loc"]))
@@ -76,13 +76,13 @@ def told(error: ValidationError) -> str:
 
 
 def _option(name: str, kind: Any, interval: str = "") -> Any:
-    """What an option takes, or null."""
+    """Type of a field that takes an option's values, or null."""
     option = OPTIONS[name].within(interval) if interval else OPTIONS[name]
     return Annotated[kind, AfterValidator(option.check)] | None  # type: ignore[operator]
 
 
 class PolicyFile(BaseModel):
-    """A policy that optimise wrote: its parameters, and what they are for."""
+    """A policy written by `optimise`: its parameters and the setting they were found in."""
 
     model_config = ConfigDict(strict=True)
 
@@ -98,7 +98,7 @@ class PolicyFile(BaseModel):
 
 
 def read_theta(path: Path) -> tuple[tuple[float, ...], str | None]:
-    """Parameters from a policy, a .json list of numbers or a .npy array, and the task that a policy is of.
+    """Parameters from a policy file, a .json list or a .npy array; with the policy's task.
 
     Raises:
         ValueError: the file cannot be read, or is none of these.
@@ -117,7 +117,7 @@ def _read_array(path: Path) -> tuple[float, ...]:
     try:
         if magic != np.lib.format.MAGIC_PREFIX:
             raise ValueError("not a .npy file")
-        array = np.load(path, mmap_mode="r", allow_pickle=False)  # nothing is allocated for an impossible shape
+        array = np.load(path, mmap_mode="r", allow_pickle=False)  # an impossible shape allocates nothing
         if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu" or not np.all(np.isfinite(array)):
             raise ValueError("not an array of finite numbers")
         return tuple(np.asarray(array, float).reshape(-1).tolist())

@@ -1,28 +1,28 @@
-"""How large a plan may be; what is beyond is refused before anything is computed, with what to change."""
+"""Limits on the size of a plan; a larger one is refused before anything is computed."""
 
 from typing import Final
 
 MOST_MODELS: Final = 5_000
-"""Contact models of one task."""
+"""Most contact models of one task."""
 MOST_CELLS: Final = 50_000
-"""Cells of a sweep, each of which is a file."""
+"""Most cells of a sweep; each is a file."""
 MOST_PROGRAMS: Final = 500
-"""Programs that a sweep compiles: a timestep, cone or task needs its own."""
+"""Most programs that a sweep compiles: each timestep, cone and task needs its own."""
 MOST_PARAMS: Final = 10_000_000
-"""Parameters of a network."""
+"""Most parameters of a network."""
 MOST_LAYERS: Final = 100
-"""Hidden layers of a network."""
+"""Most hidden layers of a network."""
 MOST_STEPS: Final = 1_000_000
-"""Of a rollout."""
+"""Most steps of a rollout."""
 MOST_GIB: Final = 16.0
-"""Memory of the arrays that are held at once [GiB], as `mjx_study.study.memory.check_memory` counts them."""
+"""Most memory for the arrays held at once [GiB], as `mjx_study.study.memory.check_memory` counts them."""
 
 
 def check_count(count: int, what: str, limit: int, change: str) -> None:
-    """Refuse more than a limit.
+    """Refuse a count above its limit.
 
     Raises:
-        ValueError: with the limit and what to change.
+        ValueError: names the limit and what to change.
     """
     if count > limit:
         raise ValueError(f"{count} {what} are planned, and the limit is {limit}: {change}")

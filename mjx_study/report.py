@@ -1,4 +1,4 @@
-"""A study as one HTML page that needs nothing else: warnings, figures, tables, configuration, how to run it again."""
+"""A study as one self-contained HTML page: warnings, figures, tables, configuration, and the command that made it."""
 
 import base64
 import html
@@ -43,7 +43,7 @@ SUMMARY: Final = {
     "landscapes": "At the largest sample count.",
 }
 PRESENT: Final = ("residual", "rollouts", "unconverged")
-"""Of every kind of study a variable that is a number wherever a cell is computed."""
+"""For every kind of study, a variable that is finite wherever a cell has been computed."""
 COLUMNS: Final = {
     "variance": "variance",
     "effective_samples": "effective samples",
@@ -110,7 +110,7 @@ def _figures(dataset: xr.Dataset) -> list[str]:
 
 
 def _numbers(dataset: xr.Dataset) -> str:
-    """A row for each cell and estimator."""
+    """The table of numbers, a row for each cell and estimator."""
     if not dataset.data_vars:
         return ""
     if "smoothed" in dataset:
@@ -133,7 +133,7 @@ def _numbers(dataset: xr.Dataset) -> str:
 
 
 def _with_extremes(dataset: xr.Dataset) -> xr.Dataset:
-    """A landscape's numbers without its points."""
+    """A landscape summarised by its extremes."""
     least = dataset["smoothed"].fillna(np.inf).argmin("point")
     found = {
         "least_cost": dataset["smoothed"].min("point"),
@@ -145,7 +145,7 @@ def _with_extremes(dataset: xr.Dataset) -> xr.Dataset:
 
 
 def _reduced(name: str, values: xr.DataArray) -> float:
-    """One number of all seeds, and of the last tenth of the iterations."""
+    """One number for all seeds, and for the last tenth of the iterations."""
     array = np.asarray(values.values, float)
     if name == "stopped_at":
         return float(np.sum(np.isfinite(array)))

@@ -220,7 +220,7 @@ def test_a_result_that_means_nothing_says_so() -> None:
     """Contact that is never met, a reference as uncertain as the errors, a bound below ZoBG's own radius."""
     same = (row("zobg", 10, 5.0), row("fobg", 10, 1.0), row("zobg", 100, 5.0), row("fobg", 100, 1.0))
     assert findings(result(*same))[-1] == (
-        "penalty: nothing depends on K: the contact whose stiffness is swept was never met"
+        "penalty: nothing depends on K: the contact whose stiffness is swept was never active"
     )
     assert not any("never met" in each for each in findings(result(*same[:3], row("fobg", 100, 1.001))))
     (sentence,) = findings(result(row("fobg", 10, 1.0, reference_uncertainty=0.25)))
@@ -236,7 +236,7 @@ def test_nothing_is_called_biased_on_too_few_effective_samples() -> None:
     few = row("fobg", 10, 1, **loud, effective_samples=1.9)
     (sentence,) = findings(result(few))
     assert sentence == (
-        "penalty: FoBG's mean is off by 44% at K = 10 N/m, biased or for want of rare samples: too few effective "
+        "penalty: FoBG's mean is off by 44% at K = 10 N/m, from bias or lack of rare samples: too few effective "
         "samples (1.9)"
     )
     equal = row("fobg", 10, 1, **loud | {"bias_p_value": math.nan}, effective_samples=0.0, top_share=math.nan)

@@ -1,4 +1,4 @@
-"""Where and why the C engine's step differs from MJX's: by stage, contact and constraint row."""
+"""Differences between the C engine's step and MJX's, by stage, contact and constraint row."""
 
 import copy
 from typing import Any, Final

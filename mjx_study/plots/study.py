@@ -33,9 +33,9 @@ SWEPT: Final = {
     "sigma": "noise sigma",
     "samples": "samples N in a batch",
 }
-"""What may be an axis of a figure, with its label."""
+"""Dimensions that can be the axis of a figure, with their labels."""
 MOST_FIGURES: Final = 12
-"""Of one kind; a study of more tasks, timesteps and noises is cut there."""
+"""Most figures of one kind; a study with more tasks, timesteps and noises is cut off there."""
 MOST_PANELS: Final = 6
 MOST_DECADES: Final = 1e7
 """Ratio of the ends of an axis of costs; beyond it a descent counts as diverged."""
@@ -122,7 +122,7 @@ def _for_file(text: str) -> str:
 
 
 def _ticks(values: np.ndarray) -> list[str]:
-    """In three digits or whole, and in more where that tells two values apart."""
+    """Values in three digits, or in as many as tell them apart."""
     digits = digits_to_tell_apart(values.tolist(), least=3)
     whole = digits == 3
     return [f"{value:.0f}" if whole and 100 <= value < 1e6 else f"{value:.{digits}g}" for value in values.tolist()]
@@ -219,7 +219,7 @@ def _geometric(values: xr.DataArray) -> tuple[np.ndarray, np.ndarray, np.ndarray
 
 
 def _comparison(part: xr.Dataset, title: str) -> Figure:
-    """Of one batch: variance above, relative error below; a column for each contact family."""
+    """Variance above, relative error below, with intervals of one batch; a column for each contact family."""
     families = [(family, part.isel(model=np.flatnonzero(part["contact"].values == family)).sortby("stiffness"))
                 for family in dict.fromkeys(part["contact"].values.tolist())]  # fmt: skip
     figure = Figure(figsize=(1.2 + 3.4 * len(families), 6.2), layout="constrained")
@@ -277,7 +277,7 @@ def _shade_unstable(panels: Sequence[Axes], rows: xr.Dataset, x: np.ndarray) -> 
 
 
 def _mark_default(axes: Axes, family: str, rows: xr.Dataset) -> None:
-    """Where MuJoCo's default time constant lies among the stiffnesses of its own family."""
+    """Mark the stiffness of MuJoCo's default time constant among those of its own family."""
     if family != "mujoco" or "solref" not in rows:
         return
     mass = float(rows["stiffness"][0]) / -float(rows["solref"].isel(model=0, solref_entry=0))

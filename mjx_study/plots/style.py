@@ -1,4 +1,4 @@
-"""What figures share: colours and names, lines with bands, and files."""
+"""Colours, names, lines with bands, and file formats common to all figures."""
 
 import zlib
 from collections.abc import Mapping, Sequence
@@ -30,9 +30,9 @@ STYLE: Final = {
     "delta": ("#777777", "d"),
 }
 OTHERS: Final = (("#E69F00", "#56B4E9", "#009E73", "#F0E442", "#0072B2", "#D55E00", "#CC79A7"), "1234+x|_")
-"""Colours and markers of estimators of one's own."""
+"""Colours and markers of users' own estimators."""
 NO_CONTACT: Final = 1.0
-"""Place on a stiffness axis of a task without contact."""
+"""Position of a task without contact on a stiffness axis."""
 TITLES: Final = {
     "penalty": "penalty (impedance 1e-4)",
     "impedance": "impedance 0.5",
@@ -47,7 +47,7 @@ assert set(TITLES) >= set(FAMILIES)
 
 
 def style_of(name: str) -> tuple[str, str, str]:
-    """Label, colour and marker of an estimator; those of one's own depend on the name alone."""
+    """Label, colour and marker of an estimator; for a user's own they depend on its name alone."""
     label = (ESTIMATORS[name].label if name in ESTIMATORS else "") or name.rpartition(":")[2]
     colours, markers = OTHERS
     drawn = zlib.crc32(name.encode())
@@ -60,7 +60,7 @@ def mean_with_band(axes: Axes, x, mean, error, color: str, label: str) -> None:
 
 
 def robust_limits(curves: Sequence[np.ndarray]) -> tuple[float, float]:
-    """Limits that hold all but the wildest hundredth of the values."""
+    """Axis limits that leave out the most extreme hundredth of the values."""
     values = np.concatenate(curves)
     values = values[np.isfinite(values)]
     low, high = np.quantile(values, [0.005, 0.995]) if len(values) else (-1.0, 1.0)
@@ -79,13 +79,13 @@ STYLES: Final = {
         "svg.fonttype": "none",
     },
 }
-"""Settings of matplotlib within which figures are drawn, by name."""
-COLUMN, PAGE = 3.4, 7.0  # [in] of a paper
-"""Widths of figures of one column of panels, and of more."""
+"""matplotlib settings by style."""
+COLUMN, PAGE = 3.4, 7.0
+"""Widths of a paper's column and page [in], for figures of one column of panels and of more."""
 
 
 def fit_to_paper(figure: Figure) -> None:
-    """Make a figure as wide as a column or a page, without its title, which a caption has."""
+    """Fit a figure to a column or a page and drop its title, which goes into the caption."""
     width, height = figure.get_size_inches()
     wanted = COLUMN if width < 5 else PAGE
     figure.set_size_inches(wanted, height * wanted / width)
@@ -108,9 +108,9 @@ def save_figures(figures: Mapping[str, Figure], folder: Path, formats: Sequence[
 def line_with_band(
     axes: Axes, x, y, lower, upper, *, color: str, marker: str, label: str | None = None, hollow: bool = False
 ) -> None:
-    """A line with its interval; what follows another curve is dashed with hollow markers, so that both are seen.
+    """A line with its interval. A curve that may coincide with another is dashed with hollow markers, so both show.
 
-    Two points are not joined: there is nothing between them that was measured.
+    Two points are not joined: nothing was measured between them.
     """
     joined = len(x) > 2
     line = ("--" if hollow else "-") if joined else "none"
@@ -126,4 +126,4 @@ def line_with_band(
 
 
 HOLLOW: Final = ("aobg", "ivw", "ivw_h", "ddcg", "total_propagation")
-"""Estimators that interpolate, and so coincide with one of two others."""
+"""Interpolating estimators, whose curves may coincide with another's."""

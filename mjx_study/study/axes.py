@@ -1,4 +1,4 @@
-"""Where a sweep's cells lie: the values along every dimension, and each cell's index along each of them."""
+"""The grid of a study: coordinates along every dimension, and each cell's index along each."""
 
 import dataclasses
 from collections import Counter, defaultdict
@@ -10,7 +10,7 @@ from mjx_study.study.plan import StudyCell, StudyPlan
 from mjx_study.table import digits_to_tell_apart
 
 SORTED: Final = ("timestep", "sigma", "samples")
-"""Dimensions whose values ascend; the others keep the order of the configuration."""
+"""Dimensions sorted in ascending order; the others keep the order of the configuration."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -18,9 +18,9 @@ class Axes:
     """The grid of a sweep.
 
     Attributes:
-        values: by dimension, its coordinates; names for tasks, cones and contact models, all different.
+        values: coordinates by dimension; tasks, cones and contact models by name, all different.
         models: contact family and stiffness [N/m] of each contact model.
-        places: of each cell, its index along every dimension.
+        places: each cell's index along every dimension.
     """
 
     values: dict[str, list[Any]]
@@ -29,7 +29,7 @@ class Axes:
 
 
 def axes_of(plan: StudyPlan) -> Axes:
-    """The grid of a plan. Values are told apart as they are, whatever their names look like."""
+    """The grid of a plan. Values are compared exactly, not by their printed names."""
     exact = [_exact(plan, cell) for cell in plan.cells]
     values = {name: list(dict.fromkeys(each[name] for each in exact)) for name in exact[0]}
     for name in SORTED:
@@ -70,14 +70,14 @@ def _exact(plan: StudyPlan, cell: StudyCell) -> dict[str, Any]:
 
 
 def _task_names(plan: StudyPlan, configured: list[str]) -> list[str]:
-    """What tasks call themselves, or what the configuration calls those that share a name."""
+    """The tasks' own names, or the configuration's where several share one."""
     own = {group.name: group.task.name for group in plan.groups}
     shared = Counter(own[name] for name in configured)
     return [name if shared[own[name]] > 1 else own[name] for name in configured]
 
 
 def _model_names(models: list[tuple[str, float]]) -> list[str]:
-    """Family and stiffness, in as many digits as tell a family's stiffnesses apart."""
+    """Family and stiffness, with enough digits to tell a family's stiffnesses apart."""
     by_family = defaultdict(list)
     for family, stiffness in models:
         by_family[family].append(stiffness)

@@ -1,4 +1,4 @@
-"""What is computed of each cell of a study, by its kind: a function that makes one of a plan."""
+"""The computation of a cell, by kind of study: from a plan to a function of its cells."""
 
 from typing import Final
 

@@ -1,4 +1,4 @@
-"""What a study is asked for, and what of it concerns a task: its estimators, its recipe, its parameters."""
+"""The configuration of a study, and what follows from it for a task: estimators, recipe, parameters."""
 
 import dataclasses
 import math
@@ -17,7 +17,7 @@ from mjx_study.simulation.contact import FAMILIES
 from mjx_study.tasks.task import Recipe, Task
 
 Progress = Callable[[int, int, str], None]
-"""Called with (work done, work in all, what is being done)."""
+"""Called with (work done, total work, what is being computed)."""
 OF_KIND: Final[dict[str, dict[str, Any]]] = {
     "gradients": {"reference_samples": 600},
     "descents": {
@@ -30,58 +30,57 @@ OF_KIND: Final[dict[str, dict[str, Any]]] = {
     },
     "landscapes": {"span": None, "direction": None},
 }
-"""Options that one kind of sweep alone has, and what they are unless given."""
+"""Options that only one kind of study has, with their defaults."""
 ASKED_BY: Final = {"descents": "give iterations as well", "landscapes": "give points as well"}
 SAMPLES: Final = 100
-"""In each batch, where neither the configuration nor a recipe says."""
+"""Samples in each batch unless the configuration or a recipe says otherwise."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class StudyConfig(Checked):
-    """Everything that decides a study: gradient estimates, or descents, or landscapes.
+    """Everything that determines a study of gradient estimates, descents or landscapes.
 
     Attributes:
         tasks: names of tasks, or tasks.
-        kind: gradients, descents or landscapes; None for what iterations and points say.
+        kind: gradients, descents or landscapes; None to tell it from iterations and points.
         estimators: names of estimators.
-        theta: parameters at which gradients are taken or a descent begins, of a single task; None for the task's.
-        network: widths of the hidden layers of a network in place of the task's policy, in descents; None for that.
-        contact: contact families, and "reference" for the analytic system; None for each task's. Empty for none but
-            those of `solref`.
-        stiffness: of the families that take one [N/m]; None for each task's.
-        damping: of the contact [N s/m]; None for each family's.
+        theta: parameters at which gradients are taken or descents begin; for a single task. None for the task's.
+        network: hidden widths of a network that replaces the task's policy in descents; None for the task's policy.
+        contact: contact families, and "reference" for the analytic system; None for each task's. Empty if only `solref`
+            and `solimp` are wanted.
+        stiffness: contact stiffnesses [N/m], for the families that take one; None for each task's.
+        damping: contact damping [N s/m]; None for each family's.
         solref, solimp: contact models in MuJoCo's own terms, every solref with every solimp, beside the families;
-            either alone goes with MuJoCo's default of the other.
-        timestep: [s]; None for the MJCF's. Each gets as many steps as take as long as the task's own, unless horizon is
-            given.
-        cone: pyramidal, elliptic; None for the MJCF's.
+            if only one is given, the other is MuJoCo's default.
+        timestep: timesteps [s]; None for the MJCF's. Rollouts last as long as the task's unless horizon is given.
+        cone: friction cones, pyramidal or elliptic; None for the MJCF's.
         sigma: standard deviations of the noise; None for each task's.
-        samples: sizes of a batch; None for 100, in descents for each task's recipe.
-        confidence: of the intervals within a batch.
-        seeds: batches of each size, or descents; of landscapes, batches that are taken together at each point. None for
-            10, of landscapes 1.
+        samples: batch sizes; None for 100, in descents for each task's recipe.
+        confidence: confidence level of the intervals within a batch.
+        seeds: number of batches of each size, or of descents; in landscapes, of batches pooled at each point. None for
+            10, in landscapes 1.
         iterations: steps of a descent; None for each task's recipe.
-        points: on a line through each task's theta, for landscapes; None for no landscapes.
-        span, direction: of that line, None for each task's range and a random direction.
-        optimizer: name of an optimiser of optax, "sgd" by default.
+        points: number of points of a landscape, on a line through theta; None for no landscapes.
+        span, direction: range and direction of that line; None for each task's range and a random direction.
+        optimizer: name of an optax optimiser, "sgd" by default.
         learning_rate, decay: learning_rate / i^decay at iteration i; None for each task's recipe.
-        reference_samples: pairs of rollouts behind each reference gradient; of gradients, None for 600.
-        evaluation_samples: rollouts behind the cost of a final policy; of descents, None for 200.
+        reference_samples: pairs of rollouts for each reference gradient; None for 600 in studies of gradients.
+        evaluation_samples: rollouts for the cost of a final policy; None for 200 in descents.
         seed: random seed.
-        noise: name of the noise's density; None for each task's.
+        noise: name of the noise density; None for each task's.
         baseline: baseline of zeroth-order estimates: zero_noise, leave_one_out or none.
         gamma: accuracy that the alpha-order estimate must keep, in the unit of the gradient; None for each task's.
-        published: whether gamma and what follows are the published example's, on the scale of the task's cost.
-        failure_probability: of the confidence radius epsilon.
-        variance_proxy: in epsilon: variance, second_moment or upper_bound.
+        published: take gamma and the next three from the published example, on the scale of the task's cost.
+        failure_probability: failure probability of the confidence radius epsilon.
+        variance_proxy: variance in epsilon: variance, second_moment or upper_bound.
         radius: R in epsilon: max_deviation, or a bound in the unit of the gradient.
         max_norm: largest norm of a sample of the clipped first-order estimate, in the unit of the gradient.
         window: steps between cuts of the truncated first-order estimate.
         tolerance: tolerance of the discontinuity test of "ddcg".
-        weights: plug_in or cross_fitted, of the estimators that interpolate.
+        weights: weights of interpolating estimators, plug_in or cross_fitted.
         onset: none, or linear for first-order gradients with the onset term; see `mjx_study.simulation.onset`.
         horizon: steps; None for each task's.
-        model: an MJCF in place of the task's own; None for that.
+        model: an MJCF that replaces the task's own; None for the task's.
         chunk_size: samples per device and call; None to choose by the number of samples.
     """
 
@@ -160,7 +159,7 @@ class StudyConfig(Checked):
             check_weights(self.weights, min(self.samples))
 
     def _settle(self) -> None:
-        """Refuse options that have no effect in this kind of sweep, and give its own their defaults."""
+        """Refuse options without effect in this kind of study, and fill in the defaults of its own."""
         for kind, options in OF_KIND.items():
             given = [name for name in options if getattr(self, name) is not None]
             if kind != self.kind and given:
@@ -206,12 +205,12 @@ def check_span(span: Sequence[float] | None) -> None:
 
 
 def takes_stiffness(families: Sequence[str]) -> bool:
-    """Whether any of some contact families takes stiffnesses, the reference among them."""
+    """Whether any of the contact families, "reference" included, takes a stiffness."""
     return any(family not in FAMILIES or FAMILIES[family].swept for family in families)
 
 
 def recipe_of(config: StudyConfig, task: Task) -> Recipe:
-    """Settings of a task's descents: the configuration's, and its recipe's where that leaves them open.
+    """Settings of a task's descents: the configuration's, else those of the task's recipe.
 
     Raises:
         ValueError: a setting is missing.
@@ -227,10 +226,10 @@ def recipe_of(config: StudyConfig, task: Task) -> Recipe:
 
 
 def at_theta(task: Task, theta: Sequence[float] | None) -> Task:
-    """The task at other parameters; as it is for None.
+    """The task at other parameters; unchanged for None.
 
     Raises:
-        ValueError: they are not as many as the policy has, or not finite.
+        ValueError: their number is not the policy's, or one is not finite.
     """
     if theta is None:
         return task
@@ -257,7 +256,7 @@ def configured_estimators(config: StudyConfig, task: Task) -> tuple[Estimator, .
 
 
 def bound_constants(config: StudyConfig, task: Task) -> dict[str, Any]:
-    """Constants of AoBG's bound: those of a configuration, or the published example's.
+    """Constants of AoBG's bound, from the configuration or the published example.
 
     Raises:
         ValueError: the published ones are asked for where there are none, or beside others.

@@ -14,12 +14,11 @@ from mjx_study.study.variables import variables_of
 
 UNITS: Final = {"timestep": "s", "sigma": "unit of what the noise is added to", "samples": "1", "stiffness": "N/m"}
 Cells = Mapping[int, tuple[Mapping[str, np.ndarray], Mapping[str, str]]]
-"""By index, the arrays of a cell by variable, and the versions of what computed them."""
+"""By index of a cell: its arrays by variable, and the versions of the software that computed them."""
 
 
 def as_plain(document: Any) -> Any:
-    """A document as JSON can hold it: arrays and tuples as lists, numbers that are not finite null, an infinite gamma
-    "inf"."""
+    """A document in JSON's types: arrays and tuples as lists, non-finite numbers null, an infinite gamma as "inf"."""
     if isinstance(document, Mapping):
         infinite = {"gamma": "inf"} if document.get("gamma") == math.inf else {}
         return {str(key): as_plain(item) for key, item in {**document, **infinite}.items()}
@@ -31,11 +30,11 @@ def as_plain(document: Any) -> Any:
 
 
 def dataset_of(document: Mapping[str, Any], cells: Cells) -> xr.Dataset:
-    """All cells of a study as labelled arrays; NaN for what is not there.
+    """All cells of a study as labelled arrays; NaN where a cell is missing.
 
     Args:
-        document: what a study.json holds; each cell has the key "at", its index along every dimension of cells.
-        cells: those that are computed.
+        document: contents of a study.json; each cell has the key "at", its index along every outer dimension.
+        cells: the computed cells.
     """
     config, places = document["config"], document["cells"]
     outer = tuple(places[0]["at"])
@@ -82,7 +81,7 @@ def dataset_of(document: Mapping[str, Any], cells: Cells) -> xr.Dataset:
 
 
 def _mixture(versions: Sequence[Mapping[str, str]]) -> str:
-    """What was computed by more than one version, and by which; empty where nothing was."""
+    """Packages of which cells were computed with several versions, with these; empty if there are none."""
     names = dict.fromkeys(name for each in versions for name in each)
     split = {name: [part for each in versions for part in each.get(name, "none").split(" and ")] for name in names}
     by_name = {name: list(dict.fromkeys(parts)) for name, parts in split.items()}
@@ -90,6 +89,6 @@ def _mixture(versions: Sequence[Mapping[str, str]]) -> str:
 
 
 def write_dataset(dataset: xr.Dataset, path: Path) -> Path:
-    """A dataset as NetCDF 3, which every tool reads."""
+    """Write a dataset as NetCDF 3, which every tool reads."""
     content = dataset.to_netcdf(engine="scipy")
     return write_whole(path, lambda file: file.write(bytes(content)))

@@ -1,8 +1,8 @@
-"""Descents of a cell: gradient descent with every estimator, several seeds at once, from where a run stopped.
+"""Gradient descent in a cell: every estimator, several seeds at once, resumed from the last checkpoint.
 
-All seeds of an estimator advance in one compiled program, in MJX without a return to the host between rollouts and
-update; on a reference system the rollouts are NumPy's. Iteration i of seed s draws from a key of its own, so that a
-run which was stopped and goes on ends bit for bit where an undisturbed one does; all estimators share these keys.
+All seeds of an estimator advance in one compiled program; with MJX, rollouts and update stay on the device, with an
+analytic system the rollouts are NumPy's. Iteration i of seed s has a key of its own, so that an interrupted run ends
+bit for bit where an undisturbed one does; all estimators share these keys.
 """
 
 import dataclasses
@@ -34,7 +34,7 @@ SAVE_SECONDS: Final = 20.0
 
 
 def compute_descents(plan: StudyPlan) -> Callable[..., dict[str, np.ndarray]]:
-    """A function that computes a cell; it keeps what is compiled."""
+    """A function that computes cells and keeps compiled programs between them."""
     backends: dict[tuple[Any, ...], Backend] = {}
 
     def compute(cell: StudyCell, part: Part = Part()) -> dict[str, np.ndarray]:  # noqa: B008, it is empty
@@ -56,7 +56,7 @@ def compute_descents(plan: StudyPlan) -> Callable[..., dict[str, np.ndarray]]:
 
 
 class Backend:
-    """Where rollouts come from: MJX in compiled programs that serve every contact model, or a reference on the host."""
+    """Source of rollouts: MJX, in programs that serve all contact models, or an analytic system on the host."""
 
     def __init__(self, plan: StudyPlan, cell: StudyCell):
         group, config = plan.groups[cell.group], plan.config
@@ -68,7 +68,7 @@ class Backend:
         self._iterations: dict[Estimator, Callable[..., tuple[Descent, Record]]] = {}
 
     def place(self, state: Descent) -> Descent:
-        """The state where an iteration leaves it, on all devices, so that the first one compiles for all."""
+        """Replicate the state over the devices as an iteration does, so that the first call compiles for all."""
         if self.simulator is None:
             return state
         mesh = Mesh(np.array(self.simulator.devices), ("samples",))
@@ -114,7 +114,7 @@ class Backend:
         return float(np.mean(value)), float(np.std(value, ddof=1) / math.sqrt(len(value)))
 
     def metrics(self, theta: Float[Array, " params"], model: ContactPoint) -> dict[str, float]:
-        """What a task counts beside its cost in the rollouts of `cost`: means over those that are finite."""
+        """The task's metrics in the rollouts of `cost`: means over the finite ones."""
         if self.simulator is None:
             found = self.task.analytic(model.stiffness).observe(theta, self._evaluation_keys())
         elif self.task.metrics is None:
@@ -146,7 +146,7 @@ class Backend:
 
 @dataclasses.dataclass
 class _Progress:
-    """A run so far: state, records and seconds, as arrays that a cell's file keeps."""
+    """A run so far: state, records and seconds, convertible to a checkpoint's arrays."""
 
     state: Descent
     records: list[Record]
@@ -154,7 +154,7 @@ class _Progress:
 
     @classmethod
     def of(cls, arrays: Mapping[str, np.ndarray], index: int, start: Descent) -> "_Progress":
-        """What is kept of the run of an estimator, or its start."""
+        """A run from a checkpoint, or its start."""
         if f"seconds_{index}" not in arrays:
             return cls(start, [], [])
         leaves, structure = jax.tree.flatten(start)
@@ -164,7 +164,7 @@ class _Progress:
         return cls(state, records, list(map(float, arrays[f"seconds_{index}"])))
 
     def arrays(self, index: int) -> dict[str, np.ndarray]:
-        """What is to be kept, by name."""
+        """The checkpoint's arrays by name."""
         leaves = jax.tree.leaves(self.state)
         found = {f"state_{index}_{leaf}": np.asarray(value) for leaf, value in enumerate(leaves)}
         found |= {f"history_{index}_{name}": values for name, values in self.history.items()}
@@ -183,7 +183,7 @@ class _Progress:
 def _run(
     backend: Backend, model: ContactPoint, index: int, estimator: Estimator, kept: dict[str, np.ndarray], part: Part
 ) -> dict[str, np.ndarray]:
-    """All seeds of one estimator; `kept` has its state afterwards."""
+    """Run all seeds of one estimator and add their final state to `kept`."""
     seeds, iterations = backend.seeds, backend.recipe.iterations
     run = _Progress.of(kept, index, begin(backend.optimizer, backend.task.theta, seeds))
     state, records, seconds = backend.place(run.state), run.records, run.seconds
@@ -193,7 +193,7 @@ def _run(
     done = already = len(records)
     elapsed = seconds[-1] if seconds else 0.0
     if done < iterations and bool(jnp.any(going(state))):
-        jax.block_until_ready(iterate(state, keys_of(done)))  # compiles; what it gives is dropped
+        jax.block_until_ready(iterate(state, keys_of(done)))  # compile; the result is dropped
     saved = last = time.perf_counter()
     pending: list[Record] = []
 
@@ -248,13 +248,13 @@ def _numbers(backend: Backend, model: ContactPoint, estimator: Estimator, run: _
 
 
 def _padded(values: np.ndarray, length: int) -> np.ndarray:
-    """With NaN after its end, along the first axis."""
+    """Values padded with NaN to a length along the first axis."""
     missing = [(0, length - len(values))] + [(0, 0)] * (values.ndim - 1)
     return np.pad(np.asarray(values, float), missing, constant_values=np.nan)
 
 
 def _rollouts(needs: Sequence[str], samples: int, random_start: bool) -> int:
-    """Rollouts in one iteration of one seed: a pair is two, and each batch of order 0 has its baselines."""
+    """Rollouts in one iteration of one seed; a pair counts two, and batches of order 0 have baselines."""
     count = 0
     for oracle in needs:
         baselines = samples if random_start else 1

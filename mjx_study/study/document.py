@@ -1,4 +1,4 @@
-"""What a study.json holds, as a schema: a file from elsewhere is checked before anything of it is used."""
+"""The schema of a study.json; a file from elsewhere is checked before any of it is used."""
 
 import json
 import math
@@ -10,7 +10,7 @@ from mjx_study.files import Finite, told
 from mjx_study.option import OPTIONS
 
 MOST_NUMBERS: Final = 500_000_000
-"""Of one variable of a study."""
+"""Most numbers of one variable of a study."""
 Name = Annotated[str, Field(min_length=1, max_length=1000)]
 Count = Annotated[int, Field(ge=1, le=10_000_000)]
 
@@ -62,7 +62,7 @@ class _Environment(_Part):
 
 
 class StudyDocument(_Part):
-    """A study.json: only what is read of it; the rest may be anything."""
+    """A study.json, as far as it is read; other keys may hold anything."""
 
     config: _Config
     contents: dict[str, str]
@@ -103,10 +103,10 @@ class _Format(BaseModel):
 
 
 def read_format(content: bytes | str) -> int:
-    """The format that a study.json says it has.
+    """The format number of a study.json.
 
     Raises:
-        ValueError: it says none.
+        ValueError: it has none.
     """
     try:
         return _Format.model_validate_json(content).format

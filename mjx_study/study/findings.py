@@ -1,4 +1,4 @@
-"""What a study says: a row for each estimate of a gradient, and sentences that intervals back."""
+"""Results of a study: a row for each gradient estimate, and findings that the intervals back."""
 
 import itertools
 import json
@@ -15,53 +15,53 @@ from estimators import ENOUGH_EFFECTIVE
 from mjx_study.study.variables import GRADIENTS
 
 SURE: Final = 0.001
-"""p-value at which a mean is called biased: the least that the test's 999 draws can give."""
+"""p-value at which a mean is called biased: the smallest that the test's 999 draws can give."""
 BIASED: Final = {"fobg": "FoBG", "aobg": "AoBG", "ivw": "IVW"}
-"""Whose bias is told: first order, and the interpolations that follow it."""
+"""Estimators whose bias is reported: first order, and the interpolations that follow it."""
 APART: Final = 4.0
-"""Standard errors beyond which a mean that gets no verdict is said to be off."""
+"""Standard errors beyond which a mean without a verdict is reported as off."""
 DETECTED: Final = 4.0
 """Standard errors beyond which two means are called different."""
 NOTABLE: Final = 0.05
-"""Share of the largest slope beyond which a difference is mentioned, where there is no sampling error."""
+"""Share of the largest slope beyond which a difference without sampling error is reported."""
 UNSURE: Final = 0.2
-"""Relative uncertainty of a reference beyond which errors against it say little."""
+"""Relative uncertainty beyond which a reference is too poor to judge errors by."""
 PLACE: Final = ("task", "timestep", "cone", "sigma", "samples", "model", "seed", "estimator", "contact", "stiffness")
-"""What says where a row stands."""
+"""Coordinates of a row."""
 VECTORS: Final = ("gradient", "reference")
 COUNTS: Final = ("unconverged", "nonfinite", "onsets", "onsets_bounded", "onsets_missed")
 
 
 class Row(SimpleNamespace):
-    """One estimate of a study: its place, and every scalar variable of `GRADIENTS`; None for what it does not have."""
+    """One gradient estimate: its coordinates and every scalar variable of `GRADIENTS`; None where not applicable."""
 
     def __getattr__(self, name: str) -> Any:
         raise AttributeError(f"a row has no {name}")
 
     @property
     def believable(self) -> bool:
-        """Whether the batch has effective samples enough for its errors to mean something."""
+        """Whether the batch has enough effective samples for its errors to be meaningful."""
         return self.effective_samples >= ENOUGH_EFFECTIVE
 
     @property
     def bias_verdict(self) -> str:
-        """What the test for bias says: "biased", "none seen", or "too few effective samples" for either."""
+        """Result of the test for bias: "biased", "none seen", or "too few effective samples"."""
         if not min(self.effective_samples, self.reference_effective_samples) >= ENOUGH_EFFECTIVE:
             return "too few effective samples"
         return "biased" if self.bias_p_value <= SURE else "none seen"
 
     def as_dict(self) -> dict[str, Any]:
-        """All of it by name, with what follows from it."""
+        """All variables by name, derived ones included."""
         return vars(self) | {"variance_seconds": self.variance_seconds, "bias_verdict": self.bias_verdict}
 
     @property
     def variance_seconds(self) -> float:
-        """Variance times seconds per sample: the variance that a second of computing leaves."""
+        """Variance times seconds per sample: the variance left after one second of computing."""
         return self.variance * self.seconds_per_sample
 
 
 def rows_of(dataset: xr.Dataset) -> list[Row]:
-    """A row for each estimate that is computed, contact models outermost among what the table compares."""
+    """A row for each computed estimate, ordered by contact model, seed and estimator last."""
     outer = ("task", "timestep", "cone", "sigma", "samples", "model", "seed", "estimator")
     rows, grid = [], dataset["gradient_norm"].transpose(*outer)
     names = [name for name in GRADIENTS if name in dataset and name not in VECTORS]
@@ -87,13 +87,13 @@ def rows_of(dataset: xr.Dataset) -> list[Row]:
 
 
 def findings(dataset: xr.Dataset) -> list[str]:
-    """What the intervals of a study say, in sentences."""
+    """Findings that the intervals of a study back, as sentences."""
     kind = json.loads(dataset.attrs["config"])["kind"]
     return {"gradients": _of_gradients, "descents": lambda _: [], "landscapes": _of_landscapes}[kind](dataset)
 
 
 def _of_gradients(dataset: xr.Dataset) -> list[str]:
-    """Where FoBG's variance is above ZoBG's, and whose mean is biased."""
+    """Where FoBG's variance exceeds ZoBG's, and which means are biased."""
     rows, gammas, sentences = rows_of(dataset), gammas_of(dataset), []
     confidence = json.loads(dataset.attrs["config"])["confidence"]
     for family in dict.fromkeys(row.contact for row in rows):
@@ -104,15 +104,14 @@ def _of_gradients(dataset: xr.Dataset) -> list[str]:
 
 
 def gammas_of(dataset: xr.Dataset) -> dict[str, float]:
-    """By task, AoBG's accuracy bound; infinite for none."""
+    """AoBG's accuracy bound by task; infinite for none."""
     options = [entry["estimators"].get("aobg", {}) for entry in json.loads(dataset.attrs["resolved"])]
     names = dataset["task"].values.tolist()
     return {name: float(given.get("gamma", math.inf)) for name, given in zip(names, options, strict=True)}
 
 
 def _meaningless(family: str, rows: Sequence[Row], gammas: Mapping[str, float]) -> list[str]:
-    """What makes a result mean nothing: contact that is never met, a reference as uncertain as the errors, a bound
-    that binds always."""
+    """Why a result is meaningless: contact never active, reference too uncertain, AoBG's bound below epsilon."""
     found = []
     numbers = defaultdict(list)
     for row in rows:
@@ -120,7 +119,7 @@ def _meaningless(family: str, rows: Sequence[Row], gammas: Mapping[str, float]) 
         numbers[key].append((row.gradient_norm, row.variance))
     several = [each for each in numbers.values() if len(each) > 1]
     if several and all(np.allclose(each, each[0], rtol=1e-12, atol=0, equal_nan=True) for each in several):
-        found.append(f"{family}: nothing depends on K: the contact whose stiffness is swept was never met")
+        found.append(f"{family}: nothing depends on K: the contact whose stiffness is swept was never active")
     unsure = list(dict.fromkeys(row.stiffness for row in rows if row.reference_uncertainty > UNSURE))
     if unsure:
         found.append(
@@ -158,12 +157,12 @@ def _variance_finding(family: str, rows: Sequence[Row], confidence: float) -> li
 
 
 def _bias_finding(rows: Sequence[Row], gammas: Mapping[str, float]) -> list[str]:
-    """Where a mean is farther from the reference than any draw of the test; what relies on FoBG follows it."""
+    """Means farther from the reference than any draw of the test."""
     return [sentence for row in rows if row.estimator in BIASED and (sentence := _verdict(row, gammas))]
 
 
 def _verdict(row: Row, gammas: Mapping[str, float]) -> str:
-    """A sentence where a mean is biased, or is off and cannot be judged; empty otherwise."""
+    """A sentence about a mean that is biased, or off but undecided; empty otherwise."""
     mean, where = f"{row.contact}: {BIASED[row.estimator]}'s mean is", _at([row.stiffness])
     if row.bias_verdict == "biased":
         free = row.estimator == "aobg" and math.isinf(gammas[row.task])
@@ -175,22 +174,22 @@ def _verdict(row: Row, gammas: Mapping[str, float]) -> str:
     held = (
         f"{min(row.effective_samples, row.reference_effective_samples):.1f}" if row.effective_samples else "all equal"
     )
-    return f"{mean} off by {_share(row)}{where}, biased or for want of rare samples: too few effective samples ({held})"
+    return f"{mean} off by {_share(row)}{where}, from bias or lack of rare samples: too few effective samples ({held})"
 
 
 def _share(row: Row) -> str:
-    """Of the reference gradient, without what noise adds to it, to the digits that its error leaves."""
+    """The debiased error as a share of the reference gradient, in significant digits only."""
     error = max(row.debiased_error_se, row.reference_uncertainty)
     return f"{row.debiased_error:.1%}" if error < 0.005 else f"{float(f'{100 * row.debiased_error:.2g}'):g}%"
 
 
 def _at(stiffnesses: Sequence[float]) -> str:
-    """Where, unless there is no contact."""
+    """The stiffnesses, for a sentence; empty without contact."""
     return f" at K = {', '.join(f'{value:g}' for value in stiffnesses)} N/m" if any(stiffnesses) else ""
 
 
 def _of_landscapes(dataset: xr.Dataset) -> list[str]:
-    """Where the mean of first order is not the slope of the mean cost."""
+    """Where the mean of FoBG differs from the slope of the mean cost."""
     return [
         f"{label}: {_gap(one)}" for label, one in curves_of(dataset) if {"zobg", "fobg"} <= set(one["estimator"].values)
     ]
@@ -207,7 +206,7 @@ def curves_of(dataset: xr.Dataset) -> list[tuple[str, xr.Dataset]]:
 
 
 def _gap(one: xr.Dataset) -> str:
-    """Where E[FoBG] differs from the slope of the mean cost, by quadrature where there is one."""
+    """Where E[FoBG] differs from the slope of the mean cost; by quadrature if there is one."""
     if "exact_slope" in one and bool(one["exact_slope"].notnull().all()):
         first, slope = one["exact_first"].values, one["exact_slope"].values
         largest = float(np.max(np.abs(slope)))

@@ -1,4 +1,4 @@
-"""Gradient estimates of a cell: every estimator on every seed's batches, against a reference gradient.
+"""Gradient estimates in a cell: every estimator on every seed's batches, against a reference gradient.
 
 The estimators of a seed share its batches: those of values and those of derivatives, drawn from independent keys;
 interpolated estimates combine the two. The same keys are used in every cell, so differences between contact models are
@@ -30,11 +30,11 @@ from mjx_study.tasks.task import Task
 CANDIDATES: Final = 100
 """First-order samples whose median is a candidate for the reference's control variate."""
 MOST_KEPT: Final = 1_000_000
-"""Numbers of the mean gradients of a cell; where there are more, they are left out."""
+"""Most numbers in a cell's mean gradients; larger ones are not kept."""
 
 
 def compute_gradients(plan: StudyPlan) -> Callable[[StudyCell], dict[str, np.ndarray]]:
-    """A function that computes a cell; it keeps what is compiled."""
+    """A function that computes cells and keeps compiled programs between them."""
     config, oracles, objectives = plan.config, oracles_of(plan.config), Objectives(plan)
     warm: set[tuple[int, bool]] = set()
     soft: dict[tuple[int, float], Array | None] = {}
@@ -95,7 +95,7 @@ def _of_batches(
     events: Sequence[dict[str, np.ndarray | None]],
     samples: int,
 ) -> dict[str, np.ndarray]:
-    """What the batches of each estimator's oracles tell: times, residuals, onsets."""
+    """Times, residuals and onset counts of each estimator's batches."""
     arrays: dict[str, list[Any]] = {"seconds_per_sample": [], "residual": [], "unconverged": [], "events": []}
     for estimator in chosen:
         needs = estimator.needs

@@ -36,13 +36,13 @@ BY_VERSION: Final = {"mjx_study", "estimators", "mujoco", "jax", "jaxlib", "nump
 IRRELEVANT: Final = re.compile(r"_.*|.*name.*|.*path.*|.*rgba|(tex|mat|skin|light|cam|text)_.*|.*_matid")
 """Fields of MjModel that no number depends on."""
 ACCEPT: Final = "choose another folder, or accept the mixture by --accept-versions"
-"""What a message about other versions ends with."""
+"""Advice at the end of messages about other versions."""
 UNREAD: Final = ("description",)
 """Fields of a task that no number depends on."""
 
 
 def versions() -> dict[str, str]:
-    """Of what computes, and a digest of this package's own code."""
+    """Versions of the packages that compute, and a digest of this package's code."""
     return {name: metadata.version(name) for name in VERSIONED} | {"code of mjx-study": _own_code()}
 
 
@@ -159,7 +159,7 @@ class _Digest:
             self.add(value)
 
     def _array(self, value: Any) -> None:
-        """By value: a mantissa of 40 bits and an exponent, since the last bits depend on the processor."""
+        """Digest an array by value, to 40 bits of mantissa: the last bits depend on the processor."""
         if isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jax.dtypes.prng_key):
             value = jax.random.key_data(value)
         array = np.asarray(value)
@@ -234,7 +234,7 @@ def _by_version(module: str) -> bool:
 
 
 def _file(module: str) -> Path | None:
-    """Where a module's source is; None for one of an interactive session, or that is compiled."""
+    """Path of a module's source; None in an interactive session, or for compiled modules."""
     file = getattr(sys.modules.get(module), "__file__", None)
     return Path(file) if file is not None and Path(file).is_file() else None
 
@@ -248,7 +248,7 @@ def _beside(other: str, module: str, root: Path) -> bool:
 
 
 def _closure(function: types.FunctionType) -> dict[str, Any]:
-    """What a function holds of the scope that it was made in, by name."""
+    """Variables that a function closes over, by name."""
     held = {}
     for name, cell in zip(function.__code__.co_freevars, function.__closure__ or (), strict=True):
         with suppress(ValueError):  # a cell that is empty still

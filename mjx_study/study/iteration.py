@@ -27,13 +27,13 @@ REASONS: Final = (
 @register_pytree
 @dataclasses.dataclass(frozen=True)
 class Descent:
-    """Where all seeds of a run are.
+    """State of all seeds of a run.
 
     Attributes:
         theta: parameters of each seed.
-        optimizer: state of the optimiser of each seed.
-        reason: index into `REASONS`; a seed with one stays where it is.
-        first_cost: size of each seed's mean cost at its first iteration.
+        optimizer: optimiser state of each seed.
+        reason: index into `REASONS`; 0 while a seed goes on, which otherwise stays as it is.
+        first_cost: absolute mean cost of each seed at its first iteration.
     """
 
     theta: Float[Array, "*seeds params"]
@@ -45,15 +45,15 @@ class Descent:
 @register_pytree
 @dataclasses.dataclass(frozen=True)
 class Record:
-    """What an iteration tells of each seed; NaN for one that has stopped.
+    """Record of one iteration for each seed; NaN once a seed has stopped.
 
     Attributes:
-        cost: mean over the batch, at the parameters before the update.
-        gradient_norm: of the estimate.
-        variance: of one sample.
+        cost: mean cost of the batch, before the update.
+        gradient_norm: norm of the gradient estimate.
+        variance: variance of one gradient sample.
         alpha: weight of the first-order batch; NaN for an estimator of one batch.
-        nonfinite: samples left out.
-        residual: largest of the solver's in the batch; 0 for a closed form.
+        nonfinite: number of samples left out.
+        residual: largest solver residual in the batch; 0 for an analytic system.
     """
 
     cost: Float[Array, "*seeds"]

@@ -24,15 +24,15 @@ from mjx_study.tasks.validation import check_shapes
 
 @dataclasses.dataclass(frozen=True)
 class Group:
-    """What one compilation serves.
+    """Cells that share compiled programs.
 
     Attributes:
-        name: name of the task, as the configuration has it; two tasks may call themselves the same.
-        task: as it is built.
-        timestep: [s].
-        cone: pyramidal or elliptic.
+        name: the task's name in the configuration, which is unique.
+        task: the task, as built.
+        timestep: timestep [s].
+        cone: friction cone, pyramidal or elliptic.
         models: contact models.
-        recipe: settings of its descents; None in other studies.
+        recipe: settings of descents; None in other studies.
     """
 
     name: str
@@ -45,13 +45,13 @@ class Group:
 
 @dataclasses.dataclass(frozen=True)
 class StudyCell:
-    """One file of a study.
+    """One cell of a study, kept as one file.
 
     Attributes:
         group: index of the group.
         model: the contact model.
-        sigma: of the noise.
-        samples: in each batch.
+        sigma: standard deviation of the noise.
+        samples: samples in each batch.
     """
 
     group: int
@@ -62,14 +62,14 @@ class StudyCell:
 
 @dataclasses.dataclass(frozen=True)
 class StudyPlan:
-    """A study that has been checked.
+    """A checked and resolved study.
 
     Attributes:
-        config: as given.
-        groups: what is compiled.
-        cells: what is computed, in this order.
-        chunk_size: samples per device and call, for the devices here unless the configuration gives it.
-        warnings: about contact models.
+        config: the configuration.
+        groups: groups of cells that share compiled programs.
+        cells: cells in the order of computation.
+        chunk_size: samples per device and call.
+        warnings: warnings about contact models.
     """
 
     config: StudyConfig

@@ -4,10 +4,10 @@ from pathlib import Path
 
 
 def git_revision(root: Path | None = None) -> str | None:
-    """What `git rev-parse HEAD` says, from git's files; None where the program is installed, or nothing is committed.
+    """The commit of a checkout, read from git's files; None outside a checkout, or before its first commit.
 
     Args:
-        root: of the checkout; None for that of this package.
+        root: root of the checkout; None for the one of this package.
     """
     root = Path(__file__).resolve().parents[2] if root is None else root
     try:
@@ -24,12 +24,12 @@ def git_revision(root: Path | None = None) -> str | None:
 
 
 def _git_folder(path: Path) -> Path:
-    """`.git` itself, or what the file in its place names: that of a worktree or a submodule."""
+    """`.git` itself, or the folder named by the file in its place (a worktree or a submodule)."""
     return path if path.is_dir() else path.parent / _first_line(path).removeprefix("gitdir: ")
 
 
 def _resolved(reference: str, folder: Path, common: Path) -> str:
-    """What a reference holds: loose, of this worktree first, or packed."""
+    """The commit of a reference: loose, this worktree's first, or packed."""
     for place in (folder, common):
         if (place / reference).is_file():
             return _first_line(place / reference)

@@ -34,7 +34,7 @@ WAIT_SECONDS: Final = 0.5
 
 
 def _document(plan: StudyPlan, command: str | None) -> dict[str, Any]:
-    """What study.json says."""
+    """Contents of study.json."""
     fields = {field.name: getattr(plan.config, field.name) for field in dataclasses.fields(plan.config)}
     axes = axes_of(plan)
     fields |= {"tasks": plan.config.task_names, "seeds": plan.config.batches}
@@ -58,7 +58,7 @@ def _document(plan: StudyPlan, command: str | None) -> dict[str, Any]:
 
 
 def _resolved(plan: StudyPlan, axes: Axes) -> list[dict[str, Any]]:
-    """What the configuration leaves to each task: its noise, horizons and the options of its estimators."""
+    """Settings that differ between tasks: noise, horizons, the estimators' options."""
     found: list[dict[str, Any]] = [{} for _ in axes.values["task"]]
     for cell, at in zip(plan.cells, axes.places, strict=True):
         task, entry = plan.groups[cell.group].task, found[at["task"]]
@@ -100,7 +100,7 @@ def open_store(plan: StudyPlan, folder: Path, command: str | None = None, *, acc
 
 
 def _forms(plan: StudyPlan) -> dict[str, list[Task]]:
-    """By the configuration's name of a task, what it is with every timestep and cone."""
+    """The task of every timestep and cone, by the task's name in the configuration."""
     forms: dict[str, list[Task]] = {}
     for group in plan.groups:
         forms.setdefault(group.name, []).append(group.task)
@@ -239,7 +239,7 @@ def load_study(folder: str | Path) -> xr.Dataset:
 
 
 def warnings_of(dataset: xr.Dataset) -> tuple[str, ...]:
-    """Warnings about a study: of its plan, and about its numbers."""
+    """Warnings of a study's plan, and about its numbers."""
     found = json.loads(dataset.attrs.get("warnings", "[]"))
     if dataset.attrs["missing_cells"]:
         found.append(f"{dataset.attrs['missing_cells']} cells are not computed yet; the same command goes on")
@@ -266,6 +266,6 @@ def warnings_of(dataset: xr.Dataset) -> tuple[str, ...]:
 
 
 def _count(counts: xr.DataArray) -> int:
-    """The total; of rollouts that estimators share, that of the estimator with most."""
+    """The total count; where estimators share rollouts, the largest of any estimator."""
     shared = counts.dims and "seed" not in counts.dims and "estimator" in counts.dims and "point" not in counts.dims
     return int(counts.max("estimator").sum() if shared else counts.sum())

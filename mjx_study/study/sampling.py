@@ -1,4 +1,4 @@
-"""The samples of a cell: keys, batches of every oracle over seeds, and the residuals of their solves."""
+"""Sampling a cell: keys, batches of every oracle over seeds, and solver residuals."""
 
 import time
 from collections.abc import Sequence
@@ -20,7 +20,7 @@ UNCONVERGED: Final = {"float64": 1e-6, "float32": 1e-3}
 
 
 class Objectives:
-    """The objective of each cell of a plan; what is compiled serves every contact model and noise of its group."""
+    """The objective of each cell of a plan; compiled programs serve all contact models and noises of a group."""
 
     def __init__(self, plan: StudyPlan):
         self._plan, self._compiled = plan, {}
@@ -38,7 +38,7 @@ class Objectives:
 
 
 def cell_keys(seed: int, seeds: int) -> dict[str, Any]:
-    """Independent keys, the same in every cell: of each seed's batches, of the reference and of the tests."""
+    """Independent keys for each seed's batches, the reference and the tests; the same in every cell."""
     zeroth, first, odd, candidate, test = jax.random.split(jax.random.key(seed), 5)
     by_order = [jax.random.split(stream, seeds) for stream in (zeroth, first)]
     return {"order": by_order, "reference": (odd, candidate), "test": test}
@@ -47,10 +47,10 @@ def cell_keys(seed: int, seeds: int) -> dict[str, Any]:
 def draw_batches(
     objective: Any, theta: Array, keys: dict[str, Any], oracles: Sequence[str], samples: int, seeds: slice
 ) -> tuple[dict[str, Any], dict[str, float], dict[str, np.ndarray]]:
-    """Batches of every oracle with an axis of seeds.
+    """Batches of every oracle, with a leading axis of seeds.
 
     Returns:
-        Batches, seconds that each took, and the residual of every rollout of each; all by oracle.
+        By oracle: the batch, its computing time [s], and the solver residual of every rollout.
     """
     together = max(1, LARGEST_BATCH // samples)
     drawn, seconds, residuals = {}, {}, {}
@@ -70,12 +70,12 @@ def draw_batches(
 
 
 def residuals_of(batch: Any) -> Float[np.ndarray, " rollouts"]:
-    """The solver's residual of every rollout of a batch, whatever its kind; none of a closed form."""
+    """The solver residual of every rollout of a batch of any kind; empty for an analytic system."""
     parts = batch if isinstance(batch, tuple) else (batch,)
     steps = [part.steps if isinstance(part, Linearisation) else part for part in parts]
     return np.concatenate([np.zeros(0) if part.residual is None else np.asarray(part.residual) for part in steps])
 
 
 def unconverged(residuals: np.ndarray, precision: str) -> int:
-    """How many residuals are too large, or not finite."""
+    """Number of residuals that are too large or not finite."""
     return int(np.sum(~(residuals <= UNCONVERGED[precision])))

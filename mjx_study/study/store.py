@@ -1,13 +1,13 @@
-"""A study's folder: its configuration, one file per cell, and the labelled arrays that they make together.
+"""A study's folder: its configuration, one file per cell, and one file of all results.
 
-    study.json       configuration, digests of what it is about, versions, machine, and every cell's coordinates
-    cells/00042.npz  the numbers of one cell, with digests of them, of the study and of the cell's place
-    cells/00042.part.npz  a descent that is not at its end yet, from which it goes on
-    results.nc       all of them as one NetCDF file, written when the last cell is there
+    study.json       configuration, digests of what the numbers depend on, versions, machine, every cell's coordinates
+    cells/00042.npz  one cell's numbers, with digests of these, of the study and of the cell's coordinates
+    cells/00042.part.npz  checkpoint of a descent that has not ended
+    results.nc       all cells as one NetCDF file, written after the last
     study.lock       which cells are being computed, and by which process
 
-Every file is moved into place when it is complete, so that a process may be killed at any moment. Locks are the
-operating system's and go with their process.
+Files are moved into place once complete, so that a process may be killed at any moment. Locks are the operating
+system's and end with their process.
 """
 
 import dataclasses
@@ -29,13 +29,12 @@ from mjx_study.study.document import read_document, read_format
 from mjx_study.study.identity import ACCEPT, differences
 
 FORMAT: Final = 3
-"""Of the folder; a number that goes up when an older program could not read a newer folder."""
-
+"""Format of the folder; increased when older programs cannot read newer folders."""
 
 IDENTITY: Final = ("contents", "config")
-"""Parts of study.json that must not differ for a study to go on."""
+"""Parts of study.json that must match when a study resumes."""
 VERSIONS: Final = "versions"
-"""Entry of a cell that says what computed it."""
+"""Entry of a cell with the versions that computed it."""
 
 
 class StudyError(ValueError):
@@ -44,12 +43,12 @@ class StudyError(ValueError):
 
 @dataclasses.dataclass(frozen=True)
 class Part:
-    """What a cell that takes long may keep of itself before it is complete.
+    """Checkpointing within a cell.
 
     Attributes:
-        kept: what was kept when it stopped.
-        save: keeps arrays.
-        report: tells progress within the cell: done, in all, and of what.
+        kept: arrays of the last checkpoint.
+        save: writes a checkpoint.
+        report: reports progress within the cell: done, total, and what is being computed.
     """
 
     kept: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
@@ -62,7 +61,7 @@ class Store:
 
     Attributes:
         folder: its path.
-        document: what study.json holds.
+        document: contents of study.json.
     """
 
     def __init__(self, folder: Path, document: dict[str, Any]):
@@ -72,16 +71,16 @@ class Store:
 
     @classmethod
     def create(cls, folder: Path, document: dict[str, Any], *, accept_versions: bool = False) -> "Store":
-        """A folder for a study, or the one that is there, which must be of the same configuration and contents.
+        """Create a study's folder, or open an existing one of the same configuration and contents.
 
         Args:
-            folder: of the study.
-            document: `config`, `cells`, and where there are any `contents` (digests of what the numbers depend on) and
-                `versions` (of what computes them), and whatever else there is to keep; plain data.
-            accept_versions: go on with a study of other versions, each of whose cells says which computed it.
+            folder: path of the folder.
+            document: `config`, `cells`, and optionally `contents` (digests of what the numbers depend on), `versions`
+                (of the software that computes them), and further plain data.
+            accept_versions: resume a study begun by other versions; each cell records its own.
 
         Raises:
-            StudyError: another study is there, or one of other versions, or a file that is not one.
+            StudyError: the folder holds another study, one of other versions, or a damaged file.
             ValueError: the folder cannot be written to.
         """
         prepare_folder(folder)
@@ -112,7 +111,7 @@ class Store:
         return cls(folder, document)
 
     def _extend(self, document: dict[str, Any]) -> None:
-        """Make descents that ended parts of longer ones; killed in between, it is done again."""
+        """Turn finished descents into checkpoints of longer ones; safe to repeat after a kill."""
         for index in range(len(self.document["cells"])):
             if self.has(index):
                 arrays, written_by = self.read_with_versions(index)
@@ -123,10 +122,10 @@ class Store:
 
     @classmethod
     def open(cls, folder: Path) -> "Store":
-        """The study of a folder, to read.
+        """Open a study's folder for reading.
 
         Raises:
-            StudyError: there is none, or its study.json is damaged or of a newer format.
+            StudyError: there is no study, or its study.json is damaged or of another format.
         """
         path = folder / "study.json"
         try:
@@ -144,24 +143,24 @@ class Store:
         return cls(folder, document)
 
     def path(self, index: int) -> Path:
-        """Where a cell is kept."""
+        """Path of a cell."""
         return self.folder / "cells" / f"{index:05d}.npz"
 
     def has(self, index: int) -> bool:
-        """Whether a cell is there; `read` says whether it is sound."""
+        """Whether a cell's file exists; `read` checks it."""
         return self.path(index).exists()
 
     def part_path(self, index: int) -> Path:
-        """Where a cell that is not complete is kept."""
+        """Path of a cell's checkpoint."""
         return self.folder / "cells" / f"{index:05d}.part.npz"
 
     def write(self, index: int, arrays: Mapping[str, np.ndarray]) -> None:
-        """Keep the numbers of a cell."""
+        """Write a cell."""
         self._write(self.path(index), arrays, self._authors(index), self._place(index))
         self.part_path(index).unlink(missing_ok=True)
 
     def write_part(self, index: int, arrays: Mapping[str, np.ndarray]) -> None:
-        """Keep what there is of a cell."""
+        """Write a cell's checkpoint."""
         self._write(self.part_path(index), arrays, self._authors(index), self._place(index, part=True))
 
     def _write(self, path: Path, arrays: Mapping[str, np.ndarray], versions: dict[str, str], place: str) -> None:
@@ -170,7 +169,7 @@ class Store:
         write_whole(path, lambda file: np.savez(file, digest=digest, **kept))  # type: ignore[arg-type]
 
     def _authors(self, index: int) -> dict[str, str]:
-        """Versions of what computes a cell, and of what computed a part of it."""
+        """Versions that computed a cell, those of its checkpoint included."""
         if not self.part_path(index).exists():
             return self._versions
         before = self._read(self.part_path(index), self._place(index, part=True))[1]
@@ -187,11 +186,11 @@ class Store:
         return self.read_with_versions(index)[0]
 
     def read_with_versions(self, index: int) -> tuple[dict[str, np.ndarray], dict[str, str]]:
-        """The numbers of a cell, and the versions of what computed them; see `read`."""
+        """The numbers of a cell, and the versions that computed them; see `read`."""
         return self._read(self.path(index), self._place(index))
 
     def read_part(self, index: int) -> dict[str, np.ndarray]:
-        """What there is of a cell that is not complete; empty for nothing. Raises as `read`."""
+        """A cell's checkpoint; empty if there is none. Raises as `read`."""
         path = self.part_path(index)
         return self._read(path, self._place(index, part=True))[0] if path.exists() else {}
 
@@ -213,7 +212,7 @@ class Store:
 
     @contextmanager
     def claim(self, index: int) -> Generator[bool]:
-        """Whether this process may compute a cell: no other one does, until the block is left or this process dies."""
+        """Whether this process may compute a cell; if so, no other may until the block is left or the process dies."""
         path = self.folder / "study.lock"
         try:
             descriptor = open_regular(path, os.O_RDWR | os.O_CREAT)
@@ -228,20 +227,20 @@ class Store:
                 yield True
 
     def _place(self, index: int, *, part: bool = False) -> str:
-        """Digest of a cell's index and coordinates, and of how long its descents are unless it is a part."""
+        """Digest of a cell's index and coordinates, and unless it is a checkpoint of the descents' length."""
         cell, axes = self.document["cells"][index], self.document.get("axes", {})
         at = {name: axes[name][place] for name, place in cell.get("at", {}).items()}
         iterations = None if part else self.document["config"].get("iterations")
         return _digest_of_text({"index": index, "cell": cell, "at": at, "iterations": iterations})
 
     def read_all(self) -> dict[int, tuple[dict[str, np.ndarray], dict[str, str]]]:
-        """Every cell that is there, with the versions of what computed it; see `read`."""
+        """All computed cells with their versions; see `read`."""
         there = [index for index in range(len(self.document["cells"])) if self.has(index)]
         return {index: self.read_with_versions(index) for index in there}
 
     @property
     def missing(self) -> list[int]:
-        """Cells that are not there yet."""
+        """Indices of cells not computed yet."""
         return [index for index in range(len(self.document["cells"])) if not self.has(index)]
 
 
@@ -258,7 +257,7 @@ def _digest_of_text(document: Mapping[str, Any]) -> str:
 
 
 def _identity(document: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """What must not differ for a study to go on: all that it depends on but the length of descents."""
+    """What must match when a study resumes: all that its numbers depend on, but not the length of descents."""
     found = {name: dict(document.get(name, {})) for name in IDENTITY}
     found["config"].pop("iterations", None)
     return found

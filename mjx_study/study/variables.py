@@ -15,8 +15,8 @@ class Variable:
     Attributes:
         dims: dimensions within a cell.
         unit: "gradient" is cost per unit of theta.
-        description: one line, from which a heading is made where `heading` is empty.
-        heading: short, for tables.
+        description: one line; the heading if `heading` is empty.
+        heading: short heading for tables.
     """
 
     dims: tuple[str, ...]
@@ -73,10 +73,10 @@ GRADIENTS: Final = {
     "reference": Variable(("param",), "gradient", "reference gradient"),
 }
 HISTORY: Final = ("cost", "gradient_norm", "variance", "alpha", "nonfinite", "residual")
-"""What each iteration of a descent records; see `mjx_study.study.iteration.Record`."""
+"""Variables recorded at each iteration of a descent; see `mjx_study.study.iteration.Record`."""
 METRIC: Final = "metric_"
 START: Final = "start_metric_"
-"""Prefixes of the variables of what a task counts beside its cost, of final policies and of the start's."""
+"""Prefixes of a task's metrics: of the final policies, and of the initial one."""
 STEP: Final = ("iteration", *BATCH)
 DESCENTS: Final = {
     "final_cost": Variable(BATCH, "cost", "mean cost of the final policy", "final cost, median"),
@@ -117,15 +117,15 @@ CELL: Final = {
     "solref": Variable(("solref_entry",), "1", "MuJoCo's solref of the contact; NaN where it is the MJCF's"),
     "solimp": Variable(("solimp_entry",), "1", "MuJoCo's solimp of the contact; NaN where it is the MJCF's"),
 }
-"""Of every kind."""
+"""Variables of every kind of study."""
 VARIABLES: Final = {"gradients": GRADIENTS, "descents": DESCENTS, "landscapes": LANDSCAPES}
-"""By kind of study."""
+"""Variables by kind of study."""
 MEASURED: Final = ("seconds", "seconds_per_sample")
-"""Variables that are times, and so the only ones that differ from run to run."""
+"""Measured times, the only variables that differ from run to run."""
 
 
 def variables_of(kind: str, names: Iterable[str]) -> dict[str, Variable]:
-    """The variables of a kind of study, with the metrics that are among some names."""
+    """The variables of a kind of study, with the metrics among the given names."""
     told = {name: f"{name.partition('metric_')[2]}, mean over the rollouts of a final cost" for name in names}
     metrics = {name: Variable(BATCH, "1", told[name]) for name in told if name.startswith(METRIC)}
     metrics |= {name: Variable((), "1", told[name]) for name in told if name.startswith(START)}
@@ -133,7 +133,7 @@ def variables_of(kind: str, names: Iterable[str]) -> dict[str, Variable]:
 
 
 def markdown_table(kind: str) -> str:
-    """The variables of a kind of study, as docs/studies.md has them."""
+    """The table of variables in docs/studies.md."""
     rows = [
         f"| `{name}` | {', '.join(variable.dims) or '-'} | {variable.unit} | {variable.description} |"
         for name, variable in VARIABLES[kind].items()

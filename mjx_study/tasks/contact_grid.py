@@ -24,7 +24,7 @@ from mjx_study.table import digits_to_tell_apart
 from mjx_study.tasks.task import Task
 
 REFERENCE: Final = "reference"
-"""In the place of a contact family: the task's analytic system, without MJX."""
+"""Stands for the task's analytic system, without MJX, among contact families."""
 
 
 @dataclasses.dataclass(frozen=True)
