@@ -6,130 +6,20 @@ Reference: Suh, Simchowitz, Zhang, Tedrake, "Do Differentiable Simulators Give B
 2022.
 """
 
-from estimators.alpha_order import alpha_order, constrained_alpha, interpolate, inverse_variance_alpha
-from estimators.baselines import BASELINES, leave_one_out, none, zero_noise
-from estimators.bias import BiasTest, EmpiricalBias, bias_test, empirical_bias, squared_bias_of_means
-from estimators.comparison import Comparison, compare
-from estimators.confidence import VARIANCE_PROXIES, bernstein_epsilon, coverage_interval, variance_upper_bound
-from estimators.cross_fitting import WEIGHTS, weigh_batches
-from estimators.ddcg import discontinuity_gated
-from estimators.effective import ENOUGH_EFFECTIVE, EffectiveSamples, effective_samples
-from estimators.estimator import ORACLES, Batches, Estimator, Oracle, draw, oracles_of
-from estimators.first_order import clipped_first_order, first_order
-from estimators.intervals import variance_interval
-from estimators.noise import NOISES, NoiseDensity
-from estimators.propagation import total_propagation, truncated_first_order
-from estimators.registry import (
-    ESTIMATORS,
-    AlphaOrder,
-    Antithetic,
-    AntitheticCostToGo,
-    ClippedFirstOrder,
-    CostToGo,
-    DeltaMethod,
-    DiscontinuityGated,
-    FirstOrder,
-    InverseVariance,
-    StepwiseInverseVariance,
-    TotalPropagation,
-    TruncatedFirstOrder,
-    ZerothOrder,
-    estimate,
-    find_estimator,
-    make_estimator,
-    register,
-)
-from estimators.statistics import norm_quantiles, summarise
-from estimators.stepwise import antithetic_cost_to_go, cost_to_go, stepwise_inverse_variance
-from estimators.types import (
-    AlphaChoice,
-    Differentiation,
-    Evaluation,
-    GradientEstimate,
-    Linearisation,
-    Objective,
-    PairedObjective,
-    StepDifferentiation,
-    StepEvaluation,
-    StepwiseObjective,
-    pull_back,
-)
-from estimators.zeroth_order import antithetic, delta_control_variate, zeroth_order
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
-__all__ = [
-    "BASELINES",
-    "ENOUGH_EFFECTIVE",
-    "ESTIMATORS",
-    "NOISES",
-    "ORACLES",
-    "VARIANCE_PROXIES",
-    "WEIGHTS",
-    "AlphaChoice",
-    "AlphaOrder",
-    "Antithetic",
-    "AntitheticCostToGo",
-    "Batches",
-    "BiasTest",
-    "ClippedFirstOrder",
-    "Comparison",
-    "CostToGo",
-    "DeltaMethod",
-    "Differentiation",
-    "DiscontinuityGated",
-    "EffectiveSamples",
-    "EmpiricalBias",
-    "Estimator",
-    "Evaluation",
-    "FirstOrder",
-    "GradientEstimate",
-    "InverseVariance",
-    "Linearisation",
-    "NoiseDensity",
-    "Objective",
-    "Oracle",
-    "PairedObjective",
-    "StepDifferentiation",
-    "StepEvaluation",
-    "StepwiseInverseVariance",
-    "StepwiseObjective",
-    "TotalPropagation",
-    "TruncatedFirstOrder",
-    "ZerothOrder",
-    "alpha_order",
-    "antithetic",
-    "antithetic_cost_to_go",
-    "bernstein_epsilon",
-    "bias_test",
-    "clipped_first_order",
-    "compare",
-    "constrained_alpha",
-    "cost_to_go",
-    "coverage_interval",
-    "delta_control_variate",
-    "discontinuity_gated",
-    "draw",
-    "effective_samples",
-    "empirical_bias",
-    "estimate",
-    "find_estimator",
-    "first_order",
-    "interpolate",
-    "inverse_variance_alpha",
-    "leave_one_out",
-    "make_estimator",
-    "none",
-    "norm_quantiles",
-    "oracles_of",
-    "pull_back",
-    "register",
-    "squared_bias_of_means",
-    "stepwise_inverse_variance",
-    "summarise",
-    "total_propagation",
-    "truncated_first_order",
-    "variance_interval",
-    "variance_upper_bound",
-    "weigh_batches",
-    "zero_noise",
-    "zeroth_order",
-]
+if TYPE_CHECKING:
+    from estimators._public import *  # noqa: F403
+
+
+def __getattr__(name: str) -> Any:
+    if name == "__all__" or not name.startswith("_"):
+        public = import_module("estimators._public")
+        if hasattr(public, name):
+            return getattr(public, name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *import_module("estimators._public").__all__})

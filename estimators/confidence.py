@@ -6,11 +6,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from estimators.catalogue import MAX_DEVIATION, VARIANCE_PROXIES
 from estimators.statistics import finite_rows
 from estimators.types import GradientEstimate
-
-VARIANCE_PROXIES = ("variance", "second_moment", "upper_bound")
-MAX_DEVIATION = "max_deviation"
 
 
 def bernstein_epsilon(

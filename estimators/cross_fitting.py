@@ -7,12 +7,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from estimators.catalogue import CROSS_FITTED, PLUG_IN, WEIGHTS
 from estimators.types import GradientEstimate
 
-PLUG_IN: Final = "plug_in"
-CROSS_FITTED: Final = "cross_fitted"
-WEIGHTS: Final = (PLUG_IN, CROSS_FITTED)
-"""Sources of an interpolation's weights."""
 FEWEST_SAMPLES: Final = 4
 """Two in each half, for a variance."""
 

@@ -5,14 +5,13 @@ from dataclasses import replace
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from estimators.alpha_order import interpolate, inverse_variance_alpha
-from estimators.cross_fitting import PLUG_IN, weigh_batches
+from estimators.alpha import interpolate, inverse_variance_alpha
+from estimators.catalogue import PLUG_IN, PUBLISHED_TOLERANCE
+from estimators.cross_fitting import weigh_batches
 from estimators.statistics import finite_rows, summarise
 from estimators.stepwise import node_variance
 from estimators.types import AlphaChoice, Evaluation, GradientEstimate, StepDifferentiation, pull_back
-from estimators.zeroth_order import zeroth_order
-
-PUBLISHED_TOLERANCE = 0.3
+from estimators.zeroth import zeroth_order
 
 
 def discontinuity_gated(

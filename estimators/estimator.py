@@ -8,6 +8,7 @@ from typing import Any, ClassVar, Final
 import jax
 from jaxtyping import Array, Float, Key
 
+from estimators.catalogue import Entry
 from estimators.types import GradientEstimate, Objective
 
 
@@ -55,7 +56,7 @@ class Estimator(ABC):
     Attributes:
         name: In messages, and in `ESTIMATORS`.
         label: For a legend, where that is not the name.
-        description: One line, the first of the docstring.
+        description: One line; the first of the docstring, unless the catalogue has it.
         needs: Oracles in `ORACLES`, in the order in which `combine` takes their batches.
         gaussian: Whether the formula holds for Gaussian noise only.
         additive: Whether it holds for noise on theta itself only.
@@ -68,9 +69,12 @@ class Estimator(ABC):
     gaussian: ClassVar[bool] = False
     additive: ClassVar[bool] = False
 
-    def __init_subclass__(cls) -> None:
+    def __init_subclass__(cls, entry: Entry | None = None) -> None:
+        """Take name, label, needs and description from an entry of the catalogue, where one is given."""
         line = (cls.__doc__ or "").partition("\n")[0].removesuffix(".")
         cls.description = line[:1].lower() + line[1:]
+        if entry is not None:
+            cls.name, cls.label, cls.needs, cls.description = entry.name, entry.label, entry.needs, entry.description
 
     @abstractmethod
     def combine(self, *args: Any, **kwargs: Any) -> GradientEstimate:

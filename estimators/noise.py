@@ -31,8 +31,7 @@ class NoiseDensity:
     under each; E[psi'^2], the Fisher information, scales their variance.
 
     Attributes:
-        name: Key in `NOISES`.
-        description: One line.
+        name: Key in `NOISES`, and in `estimators.catalogue.DENSITIES`.
         draw: Samples z from (key, shape, dtype).
         score: psi'(z).
         density: exp(-psi(z)), in NumPy and float64: for quadrature.
@@ -41,7 +40,6 @@ class NoiseDensity:
     """
 
     name: str
-    description: str
     draw: Draw
     score: Score
     density: Density
@@ -69,7 +67,6 @@ NOISES: dict[str, NoiseDensity] = {
     for noise in (
         NoiseDensity(
             "gaussian",
-            "the paper's",
             jax.random.normal,
             score=lambda z: z,
             density=lambda z: np.exp(-(z**2) / 2.0) / math.sqrt(2.0 * math.pi),
@@ -78,7 +75,6 @@ NOISES: dict[str, NoiseDensity] = {
         ),
         NoiseDensity(
             "logistic",
-            "heavier tails, bounded score",
             lambda key, shape, dtype: LOGISTIC_SCALE * jax.random.logistic(key, shape, dtype),
             score=lambda z: jnp.tanh(z / (2.0 * LOGISTIC_SCALE)) / LOGISTIC_SCALE,
             density=lambda z: (1.0 - np.tanh(z / (2.0 * LOGISTIC_SCALE)) ** 2) / (4.0 * LOGISTIC_SCALE),
@@ -87,7 +83,6 @@ NOISES: dict[str, NoiseDensity] = {
         ),
         NoiseDensity(
             "laplace",
-            "a score of constant size, which bounds zeroth-order samples",
             lambda key, shape, dtype: LAPLACE_SCALE * jax.random.laplace(key, shape, dtype),
             score=lambda z: jnp.sign(z) / LAPLACE_SCALE,
             density=lambda z: np.exp(-np.abs(z) / LAPLACE_SCALE) / (2.0 * LAPLACE_SCALE),
@@ -96,7 +91,6 @@ NOISES: dict[str, NoiseDensity] = {
         ),
         NoiseDensity(
             "student",
-            "Student's t with 5 degrees of freedom: rare large steps",
             lambda key, shape, dtype: STUDENT_SCALE * jax.random.t(key, DEGREES_OF_FREEDOM, shape, dtype),
             score=_student_score,
             density=_student_density,

@@ -8,13 +8,14 @@ from typing import Any, TypeVar
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
-from estimators.alpha_order import choose_alpha, interpolate, inverse_variance_alpha
+from estimators.alpha import choose_alpha, interpolate, inverse_variance_alpha
 from estimators.baselines import find_baseline
-from estimators.confidence import MAX_DEVIATION, bernstein_epsilon, check_confidence_arguments
-from estimators.cross_fitting import PLUG_IN, check_weights, weigh_batches
-from estimators.ddcg import PUBLISHED_TOLERANCE, discontinuity_gated
+from estimators.catalogue import CATALOGUE, MAX_DEVIATION, PLUG_IN, PUBLISHED_TOLERANCE, Entry
+from estimators.confidence import bernstein_epsilon, check_confidence_arguments
+from estimators.cross_fitting import check_weights, weigh_batches
+from estimators.ddcg import discontinuity_gated
 from estimators.estimator import ORACLES, Estimator, draw
-from estimators.first_order import clipped_first_order, first_order
+from estimators.first import clipped_first_order, first_order
 from estimators.places import MissingModuleError, find_attribute, importable_here
 from estimators.propagation import total_propagation, truncated_first_order
 from estimators.stepwise import antithetic_cost_to_go, cost_to_go, stepwise_inverse_variance
@@ -28,15 +29,15 @@ from estimators.types import (
     StepDifferentiation,
     StepEvaluation,
 )
-from estimators.zeroth_order import antithetic, delta_control_variate, zeroth_order
+from estimators.zeroth import antithetic, delta_control_variate, zeroth_order
 
 ESTIMATORS: dict[str, type[Estimator]] = {}
-"""Estimators by name."""
+"""Estimators by name; `estimators.catalogue.CATALOGUE` describes them."""
 EstimatorClass = TypeVar("EstimatorClass", bound=type[Estimator])
 
 
 def register(estimator: EstimatorClass) -> EstimatorClass:
-    """Enter a class into `ESTIMATORS`; for use as a decorator, above that of the dataclass.
+    """Enter a class into `ESTIMATORS` and the catalogue; for use as a decorator, above that of the dataclass.
 
     Raises:
         ValueError: It needs an oracle that there is not, or another class has its name.
@@ -45,6 +46,9 @@ def register(estimator: EstimatorClass) -> EstimatorClass:
     if estimator.name in ESTIMATORS:
         raise ValueError(f"there is an estimator {estimator.name!r} already: give this one another name")
     ESTIMATORS[estimator.name] = estimator
+    name, label = estimator.name, estimator.label
+    entry = Entry(name, label, estimator.needs, estimator.description, estimator.required())
+    CATALOGUE.setdefault(name, entry)
     return estimator
 
 
@@ -167,50 +171,40 @@ class _Interpolation(_Baselined):
 
 
 @register
-class ZerothOrder(_Baselined):
-    """Zeroth order: values times scores."""
-
-    name, label, needs = "zobg", "ZoBG", ("evaluation",)
+class ZerothOrder(_Baselined, entry=CATALOGUE["zobg"]):
+    """See `estimators.zeroth_order`."""
 
     def combine(self, evaluation: Evaluation) -> GradientEstimate:
         return zeroth_order(evaluation, self.baseline)
 
 
 @register
-class Antithetic(_Baselined):
-    """Zeroth order over pairs of opposite noise."""
-
-    name, label, needs = "zobg_antithetic", "ZoBG, antithetic", ("pair",)
+class Antithetic(_Baselined, entry=CATALOGUE["zobg_antithetic"]):
+    """See `estimators.antithetic`."""
 
     def combine(self, pair: tuple[Evaluation, Evaluation]) -> GradientEstimate:
         return antithetic(*pair, self.baseline)
 
 
 @register
-class CostToGo(_Baselined):
-    """Zeroth order: costs to go times the scores of single steps."""
-
-    name, label, needs = "zobg_to_go", "ZoBG, costs to go", ("steps",)
+class CostToGo(_Baselined, entry=CATALOGUE["zobg_to_go"]):
+    """See `estimators.cost_to_go`."""
 
     def combine(self, steps: StepEvaluation) -> GradientEstimate:
         return cost_to_go(steps, self.baseline)
 
 
 @register
-class AntitheticCostToGo(_Baselined):
-    """Costs to go over pairs of opposite noise."""
-
-    name, label, needs = "zobg_to_go_antithetic", "ZoBG, to go, antithetic", ("step_pair",)
+class AntitheticCostToGo(_Baselined, entry=CATALOGUE["zobg_to_go_antithetic"]):
+    """See `estimators.antithetic_cost_to_go`."""
 
     def combine(self, pair: tuple[StepEvaluation, StepEvaluation]) -> GradientEstimate:
         return antithetic_cost_to_go(*pair, self.baseline)
 
 
 @register
-class FirstOrder(Estimator):
-    """First order: gradients of the samples."""
-
-    name, label, needs = "fobg", "FoBG", ("differentiation",)
+class FirstOrder(Estimator, entry=CATALOGUE["fobg"]):
+    """See `estimators.first_order`."""
 
     def combine(self, differentiation: Differentiation) -> GradientEstimate:
         return first_order(differentiation)
@@ -218,13 +212,11 @@ class FirstOrder(Estimator):
 
 @register
 @dataclass(frozen=True, kw_only=True)
-class ClippedFirstOrder(Estimator):
-    """First order, the norm of every sample bounded.
+class ClippedFirstOrder(Estimator, entry=CATALOGUE["fobg_clipped"]):
+    """See `estimators.clipped_first_order`.
 
     `max_norm` of a sample, > 0, [cost/param].
     """
-
-    name, label, needs = "fobg_clipped", "FoBG, clipped", ("differentiation",)
 
     max_norm: float
 
@@ -237,13 +229,11 @@ class ClippedFirstOrder(Estimator):
 
 @register
 @dataclass(frozen=True, kw_only=True)
-class TruncatedFirstOrder(Estimator):
-    """First order, the adjoint cut every few steps.
+class TruncatedFirstOrder(Estimator, entry=CATALOGUE["fobg_truncated"]):
+    """See `estimators.truncated_first_order`.
 
     `window` of steps between cuts of the adjoint, >= 1.
     """
-
-    name, label, needs = "fobg_truncated", "FoBG, truncated", ("linearisation",)
 
     window: int
 
@@ -257,8 +247,6 @@ class TruncatedFirstOrder(Estimator):
 
 class _OneWeight(_Interpolation):
     """Base of those with one weight for two whole batches."""
-
-    needs = ("evaluation", "differentiation")
 
     @abstractmethod
     def choose(self, zeroth: GradientEstimate, first: GradientEstimate) -> AlphaChoice:
@@ -277,8 +265,8 @@ class _OneWeight(_Interpolation):
 
 @register
 @dataclass(frozen=True, kw_only=True)
-class AlphaOrder(_OneWeight):
-    """Alpha order: the two interpolated within an error of gamma.
+class AlphaOrder(_OneWeight, entry=CATALOGUE["aobg"]):
+    """See `estimators.constrained_alpha`.
 
     Attributes:
         gamma: Largest error to accept, > 0 or infinity, [cost/param].
@@ -286,8 +274,6 @@ class AlphaOrder(_OneWeight):
         variance_proxy: "variance", "second_moment" or "upper_bound".
         radius: "max_deviation" or a bound >= 0 on ||g_i - E g||, [cost/param].
     """
-
-    name, label = "aobg", "AoBG"
 
     gamma: float = float("inf")
     failure_probability: float = 0.05
@@ -311,10 +297,8 @@ class AlphaOrder(_OneWeight):
 
 
 @register
-class InverseVariance(_OneWeight):
-    """Inverse-variance weighting: alpha order with gamma infinite."""
-
-    name, label = "ivw", "IVW"
+class InverseVariance(_OneWeight, entry=CATALOGUE["ivw"]):
+    """See `estimators.inverse_variance_alpha`."""
 
     def choose(self, zeroth: GradientEstimate, first: GradientEstimate) -> AlphaChoice:
         alpha = inverse_variance_alpha(zeroth.variance, first.variance)
@@ -323,20 +307,16 @@ class InverseVariance(_OneWeight):
 
 
 @register
-class StepwiseInverseVariance(_Interpolation):
-    """Inverse-variance weights for every step and control."""
-
-    name, label, needs = "ivw_h", "IVW-H", ("steps", "step_differentiation")
+class StepwiseInverseVariance(_Interpolation, entry=CATALOGUE["ivw_h"]):
+    """See `estimators.stepwise_inverse_variance`."""
 
     def combine(self, steps: StepEvaluation, differentiation: StepDifferentiation) -> GradientEstimate:
         return stepwise_inverse_variance(steps, differentiation, self.baseline, self.weights)
 
 
 @register
-class TotalPropagation(_Interpolation):
-    """Inverse-variance weights inside the backward recursion."""
-
-    name, label, needs = "total_propagation", "total propagation", ("linearisation",)
+class TotalPropagation(_Interpolation, entry=CATALOGUE["total_propagation"]):
+    """See `estimators.total_propagation`."""
 
     def combine(self, linearisation: Linearisation) -> GradientEstimate:
         return total_propagation(linearisation, self.baseline, self.weights)
@@ -344,13 +324,12 @@ class TotalPropagation(_Interpolation):
 
 @register
 @dataclass(frozen=True, kw_only=True)
-class DiscontinuityGated(_Interpolation):
-    """Inverse-variance weighting where a test finds no discontinuity, else zeroth order.
+class DiscontinuityGated(_Interpolation, entry=CATALOGUE["ddcg"]):
+    """See `estimators.discontinuity_gated`.
 
     `sigma` of the noise, > 0, [control], and `tolerance` c of the test, in [0, 1).
     """
 
-    name, label, needs = "ddcg", "DDCG", ("evaluation", "step_differentiation")
     gaussian = True
 
     sigma: float
@@ -368,13 +347,12 @@ class DiscontinuityGated(_Interpolation):
 
 @register
 @dataclass(frozen=True, kw_only=True)
-class DeltaMethod(Estimator):
-    """First-order mean and a zeroth-order estimate of what it leaves over; noise on theta itself.
+class DeltaMethod(Estimator, entry=CATALOGUE["delta"]):
+    """See `estimators.delta_control_variate`.
 
     `sigma` of the noise, > 0, [param].
     """
 
-    name, label, needs = "delta", "delta", ("evaluation", "differentiation")
     gaussian = additive = True
 
     sigma: float

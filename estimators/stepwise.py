@@ -6,9 +6,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from estimators.alpha_order import inverse_variance_alpha
+from estimators.alpha import inverse_variance_alpha
 from estimators.baselines import find_baseline
-from estimators.cross_fitting import PLUG_IN, weigh_batches
+from estimators.catalogue import PLUG_IN
+from estimators.cross_fitting import weigh_batches
 from estimators.statistics import finite_rows, summarise
 from estimators.types import (
     AlphaChoice,

@@ -9,13 +9,10 @@ import math
 import sys
 from collections.abc import Collection
 from numbers import Integral, Real
-from typing import Any, ClassVar, Final, get_type_hints
+from typing import Any, ClassVar, Final
 
-from estimators import BASELINES, ESTIMATORS, NOISES, WEIGHTS
-from estimators.confidence import VARIANCE_PROXIES
-from mjx_study.simulation.contact import FAMILIES
-from mjx_study.simulation.onset import ONSETS
-from mjx_study.simulation.scene import CONES, INTEGRATORS, SOLVERS
+from estimators.catalogue import BASELINES, CATALOGUE, DENSITIES, VARIANCE_PROXIES, WEIGHTS
+from mjx_study.choices import CONES, FAMILIES, INTEGRATORS, ONSETS, REFERENCE, SOLVERS
 
 MOST_VALUES: Final = 10_000
 """Values of one list or range."""
@@ -239,7 +236,7 @@ MOST_SAMPLES: Final = "10000000]"
 TASKS: Final = "the task's"
 KINDS: Final = ("gradients", "descents", "landscapes")
 """Of studies."""
-CONTACTS: Final = (*FAMILIES, "reference")
+CONTACTS: Final = (*FAMILIES, REFERENCE)
 """What a study may have in the place of a contact model."""
 OPTIONS: Final[dict[str, Option]] = {
     option.name: option
@@ -247,7 +244,7 @@ OPTIONS: Final[dict[str, Option]] = {
         _number("seed", int, "[0, 4294967295]", "N", "seed of the random numbers"),
         _number("devices", int, "[1, 256]", "N", "CPU devices", unset="one per core; with JAX 0.11 one"),
         _number("sigma", float, "(0, inf)", "S", "noise, in the unit of what it is added to", unset=TASKS),
-        _choice("noise", NOISES, "NAME", "density of the noise", unset=TASKS),
+        _choice("noise", DENSITIES, "NAME", "density of the noise", unset=TASKS),
         _choice("baseline", BASELINES, "NAME", "baseline of zeroth-order samples"),
         Option("published", bool, "", "the published example's gamma, P, S2 and R, in place of the next four"),
         _number("gamma", float, "(0, inf]", "G", "AoBG's accuracy bound; inf for none", unset=TASKS),
@@ -260,7 +257,7 @@ OPTIONS: Final[dict[str, Option]] = {
         _choice("weights", WEIGHTS, "NAME", "of interpolations: by the samples that they weigh, or the other half"),
         _choice("onset", ONSETS, "NAME", "of contact, in first-order gradients: none, or linear"),
         _choice("kind", KINDS, "KIND", "what is computed", unset="by --iterations and --points"),
-        _choice("estimators", ESTIMATORS, "NAME", "see `mjx-study estimators`", label="estimator", own=True),
+        _choice("estimators", CATALOGUE, "NAME", "see `mjx-study estimators`", label="estimator", own=True),
         _choice("contact", CONTACTS, "FAMILY", f"of: {', '.join(CONTACTS)}", label="contact family", unset=TASKS),
         _number("stiffness", float, "(0, inf)", "K", "contact stiffness", unit="N/m", unset=TASKS),
         _number("damping", float, "[0, inf)", "B", "contact damping", unit="N s/m", unset="the family's"),
@@ -309,7 +306,7 @@ class Checked:
     def option(cls, name: str) -> Option:
         """An option as this configuration has it: its range, and whether it is a list."""
         option = OPTIONS[name].within(cls.ranges[name]) if name in cls.ranges else OPTIONS[name]
-        return dataclasses.replace(option, many="tuple" in str(get_type_hints(cls)[name]))
+        return dataclasses.replace(option, many="tuple" in str(cls.__annotations__[name]))
 
     @classmethod
     def default(cls, name: str) -> Any:

@@ -6,12 +6,12 @@ import platform
 import sys
 from importlib import metadata
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import jax
 import mujoco
 
-PRECISIONS: Final = ("float64", "float32")
+from mjx_study.choices import PRECISIONS
 
 
 def configure(*, precision: str = "float64", cpu_devices: int | None = None, cache: str | Path | None = None) -> None:

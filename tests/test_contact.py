@@ -8,13 +8,10 @@ import mujoco
 import numpy as np
 import pytest
 
+from mjx_study.choices import DEFAULT_SOLIMP, DEFAULT_SOLREF, FAMILIES, MIN_IMPEDANCE
 from mjx_study.simulation import constraint
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.contact import (
-    DEFAULT_SOLIMP,
-    DEFAULT_SOLREF,
-    FAMILIES,
-    MIN_IMPEDANCE,
     ContactModel,
     ContactWarning,
     apply_contact,

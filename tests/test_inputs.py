@@ -187,8 +187,9 @@ def test_no_home_folder(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(
     ("changes", "shell", "code", "says"),
     [
-        ({"MPLBACKEND": "nonsense"}, "estimators > /dev/full", 1, "cannot write to standard output: No space left"),
-        ({"JAX_PLATFORMS": "nonsense"}, "tasks", 2, "JAX has no device to compute on: Unable to initialize backend"),
+        ({}, "estimators > /dev/full", 1, "cannot write to standard output: No space left"),
+        ({"MPLBACKEND": "nonsense"}, "plot nowhere", 2, "nowhere holds no study"),
+        ({"JAX_PLATFORMS": "nonsense"}, "tasks --json", 2, "JAX has no device to compute on: Unable to"),
         ({"PYTHONIOENCODING": "ascii"}, "estimators >&-", 0, ""),
     ],
 )  # fmt: skip

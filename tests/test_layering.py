@@ -11,6 +11,7 @@ ROOT = Path(__file__).resolve().parents[1]
 # From the bottom up; a package or module may import from its own layer and from those above it in this list.
 LAYERS = [
     "estimators",
+    "mjx_study.choices",
     "mjx_study._matplotlib",
     "mjx_study.runtime",
     "mjx_study.table",
@@ -31,6 +32,7 @@ LAYERS = [
     "mjx_study.accessor",
     "mjx_study.cli",
     "mjx_study.__main__",
+    "mjx_study._public",
     "mjx_study",  # the package itself re-exports, so that nothing may import from it
 ]
 PACKAGES = ("estimators", "mjx_study")

@@ -9,9 +9,11 @@ import jax
 import pytest
 
 from estimators import ESTIMATORS, Estimator, FirstOrder, ZerothOrder, find_estimator, make_estimator, register
+from estimators.catalogue import CATALOGUE
 from mjx_study import cli
 from mjx_study.cli import options
 from mjx_study.plots.style import STYLE, style_of
+from mjx_study.study.configuration import StudyConfig
 from mjx_study.study.findings import rows_of
 from mjx_study.study.run import load_study
 
@@ -89,14 +91,16 @@ def test_an_object_keeps_its_options_and_a_class_takes_those_that_it_has(folder:
 
 
 def test_a_registered_one_has_a_name(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(ESTIMATORS, "twice", FirstOrder)  # taken out again after the test
-    del ESTIMATORS["twice"]
+    monkeypatch.setitem(CATALOGUE, "twice", CATALOGUE["fobg"])  # taken out again after the test
+    monkeypatch.setitem(ESTIMATORS, "twice", FirstOrder)
+    del ESTIMATORS["twice"], CATALOGUE["twice"]
 
     @register
     class Twice(FirstOrder):
         name, label = "twice", "FoBG, twice"
 
     assert ESTIMATORS["twice"] is Twice and make_estimator("twice") == Twice() != FirstOrder()
+    assert CATALOGUE["twice"].label == "FoBG, twice" and StudyConfig.option("estimators").check(("twice",))
     assert style_of("twice")[0] == "FoBG, twice"
     with pytest.raises(ValueError, match="there is an estimator 'twice' already"):
         register(Twice)

@@ -14,12 +14,12 @@ import jax
 import jax.numpy as jnp
 import pytest
 
+from mjx_study.choices import TASK_GROUP
 from mjx_study.cli.gradcheck import UNEXERCISED
 from mjx_study.gradcheck import plan_gradcheck
 from mjx_study.study.configuration import StudyConfig
 from mjx_study.study.plan import plan_study
 from mjx_study.tasks import make_task
-from mjx_study.tasks.own import GROUP
 from mjx_study.tasks.task import Task
 
 ROOT = Path(__file__).parents[1]
@@ -76,7 +76,7 @@ def register(monkeypatch: pytest.MonkeyPatch):
     """Has installed packages register tasks, given as (name, place)."""
 
     def register(*points: tuple[str, str]) -> None:
-        registered = metadata.EntryPoints([metadata.EntryPoint(*point, GROUP) for point in points])
+        registered = metadata.EntryPoints([metadata.EntryPoint(*point, TASK_GROUP) for point in points])
         monkeypatch.setattr(metadata, "entry_points", lambda **wanted: registered.select(**wanted))
 
     return register

@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 from mjx_study import cli
-from mjx_study.cli import options
+from mjx_study.cli import options, sweep
 from mjx_study.reference import DoublePendulum, roll_out
 from mjx_study.reference.adjoint import gradients_along
-from mjx_study.study.configuration import StudyConfig, configured_estimators
+from mjx_study.study.configuration import StudyConfig
 from mjx_study.study.plan import estimators_of, plan_study
+from mjx_study.study.resolution import configured_estimators
 from mjx_study.tasks import make_task
 
 MOMENTUM = 4 / 1.1**2  # an elastic hit of a bar ten times as heavy, in units of the published cost
@@ -81,7 +82,7 @@ def test_a_file_of_options_may_ask_for_them(tmp_path: Path, value: str, kept: bo
     path = tmp_path / "study.toml"
     path.write_text(f'tasks = ["pusher"]\npublished = {value}\n')
     parsed = cli.parser().parse_args(["sweep", "--config", str(path), "--output", "x"])
-    assert cli.sweep._fields(parsed)["published"] is kept
+    assert sweep._fields(parsed)["published"] is kept
 
 
 def test_what_they_do_to_the_weight_of_first_order_gradients() -> None:

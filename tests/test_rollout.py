@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image, ImageSequence
 
+from mjx_study import cli
 from mjx_study.cli import options as shared
 from mjx_study.cli import rollout
 from mjx_study.objective import Simulator
@@ -35,11 +36,8 @@ def elsewhere(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
 
 
 def call(*arguments: str) -> int:
-    """The command alone, by its own parser."""
-    root = shared.Parser(prog="mjx-study")
-    rollout.add(root.add_subparsers())
-    options = root.parse_args(["rollout", *arguments])
-    return options.run(options)
+    """The command alone, its errors as they are raised."""
+    return rollout.run(cli.parser("rollout").parse_args(["rollout", *arguments]))
 
 
 def document(capsys: pytest.CaptureFixture[str], *arguments: str) -> dict[str, Any]:

@@ -13,14 +13,12 @@ import mujoco
 import numpy as np
 import pytest
 
+from mjx_study.choices import CONES, INTEGRATORS, SOLVERS
 from mjx_study.cli.options import Parser, add_scene_options, scene_options
 from mjx_study.simulation.dynamics import State
 from mjx_study.simulation.limitations import FLAGS
 from mjx_study.simulation.scene import (
     ADJOINTS,
-    CONES,
-    INTEGRATORS,
-    SOLVERS,
     SceneError,
     load_model,
     load_scene,
@@ -59,17 +57,25 @@ def test_a_path_is_loaded_and_left_as_it_is(tmp_path: Path) -> None:
     assert load_scene(str(path)).host.nv == 2
 
 
-@pytest.mark.parametrize(
-    ("option", "values"), [("cone", CONES), ("solver", SOLVERS), ("integrator", {**INTEGRATORS, "rk4": None})]
-)
-def test_enumerated_options_reach_mjx(option: str, values: dict[str, Any], tmp_path: Path) -> None:
+ENUMERATED = {
+    "pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL,
+    "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC,
+    "newton": mujoco.mjtSolver.mjSOL_NEWTON,
+    "cg": mujoco.mjtSolver.mjSOL_CG,
+    "euler": mujoco.mjtIntegrator.mjINT_EULER,
+    "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
+    "rk4": mujoco.mjtIntegrator.mjINT_RK4,
+}
+
+
+@pytest.mark.parametrize(("option", "values"), [("cone", CONES), ("solver", SOLVERS), ("integrator", INTEGRATORS)])
+def test_enumerated_options_reach_mjx(option: str, values: tuple[str, ...], tmp_path: Path) -> None:
     path = tmp_path / "bare.xml"
     path.write_text("<mujoco><worldbody><body><joint/><geom size='.1'/></body></worldbody></mujoco>")
     for value in values:
         scene = load_scene(path, **{option: value})
         assert int(getattr(scene.model.opt, option)) == int(getattr(scene.host.opt, option))
-        choices: dict[str, Any] = {"cone": CONES, "solver": SOLVERS, "integrator": INTEGRATORS}[option]
-        assert int(getattr(scene.model.opt, option)) == int(choices[value])
+        assert int(getattr(scene.model.opt, option)) == int(ENUMERATED[value])
 
 
 def test_numeric_options_reach_mjx() -> None:

@@ -23,7 +23,8 @@ import estimators
 from estimators import AlphaOrder, DiscontinuityGated
 from mjx_study import cli
 from mjx_study.cli import options
-from mjx_study.cli.sweep import _fields, _solimp, _solref
+from mjx_study.cli.parsers.sweep import solimp, solref
+from mjx_study.cli.sweep import _fields
 from mjx_study.objective import Simulator, simulate
 from mjx_study.plots import study as study_plots
 from mjx_study.report import report
@@ -424,7 +425,7 @@ def test_landscapes_are_labelled_and_right(landscapes: Path) -> None:
     ],
 )
 def test_ranges(text: str, values: list[float]) -> None:
-    assert _solimp(text) == (tuple(values),)
+    assert solimp(text) == (tuple(values),)
 
 
 def test_lists_from_text_numbers_and_files() -> None:
@@ -432,8 +433,8 @@ def test_lists_from_text_numbers_and_files() -> None:
     assert stiffness.parse("10:100:2:log,1000") == (10.0, 100.0, 1000.0)
     assert samples.read([3, 10]) == (3, 10) and samples.read(5) == (5,) and samples.parse("1e3") == (1000,)
     assert samples.parse("3:9:3") == (3, 6, 9) and stiffness.read([3]) == (3.0,)
-    assert _solref("-100,-1000;-5") == ((-100.0, -5.0), (-1000.0, -5.0)) == _solref([[-100, -5], [-1000, -5]])
-    assert _solimp("0.9,0.95,0.001,0.5,2") == ((0.9, 0.95, 0.001, 0.5, 2.0),)
+    assert solref("-100,-1000;-5") == ((-100.0, -5.0), (-1000.0, -5.0)) == solref([[-100, -5], [-1000, -5]])
+    assert solimp("0.9,0.95,0.001,0.5,2") == ((0.9, 0.95, 0.001, 0.5, 2.0),)
     for wrong in (
         "10:1000",
         "1:10:1",

@@ -2,7 +2,8 @@
 
 0 what was asked was done; 1 a check that was asked for failed, or a file could not be written, in one line after the
 numbers; 2 a bad option or file, in one line, with nothing written; 128 + N ended by signal N: 130 interrupted, 143
-terminated, 129 hung up. Each command has a module of its own, with `add` for its options and `run`.
+terminated, 129 hung up. Each command has two modules: `parsers.NAME` with its options, which imports nothing that
+computes, and `NAME` with `run`, imported when the command runs.
 """
 
 import argparse
@@ -10,21 +11,9 @@ import shlex
 import signal
 import sys
 from collections.abc import Sequence
-from importlib import metadata
+from importlib import import_module, metadata
+from typing import Final
 
-from mjx_study.cli import (
-    bench,
-    compare,
-    estimators,
-    gradcheck,
-    landscape,
-    optimise,
-    plot,
-    report,
-    rollout,
-    sweep,
-    tasks,
-)
 from mjx_study.cli.options import Parser, UsageError, ending, refuse_lone_dashes
 from mjx_study.cli.output import OutputError, complain, written_out
 
@@ -40,7 +29,20 @@ start here:
   mjx-study gradcheck pusher                     are the derivatives right? exit code 1 if not
   mjx-study bench pusher                         what does a gradient cost on this machine?
 """
-COMMANDS = (compare, optimise, sweep, plot, report, landscape, rollout, gradcheck, bench, tasks, estimators)
+COMMANDS: Final = {
+    "compare": "compare gradient estimators over contact models",
+    "optimise": "optimise a policy with any estimator",
+    "sweep": "sweep contact models, noise and samples; resumable",
+    "plot": "draw a study's figures",
+    "report": "write a study as one HTML page",
+    "landscape": ("draw the cost along a line of parameters, its smoothed cost and the slope that each estimator sees"),
+    "rollout": "show a rollout: pictures, a film and its numbers",
+    "gradcheck": "check derivatives against differences, the C engine and a closed form",
+    "bench": "measure what rollouts and gradients cost here",
+    "tasks": "list the tasks",
+    "estimators": "list the gradient estimators and the noise densities",
+}
+ALIASES: Final = {"optimize": "optimise"}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -49,9 +51,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         with written_out(), ending(ENDED, signal.SIGTERM, signal.SIGHUP):
             given = sys.argv[1:] if arguments is None else list(arguments)
             refuse_lone_dashes(given)
-            options = parser().parse_args(given)
+            chosen = next((text for text in given if not text.startswith("-")), "")
+            options = parser(ALIASES.get(chosen, chosen)).parse_args(given)
             options.command_line = shlex.join(["mjx-study", *given])
-            return options.run(options)
+            return import_module(f"mjx_study.cli.{options.command}").run(options)
     except UsageError as error:
         complain(f"mjx-study: {' '.join(str(error).split())}")
         return 2
@@ -65,8 +68,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 1
 
 
-def parser() -> argparse.ArgumentParser:
-    """The whole command line."""
+def parser(chosen: str | None = None) -> argparse.ArgumentParser:
+    """The command line: all of it, or with the options of one command alone."""
     root = Parser(
         prog="mjx-study",
         description=f"{metadata.metadata('mjx-study')['Summary']}.",
@@ -75,8 +78,20 @@ def parser() -> argparse.ArgumentParser:
     )
     root.add_argument("--version", action="version", version=f"mjx-study {metadata.version('mjx-study')}")
     commands = root.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    for command in COMMANDS:
-        command.add(commands)
+    for name, summary in COMMANDS.items():
+        command = commands.add_parser(
+            name,
+            aliases=[alias for alias, of in ALIASES.items() if of == name],
+            help=summary,
+            description=summary[0].upper() + summary[1:] + ".",
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )
+        if chosen in (None, name):
+            module = import_module(f"mjx_study.cli.parsers.{name}")
+            command.epilog = module.EPILOG
+            command.add_argument("--json", action="store_true", help="print the numbers as JSON on standard output")
+            module.add(command)
+            command.set_defaults(command=name)
     return root
 
 

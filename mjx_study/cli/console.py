@@ -1,20 +1,16 @@
-"""What the command line prints: tables, numbers with their intervals, progress."""
+"""What the command line prints: tables, numbers with their intervals."""
 
 import json
 import math
 import shutil
-import sys
-from collections.abc import Callable, Generator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import xarray as xr
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from estimators import ENOUGH_EFFECTIVE
+from mjx_study.choices import FAMILIES
 from mjx_study.plots.style import style_of
-from mjx_study.simulation.contact import FAMILIES
 from mjx_study.study.dataset import as_plain
 from mjx_study.study.findings import Row, findings, rows_of
 from mjx_study.table import format_table
@@ -183,42 +179,3 @@ def _table(rows: Sequence[Row], table: Sequence[Column]) -> list[str]:
         if rows[previous].stiffness == rows[current].stiffness:
             cells[current][0] = ""
     return format_table(cells, [heading for heading, _ in table])
-
-
-@contextmanager
-def progress_bar() -> Generator[Callable[[int, int, str], None]]:
-    """A progress bar on standard error, shown only on a terminal and gone when the work is done."""
-    console = Console(stderr=True)
-    bar = Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        console=console,
-        transient=True,
-        disable=not console.is_terminal,
-    )
-    with bar:
-        task = bar.add_task("starting", total=None)
-
-        def report(done: int, total: int, what: str) -> None:
-            bar.update(task, completed=done, total=total, description=what)
-
-        yield report
-
-
-def stage_lines(progress: Callable[[int, int, str], None]) -> Callable[[int, int, str], None]:
-    """The progress, and a line on standard error for each of its stages where that is no terminal."""
-
-    def report(done: int, total: int, what: str) -> None:
-        progress(done, total, what)
-        if not sys.stderr.isatty():
-            print(f"[{done}/{total}] {what}", file=sys.stderr, flush=True)
-
-    return report
-
-
-def show_cursor() -> None:
-    """Bring back the cursor that a progress bar hides, where standard error is a terminal."""
-    if sys.stderr is not None and sys.stderr.isatty():
-        sys.stderr.write("\n\x1b[?25h")

@@ -2,13 +2,9 @@
 
 import argparse
 
-from estimators import ESTIMATORS, NOISES
-from mjx_study.cli.options import Commands, add_command, print_report
+from estimators.catalogue import CATALOGUE, DENSITIES
+from mjx_study.cli.options import print_report
 
-EPILOG = """\
-What each needs: values (rollouts), pairs (of opposite noise), steps (costs to go), gradients, or derivatives of every
-step. compare and optimise take any of them with --estimators and --estimator.
-"""
 WORDS = {
     "evaluation": "values",
     "pair": "pairs",
@@ -20,11 +16,6 @@ WORDS = {
 }
 
 
-def add(commands: Commands) -> None:
-    """Register the command."""
-    add_command(commands, "estimators", "list the gradient estimators and the noise densities", run, EPILOG)
-
-
 def run(options: argparse.Namespace) -> int:
     """List what there is."""
     entries = [
@@ -32,11 +23,11 @@ def run(options: argparse.Namespace) -> int:
             "name": item.name,
             "description": item.description,
             "needs": list(item.needs),
-            "requires": [f"--{name.replace('_', '-')}" for name in item.required() if name != "sigma"],
+            "requires": [f"--{name.replace('_', '-')}" for name in item.required if name != "sigma"],
         }
-        for item in ESTIMATORS.values()
+        for item in CATALOGUE.values()
     ]
-    densities = [{"name": item.name, "description": item.description} for item in NOISES.values()]
+    densities = [{"name": name, "description": line} for name, line in DENSITIES.items()]
     rows = [[entry["name"], _needs(entry), entry["description"]] for entry in entries]
     width = max(len(row[0]) for row in rows), max(len(row[1]) for row in rows)
     lines = [f"{name:<{width[0]}}  {needs:<{width[1]}}  {description}" for name, needs, description in rows]

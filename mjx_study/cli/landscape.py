@@ -8,22 +8,9 @@ import numpy as np
 import xarray as xr
 
 from mjx_study.cli.console import number
-from mjx_study.cli.options import (
-    Commands,
-    add_command,
-    add_contact_options,
-    add_option,
-    add_options,
-    add_process_options,
-    add_task_argument,
-    configure_process,
-    finish,
-    print_report,
-    usage_errors,
-)
-from mjx_study.cli.parameters import add_theta_option, theta_of
-from mjx_study.cli.studies import add_folder_options, compute, draw, study_fields
-from mjx_study.option import OPTIONS
+from mjx_study.cli.options import configure_process, finish, print_report, usage_errors
+from mjx_study.cli.parameters import theta_of
+from mjx_study.cli.studies import compute, draw, study_fields
 from mjx_study.study.configuration import StudyConfig, takes_stiffness
 from mjx_study.study.dataset import as_plain
 from mjx_study.study.findings import curves_of, findings
@@ -32,40 +19,6 @@ from mjx_study.study.run import warnings_of
 from mjx_study.table import format_table
 from mjx_study.tasks import make_task
 from mjx_study.tasks.contact_grid import REFERENCE
-
-EPILOG = """\
-examples:
-  mjx-study landscape ball_wall --output out             the launch angle's whole range, reference and MJX
-  mjx-study landscape momentum_transfer --contact penalty,mujoco_default --stiffness 3000,100000
-  mjx-study landscape pusher --direction 0 --span=-2,2   the first of 200 forces
-
-Top row of the figure: the cost without noise, and the mean cost with noise (its smoothed objective) with a 95 % band.
-Bottom row: the mean of ZoBG and of FoBG along the line, with theirs. Where the smoothed objective has a slope that the
-mean of FoBG does not have, the cost jumps: a first-order gradient does not see jumps.
-
-The scalar parameter of an initial-state policy with a fixed start also gets both slopes without sampling error, by
-quadrature over 1500 rollouts and gradients of each contact model (more where --noise has heavy tails), whatever
---points and --samples.
-"""
-POINTS, SAMPLES = 41, (100,)
-ESTIMATORS = ("zobg", "fobg")
-
-
-def add(commands: Commands) -> None:
-    """Register the command."""
-    summary = "draw the cost along a line of parameters, its smoothed cost and the slope that each estimator sees"
-    command = add_command(commands, "landscape", summary, run, EPILOG)
-    add_task_argument(command)
-    add_options(command, StudyConfig, "sigma", "cone", "horizon", "model", "noise")
-    add_process_options(command)
-    add_contact_options(command, "the middle one of the task's sweep")
-    add_theta_option(command, "parameters that the line goes through")
-    add_option(command, StudyConfig.option("estimators"), ESTIMATORS)
-    add_option(command, StudyConfig.option("samples"), SAMPLES)
-    add_option(command, OPTIONS["points"], POINTS)
-    add_options(command, StudyConfig, "span", "direction", "onset", "chunk_size")
-    command.add_argument("--no-reference", action="store_true", help="leave out the analytic reference")
-    add_folder_options(command)
 
 
 def run(options: argparse.Namespace) -> int:

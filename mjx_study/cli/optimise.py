@@ -10,25 +10,10 @@ import numpy as np
 import xarray as xr
 
 from mjx_study.cli.console import number
-from mjx_study.cli.options import (
-    Commands,
-    add_command,
-    add_contact_options,
-    add_estimator_options,
-    add_option,
-    add_options,
-    add_task_options,
-    attempt,
-    configure_process,
-    finish,
-    print_report,
-    task_of,
-    usage_errors,
-)
-from mjx_study.cli.parameters import add_theta_option, theta_of
-from mjx_study.cli.studies import add_folder_options, compute, draw, study_fields
+from mjx_study.cli.options import attempt, configure_process, finish, print_report, usage_errors
+from mjx_study.cli.parameters import task_of, theta_of
+from mjx_study.cli.studies import compute, draw, study_fields
 from mjx_study.disk import write_whole
-from mjx_study.option import OPTIONS
 from mjx_study.plots.style import style_of
 from mjx_study.study.configuration import StudyConfig, takes_stiffness
 from mjx_study.study.dataset import as_plain
@@ -39,47 +24,8 @@ from mjx_study.study.variables import HISTORY, METRIC, START
 from mjx_study.table import format_table
 from mjx_study.tasks.contact_grid import REFERENCE
 
-EPILOG = """\
-Every estimator starts from the task's theta, or from --theta, and draws the same noise. Without --learning-rate,
---iterations and --samples the task's own are taken, which are the paper's: plain gradient descent.
-
-With --output DIR, a study: its numbers (for plot, report, load_study), descent.png and .pdf (cost against iterations,
-rollouts and seconds; alpha), and the best seed's policy of each estimator (policy-NAME.json, for rollout --policy). The
-same command goes on where it was stopped, at most 20 s before, or with more --iterations.
-
-examples:
-  mjx-study optimise pusher --contact penalty --stiffness 1000 --output out
-  mjx-study optimise ball_wall --reference --estimators zobg,fobg,aobg --seeds 5
-  mjx-study optimise pusher --estimators ivw_h --optimizer adam --learning-rate 0.01
-  mjx-study optimise tennis --network 16,16 --optimizer adam --learning-rate 0.003 --contact penalty
-  mjx-study rollout pusher --policy out/policy-aobg.json
-
-columns of the table:
-  cost        mean cost with noise of the final policy over --evaluation-samples rollouts, the same for all, and its
-              standard deviation over seeds
-  hit, ...    what a task counts beside its cost, the mean over the same rollouts
-  alpha       mean weight of first-order gradients in the last tenth of the iterations
-  rollouts    simulated per seed, those that were differentiated and baselines included
-"""
-SEEDS = 3
 WRAPPED = ("contact", "stiffness", "sigma", "cone", "samples")
 """Options that are one value here, and a list in a study."""
-
-
-def add(commands: Commands) -> None:
-    """Register the command."""
-    command = add_command(commands, "optimise", "optimise a policy with any estimator", run, EPILOG, ("optimize",))
-    add_task_options(command)
-    add_theta_option(command, "parameters to start from")
-    add_contact_options(command, "the middle one of the task's sweep", many=False)
-    command.add_argument("--reference", action="store_true", help="on the analytic reference in place of MJX")
-    add_options(command, StudyConfig, "network", "estimators", "iterations")
-    add_option(command, OPTIONS["samples"].within("[3, 1e7]"))
-    add_option(command, OPTIONS["seeds"], SEEDS)
-    add_options(command, StudyConfig, "optimizer", "learning_rate", "decay", optimizer={"unset": "sgd"})
-    add_estimator_options(command, StudyConfig)
-    add_options(command, StudyConfig, "evaluation_samples", "chunk_size", evaluation_samples={"unset": "200"})
-    add_folder_options(command)
 
 
 def run(options: argparse.Namespace) -> int:

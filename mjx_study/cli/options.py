@@ -12,16 +12,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final, NoReturn
 
-import jax
-
-from mjx_study.cli.console import progress_bar, show_cursor
+from mjx_study.choices import FAMILIES, PRECISIONS, TASK_DESCRIPTIONS, unknown_task
+from mjx_study.cli.progress import progress_bar, show_cursor
 from mjx_study.option import OPTIONS, Checked, Option
-from mjx_study.runtime import PRECISIONS, configure
-from mjx_study.simulation.contact import FAMILIES
-from mjx_study.simulation.limitations import FLAGS
 from mjx_study.study.configuration import Progress
-from mjx_study.tasks import make_task, task_names
-from mjx_study.tasks.task import Task
 
 INTERRUPTED = "nothing was written"
 """What is said after "interrupted" where a command has nothing better to say."""
@@ -45,32 +39,6 @@ def refuse_lone_dashes(given: Sequence[str]) -> None:
     for text in given:
         if text.startswith("-") and text.endswith("=--"):
             raise UsageError(f"{text.removesuffix('=--')} needs a value, got --")
-
-
-Commands = Any
-"""argparse's collection of subparsers, whose class is private."""
-
-
-def add_command(
-    commands: Commands,
-    name: str,
-    summary: str,
-    run: Callable[[argparse.Namespace], int],
-    epilog: str = "",
-    aliases: Sequence[str] = (),
-) -> argparse.ArgumentParser:
-    """A subcommand with `--json`."""
-    command = commands.add_parser(
-        name,
-        aliases=aliases,
-        help=summary,
-        description=summary[0].upper() + summary[1:] + ".",
-        epilog=epilog,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    command.set_defaults(run=run)
-    command.add_argument("--json", action="store_true", help="print the numbers as JSON on standard output")
-    return command
 
 
 def add_option(
@@ -129,11 +97,32 @@ def add_task_options(command: argparse.ArgumentParser, *, files: str = "") -> No
 
 
 def add_task_argument(command: argparse.ArgumentParser, files: str = "") -> None:
-    """The task, by its name."""
-    metavar = "TASK|FILE.xml" if files else "TASK"
+    """The task, by its name; or a file, where `files` says so in the help."""
+
+    def read(text: str) -> str:
+        if not (files and text.lower().endswith(".xml")) and (told := unknown_task(text)):
+            raise argparse.ArgumentTypeError(told)
+        return text
+
+    named = f"one of: {', '.join(TASK_DESCRIPTIONS)}; or module:name of your own{files}"
+    command.add_argument("task", type=read, metavar="TASK|FILE.xml" if files else "TASK", help=named)
+
+
+def add_theta_option(command: argparse.ArgumentParser, purpose: str) -> None:
+    """`--theta`; `theta_of` reads it."""
     command.add_argument(
-        "task", metavar=metavar, help=f"one of: {', '.join(task_names())}; or module:name of your own{files}"
+        "--theta",
+        metavar="FILE|X[,X]",
+        help=f"{purpose}: a policy that optimise wrote, a .json or .npy file, or the numbers (default: the task's)",
     )
+
+
+def add_folder_options(command: argparse.ArgumentParser) -> None:
+    """The folder of a study."""
+    command.add_argument(
+        "--output", type=Path, metavar="DIR", help="folder of the study: the numbers and the figures; resumable"
+    )
+    add_versions_option(command)
 
 
 def add_contact_options(
@@ -148,6 +137,8 @@ def add_contact_options(
 
 def add_scene_options(command: argparse.ArgumentParser) -> None:
     """What replaces an MJCF's own <option>: what MJX lacks can be changed without editing the file."""
+    from mjx_study.simulation.limitations import FLAGS
+
     for name in ("integrator", "solver"):
         add_option(command, OPTIONS[name])
     command.add_argument(
@@ -193,16 +184,19 @@ def configure_process(options: argparse.Namespace) -> None:
         ValueError: JAX cannot be set up so, as where JAX_PLATFORMS names no platform.
     """
     configure(precision=getattr(options, "precision", PRECISIONS[0]), cpu_devices=getattr(options, "devices", 1))
+
+
+def configure(**settings: Any) -> None:
+    """`mjx_study.runtime.configure`, and a look at whether there is a device."""
+    import jax
+
+    from mjx_study.runtime import configure
+
+    configure(**settings)
     try:
         jax.local_devices()
     except RuntimeError as error:
         raise ValueError(f"JAX has no device to compute on: {error}") from error
-
-
-def task_of(options: argparse.Namespace) -> Task:
-    """The task that the options describe."""
-    task = make_task(options.task, **scene_options(options, "cone", "horizon", "model"))
-    return task if options.sigma is None else task.replace(sigma=options.sigma)
 
 
 @contextmanager

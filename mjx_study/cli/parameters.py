@@ -1,18 +1,18 @@
-"""A policy's parameters on the command line: numbers, a file of them, or a policy that optimise wrote."""
+"""The task that options describe, and its policy's parameters: numbers, a file of them, or a policy of optimise."""
 
 import argparse
 from pathlib import Path
 
+from mjx_study.cli.options import scene_options
 from mjx_study.files import read_theta
+from mjx_study.tasks import make_task
+from mjx_study.tasks.task import Task
 
 
-def add_theta_option(command: argparse.ArgumentParser, purpose: str) -> None:
-    """`--theta`; `theta_of` reads what it is given."""
-    command.add_argument(
-        "--theta",
-        metavar="FILE|X[,X]",
-        help=f"{purpose}: a policy that optimise wrote, a .json or .npy file, or the numbers (default: the task's)",
-    )
+def task_of(options: argparse.Namespace) -> Task:
+    """The task that the options describe."""
+    task = make_task(options.task, **scene_options(options, "cone", "horizon", "model"))
+    return task if options.sigma is None else task.replace(sigma=options.sigma)
 
 
 def theta_of(options: argparse.Namespace) -> tuple[float, ...] | None:

@@ -1,27 +1,11 @@
 """mjx-study report."""
 
 import argparse
-from pathlib import Path
 
-from mjx_study.cli.options import Commands, add_command, attempt, finish, print_report, usage_errors
+from mjx_study.cli.options import attempt, finish, print_report, usage_errors
 from mjx_study.disk import prepare_folder, write_whole
 from mjx_study.report import report
 from mjx_study.study.run import load_study, warnings_of
-
-EPILOG = """\
-Writes FOLDER/report.html: one page that needs no other file, with warnings, figures, a table, the whole configuration,
-versions and machine, and the command that made it. Works while the study is still being computed.
-
-example:
-  mjx-study report out
-"""
-
-
-def add(commands: Commands) -> None:
-    """Register the command."""
-    command = add_command(commands, "report", "write a study as one HTML page", run, EPILOG)
-    command.add_argument("folder", type=Path, metavar="FOLDER", help="of a study, made by sweep")
-    command.add_argument("--output", type=Path, metavar="FILE.html", help="default: FOLDER/report.html")
 
 
 def run(options: argparse.Namespace) -> int:

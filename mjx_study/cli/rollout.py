@@ -14,32 +14,21 @@ import numpy as np
 from mjx_study import objective
 from mjx_study.cli.console import number
 from mjx_study.cli.options import (
-    Commands,
     UsageError,
-    add_command,
-    add_contact_options,
-    add_option,
-    add_scene_options,
-    add_task_options,
     attempt,
     computing,
     configure_process,
     finish,
     print_report,
     scene_options,
-    task_of,
     usage_errors,
 )
-from mjx_study.cli.parameters import add_theta_option, theta_of
+from mjx_study.cli.parameters import task_of, theta_of
 from mjx_study.disk import prepare_folder, write_whole
 from mjx_study.files import PolicyFile, read_json
 from mjx_study.limits import MOST_STEPS, check_count
-from mjx_study.option import OPTIONS
 from mjx_study.plots.style import save_figure
 from mjx_study.render import (
-    FORMATS,
-    RENDERERS,
-    VIEWS,
     Motion,
     RenderError,
     animate,
@@ -49,26 +38,12 @@ from mjx_study.render import (
     stroboscope,
 )
 from mjx_study.simulation.scene import load_model
-from mjx_study.study.configuration import at_theta
+from mjx_study.study.resolution import at_theta
 from mjx_study.table import format_table
 from mjx_study.tasks.contact_grid import ContactPoint, contact_grid
 from mjx_study.tasks.network import with_network
 from mjx_study.tasks.task import Task
 
-EPILOG = """\
-Simulates one rollout and shows it: strip.png (pictures at even times), stroboscope.png (one picture with ghosts),
-rollout.gif or .mp4, and trajectory.npz (time [s], qpos, qvel, controls). Without OpenGL everything is drawn from the
-model's geometry; with it, strip and film are MuJoCo's own renderings.
-
-TASK may also be an MJCF file of your own (FILE.xml): it moves as MuJoCo's C engine moves it, from its first keyframe if
-it has one, for 2 s unless --horizon says otherwise.
-
-examples:
-  mjx-study rollout pusher
-  mjx-study rollout ball_wall --theta 0.75 --stiffness 1e4 --slow 4
-  mjx-study rollout tennis --noise --seed 3 --theta learnt.npy
-  mjx-study rollout humanoid.xml --horizon 500 --view xz --format mp4
-"""
 PASSIVE_SECONDS = 2.0
 MOST_BODIES = 12
 LARGEST = 1e10  # beyond this MuJoCo itself calls a coordinate bad
@@ -105,23 +80,6 @@ class Rollout:
         state = np.concatenate([self.qpos, self.qvel], axis=1)
         good = np.all(np.abs(state) < LARGEST, axis=1)
         return len(good) if good.all() else int(np.argmin(good))
-
-
-def add(commands: Commands) -> None:
-    """Register the command."""
-    command = add_command(commands, "rollout", "show a rollout: pictures, a film and its numbers", run, EPILOG)
-    add_task_options(command, files="; or any MJCF")
-    add_scene_options(command)
-    add_contact_options(command, "the middle one of the task's sweep", many=False, analytic=False)
-    command.add_argument("--noise", action="store_true", help="with the noise of sample --seed (default: none)")
-    add_theta_option(command, "parameters")
-    command.add_argument("--policy", type=Path, metavar="FILE", help="a policy that optimise wrote, policy-NAME.json")
-    add_option(command, OPTIONS["frames"], 6)
-    command.add_argument("--view", choices=["auto", *VIEWS], default="auto", help="default: where most happens")
-    command.add_argument("--renderer", choices=RENDERERS, default="auto", help="default: auto, opengl where it works")
-    command.add_argument("--format", choices=FORMATS, default="gif", help="of the film (default: gif)")
-    add_option(command, OPTIONS["slow"], 1.0)
-    command.add_argument("--output", type=Path, metavar="DIR", help="default: results/TASK-rollout")
 
 
 def run(options: argparse.Namespace) -> int:

@@ -7,7 +7,7 @@ from typing import Any
 
 import xarray as xr
 
-from mjx_study.cli.options import UsageError, add_versions_option, attempt, computing, usage_errors
+from mjx_study.cli.options import UsageError, attempt, computing, usage_errors
 from mjx_study.plots.study import plot_study
 from mjx_study.plots.style import save_figures
 from mjx_study.study.configuration import StudyConfig
@@ -16,14 +16,6 @@ from mjx_study.study.run import open_store, run_study
 from mjx_study.study.store import StudyError
 
 RESUMABLE = "the same command goes on where it stopped"
-
-
-def add_folder_options(command: argparse.ArgumentParser) -> None:
-    """The folder of a study."""
-    command.add_argument(
-        "--output", type=Path, metavar="DIR", help="folder of the study: the numbers and the figures; resumable"
-    )
-    add_versions_option(command)
 
 
 def study_fields(options: argparse.Namespace) -> dict[str, Any]:

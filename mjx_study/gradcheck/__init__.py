@@ -5,9 +5,10 @@ is taken at another point, and where MJX places a contact elsewhere the C engine
 these cases apart, for every entry of a step's Jacobian.
 """
 
+from mjx_study.choices import CHECKED_STIFFNESS as STIFFNESS
 from mjx_study.gradcheck.check import gradcheck
 from mjx_study.gradcheck.finding import Finding
-from mjx_study.gradcheck.plan import CONTACT, STIFFNESS, GradcheckPlan, plan_gradcheck, plan_scene_gradcheck
+from mjx_study.gradcheck.plan import CONTACT, GradcheckPlan, plan_gradcheck, plan_scene_gradcheck
 from mjx_study.gradcheck.report import GradcheckReport, StepCheck
 
 __all__ = [

@@ -7,18 +7,15 @@ from typing import Final
 import jax.numpy as jnp
 import mujoco
 
-from mjx_study.simulation.contact import FAMILIES
+from mjx_study.choices import CHECKED_STATES, CHECKED_STEPS, FAMILIES
+from mjx_study.choices import CHECKED_STIFFNESS as STIFFNESS
 from mjx_study.simulation.dynamics import initial_state
 from mjx_study.simulation.scene import Scene
 from mjx_study.tasks.contact_grid import ContactPoint, contact_grid
 from mjx_study.tasks.policy import OpenLoop
 from mjx_study.tasks.task import Task
 
-STIFFNESS: Final = (10.0, 100.0, 1000.0)
 CONTACT: Final = ("penalty", "mujoco", "mujoco_default")
-STATES: Final = 4
-HORIZON: Final = 200
-"""Number of steps of the rollout that a file's states come from."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -51,7 +48,7 @@ def plan_gradcheck(
     *,
     seed: int,
     damping: float | None = None,
-    states: int = STATES,
+    states: int = CHECKED_STATES,
     stock: bool = False,
 ) -> GradcheckPlan:
     """Check a task's gradient, and steps along its rollout.
@@ -89,8 +86,8 @@ def plan_scene_gradcheck(
     seed: int,
     pair: tuple[str, str] | None = None,
     damping: float | None = None,
-    horizon: int = HORIZON,
-    states: int = STATES,
+    horizon: int = CHECKED_STEPS,
+    states: int = CHECKED_STATES,
     stock: bool = False,
 ) -> GradcheckPlan:
     """Check steps of any scene.

@@ -14,6 +14,7 @@ from matplotlib.colors import TwoSlopeNorm
 from matplotlib.figure import Figure
 from scipy import stats
 
+from mjx_study.choices import DEFAULT_SOLREF
 from mjx_study.plots.style import (
     HOLLOW,
     NO_CONTACT,
@@ -24,7 +25,7 @@ from mjx_study.plots.style import (
     robust_limits,
     style_of,
 )
-from mjx_study.simulation.contact import DEFAULT_SOLREF, stable
+from mjx_study.simulation.contact import stable
 from mjx_study.table import digits_to_tell_apart
 
 SWEPT: Final = {

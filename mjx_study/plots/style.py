@@ -10,8 +10,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from estimators import ESTIMATORS
+from mjx_study.choices import FAMILIES
 from mjx_study.disk import write_whole
-from mjx_study.simulation.contact import FAMILIES
 
 # Okabe and Ito's colours, told apart in print and by colour-blind eyes; markers repeat the distinction.
 STYLE: Final = {
@@ -68,7 +68,6 @@ def robust_limits(curves: Sequence[np.ndarray]) -> tuple[float, float]:
     return float(low - room), float(high + room)
 
 
-FORMATS: Final = ("png", "pdf", "svg")
 STYLES: Final = {
     "screen": {"pdf.fonttype": 42},
     "paper": {
@@ -93,7 +92,7 @@ def fit_to_paper(figure: Figure) -> None:
 
 
 def save_figure(figure: Figure, folder: Path, name: str, formats: Sequence[str] = ("png", "pdf")) -> list[Path]:
-    """Write a figure in some of `FORMATS`; returns the paths."""
+    """Write a figure in some of `FIGURE_FORMATS`; returns the paths."""
     return [
         write_whole(folder / f"{name}.{kind}", lambda file, kind=kind: figure.savefig(file, format=kind, dpi=150))
         for kind in formats

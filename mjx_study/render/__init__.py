@@ -4,16 +4,15 @@ A drawing needs no OpenGL: every geom is projected along a coordinate axis. Wher
 used instead, in a separate process.
 """
 
-from mjx_study.render.animation import FORMATS, animate, check_format
+import mjx_study._matplotlib  # noqa: F401
+from mjx_study.render.animation import animate, check_format
 from mjx_study.render.figures import strip, stroboscope
 from mjx_study.render.framing import choose_view, resolve_view
 from mjx_study.render.motion import Motion
-from mjx_study.render.opengl import RENDERERS, RenderError, resolve_renderer
+from mjx_study.render.opengl import RenderError, resolve_renderer
 from mjx_study.render.outline import VIEWS
 
 __all__ = [
-    "FORMATS",
-    "RENDERERS",
     "VIEWS",
     "Motion",
     "RenderError",

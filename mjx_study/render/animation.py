@@ -15,6 +15,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image, ImageDraw, ImageFont
 
+from mjx_study.choices import FILM_FORMATS
 from mjx_study.disk import write_whole
 from mjx_study.render.drawing import Drawing
 from mjx_study.render.figures import time_label
@@ -22,7 +23,6 @@ from mjx_study.render.framing import resolve_view
 from mjx_study.render.motion import Motion
 from mjx_study.render.opengl import RenderError, images
 
-FORMATS: Final = ("gif", "mp4")
 MOST_FRAMES: Final = 120
 FRAMES_PER_SECOND: Final = 25
 LAST_FRAME: Final = 0.5
@@ -36,8 +36,8 @@ _DRAWN_COLOURS, _RENDERED_COLOURS = 64, 128
 
 def check_format(name: str) -> None:
     """Raises ValueError for an unknown format, RenderError for one that cannot be written here."""
-    if name not in FORMATS:
-        raise ValueError(f"unknown format {name!r}; choose from {', '.join(FORMATS)}")
+    if name not in FILM_FORMATS:
+        raise ValueError(f"unknown format {name!r}; choose from {', '.join(FILM_FORMATS)}")
     if name == "mp4" and shutil.which("ffmpeg") is None:
         raise RenderError("mp4 needs ffmpeg, which is not on the PATH; use the format gif")
 

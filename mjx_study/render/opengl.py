@@ -16,10 +16,10 @@ import mujoco
 import numpy as np
 from jaxtyping import Int, UInt8
 
+from mjx_study.choices import RENDERERS
 from mjx_study.render.drawing import Drawing, geom_colours
 from mjx_study.render.framing import depths
 
-RENDERERS: Final = ("auto", "drawing", "opengl")
 _WORKER: Final = Path(__file__).with_name("_opengl_worker.py")
 _PIXELS: Final = 640  # of the larger side
 _LONGEST: Final = 3.0  # ratio of the sides

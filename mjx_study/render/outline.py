@@ -7,6 +7,8 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
+from mjx_study.choices import PLANES
+
 Geom = mujoco.mjtGeom
 _ANGLE: Final = np.linspace(0, 2 * np.pi, 97)[:-1]
 CIRCLE: Final = np.stack([np.cos(_ANGLE), np.sin(_ANGLE)], axis=1)
@@ -40,7 +42,7 @@ class View:
         return np.cross(unit[self.right], unit[self.up])
 
 
-VIEWS: Final = {view.name: view for view in (View("xz", 0, 2), View("xy", 0, 1), View("yz", 1, 2))}
+VIEWS: Final = {name: View(name, *map("xyz".index, name)) for name in PLANES}
 
 
 @dataclasses.dataclass(frozen=True)

@@ -25,7 +25,6 @@ import math
 import warnings
 from collections.abc import Sequence
 from functools import partial
-from typing import Final
 
 import jax.numpy as jnp
 import mujoco
@@ -33,14 +32,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from estimators.pytree import register_pytree
+from mjx_study.choices import DEFAULT_SOLIMP, FAMILIES, MAX_IMPEDANCE, MIN_IMPEDANCE
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.scene import Scene
-
-MIN_IMPEDANCE: Final = float(mujoco.mjMINIMP)
-MAX_IMPEDANCE: Final = float(mujoco.mjMAXIMP)
-DEFAULT_SOLREF: Final = (0.02, 1.0)
-DEFAULT_SOLIMP: Final = (0.9, 0.95, 0.001, 0.5, 2.0)
-STIFF_SOLIMP: Final = (0.99, 0.9999, 0.001, 0.5, 2.0)
 
 
 class ContactWarning(UserWarning):
@@ -104,61 +98,6 @@ def contact_model(
         None if friction is None else as_array(friction),
         None if margin is None else as_array(margin),
     )
-
-
-@dataclasses.dataclass(frozen=True)
-class Family:
-    """A line of contact models over stiffness, or a single point of MuJoCo's parameters.
-
-    Attributes:
-        name: name on the command line.
-        description: one line for tables and help.
-        solimp: impedance of all its members; None for the MJCF's.
-        dampratio: damping ratio used with a stiffness when no damping is given.
-        solref: fixed reference of a single point; None for a line over stiffness, or for the MJCF's.
-    """
-
-    name: str
-    description: str
-    solimp: tuple[float, float, float, float, float] | None
-    dampratio: float = 0.0
-    solref: tuple[float, float] | None = None
-
-    @property
-    def swept(self) -> bool:
-        """Whether the family takes a stiffness."""
-        return self.solref is None and self.solimp is not None
-
-
-def _constant(impedance: float) -> tuple[float, float, float, float, float]:
-    return (impedance, impedance, 0.001, 0.5, 2.0)
-
-
-FAMILIES: Final = {
-    family.name: family
-    for family in (
-        Family(
-            "penalty",
-            "spring K without damping, impedance 1e-4: the penalty method",
-            _constant(MIN_IMPEDANCE),
-        ),
-        Family(
-            "impedance",
-            "spring K without damping, impedance 0.5: half penalty, half constraint",
-            _constant(0.5),
-        ),
-        Family("mujoco", "MuJoCo's default impedance (0.9 to 0.95), K critically damped", DEFAULT_SOLIMP, 1.0),
-        Family("mujoco_stiff", "impedance 0.99 to 0.9999, K critically damped", STIFF_SOLIMP, 1.0),
-        Family(
-            "smooth_onset",
-            "impedance rising from 1e-4 to 0.95 over 1 mm, K critically damped: force without a jump",
-            (MIN_IMPEDANCE, 0.95, 0.001, 0.5, 2.0),
-            1.0,
-        ),
-        Family("mujoco_default", "MuJoCo's defaults: solref (0.02, 1)", DEFAULT_SOLIMP, 1.0, DEFAULT_SOLREF),
-        Family("mjcf", "each contact as the MJCF has it", None),
-    )
-}
 
 
 def family_model(

@@ -36,6 +36,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from estimators.pytree import register_pytree
+from mjx_study.choices import ONSETS
 from mjx_study.simulation import constraint
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.dynamics import (
@@ -54,8 +55,6 @@ from mjx_study.simulation.scene import Scene
 
 SLOTS: Final = 8
 """Number of onsets corrected per rollout; later ones are only counted."""
-ONSETS: Final = ("none", "linear")
-"""Treatments of the onset of contact in first-order derivatives."""
 TOUCHING: Final = 1e-6
 """Share of a cell: a body closer than this before the step had touched already, so there is no onset."""
 

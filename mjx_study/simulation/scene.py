@@ -12,18 +12,16 @@ import jax
 import mujoco
 import numpy as np
 
+from mjx_study.choices import CONES, INTEGRATORS, SOLVERS
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.limitations import FLAGS, ignored, lacking
 from mjx_study.simulation.mjcf_sizes import too_large
 
-CONES: Final = {"pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL, "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC}
-SOLVERS: Final = {"newton": mujoco.mjtSolver.mjSOL_NEWTON, "cg": mujoco.mjtSolver.mjSOL_CG}
-INTEGRATORS: Final = {
-    "euler": mujoco.mjtIntegrator.mjINT_EULER,
-    "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
-    "rk4": mujoco.mjtIntegrator.mjINT_RK4,
+_ENUMERATED: Final = {
+    "cone": {name: mujoco.mjtCone.__members__[f"mjCONE_{name.upper()}"] for name in CONES},
+    "solver": {name: mujoco.mjtSolver.__members__[f"mjSOL_{name.upper()}"] for name in SOLVERS},
+    "integrator": {name: mujoco.mjtIntegrator.__members__[f"mjINT_{name.upper()}"] for name in INTEGRATORS},
 }
-_ENUMERATED: Final = {"cone": CONES, "solver": SOLVERS, "integrator": INTEGRATORS}
 SceneOption = str | float | int | Sequence[str]
 ADJOINTS: Final = ("auto", "jacobian", "tape")
 """Ways to differentiate steps (see `Scene.adjoint`)."""

@@ -1,20 +1,17 @@
-"""The configuration of a study, and what follows from it for a task: estimators, recipe, parameters."""
+"""The configuration of a study; `resolution` has what follows from it for a task."""
 
 import dataclasses
 import math
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Sequence
-from typing import Any, ClassVar, Final
+from collections.abc import Callable, Collection, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar, Final, Union
 
-import jax.numpy as jnp
-import numpy as np
-
-from estimators import ESTIMATORS, Estimator, make_estimator
-from estimators.cross_fitting import PLUG_IN, check_weights
-from estimators.ddcg import PUBLISHED_TOLERANCE
+from estimators.catalogue import CATALOGUE, PLUG_IN, PUBLISHED_TOLERANCE
+from mjx_study.choices import FAMILIES
 from mjx_study.option import CONTACTS, Checked
-from mjx_study.simulation.contact import FAMILIES
-from mjx_study.tasks.task import Recipe, Task
+
+if TYPE_CHECKING:
+    import mjx_study.tasks.task
 
 Progress = Callable[[int, int, str], None]
 """Called with (work done, total work, what is being computed)."""
@@ -86,7 +83,7 @@ class StudyConfig(Checked):
 
     ranges: ClassVar = {"samples": "[3, 1e7]"}
 
-    tasks: tuple[str | Task, ...]
+    tasks: tuple[Union[str, "mjx_study.tasks.task.Task"], ...]
     kind: str | None = None
     estimators: tuple[str, ...] = ("zobg", "fobg", "aobg")
     theta: tuple[float, ...] | None = None
@@ -134,7 +131,7 @@ class StudyConfig(Checked):
             raise ValueError("no task given")
         if self.theta is not None and len(self.tasks) > 1:
             raise ValueError("theta is of a single task; give one task, or leave theta out")
-        check_names("estimator", self.estimators, ESTIMATORS)
+        check_names("estimator", self.estimators, CATALOGUE)
         if self.contact:
             check_names("contact family", self.contact, CONTACTS)
         if self.contact is not None and not takes_stiffness(self.contact):
@@ -155,8 +152,6 @@ class StudyConfig(Checked):
             object.__setattr__(self, "kind", of_points if self.iterations is None else "descents")
         self._settle()
         check_span(self.span)
-        if self.samples is not None:
-            check_weights(self.weights, min(self.samples))
 
     def _settle(self) -> None:
         """Refuse options without effect in this kind of study, and fill in the defaults of its own."""
@@ -207,86 +202,3 @@ def check_span(span: Sequence[float] | None) -> None:
 def takes_stiffness(families: Sequence[str]) -> bool:
     """Whether any of the contact families, "reference" included, takes a stiffness."""
     return any(family not in FAMILIES or FAMILIES[family].swept for family in families)
-
-
-def recipe_of(config: StudyConfig, task: Task) -> Recipe:
-    """Settings of a task's descents: the configuration's, else those of the task's recipe.
-
-    Raises:
-        ValueError: a setting is missing.
-    """
-    given = {name: getattr(config, name) for name in ("iterations", "learning_rate", "decay")}
-    given |= {"samples": None if config.samples is None else max(config.samples)}
-    if (recipe := task.defaults.recipe) is not None:
-        return dataclasses.replace(recipe, **{name: value for name, value in given.items() if value is not None})
-    given["decay"] = given["decay"] or 0.0
-    if missing := [name.replace("_", " ") for name, value in given.items() if value is None]:
-        raise ValueError(f"{task.name} has no recipe: give {', '.join(missing)}")
-    return Recipe(**given)
-
-
-def at_theta(task: Task, theta: Sequence[float] | None) -> Task:
-    """The task at other parameters; unchanged for None.
-
-    Raises:
-        ValueError: their number is not the policy's, or one is not finite.
-    """
-    if theta is None:
-        return task
-    values = np.asarray(theta, float)
-    if values.shape != (task.policy.num_params,) or not np.all(np.isfinite(values)):
-        raise ValueError(
-            f"theta has {values.size} numbers; {task.name} needs {task.policy.num_params}, all of them finite"
-        )
-    return task.replace(theta=jnp.asarray(values, task.theta.dtype))
-
-
-def configured_estimators(config: StudyConfig, task: Task) -> tuple[Estimator, ...]:
-    """A configuration's estimators with their options, checked against the task.
-
-    Raises:
-        ValueError: there is no such estimator, an option is out of range or missing, or an estimator cannot run on the
-            task; or published constants are asked for where there are none, or beside others.
-    """
-    options = {name: getattr(config, name) for name in ("baseline", "max_norm", "window", "tolerance", "weights")}
-    options |= bound_constants(config, task) | {"sigma": task.sigma}
-    found = tuple(make_estimator(name, **options) for name in config.estimators)
-    check_estimators(found, task)
-    return found
-
-
-def bound_constants(config: StudyConfig, task: Task) -> dict[str, Any]:
-    """Constants of AoBG's bound, from the configuration or the published example.
-
-    Raises:
-        ValueError: the published ones are asked for where there are none, or beside others.
-    """
-    names = ("gamma", "failure_probability", "variance_proxy", "radius")
-    given = {name: getattr(config, name) for name in names}
-    if not config.published:
-        return given | {"gamma": task.defaults.gamma if config.gamma is None else config.gamma}
-    if task.defaults.published is None:
-        raise ValueError(f"{task.name} has no published constants of the bound; leave published out")
-    defaults = {field.name: field.default for field in dataclasses.fields(StudyConfig)}
-    if others := [name for name in names if given[name] != defaults[name]]:
-        raise ValueError(f"published sets {', '.join(names)}: leave {', '.join(others)} out")
-    return dataclasses.asdict(task.defaults.published)
-
-
-def check_estimators(estimators: Iterable[Estimator], task: Task) -> None:
-    """Refuse estimators whose formula does not hold for a task.
-
-    Raises:
-        ValueError: the noise is not Gaussian, or not on theta, where the formula needs it.
-    """
-    for estimator in estimators:
-        if estimator.gaussian and task.noise != "gaussian":
-            raise ValueError(f"{estimator.name!r} holds for Gaussian noise only; the noise is {task.noise}")
-        if estimator.additive and not task.policy.additive:
-            raise ValueError(
-                f"{estimator.name!r} needs noise that is added to theta itself; {task.name} has a feedback policy"
-            )
-        if task.onset != "none" and "linearisation" in estimator.needs:
-            raise ValueError(
-                f"{estimator.name!r} needs the derivatives of single steps, which have no onset term; leave onset out"
-            )

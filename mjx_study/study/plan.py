@@ -7,16 +7,19 @@ import jax
 
 import estimators
 from estimators import Estimator, find_estimator
+from estimators.cross_fitting import check_weights
+from mjx_study.choices import REFERENCE
 from mjx_study.limits import MOST_CELLS, MOST_PROGRAMS, check_count
 from mjx_study.objective import chunk_for
 from mjx_study.option import OPTIONS, check
-from mjx_study.study.configuration import SAMPLES, StudyConfig, at_theta, configured_estimators, recipe_of
+from mjx_study.study.configuration import SAMPLES, StudyConfig
 from mjx_study.study.iteration import make_optimizer
 from mjx_study.study.line import line_of
 from mjx_study.study.memory import LARGEST_BATCH, bytes_per_sample, check_batches, check_memory, seeds_at_once
+from mjx_study.study.resolution import at_theta, configured_estimators, recipe_of
 from mjx_study.table import digits_to_tell_apart
 from mjx_study.tasks import make_task
-from mjx_study.tasks.contact_grid import REFERENCE, ContactPoint, contact_grid, solver_grid
+from mjx_study.tasks.contact_grid import ContactPoint, contact_grid, solver_grid
 from mjx_study.tasks.network import with_network
 from mjx_study.tasks.task import Recipe, Task, check_sigma
 from mjx_study.tasks.validation import check_shapes
@@ -119,6 +122,7 @@ def plan_study(config: StudyConfig) -> StudyPlan:
         task = at_theta(task, config.theta)
         recipe = recipe_of(config, task) if config.kind == "descents" else None
         counts = config.samples or (SAMPLES if recipe is None else recipe.samples,)
+        check_weights(config.weights, min(counts))
         name = which if isinstance(which, str) else which.name
         models, told = contact_grid(task, config.contact, config.stiffness, config.damping)
         if config.solref or config.solimp:

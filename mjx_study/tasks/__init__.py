@@ -5,10 +5,11 @@ from functools import partial
 from typing import Final
 
 from estimators.places import MissingModuleError
+from mjx_study.choices import unknown_task
 from mjx_study.tasks.ball_wall import ball_wall
 from mjx_study.tasks.double_pendulum import double_pendulum
 from mjx_study.tasks.momentum_transfer import momentum_transfer
-from mjx_study.tasks.own import own_task, registered_names, registered_place
+from mjx_study.tasks.own import own_task, registered_place
 from mjx_study.tasks.pusher import pusher
 from mjx_study.tasks.sliding_box import sliding_box
 from mjx_study.tasks.task import Task
@@ -49,14 +50,12 @@ def make_task(name: str, **options) -> Task:
     place = registered_place(name)
     if place is not None:
         return own_task(place, options)
-    reason = ""
     if ":" in name:
         try:
             return own_task(name, options)
         except MissingModuleError as error:
-            reason = f" ({error})"
-    choices = dict.fromkeys([*TASKS, *registered_names()])
-    raise ValueError(f"unknown task {name!r}; choose from {', '.join(choices)}, or module:name of your own{reason}")
+            raise ValueError(unknown_task(name, f" ({error})")) from None
+    raise ValueError(unknown_task(name))
 
 
 __all__ = [

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import mujoco
 from jaxtyping import Array, Float
 
+from mjx_study.choices import TASK_DESCRIPTIONS
 from mjx_study.reference import BallWall, FunctionObjective
 from mjx_study.simulation.dynamics import State, initial_state
 from mjx_study.simulation.scene import SceneError, load_model, put_scene, require
@@ -66,9 +67,10 @@ def ball_wall(
         direction = jnp.stack([jnp.cos(parameters[0]), jnp.sin(parameters[0])])
         return State(start.qpos, speed * direction, start.act, start.warmstart)
 
+    name = "ball_wall" if variant == "box" else f"ball_wall:{variant}"
     return Task(
-        name="ball_wall" if variant == "box" else f"ball_wall:{variant}",
-        description=f"throw a ball far, with a wall ({variant}) in its way; one launch angle",
+        name=name,
+        description=TASK_DESCRIPTIONS[name],
         scene=scene,
         horizon=horizon,
         policy=InitialStatePolicy(1, horizon, scene.host.nu, start_at),

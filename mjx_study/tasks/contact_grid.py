@@ -5,15 +5,12 @@ import itertools
 import warnings
 from collections.abc import Generator, Sequence
 from contextlib import contextmanager
-from typing import Final
 
 import numpy as np
 
+from mjx_study.choices import DEFAULT_SOLIMP, DEFAULT_SOLREF, FAMILIES, REFERENCE
 from mjx_study.limits import MOST_MODELS, check_count
 from mjx_study.simulation.contact import (
-    DEFAULT_SOLIMP,
-    DEFAULT_SOLREF,
-    FAMILIES,
     ContactModel,
     ContactWarning,
     contact_model,
@@ -22,9 +19,6 @@ from mjx_study.simulation.contact import (
 )
 from mjx_study.table import digits_to_tell_apart
 from mjx_study.tasks.task import Task
-
-REFERENCE: Final = "reference"
-"""Stands for the task's analytic system, without MJX, among contact families."""
 
 
 @dataclasses.dataclass(frozen=True)

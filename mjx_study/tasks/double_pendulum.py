@@ -15,6 +15,7 @@ from typing import Final
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from mjx_study.choices import TASK_DESCRIPTIONS
 from mjx_study.reference import DoublePendulum, ReferenceObjective
 from mjx_study.simulation.dynamics import State, initial_state
 from mjx_study.simulation.scene import load_scene, require
@@ -57,9 +58,10 @@ def double_pendulum(
     def start_at(rest: State, parameters: Float[Array, " params"]) -> State:
         return State(parameters[:2], parameters[2:], rest.act, rest.warmstart)
 
+    name = "double_pendulum" if start == "default" else f"double_pendulum:{start}"
     return Task(
-        name="double_pendulum" if start == "default" else f"double_pendulum:{start}",
-        description=f"chaos without contact; four numbers of the initial state ({start})",
+        name=name,
+        description=TASK_DESCRIPTIONS[name],
         scene=scene,
         horizon=horizon,
         policy=InitialStatePolicy(4, horizon, scene.host.nu, start_at),

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from mjx_study.choices import TASK_DESCRIPTIONS
 from mjx_study.reference import FunctionObjective, MomentumTransfer
 from mjx_study.simulation.dynamics import State, initial_state
 from mjx_study.simulation.scene import load_scene, require
@@ -56,7 +57,7 @@ def momentum_transfer(
 
     return Task(
         name="momentum_transfer",
-        description="hit a pivoting bar as hard as possible with a ball; one launch angle",
+        description=TASK_DESCRIPTIONS["momentum_transfer"],
         scene=scene,
         horizon=horizon,
         policy=InitialStatePolicy(1, horizon, scene.host.nu, start_at),

@@ -3,19 +3,12 @@
 import inspect
 from collections.abc import Callable, Sequence
 from importlib import metadata
-from typing import Any, Final
+from typing import Any
 
 from estimators.places import described, find_attribute, importable_here
+from mjx_study.choices import TASK_GROUP
 from mjx_study.tasks.task import Task
 from mjx_study.tasks.validation import check_shapes
-
-GROUP: Final = "mjx_study.tasks"
-"""Entry point group in which installed packages register tasks."""
-
-
-def registered_names() -> list[str]:
-    """Names of the tasks that installed packages register."""
-    return sorted({point.name for point in metadata.entry_points(group=GROUP)})
 
 
 def registered_place(name: str) -> str | None:
@@ -24,7 +17,7 @@ def registered_place(name: str) -> str | None:
     Raises:
         ValueError: packages register different tasks by this name.
     """
-    places = {f"{point.module}:{point.attr}" for point in metadata.entry_points(group=GROUP, name=name)}
+    places = {f"{point.module}:{point.attr}" for point in metadata.entry_points(group=TASK_GROUP, name=name)}
     if len(places) > 1:
         raise ValueError(f"task {name!r} is registered more than once; choose from {', '.join(sorted(places))}")
     return next(iter(places), None)

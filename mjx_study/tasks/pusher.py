@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from mjx_study.choices import TASK_DESCRIPTIONS
 from mjx_study.reference import Pusher, ReferenceObjective
 from mjx_study.simulation.dynamics import State, initial_state
 from mjx_study.simulation.scene import load_scene, require
@@ -52,7 +53,7 @@ def pusher(*, horizon: int = HORIZON, model: str | Path = "pusher", **scene_opti
 
     return Task(
         name="pusher",
-        description="push a body through stiff contact; 200 open-loop forces",
+        description=TASK_DESCRIPTIONS["pusher"],
         scene=scene,
         horizon=horizon,
         policy=OpenLoop(horizon, scene.host.nu),

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from mjx_study.choices import TASK_DESCRIPTIONS
 from mjx_study.reference import ReferenceObjective, SlidingBox
 from mjx_study.simulation.dynamics import State, initial_state
 from mjx_study.simulation.scene import load_scene, require
@@ -56,7 +57,7 @@ def sliding_box(*, horizon: int = HORIZON, model: str | Path = "sliding_box", **
 
     return Task(
         name="sliding_box",
-        description="drag a box by friction; 400 open-loop forces",
+        description=TASK_DESCRIPTIONS["sliding_box"],
         scene=scene,
         horizon=horizon,
         policy=OpenLoop(horizon, scene.host.nu),

@@ -53,7 +53,7 @@ ESTIMATORS: Final = (
     ),
     Defect(
         "weights-swapped",
-        "estimators/alpha_order.py",
+        "estimators/alpha.py",
         "ratio = variance_first / jnp.where(variance_zeroth == 0, 1.0, variance_zeroth)",
         "ratio = variance_zeroth / jnp.where(variance_first == 0, 1.0, variance_first)",
         "each estimate weighed by its own variance",
@@ -61,7 +61,7 @@ ESTIMATORS: Final = (
     ),
     Defect(
         "variance-of-a-mixture",
-        "estimators/alpha_order.py",
+        "estimators/alpha.py",
         "(1.0 - alpha, alpha), ((1.0 - alpha) ** 2, alpha**2)",
         "(1.0 - alpha, alpha), (1.0 - alpha, alpha)",
         "variances weighed as means are",
@@ -85,7 +85,7 @@ ESTIMATORS: Final = (
     ),
     Defect(
         "control-variate-scale",
-        "estimators/zeroth_order.py",
+        "estimators/zeroth.py",
         "linear = scale**2 * jnp.sum",
         "linear = scale * jnp.sum",
         "sigma in place of its square: unbiased still, but no longer a control variate",
@@ -93,7 +93,7 @@ ESTIMATORS: Final = (
     ),
     Defect(
         "pairs-as-samples",
-        "estimators/zeroth_order.py",
+        "estimators/zeroth.py",
         "return summarise((above + below) / 2.0)",
         "return summarise(jnp.concatenate([above, below]))",
         "the halves of a pair are not independent: the same mean, another standard error",

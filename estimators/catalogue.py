@@ -1,0 +1,115 @@
+"""What can be chosen by name, with a line about each; nothing here computes or imports what does."""
+
+from dataclasses import dataclass
+from typing import Final
+
+PLUG_IN: Final = "plug_in"
+CROSS_FITTED: Final = "cross_fitted"
+WEIGHTS: Final = (PLUG_IN, CROSS_FITTED)
+"""Sources of an interpolation's weights."""
+BASELINES: Final = ("none", "zero_noise", "leave_one_out")
+"""Baselines of zeroth-order samples."""
+VARIANCE_PROXIES: Final = ("variance", "second_moment", "upper_bound")
+"""What may stand for the variance in epsilon."""
+MAX_DEVIATION: Final = "max_deviation"
+"""The radius in epsilon that is read off the samples."""
+PUBLISHED_TOLERANCE: Final = 0.3
+"""Tolerance of DDCG's test."""
+DENSITIES: Final = {
+    "gaussian": "the paper's",
+    "logistic": "heavier tails, bounded score",
+    "laplace": "a score of constant size, which bounds zeroth-order samples",
+    "student": "Student's t with 5 degrees of freedom: rare large steps",
+}
+"""Noise densities, each with a line about it."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """An estimator, described.
+
+    Attributes:
+        name: On the command line and in `ESTIMATORS`.
+        label: For a legend.
+        needs: Oracles in `ORACLES`, in the order in which `combine` takes their batches.
+        description: One line.
+        required: Options without a default.
+    """
+
+    name: str
+    label: str
+    needs: tuple[str, ...]
+    description: str
+    required: tuple[str, ...] = ()
+
+
+CATALOGUE: dict[str, Entry] = {
+    entry.name: entry
+    for entry in (
+        Entry("zobg", "ZoBG", ("evaluation",), "zeroth order: values times scores"),
+        Entry("zobg_antithetic", "ZoBG, antithetic", ("pair",), "zeroth order over pairs of opposite noise"),
+        Entry(
+            "zobg_to_go", "ZoBG, costs to go", ("steps",), "zeroth order: costs to go times the scores of single steps"
+        ),
+        Entry(
+            "zobg_to_go_antithetic",
+            "ZoBG, to go, antithetic",
+            ("step_pair",),
+            "costs to go over pairs of opposite noise",
+        ),
+        Entry("fobg", "FoBG", ("differentiation",), "first order: gradients of the samples"),
+        Entry(
+            "fobg_clipped",
+            "FoBG, clipped",
+            ("differentiation",),
+            "first order, the norm of every sample bounded",
+            ("max_norm",),
+        ),
+        Entry(
+            "fobg_truncated",
+            "FoBG, truncated",
+            ("linearisation",),
+            "first order, the adjoint cut every few steps",
+            ("window",),
+        ),
+        Entry(
+            "aobg",
+            "AoBG",
+            ("evaluation", "differentiation"),
+            "alpha order: the two interpolated within an error of gamma",
+        ),
+        Entry(
+            "ivw",
+            "IVW",
+            ("evaluation", "differentiation"),
+            "inverse-variance weighting: alpha order with gamma infinite",
+        ),
+        Entry(
+            "ivw_h",
+            "IVW-H",
+            ("steps", "step_differentiation"),
+            "inverse-variance weights for every step and control",
+        ),
+        Entry(
+            "total_propagation",
+            "total propagation",
+            ("linearisation",),
+            "inverse-variance weights inside the backward recursion",
+        ),
+        Entry(
+            "ddcg",
+            "DDCG",
+            ("evaluation", "step_differentiation"),
+            "inverse-variance weighting where a test finds no discontinuity, else zeroth order",
+            ("sigma",),
+        ),
+        Entry(
+            "delta",
+            "delta",
+            ("evaluation", "differentiation"),
+            "first-order mean and a zeroth-order estimate of what it leaves over; noise on theta itself",
+            ("sigma",),
+        ),
+    )
+}
+"""Estimators by name; `register` adds those of one's own."""

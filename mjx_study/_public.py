@@ -1,0 +1,67 @@
+"""What `mjx_study` offers; the package imports it when one of these names is first asked for."""
+
+import mjx_study._matplotlib  # noqa: F401
+from mjx_study.accessor import StudyAccessor
+from mjx_study.choices import FAMILIES
+from mjx_study.objective import MjxObjective, Simulator, simulate
+from mjx_study.plots.study import plot_study
+from mjx_study.runtime import configure
+from mjx_study.simulation.contact import (
+    ContactModel,
+    ContactWarning,
+    apply_contact,
+    contact_model,
+    effective_mass,
+    family_model,
+    solref_from_stiffness,
+    stiffness_from_solref,
+)
+from mjx_study.simulation.dynamics import State, initial_state, rollout, step, step_jacobian
+from mjx_study.simulation.scene import Scene, SceneError, load_scene, put_scene
+from mjx_study.study.configuration import StudyConfig
+from mjx_study.study.plan import estimators_of, plan_study
+from mjx_study.study.run import load_study, run_study
+from mjx_study.tasks import TASKS, make_task
+from mjx_study.tasks.policy import InitialStatePolicy, LinearFeedback, OpenLoop, Policy
+from mjx_study.tasks.task import Recipe, StudyDefaults, Task
+
+__all__ = [
+    "ContactModel",
+    "ContactWarning",
+    "FAMILIES",
+    "InitialStatePolicy",
+    "LinearFeedback",
+    "MjxObjective",
+    "OpenLoop",
+    "Policy",
+    "Recipe",
+    "Scene",
+    "SceneError",
+    "Simulator",
+    "State",
+    "StudyAccessor",
+    "StudyConfig",
+    "StudyDefaults",
+    "TASKS",
+    "Task",
+    "apply_contact",
+    "configure",
+    "contact_model",
+    "effective_mass",
+    "estimators_of",
+    "family_model",
+    "initial_state",
+    "load_scene",
+    "load_study",
+    "make_task",
+    "plan_study",
+    "plot_study",
+    "put_scene",
+    "rollout",
+    "run_study",
+    "simulate",
+    "solref_from_stiffness",
+    "step",
+    "step_jacobian",
+    "stiffness_from_solref",
+]

@@ -1,0 +1,111 @@
+"""What can be chosen by name, with a line about each; nothing here computes or imports what does."""
+
+import dataclasses
+from importlib import metadata
+from typing import Final
+
+PRECISIONS: Final = ("float64", "float32")
+CONES: Final = ("pyramidal", "elliptic")
+SOLVERS: Final = ("newton", "cg")
+INTEGRATORS: Final = ("euler", "implicitfast", "rk4")
+ONSETS: Final = ("none", "linear")
+"""Treatment of the onset of contact in first-order gradients."""
+REFERENCE: Final = "reference"
+"""Stands for the task's analytic system, without MJX, among contact families."""
+TASK_DESCRIPTIONS: Final = {
+    "pusher": "push a body through stiff contact; 200 open-loop forces",
+    "sliding_box": "drag a box by friction; 400 open-loop forces",
+    "ball_wall": "throw a ball far, with a wall (box) in its way; one launch angle",
+    "ball_wall:dome": "throw a ball far, with a wall (dome) in its way; one launch angle",
+    "momentum_transfer": "hit a pivoting bar as hard as possible with a ball; one launch angle",
+    "tennis": "return balls to a target with a paddle; linear feedback, 3 x 7",
+    "double_pendulum": "chaos without contact; four numbers of the initial state (default)",
+    "double_pendulum:published": "chaos without contact; four numbers of the initial state (published)",
+}
+CHECKED_STIFFNESS: Final = (10.0, 100.0, 1000.0)
+"""Contact stiffnesses that gradcheck takes [N/m]."""
+CHECKED_STATES: Final = 4
+"""States that gradcheck takes, of each contact model."""
+CHECKED_STEPS: Final = 200
+"""Steps of the rollout that the states of a file come from."""
+FIGURE_FORMATS: Final = ("png", "pdf", "svg")
+FIGURE_STYLES: Final = ("screen", "paper")
+FILM_FORMATS: Final = ("gif", "mp4")
+RENDERERS: Final = ("auto", "drawing", "opengl")
+PLANES: Final = ("xz", "xy", "yz")
+"""Planes of a picture: the axis to the right, and the one that points up."""
+MIN_IMPEDANCE: Final = 1e-4
+"""MuJoCo's mjMINIMP."""
+MAX_IMPEDANCE: Final = 0.9999
+"""MuJoCo's mjMAXIMP."""
+DEFAULT_SOLREF: Final = (0.02, 1.0)
+DEFAULT_SOLIMP: Final = (0.9, 0.95, 0.001, 0.5, 2.0)
+STIFF_SOLIMP: Final = (0.99, 0.9999, 0.001, 0.5, 2.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class Family:
+    """A line of contact models over stiffness, or a single point of MuJoCo's parameters.
+
+    Attributes:
+        name: name on the command line.
+        description: one line for tables and help.
+        solimp: impedance of all its members; None for the MJCF's.
+        dampratio: damping ratio used with a stiffness when no damping is given.
+        solref: fixed reference of a single point; None for a line over stiffness, or for the MJCF's.
+    """
+
+    name: str
+    description: str
+    solimp: tuple[float, float, float, float, float] | None
+    dampratio: float = 0.0
+    solref: tuple[float, float] | None = None
+
+    @property
+    def swept(self) -> bool:
+        """Whether the family takes a stiffness."""
+        return self.solref is None and self.solimp is not None
+
+
+def _constant(impedance: float) -> tuple[float, float, float, float, float]:
+    return (impedance, impedance, 0.001, 0.5, 2.0)
+
+
+FAMILIES: Final = {
+    family.name: family
+    for family in (
+        Family(
+            "penalty",
+            "spring K without damping, impedance 1e-4: the penalty method",
+            _constant(MIN_IMPEDANCE),
+        ),
+        Family(
+            "impedance",
+            "spring K without damping, impedance 0.5: half penalty, half constraint",
+            _constant(0.5),
+        ),
+        Family("mujoco", "MuJoCo's default impedance (0.9 to 0.95), K critically damped", DEFAULT_SOLIMP, 1.0),
+        Family("mujoco_stiff", "impedance 0.99 to 0.9999, K critically damped", STIFF_SOLIMP, 1.0),
+        Family(
+            "smooth_onset",
+            "impedance rising from 1e-4 to 0.95 over 1 mm, K critically damped: force without a jump",
+            (MIN_IMPEDANCE, 0.95, 0.001, 0.5, 2.0),
+            1.0,
+        ),
+        Family("mujoco_default", "MuJoCo's defaults: solref (0.02, 1)", DEFAULT_SOLIMP, 1.0, DEFAULT_SOLREF),
+        Family("mjcf", "each contact as the MJCF has it", None),
+    )
+}
+
+
+TASK_GROUP: Final = "mjx_study.tasks"
+"""Entry point group in which installed packages register tasks."""
+
+
+def unknown_task(name: str, reason: str = "") -> str | None:
+    """What to say of a task's name that is neither ours, nor registered, nor `module:name`; or of one for a reason."""
+    registered = sorted({point.name for point in metadata.entry_points(group=TASK_GROUP)})
+    if (name in TASK_DESCRIPTIONS or name in registered or ":" in name) and not reason:
+        return None
+    choices = dict.fromkeys([*TASK_DESCRIPTIONS, *registered])
+    return f"unknown task {name!r}; choose from {', '.join(choices)}, or module:name of your own{reason}"

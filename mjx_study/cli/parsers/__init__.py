@@ -1,0 +1,1 @@
+"""The options of each command: `EPILOG` for its help, and `add`."""

@@ -1,0 +1,66 @@
+"""Options of mjx-study compare."""
+
+import argparse
+
+from estimators.catalogue import CATALOGUE
+from mjx_study.choices import FAMILIES
+from mjx_study.cli.options import (
+    add_contact_options,
+    add_estimator_options,
+    add_folder_options,
+    add_option,
+    add_options,
+    add_process_options,
+    add_task_argument,
+    add_theta_option,
+)
+from mjx_study.study.configuration import StudyConfig
+
+SAMPLES = (400,)
+EPILOG = (
+    """\
+examples:
+  mjx-study compare pusher --stiffness 10,1000 --contact penalty,mujoco_default
+  mjx-study compare pusher --estimators zobg,fobg,aobg,ivw --gamma 1000 --samples 1000
+  mjx-study compare pusher --theta out/policy-aobg.json    where a descent ended, in place of where it begins
+  mjx-study compare pusher --json > pusher.json
+
+estimators:
+"""
+    + "\n".join(f"  {item.name:<21} {item.description}" for item in CATALOGUE.values())
+    + """
+
+contact families (K: from --stiffness):
+"""
+    + "\n".join(f"  {item.name:<15} {item.description}" for item in FAMILIES.values())
+    + """
+
+columns of the table:
+  variance        trace of the sample covariance of one gradient sample, with a jackknife interval
+  effective (top) samples that this variance rests on, and the share of it that the largest one carries
+  relative error  distance of the mean to a reference gradient, over the norm of the reference
+  -> debiased     the same without the noise of the two means, which adds to an error and takes from a cosine;
+                  - where noise is all there is
+  ?               fewer than three effective samples: do not believe the number
+  alpha           weight of the first-order batch in AoBG
+  epsilon, B      confidence radius of the zeroth-order mean; distance between the two means
+  residual        largest relative imbalance left by MuJoCo's constraint solver
+  ms              computing time of one sample in milliseconds, compilation excluded
+  variance x s    variance times that time: the variance that a second of computing leaves
+  nan             samples that overflowed or became NaN; they are left out, and a warning says so
+"""
+)
+
+
+def add(command: argparse.ArgumentParser) -> None:
+    """Add them."""
+    add_task_argument(command)
+    add_options(command, StudyConfig, "sigma", "cone", "horizon", "model", "timestep")
+    add_process_options(command)
+    add_contact_options(command)
+    add_theta_option(command, "parameters at which gradients are taken")
+    add_options(command, StudyConfig, "estimators", "reference_samples", reference_samples={"unset": "600"})
+    add_option(command, StudyConfig.option("samples"), SAMPLES)
+    add_estimator_options(command, StudyConfig)
+    add_options(command, StudyConfig, "confidence", "chunk_size")
+    add_folder_options(command)

@@ -1,0 +1,18 @@
+"""Options of mjx-study report."""
+
+import argparse
+from pathlib import Path
+
+EPILOG = """\
+Writes FOLDER/report.html: one page that needs no other file, with warnings, figures, a table, the whole configuration,
+versions and machine, and the command that made it. Works while the study is still being computed.
+
+example:
+  mjx-study report out
+"""
+
+
+def add(command: argparse.ArgumentParser) -> None:
+    """Add them."""
+    command.add_argument("folder", type=Path, metavar="FOLDER", help="of a study, made by sweep")
+    command.add_argument("--output", type=Path, metavar="FILE.html", help="default: FOLDER/report.html")

@@ -1,0 +1,45 @@
+"""Options of mjx-study rollout."""
+
+import argparse
+from pathlib import Path
+
+from mjx_study.choices import FILM_FORMATS, PLANES, RENDERERS
+from mjx_study.cli.options import (
+    add_contact_options,
+    add_option,
+    add_scene_options,
+    add_task_options,
+    add_theta_option,
+)
+from mjx_study.option import OPTIONS
+
+EPILOG = """\
+Simulates one rollout and shows it: strip.png (pictures at even times), stroboscope.png (one picture with ghosts),
+rollout.gif or .mp4, and trajectory.npz (time [s], qpos, qvel, controls). Without OpenGL everything is drawn from the
+model's geometry; with it, strip and film are MuJoCo's own renderings.
+
+TASK may also be an MJCF file of your own (FILE.xml): it moves as MuJoCo's C engine moves it, from its first keyframe if
+it has one, for 2 s unless --horizon says otherwise.
+
+examples:
+  mjx-study rollout pusher
+  mjx-study rollout ball_wall --theta 0.75 --stiffness 1e4 --slow 4
+  mjx-study rollout tennis --noise --seed 3 --theta learnt.npy
+  mjx-study rollout humanoid.xml --horizon 500 --view xz --format mp4
+"""
+
+
+def add(command: argparse.ArgumentParser) -> None:
+    """Add them."""
+    add_task_options(command, files="; or any MJCF")
+    add_scene_options(command)
+    add_contact_options(command, "the middle one of the task's sweep", many=False, analytic=False)
+    command.add_argument("--noise", action="store_true", help="with the noise of sample --seed (default: none)")
+    add_theta_option(command, "parameters")
+    command.add_argument("--policy", type=Path, metavar="FILE", help="a policy that optimise wrote, policy-NAME.json")
+    add_option(command, OPTIONS["frames"], 6)
+    command.add_argument("--view", choices=["auto", *PLANES], default="auto", help="default: where most happens")
+    command.add_argument("--renderer", choices=RENDERERS, default="auto", help="default: auto, opengl where it works")
+    command.add_argument("--format", choices=FILM_FORMATS, default="gif", help="of the film (default: gif)")
+    add_option(command, OPTIONS["slow"], 1.0)
+    command.add_argument("--output", type=Path, metavar="DIR", help="default: results/TASK-rollout")

@@ -1,0 +1,94 @@
+"""Options of mjx-study sweep."""
+
+import argparse
+import itertools
+from pathlib import Path
+from typing import Any
+
+from mjx_study.choices import TASK_DESCRIPTIONS
+from mjx_study.cli.options import (
+    add_estimator_options,
+    add_option,
+    add_options,
+    add_process_options,
+    add_versions_option,
+)
+from mjx_study.option import MOST_VALUES, OPTIONS, Interval, Option
+from mjx_study.study.configuration import StudyConfig
+
+EPILOG = """\
+Every combination of task, contact model, timestep, cone, sigma and number of samples is a cell: all its seeds and
+estimators are computed at once and written to DIR as one file. Stop it when you like, with Ctrl-C or kill -9; the same
+command computes what is missing, to the same numbers. Two of them at once share the work.
+
+Gradients are estimated where each task starts. With --iterations, policies are optimised; with --points, landscapes
+are drawn: the cost along a line, and the slope that every estimator sees.
+
+Numbers may be lists (10,100,1000) or ranges: FROM:TO:COUNT, or FROM:TO:COUNT:log for equal ratios.
+
+examples:
+  mjx-study sweep pusher --stiffness 10:1e5:13:log --contact penalty,mujoco --output out
+  mjx-study sweep pusher --stiffness 10:1e4:7:log --iterations 500 --samples 10 --seeds 5 --output descents
+  mjx-study sweep momentum_transfer --contact mujoco,smooth_onset --points 31 --timestep 0.001,0.002 --output slopes
+  mjx-study sweep pusher,ball_wall --timestep 0.001,0.0025,0.005 --samples 30,100,300 --output steps
+  mjx-study sweep ball_wall --solref='-1e5:-1e3:5:log;-10' --solimp 0.9,0.95,0.001,0.5,2 --output solref
+  mjx-study sweep --config study.toml --output out
+  mjx-study plot out
+  mjx-study report out
+
+A TOML file holds the same options by the names of their flags, with _ for -:
+  tasks = ["pusher"]
+  contact = ["penalty", "mujoco"]
+  stiffness = "10:1e5:13:log"
+  samples = [30, 100]
+  seeds = 10
+"""
+NUMBERS = Option("numbers", float, "X", "", Interval("(-inf, inf)"), many=True)
+TASKS = Option("tasks", str, "TASK", "", many=True)
+
+
+def add(command: argparse.ArgumentParser) -> None:
+    """Add them."""
+    choices = f"of: {', '.join(TASK_DESCRIPTIONS)}, or module:name"
+    command.add_argument("tasks", nargs="?", type=TASKS.parse, metavar="TASK[,TASK]", help=choices)
+    command.add_argument("--config", type=Path, metavar="FILE.toml", help="options from a file; flags go before it")
+    add_options(command, StudyConfig, "contact", "stiffness", "damping")
+    add_option(command, OPTIONS["solref"], read=solref)
+    add_option(command, OPTIONS["solimp"], read=solimp)
+    add_options(command, StudyConfig, "timestep", "cone", "sigma", "samples")
+    add_options(command, StudyConfig, "seeds", "estimators", seeds={"unset": "10; 1 of landscapes"})
+    add_options(command, StudyConfig, "kind", "network", "confidence")
+    add_options(command, StudyConfig, "iterations", iterations={"line": "optimise policies, N steps each", "unset": ""})
+    add_options(command, StudyConfig, "points", points={"line": "landscapes, on N points of a line through theta"})
+    add_options(command, StudyConfig, "span", "direction")
+    add_options(command, StudyConfig, "optimizer", "learning_rate", "decay", optimizer={"unset": "sgd"})
+    add_options(command, StudyConfig, "reference_samples", reference_samples={"unset": "600"})
+    add_options(command, StudyConfig, "evaluation_samples", evaluation_samples={"unset": "200"})
+    add_estimator_options(command, StudyConfig)
+    add_options(command, StudyConfig, "horizon", "model", "chunk_size")
+    add_process_options(command, seed=None)
+    command.add_argument("--output", type=Path, required=True, metavar="DIR", help="folder of the study")
+    add_versions_option(command)
+
+
+def solref(value: Any) -> tuple[tuple[float, ...], ...]:
+    """Rows of numbers; of text, the first column's numbers with every one of the second."""
+    if not isinstance(value, str):
+        return _rows(value)
+    columns = [NUMBERS.parse(column) for column in value.split(";")]
+    if len(columns) != 2:
+        raise ValueError("must be two columns separated by ;, such as -1000,-10000;-5")
+    if len(columns[0]) * len(columns[1]) > MOST_VALUES:
+        raise ValueError(f"must be at most {MOST_VALUES} contact models, got {len(columns[0]) * len(columns[1])}")
+    return tuple(itertools.product(*columns))
+
+
+def solimp(value: Any) -> tuple[tuple[float, ...], ...]:
+    """Rows of numbers; of text, separated by ;."""
+    return tuple(NUMBERS.parse(part) for part in value.split(";")) if isinstance(value, str) else _rows(value)
+
+
+def _rows(value: Any) -> tuple[tuple[float, ...], ...]:
+    if not isinstance(value, list):
+        raise ValueError(f"must be a list of lists of numbers, got {value!r:.60}")
+    return tuple(NUMBERS.read(row) for row in value)

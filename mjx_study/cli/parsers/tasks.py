@@ -1,0 +1,9 @@
+"""Options of mjx-study tasks."""
+
+import argparse
+
+EPILOG = ""
+
+
+def add(command: argparse.ArgumentParser) -> None:
+    """None but --json."""

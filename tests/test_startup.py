@@ -1,0 +1,93 @@
+"""What needs no simulation imports nothing that computes, and what is described is there."""
+
+import pkgutil
+import resource
+import subprocess
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import mujoco
+import pytest
+
+import estimators
+import mjx_study
+from estimators import BASELINES, ESTIMATORS, NOISES, catalogue
+from estimators.catalogue import CATALOGUE
+from mjx_study import choices
+from mjx_study.cli import COMMANDS
+from mjx_study.plots.style import STYLES
+from mjx_study.tasks import TASKS
+
+ROOT = Path(__file__).resolve().parents[1]
+LIGHT = [
+    "--version",
+    "--help",
+    "tasks",
+    "estimators",
+    *(f"{name} --help" for name in COMMANDS),
+    "compare puhser",
+    "sweep pusher",
+    "optimise pusher --samples 0",
+    "landscape pusher --contact spring",
+]
+HEAVY = {"jax", "jaxlib", "matplotlib", "mujoco", "numpy", "pydantic", "rich", "scipy", "xarray"}
+WATCH = """
+import sys
+from mjx_study.cli import main
+try:
+    main(sys.argv[1:])
+except SystemExit:
+    pass
+print(*sorted({name.partition(".")[0] for name in sys.modules}))
+"""
+
+
+@pytest.mark.parametrize("arguments", LIGHT)
+def test_help_lists_and_refusals_import_nothing_that_computes(arguments: str) -> None:
+    command = [sys.executable, "-c", WATCH, *arguments.split()]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=True)
+    allowed = {"mujoco", "numpy"} if arguments in ("gradcheck --help", "rollout --help") else set()  # names of flags
+    assert HEAVY & set(done.stdout.splitlines()[-1].split()) <= allowed
+
+
+def test_the_version_takes_little_longer_than_python_itself() -> None:
+    """In processor time, the least of three: all that computes takes 20 times as long as NumPy alone."""
+
+    def seconds(*arguments: str) -> float:
+        def once() -> float:
+            before = resource.getrusage(resource.RUSAGE_CHILDREN)
+            subprocess.run([sys.executable, *arguments], capture_output=True, cwd=ROOT, check=True)
+            after = resource.getrusage(resource.RUSAGE_CHILDREN)
+            return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+
+        return min(once() for _ in range(3))
+
+    assert seconds("-m", "mjx_study", "--version") < 2 * seconds("-c", "import numpy")
+
+
+@pytest.mark.parametrize("package", [estimators, mjx_study])
+def test_what_a_package_offers_is_there(package: ModuleType) -> None:
+    assert len(package.__all__) > 30 and set(package.__all__) <= set(dir(package))
+    assert all(getattr(package, name) is not None for name in package.__all__)
+    modules = {module.name for module in pkgutil.iter_modules(package.__path__)}
+    assert not modules & set(package.__all__), "a module once imported would hide what has its name"
+    with pytest.raises(AttributeError, match=f"module '{package.__name__}' has no attribute 'nothing'"):
+        package.nothing  # noqa: B018
+
+
+def test_descriptions_are_of_what_there_is() -> None:
+    """One description of each, in modules that import nothing; what they describe is elsewhere."""
+    assert list(CATALOGUE) == list(ESTIMATORS)
+    for name, estimator in ESTIMATORS.items():
+        entry = CATALOGUE[name]
+        assert (entry.label, entry.needs, entry.description) == (
+            estimator.label,
+            estimator.needs,
+            estimator.description,
+        )
+        assert entry.required == estimator.required()
+    assert tuple(catalogue.BASELINES) == tuple(BASELINES) and tuple(catalogue.DENSITIES) == tuple(NOISES)
+    assert list(choices.TASK_DESCRIPTIONS) == list(TASKS)
+    assert choices.FIGURE_STYLES == tuple(STYLES)
+    assert (choices.MIN_IMPEDANCE, choices.MAX_IMPEDANCE) == (mujoco.mjMINIMP, mujoco.mjMAXIMP)
