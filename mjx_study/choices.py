@@ -8,7 +8,7 @@ PRECISIONS: Final = ("float64", "float32")
 CONES: Final = ("pyramidal", "elliptic")
 SOLVERS: Final = ("newton", "cg")
 INTEGRATORS: Final = ("euler", "implicitfast", "rk4")
-ONSETS: Final = ("none", "linear")
+ONSETS: Final = ("none", "linear", "jump")
 """Treatment of the onset of contact in first-order gradients."""
 REFERENCE: Final = "reference"
 """Stands for the task's analytic system, without MJX, among contact families."""

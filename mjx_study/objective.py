@@ -19,9 +19,10 @@ from jaxtyping import Array, Float, Key
 
 from estimators import Differentiation, Evaluation, Linearisation, StepDifferentiation, StepEvaluation
 from mjx_study.reference.noise import noise_score, split_sample_key, standard_noise
+from mjx_study.simulation.branches import jump_term
 from mjx_study.simulation.contact import ContactModel, apply_contact
 from mjx_study.simulation.dynamics import State, rollout, step
-from mjx_study.simulation.onset import OnsetCounts, as_row, corrected_rollout
+from mjx_study.simulation.onset import OnsetCounts, as_row, corrected_rollout, without_derivative
 from mjx_study.tasks.task import Task, check_sigma
 
 MAX_CHUNK: Final = {"cpu": 512, "gpu": 2**15 + 1, "tpu": 2**15 + 1}
@@ -46,7 +47,8 @@ def rollout_cost(
         contact: the contact model; None for the MJCF's own.
         start: the initial state, before the policy acts on it.
         noise: noise of the policy's `noise_shape`.
-        onset: "none", or "linear" for a derivative with the onset term (see `mjx_study.simulation.onset`).
+        onset: "none", or "linear" or "jump" for a derivative with the onset term (see `mjx_study.simulation.onset` and
+            `mjx_study.simulation.branches`).
 
     Returns:
         The cost; and the states `(horizon + 1, ...)` including the initial one, the controls, the largest relative
@@ -54,19 +56,24 @@ def rollout_cost(
     """
     feedforward = task.policy.feedforward(theta, noise)
 
-    def control_law(index, state):
+    def control_law(index, state, theta=theta, feedforward=feedforward):
         feedback = task.policy.feedback(theta, state)
         return feedforward[index] if feedback is None else feedforward[index] + feedback
 
     model = apply_contact(task.scene.model, contact)
     first = task.policy.place(theta, noise, start)
-    simulated, counts = (task.scene, model, first, control_law, task.horizon), None
-    if onset == "none":
-        states, controls, residuals = rollout(*simulated)
-    else:
+    simulated, counts, term = (task.scene, model, first, control_law, task.horizon), None, 0.0
+    if onset == "linear":
         states, controls, residuals, counts = corrected_rollout(*simulated)
+    else:
+        states, controls, residuals = rollout(*simulated)
+    if onset == "jump":
+        fixed = jax.lax.stop_gradient((theta, feedforward))
+        law = lambda index, state: control_law(index, state, *fixed)  # noqa: E731
+        costs = task.running_cost, task.final_cost
+        term, counts = jump_term(task.scene, without_derivative(model), states, controls, law, *costs)
     cost = jnp.sum(jax.vmap(task.running_cost)(_before_each_step(states), controls)) + task.final_cost(_last(states))
-    return cost, (states, controls, jnp.max(residuals), counts)
+    return cost + term, (states, controls, jnp.max(residuals), counts)
 
 
 def simulate(

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from mjx_study.objective import Simulator
+from mjx_study.simulation.branches import jump_term
 from mjx_study.simulation.contact import ContactModel, apply_contact
 from mjx_study.simulation.dynamics import initial_state, rollout
 from mjx_study.simulation.onset import check_onset, corrected_rollout
@@ -24,45 +25,90 @@ TIMECONST, LOW, HIGH, WIDTH = 0.02, 0.9, 0.95, 0.001
 SPEED, GRAVITY = -1.7, -9.81
 BODY = '<body pos="0 0 0.1"><joint type="slide" axis="0 0 1"/><geom name="ball" size="0.1" mass="1" condim="1"/></body>'
 BOX = '<body pos="0 0 0.1"><freejoint/><geom name="box" type="box" size="0.1 0.1 0.1" mass="1"/></body>'
+LAW = lambda index, state: jnp.zeros(0)  # noqa: E731, of no control
 CONTACT = ContactModel(jnp.array([TIMECONST, 1.0]), jnp.array([LOW, HIGH, WIDTH, 0.5, 2.0]))
 
 
-def fall(gap, steps: int, timestep: float, free: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Last gap and speed of falling bodies; derivatives over the first gap, of the steps alone and with the term."""
-    b, k = 2 / (HIGH * TIMECONST), 1 / (HIGH * TIMECONST) ** 2
+@dataclasses.dataclass(frozen=True)
+class Law:
+    """MuJoCo's contact law of one body; impedances 0 to 1, lengths [m], times [s]."""
 
-    def impedance(r):
-        depth = np.minimum(np.abs(r) / WIDTH, 1.0)
+    timeconst: float = TIMECONST
+    low: float = LOW
+    high: float = HIGH
+    width: float = WIDTH
+
+    @property
+    def damping(self) -> float:
+        return 2 / (self.high * self.timeconst)
+
+    def impedance(self, r):
+        depth = np.minimum(np.abs(r) / self.width, 1.0)
         share = np.where(depth < 0.5, 2 * depth**2, 1 - 2 * (1 - depth) ** 2)
-        slope = np.where(depth < 0.5, 4 * depth, 4 * (1 - depth)) * np.where(depth < 1, np.sign(r) / WIDTH, 0.0)
-        return LOW + share * (HIGH - LOW), slope * (HIGH - LOW)
+        slope = np.where(depth < 0.5, 4 * depth, 4 * (1 - depth)) * np.where(depth < 1, np.sign(r) / self.width, 0.0)
+        return self.low + share * (self.high - self.low), slope * (self.high - self.low)
 
-    def force(r, v):
-        d, over_d = impedance(r)
+    def force(self, r, v, free):
+        """Acceleration by the contact, and its derivatives by gap and speed."""
+        (d, over_d), b, k = self.impedance(r), self.damping, 1 / (self.high * self.timeconst) ** 2
         pull = -b * v - k * d * r - free
         return d * pull, over_d * pull - d * k * (over_d * r + d), -d * b
 
-    jump = lambda v: timestep * np.maximum(LOW * (-free - b * v), 0.0)  # noqa: E731
-    r, v = gap.copy(), np.full_like(gap, SPEED)
+    def touch(self, v, free):
+        """The same at first touch, where there is no spring force."""
+        return np.maximum(self.low * (-free - self.damping * v), 0.0)
+
+
+def last_gap(law: Law, r, v, steps: int, timestep: float, free: float):
+    """The gap after some steps."""
+    for _ in range(steps):
+        push, *_ = law.force(r, v, free)
+        v = v + timestep * (free + np.where((r < 0) & (push > 0), push, 0.0))
+        r = r + timestep * v
+    return r
+
+
+def cost(gap):
+    return 100 * (gap - 0.02) ** 2
+
+
+def fall(gap, steps: int, timestep: float, free: float, law: Law = Law()):  # noqa: B008, it is frozen
+    """Last gap and speed of falling bodies, by the first gap their derivatives, and the jump term of `cost`.
+
+    Returns:
+        Last (gap, speed); its derivative of the steps alone, and with the linear term; the term of the jump.
+    """
+    r, v, last_v = gap.copy(), np.full_like(gap, SPEED), np.full_like(gap, SPEED)
     tangents = {False: (np.ones_like(r), np.zeros_like(r)), True: (np.ones_like(r), np.zeros_like(r))}
+    term = np.zeros_like(r)
     for step in range(steps):
-        push, over_r, over_v = force(r, v)
+        push, over_r, over_v = law.force(r, v, free)
         acts, cell = (r < 0) & (push > 0), timestep * v
         begins = (r < 0) & (cell < 0) & (r - cell >= 0) & (step > 0)
         share = np.where(begins, r / np.where(begins, cell, 1.0), 0.0)
+        one = np.flatnonzero(begins)
+        for speed, left, weight, tangent in (
+            (v, steps - step - 1, 1 - share, tangents[False][0]),
+            (last_v, steps - step, share, tangents[False][0] - timestep * tangents[False][1]),
+        ):
+            on, off = (
+                cost(last_gap(law, timestep * after, after, left, timestep, free))
+                for after in (speed[one] + timestep * (free + law.touch(speed[one], free)), speed[one] + timestep * free)
+            )
+            term[one] += weight[one] * (on - off) * tangent[one] / cell[one]
         for corrected, (dr, dv) in tangents.items():
             after, before = (
                 np.where(begins & corrected, part / np.where(begins, cell, 1.0), 0.0)
                 for part in (dr, dr - timestep * dv)
             )
-            extra = share * jump(v - timestep * free) * before
+            extra = timestep * share * law.touch(last_v, free) * before
             moved_r, moved_v = dr + timestep * extra, dv + extra
             next_v = moved_v + timestep * np.where(acts, over_r * moved_r + over_v * moved_v, 0.0)
-            next_v = next_v + (1 - share) * jump(v) * after
+            next_v = next_v + timestep * (1 - share) * law.touch(v, free) * after
             tangents[corrected] = (moved_r + timestep * next_v, next_v)
-        v = v + timestep * (free + np.where(acts, push, 0.0))
+        last_v, v = v, v + timestep * (free + np.where(acts, push, 0.0))
         r = r + timestep * v
-    return np.stack([r, v], -1), np.stack(tangents[False], -1), np.stack(tangents[True], -1)
+    return np.stack([r, v], -1), np.stack(tangents[False], -1), np.stack(tangents[True], -1), term
 
 
 def compiled(function, *arguments):
@@ -76,51 +122,76 @@ def test_every_sample_is_that_of_the_formula() -> None:
     scene = scene_of(floor_scene(BODY, option(timestep, "", 'refsafe="disable"'), 'condim="1"'))
     gaps = np.linspace(0.0611, 0.0789, 12)
 
-    def last(gap, free):
+    def scene_at(gap, free):
         gravity = jnp.array([0.0, 0.0, 1.0]) * free
         model = apply_contact(scene.model.replace(opt=scene.model.opt.replace(gravity=gravity)), CONTACT)
-        start = initial_state(scene, gap[None], jnp.array([SPEED]))
-        states, _, _, counts = corrected_rollout(scene, model, start, lambda index, state: jnp.zeros(0), steps)
+        return scene, model, initial_state(scene, gap[None], jnp.array([SPEED]))
+
+    def last(gap, free):
+        states, _, _, counts = corrected_rollout(*scene_at(gap, free), LAW, steps)
         found = jnp.stack([states.qpos[-1, 0], states.qvel[-1, 0]])
         return found, (found, counts)
 
+    def last_cost(gap, free):
+        states, controls, _ = rollout(*scene_at(gap, free), LAW, steps)
+        running, final = lambda state, control: 1.0, lambda state: cost(state.qpos[0])
+        term, counts = jump_term(*scene_at(gap, free)[:2], states, controls, LAW, running, final)
+        return cost(states.qpos[-1, 0]) + term, counts
+
     def sample(gap, free):
         forward, (value, counts) = jax.jacfwd(last, has_aux=True)(gap, free)
-        return value, counts, forward, jax.jacrev(last, has_aux=True)(gap, free)[0]
+        backward, _ = jax.jacrev(last, has_aux=True)(gap, free)
+        return value, counts, forward, backward, *jax.grad(last_cost, has_aux=True)(gap, free)
 
     accelerations = (0.0, GRAVITY)
     batched = jax.vmap(jax.vmap(sample, in_axes=(0, None)), in_axes=(None, 0))
-    for free, (values, counts, forward, backward) in zip(
+    for free, (values, counts, forward, backward, jumping, jumps) in zip(
         accelerations, _unstacked(compiled(batched, gaps, np.array(accelerations)), 2), strict=True
     ):
-        ours, of_steps, corrected = fall(gaps, steps, timestep, free)
+        ours, of_steps, corrected, term = fall(gaps, steps, timestep, free)
         np.testing.assert_allclose(values, ours, rtol=0, atol=1e-12)
         np.testing.assert_allclose(forward, corrected, rtol=1e-9, atol=1e-12)
         np.testing.assert_allclose(backward, corrected, rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(jumping, 200 * (ours[:, 0] - 0.02) * of_steps[:, 0] + term, rtol=1e-9, atol=1e-12)
         assert np.all(np.abs(of_steps - corrected).max(axis=1) > 0.1)  # the term is no small matter here
-        assert np.all(counts.found == 1) and not np.any(counts.bounded) and not np.any(counts.missed)
+        assert np.all(np.abs(term) > 0.1)
+        for each in (counts, jumps):
+            assert np.all(each.found == 1) and not np.any(each.bounded) and not np.any(each.missed)
 
 
 def _unstacked(tree, size: int):
     return [jax.tree.map(lambda leaf, row=row: leaf[row], tree) for row in range(size)]
 
 
-def test_the_error_of_the_mean_falls_with_the_square_of_the_timestep() -> None:
-    """In the simulation by hand: gaps spread by 5 cm, the last gap's square as cost, h b from 0.5 down to 0.13."""
-    spread = 0.05
-    noise = (np.arange(40_001) - 20_000) / 20_000 * 6 * spread
+@pytest.mark.parametrize(
+    ("law", "free"),
+    [
+        pytest.param(Law(), GRAVITY, id="MuJoCo's default"),
+        pytest.param(Law(low=0.9, high=0.9), GRAVITY, id="constant impedance"),
+        pytest.param(Law(low=0.5, high=0.5), -30.0, id="half the impedance, pressed on"),
+    ],
+)
+def test_the_error_of_the_mean_falls_with_the_square_of_the_timestep(law: Law, free: float) -> None:
+    """In the simulation by hand, by quadrature over gaps spread by 5 cm; the last gap's square as cost.
+
+    Where the impedance changes within a step's travel, the linear term's error falls more slowly, the jump's does not.
+    """
+    spread, timesteps = 0.05, (5e-3, 2.5e-3, 1.25e-3)
+    noise = (np.arange(8001) - 4000) / 4000 * 6 * spread
     weight = np.exp(-((noise / spread) ** 2) / 2)
     weight /= weight.sum()
-    errors, plain = [], []
-    for timestep in (5e-3, 2.5e-3, 1.25e-3):
-        last, of_steps, corrected = fall(0.32 + noise, round(0.25 / timestep), timestep, GRAVITY)
-        cost = 100 * (last[:, 0] - 0.02) ** 2
-        slope = weight @ ((cost - weight @ cost) * noise) / spread**2
-        gradients = [weight @ (200 * (last[:, 0] - 0.02) * tangent[:, 0]) for tangent in (of_steps, corrected)]
-        plain.append(abs(gradients[0] / slope - 1))
-        errors.append(abs(gradients[1] / slope - 1))
-    assert min(plain) > 1.0
-    assert errors[0] < 0.05 and errors[2] < 0.01 and errors[2] < 0.4 * errors[0]
+    found = []
+    for timestep in timesteps:
+        last, of_steps, linear, jump = fall(0.32 + noise, round(0.25 / timestep), timestep, free, law)
+        value = cost(last[:, 0])
+        slope = weight @ ((value - weight @ value) * noise) / spread**2
+        plain, corrected = (weight @ (200 * (last[:, 0] - 0.02) * tangent[:, 0]) for tangent in (of_steps, linear))
+        found.append(np.array([plain, corrected, plain + weight @ jump]) / slope - 1)
+    plain, linear, jump = np.abs(found).T
+    rate_linear, rate_jump = (np.polyfit(np.log(timesteps), np.log(each), 1)[0] for each in (linear, jump))
+    assert np.all(plain > 2)
+    assert np.all(jump < (2e-2, 5e-3, 1e-3)) and rate_jump > 1.7
+    assert np.all(linear < 1e-2) and rate_linear > (0.5 if law.low < law.high else 1.6)
 
 
 @pytest.mark.slow
@@ -130,7 +201,7 @@ def test_both_programs_agree_where_four_corners_land(cone: str) -> None:
     scene = scene_of(floor_scene(BOX, option(2e-3, f'cone="{cone}"'), ""))
     pose = jnp.array([0.0, 0.0, 0.15, 1.0, 0.0, 0.0, 0.0])
     start = initial_state(scene, pose, jnp.array([0.4, 0.1, -1.0, 0.01, 0.02, 0.3]))
-    steps, law = 32, lambda index, state: jnp.zeros(0)
+    steps = 32
 
     def last(velocity):
         state = dataclasses.replace(start, qvel=velocity)
@@ -146,15 +217,16 @@ def test_both_programs_agree_where_four_corners_land(cone: str) -> None:
     np.testing.assert_allclose(by_jacobian, by_tape, rtol=1e-5, atol=1e-7)
 
 
-def test_the_mean_has_the_slope_where_plain_first_order_has_the_wrong_sign() -> None:
+@pytest.mark.parametrize(("onset", "within"), [("linear", 0.04), pytest.param("jump", 0.02, marks=pytest.mark.slow)])
+def test_the_mean_has_the_slope_where_plain_first_order_has_the_wrong_sign(onset: str, within: float) -> None:
     """MuJoCo's default contact, h b = 0.2: the mean of plain first-order gradients is +0.78 at 0.5 rad, not -0.945."""
-    task = make_task("momentum_transfer").replace(onset="linear")
+    task = make_task("momentum_transfer").replace(onset=onset)
     position, points = np.array([0.5]), grid(0.5, 0.5, task.sigma, 400, task.noise)
     (cell,), _ = contact_grid(task, ("mujoco_default",))
     found = means(points, *Line(task)(points, cell.contact), position, task.sigma, task.noise)
     assert found.slope_error + found.first_error < 0.02
     assert found.slope < -0.9
-    assert np.abs(found.first - found.slope) < 0.04 + 2 * (found.slope_error + found.first_error)
+    assert np.abs(found.first - found.slope) < within + 2 * (found.slope_error + found.first_error)
 
 
 def test_onsets_beyond_the_slots_are_counted_and_left_out() -> None:
@@ -186,7 +258,7 @@ def test_a_batch_says_what_the_term_met() -> None:
 
 
 def test_what_has_no_meaning_is_refused() -> None:
-    with pytest.raises(ValueError, match="unknown onset 'exact'; choose from none, linear"):
+    with pytest.raises(ValueError, match="unknown onset 'exact'; choose from none, linear, jump"):
         check_onset("exact")
     scene = scene_of(floor_scene(BODY, option(2e-3, "", ""), 'condim="1"'))
     start = initial_state(scene)

@@ -33,7 +33,7 @@ from typing import Any, Final
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from estimators.pytree import register_pytree
 from mjx_study.choices import ONSETS
@@ -110,7 +110,7 @@ def corrected_rollout(
     if not scene.has_constraints:
         none = jnp.zeros((), int)
         return *rollout(scene, model, start, control_law, horizon), OnsetCounts(none, none, none)
-    model = _without_derivative(model)
+    model = without_derivative(model)
     jacobian = scene.uses_jacobian
 
     def observe(state: State, index: Int[Array, ""]):
@@ -168,15 +168,9 @@ def _corrections(
     slots: int,
 ) -> tuple[Float[Array, "horizon nv nv"], Float[Array, "horizon nv nv"], OnsetCounts]:
     """(1 - s) Delta_k n^T / D and s Delta_{k-1} n^T / D of every step, zero where no contact begins, and counts."""
-    horizon, num_guards = distance.shape
     timestep = scene.timestep
     travel = timestep * speed
-    begins = (distance < 0) & (travel < 0) & (distance - travel > -TOUCHING * travel)
-    begins = begins.at[0].set(False)
-    found = jnp.sum(begins)
-    (flat,) = jnp.nonzero(begins.reshape(-1), size=slots, fill_value=horizon * num_guards)
-    used = flat < horizon * num_guards
-    steps, guards = jnp.divmod(jnp.where(used, flat, num_guards), num_guards)
+    steps, guards, used, found = find_onsets(distance, travel, slots)
 
     def term(index, guard):
         pick = lambda leaf: jnp.stack([leaf[index], leaf[index - 1]])  # noqa: E731
@@ -190,10 +184,28 @@ def _corrections(
 
     here, previous, narrow = jax.vmap(term)(steps, guards)
     keep = used[:, None, None]
-    empty = jnp.zeros((horizon, *here.shape[1:]), here.dtype)
+    empty = jnp.zeros((len(distance), *here.shape[1:]), here.dtype)
     spread, shift = (empty.at[steps].add(jnp.where(keep, terms, 0.0)) for terms in (here, previous))
     counts = OnsetCounts(found, jnp.sum(narrow & used), found - jnp.sum(used))
     return spread, shift, counts
+
+
+def find_onsets(
+    distance: Float[Array, "horizon guards"], travel: Float[Array, "horizon guards"], slots: int
+) -> tuple[Int[Array, " slots"], Int[Array, " slots"], Bool[Array, " slots"], Int[Array, ""]]:
+    """Steps and guards of the first onsets, which slots hold one, and the number of all; slots without one are (1, 0).
+
+    Args:
+        distance: of each guard before each step, below zero in contact.
+        travel: of each guard in the step before, by the velocity that it ends with.
+        slots: most onsets to return.
+    """
+    begins = (distance < 0) & (travel < 0) & (distance - travel > -TOUCHING * travel)
+    begins = begins.at[0].set(False)
+    (flat,) = jnp.nonzero(begins.reshape(-1), size=slots, fill_value=begins.size)
+    used = flat < begins.size
+    steps, guards = jnp.divmod(jnp.where(used, flat, begins.shape[1]), begins.shape[1])
+    return steps, guards, used, jnp.sum(begins)
 
 
 def jump_of_velocity(
@@ -220,17 +232,30 @@ def jump_of_velocity(
 
     def both(qvel, act, control, warmstart):
         forced = force_stage(model, positioned, qvel, act, control).replace(qacc_warmstart=warmstart)
-
-        def advanced(on):
-            data = constraint.at_onset(model, forced, mask, on)
-            qacc = constraint.run_solver(model, data)
-            return advance_velocity(model, data, qacc)[0], qacc
-
-        after, qacc = jax.vmap(advanced)(jnp.array([True, False]))
+        (after, _), qacc = on_and_off(model, forced, mask)
         return after[0] - after[1], qacc[1]
 
     jumps, free = jax.vmap(both)(states.qvel, states.act, controls, states.warmstart)
     return jumps, free[0], normal
+
+
+def on_and_off(
+    model: mjx.Model, data: mjx.Data, members: Float[Array, " rows"]
+) -> tuple[tuple[Float[Array, "2 nv"], Float[Array, "2 na"]], Float[Array, "2 nv"]]:
+    """Velocities and activations after a step, and its accelerations, with some rows at first touch and without them.
+
+    Args:
+        model: the model to step.
+        data: the state before the constraint solve (`force_stage`), with the solver's warm start.
+        members: 1 for these rows, 0 for those left unchanged.
+    """
+
+    def advanced(on):
+        prepared = constraint.at_onset(model, data, members, on)
+        qacc = constraint.run_solver(model, prepared)
+        return advance_velocity(model, prepared, qacc), qacc
+
+    return jax.vmap(advanced)(jnp.array([True, False]))
 
 
 def _tangent(value: Float[Array, "..."]) -> Float[Array, "..."]:
@@ -239,11 +264,12 @@ def _tangent(value: Float[Array, "..."]) -> Float[Array, "..."]:
 
 
 @jax.custom_jvp
-def _without_derivative(model: mjx.Model) -> mjx.Model:
+def without_derivative(model: mjx.Model) -> mjx.Model:
+    """The model; differentiating with respect to it raises TypeError."""
     return model
 
 
-@partial(_without_derivative.defjvp, symbolic_zeros=True)
+@partial(without_derivative.defjvp, symbolic_zeros=True)
 def _(primals, tangents):
     if any(not isinstance(leaf, jax.custom_derivatives.SymbolicZero) for leaf in jax.tree.leaves(tangents)):
         raise TypeError("with the onset term a rollout is differentiable in states and controls, not in the model")

@@ -75,7 +75,8 @@ class StudyConfig(Checked):
         window: steps between cuts of the truncated first-order estimate.
         tolerance: tolerance of the discontinuity test of "ddcg".
         weights: weights of interpolating estimators, plug_in or cross_fitted.
-        onset: none, or linear for first-order gradients with the onset term; see `mjx_study.simulation.onset`.
+        onset: none, or first-order gradients with the onset term: linear (`mjx_study.simulation.onset`), or jump, which
+            costs four rollouts per onset (`mjx_study.simulation.branches`).
         horizon: steps; None for each task's.
         model: an MJCF that replaces the task's own; None for the task's.
         chunk_size: samples per device and call; None to choose by the number of samples.

@@ -125,7 +125,7 @@ class Task:
             none. `analytic` gives it the task's noise.
         noise: name of the noise density in `estimators.NOISES`.
         onset: treatment of the onset of contact in first-order gradients: "none" for exact derivatives of the steps, or
-            "linear" to add what those miss (see `mjx_study.simulation.onset`).
+            "linear" or "jump" to add what those miss (see `mjx_study.simulation.onset` and `.branches`).
         metrics: numbers of a rollout by name, as a function of its states including the initial one, to report beside
             the cost; None for none.
         defaults: how the task is studied unless a study says otherwise.
