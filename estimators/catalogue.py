@@ -58,6 +58,7 @@ CATALOGUE: dict[str, Entry] = {
             "costs to go over pairs of opposite noise",
         ),
         Entry("fobg", "FoBG", ("differentiation",), "first order: gradients of the samples"),
+        Entry("fobg_onset", "FoBG, onset", ("corrected",), "first order, corrected where contact begins"),
         Entry(
             "fobg_clipped",
             "FoBG, clipped",
@@ -77,6 +78,12 @@ CATALOGUE: dict[str, Entry] = {
             "AoBG",
             ("evaluation", "differentiation"),
             "alpha order: the two interpolated within an error of gamma",
+        ),
+        Entry(
+            "aobg_onset",
+            "AoBG, onset",
+            ("evaluation", "corrected"),
+            "alpha order, its first-order batch corrected where contact begins",
         ),
         Entry(
             "ivw",

@@ -211,6 +211,11 @@ class FirstOrder(Estimator, entry=CATALOGUE["fobg"]):
 
 
 @register
+class OnsetFirstOrder(FirstOrder, entry=CATALOGUE["fobg_onset"]):
+    """See `estimators.first_order`; the batch is corrected where contact begins."""
+
+
+@register
 @dataclass(frozen=True, kw_only=True)
 class ClippedFirstOrder(Estimator, entry=CATALOGUE["fobg_clipped"]):
     """See `estimators.clipped_first_order`.
@@ -294,6 +299,11 @@ class AlphaOrder(_OneWeight, entry=CATALOGUE["aobg"]):
             radius=self.radius,
         )
         return choose_alpha(zeroth, first, gamma=self.gamma, epsilon=epsilon)
+
+
+@register
+class OnsetAlphaOrder(AlphaOrder, entry=CATALOGUE["aobg_onset"]):
+    """See `estimators.choose_alpha`; the first-order batch is corrected where contact begins."""
 
 
 @register

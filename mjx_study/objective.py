@@ -9,6 +9,7 @@ solver's loop independently, in chunks of fixed size that bound memory.
 import dataclasses
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, Final
 
 import jax
@@ -151,6 +152,7 @@ class Simulator:
         return {
             "value": self._sample_value,
             "gradient": self._sample_gradient,
+            "corrected": partial(self._sample_gradient, onset="linear" if self.task.onset == "none" else None),
             "steps": self._sample_steps,
             "step_gradient": self._sample_step_gradient,
             "linearisation": self._sample_linearisation,
@@ -198,9 +200,9 @@ class Simulator:
         scores = noise_score(noise, sigma, self.task.noise)
         return value, self.task.policy.score(theta, _before_each_step(states), scores), residual
 
-    def _sample_gradient(self, theta, contact, sigma, key_data, noise_scale):
+    def _sample_gradient(self, theta, contact, sigma, key_data, noise_scale, onset=None):
         (value, (*_, residual, counts)), gradient = jax.value_and_grad(self._cost, has_aux=True)(
-            theta, contact, sigma, key_data, noise_scale, self.task.onset
+            theta, contact, sigma, key_data, noise_scale, onset or self.task.onset
         )
         return value, gradient, residual, as_row(counts)
 
@@ -370,6 +372,10 @@ class MjxObjective:
         """The rollouts of `evaluate_pair`, step by step."""
         plus, minus = self._evaluate_steps(theta, keys, (1.0, -1.0))
         return plus, minus
+
+    def differentiate_corrected(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> Differentiation:
+        """`differentiate` with the onset term that the task asks for, or the linear one where it asks for none."""
+        return Differentiation(*jax.tree.map(jnp.asarray, self._run("corrected", theta, keys)))
 
     def differentiate_steps(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> StepDifferentiation:
         """The rollouts of `differentiate`, with the derivative of each sample's cost with respect to its noise."""

@@ -110,7 +110,7 @@ def test_a_registered_one_has_a_name(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_every_estimator_has_a_style_of_its_own() -> None:
     assert set(STYLE) == set(ESTIMATORS)
-    assert len({style_of(name) for name in ESTIMATORS}) == len({style_of(name)[1:] for name in ESTIMATORS}) == 13
+    assert len({style_of(name) for name in ESTIMATORS}) == len({style_of(name)[1:] for name in ESTIMATORS}) == 15
     assert style_of(OWN) == style_of(OWN) and style_of(OWN)[0] == "SignAgreement"
     assert style_of(OWN)[1:] not in STYLE.values()
     assert style_of("zobg")[0] == ZerothOrder.label and jax.tree.leaves(ZerothOrder()) == [ZerothOrder()]

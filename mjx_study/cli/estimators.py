@@ -11,6 +11,7 @@ WORDS = {
     "steps": "steps",
     "step_pair": "pairs by step",
     "differentiation": "gradients",
+    "corrected": "corrected gradients",
     "step_differentiation": "gradients by step",
     "linearisation": "derivatives of steps",
 }

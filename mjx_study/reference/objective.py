@@ -112,6 +112,10 @@ class ReferenceObjective:
         value, gradient = self._differentiate(theta, starts, noise)
         return Differentiation(jnp.asarray(value), jnp.asarray(gradient.reshape(len(noise), -1)))
 
+    def differentiate_corrected(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> Differentiation:
+        """`differentiate`: an analytic system has no onset term, its springs begin without a jump."""
+        return self.differentiate(theta, keys)
+
     def differentiate_steps(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> StepDifferentiation:
         """The rollouts of `differentiate`, with the derivative of each sample's cost with respect to its noise."""
         starts, noise = self._draw(keys)
@@ -268,6 +272,10 @@ class FunctionObjective:
         """Values and hand-written gradients."""
         points = self._point(theta) + self._noise(keys)
         return Differentiation(jnp.asarray(self.function.value(points)), jnp.asarray(self.function.gradient(points)))
+
+    def differentiate_corrected(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> Differentiation:
+        """`differentiate`: an analytic system has no onset term, its springs begin without a jump."""
+        return self.differentiate(theta, keys)
 
     def differentiate_steps(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> StepDifferentiation:
         """The samples of `differentiate`; there is one step."""

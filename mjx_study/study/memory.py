@@ -28,6 +28,7 @@ def numbers_per_sample(task: Task, oracle: str) -> int:
         "steps": 2 * steps + noise,
         "step_pair": 2 * (2 * steps + noise),
         "differentiation": params + 2,
+        "corrected": params + 5,
         "step_differentiation": noise + 2,
         "linearisation": 2 * steps + noise + task.horizon * (inputs * (states + 1) + dimensions * states),
     }

@@ -70,6 +70,9 @@ class OneStep:
         value, gradient = jax.vmap(jax.value_and_grad(self.function))(inputs)
         return Differentiation(value=value, gradient=gradient)
 
+    def differentiate_corrected(self, theta: Array, keys: Array) -> Differentiation:
+        return self.differentiate(theta, keys)
+
 
 def one_step(batch: Evaluation) -> StepEvaluation:
     return StepEvaluation(batch.value[:, None], batch.baseline[:, None], batch.score[:, None], None)
@@ -176,6 +179,9 @@ class LinearQuadratic:
 
         value, gradient = jax.vmap(one)(*jax.vmap(self.sample)(keys))
         return Differentiation(value, gradient)
+
+    def differentiate_corrected(self, theta: Array, keys: Array) -> Differentiation:
+        return self.differentiate(theta, keys)
 
     def differentiate_steps(self, theta: Array, keys: Array) -> StepDifferentiation:
         starts, noise = jax.vmap(self.sample)(keys)

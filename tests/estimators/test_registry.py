@@ -72,7 +72,7 @@ def test_every_estimator_calls_the_oracles_that_it_names_with_independent_keys(n
 
 
 def test_the_table_is_keyed_by_name():
-    assert len(ESTIMATORS) == 13 and len(ORACLES) == 7
+    assert len(ESTIMATORS) == 15 and len(ORACLES) == 8
     for name, entry in ESTIMATORS.items():
         assert issubclass(entry, Estimator) and entry.name == name and entry.description and entry.label
         assert isinstance(made(name), entry) and made(name) == made(name) and hash(made(name)) == hash(made(name))
