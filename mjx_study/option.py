@@ -255,7 +255,7 @@ OPTIONS: Final[dict[str, Option]] = {
         _number("window", int, "[1, 1000000]", "H", "steps between cuts of fobg_truncated"),
         _number("tolerance", float, "[0, 1)", "C", "of ddcg's test"),
         _choice("weights", WEIGHTS, "NAME", "of interpolations: by the samples that they weigh, or the other half"),
-        _choice("onset", ONSETS, "NAME", "of contact, in first-order gradients: none, linear, or jump (4 rollouts per onset)"),
+        _choice("onset", ONSETS, "NAME", "of contact, in first-order gradients: none, linear, or jump (costly)"),
         _choice("kind", KINDS, "KIND", "what is computed", unset="by --iterations and --points"),
         _choice("estimators", CATALOGUE, "NAME", "see `mjx-study estimators`", label="estimator", own=True),
         _choice("contact", CONTACTS, "FAMILY", f"of: {', '.join(CONTACTS)}", label="contact family", unset=TASKS),

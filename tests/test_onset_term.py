@@ -93,7 +93,10 @@ def fall(gap, steps: int, timestep: float, free: float, law: Law = Law()):  # no
         ):
             on, off = (
                 cost(last_gap(law, timestep * after, after, left, timestep, free))
-                for after in (speed[one] + timestep * (free + law.touch(speed[one], free)), speed[one] + timestep * free)
+                for after in (
+                    speed[one] + timestep * (free + law.touch(speed[one], free)),
+                    speed[one] + timestep * free,
+                )
             )
             term[one] += weight[one] * (on - off) * tangent[one] / cell[one]
         for corrected, (dr, dv) in tangents.items():
@@ -134,7 +137,7 @@ def test_every_sample_is_that_of_the_formula() -> None:
 
     def last_cost(gap, free):
         states, controls, _ = rollout(*scene_at(gap, free), LAW, steps)
-        running, final = lambda state, control: 1.0, lambda state: cost(state.qpos[0])
+        running, final = lambda state, control: jnp.ones(()), lambda state: cost(state.qpos[0])
         term, counts = jump_term(*scene_at(gap, free)[:2], states, controls, LAW, running, final)
         return cost(states.qpos[-1, 0]) + term, counts
 
@@ -205,11 +208,11 @@ def test_both_programs_agree_where_four_corners_land(cone: str) -> None:
 
     def last(velocity):
         state = dataclasses.replace(start, qvel=velocity)
-        states, *_, counts = corrected_rollout(scene, scene.model, state, law, steps)
+        states, *_, counts = corrected_rollout(scene, scene.model, state, LAW, steps)
         return states.qvel[-1], (states.qvel[-1], counts)
 
     by_jacobian, (value, counts) = compiled(jax.jacfwd(last, has_aux=True), start.qvel)
-    plain = compiled(lambda: rollout(scene, scene.model, start, law, steps)[0].qvel[-1])
+    plain = compiled(lambda: rollout(scene, scene.model, start, LAW, steps)[0].qvel[-1])
     np.testing.assert_allclose(value, plain, rtol=1e-9)
     assert counts.found >= 4 and counts.missed == 0
     scene = dataclasses.replace(scene, adjoint="tape")
