@@ -216,13 +216,45 @@ def test_bias_is_reported_only_beyond_what_noise_explains() -> None:
     assert sentence.endswith("(p <= 0.001): it has no accuracy bound; --gamma sets one")
 
 
+def joined(dimension: str, values: list[Any], parts: list[xr.Dataset]) -> xr.Dataset:
+    """Studies that differ in one dimension, as one."""
+    along = [part.assign_coords({dimension: [value]}) for part, value in zip(parts, values, strict=True)]
+    return xr.concat(along, dimension, data_vars="minimal", coords="minimal", compat="override")
+
+
+def test_seeds_are_counted_and_not_repeated() -> None:
+    shares, p_values = (0.02, 0.03, 0.044), (0.001, 0.001, 0.4)
+    rows = [row("fobg", 10, 1, relative_error=share, bias_p_value=p) for share, p in zip(shares, p_values, strict=True)]
+    parts = [result(row("zobg", 10, variance), each) for each, variance in zip(rows, (100, 100, 1), strict=True)]
+    assert findings(joined("seed", [0, 1, 2], parts)) == [
+        "penalty: FoBG's variance is not told apart from ZoBG's at K = 10 N/m (95% intervals)",
+        "penalty: FoBG's mean is biased by 2.5% at K = 10 N/m in 2 of 3 seeds (p <= 0.001)",
+    ]
+    below = joined("seed", [0, 1], parts[:2])
+    assert findings(below)[0] == "penalty: FoBG's variance is below ZoBG's at K = 10 N/m (95% intervals)"
+
+
+def test_noises_are_told_apart() -> None:
+    """Not the last one's verdict for all."""
+    parts = [result(row("zobg", 10, 100), row("fobg", 10, variance)) for variance in (1, 1e6)]
+    quiet, loud = findings(joined("sigma", [0.01, 1.0], parts))
+    assert quiet == "sigma 0.01, penalty: FoBG's variance is below ZoBG's at K = 10 N/m (95% intervals)"
+    assert loud == "sigma 1, penalty: FoBG's variance is above ZoBG's at K = 10 N/m (95% intervals)"
+
+
+def test_a_bias_beyond_computing_is_no_number() -> None:
+    wild = row("fobg", 10, 1, relative_error=math.nan, bias_p_value=0.001)
+    (sentence,) = findings(result(wild))
+    assert sentence == "penalty: FoBG's mean is biased by more than can be computed at K = 10 N/m (p <= 0.001)"
+
+
 def test_a_result_that_means_nothing_says_so() -> None:
     """Contact that is never met, a reference as uncertain as the errors, a bound below ZoBG's own radius."""
     same = (row("zobg", 10, 5.0), row("fobg", 10, 1.0), row("zobg", 100, 5.0), row("fobg", 100, 1.0))
     assert findings(result(*same))[-1] == (
         "penalty: nothing depends on K: the contact whose stiffness is swept was never active"
     )
-    assert not any("never met" in each for each in findings(result(*same[:3], row("fobg", 100, 1.001))))
+    assert not any("never active" in each for each in findings(result(*same[:3], row("fobg", 100, 1.001))))
     (sentence,) = findings(result(row("fobg", 10, 1.0, reference_uncertainty=0.25)))
     assert sentence.startswith("penalty: the reference's own uncertainty is above 20% at K = 10 N/m: errors and")
     (sentence,) = findings(result(row("aobg", 10, 1.0, alpha=0.0, epsilon=7.0, discrepancy=1.0), gamma=5.0))

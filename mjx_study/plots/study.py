@@ -273,7 +273,13 @@ def _shade_unstable(panels: Sequence[Axes], rows: xr.Dataset, x: np.ndarray) -> 
     for axes in panels:
         axes.axvspan(left, x[-1] * 1.15, color="0.5", alpha=0.13, linewidth=0, zorder=0)
     panels[0].annotate(
-        "unstable step", (left, 0.03), xycoords=("data", "axes fraction"), fontsize="x-small", color="0.35", rotation=90
+        "unstable step",
+        (left, 0.98),
+        xycoords=("data", "axes fraction"),
+        rotation=90,
+        va="top",
+        fontsize="x-small",
+        color="0.35",
     )
 
 
@@ -420,10 +426,10 @@ def _achieved(part: xr.Dataset, title: str) -> Figure | None:
             above = (mine["final_cost"] - best.sel(model=mine["model"])).transpose("model", "seed").values
             lost = ~np.isfinite(above).any(axis=1) | ~(np.nanmedian(np.nan_to_num(above, nan=np.inf), axis=1) < ceiling)
             above = np.clip(np.nan_to_num(above, nan=ceiling), floor, ceiling)
-            middle, low, high = (
-                np.where(lost, np.nan, reduce(above, axis=1)) for reduce in (np.median, np.min, np.max)
-            )
-            _line(axes, mine, x, middle, low, high, style)
+            middle = np.where(lost, np.nan, np.median(above, axis=1))
+            _line(axes, mine, x, middle, middle, middle, style)
+            seeds = np.where((above > floor) & (above < ceiling), above, np.nan)
+            axes.plot(x, seeds, color=style["color"], marker=".", markersize=4, linestyle="none", alpha=0.6)
             axes.plot(x[lost], np.full(lost.sum(), ceiling / 2), color=style["color"], marker="^", linestyle="none")
         axes.plot([], [], color="0.4", marker="^", linestyle="none", label="beyond the axis")
         axes.set_ylim(floor / 1.5, ceiling)
@@ -431,7 +437,7 @@ def _achieved(part: xr.Dataset, title: str) -> Figure | None:
     iterations, seeds = part.sizes["iteration"], part.sizes["seed"]
     return _against_stiffness(
         part,
-        f"{title}\ncost after {iterations} iterations ({seeds} seeds: median, least and greatest)",
+        f"{title}\ncost after {iterations} iterations ({seeds} seeds as dots, and their median)",
         "cost above the best policy found\nat that contact model",
         draw,
     )

@@ -13,6 +13,7 @@ import xarray as xr
 
 from estimators import ENOUGH_EFFECTIVE
 from mjx_study.study.variables import GRADIENTS
+from mjx_study.table import digits_to_tell_apart
 
 SURE: Final = 0.001
 """p-value at which a mean is called biased: the smallest that the test's 999 draws can give."""
@@ -28,7 +29,12 @@ UNSURE: Final = 0.2
 """Relative uncertainty beyond which a reference is too poor to judge errors by."""
 PLACE: Final = ("task", "timestep", "cone", "sigma", "samples", "model", "seed", "estimator", "contact", "stiffness")
 """Coordinates of a row."""
+SETTING: Final = ("task", "timestep", "cone", "sigma", "samples")
+"""Coordinates that every row of a finding shares."""
 VECTORS: Final = ("gradient", "reference")
+BELOW, ABOVE, ALIKE = "below ZoBG's", "above ZoBG's", "not told apart from ZoBG's"
+UNKNOWN: Final = "not to be told from so few effective samples"
+"""Verdicts on FoBG's variance."""
 COUNTS: Final = ("unconverged", "nonfinite", "onsets", "onsets_bounded", "onsets_missed")
 
 
@@ -93,14 +99,23 @@ def findings(dataset: xr.Dataset) -> list[str]:
 
 
 def _of_gradients(dataset: xr.Dataset) -> list[str]:
-    """Where FoBG's variance exceeds ZoBG's, and which means are biased."""
+    """Where FoBG's variance exceeds ZoBG's, and which means are biased; by task, timestep, cone, noise and samples."""
     rows, gammas, sentences = rows_of(dataset), gammas_of(dataset), []
     confidence = json.loads(dataset.attrs["config"])["confidence"]
-    for family in dict.fromkeys(row.contact for row in rows):
-        part = [row for row in rows if row.contact == family]
-        sentences += _variance_finding(family, part, confidence)
-        sentences += _bias_finding(part, gammas) + _meaningless(family, part, gammas)
+    varied = [name for name in SETTING if len({getattr(row, name) for row in rows}) > 1]
+    for setting in dict.fromkeys(tuple(getattr(row, name) for name in SETTING) for row in rows):
+        alike = [row for row in rows if tuple(getattr(row, name) for name in SETTING) == setting]
+        told = [_setting(name, value) for name, value in zip(SETTING, setting, strict=True) if name in varied]
+        for family in dict.fromkeys(row.contact for row in alike):
+            part, prefix = [row for row in alike if row.contact == family], ", ".join([*told, family])
+            found = [*_variance_finding(part, confidence), *_bias_findings(part, gammas), *_meaningless(part, gammas)]
+            sentences += [f"{prefix}: {sentence}" for sentence in found]
     return sentences
+
+
+def _setting(name: str, value: Any) -> str:
+    text = f"{value:.3g}" if isinstance(value, float) else str(value)
+    return text if name in ("task", "cone") else f"{name} {text}"
 
 
 def gammas_of(dataset: xr.Dataset) -> dict[str, float]:
@@ -110,82 +125,111 @@ def gammas_of(dataset: xr.Dataset) -> dict[str, float]:
     return {name: float(given.get("gamma", math.inf)) for name, given in zip(names, options, strict=True)}
 
 
-def _meaningless(family: str, rows: Sequence[Row], gammas: Mapping[str, float]) -> list[str]:
+def _meaningless(rows: Sequence[Row], gammas: Mapping[str, float]) -> list[str]:
     """Why a result is meaningless: contact never active, reference too uncertain, AoBG's bound below epsilon."""
     found = []
     numbers = defaultdict(list)
     for row in rows:
-        key = (row.estimator, row.task, row.timestep, row.cone, row.sigma, row.samples, row.seed)
-        numbers[key].append((row.gradient_norm, row.variance))
+        numbers[row.estimator, row.seed].append((row.gradient_norm, row.variance))
     several = [each for each in numbers.values() if len(each) > 1]
     if several and all(np.allclose(each, each[0], rtol=1e-12, atol=0, equal_nan=True) for each in several):
-        found.append(f"{family}: nothing depends on K: the contact whose stiffness is swept was never active")
+        found.append("nothing depends on K: the contact whose stiffness is swept was never active")
     unsure = list(dict.fromkeys(row.stiffness for row in rows if row.reference_uncertainty > UNSURE))
     if unsure:
         found.append(
-            f"{family}: the reference's own uncertainty is above {UNSURE:.0%}{_at(unsure)}: errors and verdicts say "
+            f"the reference's own uncertainty is above {UNSURE:.0%}{_at(unsure)}: errors and verdicts say "
             "little there; --reference-samples makes it better"
         )
     bound = [row for row in rows if row.estimator == "aobg" and (row.epsilon or 0.0) > gammas[row.task]]
     if bound:
         stiffnesses = list(dict.fromkeys(row.stiffness for row in bound))
         found.append(
-            f"{family}: AoBG is ZoBG{_at(stiffnesses)}: its bound gamma is below epsilon, the radius of ZoBG's mean; "
+            f"AoBG is ZoBG{_at(stiffnesses)}: its bound gamma is below epsilon, the radius of ZoBG's mean; "
             "a larger --gamma or more --samples changes that"
         )
     return found
 
 
-def _variance_finding(family: str, rows: Sequence[Row], confidence: float) -> list[str]:
-    table = {(row.stiffness, row.estimator): row for row in rows}
-    below, above, alike = "below ZoBG's", "above ZoBG's", "not told apart from ZoBG's"
-    unknown = "not to be told from so few effective samples"
-    groups: dict[str, list[float]] = {verdict: [] for verdict in (below, above, alike, unknown)}
-    for stiffness in sorted({stiffness for stiffness, _ in table}):
-        if (stiffness, "zobg") not in table or (stiffness, "fobg") not in table:
+def _variance_finding(rows: Sequence[Row], confidence: float) -> list[str]:
+    """FoBG's variance against ZoBG's at each stiffness: the verdict that all seeds share, if most of them have one."""
+    table: dict[float, dict[str, list[Row]]] = defaultdict(lambda: defaultdict(list))
+    for row in rows:
+        table[row.stiffness][row.estimator].append(row)
+    groups: dict[str, list[float]] = {verdict: [] for verdict in (BELOW, ABOVE, ALIKE, UNKNOWN)}
+    for stiffness, estimates in sorted(table.items()):
+        if not {"zobg", "fobg"} <= estimates.keys():
             return []
-        zeroth, first = table[stiffness, "zobg"], table[stiffness, "fobg"]
-        if not (zeroth.believable and first.believable):
-            verdict = unknown
-        elif first.variance_upper < zeroth.variance_lower:
-            verdict = below
-        else:
-            verdict = above if first.variance_lower > zeroth.variance_upper else alike
-        groups[verdict].append(stiffness)
+        verdicts = [_order(*pair) for pair in zip(estimates["zobg"], estimates["fobg"], strict=True)]
+        known = [verdict for verdict in verdicts if verdict != UNKNOWN]
+        shared = known[0] if len(set(known)) == 1 else ALIKE
+        groups[shared if 2 * len(known) > len(verdicts) else UNKNOWN].append(stiffness)
     parts = [f"{verdict}{_at(group)}" for verdict, group in groups.items() if group]
-    return [f"{family}: FoBG's variance is {'; '.join(parts)} ({confidence:.0%} intervals)"]
+    return [f"FoBG's variance is {'; '.join(parts)} ({confidence:.0%} intervals)"]
 
 
-def _bias_finding(rows: Sequence[Row], gammas: Mapping[str, float]) -> list[str]:
-    """Means farther from the reference than any draw of the test."""
-    return [sentence for row in rows if row.estimator in BIASED and (sentence := _verdict(row, gammas))]
+def _order(zeroth: Row, first: Row) -> str:
+    if not (zeroth.believable and first.believable):
+        return UNKNOWN
+    if first.variance_upper < zeroth.variance_lower:
+        return BELOW
+    return ABOVE if first.variance_lower > zeroth.variance_upper else ALIKE
 
 
-def _verdict(row: Row, gammas: Mapping[str, float]) -> str:
-    """A sentence about a mean that is biased, or off but undecided; empty otherwise."""
-    mean, where = f"{row.contact}: {BIASED[row.estimator]}'s mean is", _at([row.stiffness])
-    if row.bias_verdict == "biased":
-        free = row.estimator == "aobg" and math.isinf(gammas[row.task])
-        advice = ": it has no accuracy bound; --gamma sets one" if free else ""
-        return f"{mean} biased by {_share(row)}{where} (p <= {row.bias_p_value:.3f}){advice}"
-    off = row.bias_p_value <= SURE or row.debiased_error > APART * row.debiased_error_se
-    if row.bias_verdict == "none seen" or not off:
-        return ""
-    held = (
-        f"{min(row.effective_samples, row.reference_effective_samples):.1f}" if row.effective_samples else "all equal"
-    )
-    return f"{mean} off by {_share(row)}{where}, from bias or lack of rare samples: too few effective samples ({held})"
+def _bias_findings(rows: Sequence[Row], gammas: Mapping[str, float]) -> list[str]:
+    """Means farther from the reference than any draw of the test, or off but undecided; a sentence each.
+
+    Of several seeds the counts are given, and the median of the debiased errors.
+    """
+    sentences = []
+    for estimator in dict.fromkeys(row.estimator for row in rows if row.estimator in BIASED):
+        mine = [row for row in rows if row.estimator == estimator]
+        seeds = len({row.seed for row in mine})
+        biased = [row for row in mine if row.bias_verdict == "biased"]
+        off = [row for row in mine if row.bias_verdict == "too few effective samples" and _off(row)]
+        mean = f"{BIASED[estimator]}'s mean is"
+        if biased:
+            shares = ", ".join(f"{_share(same)}{_at([stiffness])}{_of(same, seeds)}" for stiffness, same in _by(biased))
+            least = max(row.bias_p_value for row in biased)
+            free = estimator == "aobg" and math.isinf(gammas[biased[0].task])
+            advice = ": it has no accuracy bound; --gamma sets one" if free else ""
+            sentences.append(f"{mean} biased by {shares} (p <= {least:.3f}){advice}")
+        for stiffness, same in _by(off):
+            fewest = [min(row.effective_samples, row.reference_effective_samples) for row in same]
+            held = f"{min(fewest):.1f}" if all(row.effective_samples for row in same) else "all equal"
+            sentences.append(
+                f"{mean} off by {_share(same)}{_at([stiffness])}{_of(same, seeds)}, from bias or lack of rare samples: "
+                f"too few effective samples ({held})"
+            )
+    return sentences
 
 
-def _share(row: Row) -> str:
-    """The debiased error as a share of the reference gradient, in significant digits only."""
-    error = max(row.debiased_error_se, row.reference_uncertainty)
-    return f"{row.debiased_error:.1%}" if error < 0.005 else f"{float(f'{100 * row.debiased_error:.2g}'):g}%"
+def _by(rows: Sequence[Row]) -> list[tuple[float, list[Row]]]:
+    """Rows by stiffness."""
+    return [(k, [row for row in rows if row.stiffness == k]) for k in dict.fromkeys(row.stiffness for row in rows)]
+
+
+def _off(row: Row) -> bool:
+    return row.bias_p_value <= SURE or row.debiased_error > APART * row.debiased_error_se
+
+
+def _of(rows: Sequence[Row], seeds: int) -> str:
+    return f" in {len(rows)} of {seeds} seeds" if seeds > 1 else ""
+
+
+def _share(rows: Sequence[Row]) -> str:
+    """The median debiased error as a share of the reference gradient, in significant digits only."""
+    share = float(np.median([row.debiased_error for row in rows]))
+    error = max(max(row.debiased_error_se, row.reference_uncertainty) for row in rows)
+    if not math.isfinite(share):
+        return "more than can be computed"
+    return f"{share:.1%}" if error < 0.005 else f"{float(f'{100 * share:.2g}'):g}%"
 
 
 def _at(stiffnesses: Sequence[float]) -> str:
     """The stiffnesses, for a sentence; empty without contact."""
-    return f" at K = {', '.join(f'{value:g}' for value in stiffnesses)} N/m" if any(stiffnesses) else ""
+    digits = digits_to_tell_apart(stiffnesses, least=4)
+    rounded = (float(f"{value:.{digits}g}") for value in stiffnesses)
+    return f" at K = {', '.join(f'{value:.{digits + 2}g}' for value in rounded)} N/m" if any(stiffnesses) else ""
 
 
 def _of_landscapes(dataset: xr.Dataset) -> list[str]:
