@@ -10,7 +10,7 @@ from typing import Final
 
 from make_figures import save
 
-from mjx_study.cli.progress import progress_bar
+from mjx_study.cli.progress import shown_progress
 from mjx_study.plots.study import plot_study
 from mjx_study.runtime import configure
 from mjx_study.study.configuration import StudyConfig
@@ -61,7 +61,7 @@ def main() -> None:
     configure()
     for name, config in SWEEPS.items():
         folder = HERE.parent / "results" / "study" / name
-        with progress_bar() as progress:
+        with shown_progress() as progress:
             run_study(plan_study(config), folder, progress)
         path = HERE / f"{name}.png"
         save(plot_study(load_study(folder))[FIGURES.get(name, name)], path)

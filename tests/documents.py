@@ -1,5 +1,6 @@
 """Documents of studies whose cells hold whatever a test writes into them."""
 
+import re
 from typing import Any
 
 
@@ -20,3 +21,10 @@ def study_document(cells: int, **changes: Any) -> dict[str, Any]:
         "resolved": [{"horizon": [1], "noise": "gaussian", "estimators": {}}],
         "cells": [{"label": str(index), "at": at} for index, at in enumerate(places)],
     }
+
+
+def stages_of(told: str) -> list[str]:
+    """The stages that a command tells on standard error where that is no terminal, without their times."""
+    lines = told.splitlines()
+    assert all(re.match(r" *\d+\.\d s  \[", line) for line in lines), told
+    return [line.partition(" s  ")[2] for line in lines]

@@ -22,6 +22,7 @@ from mjx_study.study.findings import rows_of
 from mjx_study.study.plan import StudyPlan, plan_study
 from mjx_study.study.run import load_study
 from mjx_study.tasks import TASKS
+from tests.documents import stages_of
 
 SMALL = ["--horizon", "4", "--samples", "8", "--reference-samples", "8"]
 MJCF = """<mujoco><worldbody>
@@ -57,6 +58,9 @@ def small_run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     command += ["--stiffness", "10,1000", "--contact", "penalty,mujoco_default", "--estimators", "zobg,fobg,aobg,ivw"]
     done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=300)
     assert done.returncode == 0, done.stderr
+    first, *others = stages_of(done.stderr)
+    assert first == "[0/3] pusher, penalty, K = 10 N/m, h = 0.005 s, N = 8 (compiling first)"
+    assert others == ["[1/3] pusher, penalty, K = 1000 N/m, h = 0.005 s, N = 8", others[1], "[3/3] done"]
     assert "Warp" not in done.stdout and "warp" not in done.stdout
     return folder, done.stdout
 
@@ -264,6 +268,14 @@ def test_an_output_folder_that_is_a_file(capsys: pytest.CaptureFixture[str], tmp
 
 def test_an_output_folder_that_cannot_be_written(capsys: pytest.CaptureFixture[str]) -> None:
     assert "cannot write to the output folder" in refused(capsys, "compare", "pusher", "--output", "/proc/results")
+
+
+def test_the_log_level_of_xla_is_the_users_where_it_is_set(monkeypatch: pytest.MonkeyPatch) -> None:
+    for given, found in ((None, "3"), ("0", "0")):
+        monkeypatch.setenv("TF_CPP_MIN_LOG_LEVEL", given or "")
+        if given is None:
+            monkeypatch.delenv("TF_CPP_MIN_LOG_LEVEL")
+        assert cli.main(["estimators"]) == 0 and os.environ["TF_CPP_MIN_LOG_LEVEL"] == found
 
 
 def test_interruption_leaves_only_what_is_complete(tmp_path: Path) -> None:

@@ -17,6 +17,7 @@ from mjx_study.cli import options, studies
 from mjx_study.study import cells as sweep_cells
 from mjx_study.study.plan import StudyCell, StudyPlan
 from mjx_study.study.run import run_study
+from tests.documents import stages_of
 
 SIGNALS = """
 import os, signal, sys, time
@@ -63,8 +64,10 @@ def ended(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
     """Standard output of a command that could not write."""
     capsys.readouterr()
     assert cli.main(list(arguments)) == 1
-    out, error = capsys.readouterr()
-    assert error.count("\n") == 1 and error.startswith("mjx-study: cannot write"), error
+    out, told = capsys.readouterr()
+    *stages, error = told.splitlines()
+    stages_of("\n".join(stages))
+    assert error.startswith("mjx-study: cannot write"), told
     assert "No space left on device" in error
     return out
 

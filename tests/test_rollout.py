@@ -18,6 +18,7 @@ from mjx_study.objective import Simulator
 from mjx_study.render import RenderError
 from mjx_study.tasks import make_task
 from mjx_study.tasks.contact_grid import contact_grid
+from tests.documents import stages_of
 
 SHORT = ["pusher", "--horizon", "10", "--renderer", "drawing"]
 FILES = ["rollout.gif", "strip.pdf", "strip.png", "stroboscope.pdf", "stroboscope.png", "trajectory.npz"]
@@ -44,7 +45,7 @@ def document(capsys: pytest.CaptureFixture[str], *arguments: str) -> dict[str, A
     """What a run prints as JSON, and nothing else."""
     assert call(*arguments, "--json") == 0
     printed = capsys.readouterr()
-    assert printed.err == ""
+    assert stages_of(printed.err) == ["[0/2] simulating", "[1/2] drawing"]
     return json.loads(printed.out)
 
 

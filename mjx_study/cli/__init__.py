@@ -7,6 +7,7 @@ computes, and `NAME` with `run`, imported when the command runs.
 """
 
 import argparse
+import os
 import shlex
 import signal
 import sys
@@ -47,6 +48,8 @@ ALIASES: Final = {"optimize": "optimise"}
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code."""
+    # Else XLA prints banners when a program takes minutes to compile; what fails in it raises all the same.
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     try:
         with written_out(), ending(ENDED, signal.SIGTERM, signal.SIGHUP):
             given = sys.argv[1:] if arguments is None else list(arguments)

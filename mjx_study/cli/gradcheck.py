@@ -6,7 +6,6 @@ from pathlib import Path
 from mjx_study import gradcheck as check
 from mjx_study.choices import CHECKED_STEPS
 from mjx_study.cli.options import UsageError, computing, configure_process, print_report, scene_options, usage_errors
-from mjx_study.cli.progress import stage_lines
 from mjx_study.gradcheck.plan import GradcheckPlan
 from mjx_study.simulation.scene import load_scene
 from mjx_study.tasks import make_task
@@ -21,7 +20,7 @@ def run(options: argparse.Namespace) -> int:
         configure_process(options)
         plan = _plan(options)
     with computing() as progress:
-        report = check.gradcheck(plan, stage_lines(progress))
+        report = check.gradcheck(plan, progress)
     print_report(options, report.as_json(), report.lines(verbose=options.verbose))
     return 1 if not report.passed else UNEXERCISED if report.unexercised else 0
 

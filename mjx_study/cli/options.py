@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Final, NoReturn
 
 from mjx_study.choices import FAMILIES, PRECISIONS, TASK_DESCRIPTIONS, unknown_task
-from mjx_study.cli.progress import progress_bar, show_cursor
+from mjx_study.cli.progress import show_cursor, shown_progress
 from mjx_study.option import OPTIONS, Checked, Option
 from mjx_study.study.configuration import Progress
 
@@ -210,8 +210,8 @@ def usage_errors() -> Generator[None]:
 
 @contextmanager
 def computing(interrupted: str = INTERRUPTED) -> Generator[Progress]:
-    """A progress bar around computing; a signal ends the process at once, see `ending`."""
-    with ending(interrupted, *ENDINGS), progress_bar() as progress:
+    """Progress around computing; a signal ends the process at once, see `ending`."""
+    with ending(interrupted, *ENDINGS), shown_progress() as progress:
         yield progress
 
 

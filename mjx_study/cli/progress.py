@@ -1,27 +1,24 @@
-"""Progress on standard error: a bar on a terminal, lines elsewhere."""
+"""Progress on standard error: a bar on a terminal, a line for each stage elsewhere."""
 
 import sys
+import time
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
 
+from mjx_study.cli.output import complain
+
 
 @contextmanager
-def progress_bar() -> Generator[Callable[[int, int, str], None]]:
-    """A progress bar on standard error, shown only on a terminal and gone when the work is done."""
+def shown_progress() -> Generator[Callable[[int, int, str], None]]:
+    """A bar on a terminal, gone when the work is done; elsewhere a line for each stage, with the elapsed time."""
+    if sys.stderr is None or not sys.stderr.isatty():
+        yield _stage_lines()
+        return
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-    console = Console(stderr=True)
-    bar = Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        console=console,
-        transient=True,
-        disable=not console.is_terminal,
-    )
-    with bar:
+    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task("starting", total=None)
 
         def report(done: int, total: int, what: str) -> None:
@@ -30,13 +27,15 @@ def progress_bar() -> Generator[Callable[[int, int, str], None]]:
         yield report
 
 
-def stage_lines(progress: Callable[[int, int, str], None]) -> Callable[[int, int, str], None]:
-    """The progress, and a line on standard error for each of its stages where that is no terminal."""
+def _stage_lines() -> Callable[[int, int, str], None]:
+    """A stage is what has a name of its own; progress within it is not told."""
+    begun, last = time.monotonic(), ""
 
     def report(done: int, total: int, what: str) -> None:
-        progress(done, total, what)
-        if not sys.stderr.isatty():
-            print(f"[{done}/{total}] {what}", file=sys.stderr, flush=True)
+        nonlocal last
+        if what != last:
+            complain(f"{time.monotonic() - begun:7.1f} s  [{done}/{total}] {what}")
+            last = what
 
     return report
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+from typing import Any
 
 import jax
 
@@ -88,6 +89,13 @@ class StudyPlan:
             return 2 * len(self.groups)
         settings = {(cell.group, cell.sigma, cell.samples) for cell in self.cells}
         return len(settings) * len(self.config.estimators)
+
+    def program_of(self, cell: StudyCell) -> tuple[Any, ...] | None:
+        """A key of what is compiled for a cell; None for an analytic system."""
+        if cell.model.analytic:
+            return None
+        own = (cell.sigma, cell.samples) if self.config.kind == "descents" else (cell.model.contact is None,)
+        return cell.group, *own
 
     @property
     def memory(self) -> int:

@@ -148,6 +148,7 @@ class _Run:
 
     def __init__(self, plan: StudyPlan, progress: Progress):
         self._plan, self._progress, self._total = plan, progress, len(plan.cells)
+        self._begun: set[Any] = {None}
 
     def in_memory(self, document: dict[str, Any]) -> xr.Dataset:
         """All cells, none of them written."""
@@ -206,6 +207,9 @@ class _Run:
         """A cell's numbers, with progress in whole cells, or where there is a single one within it."""
         cell = self._plan.cells[index]
         label = self._plan.label(cell)
+        if (program := self._plan.program_of(cell)) not in self._begun:
+            self._begun.add(program)
+            label += " (compiling first)"
         self._progress(done, self._total, label)
         if self._plan.config.kind != "descents":
             return compute(cell)

@@ -13,6 +13,7 @@ from mjx_study.gradcheck.check import unoffered
 from mjx_study.gradcheck.cost import CostCheck, judge_closed_forms
 from mjx_study.gradcheck.coverage import coverage
 from mjx_study.gradcheck.finding import Entry
+from tests.documents import stages_of
 
 PARTS = frozenset({"contact", "stick", "slide", "separate", "limit"})
 STICKING = coverage(PARTS, [{"contact", "stick"}, {"contact", "stick", "limit"}, {"separate"}])
@@ -64,13 +65,14 @@ def test_what_is_never_exercised_is_a_warning_and_another_exit_code(
 def test_each_stage_is_a_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     def stages(plan, progress):
         progress(0, 2, "compiling")
+        progress(0, 2, "compiling")
         progress(1, 2, "penalty: start")
         return report(STEP)
 
     monkeypatch.setattr(options, "configure", lambda **_: None)
     monkeypatch.setattr(command.check, "gradcheck", stages)
     assert cli.main(["gradcheck", "pusher", "--horizon", "2", "--stiffness", "100"]) == 0
-    assert capsys.readouterr().err.splitlines() == ["[0/2] compiling", "[1/2] penalty: start"]
+    assert stages_of(capsys.readouterr().err) == ["[0/2] compiling", "[1/2] penalty: start"]
 
 
 def test_unresolved_entries_are_counted() -> None:
