@@ -1,6 +1,8 @@
 """Imports only point down the layers, and importing has no effect on the process."""
 
 import ast
+import pkgutil
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -145,3 +147,49 @@ def test_import_has_no_global_effect() -> None:
     done = subprocess.run([sys.executable, "-c", IMPORT_ALL, *modules], capture_output=True, text=True, cwd=ROOT)
     assert done.returncode == 0, done.stderr
     assert done.stdout == ""
+
+
+ARCHITECTURE = (ROOT / "docs" / "architecture.md").read_text()
+BESIDE = {"mjx_study.choices", "mjx_study._matplotlib", "mjx_study.runtime", "mjx_study.table", "mjx_study.disk"} | {
+    "mjx_study.limits", "mjx_study.option", "mjx_study.files", "mjx_study.accessor", "mjx_study._public"
+}  # fmt: skip
+"""Small modules that the picture of the packages leaves out."""
+
+
+def package_imports() -> dict[str, set[str]]:
+    """The packages of the picture, with those that each imports."""
+    found: dict[str, set[str]] = {}
+    for path in FILES:
+        module = module_of(path)
+        package = LAYERS[layer_of(module)]
+        if package in BESIDE | {"mjx_study", "mjx_study.__main__"}:
+            continue
+        imported = {
+            LAYERS[layer_of(name)] for name in imports_of(path.read_text(), module, is_package=path.stem == "__init__")
+        }
+        found.setdefault(package, set()).update(imported - BESIDE - {package})
+    return found
+
+
+def test_the_picture_of_the_packages_is_right() -> None:
+    """Its arrows are the imports, less those that follow from others."""
+    imports = package_imports()
+
+    def beyond(package: str) -> set[str]:
+        return imports[package].union(*(beyond(each) for each in imports[package]))
+
+    expected = {
+        (package, other)
+        for package, others in imports.items()
+        for other in others
+        if not any(other in beyond(between) for between in others - {other})
+    }
+    drawn = {tuple(line.split(" --> ")) for line in ARCHITECTURE.replace("    ", "").splitlines() if " --> " in line}
+    assert drawn == {tuple(each.removeprefix("mjx_study.") for each in pair) for pair in expected}
+
+
+def test_what_the_page_names_is_there() -> None:
+    named = set(re.findall(r"`((?:mjx_study|estimators)(?:\.\w+)+)`", ARCHITECTURE))
+    assert len(named) > 15
+    for place in named:
+        assert pkgutil.resolve_name(place) is not None
