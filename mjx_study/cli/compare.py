@@ -7,7 +7,7 @@ import sys
 from mjx_study.cli.console import alarms, gradients_as_json, print_gradients
 from mjx_study.cli.options import configure_process, finish, usage_errors
 from mjx_study.cli.parameters import theta_of
-from mjx_study.cli.studies import compute, draw, study_fields
+from mjx_study.cli.studies import announce, compute, draw, study_fields
 from mjx_study.study.configuration import StudyConfig
 from mjx_study.study.plan import plan_study
 
@@ -17,6 +17,8 @@ def run(options: argparse.Namespace) -> int:
     with usage_errors():
         configure_process(options)
         plan = plan_study(StudyConfig(**study_fields(options), tasks=(options.task,), theta=theta_of(options), seeds=1))
+    if options.dry_run:
+        return announce(plan, options)
     dataset, unwritten = compute(plan, options)
     written, undrawn = draw(dataset, options.output, unwritten)
     if options.json:

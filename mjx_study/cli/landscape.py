@@ -10,7 +10,7 @@ import xarray as xr
 from mjx_study.cli.console import number
 from mjx_study.cli.options import configure_process, finish, print_report, usage_errors
 from mjx_study.cli.parameters import theta_of
-from mjx_study.cli.studies import compute, draw, study_fields
+from mjx_study.cli.studies import announce, compute, draw, study_fields
 from mjx_study.study.configuration import StudyConfig, takes_stiffness
 from mjx_study.study.dataset import as_plain
 from mjx_study.study.findings import curves_of, findings
@@ -26,6 +26,8 @@ def run(options: argparse.Namespace) -> int:
     with usage_errors():
         configure_process(options)
         plan = plan_study(_configuration(options))
+    if options.dry_run:
+        return announce(plan, options)
     dataset, unwritten = compute(plan, options)
     written, undrawn = draw(dataset, options.output, unwritten)
     lines = _lines(dataset)

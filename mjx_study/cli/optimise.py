@@ -12,7 +12,7 @@ import xarray as xr
 from mjx_study.cli.console import number
 from mjx_study.cli.options import attempt, configure_process, finish, print_report, usage_errors
 from mjx_study.cli.parameters import task_of, theta_of
-from mjx_study.cli.studies import compute, draw, study_fields
+from mjx_study.cli.studies import announce, compute, draw, study_fields
 from mjx_study.disk import write_whole
 from mjx_study.plots.style import style_of
 from mjx_study.study.configuration import StudyConfig, takes_stiffness
@@ -33,6 +33,8 @@ def run(options: argparse.Namespace) -> int:
     with usage_errors():
         configure_process(options)
         plan = plan_study(_configuration(options))
+    if options.dry_run:
+        return announce(plan, options)
     dataset, unwritten = compute(plan, options)
     document = as_document(dataset)
     written, undrawn = draw(dataset, options.output, unwritten)

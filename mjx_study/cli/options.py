@@ -122,7 +122,7 @@ def add_folder_options(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--output", type=Path, metavar="DIR", help="folder of the study: the numbers and the figures; resumable"
     )
-    add_versions_option(command)
+    add_study_options(command)
 
 
 def add_contact_options(
@@ -170,8 +170,9 @@ def add_process_options(command: argparse.ArgumentParser, seed: int | None = 0) 
     add_option(command, OPTIONS["devices"])
 
 
-def add_versions_option(command: argparse.ArgumentParser) -> None:
-    """For commands that go on with what is in a folder."""
+def add_study_options(command: argparse.ArgumentParser) -> None:
+    """For commands that run studies."""
+    command.add_argument("--dry-run", action="store_true", help="print what it would cost; compute and write nothing")
     command.add_argument(
         "--accept-versions", action="store_true", help="go on with a folder that other versions of the software began"
     )

@@ -7,10 +7,11 @@ from typing import Any
 
 import xarray as xr
 
-from mjx_study.cli.options import UsageError, attempt, computing, usage_errors
+from mjx_study.cli.options import UsageError, attempt, computing, print_report, usage_errors
 from mjx_study.plots.study import plot_study
 from mjx_study.plots.style import save_figures
 from mjx_study.study.configuration import StudyConfig
+from mjx_study.study.forecast import forecast
 from mjx_study.study.plan import StudyPlan
 from mjx_study.study.run import open_store, run_study
 from mjx_study.study.store import StudyError
@@ -45,6 +46,15 @@ def compute(plan: StudyPlan, options: argparse.Namespace) -> tuple[xr.Dataset, s
         raise UsageError(str(error)) from error
     reason = dataset.attrs.pop("unwritten", None)
     return dataset, reason and f"{reason}; what is there is complete, and the same command goes on"
+
+
+def announce(plan: StudyPlan, options: argparse.Namespace) -> int:
+    """Print what a study would take."""
+    with usage_errors():
+        found = forecast(plan, options.output, accept_versions=options.accept_versions)
+    warnings = [f"warning: {message}" for message in plan.warnings]
+    print_report(options, dataclasses.asdict(found) | {"warnings": list(plan.warnings)}, [*found.lines, *warnings])
+    return 0
 
 
 def draw(dataset: xr.Dataset, folder: Path | None, unwritten: str | None) -> tuple[list[Path], str | None]:

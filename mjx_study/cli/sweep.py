@@ -11,7 +11,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, create_model
 
 from mjx_study.cli.options import UsageError, computing, configure_process, finish, print_report, usage_errors
 from mjx_study.cli.parsers.sweep import TASKS, solimp, solref
-from mjx_study.cli.studies import RESUMABLE
+from mjx_study.cli.studies import RESUMABLE, announce
 from mjx_study.files import read_toml
 from mjx_study.option import OPTIONS
 from mjx_study.study.run import (
@@ -32,6 +32,9 @@ def run(options: argparse.Namespace) -> int:
     with usage_errors():
         configure_process(options)
         plan = plan_study(StudyConfig(**_fields(options)))
+    if options.dry_run:
+        return announce(plan, options)
+    with usage_errors():
         store = open_store(plan, options.output, options.command_line, accept_versions=options.accept_versions)
         missing = len(store.missing)
     if not options.json:

@@ -8,7 +8,7 @@ bit for bit where an undisturbed one does; all estimators share these keys.
 import dataclasses
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, Final
 
@@ -18,11 +18,12 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float, Key
 
-from estimators import ORACLES, Estimator, Objective, draw
+from estimators import Estimator, Objective, draw
 from mjx_study.objective import Simulator, TracedObjective, simulate
 from mjx_study.simulation.contact import ContactModel
 from mjx_study.study.iteration import Descent, Record, advance, begin, going, make_optimizer
 from mjx_study.study.plan import StudyCell, StudyPlan, estimators_of
+from mjx_study.study.sampling import rollouts_of
 from mjx_study.study.store import Part
 from mjx_study.study.variables import HISTORY, METRIC, START
 from mjx_study.tasks.contact_grid import ContactPoint
@@ -242,7 +243,7 @@ def _numbers(backend: Backend, model: ContactPoint, estimator: Estimator, run: _
         "reason": np.where(reason > 0, reason, np.nan).reshape(seeds),
         "final_cost": np.array([mean for mean, _ in costs]),
         "final_cost_se": np.array([error for _, error in costs]),
-        "rollouts": np.array(_rollouts(estimator.needs, backend.samples, backend.task.random_start)),
+        "rollouts": np.array(_rollouts(estimator, backend)),
         **{METRIC + name: np.array([each[name] for each in metrics]) for name in metrics[0]},
     }
 
@@ -253,11 +254,6 @@ def _padded(values: np.ndarray, length: int) -> np.ndarray:
     return np.pad(np.asarray(values, float), missing, constant_values=np.nan)
 
 
-def _rollouts(needs: Sequence[str], samples: int, random_start: bool) -> int:
-    """Rollouts in one iteration of one seed; a pair counts two, and batches of order 0 have baselines."""
-    count = 0
-    for oracle in needs:
-        baselines = samples if random_start else 1
-        count += samples * (2 if "pair" in oracle else 1)
-        count += baselines if ORACLES[oracle].order == 0 or oracle == "linearisation" else 0
-    return count
+def _rollouts(estimator: Estimator, backend: Backend) -> int:
+    """Rollouts in one iteration of one seed."""
+    return sum(rollouts_of(oracle, backend.samples, backend.task.random_start)[0] for oracle in estimator.needs)

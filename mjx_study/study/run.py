@@ -91,12 +91,27 @@ def open_store(plan: StudyPlan, folder: Path, command: str | None = None, *, acc
     Raises:
         ValueError: it cannot be written to, or holds another study.
     """
+    document = _document_in(plan, folder, command)
+    return Store.create(prepare_folder(folder), document, accept_versions=accept_versions)
+
+
+def begun_store(plan: StudyPlan, folder: Path, *, accept_versions: bool = False) -> Store | None:
+    """The folder of a plan as `open_store` would go on with it, to read; None where nothing is begun.
+
+    Raises:
+        ValueError: the folder holds another study.
+    """
+    return Store.begun(folder, _document_in(plan, folder), accept_versions=accept_versions)
+
+
+def _document_in(plan: StudyPlan, folder: Path, command: str | None = None) -> dict[str, Any]:
+    """The document of a plan, with the chunk size of what is begun in a folder."""
     document = _document(plan, command)
     if plan.config.chunk_size is None:
         begun = (folder / "study.json").exists()
         stored = Store.open(folder).document["config"]["chunk_size"] if begun else plan.chunk_size
         document["config"]["chunk_size"] = stored
-    return Store.create(prepare_folder(folder), document, accept_versions=accept_versions)
+    return document
 
 
 def _forms(plan: StudyPlan) -> dict[str, list[Task]]:

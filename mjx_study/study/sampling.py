@@ -69,6 +69,13 @@ def draw_batches(
     return drawn, seconds, residuals
 
 
+def rollouts_of(oracle: str, samples: int, random_start: bool) -> tuple[int, int]:
+    """Rollouts of a batch, and how many of them are differentiated: a pair is two, and order 0 has its baselines."""
+    order = ORACLES[oracle].order
+    baselines = (samples if random_start else 1) if order == 0 or oracle == "linearisation" else 0
+    return samples * (2 if "pair" in oracle else 1) + baselines, samples * order
+
+
 def residuals_of(batch: Any) -> Float[np.ndarray, " rollouts"]:
     """The solver residual of every rollout of a batch of any kind; empty for an analytic system."""
     parts = batch if isinstance(batch, tuple) else (batch,)

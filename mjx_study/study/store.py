@@ -83,32 +83,45 @@ class Store:
             StudyError: the folder holds another study, one of other versions, or a damaged file.
             ValueError: the folder cannot be written to.
         """
+        if kept := cls.begun(folder, document, accept_versions=accept_versions):
+            prepare_folder(folder)
+            document = as_plain(document)
+            if (document["config"].get("iterations") or 0) > (kept.document["config"].get("iterations") or 0):
+                kept._extend(document)
+            kept._versions = document.get("versions", {})
+            return kept
         prepare_folder(folder)
         prepare_folder(folder / "cells")
         document = as_plain({"format": FORMAT} | document)
         path = folder / "study.json"
-        if path.exists():
-            kept = cls.open(folder)
-            theirs, ours = (_flat(_identity(each)) for each in (kept.document, document))
-            if told := differences(theirs, ours):
-                raise StudyError(f"{folder} holds another study ({told}); choose another folder")
-            there, asked = (each["config"].get("iterations") or 0 for each in (kept.document, document))
-            if asked < there:
-                raise StudyError(
-                    f"{folder} holds {there} iterations, and {asked} are asked for: give --iterations {there} or more, "
-                    "or another folder"
-                )
-            told = differences(*(each.get("versions", {}) for each in (kept.document, document)))
-            if told and (kept.missing or asked > there) and not accept_versions:
-                raise StudyError(f"{folder} was computed with other versions ({told}); {ACCEPT}")
-            if asked > there:
-                kept._extend(document)
-            kept._versions = document.get("versions", {})
-            return kept
         if any((folder / "cells").glob("*.npz")):
             raise StudyError(f"{folder} holds cells of a study without its study.json; choose another folder")
         _write_document(path, document)
         return cls(folder, document)
+
+    @classmethod
+    def begun(cls, folder: Path, document: dict[str, Any], *, accept_versions: bool = False) -> "Store | None":
+        """The study that a folder has, to read, as `create` would go on with it; None where there is none.
+
+        Raises:
+            StudyError: as `create`.
+        """
+        if not (folder / "study.json").exists():
+            return None
+        document, kept = as_plain({"format": FORMAT} | document), cls.open(folder)
+        theirs, ours = (_flat(_identity(each)) for each in (kept.document, document))
+        if told := differences(theirs, ours):
+            raise StudyError(f"{folder} holds another study ({told}); choose another folder")
+        there, asked = (each["config"].get("iterations") or 0 for each in (kept.document, document))
+        if asked < there:
+            raise StudyError(
+                f"{folder} holds {there} iterations, and {asked} are asked for: give --iterations {there} or more, "
+                "or another folder"
+            )
+        told = differences(*(each.get("versions", {}) for each in (kept.document, document)))
+        if told and (kept.missing or asked > there) and not accept_versions:
+            raise StudyError(f"{folder} was computed with other versions ({told}); {ACCEPT}")
+        return kept
 
     def _extend(self, document: dict[str, Any]) -> None:
         """Turn finished descents into checkpoints of longer ones; safe to repeat after a kill."""

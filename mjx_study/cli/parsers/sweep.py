@@ -11,7 +11,7 @@ from mjx_study.cli.options import (
     add_option,
     add_options,
     add_process_options,
-    add_versions_option,
+    add_study_options,
 )
 from mjx_study.option import MOST_VALUES, OPTIONS, Interval, Option
 from mjx_study.study.configuration import StudyConfig
@@ -68,7 +68,7 @@ def add(command: argparse.ArgumentParser) -> None:
     add_options(command, StudyConfig, "horizon", "model", "chunk_size")
     add_process_options(command, seed=None)
     command.add_argument("--output", type=Path, required=True, metavar="DIR", help="folder of the study")
-    add_versions_option(command)
+    add_study_options(command)
 
 
 def solref(value: Any) -> tuple[tuple[float, ...], ...]:

@@ -1,0 +1,87 @@
+"""A dry run: the cost of a study counted from its plan, with nothing computed or written."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mjx_study import cli
+from mjx_study.cli import options
+from mjx_study.study.configuration import StudyConfig
+from mjx_study.study.forecast import forecast
+from mjx_study.study.plan import plan_study
+from mjx_study.study.run import run_study
+
+DESCENTS = (
+    "optimise pusher --reference --horizon 8 --iterations 3 --seeds 2 --samples 4 --evaluation-samples 5 "
+    "--estimators zobg,fobg --output"
+).split()
+
+
+@pytest.fixture(autouse=True)
+def configured(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(options, "configure", lambda **_: None)
+
+
+def test_batches_of_gradients_are_counted() -> None:
+    """Of each cell: 3 seeds of 8 values, one baseline and 8 gradients; 10 pairs and 100 candidates of the reference."""
+    config = StudyConfig(
+        tasks=("pusher",), contact=("penalty",), stiffness=(10.0, 100.0), samples=(8,), seeds=3, horizon=4,
+        reference_samples=10,
+    )  # fmt: skip
+    found = forecast(plan_study(config))
+    assert (found.cells, found.computed, found.programs, found.seconds) == (2, 0, 2, None)
+    assert found.rollouts == 2 * (3 * (8 + 1 + 8) + 2 * 10 + 100)
+    assert found.gradients == 2 * (3 * 8 + 100)
+
+
+def test_points_of_landscapes_are_counted() -> None:
+    """5 points of 8 values, a baseline and 8 gradients; 1500 gradients of the quadrature in MJX alone."""
+    config = StudyConfig(
+        tasks=("ball_wall",), contact=("reference", "mujoco_default"), points=5, samples=(8,),
+        stiffness=(1000.0,), estimators=("zobg", "fobg"),
+    )  # fmt: skip
+    found = forecast(plan_study(config))
+    assert found.rollouts == 2 * 5 * (8 + 1 + 8) + 1500 and found.gradients == 2 * 5 * 8 + 1500
+
+
+def test_what_is_forecast_is_what_descents_do(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Their own count of rollouts, and after that nothing is left to do."""
+    folder = tmp_path / "out"
+    assert cli.main([*DESCENTS, str(folder), "--dry-run", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert not folder.exists() and (told["cells"], told["computed"], told["programs"]) == (1, 0, 0)
+    config = StudyConfig(
+        tasks=("pusher",), contact=("reference",), stiffness=(550.0,), horizon=8, iterations=3, seeds=2, samples=(4,),
+        evaluation_samples=5, estimators=("zobg", "fobg"),
+    )  # fmt: skip
+    data = run_study(config, tmp_path / "other")
+    assert told["rollouts"] == 2 * 3 * int(np.sum(data["rollouts"])) + (2 * 2 + 1) * 5
+    assert told["gradients"] == 2 * 3 * 4 and told["kept"] >= 8 * data["theta"].size
+
+    assert cli.main([*DESCENTS, str(folder)]) == 0
+    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    capsys.readouterr()
+    assert cli.main([*DESCENTS, str(folder), "--dry-run"]) == 0
+    assert "cells: 1, 1 computed, 0 to compute\n" in capsys.readouterr().out
+    longer = ["5" if part == "3" else part for part in DESCENTS]
+    assert cli.main([*longer, str(folder), "--dry-run", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["computed"] == 0
+    assert cli.main([*DESCENTS, str(folder), "--dry-run", "--sigma", "0.3"]) == 2
+    assert "holds another study" in capsys.readouterr().err
+    assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
+
+
+def test_computed_cells_have_a_rate(tmp_path: Path) -> None:
+    """Of two cells, one is taken away; its time is that of the other, per sample."""
+    config = StudyConfig(
+        tasks=("pusher",), contact=("reference",), stiffness=(10.0,), horizon=8, iterations=3, seeds=2, samples=(4, 8),
+        evaluation_samples=5, estimators=("zobg", "fobg"),
+    )  # fmt: skip
+    data = run_study(config, tmp_path)
+    assert forecast(plan_study(config), tmp_path).seconds == 0
+    (tmp_path / "cells" / "00001.npz").unlink()
+    found = forecast(plan_study(config), tmp_path)
+    spent = float(data["seconds"].isel(samples=0).max("iteration").sum())
+    assert found.computed == 1 and found.seconds == pytest.approx(2 * spent)
