@@ -83,17 +83,15 @@ class Store:
             StudyError: the folder holds another study, one of other versions, or a damaged file.
             ValueError: the folder cannot be written to.
         """
-        if kept := cls.begun(folder, document, accept_versions=accept_versions):
-            prepare_folder(folder)
-            document = as_plain(document)
+        kept = cls.begun(folder, document, accept_versions=accept_versions)
+        prepare_folder(folder)
+        prepare_folder(folder / "cells")
+        document, path = as_plain({"format": FORMAT} | document), folder / "study.json"
+        if kept is not None:
             if (document["config"].get("iterations") or 0) > (kept.document["config"].get("iterations") or 0):
                 kept._extend(document)
             kept._versions = document.get("versions", {})
             return kept
-        prepare_folder(folder)
-        prepare_folder(folder / "cells")
-        document = as_plain({"format": FORMAT} | document)
-        path = folder / "study.json"
         if any((folder / "cells").glob("*.npz")):
             raise StudyError(f"{folder} holds cells of a study without its study.json; choose another folder")
         _write_document(path, document)
