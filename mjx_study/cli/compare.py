@@ -4,12 +4,13 @@ import argparse
 import json
 import sys
 
-from mjx_study.cli.console import alarms, gradients_as_json, print_gradients
+from mjx_study.cli.console import gradients_as_json, print_gradients
 from mjx_study.cli.options import configure_process, finish, usage_errors
 from mjx_study.cli.parameters import theta_of
 from mjx_study.cli.studies import announce, compute, draw, study_fields
 from mjx_study.study.configuration import StudyConfig
 from mjx_study.study.plan import plan_study
+from mjx_study.study.run import warnings_of
 
 
 def run(options: argparse.Namespace) -> int:
@@ -23,7 +24,7 @@ def run(options: argparse.Namespace) -> int:
     written, undrawn = draw(dataset, options.output, unwritten)
     if options.json:
         print(json.dumps(gradients_as_json(dataset), allow_nan=False))
-        for warning in alarms(dataset):
+        for warning in warnings_of(dataset):
             print(f"warning: {warning}", file=sys.stderr)
     else:
         print_gradients(dataset)

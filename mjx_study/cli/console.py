@@ -13,6 +13,7 @@ from mjx_study.choices import FAMILIES
 from mjx_study.plots.style import style_of
 from mjx_study.study.dataset import as_plain
 from mjx_study.study.findings import Row, findings, rows_of
+from mjx_study.study.run import warnings_of
 from mjx_study.table import format_table
 
 Column = tuple[str, Callable[[Row], str]]
@@ -138,31 +139,8 @@ def print_gradients(dataset: xr.Dataset, print_line: Callable[[str], None] = pri
         )
     for sentence in findings(dataset):
         print_line(sentence + ".")
-    for warning in alarms(dataset):
+    for warning in warnings_of(dataset):
         print_line(f"warning: {warning}")
-
-
-def alarms(dataset: xr.Dataset) -> list[str]:
-    """What a reader must not overlook: samples left out, solves that did not converge, contact models at their edge."""
-    messages = []
-    for row in rows_of(dataset):
-        stiffness = f"K = {number(row.stiffness)} N/m, " if row.stiffness else ""
-        where = f"{row.contact}, {stiffness}{style_of(row.estimator)[0]}"
-        if row.nonfinite:
-            messages.append(f"{where}: {row.nonfinite} of {row.samples} samples are not finite and were left out")
-        if row.unconverged:
-            messages.append(
-                f"{where}: {row.unconverged} samples have an unconverged solve (residual {row.residual:.1e})"
-            )
-        if row.onsets_missed:
-            messages.append(
-                f"{where}: {row.onsets_missed} of {row.onsets} onsets of contact have no term: there are too many"
-            )
-        if row.onsets_bounded:
-            messages.append(
-                f"{where}: {row.onsets_bounded} of {row.onsets} onsets are grazing, and their terms bounded"
-            )
-    return messages + json.loads(dataset.attrs["warnings"])
 
 
 def gradients_as_json(dataset: xr.Dataset) -> dict[str, Any]:
@@ -170,7 +148,7 @@ def gradients_as_json(dataset: xr.Dataset) -> dict[str, Any]:
     rows = [row.as_dict() for row in rows_of(dataset)]
     names = ("config", "resolved", "environment")
     document = {name: json.loads(dataset.attrs[name]) for name in names}
-    return as_plain(document | {"findings": findings(dataset), "warnings": alarms(dataset), "rows": rows})
+    return as_plain(document | {"findings": findings(dataset), "warnings": list(warnings_of(dataset)), "rows": rows})
 
 
 def _table(rows: Sequence[Row], table: Sequence[Column]) -> list[str]:
