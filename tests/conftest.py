@@ -1,11 +1,63 @@
-"""Settings that every test runs under: float64, two CPU devices, and reuse of random keys as an error."""
+"""Settings that every test runs under: float64, two CPU devices, and reuse of random keys as an error.
 
+From JAX 0.11 on, programs split over several CPU devices crash (see `mjx_study.runtime`); there one device has to do.
+"""
+
+import os
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import jax
+import pytest
 
+OLD = jax.__version_info__ < (0, 11)
+# Compilation is most of a test's time, and rounding does not matter: no optimisation, and XLA's plain emitters, which
+# compile twice as fast as those of fusions. Subprocesses inherit it. XLA reads it when the first array is made, and
+# aborts at a flag that it does not know.
+FLAGS = [
+    "--xla_backend_optimization_level=0",
+    "--xla_cpu_parallel_codegen_split_count=1",
+    *(["--xla_cpu_use_fusion_emitters=false"] if OLD else []),
+]
+os.environ["XLA_FLAGS"] = " ".join([*FLAGS, os.environ.get("XLA_FLAGS", "")])
+
+DEVICES = 2 if OLD else 1
+CACHE = os.environ.get("JAX_COMPILATION_CACHE_DIR") or str(Path(__file__).parents[1] / ".pytest_cache" / "jax")
 jax.config.update("jax_enable_x64", True)
-jax.config.update("jax_num_cpu_devices", 2)
+jax.config.update("jax_num_cpu_devices", DEVICES)
 jax.config.update("jax_debug_key_reuse", True)
-jax.config.update("jax_compilation_cache_dir", str(Path(__file__).parents[1] / ".pytest_cache" / "jax"))
+jax.config.update("jax_compilation_cache_dir", CACHE)
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+
+
+@pytest.fixture(scope="module")
+def shared_programs() -> Iterator[None]:
+    """Studies of a module that need the same task and chunk size share them with all that is compiled."""
+    from mjx_study.runtime import precision  # not above: type checking is switched on after this file is imported
+    from mjx_study.study import plan, sampling
+    from mjx_study.tasks import TASKS
+
+    build, make = plan._build, sampling.Simulator
+    tasks: dict[Any, Any] = {}
+    simulators: dict[Any, Any] = {}
+
+    def built(config: Any, which: Any, timestep: float | None, cone: str | None) -> Any:
+        if not isinstance(which, str) or which not in TASKS:
+            return build(config, which, timestep, cone)
+        key = (which, timestep, cone, config.horizon, config.model, config.onset, config.noise, precision())
+        if key not in tasks:
+            tasks[key] = build(config, which, timestep, cone)
+        return tasks[key]
+
+    def made(task: Any, *, chunk_size: int) -> Any:
+        if not any(task is each for each in tasks.values()):
+            return make(task, chunk_size=chunk_size)
+        if (id(task), chunk_size) not in simulators:
+            simulators[id(task), chunk_size] = make(task, chunk_size=chunk_size)
+        return simulators[id(task), chunk_size]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(plan, "_build", built)
+        patch.setattr(sampling, "Simulator", made)
+        yield

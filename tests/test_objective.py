@@ -20,6 +20,7 @@ from mjx_study.simulation.scene import put_scene
 from mjx_study.tasks import make_task
 from mjx_study.tasks.policy import InitialStatePolicy, LinearFeedback, OpenLoop, Policy
 from mjx_study.tasks.task import StudyDefaults, Task
+from tests.conftest import DEVICES
 from tests.estimators.statistics_helpers import assert_mean_is
 from tests.pusher_fixtures import (
     HORIZON,
@@ -68,7 +69,7 @@ def simulator() -> Simulator:
 
 @pytest.fixture(scope="module")
 def large() -> Simulator:
-    """Both devices together hold 1000 samples."""
+    """Two devices together hold 1000 samples."""
     return Simulator(pusher_task(), chunk_size=500)
 
 
@@ -107,6 +108,7 @@ def cart_evaluations() -> dict[tuple[int, int], Evaluation]:
     return results
 
 
+@pytest.mark.skipif(DEVICES < 2, reason="from JAX 0.11 on, programs over several CPU devices crash")
 def test_neither_chunks_nor_devices_matter(cart_evaluations):
     assert len(jax.local_devices()) == 2
     first, *others = cart_evaluations.values()

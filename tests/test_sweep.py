@@ -37,7 +37,10 @@ from mjx_study.study.run import load_study, open_store, run_study, warnings_of
 from mjx_study.study.store import Store, StudyError
 from mjx_study.study.variables import MEASURED, VARIABLES, markdown_table
 from mjx_study.tasks import make_task
+from tests.conftest import DEVICES
 from tests.documents import study_document
+
+pytestmark = pytest.mark.usefixtures("shared_programs")
 
 SMALL: dict[str, Any] = {
     "tasks": ("pusher",),
@@ -180,7 +183,8 @@ def test_descents_are_labelled(descents: Path) -> None:
 # Disturbances. The command runs in processes of its own, which are killed, starved and raced.
 
 ARGUMENTS = ["pusher", "--contact", "penalty,mujoco", "--stiffness", "10,1000", "--samples", "4,8", "--seeds", "3",
-             "--horizon", "20", "--reference-samples", "6", "--chunk-size", "24", "--devices", "2"]  # fmt: skip
+             "--horizon", "20", "--reference-samples", "6", "--chunk-size", "24",
+             "--devices", str(DEVICES)]  # fmt: skip
 
 
 def process(folder: Path, *more: str, **kwargs: Any) -> subprocess.Popen[str]:

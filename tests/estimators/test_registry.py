@@ -1,6 +1,7 @@
 """Running estimators by name: oracles, keys, sharing, precision, transformations and refusals."""
 
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, cast
 
 import jax
@@ -39,19 +40,21 @@ def made(name: str, **changes: Any) -> Estimator:
     return make_estimator(name, **OPTIONS | changes)
 
 
-@dataclass
 class Spy:
     """Records the keys that each oracle is given."""
 
-    num_params: int = 2
-    calls: list[tuple[str, np.ndarray]] = field(default_factory=list)
+    num_params = 2
 
-    def __getattr__(self, name: str) -> Any:
-        method = getattr(OBJECTIVE, name)
+    def __init__(self) -> None:
+        self.calls: list[tuple[str, np.ndarray]] = []
+        # attributes of the instance: from Python 3.12 on a runtime protocol does not ask __getattr__
+        for method in {oracle.method for oracle in ORACLES.values()}:
+            setattr(self, method, self.recorder(method))
 
+    def recorder(self, name: str) -> Callable[[Array, Array], Any]:
         def call(theta: Array, keys: Array) -> Any:
             self.calls.append((name, np.asarray(jax.random.key_data(jax.random.clone(keys)))))
-            return method(theta, keys)
+            return getattr(OBJECTIVE, name)(theta, keys)
 
         return call
 
