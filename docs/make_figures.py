@@ -1,7 +1,8 @@
-"""Draws docs/tasks.png and docs/physics.png: the tasks as MJX simulates them, and what is known of each without MJX.
+"""Draws docs/tasks.png, docs/physics.png and docs/onset-correction.png: the tasks as MJX simulates them, what is known
+of each without MJX, and first-order gradients with and without the onset term.
 
-    python docs/make_figures.py             both figures
-    python docs/make_figures.py physics     one of them: tasks or physics
+    python docs/make_figures.py             all of them
+    python docs/make_figures.py physics     one of them: tasks, physics or onset-correction
 
 It takes a minute or two, most of it to compile; compiled programs are kept between runs.
 """
@@ -41,6 +42,7 @@ from mjx_study.render.drawing import PALETTE, Drawing
 from mjx_study.runtime import configure
 from mjx_study.simulation.contact import ContactModel, contact_model, solref_from_stiffness
 from mjx_study.simulation.dynamics import State, initial_state
+from mjx_study.study.quadrature import Line, grid, means
 from mjx_study.tasks import make_task
 from mjx_study.tasks.contact_grid import contact_grid
 from mjx_study.tasks.task import Task
@@ -602,7 +604,40 @@ def physics_figure() -> Figure:
     return figure
 
 
-FIGURES = {"tasks": tasks_figure, "physics": physics_figure}
+# The onset term
+
+
+def correction_figure() -> Figure:
+    """momentum_transfer, MuJoCo's default contact: slope of the mean cost, and means of first-order gradients."""
+    task = task_of("momentum_transfer")
+    contact, position = contact_of(task, "mujoco_default", 1.0), np.linspace(0.05, 0.74, 47)
+    points = grid(position[0], position[-1], task.sigma, 2000, task.noise)
+    found = {
+        onset: means(points, *Line(task.replace(onset=onset))(points, contact), position, task.sigma, task.noise)
+        for onset in ("none", "linear", "jump")
+    }
+    figure = Figure(figsize=(9.0, 3.6), dpi=DPI, layout="constrained")
+    FigureCanvasAgg(figure)
+    wide, near = figure.subplots(1, 2)
+    for axes in (wide, near):
+        axes.plot(position, found["none"].slope, color=INK, linewidth=4, alpha=0.35, label="slope of the mean cost")
+        for onset, colour, label in (
+            ("none", ORANGE, "E[FoBG]"),
+            ("linear", BLUE, "E[FoBG], linear onset term"),
+            ("jump", GREEN, "E[FoBG], jump"),
+        ):
+            axes.plot(position, found[onset].first, color=colour, linewidth=1.5, label=label)
+        axes.axhline(0.0, color=GREY, linewidth=0.8)
+        axes.set_xlabel("launch angle [rad]")
+        axes.grid(alpha=0.25)
+    near.set_ylim(-1.05, 0.15)
+    wide.set_ylabel("gradient [1/rad]")
+    wide.legend(frameon=False, fontsize=8.5)
+    near.set_title("the same, enlarged", fontsize=10)
+    return figure
+
+
+FIGURES = {"tasks": tasks_figure, "physics": physics_figure, "onset-correction": correction_figure}
 
 
 def main(names: list[str]) -> None:

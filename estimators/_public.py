@@ -4,6 +4,7 @@ from estimators.alpha import alpha_order, constrained_alpha, interpolate, invers
 from estimators.baselines import BASELINES, leave_one_out, none, zero_noise
 from estimators.bias import BiasTest, EmpiricalBias, bias_test, empirical_bias, squared_bias_of_means
 from estimators.catalogue import VARIANCE_PROXIES, WEIGHTS
+from estimators.circulation import Circulation, circulation
 from estimators.comparison import Comparison, compare
 from estimators.confidence import bernstein_epsilon, coverage_interval, variance_upper_bound
 from estimators.cross_fitting import weigh_batches
@@ -64,6 +65,7 @@ __all__ = [
     "Antithetic",
     "AntitheticCostToGo",
     "Batches",
+    "Circulation",
     "BiasTest",
     "ClippedFirstOrder",
     "Comparison",
@@ -95,6 +97,7 @@ __all__ = [
     "antithetic_cost_to_go",
     "bernstein_epsilon",
     "bias_test",
+    "circulation",
     "clipped_first_order",
     "compare",
     "constrained_alpha",

@@ -3,11 +3,15 @@
 import argparse
 from pathlib import Path
 
+from estimators import make_estimator
 from mjx_study import gradcheck as check
 from mjx_study.choices import CHECKED_STEPS
 from mjx_study.cli.options import UsageError, computing, configure_process, print_report, scene_options, usage_errors
+from mjx_study.cli.parsers.gradcheck import MEAN
+from mjx_study.gradcheck.mean import lines_of
 from mjx_study.gradcheck.plan import GradcheckPlan
 from mjx_study.simulation.scene import load_scene
+from mjx_study.study.resolution import check_estimators
 from mjx_study.tasks import make_task
 
 UNEXERCISED = 3
@@ -16,6 +20,11 @@ UNEXERCISED = 3
 
 def run(options: argparse.Namespace) -> int:
     """Check and print; 1 where something is wrong, 3 where something was not exercised."""
+    given = [name for name in MEAN if getattr(options, name) is not None]
+    if options.mean:
+        return _run_mean(options)
+    if given:
+        raise UsageError(f"--{given[0]} is for --mean")
     with usage_errors():
         configure_process(options)
         plan = _plan(options)
@@ -23,6 +32,29 @@ def run(options: argparse.Namespace) -> int:
         report = check.gradcheck(plan, progress)
     print_report(options, report.as_json(), report.lines(verbose=options.verbose))
     return 1 if not report.passed else UNEXERCISED if report.unexercised else 0
+
+
+def _run_mean(options: argparse.Namespace) -> int:
+    chosen = {name: getattr(options, name) for name in MEAN if getattr(options, name) is not None}
+    chosen = MEAN | chosen
+    with usage_errors():
+        configure_process(options)
+        if Path(options.task).suffix.lower() == ".xml":
+            raise UsageError("--mean is for tasks: a file has no cost")
+        scene = scene_options(options, "cone", "iterations", "ls_iterations", "horizon", "model")
+        task = make_task(options.task, **scene).replace(onset=chosen["onset"])
+        plan = check.plan_gradcheck(
+            task, options.contact, options.stiffness, seed=options.seed, damping=options.damping
+        )
+        found = [make_estimator(name, gamma=task.defaults.gamma, sigma=task.sigma) for name in chosen["estimators"]]
+        check_estimators(found, task)
+    path = {name: chosen[name] for name in ("samples", "span", "direction")}
+    with computing() as progress:
+        checks = check.check_mean(task, plan.cells, found, seed=options.seed, progress=progress, **path)
+    document = {"checks": [each.as_dict() for each in checks], "warnings": list(plan.warnings)}
+    print_report(options, document, [*lines_of(checks), *(f"warning: {text}" for text in plan.warnings)])
+    verdicts = {each.verdict for each in checks}
+    return 1 if "biased" in verdicts else UNEXERCISED if "undecided" in verdicts else 0
 
 
 def _plan(options: argparse.Namespace) -> GradcheckPlan:

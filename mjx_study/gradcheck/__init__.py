@@ -8,6 +8,7 @@ these cases apart, for every entry of a step's Jacobian.
 from mjx_study.choices import CHECKED_STIFFNESS as STIFFNESS
 from mjx_study.gradcheck.check import gradcheck
 from mjx_study.gradcheck.finding import Finding
+from mjx_study.gradcheck.mean import MeanCheck, check_mean
 from mjx_study.gradcheck.plan import CONTACT, GradcheckPlan, plan_gradcheck, plan_scene_gradcheck
 from mjx_study.gradcheck.report import GradcheckReport, StepCheck
 
@@ -17,7 +18,9 @@ __all__ = [
     "Finding",
     "GradcheckPlan",
     "GradcheckReport",
+    "MeanCheck",
     "StepCheck",
+    "check_mean",
     "gradcheck",
     "plan_gradcheck",
     "plan_scene_gradcheck",

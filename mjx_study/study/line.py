@@ -44,7 +44,7 @@ def line_of(task: Task, points: int, span: Sequence[float] | None, direction: st
         ValueError: there is no such direction.
     """
     theta = np.asarray(task.theta, float)
-    along = _direction(direction or "random", len(theta), seed)
+    along = direction_of(direction or "random", len(theta), seed)
     low, high = span or task.defaults.span or (-SPAN_SIGMAS * task.sigma, SPAN_SIGMAS * task.sigma)
     check_span((low, high))
     position = np.linspace(low, high, points)
@@ -52,7 +52,8 @@ def line_of(task: Task, points: int, span: Sequence[float] | None, direction: st
     return ThetaLine(position, along, tuple(jnp.asarray(origin + t * along, task.theta.dtype) for t in position))
 
 
-def _direction(direction: str, params: int, seed: int) -> Float[np.ndarray, " params"]:
+def direction_of(direction: str, params: int, seed: int) -> Float[np.ndarray, " params"]:
+    """A unit vector: random, or of one parameter; as `line_of`."""
     if params == 1:
         return np.ones(1)
     if direction == "random":

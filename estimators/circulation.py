@@ -1,0 +1,123 @@
+"""Whether an estimator's mean is the gradient of F, told from values of F alone: no reference gradient is needed."""
+
+from dataclasses import dataclass
+from typing import Final
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, Key
+
+from estimators.effective import ENOUGH_EFFECTIVE, effective_samples
+from estimators.estimator import ORACLES, Estimator, draw
+from estimators.pytree import register_pytree
+from estimators.statistics import summarise
+from estimators.types import Objective
+
+NODES: Final = 9
+"""Of the quadrature along a path."""
+SURE: Final = 3.29
+"""Standard errors of an interval of 99.9 %."""
+TOLERANCE: Final = 0.05
+"""Share of F's difference within which a mean counts as right."""
+
+
+@register_pytree
+@dataclass(frozen=True)
+class Circulation:
+    """The integral of an estimator's mean along a path of theta, against the difference of F. See `circulation`.
+
+    Attributes:
+        difference: F(end) - F(start), [cost].
+        gap: The integral less the difference, 0 for an unbiased estimator, [cost].
+        standard_error: Of the gap, [cost].
+        quadrature: Error of the integral's quadrature that is seen above its noise, [cost].
+        effective: n_eff behind the gap; below `ENOUGH_EFFECTIVE` the standard error says little.
+        num_nonfinite: Samples that were left out because they are not finite somewhere on the path.
+    """
+
+    difference: Float[Array, ""]
+    gap: Float[Array, ""]
+    standard_error: Float[Array, ""]
+    quadrature: Float[Array, ""]
+    effective: Float[Array, ""]
+    num_nonfinite: Int[Array, ""]
+
+    @property
+    def half_width(self) -> Float[Array, ""]:
+        """Of the interval about the gap: 99.9 %, and the quadrature's error, [cost]."""
+        return SURE * self.standard_error + self.quadrature
+
+    def verdict(self, tolerance: float = TOLERANCE) -> str:
+        """What the interval says: right (within a share of F's difference), biased, or undecided."""
+        gap, half, within = abs(float(self.gap)), float(self.half_width), tolerance * abs(float(self.difference))
+        if (gap > 0 and not float(self.effective) >= ENOUGH_EFFECTIVE) or float(self.quadrature) > within:
+            return "undecided"
+        return "right" if gap + half <= within else "biased" if gap > half else "undecided"
+
+
+def circulation(
+    estimator: Estimator,
+    objective: Objective,
+    start: Float[Array, " params"],
+    end: Float[Array, " params"],
+    key: Key[Array, ""],
+    num_samples: int,
+    *,
+    nodes: int = NODES,
+) -> Circulation:
+    """Integrate an estimator's mean from one theta to another.
+
+        sum_j w_j g_i(theta_j)^T (end - start) - (f_i(end) - f_i(start))
+
+    of every sample i, with the same keys everywhere: its mean is 0 if E g = grad F. The nodes are Gauss and Legendre's;
+    the error of the quadrature is the difference to the rule on every second of them, less three standard errors. With
+    one node this is a central difference of the mean cost against the estimator's mean in the middle.
+
+    Args:
+        estimator: With its options.
+        objective: What to differentiate.
+        start, end: Of the path, [param]; a few standard deviations of the noise apart, or less.
+        key: Source of all randomness; used up.
+        num_samples: At every node, >= 2.
+        nodes: Odd.
+
+    Returns:
+        The difference and the gap.
+
+    Raises:
+        ValueError: The nodes are not an odd number, or there are too few samples.
+    """
+    if nodes < 1 or nodes % 2 == 0:
+        raise ValueError(f"nodes must be an odd number; got {nodes}")
+    if num_samples < 2:
+        raise ValueError(f"num_samples must be at least 2; got {num_samples}")
+    points, weights, coarse = path_rule(nodes)
+    step = end - start
+    order = max(ORACLES[oracle].order for oracle in estimator.needs)
+
+    def along(theta):
+        return estimator(draw(estimator.needs, objective, theta, jax.random.clone(key), num_samples)).per_sample @ step
+
+    slopes = jnp.stack([along(start + t * step) for t in points])
+    keys = jax.random.split(jax.random.split(key)[order], num_samples)
+    first, last = (objective.evaluate(theta, jax.random.clone(keys)).value for theta in (start, end))
+    difference, gap = last - first, jnp.asarray(weights, slopes.dtype) @ slopes - (last - first)
+    rough = jnp.asarray(weights - coarse, slopes.dtype) @ slopes
+    found = summarise(jnp.stack([gap, difference, rough], axis=1))
+    quadrature = jnp.maximum(jnp.abs(found.mean[2]) - 3 * found.standard_error[2], 0.0)
+    alone = summarise(jnp.where(jnp.isfinite(rough), gap, jnp.nan)[:, None])
+    count = effective_samples(alone).count
+    return Circulation(found.mean[1], found.mean[0], found.standard_error[0], quadrature, count, found.num_nonfinite)
+
+
+def path_rule(
+    nodes: int,
+) -> tuple[Float[np.ndarray, " nodes"], Float[np.ndarray, " nodes"], Float[np.ndarray, " nodes"]]:
+    """Nodes on [0, 1], their weights, and weights of an interpolatory rule on every second node."""
+    points, weights = np.polynomial.legendre.leggauss(nodes)
+    coarse, some = np.zeros(nodes), points[::2]
+    moments = np.zeros(len(some))
+    moments[0] = 2.0
+    coarse[::2] = np.linalg.solve(np.polynomial.legendre.legvander(some, len(some) - 1).T, moments)
+    return (points + 1) / 2, weights / 2, coarse / 2

@@ -1,0 +1,81 @@
+"""The integral of a mean along a path against the difference of F: right, biased, undecided, and with what power."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from estimators import ESTIMATORS, make_estimator
+from estimators.circulation import circulation, path_rule
+from mjx_study.reference import FunctionObjective, Heaviside
+from tests.estimators import objectives
+
+HESSIAN = np.array([[1.0, 0.4, 0.0], [0.4, -0.5, 0.3], [0.0, 0.3, 0.8]])
+START, END = jnp.array([1.0, -1.5, 0.8]), jnp.array([1.6, -2.2, 1.3])
+BIASED = ("fobg_clipped", "fobg_truncated")
+
+
+def check(name: str, objective: Any, start=START, end=END, samples: int = 50_000, **options):
+    estimator = make_estimator(name, **{"sigma": objective.sigma, "max_norm": 1e9, "window": 99} | options)
+    run = jax.jit(lambda key: circulation(estimator, objective, start, end, key, samples, nodes=5))
+    return run(jax.random.key(0))
+
+
+@pytest.mark.parametrize("name", [name for name in ESTIMATORS if name not in BIASED])
+def test_what_is_unbiased_passes_on_a_smooth_objective(name: str) -> None:
+    """A quadratic, whose difference is known; a bias of a tenth would be found."""
+    found = check(name, objectives.quadratic(HESSIAN, 0.3))
+    exact = (END @ HESSIAN @ END - START @ HESSIAN @ START) / 2
+    assert abs(found.difference - exact) < 0.03 * abs(exact)
+    assert 2 * found.half_width < 0.1 * abs(found.difference)
+    assert found.verdict(0.1) == "right" and found.num_nonfinite == 0
+
+
+def test_a_clip_is_found() -> None:
+    found = check("fobg_clipped", objectives.quadratic(HESSIAN, 0.3), max_norm=1.0)
+    assert found.verdict() == "biased"
+    assert found.gap * found.difference < 0  # it falls short
+
+
+def test_a_jump_is_found_without_a_reference_gradient() -> None:
+    objective = FunctionObjective(Heaviside(), 0.1)
+    ends = jnp.array([-0.05]), jnp.array([0.1])
+    results = {
+        name: circulation(make_estimator(name), objective, *ends, jax.random.key(0), 4000) for name in ("zobg", "fobg")
+    }
+    assert results["fobg"].verdict() == "biased"
+    np.testing.assert_allclose(results["fobg"].gap, -results["fobg"].difference, rtol=1e-12)
+    assert results["zobg"].verdict(0.2) == "right"
+
+
+def test_few_samples_decide_nothing() -> None:
+    assert check("zobg", objectives.quadratic(HESSIAN, 0.3), samples=100).verdict() == "undecided"
+
+
+def test_the_rules_integrate_polynomials() -> None:
+    for nodes in (1, 3, 9):
+        points, weights, coarse = path_rule(nodes)
+        for power in range(2 * nodes):
+            assert abs(weights @ points**power - 1 / (power + 1)) < 1e-12
+        for power in range((nodes + 1) // 2):
+            assert abs(coarse @ points**power - 1 / (power + 1)) < 1e-12
+
+
+def test_a_path_too_long_for_its_nodes_is_not_judged_right() -> None:
+    """The error of the quadrature is part of the interval: five nodes, a wave of many periods."""
+    wave = objectives.OneStep(lambda x: jnp.sin(20 * x[0]), 1, 0.02)
+    found = check("fobg", wave, jnp.zeros(1), jnp.ones(1), 5000)
+    assert found.quadrature > 10 * found.standard_error and found.verdict() == "undecided"
+    assert check("fobg", wave, jnp.zeros(1), 0.05 * jnp.ones(1), 5000).verdict() == "right"
+
+
+def test_what_has_no_meaning_is_refused() -> None:
+    fobg = make_estimator("fobg")
+    with pytest.raises(ValueError, match="nodes must be an odd number; got 4"):
+        circulation(
+            make_estimator("fobg"), objectives.quadratic(HESSIAN, 0.3), START, END, jax.random.key(0), 9, nodes=4
+        )
+    with pytest.raises(ValueError, match="num_samples must be at least 2; got 1"):
+        circulation(fobg, objectives.quadratic(HESSIAN, 0.3), START, END, jax.random.key(0), 1)

@@ -1,0 +1,37 @@
+"""gradcheck --mean: through MuJoCo's default contact first order is biased, with the onset term it is not."""
+
+import jax.numpy as jnp
+import pytest
+
+from estimators import make_estimator
+from mjx_study.cli import main
+from mjx_study.gradcheck import check_mean
+from mjx_study.gradcheck.mean import lines_of
+from mjx_study.tasks import make_task
+from mjx_study.tasks.contact_grid import contact_grid
+
+
+@pytest.mark.slow
+def test_the_bias_of_first_order_is_found_and_is_gone_with_the_onset_term() -> None:
+    task = make_task("momentum_transfer").replace(theta=jnp.full(1, 0.3))
+    cells, _ = contact_grid(task, ("mujoco_default",))
+    chosen = [make_estimator(name) for name in ("fobg", "fobg_onset")]
+    plain, corrected = check_mean(task, cells, chosen, samples=400, seed=0)
+    assert plain.verdict == "biased" and plain.circulation.gap > 0.4 * abs(plain.circulation.difference)
+    assert corrected.verdict == "right"
+    assert 2 * corrected.circulation.half_width < 0.05 * abs(corrected.circulation.difference)
+    assert len(lines_of([plain, corrected])) >= 3
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["pusher", "--samples", "9"], "--samples is for --mean"),
+        (["model.xml", "--mean"], "--mean is for tasks: a file has no cost"),
+        (["tennis", "--mean", "--estimators", "delta"], "'delta' needs noise that is added to theta itself"),
+        (["tennis", "--mean", "--onset", "jump", "--estimators", "total_propagation"], "have no onset term"),
+    ],
+)
+def test_what_has_no_meaning_is_refused(arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["gradcheck", *arguments]) == 2
+    assert message in capsys.readouterr().err
