@@ -1,6 +1,7 @@
 """Options of mjx-study gradcheck."""
 
 import argparse
+import dataclasses
 
 from mjx_study.choices import CHECKED_STATES, CHECKED_STEPS, CHECKED_STIFFNESS
 from mjx_study.cli.options import (
@@ -60,8 +61,9 @@ def add(command: argparse.ArgumentParser) -> None:
     command.add_argument("--stock", action="store_true", help="check the derivative of mjx.step itself, too")
     command.add_argument("--mean", action="store_true", help="check the means of estimators in place of derivatives")
     for name, default in MEAN.items():
-        changes = {"line": f"with --mean: {OPTIONS[name].line}", "many": isinstance(default, tuple) or name == "span"}
-        unset = {"unset": "two sigma about theta"} if name == "span" else {}
-        add_option(command, OPTIONS[name], default, given=False, **changes, **unset)
+        option = dataclasses.replace(OPTIONS[name], line=f"with --mean: {OPTIONS[name].line}")
+        if name in ("estimators", "span"):
+            option = dataclasses.replace(option, many=True)
+        add_option(command, option, default, given=False)
     command.add_argument("--verbose", action="store_true", help="every entry of every finding")
     add_process_options(command)
