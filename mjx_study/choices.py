@@ -1,4 +1,4 @@
-"""What can be chosen by name, with a line about each; nothing here computes or imports what does."""
+"""Names that users choose from, with one line about each; imports nothing that computes."""
 
 import dataclasses
 from importlib import metadata
@@ -103,7 +103,7 @@ TASK_GROUP: Final = "mjx_study.tasks"
 
 
 def unknown_task(name: str, reason: str = "") -> str | None:
-    """What to say of a task's name that is neither ours, nor registered, nor `module:name`; or of one for a reason."""
+    """The message about a task's name that is unknown, or unusable for a reason; None for a possible one."""
     registered = sorted({point.name for point in metadata.entry_points(group=TASK_GROUP)})
     if (name in TASK_DESCRIPTIONS or name in registered or ":" in name) and not reason:
         return None

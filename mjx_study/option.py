@@ -1,7 +1,7 @@
-"""What can be chosen, each option described once: name, type, range, unit, and a line about it.
+"""Every option, described once: name, type, range, unit and one line of help.
 
-The command line, TOML files and the configurations of Python are checked against these descriptions. A configuration
-gives the default of each of its fields, and may narrow a range.
+The command line, TOML files and configurations in Python are checked against these descriptions. A configuration sets
+the defaults and may narrow a range.
 """
 
 import dataclasses
@@ -15,12 +15,12 @@ from estimators.catalogue import BASELINES, CATALOGUE, DENSITIES, VARIANCE_PROXI
 from mjx_study.choices import CONES, FAMILIES, INTEGRATORS, ONSETS, REFERENCE, SOLVERS
 
 MOST_VALUES: Final = 10_000
-"""Values of one list or range."""
+"""Most values of one list or range."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Interval:
-    """Numbers from low to high, as "(0, 1]" says it; an infinite end is in it only where its bracket is square."""
+    """An interval in the usual notation, such as "(0, 1]"; a square bracket at an infinite end includes infinity."""
 
     text: str
 
@@ -35,10 +35,11 @@ class Interval:
         return float(self.text[1:-1].split(",")[1])
 
     def __contains__(self, value: Any) -> bool:
-        if abs(value) > sys.float_info.max and isinstance(value, Integral):  # which no float can hold
+        if abs(value) > sys.float_info.max and isinstance(value, Integral):  # larger than any float
             return False
         above = value >= self.low if self.text[0] == "[" else value > self.low
-        return bool(above and (value <= self.high if self.text[-1] == "]" else value < self.high))  # of NumPy's, too
+        below = value <= self.high if self.text[-1] == "]" else value < self.high
+        return bool(above and below)
 
     def __str__(self) -> str:
         bracket, low, high = self.text[0], _plain(self.low), _plain(self.high)
@@ -51,21 +52,21 @@ class Interval:
 
 @dataclasses.dataclass(frozen=True)
 class Option:
-    """One thing that can be chosen.
+    """One option.
 
     Attributes:
-        name: of the field of a configuration.
-        kind: int, float, str, or bool, a flag on the command line.
-        metavar: what stands for a value in the help.
-        line: about it, for the help.
-        interval: where its numbers lie.
-        unit: of its numbers.
-        choices: names that it takes; in place of a number where it has an interval as well.
-        own: whether it takes `module:name` of one's own beside them.
-        label: of a value in messages, where that is not the name.
-        many: whether it is a list; what has it says so.
-        unset: what stands for it where it is not given.
-        flag: on the command line, where that is not the name.
+        name: name of the configuration's field.
+        kind: int, float, str or bool; bool is a flag on the command line.
+        metavar: placeholder for a value in the help.
+        line: one line of help.
+        interval: range of its numbers.
+        unit: unit of its numbers.
+        choices: accepted names; beside numbers if it has an interval as well.
+        own: whether it also takes a user's own `module:name`.
+        label: noun for a value in messages; empty for the name.
+        many: whether it takes a list; set by the configuration that holds it.
+        unset: default to show in the help if the configuration has none.
+        flag: flag on the command line; empty for the name.
     """
 
     name: str
@@ -82,14 +83,14 @@ class Option:
     flag: str = ""
 
     def within(self, interval: str) -> "Option":
-        """The same with another range."""
+        """The option with another range."""
         return dataclasses.replace(self, interval=Interval(interval))
 
     def check(self, value: Any) -> Any:
-        """The value as it came; of a list, every one of its values is checked.
+        """Check a value, or every value of a list, and return it.
 
         Raises:
-            ValueError: one is of another type, or out of range; the message goes after the option's name.
+            ValueError: wrong type or out of range; the message is meant to follow the option's name.
         """
         if not self.many:
             self._check_one(value)
@@ -103,10 +104,10 @@ class Option:
         return value
 
     def parse(self, text: str) -> Any:
-        """What text says: a number or a name, or a list of them; numbers of a list may be ranges FROM:TO:COUNT[:log].
+        """Parse text: a number, a name, or a list of them, in which numbers may be ranges FROM:TO:COUNT[:log].
 
         Raises:
-            ValueError: as `check`, or it is no number.
+            ValueError: as `check`, or not a number.
         """
         if not self.many:
             return self.check(self._parse_one(text.strip() if self.kind is not str else text))
@@ -116,7 +117,7 @@ class Option:
         return self.check(tuple(each for part in parts for each in self._parse_range(part)))
 
     def read(self, value: Any) -> Any:
-        """What a file says: a number, a name, a list of them, or, where it is a list, text as `parse` reads it.
+        """Read a value from a file: a number, a name, or a list of them; a list may be text as for `parse`.
 
         Raises:
             ValueError: as `parse`.
@@ -128,7 +129,7 @@ class Option:
         return tuple(self._typed(each) for each in self.check(value if isinstance(value, list) else [value]))
 
     def describe(self, default: Any = None) -> str:
-        """For the help: the line, the unit, and the default or what stands for it."""
+        """Help text: the line, the unit and the default."""
         default = ",".join(map(str, default)) if isinstance(default, tuple) else default
         told = self.unset if default is None else f"{default:g}" if isinstance(default, float) else str(default)
         return self.line + (f" [{self.unit}]" if self.unit else "") + (f" (default: {told})" if told else "")
@@ -171,7 +172,7 @@ class Option:
 
 
 def _whole(value: str | float) -> Any:
-    """A whole number where it is one, such as 1e5."""
+    """A whole number as int, such as 1e5; anything else unchanged."""
     try:
         return int(float(value)) if float(value).is_integer() else value
     except ValueError:
@@ -179,7 +180,7 @@ def _whole(value: str | float) -> Any:
 
 
 def _plain(value: Any) -> str:
-    """A number in few characters."""
+    """A number in few characters, for messages."""
     try:
         return f"{int(value)}" if value == int(value) and abs(value) < 1e16 else f"{value:g}"
     except (OverflowError, ValueError):
@@ -187,19 +188,19 @@ def _plain(value: Any) -> str:
 
 
 def _short(value: Any) -> str:
-    """A value as Python writes it, cut where it is long."""
+    """A value's repr, truncated."""
     try:
         text = repr(value)
-    except ValueError:  # a whole number of more digits than Python prints
+    except ValueError:  # an integer with more digits than Python prints
         return "a number of thousands of digits"
     return text if len(text) <= 60 else f"{text[:50]}..."
 
 
 def expand_range(text: str) -> list[float]:
-    """The numbers of FROM:TO:COUNT, evenly spaced, or of FROM:TO:COUNT:log, in equal ratios; of both ends exactly.
+    """The numbers of FROM:TO:COUNT, evenly spaced, or FROM:TO:COUNT:log, in equal ratios; both ends are exact.
 
     Raises:
-        ValueError: it is no such range, or of more than `MOST_VALUES` numbers.
+        ValueError: not such a range, or more than `MOST_VALUES` numbers.
     """
     parts = text.split(":")
     log = parts[3:] == ["log"]
@@ -235,59 +236,59 @@ def _choice(name: str, choices: Collection[str], metavar: str, line: str, **more
 MOST_SAMPLES: Final = "10000000]"
 TASKS: Final = "the task's"
 KINDS: Final = ("gradients", "descents", "landscapes")
-"""Of studies."""
+"""Kinds of study."""
 CONTACTS: Final = (*FAMILIES, REFERENCE)
-"""What a study may have in the place of a contact model."""
+"""Contact families of a study, and the analytic reference."""
 OPTIONS: Final[dict[str, Option]] = {
     option.name: option
     for option in (
-        _number("seed", int, "[0, 4294967295]", "N", "seed of the random numbers"),
+        _number("seed", int, "[0, 4294967295]", "N", "random seed"),
         _number("devices", int, "[1, 256]", "N", "CPU devices", unset="one per core; with JAX 0.11 one"),
-        _number("sigma", float, "(0, inf)", "S", "noise, in the unit of what it is added to", unset=TASKS),
-        _choice("noise", DENSITIES, "NAME", "density of the noise", unset=TASKS),
-        _choice("baseline", BASELINES, "NAME", "baseline of zeroth-order samples"),
-        Option("published", bool, "", "the published example's gamma, P, S2 and R, in place of the next four"),
+        _number("sigma", float, "(0, inf)", "S", "standard deviation of the noise", unset=TASKS),
+        _choice("noise", DENSITIES, "NAME", "noise density", unset=TASKS),
+        _choice("baseline", BASELINES, "NAME", "baseline of zeroth-order estimates"),
+        Option("published", bool, "", "use the published example's values of the next four options"),
         _number("gamma", float, "(0, inf]", "G", "AoBG's accuracy bound; inf for none", unset=TASKS),
-        _number("failure_probability", float, "(0, 1)", "P", "probability that epsilon's interval misses"),
-        _choice("variance_proxy", VARIANCE_PROXIES, "S2", f"in epsilon: {', '.join(VARIANCE_PROXIES)}"),
-        _number("radius", float, "[0, inf)", "R", "in epsilon: max_deviation or a number", choices=("max_deviation",)),
-        _number("max_norm", float, "(0, inf)", "G", "largest norm of a sample of fobg_clipped"),
-        _number("window", int, "[1, 1000000]", "H", "steps between cuts of fobg_truncated"),
-        _number("tolerance", float, "[0, 1)", "C", "of ddcg's test"),
-        _choice("weights", WEIGHTS, "NAME", "of interpolations: by the samples that they weigh, or the other half"),
-        _choice("onset", ONSETS, "NAME", "of contact, in first-order gradients: none, linear, or jump (costly)"),
-        _choice("kind", KINDS, "KIND", "what is computed", unset="by --iterations and --points"),
+        _number("failure_probability", float, "(0, 1)", "P", "failure probability of epsilon"),
+        _choice("variance_proxy", VARIANCE_PROXIES, "S2", f"variance in epsilon: {', '.join(VARIANCE_PROXIES)}"),
+        _number("radius", float, "[0, inf)", "R", "R in epsilon, or max_deviation", choices=("max_deviation",)),
+        _number("max_norm", float, "(0, inf)", "G", "fobg_clipped: norm at which samples are clipped"),
+        _number("window", int, "[1, 1000000]", "H", "fobg_truncated: steps between cuts"),
+        _number("tolerance", float, "[0, 1)", "C", "ddcg: tolerance of its discontinuity test"),
+        _choice("weights", WEIGHTS, "NAME", "weights of interpolations: plug_in, or cross_fitted (unbiased)"),
+        _choice("onset", ONSETS, "NAME", "onset term of first-order gradients: none, linear, or jump (costly)"),
+        _choice("kind", KINDS, "KIND", "kind of study", unset="from --iterations and --points"),
         _choice("estimators", CATALOGUE, "NAME", "see `mjx-study estimators`", label="estimator", own=True),
         _choice("contact", CONTACTS, "FAMILY", f"of: {', '.join(CONTACTS)}", label="contact family", unset=TASKS),
         _number("stiffness", float, "(0, inf)", "K", "contact stiffness", unit="N/m", unset=TASKS),
         _number("damping", float, "[0, inf)", "B", "contact damping", unit="N s/m", unset="the family's"),
         _choice("cone", CONES, "CONE", f"friction cone: {', '.join(CONES)}", unset="the MJCF's"),
         _number("timestep", float, "(0, 1)", "H", "timestep", unit="s", unset="the MJCF's"),
-        _number("horizon", int, "[1, 1000000]", "H", "steps", unset=TASKS),
-        Option("model", str, "FILE.xml", "an MJCF in place of the task's own"),
-        _number("theta", float, "(-inf, inf)", "X", "parameters", unset=TASKS),
+        _number("horizon", int, "[1, 1000000]", "H", "number of steps", unset=TASKS),
+        Option("model", str, "FILE.xml", "MJCF that replaces the task's own"),
+        _number("theta", float, "(-inf, inf)", "X", "policy parameters", unset=TASKS),
         _number("samples", int, "[1, " + MOST_SAMPLES, "N", "samples in each batch", unset=TASKS),
-        _number("reference_samples", int, "[3, " + MOST_SAMPLES, "N", "pairs of rollouts behind each reference"),
-        _number("evaluation_samples", int, "[2, " + MOST_SAMPLES, "N", "rollouts behind a final cost"),
+        _number("reference_samples", int, "[3, " + MOST_SAMPLES, "N", "pairs of rollouts for each reference"),
+        _number("evaluation_samples", int, "[2, " + MOST_SAMPLES, "N", "rollouts for the cost of a final policy"),
         _number("chunk_size", int, "[1, " + MOST_SAMPLES, "N", "samples per device and call", unset="by the samples"),
-        _number("confidence", float, "(0, 1)", "P", "confidence of the reported intervals"),
-        _number("seeds", int, "[1, 100000]", "N", "batches, or descents, of each"),
-        _number("iterations", int, "[1, 10000000]", "N", "of the optimiser", unset=TASKS),
-        Option("optimizer", str, "NAME", "of optax"),
+        _number("confidence", float, "(0, 1)", "P", "confidence level of the intervals"),
+        _number("seeds", int, "[1, 100000]", "N", "number of batches, or of descents"),
+        _number("iterations", int, "[1, 10000000]", "N", "iterations of the optimiser", unset=TASKS),
+        Option("optimizer", str, "NAME", "optax optimiser"),
         _number("learning_rate", float, "(0, inf)", "R", "learning rate", unset=TASKS),
         _number("decay", float, "[0, 2]", "A", "learning rate / i^A", unset=TASKS),
-        _number("network", int, "[1, 100000]", "N", "hidden widths of a tanh network as policy"),
+        _number("network", int, "[1, 100000]", "N", "hidden widths of a tanh network that replaces the policy"),
         _number("points", int, "[2, 100000]", "N", "points on the line"),
         _number("span", float, "(-inf, inf)", "LO,HI", "range of the line", unset=TASKS),
         _number("solref", float, "(-inf, inf)", "A;B", "contact models in MuJoCo's terms, every A with every B"),
-        _number("solimp", float, "(-inf, inf)", "D0,D1,W,M,P", "with them; several separated by ;"),
+        _number("solimp", float, "(-inf, inf)", "D0,D1,W,M,P", "solimp to combine with them; several separated by ;"),
         Option("direction", str, "DIR", "random, or a parameter's index", unset="random"),
         _number("states", int, "[1, 1000]", "N", "states to check"),
         _choice("integrator", INTEGRATORS, "NAME", f"integrator: {', '.join(INTEGRATORS)}", unset="the MJCF's"),
-        _choice("solver", SOLVERS, "NAME", f"of the constraints: {', '.join(SOLVERS)}", unset="the MJCF's"),
-        _number("ls_iterations", int, "[1, 100000]", "N", "of its line search", unset="the MJCF's"),
-        _number("frames", int, "[1, 100]", "N", "pictures in the strip"),
-        _number("slow", float, "(0, 1000]", "FACTOR", "slow motion"),
+        _choice("solver", SOLVERS, "NAME", f"constraint solver: {', '.join(SOLVERS)}", unset="the MJCF's"),
+        _number("ls_iterations", int, "[1, 100000]", "N", "iterations of the solver's line search", unset="the MJCF's"),
+        _number("frames", int, "[1, 100]", "N", "frames in the film strip"),
+        _number("slow", float, "(0, 1000]", "FACTOR", "slow-motion factor"),
     )
 }  # fmt: skip
 """Every option by its name."""
@@ -297,20 +298,20 @@ class Checked:
     """Base of a configuration, a frozen dataclass whose fields are options: each is checked when it is made.
 
     Attributes:
-        ranges: of options that this configuration narrows.
+        ranges: intervals of the options that this configuration narrows.
     """
 
     ranges: ClassVar[dict[str, str]] = {}
 
     @classmethod
     def option(cls, name: str) -> Option:
-        """An option as this configuration has it: its range, and whether it is a list."""
+        """An option with this configuration's range, and whether it is a list here."""
         option = OPTIONS[name].within(cls.ranges[name]) if name in cls.ranges else OPTIONS[name]
         return dataclasses.replace(option, many="tuple" in str(cls.__annotations__[name]))
 
     @classmethod
     def default(cls, name: str) -> Any:
-        """What the configuration takes where an option is not given."""
+        """The configuration's default for an option."""
         return next(field.default for field in dataclasses.fields(cls) if field.name == name)  # type: ignore[arg-type]
 
     def __post_init__(self) -> None:
@@ -324,10 +325,10 @@ class Checked:
 
 
 def check(option: Option, value: Any) -> Any:
-    """A value that an option takes.
+    """Check a value and return it.
 
     Raises:
-        ValueError: with the option's name.
+        ValueError: names the option.
     """
     try:
         return option.check(value)

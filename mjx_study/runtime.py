@@ -15,13 +15,13 @@ from mjx_study.choices import PRECISIONS
 
 
 def configure(*, precision: str = "float64", cpu_devices: int | None = None, cache: str | Path | None = None) -> None:
-    """Set JAX up for a study, and have MuJoCo's warnings on standard error; call it before the first array is made.
+    """Set up JAX for a study and send MuJoCo's warnings to standard error; call it before making any array.
 
     Args:
-        precision: float64 or float32. Stiff contact needs float64: two equal float32 programs of one stiff rollout
-            differ in the second digit.
-        cpu_devices: CPU devices that JAX shows, so that samples use as many cores; None for `default_cpu_devices()`.
-        cache: folder of compiled programs that are kept between runs; None for `default_cache()`.
+        precision: float64 or float32. Stiff contact needs float64: equivalent float32 programs of one rollout differ in
+            the second digit.
+        cpu_devices: number of CPU devices, that is, of cores that samples use; None for `default_cpu_devices()`.
+        cache: folder for compiled programs kept between runs; None for `default_cache()`.
 
     Raises:
         ValueError: unknown precision, or fewer than one device.
@@ -56,7 +56,7 @@ def default_cpu_devices() -> int:
 
 
 def default_cache() -> Path | None:
-    """Compiled programs of this kind of machine: `$XDG_CACHE_HOME/mjx-study/<processor>`; None without a home folder.
+    """Default folder of compiled programs, `$XDG_CACHE_HOME/mjx-study/<processor>`; None without a home folder.
 
     A program compiled for one processor may use instructions that another lacks, so each has its own folder.
     """
@@ -88,7 +88,7 @@ def precision() -> str:
 
 
 def environment() -> dict[str, Any]:
-    """What a result depends on besides its configuration: versions, machine, devices, precision."""
+    """Versions, machine, devices and precision, on which results depend beside their configuration."""
     names = ("mjx-study", "mujoco", "mujoco-mjx", "jax", "jaxlib", "numpy")
     return {
         "versions": {name: metadata.version(name) for name in names},

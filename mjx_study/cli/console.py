@@ -1,4 +1,4 @@
-"""What the command line prints: tables, numbers with their intervals."""
+"""Printed tables, and numbers with their intervals."""
 
 import json
 import math

@@ -1,4 +1,4 @@
-"""What the commands share: options, their checks, one line for what is wrong, and a clean end when interrupted."""
+"""Shared by the commands: options and their checks, one-line errors, and a clean end when interrupted."""
 
 import argparse
 import dataclasses
@@ -18,7 +18,7 @@ from mjx_study.option import OPTIONS, Checked, Option
 from mjx_study.study.configuration import Progress
 
 INTERRUPTED = "nothing was written"
-"""What is said after "interrupted" where a command has nothing better to say."""
+"""Default continuation of "interrupted; ..."."""
 ENDINGS: Final = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated", signal.SIGHUP: "hung up"}
 """Signals that end a command with one line and exit code 128 + their number."""
 
@@ -50,15 +50,15 @@ def add_option(
     read: Callable[[str], Any] | None = None,
     **changes: Any,
 ) -> None:
-    """An option of a command.
+    """Add an option to a command.
 
     Args:
-        command: that gets it.
-        option: its description.
-        default: where it is not given.
-        given: whether the command's namespace holds that default; otherwise None, and a configuration has it.
-        read: of text, in place of the option's own `parse`.
-        **changes: of the description.
+        command: the command's parser.
+        option: description of the option.
+        default: default value, shown in the help.
+        given: whether the parsed namespace holds the default; otherwise None, for a configuration to fill in.
+        read: parser of the text; None for the option's own.
+        **changes: changes of the description.
     """
     option = dataclasses.replace(option, **changes)
 
@@ -83,13 +83,13 @@ def add_option(
 
 
 def add_options(command: argparse.ArgumentParser, owner: type[Checked], *names: str, **changes: dict[str, Any]) -> None:
-    """Options of a configuration, by name, with changes of their descriptions."""
+    """Add options of a configuration by name, with changes of their descriptions."""
     for name in names:
         add_option(command, owner.option(name), owner.default(name), given=False, **changes.get(name, {}))
 
 
 def add_task_options(command: argparse.ArgumentParser, *, files: str = "") -> None:
-    """The task, what may replace its own settings, and how it is computed."""
+    """Add the task, options that override its settings, and process options."""
     add_task_argument(command, files)
     for name in ("sigma", "cone", "horizon", "model"):
         add_option(command, OPTIONS[name])
@@ -97,7 +97,7 @@ def add_task_options(command: argparse.ArgumentParser, *, files: str = "") -> No
 
 
 def add_task_argument(command: argparse.ArgumentParser, files: str = "") -> None:
-    """The task, by its name; or a file, where `files` says so in the help."""
+    """Add the task, by name, or by file if `files` describes that."""
 
     def read(text: str) -> str:
         if not (files and text.lower().endswith(".xml")) and (told := unknown_task(text)):
@@ -118,7 +118,7 @@ def add_theta_option(command: argparse.ArgumentParser, purpose: str) -> None:
 
 
 def add_folder_options(command: argparse.ArgumentParser) -> None:
-    """The folder of a study."""
+    """Add the folder of a study."""
     command.add_argument(
         "--output", type=Path, metavar="DIR", help="folder of the study: the numbers and the figures; resumable"
     )
@@ -128,7 +128,7 @@ def add_folder_options(command: argparse.ArgumentParser) -> None:
 def add_contact_options(
     command: argparse.ArgumentParser, stiffness: str = "the task's sweep", *, many: bool = True, analytic: bool = True
 ) -> None:
-    """The contact models; one or many, the analytic reference among them or not."""
+    """Add the contact models: one or many, with or without the analytic reference."""
     add_option(command, dataclasses.replace(OPTIONS["stiffness"], many=many), unset=stiffness)
     contact = dataclasses.replace(OPTIONS["contact"], many=many)
     add_option(command, contact if analytic else dataclasses.replace(contact, choices=tuple(FAMILIES)))
@@ -136,7 +136,7 @@ def add_contact_options(
 
 
 def add_scene_options(command: argparse.ArgumentParser) -> None:
-    """What replaces an MJCF's own <option>: what MJX lacks can be changed without editing the file."""
+    """Add overrides of an MJCF's <option>, so that a model can be adapted to MJX without editing its file."""
     from mjx_study.simulation.limitations import FLAGS
 
     for name in ("integrator", "solver"):
@@ -150,7 +150,7 @@ def add_scene_options(command: argparse.ArgumentParser) -> None:
 
 
 def scene_options(options: argparse.Namespace, *names: str) -> dict[str, Any]:
-    """Those of the options, and of `add_scene_options`, that are given, as `load_scene` takes them."""
+    """The given scene options and the named ones, as arguments of `load_scene`."""
     given = {name: getattr(options, name, None) for name in ("integrator", "solver", "disable_flags", *names)}
     return {name: value for name, value in given.items() if value is not None}
 
@@ -243,7 +243,7 @@ def _leave(message: str, code: int) -> NoReturn:
 
 
 def attempt(write: Callable[[], list[Path]]) -> tuple[list[Path], str | None]:
-    """What a function wrote; or nothing, and why: a full disk must not cost the numbers, which are printed anyway."""
+    """Paths that a function wrote, or the reason why it could not: a full disk must not cost the printed numbers."""
     try:
         return write(), None
     except OSError as error:

@@ -51,7 +51,7 @@ LARGEST = 1e10  # beyond this MuJoCo itself calls a coordinate bad
 
 @dataclasses.dataclass(frozen=True)
 class Rollout:
-    """What was simulated; controls are those of each step, one row fewer than there are states.
+    """A simulated rollout; there is one control fewer than states.
 
     Attributes:
         title: in one line.
@@ -71,7 +71,7 @@ class Rollout:
 
     @property
     def time(self) -> np.ndarray:
-        """Of each state [s]."""
+        """Time of each state [s]."""
         return np.arange(len(self.qpos)) * self.model.opt.timestep
 
     @property

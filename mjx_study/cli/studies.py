@@ -1,4 +1,4 @@
-"""What the commands that run studies share: fields from options, the folder, and what is drawn of the result."""
+"""Shared by the commands that run studies: options to configuration, the folder, figures."""
 
 import argparse
 import dataclasses
@@ -20,7 +20,7 @@ RESUMABLE = "the same command goes on where it stopped"
 
 
 def study_fields(options: argparse.Namespace) -> dict[str, Any]:
-    """Fields of a `StudyConfig` that are given as options."""
+    """Fields of a `StudyConfig` set by the options."""
     given = {field.name: getattr(options, field.name, None) for field in dataclasses.fields(StudyConfig)}
     return {name: value for name, value in given.items() if value is not None and name not in ("tasks", "theta")}
 

@@ -70,7 +70,7 @@ def _fields(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def _schema() -> type[BaseModel]:
-    """Of a TOML file: the configuration's fields as their options read them."""
+    """Schema of a TOML file: the configuration's fields, as their options read them."""
     own = {"tasks": TASKS.read, "direction": _direction, "solref": solref, "solimp": solimp}
 
     def reader(name: str) -> Callable[[Any], Any]:
@@ -128,7 +128,7 @@ def _document(dataset: xr.Dataset, computed: int, folder: Path) -> dict[str, Any
 
 
 def _tail(dataset: xr.Dataset, computed: int, plan: StudyPlan) -> list[str]:
-    """What was computed, and what there is to warn about beyond what the head said."""
+    """The end of the output: what was computed, and warnings that the head did not give."""
     sizes = ", ".join(f"{name} {size}" for name, size in dataset.sizes.items())
     lines = [f"computed {computed} cells; {sizes}"]
     lines += [f"warning: {message}" for message in warnings_of(dataset) if message not in plan.warnings]

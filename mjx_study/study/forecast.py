@@ -145,6 +145,6 @@ def _spent(config: StudyConfig, cell: StudyCell, arrays: dict[str, Any]) -> floa
 
 
 def _size(plan: StudyPlan, cell: StudyCell) -> int:
-    """What the time of a cell is proportional to: samples, steps and iterations."""
+    """The work of a cell, to which its time is proportional: samples times steps times iterations."""
     group = plan.groups[cell.group]
     return cell.samples * group.task.horizon * (group.recipe.iterations if group.recipe else 1)

@@ -1,4 +1,4 @@
-"""What follows from a configuration for a task: estimators, recipe, parameters."""
+"""A configuration resolved for a task: its estimators, recipe and parameters."""
 
 import dataclasses
 from collections.abc import Iterable, Sequence

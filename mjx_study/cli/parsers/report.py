@@ -14,5 +14,5 @@ example:
 
 def add(command: argparse.ArgumentParser) -> None:
     """Add them."""
-    command.add_argument("folder", type=Path, metavar="FOLDER", help="of a study, made by sweep")
+    command.add_argument("folder", type=Path, metavar="FOLDER", help="folder of a study")
     command.add_argument("--output", type=Path, metavar="FILE.html", help="default: FOLDER/report.html")
