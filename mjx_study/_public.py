@@ -16,8 +16,10 @@ from mjx_study.simulation.contact import (
     solref_from_stiffness,
     stiffness_from_solref,
 )
-from mjx_study.simulation.dynamics import State, initial_state, rollout, step, step_jacobian
-from mjx_study.simulation.scene import Scene, SceneError, load_scene, put_scene
+from mjx_study.simulation.drop_in import differentiable_mjx, solver_residual, step
+from mjx_study.simulation.dynamics import State, initial_state, rollout, step_jacobian
+from mjx_study.simulation.dynamics import step as scene_step
+from mjx_study.simulation.scene import Scene, SceneError, check_model, load_scene, put_scene
 from mjx_study.study.configuration import StudyConfig
 from mjx_study.study.plan import estimators_of, plan_study
 from mjx_study.study.run import load_study, run_study
@@ -45,8 +47,10 @@ __all__ = [
     "TASKS",
     "Task",
     "apply_contact",
+    "check_model",
     "configure",
     "contact_model",
+    "differentiable_mjx",
     "effective_mass",
     "estimators_of",
     "family_model",
@@ -59,8 +63,10 @@ __all__ = [
     "put_scene",
     "rollout",
     "run_study",
+    "scene_step",
     "simulate",
     "solref_from_stiffness",
+    "solver_residual",
     "step",
     "step_jacobian",
     "stiffness_from_solref",

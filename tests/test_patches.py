@@ -1,5 +1,6 @@
 """The terms that stand in for MJX's have its values, and the derivatives that its own lack."""
 
+import threading
 from typing import Any
 
 import jax
@@ -99,38 +100,47 @@ def test_a_rotation_has_its_derivative_at_no_angle() -> None:
 
 
 def test_mjxs_own_functions_are_back_afterwards() -> None:
-    before = {key: original(*key) for key in patches._REPLACED}
+    still, slow = jnp.array([1.0, 0, 0, 0]), jnp.full(3, 1e-9)  # too slow for MJX to have a derivative
+    turn = jax.jit(lambda velocity: original("math", "quat_integrate")(still, velocity, 0.1)[1])
+    stock = float(jax.grad(turn)(slow)[0])
     with pytest.raises(KeyError), patches.patched(), patches.patched():
-        assert all(original(*key) is patches._REPLACED[key] for key in before)
+        assert float(jax.grad(turn)(slow)[0]) == pytest.approx(0.05)
         raise KeyError
-    assert all(original(*key) is function for key, function in before.items())
+    assert float(jax.grad(turn)(slow)[0]) == stock != pytest.approx(0.05)
+
+
+def test_other_threads_are_left_alone() -> None:
+    chosen: list[Any] = []
+    with patches.patched():
+        thread = threading.Thread(target=lambda: chosen.append(patches._CHOSEN.value))
+        thread.start()
+        thread.join()
+        assert patches._CHOSEN.value
+    assert chosen == [()]
 
 
 def test_another_mjx_is_an_error_and_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    own = original("constraint", "_kbi")
     monkeypatch.setattr(patches, "_REPLACED", {**patches._REPLACED, ("math", "no_such_function"): jnp.sin})
     with pytest.raises(RuntimeError, match="no math.no_such_function"), patches.patched():
         pytest.fail("nothing may be traced")
-    assert original("constraint", "_kbi") is own
+    assert not patches._CHOSEN.value
 
 
 def test_tendon_springs_are_linear_at_rest() -> None:
-    """Zero in value; in derivative what is missing where MJX's two halves meet."""
+    """Also where MJX's two halves meet, each with derivative zero."""
     xml = """<mujoco><worldbody><body><joint name="x" type="slide"/><geom size=".1" mass="1"/></body></worldbody>
     <tendon><fixed stiffness="100" springlength="0"><joint joint="x" coef="2"/></fixed></tendon></mujoco>"""
     host = mujoco.MjModel.from_xml_string(xml)
     model = mjx.put_model(host)
     data = mjx.put_data(host, mujoco.MjData(host))
 
-    def gap(x):
+    def force(x):
         moved = mjx.kinematics(model, data.replace(qpos=x[None]))
-        return patches.tendon_spring_gap(model, mjx.tendon(model, mjx.com_pos(model, moved)))[0]
+        return patches.springs_and_dampers(model, mjx.tendon(model, mjx.com_pos(model, moved)))[0]
 
-    program = jax.jit(jax.value_and_grad(gap))
-    assert patches.has_tendon_springs(model)
+    program = jax.jit(jax.value_and_grad(force))
     assert [float(part) for part in program(jnp.zeros(()))] == [0.0, -400.0]
-    assert [float(part) for part in program(jnp.array(0.1))] == [0.0, 0.0]
-    assert not patches.has_tendon_springs(load_scene("pusher").model)
+    assert [float(part) for part in program(jnp.array(0.1))] == [-40.0, -400.0]
 
 
 @pytest.mark.parametrize("place", ["inside", "outside", "edge", "above", "axis", "middle"])

@@ -13,6 +13,7 @@ solve has converged; `residual` measures that, and every result carries it.
 MJX's constraint rows are private (`Data._impl.efc_*`) and are read only here.
 """
 
+from collections.abc import Callable
 from typing import Any, Final
 
 import jax
@@ -22,7 +23,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from mjx_study.simulation._mjx import mjx
-from mjx_study.simulation.patches import patched
+from mjx_study.simulation.patches import AT_FIRST_TOUCH, patched
 from mjx_study.simulation.scene import num_constraint_rows
 
 _ELLIPTIC = mujoco.mjtCone.mjCONE_ELLIPTIC
@@ -184,12 +185,15 @@ def solve_to_rounding(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]:
     return qacc
 
 
-def solve(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]:
+def solve(
+    model: mjx.Model, data: mjx.Data, solver: Callable[[mjx.Model, mjx.Data], Float[Array, " nv"]] = run_solver
+) -> Float[Array, " nv"]:
     """The constrained acceleration with its implicit derivative, exact in forward and reverse mode.
 
     Args:
         model: the model on the device; its array leaves may be traced and differentiated.
         data: state after `mjx.fwd_acceleration`; `qacc_warmstart` starts the loop and is not differentiated.
+        solver: what finds the acceleration.
 
     Returns:
         qacc [m/s^2 or rad/s^2].
@@ -203,7 +207,7 @@ def solve(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]:
     return jax.lax.custom_root(
         f=lambda qacc: imbalance(model, data, qacc),
         initial_guess=data.qacc_warmstart,
-        solve=lambda _, __: jax.lax.stop_gradient(run_solver(model, data)),
+        solve=lambda _, __: jax.lax.stop_gradient(solver(model, data)),
         tangent_solve=tangent_solve,
     )
 
@@ -244,7 +248,7 @@ def at_onset(model: mjx.Model, data: mjx.Data, members: Float[Array, " rows"], o
         members: 1 for these rows, 0 for those left unchanged.
         on: whether they are active.
     """
-    with patched(touching=True):
+    with patched(AT_FIRST_TOUCH):
         touching: Any = mjx.make_constraint(model, data)._impl
     rows: Any = data._impl
     chosen, acts = members > 0, jnp.where(on, 1.0, 0.0).astype(rows.efc_J.dtype)

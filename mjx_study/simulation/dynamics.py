@@ -28,7 +28,7 @@ from estimators.pytree import register_pytree
 from mjx_study.simulation import constraint
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.integration import integrate_position
-from mjx_study.simulation.patches import has_tendon_springs, patched, tendon_spring_gap
+from mjx_study.simulation.patches import patched
 from mjx_study.simulation.scene import Scene
 
 
@@ -157,11 +157,12 @@ def rollout(
 
 
 def position_stage(scene: Scene, model: mjx.Model, qpos: Float[Array, " nq"]) -> mjx.Data:
-    return _fwd_position(model, scene.template.replace(qpos=qpos))
+    return fwd_position(model, scene.template.replace(qpos=qpos))
 
 
 @jax.jit
-def _fwd_position(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+def fwd_position(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """MJX's own, patched."""
     with patched():
         return mjx.fwd_position(model, data)
 
@@ -178,8 +179,6 @@ def force_stage(
     with patched():
         data = mjx.make_constraint(model, data)  # again: aref depends on qvel
         data = mjx.fwd_velocity(model, data)
-        if has_tendon_springs(model):
-            data = data.replace(qfrc_passive=data.qfrc_passive + tendon_spring_gap(model, data))
         data = mjx.fwd_actuation(model, data)
         return mjx.fwd_acceleration(model, data)
 
@@ -197,7 +196,7 @@ def advance_velocity(
 
 @jax.jit
 def _constrained_update(model: mjx.Model, data: mjx.Data, qvel: Array, act: Array, control: Array, warmstart: Array):
-    data = force_stage(model, _fwd_position(model, data), qvel, act, control)
+    data = force_stage(model, fwd_position(model, data), qvel, act, control)
     qacc = checkpoint_name(constraint.solve(model, data.replace(qacc_warmstart=warmstart)), "qacc")
     return *advance_velocity(model, data, qacc), qacc, constraint.residual(model, data, qacc)
 
@@ -265,8 +264,8 @@ def step_jacobian(
 
 @jax.jit
 def _jacobian(model: mjx.Model, template: mjx.Data, qpos: Array, qvel: Array, act: Array, control: Array, qacc: Array):
-    def position_stage(qpos):
-        return _fwd_position(model, template.replace(qpos=qpos))
+    def positions(qpos):
+        return fwd_position(model, template.replace(qpos=qpos))
 
     def equations(data, qvel, act, control, qacc):
         data = force_stage(model, data, qvel, act, control)
@@ -276,9 +275,9 @@ def _jacobian(model: mjx.Model, template: mjx.Data, qpos: Array, qvel: Array, ac
         push = lambda direction: jax.jvp(function, (point,), (direction,))[1]  # noqa: E731
         return jax.vmap(push, out_axes=-1)(jnp.eye(point.shape[0], dtype=point.dtype))
 
-    positioned = position_stage(qpos)
+    positioned = positions(qpos)
     blocks = [
-        (lambda x: equations(position_stage(x), qvel, act, control, qacc), qpos),
+        (lambda x: equations(positions(x), qvel, act, control, qacc), qpos),
         (lambda x: equations(positioned, x, act, control, qacc), qvel),
         (lambda x: equations(positioned, qvel, x, control, qacc), act),
         (lambda x: equations(positioned, qvel, act, x, qacc), control),
@@ -313,6 +312,6 @@ def _runge_kutta(scene: Scene, model: mjx.Model, state: State, control: Float[Ar
     if state.act.size == 0:
         return State(qpos, qvel, state.act, qacc)
     # MJX's own advance of the activation, with its clamping
-    data = force_stage(model, position_stage(scene, model, state.qpos), state.qvel, state.act, control)
+    data = smooth_stages(scene, model, state, control)
     act = mjx.euler(model, data.replace(act_dot=mean[2], qacc=data.qacc_smooth)).act
     return State(qpos, qvel, act, qacc)

@@ -9,12 +9,14 @@ import jax.numpy as jnp
 import mujoco
 from jaxtyping import Array, Float
 
+from mjx_study.simulation._mjx import mjx
+
 _FREE, _BALL = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL)
 _SMALL = 1e-4  # [rad^2]; the series' first omitted term is below 1e-16 of the result
 
 
 def integrate_position(
-    host: mujoco.MjModel,
+    host: mujoco.MjModel | mjx.Model,
     qpos: Float[Array, " nq"],
     qvel: Float[Array, " nv"],
     timestep: Float[Array, ""] | float,
@@ -41,7 +43,7 @@ def integrate_position(
 
 
 def difference_position(
-    host: mujoco.MjModel, start: Float[Array, " nq"], end: Float[Array, " nq"]
+    host: mujoco.MjModel | mjx.Model, start: Float[Array, " nq"], end: Float[Array, " nq"]
 ) -> Float[Array, " nv"]:
     """The velocity that moves from `start` to `end` in unit time, the inverse of `integrate_position`.
 

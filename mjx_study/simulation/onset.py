@@ -132,7 +132,7 @@ def corrected_rollout(
         moved = difference_position(scene.host, fixed.qpos, state.qpos)
         velocity = shift @ (moved - scene.timestep * (state.qvel - fixed.qvel))
         carried = integrate_position(scene.host, fixed.qpos, velocity, scene.timestep)
-        shifted = State(state.qpos + _tangent(carried), state.qvel + _tangent(velocity), state.act, fixed.warmstart)
+        shifted = State(state.qpos + tangent_of(carried), state.qvel + tangent_of(velocity), state.act, fixed.warmstart)
         if jacobian:
             pairs = (
                 (shifted.qpos, fixed.qpos),
@@ -144,9 +144,9 @@ def corrected_rollout(
             qvel, act = fixed_after.qvel + change[: scene.host.nv], fixed_after.act + change[scene.host.nv :]
         else:
             stepped, _ = step(scene, model, shifted, control)
-            qvel, act = fixed_after.qvel + _tangent(stepped.qvel), fixed_after.act + _tangent(stepped.act)
-        qvel = qvel + _tangent(spread @ moved)
-        qpos = fixed_after.qpos + _tangent(integrate_position(scene.host, shifted.qpos, qvel, scene.timestep))
+            qvel, act = fixed_after.qvel + tangent_of(stepped.qvel), fixed_after.act + tangent_of(stepped.act)
+        qvel = qvel + tangent_of(spread @ moved)
+        qpos = fixed_after.qpos + tangent_of(integrate_position(scene.host, shifted.qpos, qvel, scene.timestep))
         following = State(qpos, qvel, act, fixed_after.warmstart)
         return following, (following, control)
 
@@ -168,19 +168,14 @@ def _corrections(
     slots: int,
 ) -> tuple[Float[Array, "horizon nv nv"], Float[Array, "horizon nv nv"], OnsetCounts]:
     """(1 - s) Delta_k n^T / D and s Delta_{k-1} n^T / D of every step, zero where no contact begins, and counts."""
-    timestep = scene.timestep
-    travel = timestep * speed
+    travel = scene.timestep * speed
     steps, guards, used, found = find_onsets(distance, travel, slots)
 
     def term(index, guard):
         pick = lambda leaf: jnp.stack([leaf[index], leaf[index - 1]])  # noqa: E731
         states, inputs = jax.tree.map(pick, before), pick(controls)
-        jumps, free, normal = jump_of_velocity(scene, model, states, inputs, guard)
-        share = distance[index, guard] / travel[index, guard]
-        least = timestep**2 * jnp.abs(normal @ free)
-        cell = jnp.minimum(travel[index, guard], -least)
-        here, previous = (jnp.outer(jump, normal) / cell for jump in jumps)
-        return (1 - share) * here, share * previous, travel[index, guard] > -least
+        positioned = position_stage(scene, model, before.qpos[index])
+        return onset_term(model, positioned, states, inputs, guard, distance[index, guard], travel[index, guard])
 
     here, previous, narrow = jax.vmap(term)(steps, guards)
     keep = used[:, None, None]
@@ -200,23 +195,47 @@ def find_onsets(
         travel: of each guard in the step before, by the velocity that it ends with.
         slots: most onsets to return.
     """
-    begins = (distance < 0) & (travel < 0) & (distance - travel > -TOUCHING * travel)
-    begins = begins.at[0].set(False)
+    begins = onset_begins(distance, travel).at[0].set(False)
     (flat,) = jnp.nonzero(begins.reshape(-1), size=slots, fill_value=begins.size)
     used = flat < begins.size
     steps, guards = jnp.divmod(jnp.where(used, flat, begins.shape[1]), begins.shape[1])
     return steps, guards, used, jnp.sum(begins)
 
 
+def onset_begins(distance: Float[Array, "*steps guards"], travel: Float[Array, "*steps guards"]) -> Bool[Array, "..."]:
+    """Whether contact begins at a step, by each guard before it and the guard's travel in the step before that."""
+    return (distance < 0) & (travel < 0) & (distance - travel > -TOUCHING * travel)
+
+
+def onset_term(
+    model: mjx.Model,
+    positioned: mjx.Data,
+    states: State,
+    controls: Float[Array, "cases nu"],
+    guard: Int[Array, ""],
+    distance: Float[Array, ""],
+    travel: Float[Array, ""],
+) -> tuple[Float[Array, "nv nv"], Float[Array, "nv nv"], Bool[Array, ""]]:
+    """(1 - s) Delta_k n^T / D, s Delta_{k-1} n^T / D, and whether D was bounded, of one onset.
+
+    Arguments are those of `jump_of_velocity`; its cases are steps k and k - 1, or k for both.
+    """
+    jumps, free, normal = jump_of_velocity(model, positioned, states, controls, guard)
+    share, least = distance / travel, model.opt.timestep**2 * jnp.abs(normal @ free)
+    cell = jnp.minimum(travel, -least)
+    here, previous = (jnp.outer(jump, normal) / cell for jump in (jumps[0], jumps[-1]))
+    return (1 - share) * here, share * previous, travel > -least
+
+
 def jump_of_velocity(
-    scene: Scene, model: mjx.Model, states: State, controls: Float[Array, "cases nu"], guard: Int[Array, ""]
+    model: mjx.Model, positioned: mjx.Data, states: State, controls: Float[Array, "cases nu"], guard: Int[Array, ""]
 ) -> tuple[Float[Array, "cases nv"], Float[Array, " nv"], Float[Array, " nv"]]:
     """Jump that the onset of one contact or limit causes in the velocity after a step, at first touch.
 
     Args:
-        scene: static part of the model.
         model: the model to step.
-        states: velocities and activations of each case; positions are those of the first.
+        positioned: position stage of the first case.
+        states: velocities and activations of each case.
         controls: controls of each case.
         guard: index of the contact or limit, as in `constraint.guard_rows`.
 
@@ -224,7 +243,6 @@ def jump_of_velocity(
         v'(on) - v'(off) of each case; the first case's acceleration without the contact; the derivative of the guard
         with respect to the velocity coordinates.
     """
-    positioned = position_stage(scene, model, states.qpos[0])
     normal_rows, members = constraint.guard_rows(model, positioned)
     mask = jnp.asarray(members)[guard]
     rows: Any = positioned._impl
@@ -258,7 +276,7 @@ def on_and_off(
     return jax.vmap(advanced)(jnp.array([True, False]))
 
 
-def _tangent(value: Float[Array, "..."]) -> Float[Array, "..."]:
+def tangent_of(value: Float[Array, "..."]) -> Float[Array, "..."]:
     """Zero, with the derivative of the value."""
     return value - jax.lax.stop_gradient(value)
 
@@ -272,5 +290,5 @@ def without_derivative(model: mjx.Model) -> mjx.Model:
 @partial(without_derivative.defjvp, symbolic_zeros=True)
 def _(primals, tangents):
     if any(not isinstance(leaf, jax.custom_derivatives.SymbolicZero) for leaf in jax.tree.leaves(tangents)):
-        raise TypeError("with the onset term a rollout is differentiable in states and controls, not in the model")
+        raise TypeError("with the onset term derivatives are in states and controls, not in the model")
     return primals[0], tangents[0]

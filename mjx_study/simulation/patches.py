@@ -6,9 +6,10 @@ to rounding; see `docs/gradient-faults.md`.
 """
 
 import contextlib
+import functools
 import sys
-import threading
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Mapping
+from types import MappingProxyType
 from typing import Any, Final
 
 import jax
@@ -17,10 +18,9 @@ import mujoco
 from jaxtyping import Array, Float
 
 from mjx_study.simulation._mjx import mjx
-from mjx_study.simulation.integration import rotation_between
+from mjx_study.simulation.integration import rotate_quaternion, rotation_between
 
 _REFSAFE: Final = int(mujoco.mjtDisableBit.mjDSBL_REFSAFE)
-_LOCK: Final = threading.RLock()
 _UNSEEN: Final = 1e-30  # [m]; its square is still a normal number
 
 
@@ -81,28 +81,36 @@ def rotation_difference(end: Float[Array, " 4"], start: Float[Array, " 4"]) -> F
     return rotation_between(start, end)
 
 
-def tendon_spring_gap(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]:
-    """Term missing from MJX's tendon springs [N or N m]: zero in value, not in derivative.
-
-    A spring with a single rest length rather than a range is linear; MJX composes it of two halves that both have
-    derivative zero where they meet. Adding this to the passive force restores the linear spring's derivative.
-    """
-    shortest, longest = model.tendon_lengthspring.T
-    linear = (shortest == longest) & (data.ten_length == shortest)
-    stiffness = jnp.where(linear, model.tendon_stiffness, 0.0)
-    rows: Any = data._impl
-    return rows.ten_J.T @ (stiffness * (shortest - data.ten_length))
-
-
-def has_tendon_springs(model: mjx.Model) -> bool:
-    """Whether there are tendons whose springs are enabled; static."""
-    off = mujoco.mjtDisableBit.mjDSBL_SPRING | mujoco.mjtDisableBit.mjDSBL_DAMPER
-    return model.ntendon > 0 and not model.opt.disableflags & int(off)
+def turned_quaternion(
+    quaternion: Float[Array, " 4"], velocity: Float[Array, " 3"], timestep: Float[Array, ""] | float
+) -> Float[Array, " 4"]:
+    """The unit quaternion after a timestep [s] at an angular velocity [rad/s]; MJX's `quat_integrate`."""
+    return rotate_quaternion(quaternion, timestep * velocity)
 
 
 def _module(name: str) -> Any:
     """A module of MJX's implementation."""
     return sys.modules[f"{mjx.make_constraint.__module__.rpartition('.')[0]}.{name}"]
+
+
+_mjx_spring_damper = getattr(_module("passive"), "_spring_damper", None)
+
+
+def springs_and_dampers(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]:
+    """MJX's springs and dampers [N or N m] of joints and tendons, with a tendon's stiffness at its rest length.
+
+    A spring with a single rest length rather than a range is linear; MJX composes it of two halves that both have
+    derivative zero where they meet. What is added is zero in value, not in derivative.
+    """
+    assert _mjx_spring_damper is not None, "`patched` has checked that MJX has it"
+    force = _mjx_spring_damper(model, data)
+    if model.ntendon == 0 or model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_SPRING):
+        return force
+    shortest, longest = model.tendon_lengthspring.T
+    linear = (shortest == longest) & (data.ten_length == shortest)
+    stiffness = jnp.where(linear, model.tendon_stiffness, 0.0)
+    rows: Any = data._impl
+    return force + rows.ten_J.T @ (stiffness * (shortest - data.ten_length))
 
 
 _mjx_wrap_inside = getattr(_module("support"), "wrap_inside", None)
@@ -158,35 +166,54 @@ def _positive(length: Float[Array, ""]) -> Float[Array, ""]:
     return length + 1e-12 * (length <= 1e-8)
 
 
-_REPLACED: Final[dict[tuple[str, str], Callable[..., Any]]] = {
+Place = tuple[str, str]
+"""Module and name of a function of MJX."""
+
+_REPLACED: Final[dict[Place, Callable[..., Any]]] = {
     ("constraint", "_kbi"): stiffness_damping_impedance,
-    ("math", "quat_to_axis_angle"): rotation_vector,
+    ("math", "quat_integrate"): turned_quaternion,
     ("math", "quat_sub"): rotation_difference,
+    ("math", "quat_to_axis_angle"): rotation_vector,
+    ("passive", "_spring_damper"): springs_and_dampers,
     ("support", "wrap_inside"): wrap_inside,
     ("collision_sdf", "_cylinder"): cylinder_distance,
 }
+AT_FIRST_TOUCH: Final = {("constraint", "_kbi"): _touching}
+"""Gives every active constraint row the values of first touch."""
+
+_CHOSEN: Final = jax.make_user_context(())
+"""Pairs of place and function, in this thread; JAX traces again what it has traced with others."""
 
 
 @contextlib.contextmanager
-def patched(*, touching: bool = False) -> Generator[None]:
-    """Patch MJX with the functions of this module in whatever is traced inside.
-
-    Args:
-        touching: give every active constraint row the values of first touch.
+def patched(also: Mapping[Place, Callable[..., Any]] = MappingProxyType({})) -> Generator[None]:
+    """Patch MJX with the functions of this module, and others, in whatever this thread traces inside.
 
     MJX has no hook for them: they are called deep inside its pipeline. If a version of MJX lacks one of them, that is
-    an error here rather than a silent return of the fault.
+    an error here rather than a silent return of the fault. The first time leaves a branch in MJX at each place; outside
+    of this context, and in other threads, it takes MJX's own function.
 
     Raises:
         RuntimeError: MJX has no function of such a name.
     """
-    with _LOCK, contextlib.ExitStack() as undo:
-        replaced = _REPLACED | ({("constraint", "_kbi"): _touching} if touching else {})
-        for (module_name, name), ours in replaced.items():
-            module = _module(module_name)
-            original = getattr(module, name, None)
-            if original is None:
-                raise RuntimeError(f"this version of MJX has no {module_name}.{name}: adapt patches.py to it")
-            undo.callback(setattr, module, name, original)
-            setattr(module, name, ours)
+    chosen = {**_REPLACED, **also}
+    for place in chosen:
+        _branch_at(*place)
+    with _CHOSEN(tuple(chosen.items())):
         yield
+
+
+def _branch_at(module_name: str, name: str) -> None:
+    module = _module(module_name)
+    original = getattr(module, name, None)
+    if original is None:
+        raise RuntimeError(f"this version of MJX has no {module_name}.{name}: adapt patches.py to it")
+    if hasattr(original, "branches"):
+        return
+
+    @functools.wraps(original)
+    def branch(*arguments: Any, **named: Any) -> Any:
+        return dict(_CHOSEN.value).get((module_name, name), original)(*arguments, **named)
+
+    branch.branches = True  # type: ignore[attr-defined]
+    setattr(module, name, branch)

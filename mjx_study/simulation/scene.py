@@ -172,7 +172,7 @@ def put_scene(host: mujoco.MjModel, name: str, *, adjoint: SceneOption = "auto",
     if options:
         host = copy.copy(host)
         _set_options(host, options)
-    _refuse_unsupported(host, name)
+    check_model(host, name)
     try:
         model = mjx.put_model(host)
         template = mjx.make_data(host)
@@ -263,7 +263,12 @@ def _disable_flags(host: mujoco.MjModel, names: SceneOption) -> None:
         FLAGS[name].disable(host.opt)
 
 
-def _refuse_unsupported(host: mujoco.MjModel, name: str) -> None:
+def check_model(host: mujoco.MjModel, name: str = "the model") -> None:
+    """Refuse a model with features that MJX lacks, or would ignore without a word.
+
+    Raises:
+        SceneError: there are such features; the message names them and what to do.
+    """
     for option, choices in _ENUMERATED.items():
         value = int(getattr(host.opt, option))
         if value not in {int(choice) for choice in choices.values()}:

@@ -1,0 +1,148 @@
+"""`mjx.step` with exact derivatives, for code that knows nothing of scenes: as a function, and as a context.
+
+Both are MJX's own pipeline, traced with the patches of `patches` and with `constraint`'s implicit derivative around
+MJX's own solver.
+"""
+
+import contextlib
+from collections.abc import Generator
+from functools import partial
+from typing import Any, Final
+
+import jax
+import jax.numpy as jnp
+from jax.ad_checkpoint import checkpoint_name
+from jax.custom_derivatives import SymbolicZero, zero_from_primal
+from jaxtyping import Array, Float
+
+from mjx_study.simulation import constraint
+from mjx_study.simulation._mjx import mjx
+from mjx_study.simulation.dynamics import State, fwd_position
+from mjx_study.simulation.integration import difference_position, integrate_position
+from mjx_study.simulation.onset import onset_begins, onset_term, tangent_of, without_derivative
+from mjx_study.simulation.patches import patched
+
+ONSETS: Final = ("none", "linear")
+"""Treatments of the onset of contact in the derivatives of a step."""
+STEP_SLOTS: Final = 2
+"""Number of onsets with a term in one step; others are left out."""
+SAVE_SOLUTION: Final = jax.checkpoint_policies.save_only_these_names("qacc")
+"""Policy of `jax.checkpoint` with which the backward pass computes steps again, but does not run their solver again."""
+
+
+def step(model: mjx.Model, data: mjx.Data, *, onset: str = "none") -> mjx.Data:
+    """`mjx.step`, differentiable through contact, in forward and reverse mode, in every array of model and data.
+
+    Values are those of `mjx.step` to rounding, with the solver's budget of the model. The derivative is that of a
+    converged step, by the implicit function theorem at the acceleration that the solver left; it is only as good as
+    the solver has converged, which `solver_residual` tells. Reverse mode stores a step's inputs and its acceleration,
+    and computes the rest again.
+
+    Args:
+        model: the model; its array leaves may be traced, batched under `jax.vmap` and differentiated.
+        data: the state before the step.
+        onset: "none", or "linear", with which derivatives account for a change of the step at which contact begins;
+            then they are with respect to qpos, qvel, act and ctrl only (see `_corrected_step`).
+
+    Returns:
+        The state after the step, with all that `mjx.step` fills in.
+
+    Raises:
+        ValueError: unknown onset, or the model is for another implementation than MJX's own in JAX.
+        TypeError: differentiation with respect to the model, with the onset term.
+    """
+    if onset not in ONSETS:
+        raise ValueError(f"unknown onset {onset!r} of a step; choose from {', '.join(ONSETS)}")
+    if model.impl != mjx.Impl.JAX:
+        raise ValueError(f"only MJX's implementation in JAX has derivatives, this model is for {model.impl.value}")
+    advance = mjx.step if onset == "none" else _corrected_step
+    with differentiable_mjx():
+        return jax.checkpoint(advance, policy=SAVE_SOLUTION)(model, data)
+
+
+@contextlib.contextmanager
+def differentiable_mjx() -> Generator[None]:
+    """`mjx.step` and `mjx.forward` have the derivatives of `step` in whatever is called, or traced, inside.
+
+    For environments that call `mjx.step` themselves. What JAX has traced outside is traced again inside, and the other
+    way round, also behind `jax.jit`; programs that are compiled ahead of time stay what they are. Call the gradient
+    inside: `jax.grad(f)` alone traces nothing yet. Other threads are not affected. A decorator, too:
+    `@differentiable_mjx()`.
+    """
+    with patched({("solver", "solve"): _solve}):
+        yield
+
+
+def solver_residual(model: mjx.Model, data: mjx.Data) -> Float[Array, ""]:
+    """Relative imbalance of forces that the solver left in the step before, 0 where it has converged; dimensionless.
+
+    Args:
+        model: the model.
+        data: the state after `mjx.step`, `mjx.forward` or `step`.
+    """
+    return constraint.residual(model, data, data.qacc)
+
+
+def _solve(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    qacc = checkpoint_name(constraint.solve(model, data, lambda *arguments: mjx.solve(*arguments).qacc), "qacc")
+    rows: Any = data._impl
+    force = constraint.row_force(model, data, rows.efc_J @ qacc - rows.efc_aref)
+    return data.replace(qacc=qacc, qfrc_constraint=rows.efc_J.T @ force, _impl=rows.replace(efc_force=force))
+
+
+def _corrected_step(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """`mjx.step` with the same values, and derivatives that include the onset term (`onset`).
+
+    Delta_k stands in for Delta_{k-1}, which the state does not tell: an error of order h of the term. The first
+    `STEP_SLOTS` onsets of the step have a term. None begins at time 0, before which there was no step.
+    """
+    model, timestep = without_derivative(model), model.opt.timestep
+    fixed = jax.lax.stop_gradient(data)
+    moved = difference_position(model, fixed.qpos, data.qpos)
+    earlier, later = _onset_change(model, fixed, moved, moved - timestep * (data.qvel - fixed.qvel))
+    shifted = integrate_position(model, fixed.qpos, earlier, timestep)
+    after = mjx.step(model, data.replace(qpos=data.qpos + tangent_of(shifted), qvel=data.qvel + tangent_of(earlier)))
+    spread = integrate_position(model, jax.lax.stop_gradient(after.qpos), later, timestep)
+    return after.replace(qpos=after.qpos + tangent_of(spread), qvel=after.qvel + tangent_of(later))
+
+
+@jax.custom_jvp
+def _onset_change(
+    model: mjx.Model, data: mjx.Data, moved: Float[Array, " nv"], moved_before: Float[Array, " nv"]
+) -> tuple[Float[Array, " nv"], Float[Array, " nv"]]:
+    """Velocities, before and after the step, that are zero and change where contact begins at another step."""
+    return jnp.zeros_like(moved), jnp.zeros_like(moved)
+
+
+@partial(_onset_change.defjvp, symbolic_zeros=True)
+def _(primals, tangents):
+    model, data, moved, _ = primals
+    change, change_before = (zero_from_primal(t) if isinstance(t, SymbolicZero) else t for t in tangents[2:])
+    spread, shift = _step_terms(model, data)
+    zero = jnp.zeros_like(moved)
+    return (zero, zero), (shift @ change_before, spread @ change)
+
+
+def _step_terms(model: mjx.Model, data: mjx.Data) -> tuple[Float[Array, "nv nv"], Float[Array, "nv nv"]]:
+    """(1 - s) Delta n^T / D and s Delta n^T / D of a step, zero where no contact begins."""
+    positioned = fwd_position(model, data)
+    distance, speed = constraint.guards(model, positioned)
+    travel = model.opt.timestep * speed
+    none = jnp.zeros((2, model.nv, model.nv), data.qvel.dtype)
+    if not distance.size:
+        return none[0], none[1]
+    begins = onset_begins(distance, travel) & (data.time > 0)
+
+    def terms():
+        (chosen,) = jnp.nonzero(begins, size=min(STEP_SLOTS, distance.size), fill_value=distance.size)
+        states = State(*(leaf[None] for leaf in (data.qpos, data.qvel, data.act, data.qacc_warmstart)))
+
+        def term(guard):
+            return onset_term(model, positioned, states, data.ctrl[None], guard, distance[guard], travel[guard])
+
+        here, previous, _ = jax.vmap(term)(jnp.minimum(chosen, distance.size - 1))
+        used = (chosen < distance.size)[:, None, None]
+        return jnp.stack([jnp.sum(jnp.where(used, part, 0.0), axis=0) for part in (here, previous)])
+
+    here, previous = jax.lax.cond(jnp.any(begins), terms, lambda: none)
+    return here, previous

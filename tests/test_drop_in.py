@@ -1,0 +1,289 @@
+"""The drop-in step: MJX's in every field, with derivatives that MJX's lacks, by itself and under the context."""
+
+import re
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+import mjx_study as study
+from mjx_study.simulation._mjx import mjx
+from mjx_study.simulation.drop_in import differentiable_mjx, solver_residual, step
+from mjx_study.simulation.dynamics import initial_state
+from mjx_study.simulation.onset import corrected_rollout
+from mjx_study.simulation.patches import patched
+from tests.scenes import (
+    CASES,
+    assert_close_by_rows,
+    central_jacobian,
+    compiled,
+    floor_scene,
+    option,
+    scene_of,
+    slider,
+    split,
+)
+from tests.test_dynamics import jacobian, prepare
+
+PAGE = Path(__file__).parents[1] / "docs" / "differentiable-mjx.md"
+MODELS = Path(mjx.__file__).parent / "test_data"
+FAST = ("tendon/armature", "tendon/wrap_sidesite")
+CROWDS = {f"humanoid/{count:02}_humanoids" for count in range(2, 11)}  # copies of the first, and slow
+STILL = {"ray", "actuator/general_dyntype"}  # no coordinate; an inertia matrix that is singular
+NAMES = sorted({str(path.relative_to(MODELS))[:-4] for path in MODELS.rglob("*.xml")} - CROWDS - STILL)
+
+# A sphere that slides on the plane, pushed by a servo; sensors of all three stages, and of contact.
+SENSED = floor_scene(
+    slider().replace("</body>", '<site name="s" size=".2"/></body>').replace('axis="1 0 0"', 'name="x" axis="1 0 0"'),
+    option(extra='cone="elliptic"'),
+).replace(
+    "</mujoco>",
+    """<actuator><position joint="x" kp="30" kv="1"/></actuator><sensor><framepos objtype="site" objname="s"/>
+    <velocimeter site="s"/><accelerometer site="s"/><touch site="s"/><actuatorfrc actuator="position"/></sensor>
+    </mujoco>""".replace("<position ", '<position name="position" '),
+)
+
+
+def device(source: str) -> tuple[mjx.Model, mjx.Data]:
+    """A model from an MJCF, and its empty state with fixed types."""
+    scene = study.put_scene(mujoco.MjModel.from_xml_string(source), "test")
+    return scene.model, scene.template
+
+
+def assert_same(ours: Any, theirs: Any, tolerance: float) -> None:
+    """Every field agrees, relative to its largest entry."""
+    assert jax.tree.structure(ours) == jax.tree.structure(theirs)
+    for (path, one), other in zip(jax.tree_util.tree_leaves_with_path(ours), jax.tree.leaves(theirs), strict=True):
+        one, other = np.asarray(one), np.asarray(other)
+        assert one.dtype == other.dtype, path
+        scale = np.abs(other[np.isfinite(other)]).max(initial=1.0)
+        np.testing.assert_allclose(one, other, rtol=0, atol=tolerance * scale, err_msg=jax.tree_util.keystr(path))
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=[] if n in FAST else [pytest.mark.slow]) for n in NAMES])
+def test_every_field_is_mjxs(name: str) -> None:
+    """Three steps of MJX's own test models, with their own budgets, each from the same state."""
+    host = mujoco.MjModel.from_xml_path(str(MODELS / f"{name}.xml"))
+    model, rng = mjx.put_model(host), np.random.default_rng(0)
+    data = mjx.make_data(host).replace(
+        qvel=jnp.asarray(0.1 * rng.standard_normal(host.nv)), ctrl=jnp.asarray(0.1 * rng.standard_normal(host.nu))
+    )
+    stock, ours = (compiled(function, model, data) for function in (mjx.step, step))
+    for _ in range(3):
+        following = stock(model, data)
+        assert_same(ours(model, data), following, 1e-9)
+        carried = {name: getattr(following, name) for name in ("qpos", "qvel", "act", "time", "qacc_warmstart")}
+        data = data.replace(**carried)  # others change their type in a step
+    assert np.abs(data.qvel).max() > 0
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=[] if n == "sphere-sphere condim 1" else [pytest.mark.slow]) for n in CASES]
+)
+def test_derivatives_are_those_of_the_scenes_step(name: str) -> None:
+    """Forwards and backwards; `test_dynamics` has these against central differences."""
+    case = prepare(name)
+    scene = case.scene
+
+    def after(model, point):
+        qpos, qvel, act, ctrl = split(scene, point)
+        data = scene.template.replace(qpos=qpos, qvel=qvel, act=act, ctrl=ctrl, qacc_warmstart=case.warmstart)
+        data = step(model, data)
+        return jnp.concatenate([data.qpos, data.qvel, data.act])
+
+    def both(model, point):
+        value, push = jax.linearize(lambda x: after(model, x), point)
+        pull = jax.linear_transpose(push, point)
+        forward = jax.vmap(push, out_axes=-1)(jnp.eye(point.shape[0]))
+        return forward, jax.vmap(lambda row: pull(row)[0])(jnp.eye(value.shape[0]))
+
+    forward, reverse = compiled(both, scene.model, case.point)(scene.model, case.point)
+    assert_close_by_rows(reverse, forward, 1e-10)
+    # from another warm start the solver stops elsewhere, 1e-8 from the solution with cones
+    assert_close_by_rows(forward, jacobian(name), 1e-6)
+
+
+def test_derivatives_of_sensors_and_forces() -> None:
+    """Of what the scene's step does not compute, against central differences, in both modes."""
+    model, data = device(SENSED)
+
+    def outputs(point):
+        qpos, qvel, ctrl = jnp.split(point, (3, 6))
+        after: Any = step(model, data.replace(qpos=qpos, qvel=qvel, ctrl=ctrl))
+        return jnp.concatenate([after.sensordata, after._impl.efc_force, after.qfrc_constraint, after.qacc])
+
+    point = np.array([0.0, 0.0, -4e-4, 0.3, 0.2, -0.1, 0.05])
+    forward, reverse = compiled(lambda x: (jax.jacfwd(outputs)(x), jax.jacrev(outputs)(x)), point)(point)
+    assert forward.shape == (11 + 3 + 3 + 3, 7) and np.abs(forward).max(axis=1).min() > 0
+    assert_close_by_rows(reverse, forward, 1e-10)
+    # the acceleration is 1e-8 off where MJX's solver stops, over differences of 5e-5
+    assert_close_by_rows(forward, central_jacobian(compiled(outputs, point), point, 5e-5), 1e-3)
+
+
+class Environment:
+    """Somebody's, who knows nothing of this package: a sphere that is pushed along the floor."""
+
+    def __init__(self, extra: str = "") -> None:
+        self.model, self.data = device(floor_scene(slider(), option(extra=extra)))
+        self.rollout = jax.jit(self._rollout)
+
+    def _rollout(self, solref, speed):
+        """Last position along x after 20 steps."""
+        model = self.model.replace(geom_solref=jnp.broadcast_to(solref, self.model.geom_solref.shape))
+        start = self.data.replace(qpos=jnp.array([0.0, 0.0, -1e-3]), qvel=jnp.stack([speed, 0.1, 0.0]))
+
+        def advance(data, _):
+            data = mjx.step(model, data)
+            return data, data.qpos[0]
+
+        return jax.lax.scan(advance, start, length=20)[1][-1]
+
+
+def test_somebody_elses_environment_has_gradients_inside_and_only_there() -> None:
+    """Twenty steps, a batch of models and states, behind a jit that has been used outside before."""
+    environment = Environment()
+    solrefs, speeds = jnp.array([[0.02, 1.0], [0.03, 0.8], [0.015, 1.2]]), jnp.array([0.3, 0.4, 0.5])
+    values = jax.vmap(environment.rollout)
+    gradients = jax.jit(jax.vmap(jax.grad(environment.rollout, argnums=(0, 1))))
+    stock = values(solrefs, speeds)
+    with pytest.raises(ValueError, match="Reverse-mode differentiation does not work"):
+        gradients(solrefs, speeds)
+    with differentiable_mjx():
+        np.testing.assert_allclose(values(solrefs, speeds), stock, rtol=1e-9)
+        over_solref, over_speed = gradients(solrefs, speeds)
+    with pytest.raises(ValueError, match="Reverse-mode differentiation does not work"):
+        gradients(solrefs, speeds)
+    np.testing.assert_array_equal(values(solrefs, speeds), stock)
+
+    for axis, size in ((0, 1e-5), (1, 1e-3)):
+        shift = size * jnp.eye(2)[axis]
+        difference = (values(solrefs + shift, speeds) - values(solrefs - shift, speeds)) / (2 * size)
+        np.testing.assert_allclose(over_solref[:, axis], difference, rtol=2e-4, atol=1e-8)
+    difference = (values(solrefs, speeds + 1e-4) - values(solrefs, speeds - 1e-4)) / 2e-4
+    np.testing.assert_allclose(over_speed, difference, rtol=1e-6)
+    assert np.abs(over_solref).min() > 1e-5 and np.all(over_speed < 0.04)  # friction brakes
+
+
+@pytest.mark.slow
+def test_a_trace_of_stock_mjx_is_not_used_again() -> None:
+    """With one iteration stock has a derivative, NaN where nothing slides: each side keeps its own."""
+    environment = Environment('cone="elliptic"')
+    options = environment.model.opt.replace(iterations=1, ls_iterations=4)
+    environment.model = environment.model.replace(opt=options)
+    gradient = jax.jit(jax.grad(environment.rollout, argnums=1))
+    point = jnp.array([0.02, 1.0]), jnp.array(0.3)
+    before = float(gradient(*point))
+    with differentiable_mjx():
+        inside = float(gradient(*point))
+    assert np.isnan([before, float(gradient(*point))]).all() and 0 < inside < 0.04
+
+
+def test_the_context_is_a_decorator_and_may_be_nested() -> None:
+    environment = Environment()
+
+    @differentiable_mjx()
+    def gradient(speed):
+        with patched(), differentiable_mjx():
+            return jax.grad(environment.rollout, argnums=1)(jnp.array([0.02, 1.0]), speed)
+
+    assert 0 < float(gradient(jnp.array(0.3))) < 0.04
+
+
+def test_the_residual_tells_whether_the_solver_has_converged() -> None:
+    model, data = device(SENSED)
+    start = data.replace(qpos=jnp.array([0.0, 0.0, -5e-4]), qvel=jnp.array([0.3, 0.2, -0.1]))
+    few = model.replace(opt=model.opt.replace(iterations=1, ls_iterations=1))
+    converged, left = (float(solver_residual(m, jax.jit(step)(m, start))) for m in (model, few))
+    assert converged < 1e-8 and left > 1e-4
+
+
+RUNGE_KUTTA = """<mujoco><option integrator="RK4" timestep="0.01"/><worldbody>{}
+<body pos="0 0 .3"><joint type="ball" damping=".01"/>
+<geom type="capsule" fromto="0 0 0 0 .05 -.2" size=".1"/></body></worldbody></mujoco>"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("floor", ["", '<geom type="plane" size="1 1 .1"/>'], ids=["free", "contact"])
+def test_runge_kutta(floor: str) -> None:
+    """In contact, too: each of its stages has an implicit derivative."""
+    scene = mujoco.MjModel.from_xml_string(RUNGE_KUTTA.format(floor))
+    scene.opt.tolerance, scene.opt.iterations, scene.opt.ls_iterations = 1e-30, 100, 50
+    model, data = mjx.put_model(scene), mjx.make_data(scene)
+    quaternion = jnp.array([0.95, 0.1, 0.05, 0.2])
+
+    def after(velocity):
+        following = step(model, data.replace(qpos=quaternion / jnp.linalg.norm(quaternion), qvel=velocity))
+        return jnp.concatenate([following.qpos, following.qvel])
+
+    point = np.array([0.3, -0.4, 0.2])
+    reverse, values = compiled(jax.jacrev(after), point), compiled(after, point)
+    assert_close_by_rows(reverse(point), central_jacobian(values, point, 1e-4), 1e-6)
+
+
+def test_what_has_no_derivative_is_refused() -> None:
+    host = mujoco.MjModel.from_xml_string("<mujoco><worldbody/></mujoco>")
+    with pytest.raises(ValueError, match="only MJX's implementation in JAX has derivatives, this model is for cpp"):
+        step(mjx.put_model(host, impl="cpp"), mjx.make_data(host))
+    host.opt.noslip_iterations = 3
+    with pytest.raises(study.SceneError, match="MJX would leave out part of sled: noslip_iterations"):
+        study.check_model(host, "sled")
+
+
+# A ball falls on the floor; a step with the onset term against rollouts with it.
+FALLING = floor_scene(
+    '<body pos="0 0 .1"><joint type="slide" axis="0 0 1"/><geom size=".1" mass="1" condim="1"/></body>',
+    option(5e-4),
+    'condim="1"',
+)
+
+
+@pytest.mark.slow
+def test_the_onset_term_of_a_step_is_that_of_a_rollout() -> None:
+    """To the order of a timestep, 1 %, where the term is four times the rest; both modes, the same values."""
+    scene = scene_of(FALLING)
+    start, speed, steps = scene.template, jnp.array([-1.5]), 80
+    gaps = 0.035 + 7.5e-4 * (np.arange(4) + 0.3) / 4  # over a cell: contact begins early or late in a step
+
+    def by_steps(gap, onset):
+        def advance(data, _):
+            return step(scene.model, data, onset=onset), None
+
+        last, _ = jax.lax.scan(advance, start.replace(qpos=gap[None], qvel=speed), length=steps)
+        return last.qpos[0], last.qpos[0]
+
+    def by_rollout(gap):
+        state = initial_state(scene, gap[None], speed)
+        return corrected_rollout(scene, scene.model, state, lambda index, state: jnp.zeros(0), steps)[0].qpos[-1, 0]
+
+    def all_of(gap):
+        linear = lambda gap: by_steps(gap, "linear")  # noqa: E731
+        forward, value = jax.jacfwd(linear, has_aux=True)(gap)
+        plain, stock = jax.jacfwd(lambda gap: by_steps(gap, "none"), has_aux=True)(gap)
+        return forward, jax.grad(linear, has_aux=True)(gap)[0], jax.jacfwd(by_rollout)(gap), plain, value, stock
+
+    forward, reverse, expected, plain, value, stock = compiled(jax.vmap(all_of), gaps)(gaps)
+    np.testing.assert_array_equal(value, stock)
+    np.testing.assert_allclose(reverse, forward, rtol=1e-9)
+    np.testing.assert_allclose(forward, expected, rtol=0, atol=0.01 * np.abs(expected - plain).max())
+    assert np.abs(expected - plain).min() > 0.1
+
+
+def test_the_onset_term_is_not_for_models() -> None:
+    model, data = device(FALLING)
+    with pytest.raises(ValueError, match="unknown onset 'smooth' of a step; choose from none, linear"):
+        step(model, data, onset="smooth")
+    with pytest.raises(TypeError, match="derivatives are in states and controls, not in the model"):
+        jax.grad(lambda mass: step(model.replace(body_mass=mass), data, onset="linear").qpos[0])(model.body_mass)
+
+
+def test_the_page_runs() -> None:
+    """Both ways give the same gradient: friction brakes the ball until it rolls, at 5/7 of its speed."""
+    names: dict[str, Any] = {}
+    for block in re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL):
+        exec(block, names)
+    np.testing.assert_allclose(names["same"], names["gradient"], rtol=1e-9, atol=1e-15)
+    assert 0 < float(names["gradient"][0]) <= 0.1 and float(names["residual"]) < 1e-6
