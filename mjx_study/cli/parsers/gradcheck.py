@@ -62,7 +62,9 @@ def add(command: argparse.ArgumentParser) -> None:
     command.add_argument("--mean", action="store_true", help="check the means of estimators in place of derivatives")
     for name, default in MEAN.items():
         option = dataclasses.replace(OPTIONS[name], line=f"with --mean: {OPTIONS[name].line}")
-        if name in ("estimators", "span"):
+        if name == "span":
+            option = dataclasses.replace(option, many=True, unset="two sigma about theta")
+        if name == "estimators":
             option = dataclasses.replace(option, many=True)
         add_option(command, option, default, given=False)
     command.add_argument("--verbose", action="store_true", help="every entry of every finding")
