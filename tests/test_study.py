@@ -236,6 +236,11 @@ def test_seeds_are_counted_and_not_repeated() -> None:
     assert findings(below)[0] == "penalty: FoBG's variance is below ZoBG's at K = 10 N/m (95% intervals)"
 
 
+def test_the_onset_term_is_judged_like_the_rest() -> None:
+    (sentence,) = findings(result(row("fobg_onset", 10, 1, relative_error=0.044, bias_p_value=0.001)))
+    assert sentence == "penalty: FoBG (onset)'s mean is biased by 4.4% at K = 10 N/m (p <= 0.001)"
+
+
 def test_noises_are_told_apart() -> None:
     """Not the last one's verdict for all."""
     parts = [result(row("zobg", 10, 100), row("fobg", 10, variance)) for variance in (1, 1e6)]

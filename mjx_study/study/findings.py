@@ -17,7 +17,13 @@ from mjx_study.table import digits_to_tell_apart
 
 SURE: Final = 0.001
 """p-value at which a mean is called biased: the smallest that the test's 999 draws can give."""
-BIASED: Final = {"fobg": "FoBG", "aobg": "AoBG", "ivw": "IVW"}
+BIASED: Final = {
+    "fobg": "FoBG",
+    "fobg_onset": "FoBG (onset)",
+    "aobg": "AoBG",
+    "aobg_onset": "AoBG (onset)",
+    "ivw": "IVW",
+}
 """Estimators whose bias is reported: first order, and the interpolations that follow it."""
 APART: Final = 4.0
 """Standard errors beyond which a mean without a verdict is reported as off."""
@@ -31,6 +37,8 @@ PLACE: Final = ("task", "timestep", "cone", "sigma", "samples", "model", "seed",
 """Coordinates of a row."""
 SETTING: Final = ("task", "timestep", "cone", "sigma", "samples")
 """Coordinates that every row of a finding shares."""
+INTERPOLATED: Final = ("aobg", "aobg_onset")
+"""Estimators with the accuracy bound gamma."""
 VECTORS: Final = ("gradient", "reference")
 BELOW, ABOVE, ALIKE = "below ZoBG's", "above ZoBG's", "not told apart from ZoBG's"
 UNKNOWN: Final = "not to be told from so few effective samples"
@@ -120,7 +128,8 @@ def _setting(name: str, value: Any) -> str:
 
 def gammas_of(dataset: xr.Dataset) -> dict[str, float]:
     """AoBG's accuracy bound by task; infinite for none."""
-    options = [entry["estimators"].get("aobg", {}) for entry in json.loads(dataset.attrs["resolved"])]
+    estimators = [entry["estimators"] for entry in json.loads(dataset.attrs["resolved"])]
+    options = [given.get("aobg", given.get("aobg_onset", {})) for given in estimators]
     names = dataset["task"].values.tolist()
     return {name: float(given.get("gamma", math.inf)) for name, given in zip(names, options, strict=True)}
 
@@ -140,7 +149,7 @@ def _meaningless(rows: Sequence[Row], gammas: Mapping[str, float]) -> list[str]:
             f"the reference's own uncertainty is above {UNSURE:.0%}{_at(unsure)}: errors and verdicts say "
             "little there; --reference-samples makes it better"
         )
-    bound = [row for row in rows if row.estimator == "aobg" and (row.epsilon or 0.0) > gammas[row.task]]
+    bound = [row for row in rows if row.estimator in INTERPOLATED and (row.epsilon or 0.0) > gammas[row.task]]
     if bound:
         stiffnesses = list(dict.fromkeys(row.stiffness for row in bound))
         found.append(
@@ -190,7 +199,7 @@ def _bias_findings(rows: Sequence[Row], gammas: Mapping[str, float]) -> list[str
         if biased:
             shares = ", ".join(f"{_share(same)}{_at([stiffness])}{_of(same, seeds)}" for stiffness, same in _by(biased))
             least = max(row.bias_p_value for row in biased)
-            free = estimator == "aobg" and math.isinf(gammas[biased[0].task])
+            free = estimator in INTERPOLATED and math.isinf(gammas[biased[0].task])
             advice = ": it has no accuracy bound; --gamma sets one" if free else ""
             sentences.append(f"{mean} biased by {shares} (p <= {least:.3f}){advice}")
         for stiffness, same in _by(off):
