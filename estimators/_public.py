@@ -4,7 +4,6 @@ from estimators.alpha import alpha_order, constrained_alpha, interpolate, invers
 from estimators.baselines import BASELINES, leave_one_out, none, zero_noise
 from estimators.bias import BiasTest, EmpiricalBias, bias_test, empirical_bias, squared_bias_of_means
 from estimators.catalogue import VARIANCE_PROXIES, WEIGHTS
-from estimators.circulation import Circulation, circulation
 from estimators.comparison import Comparison, compare
 from estimators.confidence import bernstein_epsilon, coverage_interval, variance_upper_bound
 from estimators.cross_fitting import weigh_batches
@@ -13,6 +12,7 @@ from estimators.effective import ENOUGH_EFFECTIVE, EffectiveSamples, effective_s
 from estimators.estimator import ORACLES, Batches, Estimator, Oracle, draw, oracles_of
 from estimators.first import clipped_first_order, first_order
 from estimators.intervals import variance_interval
+from estimators.mean_check import Circulation, circulation
 from estimators.noise import NOISES, NoiseDensity
 from estimators.propagation import total_propagation, truncated_first_order
 from estimators.registry import (

@@ -26,7 +26,7 @@ from hypothesis import strategies as st
 
 from estimators import ESTIMATORS
 from mjx_study import cli
-from mjx_study.cli import bench, compare, gradcheck, landscape, optimise, options, rollout, sweep
+from mjx_study.cli import bench, compare, gradcheck, landscape, optimise, options, parameters, rollout, sweep
 from mjx_study.option import OPTIONS
 from mjx_study.simulation.contact import FAMILIES
 from mjx_study.study import plan as sweep_plan
@@ -64,7 +64,7 @@ def stub(monkeypatch: pytest.MonkeyPatch) -> None:
     for command in COMMANDS:
         flags_of(command)  # outside of strategies: building a parser uses the random module
     built = functools.lru_cache(maxsize=256)(make_task)
-    for module in (options, sweep_plan, gradcheck, landscape):
+    for module in (parameters, sweep_plan, gradcheck, landscape):
         monkeypatch.setattr(module, "make_task", built)
 
 

@@ -24,7 +24,7 @@ from mjx_study.study.revision import git_revision
 from mjx_study.study.run import load_study, run_study, warnings_of
 from mjx_study.study.store import Store, StudyError
 from mjx_study.tasks import make_task
-from mjx_study.tasks.task import Task
+from mjx_study.tasks.task import StudyDefaults, Task
 
 MODULE = """
 from functools import partial
@@ -94,9 +94,9 @@ def test_a_model_counts_by_what_it_simulates(tmp_path: Path) -> None:
     "changes",
     [
         {"theta": jnp.full(2, 0.3)},
-        {"gamma": 3.0},
+        {"defaults": StudyDefaults(gamma=3.0)},
         {"final_cost": lambda state: state.qpos[0]},
-        {"stiffnesses": (1.0, 2.0)},
+        {"defaults": StudyDefaults(stiffnesses=(1.0, 2.0))},
         {"sigma": 0.2},
     ],
 )

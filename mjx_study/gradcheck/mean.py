@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 
 from estimators import Estimator
-from estimators.circulation import TOLERANCE, Circulation, circulation
+from estimators.mean_check import TOLERANCE, Circulation, circulation
 from mjx_study.objective import Simulator, chunk_for
 from mjx_study.study.configuration import Progress, check_span
 from mjx_study.study.line import direction_of
@@ -37,7 +37,7 @@ class MeanCheck:
         contact, stiffness: of the contact model [N/m], 0 for one that is not defined by a stiffness.
         estimator: its name.
         circulation: the integral of its mean against the difference of the cost.
-        verdict: "right" within `estimators.circulation.TOLERANCE`, "biased", or "undecided".
+        verdict: "right" within `estimators.mean_check.TOLERANCE`, "biased", or "undecided".
     """
 
     contact: str

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from estimators import ESTIMATORS, make_estimator
-from estimators.circulation import circulation, path_rule
+from estimators.mean_check import circulation, path_rule
 from mjx_study.reference import FunctionObjective, Heaviside
 from tests.estimators import objectives
 
