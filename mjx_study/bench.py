@@ -20,6 +20,7 @@ import mujoco
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
+from estimators import FirstOrder, ZerothOrder
 from mjx_study.objective import Simulator, chunk_for, simulate
 from mjx_study.reference.noise import split_sample_key, standard_noise
 from mjx_study.runtime import environment
@@ -28,7 +29,7 @@ from mjx_study.simulation.contact import ContactModel, apply_contact
 from mjx_study.simulation.dynamics import State
 from mjx_study.simulation.engine import engine_model
 from mjx_study.study.configuration import Progress
-from mjx_study.study.memory import bytes_per_sample, check_memory
+from mjx_study.study.memory import check_memory
 from mjx_study.tasks.contact_grid import ContactPoint, contact_grid
 from mjx_study.tasks.task import Task
 
@@ -131,7 +132,7 @@ def plan_bench(task: Task, samples: int) -> BenchPlan:
     """
     if samples < 1:
         raise ValueError(f"samples must be at least 1, got {samples}")
-    check_memory(samples * bytes_per_sample(task, ("evaluation", "differentiation"), 2))
+    check_memory(task, (ZerothOrder(), FirstOrder()), samples)
     (cell,), _ = contact_grid(task, [task.defaults.main_family], [task.defaults.middle_stiffness])
     return BenchPlan(task, samples, cell)
 

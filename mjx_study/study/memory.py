@@ -1,22 +1,23 @@
-"""Memory of a study's batches: seeds are computed a few at a time, and a plan that needs too much is refused."""
+"""Memory of a sweep's batches: seeds are taken a few at a time, and a plan that needs too much is refused."""
 
 import math
 from collections.abc import Sequence
 from typing import Final
 
+from estimators import Estimator
 from mjx_study.limits import MOST_GIB
 from mjx_study.tasks.task import Task
 
 BIAS_DRAWS: Final = 999
-"""Draws of the test for bias; its smallest p-value is 0.001."""
+"""Draws of the test for bias; its least p-value is 0.001."""
 LARGEST_BATCH: Final = 20_000
-"""Most samples drawn at once; further seeds are drawn in turn."""
+"""Samples that are drawn at once; more seeds than fit are drawn in turn."""
 AT_ONCE: Final = 512e6
-"""Most memory for the batches of several seeds [bytes]; those of a single seed may take more."""
+"""Memory that batches of several seeds may take together [bytes]; one seed's batches may take more."""
 
 
 def numbers_per_sample(task: Task, oracle: str) -> int:
-    """Numbers held by one sample of a batch."""
+    """Numbers that a sample of a batch holds."""
     params, (steps, dimensions) = task.policy.num_params, task.policy.noise_shape
     noise = steps * dimensions * (1 if task.policy.additive else 1 + params)  # scores, and the policy's Jacobian
     states = task.scene.host.nq + task.scene.host.nv + task.scene.host.na
@@ -35,29 +36,51 @@ def numbers_per_sample(task: Task, oracle: str) -> int:
 
 
 def bytes_per_sample(task: Task, oracles: Sequence[str], estimators: int) -> int:
-    """Memory per sample [bytes]: every batch, gradients by every estimator, and the draws of the test for bias."""
+    """Memory of a sample of every batch, of its gradients by every estimator, and of the draws of a test for bias."""
     numbers = sum(numbers_per_sample(task, oracle) for oracle in oracles)
     return 8 * (numbers + 3 * estimators * task.policy.num_params + 2 * BIAS_DRAWS)
 
 
 def seeds_at_once(memory_of_seed: int, seeds: int) -> int:
-    """Number of seeds that fit into `AT_ONCE`, in as few and as equal groups as possible; at least one."""
+    """How many seeds fit into `AT_ONCE`, in as few and as equal groups as possible; at least one."""
     fitting = max(1, int(AT_ONCE / memory_of_seed))
     return math.ceil(seeds / math.ceil(seeds / fitting))
 
 
-def check_memory(needed: int) -> None:
-    """Refuse batches that need more than `MOST_GIB`.
-
-    Args:
-        needed: memory of the arrays held at once [bytes].
-
-    Raises:
-        ValueError: names the limit and what to change.
-    """
+def check_batches(needed: int) -> None:
+    """Raises ValueError for batches that need more bytes than `MOST_GIB` says."""
     gib = needed / 2**30
     if gib > MOST_GIB:
         raise ValueError(
             f"the batches of a cell would take about {gib:.3g} GiB of memory, and the limit is {MOST_GIB:g} GiB: give "
-            "fewer samples, seeds or steps"
+            "fewer samples, and more seeds of them"
+        )
+
+
+def check_memory(task: Task, estimators: Sequence[Estimator], samples: int, *, other: int = 0) -> None:
+    """Refuse a plan whose arrays do not fit into `MOST_GIB`.
+
+    Args:
+        task: gives the parameters P, steps H, controls m and the size n of the state.
+        estimators: each keeps about three numbers for each of the N samples and P parameters, those that work
+            step by step N H m (P with feedback) more, and those that linearise N H n (n + m).
+        samples: N, those of all batches that are kept at once.
+        other: numbers that are kept beside them.
+
+    Raises:
+        ValueError: with the limit and what to change.
+    """
+    host, params = task.scene.host, task.policy.num_params
+    controls, state = host.nu, host.nq + host.nv + host.na
+    needs = {oracle for estimator in estimators for oracle in estimator.needs}
+    each = params * (1 + 3 * len(estimators)) + task.horizon * controls
+    if any("step" in oracle or oracle == "linearisation" for oracle in needs):
+        each += task.horizon * controls * (1 if task.policy.additive else params)
+    if "linearisation" in needs:
+        each += task.horizon * state * (state + controls)
+    gib = 8 * (samples * each + other) / 2**30
+    if gib > MOST_GIB:
+        raise ValueError(
+            f"{samples} samples of {params} parameters and {task.horizon} steps need {gib:.3g} GiB of memory, and the "
+            f"limit is {MOST_GIB:g} GiB: take fewer samples, seeds or steps, or share them between several runs"
         )

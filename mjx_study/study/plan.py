@@ -2,7 +2,7 @@
 
 import dataclasses
 import itertools
-from typing import Any, Final
+from typing import Any
 
 import jax
 
@@ -16,7 +16,7 @@ from mjx_study.option import OPTIONS, check
 from mjx_study.study.configuration import SAMPLES, StudyConfig
 from mjx_study.study.iteration import make_optimizer
 from mjx_study.study.line import line_of
-from mjx_study.study.memory import LARGEST_BATCH, bytes_per_sample, check_memory, seeds_at_once
+from mjx_study.study.memory import LARGEST_BATCH, bytes_per_sample, check_batches, check_memory, seeds_at_once
 from mjx_study.study.resolution import at_theta, configured_estimators, recipe_of
 from mjx_study.table import digits_to_tell_apart
 from mjx_study.tasks import make_task
@@ -24,9 +24,6 @@ from mjx_study.tasks.contact_grid import ContactPoint, contact_grid, solver_grid
 from mjx_study.tasks.network import with_network
 from mjx_study.tasks.task import Recipe, Task, check_sigma
 from mjx_study.tasks.validation import check_shapes
-
-HISTORY_NUMBERS: Final = 20
-"""Numbers kept of an iteration of one seed, all estimators together, roughly."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -87,7 +84,7 @@ class StudyPlan:
 
     @property
     def compilations(self) -> int:
-        """Number of programs to compile: two for each group, or one for each of its descents."""
+        """Programs of rollouts that are needed: two for each group, or one for each of its descents."""
         if self.config.kind != "descents":
             return 2 * len(self.groups)
         settings = {(cell.group, cell.sigma, cell.samples) for cell in self.cells}
@@ -102,17 +99,12 @@ class StudyPlan:
 
     @property
     def memory(self) -> int:
-        """Memory of the arrays held at once in the largest cell, roughly [bytes]."""
+        """That batches and their statistics take at once in the largest cell, roughly [bytes]."""
         cells = {(cell.group, cell.samples): cell for cell in self.cells}.values()
-        batches = max(memory_of_seed(self, cell) * seeds_together(self, cell) for cell in cells)
-        iterations = max((group.recipe.iterations for group in self.groups if group.recipe), default=0)
-        history = 8 * HISTORY_NUMBERS * self.config.batches * iterations
-        evaluated = self.config.evaluation_samples or 0
-        evaluation = evaluated * max(bytes_per_sample(group.task, ("evaluation",), 0) for group in self.groups)
-        return max(batches + history, evaluation)
+        return max(memory_of_seed(self, cell) * seeds_together(self, cell) for cell in cells)
 
     def label(self, cell: StudyCell) -> str:
-        """A cell's name in messages."""
+        """As messages name a cell."""
         group = self.groups[cell.group]
         digits = digits_to_tell_apart(each.timestep for each in self.groups)
         return f"{group.name}, {cell.model.label}, h = {group.timestep:.{digits}g} s, N = {cell.samples}"
@@ -162,11 +154,14 @@ def plan_study(config: StudyConfig) -> StudyPlan:
     most = min(LARGEST_BATCH, max(cell.samples for cell in cells) * together)
     chunk = chunk_for(most, jax.local_devices()) if config.chunk_size is None else config.chunk_size
     plan = StudyPlan(config, tuple(groups), tuple(cells), chunk, tuple(dict.fromkeys(messages)))
-    check_memory(plan.memory)
+    check_batches(plan.memory)
     for cell in {cell.group: cell for cell in cells}.values():
-        estimators_of(plan, cell)
-        if (recipe := groups[cell.group].recipe) is not None:
+        chosen, recipe = estimators_of(plan, cell), groups[cell.group].recipe
+        if recipe is not None:
             make_optimizer(config.optimizer or "", recipe.learning_rate, recipe.decay)
+            history = 20 * config.batches * recipe.iterations
+            check_memory(groups[cell.group].task, chosen, config.batches * cell.samples, other=history)
+            check_memory(groups[cell.group].task, (), config.evaluation_samples or 0)
         elif config.kind == "landscapes":
             if config.theta is not None and groups[cell.group].task.policy.num_params == 1:
                 raise ValueError("theta has one entry, and the line is its range: give --span")
@@ -175,7 +170,7 @@ def plan_study(config: StudyConfig) -> StudyPlan:
 
 
 def oracles_of(config: StudyConfig) -> tuple[str, ...]:
-    """Kinds of batches that the estimators need, evaluations included."""
+    """Kinds of batches that the estimators need, and costs."""
     return estimators.oracles_of(map(find_estimator, config.estimators), "evaluation")
 
 
@@ -186,7 +181,7 @@ def memory_of_seed(plan: StudyPlan, cell: StudyCell) -> int:
 
 
 def seeds_together(plan: StudyPlan, cell: StudyCell) -> int:
-    """Number of seeds that a cell draws at once: in studies of gradients as many as fit, otherwise all."""
+    """How many seeds a cell draws at once: of gradients as many as fit, of others all."""
     batches = plan.config.batches
     return seeds_at_once(memory_of_seed(plan, cell), batches) if plan.config.kind == "gradients" else batches
 
