@@ -2,6 +2,7 @@
 
 import argparse
 from pathlib import Path
+from typing import Any
 
 from estimators import make_estimator
 from mjx_study import gradcheck as check
@@ -20,11 +21,10 @@ UNEXERCISED = 3
 
 def run(options: argparse.Namespace) -> int:
     """Check and print; 1 where something is wrong, 3 where something was not exercised."""
-    given = [name for name in MEAN if getattr(options, name) is not None]
     if options.mean:
         return _run_mean(options)
-    if given:
-        raise UsageError(f"--{given[0]} is for --mean")
+    if given := _given(options):
+        raise UsageError(f"--{next(iter(given))} is for --mean")
     with usage_errors():
         configure_process(options)
         plan = _plan(options)
@@ -34,9 +34,13 @@ def run(options: argparse.Namespace) -> int:
     return 1 if not report.passed else UNEXERCISED if report.unexercised else 0
 
 
+def _given(options: argparse.Namespace) -> dict[str, Any]:
+    """Options of --mean that are given."""
+    return {name: getattr(options, name) for name in MEAN if getattr(options, name) is not None}
+
+
 def _run_mean(options: argparse.Namespace) -> int:
-    chosen = {name: getattr(options, name) for name in MEAN if getattr(options, name) is not None}
-    chosen = MEAN | chosen
+    chosen = MEAN | _given(options)
     with usage_errors():
         configure_process(options)
         if Path(options.task).suffix.lower() == ".xml":

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 
 from mjx_study.simulation import constraint
 from mjx_study.simulation._mjx import mjx
-from mjx_study.simulation.dynamics import State, fwd_position
+from mjx_study.simulation.dynamics import SAVE_SOLUTION, State, fwd_position
 from mjx_study.simulation.integration import difference_position, integrate_position
 from mjx_study.simulation.onset import onset_begins, onset_term, tangent_of, without_derivative
 from mjx_study.simulation.patches import patched
@@ -26,8 +26,6 @@ ONSETS: Final = ("none", "linear")
 """Treatments of the onset of contact in the derivatives of a step."""
 STEP_SLOTS: Final = 2
 """Number of onsets with a term in one step; others are left out."""
-SAVE_SOLUTION: Final = jax.checkpoint_policies.save_only_these_names("qacc")
-"""Policy of `jax.checkpoint` with which the backward pass computes steps again, but does not run their solver again."""
 
 
 def step(model: mjx.Model, data: mjx.Data, *, onset: str = "none") -> mjx.Data:

@@ -16,6 +16,7 @@ and its derivative is that of the converged step. Two programs compute the deriv
 import dataclasses
 from collections.abc import Callable
 from functools import partial
+from typing import Final
 
 import jax
 import jax.numpy as jnp
@@ -30,6 +31,9 @@ from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.integration import integrate_position
 from mjx_study.simulation.patches import patched
 from mjx_study.simulation.scene import Scene
+
+SAVE_SOLUTION: Final = jax.checkpoint_policies.save_only_these_names("qacc")
+"""Policy of `jax.checkpoint` with which the backward pass computes steps again, but does not run their solver again."""
 
 
 @register_pytree
@@ -146,7 +150,7 @@ def rollout(
         return following, (following, control, residual)
 
     if not scene.uses_jacobian:
-        advance = jax.checkpoint(advance, policy=jax.checkpoint_policies.save_only_these_names("qacc"))
+        advance = jax.checkpoint(advance, policy=SAVE_SOLUTION)
     _, (states, controls, residuals) = jax.lax.scan(advance, start, jnp.arange(horizon))
     trajectory = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), start, states)
     return trajectory, controls, residuals

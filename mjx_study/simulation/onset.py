@@ -40,6 +40,7 @@ from mjx_study.choices import ONSETS
 from mjx_study.simulation import constraint
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.dynamics import (
+    SAVE_SOLUTION,
     ControlLaw,
     State,
     advance_velocity,
@@ -151,7 +152,7 @@ def corrected_rollout(
         return following, (following, control)
 
     if not jacobian:
-        follow = jax.checkpoint(follow, policy=jax.checkpoint_policies.save_only_these_names("qacc"))
+        follow = jax.checkpoint(follow, policy=SAVE_SOLUTION)
     known = (jnp.arange(horizon), before, controls, after, jacobians, spread, shift)
     _, (states, controls) = jax.lax.scan(follow, start, known)
     trajectory = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), start, states)

@@ -67,7 +67,7 @@ def forecast(plan: StudyPlan, folder: Path | None = None, *, accept_versions: bo
         ValueError: the folder holds another study, or one of other versions.
     """
     store = None if folder is None else begun_store(plan, folder, accept_versions=accept_versions)
-    longer = store is not None and (store.document["config"].get("iterations") or 0) < _iterations(plan)
+    longer = store is not None and (store.document["config"].get("iterations") or 0) < plan.iterations
     missing = range(len(plan.cells)) if store is None or longer else store.missing
     cells = [plan.cells[index] for index in missing]
     counts = [_rollouts(plan, cell) for cell in cells]
@@ -83,11 +83,6 @@ def forecast(plan: StudyPlan, folder: Path | None = None, *, accept_versions: bo
         memory=plan.memory,
         seconds=None if store is None or longer else _seconds(plan, store, cells),
     )
-
-
-def _iterations(plan: StudyPlan) -> int:
-    """Iterations of the longest descent; 0 in other studies."""
-    return max((group.recipe.iterations for group in plan.groups if group.recipe), default=0)
 
 
 def _rollouts(plan: StudyPlan, cell: StudyCell) -> tuple[int, int]:

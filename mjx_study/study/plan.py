@@ -103,6 +103,11 @@ class StudyPlan:
         cells = {(cell.group, cell.samples): cell for cell in self.cells}.values()
         return max(memory_of_seed(self, cell) * seeds_together(self, cell) for cell in cells)
 
+    @property
+    def iterations(self) -> int:
+        """Iterations of the longest descent; 0 in other studies."""
+        return max((group.recipe.iterations for group in self.groups if group.recipe), default=0)
+
     def label(self, cell: StudyCell) -> str:
         """As messages name a cell."""
         group = self.groups[cell.group]

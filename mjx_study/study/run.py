@@ -38,7 +38,7 @@ def _document(plan: StudyPlan, command: str | None) -> dict[str, Any]:
     fields = {field.name: getattr(plan.config, field.name) for field in dataclasses.fields(plan.config)}
     axes = axes_of(plan)
     fields |= {"tasks": plan.config.task_names, "seeds": plan.config.batches}
-    fields["iterations"] = max((group.recipe.iterations for group in plan.groups if group.recipe), default=None)
+    fields["iterations"] = plan.iterations or None
     return {
         "config": fields,
         "warnings": list(plan.warnings),
