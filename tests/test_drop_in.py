@@ -272,10 +272,44 @@ def test_the_onset_term_of_a_step_is_that_of_a_rollout() -> None:
     assert np.abs(expected - plain).min() > 0.1
 
 
+@pytest.mark.slow
+def test_an_environment_has_the_onset_term_inside_and_only_there() -> None:
+    """The context's derivative is that of `step`, behind a jit used with and without; an imported `step` is refused."""
+    model, data = device(FALLING)
+    imported = mjx.step  # as by `from mujoco.mjx import step` before anything is patched
+    while hasattr(imported, "branches"):
+        imported = imported.__wrapped__
+
+    def height(gap, advance):
+        def following(data, _):
+            return (mjx.step if advance is None else advance)(model, data), None
+
+        start = data.replace(qpos=gap[None], qvel=jnp.array([-1.5]))
+        return jax.lax.scan(following, start, length=80)[0].qpos[0]
+
+    gradient = jax.jit(jax.grad(height), static_argnums=1)
+    gap = jnp.array(0.0352)
+    expected = float(gradient(gap, lambda model, data: step(model, data, onset="linear")))
+    with differentiable_mjx():
+        plain = float(gradient(gap, None))
+    with differentiable_mjx(onset="linear"):
+        corrected = float(gradient(gap, None))
+        with pytest.raises(RuntimeError, match="would have no onset term: call mjx.step by that name"):
+            gradient(gap, imported)
+        with differentiable_mjx():
+            assert float(gradient(gap, None)) == plain
+    np.testing.assert_allclose(corrected, expected, rtol=1e-12)
+    assert abs(corrected - plain) > 0.1
+    with pytest.raises(ValueError, match="Reverse-mode differentiation does not work"):
+        gradient(gap, None)
+
+
 def test_the_onset_term_is_not_for_models() -> None:
     model, data = device(FALLING)
     with pytest.raises(ValueError, match="unknown onset 'smooth' of a step; choose from none, linear"):
         step(model, data, onset="smooth")
+    with pytest.raises(ValueError, match="unknown onset 'smooth' of a step"), differentiable_mjx(onset="smooth"):
+        pass
     with pytest.raises(TypeError, match="derivatives are in states and controls, not in the model"):
         jax.grad(lambda mass: step(model.replace(body_mass=mass), data, onset="linear").qpos[0])(model.body_mass)
 

@@ -5,7 +5,7 @@ MJX's own solver.
 """
 
 import contextlib
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from functools import partial
 from typing import Any, Final
 
@@ -20,8 +20,9 @@ from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.dynamics import SAVE_SOLUTION, State, fwd_position
 from mjx_study.simulation.integration import difference_position, integrate_position
 from mjx_study.simulation.onset import onset_begins, onset_term, tangent_of, without_derivative
-from mjx_study.simulation.patches import patched
+from mjx_study.simulation.patches import Place, patched
 
+Replacements = dict[Place, Callable[..., mjx.Data]]
 ONSETS: Final = ("none", "linear")
 """Treatments of the onset of contact in the derivatives of a step."""
 STEP_SLOTS: Final = 2
@@ -49,26 +50,43 @@ def step(model: mjx.Model, data: mjx.Data, *, onset: str = "none") -> mjx.Data:
         ValueError: unknown onset, or the model is for another implementation than MJX's own in JAX.
         TypeError: differentiation with respect to the model, with the onset term.
     """
-    if onset not in ONSETS:
-        raise ValueError(f"unknown onset {onset!r} of a step; choose from {', '.join(ONSETS)}")
+    _check_onset(onset)
     if model.impl != mjx.Impl.JAX:
         raise ValueError(f"only MJX's implementation in JAX has derivatives, this model is for {model.impl.value}")
     advance = mjx.step if onset == "none" else _corrected_step
-    with differentiable_mjx():
+    with patched(_SOLVE):
         return jax.checkpoint(advance, policy=SAVE_SOLUTION)(model, data)
 
 
 @contextlib.contextmanager
-def differentiable_mjx() -> Generator[None]:
+def differentiable_mjx(*, onset: str = "none") -> Generator[None]:
     """`mjx.step` and `mjx.forward` have the derivatives of `step` in whatever is called, or traced, inside.
 
     For environments that call `mjx.step` themselves. What JAX has traced outside is traced again inside, and the other
     way round, also behind `jax.jit`; programs that are compiled ahead of time stay what they are. Call the gradient
     inside: `jax.grad(f)` alone traces nothing yet. Other threads are not affected. A decorator, too:
     `@differentiable_mjx()`.
+
+    Args:
+        onset: as in `step`. With "linear", what was imported from MJX as `step` before, rather than called as
+            `mjx.step`, raises RuntimeError.
+
+    Raises:
+        ValueError: unknown onset.
     """
-    with patched({("solver", "solve"): _solve}):
+    _check_onset(onset)
+    with patched(_REPLACED[onset]):
         yield
+
+
+def _check_onset(onset: str) -> None:
+    if onset not in ONSETS:
+        raise ValueError(f"unknown onset {onset!r} of a step; choose from {', '.join(ONSETS)}")
+
+
+def _uncorrected(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """In place of MJX's integrators, which a step that is not `mjx.step`'s replacement still calls."""
+    raise RuntimeError("this step would have no onset term: call mjx.step by that name, or mjx_study.step")
 
 
 def solver_residual(model: mjx.Model, data: mjx.Data) -> Float[Array, ""]:
@@ -86,6 +104,17 @@ def _solve(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     rows: Any = data._impl
     force = constraint.row_force(model, data, rows.efc_J @ qacc - rows.efc_aref)
     return data.replace(qacc=qacc, qfrc_constraint=rows.efc_J.T @ force, _impl=rows.replace(efc_force=force))
+
+
+_SOLVE: Final[Replacements] = {("solver", "solve"): _solve}
+_REPLACED: Final[dict[str, Replacements]] = {
+    "none": {**_SOLVE, ("", "step"): step},
+    "linear": {
+        **_SOLVE,
+        ("", "step"): partial(step, onset="linear"),
+        **dict.fromkeys([("forward", name) for name in ("euler", "implicit", "rungekutta4")], _uncorrected),
+    },
+}
 
 
 def _corrected_step(model: mjx.Model, data: mjx.Data) -> mjx.Data:

@@ -89,8 +89,8 @@ def turned_quaternion(
 
 
 def _module(name: str) -> Any:
-    """A module of MJX's implementation."""
-    return sys.modules[f"{mjx.make_constraint.__module__.rpartition('.')[0]}.{name}"]
+    """A module of MJX's implementation, or the package `mujoco.mjx`, by the empty name."""
+    return sys.modules[f"{mjx.make_constraint.__module__.rpartition('.')[0]}.{name}"] if name else mjx
 
 
 _mjx_spring_damper = getattr(_module("passive"), "_spring_damper", None)
@@ -167,7 +167,7 @@ def _positive(length: Float[Array, ""]) -> Float[Array, ""]:
 
 
 Place = tuple[str, str]
-"""Module and name of a function of MJX."""
+"""Module and name of a function of MJX; no module is the package, whose names only callers of MJX use."""
 
 _REPLACED: Final[dict[Place, Callable[..., Any]]] = {
     ("constraint", "_kbi"): stiffness_damping_impedance,
@@ -207,7 +207,7 @@ def _branch_at(module_name: str, name: str) -> None:
     module = _module(module_name)
     original = getattr(module, name, None)
     if original is None:
-        raise RuntimeError(f"this version of MJX has no {module_name}.{name}: adapt patches.py to it")
+        raise RuntimeError(f"this version of MJX has no {module.__name__}.{name}: adapt patches.py to it")
     if hasattr(original, "branches"):
         return
 
