@@ -3,6 +3,7 @@
 From JAX 0.11 on, programs split over several CPU devices crash (see `mjx_study.runtime`); there one device has to do.
 """
 
+import gc
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -21,6 +22,10 @@ FLAGS = [
     *(["--xla_cpu_use_fusion_emitters=false"] if OLD else []),
 ]
 os.environ["XLA_FLAGS"] = " ".join([*FLAGS, os.environ.get("XLA_FLAGS", "")])
+
+gc.set_threshold(
+    1_000_000, 20, 50
+)  # tracing makes millions of objects that live on: looking for garbage was a sixth of it
 
 DEVICES = 2 if OLD else 1
 CACHE = os.environ.get("JAX_COMPILATION_CACHE_DIR") or str(Path(__file__).parents[1] / ".pytest_cache" / "jax")

@@ -155,18 +155,20 @@ def compiled(function: Callable[..., Any], *examples: Any) -> Callable[..., Any]
     return jax.jit(function).lower(*examples).compile(compiler_options={"xla_backend_optimization_level": "0"})
 
 
+_PLAIN: Final = jax.make_user_context(False)
+
+
 @contextlib.contextmanager
 def plain_warm_start() -> Generator[None]:
     """What is traced inside is MJX's own: its solver starts where MJX does, without improving the start.
 
-    Its terms are MJX's, too, not those that round otherwise and have derivatives.
+    Its terms are MJX's, too, not those that round otherwise and have derivatives. JAX traces again what it has traced
+    outside.
     """
-    with pytest.MonkeyPatch.context() as patch:
+    with pytest.MonkeyPatch.context() as patch, _PLAIN(True):
         patch.setattr(constraint, "PREDICTOR_STEPS", 0)
         patch.setattr(patches, "_REPLACED", {})
-        jax.clear_caches()  # a trace from before would be used again
         yield
-    jax.clear_caches()
 
 
 def sizes(scene: Scene) -> tuple[int, int, int, int]:

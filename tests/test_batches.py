@@ -15,21 +15,26 @@ from mjx_study.study.resolution import check_estimators
 from mjx_study.tasks import make_task
 from mjx_study.tasks.contact_grid import contact_grid
 from mjx_study.tasks.task import Task
+from tests.carts import cart, launched_cart, steered_cart
 
-# What each stands for: an open loop; feedback from random starts, five bodies; one parameter before the simulation.
+# What each stands for: an open loop; feedback from random starts; parameters that act before the simulation.
+CARTS = {"cart": cart, "steered cart": steered_cart, "launched cart": launched_cart}
 TASKS = {"pusher": 12, "tennis": 8, "double_pendulum": 10}
 SAMPLES = 6
 
 
-@pytest.fixture(scope="module", params=TASKS)
+@pytest.fixture(scope="module", params=[*CARTS, *(pytest.param(name, marks=pytest.mark.slow) for name in TASKS)])
 def drawn(request: pytest.FixtureRequest) -> tuple[Task, Any, dict[str, Any]]:
     """A task of few steps, its MJX objective, and one batch of every kind from the same keys."""
-    task = make_task(request.param, horizon=TASKS[request.param])
+    name = request.param
+    task = CARTS[name]() if name in CARTS else make_task(name, horizon=TASKS[name])
     theta = task.theta + 0.05 * jax.random.normal(jax.random.key(1), task.theta.shape)
     task = task.replace(theta=theta)
-    family = "penalty" if task.contact_pair else "mjcf"
-    (cell,), _ = contact_grid(task, [family], [task.defaults.stiffnesses[0]] if task.contact_pair else None)
-    objective = Simulator(task, chunk_size=2).objective(cell.contact)
+    contact = None
+    if name in TASKS and task.contact_pair:
+        (cell,), _ = contact_grid(task, ["penalty"], [task.defaults.stiffnesses[0]])
+        contact = cell.contact
+    objective = Simulator(task, chunk_size=2).objective(contact)
     keys = jax.random.split(jax.random.key(0), SAMPLES)
     batches = {
         name: getattr(objective, oracle.method)(task.theta, jax.random.clone(keys))
@@ -89,7 +94,7 @@ def test_every_estimator_runs_on_every_kind_of_task(drawn, name: str) -> None:
     estimator = make_estimator(name, gamma=task.defaults.gamma, sigma=task.sigma, max_norm=1e9, window=task.horizon)
     if name == "delta" and not task.policy.additive:
         with pytest.raises(
-            ValueError, match="'delta' needs noise that is added to theta itself; tennis has a feedback"
+            ValueError, match=f"'delta' needs noise that is added to theta itself; {task.name} has a feedback"
         ):
             check_estimators([estimator], task)
         return
@@ -123,11 +128,12 @@ def test_a_reference_draws_the_noise_that_mjx_draws(noise: str) -> None:
 
 def test_linearising_on_the_tape() -> None:
     """Forward mode through the tape program gives the Jacobians of the Jacobian program."""
-    task = make_task("pusher", horizon=5)
-    (cell,), _ = contact_grid(task, ["penalty"], [100.0])
     keys = jax.random.split(jax.random.key(4), 2)
-    small = Simulator(task, chunk_size=1).objective(cell.contact).linearise(task.theta, keys)
-    on_tape = Simulator(make_task("pusher", horizon=5, adjoint="tape"), chunk_size=1)
-    large = on_tape.objective(cell.contact).linearise(task.theta, jax.random.clone(keys))
+    task = cart()
+    assert task.scene.uses_jacobian
+    small, large = (
+        Simulator(each, chunk_size=1).objective(None).linearise(task.theta, jax.random.clone(keys))
+        for each in (task, cart(adjoint="tape"))
+    )
     for one, other in zip(jax.tree.leaves(small), jax.tree.leaves(large), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9 * float(jnp.abs(other).max()))

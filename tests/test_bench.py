@@ -29,7 +29,8 @@ RATIOS = {"gradient_per_value", "rollouts_over_stock", "speedup_over_stock"}
 @pytest.mark.parametrize(
     ("task", "engine"),
     [
-        ("pusher", True),
+        ("tests.carts:cart", True),
+        pytest.param("pusher", True, marks=pytest.mark.slow),
         pytest.param("tennis", True, marks=pytest.mark.slow),
         pytest.param("double_pendulum", False, marks=pytest.mark.slow),
     ],
@@ -43,6 +44,7 @@ def test_bench_prints_its_ratios_and_the_machine(capsys: pytest.CaptureFixture[s
     assert document["environment"]["processor"] and document["gradient_memory"] > 0
 
 
+@pytest.mark.slow
 def test_stock_mjx_runs_the_same_samples() -> None:
     """The rival's costs are ours: same starts, noise of the task's own density, policy and contact."""
     task = make_task("tennis", horizon=5).replace(noise="laplace")

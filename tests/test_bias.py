@@ -15,6 +15,7 @@ def measured(name: str, families: tuple[str, ...], position: np.ndarray, size: i
     return {cell.family: means(points, *line(points, cell.contact), position, task.sigma, task.noise) for cell in cells}
 
 
+@pytest.mark.slow
 def test_momentum_transfer() -> None:
     """Right where the damping begins smoothly or there is none; of the wrong sign with MuJoCo's default."""
     found = measured("momentum_transfer", ("penalty", "smooth_onset", "mujoco_default"), np.array([0.5]), 1500)

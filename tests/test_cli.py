@@ -1,6 +1,8 @@
 """The command line as a user meets it: figures that are true, one line for what is wrong, nothing written then."""
 
+import contextlib
 import dataclasses
+import io
 import json
 import os
 import re
@@ -23,6 +25,8 @@ from mjx_study.study.plan import StudyPlan, plan_study
 from mjx_study.study.run import load_study
 from mjx_study.tasks import TASKS
 from tests.documents import stages_of
+
+pytestmark = pytest.mark.usefixtures("shared_programs")
 
 SMALL = ["--horizon", "4", "--samples", "8", "--reference-samples", "8"]
 MJCF = """<mujoco><worldbody>
@@ -50,19 +54,19 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
 
 
 @pytest.fixture(scope="module")
-def small_run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+def small_run(shared_programs: None, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     """One small comparison with an output folder, and what it printed."""
     folder = tmp_path_factory.mktemp("out") / "results"
-    environment = os.environ | {"XDG_CACHE_HOME": str(tmp_path_factory.mktemp("cache"))}
-    command = [sys.executable, "-m", "mjx_study", "compare", "pusher", *SMALL, "--output", str(folder)]
+    command = ["compare", "pusher", *SMALL, "--output", str(folder)]
     command += ["--stiffness", "10,1000", "--contact", "penalty,mujoco_default", "--estimators", "zobg,fobg,aobg,ivw"]
-    done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=300)
-    assert done.returncode == 0, done.stderr
-    first, *others = stages_of(done.stderr)
+    out, told = io.StringIO(), io.StringIO()
+    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(out), contextlib.redirect_stderr(told):
+        patch.setattr(options, "configure", lambda **_: None)
+        assert cli.main(command) == 0
+    first, *others = stages_of(told.getvalue())
     assert first == "[0/3] pusher, penalty, K = 10 N/m, h = 0.005 s, N = 8 (compiling first)"
     assert others == ["[1/3] pusher, penalty, K = 1000 N/m, h = 0.005 s, N = 8", others[1], "[3/3] done"]
-    assert "Warp" not in done.stdout and "warp" not in done.stdout
-    return folder, done.stdout
+    return folder, out.getvalue()
 
 
 def test_compare_reports_every_column_for_every_cell(small_run: tuple[Path, str]) -> None:
@@ -128,6 +132,7 @@ def test_warnings_about_the_contact_reach_the_reader(capsys: pytest.CaptureFixtu
     assert "warning: penalty, K = 10000 N/m: h^2 k" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_one_nan_sample_does_not_poison_the_table(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

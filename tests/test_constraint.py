@@ -151,6 +151,7 @@ def test_the_residual_measures_the_distance_from_the_solution(resting) -> None:
     assert far / near == pytest.approx(10, rel=0.05)  # linear in the distance
 
 
+@pytest.mark.slow
 def test_a_short_budget_shows_in_the_residual() -> None:
     case, residuals = CASES["mechanism"], []
     for iterations in (1, 100):

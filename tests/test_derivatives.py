@@ -15,7 +15,7 @@ SMOOTH = 1e-6
 """Relative error of a step's Jacobian against differences where the step is smooth."""
 slow = pytest.mark.slow
 ROWS = [
-    pytest.param("pusher", "pyramidal", 40, 100.0, id="pusher"),
+    pytest.param("pusher", "pyramidal", 40, 100.0, id="pusher", marks=slow),
     pytest.param("sliding_box", "elliptic", 60, 500.0, id="sliding_box elliptic", marks=slow),
     pytest.param("sliding_box", "pyramidal", 60, 500.0, id="sliding_box pyramidal", marks=slow),
     pytest.param("ball_wall", "elliptic", 100, 3000.0, id="ball_wall elliptic", marks=slow),

@@ -33,10 +33,9 @@ from tests.scenes import (
     stock_step_flat,
 )
 
-# Where the other cases already cover what a case's derivatives would show, they are left to `make test-all`.
-SLOW = ("box-plane pyramidal", "chain elliptic CG")
+# What the other cases already cover is left to `make test-all`.
+SLOW = ("box-plane pyramidal", "box-plane elliptic", "chain elliptic CG")
 MARKED = [pytest.param(name, marks=[pytest.mark.slow] if name in SLOW else []) for name in CASES]
-STEPPED = [pytest.param(name, marks=[pytest.mark.slow] if name == SLOW[1] else []) for name in CASES]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -123,7 +122,7 @@ def test_a_velocity_servo_is_implicit_under_implicitfast() -> None:
     np.testing.assert_allclose(after.qvel, [0.5 + 0.01 * 300 * 1.5 / (2 + 0.01 * 300)], rtol=1e-12)
 
 
-@pytest.mark.parametrize("name", STEPPED)
+@pytest.mark.parametrize("name", MARKED)
 def test_the_step_is_mjxs(name: str) -> None:
     """Over 25 steps, each from the same state, so that each step is compared and not how errors grow.
 
@@ -163,7 +162,7 @@ def test_the_step_is_mjxs(name: str) -> None:
     assert after.shape == (nq + nv + na,)
 
 
-@pytest.mark.parametrize("name", STEPPED)
+@pytest.mark.parametrize("name", MARKED)
 def test_the_state_is_in_contact(name: str) -> None:
     """Without its constraints the step would end elsewhere; the tests below are of contact."""
     case = prepare(name)
@@ -184,10 +183,7 @@ def test_reverse_mode_is_the_central_difference(name: str) -> None:
 
 @pytest.mark.parametrize(
     "name",
-    [
-        pytest.param(name, marks=[] if name in ("sphere-sphere condim 1", "mechanism") else [pytest.mark.slow])
-        for name in CASES
-    ],
+    [pytest.param(name, marks=[] if name == "sphere-sphere condim 1" else [pytest.mark.slow]) for name in CASES],
 )
 def test_both_programs_and_both_modes_agree(name: str) -> None:
     """The tape, forwards and backwards, equals the Jacobian program."""
@@ -239,6 +235,7 @@ def sliding_step(extra: str) -> Callable[[np.ndarray], np.ndarray]:
     return lambda point: np.asarray(program(jnp.asarray(point)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cone", [pytest.param("pyramidal", marks=pytest.mark.slow), "elliptic"])
 def test_conjugate_gradients_have_newtons_derivative(cone: str) -> None:
     newton = sliding_jacobian(f'cone="{cone}" solver="Newton"')
@@ -249,6 +246,7 @@ def test_conjugate_gradients_have_newtons_derivative(cone: str) -> None:
         assert_close_by_rows(gradients(at(height)), newton(at(height)), 1e-6)
 
 
+@pytest.mark.slow
 def test_the_derivative_does_not_depend_on_the_budget() -> None:
     """Unlike an unrolled solver's: with enough iterations more of them change nothing."""
     expected = sliding_jacobian('cone="elliptic" solver="Newton"')(at(-0.0004))
@@ -446,6 +444,7 @@ def test_runge_kutta_converges_with_order_four(pendulum) -> None:
     np.testing.assert_allclose(orders, 4, atol=0.15)  # the next order's share, which halves with the timestep
 
 
+@pytest.mark.slow
 def test_derivative_of_runge_kutta(pendulum) -> None:
     scene, start, run = pendulum
     program = compiled(jax.jacrev(lambda x: step_flat(scene, scene.model, x, jnp.zeros(1))[0]), start)
@@ -462,6 +461,7 @@ def test_initial_state_defaults() -> None:
     assert state.act.shape == (2,) and not np.any(state.qvel) and not np.any(state.warmstart)
 
 
+@pytest.mark.slow
 def test_second_derivatives_see_the_acceleration() -> None:
     """The step's Jacobian depends on qacc; its own derivative must follow that, as the tape's does by itself."""
 

@@ -1,7 +1,9 @@
 """Landscapes: quadrature against closed forms, curves against each other, and what the command says and writes."""
 
+import contextlib
 import dataclasses
 import importlib
+import io
 import json
 from functools import partial
 from pathlib import Path
@@ -148,17 +150,27 @@ def test_noise_reaches_quadrature_and_the_reference() -> None:
         assert found.slope - found.first == pytest.approx(jump * peak, rel=1e-9)
 
 
-def flight(**options: Any) -> StudyPlan:
-    """40 steps of a shot ball, before it meets anything: x = v cos(theta) t, and everything is smooth."""
-    task = make_task("momentum_transfer", horizon=40)
-    task = task.replace(final_cost=lambda state: state.qpos[0] ** 2, sigma=0.1)
-    return plan_study(config(task, contact=("reference", "mujoco"), stiffness=(10_000.0,), span=(0.3, 1.2), **options))
+def shot(horizon: int = 40) -> Task:
+    """A shot ball before it meets anything: x = v cos(theta) t, and everything is smooth."""
+    task = make_task("momentum_transfer", horizon=horizon)
+    return task.replace(final_cost=lambda state: state.qpos[0] ** 2, sigma=0.1)
 
 
 @pytest.fixture(scope="module")
-def flown() -> xr.Dataset:
-    """The reference, and one contact model."""
-    return run_study(flight(points=5, samples=(300,)))
+def drawn(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """A folder that the command wrote, and what it printed: the reference, and one contact model."""
+    folder = tmp_path_factory.mktemp("landscape") / "out"
+    arguments = ["landscape", f"{__name__}:shot", "--points", "5", "--samples", "300", "--span", "0.3,1.2"]
+    arguments += ["--contact", "mujoco", "--stiffness", "10000", "--output", str(folder)]
+    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(io.StringIO()) as printed:
+        patch.setattr(options, "configure", lambda **_: None)
+        assert cli.main(arguments) == 0
+    return folder, printed.getvalue()
+
+
+@pytest.fixture(scope="module")
+def flown(drawn: tuple[Path, str]) -> xr.Dataset:
+    return load_study(drawn[0])
 
 
 def test_curves_agree_with_quadrature_and_with_each_other(flown: xr.Dataset) -> None:
@@ -187,6 +199,7 @@ def test_a_reference_that_jumps_is_found_out(flown: xr.Dataset) -> None:
     assert len(document["curves"][0]["exact_slope"]) == 5
 
 
+@pytest.mark.slow
 def test_a_direction_through_many_parameters() -> None:
     """Along one force of the pusher: both slopes are the gradient's entry, within their errors."""
     task = make_task("pusher", horizon=10)
@@ -239,7 +252,8 @@ class Broken:
 
 
 def test_samples_that_are_not_finite_are_left_out_and_counted(monkeypatch: pytest.MonkeyPatch) -> None:
-    plan = flight(points=2, samples=(50,))
+    chosen: dict[str, Any] = {"contact": ("reference",), "stiffness": (10_000.0,), "span": (0.3, 1.2)}
+    plan = plan_study(config(shot(), **chosen, points=2, samples=(50,)))
     plan = dataclasses.replace(plan, cells=plan.cells[:1])
     monkeypatch.setattr(sampling.Objectives, "__call__", lambda *_: Broken())
     monkeypatch.setattr(landscapes, "closed_form", lambda *_: None)
@@ -250,15 +264,12 @@ def test_samples_that_are_not_finite_are_left_out_and_counted(monkeypatch: pytes
     assert np.all(arrays["slope"][1] < 0) and all(np.isfinite(arrays[name]).all() for name in ("slope", "slope_se"))
 
 
-def test_the_command_prints_and_writes(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    arguments = ["landscape", "ball_wall", "--points", "3", "--samples", "8", "--contact", "penalty"]
-    assert cli.main([*arguments, "--horizon", "4", "--output", str(tmp_path)]) == 0
-    printed = capsys.readouterr().out
-    assert "where the mean cost is least" in printed and "theta from 0 to 1.5 in 3 points" in printed
-    assert {"landscape.pdf", "landscape.png", "study.json"} < {path.name for path in tmp_path.iterdir()}
-    data = load_study(tmp_path)
-    assert data["contact"].values.tolist() == ["reference", "penalty"] and data.sizes["point"] == 3
-    assert json.loads(data.attrs["environment"])["precision"] == "float64"
+def test_the_command_prints_and_writes(drawn: tuple[Path, str], flown: xr.Dataset) -> None:
+    folder, printed = drawn
+    assert "where the mean cost is least" in printed and "theta from 0.3 to 1.2 in 5 points" in printed
+    assert {"landscape.pdf", "landscape.png", "study.json"} < {path.name for path in folder.iterdir()}
+    assert flown["contact"].values.tolist() == ["reference", "mujoco"] and flown.sizes["point"] == 5
+    assert json.loads(flown.attrs["environment"])["precision"] == "float64"
 
 
 @pytest.mark.parametrize(

@@ -58,6 +58,7 @@ def test_what_cannot_be_a_network_is_refused() -> None:
         with_network(make_task("pusher", horizon=3), (4, 0), jax.random.key(8))
 
 
+@pytest.mark.slow
 def test_a_network_is_optimised_and_replayed(
     capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

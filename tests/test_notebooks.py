@@ -78,6 +78,7 @@ def test_there_is_one_for_each_question() -> None:
     assert [path.stem for path in NOTEBOOKS] == list(SMALL)
 
 
+@pytest.mark.slow
 @each
 def test_runs(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """At a small size, in an empty folder, where it leaves nothing behind."""

@@ -1,6 +1,6 @@
 """From a task and a contact model to an objective: batching, devices, scores, baselines, failures, memory.
 
-What does not depend on contact runs on a cart, a mass on a slide, which compiles in a third of the pusher's time.
+What does not depend on contact runs on a cart.
 """
 
 import dataclasses
@@ -19,7 +19,7 @@ from mjx_study.simulation.dynamics import State, initial_state
 from mjx_study.simulation.scene import put_scene
 from mjx_study.tasks import make_task
 from mjx_study.tasks.policy import InitialStatePolicy, LinearFeedback, OpenLoop, Policy
-from mjx_study.tasks.task import StudyDefaults, Task
+from tests.carts import cart
 from tests.conftest import DEVICES
 from tests.estimators.statistics_helpers import assert_mean_is
 from tests.pusher_fixtures import (
@@ -33,33 +33,8 @@ from tests.pusher_fixtures import (
     sample_keys,
 )
 
-CART = """<mujoco model="cart">
-  <option timestep="0.01" integrator="Euler"><flag eulerdamp="disable"/></option>
-  <worldbody><body>
-    <joint name="x" type="slide" axis="1 0 0" damping="0.1"/><geom name="cart" size="0.1" mass="1"/>
-  </body></worldbody>
-  <actuator><motor joint="x"/></actuator>
-</mujoco>"""
 ANY_CONTACT = ContactModel(jnp.array([-1.0, -1.0]), jnp.array([0.9, 0.9, 0.001, 0.5, 2.0]))
 LIMIT = 0.25  # [N]; controls beyond it have no cost in the task that breaks
-
-
-def cart(running_cost=lambda state, control: jnp.sum(state.qpos**2) + jnp.sum(control**2), horizon: int = 5) -> Task:
-    scene = put_scene(mujoco.MjModel.from_xml_string(CART), "cart")
-    return Task(
-        name="cart",
-        description="a mass on a slide",
-        scene=scene,
-        horizon=horizon,
-        policy=OpenLoop(horizon, 1),
-        theta=jnp.linspace(0.0, 0.2, horizon),
-        sigma=0.1,
-        start=initial_state(scene, qpos=jnp.array([1.0])),
-        running_cost=running_cost,
-        final_cost=lambda state: jnp.sum(state.qvel**2),
-        contact_pair=("cart", "cart"),
-        defaults=StudyDefaults(gamma=1.0),
-    )
 
 
 @pytest.fixture
@@ -90,6 +65,7 @@ def test_a_sweep_compiles_each_program_once(simulator):
     assert set(compiled) == {2}
 
 
+@pytest.mark.slow
 def test_chunk_size_does_not_matter_in_contact(simulator, large):
     """Other samples share a solver loop; at K = 10 rounding is not amplified."""
     contact, theta = penalty(10.0), pusher_task().theta
@@ -389,6 +365,7 @@ BALL = """<mujoco model="ball">
 </mujoco>"""
 
 
+@pytest.mark.slow
 def test_a_starved_solver_shows_in_the_residual(monkeypatch):
     """A ball that slides and spins: the elliptic cone couples the rows, and one iteration does not solve it.
 
@@ -417,6 +394,7 @@ def test_a_starved_solver_shows_in_the_residual(monkeypatch):
 # Memory
 
 
+@pytest.mark.slow
 def test_memory_of_a_thousand_gradients(large):
     """1000 samples of 200 steps at once: 24 numbers per step, among them the 2 x 5 Jacobian, make 36.6 MiB."""
     task = pusher_task()

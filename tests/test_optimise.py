@@ -109,7 +109,9 @@ def test_an_iteration_is_gradient_descent_on_the_estimate() -> None:
     assert run["gradient_norm"].values[0] == pytest.approx(float(jnp.linalg.norm(estimate.mean)), rel=1e-9)
 
 
-@pytest.mark.parametrize("reference", [False, True], ids=["MJX", "reference"])
+@pytest.mark.parametrize(
+    "reference", [pytest.param(False, id="MJX", marks=pytest.mark.slow), pytest.param(True, id="reference")]
+)
 def test_a_stopped_run_goes_on_to_the_same_end(tmp_path: Path, reference: bool) -> None:
     """Bit for bit, with an optimiser that has a memory: with more iterations, and from a part of a cell."""
     common: dict[str, Any] = {"optimizer": "adam", "learning_rate": 0.01, "estimators": ("fobg", "zobg")}
@@ -252,6 +254,7 @@ def test_a_task_without_recipe_or_reference_says_what_is_missing(monkeypatch: py
         plan_study(config(horizon=3, contact=("reference",)))
 
 
+@pytest.mark.slow
 def test_one_compilation_for_all_iterations(monkeypatch: pytest.MonkeyPatch) -> None:
     compiled: list[Any] = []
     jit = jax.jit
@@ -318,6 +321,7 @@ def test_sliding_box_first_order_degrades() -> None:
     assert np.mean(cost["aobg"]) < np.mean(cost["zobg"]) + 3 * error
 
 
+@pytest.mark.slow
 def test_outcomes_of_tennis_are_what_happened() -> None:
     """A ball was hit where the reference counts an impact; in MJX the paddle's corners count too."""
     task = make_task("tennis")
@@ -340,6 +344,7 @@ def test_outcomes_of_tennis_are_what_happened() -> None:
     assert np.mean(hit[found["hit"] == 1]) > 0.97 and np.mean(hit) < np.mean(found["hit"]) + 0.15
 
 
+@pytest.mark.slow
 def test_outcomes_of_the_sliding_box_tell_who_is_aboard() -> None:
     """Pushed gently the block stays on the box, pushed hard it falls; MJX and the reference agree."""
     for force, aboard in ((0.05, 1.0), (1.0, 0.0)):

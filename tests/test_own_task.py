@@ -129,6 +129,7 @@ def test_optimise(folder: Path) -> None:
     assert len(found["theta"][0]) == 80
 
 
+@pytest.mark.slow
 def test_sweep_and_plot(folder: Path) -> None:
     """Of 4 samples, FoBG's are nearer to the reference and vary less than a tenth of ZoBG's; it is a seventieth."""
     arguments = ["--samples", "4", "--seeds", "2", "--reference-samples", "4", "--output", "out"]

@@ -81,6 +81,7 @@ def test_the_wall_stops_the_ball_and_its_top_is_real() -> None:
     assert x[3] > 0.9  # cleared it
 
 
+@pytest.mark.slow
 def test_on_the_dome_the_bounce_turns_with_the_angle() -> None:
     """A flat face throws all of these back alike; the round top throws them up, the more the higher they meet it."""
     angles = np.linspace(0.56, 0.62, 7)[:, None]
@@ -182,6 +183,7 @@ def test_a_stiff_damper_creeps_less() -> None:
 # Tennis
 
 
+@pytest.mark.slow
 def test_balls_bounce_as_in_the_reference() -> None:
     """64 starts and a policy that reaches every ball: where the ball ends, an error that falls as 1 / sqrt(K)."""
     task = make_task("tennis")
@@ -210,6 +212,7 @@ def test_balls_bounce_as_in_the_reference() -> None:
 # The double pendulum
 
 
+@pytest.mark.slow
 def test_the_pendulum_is_the_reference() -> None:
     """The same equations of motion and Runge-Kutta steps; chaos multiplies the 1e-14 kg m^2 of MuJoCo's points."""
     task = make_task("double_pendulum", horizon=500)

@@ -76,6 +76,7 @@ def test_non_finite_samples_of_the_pilot_do_not_poison_it():
     assert result.variance < 0.5 * reference_gradient(odd_batch(1000, 1), pilot, [], NOISE).variance
 
 
+@pytest.mark.slow
 def test_is_precise_on_the_pusher():
     """At K = 10 the cost is nearly linear in the noise: 500 odd samples give 1e-2 of the gradient."""
     mjx, theta = pusher_simulator().objective(penalty(10.0)), pusher_task().theta

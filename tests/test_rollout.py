@@ -1,5 +1,6 @@
 """`mjx-study rollout`: numbers are those of the objective and of the C engine, files are whole, errors are clear."""
 
+import functools
 import json
 from pathlib import Path
 from typing import Any
@@ -49,13 +50,18 @@ def document(capsys: pytest.CaptureFixture[str], *arguments: str) -> dict[str, A
     return json.loads(printed.out)
 
 
+@functools.cache
+def ten_steps() -> Simulator:
+    return Simulator(make_task("pusher", horizon=10), chunk_size=1)
+
+
 @pytest.mark.parametrize("noise", [[], ["--noise", "--seed", "3"]], ids=["silent", "noisy"])
 def test_the_cost_is_the_objectives(capsys: pytest.CaptureFixture[str], noise: list[str]) -> None:
     """The same sample as in a batch: the value with its key's noise, the baseline without."""
     facts = document(capsys, *SHORT, "--contact", "penalty", "--stiffness", "1000", *noise)
-    task = make_task("pusher", horizon=10)
+    task = ten_steps().task
     (cell,), _ = contact_grid(task, ("penalty",), (1000.0,))
-    batch = Simulator(task, chunk_size=1).objective(cell.contact).evaluate(task.theta, jax.random.key(3)[None])
+    batch = ten_steps().objective(cell.contact).evaluate(task.theta, jax.random.key(3)[None])
     assert facts["cost"] == pytest.approx(float((batch.value if noise else batch.baseline)[0]), rel=1e-9)
     assert facts["contact"] == "penalty" and facts["stiffness"] == 1000 and facts["finite"]
     assert facts["sigma"] == (0.1 if noise else 0) and facts["residual"] < 1e-6
@@ -89,7 +95,9 @@ def test_pictures_and_film_are_whole(capsys: pytest.CaptureFixture[str], elsewhe
         assert words in printed
 
 
-@pytest.mark.parametrize("kind", ["json", "npy", "policy"])
+@pytest.mark.parametrize(
+    "kind", [pytest.param("json", marks=pytest.mark.slow), pytest.param("npy", marks=pytest.mark.slow), "policy"]
+)
 def test_theta_from_a_file(capsys: pytest.CaptureFixture[str], elsewhere: Path, kind: str) -> None:
     theta = np.linspace(0, 1, 10)
     path = elsewhere / ("theta.npy" if kind == "npy" else f"{kind}.json")
@@ -104,7 +112,9 @@ def test_theta_from_a_file(capsys: pytest.CaptureFixture[str], elsewhere: Path, 
     np.testing.assert_allclose(data["controls"][:, 0], theta)
 
 
-@pytest.mark.parametrize("keyframe", ["", KEYFRAME], ids=["reference pose", "keyframe"])
+@pytest.mark.parametrize(
+    "keyframe", [pytest.param("", id="reference pose", marks=pytest.mark.slow), pytest.param(KEYFRAME, id="keyframe")]
+)
 def test_an_mjcf_moves_as_the_c_engine_moves_it(
     capsys: pytest.CaptureFixture[str], elsewhere: Path, keyframe: str
 ) -> None:

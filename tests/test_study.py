@@ -147,6 +147,7 @@ def test_an_alpha_order_row_follows_from_the_other_two(spied) -> None:
         assert both.seconds_per_sample == pytest.approx(zeroth.seconds_per_sample + first.seconds_per_sample)
 
 
+@pytest.mark.slow
 def test_results_do_not_depend_on_the_chunk_size() -> None:
     chosen = [compare(stiffness=(100.0,), contact=("mujoco",), chunk_size=chunk) for chunk in (2, 9)]
     for name in ("gradient", "reference"):
@@ -171,6 +172,7 @@ def test_a_second_run_gives_the_same_numbers(spied) -> None:
     assert np.all(other["gradient"].values != again["gradient"].values)
 
 
+@pytest.mark.slow
 def test_zeroth_order_alone_does_not_differentiate_for_itself() -> None:
     found = compare(stiffness=(10.0,), contact=("penalty",), estimators=("zobg",))
     assert [row.estimator for row in rows_of(found)] == ["zobg"]

@@ -36,7 +36,9 @@ def p_values(draw_first, draw_zeroth, trials: int) -> np.ndarray:
     return np.asarray(batch(keys))
 
 
-@pytest.mark.parametrize("params", [1, 5, 150])
+@pytest.mark.parametrize(
+    "params", [pytest.param(1, marks=pytest.mark.slow), 5, pytest.param(150, marks=pytest.mark.slow)]
+)
 def test_the_level_is_kept_with_more_parameters_than_samples(params: int) -> None:
     """Equal means, unequal variances: rejected at 5 % about 5 % of the time, within 4 standard errors and 2 points.
 
@@ -80,7 +82,12 @@ def verdicts(share: float, samples: int, params: int = 1, trials: int = 1000) ->
 
 
 @pytest.mark.parametrize(
-    ("samples", "expected", "params"), [(400, 3.2, 1), (50, 0.4, 1), (50, 8.0, 1), (50, 8.0, 20), (400, 20.0, 1)]
+    ("samples", "expected", "params"),
+    [
+        (50, 0.4, 1),
+        (50, 8.0, 1),
+        *(pytest.param(*case, marks=pytest.mark.slow) for case in ((400, 3.2, 1), (50, 8.0, 20), (400, 20.0, 1))),
+    ],
 )
 def test_an_unbiased_estimate_with_rare_samples_is_not_called_biased(
     samples: int, expected: float, params: int
@@ -146,7 +153,7 @@ def test_empirical_bias_of_the_papers_example() -> None:
         empirical_bias(estimate, jnp.ones(1), 4999)
 
 
-@pytest.mark.parametrize("offset", [0.0, 0.5])
+@pytest.mark.parametrize("offset", [pytest.param(0.0, marks=pytest.mark.slow), 0.5])
 def test_squared_bias_from_batch_means_is_unbiased_and_its_interval_holds(offset: float) -> None:
     """Ten batch means of noise 0.3 in 20 dimensions, and a reference of error 0.05 in each: 2000 times."""
 
@@ -217,7 +224,7 @@ def test_plug_in_bounds_fail_on_rare_events(proxy: str) -> None:
     assert share == pytest.approx(1 - 0.99**50, abs=4 * binomial_standard_error(0.4, COVERAGE_TRIALS))
 
 
-@pytest.mark.parametrize("name", ["gaussian", "heavy tails", "jump"])
+@pytest.mark.parametrize("name", ["gaussian", pytest.param("heavy tails", marks=pytest.mark.slow), "jump"])
 @pytest.mark.parametrize("proxy", ["variance", "second_moment"])
 def test_plug_in_bounds_hold_where_tails_are_seen(name: str, proxy: str) -> None:
     _, lower, _ = coverage(name, proxy, "max_deviation", 100)

@@ -150,7 +150,7 @@ def test_standard_errors_of_a_comparison_against_repetition(kind: str):
 
 
 # True relative error, parameters, samples, the reference's own relative standard error.
-DEBIASED = [(0.3, 200, 400, 0.1), (0.0, 20, 400, 0.02), (0.3, 5, 50, 0.02)]
+DEBIASED = [pytest.param(0.3, 200, 400, 0.1, marks=pytest.mark.slow), (0.0, 20, 400, 0.02), (0.3, 5, 50, 0.02)]
 
 
 @pytest.mark.parametrize(("true", "params", "samples", "uncertainty"), DEBIASED)

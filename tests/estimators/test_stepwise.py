@@ -283,7 +283,9 @@ def test_a_noise_density_and_its_score(name: str) -> None:
     assert noise.name == name and noise.information >= 1.0
 
 
-@pytest.mark.parametrize("name", NOISES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] if name == "student" else []) for name in NOISES]
+)
 def test_zeroth_order_is_unbiased_under_every_noise(name: str) -> None:
     """d/dtheta E[(theta + s z)^3] = 3 (theta^2 + s^2) for any density of variance 1 without skew."""
     noise, sigma, theta = NOISES[name], 0.5, 1.0

@@ -82,6 +82,7 @@ def test_a_kink_is_told_from_a_wrong_derivative() -> None:
     assert any(line.startswith("kink:") for line in report.lines())
 
 
+@pytest.mark.slow
 def test_a_jump_is_told_from_a_wrong_derivative() -> None:
     """MuJoCo's default contact begins with its damping force: a ball that arrives with speed meets a jump."""
     falling = BALL.format(name="z", axis="0 0 1").replace("<body", '<body pos="0 0 .1"')
@@ -111,6 +112,7 @@ def test_a_joint_at_its_limit_is_named() -> None:
     assert report.passed and causes == {"x is at its limit"}
 
 
+@pytest.mark.slow
 def test_an_upright_cylinder_excuses_its_own_entries_and_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
     """Its three contact points turn with the direction in which it tilts, however little; what stands beside does not.
 
@@ -143,6 +145,7 @@ def test_an_upright_cylinder_excuses_its_own_entries_and_no_other(monkeypatch: p
     assert not report.passed
 
 
+@pytest.mark.slow
 def test_runge_kutta_is_compared_with_the_engine() -> None:
     rod = '<body><joint name="j" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0 0 -.3" size=".02" mass="1"/></body>'
     motor = '<actuator><motor joint="j"/></actuator>'
@@ -162,6 +165,7 @@ def test_a_silent_zero_fails() -> None:
     assert report.lines()[-1] == "SOMETHING IS WRONG: see above"
 
 
+@pytest.mark.slow
 def test_a_nan_fails_in_the_mode_that_has_it() -> None:
     tendon = '<tendon><fixed name="t" actuatorfrcrange="-1 1"><joint joint="x" coef="1"/></fixed></tendon>'
     far = '<geom type="plane" size="1 1 1" pos="0 0 -9"/>'  # with contacts, reverse mode is checked on the tape as well
@@ -171,6 +175,7 @@ def test_a_nan_fails_in_the_mode_that_has_it() -> None:
     assert not report.passed and nan.modes == ("tape",) and "limited actuator force" in nan.cause
 
 
+@pytest.mark.slow
 def test_an_unconverged_solve_is_told_from_a_wrong_derivative() -> None:
     """One iteration on two contacts that compete; given its budget, the same scene is right."""
     sliding = (
@@ -187,6 +192,7 @@ def test_an_unconverged_solve_is_told_from_a_wrong_derivative() -> None:
     assert whole.passed and whole.steps[0].residual < 1e-9
 
 
+@pytest.mark.slow
 def test_contacts_placed_differently_are_reported_and_do_not_fail() -> None:
     """MuJoCo and MJX pick other points of the area in which two boxes touch."""
     boxes = (
@@ -201,6 +207,7 @@ def test_contacts_placed_differently_are_reported_and_do_not_fail() -> None:
     assert report.steps[0].engine is None  # another step has another derivative
 
 
+@pytest.mark.slow
 def test_stock_derivatives_are_checked_apart() -> None:
     """MJX takes the derivative of a rotation at rest as zero: a finding that is not the project's."""
     world = '<worldbody><body><joint name="ball" type="ball"/><geom size=".1" mass="1"/></body></worldbody>'
