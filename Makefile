@@ -2,7 +2,7 @@
 # 3.11-3.13 with pip and venv, and a package index that pip can reach; nothing else.
 
 PYTHON ?= python3
-PYTEST_ARGS ?= -n 2 --dist loadfile
+PYTEST_ARGS ?= -n 2 --dist loadgroup
 LOCK_ARGS ?=
 
 VENV := .venv

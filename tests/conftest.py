@@ -36,16 +36,28 @@ jax.config.update("jax_compilation_cache_dir", CACHE)
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """With xdist, a module's tests run in one process; so do those of modules that share a group and thus programs."""
+    for item in items:
+        if item.get_closest_marker("xdist_group") is None:
+            item.add_marker(pytest.mark.xdist_group(item.nodeid.partition("::")[0]))
+
+
+@pytest.fixture(scope="session")
+def programs() -> tuple[dict[Any, Any], dict[Any, Any]]:
+    """Tasks and simulators that `shared_programs` has made."""
+    return {}, {}
+
+
 @pytest.fixture(scope="module")
-def shared_programs() -> Iterator[None]:
-    """Studies of a module that need the same task and chunk size share them with all that is compiled."""
+def shared_programs(programs: tuple[dict[Any, Any], dict[Any, Any]]) -> Iterator[None]:
+    """Studies that need the same task and chunk size share them with all that is compiled."""
     from mjx_study.runtime import precision  # not above: type checking is switched on after this file is imported
-    from mjx_study.study import plan, sampling
+    from mjx_study.study import descents, plan, sampling
     from mjx_study.tasks import TASKS
 
     build, make = plan._build, sampling.Simulator
-    tasks: dict[Any, Any] = {}
-    simulators: dict[Any, Any] = {}
+    tasks, simulators = programs
 
     def built(config: Any, which: Any, timestep: float | None, cone: str | None) -> Any:
         if not isinstance(which, str) or which not in TASKS:
@@ -64,5 +76,6 @@ def shared_programs() -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(plan, "_build", built)
-        patch.setattr(sampling, "Simulator", made)
+        for module in (sampling, descents):
+            patch.setattr(module, "Simulator", made)
         yield

@@ -26,9 +26,9 @@ from mjx_study.study.run import load_study
 from mjx_study.tasks import TASKS
 from tests.documents import stages_of
 
-pytestmark = pytest.mark.usefixtures("shared_programs")
+pytestmark = [pytest.mark.usefixtures("shared_programs"), pytest.mark.xdist_group("pusher of four steps")]
 
-SMALL = ["--horizon", "4", "--samples", "8", "--reference-samples", "8"]
+SMALL = ["--horizon", "4", "--samples", "8", "--reference-samples", "8", "--chunk-size", "4"]
 MJCF = """<mujoco><worldbody>
   <body name="a"><joint name="{joint}" type="slide" axis="1 0 0"/>
     <geom name="pusher" type="{geom}" size="0.5 0.5 0.5" mass="0.1"/></body>

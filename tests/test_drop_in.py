@@ -81,9 +81,8 @@ def test_every_field_is_mjxs(name: str) -> None:
     assert np.abs(data.qvel).max() > 0
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=[] if n == "sphere-sphere condim 1" else [pytest.mark.slow]) for n in CASES]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CASES)
 def test_derivatives_are_those_of_the_scenes_step(name: str) -> None:
     """Forwards and backwards; `test_dynamics` has these against central differences."""
     case = prepare(name)
@@ -107,6 +106,7 @@ def test_derivatives_are_those_of_the_scenes_step(name: str) -> None:
     assert_close_by_rows(forward, jacobian(name), 1e-6)
 
 
+@pytest.mark.slow
 def test_derivatives_of_sensors_and_forces() -> None:
     """Of what the scene's step does not compute, against central differences, in both modes."""
     model, data = device(SENSED)
@@ -182,6 +182,7 @@ def test_a_trace_of_stock_mjx_is_not_used_again() -> None:
     assert np.isnan([before, float(gradient(*point))]).all() and 0 < inside < 0.04
 
 
+@pytest.mark.slow
 def test_the_context_is_a_decorator_and_may_be_nested() -> None:
     environment = Environment()
 

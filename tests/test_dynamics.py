@@ -34,7 +34,7 @@ from tests.scenes import (
 )
 
 # What the other cases already cover is left to `make test-all`.
-SLOW = ("box-plane pyramidal", "box-plane elliptic", "chain elliptic CG")
+SLOW = ("capsule-plane pyramidal CG implicitfast", "box-plane pyramidal", "box-plane elliptic", "chain elliptic CG")
 MARKED = [pytest.param(name, marks=[pytest.mark.slow] if name in SLOW else []) for name in CASES]
 
 

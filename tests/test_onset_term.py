@@ -120,7 +120,8 @@ def compiled(function, *arguments):
     return jax.device_get(program(*arguments))
 
 
-def test_every_sample_is_that_of_the_formula() -> None:
+@pytest.mark.parametrize("mode", [jax.jacrev, pytest.param(jax.jacfwd, marks=pytest.mark.slow)])
+def test_every_sample_is_that_of_the_formula(mode) -> None:
     timestep, steps = 2e-3, 60
     scene = scene_of(floor_scene(BODY, option(timestep, "", 'refsafe="disable"'), 'condim="1"'))
     gaps = np.linspace(0.0611, 0.0789, 12)
@@ -142,19 +143,17 @@ def test_every_sample_is_that_of_the_formula() -> None:
         return cost(states.qpos[-1, 0]) + term, counts
 
     def sample(gap, free):
-        forward, (value, counts) = jax.jacfwd(last, has_aux=True)(gap, free)
-        backward, _ = jax.jacrev(last, has_aux=True)(gap, free)
-        return value, counts, forward, backward, *jax.grad(last_cost, has_aux=True)(gap, free)
+        derivative, (value, counts) = mode(last, has_aux=True)(gap, free)
+        return value, counts, derivative, *jax.grad(last_cost, has_aux=True)(gap, free)
 
     accelerations = (0.0, GRAVITY)
     batched = jax.vmap(jax.vmap(sample, in_axes=(0, None)), in_axes=(None, 0))
-    for free, (values, counts, forward, backward, jumping, jumps) in zip(
+    for free, (values, counts, derivative, jumping, jumps) in zip(
         accelerations, _unstacked(compiled(batched, gaps, np.array(accelerations)), 2), strict=True
     ):
         ours, of_steps, corrected, term = fall(gaps, steps, timestep, free)
         np.testing.assert_allclose(values, ours, rtol=0, atol=1e-12)
-        np.testing.assert_allclose(forward, corrected, rtol=1e-9, atol=1e-12)
-        np.testing.assert_allclose(backward, corrected, rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(derivative, corrected, rtol=1e-9, atol=1e-12)
         np.testing.assert_allclose(jumping, 200 * (ours[:, 0] - 0.02) * of_steps[:, 0] + term, rtol=1e-9, atol=1e-12)
         assert np.all(np.abs(of_steps - corrected).max(axis=1) > 0.1)  # the term is no small matter here
         assert np.abs(term).max() > 0.1
@@ -170,8 +169,8 @@ def _unstacked(tree, size: int):
     ("law", "free"),
     [
         pytest.param(Law(), GRAVITY, id="MuJoCo's default"),
-        pytest.param(Law(low=0.9, high=0.9), GRAVITY, id="constant impedance"),
-        pytest.param(Law(low=0.5, high=0.5), -30.0, id="half the impedance, pressed on"),
+        pytest.param(Law(low=0.9, high=0.9), GRAVITY, id="constant impedance", marks=pytest.mark.slow),
+        pytest.param(Law(low=0.5, high=0.5), -30.0, id="half the impedance, pressed on", marks=pytest.mark.slow),
     ],
 )
 def test_the_error_of_the_mean_falls_with_the_square_of_the_timestep(law: Law, free: float) -> None:
@@ -233,6 +232,7 @@ def test_the_mean_has_the_slope_where_plain_first_order_has_the_wrong_sign(onset
     assert np.abs(found.first - found.slope) < within + 2 * (found.slope_error + found.first_error)
 
 
+@pytest.mark.slow
 def test_onsets_beyond_the_slots_are_counted_and_left_out() -> None:
     scene = scene_of(floor_scene(BODY, option(2e-3, "", 'refsafe="disable"'), 'condim="1"'))
     start = initial_state(scene, jnp.array([0.05]), jnp.array([SPEED]))

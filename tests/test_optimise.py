@@ -19,7 +19,7 @@ from mjx_study import cli, disk
 from mjx_study.cli import options
 from mjx_study.objective import Simulator
 from mjx_study.reference import ReferenceObjective, Tennis, roll_out
-from mjx_study.study import descents, plan, store
+from mjx_study.study import descents, plan, sampling, store
 from mjx_study.study import iteration as descent
 from mjx_study.study.configuration import StudyConfig
 from mjx_study.study.descents import Backend
@@ -30,6 +30,8 @@ from mjx_study.study.store import StudyError
 from mjx_study.study.variables import HISTORY, METRIC
 from mjx_study.tasks import TASKS, make_task
 from mjx_study.tasks.task import StudyDefaults
+
+pytestmark = pytest.mark.usefixtures("shared_programs")
 
 SHORT: dict[str, Any] = {
     "horizon": 60,
@@ -64,7 +66,7 @@ def final(study: StudyConfig) -> dict[str, np.ndarray]:
 
 
 @pytest.fixture(scope="module")
-def short() -> xr.Dataset:
+def short(shared_programs: None) -> xr.Dataset:
     """Two estimators through MJX, six iterations of two seeds."""
     return descend(config(estimators=("zobg", "aobg")))
 
@@ -101,7 +103,7 @@ def test_an_iteration_is_gradient_descent_on_the_estimate() -> None:
     """The first step by hand: theta minus the learning rate times the estimate with the same keys."""
     planned = plan_study(config(estimators=("aobg",), iterations=1))
     (group,), (cell,) = planned.groups, planned.cells
-    objective = Simulator(group.task, chunk_size=3).objective(cell.model.contact)
+    objective = sampling.Simulator(group.task, chunk_size=planned.chunk_size).objective(cell.model.contact)
     key = jax.random.fold_in(jax.random.fold_in(jax.random.key(0), 1), 0)
     estimate = estimators.estimate(estimators_of(planned, cell)[0], objective, group.task.theta, key, 5)
     run = descend(planned).sel(estimator="aobg", seed=1)
@@ -129,7 +131,7 @@ def test_a_stopped_run_goes_on_to_the_same_end(tmp_path: Path, reference: bool) 
 
 def test_a_run_killed_in_its_middle_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What was kept last is what it goes on from, and no iteration before it is computed again."""
-    study = config(estimators=("zobg", "fobg"), contact=("reference",), iterations=30)
+    study = config(estimators=("zobg", "fobg"), contact=("reference",), iterations=15)
     whole = descend(study)
 
     class Killed(BaseException):

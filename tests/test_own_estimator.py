@@ -21,7 +21,7 @@ PAGE = (Path(__file__).parents[1] / "docs" / "estimators.md").read_text()
 (CODE,) = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
 OWN = "my_estimators:SignAgreement"
 
-pytestmark = pytest.mark.usefixtures("shared_programs")
+pytestmark = [pytest.mark.usefixtures("shared_programs"), pytest.mark.xdist_group("pusher of four steps")]
 
 
 @pytest.fixture(autouse=True)
@@ -38,7 +38,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 def test_compare_and_sweep_take_it(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     small = ["pusher", "--horizon", "4", "--samples", "8", "--reference-samples", "8", "--stiffness", "10,100"]
-    small += ["--chunk-size", "9"]
+    small += ["--chunk-size", "4"]
     common = [*small, "--contact", "penalty", "--estimators", f"fobg,{OWN}"]
     assert cli.main(["compare", *common, "--baseline", "none", "--output", "out"]) == 0
     assert re.search(r"^ +SignAgreement  ", capsys.readouterr().out, re.MULTILINE)

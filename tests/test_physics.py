@@ -23,16 +23,25 @@ from mjx_study.tasks import make_task
 from mjx_study.tasks.contact_grid import contact_grid
 from mjx_study.tasks.task import Task
 
+BATCH = 7
 CRITICAL_RESTITUTION = math.exp(-2)
 """Of a critically damped spring that lets go when its force ends."""
 
 
 def rollouts(task: Task) -> Callable[..., Any]:
-    """Noise-free rollouts as a compiled function of parameters (batch, params) and contact model."""
-    return jax.jit(
+    """Noise-free rollouts as a function of parameters (batch, params) and contact model, compiled once."""
+    program = jax.jit(
         jax.vmap(lambda theta, contact: simulate(task, theta, contact, jax.random.key(0), 0.0), in_axes=(0, None)),
         compiler_options={"xla_backend_optimization_level": "0"},
     )
+
+    def run(theta, contact):
+        size = len(theta)
+        assert size <= BATCH
+        found = program(jnp.resize(theta, (BATCH, theta.shape[1])), contact)
+        return jax.tree.map(lambda leaf: leaf[:size], found)
+
+    return run
 
 
 def contact(task: Task, family: str, stiffness: float) -> ContactModel:

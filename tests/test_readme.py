@@ -37,8 +37,9 @@ def test_every_command_parses(page: Path) -> None:
     commands = [shlex.split(line, comments=True) for line in "".join(blocks("sh", page.read_text())).splitlines()]
     ours = [command[1:] for command in commands if command[:1] == ["mjx-study"]]
     assert len(ours) >= 1 or page.name in ("architecture.md", "concepts.md", "gradient-faults.md", "testing.md")
+    parser = cli.parser()
     for arguments in ours:
-        options = cli.parser().parse_args(["pusher" if argument == "TASK" else argument for argument in arguments])
+        options = parser.parse_args(["pusher" if argument == "TASK" else argument for argument in arguments])
         assert options.command in cli.COMMANDS
         task = getattr(options, "task", "pusher")
         assert task in TASKS or task == "my_model.xml" or ":" in task, task

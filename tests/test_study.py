@@ -25,7 +25,7 @@ from mjx_study.study.variables import GRADIENTS
 from mjx_study.tasks import make_task
 from mjx_study.tasks.task import StudyDefaults, Task
 
-pytestmark = pytest.mark.usefixtures("shared_programs")
+pytestmark = [pytest.mark.usefixtures("shared_programs"), pytest.mark.xdist_group("pusher of four steps")]
 
 SMALL: dict[str, Any] = {"horizon": 4, "samples": (8,), "reference_samples": 8, "seeds": 1}
 
@@ -315,7 +315,7 @@ def test_warnings_name_what_must_not_be_overlooked() -> None:
 
 def test_an_unconverged_solve_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sampling.UNCONVERGED, "float64", 1e-30)
-    found = compare(stiffness=(10.0,), contact=("penalty",))
+    found = compare(stiffness=(10.0,), contact=("penalty",), chunk_size=4)
     assert all(row.unconverged > 0 for row in rows_of(found))
     assert any("the contact solver did not converge" in warning for warning in warnings_of(found))
 

@@ -57,8 +57,7 @@ def test_the_pusher_is_right(capsys: pytest.CaptureFixture[str]) -> None:
         assert step["coverage"]["counts"]["push"] and step["coverage"]["missing"] == []
 
 
-@pytest.mark.usefixtures("configured")
-def test_a_wrong_derivative_is_found(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_wrong_derivative_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
     right = dynamics.step_jacobian
 
     def slightly_wrong(*arguments):
@@ -66,10 +65,9 @@ def test_a_wrong_derivative_is_found(capsys: pytest.CaptureFixture[str], monkeyp
         return over_step * (1 + 1e-4), over_qacc
 
     monkeypatch.setattr(dynamics, "step_jacobian", slightly_wrong)
-    arguments = ["gradcheck", "pusher", "--horizon", "6", "--stiffness", "100", "--contact", "penalty", "--states", "1"]
-    assert cli.main(arguments) == 1
-    printed = capsys.readouterr().out
-    assert "wrong" in printed and "SOMETHING IS WRONG" in printed
+    report = check(f"<worldbody>{BALL.format(name='x', axis='1 0 0')}</worldbody>")
+    assert not report.passed and {finding.verdict for finding in report.findings} == {"wrong"}
+    assert report.lines()[-1] == "SOMETHING IS WRONG: see above"
 
 
 def test_a_kink_is_told_from_a_wrong_derivative() -> None:
