@@ -242,6 +242,18 @@ FALLING = floor_scene(
 )
 
 
+def test_the_backward_pass_does_not_run_the_solver_again() -> None:
+    """The only loop of open end is the solver's; gradients, too, have it once."""
+    model, data = device(FALLING)
+
+    def last(speed):
+        start = data.replace(qvel=data.qvel.at[0].set(speed))
+        return jax.lax.scan(lambda data, _: (step(model, data), None), start, length=3)[0].qpos[0]
+
+    programs = [str(jax.make_jaxpr(function)(-0.1)) for function in (last, jax.grad(last))]
+    assert [program.count("while[") for program in programs] == [1, 1]
+
+
 @pytest.mark.slow
 def test_the_onset_term_of_a_step_is_that_of_a_rollout() -> None:
     """To the order of a timestep, 1 %, where the term is four times the rest; both modes, the same values."""

@@ -20,6 +20,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Bool, Float
 
 from mjx_study.simulation._mjx import mjx
@@ -204,10 +205,12 @@ def solve(
     def tangent_solve(linear_map, right_side):
         return solve_positive_definite(jax.vmap(linear_map)(jnp.eye(model.nv, dtype=right_side.dtype)), right_side)
 
+    # Named, and found outside of the root: JAX stores what is named, and would compute again what the root computes.
+    found = checkpoint_name(solver(*jax.lax.stop_gradient((model, data))), "qacc")
     return jax.lax.custom_root(
         f=lambda qacc: imbalance(model, data, qacc),
-        initial_guess=data.qacc_warmstart,
-        solve=lambda _, __: jax.lax.stop_gradient(solver(model, data)),
+        initial_guess=found,
+        solve=lambda _, solution: solution,
         tangent_solve=tangent_solve,
     )
 

@@ -11,7 +11,6 @@ from typing import Any, Final
 
 import jax
 import jax.numpy as jnp
-from jax.ad_checkpoint import checkpoint_name
 from jax.custom_derivatives import SymbolicZero, zero_from_primal
 from jaxtyping import Array, Float
 
@@ -100,7 +99,7 @@ def solver_residual(model: mjx.Model, data: mjx.Data) -> Float[Array, ""]:
 
 
 def _solve(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    qacc = checkpoint_name(constraint.solve(model, data, lambda *arguments: mjx.solve(*arguments).qacc), "qacc")
+    qacc = constraint.solve(model, data, lambda *arguments: mjx.solve(*arguments).qacc)
     rows: Any = data._impl
     force = constraint.row_force(model, data, rows.efc_J @ qacc - rows.efc_aref)
     return data.replace(qacc=qacc, qfrc_constraint=rows.efc_J.T @ force, _impl=rows.replace(efc_force=force))
