@@ -43,13 +43,14 @@ class Differentiation:
         value: f_i, the total cost, [cost].
         gradient: grad_theta f_i at fixed noise, [cost/param].
         residual: How far sample i's own numerical solve was from converged, relative; None for closed forms.
-        events: Discontinuities that the gradient allows for: found, bounded, and left out; None if it allows for none.
+        events: Discontinuities that the gradient allows for: their number, how many of them are bounded, how many left
+            out, their strength and the time of the first; None if it allows for none.
     """
 
     value: Float[Array, " samples"]
     gradient: Float[Array, "samples params"]
     residual: Float[Array, " samples"] | None = None
-    events: Float[Array, "samples 3"] | None = None
+    events: Float[Array, "samples 5"] | None = None
 
 
 @register_pytree
@@ -92,7 +93,7 @@ class StepDifferentiation:
     noise_gradient: Float[Array, "samples steps controls"]
     policy_jacobian: Float[Array, "samples steps controls params"] | None
     residual: Float[Array, " samples"] | None = None
-    events: Float[Array, "samples 3"] | None = None
+    events: Float[Array, "samples 5"] | None = None
 
 
 @register_pytree

@@ -243,6 +243,19 @@ def test_the_onset_term_is_judged_like_the_rest() -> None:
     assert sentence == "penalty: FoBG (onset)'s mean is biased by 4.4% at K = 10 N/m (p <= 0.001)"
 
 
+def test_an_onset_term_that_is_not_to_be_trusted_is_told() -> None:
+    """Noise that does not reach the next step, and onsets that take much of the speed in one; not so for the jump."""
+    events = {"onsets": 100.0, "onset_spread": 2.0, "onset_strength": 0.1}
+    assert findings(result(row("fobg_onset", 10, 1, **events))) == []
+    (narrow,) = findings(result(row("fobg_onset", 10, 1, **events | {"onset_spread": 0.4})))
+    assert narrow.startswith(
+        "penalty: noise is too narrow for the onset term at K = 10 N/m: the step at which contact "
+    )
+    (strong,) = findings(result(row("fobg_onset", 10, 1, **events | {"onset_strength": 0.25})))
+    assert strong.startswith("penalty: the linear onset term can be off by up to 12% of what it adds at K = 10 N/m")
+    assert findings(result(row("fobg_onset", 10, 1, **events | {"onset_strength": 0.0}))) == []
+
+
 def test_noises_are_told_apart() -> None:
     """Not the last one's verdict for all."""
     parts = [result(row("zobg", 10, 100), row("fobg", 10, variance)) for variance in (1, 1e6)]

@@ -26,7 +26,7 @@ from mjx_study.simulation import constraint
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.dynamics import ControlLaw, State, force_stage, position_stage, step
 from mjx_study.simulation.integration import difference_position, integrate_position
-from mjx_study.simulation.onset import SLOTS, OnsetCounts, find_onsets, on_and_off
+from mjx_study.simulation.onset import SLOTS, OnsetCounts, find_onsets, first_step, least_travel, on_and_off
 from mjx_study.simulation.scene import Scene
 
 WITHIN: Final = 0.1
@@ -63,8 +63,7 @@ def jump_term(
     """
     before, controls = jax.lax.stop_gradient((jax.tree.map(lambda leaf: leaf[:-1], states), controls))
     if not scene.has_constraints:
-        none = jnp.zeros((), int)
-        return jnp.zeros_like(before.qpos, shape=()), OnsetCounts(none, none, none)
+        return jnp.zeros_like(before.qpos, shape=()), OnsetCounts.none(before.qpos.dtype)
 
     def guards(qpos, qvel):
         return constraint.guards(model, position_stage(scene, model, qpos).replace(qvel=qvel))
@@ -100,7 +99,8 @@ def jump_term(
         before.qpos[at], states.qpos[at]
     )
     narrow, lost = jnp.sum(flags, axis=0)
-    return jnp.sum(weights * moved), OnsetCounts(found, narrow, found - filled + lost)
+    first = first_step(steps, used, weights.dtype)
+    return jnp.sum(weights * moved), OnsetCounts(found, narrow, found - filled + lost, jnp.zeros_like(first), first)
 
 
 def _weights(
@@ -129,10 +129,10 @@ def _weights(
             return cost_to_go(index + 1, State(integrate_position(host, touch, qvel, timestep), qvel, act, qacc))
 
         on, off = jax.vmap(go_on)(after, act, qacc)
-        return on - off, normals @ prepared._impl.efc_J, qacc[1]
+        return on - off, normals @ prepared._impl.efc_J, least_travel(model, prepared, normals, qacc[1])
 
-    (here, previous), (normal, _), (free, _) = jax.vmap(jump)(jnp.stack([begins, begins - 1]))
-    travel, least = timestep * (normal @ qvel), timestep**2 * jnp.abs(normal @ free)
+    (here, previous), (normal, _), (least, _) = jax.vmap(jump)(jnp.stack([begins, begins - 1]))
+    travel = timestep * (normal @ qvel)
     lost = travel >= 0
     cell = jnp.where(lost, -1.0, jnp.minimum(travel, -least))
     weights = jnp.stack([(1 - share) * here, share * previous])[:, None] * normal / cell

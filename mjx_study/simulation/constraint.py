@@ -24,7 +24,7 @@ from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Bool, Float
 
 from mjx_study.simulation._mjx import mjx
-from mjx_study.simulation.patches import AT_FIRST_TOUCH, patched
+from mjx_study.simulation.patches import AT_FIRST_TOUCH, RELAXING, patched
 from mjx_study.simulation.scene import num_constraint_rows
 
 _ELLIPTIC = mujoco.mjtCone.mjCONE_ELLIPTIC
@@ -264,6 +264,19 @@ def at_onset(model: mjx.Model, data: mjx.Data, members: Float[Array, " rows"], o
         }
     )
     return changed
+
+
+def relaxation_rate(model: mjx.Model, data: mjx.Data, normal: Float[Array, " rows"]) -> Float[Array, ""]:
+    """max(b, sqrt(k d)) [1/s] of a guard at first touch: how fast its contact changes the speed of approach.
+
+    Args:
+        model: the model on the device.
+        data: state with its constraint rows; the guard is moving.
+        normal: the guard's weights of `guard_rows`.
+    """
+    with patched(RELAXING):
+        rows: Any = mjx.make_constraint(model, data)._impl
+    return -(normal @ rows.efc_aref) / (normal @ (rows.efc_J @ data.qvel))
 
 
 def solve_positive_definite(

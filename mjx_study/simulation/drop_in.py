@@ -166,7 +166,7 @@ def _step_terms(model: mjx.Model, data: mjx.Data) -> tuple[Float[Array, "nv nv"]
         def term(guard):
             return onset_term(model, positioned, states, data.ctrl[None], guard, distance[guard], travel[guard])
 
-        here, previous, _ = jax.vmap(term)(jnp.minimum(chosen, distance.size - 1))
+        here, previous, *_ = jax.vmap(term)(jnp.minimum(chosen, distance.size - 1))
         used = (chosen < distance.size)[:, None, None]
         return jnp.stack([jnp.sum(jnp.where(used, part, 0.0), axis=0) for part in (here, previous)])
 

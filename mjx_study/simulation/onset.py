@@ -20,8 +20,11 @@ the first weight alone (s = 0) leaves an error of h b, where b is the contact's 
 Not covered: initial contact; a force that jumps where contact ends (impedance and a pressing force); edges of
 features, where the contact point itself jumps.
 
-A cell narrower than h^2 |a|, with a the acceleration of the guard, counts as that wide: the guard's speed is not
-constant over such a step, and without a bound grazing contacts would have infinite variance. These onsets are counted.
+Part of the jump is in proportion to the acceleration a of the guard, not to its speed: at grazing speed Delta/D
+diverges, and the variance of the correction with it. A cell narrower than h |a| / max(b, sqrt(k d)) therefore counts
+as that wide, with b and k the contact's damping and stiffness and d its impedance: bodies slower than that are pressed
+together rather than hit each other. The flux of onsets is in proportion to their speed, so that few are that slow; they
+are counted.
 
 Reference: Kong, Payne, Zhu, Johnson, "Saltation Matrices: The Essential Tool for Linearizing Hybrid Dynamical Systems"
 (arXiv 2306.06862), for the limit of continuous time.
@@ -73,18 +76,29 @@ class OnsetCounts:
 
     Attributes:
         found: number of onsets of contacts and limits.
-        bounded: number of these with a cell so narrow that the term was bounded.
+        bounded: number of these at grazing speed, whose term is bounded.
         missed: number of these left uncorrected for lack of slots.
+        strength: share of the approach speed that an onset takes in one step, root mean square over the corrected ones;
+            0 without any, and with the jump, whose error does not depend on it.
+        first: step of the first onset; NaN without any.
     """
 
     found: Int[Array, "*batch"]
     bounded: Int[Array, "*batch"]
     missed: Int[Array, "*batch"]
+    strength: Float[Array, "*batch"]
+    first: Float[Array, "*batch"]
+
+    @classmethod
+    def none(cls, dtype: Any) -> "OnsetCounts":
+        """Of a rollout without constraints."""
+        zero = jnp.zeros((), int)
+        return cls(zero, zero, zero, jnp.zeros((), dtype), jnp.full((), jnp.nan, dtype))
 
 
-def as_row(counts: OnsetCounts | None) -> Float[Array, "*batch 3"] | None:
+def as_row(counts: OnsetCounts | None) -> Float[Array, "*batch 5"] | None:
     """The counts in one array, as batches store them."""
-    return None if counts is None else jnp.stack([counts.found, counts.bounded, counts.missed], axis=-1).astype(float)
+    return None if counts is None else jnp.stack([*jax.tree.leaves(counts)], axis=-1).astype(float)
 
 
 def corrected_rollout(
@@ -109,8 +123,7 @@ def corrected_rollout(
         TypeError: differentiation with respect to the model.
     """
     if not scene.has_constraints:
-        none = jnp.zeros((), int)
-        return *rollout(scene, model, start, control_law, horizon), OnsetCounts(none, none, none)
+        return *rollout(scene, model, start, control_law, horizon), OnsetCounts.none(start.qpos.dtype)
     model = without_derivative(model)
     jacobian = scene.uses_jacobian
 
@@ -178,12 +191,19 @@ def _corrections(
         positioned = position_stage(scene, model, before.qpos[index])
         return onset_term(model, positioned, states, inputs, guard, distance[index, guard], travel[index, guard])
 
-    here, previous, narrow = jax.vmap(term)(steps, guards)
+    here, previous, strength, narrow = jax.vmap(term)(steps, guards)
     keep = used[:, None, None]
     empty = jnp.zeros((len(distance), *here.shape[1:]), here.dtype)
     spread, shift = (empty.at[steps].add(jnp.where(keep, terms, 0.0)) for terms in (here, previous))
-    counts = OnsetCounts(found, jnp.sum(narrow & used), found - jnp.sum(used))
+    filled = jnp.sum(used)
+    strength = jnp.sqrt(jnp.sum(jnp.where(used, strength**2, 0.0)) / jnp.maximum(filled, 1))
+    counts = OnsetCounts(found, jnp.sum(narrow & used), found - filled, strength, first_step(steps, used, here.dtype))
     return spread, shift, counts
+
+
+def first_step(steps: Int[Array, " slots"], used: Bool[Array, " slots"], dtype: Any) -> Float[Array, ""]:
+    """Step of the first onset, NaN without any."""
+    return jnp.where(used[0], steps[0].astype(dtype), jnp.nan)
 
 
 def find_onsets(
@@ -216,21 +236,21 @@ def onset_term(
     guard: Int[Array, ""],
     distance: Float[Array, ""],
     travel: Float[Array, ""],
-) -> tuple[Float[Array, "nv nv"], Float[Array, "nv nv"], Bool[Array, ""]]:
-    """(1 - s) Delta_k n^T / D, s Delta_{k-1} n^T / D, and whether D was bounded, of one onset.
+) -> tuple[Float[Array, "nv nv"], Float[Array, "nv nv"], Float[Array, ""], Bool[Array, ""]]:
+    """(1 - s) Delta_k n^T / D, s Delta_{k-1} n^T / D, share of the approach speed lost, and whether D was bounded.
 
     Arguments are those of `jump_of_velocity`; its cases are steps k and k - 1, or k for both.
     """
-    jumps, free, normal = jump_of_velocity(model, positioned, states, controls, guard)
-    share, least = distance / travel, model.opt.timestep**2 * jnp.abs(normal @ free)
-    cell = jnp.minimum(travel, -least)
+    jumps, normal, least = jump_of_velocity(model, positioned, states, controls, guard)
+    share, cell = distance / travel, jnp.minimum(travel, -least)
     here, previous = (jnp.outer(jump, normal) / cell for jump in (jumps[0], jumps[-1]))
-    return (1 - share) * here, share * previous, travel > -least
+    strength = -model.opt.timestep * (normal @ jumps[0]) / cell
+    return (1 - share) * here, share * previous, strength, travel > -least
 
 
 def jump_of_velocity(
     model: mjx.Model, positioned: mjx.Data, states: State, controls: Float[Array, "cases nu"], guard: Int[Array, ""]
-) -> tuple[Float[Array, "cases nv"], Float[Array, " nv"], Float[Array, " nv"]]:
+) -> tuple[Float[Array, "cases nv"], Float[Array, " nv"], Float[Array, ""]]:
     """Jump that the onset of one contact or limit causes in the velocity after a step, at first touch.
 
     Args:
@@ -241,21 +261,34 @@ def jump_of_velocity(
         guard: index of the contact or limit, as in `constraint.guard_rows`.
 
     Returns:
-        v'(on) - v'(off) of each case; the first case's acceleration without the contact; the derivative of the guard
-        with respect to the velocity coordinates.
+        v'(on) - v'(off) of each case; the derivative of the guard with respect to the velocity coordinates; the first
+        case's least travel.
     """
-    normal_rows, members = constraint.guard_rows(model, positioned)
-    mask = jnp.asarray(members)[guard]
     rows: Any = positioned._impl
-    normal = jnp.asarray(normal_rows, rows.efc_J.dtype)[guard] @ rows.efc_J
+    weights, members = (jnp.asarray(each, rows.efc_J.dtype)[guard] for each in constraint.guard_rows(model, positioned))
 
     def both(qvel, act, control, warmstart):
         forced = force_stage(model, positioned, qvel, act, control).replace(qacc_warmstart=warmstart)
-        (after, _), qacc = on_and_off(model, forced, mask)
-        return after[0] - after[1], qacc[1]
+        (after, _), qacc = on_and_off(model, forced, members)
+        return after[0] - after[1], least_travel(model, forced, weights, qacc[1])
 
-    jumps, free = jax.vmap(both)(states.qvel, states.act, controls, states.warmstart)
-    return jumps, free[0], normal
+    jumps, least = jax.vmap(both)(states.qvel, states.act, controls, states.warmstart)
+    return jumps, weights @ rows.efc_J, least[0]
+
+
+def least_travel(
+    model: mjx.Model, data: mjx.Data, normal: Float[Array, " rows"], free: Float[Array, " nv"]
+) -> Float[Array, ""]:
+    """Travel of a guard in a step [m or rad] below which its onset counts as grazing: h |a| / max(b, sqrt(k d)).
+
+    Args:
+        model: the model to step.
+        data: state with its constraint rows.
+        normal: the guard's weights of `constraint.guard_rows`.
+        free: acceleration without the contact.
+    """
+    rows: Any = data._impl
+    return model.opt.timestep * jnp.abs(normal @ (rows.efc_J @ free)) / constraint.relaxation_rate(model, data, normal)
 
 
 def on_and_off(

@@ -70,6 +70,14 @@ def _touching(
     return jnp.zeros_like(k), b, impedance
 
 
+def _relaxing(
+    model: mjx.Model, solref: Float[Array, " 2"], solimp: Float[Array, " 5"], position: Float[Array, ""]
+) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
+    """The same, with the row's relaxation rate in place of its damping."""
+    k, b, impedance = stiffness_damping_impedance(model, solref, solimp, jnp.zeros_like(position))
+    return jnp.zeros_like(k), jnp.maximum(b, jnp.sqrt(k * impedance)), impedance
+
+
 def rotation_vector(quaternion: Float[Array, " 4"]) -> tuple[Float[Array, " 3"], Float[Array, ""]]:
     """(rotation vector [rad], 1) instead of MJX's (axis, angle), of which MJX only ever takes the product."""
     still = jnp.zeros_like(quaternion).at[0].set(1.0)
@@ -180,6 +188,8 @@ _REPLACED: Final[dict[Place, Callable[..., Any]]] = {
 }
 AT_FIRST_TOUCH: Final = {("constraint", "_kbi"): _touching}
 """Gives every active constraint row the values of first touch."""
+RELAXING: Final = {("constraint", "_kbi"): _relaxing}
+"""Gives every active constraint row a reference acceleration of minus its relaxation rate times its velocity."""
 
 _CHOSEN: Final = jax.make_user_context(())
 """Pairs of place and function, in this thread; JAX traces again what it has traced with others."""

@@ -23,7 +23,7 @@ from mjx_study.study.memory import BIAS_DRAWS
 from mjx_study.study.plan import StudyCell, StudyPlan, estimators_of, oracles_of, seeds_together
 from mjx_study.study.reference_gradient import reference_gradient
 from mjx_study.study.sampling import Objectives, cell_keys, draw_batches, unconverged
-from mjx_study.study.variables import BATCH, GRADIENTS
+from mjx_study.study.variables import BATCH, GRADIENTS, ONSETS
 from mjx_study.tasks.contact_grid import contact_grid
 from mjx_study.tasks.task import Task
 
@@ -83,9 +83,9 @@ def compute_gradients(plan: StudyPlan) -> Callable[[StudyCell], dict[str, np.nda
 
 
 def _events(batch: Any) -> np.ndarray | None:
-    """Onsets of contact in a batch: found, bounded and missed; None where none are looked for."""
+    """Onsets of contact in each rollout of a batch, as in `OnsetCounts`; None where none are looked for."""
     events = getattr(batch, "events", None)
-    return None if events is None else np.asarray(events).reshape(-1, 3).sum(0)
+    return None if events is None else np.asarray(events).reshape(-1, 5)
 
 
 def _of_batches(
@@ -104,11 +104,18 @@ def _of_batches(
         arrays["residual"].append(np.max(np.where(np.isfinite(all_of), all_of, np.inf), initial=0.0))
         arrays["unconverged"].append(unconverged(all_of, precision()))
         found = [met for each in events for oracle in needs if (met := each[oracle]) is not None]
-        arrays["events"].append(np.sum(found, axis=0) if found else np.full(3, np.nan))
-    counts = np.stack(arrays.pop("events"), axis=-1)
-    if np.any(np.isfinite(counts)):
-        arrays |= dict(zip(("onsets", "onsets_bounded", "onsets_missed"), counts, strict=True))
+        arrays["events"].append(_onset_numbers(np.concatenate(found)) if found else np.full(len(ONSETS), np.nan))
+    numbers = np.stack(arrays.pop("events"), axis=-1)
+    if np.any(np.isfinite(numbers)):
+        arrays |= dict(zip(ONSETS, numbers, strict=True))
     return {name: np.array(values) for name, values in arrays.items()}
+
+
+def _onset_numbers(events: np.ndarray) -> np.ndarray:
+    """`ONSETS` of rollouts."""
+    *counts, strength, first = events[events[:, 0] > 0].T
+    counts, some = [np.sum(each) for each in counts], len(first) > 0
+    return np.array([*counts, np.sqrt(np.mean(strength**2)) if some else np.nan, np.std(first) if some else np.nan])
 
 
 def _of_seeds(numbers: Sequence[dict[str, Any]], seeds: int) -> dict[str, np.ndarray]:

@@ -66,12 +66,18 @@ GRADIENTS: Final = {
     "onsets": Variable(("estimator",), "1", "onsets of contact in the first-order batches"),
     "onsets_bounded": Variable(("estimator",), "1", "onsets at grazing speed, whose term is bounded"),
     "onsets_missed": Variable(("estimator",), "1", "onsets without a term"),
+    "onset_strength": Variable(
+        ("estimator",), "1", "share of the approach speed that an onset takes in a step, root mean square"
+    ),
+    "onset_spread": Variable(("estimator",), "1", "standard deviation of the step of a rollout's first onset"),
     "reference_norm": Variable((), "gradient", "norm of the reference gradient"),
     "reference_uncertainty": Variable((), "1", "standard error of the reference, over its norm"),
     "reference_effective_samples": Variable((), "1", "samples that the reference's variance rests on"),
     "gradient": Variable((*BATCH, "param"), "gradient", "mean gradient"),
     "reference": Variable(("param",), "gradient", "reference gradient"),
 }
+ONSETS: Final = tuple(name for name in GRADIENTS if name.startswith("onset"))
+"""Variables of studies with an onset term."""
 HISTORY: Final = ("cost", "gradient_norm", "variance", "alpha", "nonfinite", "residual")
 """Variables recorded at each iteration of a descent; see `mjx_study.study.iteration.Record`."""
 METRIC: Final = "metric_"
