@@ -78,13 +78,13 @@ def cost(gap):
     return 100 * (gap - 0.02) ** 2
 
 
-def fall(gap, steps: int, timestep: float, free: float, law: Law = Law(), speed: float = SPEED):  # noqa: B008, frozen
+def fall(gap, steps: int, timestep: float, free: float, law: Law = Law(), start: float = SPEED):  # noqa: B008, frozen
     """Last gap and speed of falling bodies, by the first gap their derivatives, and the jump term of `cost`.
 
     Returns:
         Last (gap, speed); its derivative of the steps alone, and with the linear term; the term of the jump.
     """
-    r, v, last_v = gap.copy(), np.full_like(gap, speed), np.full_like(gap, speed)
+    r, v, last_v = gap.copy(), np.full_like(gap, start), np.full_like(gap, start)
     tangents = {False: (np.ones_like(r), np.zeros_like(r)), True: (np.ones_like(r), np.zeros_like(r))}
     term = np.zeros_like(r)
     for step in range(steps):
@@ -158,7 +158,7 @@ def test_every_sample_is_that_of_the_formula(mode) -> None:
     for (gaps, speed, free), (values, counts, derivative, jumping, jumps) in zip(
         cases, _unstacked(results, len(cases)), strict=True
     ):
-        ours, of_steps, corrected, term = fall(gaps, steps, timestep, free, speed=speed)
+        ours, of_steps, corrected, term = fall(gaps, steps, timestep, free, start=speed)
         np.testing.assert_allclose(values, ours, rtol=0, atol=1e-12)
         np.testing.assert_allclose(derivative, corrected, rtol=1e-9, atol=1e-12)
         np.testing.assert_allclose(jumping, 200 * (ours[:, 0] - 0.02) * of_steps[:, 0] + term, rtol=1e-9, atol=1e-9)

@@ -203,7 +203,8 @@ def _corrections(
 
 def first_step(steps: Int[Array, " slots"], used: Bool[Array, " slots"], dtype: Any) -> Float[Array, ""]:
     """Step of the first onset, NaN without any."""
-    return jnp.where(used[0], steps[0].astype(dtype), jnp.nan)
+    first = jnp.min(jnp.where(used, steps.astype(dtype), jnp.inf), initial=jnp.inf)
+    return jnp.where(jnp.isinf(first), jnp.nan, first)
 
 
 def find_onsets(
