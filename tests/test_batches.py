@@ -1,6 +1,8 @@
 """Every kind of batch of every task, in MJX and on its reference: the same rollouts seen in different ways."""
 
 import dataclasses
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
@@ -126,14 +128,17 @@ def test_a_reference_draws_the_noise_that_mjx_draws(noise: str) -> None:
     np.testing.assert_allclose(ours.score, theirs.score, rtol=1e-12)
 
 
-def test_linearising_on_the_tape() -> None:
+@pytest.mark.parametrize(
+    "make", [cart, pytest.param(partial(make_task, "pusher", horizon=5), marks=pytest.mark.slow, id="in contact")]
+)
+def test_linearising_on_the_tape(make: Callable[..., Task]) -> None:
     """Forward mode through the tape program gives the Jacobians of the Jacobian program."""
     keys = jax.random.split(jax.random.key(4), 2)
-    task = cart()
+    task = make()
     assert task.scene.uses_jacobian
     small, large = (
         Simulator(each, chunk_size=1).objective(None).linearise(task.theta, jax.random.clone(keys))
-        for each in (task, cart(adjoint="tape"))
+        for each in (task, make(adjoint="tape"))
     )
     for one, other in zip(jax.tree.leaves(small), jax.tree.leaves(large), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9 * float(jnp.abs(other).max()))
