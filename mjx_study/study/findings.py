@@ -37,8 +37,8 @@ SHARE_OFF: Final = 0.5
 """Bound on the error of the linear onset term's mean, as a share of what it adds, over the onset's strength. Of 11
 contact models on momentum_transfer and ball_wall the largest was 0.48; corners of boxes are another matter."""
 NARROW: Final = 0.75
-"""Steps over which the first onset must spread for an onset term to be right within 1 % of what it adds; at half of
-that the error reaches 40 %."""
+"""Standard deviation of the step of the first onset from which an onset term is right within 1.5 % of what it adds; at
+0.5 it can be off by 60 %."""
 PLACE: Final = ("task", "timestep", "cone", "sigma", "samples", "model", "seed", "estimator", "contact", "stiffness")
 """Coordinates of a row."""
 SETTING: Final = ("task", "timestep", "cone", "sigma", "samples")
