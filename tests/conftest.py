@@ -23,9 +23,8 @@ FLAGS = [
 ]
 os.environ["XLA_FLAGS"] = " ".join([*FLAGS, os.environ.get("XLA_FLAGS", "")])
 
-gc.set_threshold(
-    1_000_000, 20, 50
-)  # tracing makes millions of objects that live on: looking for garbage was a sixth of it
+# Tracing makes millions of objects that live on; looking for garbage among them was a sixth of its time.
+gc.set_threshold(1_000_000, 20, 50)
 
 DEVICES = 2 if OLD else 1
 CACHE = os.environ.get("JAX_COMPILATION_CACHE_DIR") or str(Path(__file__).parents[1] / ".pytest_cache" / "jax")

@@ -129,10 +129,10 @@ def _weights(
             return cost_to_go(index + 1, State(integrate_position(host, touch, qvel, timestep), qvel, act, qacc))
 
         on, off = jax.vmap(go_on)(after, act, qacc)
-        return on - off, normals @ prepared._impl.efc_J, least_travel(model, prepared, normals, qacc[1])
+        return on - off, normals @ prepared._impl.efc_J, qacc[1]
 
-    (here, previous), (normal, _), (least, _) = jax.vmap(jump)(jnp.stack([begins, begins - 1]))
-    travel = timestep * (normal @ qvel)
+    (here, previous), (normal, _), (free, _) = jax.vmap(jump)(jnp.stack([begins, begins - 1]))
+    travel, least = timestep * (normal @ qvel), least_travel(model, positioned.replace(qvel=qvel), normals, free)
     lost = travel >= 0
     cell = jnp.where(lost, -1.0, jnp.minimum(travel, -least))
     weights = jnp.stack([(1 - share) * here, share * previous])[:, None] * normal / cell

@@ -271,7 +271,7 @@ def relaxation_rate(model: mjx.Model, data: mjx.Data, normal: Float[Array, " row
 
     Args:
         model: the model on the device.
-        data: state with its constraint rows; the guard is moving.
+        data: position stage, with the velocity; the guard is moving.
         normal: the guard's weights of `guard_rows`.
     """
     with patched(RELAXING):

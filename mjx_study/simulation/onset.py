@@ -98,7 +98,7 @@ class OnsetCounts:
 
 def as_row(counts: OnsetCounts | None) -> Float[Array, "*batch 5"] | None:
     """The counts in one array, as batches store them."""
-    return None if counts is None else jnp.stack([*jax.tree.leaves(counts)], axis=-1).astype(float)
+    return None if counts is None else jnp.stack(jax.tree.leaves(counts), axis=-1).astype(float)
 
 
 def corrected_rollout(
@@ -271,10 +271,11 @@ def jump_of_velocity(
     def both(qvel, act, control, warmstart):
         forced = force_stage(model, positioned, qvel, act, control).replace(qacc_warmstart=warmstart)
         (after, _), qacc = on_and_off(model, forced, members)
-        return after[0] - after[1], least_travel(model, forced, weights, qacc[1])
+        return after[0] - after[1], qacc[1]
 
-    jumps, least = jax.vmap(both)(states.qvel, states.act, controls, states.warmstart)
-    return jumps, weights @ rows.efc_J, least[0]
+    jumps, free = jax.vmap(both)(states.qvel, states.act, controls, states.warmstart)
+    least = least_travel(model, positioned.replace(qvel=states.qvel[0]), weights, free[0])
+    return jumps, weights @ rows.efc_J, least
 
 
 def least_travel(
@@ -284,7 +285,7 @@ def least_travel(
 
     Args:
         model: the model to step.
-        data: state with its constraint rows.
+        data: position stage, with the velocity.
         normal: the guard's weights of `constraint.guard_rows`.
         free: acceleration without the contact.
     """

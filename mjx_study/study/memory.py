@@ -1,4 +1,4 @@
-"""Memory of a sweep's batches: seeds are taken a few at a time, and a plan that needs too much is refused."""
+"""Memory of a study's batches: seeds are computed a few at a time, and a plan that needs too much is refused."""
 
 import math
 from collections.abc import Sequence
@@ -9,15 +9,15 @@ from mjx_study.limits import MOST_GIB
 from mjx_study.tasks.task import Task
 
 BIAS_DRAWS: Final = 999
-"""Draws of the test for bias; its least p-value is 0.001."""
+"""Draws of the test for bias; its smallest p-value is 0.001."""
 LARGEST_BATCH: Final = 20_000
-"""Samples that are drawn at once; more seeds than fit are drawn in turn."""
+"""Most samples drawn at once; further seeds are drawn in turn."""
 AT_ONCE: Final = 512e6
-"""Memory that batches of several seeds may take together [bytes]; one seed's batches may take more."""
+"""Most memory for the batches of several seeds [bytes]; those of a single seed may take more."""
 
 
 def numbers_per_sample(task: Task, oracle: str) -> int:
-    """Numbers that a sample of a batch holds."""
+    """Numbers held by one sample of a batch."""
     params, (steps, dimensions) = task.policy.num_params, task.policy.noise_shape
     noise = steps * dimensions * (1 if task.policy.additive else 1 + params)  # scores, and the policy's Jacobian
     states = task.scene.host.nq + task.scene.host.nv + task.scene.host.na
@@ -36,13 +36,13 @@ def numbers_per_sample(task: Task, oracle: str) -> int:
 
 
 def bytes_per_sample(task: Task, oracles: Sequence[str], estimators: int) -> int:
-    """Memory of a sample of every batch, of its gradients by every estimator, and of the draws of a test for bias."""
+    """Memory per sample [bytes]: every batch, gradients by every estimator, and the draws of the test for bias."""
     numbers = sum(numbers_per_sample(task, oracle) for oracle in oracles)
     return 8 * (numbers + 3 * estimators * task.policy.num_params + 2 * BIAS_DRAWS)
 
 
 def seeds_at_once(memory_of_seed: int, seeds: int) -> int:
-    """How many seeds fit into `AT_ONCE`, in as few and as equal groups as possible; at least one."""
+    """Number of seeds that fit into `AT_ONCE`, in as few and as equal groups as possible; at least one."""
     fitting = max(1, int(AT_ONCE / memory_of_seed))
     return math.ceil(seeds / math.ceil(seeds / fitting))
 

@@ -2,7 +2,7 @@
 
 import dataclasses
 import itertools
-from typing import Any
+from typing import Any, Final
 
 import jax
 
@@ -24,6 +24,9 @@ from mjx_study.tasks.contact_grid import ContactPoint, contact_grid, solver_grid
 from mjx_study.tasks.network import with_network
 from mjx_study.tasks.task import Recipe, Task, check_sigma
 from mjx_study.tasks.validation import check_shapes
+
+HISTORY_NUMBERS: Final = 20
+"""Numbers kept of an iteration of one seed, all estimators together, roughly."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,7 +87,7 @@ class StudyPlan:
 
     @property
     def compilations(self) -> int:
-        """Programs of rollouts that are needed: two for each group, or one for each of its descents."""
+        """Number of programs to compile: two for each group, or one for each of its descents."""
         if self.config.kind != "descents":
             return 2 * len(self.groups)
         settings = {(cell.group, cell.sigma, cell.samples) for cell in self.cells}
@@ -99,7 +102,7 @@ class StudyPlan:
 
     @property
     def memory(self) -> int:
-        """That batches and their statistics take at once in the largest cell, roughly [bytes]."""
+        """Memory of the batches and their statistics held at once in the largest cell, roughly [bytes]."""
         cells = {(cell.group, cell.samples): cell for cell in self.cells}.values()
         return max(memory_of_seed(self, cell) * seeds_together(self, cell) for cell in cells)
 
@@ -109,7 +112,7 @@ class StudyPlan:
         return max((group.recipe.iterations for group in self.groups if group.recipe), default=0)
 
     def label(self, cell: StudyCell) -> str:
-        """As messages name a cell."""
+        """A cell's name in messages."""
         group = self.groups[cell.group]
         digits = digits_to_tell_apart(each.timestep for each in self.groups)
         return f"{group.name}, {cell.model.label}, h = {group.timestep:.{digits}g} s, N = {cell.samples}"
@@ -164,7 +167,7 @@ def plan_study(config: StudyConfig) -> StudyPlan:
         chosen, recipe = estimators_of(plan, cell), groups[cell.group].recipe
         if recipe is not None:
             make_optimizer(config.optimizer or "", recipe.learning_rate, recipe.decay)
-            history = 20 * config.batches * recipe.iterations
+            history = HISTORY_NUMBERS * config.batches * recipe.iterations
             check_memory(groups[cell.group].task, chosen, config.batches * cell.samples, other=history)
             check_memory(groups[cell.group].task, (), config.evaluation_samples or 0)
         elif config.kind == "landscapes":
@@ -175,7 +178,7 @@ def plan_study(config: StudyConfig) -> StudyPlan:
 
 
 def oracles_of(config: StudyConfig) -> tuple[str, ...]:
-    """Kinds of batches that the estimators need, and costs."""
+    """Kinds of batches that the estimators need, evaluations included."""
     return estimators.oracles_of(map(find_estimator, config.estimators), "evaluation")
 
 
@@ -186,7 +189,7 @@ def memory_of_seed(plan: StudyPlan, cell: StudyCell) -> int:
 
 
 def seeds_together(plan: StudyPlan, cell: StudyCell) -> int:
-    """How many seeds a cell draws at once: of gradients as many as fit, of others all."""
+    """Number of seeds that a cell draws at once: in studies of gradients as many as fit, otherwise all."""
     batches = plan.config.batches
     return seeds_at_once(memory_of_seed(plan, cell), batches) if plan.config.kind == "gradients" else batches
 
