@@ -18,10 +18,9 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from jax.sharding import Mesh, PartitionSpec
 
 from estimators import FirstOrder, ZerothOrder
-from mjx_study.objective import Simulator, chunk_for, simulate
+from mjx_study.objective import Simulator, chunk_for, simulate, spread
 from mjx_study.reference.noise import split_sample_key, standard_noise
 from mjx_study.runtime import environment
 from mjx_study.simulation._mjx import mjx
@@ -142,7 +141,7 @@ def bench(plan: BenchPlan, progress: Progress = lambda done, total, what: None) 
     task, samples, cell = plan.task, plan.samples, plan.cell
     devices = jax.local_devices()
     keys = jax.random.split(jax.random.key(0), samples)
-    simulator = Simulator(task, chunk_size=chunk_for(samples, devices))
+    simulator = Simulator(task, chunk_size=chunk_for(-(-samples // len(devices)), devices[:1]))
     objective = simulator.objective(cell.contact)
     full = -(-samples // (simulator.chunk_size * len(devices))) * simulator.chunk_size * len(devices)
     key_data = np.resize(jax.random.key_data(keys), (full, 2))  # no padded chunks, as in stock
@@ -201,7 +200,7 @@ def _fitting_stock(task: Task, contact: ContactModel | None, keys: Any, samples:
 
 
 def _stock_programs(task: Task, contact: ContactModel | None, keys: Any, devices: Any) -> tuple[Callable[[], Any], ...]:
-    """Programs for costs and gradients of the same samples through `mjx.step`, sharded like ours."""
+    """Programs for costs and gradients of the same samples through `mjx.step`, spread like ours."""
     scene, policy = task.scene, task.policy
     dtype = scene.template.qpos.dtype
 
@@ -222,20 +221,15 @@ def _stock_programs(task: Task, contact: ContactModel | None, keys: Any, devices
         last, values = jax.lax.scan(advance, first, policy.feedforward(theta, noise))
         return jnp.sum(values) + task.final_cost(State(last.qpos, last.qvel, last.act, last.qacc_warmstart))
 
-    mesh = Mesh(np.array(devices), ("samples",))
-    shared, split = PartitionSpec(), PartitionSpec("samples")
-
     def program(function):
-        batched = jax.vmap(function, in_axes=(None, None, 0))
-        specs = {"mesh": mesh, "in_specs": (shared, shared, split), "out_specs": split}
-        return jax.jit(jax.shard_map(batched, **specs, check_vma=False))
+        return jax.jit(jax.vmap(function, in_axes=(None, None, 0)))
 
     budget = int(scene.host.opt.iterations)
     values = program(lambda theta, contact, key: cost(theta, contact, key, budget))
     gradients = program(jax.grad(lambda theta, contact, key: cost(theta, contact, key, 1)))
-    rows = np.minimum(np.arange(-(-len(keys) // len(devices)) * len(devices)), len(keys) - 1)
-    key_data = np.asarray(jax.random.key_data(keys))[rows]
-    return tuple((lambda run=run: run(task.theta, contact, key_data)) for run in (values, gradients))
+    shared, rows = (task.theta, contact), (np.asarray(jax.random.key_data(keys)),)
+    chunk = -(-len(keys) // len(devices))
+    return tuple((lambda run=run: spread(run, shared, rows, chunk, devices)) for run in (values, gradients))
 
 
 def _engine_seconds(task: Task, contact: ContactModel | None) -> float | None:

@@ -2,20 +2,21 @@
 
 Batching, chunks and devices are handled here and nowhere else. A `Simulator` holds the compiled programs of a task, one
 for each kind of batch that estimators ask for; contact parameters, theta, sigma and keys are arguments, so a sweep over
-them compiles nothing new. Samples are spread over the devices with `jax.shard_map`, where each device leaves the
-solver's loop independently, in chunks of fixed size that bound memory.
+them compiles nothing new. Samples run in chunks of fixed size that bound memory, on all devices at once: a chunk is one
+call of a program for one device, so that each device leaves the solver's loop independently. What a chunk holds does
+not depend on the devices, and neither does a bit of the result.
 """
 
 import dataclasses
 import math
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any, Final
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Float, Key
 
 from estimators import Differentiation, Evaluation, Linearisation, StepDifferentiation, StepEvaluation
@@ -26,10 +27,54 @@ from mjx_study.simulation.dynamics import State, rollout, step
 from mjx_study.simulation.onset import OnsetCounts, as_row, corrected_rollout, without_derivative
 from mjx_study.tasks.task import Task, check_sigma
 
-MAX_CHUNK: Final = {"cpu": 512, "gpu": 2**15 + 1, "tpu": 2**15 + 1}
-"""Largest number of samples per device and call, by backend: a CPU gains nothing from larger batches, an accelerator
+MAX_CHUNK: Final = {"cpu": 256, "gpu": 2**15 + 1, "tpu": 2**15 + 1}
+"""Largest number of samples per device and call, by backend: a CPU gains little from larger batches, an accelerator
 needs them. It bounds memory (about 40 kB per gradient of 200 steps of a two-joint model). One more than a power of two,
 for the baseline."""
+
+
+def spread(
+    program: Callable[..., Any], shared: Any, rows: Sequence[np.ndarray], chunk: int, devices: Sequence[Any]
+) -> Any:
+    """Call a compiled program on chunks of rows, on all devices at once.
+
+    On CPUs all chunks run on the first device, called from as many threads as there are devices: those calls run side
+    by side, and one compilation serves all cores. (JAX 0.11 crashes as it compiles MJX under `shard_map` or `pmap`.)
+
+    Args:
+        program: what `jax.jit` returned, of the shared arguments and one chunk of each array of rows.
+        shared: arguments that are the same for every row.
+        rows: arrays of one length.
+        chunk: rows in a call; the last chunk is padded by repeating the last row.
+        devices: of this process.
+
+    Returns:
+        The program's outputs, which have a leading axis of rows, as NumPy arrays.
+    """
+    devices = [devices[0] if device.platform == "cpu" else device for device in devices]
+    count = len(rows[0])
+    chunks = np.minimum(np.arange(math.ceil(count / chunk) * chunk), count - 1).reshape(-1, chunk)
+    devices, outputs = devices[: len(chunks)], [None] * len(chunks)
+    placed = {device: jax.device_put(shared, device) for device in devices}
+
+    def call(device: Any, part: np.ndarray) -> Any:
+        return program(*placed[device], *jax.device_put(tuple(array[part] for array in rows), device))
+
+    # In this thread, because tracing patches MJX for the whole process.
+    first = [call(device, part) for device, part in zip(placed, chunks, strict=False)]
+    others = iter(range(len(first), len(chunks)))
+
+    def work(device: Any) -> None:
+        for index in others:
+            outputs[index] = jax.device_get(call(device, chunks[index]))
+
+    with ThreadPoolExecutor(len(devices)) as pool:
+        workers = [pool.submit(work, device) for device in devices[1:]]
+        outputs[: len(first)] = jax.device_get(first)
+        work(devices[0])
+        for worker in workers:
+            worker.result()
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves)[:count], *outputs)
 
 
 def rollout_cost(
@@ -129,10 +174,9 @@ class Simulator:
     def __post_init__(self) -> None:
         if self.chunk_size < 1:
             raise ValueError(f"chunk_size must be at least 1 sample, got {self.chunk_size}")
-        devices = tuple(self.devices) or tuple(jax.local_devices())
-        object.__setattr__(self, "devices", devices)
-        programs = {name: self._compile(program, devices) for name, program in self.sample_programs.items()}
-        object.__setattr__(self, "_programs", programs)
+        object.__setattr__(self, "devices", tuple(self.devices) or tuple(jax.local_devices()))
+        batched = {name: jax.vmap(each, (None, None, None, 0, 0)) for name, each in self.sample_programs.items()}
+        object.__setattr__(self, "_programs", {name: jax.jit(each) for name, each in batched.items()})
 
     def objective(self, contact: ContactModel | None, sigma: float | None = None) -> "MjxObjective":
         """The objective under a contact model, with the task's noise level or another."""
@@ -160,26 +204,11 @@ class Simulator:
 
     def gradient_memory(self, contact: ContactModel | None, samples: int) -> int:
         """XLA's planned temporary memory for the gradients of a batch, all chunks at once on all devices [bytes]."""
-        capacity = self.chunk_size * len(self.devices)
         dtype = self.task.scene.template.qpos.dtype
-        keys = np.asarray(jax.random.key_data(jax.random.split(jax.random.key(0), capacity)))
-        arguments = (self.task.theta, contact, np.asarray(1.0, dtype), keys, np.ones(capacity, dtype))
+        keys = np.asarray(jax.random.key_data(jax.random.split(jax.random.key(0), self.chunk_size)))
+        arguments = (self.task.theta, contact, np.asarray(1.0, dtype), keys, np.ones(self.chunk_size, dtype))
         plan = self._programs["gradient"].lower(*arguments).compile().memory_analysis()  # type: ignore[attr-defined]
-        return plan.temp_size_in_bytes * len(self.devices) * samples // capacity
-
-    def _compile(self, program, devices: tuple[Any, ...]):
-        mesh = Mesh(np.array(devices), ("samples",))
-        shared, split = PartitionSpec(), PartitionSpec("samples")
-        batched = jax.vmap(program, in_axes=(None, None, None, 0, 0))
-        return jax.jit(
-            jax.shard_map(
-                batched,
-                mesh=mesh,
-                in_specs=(shared, shared, shared, split, split),
-                out_specs=split,
-                check_vma=False,
-            )
-        )
+        return plan.temp_size_in_bytes * samples // self.chunk_size
 
     def _draw(self, sigma, key_data, noise_scale) -> tuple[State, Float[Array, "steps dimensions"]]:
         """Initial state and noise of a sample."""
@@ -259,7 +288,7 @@ class Simulator:
         )
 
     def run(self, name: str, theta, contact, sigma, keys, noise_scale):
-        """Run one of `sample_programs` chunk by chunk; the last chunk is padded by repeating its last sample.
+        """Run one of `sample_programs`, see `spread`.
 
         Args:
             name: name of the program.
@@ -280,16 +309,8 @@ class Simulator:
             raise ValueError(f"theta has shape {theta.shape}, the policy needs ({self.task.policy.num_params},)")
         if len(noise_scale) == 0:
             raise ValueError("there is no sample to run: give at least one key")
-        dtype = self.task.scene.template.qpos.dtype
-        samples, capacity = len(noise_scale), self.chunk_size * len(self.devices)
-        padded = np.minimum(np.arange(math.ceil(samples / capacity) * capacity), samples - 1)
-        program = self._programs[name]  # type: ignore[attr-defined]
-        outputs = [
-            program(theta, contact, np.asarray(sigma, dtype), keys[part], noise_scale[part])
-            for part in padded.reshape(-1, capacity)
-        ]
-        host = jax.device_get(outputs)
-        return jax.tree.map(lambda *leaves: np.concatenate(leaves)[:samples], *host)
+        shared = theta, contact, np.asarray(sigma, self.task.scene.template.qpos.dtype)
+        return spread(self._programs[name], shared, (keys, noise_scale), self.chunk_size, self.devices)  # type: ignore[attr-defined]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -427,15 +448,16 @@ class MjxObjective:
 
 @dataclasses.dataclass(frozen=True)
 class TracedObjective(MjxObjective):
-    """The same objective inside a larger compiled program: nothing returns to the host between batch and estimate."""
+    """The same objective inside a larger compiled program, on one device: nothing returns to the host between batch and
+    estimate."""
 
     def _run(self, name: str, theta, keys, rows=None, noise_scale=None):
         simulator = self.simulator
         rows = np.arange(len(keys)) if rows is None else rows
         dtype = simulator.task.scene.template.qpos.dtype
         scale = np.ones(len(rows), dtype) if noise_scale is None else np.asarray(noise_scale, dtype)
-        capacity = simulator.chunk_size * len(simulator.devices)
-        chunks = np.minimum(np.arange(math.ceil(len(rows) / capacity) * capacity), len(rows) - 1).reshape(-1, capacity)
+        chunk = simulator.chunk_size
+        chunks = np.minimum(np.arange(math.ceil(len(rows) / chunk) * chunk), len(rows) - 1).reshape(-1, chunk)
         program, key_data = simulator._programs[name], jax.random.key_data(keys)  # type: ignore[attr-defined]
         sigma = jnp.asarray(self.sigma, dtype)
 
@@ -457,6 +479,10 @@ def _for_all(rows, samples: int):
 
 
 def chunk_for(samples: int, devices: Sequence[Any]) -> int:
-    """The chunk size that runs `samples` and their baseline in the fewest evenly filled calls on these devices."""
-    per_device, most = math.ceil((samples + 1) / len(devices)), MAX_CHUNK[devices[0].platform]
-    return math.ceil(per_device / math.ceil(per_device / most))
+    """The chunk size that runs `samples` and their baseline in the fewest evenly filled calls.
+
+    On accelerators as many calls as devices at least; on CPUs it does not depend on their number.
+    """
+    platform = devices[0].platform
+    each = math.ceil((samples + 1) / (1 if platform == "cpu" else len(devices)))
+    return math.ceil(each / math.ceil(each / MAX_CHUNK[platform]))

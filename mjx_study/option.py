@@ -243,7 +243,7 @@ OPTIONS: Final[dict[str, Option]] = {
     option.name: option
     for option in (
         _number("seed", int, "[0, 4294967295]", "N", "random seed"),
-        _number("devices", int, "[1, 256]", "N", "CPU devices", unset="one per core; with JAX 0.11 one"),
+        _number("devices", int, "[1, 256]", "N", "CPU devices", unset="one per core"),
         _number("sigma", float, "(0, inf)", "S", "standard deviation of the noise", unset=TASKS),
         _choice("noise", DENSITIES, "NAME", "noise density", unset=TASKS),
         _choice("baseline", BASELINES, "NAME", "baseline of zeroth-order estimates"),

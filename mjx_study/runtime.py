@@ -20,7 +20,7 @@ def configure(*, precision: str = "float64", cpu_devices: int | None = None, cac
     Args:
         precision: float64 or float32. Stiff contact needs float64: equivalent float32 programs of one rollout differ in
             the second digit.
-        cpu_devices: number of CPU devices, that is, of cores that samples use; None for `default_cpu_devices()`.
+        cpu_devices: number of CPU devices, that is, of cores that samples use; None for all.
         cache: folder for compiled programs kept between runs; None for `default_cache()`.
 
     Raises:
@@ -28,7 +28,7 @@ def configure(*, precision: str = "float64", cpu_devices: int | None = None, cac
     """
     if precision not in PRECISIONS:
         raise ValueError(f"unknown precision {precision!r}; choose from {', '.join(PRECISIONS)}")
-    devices = default_cpu_devices() if cpu_devices is None else cpu_devices
+    devices = available_cores() if cpu_devices is None else cpu_devices
     if devices < 1:
         raise ValueError(f"cpu_devices must be at least 1, got {devices}")
     mujoco.set_mju_user_warning(lambda message: print(f"MuJoCo: {message}", file=sys.stderr))  # not a file in the cwd
@@ -44,15 +44,6 @@ def available_cores() -> int:
     """Cores this process may run on."""
     affinity = getattr(os, "sched_getaffinity", None)
     return len(affinity(0)) if affinity else os.cpu_count() or 1
-
-
-def default_cpu_devices() -> int:
-    """One CPU device per core; a single one from JAX 0.11 on.
-
-    jaxlib 0.11.2 crashes (a segmentation fault) in MJX programs that `shard_map` splits over several CPU devices; one
-    device, and accelerators, are not affected.
-    """
-    return available_cores() if jax.__version_info__ < (0, 11) else 1
 
 
 def default_cache() -> Path | None:

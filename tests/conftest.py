@@ -1,7 +1,4 @@
-"""Settings that every test runs under: float64, two CPU devices, and reuse of random keys as an error.
-
-From JAX 0.11 on, programs split over several CPU devices crash (see `mjx_study.runtime`); there one device has to do.
-"""
+"""Settings that every test runs under: float64, two CPU devices, and reuse of random keys as an error."""
 
 import gc
 import os
@@ -12,24 +9,22 @@ from typing import Any
 import jax
 import pytest
 
-OLD = jax.__version_info__ < (0, 11)
 # Compilation is most of a test's time, and rounding does not matter: no optimisation, and XLA's plain emitters, which
 # compile twice as fast as those of fusions. Subprocesses inherit it. XLA reads it when the first array is made, and
 # aborts at a flag that it does not know.
 FLAGS = [
     "--xla_backend_optimization_level=0",
     "--xla_cpu_parallel_codegen_split_count=1",
-    *(["--xla_cpu_use_fusion_emitters=false"] if OLD else []),
+    *(["--xla_cpu_use_fusion_emitters=false"] if jax.__version_info__ < (0, 11) else []),
 ]
 os.environ["XLA_FLAGS"] = " ".join([*FLAGS, os.environ.get("XLA_FLAGS", "")])
 
 # Tracing makes millions of objects that live on; looking for garbage among them was a sixth of its time.
 gc.set_threshold(1_000_000, 20, 50)
 
-DEVICES = 2 if OLD else 1
 CACHE = os.environ.get("JAX_COMPILATION_CACHE_DIR") or str(Path(__file__).parents[1] / ".pytest_cache" / "jax")
 jax.config.update("jax_enable_x64", True)
-jax.config.update("jax_num_cpu_devices", DEVICES)
+jax.config.update("jax_num_cpu_devices", 2)
 jax.config.update("jax_debug_key_reuse", True)
 jax.config.update("jax_compilation_cache_dir", CACHE)
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)

@@ -4,6 +4,7 @@ What does not depend on contact runs on a cart.
 """
 
 import dataclasses
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +21,6 @@ from mjx_study.simulation.scene import put_scene
 from mjx_study.tasks import make_task
 from mjx_study.tasks.policy import InitialStatePolicy, LinearFeedback, OpenLoop, Policy
 from tests.carts import cart
-from tests.conftest import DEVICES
 from tests.estimators.statistics_helpers import assert_mean_is
 from tests.pusher_fixtures import (
     HORIZON,
@@ -44,7 +44,7 @@ def simulator() -> Simulator:
 
 @pytest.fixture(scope="module")
 def large() -> Simulator:
-    """Two devices together hold 1000 samples."""
+    """Two chunks hold 1000 samples."""
     return Simulator(pusher_task(), chunk_size=500)
 
 
@@ -84,9 +84,11 @@ def cart_evaluations() -> dict[tuple[int, int], Evaluation]:
     return results
 
 
-@pytest.mark.skipif(DEVICES < 2, reason="from JAX 0.11 on, programs over several CPU devices crash")
 def test_neither_chunks_nor_devices_matter(cart_evaluations):
+    """Of devices not a bit depends; chunks of another size are another program, which may round differently."""
     assert len(jax.local_devices()) == 2
+    for one, other in zip(*(jax.tree.leaves(cart_evaluations[3, devices]) for devices in (1, 2)), strict=True):
+        np.testing.assert_array_equal(one, other)
     first, *others = cart_evaluations.values()
     assert first.value.shape == (7,) and len(np.unique(first.value)) == 7
     for other in others:
@@ -123,11 +125,15 @@ def test_a_sample_depends_on_its_own_key_alone(simulator):
     np.testing.assert_allclose(alone.value[0], straight[0].value[4], rtol=1e-12)
 
 
-@pytest.mark.parametrize(("samples", "devices"), [(1, 2), (7, 2), (1000, 2), (1023, 1), (5000, 3)])
-def test_chunk_for_wastes_less_than_a_call_per_device(samples, devices):
-    chunk = chunk_for(samples, jax.local_devices()[:1] * devices)
+@pytest.mark.parametrize("platform", ["cpu", "gpu"])
+@pytest.mark.parametrize(("samples", "devices"), [(1, 2), (7, 2), (1000, 2), (1023, 1), (200_000, 3)])
+def test_chunk_for_wastes_less_than_a_call_per_device(samples, devices, platform):
+    device = SimpleNamespace(platform=platform)
+    chunk, most = chunk_for(samples, [device] * devices), MAX_CHUNK[platform]
+    if platform == "cpu":
+        assert chunk == chunk_for(samples, [device])
+        devices = 1
     calls = -(-(samples + 1) // (chunk * devices))
-    most = MAX_CHUNK[jax.default_backend()]
     assert 1 <= chunk <= most
     assert calls == -(-(samples + 1) // (most * devices))  # no more calls than the largest chunk would take
     assert (chunk - calls) * calls * devices < samples + 1  # smaller chunks of that number would not hold them
@@ -399,10 +405,9 @@ def test_memory_of_a_thousand_gradients(large):
     """1000 samples of 200 steps at once: 24 numbers per step, among them the 2 x 5 Jacobian, make 36.6 MiB."""
     task = pusher_task()
     keys = np.asarray(jax.random.key_data(sample_keys(1000)))
-    arguments = (task.theta, penalty(10.0), np.asarray(SIGMA), keys, np.ones(1000))
+    arguments = (task.theta, penalty(10.0), np.asarray(SIGMA), keys[:500], np.ones(500))
     plan = large._programs["gradient"].lower(*arguments).compile().memory_analysis()
-    temporary = plan.temp_size_in_bytes * len(large.devices)  # the plan is one device's
-    output = plan.output_size_in_bytes * len(large.devices)
+    temporary, output = 2 * plan.temp_size_in_bytes, 2 * plan.output_size_in_bytes  # the plan is of a chunk
     assert 1000 * HORIZON * 8 <= output <= 1000 * (HORIZON + 10) * 8  # gradients, values, residuals
     assert output <= temporary <= 40 * 2**20
 

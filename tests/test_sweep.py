@@ -37,7 +37,6 @@ from mjx_study.study.run import load_study, open_store, run_study, warnings_of
 from mjx_study.study.store import Store, StudyError
 from mjx_study.study.variables import MEASURED, VARIABLES, markdown_table
 from mjx_study.tasks import make_task
-from tests.conftest import DEVICES
 from tests.documents import study_document
 
 pytestmark = pytest.mark.usefixtures("shared_programs")
@@ -187,11 +186,11 @@ def test_descents_are_labelled(descents: Path) -> None:
     assert data["rollouts"].squeeze().isel(model=0).values.tolist() == [4, 9]
 
 
-# Disturbances. The command runs in processes of its own, which are killed, starved and raced.
+# Disturbances. The command runs in processes of its own, which are killed, starved and raced; on one device, not two.
 
 ARGUMENTS = ["pusher", "--contact", "penalty,mujoco", "--stiffness", "10,1000", "--samples", "4,8", "--seeds", "3",
              "--horizon", "20", "--reference-samples", "6", "--chunk-size", "24",
-             "--devices", str(DEVICES)]  # fmt: skip
+             "--devices", "1"]  # fmt: skip
 
 
 def process(folder: Path, *more: str, **kwargs: Any) -> subprocess.Popen[str]:
@@ -266,7 +265,7 @@ def test_a_killed_sweep_goes_on_to_the_same_data(undisturbed: Path, tmp_path: Pa
 @pytest.mark.slow
 def test_two_processes_share_a_study_and_a_third_has_nothing_to_do(undisturbed: Path, tmp_path: Path) -> None:
     folder = tmp_path / "out"
-    both = [process(folder), process(folder)]
+    both = [process(folder), process(folder, "--devices", "2")]
     said = [running.communicate()[0] for running in both]
     assert [running.returncode for running in both] == [0, 0]
     computed = [int(re.search(r"computed (\d+) cells", text).group(1)) for text in said]  # type: ignore[union-attr]

@@ -1,21 +1,23 @@
 """Gradient descent in a cell: every estimator, several seeds at once, resumed from the last checkpoint.
 
-All seeds of an estimator advance in one compiled program; with MJX, rollouts and update stay on the device, with an
-analytic system the rollouts are NumPy's. Iteration i of seed s has a key of its own, so that an interrupted run ends
-bit for bit where an undisturbed one does; all estimators share these keys.
+All seeds of an estimator advance in one compiled program. With MJX, its rollouts and update stay on one device, and the
+estimators advance side by side on as many devices as there are; with an analytic system the rollouts are NumPy's.
+Iteration i of seed s has a key of its own, so that an interrupted run ends bit for bit where an undisturbed one does;
+all estimators share these keys.
 """
 
 import dataclasses
 import math
+import threading
 import time
 from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any, Final
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float, Key
 
 from estimators import Estimator, Objective, draw
@@ -44,7 +46,11 @@ def compute_descents(plan: StudyPlan) -> Callable[..., dict[str, np.ndarray]]:
             backends[key] = Backend(plan, cell)
         backend, chosen = backends[key], estimators_of(plan, cell)
         kept = dict(part.kept)
-        runs = [_run(backend, cell.model, index, each, kept, part) for index, each in enumerate(chosen)]
+        begun = [_begin(backend, cell.model, index, each, kept, part) for index, each in enumerate(chosen)]
+        with ThreadPoolExecutor(backend.threads) as pool:
+            each_in_turn = map if backend.threads == 1 else pool.map
+            ended = list(each_in_turn(lambda descend: descend(), begun))
+        runs = [_numbers(backend, cell.model, each, run) for each, run in zip(chosen, ended, strict=True)]
         found = {name: np.stack([run[name] for run in runs], axis=-1) for name in runs[0] if name != "theta"}
         found["theta"] = np.stack([run["theta"] for run in runs], axis=1)  # (seed, estimator, param)
         mean, error = backend.cost(backend.task.theta, cell.model)
@@ -66,14 +72,20 @@ class Backend:
         self.config, self.seeds = config, config.batches
         self.optimizer = make_optimizer(config.optimizer, self.recipe.learning_rate, self.recipe.decay)
         self.simulator = None if cell.model.analytic else Simulator(self.task, chunk_size=plan.chunk_size)
+        self.saving = threading.Lock()
         self._iterations: dict[Estimator, Callable[..., tuple[Descent, Record]]] = {}
 
-    def place(self, state: Descent) -> Descent:
-        """Replicate the state over the devices as an iteration does, so that the first call compiles for all."""
+    @property
+    def threads(self) -> int:
+        """Number of estimators to advance side by side."""
+        return 1 if self.simulator is None else len(self.simulator.devices)
+
+    def place(self, state: Descent, index: int) -> Descent:
+        """Put the state of an estimator on its device; on CPUs that is always the first, see `spread`."""
         if self.simulator is None:
             return state
-        mesh = Mesh(np.array(self.simulator.devices), ("samples",))
-        return jax.device_put(state, NamedSharding(mesh, PartitionSpec()))
+        device = self.simulator.devices[index % self.threads]
+        return jax.device_put(state, self.simulator.devices[0] if device.platform == "cpu" else device)
 
     def iteration(
         self, estimator: Estimator, model: ContactPoint
@@ -181,51 +193,58 @@ class _Progress:
         }
 
 
-def _run(
+def _begin(
     backend: Backend, model: ContactPoint, index: int, estimator: Estimator, kept: dict[str, np.ndarray], part: Part
-) -> dict[str, np.ndarray]:
-    """Run all seeds of one estimator and add their final state to `kept`."""
+) -> Callable[[], _Progress]:
+    """Compile an iteration of all seeds of one estimator; what is returned runs the rest and adds it to `kept`."""
     seeds, iterations = backend.seeds, backend.recipe.iterations
     run = _Progress.of(kept, index, begin(backend.optimizer, backend.task.theta, seeds))
-    state, records, seconds = backend.place(run.state), run.records, run.seconds
+    state, records, seconds = backend.place(run.state, index), run.records, run.seconds
     keys = jax.vmap(lambda seed: jax.random.fold_in(jax.random.key(backend.config.seed), seed))(jnp.arange(seeds))
     keys_of = jax.jit(lambda index: jax.vmap(lambda key: jax.random.fold_in(key, index))(jax.random.clone(keys)))
     iterate = backend.iteration(estimator, model)
-    done = already = len(records)
-    elapsed = seconds[-1] if seconds else 0.0
-    if done < iterations and bool(jnp.any(going(state))):
-        jax.block_until_ready(iterate(state, keys_of(done)))  # compile; the result is dropped
-    saved = last = time.perf_counter()
-    pending: list[Record] = []
+    already = len(records)
+    if already < iterations and bool(jnp.any(going(state))):
+        jax.block_until_ready(iterate(state, keys_of(already)))  # compile; the result is dropped
 
-    def collect(record: Record | None) -> None:
-        nonlocal last, elapsed
-        if record is not None:
-            pending.append(record)
-        if pending and (record is None or len(pending) >= REPORT_EVERY):
-            records.extend(jax.device_get(pending))
-            now = time.perf_counter()
-            seconds.extend(elapsed + (now - last) * (index + 1) / len(pending) for index in range(len(pending)))
-            elapsed, last = seconds[-1], now
-            pending.clear()
+    def descend() -> _Progress:
+        nonlocal state
+        done, elapsed, pending = already, seconds[-1] if seconds else 0.0, []
+        saved = last = time.perf_counter()
 
-    while done < iterations:
-        if not pending and not bool(jnp.any(going(state))):
-            break
-        state, record = iterate(state, keys_of(done))
-        done += 1
-        collect(record)
-        if not pending:
-            part.report(index * iterations + done, len(backend.config.estimators) * iterations, estimator.name)
-            if time.perf_counter() - saved > SAVE_SECONDS:
-                part.save(kept | _Progress(state, records, seconds).arrays(index))
-                saved = last = time.perf_counter()
-    collect(None)
-    run = _Progress(state, records, seconds)
-    kept |= run.arrays(index)
-    if done > already:
-        part.save(kept)
-    return _numbers(backend, model, estimator, run)
+        def collect(record: Record | None) -> None:
+            nonlocal last, elapsed
+            if record is not None:
+                pending.append(record)
+            if pending and (record is None or len(pending) >= REPORT_EVERY):
+                records.extend(jax.device_get(pending))
+                now = time.perf_counter()
+                seconds.extend(elapsed + (now - last) * (index + 1) / len(pending) for index in range(len(pending)))
+                elapsed, last = seconds[-1], now
+                pending.clear()
+
+        def save() -> None:
+            with backend.saving:
+                kept.update(_Progress(state, records, seconds).arrays(index))
+                part.save(dict(kept))
+
+        while done < iterations:
+            if not pending and not bool(jnp.any(going(state))):
+                break
+            state, record = iterate(state, keys_of(done))
+            done += 1
+            collect(record)
+            if not pending:
+                part.report(index * iterations + done, len(backend.config.estimators) * iterations, estimator.name)
+                if time.perf_counter() - saved > SAVE_SECONDS:
+                    save()
+                    saved = last = time.perf_counter()
+        collect(None)
+        if done > already:
+            save()
+        return _Progress(state, records, seconds)
+
+    return descend
 
 
 def _numbers(backend: Backend, model: ContactPoint, estimator: Estimator, run: _Progress) -> dict[str, np.ndarray]:

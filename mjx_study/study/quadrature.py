@@ -10,16 +10,15 @@ rule on every second point estimates it.
 
 import dataclasses
 import math
-from typing import Any, Final
+from typing import Final
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Float
 
 from estimators import NOISES
-from mjx_study.objective import rollout_cost
+from mjx_study.objective import rollout_cost, spread
 from mjx_study.reference.noise import split_sample_key
 from mjx_study.simulation.contact import ContactModel
 from mjx_study.tasks.task import Task
@@ -68,7 +67,6 @@ class Line:
                 f"{'' if task.policy.additive else ', the noise on its controls'}"
                 f"{', its starts drawn' if task.random_start else ''}"
             )
-        self.devices = jax.local_devices()
         shape, dtype = task.policy.noise_shape, task.theta.dtype
 
         def cost(theta, contact):
@@ -76,20 +74,14 @@ class Line:
             return rollout_cost(task, theta[None], contact, start, jnp.zeros(shape, dtype), task.onset)[0]
 
         batched = jax.vmap(jax.value_and_grad(cost), in_axes=(0, None))
-        mesh, split = Mesh(np.array(self.devices), ("points",)), PartitionSpec("points")
-        specs: dict[str, Any] = {"mesh": mesh, "in_specs": (split, PartitionSpec()), "out_specs": split}
-        self._program = jax.jit(jax.shard_map(batched, **specs, check_vma=False))
+        self._program = jax.jit(lambda contact, thetas: batched(thetas, contact))
         self._dtype = dtype
 
     def __call__(
         self, points: Float[np.ndarray, " points"], contact: ContactModel | None
     ) -> tuple[Float[np.ndarray, " points"], Float[np.ndarray, " points"]]:
         """Cost without noise and its derivative at each point."""
-        capacity = CHUNK * len(self.devices)
-        rows = np.minimum(np.arange(-(-len(points) // capacity) * capacity), len(points) - 1)
-        parts = [self._program(points[part].astype(self._dtype), contact) for part in rows.reshape(-1, capacity)]
-        values, slopes = (np.concatenate(leaves)[: len(points)] for leaves in zip(*jax.device_get(parts), strict=True))
-        return values, slopes
+        return spread(self._program, (contact,), (points.astype(self._dtype),), CHUNK, jax.local_devices())
 
 
 def grid(low: float, high: float, sigma: float, size: int, noise: str) -> Float[np.ndarray, " size"]:
