@@ -24,12 +24,13 @@ SMALL = {
     "rollout": "--horizon 4 --frames 1",
     "gradcheck": "--horizon 4 --states 1",
     "bench": "--samples 4 --horizon 4",
+    "claims": "--only lemma-closed-form",
 }
 OF_KIND = {"--iterations": "--iterations 2 --evaluation-samples 4", "--points": "--points 2"}
 # What a page takes for granted, or another one makes.
 MJCF = """<mujoco><worldbody><geom type="plane" size="1 1 0.1"/>
 <body pos="0 0 0.09"><freejoint/><geom size="0.1"/></body></worldbody></mujoco>"""
-ORDER = ("optimise", "rollout", "compare", "landscape", "gradcheck", "bench", "sweep", "plot", "report")
+ORDER = ("optimise", "rollout", "compare", "landscape", "gradcheck", "bench", "claims", "sweep", "plot", "report")
 
 
 def from_page(page: Path) -> list[list[str]]:

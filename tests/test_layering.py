@@ -30,6 +30,7 @@ LAYERS = [
     "mjx_study.bench",
     "mjx_study.render",
     "mjx_study.plots",
+    "mjx_study.claims",
     "mjx_study.report",
     "mjx_study.accessor",
     "mjx_study.cli",

@@ -39,6 +39,7 @@ COMMANDS: Final = {
     "landscape": ("draw the cost along a line of parameters, its smoothed cost and the slope that each estimator sees"),
     "rollout": "show a rollout: pictures, a film and its numbers",
     "gradcheck": "check derivatives against differences, the C engine and a closed form",
+    "claims": "measure which claims survive, in which contact models",
     "bench": "measure what rollouts and gradients cost here",
     "tasks": "list the tasks",
     "estimators": "list the gradient estimators and the noise densities",

@@ -1,0 +1,11 @@
+"""All claims, in the order of the ledger."""
+
+from typing import Final
+
+from mjx_study.claims import theory
+from mjx_study.claims.ledger import Claim
+
+CLAIMS: Final[dict[str, Claim]] = {claim.id: claim for claim in theory.CLAIMS}
+"""By id."""
+VERDICTS: Final = sum(len(claim.cases) for claim in CLAIMS.values())
+"""Verdicts of the whole ledger, for all of which the intervals hold at once."""

@@ -1,0 +1,258 @@
+"""Where claims are measured: studies and landscapes that several claims share, and statistics made of them."""
+
+import dataclasses
+import hashlib
+import math
+from collections.abc import Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any, Final
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import xarray as xr
+from jaxtyping import Float
+
+import estimators
+from estimators import Estimator, GradientEstimate
+from estimators.intervals import student_quantile
+from mjx_study.choices import REFERENCE
+from mjx_study.reference import FunctionObjective, smoothed
+from mjx_study.study.configuration import StudyConfig
+from mjx_study.study.quadrature import Line, means
+from mjx_study.study.run import run_study
+from mjx_study.tasks import make_task
+from mjx_study.tasks.contact_grid import ContactPoint, contact_grid
+from mjx_study.tasks.task import Task
+
+
+@dataclasses.dataclass(frozen=True)
+class Effort:
+    """How much is measured.
+
+    Attributes:
+        name: on the command line.
+        density: points of a landscape in one standard deviation of the noise.
+        draws: samples where a sample costs nothing.
+        batches: batches where one costs little.
+        samples, seeds: of batches that are simulated.
+        seeds_of_descents, iterations: of descents; iterations as a share of the task's recipe.
+    """
+
+    name: str
+    density: int
+    draws: int
+    batches: int
+    samples: int
+    seeds: int
+    seeds_of_descents: int
+    iterations: float
+
+
+EFFORTS: Final = {
+    "quick": Effort("quick", 40, 100_000, 400, 100, 10, 5, 0.4),
+    "full": Effort("full", 200, 1_000_000, 4000, 400, 20, 10, 1.0),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Statistic:
+    """An estimate and what its interval is made of.
+
+    Attributes:
+        estimate: the value.
+        error: its standard error.
+        freedom: degrees of freedom of the error.
+        slack: bound on a deterministic error, as of a quadrature.
+        samples, of: how many of what the standard error comes from.
+        trials: if not 0, the estimate is a share of so many trials, and the interval is Wilson's.
+    """
+
+    estimate: float
+    error: float = 0.0
+    freedom: float = 1e9
+    slack: float = 0.0
+    samples: int = 0
+    of: str = ""
+    trials: int = 0
+
+
+def exact(estimate: float, slack: float = 0.0) -> Statistic:
+    """A statistic without sampling error."""
+    return Statistic(float(estimate), slack=float(slack), of="quadrature")
+
+
+def mean_of(values: Sequence[float] | np.ndarray, of: str, slack: float = 0.0) -> Statistic:
+    """A mean over independent values, with the t-interval of its standard error."""
+    kept = np.asarray(values, float)
+    error = float(np.std(kept, ddof=1) / math.sqrt(len(kept)))
+    return Statistic(float(np.mean(kept)), error, float(len(kept) - 1), slack, len(kept), of)
+
+
+def share_of(happened: np.ndarray, of: str) -> Statistic:
+    """A share of independent trials."""
+    return Statistic(float(np.mean(happened)), samples=len(happened), of=of, trials=len(happened))
+
+
+def ratio_of(top: np.ndarray, bottom: np.ndarray, of: str) -> Statistic:
+    """log10 of the ratio of two means over the same trials, by the delta method."""
+    high, low = float(np.mean(top)), float(np.mean(bottom))
+    terms = (top / high - bottom / low) / math.log(10)
+    return dataclasses.replace(mean_of(terms, of), estimate=math.log10(high / low))
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Landscape:
+    """Cost and derivative of a rollout in MJX over one parameter, tabulated; constant in each cell of a fine grid.
+
+    A `Function`, so that estimators and descents run on it as on an analytic system, with nothing simulated again.
+
+    Attributes:
+        points, values, slopes: the uniform grid, cost and derivative on it.
+    """
+
+    points: Float[np.ndarray, " size"]
+    values: Float[np.ndarray, " size"]
+    slopes: Float[np.ndarray, " size"]
+    num_params: int = 1
+
+    def value(self, x: Float[np.ndarray, "*batch 1"]) -> Float[np.ndarray, "*batch"]:
+        """Of the cell; beyond the grid that of its end."""
+        return self.values[self._cell(x)]
+
+    def gradient(self, x: Float[np.ndarray, "*batch 1"]) -> Float[np.ndarray, "*batch 1"]:
+        """Likewise."""
+        return self.slopes[self._cell(x)][..., None]
+
+    def _cell(self, x: np.ndarray) -> np.ndarray:
+        spacing = self.points[1] - self.points[0]
+        return np.clip(np.rint((x[..., 0] - self.points[0]) / spacing), 0, len(self.points) - 1).astype(int)
+
+
+@dataclasses.dataclass(frozen=True)
+class Slopes:
+    """What is known of a function of one parameter at one theta.
+
+    Attributes:
+        gradient, first: grad F, and the mean of first-order gradients.
+        errors: of both, by quadrature, over |grad F|.
+        objective: F as an objective for estimators.
+        theta: where.
+    """
+
+    gradient: float
+    first: float
+    errors: tuple[float, float]
+    objective: FunctionObjective
+    theta: float
+
+    @property
+    def relative(self) -> float:
+        """E[FoBG] / grad F - 1."""
+        return self.first / self.gradient - 1
+
+
+class Laboratory:
+    """Measures at one effort, and keeps what is simulated and compiled.
+
+    Args:
+        effort: how much to measure.
+        folder: of studies, which a later run goes on with; None to keep them in memory.
+        accept_versions: go on with studies that other versions began.
+    """
+
+    def __init__(self, effort: Effort, folder: Path | None = None, accept_versions: bool = False):
+        self.effort, self._folder, self._accept = effort, folder, accept_versions
+        self.study, self.task = cache(self._study), cache(self._task)
+        self._line, self.landscape = cache(self._make_line), cache(self._landscape)
+
+    def _study(self, config: StudyConfig) -> xr.Dataset:
+        """A study, computed once."""
+        folder = None
+        if self._folder is not None:
+            name = hashlib.sha256(repr(config).encode()).hexdigest()[:12]
+            folder = self._folder / f"{config.task_names[0].replace(':', '_')}-{config.kind}-{name}"
+        return run_study(config, folder, accept_versions=self._accept)
+
+    def _task(self, name: str, timestep: float | None = None, onset: str = "none") -> Task:
+        task = make_task(name)
+        if timestep is not None:
+            horizon = round(task.horizon * task.scene.timestep / timestep)
+            task = make_task(name, timestep=timestep, horizon=horizon)
+        return task.replace(onset=onset)
+
+    def _make_line(self, name: str, timestep: float | None, onset: str) -> Line:
+        return Line(self.task(name, timestep, onset))
+
+    def contact(self, task: Task, family: str, stiffness: float) -> ContactPoint:
+        """The contact model of a family."""
+        (cell,), _ = contact_grid(task, (family,), (stiffness,))
+        return cell
+
+    def _landscape(
+        self, name: str, family: str, stiffness: float, low: float, high: float, sigma: float,
+        timestep: float | None = None, onset: str = "none",
+    ) -> Landscape:  # fmt: skip
+        """The landscape of a task between two parameters and the noise about them."""
+        task = self.task(name, timestep, onset)
+        points = np.arange(low - 5.4 * sigma, high + 5.4 * sigma, sigma / self.effort.density)
+        contact = self.contact(task, family, stiffness).contact
+        return Landscape(points, *self._line(name, timestep, onset)(points, contact))
+
+    def slopes(
+        self, name: str, family: str, theta: float, *, stiffness: float, sigma: float | None = None,
+        timestep: float | None = None, onset: str = "none",
+    ) -> Slopes:  # fmt: skip
+        """Gradient and means at theta, by quadrature; of the analytic system in closed form."""
+        task = self.task(name)
+        sigma = task.sigma if sigma is None else sigma
+        if family == REFERENCE:
+            reference = task.analytic(stiffness)
+            assert isinstance(reference, FunctionObjective)
+            return closed_form(reference.function, theta, sigma)
+        table = self.landscape(name, family, stiffness, theta, theta, sigma, timestep, onset)
+        found = means(table.points, table.values, table.slopes, np.array([theta]), sigma, task.noise)
+        slope, first = float(found.slope[0]), float(found.first[0])
+        errors = float(found.slope_error[0]) / abs(slope), float(found.first_error[0]) / abs(slope)
+        return Slopes(slope, first, errors, FunctionObjective(table, sigma), theta)
+
+
+def closed_form(function: Any, theta: float, sigma: float) -> Slopes:
+    """Gradient and means of an analytic function of one parameter."""
+    exactly = smoothed(function, np.array([theta]), sigma)
+    gradient, jump = float(exactly.gradient[0]), float(exactly.jump_term[0])
+    return Slopes(gradient, gradient - jump, (1e-12, 1e-12), FunctionObjective(function, sigma), theta)
+
+
+def batch(estimator: Estimator, at: Slopes, samples: int) -> GradientEstimate:
+    """A large batch of an estimator."""
+    return estimators.estimate(estimator, at.objective, jnp.array([at.theta]), jax.random.key(0), samples)
+
+
+def batches(chosen: Sequence[Estimator], at: Slopes, samples: int, count: int) -> list[GradientEstimate]:
+    """Many independent batches of some estimators, which share them; leaves have a leading axis of batches."""
+    needs = estimators.oracles_of(chosen)
+    drawn = estimators.draw(needs, at.objective, jnp.array([at.theta]), jax.random.key(1), samples * count)
+    parts = jax.tree.map(lambda leaf: leaf.reshape(count, samples, *leaf.shape[1:]), drawn)
+    return [jax.jit(jax.vmap(each))(parts) for each in chosen]
+
+
+def log_variance(estimate: GradientEstimate) -> Statistic:
+    """log10 of a batch's variance, with the error of its jackknife interval; that of zero is of 1e-300."""
+    variance, confidence = max(float(estimate.variance), 1e-300), 0.95
+    freedom = jnp.maximum(estimators.effective_samples(estimate).count - 1.0, 2.0)
+    half = (
+        math.log10(float(estimators.variance_interval(estimate, confidence)[1]) / variance) if variance > 1e-300 else 0
+    )
+    error = half / float(student_quantile(0.5 + confidence / 2, freedom))
+    return Statistic(math.log10(variance), error, float(freedom), samples=len(estimate.per_sample), of="samples")
+
+
+def difference_of(one: Statistic, other: Statistic) -> Statistic:
+    """One statistic less an independent other, with Welch and Satterthwaite's degrees of freedom."""
+    squares = np.array([one.error**2, other.error**2])
+    parts = float(np.sum(squares**2 / np.array([one.freedom, other.freedom])))
+    freedom = float(np.sum(squares)) ** 2 / parts if parts > 0 else 1e9
+    error, slack = math.sqrt(float(np.sum(squares))), one.slack + other.slack
+    return Statistic(one.estimate - other.estimate, error, freedom, slack, one.samples, one.of)

@@ -1,0 +1,246 @@
+"""What a claim is, how its verdict follows from a measurement, and how a ledger of claims is measured and kept.
+
+A verdict is where an interval lies. A claim names beforehand the values of a statistic with which it holds, and perhaps
+those with which its opposite does; the interval of the measurement lies within the first (holds), within the second
+(reversed), outside the first (fails), or across its border (undecided). All intervals of a ledger hold at once: each is
+at level 1 - ALPHA / m, with m the number of verdicts of the whole ledger (Bonferroni), whichever of them are measured.
+"""
+
+import dataclasses
+import hashlib
+import inspect
+import json
+import math
+from collections.abc import Callable, Sequence
+from importlib import metadata
+from pathlib import Path
+from typing import Any, Final
+
+import jax.numpy as jnp
+from scipy.stats import t as student
+
+from estimators import coverage_interval
+from mjx_study.choices import REFERENCE
+from mjx_study.claims import laboratory
+from mjx_study.claims.laboratory import EFFORTS, Effort, Laboratory, Statistic
+from mjx_study.disk import prepare_folder, write_whole
+from mjx_study.runtime import environment, precision
+from mjx_study.study.configuration import Progress
+from mjx_study.study.identity import VERSIONED
+from mjx_study.study.revision import git_revision
+
+ALPHA: Final = 0.05
+"""Probability that any interval of a ledger misses its value."""
+VERDICTS: Final = ("holds", "fails", "reversed", "undecided")
+FAMILIES: Final = (
+    REFERENCE, "penalty", "impedance", "mujoco", "mujoco_default", "mujoco_stiff", "smooth_onset", "mjcf",
+)  # fmt: skip
+"""Columns of the matrix."""
+REAL: Final = FAMILIES[1:-1]
+"""Contact families of MJX that are compared; "mjcf" is for what has no contact."""
+Range = tuple[float, float]
+
+
+@dataclasses.dataclass(frozen=True)
+class Criterion:
+    """What decides a claim, fixed before it is measured.
+
+    Attributes:
+        quantity: the statistic, in words.
+        holds: values with which the claim holds.
+        reversed: values with which its opposite does; None where it has none.
+    """
+
+    quantity: str
+    holds: Range
+    reversed: Range | None = None
+
+    def verdict(self, interval: Range) -> str:
+        """One of `VERDICTS`."""
+        low, high = interval
+        if not (math.isfinite(low) or math.isfinite(high)):
+            return "undecided"
+        if self.holds[0] <= low and high <= self.holds[1]:
+            return "holds"
+        if self.reversed is not None and self.reversed[0] <= low and high <= self.reversed[1]:
+            return "reversed"
+        return "fails" if high < self.holds[0] or low > self.holds[1] else "undecided"
+
+    def lines(self) -> str:
+        """The ranges in words."""
+        told = f"holds {_range(self.holds)}"
+        return told if self.reversed is None else f"{told}, reversed {_range(self.reversed)}"
+
+
+def above(quantity: str, bound: float, opposite: float | None = None) -> Criterion:
+    """A claim that a quantity is above a bound; reversed below another."""
+    return Criterion(quantity, (bound, math.inf), None if opposite is None else (-math.inf, opposite))
+
+
+def below(quantity: str, bound: float, opposite: float | None = None) -> Criterion:
+    """A claim that a quantity is below a bound; reversed above another."""
+    return Criterion(quantity, (-math.inf, bound), None if opposite is None else (opposite, math.inf))
+
+
+def within(quantity: str, low: float, high: float) -> Criterion:
+    """A claim that a quantity lies in a range."""
+    return Criterion(quantity, (low, high))
+
+
+@dataclasses.dataclass(frozen=True)
+class Claim:
+    """A sentence that measurements can refute.
+
+    Attributes:
+        id: name on the command line.
+        place: where the paper says it, or which of its questions it answers.
+        statement: one sentence.
+        criterion: what decides it.
+        systems: the contact families under which each system is measured.
+        measure: statistic of a system under a family.
+        show: a command that shows it.
+    """
+
+    id: str
+    place: str
+    statement: str
+    criterion: Criterion
+    systems: dict[str, tuple[str, ...]]
+    measure: Callable[[Laboratory, str, str], Statistic]
+    show: str
+
+    @property
+    def cases(self) -> list[tuple[str, str]]:
+        """Systems and families; each gets a verdict."""
+        return [(system, family) for system, families in self.systems.items() for family in families]
+
+    def key(self, effort: Effort) -> str:
+        """Digest of what a measurement depends on: the claim, the code that measures it, the effort, the versions."""
+        code = [inspect.getsource(part) for part in (self.measure, laboratory)]
+        versions = [metadata.version(name) for name in VERSIONED if name != "mjx-study"]
+        parts = (self.id, self.criterion, self.systems, code, effort, versions, precision())
+        return hashlib.sha256(repr(parts).encode()).hexdigest()[:16]
+
+
+def interval_of(statistic: Statistic, level: float) -> Range:
+    """A statistic's interval: Student's t with a bound on deterministic error added, or Wilson's of a share."""
+    if statistic.trials:
+        covered = jnp.arange(statistic.trials) < round(statistic.estimate * statistic.trials)
+        return coverage_interval(covered, level)[1:]
+    half = statistic.slack
+    if statistic.error > 0:
+        half += statistic.error * float(student.ppf(0.5 + level / 2, statistic.freedom))
+    if not math.isfinite(statistic.estimate + half):
+        return -math.inf, math.inf
+    return statistic.estimate - half, statistic.estimate + half
+
+
+def deciding_size(statistic: Statistic, criterion: Criterion, level: float) -> int | None:
+    """Samples with which an undecided interval about the same estimate would decide; None if none would."""
+    low, high = interval_of(statistic, level)
+    borders = [border for part in (criterion.holds, criterion.reversed or ()) for border in part if low < border < high]
+    distance = min((abs(statistic.estimate - border) for border in borders), default=0.0) - statistic.slack
+    if not borders or distance <= 0 or not statistic.samples:
+        return None
+    half = (high - low) / 2 - statistic.slack
+    return math.ceil(statistic.samples * (half / distance) ** 2)
+
+
+def measure_ledger(
+    claims: Sequence[Claim],
+    effort: str,
+    folder: Path | None = None,
+    progress: Progress = lambda done, total, what: None,
+    *,
+    verdicts: int,
+    command: str | None = None,
+    accept_versions: bool = False,
+) -> dict[str, Any]:
+    """Measure claims, or take from a folder those that were measured by the same code at the same effort.
+
+    Args:
+        claims: what to measure.
+        effort: key in `EFFORTS`.
+        folder: where the measurements are kept, one file a claim, and the studies they come from; None for nowhere.
+        progress: told of every case.
+        verdicts: of the whole ledger, for the level of the intervals.
+        command: that asked for it, to be kept.
+        accept_versions: go on with studies in the folder that other versions began.
+
+    Returns:
+        The ledger as plain data.
+    """
+    chosen = EFFORTS[effort]
+    if folder is not None:
+        prepare_folder(folder / "parts")
+    lab = Laboratory(chosen, None if folder is None else folder / "studies", accept_versions)
+    total, done, found = sum(len(claim.cases) for claim in claims), 0, []
+    for claim in claims:
+        path = None if folder is None else folder / "parts" / f"{claim.id}.json"
+        kept = json.loads(path.read_text()) if path is not None and path.exists() else {}
+        if kept.get("key") != claim.key(chosen):
+            kept = {"key": claim.key(chosen), "revision": git_revision(), "cases": []}
+        for system, family in claim.cases[len(kept["cases"]) :]:
+            progress(done + len(kept["cases"]), total, f"{claim.id}: {system}, {family}")
+            statistic = claim.measure(lab, system, family)
+            kept["cases"].append({"system": system, "family": family, **dataclasses.asdict(statistic)})
+            if path is not None:
+                write_whole(path, lambda file, kept=kept: file.write(json.dumps(kept, indent=1).encode()))
+        done += len(claim.cases)
+        found.append(_told(claim, kept, 1 - ALPHA / verdicts))
+    progress(total, total, "done")
+    revisions = sorted({entry["revision"] or "unknown" for entry in found})
+    return {
+        "effort": dataclasses.asdict(chosen),
+        "alpha": ALPHA,
+        "verdicts": verdicts,
+        "level": 1 - ALPHA / verdicts,
+        "command": command,
+        "environment": environment(),
+        "revisions": revisions,
+        "claims": found,
+    }
+
+
+def _told(claim: Claim, kept: dict[str, Any], level: float) -> dict[str, Any]:
+    """A claim with its evidence, as plain data; what is not finite is None."""
+    evidence = []
+    names = [field.name for field in dataclasses.fields(Statistic)]
+    for case in kept["cases"]:
+        statistic = Statistic(**{name: case[name] for name in names})
+        interval = interval_of(statistic, level)
+        verdict = claim.criterion.verdict(interval)
+        size = deciding_size(statistic, claim.criterion, level) if verdict == "undecided" else None
+        numbers = {"estimate": statistic.estimate, "lower": interval[0], "upper": interval[1]}
+        evidence.append(
+            {"system": case["system"], "family": case["family"]}
+            | {name: value if math.isfinite(value) else None for name, value in numbers.items()}
+            | {"verdict": verdict, "samples": statistic.samples, "of": statistic.of, "deciding": size}
+        )
+    return {
+        "id": claim.id,
+        "place": claim.place,
+        "statement": claim.statement,
+        "quantity": claim.criterion.quantity,
+        "criterion": claim.criterion.lines(),
+        "show": claim.show,
+        "revision": kept["revision"],
+        "evidence": evidence,
+    }
+
+
+def matrix(document: dict[str, Any]) -> dict[str, dict[str, list[str]]]:
+    """By claim and family: the verdicts of its systems."""
+    found: dict[str, dict[str, list[str]]] = {}
+    for claim in document["claims"]:
+        row = found.setdefault(claim["id"], {})
+        for each in claim["evidence"]:
+            row.setdefault(each["family"], []).append(each["verdict"])
+    return found
+
+
+def _range(part: Range) -> str:
+    low, high = part
+    if math.isinf(high):
+        return f"above {low:g}"
+    return f"below {high:g}" if math.isinf(low) else f"from {low:g} to {high:g}"

@@ -1,0 +1,116 @@
+"""A measured ledger as text: a table for the terminal, and docs/claims.md."""
+
+import math
+from collections import Counter
+from typing import Any, Final
+
+from mjx_study.claims.ledger import FAMILIES, VERDICTS, matrix
+from mjx_study.table import format_table
+
+HEAD: Final = """\
+# Which claims survive
+
+Claims of [Suh et al. 2022](https://arxiv.org/abs/2202.00817), answers to the questions that it leaves open, and claims
+of this project, each measured on the analytic references and in MJX's [contact models](contact-models.md). What decides
+a claim was fixed in the code before it was measured: the values of one statistic with which it holds, and those with
+which the opposite does.
+
+```sh
+mjx-study claims --quick --output out          # all of them, resumable; out/claims.md is this page
+mjx-study claims --only lemma-closed-form      # one, or several separated by commas
+```
+
+![Verdicts of all claims by contact family](claims.png)
+"""
+LEGEND: Final = """\
+The *interval* of the statistic decides: inside the values that are asked for, the claim **holds**; inside those of the
+opposite it is **reversed**; outside the first it **fails**; across a border it is undecided, and the last column says
+how many samples would decide if the estimate stayed. In the picture a square has a strip for each system, in the order
+of the tables. "reference" is the analytic system, "mjcf" a model without contact. Contact is of 10 kN/m
+where no stiffness is named.
+"""
+
+
+def told(document: dict[str, Any]) -> str:
+    """What was run, and how sure the intervals are, in one paragraph."""
+    made = document["environment"]
+    versions = ", ".join(f"{name} {version}" for name, version in made["versions"].items() if name != "mjx-study")
+    return (
+        f"Measured with `{document['command'] or 'measure_ledger'}` ({document['effort']['name']} effort) on "
+        f"{made['cores']} cores ({made['processor']}), {made['precision']}; {versions}. The ledger has "
+        f"{document['verdicts']} verdicts. Each interval is at level {document['level']:.5f}, that is 1 - "
+        f"{document['alpha']:g} / {document['verdicts']} (Bonferroni), so that with probability "
+        f"{1 - document['alpha']:g} or more no interval of the whole ledger misses its value. "
+        "Bounds on quadrature errors are added."
+    )
+
+
+def count(document: dict[str, Any]) -> str:
+    """How many verdicts of each kind."""
+    found = Counter(each["verdict"] for claim in document["claims"] for each in claim["evidence"])
+    listed = ", ".join(f"{found[verdict]} {verdict}" for verdict in VERDICTS if found[verdict])
+    return f"{len(document['claims'])} claims, {sum(found.values())} verdicts: {listed}"
+
+
+def table(document: dict[str, Any]) -> list[str]:
+    """The matrix for a terminal."""
+    rows = matrix(document)
+    shown = [family for family in FAMILIES if any(family in row for row in rows.values())]
+    cells = [[name, *(_summary(row.get(family, [])) for family in shown)] for name, row in rows.items()]
+    return format_table(cells, ["", *shown])
+
+
+def _summary(verdicts: list[str]) -> str:
+    """A common verdict, or on how many systems the claim holds."""
+    if len(set(verdicts)) < 2:
+        return "".join(verdicts[:1])
+    return f"holds {verdicts.count('holds')}/{len(verdicts)}"
+
+
+def undecided(document: dict[str, Any]) -> list[str]:
+    """A line for each verdict that is open, with the samples that would decide."""
+    return [
+        f"{claim['id']}, {each['system']}, {each['family']}: {_interval(each)}, {_deciding(each)}"
+        for claim in document["claims"]
+        for each in claim["evidence"]
+        if each["verdict"] == "undecided"
+    ]
+
+
+def markdown(document: dict[str, Any]) -> str:
+    """docs/claims.md."""
+    parts = [HEAD, f"*{count(document)}.* {told(document)}\n", LEGEND]
+    for claim in document["claims"]:
+        parts.append(
+            f"## {claim['id']}\n\n{claim['statement']} *({claim['place']}.)*\n\n"
+            f"- Statistic: {claim['quantity']}; {claim['criterion']}.\n- Shown by `{claim['show']}`.\n"
+        )
+        rows = [
+            f"| {each['system']} | `{each['family']}` | {_number(each['estimate'])} | {_interval(each)} | "
+            f"{_bold(each['verdict'])} | {_deciding(each) if each['verdict'] == 'undecided' else ''} |"
+            for each in claim["evidence"]
+        ]
+        header = ("system", "contact", "estimate", "interval", "verdict", "would decide")
+        rows = [f"| {' | '.join(header)} |", f"|{' --- |' * len(header)}", *rows]
+        parts.append("\n".join(rows) + "\n")
+    return "\n".join(parts)
+
+
+def _bold(verdict: str) -> str:
+    return verdict if verdict == "undecided" else f"**{verdict}**"
+
+
+def _deciding(each: dict[str, Any]) -> str:
+    if each["deciding"] is None:
+        return "a finer quadrature" if each["of"] == "quadrature" else "no number that can be told"
+    size = float(format(each["deciding"], ".2g"))
+    return f"{size:,.0f} {each['of']} in place of {each['samples']:,}"
+
+
+def _interval(each: dict[str, Any]) -> str:
+    return f"{_number(each['lower'], -math.inf)} to {_number(each['upper'])}"
+
+
+def _number(value: float | None, absent: float = math.inf) -> str:
+    value = absent if value is None else value
+    return f"{value:.3g}"
