@@ -46,12 +46,12 @@ test-all: $(STAMP) ## Run all the tests, the slow ones too, and those of test-ne
 NEWER_PYTHON ?= $(shell for each in python3.13 python3.12 $$HOME/.pyenv/versions/3.1[32].*/bin/python; do \
 	$$each -c '' 2>/dev/null && echo $$each && break; done)
 NEWEST := .venv-newest
-NEWEST_TESTS := objective.py batches.py bench.py bias.py optimise.py
+NEWEST_TESTS := objective.py batches.py bench.py bias.py optimise.py cluster.py
 test-newer-jax: ## Run the tests of devices on the newest JAX, if there is a Python 3.12 or 3.13 (NEWER_PYTHON=path)
 	@python=$(NEWER_PYTHON); if [ -z "$$python" ]; then \
 		echo 'NOT TESTED on the newest JAX: no Python 3.12 or 3.13 here; NEWER_PYTHON=path names one'; else \
 		{ test -x $(NEWEST)/bin/pip || $$python -m venv $(NEWEST); } && \
-		$(NEWEST)/bin/python -m pip install --quiet --disable-pip-version-check -e . 'jax>=0.11' \
+		$(NEWEST)/bin/python -m pip install --quiet --disable-pip-version-check -e '.[cluster]' 'jax>=0.11' \
 			pytest pytest-xdist hypothesis beartype && \
 		$(NEWEST)/bin/python -c 'import jax; print("JAX", jax.__version__)' && \
 		$(NEWEST)/bin/python -m pytest -p no:cacheprovider $(PYTEST_ARGS) $(addprefix tests/test_,$(NEWEST_TESTS)); fi

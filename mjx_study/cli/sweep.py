@@ -2,7 +2,9 @@
 
 import argparse
 import dataclasses
+import json
 from collections.abc import Callable, Iterable
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -14,6 +16,7 @@ from mjx_study.cli.parsers.sweep import TASKS, solimp, solref
 from mjx_study.cli.studies import RESUMABLE, announce
 from mjx_study.files import read_toml
 from mjx_study.option import OPTIONS
+from mjx_study.study.cluster import connected
 from mjx_study.study.run import (
     StudyConfig,
     StudyPlan,
@@ -41,8 +44,12 @@ def run(options: argparse.Namespace) -> int:
         print("\n".join(_head(plan, missing)), flush=True)
     unwritten = None
     try:
-        with computing(RESUMABLE) as progress:
-            dataset = run_study(plan, store, progress)
+        with ExitStack() as stack:
+            if options.cluster is not None:
+                with usage_errors():
+                    options.cluster = stack.enter_context(connected(options.cluster))
+            progress = stack.enter_context(computing(RESUMABLE))
+            dataset = run_study(plan, store, progress, cluster=options.cluster)
     except StudyError as error:
         raise UsageError(str(error)) from error
     except OSError as error:
@@ -54,7 +61,8 @@ def run(options: argparse.Namespace) -> int:
     drawn = f"written to {options.output}: results.nc; mjx-study plot {options.output} draws it"
     lines = [*_tail(dataset, computed, plan), *([drawn] if unwritten is None else [])]
     print_report(options, _document(dataset, computed, options.output), lines)
-    return finish(unwritten)
+    failed = len(json.loads(dataset.attrs.get("failed_cells", "{}")))
+    return finish(unwritten, f"{failed} cells failed; the warnings say why" if failed else None)
 
 
 def _fields(options: argparse.Namespace) -> dict[str, Any]:

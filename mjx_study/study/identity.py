@@ -27,6 +27,7 @@ import numpy as np
 from estimators import find_estimator
 from mjx_study.runtime import precision
 from mjx_study.simulation.scene import Scene
+from mjx_study.study.plan import StudyPlan
 from mjx_study.tasks.task import Task
 
 VERSIONED: Final = ("mjx-study", "mujoco", "mujoco-mjx", "jax", "jaxlib", "numpy", "optax")
@@ -66,6 +67,14 @@ def contents(tasks: Mapping[str, Iterable[Task]]) -> dict[str, str]:
         found |= {f"model of {name}": models.hexdigest(), f"task {name}": rest.hexdigest()}
         sources |= rest.sources
     return found | {f"source of {name}": digest for name, digest in sorted(sources.items())}
+
+
+def plan_contents(plan: StudyPlan) -> dict[str, str]:
+    """`contents` of a plan's tasks in all their forms, and `estimator_contents` of its estimators."""
+    forms: dict[str, list[Task]] = {}
+    for group in plan.groups:
+        forms.setdefault(group.name, []).append(group.task)
+    return contents(forms) | estimator_contents(*plan.config.estimators)
 
 
 def estimator_contents(*names: str) -> dict[str, str]:

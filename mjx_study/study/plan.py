@@ -85,6 +85,10 @@ class StudyPlan:
     chunk_size: int
     warnings: tuple[str, ...]
 
+    def with_chunk(self, size: int) -> "StudyPlan":
+        """The plan with another chunk size, such as that of a study that is begun."""
+        return dataclasses.replace(self, chunk_size=size)
+
     @property
     def compilations(self) -> int:
         """Number of programs to compile: two for each group, or one for each of its descents."""

@@ -8,7 +8,8 @@ their own; everything else is traced.
 import dataclasses
 import json
 import time
-from contextlib import suppress
+from collections.abc import Generator, Sequence
+from contextlib import ExitStack, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
@@ -21,13 +22,13 @@ from mjx_study.disk import prepare_folder
 from mjx_study.runtime import environment
 from mjx_study.study.axes import Axes, axes_of, solver_arrays, solver_parameters
 from mjx_study.study.cells import COMPUTE
+from mjx_study.study.cluster import cells_on, connected
 from mjx_study.study.configuration import Progress, StudyConfig
 from mjx_study.study.dataset import Cells, as_plain, dataset_of, write_dataset
-from mjx_study.study.identity import contents, differences, estimator_contents, versions
+from mjx_study.study.identity import differences, plan_contents, versions
 from mjx_study.study.plan import StudyCell, StudyPlan, estimators_of, plan_study
 from mjx_study.study.revision import git_revision
 from mjx_study.study.store import Part, Store
-from mjx_study.tasks.task import Task
 
 WAIT_SECONDS: Final = 0.5
 """Between looks at cells that another process computes."""
@@ -42,7 +43,7 @@ def _document(plan: StudyPlan, command: str | None) -> dict[str, Any]:
     return {
         "config": fields,
         "warnings": list(plan.warnings),
-        "contents": contents(_forms(plan)) | estimator_contents(*plan.config.estimators),
+        "contents": plan_contents(plan),
         "versions": versions(),
         "environment": environment(),
         "revision": git_revision(),
@@ -114,14 +115,6 @@ def _document_in(plan: StudyPlan, folder: Path, command: str | None = None) -> d
     return document
 
 
-def _forms(plan: StudyPlan) -> dict[str, list[Task]]:
-    """The task of every timestep and cone, by the task's name in the configuration."""
-    forms: dict[str, list[Task]] = {}
-    for group in plan.groups:
-        forms.setdefault(group.name, []).append(group.task)
-    return forms
-
-
 def run_study(
     study: StudyConfig | StudyPlan,
     folder: str | Path | Store | None = None,
@@ -130,6 +123,7 @@ def run_study(
     command: str | None = None,
     accept_versions: bool = False,
     keep_going: bool = False,
+    cluster: Any = None,
 ) -> xr.Dataset:
     """Run a study in memory; or with a folder compute what is missing there, beside any process that does the same.
 
@@ -140,22 +134,29 @@ def run_study(
         command: command that asked for it, to be kept with a new study.
         accept_versions: go on with a study that other versions of JAX, MuJoCo or this package began.
         keep_going: where a file cannot be written, compute the rest in memory; the attribute `unwritten` says why.
+        cluster: a `distributed.Client`, or what `connected` takes, whose workers compute the cells; needs a folder.
 
     Returns:
-        All numbers of the study, labelled; the attribute `computed_cells` says how many cells this call computed.
+        All numbers of the study, labelled; the attribute `computed_cells` says how many cells this call computed, and
+        `failed_cells` which could not be computed on the cluster, and why.
 
     Raises:
-        ValueError: the configuration cannot be run, or the folder holds another study or cannot be written to.
-        StudyError: a file of the study is damaged.
+        ValueError: the configuration cannot be run, the folder holds another study or cannot be written to, or the
+            cluster cannot be reached.
+        StudyError: a file of the study is damaged, or a worker has other versions.
         OSError: a cell could not be written; what was written before is kept.
     """
     plan = plan_study(study) if isinstance(study, StudyConfig) else study
     run = _Run(plan, progress)
     if folder is None:
+        if cluster is not None:
+            raise ValueError("a cluster needs a folder for the study")
         return run.in_memory(as_plain(_document(plan, command)))
     if not isinstance(folder, Store):
         folder = open_store(plan, Path(folder), command, accept_versions=accept_versions)
-    return run.in_folder(folder, keep_going)
+    with ExitStack() as stack:
+        client = stack.enter_context(connected(cluster)) if isinstance(cluster, str) else cluster
+        return run.in_folder(folder, keep_going, client)
 
 
 class _Run:
@@ -174,32 +175,34 @@ class _Run:
         self._progress(self._total, self._total, "done")
         return _labelled(document, cells).assign_attrs(computed_cells=self._total)
 
-    def in_folder(self, store: Store, keep_going: bool) -> xr.Dataset:
+    def in_folder(self, store: Store, keep_going: bool, client: Any) -> xr.Dataset:
         """The cells that a folder lacks, written there; what cannot be written is kept in memory or ends the run."""
-        self._plan = dataclasses.replace(self._plan, chunk_size=store.document["config"]["chunk_size"])
+        self._plan = self._plan.with_chunk(store.document["config"]["chunk_size"])
         for index in range(self._total):
             if store.has(index):
                 store.read(index)  # a damaged file is refused before anything is computed
             else:
                 store.read_part(index)
-        compute, computed, held = COMPUTE[self._plan.config.kind](self._plan), 0, {}  # type: ignore[index]
+        compute = COMPUTE[self._plan.config.kind](self._plan)  # type: ignore[index]
+        cells = partial(self._cells_here, compute) if client is None else partial(self._cells_there, client)
+        computed, held, failed = 0, {}, set()
         unwritten: OSError | None = None
-        while missing := [index for index in store.missing if index not in held]:
+        while missing := [index for index in store.missing if index not in held and index not in failed]:
             claimed = False
-            for index in missing:
-                with store.claim(index) as ours:
-                    if not ours or store.has(index):
+            for index, arrays in cells(store, missing):
+                claimed = True
+                try:
+                    if isinstance(arrays, str):
+                        failed.add(index)
+                        store.write_failure(index, arrays)
                         continue
-                    done = self._total - len(store.missing) + len(held)
-                    part = Part(store.read_part(index), partial(_keep, store, index))
-                    arrays = self._numbers(compute, index, done, part)
-                    claimed, computed = True, computed + 1
-                    try:
-                        store.write(index, arrays)
-                    except OSError as error:
-                        if not keep_going:
-                            raise
-                        unwritten = error
+                    computed += 1
+                    store.write(index, arrays)
+                except OSError as error:
+                    if not keep_going:
+                        raise
+                    unwritten = error
+                    if not isinstance(arrays, str):
                         held[index] = (arrays, store.document["versions"])
             if not claimed:
                 self._progress(self._total - len(missing), self._total, "another process computes the rest")
@@ -216,7 +219,36 @@ class _Run:
             dataset.attrs["other_versions"] = told
         if unwritten is not None:
             dataset.attrs["unwritten"] = f"cannot write to {store.folder}: {unwritten.strerror or unwritten}"
+        if failures := store.failures:
+            labels = {self._plan.label(self._plan.cells[index]): reason for index, reason in failures.items()}
+            dataset.attrs["failed_cells"] = json.dumps(labels)
         return dataset.assign_attrs(computed_cells=computed)
+
+    def _cells_here(
+        self, compute: Any, store: Store, missing: Sequence[int]
+    ) -> Generator[tuple[int, dict[str, np.ndarray]]]:
+        """Those cells that nobody else computes, one after another in this process."""
+        for place, index in enumerate(missing):
+            with store.claim(index) as ours:
+                if ours and not store.has(index):
+                    part = Part(store.read_part(index), partial(_keep, store, index))
+                    yield index, self._numbers(compute, index, self._total - len(missing) + place, part)
+
+    def _cells_there(
+        self, client: Any, store: Store, missing: Sequence[int]
+    ) -> Generator[tuple[int, dict[str, np.ndarray] | str]]:
+        """Those cells that nobody else computes, on a cluster; why one failed is text."""
+        with store.claim(*missing) as ours:
+            kept = {index: store.read_part(index) for index in ours if not store.has(index)}
+            done = self._total - len(kept)
+
+            def told(workers: int) -> None:
+                self._progress(done, self._total, f"{workers} workers" if workers else "waiting for workers")
+
+            for index, arrays in cells_on(client, self._plan, kept, told):
+                done += 1
+                self._progress(done, self._total, self._plan.label(self._plan.cells[index]))
+                yield index, arrays
 
     def _numbers(self, compute: Any, index: int, done: int, part: Part) -> dict[str, np.ndarray]:
         """A cell's numbers, with progress in whole cells, or where there is a single one within it."""
@@ -262,6 +294,8 @@ def warnings_of(dataset: xr.Dataset) -> tuple[str, ...]:
     found = json.loads(dataset.attrs.get("warnings", "[]"))
     if dataset.attrs["missing_cells"]:
         found.append(f"{dataset.attrs['missing_cells']} cells are not computed yet; the same command goes on")
+    failed = json.loads(dataset.attrs.get("failed_cells", "{}"))
+    found += [f"{label}: failed, {reason}; the same command tries again" for label, reason in failed.items()]
     if dataset.attrs.get("mixed_versions"):
         found.append(f"cells were computed with different versions: {dataset.attrs['mixed_versions']}")
     if told := dataset.attrs.get("other_versions"):

@@ -3,6 +3,7 @@
     study.json       configuration, digests of what the numbers depend on, versions, machine, every cell's coordinates
     cells/00042.npz  one cell's numbers, with digests of these, of the study and of the cell's coordinates
     cells/00042.part.npz  checkpoint of a descent that has not ended
+    cells/00042.failed    why a cell could not be computed; the next run tries again
     results.nc       all cells as one NetCDF file, written after the last
     study.lock       which cells are being computed, and by which process
 
@@ -17,7 +18,7 @@ import io
 import json
 import os
 from collections.abc import Callable, Generator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Final
 
@@ -169,6 +170,20 @@ class Store:
         """Write a cell."""
         self._write(self.path(index), arrays, self._authors(index), self._place(index))
         self.part_path(index).unlink(missing_ok=True)
+        self._failed(index).unlink(missing_ok=True)
+
+    def write_failure(self, index: int, reason: str) -> None:
+        """Write why a cell could not be computed."""
+        write_whole(self._failed(index), lambda file: file.write(reason.encode()))
+
+    @property
+    def failures(self) -> dict[int, str]:
+        """Why cells that are missing could not be computed."""
+        paths = sorted((self.folder / "cells").glob("*.failed"))
+        return {int(path.stem): path.read_text() for path in paths if not self.has(int(path.stem))}
+
+    def _failed(self, index: int) -> Path:
+        return self.path(index).with_suffix(".failed")
 
     def write_part(self, index: int, arrays: Mapping[str, np.ndarray]) -> None:
         """Write a cell's checkpoint."""
@@ -222,20 +237,23 @@ class Store:
         return arrays, json.loads(str(arrays.pop(VERSIONS)))
 
     @contextmanager
-    def claim(self, index: int) -> Generator[bool]:
-        """Whether this process may compute a cell; if so, no other may until the block is left or the process dies."""
+    def claim(self, *indices: int) -> Generator[list[int]]:
+        """Those of some cells that this process may compute; no other may until the block is left or the process dies.
+
+        A process may be in one such block at a time: the system takes all its locks when it closes the file once.
+        """
         path = self.folder / "study.lock"
         try:
             descriptor = open_regular(path, os.O_RDWR | os.O_CREAT)
         except OSError as error:
             raise StudyError(f"cannot lock {path}: {_told(error)}") from error
         with os.fdopen(descriptor, "r+b") as file:
-            try:
-                fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB, 1, index)
-            except (BlockingIOError, PermissionError):
-                yield False
-            else:
-                yield True
+            ours = []
+            for index in indices:
+                with suppress(BlockingIOError, PermissionError):
+                    fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB, 1, index)
+                    ours.append(index)
+            yield ours
 
     def _place(self, index: int, *, part: bool = False) -> str:
         """Digest of a cell's index and coordinates, and unless it is a checkpoint of the descents' length."""

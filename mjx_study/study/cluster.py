@@ -1,0 +1,236 @@
+"""Cells of a study on many machines, by Dask: workers compute cells and return arrays, the client alone writes.
+
+A worker has one cell at a time, and the next when the client has the arrays of the last, so that a worker that dies
+takes one cell with it, and that cell is known. Workers keep what they compiled, by the content of the study, and a cell
+goes to a worker that has its program if there is one.
+"""
+
+import functools
+import logging
+import math
+import os
+import pickle
+import queue
+import threading
+import time
+from collections import Counter, defaultdict, deque
+from collections.abc import Callable, Generator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
+from glob import glob
+from typing import Any, Final
+
+import numpy as np
+
+from mjx_study.runtime import available_cores, configure, precision
+from mjx_study.study.cells import COMPUTE
+from mjx_study.study.identity import differences, plan_contents, versions
+from mjx_study.study.plan import StudyPlan, plan_study
+from mjx_study.study.store import Part, StudyError
+
+TRIES: Final = 3
+"""Times that a cell is begun before it counts as failed."""
+CONNECT_SECONDS: Final = 30
+"""Time for a scheduler to answer."""
+POLL_SECONDS: Final = 1.0
+"""Between looks at which workers there are."""
+GPUS: Final = "/dev/nvidia[0-9]*"
+_ONE_AT_A_TIME, _SET_UP = threading.Lock(), threading.Event()
+Arrays = dict[str, np.ndarray]
+
+
+class WorkerRefusedError(Exception):
+    """A worker would not compute the client's numbers."""
+
+
+@contextmanager
+def connected(cluster: str) -> Generator[Any]:
+    """A `distributed.Client` of a scheduler's address, or of workers that start now and end with the block.
+
+    Args:
+        cluster: "local:N", N processes here; "slurm:N", N workers as Dask's jobqueue.yaml describes them; or an address
+            such as "tcp://host:8786". Without N, a process per core, or one worker of Slurm.
+
+    Raises:
+        ValueError: Dask is not installed, or nothing is reached.
+    """
+    with ExitStack() as stack:
+        try:
+            client = _connect(cluster, stack)
+        except ImportError as error:
+            raise ValueError(f"a cluster needs Dask ({error}): pip install 'mjx-study[cluster]'") from error
+        except OSError as error:
+            raise ValueError(f"cannot reach the cluster {cluster}: {error}") from error
+        yield client
+
+
+def _connect(cluster: str, stack: ExitStack) -> Any:
+    """The client, which the stack closes, as it does the workers that are started."""
+    import distributed
+
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what happens to workers is told by us
+
+    kind, _, count = cluster.partition(":")
+    address: Any = cluster
+    if kind == "local":
+        workers = int(count or available_cores())
+        local = distributed.LocalCluster(
+            n_workers=workers,
+            threads_per_worker=1,
+            processes=True,
+            dashboard_address="127.0.0.1:0",
+            silence_logs=logging.CRITICAL,
+        )
+        address = stack.enter_context(local)
+    elif kind == "slurm":
+        from dask_jobqueue.slurm import SLURMCluster
+
+        address = stack.enter_context(SLURMCluster())
+        address.scale(int(count or 1))
+    return stack.enter_context(distributed.Client(address, timeout=CONNECT_SECONDS, set_as_default=False))
+
+
+def cells_on(
+    client: Any, plan: StudyPlan, kept: Mapping[int, Mapping[str, np.ndarray]], told: Callable[[int], None]
+) -> Generator[tuple[int, Arrays | str]]:
+    """Compute cells on the workers that a cluster has, while they come and go.
+
+    Args:
+        client: a `distributed.Client`.
+        plan: the study.
+        kept: the cells to compute, by index, each with the arrays of its checkpoint.
+        told: called with the number of workers when it changes.
+
+    Yields:
+        Index and arrays of each cell in the order in which they end, or why it failed `TRIES` times.
+
+    Raises:
+        StudyError: a worker has other versions, or the scheduler is lost.
+    """
+    study = _packed(plan)
+    waiting: dict[Any, deque[int]] = defaultdict(deque)
+    has: dict[Any, set[str]] = defaultdict(set)  # which workers have a program
+    at: dict[Any, tuple[int, str]] = {}  # by future, its cell and worker
+    ended: queue.SimpleQueue[Any] = queue.SimpleQueue()
+    tries: Counter[int] = Counter()
+
+    def wait(index: int) -> None:
+        waiting[plan.program_of(plan.cells[index])].append(index)
+
+    def begin(worker: str) -> None:
+        for program in _program_for(worker, waiting, has):
+            index = waiting[program].popleft()
+            has[program].add(worker)
+            future = client.submit(_compute, study, index, dict(kept[index]), workers=[worker], pure=False)
+            at[future] = index, worker
+            future.add_done_callback(fetch)
+
+    def fetch(future: Any) -> None:
+        """In a thread of Dask, which waits here if the worker is lost before its arrays have come."""
+        try:
+            outcome = future.result()
+        except BaseException as error:  # whatever a cell raises on another machine, or that it is cancelled
+            outcome = error
+        ended.put((future, outcome))
+
+    def tried(index: int, reason: str) -> Generator[tuple[int, str]]:
+        """The failure of a cell, if that was its last try."""
+        tries[index] += 1
+        if tries[index] < TRIES:
+            wait(index)
+        else:
+            yield index, reason
+
+    for index in kept:
+        wait(index)
+    looked, count = -math.inf, -1
+    try:
+        while at or any(waiting.values()):
+            if time.monotonic() - looked >= POLL_SECONDS:
+                workers, looked = set(client.nthreads()), time.monotonic()
+                for holders in has.values():
+                    holders &= workers
+                for future, (index, worker) in list(at.items()):
+                    if worker not in workers:
+                        del at[future]
+                        future.cancel()
+                        yield from tried(index, f"lost its worker {TRIES} times (killed, crashed or out of memory)")
+                for worker in workers - {worker for _, worker in at.values()}:
+                    begin(worker)
+                if len(workers) != count:
+                    count = len(workers)
+                    told(count)
+            with suppress(queue.Empty):
+                future, outcome = ended.get(timeout=POLL_SECONDS)
+                if future not in at:
+                    continue
+                index, worker = at.pop(future)
+                if isinstance(outcome, WorkerRefusedError):
+                    raise StudyError(str(outcome)) from outcome
+                begin(worker)
+                if isinstance(outcome, BaseException):
+                    yield from tried(index, f"{type(outcome).__name__}: {outcome}".partition("\n")[0])
+                else:
+                    yield index, outcome
+    except OSError as error:
+        raise StudyError(f"lost the scheduler ({error}); the same command goes on") from error
+    finally:
+        with suppress(OSError):
+            client.cancel(list(at))
+
+
+def _program_for(worker: str, waiting: Mapping[Any, deque[int]], has: Mapping[Any, set[str]]) -> list[Any]:
+    """The program of the next cell of a worker; none where those that have one will be sooner.
+
+    One that it has, otherwise that with the most cells for each worker that has it.
+    """
+    left = {program: len(cells) for program, cells in waiting.items() if cells}
+    own = [program for program in left if worker in has[program]]
+    new = [program for program, cells in left.items() if cells > len(has[program])]
+    return sorted(own or new, key=lambda program: left[program] / (1 + len(has[program])))[-1:]
+
+
+def _packed(plan: StudyPlan) -> bytes:
+    """What a worker needs: the configuration, and what its own plan must agree with."""
+    import cloudpickle
+
+    return cloudpickle.dumps((plan.config, plan.chunk_size, precision(), versions(), plan_contents(plan)))
+
+
+def _compute(study: bytes, index: int, kept: Arrays) -> Arrays:
+    """Compute a cell, on a worker."""
+    with _ONE_AT_A_TIME:
+        plan, compute = _prepared(study)
+        cell = plan.cells[index]
+        return compute(cell, Part(kept)) if plan.config.kind == "descents" else compute(cell)
+
+
+@functools.lru_cache(maxsize=4)
+def _prepared(study: bytes) -> tuple[StudyPlan, Callable[..., Arrays]]:
+    """The plan and what computes its cells, compiled programs included, on a worker.
+
+    Raises:
+        WorkerRefusedError: the numbers would be others than the client's.
+    """
+    config, chunk, asked, *client = pickle.loads(study)
+    if not _SET_UP.is_set():
+        _set_up(asked)
+    plan = plan_study(config)
+    ours = versions(), plan_contents(plan)
+    if told := differences(*({**one, **other} for one, other in (client, ours))):
+        from distributed import get_worker
+
+        raise WorkerRefusedError(f"the worker {get_worker().address} is refused: {told} ('there' is the client)")
+    plan = plan.with_chunk(chunk)
+    return plan, COMPUTE[plan.config.kind](plan)  # type: ignore[index]
+
+
+def _set_up(asked: str) -> None:
+    """Set a worker's JAX up: one CPU device; of several GPUs, the one that the worker's number picks."""
+    from distributed import get_worker
+
+    name, there = get_worker().name, os.environ.get("CUDA_VISIBLE_DEVICES")
+    gpus = there.split(",") if there else sorted(path.removeprefix("/dev/nvidia") for path in glob(GPUS))
+    if isinstance(name, int) and len(gpus) > 1:
+        os.environ["CUDA_VISIBLE_DEVICES"] = gpus[name % len(gpus)]
+    configure(precision=asked, cpu_devices=1)
+    _SET_UP.set()

@@ -1,0 +1,147 @@
+"""Cells on Dask's workers: real schedulers and processes, which are killed, poisoned and refused."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections import deque
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+import xarray as xr
+
+from mjx_study import cli
+from mjx_study.study import cluster
+from mjx_study.study.cluster import TRIES, connected
+from mjx_study.study.configuration import StudyConfig
+from mjx_study.study.run import load_study, run_study, warnings_of
+from mjx_study.study.store import Store, StudyError
+from tests.poison import ACCOUNT, CRASH, RAISE, SLOW
+from tests.test_sweep import same
+
+STIFFNESSES = tuple(SLOW + index for index in range(8))
+ARGUMENTS = ["tests.poison:poison", "--contact", "reference", "--stiffness", ",".join(map(str, STIFFNESSES)),
+             "--samples", "4", "--seeds", "2", "--reference-samples", "6"]  # fmt: skip
+
+
+def config(*stiffness: float, **changes: Any) -> StudyConfig:
+    chosen: dict[str, Any] = {"tasks": ("tests.poison:poison",), "contact": ("reference",), "samples": (4,), "seeds": 2}
+    return StudyConfig(**(chosen | {"stiffness": stiffness, "reference_samples": 6} | changes))
+
+
+@pytest.fixture(scope="module")
+def workers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+    """A client of two workers."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv(ACCOUNT, str(tmp_path_factory.mktemp("account") / "account"))
+        with connected("local:2") as client:
+            yield client
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> xr.Dataset:
+    """Computed in this process."""
+    return run_study(config(*STIFFNESSES), tmp_path_factory.mktemp("study"))
+
+
+def test_a_killed_worker_costs_its_cell_and_nothing_else(workers: Any, undisturbed: xr.Dataset, tmp_path: Path) -> None:
+    """By SIGKILL, as soon as a cell is there; the numbers are those of a run in this process, to the bit."""
+    killed: list[int] = []
+
+    def kill(done: int, total: int, what: str) -> None:
+        if done and not killed:
+            killed.append(min(workers.run(os.getpid).values()))
+            os.kill(killed[0], signal.SIGKILL)
+
+    found = run_study(config(*STIFFNESSES), tmp_path, kill, cluster=workers)
+    assert killed and killed[0] not in workers.run(os.getpid).values()
+    assert found.attrs["computed_cells"] == len(STIFFNESSES) and found.attrs["missing_cells"] == 0
+    assert same(found, undisturbed) and same(load_study(tmp_path), undisturbed)
+    assert run_study(config(*STIFFNESSES), tmp_path, cluster=workers).attrs["computed_cells"] == 0
+
+
+def test_a_poisonous_cell_fails_and_the_rest_goes_on(workers: Any, tmp_path: Path) -> None:
+    found = run_study(config(1.0, CRASH, 2.0, RAISE), tmp_path, cluster=workers)
+    account = Path(workers.submit(os.environ.get, ACCOUNT, pure=False).result()).read_text().split()
+    assert account.count(str(CRASH)) == account.count(str(RAISE)) == TRIES
+    assert found.attrs["computed_cells"] == 2 == found.attrs["missing_cells"]
+    told = [message for message in warnings_of(found) if "failed" in message]
+    assert len(told) == 2 and all("; the same command tries again" in message for message in told)
+    assert "K = 13 N/m" in told[0] and f"lost its worker {TRIES} times (killed, crashed or out of memory)" in told[0]
+    assert "K = 17 N/m" in told[1] and "MemoryError: no memory for the batch;" in told[1]
+    store = Store.open(tmp_path)
+    assert sorted(store.failures) == store.missing == [1, 3]
+    store.write(3, store.read(0))
+    assert sorted(store.failures) == [1] and not list((tmp_path / "cells").glob("00003.failed"))
+
+
+def test_a_worker_of_other_versions_is_refused(workers: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ours = cluster.versions()
+    monkeypatch.setattr(cluster, "versions", lambda: ours | {"jax": "0.0"})
+    with pytest.raises(StudyError, match=r"^the worker tcp://\S+ is refused: jax 0\.0 there and \S+ here"):
+        run_study(config(1.0), tmp_path, cluster=workers)
+    monkeypatch.setattr(cluster, "versions", lambda: ours)
+    monkeypatch.setattr(cluster, "plan_contents", lambda plan: {"precision": "float32"})
+    with pytest.raises(StudyError, match="is refused: precision float32 there and float64 here"):
+        run_study(config(1.0), tmp_path, cluster=workers.scheduler.address)
+    monkeypatch.setattr(cluster, "CONNECT_SECONDS", 1)
+    with pytest.raises(ValueError, match="cannot reach the cluster tcp://127.0.0.1:1: "):
+        run_study(config(1.0), tmp_path, cluster="tcp://127.0.0.1:1")
+
+
+def test_a_cell_goes_where_its_program_is() -> None:
+    """A worker keeps to what it has; a new one compiles only where there is enough to do."""
+    waiting = {"a": deque(range(9)), "b": deque(range(3)), "c": deque([1])}
+    has = {"a": {"w1", "w2"}, "b": {"w3"}, "c": {"w1", "w4"}}
+    assert cluster._program_for("w3", waiting, has) == ["b"]
+    assert cluster._program_for("w1", waiting, has) == ["a"]
+    assert cluster._program_for("new", waiting, has) == ["a"]
+    assert cluster._program_for("w4", {"a": deque([1, 2]), "c": deque()}, has) == []
+
+
+def test_what_is_no_cluster_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(ValueError, match="a cluster needs a folder"):
+        run_study(config(1.0), cluster="local:1")
+    for wrong in ("local:0", "localhost:8786", "slurm:x"):
+        assert cli.main(["sweep", *ARGUMENTS, "--output", str(tmp_path), "--cluster", wrong]) == 2
+        assert "must be local:N, slurm:N or an address such as tcp://host:8786" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_a_worker_simulates_the_same_bits(workers: Any, tmp_path: Path) -> None:
+    """MJX on one device of a worker and on two here; descents as well as gradients."""
+    descents = {"reference_samples": None, "iterations": 3, "learning_rate": 0.01, "evaluation_samples": 6}
+    for name, changes in {"gradients": {}, "descents": descents}.items():
+        asked = config(1.0, 2.0, 3.0, tasks=("tests.carts:cart",), contact=("penalty",), chunk_size=4, **changes)
+        here = run_study(asked, tmp_path / f"{name} here")
+        assert same(run_study(asked, tmp_path / f"{name} there", cluster=workers), here)
+
+
+def sweep(folder: Path) -> subprocess.Popen[str]:
+    command = [sys.executable, "-m", "mjx_study", "sweep", *ARGUMENTS, "--cluster", "local:2", "--output", str(folder)]
+    environment = os.environ | {ACCOUNT: str(folder)}
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
+
+
+@pytest.mark.slow
+def test_a_killed_client_goes_on_to_the_same_data(undisturbed: xr.Dataset, tmp_path: Path) -> None:
+    """The command itself, killed by SIGKILL after its second cell: its workers end, a second run computes the rest."""
+    folder = tmp_path / "out"
+    running = sweep(folder)
+    while len(list(folder.glob("cells/*.npz"))) < 2:
+        assert running.poll() is None, running.communicate()[1]
+        time.sleep(0.05)
+    children = psutil.Process(running.pid).children(recursive=True)
+    running.send_signal(signal.SIGKILL)
+    running.communicate()
+    assert not psutil.wait_procs(children, timeout=60)[1], "its workers live on"
+    assert 2 <= len(STIFFNESSES) - len(Store.open(folder).missing) < len(STIFFNESSES)
+    last = sweep(folder)
+    said, errors = last.communicate()
+    assert last.returncode == 0, errors
+    assert "distributed" not in errors and f"computed {len(STIFFNESSES)}" not in said
+    assert same(load_study(folder), undisturbed)
