@@ -1,5 +1,6 @@
 """Whether an estimator's mean is the gradient of F, told from values of F alone: no reference gradient is needed."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -9,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
 from estimators.effective import ENOUGH_EFFECTIVE, effective_samples
-from estimators.estimator import ORACLES, Estimator, draw
+from estimators.estimator import ORACLES, Estimator, draw, oracles_of
 from estimators.pytree import register_pytree
 from estimators.statistics import summarise
 from estimators.types import Objective
@@ -66,7 +67,22 @@ def circulation(
     *,
     nodes: int = NODES,
 ) -> Circulation:
-    """Integrate an estimator's mean from one theta to another.
+    """Integrate an estimator's mean from one theta to another; see `circulations`."""
+    (found,) = circulations([estimator], objective, start, end, key, num_samples, nodes=nodes)
+    return found
+
+
+def circulations(
+    estimators: Sequence[Estimator],
+    objective: Objective,
+    start: Float[Array, " params"],
+    end: Float[Array, " params"],
+    key: Key[Array, ""],
+    num_samples: int,
+    *,
+    nodes: int = NODES,
+) -> list[Circulation]:
+    """Integrate the means of estimators, which share their batches, from one theta to another.
 
         sum_j w_j g_i(theta_j)^T (end - start) - (f_i(end) - f_i(start))
 
@@ -75,7 +91,7 @@ def circulation(
     one node this is a central difference of the mean cost against the estimator's mean in the middle.
 
     Args:
-        estimator: With its options.
+        estimators: With their options.
         objective: What to differentiate.
         start, end: Of the path, [param]; a few standard deviations of the noise apart, or less.
         key: Source of all randomness; used up.
@@ -83,7 +99,7 @@ def circulation(
         nodes: Odd.
 
     Returns:
-        The difference and the gap.
+        The difference and the gap of each.
 
     Raises:
         ValueError: The nodes are not an odd number, or there are too few samples.
@@ -93,17 +109,31 @@ def circulation(
     if num_samples < 2:
         raise ValueError(f"num_samples must be at least 2; got {num_samples}")
     points, weights, coarse = path_rule(nodes)
-    step = end - start
-    order = max(ORACLES[oracle].order for oracle in estimator.needs)
+    step, needs = end - start, oracles_of(estimators)
 
     def along(theta):
-        return estimator(draw(estimator.needs, objective, theta, jax.random.clone(key), num_samples)).per_sample @ step
+        batches = draw(needs, objective, theta, jax.random.clone(key), num_samples)
+        return jnp.stack([estimator(batches).per_sample @ step for estimator in estimators])
 
-    slopes = jnp.stack([along(start + t * step) for t in points])
-    keys = jax.random.split(jax.random.split(key)[order], num_samples)
-    first, last = (objective.evaluate(theta, jax.random.clone(keys)).value for theta in (start, end))
-    difference, gap = last - first, jnp.asarray(weights, slopes.dtype) @ slopes - (last - first)
-    rough = jnp.asarray(weights - coarse, slopes.dtype) @ slopes
+    def difference(order):
+        keys = jax.random.split(jax.random.split(key)[order], num_samples)
+        first, last = (objective.evaluate(theta, jax.random.clone(keys)).value for theta in (start, end))
+        return last - first
+
+    slopes = jnp.stack([along(start + t * step) for t in points], axis=1)
+    orders = [max(ORACLES[oracle].order for oracle in estimator.needs) for estimator in estimators]
+    differences = {order: difference(order) for order in set(orders)}
+    weights, rough = jnp.asarray(weights, slopes.dtype), jnp.asarray(weights - coarse, slopes.dtype)
+    return [
+        _circulation(differences[order], weights @ each, rough @ each)
+        for order, each in zip(orders, slopes, strict=True)
+    ]
+
+
+def _circulation(
+    difference: Float[Array, " samples"], integral: Float[Array, " samples"], rough: Float[Array, " samples"]
+) -> Circulation:
+    gap = integral - difference
     found = summarise(jnp.stack([gap, difference, rough], axis=1))
     quadrature = jnp.maximum(jnp.abs(found.mean[2]) - 3 * found.standard_error[2], 0.0)
     alone = summarise(jnp.where(jnp.isfinite(rough), gap, jnp.nan)[:, None])

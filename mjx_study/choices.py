@@ -102,10 +102,15 @@ TASK_GROUP: Final = "mjx_study.tasks"
 """Entry point group in which installed packages register tasks."""
 
 
+def is_file(name: str) -> bool:
+    """Whether a task's name is the path of an MJCF."""
+    return name.lower().endswith(".xml")
+
+
 def unknown_task(name: str, reason: str = "") -> str | None:
     """The message about a task's name that is unknown, or unusable for a reason; None for a possible one."""
     registered = sorted({point.name for point in metadata.entry_points(group=TASK_GROUP)})
-    if (name in TASK_DESCRIPTIONS or name in registered or ":" in name) and not reason:
+    if (name in TASK_DESCRIPTIONS or name in registered or ":" in name or is_file(name)) and not reason:
         return None
     choices = dict.fromkeys([*TASK_DESCRIPTIONS, *registered])
-    return f"unknown task {name!r}; choose from {', '.join(choices)}, or module:name of your own{reason}"
+    return f"unknown task {name!r}; choose from {', '.join(choices)}, module:name of your own, or an MJCF{reason}"

@@ -28,6 +28,7 @@ start here:
   mjx-study landscape ball_wall --output out     the cost, the cost with noise, and the slopes that estimators see
   mjx-study rollout tennis                       pictures and a film of a task
   mjx-study gradcheck pusher                     are the derivatives right? exit code 1 if not
+  mjx-study diagnose robot.xml                   any MJCF: what contact does to its gradients, and what to do about it
   mjx-study bench pusher                         what does a gradient cost on this machine?
 """
 COMMANDS: Final = {
@@ -39,6 +40,7 @@ COMMANDS: Final = {
     "landscape": ("draw the cost along a line of parameters, its smoothed cost and the slope that each estimator sees"),
     "rollout": "show a rollout: pictures, a film and its numbers",
     "gradcheck": "check derivatives against differences, the C engine and a closed form",
+    "diagnose": "say of a model whether its gradients are worth having, and which estimator to take",
     "claims": "measure which claims survive, in which contact models",
     "bench": "measure what rollouts and gradients cost here",
     "tasks": "list the tasks",

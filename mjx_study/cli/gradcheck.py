@@ -1,12 +1,11 @@
 """mjx-study gradcheck."""
 
 import argparse
-from pathlib import Path
 from typing import Any
 
 from estimators import make_estimator
 from mjx_study import gradcheck as check
-from mjx_study.choices import CHECKED_STEPS
+from mjx_study.choices import CHECKED_STEPS, is_file
 from mjx_study.cli.options import UsageError, computing, configure_process, print_report, scene_options, usage_errors
 from mjx_study.cli.parsers.gradcheck import MEAN
 from mjx_study.gradcheck.mean import lines_of
@@ -43,8 +42,6 @@ def _run_mean(options: argparse.Namespace) -> int:
     chosen = MEAN | _given(options)
     with usage_errors():
         configure_process(options)
-        if Path(options.task).suffix.lower() == ".xml":
-            raise UsageError("--mean is for tasks: a file has no cost")
         scene = scene_options(options, "cone", "iterations", "ls_iterations", "horizon", "model")
         task = make_task(options.task, **scene).replace(onset=chosen["onset"])
         plan = check.plan_gradcheck(
@@ -64,7 +61,7 @@ def _run_mean(options: argparse.Namespace) -> int:
 def _plan(options: argparse.Namespace) -> GradcheckPlan:
     common = {"seed": options.seed, "damping": options.damping, "states": options.states, "stock": options.stock}
     chosen = scene_options(options, "cone", "iterations", "ls_iterations")
-    if Path(options.task).suffix.lower() != ".xml":
+    if not is_file(options.task):
         if options.pair is not None:
             raise UsageError("--pair is for files; a task has its own")
         chosen |= {name: getattr(options, name) for name in ("horizon", "model") if getattr(options, name) is not None}

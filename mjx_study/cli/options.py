@@ -88,24 +88,24 @@ def add_options(command: argparse.ArgumentParser, owner: type[Checked], *names: 
         add_option(command, owner.option(name), owner.default(name), given=False, **changes.get(name, {}))
 
 
-def add_task_options(command: argparse.ArgumentParser, *, files: str = "") -> None:
+def add_task_options(command: argparse.ArgumentParser) -> None:
     """Add the task, options that override its settings, and process options."""
-    add_task_argument(command, files)
+    add_task_argument(command)
     for name in ("sigma", "cone", "horizon", "model"):
         add_option(command, OPTIONS[name])
     add_process_options(command)
 
 
-def add_task_argument(command: argparse.ArgumentParser, files: str = "") -> None:
-    """Add the task, by name, or by file if `files` describes that."""
+def add_task_argument(command: argparse.ArgumentParser) -> None:
+    """Add the task, by name or file."""
 
     def read(text: str) -> str:
-        if not (files and text.lower().endswith(".xml")) and (told := unknown_task(text)):
+        if told := unknown_task(text):
             raise argparse.ArgumentTypeError(told)
         return text
 
-    named = f"one of: {', '.join(TASK_DESCRIPTIONS)}; or module:name of your own{files}"
-    command.add_argument("task", type=read, metavar="TASK|FILE.xml" if files else "TASK", help=named)
+    named = f"one of: {', '.join(TASK_DESCRIPTIONS)}; module:name of your own; or any MJCF that MJX runs"
+    command.add_argument("task", type=read, metavar="TASK|FILE.xml", help=named)
 
 
 def add_theta_option(command: argparse.ArgumentParser, purpose: str) -> None:

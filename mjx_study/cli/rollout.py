@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 
 from mjx_study import objective
+from mjx_study.choices import is_file
 from mjx_study.cli.console import number
 from mjx_study.cli.options import (
     UsageError,
@@ -106,7 +107,7 @@ def run(options: argparse.Namespace) -> int:
 
 def _plan(options: argparse.Namespace):
     """A function without arguments that simulates what the options ask for, and what there is to warn about."""
-    if Path(options.task).suffix.lower() != ".xml":
+    if not is_file(options.task):
         return _plan_task(options)
     unfit = ("contact", "stiffness", "damping", "noise", "sigma", "theta", "policy", "model")
     given = [f"--{name}" for name in unfit if getattr(options, name) not in (None, False)]

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 
 from estimators import Estimator
-from estimators.mean_check import TOLERANCE, Circulation, circulation
+from estimators.mean_check import TOLERANCE, Circulation, circulations
 from mjx_study.objective import Simulator, chunk_for
 from mjx_study.study.configuration import Progress, check_span
 from mjx_study.study.line import direction_of
@@ -91,15 +91,15 @@ def check_mean(
     low, high = (-reach, reach) if span is None else span
     along = jnp.asarray(direction_of(direction, task.policy.num_params, seed), task.theta.dtype)
     simulator = Simulator(task, chunk_size=chunk_for(samples, jax.local_devices()))
-    found, total = [], len(cells) * len(estimators)
-    for cell in cells:
-        for estimator in estimators:
-            progress(len(found), total, f"{cell.label}: {estimator.name}")
-            ends = task.theta + low * along, task.theta + high * along
-            objective, key = simulator.objective(cell.contact), jax.random.key(seed)
-            numbers = circulation(estimator, objective, *ends, key, samples)
-            stiffness = cell.stiffness or 0.0
-            found.append(MeanCheck(cell.family, stiffness, estimator.name, numbers, numbers.verdict(tolerance)))
+    found, total, ends = [], len(cells), (task.theta + low * along, task.theta + high * along)
+    for index, cell in enumerate(cells):
+        progress(index, total, cell.label)
+        objective, key = simulator.objective(cell.contact), jax.random.key(seed)
+        numbers = circulations(estimators, objective, *ends, key, samples)
+        found += [
+            MeanCheck(cell.family, cell.stiffness or 0.0, estimator.name, each, each.verdict(tolerance))
+            for estimator, each in zip(estimators, numbers, strict=True)
+        ]
     progress(total, total, "done")
     return found
 

@@ -5,14 +5,12 @@ from collections.abc import Sequence
 from typing import Final
 
 import jax.numpy as jnp
-import mujoco
 
 from mjx_study.choices import CHECKED_STATES, CHECKED_STEPS, FAMILIES
 from mjx_study.choices import CHECKED_STIFFNESS as STIFFNESS
-from mjx_study.simulation.dynamics import initial_state
 from mjx_study.simulation.scene import Scene
 from mjx_study.tasks.contact_grid import ContactPoint, contact_grid
-from mjx_study.tasks.policy import OpenLoop
+from mjx_study.tasks.mjcf import scene_task
 from mjx_study.tasks.task import Task
 
 CONTACT: Final = ("penalty", "mujoco", "mujoco_default")
@@ -23,7 +21,7 @@ class GradcheckPlan:
     """A validated plan of what to check.
 
     Attributes:
-        subject: the task; for a file, one without cost or policy.
+        subject: the task; for a file, what `scene_task` makes of it.
         is_task: whether to check its cost.
         cells: contact models.
         warnings: warnings about the contact models.
@@ -113,44 +111,10 @@ def plan_scene_gradcheck(
         raise ValueError("a contact family with a stiffness needs one: give --stiffness in N/m, and --pair")
     if (swept or stiffnesses is not None) and pair is None:
         raise ValueError("a stiffness in N/m needs the mass that it acts on: give --pair GEOM,GEOM")
-    subject = _bare_task(scene, pair, horizon)
+    subject = scene_task(scene, horizon=horizon, pair=pair)
     _check(subject, states)
-    if pair is None and families != ("mjcf",):
-        # single points of MuJoCo's parameters do not need the pair that a stiffness does
-        moving = _any_pair(scene)
-        subject = subject if moving is None else subject.replace(contact_pair=moving)
     cells, messages = contact_grid(subject, families, stiffnesses or (), damping)
-    if pair is None:
-        cells = tuple(dataclasses.replace(cell, stiffness=0.0) for cell in cells)
     return GradcheckPlan(subject, False, cells, messages, states, seed, stock)
-
-
-def _bare_task(scene: Scene, pair: tuple[str, str] | None, horizon: int) -> Task:
-    """A placeholder task for a bare scene."""
-    zero = jnp.zeros((), scene.template.qpos.dtype)
-    policy = OpenLoop(horizon, scene.host.nu)
-    return Task(
-        name=scene.name,
-        description="an MJCF",
-        scene=scene,
-        horizon=horizon,
-        policy=policy,
-        theta=jnp.zeros(policy.num_params, zero.dtype),
-        sigma=1.0,
-        start=initial_state(scene),
-        running_cost=lambda state, control: zero,
-        final_cost=lambda state: zero,
-        contact_pair=pair,
-    )
-
-
-def _any_pair(scene: Scene) -> tuple[str, str] | None:
-    host = scene.host
-    named = [(mujoco.mj_id2name(host, mujoco.mjtObj.mjOBJ_GEOM, geom), geom) for geom in range(host.ngeom)]
-    named = [(name, geom) for name, geom in named if name]
-    moving = [name for name, geom in named if host.body_invweight0[host.geom_bodyid[geom], 0] > 0]
-    others = [name for name, _ in named if name != moving[0]] if moving else []
-    return (moving[0], others[0]) if others else None
 
 
 def _check(task: Task, states: int) -> None:

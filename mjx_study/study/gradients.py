@@ -104,14 +104,14 @@ def _of_batches(
         arrays["residual"].append(np.max(np.where(np.isfinite(all_of), all_of, np.inf), initial=0.0))
         arrays["unconverged"].append(unconverged(all_of, precision()))
         found = [met for each in events for oracle in needs if (met := each[oracle]) is not None]
-        arrays["events"].append(_onset_numbers(np.concatenate(found)) if found else np.full(len(ONSETS), np.nan))
+        arrays["events"].append(onset_numbers(np.concatenate(found)) if found else np.full(len(ONSETS), np.nan))
     numbers = np.stack(arrays.pop("events"), axis=-1)
     if np.any(np.isfinite(numbers)):
         arrays |= dict(zip(ONSETS, numbers, strict=True))
     return {name: np.array(values) for name, values in arrays.items()}
 
 
-def _onset_numbers(events: np.ndarray) -> np.ndarray:
+def onset_numbers(events: np.ndarray) -> np.ndarray:
     """`ONSETS` of rollouts."""
     *counts, strength, first = events[events[:, 0] > 0].T
     counts, some = [np.sum(each) for each in counts], len(first) > 0

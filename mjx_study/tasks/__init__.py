@@ -5,9 +5,10 @@ from functools import partial
 from typing import Final
 
 from estimators.places import MissingModuleError
-from mjx_study.choices import unknown_task
+from mjx_study.choices import is_file, unknown_task
 from mjx_study.tasks.ball_wall import ball_wall
 from mjx_study.tasks.double_pendulum import double_pendulum
+from mjx_study.tasks.mjcf import mjcf_task
 from mjx_study.tasks.momentum_transfer import momentum_transfer
 from mjx_study.tasks.own import own_task, registered_place
 from mjx_study.tasks.pusher import pusher
@@ -38,7 +39,8 @@ def make_task(name: str, **options) -> Task:
 
     Args:
         name: name of a task of this package, else of one registered by an installed package (entry point group
-            `mjx_study.tasks`), else `module:attribute` of a Task or of a function of the options that returns one.
+            `mjx_study.tasks`), else `module:attribute` of a Task or of a function of the options that returns one; or
+            the path of an MJCF, for what `mjx_study.tasks.mjcf.scene_task` makes of it.
         **options: arguments for the builder; a ready-made Task takes none.
 
     Raises:
@@ -47,6 +49,10 @@ def make_task(name: str, **options) -> Task:
     """
     if name in TASKS:
         return TASKS[name](**options)
+    if is_file(name):
+        if "model" in options:
+            raise ValueError(f"model replaces the MJCF of a task, and {name} is a file already")
+        return mjcf_task(name, **options)
     place = registered_place(name)
     if place is not None:
         return own_task(place, options)

@@ -141,7 +141,8 @@ def _warnings_of_contact() -> Generator[list[warnings.WarningMessage]]:
 
 
 def _contact(task: Task, family: str, stiffness: float | None, damping: float | None) -> ContactModel:
-    return family_model(family, task.scene, stiffness=stiffness, damping=damping, effective_mass=task.effective_mass)
+    mass = 1.0 if stiffness is None else task.effective_mass
+    return family_model(family, task.scene, stiffness=stiffness, damping=damping, effective_mass=mass)
 
 
 def _stiffness(task: Task, contact: ContactModel | None) -> float:

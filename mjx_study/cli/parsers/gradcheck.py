@@ -47,7 +47,7 @@ MEAN = {"estimators": ("zobg", "fobg"), "onset": "none", "samples": 1000, "span"
 
 def add(command: argparse.ArgumentParser) -> None:
     """Add them."""
-    add_task_argument(command, "; or any MJCF that MJX runs")
+    add_task_argument(command)
     usual = ",".join(f"{each:g}" for each in CHECKED_STIFFNESS)
     add_contact_options(command, analytic=False, stiffness=f"{usual}, or the task's where that is stiffer")
     add_option(command, PAIR)

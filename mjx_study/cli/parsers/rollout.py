@@ -31,7 +31,7 @@ examples:
 
 def add(command: argparse.ArgumentParser) -> None:
     """Add them."""
-    add_task_options(command, files="; or any MJCF")
+    add_task_options(command)
     add_scene_options(command)
     add_contact_options(command, "the middle one of the task's sweep", many=False, analytic=False)
     command.add_argument("--noise", action="store_true", help="with the noise of sample --seed (default: none)")

@@ -1,0 +1,453 @@
+"""One page about a model: where contact begins, whether derivatives and means are right, and which estimator to take.
+
+Every statement is measured here and comes with the command that measures it again. The error of an estimator after a
+second of computing is sqrt(bias^2 + variance x seconds per sample), relative to the gradient: the bias is what the
+estimator's mean misses of the mean cost's difference along a path (`estimators.circulation`), where it is seen.
+"""
+
+import dataclasses
+import math
+from collections.abc import Iterator, Sequence
+from typing import Any, Final
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from estimators import ORACLES, Circulation, Estimator, make_estimator, oracles_of, variance_interval
+from estimators.mean_check import circulations
+from mjx_study.choices import is_file
+from mjx_study.gradcheck import GradcheckPlan, GradcheckReport, gradcheck, plan_gradcheck, plan_scene_gradcheck
+from mjx_study.gradcheck.mean import FEEDBACK, HALF_LENGTH
+from mjx_study.objective import MjxObjective, Simulator, chunk_for, simulate
+from mjx_study.runtime import environment, precision
+from mjx_study.simulation.contact import stable, stiffness_from_solref
+from mjx_study.simulation.engine import engine_model
+from mjx_study.study.configuration import Progress
+from mjx_study.study.findings import NARROW, NOTABLE, SHARE_OFF
+from mjx_study.study.gradients import onset_numbers
+from mjx_study.study.memory import check_memory
+from mjx_study.study.sampling import cell_keys, draw_batches, unconverged
+from mjx_study.study.variables import ONSETS
+from mjx_study.table import format_table
+from mjx_study.tasks.contact_grid import ContactPoint, contact_grid
+from mjx_study.tasks.task import Task
+
+ESTIMATORS: Final = ("zobg", "fobg", "aobg", "fobg_onset", "aobg_onset")
+STATES: Final = 2
+"""Of the gradient check."""
+ACCURATE: Final = 0.1
+"""Relative error that a number of samples is given for."""
+SMOOTH: Final = 0.01
+"""Impedance at first touch below which force sets in without a jump."""
+WIDTHS: Final = 3.0
+"""Steps' travel over which an impedance should rise."""
+SHOWN: Final = 6
+"""Contacts in the text, the least resolved first."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Touch:
+    """A contact that begins in the rollout without noise, and how its step resolves it.
+
+    Attributes:
+        pair: the geoms.
+        time: when [s].
+        speed: of approach [m/s]; not positive for one that begins without.
+        damping: h b, at full impedance.
+        stiffness: h^2 k, at full impedance.
+        travel: h v over the width of the impedance's rise.
+        impedance: d_0, at first touch; 0.9 is MuJoCo's default.
+        stable: whether the step in contact is.
+    """
+
+    pair: str
+    time: float
+    speed: float
+    damping: float
+    stiffness: float
+    travel: float
+    impedance: float
+    stable: bool
+
+
+@dataclasses.dataclass(frozen=True)
+class Measured:
+    """An estimator on one batch.
+
+    Attributes:
+        estimator: its name.
+        variance, lower, upper: of one sample, with its 95 % interval [gradient^2].
+        seconds: computing time of a sample [s].
+        check: of its mean, along a path in the direction of the gradient; None of zeroth order, which has no bias.
+        verdict: of its mean: unbiased by theory, or right, biased or undecided by the check.
+        norm: of the mean, without what noise adds to it [gradient].
+    """
+
+    estimator: str
+    variance: float
+    lower: float
+    upper: float
+    seconds: float
+    check: Circulation | None
+    verdict: str
+    norm: float
+
+    @property
+    def bias(self) -> float:
+        """What the mean misses, as a share of the difference of the mean cost; 0 where nothing is seen."""
+        if self.check is None or self.verdict != "biased":
+            return 0.0
+        return abs(float(self.check.gap) / float(self.check.difference))
+
+    def error(self, norm: float, variance: float | None = None) -> float:
+        """Relative error after a second of computing."""
+        spread = (self.variance if variance is None else variance) * self.seconds
+        return math.hypot(self.bias, math.sqrt(spread) / norm) if norm > 0 else math.inf
+
+
+@dataclasses.dataclass(frozen=True)
+class Diagnosis:
+    """Everything that was measured; `lines` is the page.
+
+    Attributes:
+        subject: as it was named.
+        task: what was studied.
+        contact: label of the contact model.
+        samples: of each batch.
+        touches: contacts that begin without noise.
+        onsets: `mjx_study.study.variables.ONSETS` of the first-order batch.
+        lost: samples that are not finite, of any batch.
+        unconverged: rollouts in which the solver did not converge.
+        derivatives: the gradient check.
+        estimators: best first.
+        warnings: about the contact model.
+        options: contact options, as a command has them.
+    """
+
+    subject: str
+    task: Task
+    contact: str
+    samples: int
+    touches: tuple[Touch, ...]
+    onsets: dict[str, float]
+    lost: int
+    unconverged: int
+    derivatives: GradcheckReport
+    estimators: tuple[Measured, ...]
+    warnings: tuple[str, ...]
+    options: str
+
+    @property
+    def norm(self) -> float:
+        """Norm of the gradient, by the estimator that knows it best of those without a bias."""
+        free = [each for each in self.estimators if each.verdict != "biased"]
+        return min(free, key=lambda each: each.variance).norm if free else math.nan
+
+    @property
+    def best(self) -> Measured:
+        """The estimator of least error after a second of computing."""
+        return self.estimators[0]
+
+    def as_json(self) -> dict[str, Any]:
+        """As plain data."""
+        shown = [
+            {
+                "estimator": each.estimator,
+                "variance": each.variance,
+                "seconds_per_sample": each.seconds,
+                "mean": each.verdict,
+                "bias": each.bias,
+                "error_after_a_second": _finite(each.error(self.norm)),
+            }
+            for each in self.estimators
+        ]
+        return {
+            "subject": self.subject,
+            "cost": self.task.description,
+            "contact": self.contact,
+            "samples": self.samples,
+            "touches": [dataclasses.asdict(each) for each in self.touches],
+            **{name: _finite(value) for name, value in self.onsets.items()},
+            "nonfinite": self.lost,
+            "unconverged": self.unconverged,
+            "derivatives": "right" if self.derivatives.passed else "wrong",
+            "unexercised": self.derivatives.unexercised,
+            "estimators": shown,
+            "best": self.best.estimator,
+            "gradient_norm": _finite(self.norm),
+            "samples_needed": _finite(self._samples_needed),
+            "warnings": [*self.warnings, *self._cautions()],
+            "advice": [text for text, _ in self._advice()],
+            "environment": environment(),
+        }
+
+    @property
+    def _samples_needed(self) -> float:
+        return self.best.variance / (ACCURATE * self.norm) ** 2
+
+    def lines(self) -> list[str]:
+        """The page."""
+        task, command = self.task, f"mjx-study {{}} {self.subject}{self.options}"
+        lines = [f"{self.subject}: {task.description or task.name}", f"contact {self.contact}, {self.samples} samples"]
+        lines += [f"warning: {text}" for text in (*self.warnings, *self._cautions())]
+        lines += ["", "contact", *self._contact_lines()]
+        state = "every derivative that exists is right" if self.derivatives.passed else "A DERIVATIVE IS WRONG"
+        missing = ", where it was exercised" if self.derivatives.passed and self.derivatives.unexercised else ""
+        lines += ["", "derivatives of a step", f"  {state}{missing}", f"  > {command.format('gradcheck')}"]
+        names = ",".join(each.estimator for each in self.estimators if each.check is not None)
+        lines += ["", "estimators, by their relative error after a second of computing", *self._estimator_lines()]
+        lines += [f"  > {command.format('gradcheck')} --mean --estimators {names} --samples {self.samples}"]
+        names = ",".join(each.estimator for each in self.estimators)
+        lines += [f"  > {command.format('compare')} --estimators {names} --samples {self.samples}"]
+        lines += ["", "advice"]
+        for text, flags in self._advice():
+            lines += [f"  {text}", *([f"  > {command.format('compare')} {flags}"] if flags else [])]
+        return lines
+
+    def _contact_lines(self) -> list[str]:
+        found = self.onsets.get("onsets", 0)
+        lines = [f"  {found / self.samples:.2g} onsets in a rollout with noise"]
+        if found:
+            lines[0] += (
+                f"; the first at a step that varies by {self.onsets['onset_spread']:.2g} steps, "
+                f"each takes {self.onsets['onset_strength']:.0%} of the approach speed in one"
+            )
+        if not self.touches:
+            return [*lines, "  none in the rollout without noise"]
+        worst = sorted(self.touches, key=lambda each: (each.stable, -each.damping * each.impedance, -each.travel))
+        header = ["  without noise", "t [s]", "v [m/s]", "h b", "h^2 k", "h v / width", "impedance", "step"]
+        rows = [
+            [
+                f"  {each.pair}",
+                f"{each.time:.3g}",
+                *(f"{number:.2g}" for number in (each.speed, each.damping, each.stiffness, each.travel)),
+                f"{each.impedance:g}",
+                "stable" if each.stable else "UNSTABLE",
+            ]
+            for each in worst[:SHOWN]
+        ]
+        more = len(worst) - len(rows)
+        return [*lines, *format_table(rows, header), *([f"  and {more} more"] if more else [])]
+
+    def _estimator_lines(self) -> list[str]:
+        rows = []
+        for each in self.estimators:
+            ends = (each.error(self.norm, end) for end in (each.lower, each.upper))
+            rows.append(
+                [
+                    f"  {each.estimator}",
+                    f"{each.error(self.norm):.2%}",
+                    " to ".join(f"{end:.2%}" for end in ends),
+                    f"{each.bias:.1%}" if each.verdict == "biased" else each.verdict,
+                    f"{1e3 * each.seconds:.3g}",
+                ]
+            )
+        return format_table(rows, ["  estimator", "error", "95 % interval", "mean", "ms a sample"])
+
+    def _cautions(self) -> Iterator[str]:
+        """What makes numbers on the page mean less."""
+        if self.lost:
+            yield f"{self.lost} samples are not finite and were left out"
+        if self.unconverged:
+            yield f"{self.unconverged} rollouts in which the contact solver did not converge"
+        if unstable := [each for each in self.touches if not each.stable]:
+            yield f"the step in contact is unstable: {unstable[0].pair}, h^2 k = {unstable[0].stiffness:.2g}"
+        if undecided := [each.estimator for each in self.estimators if each.verdict == "undecided"]:
+            yield f"the mean of {', '.join(undecided)} could not be judged with {self.samples} samples"
+        if not self.derivatives.passed:
+            yield "a derivative is wrong: no first-order estimate is to be trusted"
+
+    def _advice(self) -> Iterator[tuple[str, str]]:
+        """What to do, each with options of `compare` that show it."""
+        by_name, timestep = {each.estimator: each for each in self.estimators}, self.task.scene.timestep
+        needed = _round(self._samples_needed)
+        yield f"take {self.best.estimator}; a relative error of {ACCURATE:.0%} needs {needed} samples", ""
+        if not self.onsets.get("onsets"):
+            yield "no contact begins: longer rollouts, more noise or another start would say more", ""
+            return
+        plain, corrected = by_name["fobg"], by_name["fobg_onset"]
+        if plain.verdict == "biased":
+            text = f"plain first order is biased by {plain.bias:.0%}, for contact sets in with a jump"
+            if corrected.verdict == "right":
+                text += ": the onset term corrects that"
+            if travel := max((each.speed * timestep for each in self.touches if each.impedance > SMOOTH), default=0.0):
+                text += f'; an impedance that rises from 0, solimp="0 0.95 {WIDTHS * travel:.1g}", avoids it'
+            yield text, "--onset linear"
+        if corrected.verdict == "right":
+            return
+        spread, strength = self.onsets["onset_spread"], self.onsets["onset_strength"]
+        if spread < NARROW:
+            step = timestep * spread / NARROW
+            yield f"the noise is too narrow for onset terms: take a timestep of {step:.1g} s, or more noise", ""
+        elif SHARE_OFF * strength > NOTABLE:
+            step = timestep * NOTABLE / (SHARE_OFF * strength)
+            yield (
+                f"the linear onset term can be off by {SHARE_OFF * strength:.0%} of what it adds: a timestep of "
+                f"{step:.1g} s makes that {NOTABLE:.0%}; the jump is exact but for the square of the step",
+                "--onset jump",
+            )
+
+
+def diagnose(
+    subject: str,
+    task: Task,
+    family: str | None = None,
+    stiffness: float | None = None,
+    *,
+    damping: float | None = None,
+    samples: int = 500,
+    seed: int = 0,
+    options: str = "",
+    progress: Progress = lambda done, total, what: None,
+) -> Diagnosis:
+    """Measure everything under one contact model.
+
+    Args:
+        subject: as the user named it; of a file the gradient check takes single steps alone.
+        task: what to study.
+        family: contact family; None for the task's main one.
+        stiffness: of the contact [N/m]; None for the task's middle one.
+        damping: of the contact [N s/m]; None for the family's.
+        samples: of each batch, and at each node of the path along which means are checked.
+        seed: of all randomness.
+        options: contact options, as a command has them.
+        progress: called before each part.
+
+    Raises:
+        ValueError: there is no such contact model, or the batches do not fit in memory.
+    """
+    family, stiffness = family or task.defaults.main_family, stiffness or task.defaults.middle_stiffness
+    (cell,), warnings = contact_grid(task, [family], [stiffness], damping)
+    chosen = [make_estimator(name, gamma=task.defaults.gamma, sigma=task.sigma) for name in ESTIMATORS]
+    check_memory(task, chosen, samples)
+    total = 4
+    progress(0, total, "rollout without noise")
+    touches = _touches(task, cell)
+    progress(1, total, "derivatives of steps")
+    derivatives = gradcheck(_plan(subject, task, family, stiffness, damping, seed))
+    progress(2, total, "batches")
+    simulator = Simulator(task, chunk_size=chunk_for(samples, jax.local_devices()))
+    objective = simulator.objective(cell.contact)
+    oracles = oracles_of(chosen, "evaluation")
+    for samples_drawn in (1, samples):  # the first compiles
+        drawn = draw_batches(objective, task.theta, cell_keys(seed, 1), oracles, samples_drawn, slice(1))
+    batches, seconds, residuals = drawn
+    batches = jax.tree.map(lambda leaf: leaf[0], batches)
+    progress(3, total, "means along a path")
+    found = _measure(chosen, objective, batches, seconds, samples, seed)
+    progress(total, total, "done")
+    events = np.asarray(batches["corrected"].events).reshape(-1, len(ONSETS))
+    diagnosis = Diagnosis(
+        subject=subject,
+        task=task,
+        contact=cell.label,
+        samples=samples,
+        touches=tuple(touches),
+        onsets=dict(zip(ONSETS, onset_numbers(events).tolist(), strict=True)),
+        lost=max(samples - int(estimator(batches).num_finite) for estimator in chosen),
+        unconverged=max(unconverged(each, precision()) for each in residuals.values()),
+        derivatives=derivatives,
+        estimators=tuple(found),
+        warnings=tuple(warnings),
+        options=options,
+    )
+    order = sorted(found, key=lambda each: each.error(diagnosis.norm))
+    return dataclasses.replace(diagnosis, estimators=tuple(order))
+
+
+def _plan(subject: str, task: Task, family: str, stiffness: float, damping: float | None, seed: int) -> GradcheckPlan:
+    common = {"seed": seed, "damping": damping, "states": STATES}
+    if is_file(subject):
+        return plan_scene_gradcheck(task.scene, [family], None, horizon=task.horizon, **common)
+    return plan_gradcheck(task, [family], [stiffness], **common)
+
+
+def _measure(
+    chosen: Sequence[Estimator],
+    objective: MjxObjective,
+    batches: Any,
+    seconds: dict[str, float],
+    samples: int,
+    seed: int,
+) -> list[Measured]:
+    """The estimators on their batches, and their means along a path in the direction of the surest of them."""
+    estimates, task = [estimator(batches) for estimator in chosen], objective.simulator.task
+    surest = min(estimates, key=lambda each: float(each.variance / jnp.sum(each.mean**2)))
+    reach = HALF_LENGTH * task.sigma if task.policy.additive else FEEDBACK
+    along = reach * surest.mean / jnp.linalg.norm(surest.mean)
+    first = [each for each in chosen if any(ORACLES[oracle].order for oracle in each.needs)]
+    path = task.theta - along, task.theta + along
+    found = circulations(first, objective, *path, jax.random.key(seed), samples)
+    checks: dict[Estimator, Circulation] = dict(zip(first, found, strict=True))
+    measured = []
+    for estimator, estimate in zip(chosen, estimates, strict=True):
+        lower, upper = variance_interval(estimate, 0.95)
+        squared = float(jnp.sum(estimate.mean**2)) - float(estimate.variance) / samples
+        check = checks.get(estimator)
+        measured.append(
+            Measured(
+                estimator=estimator.name,
+                variance=float(estimate.variance),
+                lower=float(lower),
+                upper=float(upper),
+                seconds=sum(seconds[oracle] for oracle in estimator.needs) / samples,
+                check=check,
+                verdict="unbiased" if check is None else check.verdict(),
+                norm=math.sqrt(max(squared, 0.0)),
+            )
+        )
+    return measured
+
+
+def _touches(task: Task, cell: ContactPoint) -> Iterator[Touch]:
+    """Contacts that begin in the rollout without noise, in the C engine."""
+    run = jax.jit(lambda theta, contact: simulate(task, theta, contact, jax.random.key(0), 0.0))
+    states, *_ = run(task.theta, cell.contact)
+    host = engine_model(task.scene, cell.contact)
+    data, timestep, before = mujoco.MjData(host), task.scene.timestep, None
+    for index, (qpos, qvel) in enumerate(zip(np.asarray(states.qpos), np.asarray(states.qvel), strict=True)):
+        if not (np.isfinite(qpos).all() and np.isfinite(qvel).all()):
+            return
+        data.qpos[:], data.qvel[:] = qpos, qvel
+        mujoco.mj_forward(host, data)
+        now = {tuple(contact.geom): contact for contact in data.contact if contact.dist < contact.includemargin}
+        for pair in now.keys() - (now.keys() if before is None else before):
+            yield _touch(host, data, now[pair], index * timestep, timestep)
+        before = now.keys()
+
+
+def _touch(host: mujoco.MjModel, data: mujoco.MjData, contact: Any, time: float, timestep: float) -> Touch:
+    solref = np.array(contact.solref)
+    if solref[0] > 0 and not host.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_REFSAFE:
+        solref[0] = max(solref[0], 2 * timestep)
+    k, b = stiffness_from_solref(solref.tolist(), effective_mass=1.0)
+    first, edges = contact.efc_address, 2 * (contact.dim - 1)
+    pyramid = contact.dim > 1 and host.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
+    speed = (
+        -float(np.mean(data.efc_vel[first : first + edges] if pyramid else data.efc_vel[first])) if first >= 0 else 0.0
+    )
+    names = (mujoco.mj_id2name(host, mujoco.mjtObj.mjOBJ_GEOM, geom) or f"geom {geom}" for geom in contact.geom)
+    return Touch(
+        pair=" and ".join(names),
+        time=time,
+        speed=speed,
+        damping=timestep * b,
+        stiffness=timestep**2 * k,
+        travel=timestep * speed / float(contact.solimp[2]),
+        impedance=float(contact.solimp[0]),
+        stable=stable(solref.tolist(), timestep),
+    )
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def _round(number: float) -> str:
+    """Two significant digits, upwards, with separators."""
+    if not math.isfinite(number):
+        return "more than can be told"
+    digits = max(0, math.floor(math.log10(max(number, 1.0))) - 1)
+    return f"{math.ceil(number / 10**digits) * 10**digits:,}"

@@ -1,0 +1,97 @@
+"""A task made of an MJCF alone: how far do its bodies come from where they start?"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jaxtyping import Array, Float
+
+from mjx_study.choices import CHECKED_STEPS
+from mjx_study.simulation.dynamics import State, initial_state
+from mjx_study.simulation.scene import Scene, load_scene
+from mjx_study.tasks.policy import InitialStatePolicy, OpenLoop
+from mjx_study.tasks.task import StudyDefaults, Task
+
+NOISE: Final = 0.1
+"""Standard deviation of the noise: share of the middle actuator's half range, or [m/s, rad/s] of initial velocities."""
+_FREE, _BALL = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL)
+
+
+def mjcf_task(path: str | Path, *, horizon: int = CHECKED_STEPS, **scene_options: str | float | Sequence[str]) -> Task:
+    """The task of a file; see `scene_task`.
+
+    Args:
+        path: an MJCF that MJX runs.
+        horizon: number of steps.
+        **scene_options: see `load_scene`.
+    """
+    return scene_task(load_scene(path, **scene_options), horizon=horizon)
+
+
+def scene_task(scene: Scene, *, horizon: int = CHECKED_STEPS, pair: tuple[str, str] | None = None) -> Task:
+    """Half the squared displacement of the free bodies, or of the joints where none is free, after some steps.
+
+    It starts from the first keyframe, or the reference pose. Parameters are the controls of every step, from the
+    keyframe's; of a model without actuators, what is added to the initial velocity.
+
+    Args:
+        scene: the scene; its contact parameters are the MJCF's own.
+        horizon: number of steps.
+        pair: names of the two geoms whose contact stiffness is swept; None for none.
+
+    Raises:
+        ValueError: nothing in the scene can move.
+    """
+    host, dtype = scene.host, scene.template.qpos.dtype
+    if host.nv == 0:
+        raise ValueError(f"{scene.name} has no degree of freedom: there is nothing to study")
+    key = host.nkey > 0
+    start = initial_state(scene, host.key_qpos[0], host.key_qvel[0]) if key else initial_state(scene)
+    measured, what = _measured(host)
+    origin = start.qpos[measured]
+
+    def push(start: State, change: Float[Array, " params"]) -> State:
+        return State(start.qpos, start.qvel + change, start.act, start.warmstart)
+
+    if host.nu:
+        policy, changed = OpenLoop(horizon, host.nu), "controls"
+        theta = np.tile(host.key_ctrl[0] if key else np.zeros(host.nu), horizon)
+        limited = host.actuator_ctrllimited.astype(bool)
+        half = np.diff(host.actuator_ctrlrange[limited], axis=1) / 2
+        sigma = NOISE * float(np.median(half)) if limited.any() else NOISE
+    else:
+        policy, changed = InitialStatePolicy(host.nv, horizon, 0, push), "initial velocities"
+        theta, sigma = np.zeros(host.nv), NOISE
+    return Task(
+        name=scene.name,
+        description=f"half the squared displacement of {what} after {horizon} steps, by the {changed}",
+        scene=scene,
+        horizon=horizon,
+        policy=policy,
+        theta=jnp.asarray(theta, dtype),
+        sigma=sigma,
+        start=start,
+        final_cost=lambda state: jnp.sum((state.qpos[measured] - origin) ** 2) / 2,
+        contact_pair=pair,
+        defaults=StudyDefaults(families=("mjcf",)),
+    )
+
+
+def _measured(host: mujoco.MjModel) -> tuple[np.ndarray, str]:
+    """Indices in qpos of the coordinates whose displacement is the cost, and what they are."""
+    free, scalar = (
+        host.jnt_qposadr[mask] for mask in (host.jnt_type == _FREE, ~np.isin(host.jnt_type, (_FREE, _BALL)))
+    )
+    if len(free):
+        return (free[:, None] + np.arange(3)).reshape(-1), f"{_count(len(free), 'free body', 'free bodies')}"
+    if len(scalar):
+        return scalar, _count(len(scalar), "joint", "joints")
+    balls = host.jnt_qposadr[host.jnt_type == _BALL]  # the vector part: small angles, halved
+    return (balls[:, None] + np.arange(1, 4)).reshape(-1), _count(len(balls), "ball joint", "ball joints")
+
+
+def _count(number: int, singular: str, plural: str) -> str:
+    return f"the {singular}" if number == 1 else f"{number} {plural}"
