@@ -2,11 +2,12 @@
 
 Every statement is measured here and comes with the command that measures it again. The error of an estimator after a
 second of computing is sqrt(bias^2 + variance x seconds per sample), relative to the gradient: the bias is what the
-estimator's mean misses of the mean cost's difference along a path (`estimators.circulation`), where it is seen.
+estimator's mean misses of the mean cost's slope along a path (`estimators.circulation`), where something is seen.
 """
 
 import dataclasses
 import math
+import textwrap
 from collections.abc import Iterator, Sequence
 from typing import Any, Final
 
@@ -80,8 +81,9 @@ class Measured:
         estimator: its name.
         variance, lower, upper: of one sample, with its 95 % interval [gradient^2].
         seconds: computing time of a sample [s].
-        check: of its mean, along a path in the direction of the gradient; None of zeroth order, which has no bias.
+        check: of its mean, along a path; None of zeroth order, which has no bias.
         verdict: of its mean: unbiased by theory, or right, biased or undecided by the check.
+        bias: what the mean misses along the path, where something is seen [gradient].
         norm: of the mean, without what noise adds to it [gradient].
     """
 
@@ -92,19 +94,13 @@ class Measured:
     seconds: float
     check: Circulation | None
     verdict: str
+    bias: float
     norm: float
 
-    @property
-    def bias(self) -> float:
-        """What the mean misses, as a share of the difference of the mean cost; 0 where nothing is seen."""
-        if self.check is None or self.verdict != "biased":
-            return 0.0
-        return abs(float(self.check.gap) / float(self.check.difference))
-
     def error(self, norm: float, variance: float | None = None) -> float:
-        """Relative error after a second of computing."""
+        """Error after a second of computing, relative to a gradient of this norm."""
         spread = (self.variance if variance is None else variance) * self.seconds
-        return math.hypot(self.bias, math.sqrt(spread) / norm) if norm > 0 else math.inf
+        return math.hypot(self.bias, math.sqrt(spread)) / norm if norm > 0 else math.inf
 
 
 @dataclasses.dataclass(frozen=True)
@@ -140,10 +136,18 @@ class Diagnosis:
     options: str
 
     @property
+    def surest(self) -> Measured:
+        """The estimator of least variance of those without a bias that is seen."""
+        return min((each for each in self.estimators if each.verdict != "biased"), key=lambda each: each.variance)
+
+    @property
     def norm(self) -> float:
-        """Norm of the gradient, by the estimator that knows it best of those without a bias."""
-        free = [each for each in self.estimators if each.verdict != "biased"]
-        return min(free, key=lambda each: each.variance).norm if free else math.nan
+        """Norm of the gradient; its standard error where that is larger."""
+        return max(self.surest.norm, self._uncertainty)
+
+    @property
+    def _uncertainty(self) -> float:
+        return math.sqrt(self.surest.variance / self.samples)
 
     @property
     def best(self) -> Measured:
@@ -158,7 +162,7 @@ class Diagnosis:
                 "variance": each.variance,
                 "seconds_per_sample": each.seconds,
                 "mean": each.verdict,
-                "bias": each.bias,
+                "bias": each.bias / self.norm,
                 "error_after_a_second": _finite(each.error(self.norm)),
             }
             for each in self.estimators
@@ -203,7 +207,8 @@ class Diagnosis:
         lines += [f"  > {command.format('compare')} --estimators {names} --samples {self.samples}"]
         lines += ["", "advice"]
         for text, flags in self._advice():
-            lines += [f"  {text}", *([f"  > {command.format('compare')} {flags}"] if flags else [])]
+            lines += textwrap.wrap(text, 100, initial_indent="  ", subsequent_indent="    ")
+            lines += [f"  > {command.format('compare')} {flags}"] if flags else []
         return lines
 
     def _contact_lines(self) -> list[str]:
@@ -240,7 +245,7 @@ class Diagnosis:
                     f"  {each.estimator}",
                     f"{each.error(self.norm):.2%}",
                     " to ".join(f"{end:.2%}" for end in ends),
-                    f"{each.bias:.1%}" if each.verdict == "biased" else each.verdict,
+                    f"off by {each.bias / self.norm:.1%}" if each.verdict == "biased" else each.verdict,
                     f"{1e3 * each.seconds:.3g}",
                 ]
             )
@@ -254,6 +259,11 @@ class Diagnosis:
             yield f"{self.unconverged} rollouts in which the contact solver did not converge"
         if unstable := [each for each in self.touches if not each.stable]:
             yield f"the step in contact is unstable: {unstable[0].pair}, h^2 k = {unstable[0].stiffness:.2g}"
+        if self.surest.norm < 2 * self._uncertainty:
+            yield (
+                f"the gradient is too small to be told from 0 with {self.samples} samples: errors are relative to "
+                f"{self.norm:.2g}"
+            )
         if undecided := [each.estimator for each in self.estimators if each.verdict == "undecided"]:
             yield f"the mean of {', '.join(undecided)} could not be judged with {self.samples} samples"
         if not self.derivatives.passed:
@@ -269,7 +279,7 @@ class Diagnosis:
             return
         plain, corrected = by_name["fobg"], by_name["fobg_onset"]
         if plain.verdict == "biased":
-            text = f"plain first order is biased by {plain.bias:.0%}, for contact sets in with a jump"
+            text = f"plain first order is biased by {plain.bias / self.norm:.0%}, for contact sets in with a jump"
             if corrected.verdict == "right":
                 text += ": the onset term corrects that"
             if travel := max((each.speed * timestep for each in self.touches if each.impedance > SMOOTH), default=0.0):
@@ -386,6 +396,8 @@ def _measure(
         lower, upper = variance_interval(estimate, 0.95)
         squared = float(jnp.sum(estimate.mean**2)) - float(estimate.variance) / samples
         check = checks.get(estimator)
+        verdict = "unbiased" if check is None else check.verdict()
+        missed = 0.0 if check is None else abs(float(check.gap)) / (2 * reach)
         measured.append(
             Measured(
                 estimator=estimator.name,
@@ -394,7 +406,8 @@ def _measure(
                 upper=float(upper),
                 seconds=sum(seconds[oracle] for oracle in estimator.needs) / samples,
                 check=check,
-                verdict="unbiased" if check is None else check.verdict(),
+                verdict=verdict,
+                bias=missed if verdict == "biased" else 0.0,
                 norm=math.sqrt(max(squared, 0.0)),
             )
         )

@@ -24,13 +24,26 @@ SMALL = {
     "rollout": "--horizon 4 --frames 1",
     "gradcheck": "--horizon 4 --states 1",
     "bench": "--samples 4 --horizon 4",
+    "diagnose": "--samples 4 --horizon 4",
     "claims": "--only lemma-closed-form",
 }
 OF_KIND = {"--iterations": "--iterations 2 --evaluation-samples 4", "--points": "--points 2"}
 # What a page takes for granted, or another one makes.
 MJCF = """<mujoco><worldbody><geom type="plane" size="1 1 0.1"/>
 <body pos="0 0 0.09"><freejoint/><geom size="0.1"/></body></worldbody></mujoco>"""
-ORDER = ("optimise", "rollout", "compare", "landscape", "gradcheck", "bench", "claims", "sweep", "plot", "report")
+ORDER = (
+    "optimise",
+    "rollout",
+    "compare",
+    "landscape",
+    "gradcheck",
+    "diagnose",
+    "bench",
+    "claims",
+    "sweep",
+    "plot",
+    "report",
+)
 
 
 def from_page(page: Path) -> list[list[str]]:
@@ -73,7 +86,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     )
     for name, language, page in files:
         (tmp_path / name).write_text(re.findall(rf"```{language}\n(.*?)```", page, re.DOTALL)[0])
-    for name in ("my_model.xml", "humanoid.xml"):
+    for name in ("my_model.xml", "humanoid.xml", "robot.xml"):
         (tmp_path / name).write_text(MJCF)
     np.save(tmp_path / "learnt.npy", np.zeros(21))
     (tmp_path / "study.toml").write_text('tasks = ["pusher"]\nstiffness = "10:1000:2:log"\n')

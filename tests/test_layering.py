@@ -27,6 +27,7 @@ LAYERS = [
     "mjx_study.objective",
     "mjx_study.study",
     "mjx_study.gradcheck",
+    "mjx_study.diagnose",
     "mjx_study.bench",
     "mjx_study.render",
     "mjx_study.plots",

@@ -27,7 +27,7 @@ def test_the_bias_of_first_order_is_found_and_is_gone_with_the_onset_term() -> N
     ("arguments", "message"),
     [
         (["pusher", "--samples", "9"], "--samples is for --mean"),
-        (["model.xml", "--mean"], "--mean is for tasks: a file has no cost"),
+        (["model.xml", "--mean"], "no MJCF file at model.xml"),
         (["tennis", "--mean", "--estimators", "delta"], "'delta' needs noise that is added to theta itself"),
         (["tennis", "--mean", "--onset", "jump", "--estimators", "total_propagation"], "have no onset term"),
     ],

@@ -1,0 +1,155 @@
+"""diagnose: what it measures of a ball that bounces is what can be said by hand, and what it advises is right."""
+
+import dataclasses
+import math
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mjx_study import cli
+from mjx_study.diagnose import Diagnosis, Measured, Touch, diagnose
+from mjx_study.objective import Simulator
+from mjx_study.study.quadrature import Line, grid, means
+from mjx_study.tasks import make_task
+from mjx_study.tasks.mjcf import mjcf_task
+
+GRAVITY, HEIGHT, TIMESTEP = 9.81, 0.05, 0.002
+K, B = 3e4, 60.0  # [1/s^2], [1/s]: it bounces
+BALL = """<mujoco><option timestep="{h}"/>
+  <worldbody><geom name="floor" type="plane" size="1 1 .1"/>
+  <body pos="0 0 {z}"><joint type="slide" axis="0 0 1"/>
+    <geom name="ball" size=".1" mass="1" condim="1" solref="{k} {b}" solimp="{solimp}" priority="1"/></body>
+  </worldbody></mujoco>"""
+
+
+def ball(folder: Path, solimp: str = "0.9 0.95 0.001 0.5 2") -> str:
+    path = folder / "ball.xml"
+    path.write_text(BALL.format(h=TIMESTEP, z=0.1 + HEIGHT, k=-K, b=-B, solimp=solimp))
+    return str(path)
+
+
+@pytest.fixture(scope="module")
+def found(tmp_path_factory: pytest.TempPathFactory) -> Diagnosis:
+    """Of the ball, on its way up again."""
+    name = ball(tmp_path_factory.mktemp("ball"))
+    return diagnose(name, make_task(name, horizon=65).replace(sigma=0.05), samples=500)
+
+
+def test_the_contact_is_what_it_is_by_hand(found: Diagnosis) -> None:
+    (touch,) = found.touches
+    speed = math.sqrt(2 * GRAVITY * HEIGHT)
+    assert touch.pair == "floor and ball" and touch.impedance == 0.9 and touch.stable
+    assert touch.speed == pytest.approx(speed, abs=GRAVITY * TIMESTEP)
+    assert touch.time == pytest.approx(speed / GRAVITY, abs=2 * TIMESTEP)
+    assert touch.damping == pytest.approx(TIMESTEP * B) and touch.stiffness == pytest.approx(TIMESTEP**2 * K)
+    assert touch.travel == pytest.approx(TIMESTEP * touch.speed / 0.001)
+    assert found.onsets["onsets"] == found.samples and found.lost == found.unconverged == 0
+
+
+def test_the_bias_and_the_cure_are_seen_and_the_best_estimator_is_named(found: Diagnosis) -> None:
+    by_name = {each.estimator: each for each in found.estimators}
+    assert by_name["fobg"].verdict == "biased" and by_name["fobg_onset"].verdict == "right"
+    assert by_name["zobg"].verdict == "unbiased" and by_name["zobg"].bias == 0
+    assert found.best.estimator in ("fobg_onset", "aobg_onset")
+    errors = [each.error(found.norm) for each in found.estimators]
+    assert errors == sorted(errors)
+    task = found.task
+    points = grid(0.0, 0.0, task.sigma, 1000, "gaussian")
+    exact = means(points, *Line(task)(points, None), np.zeros(1), task.sigma, "gaussian")
+    assert found.norm == pytest.approx(abs(exact.slope[0]), rel=0.05)
+    bias = abs(exact.first[0] - exact.slope[0])
+    assert by_name["fobg"].bias == pytest.approx(bias, rel=0.3)  # one is over a path, the other at its middle
+    assert found.derivatives.passed
+
+
+def test_every_statement_has_a_command_and_the_page_is_complete(found: Diagnosis) -> None:
+    page = found.lines()
+    commands = [line.removeprefix("  > mjx-study ").split() for line in page if line.startswith("  > ")]
+    assert {command[0] for command in commands} == {"gradcheck", "compare"}
+    for command in commands:
+        assert cli.parser(command[0]).parse_args(command).task == found.subject
+    text = "\n".join(page)
+    assert "plain first order is biased by" in text and "the onset term corrects that" in text
+    assert f"take {found.best.estimator}" in text and max(map(len, page)) < 200
+    document = found.as_json()
+    assert document["best"] == found.best.estimator and document["derivatives"] == "right"
+
+
+@pytest.mark.slow
+def test_the_advised_impedance_avoids_the_bias(found: Diagnosis, tmp_path: Path) -> None:
+    (advice,) = (text for text, _ in found._advice() if "solimp" in text)
+    solimp = advice.partition('solimp="')[2].partition('"')[0]
+    name = ball(tmp_path, solimp)
+    smooth = diagnose(name, make_task(name, horizon=65).replace(sigma=0.05), samples=500)
+    assert {each.estimator: each.verdict for each in smooth.estimators}["fobg"] == "right"
+    assert not [text for text, _ in smooth._advice() if "biased" in text]
+
+
+@pytest.mark.slow
+def test_the_command_prints_the_page(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["diagnose", ball(tmp_path), "--horizon", "65", "--samples", "50"]) == 0
+    printed = capsys.readouterr().out
+    assert "half the squared displacement of the joint after 65 steps, by the initial velocities" in printed
+    assert "estimators, by their relative error after a second of computing" in printed
+
+
+def planted(**changes: object) -> Measured:
+    numbers = {"estimator": "fobg", "variance": 4.0, "lower": 3.0, "upper": 5.0, "seconds": 0.01}
+    return Measured(**(numbers | {"check": None, "verdict": "unbiased", "bias": 0.0, "norm": 2.0} | changes))  # type: ignore[arg-type]
+
+
+def test_the_error_after_a_second_is_that_of_as_many_samples() -> None:
+    hundred = math.sqrt(4.0 / 100) / 2.0
+    assert planted().error(2.0) == pytest.approx(hundred)
+    assert planted().error(2.0, 16.0) == pytest.approx(2 * hundred)
+    assert planted(bias=0.3).error(2.0) == pytest.approx(math.hypot(0.15, hundred))
+    assert planted().error(0.0) == math.inf
+
+
+@pytest.mark.parametrize(
+    ("spread", "strength", "expected"),
+    [(0.3, 0.5, "the noise is too narrow"), (2.0, 0.5, "can be off by 25%"), (2.0, 0.05, None)],
+)
+def test_when_the_onset_term_is_not_to_be_trusted(
+    found: Diagnosis, spread: float, strength: float, expected: str | None
+) -> None:
+    """Unless its mean was measured to be right."""
+    onsets = found.onsets | {"onset_spread": spread, "onset_strength": strength}
+    right = dataclasses.replace(found, onsets=onsets)
+    assert not [text for text, _ in right._advice() if "narrow" in text or "can be off" in text]
+    undecided = tuple(dataclasses.replace(each, verdict="undecided") for each in found.estimators)
+    told = [text for text, _ in dataclasses.replace(right, estimators=undecided)._advice()]
+    assert any(expected in text for text in told) if expected else len(told) == 1
+
+
+def test_an_unstable_step_is_told_first(found: Diagnosis) -> None:
+    touch = Touch("a and b", 0.1, 1.0, 0.1, 9.0, 2.0, 0.9, False)
+    page = dataclasses.replace(found, touches=(touch, *found.touches)).lines()
+    assert page[2] == "warning: the step in contact is unstable: a and b, h^2 k = 9"
+    assert any("UNSTABLE" in line for line in page)
+
+
+def test_the_task_of_a_file(tmp_path: Path) -> None:
+    """Its cost is the displacement, its noise is on the initial velocity, or on the controls from the keyframe's."""
+    task = mjcf_task(ball(tmp_path), horizon=5)
+    assert task.theta.shape == (1,) and task.contact_pair is None
+    falls = (
+        Simulator(task, chunk_size=4).objective(None, 1e-9).evaluate(task.theta, jax.random.split(jax.random.key(0), 2))
+    )
+    drop = GRAVITY * TIMESTEP**2 * 15  # after five steps of semi-implicit Euler
+    assert jnp.allclose(falls.value, drop**2 / 2, rtol=1e-5)
+    path = tmp_path / "arm.xml"
+    path.write_text(
+        """<mujoco><worldbody><body><joint name="a" type="hinge"/><geom size=".1" fromto="0 0 0 1 0 0" type="capsule"/>
+        </body></worldbody><actuator><motor joint="a" ctrlrange="-4 4" ctrllimited="true"/></actuator>
+        <keyframe><key qpos="0.5" qvel="1" ctrl="2"/></keyframe></mujoco>"""
+    )
+    arm = make_task(str(path), horizon=3)
+    assert arm.theta.tolist() == [2.0] * 3 and arm.sigma == pytest.approx(0.4)
+    start = arm.draw_start(jax.random.key(0))
+    assert start.qpos.tolist() == [0.5] and start.qvel.tolist() == [1.0]
+    with pytest.raises(ValueError, match="a file already"):
+        make_task(str(path), model="other.xml")
