@@ -1,4 +1,4 @@
-"""Measures the engine that hands out cells: cells that sleep, on as many local workers as asked for.
+"""Measures what docs/scaling.md says of the engine: cells that sleep, on as many local workers as asked for.
 
     python docs/make_scaling.py --workers 20 --cells 10000 --seconds 0.1
 

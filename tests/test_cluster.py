@@ -1,6 +1,7 @@
 """Cells on Dask's workers: real schedulers and processes, which are killed, poisoned and refused."""
 
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -10,9 +11,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import dask.config
 import psutil
 import pytest
 import xarray as xr
+import yaml
 
 from mjx_study import cli
 from mjx_study.study import cluster
@@ -119,6 +122,49 @@ def test_a_worker_simulates_the_same_bits(workers: Any, tmp_path: Path) -> None:
         asked = config(1.0, 2.0, 3.0, tasks=("tests.carts:cart",), contact=("penalty",), chunk_size=4, **changes)
         here = run_study(asked, tmp_path / f"{name} here")
         assert same(run_study(asked, tmp_path / f"{name} there", cluster=workers), here)
+
+
+def test_each_worker_has_a_gpu_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By its number; one that has none, or a machine of one GPU, leaves the choice to JAX."""
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+    monkeypatch.setattr(cluster, "glob", lambda pattern: ["/dev/nvidia1", "/dev/nvidia0"])
+    assert [cluster._gpu(name) for name in (0, 1, 2, "SLURMCluster-0-1")] == ["0", "1", "0", "1"]
+    assert cluster._gpu("tcp://node-1:8786") is None
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "4,6,7")
+    assert cluster._gpu(4) == "6"
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "4")
+    assert cluster._gpu(0) is None
+
+
+def test_the_example_files_are_sound() -> None:
+    """The shell parses, Dask's configuration makes a job's script, and what Kubernetes is asked for fits together."""
+    files = Path(__file__).parents[1] / "docs" / "cluster"
+    page = (files.parent / "scaling.md").read_text()
+    shown = [line for line in page.splitlines() if line.startswith("mjx-study") and "--cluster" in line]
+    asked = [cli.parser().parse_args(shlex.split(line, comments=True)[1:]).cluster for line in shown]
+    assert asked == ["local:16", "slurm:32", "tcp://scheduler:8786"]
+    assert sorted(path.name for path in files.iterdir()) == ["jobqueue.yaml", "kubernetes.yaml", "slurm.sh"]
+    subprocess.run(["bash", "-n", str(files / "slurm.sh")], check=True)
+    jobqueue = pytest.importorskip("dask_jobqueue")
+    settings = yaml.safe_load((files / "jobqueue.yaml").read_text())["jobqueue"]["slurm"]
+    known = set(dask.config.get("jobqueue.slurm"))
+    assert set(settings) <= known
+    with dask.config.set({f"jobqueue.slurm.{name}": value for name, value in settings.items()}):
+        script = jobqueue.slurm.SLURMJob(scheduler="tcp://there:8786", name="mjx-study").job_script()
+    assert "dask worker tcp://there:8786" in script.replace("python -m distributed.cli.dask_worker", "dask worker")
+    assert "--nthreads 1 " in script and "--nworkers 4 " in script
+    assert "source /shared/mjx-study/.venv/bin/activate" in script
+    objects = {(part["kind"], part["metadata"]["name"]): part["spec"] for part in parts(files / "kubernetes.yaml")}
+    (client,) = objects["Job", "sweep"]["template"]["spec"]["containers"]
+    options = cli.parser().parse_args(client["command"][1:])
+    assert options.cluster == "tcp://scheduler:8786" and ("Service", "scheduler") in objects
+    for name in ("scheduler", "worker"):
+        deployment = objects["Deployment", name]
+        assert deployment["selector"]["matchLabels"] == deployment["template"]["metadata"]["labels"]
+
+
+def parts(path: Path) -> list[dict[str, Any]]:
+    return list(yaml.safe_load_all(path.read_text()))
 
 
 def sweep(folder: Path) -> subprocess.Popen[str]:

@@ -11,6 +11,7 @@ import math
 import os
 import pickle
 import queue
+import re
 import threading
 import time
 from collections import Counter, defaultdict, deque
@@ -228,9 +229,14 @@ def _set_up(asked: str) -> None:
     """Set a worker's JAX up: one CPU device; of several GPUs, the one that the worker's number picks."""
     from distributed import get_worker
 
-    name, there = get_worker().name, os.environ.get("CUDA_VISIBLE_DEVICES")
-    gpus = there.split(",") if there else sorted(path.removeprefix("/dev/nvidia") for path in glob(GPUS))
-    if isinstance(name, int) and len(gpus) > 1:
-        os.environ["CUDA_VISIBLE_DEVICES"] = gpus[name % len(gpus)]
+    if (gpu := _gpu(get_worker().name)) is not None:
+        os.environ["CUDA_VISIBLE_DEVICES"] = gpu
     configure(precision=asked, cpu_devices=1)
     _SET_UP.set()
+
+
+def _gpu(worker: Any) -> str | None:
+    """The GPU of a worker whose name is a number or ends with one after a hyphen; None to leave it to JAX."""
+    visible, number = os.environ.get("CUDA_VISIBLE_DEVICES"), re.fullmatch(r"(?:.*-)?(\d+)", str(worker))
+    gpus = visible.split(",") if visible else [path.removeprefix("/dev/nvidia") for path in sorted(glob(GPUS))]
+    return gpus[int(number[1]) % len(gpus)] if number and len(gpus) > 1 else None
