@@ -7,10 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.colors import to_hex
 
 from mjx_study import cli
 from mjx_study.claims import ledger
 from mjx_study.claims.catalogue import CLAIMS, VERDICTS
+from mjx_study.claims.figure import COLOURS, draw_matrix
 from mjx_study.claims.laboratory import EFFORTS, Laboratory, Statistic, exact, mean_of, ratio_of, share_of
 from mjx_study.claims.ledger import Claim, above, below, deciding_size, interval_of, measure_ledger, within
 from mjx_study.claims.page import markdown, table
@@ -67,7 +69,8 @@ def test_the_sample_size_that_would_decide() -> None:
     assert size is not None and 1200 < size < 1600
     assert criterion.verdict(interval_of(planted(0.6, size + 20), LEVEL)) == "holds"
     assert criterion.verdict(interval_of(planted(0.6, size - 40), LEVEL)) == "undecided"
-    assert deciding_size(exact(0.45, 0.1), criterion, LEVEL) is None  # only a finer quadrature would
+    assert deciding_size(exact(0.45, 0.1, 100), criterion, LEVEL) == 200  # of a quadrature, in proportion
+    assert deciding_size(exact(0.45, 0.1), criterion, LEVEL) is None
     assert deciding_size(dataclasses.replace(few, slack=0.2), criterion, LEVEL) is None
 
 
@@ -133,6 +136,15 @@ def test_the_page_is_what_the_code_says() -> None:
             ends = [-math.inf if each["lower"] is None else each["lower"]]
             ends.append(math.inf if each["upper"] is None else each["upper"])
             assert each["verdict"] == claim.criterion.verdict((ends[0], ends[1])), (told["id"], each)
+
+
+def test_the_picture_has_a_strip_for_each_verdict() -> None:
+    document = json.loads((DOCS / "claims.json").read_text())
+    (axes,) = draw_matrix(document).axes
+    evidence = [each for claim in document["claims"] for each in claim["evidence"]]
+    drawn = [to_hex(patch.get_facecolor()).upper() for patch in axes.patches]
+    assert sorted(drawn) == sorted(COLOURS[each["verdict"]] for each in evidence)
+    assert [label.get_text() for label in axes.get_yticklabels()] == [claim["id"] for claim in document["claims"]]
 
 
 def test_the_commands_that_show_claims_exist() -> None:

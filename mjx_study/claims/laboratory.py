@@ -3,7 +3,9 @@
 import dataclasses
 import hashlib
 import math
-from collections.abc import Sequence
+import re
+import time
+from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any, Final
@@ -15,9 +17,10 @@ import xarray as xr
 from jaxtyping import Float
 
 import estimators
-from estimators import Estimator, GradientEstimate
+from estimators import Estimator, GradientEstimate, Objective
 from estimators.intervals import student_quantile
 from mjx_study.choices import REFERENCE
+from mjx_study.objective import Simulator
 from mjx_study.reference import FunctionObjective, smoothed
 from mjx_study.study.configuration import StudyConfig
 from mjx_study.study.quadrature import Line, means
@@ -25,6 +28,11 @@ from mjx_study.study.run import run_study
 from mjx_study.tasks import make_task
 from mjx_study.tasks.contact_grid import ContactPoint, contact_grid
 from mjx_study.tasks.task import Task
+
+TIMED: Final = 64
+"""Samples per device in a batch that is timed."""
+REPEATS: Final = 12
+"""Of what is timed."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,9 +86,9 @@ class Statistic:
     trials: int = 0
 
 
-def exact(estimate: float, slack: float = 0.0) -> Statistic:
-    """A statistic without sampling error."""
-    return Statistic(float(estimate), slack=float(slack), of="quadrature")
+def exact(estimate: float, slack: float = 0.0, points: int = 0) -> Statistic:
+    """A statistic without sampling error, of a quadrature with so many points."""
+    return Statistic(float(estimate), slack=float(slack), samples=points, of="points")
 
 
 def mean_of(values: Sequence[float] | np.ndarray, of: str, slack: float = 0.0) -> Statistic:
@@ -139,6 +147,7 @@ class Slopes:
         errors: of both, by quadrature, over |grad F|.
         objective: F as an objective for estimators.
         theta: where.
+        points: of the quadrature; 0 for a closed form.
     """
 
     gradient: float
@@ -146,6 +155,7 @@ class Slopes:
     errors: tuple[float, float]
     objective: FunctionObjective
     theta: float
+    points: int = 0
 
     @property
     def relative(self) -> float:
@@ -166,13 +176,16 @@ class Laboratory:
         self.effort, self._folder, self._accept = effort, folder, accept_versions
         self.study, self.task = cache(self._study), cache(self._task)
         self._line, self.landscape = cache(self._make_line), cache(self._landscape)
+        self.tabulated, self.simulator = cache(self._tabulated), cache(self._simulator)
 
     def _study(self, config: StudyConfig) -> xr.Dataset:
         """A study, computed once."""
         folder = None
         if self._folder is not None:
-            name = hashlib.sha256(repr(config).encode()).hexdigest()[:12]
-            folder = self._folder / f"{config.task_names[0].replace(':', '_')}-{config.kind}-{name}"
+            fields = {field.name: getattr(config, field.name) for field in dataclasses.fields(config)}
+            told = repr(fields | {"tasks": config.task_names, "effort": self.effort})
+            digest = hashlib.sha256(told.encode()).hexdigest()[:12]
+            folder = self._folder / f"{re.sub(r'[^a-z_]+', '-', config.task_names[0])}-{config.kind}-{digest}"
         return run_study(config, folder, accept_versions=self._accept)
 
     def _task(self, name: str, timestep: float | None = None, onset: str = "none") -> Task:
@@ -200,6 +213,22 @@ class Laboratory:
         contact = self.contact(task, family, stiffness).contact
         return Landscape(points, *self._line(name, timestep, onset)(points, contact))
 
+    def _simulator(self, name: str) -> Simulator:
+        return Simulator(self.task(name), chunk_size=TIMED)
+
+    def objective(self, name: str, family: str, stiffness: float) -> Objective:
+        """A task under a family, for what is measured rollout by rollout."""
+        task = self.task(name)
+        if family == REFERENCE:
+            return task.analytic(stiffness)
+        return self.simulator(name).objective(self.contact(task, family, stiffness).contact)
+
+    def _tabulated(self, name: str, family: str, stiffness: float, low: float, high: float) -> Task:
+        """A task whose analytic system is its landscape under a family."""
+        task = self.task(name)
+        sigma, table = task.sigma, self.landscape(name, family, stiffness, low, high, task.sigma)
+        return task.replace(name=f"{name}, {family}", reference=lambda stiffness: FunctionObjective(table, sigma))
+
     def slopes(
         self, name: str, family: str, theta: float, *, stiffness: float, sigma: float | None = None,
         timestep: float | None = None, onset: str = "none",
@@ -215,7 +244,18 @@ class Laboratory:
         found = means(table.points, table.values, table.slopes, np.array([theta]), sigma, task.noise)
         slope, first = float(found.slope[0]), float(found.first[0])
         errors = float(found.slope_error[0]) / abs(slope), float(found.first_error[0]) / abs(slope)
-        return Slopes(slope, first, errors, FunctionObjective(table, sigma), theta)
+        return Slopes(slope, first, errors, FunctionObjective(table, sigma), theta, len(table.points))
+
+
+def times_of(work: Callable[[], Any]) -> np.ndarray:
+    """Times of the same work, repeated, after a first one [s]."""
+    jax.block_until_ready(work())
+    found = []
+    for _ in range(REPEATS):
+        begun = time.perf_counter()
+        jax.block_until_ready(work())
+        found.append(time.perf_counter() - begun)
+    return np.array(found)
 
 
 def closed_form(function: Any, theta: float, sigma: float) -> Slopes:

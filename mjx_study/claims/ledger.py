@@ -116,7 +116,7 @@ class Claim:
 
     def key(self, effort: Effort) -> str:
         """Digest of what a measurement depends on: the claim, the code that measures it, the effort, the versions."""
-        code = [inspect.getsource(part) for part in (self.measure, laboratory)]
+        code = [inspect.getsource(part) for part in (inspect.getmodule(self.measure) or self.measure, laboratory)]
         versions = [metadata.version(name) for name in VERSIONED if name != "mjx-study"]
         parts = (self.id, self.criterion, self.systems, code, effort, versions, precision())
         return hashlib.sha256(repr(parts).encode()).hexdigest()[:16]
@@ -136,14 +136,21 @@ def interval_of(statistic: Statistic, level: float) -> Range:
 
 
 def deciding_size(statistic: Statistic, criterion: Criterion, level: float) -> int | None:
-    """Samples with which an undecided interval about the same estimate would decide; None if none would."""
+    """Samples with which an undecided interval about the same estimate would decide; None if none would.
+
+    The error of samples falls with their square root, that of a quadrature with its points, since it may be at a jump.
+    """
     low, high = interval_of(statistic, level)
     borders = [border for part in (criterion.holds, criterion.reversed or ()) for border in part if low < border < high]
-    distance = min((abs(statistic.estimate - border) for border in borders), default=0.0) - statistic.slack
-    if not borders or distance <= 0 or not statistic.samples:
+    if not borders or not statistic.samples or not math.isfinite(high):
         return None
-    half = (high - low) / 2 - statistic.slack
-    return math.ceil(statistic.samples * (half / distance) ** 2)
+    border = min(borders, key=lambda border: abs(statistic.estimate - border))
+    distance = abs(statistic.estimate - border)
+    if statistic.error == 0 and not statistic.trials:
+        return math.ceil(statistic.samples * statistic.slack / distance) if distance > 0 else None
+    half = (statistic.estimate - low if border < statistic.estimate else high - statistic.estimate) - statistic.slack
+    distance -= statistic.slack
+    return math.ceil(statistic.samples * (half / distance) ** 2) if distance > 0 else None
 
 
 def measure_ledger(

@@ -2,6 +2,7 @@
 
 import math
 from collections import Counter
+from collections.abc import Sequence
 from typing import Any, Final
 
 from mjx_study.claims.ledger import FAMILIES, VERDICTS, matrix
@@ -41,7 +42,7 @@ def told(document: dict[str, Any]) -> str:
         f"{document['verdicts']} verdicts. Each interval is at level {document['level']:.5f}, that is 1 - "
         f"{document['alpha']:g} / {document['verdicts']} (Bonferroni), so that with probability "
         f"{1 - document['alpha']:g} or more no interval of the whole ledger misses its value. "
-        "Bounds on quadrature errors are added."
+        "Estimates of quadrature errors are added."
     )
 
 
@@ -54,10 +55,16 @@ def count(document: dict[str, Any]) -> str:
 
 def table(document: dict[str, Any]) -> list[str]:
     """The matrix for a terminal."""
+    header, *rows = cells(document)
+    return format_table(rows, header)
+
+
+def cells(document: dict[str, Any]) -> list[list[str]]:
+    """The matrix as text: families, then a row for each claim."""
     rows = matrix(document)
     shown = [family for family in FAMILIES if any(family in row for row in rows.values())]
-    cells = [[name, *(_summary(row.get(family, [])) for family in shown)] for name, row in rows.items()]
-    return format_table(cells, ["", *shown])
+    summary = [[name, *(_summary(row.get(family, [])) for family in shown)] for name, row in rows.items()]
+    return [["", *shown], *summary]
 
 
 def _summary(verdicts: list[str]) -> str:
@@ -79,21 +86,26 @@ def undecided(document: dict[str, Any]) -> list[str]:
 
 def markdown(document: dict[str, Any]) -> str:
     """docs/claims.md."""
-    parts = [HEAD, f"*{count(document)}.* {told(document)}\n", LEGEND]
+    header, *rows = cells(document)
+    linked = [[f"[{name}](#{name})", *verdicts] for name, *verdicts in rows]
+    parts = [HEAD, f"*{count(document)}.* {told(document)}\n", LEGEND, _pipes(header, linked)]
     for claim in document["claims"]:
         parts.append(
             f"## {claim['id']}\n\n{claim['statement']} *({claim['place']}.)*\n\n"
             f"- Statistic: {claim['quantity']}; {claim['criterion']}.\n- Shown by `{claim['show']}`.\n"
         )
         rows = [
-            f"| {each['system']} | `{each['family']}` | {_number(each['estimate'])} | {_interval(each)} | "
-            f"{_bold(each['verdict'])} | {_deciding(each) if each['verdict'] == 'undecided' else ''} |"
+            [each["system"], f"`{each['family']}`", _number(each["estimate"]), _interval(each), _bold(each["verdict"])]
+            + [_deciding(each) if each["verdict"] == "undecided" else ""]
             for each in claim["evidence"]
         ]
-        header = ("system", "contact", "estimate", "interval", "verdict", "would decide")
-        rows = [f"| {' | '.join(header)} |", f"|{' --- |' * len(header)}", *rows]
-        parts.append("\n".join(rows) + "\n")
+        parts.append(_pipes(("system", "contact", "estimate", "interval", "verdict", "would decide"), rows))
     return "\n".join(parts)
+
+
+def _pipes(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    lines = [f"| {' | '.join(header)} |", f"|{' --- |' * len(header)}", *(f"| {' | '.join(row)} |" for row in rows)]
+    return "\n".join(lines) + "\n"
 
 
 def _bold(verdict: str) -> str:
@@ -102,7 +114,7 @@ def _bold(verdict: str) -> str:
 
 def _deciding(each: dict[str, Any]) -> str:
     if each["deciding"] is None:
-        return "a finer quadrature" if each["of"] == "quadrature" else "no number that can be told"
+        return "no number that can be told"
     size = float(format(each["deciding"], ".2g"))
     return f"{size:,.0f} {each['of']} in place of {each['samples']:,}"
 

@@ -61,13 +61,13 @@ def at(
 def bias(lab: Laboratory, system: str, family: str) -> Statistic:
     """|E[FoBG] - grad F| / |grad F|."""
     found = at(lab, system, family)
-    return exact(abs(found.relative), found.errors[0] + found.errors[1])
+    return exact(abs(found.relative), sum(found.errors), found.points)
 
 
 def signed_bias(lab: Laboratory, system: str, family: str) -> Statistic:
     """(E[FoBG] - grad F) / grad F."""
     found = at(lab, system, family)
-    return exact(found.relative, found.errors[0] + found.errors[1])
+    return exact(found.relative, sum(found.errors), found.points)
 
 
 def zeroth_bias(lab: Laboratory, system: str, family: str) -> Statistic:

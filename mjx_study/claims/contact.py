@@ -1,0 +1,362 @@
+"""Claims about simulated contact: stiffness, chaos, geometry, friction, and the bias where contact begins."""
+
+import math
+from typing import Final
+
+import jax
+import numpy as np
+
+from estimators import FirstOrder, ZerothOrder
+from mjx_study.choices import REFERENCE
+from mjx_study.claims.laboratory import (
+    TIMED,
+    Laboratory,
+    Statistic,
+    batch,
+    batches,
+    difference_of,
+    exact,
+    log_variance,
+    mean_of,
+    ratio_of,
+    times_of,
+)
+from mjx_study.claims.ledger import REAL, Claim, above, below, within
+from mjx_study.claims.theory import EDGE, FACTOR, FIVE, HIT, NEGLIGIBLE, SHORT, STIFFNESS, WALL, at, bias, signed_bias
+from mjx_study.study.configuration import StudyConfig
+
+STIFFNESSES: Final = (10.0, 100.0, 1000.0, 1200.0)
+"""Of the pusher's contact [N/m]."""
+SWEPT: Final = tuple(family for family in REAL if family != "mujoco_default")
+"""Families that take a stiffness."""
+CRITICAL: Final = 14.14
+"""Critical damping of 1000 N/m between the pusher's bodies, of effective mass 0.05 kg [N s/m]."""
+HALF_STEP: Final = {"pusher": 0.0025, "momentum_transfer": 0.001}
+"""Half of the tasks' timesteps [s]."""
+HORIZONS: Final = (400, 2000)
+"""Of the double pendulum [steps of 1 ms]."""
+DOME: Final = "ball_wall:dome, 0.65 rad"
+DAMPED: Final = ("impedance", "mujoco_default", "mujoco_stiff")
+"""Families whose force sets in with a jump."""
+
+
+def study(lab: Laboratory, task: str, **changes):
+    """A study of ZoBG and FoBG where a task starts; no use is made of its reference gradient."""
+    effort, common = lab.effort, {"estimators": ("zobg", "fobg"), "reference_samples": 3}
+    common |= {"samples": (effort.samples,), "seeds": effort.seeds}
+    return lab.study(StudyConfig(tasks=(task,), **common | changes))
+
+
+def pusher(lab: Laboratory, *, half: bool = False, damping: float | None = None):
+    """The study of the pusher that most claims share, at half the timestep, or critically damped at 1000 N/m."""
+    if damping is not None:
+        return study(lab, "pusher", contact=("penalty", "impedance"), stiffness=(1000.0,), damping=damping)
+    if half:
+        return study(lab, "pusher", contact=REAL, stiffness=STIFFNESSES[2:], timestep=(HALF_STEP["pusher"],))
+    return study(lab, "pusher", contact=(REFERENCE, *REAL), stiffness=STIFFNESSES)
+
+
+def values(dataset, variable: str, family: str, stiffness: float | None, estimator: str) -> np.ndarray:
+    """A variable of one contact model."""
+    models = dataset["contact"].values == family
+    if stiffness is not None and family != "mujoco_default":
+        models &= np.isclose(dataset["stiffness"].values, stiffness)
+    (model,) = np.flatnonzero(models)
+    found = dataset[variable].isel(model=model, task=0, timestep=0, cone=0, sigma=0, samples=0)
+    return np.atleast_1d(found.sel(estimator=estimator).values)
+
+
+def logs(dataset, family: str, stiffness: float | None, estimator: str) -> np.ndarray:
+    """log10 of every batch's variance; 300 where all samples overflowed."""
+    return np.nan_to_num(np.log10(values(dataset, "variance", family, stiffness, estimator)), nan=300.0, posinf=300.0)
+
+
+def ratio(dataset, family: str, stiffness: float | None) -> Statistic:
+    """Mean over batches of log10 of FoBG's variance over ZoBG's."""
+    one, other = (logs(dataset, family, stiffness, name) for name in ("fobg", "zobg"))
+    return mean_of(one - other, "batches")
+
+
+def soft(lab: Laboratory, system: str, family: str) -> Statistic:
+    """At 10 N/m."""
+    return ratio(pusher(lab), family, STIFFNESSES[0])
+
+
+def stiff(lab: Laboratory, system: str, family: str) -> Statistic:
+    """At 1200 N/m."""
+    return ratio(pusher(lab), family, STIFFNESSES[3])
+
+
+def rate(lab: Laboratory, system: str, family: str) -> Statistic:
+    """log10 of FoBG's variance per decade of stiffness, from 10 to 1000 N/m."""
+    ends = [logs(pusher(lab), family, stiffness, "fobg") for stiffness in STIFFNESSES[::2]]
+    return mean_of((ends[1] - ends[0]) / 2, "batches")
+
+
+def finer(lab: Laboratory, system: str, family: str) -> Statistic:
+    """log10 of FoBG's variance at half the timestep over that at the whole, at 1200 N/m."""
+    parts = [logs(pusher(lab, half=half), family, STIFFNESSES[3], "fobg") for half in (True, False)]
+    return mean_of(parts[0] - parts[1], "batches")
+
+
+def gradient_cost(lab: Laboratory, system: str, family: str) -> Statistic:
+    """log10 of the time of a first-order sample over that of a zeroth-order one."""
+    objective, theta = lab.objective(system, family, STIFFNESS), lab.task(system).theta
+    keys = jax.random.split(jax.random.key(0), TIMED * len(jax.local_devices()) - 1)  # and a baseline
+    methods = (objective.differentiate, objective.evaluate)
+    one, other = (times_of(lambda method=method: method(theta, jax.random.clone(keys))) for method in methods)
+    return mean_of(np.log10(one / other), "batches")
+
+
+def implicit(lab: Laboratory, system: str, family: str) -> Statistic:
+    """log10 of FoBG's variance over that of a spring equally stiff and damped, at 1000 N/m."""
+    if system == "pusher, undamped":
+        one, other = (logs(pusher(lab), name, 1000.0, "fobg") for name in (family, "penalty"))
+    else:
+        spring = pusher(lab, damping=CRITICAL)
+        ours = spring if family == "impedance" else pusher(lab)
+        one, other = logs(ours, family, 1000.0, "fobg"), logs(spring, "penalty", 1000.0, "fobg")
+    return mean_of(one - other, "batches")
+
+
+def chaos(lab: Laboratory, system: str, family: str) -> Statistic:
+    """At a horizon."""
+    horizon = int(system.partition(", ")[2].removesuffix(" steps"))
+    samples = (lab.effort.samples // 2,)
+    dataset = study(lab, "double_pendulum", contact=(family,), horizon=horizon, samples=samples)
+    return ratio(dataset, family, None)
+
+
+def geometry(lab: Laboratory, system: str, family: str) -> Statistic:
+    """log10 of FoBG's mean squared error over ZoBG's, in batches of 200."""
+    point = at(lab, system, family)
+    found = batches([FirstOrder(), ZerothOrder()], point, 200, 2 * lab.effort.batches)
+    squared = [(np.asarray(each.mean)[:, 0] - point.gradient) ** 2 for each in found]
+    return ratio_of(squared[0], squared[1], "batches")
+
+
+def dome(lab: Laboratory, system: str, family: str) -> Statistic:
+    """log10 of FoBG's variance on the dome over that at the box, sigma = 0.03 rad."""
+    found = [
+        log_variance(batch(FirstOrder(), at(lab, name, family, sigma=0.03), lab.effort.draws))
+        for name in (system, system.replace(":dome", ""))
+    ]
+    return difference_of(found[0], found[1])
+
+
+def dome_bias(lab: Laboratory, system: str, family: str) -> Statistic:
+    """(E[FoBG] - grad F) / grad F on the dome, sigma = 0.03 rad."""
+    found = at(lab, system, family, sigma=0.03)
+    return exact(found.relative, sum(found.errors), found.points)
+
+
+def timestep(lab: Laboratory, system: str, family: str) -> Statistic:
+    """The relative bias at half the timestep, as a share of that at the whole."""
+    whole, half = at(lab, system, family), at(lab, system, family, timestep=HALF_STEP["momentum_transfer"])
+    slack = (sum(half.errors) + abs(half.relative / whole.relative) * sum(whole.errors)) / abs(whole.relative)
+    return exact(half.relative / whole.relative, slack, whole.points)
+
+
+def cured(lab: Laboratory, system: str, family: str) -> Statistic:
+    """(E[FoBG with the onset term] - grad F) / grad F."""
+    found = at(lab, system, family, onset="linear")
+    return exact(found.relative, sum(found.errors), found.points)
+
+
+def cure_cost(lab: Laboratory, system: str, family: str) -> Statistic:
+    """log10 of FoBG's variance with the onset term over that without."""
+    found = [
+        log_variance(batch(FirstOrder(), at(lab, system, family, onset=onset), lab.effort.draws))
+        for onset in ("linear", "none")
+    ]
+    return difference_of(found[0], found[1])
+
+
+def onset_cost(lab: Laboratory, system: str, family: str) -> Statistic:
+    """log10 of FoBG's variance over that with MuJoCo's default impedance, equally stiff and damped."""
+    found = [log_variance(batch(FirstOrder(), at(lab, system, name), lab.effort.draws)) for name in (family, "mujoco")]
+    return difference_of(found[0], found[1])
+
+
+def softened(lab: Laboratory, system: str, family: str) -> Statistic:
+    """|grad F at 3 kN/m over that at 30 kN/m - 1|."""
+    one, other = (at(lab, system, family, stiffness=stiffness) for stiffness in (3e3, 3e4))
+    share = one.gradient / other.gradient
+    return exact(abs(share - 1), one.errors[0] * abs(share) + abs(share) * other.errors[0], one.points)
+
+
+STIFFNESS_COMMAND: Final = "mjx-study compare pusher --stiffness 10,100,1000,1200 --contact penalty,mujoco,smooth_onset"
+RATIO: Final = "mean over batches of log10 Var[FoBG] / Var[ZoBG]"
+CLAIMS: Final = (
+    Claim(
+        "soft-favours-fobg",
+        "section 3.3, pushing with stiff contact",
+        "While contact is soft (10 N/m), the first-order estimate has the lower variance.",
+        below(RATIO, -FACTOR, FACTOR),
+        {"pusher, 10 N/m": (REFERENCE, *SWEPT)},
+        soft,
+        STIFFNESS_COMMAND,
+    ),
+    Claim(
+        "stiffness-raises-variance",
+        "section 3.3, pushing with stiff contact",
+        "The first-order variance rises with the contact's stiffness.",
+        above("mean over batches of log10 Var[FoBG] per decade of stiffness, 10 to 1000 N/m", FACTOR, -FACTOR),
+        {"pusher": (REFERENCE, *SWEPT)},
+        rate,
+        STIFFNESS_COMMAND,
+    ),
+    Claim(
+        "stiffness-crossover",
+        "section 3.3, pushing with stiff contact",
+        "At 1200 N/m, where the step is still stable, the zeroth-order estimate has the lower variance.",
+        above(RATIO, FACTOR, -FACTOR),
+        {"pusher, 1200 N/m": (REFERENCE, *SWEPT)},
+        stiff,
+        STIFFNESS_COMMAND,
+    ),
+    Claim(
+        "default-contact-is-soft",
+        "section 3.3, for MuJoCo's default contact (125 N/m here)",
+        "At MuJoCo's default contact, too, the zeroth-order estimate has the lower variance.",
+        above(RATIO, FACTOR, -FACTOR),
+        {"pusher": ("mujoco_default",)},
+        stiff,
+        "mjx-study compare pusher --contact mujoco_default",
+    ),
+    Claim(
+        "smaller-step-mends",
+        "section 3.3",
+        "At 1200 N/m half the timestep lowers the first-order variance.",
+        below("mean over batches of log10 Var[FoBG], at 2.5 ms over at 5 ms", -FACTOR, FACTOR),
+        {"pusher, 1200 N/m": SWEPT},
+        finer,
+        "mjx-study sweep pusher --stiffness 1200 --timestep 0.0025,0.005 --output out",
+    ),
+    Claim(
+        "fobg-costs-more",
+        "section 6, computation time",
+        "A first-order sample takes longer than a zeroth-order one.",
+        above("mean over batches of log10 of their time, FoBG's over ZoBG's", math.log10(1.1), 0.0),
+        {"pusher": (REFERENCE,), "sliding_box": (REFERENCE,)},
+        gradient_cost,
+        "mjx-study bench momentum_transfer",
+    ),
+    Claim(
+        "chaos-early",
+        "section 3.3, chaos of the double pendulum",
+        "At 0.4 s the first-order estimate has the lower variance.",
+        below(RATIO, -FACTOR, FACTOR),
+        {f"double_pendulum, {HORIZONS[0]} steps": (REFERENCE,)},
+        chaos,
+        "mjx-study compare double_pendulum --horizon 400",
+    ),
+    Claim(
+        "chaos-crossover",
+        "section 3.3, chaos of the double pendulum",
+        "As the horizon grows (to 2 s) the zeroth-order estimate has the lower variance.",
+        above(RATIO, FACTOR, -FACTOR),
+        {f"double_pendulum, {HORIZONS[1]} steps": (REFERENCE,)},
+        chaos,
+        "mjx-study compare double_pendulum --horizon 2000",
+    ),
+    Claim(
+        "dome-raises-variance",
+        "section 3.2, geometric discontinuity",
+        "A dome in place of the wall's corner raises the first-order variance.",
+        above("log10 Var[FoBG], the dome's over the box's, sigma = 0.03 rad", FACTOR, -FACTOR),
+        {DOME: FIVE},
+        dome,
+        "mjx-study landscape ball_wall:dome --contact penalty,smooth_onset",
+    ),
+    Claim(
+        "dome-unbiased",
+        "section 3.2, geometric discontinuity",
+        "On the dome the first-order estimate is unbiased.",
+        within("(E[FoBG] - grad F) / grad F, sigma = 0.03 rad", -NEGLIGIBLE, NEGLIGIBLE),
+        {DOME: FIVE},
+        dome_bias,
+        "mjx-study landscape ball_wall:dome --contact penalty,smooth_onset",
+    ),
+    Claim(
+        "implicit-less-stiff",
+        "section 6, implicit time-stepping (left open)",
+        "An implicit contact suffers less from stiffness than a spring as stiff and as damped.",
+        below("mean over batches of log10 Var[FoBG], over the spring's, 1000 N/m and 5 ms", -FACTOR, FACTOR),
+        {"pusher, undamped": ("impedance",), "pusher, damped": tuple(name for name in SWEPT if name != "penalty")},
+        implicit,
+        "mjx-study compare pusher --stiffness 1000 --contact penalty,impedance --damping 14.14",
+    ),
+    Claim(
+        "implicit-geometry",
+        "section 6, implicit time-stepping (left open)",
+        "At the edge of a wall or a bar first order remains the less accurate of the two, implicit contact or not.",
+        above("log10 of the mean squared error, FoBG's over ZoBG's, in batches of 200", FACTOR, -FACTOR),
+        {WALL: (REFERENCE, *FIVE), EDGE: (REFERENCE, *FIVE)},
+        geometry,
+        "mjx-study compare ball_wall --contact penalty,mujoco_default,mujoco_stiff",
+    ),
+    Claim(
+        "analytic-smoothing-moves",
+        "section 6, analytic smoothing",
+        "Smoothing by a softer contact moves the gradient of the mean cost, which noise alone leaves where it is.",
+        above("|grad F at 3 kN/m over that at 30 kN/m - 1|", NEGLIGIBLE),
+        {HIT: ("penalty", "impedance", "mujoco_stiff", "smooth_onset")},
+        softened,
+        "mjx-study landscape momentum_transfer --stiffness 3000,30000 --contact penalty",
+    ),
+    Claim(
+        "onset-bias",
+        "this project",
+        "Where contact sets in with a jump of its force, first order is biased, though the cost has no jump.",
+        above("|E[FoBG] - grad F| / |grad F|", NEGLIGIBLE),
+        {HIT: DAMPED, SHORT: DAMPED},
+        bias,
+        "mjx-study gradcheck momentum_transfer --mean --contact mujoco_default --estimators fobg",
+    ),
+    Claim(
+        "onset-sign",
+        "this project",
+        "That bias can turn the sign of the mean.",
+        below("(E[FoBG] - grad F) / grad F", -1.0),
+        {HIT: DAMPED},
+        signed_bias,
+        "mjx-study landscape momentum_transfer --contact mujoco_default",
+    ),
+    Claim(
+        "onset-any-timestep",
+        "this project",
+        "That bias does not shrink with the timestep.",
+        within("bias at 1 ms over bias at 2 ms", 0.8, 1.25),
+        {HIT: ("mujoco_default", "mujoco_stiff")},
+        timestep,
+        "mjx-study sweep momentum_transfer --contact mujoco --points 3 --timestep 0.001,0.002 --output slopes",
+    ),
+    Claim(
+        "onset-cure",
+        "this project",
+        "With the onset term the first-order estimate is unbiased.",
+        within("(E[FoBG with the term] - grad F) / grad F", -NEGLIGIBLE, NEGLIGIBLE),
+        {HIT: FIVE},
+        cured,
+        "mjx-study gradcheck momentum_transfer --mean --contact mujoco_default --estimators fobg,fobg_onset",
+    ),
+    Claim(
+        "onset-cure-free",
+        "this project",
+        "The onset term costs no variance.",
+        below("log10 Var[FoBG], with the term over without", FACTOR),
+        {HIT: DAMPED},
+        cure_cost,
+        "mjx-study compare momentum_transfer --contact mujoco_default --estimators zobg,fobg,fobg_onset",
+    ),
+    Claim(
+        "smooth-onset-costs",
+        "this project",
+        "A smooth onset, unbiased as it is, costs variance against MuJoCo's default impedance.",
+        above("log10 Var[FoBG], smooth onset's over the default impedance's", FACTOR, -FACTOR),
+        {HIT: ("smooth_onset",), SHORT: ("smooth_onset",)},
+        onset_cost,
+        "mjx-study compare momentum_transfer --contact mujoco,smooth_onset",
+    ),
+)

@@ -1,0 +1,173 @@
+"""Claims about what gradient descent achieves: the paper's experiments, on the references and in MJX.
+
+Tasks with one parameter descend on tabulated landscapes of MJX; the others are simulated.
+"""
+
+from typing import Final
+
+import numpy as np
+import xarray as xr
+
+from mjx_study.choices import REFERENCE
+from mjx_study.claims.laboratory import Laboratory, Statistic, mean_of
+from mjx_study.claims.ledger import Claim, above, below
+from mjx_study.claims.theory import FIVE, STIFFNESS
+from mjx_study.study.configuration import StudyConfig
+
+BALL, BAR, SOFT, STIFF = "ball_wall", "momentum_transfer", "pusher, 10 N/m", "pusher, 1000 N/m"
+SPANS: Final = {BALL: (0.0, 1.5), BAR: (0.0, 1.0)}
+"""Angles that a descent may reach [rad]."""
+LARGEST: Final = 10.0
+"""Where a descent diverged, its cost counts as this many times what the best one gained."""
+
+
+def descents(lab: Laboratory, system: str, family: str) -> xr.Dataset:
+    """Descents of ZoBG, FoBG and AoBG by the task's recipe, cut short or not by the effort.
+
+    The ball's is never cut short: zeroth order clears the wall late.
+    """
+    name, _, stiffness = system.partition(", ")
+    task, effort = lab.task(name), lab.effort
+    recipe = task.defaults.recipe
+    assert recipe is not None
+    many = recipe.samples > effort.samples
+    share = 1.0 if system == BALL else effort.iterations
+    common = {
+        "iterations": max(10, round(share * recipe.iterations)),
+        "seeds": effort.seeds_of_descents,
+        "samples": (effort.samples if many else recipe.samples,),
+    }
+    if name in SPANS:
+        contact = (STIFFNESS, *SPANS[name])
+        described = lab.tabulated(name, family, *contact) if family != REFERENCE else name
+        return lab.study(StudyConfig(tasks=(described,), contact=(REFERENCE,), stiffness=(STIFFNESS,), **common))
+    hard = {"stiffness": (float(stiffness.removesuffix(" N/m")),)} if stiffness else {}
+    if hard == {} and family != "mujoco_default":
+        hard = {"stiffness": (task.defaults.middle_stiffness,)}
+    return lab.study(StudyConfig(tasks=(name,), contact=(family,), **hard, **common))
+
+
+def final(dataset: xr.Dataset, estimator: str) -> np.ndarray:
+    """Costs of the final policies by seed, from 0 at the start to -1 for the best estimator's mean."""
+    cell = dataset.isel(task=0, timestep=0, cone=0, model=0, sigma=0, samples=0)
+    start, costs = float(cell["start_cost"]), cell["final_cost"].transpose("seed", "estimator")
+    finite = costs.where(np.isfinite(costs))
+    best = float(finite.mean("seed").min())
+    scaled = ((costs - start) / (start - best)).sel(estimator=estimator).values
+    return np.clip(np.nan_to_num(scaled, nan=LARGEST, posinf=LARGEST), -LARGEST, LARGEST)
+
+
+def along(dataset: xr.Dataset, estimator: str) -> np.ndarray:
+    """Costs averaged over the iterations, by seed, on the scale of `final`."""
+    cell = dataset.isel(task=0, timestep=0, cone=0, model=0, sigma=0, samples=0)
+    start, best = float(cell["start_cost"]), float(cell["final_cost"].mean("seed").min())
+    costs = cell["cost"].sel(estimator=estimator).transpose("iteration", "seed").values
+    return np.mean(np.clip(np.nan_to_num((costs - start) / (start - best), nan=LARGEST), -LARGEST, LARGEST), axis=0)
+
+
+def behind(lab: Laboratory, system: str, family: str) -> Statistic:
+    """How far FoBG ends behind ZoBG."""
+    found = descents(lab, system, family)
+    return mean_of(final(found, "fobg") - final(found, "zobg"), "seeds")
+
+
+def ahead(lab: Laboratory, system: str, family: str) -> Statistic:
+    """How far FoBG ends ahead of ZoBG."""
+    found = descents(lab, system, family)
+    return mean_of(final(found, "zobg") - final(found, "fobg"), "seeds")
+
+
+def regret(lab: Laboratory, system: str, family: str) -> Statistic:
+    """How far AoBG ends behind the better of the two."""
+    found = descents(lab, system, family)
+    better = min(("zobg", "fobg"), key=lambda name: final(found, name).mean())
+    return mean_of(final(found, "aobg") - final(found, better), "seeds")
+
+
+def slower(lab: Laboratory, system: str, family: str) -> Statistic:
+    """How far AoBG is behind the better of the two on the way."""
+    found = descents(lab, system, family)
+    better = min(("zobg", "fobg"), key=lambda name: along(found, name).mean())
+    return mean_of(along(found, "aobg") - along(found, better), "seeds")
+
+
+def apart(lab: Laboratory, system: str, family: str) -> Statistic:
+    """Distance between the policies that FoBG and ZoBG end at, in standard deviations of the noise."""
+    found = descents(lab, system, family)
+    theta = found["theta"].isel(task=0, timestep=0, cone=0, model=0, sigma=0, samples=0, param=0)
+    one, other = (theta.sel(estimator=name).values for name in ("fobg", "zobg"))
+    return mean_of(np.abs(one - other) / float(found["sigma"].values[0]), "seeds")
+
+
+GAIN: Final = "as a share of what the best gained"
+EVERYWHERE: Final = {
+    BALL: (REFERENCE, "penalty", "mujoco_default", "smooth_onset"),
+    BAR: (REFERENCE, *FIVE),
+    SOFT: (REFERENCE,),
+    STIFF: (REFERENCE,),
+}
+CLAIMS: Final = (
+    Claim(
+        "ball-over-wall",
+        "section 5.1, ball with wall",
+        "First-order descent stays short of the wall, which zeroth order clears.",
+        above(f"final cost, FoBG's less ZoBG's, {GAIN}", 0.1, -0.1),
+        {BALL: EVERYWHERE[BALL]},
+        behind,
+        "mjx-study optimise ball_wall --reference",
+    ),
+    Claim(
+        "bar-off-the-cliff",
+        "section 5.1, angular momentum transfer",
+        "First-order descent goes over the edge past which the bar is missed, or ends behind zeroth order otherwise.",
+        above(f"final cost, FoBG's less ZoBG's, {GAIN}", 0.1, -0.1),
+        {BAR: EVERYWHERE[BAR]},
+        behind,
+        "mjx-study optimise momentum_transfer --reference",
+    ),
+    Claim(
+        "different-minima",
+        "section 5.1, bias-variance leads to different minima",
+        "The two estimators end at different policies, not at one of them sooner.",
+        above("distance of the final angles, FoBG's from ZoBG's, in standard deviations of the noise", 1.0),
+        {BALL: EVERYWHERE[BALL], BAR: EVERYWHERE[BAR]},
+        apart,
+        "mjx-study optimise momentum_transfer --contact mujoco_default",
+    ),
+    Claim(
+        "soft-push",
+        "section 5.2, pushing",
+        "For soft springs (10 N/m) first order outperforms zeroth order.",
+        above(f"final cost, ZoBG's less FoBG's, {GAIN}", 0.001, -0.001),
+        {SOFT: EVERYWHERE[SOFT]},
+        ahead,
+        "mjx-study optimise pusher --contact penalty --stiffness 10",
+    ),
+    Claim(
+        "stiff-push",
+        "section 5.2, pushing",
+        "For stiff springs (1000 N/m) zeroth order outperforms first order.",
+        above(f"final cost, FoBG's less ZoBG's, {GAIN}", 0.001, -0.001),
+        {STIFF: EVERYWHERE[STIFF]},
+        behind,
+        "mjx-study optimise pusher --contact penalty --stiffness 1000",
+    ),
+    Claim(
+        "aobg-as-good",
+        "sections 5.1 and 5.2; conclusion",
+        "The interpolation ends where the better of the two does.",
+        below(f"final cost, AoBG's less the better one's, {GAIN}", 0.02),
+        EVERYWHERE,
+        regret,
+        "mjx-study optimise pusher --contact penalty --stiffness 1000",
+    ),
+    Claim(
+        "aobg-faster",
+        "section 5.2: slightly faster convergence",
+        "At equal iterations the interpolation is ahead of the better of the two on the way.",
+        below(f"cost averaged over the iterations, AoBG's less the better one's, {GAIN}", -0.001, 0.001),
+        EVERYWHERE,
+        slower,
+        "mjx-study optimise sliding_box --reference",
+    ),
+)
