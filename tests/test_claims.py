@@ -69,7 +69,7 @@ def test_the_sample_size_that_would_decide() -> None:
     assert size is not None and 1200 < size < 1600
     assert criterion.verdict(interval_of(planted(0.6, size + 20), LEVEL)) == "holds"
     assert criterion.verdict(interval_of(planted(0.6, size - 40), LEVEL)) == "undecided"
-    assert deciding_size(exact(0.45, 0.1, 100), criterion, LEVEL) == 200  # of a quadrature, in proportion
+    assert deciding_size(exact(0.25, 0.5, 100), criterion, LEVEL) == 200  # of a quadrature, in proportion
     assert deciding_size(exact(0.45, 0.1), criterion, LEVEL) is None
     assert deciding_size(dataclasses.replace(few, slack=0.2), criterion, LEVEL) is None
 
