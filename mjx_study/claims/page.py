@@ -30,10 +30,11 @@ how many samples would decide if the estimate stayed. In the picture a square ha
 of the tables. "reference" is the analytic system, "mjcf" a model without contact. Contact is of 10 kN/m
 where no stiffness is named.
 
-Three things to know. The angle 0.75 rad was chosen after a look at the bias along the bar: at 0.77 rad that of the default
-contact happens to pass through zero. Quick descents are cut to 40 % of their recipes, except the ball's, in which zeroth
-order clears the wall late. Not in the ledger yet: descents on `sliding_box` and `tennis`, and simulated ones on `pusher`
-([what they achieve](estimators.md#what-they-achieve)); friction's slip tolerance and the double pendulum in MJX.
+Three things to know. The angle 0.75 rad was chosen after a look at the bias along the bar: at 0.77 rad that of the
+default contact happens to pass through zero. Quick descents are cut to 40 % of their recipes, except the ball's, in
+which zeroth order clears the wall late. Not in the ledger yet: descents on `sliding_box` and `tennis`, and simulated
+ones on `pusher` ([what they achieve](estimators.md#what-they-achieve)); friction's slip tolerance and the double
+pendulum in MJX.
 """
 
 
