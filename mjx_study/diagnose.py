@@ -283,14 +283,21 @@ class Diagnosis:
             if corrected.verdict == "right":
                 text += ": the onset term corrects that"
             if travel := max((each.speed * timestep for each in self.touches if each.impedance > SMOOTH), default=0.0):
-                text += f'; an impedance that rises from 0, solimp="0 0.95 {WIDTHS * travel:.1g}", avoids it'
-            yield text, "--onset linear"
+                text += f'; an impedance that rises from 0, solimp="0 0.95 {WIDTHS * travel:.1g}", has no jump'
+            yield text, "--onset linear" if corrected.verdict == "right" else ""
         if corrected.verdict == "right":
             return
         spread, strength = self.onsets["onset_spread"], self.onsets["onset_strength"]
+        explained = SHARE_OFF * strength * (plain.bias + corrected.bias)
         if spread < NARROW:
             step = timestep * spread / NARROW
             yield f"the noise is too narrow for onset terms: take a timestep of {step:.1g} s, or more noise", ""
+        elif corrected.bias > explained:
+            yield (
+                f"the onset term leaves a bias of {corrected.bias / self.norm:.0%}, which its own error does not "
+                "explain: corners that turn, edges and contacts that end under load have no term",
+                "",
+            )
         elif SHARE_OFF * strength > NOTABLE:
             step = timestep * NOTABLE / (SHARE_OFF * strength)
             yield (

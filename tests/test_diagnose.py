@@ -125,6 +125,16 @@ def test_when_the_onset_term_is_not_to_be_trusted(
     assert any(expected in text for text in told) if expected else len(told) == 1
 
 
+def test_a_bias_that_the_onset_term_leaves_is_told(found: Diagnosis) -> None:
+    worse = {"verdict": "biased", "bias": 2 * found.norm}
+    left = tuple(
+        dataclasses.replace(each, **worse) if each.estimator == "fobg_onset" else each for each in found.estimators
+    )
+    told = [text for text, _ in dataclasses.replace(found, estimators=left)._advice()]
+    assert any("the onset term leaves a bias of 200%" in text for text in told)
+    assert not any("corrects that" in text for text in told)
+
+
 def test_an_unstable_step_is_told_first(found: Diagnosis) -> None:
     touch = Touch("a and b", 0.1, 1.0, 0.1, 9.0, 2.0, 0.9, False)
     page = dataclasses.replace(found, touches=(touch, *found.touches)).lines()
