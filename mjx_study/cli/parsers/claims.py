@@ -7,7 +7,7 @@ from mjx_study.cli.options import add_option
 from mjx_study.option import OPTIONS
 
 EPILOG = """\
-Each claim has a statistic and, fixed beforehand, the values with which it holds and those with which its opposite does.
+Each claim has a statistic, the values with which it holds, and those with which its opposite does.
 Its interval decides: holds, fails, reversed, or undecided, with the number of samples that would decide. The intervals
 of the whole ledger hold at once with probability 95 % (Bonferroni), whichever claims are run.
 
