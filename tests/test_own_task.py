@@ -196,7 +196,7 @@ def test_packages_register_tasks(write, register) -> None:
     assert make_task("hop", horizon=5).horizon == 5
     assert make_task("hop:high").horizon == 3
     assert refused("hip").startswith("unknown task 'hip'; choose from pusher, ")
-    assert "double_pendulum:published, hop, hop:high, other, or module:name of your own" in refused("hip")
+    assert "double_pendulum:published, hop, hop:high, other, module:name of your own, or an MJCF" in refused("hip")
     assert refused("other") == "there is no module 'broken' here or installed"
 
 
@@ -217,7 +217,8 @@ def test_the_current_directory_is_on_the_path_during_the_import_only(write, tmp_
 
 def test_no_such_module(write) -> None:
     write("import nowhere_at_all", "inner")
-    assert refused("mine:hop").endswith("or module:name of your own (there is no module 'mine' here or installed)")
+    told = "module:name of your own, or an MJCF (there is no module 'mine' here or installed)"
+    assert refused("mine:hop").endswith(told)
     assert refused("mine.tasks:hop").endswith("(there is no module 'mine' here or installed)")
     assert refused("ball_wall:dom").startswith("unknown task 'ball_wall:dom'; choose from pusher, ")
     for name in ("mine.py:hop", "folder/mine:hop", ":hop", ".mine:hop"):
