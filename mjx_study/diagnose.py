@@ -20,7 +20,7 @@ from estimators import ORACLES, Circulation, Estimator, make_estimator, oracles_
 from estimators.mean_check import circulations
 from mjx_study.choices import is_file
 from mjx_study.gradcheck import GradcheckPlan, GradcheckReport, gradcheck, plan_gradcheck, plan_scene_gradcheck
-from mjx_study.gradcheck.mean import FEEDBACK, HALF_LENGTH
+from mjx_study.gradcheck.mean import reach_of
 from mjx_study.objective import MjxObjective, Simulator, chunk_for, simulate
 from mjx_study.runtime import environment, precision
 from mjx_study.simulation.contact import stable, stiffness_from_solref
@@ -85,6 +85,7 @@ class Measured:
         verdict: of its mean: unbiased by theory, or right, biased or undecided by the check.
         bias: what the mean misses along the path, where something is seen [gradient].
         norm: of the mean, without what noise adds to it [gradient].
+        lost: samples that are not finite and were left out.
     """
 
     estimator: str
@@ -96,6 +97,7 @@ class Measured:
     verdict: str
     bias: float
     norm: float
+    lost: int
 
     def error(self, norm: float, variance: float | None = None) -> float:
         """Error after a second of computing, relative to a gradient of this norm."""
@@ -114,7 +116,6 @@ class Diagnosis:
         samples: of each batch.
         touches: contacts that begin without noise.
         onsets: `mjx_study.study.variables.ONSETS` of the first-order batch.
-        lost: samples that are not finite, of any batch.
         unconverged: rollouts in which the solver did not converge.
         derivatives: the gradient check.
         estimators: best first.
@@ -128,12 +129,16 @@ class Diagnosis:
     samples: int
     touches: tuple[Touch, ...]
     onsets: dict[str, float]
-    lost: int
     unconverged: int
     derivatives: GradcheckReport
     estimators: tuple[Measured, ...]
     warnings: tuple[str, ...]
     options: str
+
+    @property
+    def lost(self) -> int:
+        """Samples that are not finite, of the batch with the most."""
+        return max(each.lost for each in self.estimators)
 
     @property
     def surest(self) -> Measured:
@@ -363,7 +368,6 @@ def diagnose(
         samples=samples,
         touches=tuple(touches),
         onsets=dict(zip(ONSETS, onset_numbers(events).tolist(), strict=True)),
-        lost=max(samples - int(estimator(batches).num_finite) for estimator in chosen),
         unconverged=max(unconverged(each, precision()) for each in residuals.values()),
         derivatives=derivatives,
         estimators=tuple(found),
@@ -392,7 +396,7 @@ def _measure(
     """The estimators on their batches, and their means along a path in the direction of the surest of them."""
     estimates, task = [estimator(batches) for estimator in chosen], objective.simulator.task
     surest = min(estimates, key=lambda each: float(each.variance / jnp.sum(each.mean**2)))
-    reach = HALF_LENGTH * task.sigma if task.policy.additive else FEEDBACK
+    reach = reach_of(task)
     along = reach * surest.mean / jnp.linalg.norm(surest.mean)
     first = [each for each in chosen if any(ORACLES[oracle].order for oracle in each.needs)]
     path = task.theta - along, task.theta + along
@@ -416,6 +420,7 @@ def _measure(
                 verdict=verdict,
                 bias=missed if verdict == "biased" else 0.0,
                 norm=math.sqrt(max(squared, 0.0)),
+                lost=int(estimate.num_nonfinite),
             )
         )
     return measured

@@ -98,7 +98,7 @@ def test_the_command_prints_the_page(tmp_path: Path, capsys: pytest.CaptureFixtu
 
 def planted(**changes: object) -> Measured:
     numbers = {"estimator": "fobg", "variance": 4.0, "lower": 3.0, "upper": 5.0, "seconds": 0.01}
-    return Measured(**(numbers | {"check": None, "verdict": "unbiased", "bias": 0.0, "norm": 2.0} | changes))  # type: ignore[arg-type]
+    return Measured(**(numbers | {"check": None, "verdict": "unbiased", "bias": 0.0, "norm": 2.0, "lost": 0} | changes))  # type: ignore[arg-type]
 
 
 def test_the_error_after_a_second_is_that_of_as_many_samples() -> None:

@@ -6,23 +6,34 @@ from typing import Final
 import jax
 import numpy as np
 
-from estimators import FirstOrder, ZerothOrder
+from estimators import FirstOrder
 from mjx_study.choices import REFERENCE
 from mjx_study.claims.laboratory import (
     TIMED,
     Laboratory,
     Statistic,
     batch,
-    batches,
     difference_of,
     exact,
     log_variance,
     mean_of,
-    ratio_of,
     times_of,
 )
 from mjx_study.claims.ledger import REAL, Claim, above, below, within
-from mjx_study.claims.theory import EDGE, FACTOR, FIVE, HIT, NEGLIGIBLE, SHORT, STIFFNESS, WALL, at, bias, signed_bias
+from mjx_study.claims.theory import (
+    EDGE,
+    FACTOR,
+    FIVE,
+    HIT,
+    NEGLIGIBLE,
+    SHORT,
+    STIFFNESS,
+    WALL,
+    at,
+    bias,
+    compared,
+    signed_bias,
+)
 from mjx_study.study.configuration import StudyConfig
 
 STIFFNESSES: Final = (10.0, 100.0, 1000.0, 1200.0)
@@ -129,10 +140,7 @@ def chaos(lab: Laboratory, system: str, family: str) -> Statistic:
 
 def geometry(lab: Laboratory, system: str, family: str) -> Statistic:
     """log10 of FoBG's mean squared error over ZoBG's, in batches of 200."""
-    point = at(lab, system, family)
-    found = batches([FirstOrder(), ZerothOrder()], point, 200, 2 * lab.effort.batches)
-    squared = [(np.asarray(each.mean)[:, 0] - point.gradient) ** 2 for each in found]
-    return ratio_of(squared[0], squared[1], "batches")
+    return compared("fobg", "zobg", lab, system, family)
 
 
 def dome(lab: Laboratory, system: str, family: str) -> Statistic:

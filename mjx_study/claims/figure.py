@@ -5,7 +5,7 @@ from typing import Any, Final
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from mjx_study.claims.ledger import FAMILIES, VERDICTS, matrix
+from mjx_study.claims.ledger import VERDICTS, columns, matrix
 from mjx_study.plots.style import TITLES
 
 COLOURS: Final = {"holds": "#0072B2", "fails": "#E69F00", "reversed": "#D55E00", "undecided": "#DDDDDD"}
@@ -15,7 +15,8 @@ SIGNS: Final = {"holds": "+", "fails": "×", "reversed": "−", "undecided": "?"
 
 def draw_matrix(document: dict[str, Any]) -> Figure:
     """A square for each claim and family, with a strip for each system."""
-    rows, shown = matrix(document), [name for name in FAMILIES if any(name in row for row in matrix(document).values())]
+    rows = matrix(document)
+    shown = columns(rows)
     figure = Figure(figsize=(3.6 + 0.5 * len(shown), 1.9 + 0.24 * len(rows)), layout="constrained")
     axes = figure.subplots()
     for down, row in enumerate(rows.values()):

@@ -246,6 +246,11 @@ def matrix(document: dict[str, Any]) -> dict[str, dict[str, list[str]]]:
     return found
 
 
+def columns(rows: dict[str, dict[str, list[str]]]) -> list[str]:
+    """The families of a matrix that have any verdict."""
+    return [family for family in FAMILIES if any(family in row for row in rows.values())]
+
+
 def _range(part: Range) -> str:
     low, high = part
     if math.isinf(high):

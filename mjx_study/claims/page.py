@@ -5,7 +5,7 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import Any, Final
 
-from mjx_study.claims.ledger import FAMILIES, VERDICTS, matrix
+from mjx_study.claims.ledger import VERDICTS, columns, matrix
 from mjx_study.table import format_table
 
 HEAD: Final = """\
@@ -71,7 +71,7 @@ def table(document: dict[str, Any]) -> list[str]:
 def cells(document: dict[str, Any]) -> list[list[str]]:
     """The matrix as text: families, then a row for each claim."""
     rows = matrix(document)
-    shown = [family for family in FAMILIES if any(family in row for row in rows.values())]
+    shown = columns(rows)
     summary = [[name, *(_summary(row.get(family, [])) for family in shown)] for name, row in rows.items()]
     return [["", *shown], *summary]
 

@@ -172,7 +172,8 @@ def solution(lab: Laboratory, system: str, family: str) -> Statistic:
 def compared(one: str, other: str, lab: Laboratory, system: str, family: str) -> Statistic:
     """log10 of the ratio of two estimators' mean squared errors, over batches of 200; gamma is |grad F| / 2."""
     point = at(lab, system, family)
-    known = {"ivw": InverseVariance(), "zobg": ZerothOrder(), "aobg": AlphaOrder(gamma=abs(point.gradient) / 2)}
+    bounded = AlphaOrder(gamma=abs(point.gradient) / 2)
+    known = {"zobg": ZerothOrder(), "fobg": FirstOrder(), "ivw": InverseVariance(), "aobg": bounded}
     found = batches([known[one], known[other]], point, 200, 2 * lab.effort.batches)
     squared = [(np.asarray(each.mean)[:, 0] - point.gradient) ** 2 for each in found]
     return ratio_of(squared[0], squared[1], "batches")

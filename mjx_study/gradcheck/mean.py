@@ -57,6 +57,11 @@ class MeanCheck:
         return named | finite | {"verdict": self.verdict}
 
 
+def reach_of(task: Task) -> float:
+    """Half the length of a path through a task's theta, unless it is given [unit of theta]."""
+    return HALF_LENGTH * task.sigma if task.policy.additive else FEEDBACK
+
+
 def check_mean(
     task: Task,
     cells: Sequence[ContactPoint],
@@ -87,8 +92,7 @@ def check_mean(
     """
     check_estimators(estimators, task)
     check_span(span)
-    reach = HALF_LENGTH * task.sigma if task.policy.additive else FEEDBACK
-    low, high = (-reach, reach) if span is None else span
+    low, high = (-reach_of(task), reach_of(task)) if span is None else span
     along = jnp.asarray(direction_of(direction, task.policy.num_params, seed), task.theta.dtype)
     simulator = Simulator(task, chunk_size=chunk_for(samples, jax.local_devices()))
     found, total, ends = [], len(cells), (task.theta + low * along, task.theta + high * along)

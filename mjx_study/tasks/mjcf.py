@@ -83,14 +83,13 @@ def scene_task(scene: Scene, *, horizon: int = CHECKED_STEPS, pair: tuple[str, s
 
 def _measured(host: mujoco.MjModel) -> tuple[np.ndarray, str]:
     """Indices in qpos of the coordinates whose displacement is the cost, and what they are."""
-    free, scalar = (
-        host.jnt_qposadr[mask] for mask in (host.jnt_type == _FREE, ~np.isin(host.jnt_type, (_FREE, _BALL)))
-    )
+    free, balls = (host.jnt_qposadr[host.jnt_type == kind] for kind in (_FREE, _BALL))
+    scalar = np.setdiff1d(host.jnt_qposadr, [*free, *balls])
     if len(free):
-        return (free[:, None] + np.arange(3)).reshape(-1), f"{_count(len(free), 'free body', 'free bodies')}"
+        return (free[:, None] + np.arange(3)).reshape(-1), _count(len(free), "free body", "free bodies")
     if len(scalar):
         return scalar, _count(len(scalar), "joint", "joints")
-    balls = host.jnt_qposadr[host.jnt_type == _BALL]  # the vector part: small angles, halved
+    # the vector part of the quaternion: half the angle, where that is small
     return (balls[:, None] + np.arange(1, 4)).reshape(-1), _count(len(balls), "ball joint", "ball joints")
 
 
