@@ -13,7 +13,7 @@ UV_VERSION := 0.13.8
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo figures study coverage test test-all test-newer-jax defects lint format lock clean
+.PHONY: help demo figures study coverage test test-all test-newer-jax defects lint docs dist format lock clean
 
 help: ## List the targets
 	@awk 'BEGIN { FS = ":.*## " } /^[a-z-]+:.*## / { printf "  %-10s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
@@ -63,6 +63,15 @@ lint: $(STAMP) ## Check style, formatting and types
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/basedpyright
+
+docs: $(STAMP) ## Build the site into build/site; a dead link or a faulty docstring is an error (half a minute)
+	$(BIN)/python docs/make_site.py
+
+dist: $(STAMP) ## Build sdist and wheel into dist, and check what is in them
+	rm -rf dist
+	$(BIN)/check-manifest --no-build-isolation
+	$(BIN)/python -m build --no-isolation
+	$(BIN)/twine check --strict dist/*
 
 format: $(STAMP) ## Put imports and formatting right
 	$(BIN)/ruff check --fix-only .

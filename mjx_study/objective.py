@@ -287,7 +287,7 @@ class Simulator:
             _before_each_step(states)
         )
 
-    def run(self, name: str, theta, contact, sigma, keys, noise_scale):
+    def run(self, name: str, theta: Any, contact: ContactModel | None, sigma: Any, keys: Any, noise_scale: Any) -> Any:
         """Run one of `sample_programs`, see `spread`.
 
         Args:

@@ -11,11 +11,10 @@ import pytest
 from mjx_study import cli
 from mjx_study.cli import options
 from mjx_study.cli.gradcheck import UNEXERCISED
+from mjx_study.tasks import TASKS
 
 ROOT = Path(__file__).parents[1]
-PAGES = [
-    page for page in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))) if "\nmjx-study " in page.read_text()
-]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 SMALL = {
     "compare": "--samples 4 --reference-samples 4 --horizon 4",
     "optimise": "--iterations 2 --samples 4 --evaluation-samples 4 --seeds 2 --horizon 4",
@@ -46,10 +45,11 @@ ORDER = (
 )
 
 
-def from_page(page: Path) -> list[list[str]]:
-    lines = "".join(re.findall(r"```sh\n(.*?)```", page.read_text(), re.DOTALL)).splitlines()
-    commands = [shlex.split(line, comments=True) for line in lines]
-    return [command[1:] for command in commands if command[:1] == ["mjx-study"]]
+def from_page(page: Path, language: str = "sh") -> list[list[str]]:
+    """Commands in a page's fenced blocks, those that a prompt or the arrow of `diagnose` goes before included."""
+    text = "".join(re.findall(rf"^```{language}\n(.*?)^```", page.read_text(), re.DOTALL | re.MULTILINE))
+    commands = re.findall(r"^ *(?:[$>] )?mjx-study (.*)$", text, re.MULTILINE)
+    return [shlex.split(command, comments=True) for command in commands]
 
 
 def from_help() -> list[list[str]]:
@@ -96,7 +96,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("source", [*PAGES, None], ids=lambda page: page.name if page else "help")
+@pytest.mark.parametrize("source", [*filter(from_page, PAGES), None], ids=lambda page: page.name if page else "help")
 def test_every_command_runs(source: Path | None, here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     commands = from_help() if source is None else from_page(source)
     assert commands
@@ -113,7 +113,12 @@ def test_every_command_runs(source: Path | None, here: Path, capsys: pytest.Capt
 
 def test_every_command_parses() -> None:
     parser = cli.parser()
-    for commands in (from_help(), [command for page in PAGES for command in from_page(page)]):
+    pages = [command for page in PAGES for command in from_page(page, r"\w*")]
+    for commands in (from_help(), pages):
         assert {command[0] for command in commands} >= {"compare", "optimise", "sweep", "landscape", "rollout"}
         for command in commands:
-            assert parser.parse_args(small(command)).command in cli.COMMANDS
+            parsed = parser.parse_args(["pusher" if part == "TASK" else part for part in command])
+            assert parsed.command in cli.COMMANDS
+            task = getattr(parsed, "task", "pusher")
+            assert task in TASKS or task.endswith(".xml") or ":" in task, command
+    assert {"compare", "gradcheck"} <= {command[0] for page in PAGES for command in from_page(page, "text")}

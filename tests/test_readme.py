@@ -1,14 +1,12 @@
 """What the README shows works as it stands there."""
 
 import re
-import shlex
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-from mjx_study import cli
 from mjx_study.simulation.contact import FAMILIES
 from mjx_study.tasks import TASKS
 
@@ -30,19 +28,6 @@ def test_the_python_example_runs(tmp_path: Path) -> None:
     lines = done.stdout.splitlines()
     assert len(lines) == 9 and all("not finite 0" in line for line in lines), done.stdout
     assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_every_command_parses(page: Path) -> None:
-    commands = [shlex.split(line, comments=True) for line in "".join(blocks("sh", page.read_text())).splitlines()]
-    ours = [command[1:] for command in commands if command[:1] == ["mjx-study"]]
-    assert len(ours) >= 1 or page.name in ("architecture.md", "concepts.md", "gradient-faults.md", "testing.md")
-    parser = cli.parser()
-    for arguments in ours:
-        options = parser.parse_args(["pusher" if argument == "TASK" else argument for argument in arguments])
-        assert options.command in cli.COMMANDS
-        task = getattr(options, "task", "pusher")
-        assert task in TASKS or task == "my_model.xml" or ":" in task, task
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)

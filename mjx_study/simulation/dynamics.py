@@ -259,7 +259,10 @@ def step_jacobian(
     Args:
         scene: static part of the model.
         model: the model to step.
-        qpos, qvel, act, control: point of linearisation.
+        qpos: positions at the point of linearisation.
+        qvel: velocities there.
+        act: activations there.
+        control: controls there.
         qacc: the converged constrained acceleration there.
     """
     return _jacobian(model, scene.template, qpos, qvel, act, control, qacc)

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from functools import partial
-from typing import Final
+from typing import Any, Final
 
 from estimators.places import MissingModuleError
 from mjx_study.choices import is_file, unknown_task
@@ -34,7 +34,7 @@ def task_names() -> list[str]:
     return list(TASKS)
 
 
-def make_task(name: str, **options) -> Task:
+def make_task(name: str, **options: Any) -> Task:
     """Build a task by name; `options` go to its builder (`cone`, `horizon`, ...).
 
     Args:

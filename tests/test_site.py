@@ -1,0 +1,67 @@
+"""The site has every page once, and what is written for GitHub reads as well there."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from docs import make_site
+
+ROOT = Path(__file__).parents[1]
+OWN = make_site.places()
+
+
+def pages_of(nav: Any) -> list[str]:
+    if isinstance(nav, str):
+        return [nav]
+    return [page for part in (nav.values() if isinstance(nav, dict) else nav) for page in pages_of(part)]
+
+
+def test_every_page_is_in_the_navigation_once() -> None:
+    nav = pages_of(yaml.safe_load((ROOT / "mkdocs.yml").read_text())["nav"])
+    staged = [str(place) for place in OWN.values() if place.suffix == ".md"]
+    made = [f"reference/{name}.md" for name in ("commands", *make_site.PACKAGES)]
+    assert sorted(nav) == sorted(staged + made)
+    assert {f"docs/{path.name}" for path in (ROOT / "docs").glob("*.md")} <= {str(source) for source in OWN}
+
+
+@pytest.mark.parametrize(
+    ("page", "text", "expected"),
+    [
+        ("README.md", "[a](docs/tasks.md#pusher)", "[a](tasks.md#pusher)"),
+        ("docs/tasks.md", "[a](../README.md)", "[a](index.md)"),
+        ("docs/tasks.md", "[a](../tests/test_site.py), a [b](https://b.org)", "a, a [b](https://b.org)"),
+        ("notebooks/3_bring_your_own.ipynb", "![a [b]](../docs/map.png)", "![a [b]](../map.png)"),
+        ("docs/tasks.md", "$HOME and $x$", "$HOME and $x$"),
+    ],
+)
+def test_links_are_the_sites(page: str, text: str, expected: str) -> None:
+    assert make_site.adapted(text, Path(page), OWN) == expected
+
+
+def test_a_link_that_leads_nowhere_is_refused() -> None:
+    with pytest.raises(FileNotFoundError, match="nowhere"):
+        make_site.adapted("[a](nowhere.md)", Path("docs/tasks.md"), OWN)
+
+
+def test_formulas_become_mathml() -> None:
+    found = make_site.adapted("with $`a_0`$\n\n```math\n\\frac{a}{b}\n```\n", Path("README.md"), OWN)
+    assert "<msub><mi>a</mi><mn>0</mn></msub>" in found and "<mfrac>" in found and "`" not in found
+
+
+@pytest.mark.parametrize("package", make_site.PACKAGES)
+def test_the_page_of_names_has_all_public_ones(package: str) -> None:
+    page = make_site.page_of_names(package)
+    names = [line.removeprefix("::: ") for line in page.splitlines() if line.startswith("::: ")]
+    public = set(vars(make_site.import_module(f"{package}._public"))["__all__"])
+    assert sorted(names) == sorted(f"{package}.{name}" for name in public)
+
+
+def test_boxes_of_a_diagram_are_apart_and_arrows_lead_down() -> None:
+    found = make_site.drawn([("a", "b"), ("a", "c"), ("c", "d"), ("b", "d"), ("a", "d")])
+    boxes = {tuple(part.split('"')[1::2][:2]) for part in found.split("<rect ")[1:]}
+    assert len(boxes) == 4
+    for line in found.split("<line ")[1:]:
+        _, top, _, bottom = map(float, line.split('"')[1:8:2])
+        assert top < bottom
