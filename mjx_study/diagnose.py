@@ -17,13 +17,13 @@ import mujoco
 import numpy as np
 
 from estimators import ORACLES, Circulation, Estimator, make_estimator, oracles_of, variance_interval
-from estimators.mean_check import circulations
+from estimators.mean_check import NODES, circulations
 from mjx_study.choices import is_file
 from mjx_study.gradcheck import GradcheckPlan, GradcheckReport, gradcheck, plan_gradcheck, plan_scene_gradcheck
 from mjx_study.gradcheck.mean import reach_of
 from mjx_study.objective import MjxObjective, Simulator, chunk_for, simulate
 from mjx_study.runtime import environment, precision
-from mjx_study.simulation.contact import stable, stiffness_from_solref
+from mjx_study.simulation.contact import ContactModel, stable, stiffness_from_solref
 from mjx_study.simulation.engine import engine_model
 from mjx_study.study.configuration import Progress
 from mjx_study.study.findings import NARROW, NOTABLE, SHARE_OFF
@@ -38,6 +38,16 @@ from mjx_study.tasks.task import Task
 ESTIMATORS: Final = ("zobg", "fobg", "aobg", "fobg_onset", "aobg_onset")
 STATES: Final = 2
 """Of the gradient check."""
+SAMPLES: Final = 500
+"""Of each batch, where time allows."""
+LEAST: Final = 20
+"""Fewest samples, however long they take."""
+FEW: Final = 100
+"""Samples below which the page says so."""
+BUDGET: Final = 60.0
+"""Time for all batches, compilation apart [s]."""
+CHUNK: Final = 16
+"""Fewest samples in a call of a program."""
 ACCURATE: Final = 0.1
 """Relative error that a number of samples is given for."""
 SMOOTH: Final = 0.01
@@ -106,34 +116,20 @@ class Measured:
 
 
 @dataclasses.dataclass(frozen=True)
-class Diagnosis:
-    """Everything that was measured; `lines` is the page.
+class Measurement:
+    """The estimators under one contact model.
 
     Attributes:
-        subject: as it was named.
-        task: what was studied.
-        contact: label of the contact model.
         samples: of each batch.
-        touches: contacts that begin without noise.
         onsets: `mjx_study.study.variables.ONSETS` of the first-order batch.
         unconverged: rollouts in which the solver did not converge.
-        derivatives: the gradient check.
         estimators: best first.
-        warnings: about the contact model.
-        options: contact options, as a command has them.
     """
 
-    subject: str
-    task: Task
-    contact: str
     samples: int
-    touches: tuple[Touch, ...]
     onsets: dict[str, float]
     unconverged: int
-    derivatives: GradcheckReport
     estimators: tuple[Measured, ...]
-    warnings: tuple[str, ...]
-    options: str
 
     @property
     def lost(self) -> int:
@@ -158,6 +154,34 @@ class Diagnosis:
     def best(self) -> Measured:
         """The estimator of least error after a second of computing."""
         return self.estimators[0]
+
+    @property
+    def samples_needed(self) -> float:
+        """By the best, for a relative error of `ACCURATE`."""
+        return self.best.variance / (ACCURATE * self.norm) ** 2
+
+
+@dataclasses.dataclass(frozen=True)
+class Diagnosis(Measurement):
+    """Everything that was measured; `lines` is the page.
+
+    Attributes:
+        subject: as it was named.
+        task: what was studied.
+        contact: label of the contact model.
+        touches: contacts that begin without noise.
+        derivatives: the gradient check.
+        warnings: about the contact model.
+        options: contact options, as a command has them.
+    """
+
+    subject: str
+    task: Task
+    contact: str
+    touches: tuple[Touch, ...]
+    derivatives: GradcheckReport
+    warnings: tuple[str, ...]
+    options: str
 
     def as_json(self) -> dict[str, Any]:
         """As plain data."""
@@ -186,15 +210,11 @@ class Diagnosis:
             "estimators": shown,
             "best": self.best.estimator,
             "gradient_norm": _finite(self.norm),
-            "samples_needed": _finite(self._samples_needed),
+            "samples_needed": _finite(self.samples_needed),
             "warnings": [*self.warnings, *self._cautions()],
             "advice": [text for text, _ in self._advice()],
             "environment": environment(),
         }
-
-    @property
-    def _samples_needed(self) -> float:
-        return self.best.variance / (ACCURATE * self.norm) ** 2
 
     def lines(self) -> list[str]:
         """The page."""
@@ -269,6 +289,8 @@ class Diagnosis:
                 f"the gradient is too small to be told from 0 with {self.samples} samples: errors are relative to "
                 f"{self.norm:.2g}"
             )
+        if self.samples < FEW:
+            yield f"{self.samples} samples are few: --samples {SAMPLES} takes longer and says more"
         if undecided := [each.estimator for each in self.estimators if each.verdict == "undecided"]:
             yield f"the mean of {', '.join(undecided)} could not be judged with {self.samples} samples"
         if not self.derivatives.passed:
@@ -277,7 +299,7 @@ class Diagnosis:
     def _advice(self) -> Iterator[tuple[str, str]]:
         """What to do, each with options of `compare` that show it."""
         by_name, timestep = {each.estimator: each for each in self.estimators}, self.task.scene.timestep
-        needed = _round(self._samples_needed)
+        needed = _round(self.samples_needed)
         yield f"take {self.best.estimator}; a relative error of {ACCURATE:.0%} needs {needed} samples", ""
         if not self.onsets.get("onsets"):
             yield "no contact begins: longer rollouts, more noise or another start would say more", ""
@@ -319,7 +341,7 @@ def diagnose(
     stiffness: float | None = None,
     *,
     damping: float | None = None,
-    samples: int = 500,
+    samples: int | None = None,
     seed: int = 0,
     options: str = "",
     progress: Progress = lambda done, total, what: None,
@@ -332,7 +354,8 @@ def diagnose(
         family: contact family; None for the task's main one.
         stiffness: of the contact [N/m]; None for the task's middle one.
         damping: of the contact [N s/m]; None for the family's.
-        samples: of each batch, and at each node of the path along which means are checked.
+        samples: of each batch, and at each node of the path along which means are checked; None for `SAMPLES`, or as
+            many as `BUDGET` has room for.
         seed: of all randomness.
         options: contact options, as a command has them.
         progress: called before each part.
@@ -343,39 +366,66 @@ def diagnose(
     family, stiffness = family or task.defaults.main_family, stiffness or task.defaults.middle_stiffness
     (cell,), warnings = contact_grid(task, [family], [stiffness], damping)
     chosen = [make_estimator(name, gamma=task.defaults.gamma, sigma=task.sigma) for name in ESTIMATORS]
-    check_memory(task, chosen, samples)
+    check_memory(task, chosen, samples or SAMPLES)
     total = 4
     progress(0, total, "rollout without noise")
     touches = _touches(task, cell)
     progress(1, total, "derivatives of steps")
     derivatives = gradcheck(_plan(subject, task, family, stiffness, damping, seed))
-    progress(2, total, "batches")
-    simulator = Simulator(task, chunk_size=chunk_for(samples, jax.local_devices()))
-    objective = simulator.objective(cell.contact)
-    oracles = oracles_of(chosen, "evaluation")
-    for samples_drawn in (1, samples):  # the first compiles
-        drawn = draw_batches(objective, task.theta, cell_keys(seed, 1), oracles, samples_drawn, slice(1))
-    batches, seconds, residuals = drawn
-    batches = jax.tree.map(lambda leaf: leaf[0], batches)
-    progress(3, total, "means along a path")
-    found = _measure(chosen, objective, batches, seconds, samples, seed)
+    progress(2, total, "estimators")
+    found = measure(Simulator(task, chunk_size=_chunk(task, samples or SAMPLES)), cell.contact, samples, seed)
     progress(total, total, "done")
-    events = np.asarray(batches["corrected"].events).reshape(-1, len(ONSETS))
-    diagnosis = Diagnosis(
+    return Diagnosis(
+        **vars(found),
         subject=subject,
         task=task,
         contact=cell.label,
-        samples=samples,
         touches=tuple(touches),
-        onsets=dict(zip(ONSETS, onset_numbers(events).tolist(), strict=True)),
-        unconverged=max(unconverged(each, precision()) for each in residuals.values()),
         derivatives=derivatives,
-        estimators=tuple(found),
         warnings=tuple(warnings),
         options=options,
     )
-    order = sorted(found, key=lambda each: each.error(diagnosis.norm))
-    return dataclasses.replace(diagnosis, estimators=tuple(order))
+
+
+def _chunk(task: Task, samples: int) -> int:
+    """Samples in a call of a program: on a CPU fewer of larger models, so that the first call takes seconds."""
+    devices = jax.local_devices()
+    most = max(CHUNK, CHUNK * (CHUNK // task.scene.host.nv) ** 2) if devices[0].platform == "cpu" else samples + 1
+    return min(chunk_for(samples, devices), most)
+
+
+def measure(
+    simulator: Simulator, contact: ContactModel | None, samples: int | None = None, seed: int = 0
+) -> Measurement:
+    """The estimators at the task's theta, without the contacts and the derivatives of a step.
+
+    Args:
+        simulator: what it has compiled serves every contact model.
+        contact: the contact model; None for the MJCF's own.
+        samples: see `diagnose`.
+        seed: of all randomness.
+    """
+    task = simulator.task
+    chosen = [make_estimator(name, gamma=task.defaults.gamma, sigma=task.sigma) for name in ESTIMATORS]
+    oracles, objective, keys = oracles_of(chosen, "evaluation"), simulator.objective(contact), cell_keys(seed, 1)
+
+    def drawn(count: int):
+        return draw_batches(objective, task.theta, keys, oracles, count, slice(1))
+
+    full = simulator.chunk_size - 1  # and a baseline: one call of a program
+    drawn(1)  # compiles
+    if samples is None:
+        rate = sum(drawn(full)[1].values()) / full
+        samples = int(np.clip(BUDGET / rate / (NODES + 1), LEAST, SAMPLES))
+    batches, seconds, residuals = drawn(samples)
+    batches = jax.tree.map(lambda leaf: leaf[0], batches)
+    found = _measure(chosen, objective, batches, seconds, samples, seed)
+    events = np.asarray(batches["corrected"].events).reshape(-1, len(ONSETS))
+    onsets = dict(zip(ONSETS, onset_numbers(events).tolist(), strict=True))
+    unsolved = max(unconverged(each, precision()) for each in residuals.values())
+    unordered = Measurement(samples, onsets, unsolved, tuple(found))
+    order = sorted(found, key=lambda each: each.error(unordered.norm))
+    return dataclasses.replace(unordered, estimators=tuple(order))
 
 
 def _plan(subject: str, task: Task, family: str, stiffness: float, damping: float | None, seed: int) -> GradcheckPlan:
