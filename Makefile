@@ -21,13 +21,17 @@ help: ## List the targets
 demo: $(STAMP) ## Compare the gradient estimators on the pusher, into results/pusher
 	$(BIN)/mjx-study compare pusher --output results/pusher
 
-figures: $(STAMP) ## Make the figures of docs/ again
+figures: $(STAMP) ## Make the figures and films of docs/ again
 	$(BIN)/mjx-study compare pusher --output results/pusher && cp results/pusher/comparison.png docs/pusher.png
 	$(BIN)/mjx-study landscape momentum_transfer --contact penalty,mujoco_default,smooth_onset --output results/onset
 	cp results/onset/landscape.png docs/onset.png
 	$(BIN)/mjx-study optimise pusher --contact penalty --stiffness 1000 --output results/optimisation
 	cp results/optimisation/descent.png docs/optimisation.png
 	$(BIN)/python docs/make_figures.py
+	$(BIN)/mjx-study rollout ball_wall --theta 0.75 --stiffness 1e4 --slow 2
+	for task in momentum_transfer tennis double_pendulum; do $(BIN)/mjx-study rollout $$task || exit; done
+	for task in ball_wall momentum_transfer tennis double_pendulum; do \
+		cp results/$$task-rollout/rollout.gif docs/film_$$task.gif || exit; done
 
 study: $(STAMP) ## Sweep stiffness and draw the README's figures of it again (half an hour; resumable)
 	$(BIN)/python docs/make_study.py
@@ -72,6 +76,9 @@ dist: $(STAMP) ## Build sdist and wheel into dist, and check what is in them
 	$(BIN)/check-manifest --no-build-isolation
 	$(BIN)/python -m build --no-isolation
 	$(BIN)/twine check --strict dist/*
+	rm -rf build/wheel
+	$(BIN)/python -m pip install --quiet --no-deps --target build/wheel dist/*.whl
+	cd build/wheel && PYTHONPATH= $(CURDIR)/$(BIN)/python -m mjx_study tasks
 
 format: $(STAMP) ## Put imports and formatting right
 	$(BIN)/ruff check --fix-only .

@@ -28,7 +28,7 @@ from mjx_study import cli
 ROOT = Path(__file__).parents[1]
 PAGES = ROOT / "build" / "pages"
 PIPED: Final = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
-PACKAGES = ("mjx_study", "estimators")
+PACKAGES = ("mjx_study", "mjx_study.gradcheck", "estimators")
 OUTPUT = {"image/png": "png", "text/html": "html", "text/plain": "text"}
 """Kinds of output that notebooks have, the best first."""
 
@@ -104,7 +104,11 @@ def drawn(arrows: list[tuple[str, str]]) -> str:
 def parts_of_notebook(path: Path, own: dict[Path, Path]) -> Iterator[str]:
     """A notebook as Markdown; its pictures are left where its page goes."""
     folder, pictures = (PAGES / own[path]).parent, 0
-    for cell in nbformat.read(ROOT / path, as_version=4).cells:
+    title, *cells = nbformat.read(ROOT / path, as_version=4).cells
+    yield adapted(title.source, path, own) + f"\n\n[The notebook]({path.name}){{ .notebook download }}"
+    for cell in cells:
+        if "install" in cell.metadata.get("tags", ()):
+            continue
         yield adapted(cell.source, path, own) if cell.cell_type == "markdown" else f"```python\n{cell.source}\n```"
         for output in cell.get("outputs", ()):
             if output.output_type == "stream":
@@ -124,14 +128,13 @@ def parts_of_notebook(path: Path, own: dict[Path, Path]) -> Iterator[str]:
 
 
 def page_of_names(package: str) -> str:
-    """Every public name of a package by the module that it comes from, in the order of `_public`."""
-    source = ROOT / package / "_public.py"
-    public = set(import_module(package).__all__)
+    """Every public name of a package by the module that it comes from."""
+    folder = ROOT / package.replace(".", "/")
+    source = next(path for path in (folder / "_public.py", folder / "__init__.py") if path.is_file())
     lines = [f"# {package}", "", (import_module(package).__doc__ or "").strip(), ""]
     for node in ast.parse(source.read_text()).body:
         if isinstance(node, ast.ImportFrom) and node.module:
             names = [alias.asname or alias.name for alias in node.names]
-            assert public.issuperset(names), names
             about = (import_module(node.module).__doc__ or "").strip().partition("\n")[0]
             lines += [f"## {node.module.partition('.')[2]}", "", about, ""]
             lines += [f"::: {package}.{name}\n" for name in names]
@@ -161,6 +164,7 @@ def main() -> None:
         target.parent.mkdir(parents=True, exist_ok=True)
         if source.suffix == ".ipynb":
             target.write_text("\n\n".join(parts_of_notebook(source, own)))
+            shutil.copy(ROOT / source, target.parent)
         elif source.suffix == ".md":
             target.write_text(adapted((ROOT / source).read_text(), source, own))
         else:

@@ -130,7 +130,24 @@ def test_the_title_asks_and_the_text_answers(path: Path) -> None:
     known += [cell.source for cell in code_cells(notebook)]
     for number in re.findall(r"\d+(?:\.\d+)?", answer):
         assert any(number in text for text in known), f"{number} is nowhere in the code or its outputs"
-    assert "mjx_study.configure()" in next(cell for cell in rest if cell.cell_type == "code").source
+    install, setup, *_ = [cell for cell in rest if cell.cell_type == "code"]
+    assert install.metadata.tags == ["install"] and "mjx_study.configure()" in setup.source
+
+
+def test_the_same_cell_installs_where_there_is_no_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """From the wheel beside the notebook, and for the GPU if there is one. Where there is the package, nothing runs."""
+    (source,) = {code_cells(read(path))[0].source for path in NOTEBOOKS}
+    commands: list[list[str]] = []
+    monkeypatch.setattr("subprocess.run", lambda command, check: commands.append(command))
+    monkeypatch.setattr("shutil.which", lambda _: "/somewhere/nvidia-smi")
+    monkeypatch.chdir(tmp_path)
+    exec(source, {})
+    assert commands == []
+    (tmp_path / "mjx_study-0.1.0-py3-none-any.whl").touch()
+    monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
+    exec(source, {})
+    ((*_, what),) = commands
+    assert what == "mjx_study-0.1.0-py3-none-any.whl[cuda]"
 
 
 @each

@@ -3,9 +3,11 @@
 import re
 import subprocess
 import sys
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
+import yaml
 
 from mjx_study.simulation.contact import FAMILIES
 from mjx_study.tasks import TASKS
@@ -34,6 +36,13 @@ def test_the_python_example_runs(tmp_path: Path) -> None:
 def test_every_link_within_the_project_leads_somewhere(page: Path) -> None:
     for target in re.findall(r"\]\(([^)#]+)\)", page.read_text()):
         assert target.startswith("https://") or (page.parent / target).is_file(), target
+
+
+def test_the_citation_is_of_this_version() -> None:
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    assert citation["version"] == version("mjx-study") and f"version = {{{version('mjx-study')}}}" in README
+    assert {"cff-version", "message", "title", "authors"} <= set(citation)  # what the schema requires
+    assert citation["title"] in README and citation["references"][0]["title"] in README
 
 
 def test_every_task_is_explained() -> None:

@@ -45,6 +45,7 @@ def test_shipped_models_load_by_name() -> None:
 
 
 def test_a_name_needs_no_particular_working_directory(tmp_path: Path) -> None:
+    (tmp_path / "pusher").mkdir()  # such as the folder of its study
     code = "from mjx_study.simulation.scene import load_scene; print(load_scene('pusher').host.nq)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path)
     assert (done.returncode, done.stdout) == (0, "2\n"), done.stderr

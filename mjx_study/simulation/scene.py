@@ -191,17 +191,16 @@ def put_scene(host: mujoco.MjModel, name: str, *, adjoint: SceneOption = "auto",
 
 
 def _find(source: str | Path) -> Path:
-    path = Path(source)
+    path, shipped = Path(source), models_folder() / f"{source}.xml"
+    if shipped.is_file():
+        return shipped
     if path.is_dir():
         raise SceneError(f"{path} is a folder, not an MJCF file")
     if path.suffix.lower() == ".xml":
         if not path.is_file():
             raise SceneError(f"no MJCF file at {path}")
         return path
-    shipped = models_folder() / f"{source}.xml"
-    if not shipped.is_file():
-        raise SceneError(f"no model named {source!r}; there are {', '.join(model_names())}, or give a path to an .xml")
-    return shipped
+    raise SceneError(f"no model named {source!r}; there are {', '.join(model_names())}, or give a path to an .xml")
 
 
 def require(scene: Scene, *, joints: tuple[str, ...], geoms: tuple[str, ...], driven: tuple[str, ...] = ()) -> None:
