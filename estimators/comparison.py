@@ -65,7 +65,6 @@ def compare(estimate: GradientEstimate, reference: GradientEstimate) -> Comparis
     An interpolated estimate enters with its weight taken as given.
 
     Args:
-        estimate: The estimate to judge.
         reference: An estimate from other samples.
 
     Returns:

@@ -17,10 +17,8 @@ class Oracle:
     """A kind of batch.
 
     Attributes:
-        name: As estimators ask for it.
         order: 0 if only values are needed, 1 if derivatives; batches of one order share their samples.
         method: Of the objective, called with theta and keys.
-        phrase: For a message.
     """
 
     name: str
@@ -55,7 +53,6 @@ class Estimator(ABC):
     can be static under `jit`.
 
     Attributes:
-        name: In messages, and in `ESTIMATORS`.
         label: For a legend, where that is not the name.
         description: One line; the first of the docstring, unless the catalogue has it.
         needs: Oracles in `ORACLES`, in the order in which `combine` takes their batches.

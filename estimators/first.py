@@ -17,12 +17,6 @@ def first_order(differentiation: Differentiation) -> GradientEstimate:
     whose value is not finite counts as not finite even where its gradient is: both orders then leave out the
     same rollouts.
 
-    Args:
-        differentiation: The batch.
-
-    Returns:
-        The estimate, one row per sample.
-
     Reference: Suh et al. 2022, def. of the FoBG. Its unbiasedness (lemma in the main text) needs the
     polynomially Lipschitz condition of the appendix, ||f(z) - f(z')|| <= a (1 + ||z||^b + ||z'||^b) ||z -
     z'||, printed there without the last factor.
@@ -40,11 +34,7 @@ def clipped_first_order(differentiation: Differentiation, max_norm: float | Floa
     first-order mean.
 
     Args:
-        differentiation: The batch.
         max_norm: c > 0, [cost/param].
-
-    Returns:
-        The estimate, one row per sample.
 
     Reference: Pascanu, Mikolov, Bengio, "On the difficulty of training recurrent neural networks", ICML 2013, there
     for the mean.

@@ -91,8 +91,6 @@ def circulations(
     one node this is a central difference of the mean cost against the estimator's mean in the middle.
 
     Args:
-        estimators: With their options.
-        objective: What to differentiate.
         start, end: Of the path, [param]; a few standard deviations of the noise apart, or less.
         key: Source of all randomness; used up.
         num_samples: At every node, >= 2.

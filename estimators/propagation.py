@@ -30,11 +30,7 @@ def truncated_first_order(linearisation: Linearisation, window: int) -> Gradient
     the horizon is the first-order batched gradient.
 
     Args:
-        linearisation: The batch.
         window: Steps between cuts, >= 1.
-
-    Returns:
-        The estimate, one row per sample.
 
     Raises:
         ValueError: The window is below 1.
@@ -62,9 +58,7 @@ def total_propagation(linearisation: Linearisation, baseline: str, weights: str 
     the same rollouts, as published, so that they are not independent.
 
     Args:
-        linearisation: The batch.
         baseline: A name in `BASELINES`, applied step by step.
-        weights: A name in `WEIGHTS`.
 
     Returns:
         The estimate; its `alpha` holds the mean weight.

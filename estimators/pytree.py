@@ -17,12 +17,6 @@ def register_pytree(dataclass_type: type[DataclassT]) -> type[DataclassT]:
     around arrays with a batch axis in front (`vmap`, `eval_shape`), and with shape annotations checked at run
     time that `__init__` would refuse them. Here rebuilding sets the fields and nothing else, so that a
     constructor in somebody's code is checked and a transformation is not.
-
-    Args:
-        dataclass_type: A dataclass, frozen or not. All its fields become leaves or subtrees.
-
-    Returns:
-        The same class.
     """
     names = tuple(field.name for field in fields(dataclass_type))  # pyright: ignore[reportArgumentType]
 

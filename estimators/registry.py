@@ -124,13 +124,9 @@ def estimate(
 
     Args:
         estimator: One with its options, or a name for one with all of them at their defaults.
-        objective: What to differentiate.
         theta: Where, [param].
         key: Source of all randomness; used up.
         num_samples: Samples in each batch, >= 1.
-
-    Returns:
-        The estimate.
 
     Raises:
         ValueError: The name is unknown, an option or a method of the objective is missing, there is no sample to draw,

@@ -9,7 +9,6 @@ from estimators.types import GradientEstimate
 
 
 def finite_rows(per_sample: Float[Array, "samples params"]) -> Bool[Array, " samples"]:
-    """Whether every entry of a row is finite."""
     return jnp.all(jnp.isfinite(per_sample), axis=1)
 
 

@@ -32,11 +32,7 @@ def cost_to_go(steps: StepEvaluation, baseline: str) -> GradientEstimate:
     variance.
 
     Args:
-        steps: The batch.
         baseline: A name in `BASELINES`, applied step by step.
-
-    Returns:
-        The estimate, one row per sample.
 
     Raises:
         ValueError: No baseline has that name.
@@ -47,16 +43,7 @@ def cost_to_go(steps: StepEvaluation, baseline: str) -> GradientEstimate:
 
 
 def antithetic_cost_to_go(plus: StepEvaluation, minus: StepEvaluation, baseline: str) -> GradientEstimate:
-    """`cost_to_go` over pairs of opposite noise; a pair is one sample.
-
-    Args:
-        plus: The batch.
-        minus: The batch of the same starts and the opposite noise.
-        baseline: A name in `BASELINES`, applied within each half.
-
-    Returns:
-        The estimate, one row per pair.
-    """
+    """`cost_to_go` over pairs of opposite noise; a pair is one sample."""
     above, below = (cost_to_go(steps, baseline).per_sample for steps in (plus, minus))
     return summarise((above + below) / 2.0)
 
@@ -89,10 +76,8 @@ def stepwise_inverse_variance(
     the weights as given.
 
     Args:
-        zeroth: Batch of evaluations.
         first: Batch of differentiations from the same number of independent samples.
         baseline: A name in `BASELINES`, applied step by step.
-        weights: A name in `WEIGHTS`.
 
     Returns:
         The estimate; its `alpha` holds the mean weight.

@@ -17,11 +17,7 @@ def zeroth_order(evaluation: Evaluation, baseline: str) -> GradientEstimate:
     (N sigma^2) for |f - b| <= B_V, ||D pi|| <= B_pi and m noise dimensions at each of H steps.
 
     Args:
-        evaluation: The batch.
         baseline: A name in `BASELINES`.
-
-    Returns:
-        The estimate, one row per sample.
 
     Raises:
         ValueError: No baseline has that name.
@@ -43,12 +39,8 @@ def antithetic(plus: Evaluation, minus: Evaluation, baseline: str) -> GradientEs
     noise, ((f^+ - f^-) / 2) s^+, all of the signal without the even part's variance.
 
     Args:
-        plus: The batch.
         minus: The batch of the same starts and the opposite noise.
         baseline: A name in `BASELINES`, applied within each half.
-
-    Returns:
-        The estimate, one row per pair.
 
     Raises:
         ValueError: No baseline has that name.
@@ -76,9 +68,6 @@ def delta_control_variate(
         evaluation: The batch, open loop.
         gradient: g, such as a first-order mean from other samples, [cost/param].
         sigma: Standard deviation of the noise, [param].
-
-    Returns:
-        The estimate, one row per sample.
     """
     scale = jnp.asarray(sigma, evaluation.score.dtype)
     # A sum, since a matrix product of float32 may be rounded to fewer digits on an accelerator.

@@ -12,8 +12,6 @@ from mjx_study.study.run import warnings_of
 
 @xr.register_dataset_accessor("mjx_study")
 class StudyAccessor:
-    """Tables, findings, figures and reports of a study's Dataset."""
-
     def __init__(self, dataset: xr.Dataset):
         self._dataset = dataset
 
@@ -26,17 +24,13 @@ class StudyAccessor:
         return self._dataset[short].to_dataframe().reset_index()
 
     def findings(self) -> list[str]:
-        """Findings backed by the intervals, as sentences."""
         return findings(self._dataset)
 
     def warnings(self) -> tuple[str, ...]:
-        """Warnings that belong with any use of the numbers."""
         return warnings_of(self._dataset)
 
     def plot(self) -> dict[str, Figure]:
-        """All figures that the study has data for, by name."""
         return plot_study(self._dataset)
 
     def report(self) -> str:
-        """The study as one HTML page."""
         return report(self._dataset)

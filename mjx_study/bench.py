@@ -44,7 +44,6 @@ class BenchReport:
 
     Attributes:
         task, samples, horizon: name of the task, number of samples, number of steps.
-        contact: family and stiffness of the contact.
         value_seconds: time of a zeroth-order sample, one rollout and its share of the baselines [s].
         gradient_seconds: time of a first-order sample, one rollout and its gradient [s].
         rollout_seconds: time of one rollout [s].
@@ -53,7 +52,6 @@ class BenchReport:
         engine_gradient_seconds: time of a gradient by the C engine's differences on as many threads [s]; None if it has
             none.
         gradient_memory: temporary memory of all samples' gradients at once [MiB].
-        environment: versions and machine.
     """
 
     task: str
@@ -82,11 +80,9 @@ class BenchReport:
         return ratios
 
     def as_json(self) -> dict[str, Any]:
-        """The report as plain data."""
         return dataclasses.asdict(self) | {"ratios": self.ratios}
 
     def lines(self) -> list[str]:
-        """The report as text."""
         ratios, devices = self.ratios, self.environment["devices"]
 
         def rate(label: str, seconds: float | None) -> list[str]:
@@ -116,8 +112,6 @@ class BenchReport:
 
 @dataclasses.dataclass(frozen=True)
 class BenchPlan:
-    """A validated benchmark configuration."""
-
     task: Task
     samples: int
     cell: ContactPoint

@@ -26,6 +26,7 @@ from mjx_study.runtime import environment, precision
 from mjx_study.simulation.contact import ContactModel, stable, stiffness_from_solref
 from mjx_study.simulation.engine import engine_model
 from mjx_study.study.configuration import Progress
+from mjx_study.study.dataset import as_plain
 from mjx_study.study.findings import NARROW, NOTABLE, SHARE_OFF
 from mjx_study.study.gradients import onset_numbers
 from mjx_study.study.memory import check_memory
@@ -63,8 +64,6 @@ class Touch:
     """A contact that begins in the rollout without noise, and how its step resolves it.
 
     Attributes:
-        pair: the geoms.
-        time: when [s].
         speed: of approach [m/s]; not positive for one that begins without.
         damping: h b, at full impedance.
         stiffness: h^2 k, at full impedance.
@@ -88,7 +87,6 @@ class Measured:
     """An estimator on one batch.
 
     Attributes:
-        estimator: its name.
         variance, lower, upper: of one sample, with its 95 % interval [gradient^2].
         seconds: computing time of a sample [s].
         check: of its mean, along a path; None of zeroth order, which has no bias.
@@ -120,7 +118,6 @@ class Measurement:
     """The estimators under one contact model.
 
     Attributes:
-        samples: of each batch.
         onsets: `mjx_study.study.variables.ONSETS` of the first-order batch.
         unconverged: rollouts in which the solver did not converge.
         estimators: best first.
@@ -184,7 +181,6 @@ class Diagnosis(Measurement):
     options: str
 
     def as_json(self) -> dict[str, Any]:
-        """As plain data."""
         shown = [
             {
                 "estimator": each.estimator,
@@ -192,32 +188,32 @@ class Diagnosis(Measurement):
                 "seconds_per_sample": each.seconds,
                 "mean": each.verdict,
                 "bias": each.bias / self.norm,
-                "error_after_a_second": _finite(each.error(self.norm)),
+                "error_after_a_second": each.error(self.norm),
             }
             for each in self.estimators
         ]
-        return {
+        document = {
             "subject": self.subject,
             "cost": self.task.description,
             "contact": self.contact,
             "samples": self.samples,
             "touches": [dataclasses.asdict(each) for each in self.touches],
-            **{name: _finite(value) for name, value in self.onsets.items()},
+            **self.onsets,
             "nonfinite": self.lost,
             "unconverged": self.unconverged,
             "derivatives": "right" if self.derivatives.passed else "wrong",
             "unexercised": self.derivatives.unexercised,
             "estimators": shown,
             "best": self.best.estimator,
-            "gradient_norm": _finite(self.norm),
-            "samples_needed": _finite(self.samples_needed),
+            "gradient_norm": self.norm,
+            "samples_needed": self.samples_needed,
             "warnings": [*self.warnings, *self._cautions()],
             "advice": [text for text, _ in self._advice()],
             "environment": environment(),
         }
+        return as_plain(document)
 
     def lines(self) -> list[str]:
-        """The page."""
         task, command = self.task, f"mjx-study {{}} {self.subject}{self.options}"
         lines = [f"{self.subject}: {task.description or task.name}", f"contact {self.contact}, {self.samples} samples"]
         lines += [f"warning: {text}" for text in (*self.warnings, *self._cautions())]
@@ -350,13 +346,11 @@ def diagnose(
 
     Args:
         subject: as the user named it; of a file the gradient check takes single steps alone.
-        task: what to study.
         family: contact family; None for the task's main one.
         stiffness: of the contact [N/m]; None for the task's middle one.
         damping: of the contact [N s/m]; None for the family's.
         samples: of each batch, and at each node of the path along which means are checked; None for `SAMPLES`, or as
             many as `BUDGET` has room for.
-        seed: of all randomness.
         options: contact options, as a command has them.
         progress: called before each part.
 
@@ -514,10 +508,6 @@ def _touch(host: mujoco.MjModel, data: mujoco.MjData, contact: Any, time: float,
         impedance=float(contact.solimp[0]),
         stable=stable(solref.tolist(), timestep),
     )
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
 
 
 def _round(number: float) -> str:

@@ -43,7 +43,6 @@ def spread(
 
     Args:
         program: what `jax.jit` returned, of the shared arguments and one chunk of each array of rows.
-        shared: arguments that are the same for every row.
         rows: arrays of one length.
         chunk: rows in a call; the last chunk is padded by repeating the last row.
         devices: of this process.
@@ -88,8 +87,6 @@ def rollout_cost(
     """Total cost V_1 of one rollout, a pure function of everything that may be traced or differentiated.
 
     Args:
-        task: the task to simulate.
-        theta: parameters of its policy.
         contact: the contact model; None for the MJCF's own.
         start: the initial state, before the policy acts on it.
         noise: noise of the policy's `noise_shape`.
@@ -132,8 +129,6 @@ def simulate(
     """One sample's rollout: states including the initial one, controls, cost and largest solver residual.
 
     Args:
-        task: the task to simulate.
-        theta: parameters of its policy.
         contact: the contact model; None for the MJCF's own.
         key: key of the sample; draws initial state and noise as in a batch.
         noise_scale: factor on the noise; 0 for a zero-noise rollout.
@@ -211,7 +206,6 @@ class Simulator:
         return plan.temp_size_in_bytes * samples // self.chunk_size
 
     def _draw(self, sigma, key_data, noise_scale) -> tuple[State, Float[Array, "steps dimensions"]]:
-        """Initial state and noise of a sample."""
         task = self.task
         start_key, noise_key = split_sample_key(jax.random.wrap_key_data(key_data))
         dtype = task.scene.template.qpos.dtype
@@ -291,10 +285,7 @@ class Simulator:
         """Run one of `sample_programs`, see `spread`.
 
         Args:
-            name: name of the program.
             theta: parameters, (params,).
-            contact: the contact model; None for the MJCF's own.
-            sigma: standard deviation of the noise.
             keys: data of each sample's key.
             noise_scale: factor on each sample's noise.
 
@@ -329,7 +320,6 @@ class MjxObjective:
 
     @property
     def num_params(self) -> int:
-        """Length of theta."""
         return self.simulator.task.policy.num_params
 
     def evaluate(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> Evaluation:
@@ -383,14 +373,12 @@ class MjxObjective:
         return Differentiation(*jax.tree.map(jnp.asarray, self._run("gradient", theta, keys)))
 
     def evaluate_steps(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> StepEvaluation:
-        """The rollouts of `evaluate`, step by step."""
         (steps,) = self._evaluate_steps(theta, keys, (1.0,))
         return steps
 
     def evaluate_step_pair(
         self, theta: Float[Array, " params"], keys: Key[Array, " samples"]
     ) -> tuple[StepEvaluation, StepEvaluation]:
-        """The rollouts of `evaluate_pair`, step by step."""
         plus, minus = self._evaluate_steps(theta, keys, (1.0, -1.0))
         return plus, minus
 

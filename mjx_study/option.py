@@ -26,12 +26,10 @@ class Interval:
 
     @property
     def low(self) -> float:
-        """The lower end."""
         return float(self.text[1:-1].split(",")[0])
 
     @property
     def high(self) -> float:
-        """The upper end."""
         return float(self.text[1:-1].split(",")[1])
 
     def __contains__(self, value: Any) -> bool:
@@ -58,7 +56,6 @@ class Option:
         name: name of the configuration's field.
         kind: int, float, str or bool; bool is a flag on the command line.
         metavar: placeholder for a value in the help.
-        line: one line of help.
         interval: range of its numbers.
         unit: unit of its numbers.
         choices: accepted names; beside numbers if it has an interval as well.
@@ -311,7 +308,6 @@ class Checked:
 
     @classmethod
     def default(cls, name: str) -> Any:
-        """The configuration's default for an option."""
         return next(field.default for field in dataclasses.fields(cls) if field.name == name)  # type: ignore[arg-type]
 
     def __post_init__(self) -> None:

@@ -63,7 +63,6 @@ COLUMNS: Final = {
 
 
 def report(dataset: xr.Dataset) -> str:
-    """The page."""
     config = json.loads(dataset.attrs["config"])
     tasks = ", ".join(config["tasks"])
     kind = KINDS[config["kind"]]

@@ -68,7 +68,6 @@ def _processor() -> str:
 
 
 def processor_name() -> str:
-    """The processor's name as the operating system gives it."""
     names = [line.split(":", 1)[1].strip() for line in _processor().splitlines() if line.startswith("model name")]
     return names[0] if names else platform.machine()
 

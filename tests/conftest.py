@@ -53,12 +53,12 @@ def shared_programs(programs: tuple[dict[Any, Any], dict[Any, Any]]) -> Iterator
     build, make = plan._build, sampling.Simulator
     tasks, simulators = programs
 
-    def built(config: Any, which: Any, timestep: float | None, cone: str | None) -> Any:
+    def built(config: Any, which: Any, timestep: float | None, cone: str | None, given: Any) -> Any:
         if not isinstance(which, str) or which not in TASKS:
-            return build(config, which, timestep, cone)
+            return build(config, which, timestep, cone, given)
         key = (which, timestep, cone, config.horizon, config.model, config.onset, config.noise, precision())
         if key not in tasks:
-            tasks[key] = build(config, which, timestep, cone)
+            tasks[key] = build(config, which, timestep, cone, given)
         return tasks[key]
 
     def made(task: Any, *, chunk_size: int) -> Any:

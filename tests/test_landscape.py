@@ -2,7 +2,6 @@
 
 import contextlib
 import dataclasses
-import importlib
 import io
 import json
 from functools import partial
@@ -19,11 +18,13 @@ from scipy.integrate import quad
 
 from estimators import NOISES, Differentiation, Evaluation
 from mjx_study import cli
-from mjx_study.cli import options
-from mjx_study.cli.landscape import as_document
+from mjx_study.cli import options, studies
+from mjx_study.cli.landscape import curves
+from mjx_study.cli.studies import as_document
 from mjx_study.reference import BallWall, FunctionObjective, Heaviside, Quadratic, smoothed
 from mjx_study.simulation.dynamics import State
 from mjx_study.study import landscapes, sampling
+from mjx_study.study import plan as plan_module
 from mjx_study.study.configuration import StudyConfig
 from mjx_study.study.findings import curves_of, findings
 from mjx_study.study.landscapes import closed_form, compute_landscapes
@@ -207,7 +208,7 @@ def test_curves_agree_with_quadrature_and_with_each_other(flown: xr.Dataset) -> 
 def test_a_reference_that_jumps_is_found_out(flown: xr.Dataset) -> None:
     assert curves_of(flown)[0][0] == "reference 10000"
     assert "E[FoBG] differs from the mean cost's slope" in findings(flown)[0]
-    document = json.loads(json.dumps(as_document(flown), allow_nan=False))
+    document = json.loads(json.dumps(as_document(flown, curves), allow_nan=False))
     assert len(document["curves"][0]["exact_slope"]) == 5
 
 
@@ -323,7 +324,9 @@ def test_a_family_without_stiffness_is_taken_as_it_is(command: str, monkeypatch:
         assert [cell.model.family for cell in plan.cells][-1] == "mujoco_default"
         raise Planned
 
-    monkeypatch.setattr(importlib.import_module(f"mjx_study.cli.{command}"), "compute", compute)
+    monkeypatch.setattr(studies, "_compute", compute)
+    if command != "compare":
+        monkeypatch.setattr(plan_module, "make_task", None)  # the task is built once, by the command
     with pytest.raises(Planned):
         cli.main([command, "momentum_transfer", "--contact", "mujoco_default", "--horizon", "4"])
 

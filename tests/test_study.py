@@ -12,6 +12,7 @@ import xarray as xr
 from estimators import AlphaOrder, InverseVariance
 from mjx_study import disk
 from mjx_study.cli import console
+from mjx_study.cli.studies import as_document
 from mjx_study.objective import MjxObjective, Simulator
 from mjx_study.plots.study import plot_study
 from mjx_study.plots.style import save_figure
@@ -299,25 +300,30 @@ def test_nothing_is_called_biased_on_too_few_effective_samples() -> None:
     unsure = row("fobg", 10, 1, **loud, reference_effective_samples=2.0)
     for doubtful in (few, equal, unsure):
         assert one(doubtful).bias_verdict == "too few effective samples"
-        assert console.gradients_as_json(result(doubtful))["rows"][0]["bias_verdict"] == "too few effective samples"
+        assert as_json(result(doubtful))["rows"][0]["bias_verdict"] == "too few effective samples"
     agrees = row("fobg", 10, 1, debiased_error=0.01, debiased_error_se=0.01, effective_samples=0.0)
     assert findings(result(agrees)) == []
     assert one(row("fobg", 10, 1)).bias_verdict == "none seen"
 
 
+def as_json(dataset: xr.Dataset) -> dict[str, Any]:
+    return as_document(dataset, console.rows_as_json)
+
+
+def table(dataset: xr.Dataset) -> list[str]:
+    return console.gradient_lines(dataset, as_json(dataset))
+
+
 def test_doubtful_numbers_are_marked_in_the_table(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "200")
-    lines: list[str] = []
     sure = row("zobg", 10, 1, relative_error=0.325, debiased_error=0.298, debiased_error_se=0.0098)
-    console.print_gradients(result(sure, row("fobg", 20, 1, effective_samples=1.2, top_share=0.9)), lines.append)
+    lines = table(result(sure, row("fobg", 20, 1, effective_samples=1.2, top_share=0.9)))
     (above,) = [line for line in lines if "0.325 -> 0.298 ± 0.010" in line]
     assert "30 (10%)" in above and "?" not in above
     (below,) = [line for line in lines if "1.2 (90%)" in line]
     assert "(0.5 to 2)?" in below
     assert any(line.startswith("?: fewer than 3 effective samples") for line in lines)
-    lines.clear()
-    console.print_gradients(result(sure), lines.append)
-    assert not any("?" in line for line in lines)
+    assert not any("?" in line for line in table(result(sure)))
 
 
 def test_warnings_name_what_must_not_be_overlooked() -> None:
@@ -334,15 +340,17 @@ def test_an_unconverged_solve_is_counted(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 def test_numbers_that_are_not_finite_become_null_in_json() -> None:
-    document = console.gradients_as_json(result(row("fobg", 10, math.inf, cosine=math.nan)))
+    document = as_json(result(row("fobg", 10, math.inf, cosine=math.nan)))
     assert document["rows"][0]["variance"] is None and document["rows"][0]["cosine"] is None
 
 
 def test_figures_survive_what_cannot_be_drawn(tmp_path) -> None:
     made_up = result(row("zobg", 10, math.nan), row("fobg", 10, 0.0), row("zobg", 20, 1.0), row("fobg", 20, math.inf))
-    (figure,) = plot_study(made_up).values()
-    for path in save_figure(figure, tmp_path, "figure"):
-        assert path.stat().st_size > 1000
+    nothing = result(row("zobg", 10, 0.0, relative_error=math.nan), row("zobg", 20, 0.0, relative_error=math.nan))
+    for study in (made_up, nothing):
+        (figure,) = plot_study(study).values()
+        for path in save_figure(figure, tmp_path, "figure"):
+            assert path.stat().st_size > 1000
 
 
 def test_a_file_is_whole_or_absent(tmp_path) -> None:
@@ -379,12 +387,10 @@ def test_numbers_are_short(value: float | None, digits: int, shown: str) -> None
 @pytest.mark.parametrize(("columns", "tables"), [(200, 1), (80, 3)])
 def test_the_table_fits_the_terminal(monkeypatch: pytest.MonkeyPatch, columns: int, tables: int) -> None:
     monkeypatch.setenv("COLUMNS", str(columns))
-    lines: list[str] = []
     full = row("aobg", 1000, 6.4e20, alpha=0.5, epsilon=641.0, discrepancy=1.2e11, relative_error=4.1e9)
-    console.print_gradients(result(full), lines.append)
-    table = [line for line in lines if "K [N/m]" in line or "AoBG" in line]
-    assert sum("K [N/m]" in line for line in table) == tables
-    assert max(map(len, table)) <= columns
+    shown = [line for line in table(result(full)) if "K [N/m]" in line or "AoBG" in line]
+    assert sum("K [N/m]" in line for line in shown) == tables
+    assert max(map(len, shown)) <= columns
 
 
 def built(**changes: Any) -> Task:

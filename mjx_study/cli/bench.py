@@ -8,7 +8,6 @@ from mjx_study.cli.parameters import task_of
 
 
 def run(options: argparse.Namespace) -> int:
-    """Measure and print."""
     with usage_errors():
         configure_process(options)
         plan = benchmark.plan_bench(task_of(options), options.samples)

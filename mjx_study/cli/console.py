@@ -1,6 +1,6 @@
 """Printed tables, and numbers with their intervals."""
 
-import json
+import itertools
 import math
 import shutil
 from collections.abc import Callable, Sequence
@@ -11,9 +11,7 @@ import xarray as xr
 from estimators import ENOUGH_EFFECTIVE
 from mjx_study.choices import FAMILIES
 from mjx_study.plots.style import style_of
-from mjx_study.study.dataset import as_plain
 from mjx_study.study.findings import Row, findings, rows_of
-from mjx_study.study.run import warnings_of
 from mjx_study.table import format_table
 
 Column = tuple[str, Callable[[Row], str]]
@@ -105,50 +103,41 @@ def _blocks(rows: Sequence[Row], confidence: float, width: int) -> list[list[str
     return [_table(rows, identity + block) for block in blocks]
 
 
-def print_gradients(dataset: xr.Dataset, print_line: Callable[[str], None] = print) -> None:
-    """A study of gradients as text: configuration, a table for each contact family, findings, warnings."""
-    config, rows = json.loads(dataset.attrs["config"]), rows_of(dataset)
-    for resolved, task in zip(json.loads(dataset.attrs["resolved"]), dataset["task"].values.tolist(), strict=True):
-        print_line(
+def gradient_lines(dataset: xr.Dataset, document: dict[str, Any]) -> list[str]:
+    """A study of gradients as text: configuration, a table for each contact family, findings."""
+    config, rows, lines = document["config"], rows_of(dataset), []
+    for resolved, task in zip(document["resolved"], dataset["task"].values.tolist(), strict=True):
+        lines.append(
             f"{task}: {', '.join(map(str, config['samples']))} samples in each batch, "
             f"sigma {', '.join(f'{sigma:g}' for sigma in dataset['sigma'].values)}, "
             f"{', '.join(map(str, resolved['horizon']))} steps, {', '.join(dataset['cone'].values)} cone, "
-            f"seed {config['seed']}, {json.loads(dataset.attrs['environment'])['precision']}"
+            f"seed {config['seed']}, {document['environment']['precision']}"
         )
     width = shutil.get_terminal_size((140, 24)).columns
     for family in dict.fromkeys(row.contact for row in rows):
-        print_line("")
-        print_line(f"{family}: {FAMILIES[family].description}" if family in FAMILIES else family)
-        for block in _blocks([row for row in rows if row.contact == family], config["confidence"], width):
-            for line in block:
-                print_line(line)
-    print_line("")
+        lines += ["", f"{family}: {FAMILIES[family].description}" if family in FAMILIES else family]
+        lines += itertools.chain(*_blocks([row for row in rows if row.contact == family], config["confidence"], width))
+    lines.append("")
     uncertainty = [row.reference_uncertainty for row in rows if math.isfinite(row.reference_uncertainty)]
     if uncertainty:
         low, high = number(min(uncertainty), 2), number(max(uncertainty), 2)
-        spread = low if low == high else f"{low} to {high}"
-        print_line(
+        lines += [
             f"Errors and cosines are against an unbiased zeroth-order reference, {config['reference_samples']} pairs "
-            f"of rollouts with a control variate;\nits own relative uncertainty is {spread}, and smaller errors "
-            "cannot be told from zero."
-        )
+            "of rollouts with a control variate;",
+            f"its own relative uncertainty is {low if low == high else f'{low} to {high}'}, and smaller errors cannot "
+            "be told from zero.",
+        ]
     if not all(row.believable for row in rows):
-        print_line(
+        lines.append(
             f"?: fewer than {ENOUGH_EFFECTIVE:g} effective samples carry the batch's variance; believe neither the "
             "number nor its error."
         )
-    for sentence in findings(dataset):
-        print_line(sentence + ".")
-    for warning in warnings_of(dataset):
-        print_line(f"warning: {warning}")
+    return lines + [f"{sentence}." for sentence in document["findings"]]
 
 
-def gradients_as_json(dataset: xr.Dataset) -> dict[str, Any]:
-    """A study of gradients as plain data: a row for each estimate."""
-    rows = [row.as_dict() for row in rows_of(dataset)]
-    names = ("config", "resolved", "environment")
-    document = {name: json.loads(dataset.attrs[name]) for name in names}
-    return as_plain(document | {"findings": findings(dataset), "warnings": list(warnings_of(dataset)), "rows": rows})
+def rows_as_json(dataset: xr.Dataset) -> dict[str, Any]:
+    """Findings, and a row for each estimate."""
+    return {"findings": findings(dataset), "rows": [row.as_dict() for row in rows_of(dataset)]}
 
 
 def _table(rows: Sequence[Row], table: Sequence[Column]) -> list[str]:

@@ -18,7 +18,6 @@ WORDS = {
 
 
 def run(options: argparse.Namespace) -> int:
-    """List what there is."""
     entries = [
         {
             "name": item.name,

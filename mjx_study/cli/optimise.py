@@ -10,18 +10,16 @@ import numpy as np
 import xarray as xr
 
 from mjx_study.cli.console import number
-from mjx_study.cli.options import attempt, configure_process, finish, print_report, usage_errors
-from mjx_study.cli.parameters import task_of, theta_of
-from mjx_study.cli.studies import announce, compute, draw, study_fields
+from mjx_study.cli.options import scene_options
+from mjx_study.cli.studies import run_one, study_fields
 from mjx_study.disk import write_whole
 from mjx_study.plots.style import style_of
 from mjx_study.study.configuration import StudyConfig, takes_stiffness
-from mjx_study.study.dataset import as_plain
 from mjx_study.study.iteration import REASONS
-from mjx_study.study.plan import plan_study
-from mjx_study.study.run import warnings_of
+from mjx_study.study.plan import StudyPlan, plan_study
 from mjx_study.study.variables import HISTORY, METRIC, START
 from mjx_study.table import format_table
+from mjx_study.tasks import make_task
 from mjx_study.tasks.contact_grid import REFERENCE
 
 WRAPPED = ("contact", "stiffness", "sigma", "cone", "samples")
@@ -29,62 +27,39 @@ WRAPPED = ("contact", "stiffness", "sigma", "cone", "samples")
 
 
 def run(options: argparse.Namespace) -> int:
-    """Optimise, print, and write where an output folder is given."""
-    with usage_errors():
-        configure_process(options)
-        plan = plan_study(_configuration(options))
-    if options.dry_run:
-        return announce(plan, options)
-    dataset, unwritten = compute(plan, options)
-    document = as_document(dataset)
-    written, undrawn = draw(dataset, options.output, unwritten)
-    if options.output is not None and not unwritten:
-        policies, unsaved = attempt(lambda: _save_policies(document, options.output))
-        written, undrawn = [*policies, *written], undrawn or unsaved
-    lines = _lines(document)
-    if options.output is None:
-        lines.append("add --output DIR for a figure, the policies, and to go on later")
-    elif written:
-        lines.append(f"written to {options.output}: {', '.join(path.name for path in written)}")
-    print_report(options, document, lines)
-    return finish(unwritten, undrawn)
+    offer = "a figure, the policies, and to go on later"
+    return run_one(options, _plan, descents, _lines, offer, _save_policies)
 
 
-def _configuration(options: argparse.Namespace) -> StudyConfig:
+def _plan(options: argparse.Namespace) -> StudyPlan:
     """One contact model, that of the options or the task's own."""
-    fields = study_fields(options)
+    fields, task = study_fields(options), make_task(options.task, **scene_options(options, "horizon", "model"))
     if options.reference:
         if options.contact not in (None, REFERENCE):
             raise ValueError(f"--reference is in the place of --contact {options.contact}; leave one of them out")
         fields["contact"] = REFERENCE
-    task = task_of(options)
     fields.setdefault("contact", task.defaults.main_family)
     if takes_stiffness((fields["contact"],)):
         fields.setdefault("stiffness", task.defaults.middle_stiffness)
     fields |= {name: (fields[name],) for name in WRAPPED if name in fields}
-    return StudyConfig(**fields, tasks=(options.task,), kind="descents", theta=theta_of(options))
+    return plan_study(StudyConfig(**fields, kind="descents"), {options.task: task})
 
 
-def as_document(dataset: xr.Dataset) -> dict[str, Any]:
-    """A study of one descent as plain data; histories by iteration and seed."""
+def descents(dataset: xr.Dataset) -> dict[str, Any]:
+    """The descents of every estimator; histories by iteration and seed."""
     config, resolved = json.loads(dataset.attrs["config"]), json.loads(dataset.attrs["resolved"])[0]
     one = dataset.isel({name: 0 for name in ("task", "timestep", "cone", "model", "sigma", "samples")})
     place = {name: one[name].item() for name in ("contact", "stiffness", "cone", "sigma", "samples")}
     place["stiffness"] = place["stiffness"] or None
-    return as_plain(
-        {
-            "config": config | resolved["recipe"] | place | {"task": config["tasks"][0], "noise": resolved["noise"]},
-            "environment": json.loads(dataset.attrs["environment"]),
-            "start_cost": [one["start_cost"].item(), one["start_cost_se"].item()],
-            "start_metrics": {str(name)[len(START) :]: one[name].item() for name in one if str(name).startswith(START)},
-            "warnings": list(warnings_of(dataset)),
-            "runs": [_run(one.sel(estimator=name)) for name in config["estimators"]],
-        }
-    )
+    return {
+        "config": config | resolved["recipe"] | place | {"task": config["tasks"][0], "noise": resolved["noise"]},
+        "start_cost": [one["start_cost"].item(), one["start_cost_se"].item()],
+        "start_metrics": {str(name)[len(START) :]: one[name].item() for name in one if str(name).startswith(START)},
+        "runs": [_run(one.sel(estimator=name)) for name in config["estimators"]],
+    }
 
 
 def _run(one: xr.Dataset) -> dict[str, Any]:
-    """One estimator's descents."""
     final, stopped_at = one["final_cost"].values, one["stopped_at"].values
     known = np.flatnonzero(np.isfinite(one["seconds"].values))
     length = int(known[-1]) + 1 if len(known) else 0
@@ -119,7 +94,7 @@ def _save_policies(document: dict[str, Any], folder: Path) -> list[Path]:
     return written
 
 
-def _lines(document: dict[str, Any]) -> list[str]:
+def _lines(dataset: xr.Dataset, document: dict[str, Any]) -> list[str]:
     config = document["config"]
     where = "analytic reference" if config["contact"] == REFERENCE else config["contact"]
     if config["contact"] != REFERENCE and config["stiffness"]:
@@ -142,7 +117,7 @@ def _lines(document: dict[str, Any]) -> list[str]:
         for stop in run["stopped"]:
             label, _, _ = style_of(run["estimator"])
             lines.append(f"{label}, seed {stop['seed']}: stopped at iteration {stop['iteration']}, {stop['reason']}")
-    return lines + [f"warning: {message}" for message in document["warnings"]]
+    return lines
 
 
 def _row(run: dict[str, Any]) -> list[str]:

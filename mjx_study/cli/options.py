@@ -53,8 +53,6 @@ def add_option(
     """Add an option to a command.
 
     Args:
-        command: the command's parser.
-        option: description of the option.
         default: default value, shown in the help.
         given: whether the parsed namespace holds the default; otherwise None, for a configuration to fill in.
         read: parser of the text; None for the option's own.
@@ -97,7 +95,6 @@ def add_task_options(command: argparse.ArgumentParser) -> None:
 
 
 def add_task_argument(command: argparse.ArgumentParser) -> None:
-    """Add the task, by name or file."""
 
     def read(text: str) -> str:
         if told := unknown_task(text):
@@ -118,7 +115,6 @@ def add_theta_option(command: argparse.ArgumentParser, purpose: str) -> None:
 
 
 def add_folder_options(command: argparse.ArgumentParser) -> None:
-    """Add the folder of a study."""
     command.add_argument(
         "--output", type=Path, metavar="DIR", help="folder of the study: the numbers and the figures; resumable"
     )
@@ -171,7 +167,6 @@ def add_process_options(command: argparse.ArgumentParser, seed: int | None = 0) 
 
 
 def add_study_options(command: argparse.ArgumentParser) -> None:
-    """For commands that run studies."""
     command.add_argument("--dry-run", action="store_true", help="print what it would cost; compute and write nothing")
     command.add_argument(
         "--accept-versions", action="store_true", help="go on with a folder that other versions of the software began"

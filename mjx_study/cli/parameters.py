@@ -10,7 +10,6 @@ from mjx_study.tasks.task import Task
 
 
 def task_of(options: argparse.Namespace) -> Task:
-    """The task that the options describe."""
     task = make_task(options.task, **scene_options(options, "cone", "horizon", "model"))
     return task if options.sigma is None else task.replace(sigma=options.sigma)
 

@@ -11,7 +11,6 @@ from mjx_study.study.run import load_study, warnings_of
 
 
 def run(options: argparse.Namespace) -> int:
-    """Load, draw, write."""
     with usage_errors():
         dataset = load_study(options.folder)
         folder = prepare_folder(options.output or options.folder)

@@ -9,7 +9,6 @@ from mjx_study.study.run import load_study, warnings_of
 
 
 def run(options: argparse.Namespace) -> int:
-    """Load, write."""
     with usage_errors():
         dataset = load_study(options.folder)
         path = options.output or options.folder / "report.html"

@@ -55,8 +55,6 @@ class Rollout:
     """A simulated rollout; there is one control fewer than states.
 
     Attributes:
-        title: in one line.
-        model: what moved.
         qpos, qvel, controls: the trajectory.
         facts: what is known about it, as JSON has it.
         focus: geoms to show in any case.
@@ -84,7 +82,6 @@ class Rollout:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Simulate, draw, write, print."""
     with usage_errors():
         configure_process(options)
         check_format(options.format)

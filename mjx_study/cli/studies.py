@@ -1,19 +1,31 @@
-"""Shared by the commands that run studies: options to configuration, the folder, figures."""
+"""Shared by the commands that run studies: options to configuration, the folder, numbers and figures."""
 
 import argparse
 import dataclasses
+import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import xarray as xr
 
-from mjx_study.cli.options import UsageError, attempt, computing, print_report, usage_errors
+from mjx_study.cli.options import (
+    UsageError,
+    attempt,
+    computing,
+    configure_process,
+    finish,
+    print_report,
+    usage_errors,
+)
+from mjx_study.cli.parameters import theta_of
 from mjx_study.plots.study import plot_study
 from mjx_study.plots.style import save_figures
 from mjx_study.study.configuration import StudyConfig
+from mjx_study.study.dataset import as_plain
 from mjx_study.study.forecast import forecast
 from mjx_study.study.plan import StudyPlan
-from mjx_study.study.run import open_store, run_study
+from mjx_study.study.run import open_store, run_study, warnings_of
 from mjx_study.study.store import StudyError
 
 RESUMABLE = "the same command goes on where it stopped"
@@ -22,10 +34,54 @@ RESUMABLE = "the same command goes on where it stopped"
 def study_fields(options: argparse.Namespace) -> dict[str, Any]:
     """Fields of a `StudyConfig` set by the options."""
     given = {field.name: getattr(options, field.name, None) for field in dataclasses.fields(StudyConfig)}
-    return {name: value for name, value in given.items() if value is not None and name not in ("tasks", "theta")}
+    given |= {"theta": theta_of(options)} if hasattr(options, "theta") else {}
+    given |= {"tasks": (options.task,)} if hasattr(options, "task") else {}
+    return {name: value for name, value in given.items() if value is not None}
 
 
-def compute(plan: StudyPlan, options: argparse.Namespace) -> tuple[xr.Dataset, str | None]:
+def as_document(dataset: xr.Dataset, own: Callable[[xr.Dataset], dict[str, Any]]) -> dict[str, Any]:
+    """A study as plain data: its configuration and warnings, and what a command's own function makes of it."""
+    document = {name: json.loads(dataset.attrs[name]) for name in ("config", "resolved", "environment")}
+    return as_plain(document | {"warnings": warnings_of(dataset)} | own(dataset))
+
+
+def run_one(
+    options: argparse.Namespace,
+    planned: Callable[[argparse.Namespace], StudyPlan],
+    own: Callable[[xr.Dataset], dict[str, Any]],
+    lines_of: Callable[[xr.Dataset, dict[str, Any]], list[str]],
+    offer: str,
+    also: Callable[[dict[str, Any], Path], list[Path]] = lambda document, folder: [],
+) -> int:
+    """A command about one study: plan, compute, draw where an output folder is given, print.
+
+    Args:
+        planned: the plan that they ask for.
+        own: see `as_document`.
+        lines_of: the text, of the study and this document.
+        offer: what `--output` would add.
+        also: writes further files of the document into the folder, and returns their paths.
+    """
+    with usage_errors():
+        configure_process(options)
+        plan = planned(options)
+    if options.dry_run:
+        return announce(plan, options)
+    dataset, unwritten = _compute(plan, options)
+    document, folder, failures = as_document(dataset, own), options.output, [unwritten]
+    written: list[Path] = []
+    if folder is not None and not unwritten:
+        for write in (lambda: also(document, folder), lambda: save_figures(plot_study(dataset), folder)):
+            paths, failure = attempt(write)
+            written, failures = written + paths, [*failures, failure]
+    lines = [*lines_of(dataset, document), *(f"warning: {message}" for message in document["warnings"])]
+    lines += [f"add --output DIR for {offer}"] if folder is None else []
+    lines += [f"written to {folder}: {', '.join(path.name for path in written)}"] if written else []
+    print_report(options, document, lines)
+    return finish(*failures)
+
+
+def _compute(plan: StudyPlan, options: argparse.Namespace) -> tuple[xr.Dataset, str | None]:
     """Run a study, in its folder where one is given; what a full disk refuses is kept in memory.
 
     Returns:
@@ -55,10 +111,3 @@ def announce(plan: StudyPlan, options: argparse.Namespace) -> int:
     warnings = [f"warning: {message}" for message in plan.warnings]
     print_report(options, dataclasses.asdict(found) | {"warnings": list(plan.warnings)}, [*found.lines, *warnings])
     return 0
-
-
-def draw(dataset: xr.Dataset, folder: Path | None, unwritten: str | None) -> tuple[list[Path], str | None]:
-    """The figures of a study in its folder; what was written, and why something was not."""
-    if folder is None or unwritten:
-        return [], None
-    return attempt(lambda: save_figures(plot_study(dataset), folder))

@@ -13,7 +13,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, create_model
 
 from mjx_study.cli.options import UsageError, computing, configure_process, finish, print_report, usage_errors
 from mjx_study.cli.parsers.sweep import TASKS, solimp, solref
-from mjx_study.cli.studies import RESUMABLE, announce
+from mjx_study.cli.studies import RESUMABLE, announce, study_fields
 from mjx_study.files import read_toml
 from mjx_study.option import OPTIONS
 from mjx_study.study.cluster import connected
@@ -31,7 +31,6 @@ from mjx_study.table import digits_to_tell_apart
 
 
 def run(options: argparse.Namespace) -> int:
-    """Plan, compute what is missing, print."""
     with usage_errors():
         configure_process(options)
         plan = plan_study(StudyConfig(**_fields(options)))
@@ -67,9 +66,7 @@ def run(options: argparse.Namespace) -> int:
 
 def _fields(options: argparse.Namespace) -> dict[str, Any]:
     """The configuration's fields: flags first, then the file's."""
-    given = {field.name: getattr(options, field.name, None) for field in dataclasses.fields(StudyConfig)}
-    kept = {} if options.config is None else read_toml(options.config, _schema())
-    merged = kept | {name: value for name, value in given.items() if value is not None}
+    merged = ({} if options.config is None else read_toml(options.config, _schema())) | study_fields(options)
     if "tasks" not in merged:
         raise ValueError("no task: name one, or give --config")
     if merged.get("solref") or merged.get("solimp"):
@@ -96,7 +93,6 @@ def _direction(value: Any) -> str:
 
 
 def _head(plan: StudyPlan, missing: int) -> list[str]:
-    """The configuration as it was resolved."""
     config, cells = plan.config, len(plan.cells)
     lengths = _listed(group.recipe.iterations for group in plan.groups if group.recipe)
     kind = {"descents": f"descents of {lengths} iterations", "landscapes": f"{config.points} points"}

@@ -27,7 +27,6 @@ class Place:
 
     Attributes:
         layout: the scene and the names of its coordinates.
-        state: the state.
         stages: MJX's quantities at the state.
         qacc: its constrained acceleration.
         solref: solref of all geoms under the contact model, (geoms, 2).
@@ -43,7 +42,6 @@ class Place:
 
     @property
     def host(self) -> mujoco.MjModel:
-        """The model."""
         return self.layout.scene.host
 
     @cached_property
@@ -52,7 +50,6 @@ class Place:
         return degenerate_contacts(self.host, self.state, self.stages["geom"][self.touching()])
 
     def touching(self) -> np.ndarray:
-        """Indices of active contacts."""
         return np.flatnonzero(self.stages["dist"] < self.stages["margin"])
 
 
@@ -75,7 +72,6 @@ def cause_of_kink(place: Place, output: Coordinate, source: Coordinate) -> str:
 
 
 def singular(place: Place) -> bool:
-    """Whether the inertia matrix is singular."""
     inertia = place.stages["qM"]
     return not np.all(np.isfinite(inertia)) or bool(np.linalg.cond(inertia) > 1e12)
 

@@ -19,7 +19,6 @@ from mjx_study.study.configuration import Progress
 
 
 def gradcheck(plan: GradcheckPlan, progress: Progress = lambda done, total, what: None) -> GradcheckReport:
-    """Run every check of a plan."""
     with quiet_engine():  # states on their way to something else may warn
         return _gradcheck(plan, progress)
 
@@ -67,8 +66,6 @@ def _gradcheck(plan: GradcheckPlan, progress: Progress) -> GradcheckReport:
 
 
 class _Work:
-    """Counts pieces of work."""
-
     def __init__(self, progress: Progress, total: int):
         self.progress, self.total, self.done = progress, total, 0
 

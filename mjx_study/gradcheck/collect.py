@@ -19,7 +19,6 @@ _Key = tuple[str, str, tuple[str, ...], str]
 
 
 def collect(cell: ContactPoint, layout: Coordinates, checks: Sequence[StateCheck]) -> list[Finding]:
-    """Findings of all states, grouped."""
     groups: dict[_Key, list[Entry]] = {}
     for check in checks:
         for key, entry in [*_of_entries(check, layout), *_of_engine(check, layout), *_of_state(check, layout)]:
@@ -30,7 +29,6 @@ def collect(cell: ContactPoint, layout: Coordinates, checks: Sequence[StateCheck
 def step_check(
     cell: ContactPoint, layout: Coordinates, checks: Sequence[StateCheck], found: Sequence[Finding], coverage: Coverage
 ) -> StepCheck:
-    """The row of one contact model."""
 
     def worst(modes: Sequence[str], blocks: Sequence[str]) -> float:
         columns = layout.columns(*blocks)
@@ -83,7 +81,6 @@ def _codes(check: StateCheck, modes: Sequence[str]) -> np.ndarray:
 
 
 def _of_entries(check: StateCheck, layout: Coordinates) -> list[tuple[_Key, Entry]]:
-    """Findings on single entries of the derivatives."""
     found: list[tuple[_Key, Entry]] = []
     for who, modes in (("project", _own_modes(check)), (STOCK, [STOCK] if STOCK in check.judged else [])):
         if not modes:
@@ -131,7 +128,6 @@ def _of_engine(check: StateCheck, layout: Coordinates) -> list[tuple[_Key, Entry
 
 
 def _of_state(check: StateCheck, layout: Coordinates) -> list[tuple[_Key, Entry]]:
-    """Findings on a state as a whole."""
     found: list[tuple[_Key, Entry]] = []
     residual, values = check.linear.residual, check.values
     if not residual <= diagnosis.RESIDUAL_TOLERANCE:

@@ -31,7 +31,6 @@ class Compiler:
         return self._programs[key]
 
     def run(self, function: Callable[..., Any], *arguments: Any) -> Any:
-        """The function's result, from its compiled program."""
         return self.start(function, *arguments).result()(*arguments)
 
 

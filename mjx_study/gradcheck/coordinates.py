@@ -37,7 +37,6 @@ class Coordinate:
 
     Attributes:
         block: qpos, quaternion length, qvel, act, ctrl or contact.
-        name: name within the block.
         joint: index of its joint, or -1.
     """
 
@@ -54,7 +53,6 @@ class Coordinates:
     """The layout of the flat vector of one scene under one contact model.
 
     Attributes:
-        scene: the scene.
         inputs: names of its entries, in the order position, quaternion lengths, velocity, activation, control, and
             contact parameters if the scene has contacts.
         outputs: names of a step's outputs: position, velocity, activation.
@@ -72,7 +70,6 @@ class Coordinates:
         return len(self.inputs) - len(self.scales)
 
     def columns(self, *blocks: str) -> list[int]:
-        """Indices of the inputs in these blocks."""
         return [index for index, coordinate in enumerate(self.inputs) if coordinate.block in blocks]
 
     def blocks(self) -> list[str]:
@@ -117,7 +114,6 @@ class Coordinates:
 
 
 def coordinates(scene: Scene, contact: ContactModel | None) -> Coordinates:
-    """The layout for a scene under a contact model."""
     host = scene.host
     dofs = dof_names(host)
     activations = _activation_names(host)

@@ -34,7 +34,6 @@ class CostCheck:
     """The checks of one contact model's whole-horizon gradient; errors are relative to its norm.
 
     Attributes:
-        contact: contact family.
         stiffness: K [N/m].
         gradient_norm: norm of the gradient, in cost per unit of theta.
         modes: difference of reverse and forward mode, along some directions.
@@ -76,7 +75,6 @@ class CostPrograms:
         return self.compiler.run(self._both_modes, self.task.theta, contact, directions)
 
     def costs(self, contact: ContactModel | None, changes: np.ndarray) -> np.ndarray:
-        """Costs after changes of theta."""
         theta = np.asarray(self.task.theta)
         rows = -(-len(changes) // BATCH) * BATCH
         thetas = np.broadcast_to(theta, (rows, len(theta))).copy()
@@ -157,9 +155,6 @@ def cost_verdict(*, finite: bool, modes: float, residual: float, excused: list[s
     """The verdict on a gradient.
 
     Args:
-        finite: whether the gradient is finite.
-        modes: relative difference of the two modes.
-        residual: residual of the solver.
         excused: kink or jump for each direction whose difference disagrees, or None if nothing excuses it.
     """
     if not finite:
@@ -180,7 +175,6 @@ def _against_closed_form(task: Task, cell: ContactPoint, gradient: np.ndarray, k
 
 
 def _host_states(states: Any, controls: Any) -> list[HostState]:
-    """The states of a rollout before each step."""
     qpos, qvel, act, warmstart = map(np.asarray, (states.qpos, states.qvel, states.act, states.warmstart))
     controls = np.asarray(controls)
     return [HostState(qpos[i], qvel[i], act[i], controls[i], warmstart[i]) for i in range(len(controls))]

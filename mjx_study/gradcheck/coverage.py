@@ -24,7 +24,6 @@ class Coverage:
     """Counts of the states that exercise each part of a model.
 
     Attributes:
-        states: number of states.
         counts: number of states by part, for parts that the model has.
         missing: parts that the model has but no state exercises.
     """
@@ -96,7 +95,6 @@ OPTIONAL: Final = frozenset({"separate", "contact", "friction loss"})
 
 
 def coverage(parts: frozenset[str], states: Sequence[Collection[str]]) -> Coverage:
-    """Coverage of a model's parts by some states."""
     counts = {part: sum(part in state for state in states) for part in PARTS if part in parts}
     missing = [part for part, count in counts.items() if not count and part not in OPTIONAL]
     if "contact" in counts and not counts["contact"]:

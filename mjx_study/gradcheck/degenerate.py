@@ -24,7 +24,6 @@ class DegenerateContact:
     """One such contact, and the entries of a Jacobian that it can excuse.
 
     Attributes:
-        cause: one sentence.
         movers: joints that move one of its bodies; the step jumps only in their positions.
         moved: joints of the same kinematic trees, which its force accelerates.
     """
@@ -45,7 +44,6 @@ class DegenerateContact:
 def degenerate_contacts(
     host: mujoco.MjModel, state: HostState, touching: Int[np.ndarray, "contacts 2"]
 ) -> list[DegenerateContact]:
-    """Degenerate contacts among pairs of geoms."""
     if not len(touching):
         return []
     data = host_data(host, state)

@@ -66,8 +66,6 @@ def judge(
 
     Args:
         layout: layout with the blocks within which entries of a row are compared in size.
-        jacobian: the derivative.
-        truth: result of the finite differences.
         converged: derivative from a converged start of the solver, which tells an unconverged solve from a wrong
             derivative; None if the solver had converged.
         starved: whether the solve is so far from converged that no entry can be called wrong.

@@ -27,7 +27,6 @@ class Differences:
 
     Attributes:
         value: derivative by central differences if there is one, else the mean of the one-sided slopes.
-        uncertainty: uncertainty of the value.
         gap: disagreement of the one-sided slopes at the smallest step not dominated by rounding; at an odd jump, the
             slope of the central difference.
         kink: entries whose one-sided slopes disagree however small the step.

@@ -43,8 +43,6 @@ def difference_of_engines(
     """The differences, and whether all of them are documented.
 
     Args:
-        host: the engine's model.
-        state: state of the comparison.
         stages: MJX's quantities there.
         ours: MJX's constrained acceleration [m/s^2 or rad/s^2].
         theirs: the engine's.

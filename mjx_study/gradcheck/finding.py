@@ -14,13 +14,11 @@ class Entry:
     """One entry of one step's Jacobian that is not right.
 
     Attributes:
-        state: description of the state.
         index: steps since the start of the rollout.
         time: time since the start of the rollout [s].
         name: name of the entry, as in d qvel[hinge] / d ctrl[motor].
         derivative: derivative by automatic differentiation; for a step that differs, the change here.
         difference: central difference; for a step that differs, the change there; None if there is none.
-        gap: gap of the one-sided slopes.
     """
 
     state: str
@@ -37,12 +35,9 @@ class Finding:
     """Entries that are not right for one reason.
 
     Attributes:
-        contact: label of the contact model.
         who: owner of the derivative: `project`, or `mjx.step` for MJX's own.
         verdict: kink, jump, unconverged, zero, nan, engine, wrong, value, engine_mismatch or apart.
         modes: modes of differentiation that show it: forward, reverse, tape.
-        cause: one sentence.
-        entries: all entries concerned.
     """
 
     contact: str

@@ -35,7 +35,6 @@ class MeanCheck:
 
     Attributes:
         contact, stiffness: of the contact model [N/m], 0 for one that is not defined by a stiffness.
-        estimator: its name.
         circulation: the integral of its mean against the difference of the cost.
         verdict: "right" within `estimators.mean_check.TOLERANCE`, "biased", or "undecided".
     """
@@ -78,8 +77,6 @@ def check_mean(
 
     Args:
         task: at the theta that the path goes through, with its onset treatment.
-        cells: contact models.
-        estimators: with their options.
         samples: at each of the path's nodes.
         seed: of the samples and of a random direction.
         span: ends of the path, from theta along the direction [unit of theta]; None for two standard deviations of the
@@ -109,7 +106,6 @@ def check_mean(
 
 
 def lines_of(checks: Sequence[MeanCheck]) -> list[str]:
-    """The checks as a table."""
     rows = []
     for check in checks:
         told = check.as_dict()

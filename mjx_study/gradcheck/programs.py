@@ -33,10 +33,7 @@ class Linear:
     """A step's value and derivative at one state.
 
     Attributes:
-        qpos: position after the step.
-        residual: relative residual of the solver.
         forward: Jacobian (outputs, inputs) by forward mode.
-        reverse: Jacobian by reverse mode.
         tape: Jacobian by reverse mode on the tape, if `reverse` is that of the Jacobian program; else None.
     """
 
@@ -68,7 +65,6 @@ class Setting:
 
     Attributes:
         contact: the contact model, or None for the MJCF's own.
-        scales: units of its parameters.
     """
 
     contact: ContactModel | None
@@ -130,7 +126,6 @@ class Programs:
         return _host(self.compiler.run(self._stock_step, *_point(setting, base)), base)
 
     def stock(self, setting: Setting, base: HostState) -> Float[np.ndarray, "outputs inputs"]:
-        """The derivative of `mjx.step` by `jax.jvp`."""
         inputs, point = len(self.layout.inputs), _point(setting, base)
         pushes = [_unit_rows(first, inputs) for first in range(0, inputs, DIRECTIONS)]
         rows = [np.asarray(self.compiler.run(self._stock, *point, push)) for push in pushes]
@@ -258,8 +253,5 @@ def _host(after: State, base: HostState) -> HostState:
 
 def _unit_rows(first: int, size: int) -> Float[np.ndarray, "directions size"]:
     """Rows of the identity from `first` on, `DIRECTIONS` of them or `size` if fewer, padded with zeros."""
-    count = min(DIRECTIONS, size)
-    rows = np.zeros((count, size))
-    for row in range(min(count, max(size - first, 0))):
-        rows[row, first + row] = 1.0
-    return rows
+    rows = np.eye(size)[first : first + DIRECTIONS]
+    return np.pad(rows, ((0, min(DIRECTIONS, size) - len(rows)), (0, 0)))

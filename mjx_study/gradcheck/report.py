@@ -9,6 +9,7 @@ from mjx_study.gradcheck.cost import CostCheck
 from mjx_study.gradcheck.coverage import Coverage
 from mjx_study.gradcheck.diagnosis import FAILURES, MEANING
 from mjx_study.gradcheck.finding import Finding
+from mjx_study.study.dataset import as_plain
 from mjx_study.table import format_table
 
 SHOWN: Final = 12
@@ -20,9 +21,7 @@ class StepCheck:
     """The checks of single steps under one contact model; errors are relative, the worst over the states.
 
     Attributes:
-        contact: contact family.
         stiffness: K [N/m]; 0 if the contact model is not defined by one.
-        states: number of states.
         entries: total number of Jacobian entries.
         unresolved: number of entries that differences are too uncertain to judge.
         modes: difference of reverse and forward mode.
@@ -32,7 +31,6 @@ class StepCheck:
         engine_step: difference of the next state from the C engine's, likewise.
         engine: difference of the Jacobian from the C engine's where the steps agree; None if they never do.
         stock: error of the derivative of `mjx.step`; None if not asked for, infinite if it is NaN.
-        residual: residual of the solver.
         coverage: parts of the model that the states exercise.
         verdict: the gravest of the findings on the project's own derivative.
     """
@@ -55,7 +53,6 @@ class StepCheck:
 
     @property
     def label(self) -> str:
-        """Label of the contact model."""
         return f"{self.contact}, K = {self.stiffness:g} N/m" if self.stiffness else self.contact
 
 
@@ -65,12 +62,10 @@ class GradcheckReport:
 
     Attributes:
         subject: name of the task or file.
-        summary: one-line summary of what was checked.
         costs: checks of whole-horizon gradients, one per contact model; empty for a file.
         steps: checks of single steps, one per contact model.
         findings: findings, gravest first.
         warnings: warnings about contact models and about features without a derivative.
-        environment: versions and machine.
     """
 
     subject: str
@@ -94,7 +89,7 @@ class GradcheckReport:
 
     def as_json(self) -> dict[str, Any]:
         """The report as plain data; non-finite numbers become None."""
-        return _plain(dataclasses.asdict(self) | {"passed": self.passed, "unexercised": self.unexercised})
+        return as_plain(dataclasses.asdict(self) | {"passed": self.passed, "unexercised": self.unexercised})
 
     def lines(self, *, verbose: bool = False) -> list[str]:
         """The report as text; `verbose` lists every entry of every finding."""
@@ -134,10 +129,7 @@ class GradcheckReport:
                 check.contact,
                 _stiffness(check.stiffness),
                 f"{check.gradient_norm:.4g}",
-                *map(
-                    _figure,
-                    (check.modes, check.difference, check.one_sided, check.closed_form, check.residual),
-                ),
+                *map(_figure, (check.modes, check.difference, check.one_sided, check.closed_form, check.residual)),
                 _verdict(check.verdict),
             ]
             for check in self.costs
@@ -146,24 +138,13 @@ class GradcheckReport:
 
     def _step_table(self) -> list[str]:
         header = ["contact", "K [N/m]", "states", "modes", "differences", "parameters", "mjx step", "C step"]
+        figures = "modes differences parameters stock_step engine_step engine stock residual".split()
         rows = [
             [
                 check.contact,
                 _stiffness(check.stiffness),
                 str(check.states),
-                *map(
-                    _figure,
-                    (
-                        check.modes,
-                        check.differences,
-                        check.parameters,
-                        check.stock_step,
-                        check.engine_step,
-                        check.engine,
-                        check.stock,
-                        check.residual,
-                    ),
-                ),
+                *(_figure(getattr(check, name)) for name in figures),
                 str(check.unresolved),
                 _verdict(check.verdict),
             ]
@@ -208,16 +189,5 @@ def _figure(value: float | None) -> str:
 
 
 def _without_empty(rows: Sequence[Sequence[str]], header: Sequence[str]) -> list[str]:
-    """The table without empty columns."""
     kept = [index for index in range(len(header)) if any(row[index] != "-" for row in rows)]
     return format_table([[row[index] for index in kept] for row in rows], [header[index] for index in kept])
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _plain(part) for key, part in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(part) for part in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value

@@ -24,8 +24,6 @@ class StateCheck:
     """All results at one state.
 
     Attributes:
-        sample: the state.
-        linear: value and derivatives.
         derivatives: derivatives by mode: forward, reverse, tape, or mjx.step.
         truth: finite differences of this project's step.
         judged: verdicts on the derivatives.
@@ -33,7 +31,6 @@ class StateCheck:
         values: comparison of the step with those of `mjx.step` and of the C engine.
         engine_truth: finite differences of the C engine's step.
         engine: verdicts of these on the forward-mode derivative; None if the two steps differ.
-        place: place for looking up causes.
     """
 
     sample: Sample
@@ -54,10 +51,7 @@ def check_state(
     """Run all comparisons of a step and its derivatives.
 
     Args:
-        programs: compiled programs of the scene.
-        engine_step: the C engine's step under the contact model.
         setting: the contact model, and the units of its parameters.
-        sample: the state.
         stock: whether to differentiate `mjx.step` too.
     """
     layout = programs.layout

@@ -38,9 +38,7 @@ class Sample:
     """A state to check.
 
     Attributes:
-        label: description of the state.
         index: steps since the start of its rollout.
-        state: the state and its control.
         parts: parts of the model that it exercises.
     """
 
@@ -74,9 +72,6 @@ def states_of(
     it, from faster rollouts with repeated pushes and from random poses within the joints' limits.
 
     Args:
-        scene: the scene.
-        contact: its contact model, or None.
-        count: number of states.
         horizon: number of steps of the rollouts.
         seed: random seed of velocities, controls and poses.
         visited: states of a task's rollout; None for a rollout in the C engine.

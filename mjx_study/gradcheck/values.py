@@ -26,7 +26,6 @@ class Values:
         engine: difference of this project's state from the C engine's.
         verdict: value (this project's step and that of `mjx.step` differ), engine (they agree, and the C engine's
             differs for no documented reason), engine_mismatch (for a documented one), or empty.
-        cause: description of the difference.
         coordinate: output that differs most, an index into the layout's outputs.
         numbers: change of this coordinate here, and in the implementation that differs.
     """
@@ -56,8 +55,6 @@ def compare_values(
     """Compare one step.
 
     Args:
-        layout: the scene and its coordinates.
-        engine_step: the C engine's step.
         state: state before the step.
         ours: this project's state after it; like the others, with the step's acceleration as warm start.
         stock: state after `mjx.step`.

@@ -20,9 +20,7 @@ class Rollout:
     """A simulated batch.
 
     Attributes:
-        states: states, including the initial one.
         controls: controls as applied, feedback included.
-        value: total cost of each rollout.
         costs: running costs, followed by the final cost.
     """
 
@@ -33,7 +31,6 @@ class Rollout:
 
     @property
     def value_to_go(self) -> Float[np.ndarray, "*batch horizon"]:
-        """Cost to go from each step."""
         return np.cumsum(self.costs[..., ::-1], axis=-1)[..., :0:-1]
 
 

@@ -59,7 +59,6 @@ class BallWall:
         return np.where(flies, -2 * self.landing(x) * slope, 0.0)[..., None]
 
     def landing(self, x: Float[np.ndarray, "*batch 1"]) -> Float[np.ndarray, "*batch"]:
-        """Landing position [m]."""
         free = np.where(np.sin(x[..., 0]) > 0, self._range(x[..., 0]), 0.0)
         return np.where(self.meets_wall(x), self.distance, free)
 

@@ -42,7 +42,6 @@ class DoublePendulum:
     def step(
         self, state: Float[np.ndarray, "*batch 4"], control: Float[np.ndarray, "*batch 0"]
     ) -> Float[np.ndarray, "*batch 4"]:
-        """The state after one timestep."""
         h = self.timestep
         first = self._rate(state)
         second = self._rate(state + h / 2 * first)
@@ -73,7 +72,6 @@ class DoublePendulum:
         return np.asarray(kinetic + self.mass * self.gravity * height)
 
     def accelerations(self, state: Float[np.ndarray, "*batch 4"]) -> Float[np.ndarray, "*batch 2"]:
-        """Angular accelerations of both joints [rad/s^2]."""
         return self._solve(state, self._torques(state)[..., None])[..., 0]
 
     def acceleration_jacobian(self, state: Float[np.ndarray, "*batch 4"]) -> Float[np.ndarray, "*batch 2 4"]:
@@ -96,13 +94,11 @@ class DoublePendulum:
     def cost(
         self, state: Float[np.ndarray, "*batch 4"], control: Float[np.ndarray, "*batch 0"]
     ) -> Float[np.ndarray, "*batch"]:
-        """Zero: only the final state has a cost."""
         return np.zeros(state.shape[:-1])
 
     def cost_gradients(
         self, state: Float[np.ndarray, "*batch 4"], control: Float[np.ndarray, "*batch 0"]
     ) -> tuple[Float[np.ndarray, "*batch 4"], Float[np.ndarray, "*batch 0"]]:
-        """Zeros."""
         return np.zeros(state.shape), np.zeros(control.shape)
 
     def final_cost(self, state: Float[np.ndarray, "*batch 4"]) -> Float[np.ndarray, "*batch"]:

@@ -48,9 +48,7 @@ class Function(Protocol):
     """A function of the parameters alone, with a hand-written gradient; leading axes are a batch."""
 
     @property
-    def num_params(self) -> int:
-        """Number of parameters."""
-        ...
+    def num_params(self) -> int: ...
 
     def value(self, x: Float[np.ndarray, "*batch params"]) -> Float[np.ndarray, "*batch"]:
         """f(x)."""

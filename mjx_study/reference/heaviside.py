@@ -28,11 +28,9 @@ class Heaviside:
     any_noise: bool = dataclasses.field(default=False, init=False)
 
     def value(self, x: Float[np.ndarray, "*batch 1"]) -> Float[np.ndarray, "*batch"]:
-        """1 where x >= 0, else 0."""
         return np.asarray(x[..., 0] >= 0, float)
 
     def gradient(self, x: Float[np.ndarray, "*batch 1"]) -> Float[np.ndarray, "*batch 1"]:
-        """Zero everywhere."""
         return np.zeros(x.shape)
 
     def jumps(self) -> tuple[Jump, ...]:
@@ -40,7 +38,6 @@ class Heaviside:
         return (Jump(0.0, 1.0),)
 
     def breakpoints(self) -> tuple[float, ...]:
-        """0."""
         return (0.0,)
 
     def smoothed(self, theta: Float[np.ndarray, " 1"], sigma: float) -> Smoothed:
@@ -77,7 +74,6 @@ class RelaxedHeaviside:
         return np.where(np.abs(x) < self.width / 2, 1 / self.width, 0.0)
 
     def jumps(self) -> tuple[Jump, ...]:
-        """None."""
         return ()
 
     def breakpoints(self) -> tuple[float, ...]:

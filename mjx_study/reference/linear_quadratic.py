@@ -49,24 +49,20 @@ class LinearQuadratic:
 
     @property
     def num_states(self) -> int:
-        """Length of the state."""
         return self.control.shape[0]
 
     @property
     def num_controls(self) -> int:
-        """Length of the control."""
         return self.control.shape[1]
 
     def step(
         self, state: Float[np.ndarray, "*batch states"], control: Float[np.ndarray, "*batch controls"]
     ) -> Float[np.ndarray, "*batch states"]:
-        """A x + B u."""
         return state @ self.transition.T + control @ self.control.T
 
     def jacobians(
         self, state: Float[np.ndarray, "*batch states"], control: Float[np.ndarray, "*batch controls"]
     ) -> tuple[Float[np.ndarray, "*batch states states"], Float[np.ndarray, "*batch states controls"]]:
-        """A and B."""
         batch = state.shape[:-1]
         over_state = np.broadcast_to(self.transition, (*batch, *self.transition.shape))
         return over_state, np.broadcast_to(self.control, (*batch, *self.control.shape))
@@ -74,21 +70,17 @@ class LinearQuadratic:
     def cost(
         self, state: Float[np.ndarray, "*batch states"], control: Float[np.ndarray, "*batch controls"]
     ) -> Float[np.ndarray, "*batch"]:
-        """x^T Q x + u^T R u."""
         return np.asarray(_form(self.state_weight, state) + _form(self.control_weight, control))
 
     def cost_gradients(
         self, state: Float[np.ndarray, "*batch states"], control: Float[np.ndarray, "*batch controls"]
     ) -> tuple[Float[np.ndarray, "*batch states"], Float[np.ndarray, "*batch controls"]]:
-        """2 Q x and 2 R u."""
         return 2 * state @ self.state_weight, 2 * control @ self.control_weight
 
     def final_cost(self, state: Float[np.ndarray, "*batch states"]) -> Float[np.ndarray, "*batch"]:
-        """x^T P x."""
         return np.asarray(_form(self.final_weight, state))
 
     def final_gradient(self, state: Float[np.ndarray, "*batch states"]) -> Float[np.ndarray, "*batch states"]:
-        """2 P x."""
         return 2 * state @ self.final_weight
 
     def smoothed(

@@ -80,34 +80,28 @@ class ReferenceObjective:
 
     @property
     def num_params(self) -> int:
-        """Length of theta."""
         states, controls = self.system.num_states, self.system.num_controls
         return {"controls": self.horizon * controls, "feedback": controls * states, "start": states}[self.parametrises]
 
     def evaluate(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> Evaluation:
-        """Values and scores from rollouts alone."""
         return self._evaluation(theta, *self._draw(keys))
 
     def evaluate_pair(
         self, theta: Float[Array, " params"], keys: Key[Array, " samples"]
     ) -> tuple[Evaluation, Evaluation]:
-        """Two evaluations with opposite noise, sample by sample, from the same initial states."""
         starts, noise = self._draw(keys)
         return self._evaluation(theta, starts, noise), self._evaluation(theta, starts, -noise)
 
     def evaluate_steps(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> StepEvaluation:
-        """The rollouts of `evaluate`, step by step."""
         return self._steps(theta, *self._draw(keys))[0]
 
     def evaluate_step_pair(
         self, theta: Float[Array, " params"], keys: Key[Array, " samples"]
     ) -> tuple[StepEvaluation, StepEvaluation]:
-        """The rollouts of `evaluate_pair`, step by step."""
         starts, noise = self._draw(keys)
         return self._steps(theta, starts, noise)[0], self._steps(theta, starts, -noise)[0]
 
     def differentiate(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> Differentiation:
-        """Values and hand-written gradients."""
         starts, noise = self._draw(keys)
         value, gradient = self._differentiate(theta, starts, noise)
         return Differentiation(jnp.asarray(value), jnp.asarray(gradient.reshape(len(noise), -1)))
@@ -117,7 +111,6 @@ class ReferenceObjective:
         return self.differentiate(theta, keys)
 
     def differentiate_steps(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> StepDifferentiation:
-        """The rollouts of `differentiate`, with the derivative of each sample's cost with respect to its noise."""
         starts, noise = self._draw(keys)
         start, controls, *feedback = self._policy(theta, starts, noise)
         rollout = roll_out(self.system, start, controls, *feedback)
@@ -128,7 +121,6 @@ class ReferenceObjective:
         )
 
     def linearise(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> Linearisation:
-        """The rollouts of `differentiate`, with the derivatives of every step."""
         steps, rollout, feedback = self._steps(theta, *self._draw(keys))
         before, samples = rollout.states[:, :-1], len(rollout.value)
         over_cost = self.system.cost_gradients(before, rollout.controls)
@@ -150,7 +142,6 @@ class ReferenceObjective:
         )
 
     def observe(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> dict[str, np.ndarray]:
-        """Metrics of the rollouts of `evaluate`."""
         if self.metrics is None:
             return {}
         return self.metrics(roll_out(self.system, *self._policy(theta, *self._draw(keys))).states)
@@ -243,17 +234,14 @@ class FunctionObjective:
 
     @property
     def num_params(self) -> int:
-        """Length of theta."""
         return self.function.num_params
 
     def evaluate(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> Evaluation:
-        """Values and scores."""
         return self._evaluation(theta, self._noise(keys))
 
     def evaluate_pair(
         self, theta: Float[Array, " params"], keys: Key[Array, " samples"]
     ) -> tuple[Evaluation, Evaluation]:
-        """Two evaluations with opposite noise, sample by sample."""
         noise = self._noise(keys)
         return self._evaluation(theta, noise), self._evaluation(theta, -noise)
 
@@ -269,7 +257,6 @@ class FunctionObjective:
         return _one_step(plus), _one_step(minus)
 
     def differentiate(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> Differentiation:
-        """Values and hand-written gradients."""
         points = self._point(theta) + self._noise(keys)
         return Differentiation(jnp.asarray(self.function.value(points)), jnp.asarray(self.function.gradient(points)))
 

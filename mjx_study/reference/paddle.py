@@ -30,7 +30,6 @@ def frame(angle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def dot(left: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Scalar product along the last axis."""
     return np.asarray(left[..., 0] * right[..., 0] + left[..., 1] * right[..., 1])
 
 

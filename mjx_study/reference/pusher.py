@@ -42,7 +42,6 @@ class Pusher(QuadraticCost):
     def step(
         self, state: Float[np.ndarray, "*batch 4"], control: Float[np.ndarray, "*batch 1"]
     ) -> Float[np.ndarray, "*batch 4"]:
-        """The state after one timestep."""
         position, velocity = state[..., :2], state[..., 2:]
         penetration = self.distance - (position[..., 1] - position[..., 0])
         spring = self.stiffness * np.maximum(penetration, 0.0)

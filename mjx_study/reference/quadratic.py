@@ -30,15 +30,12 @@ class Quadratic:
 
     @property
     def num_params(self) -> int:
-        """Number of parameters."""
         return len(self.linear)
 
     def value(self, x: Float[np.ndarray, "*batch params"]) -> Float[np.ndarray, "*batch"]:
-        """x^T A x / 2 + b^T x + c."""
         return np.asarray(np.einsum("...i,ij,...j->...", x, self.matrix, x) / 2 + x @ self.linear + self.offset)
 
     def gradient(self, x: Float[np.ndarray, "*batch params"]) -> Float[np.ndarray, "*batch params"]:
-        """A x + b."""
         return x @ self.matrix + self.linear
 
     def smoothed(self, theta: Float[np.ndarray, " params"], sigma: float) -> Smoothed:

@@ -20,19 +20,15 @@ class QuadraticCost:
     def cost(
         self, state: Float[np.ndarray, "*batch states"], control: Float[np.ndarray, "*batch controls"]
     ) -> Float[np.ndarray, "*batch"]:
-        """e^T Q e + R |u|^2."""
         return np.asarray(self.final_cost(state) + self.control_weight * np.sum(control**2, axis=-1))
 
     def cost_gradients(
         self, state: Float[np.ndarray, "*batch states"], control: Float[np.ndarray, "*batch controls"]
     ) -> tuple[Float[np.ndarray, "*batch states"], Float[np.ndarray, "*batch controls"]]:
-        """2 Q e and 2 R u."""
         return self.final_gradient(state), 2 * self.control_weight * control
 
     def final_cost(self, state: Float[np.ndarray, "*batch states"]) -> Float[np.ndarray, "*batch"]:
-        """e^T Q e."""
         return np.asarray(np.sum(np.array(self.state_weight) * (state - np.array(self.goal)) ** 2, axis=-1))
 
     def final_gradient(self, state: Float[np.ndarray, "*batch states"]) -> Float[np.ndarray, "*batch states"]:
-        """2 Q e."""
         return 2 * np.array(self.state_weight) * (state - np.array(self.goal))

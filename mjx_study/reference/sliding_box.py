@@ -45,7 +45,6 @@ class SlidingBox(QuadraticCost):
     def step(
         self, state: Float[np.ndarray, "*batch 4"], control: Float[np.ndarray, "*batch 1"]
     ) -> Float[np.ndarray, "*batch 4"]:
-        """The state after one timestep."""
         slip = np.clip(state[..., 3] - state[..., 2], -self.slip_tolerance, self.slip_tolerance)
         friction = self.viscosity * slip * self.on_box(state)
         force = np.stack([control[..., 0] + friction, -friction], axis=-1)

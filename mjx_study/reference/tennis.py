@@ -61,7 +61,6 @@ class Tennis:
     def step(
         self, state: Float[np.ndarray, "*batch 7"], control: Float[np.ndarray, "*batch 3"]
     ) -> Float[np.ndarray, "*batch 7"]:
-        """The state after one timestep."""
         after, _, _ = self._move(state, control, differentiate=False)
         return after
 
@@ -81,21 +80,17 @@ class Tennis:
     def cost(
         self, state: Float[np.ndarray, "*batch 7"], control: Float[np.ndarray, "*batch 3"]
     ) -> Float[np.ndarray, "*batch"]:
-        """R |u|^2."""
         return np.asarray(self.control_weight * np.sum(control**2, axis=-1))
 
     def cost_gradients(
         self, state: Float[np.ndarray, "*batch 7"], control: Float[np.ndarray, "*batch 3"]
     ) -> tuple[Float[np.ndarray, "*batch 7"], Float[np.ndarray, "*batch 3"]]:
-        """0 and 2 R u."""
         return np.zeros(state.shape), 2 * self.control_weight * control
 
     def final_cost(self, state: Float[np.ndarray, "*batch 7"]) -> Float[np.ndarray, "*batch"]:
-        """e^T Q e."""
         return np.asarray(np.sum(np.array(self.final_weight) * (state - np.array(self.goal)) ** 2, axis=-1))
 
     def final_gradient(self, state: Float[np.ndarray, "*batch 7"]) -> Float[np.ndarray, "*batch 7"]:
-        """2 Q e."""
         return 2 * np.array(self.final_weight) * (state - np.array(self.goal))
 
     def _move(self, state, control, *, differentiate: bool):

@@ -14,7 +14,6 @@ import numpy as np
 
 
 def main(folder: Path) -> None:
-    """Render every configuration of a request."""
     request = np.load(folder / "request.npz")
     model = mujoco.MjModel.from_binary_path(str(folder / "model.mjb"))
     width, height = int(request["width"]), int(request["height"])

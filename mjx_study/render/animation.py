@@ -64,7 +64,6 @@ def animate(motion: Motion, path: Path, *, slow: float = 1.0, view: str = "auto"
     """Write a film of a motion, in real time if `slow` is 1; the file is complete or absent.
 
     Args:
-        motion: the motion to show.
         path: file name that ends in .gif or .mp4.
         slow: slow-motion factor.
         view: xz, xy, yz, or auto for the one that shows most of the motion.

@@ -49,12 +49,7 @@ def geom_colours(motion: Motion) -> Float[np.ndarray, "ngeom 4"]:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Drawing:
-    """Draws one view of a motion onto Matplotlib axes.
-
-    Attributes:
-        motion: the motion to draw.
-        view: the projection.
-    """
+    """Draws one view of a motion onto Matplotlib axes."""
 
     motion: Motion
     view: View

@@ -22,10 +22,7 @@ def strip(motion: Motion, *, frames: int = 6, view: str = "auto", renderer: str 
     """Pictures of a motion at evenly spaced times, first and last included, each labelled with its time.
 
     Args:
-        motion: the motion to show.
         frames: number of pictures; fewer if the motion has fewer times.
-        view: xz, xy, yz, or auto for the one that shows most of the motion.
-        renderer: drawing, opengl, or auto for opengl where it works.
 
     Raises:
         ValueError: fewer than one picture, or an unknown view or renderer.
@@ -72,9 +69,7 @@ def stroboscope(motion: Motion, *, poses: int = 9, view: str = "auto") -> Figure
     """One drawing with the path and evenly spaced poses, earlier ones fainter.
 
     Args:
-        motion: the motion to show.
         poses: number of poses, first and last included.
-        view: xz, xy, yz, or auto for the one that shows most of the motion.
 
     Raises:
         ValueError: fewer than one pose, or an unknown view.

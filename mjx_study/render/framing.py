@@ -27,7 +27,6 @@ class Bounds:
 
     @property
     def size(self) -> Float[np.ndarray, " axes"]:
-        """Width and height [m]."""
         return self.high - self.low
 
     def united(self, other: "Bounds") -> "Bounds":
@@ -43,7 +42,6 @@ class Bounds:
         return Bounds(self.low - distance, self.high + distance)
 
     def overlaps(self, other: "Bounds") -> bool:
-        """Whether the two intersect."""
         return bool(np.all(self.low <= other.high) and np.all(other.low <= self.high))
 
 

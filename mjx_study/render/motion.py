@@ -37,7 +37,6 @@ class Motion:
     """A model's motion.
 
     Attributes:
-        model: the compiled model.
         time: increasing times [s].
         qpos: generalised positions at these times [m or rad; unit quaternions].
         focus: geoms that every picture shows, however far they are from the motion.
@@ -62,7 +61,6 @@ class Motion:
 
     @property
     def duration(self) -> float:
-        """Time from first to last [s]."""
         return float(self.time[-1] - self.time[0])
 
     @cached_property

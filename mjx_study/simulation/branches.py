@@ -50,10 +50,7 @@ def jump_term(
     """Zero, with the onset term as its derivative with respect to whatever the states depend on.
 
     Args:
-        scene: static part of the model.
-        model: the model to step.
         states: of `dynamics.rollout`, `(horizon + 1, ...)`, with their derivatives.
-        controls: of the rollout.
         control_law: of the rollout, independent of what is differentiated.
         running_cost, final_cost: as in `tasks.Task`.
         slots: number of onsets to correct, first ones first.

@@ -47,7 +47,6 @@ def row_force(model: mjx.Model, data: mjx.Data, slack: Float[Array, " rows"]) ->
     the cone (`_elliptic_force`).
 
     Args:
-        model: the model on the device.
         data: state with its constraint rows, after `mjx.make_constraint`.
         slack: J a - aref [m/s^2 or rad/s^2].
 
@@ -246,8 +245,6 @@ def at_onset(model: mjx.Model, data: mjx.Data, members: Float[Array, " rows"], o
     """The state with some constraint rows at first touch (no penetration, impedance d_0), or removed.
 
     Args:
-        model: the model on the device.
-        data: state with its constraint rows.
         members: 1 for these rows, 0 for those left unchanged.
         on: whether they are active.
     """
@@ -270,7 +267,6 @@ def relaxation_rate(model: mjx.Model, data: mjx.Data, normal: Float[Array, " row
     """max(b, sqrt(k d)) [1/s] of a guard at first touch: how fast its contact changes the speed of approach.
 
     Args:
-        model: the model on the device.
         data: position stage, with the velocity; the guard is moving.
         normal: the guard's weights of `guard_rows`.
     """

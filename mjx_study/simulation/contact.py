@@ -112,7 +112,6 @@ def family_model(
 
     Args:
         name: one of `FAMILIES` except "mjcf".
-        scene: the scene it is meant for.
         stiffness: K [N/m], positive; None for a family that is a single point.
         damping: B [N s/m], not negative; None for the family's damping ratio.
         effective_mass: effective mass of the contact along its normal [kg]; see `effective_mass`.

@@ -62,7 +62,6 @@ def converged_host(scene: Scene, contact: ContactModel | None) -> mujoco.MjModel
 
 
 def host_data(host: mujoco.MjModel, state: HostState) -> mujoco.MjData:
-    """The engine's data at a state."""
     data = mujoco.MjData(host)
     data.qpos[:], data.qvel[:], data.act[:] = state.qpos, state.qvel, state.act
     data.ctrl[:], data.qacc_warmstart[:] = state.control, state.warmstart

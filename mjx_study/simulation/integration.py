@@ -24,7 +24,6 @@ def integrate_position(
     """Positions after moving with `qvel` for one timestep.
 
     Args:
-        host: the model, for its joints.
         qpos: positions [m or rad; unit quaternions].
         qvel: velocities [m/s or rad/s], angular ones in the body frame as in MuJoCo.
         timestep: time to move for [s].
@@ -48,7 +47,6 @@ def difference_position(
     """The velocity that moves from `start` to `end` in unit time, the inverse of `integrate_position`.
 
     Args:
-        host: the model, for its joints.
         start, end: positions [m or rad; quaternions of any length].
     """
     parts = []

@@ -24,7 +24,6 @@ class Flag:
             option.disableflags |= self.bit
 
     def disabled(self, option: mujoco.MjOption) -> bool:
-        """Whether the flag is disabled."""
         return not option.enableflags & self.bit if self.optional else bool(option.disableflags & self.bit)
 
 

@@ -111,7 +111,6 @@ def corrected_rollout(
     Args:
         scene: static part of the model.
         model: the model to step; may be traced, but not differentiated.
-        start: the initial state.
         control_law: maps (step index, state) to the control of that step.
         horizon: number of steps, at least 1.
         slots: number of onsets to correct, first ones first.
@@ -255,7 +254,6 @@ def jump_of_velocity(
     """Jump that the onset of one contact or limit causes in the velocity after a step, at first touch.
 
     Args:
-        model: the model to step.
         positioned: position stage of the first case.
         states: velocities and activations of each case.
         controls: controls of each case.
@@ -284,7 +282,6 @@ def least_travel(
     """Travel of a guard in a step [m or rad] below which its onset counts as grazing: h |a| / max(b, sqrt(k d)).
 
     Args:
-        model: the model to step.
         data: position stage, with the velocity.
         normal: the guard's weights of `constraint.guard_rows`.
         free: acceleration without the contact.
@@ -299,7 +296,6 @@ def on_and_off(
     """Velocities and activations after a step, and its accelerations, with some rows at first touch and without them.
 
     Args:
-        model: the model to step.
         data: the state before the constraint solve (`force_stage`), with the solver's warm start.
         members: 1 for these rows, 0 for those left unchanged.
     """

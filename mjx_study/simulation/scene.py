@@ -87,7 +87,6 @@ class Scene:
 
     @property
     def timestep(self) -> float:
-        """Time per step [s]."""
         return float(self.host.opt.timestep)
 
     @property
@@ -125,7 +124,6 @@ def models_folder() -> Path:
 
 
 def model_names() -> list[str]:
-    """Names of the shipped MJCF files."""
     return sorted(path.stem for path in models_folder().glob("*.xml"))
 
 
@@ -207,7 +205,6 @@ def require(scene: Scene, *, joints: tuple[str, ...], geoms: tuple[str, ...], dr
     """Refuse a model that a task cannot use.
 
     Args:
-        scene: the model.
         joints: names of all its joints, of one coordinate each, in state order.
         geoms: names of geoms that it must have.
         driven: name of the joint that each actuator drives, in control order.

@@ -96,8 +96,6 @@ def cells_on(
     """Compute cells on the workers that a cluster has, while they come and go.
 
     Args:
-        client: a `distributed.Client`.
-        plan: the study.
         kept: the cells to compute, by index, each with the arrays of its checkpoint.
         told: called with the number of workers when it changes.
 
@@ -198,7 +196,6 @@ def _packed(plan: StudyPlan) -> bytes:
 
 
 def _compute(study: bytes, index: int, kept: Arrays) -> Arrays:
-    """Compute a cell, on a worker."""
     with _ONE_AT_A_TIME:
         plan, compute = _prepared(study)
         cell = plan.cells[index]

@@ -167,7 +167,6 @@ class StudyConfig(Checked):
 
     @property
     def task_names(self) -> list[str]:
-        """Names of the tasks."""
         return [which if isinstance(which, str) else which.name for which in self.tasks]
 
     @property

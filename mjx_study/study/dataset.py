@@ -34,7 +34,6 @@ def dataset_of(document: Mapping[str, Any], cells: Cells) -> xr.Dataset:
 
     Args:
         document: contents of a study.json; each cell has the key "at", its index along every outer dimension.
-        cells: the computed cells.
     """
     config, places = document["config"], document["cells"]
     outer = tuple(places[0]["at"])

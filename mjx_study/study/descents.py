@@ -148,7 +148,6 @@ class Backend:
     def _observe(
         self, theta: Float[Array, " params"], contact: ContactModel | None, keys: Key[Array, " samples"]
     ) -> dict[str, Array]:
-        """Metrics of rollouts in MJX, by name and sample."""
 
         def one(key: Key[Array, ""]) -> dict[str, Array]:
             states, *_ = simulate(self.task, theta, contact, key, 1.0)
@@ -177,7 +176,6 @@ class _Progress:
         return cls(state, records, list(map(float, arrays[f"seconds_{index}"])))
 
     def arrays(self, index: int) -> dict[str, np.ndarray]:
-        """The checkpoint's arrays by name."""
         leaves = jax.tree.leaves(self.state)
         found = {f"state_{index}_{leaf}": np.asarray(value) for leaf, value in enumerate(leaves)}
         found |= {f"history_{index}_{name}": values for name, values in self.history.items()}
@@ -185,7 +183,6 @@ class _Progress:
 
     @property
     def history(self) -> dict[str, Float[np.ndarray, "iterations seeds"]]:
-        """Records by field."""
         seeds = self.state.reason.shape[0]
         return {
             name: np.array([getattr(record, name) for record in self.records], float).reshape(-1, seeds)
@@ -248,7 +245,6 @@ def _begin(
 
 
 def _numbers(backend: Backend, model: ContactPoint, estimator: Estimator, run: _Progress) -> dict[str, np.ndarray]:
-    """The variables of one estimator's run."""
     iterations, seeds = backend.recipe.iterations, backend.seeds
     costs = [backend.cost(theta, model) for theta in run.state.theta]
     metrics = [backend.metrics(theta, model) for theta in run.state.theta]

@@ -248,7 +248,6 @@ def _stiffnesses(rows: Sequence[Row]) -> list[float]:
 
 
 def _by(rows: Sequence[Row]) -> list[tuple[float, list[Row]]]:
-    """Rows by stiffness."""
     return [(k, [row for row in rows if row.stiffness == k]) for k in _stiffnesses(rows)]
 
 

@@ -24,7 +24,6 @@ class Forecast:
     """The cost of a study; counts are of the missing cells.
 
     Attributes:
-        cells: number of cells.
         computed: number of cells that the folder has.
         programs: programs of rollouts to compile.
         rollouts: rollouts to simulate, those that are differentiated included, about.
@@ -46,7 +45,6 @@ class Forecast:
 
     @property
     def lines(self) -> list[str]:
-        """The same as text."""
         seconds = (
             "not known" if self.seconds is None else f"{self.seconds:.3g} s or more, at the rate of the computed cells"
         )

@@ -170,7 +170,6 @@ def reference_of(
     """The reference gradient of a contact model; it does not depend on which others there are.
 
     Args:
-        task: the task.
         objective: the task under that contact model, or its analytic system.
         odd_keys: keys of the pairs of rollouts.
         candidate_keys: keys of the first-order samples whose median is a candidate for the control variate.
@@ -215,9 +214,7 @@ def estimate_numbers(batches, reference, key, chosen, confidence):
         lower, upper = estimators.variance_interval(estimate, confidence)
         median, high, most = estimators.norm_quantiles(estimate, (0.5, 0.9, 1.0))
         effective = estimators.effective_samples(estimate)
-        against = estimators.compare(estimate, reference)
         test = estimators.bias_test(estimate, reference, jax.random.clone(key), num_draws=BIAS_DRAWS)
-        choice = estimate.alpha
         result.append(
             {
                 "gradient": estimate.mean,
@@ -230,22 +227,12 @@ def estimate_numbers(batches, reference, key, chosen, confidence):
                 "norm_max": most,
                 "effective_samples": effective.count,
                 "top_share": effective.top_share,
-                "relative_error": against.relative_error,
-                "relative_error_se": against.relative_error_se,
-                "debiased_error": against.debiased_error,
-                "debiased_error_se": against.debiased_error_se,
-                "cosine": against.cosine,
-                "cosine_se": against.cosine_se,
-                "debiased_cosine": against.debiased_cosine,
-                "debiased_cosine_se": against.debiased_cosine_se,
                 "reference_norm": jnp.linalg.norm(reference.mean),
                 "reference_effective_samples": reference_effective,
-                "reference_uncertainty": against.reference_uncertainty,
-                "alpha": None if choice is None else choice.alpha,
-                "epsilon": None if choice is None else choice.epsilon,
-                "discrepancy": None if choice is None else choice.discrepancy,
+                **{name: getattr(estimate.alpha, name, None) for name in ("alpha", "epsilon", "discrepancy")},
                 "bias_p_value": test.p_value,
                 "nonfinite": estimate.num_nonfinite,
             }
+            | {name: value for name, value in vars(estimators.compare(estimate, reference)).items() if name != "error"}
         )
     return result

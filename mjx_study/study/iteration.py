@@ -31,7 +31,6 @@ class Descent:
 
     Attributes:
         theta: parameters of each seed.
-        optimizer: optimiser state of each seed.
         reason: index into `REASONS`; 0 while a seed goes on, which otherwise stays as it is.
         first_cost: absolute mean cost of each seed at its first iteration.
     """
@@ -49,7 +48,6 @@ class Record:
 
     Attributes:
         cost: mean cost of the batch, before the update.
-        gradient_norm: norm of the gradient estimate.
         variance: variance of one gradient sample.
         alpha: weight of the first-order batch; NaN for an estimator of one batch.
         nonfinite: number of samples left out.
@@ -111,10 +109,7 @@ def advance(
     """One iteration of every seed that goes on.
 
     Args:
-        state: before it.
         batches: of the estimator's oracles, with an axis of seeds in front of each array.
-        estimator: with its options.
-        optimizer: of optax.
 
     Returns:
         The state after it, and what it tells.

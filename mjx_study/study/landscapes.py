@@ -92,7 +92,6 @@ def _slopes(batches: dict[str, Any], direction: Array, chosen: tuple[Estimator, 
 
 
 def _mean(sample: Float[Array, " samples"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Mean of what is finite, and its standard error."""
     finite = jnp.isfinite(sample)
     count = jnp.sum(finite)
     return jnp.mean(sample, where=finite), jnp.std(sample, where=finite, ddof=1) / jnp.sqrt(count)

@@ -22,7 +22,6 @@ class ThetaLine:
     Attributes:
         position: t, in the unit of theta.
         direction: of unit length, (params,).
-        thetas: the points.
     """
 
     position: Float[np.ndarray, " points"]
@@ -34,8 +33,6 @@ def line_of(task: Task, points: int, span: Sequence[float] | None, direction: st
     """The line through a task's theta; for a scalar parameter, its range, whatever theta is.
 
     Args:
-        task: whose parameters they are.
-        points: how many.
         span: first and last t; None for the task's, or 10 sigma to either side.
         direction: "random" or None, or the index of one parameter.
         seed: of a random direction.

@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+from collections.abc import Mapping
 from typing import Any, Final
 
 import jax
@@ -35,10 +36,7 @@ class Group:
 
     Attributes:
         name: the task's name in the configuration, which is unique.
-        task: the task, as built.
-        timestep: timestep [s].
         cone: friction cone, pyramidal or elliptic.
-        models: contact models.
         recipe: settings of descents; None in other studies.
     """
 
@@ -55,10 +53,7 @@ class StudyCell:
     """One cell of a study, kept as one file.
 
     Attributes:
-        group: index of the group.
-        model: the contact model.
         sigma: standard deviation of the noise.
-        samples: samples in each batch.
     """
 
     group: int
@@ -72,10 +67,7 @@ class StudyPlan:
     """A checked and resolved study.
 
     Attributes:
-        config: the configuration.
-        groups: groups of cells that share compiled programs.
         cells: cells in the order of computation.
-        chunk_size: samples per device and call.
         warnings: warnings about contact models.
     """
 
@@ -122,8 +114,12 @@ class StudyPlan:
         return f"{group.name}, {cell.model.label}, h = {group.timestep:.{digits}g} s, N = {cell.samples}"
 
 
-def plan_study(config: StudyConfig) -> StudyPlan:
+def plan_study(config: StudyConfig, built: Mapping[str, Task] | None = None) -> StudyPlan:
     """Check a configuration and resolve its defaults, computing nothing.
+
+    Args:
+        built: tasks that the caller has built already, by name; with the configuration's horizon and model, and the
+            timestep and cone of the MJCF.
 
     Raises:
         ValueError: anything about the configuration that cannot be run; the message says what is accepted.
@@ -134,7 +130,7 @@ def plan_study(config: StudyConfig) -> StudyPlan:
     cells: list[StudyCell] = []
     messages: list[str] = []
     for which, timestep, cone in itertools.product(config.tasks, config.timestep or (None,), config.cone or (None,)):
-        task = _build(config, which, timestep, cone)
+        task = _build(config, which, timestep, cone, built or {})
         if config.network is not None:
             if REFERENCE in (config.contact or ()):
                 raise ValueError("a network needs MJX: the analytic references take the task's own policy")
@@ -198,7 +194,9 @@ def seeds_together(plan: StudyPlan, cell: StudyCell) -> int:
     return seeds_at_once(memory_of_seed(plan, cell), batches) if plan.config.kind == "gradients" else batches
 
 
-def _build(config: StudyConfig, which: str | Task, timestep: float | None, cone: str | None) -> Task:
+def _build(
+    config: StudyConfig, which: str | Task, timestep: float | None, cone: str | None, built: Mapping[str, Task]
+) -> Task:
     chosen = {"timestep": timestep, "cone": cone, "horizon": config.horizon, "model": config.model}
     chosen = {key: value for key, value in chosen.items() if value is not None}
     changes = {"onset": config.onset} | ({} if config.noise is None else {"noise": config.noise})
@@ -207,6 +205,8 @@ def _build(config: StudyConfig, which: str | Task, timestep: float | None, cone:
             raise ValueError(f"{', '.join(chosen)}: only for a task that is built by its name; build this one so")
         check_shapes(which)
         return which.replace(**changes)
+    if which in built and timestep is None and cone is None:
+        return built[which].replace(**changes)
     if timestep is not None and config.horizon is None:
         own = make_task(which, **{key: value for key, value in chosen.items() if key != "timestep"})
         steps = own.horizon * float(own.scene.host.opt.timestep) / timestep

@@ -88,10 +88,7 @@ def grid(low: float, high: float, sigma: float, size: int, noise: str) -> Float[
     """Midpoints of the cells of a uniform grid that covers the line and the noise about it.
 
     Args:
-        low, high: ends of the line.
-        sigma: standard deviation of the noise.
         size: cells in the width that Gaussian noise needs; heavier tails get more of the same width.
-        noise: name of the noise's density.
     """
     needed, gaussian = (high - low + 2 * sigma * NOISES[name].reach(TAIL) for name in (noise, "gaussian"))
     cells = math.ceil(size * needed / gaussian)
@@ -109,11 +106,8 @@ def means(
     """Means over the noise at each position.
 
     Args:
-        points: a uniform grid.
         values, slopes: f and f' on it.
         position: theta's.
-        sigma: standard deviation of the noise.
-        noise: name of the noise's density.
 
     Raises:
         ValueError: the grid is too coarse, or it does not cover the noise.

@@ -26,7 +26,6 @@ def reference_gradient(
         odd: odd parts of the cost, (f(w) - f(-w)) / 2, of an open loop; their batch is independent of all else here.
         pilot: another batch, which picks candidate and slope.
         candidates: vectors g to try, (params,); entries that are not finite disqualify one.
-        sigma: standard deviation of the noise.
     """
     signal = pilot.value - pilot.baseline
     signal = jnp.where(jnp.isfinite(signal), signal, 0.0)

@@ -4,11 +4,7 @@ from pathlib import Path
 
 
 def git_revision(root: Path | None = None) -> str | None:
-    """The commit of a checkout, read from git's files; None outside a checkout, or before its first commit.
-
-    Args:
-        root: root of the checkout; None for the one of this package.
-    """
+    """The commit of a checkout, read from git's files; None outside a checkout, or before its first commit."""
     root = Path(__file__).resolve().parents[2] if root is None else root
     try:
         folder = _git_folder(root / ".git")

@@ -35,7 +35,6 @@ WAIT_SECONDS: Final = 0.5
 
 
 def _document(plan: StudyPlan, command: str | None) -> dict[str, Any]:
-    """Contents of study.json."""
     fields = {field.name: getattr(plan.config, field.name) for field in dataclasses.fields(plan.config)}
     axes = axes_of(plan)
     fields |= {"tasks": plan.config.task_names, "seeds": plan.config.batches}
@@ -75,7 +74,6 @@ def _resolved(plan: StudyPlan, axes: Axes) -> list[dict[str, Any]]:
 
 
 def _options(plan: StudyPlan, cell: StudyCell) -> dict[str, dict[str, Any]]:
-    """Options of a cell's estimators, by name."""
     chosen = zip(plan.config.estimators, estimators_of(plan, cell), strict=True)
     return {name: dataclasses.asdict(estimator) for name, estimator in chosen}
 
@@ -84,8 +82,6 @@ def open_store(plan: StudyPlan, folder: Path, command: str | None = None, *, acc
     """The folder of a plan, new or begun; one that was begun keeps its chunk size unless the plan gives another.
 
     Args:
-        plan: plan of the study.
-        folder: where it is to be.
         command: command that asked for it, to be kept; None where no command did.
         accept_versions: go on with a study that other versions began.
 
@@ -128,7 +124,6 @@ def run_study(
     """Run a study in memory; or with a folder compute what is missing there, beside any process that does the same.
 
     Args:
-        study: what to run.
         folder: folder of the study, new or begun, or what `open_store` made of it; None to keep it in memory.
         progress: called before every cell, and within descents.
         command: command that asked for it, to be kept with a new study.
@@ -160,8 +155,6 @@ def run_study(
 
 
 class _Run:
-    """A plan that is carried out."""
-
     def __init__(self, plan: StudyPlan, progress: Progress):
         self._plan, self._progress, self._total = plan, progress, len(plan.cells)
         self._begun: set[Any] = {None}

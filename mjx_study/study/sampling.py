@@ -26,7 +26,6 @@ class Objectives:
         self._plan, self._compiled = plan, {}
 
     def simulator(self, group: int) -> Simulator:
-        """The simulator of a group."""
         if group not in self._compiled:
             self._compiled[group] = Simulator(self._plan.groups[group].task, chunk_size=self._plan.chunk_size)
         return self._compiled[group]

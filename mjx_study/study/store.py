@@ -48,7 +48,6 @@ class Part:
 
     Attributes:
         kept: arrays of the last checkpoint.
-        save: writes a checkpoint.
         report: reports progress within the cell: done, total, and what is being computed.
     """
 
@@ -61,7 +60,6 @@ class Store:
     """The folder of one study; `Store.create` and `Store.open` make one.
 
     Attributes:
-        folder: its path.
         document: contents of study.json.
     """
 
@@ -75,7 +73,6 @@ class Store:
         """Create a study's folder, or open an existing one of the same configuration and contents.
 
         Args:
-            folder: path of the folder.
             document: `config`, `cells`, and optionally `contents` (digests of what the numbers depend on), `versions`
                 (of the software that computes them), and further plain data.
             accept_versions: resume a study begun by other versions; each cell records its own.
@@ -155,7 +152,6 @@ class Store:
         return cls(folder, document)
 
     def path(self, index: int) -> Path:
-        """Path of a cell."""
         return self.folder / "cells" / f"{index:05d}.npz"
 
     def has(self, index: int) -> bool:
@@ -163,17 +159,14 @@ class Store:
         return self.path(index).exists()
 
     def part_path(self, index: int) -> Path:
-        """Path of a cell's checkpoint."""
         return self.folder / "cells" / f"{index:05d}.part.npz"
 
     def write(self, index: int, arrays: Mapping[str, np.ndarray]) -> None:
-        """Write a cell."""
         self._write(self.path(index), arrays, self._authors(index), self._place(index))
         self.part_path(index).unlink(missing_ok=True)
         self._failed(index).unlink(missing_ok=True)
 
     def write_failure(self, index: int, reason: str) -> None:
-        """Write why a cell could not be computed."""
         write_whole(self._failed(index), lambda file: file.write(reason.encode()))
 
     @property
@@ -186,7 +179,6 @@ class Store:
         return self.path(index).with_suffix(".failed")
 
     def write_part(self, index: int, arrays: Mapping[str, np.ndarray]) -> None:
-        """Write a cell's checkpoint."""
         self._write(self.part_path(index), arrays, self._authors(index), self._place(index, part=True))
 
     def _write(self, path: Path, arrays: Mapping[str, np.ndarray], versions: dict[str, str], place: str) -> None:
@@ -269,7 +261,6 @@ class Store:
 
     @property
     def missing(self) -> list[int]:
-        """Indices of cells not computed yet."""
         return [index for index in range(len(self.document["cells"])) if not self.has(index)]
 
 

@@ -1,7 +1,4 @@
-"""Every quantity of a study: its dimensions within a cell, unit, heading and description.
-
-Datasets, tables, JSON and reports are made from these.
-"""
+"""Every quantity of a study: its dimensions within a cell, unit and description."""
 
 import dataclasses
 from collections.abc import Iterable
@@ -15,54 +12,47 @@ class Variable:
     Attributes:
         dims: dimensions within a cell.
         unit: "gradient" is cost per unit of theta.
-        description: one line; the heading if `heading` is empty.
-        heading: short heading for tables.
     """
 
     dims: tuple[str, ...]
     unit: str
     description: str
-    heading: str = ""
 
 
 BATCH: Final = ("seed", "estimator")
 GRADIENTS: Final = {
-    "gradient_norm": Variable(BATCH, "gradient", "norm of the mean", "|gradient|"),
-    "variance": Variable(BATCH, "gradient^2", "variance of one sample, the trace of the covariance", "variance"),
+    "gradient_norm": Variable(BATCH, "gradient", "norm of the mean"),
+    "variance": Variable(BATCH, "gradient^2", "variance of one sample, the trace of the covariance"),
     "variance_lower": Variable(BATCH, "gradient^2", "lower end of the variance's confidence interval"),
     "variance_upper": Variable(BATCH, "gradient^2", "upper end of the variance's confidence interval"),
     "norm_median": Variable(BATCH, "gradient", "median of the samples' norms"),
     "norm_90": Variable(BATCH, "gradient", "90 % quantile of the samples' norms"),
     "norm_max": Variable(BATCH, "gradient", "largest norm of a sample"),
-    "effective_samples": Variable(BATCH, "1", "samples that the variance rests on", "effective samples"),
-    "top_share": Variable(BATCH, "1", "share of the variance that the largest sample carries", "top share"),
-    "relative_error": Variable(
-        BATCH, "1", "distance of the mean to the reference, over the norm of the reference", "relative error"
-    ),
+    "effective_samples": Variable(BATCH, "1", "samples that the variance rests on"),
+    "top_share": Variable(BATCH, "1", "share of the variance that the largest sample carries"),
+    "relative_error": Variable(BATCH, "1", "distance of the mean to the reference, over the norm of the reference"),
     "relative_error_se": Variable(BATCH, "1", "standard error of relative_error"),
-    "debiased_error": Variable(BATCH, "1", "relative_error without what noise adds to it", "debiased"),
+    "debiased_error": Variable(BATCH, "1", "relative_error without what noise adds to it"),
     "debiased_error_se": Variable(BATCH, "1", "standard error of debiased_error"),
-    "cosine": Variable(BATCH, "1", "cosine of the angle between mean and reference", "cosine"),
+    "cosine": Variable(BATCH, "1", "cosine of the angle between mean and reference"),
     "cosine_se": Variable(BATCH, "1", "standard error of cosine"),
     "debiased_cosine": Variable(BATCH, "1", "cosine without what noise takes from it"),
     "debiased_cosine_se": Variable(BATCH, "1", "standard error of debiased_cosine"),
-    "alpha": Variable(BATCH, "1", "weight of the first-order batch", "alpha"),
-    "epsilon": Variable(BATCH, "gradient", "confidence radius of the zeroth-order mean", "epsilon"),
-    "discrepancy": Variable(BATCH, "gradient", "distance between the two means", "B"),
+    "alpha": Variable(BATCH, "1", "weight of the first-order batch"),
+    "epsilon": Variable(BATCH, "gradient", "confidence radius of the zeroth-order mean"),
+    "discrepancy": Variable(BATCH, "gradient", "distance between the two means"),
     "bias_p_value": Variable(BATCH, "1", "p-value of no bias against the reference"),
-    "nonfinite": Variable(BATCH, "1", "samples that are not finite and were left out", "nan"),
+    "nonfinite": Variable(BATCH, "1", "samples that are not finite and were left out"),
     "pooled_error": Variable(
         ("estimator",), "1", "distance of the mean over all seeds to the reference, over the norm of the reference"
     ),
     "squared_bias": Variable(
-        ("estimator",), "1", "unbiased estimate of the squared bias, over the reference's squared norm", "squared bias"
+        ("estimator",), "1", "unbiased estimate of the squared bias, over the reference's squared norm"
     ),
-    "squared_bias_se": Variable(("estimator",), "1", "standard error of squared_bias", "± (standard error)"),
-    "residual": Variable(("estimator",), "1", "largest relative residual of the constraint solver", "residual"),
+    "squared_bias_se": Variable(("estimator",), "1", "standard error of squared_bias"),
+    "residual": Variable(("estimator",), "1", "largest relative residual of the constraint solver"),
     "unconverged": Variable(("estimator",), "1", "rollouts whose solver residual is too large"),
-    "seconds_per_sample": Variable(
-        ("estimator",), "s", "computing time of one sample, measured; compilation excluded", "ms"
-    ),
+    "seconds_per_sample": Variable(("estimator",), "s", "computing time of one sample, measured; compilation excluded"),
     "onsets": Variable(("estimator",), "1", "onsets of contact in the first-order batches"),
     "onsets_bounded": Variable(("estimator",), "1", "onsets at grazing speed, whose term is bounded"),
     "onsets_missed": Variable(("estimator",), "1", "onsets without a term"),
@@ -85,21 +75,19 @@ START: Final = "start_metric_"
 """Prefixes of a task's metrics: of the final policies, and of the initial one."""
 STEP: Final = ("iteration", *BATCH)
 DESCENTS: Final = {
-    "final_cost": Variable(BATCH, "cost", "mean cost of the final policy", "final cost, median"),
+    "final_cost": Variable(BATCH, "cost", "mean cost of the final policy"),
     "final_cost_se": Variable(BATCH, "cost", "standard error of final_cost"),
     "start_cost": Variable((), "cost", "mean cost of the start's policy"),
     "start_cost_se": Variable((), "cost", "standard error of start_cost"),
-    "stopped_at": Variable(
-        BATCH, "1", "iteration at which a seed stopped before the end; NaN for none", "stopped seeds"
-    ),
+    "stopped_at": Variable(BATCH, "1", "iteration at which a seed stopped before the end; NaN for none"),
     "reason": Variable(BATCH, "1", "why it stopped, an index into `mjx_study.study.iteration.REASONS`; NaN for none"),
     "cost": Variable(STEP, "cost", "mean cost of the batch, before the update"),
     "gradient_norm": Variable(STEP, "gradient", "norm of the estimate"),
     "variance": Variable(STEP, "gradient^2", "variance of one sample, the trace of the covariance"),
-    "alpha": Variable(STEP, "1", "weight of the first-order batch", "alpha"),
-    "nonfinite": Variable(STEP, "1", "samples that are not finite and were left out", "nan"),
+    "alpha": Variable(STEP, "1", "weight of the first-order batch"),
+    "nonfinite": Variable(STEP, "1", "samples that are not finite and were left out"),
     "residual": Variable(STEP, "1", "largest relative residual of the constraint solver"),
-    "rollouts": Variable(("estimator",), "1", "rollouts simulated in one iteration of one seed", "rollouts"),
+    "rollouts": Variable(("estimator",), "1", "rollouts simulated in one iteration of one seed"),
     "seconds": Variable(("iteration", "estimator"), "s", "time since the start, measured; compilation excluded"),
     "theta": Variable((*BATCH, "param"), "unit of theta", "parameters of the final policy"),
 }
@@ -110,7 +98,7 @@ LANDSCAPES: Final = {
     "smoothed_se": Variable(("point",), "cost", "standard error of smoothed"),
     "slope": Variable(("estimator", "point"), "gradient", "mean of the estimator along the line"),
     "slope_se": Variable(("estimator", "point"), "gradient", "standard error of slope"),
-    "nonfinite": Variable(("estimator", "point"), "1", "samples that are not finite and were left out", "nan"),
+    "nonfinite": Variable(("estimator", "point"), "1", "samples that are not finite and were left out"),
     "exact_smoothed": Variable(("point",), "cost", "smoothed without sampling error, where there is a quadrature"),
     "exact_slope": Variable(("point",), "gradient", "slope of exact_smoothed, the mean of an unbiased estimator"),
     "exact_first": Variable(("point",), "gradient", "mean of first-order gradients, without sampling error"),

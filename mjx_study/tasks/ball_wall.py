@@ -48,7 +48,6 @@ def ball_wall(
         horizon: number of 2 ms steps; the highest flight takes 330.
         model: name or path of a replacement MJCF, with the slide joints `x`, `z` in this order and the geoms `ball`,
             `wall`, `dome`.
-        adjoint, **scene_options: see `load_scene`.
 
     Raises:
         ValueError: unknown variant.

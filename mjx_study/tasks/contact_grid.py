@@ -44,7 +44,6 @@ class ContactPoint:
 
     @property
     def label(self) -> str:
-        """Name in messages."""
         return f"{self.family}, K = {self.stiffness:.{self.digits}g} N/m" if self.stiffness else self.family
 
 

@@ -42,9 +42,7 @@ def double_pendulum(
 
     Args:
         start: initial state: default or published.
-        horizon: number of 1 ms steps.
         model: name or path of a replacement MJCF, with the hinges `first` and `second` in this order.
-        **scene_options: see `load_scene`.
 
     Raises:
         ValueError: unknown start.

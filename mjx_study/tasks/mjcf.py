@@ -21,13 +21,7 @@ _FREE, _BALL = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL)
 
 
 def mjcf_task(path: str | Path, *, horizon: int = CHECKED_STEPS, **scene_options: str | float | Sequence[str]) -> Task:
-    """The task of a file; see `scene_task`.
-
-    Args:
-        path: an MJCF that MJX runs.
-        horizon: number of steps.
-        **scene_options: see `load_scene`.
-    """
+    """The task of a file; see `scene_task`."""
     return scene_task(load_scene(path, **scene_options), horizon=horizon)
 
 
@@ -39,7 +33,6 @@ def scene_task(scene: Scene, *, horizon: int = CHECKED_STEPS, pair: tuple[str, s
 
     Args:
         scene: the scene; its contact parameters are the MJCF's own.
-        horizon: number of steps.
         pair: names of the two geoms whose contact stiffness is swept; None for none.
 
     Raises:

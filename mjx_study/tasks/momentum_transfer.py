@@ -39,7 +39,6 @@ def momentum_transfer(
         horizon: number of 2 ms steps; the ball arrives within 250.
         model: name or path of a replacement MJCF, with the slide joints `x`, `y` and the hinge `pivot` in this order,
             and the geoms `ball`, `bar`; the cost uses its mass and inertia.
-        **scene_options: see `load_scene`.
     """
     scene = load_scene(model, **scene_options)
     require(scene, joints=("x", "y", "pivot"), geoms=("ball", "bar"))

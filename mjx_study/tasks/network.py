@@ -18,8 +18,6 @@ class Network(Feedback):
     """u_h = net(phi(x_h)) + w_h with tanh layers and a linear output; theta is all weights and biases, flattened.
 
     Attributes:
-        horizon: number of steps H.
-        controls: number of controls m.
         num_features: length of phi.
         features: feature map phi of the state.
         hidden: width of each hidden layer.
@@ -38,7 +36,6 @@ class Network(Feedback):
 
     @property
     def num_params(self) -> int:
-        """Weights and biases of all layers."""
         return sum((inputs + 1) * outputs for inputs, outputs in self.shapes)
 
     def initial(self, key: Key[Array, ""], dtype) -> Float[Array, " params"]:
@@ -53,7 +50,6 @@ class Network(Feedback):
         return jnp.concatenate(parts)
 
     def feedback(self, theta: Float[Array, " params"], state: State) -> Float[Array, " nu"]:
-        """net(phi(x))."""
         signal, used = self.features(state), 0
         for index, (inputs, outputs) in enumerate(self.shapes):
             weights = theta[used : used + inputs * outputs].reshape(inputs, outputs)
@@ -77,7 +73,6 @@ def with_network(task: Task, hidden: tuple[int, ...], key: Key[Array, ""]) -> Ta
     Its input is that of the task's linear feedback, or positions, velocities and activations if there is none.
 
     Args:
-        task: task with controls.
         hidden: width of each hidden layer.
         key: random key for the initial weights; consumed.
 

@@ -29,7 +29,6 @@ def own_task(place: str, options: dict[str, Any]) -> Task:
     The current directory counts as importable, in the console script too.
 
     Args:
-        place: `module:name`.
         options: arguments for the function; a ready-made Task takes none.
 
     Raises:

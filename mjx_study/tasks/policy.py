@@ -76,11 +76,9 @@ class NoisyControls:
 
     @property
     def noise_shape(self) -> tuple[int, int]:
-        """(H, m)."""
         return self.horizon, self.controls
 
     def place(self, theta: Float[Array, " params"], noise: Float[Array, "steps dimensions"], start: State) -> State:
-        """The initial state unchanged."""
         return start
 
 
@@ -97,17 +95,14 @@ class OpenLoop(NoisyControls):
 
     @property
     def num_params(self) -> int:
-        """H m."""
         return self.horizon * self.controls
 
     def feedforward(
         self, theta: Float[Array, " params"], noise: Float[Array, "steps dimensions"]
     ) -> Float[Array, "horizon nu"]:
-        """theta, reshaped, plus the noise."""
         return theta.reshape(self.horizon, self.controls) + noise
 
     def feedback(self, theta: Float[Array, " params"], state: State) -> None:
-        """None: an open loop ignores the state."""
         return None
 
     def score(
@@ -135,28 +130,18 @@ class Feedback(NoisyControls):
     def feedforward(
         self, theta: Float[Array, " params"], noise: Float[Array, "steps dimensions"]
     ) -> Float[Array, "horizon nu"]:
-        """The noise."""
         return noise
 
 
 @dataclasses.dataclass(frozen=True)
 class LinearFeedback(Feedback):
-    """u_h = Theta phi(x_h) + w_h: theta is Theta (controls, features), flattened.
-
-    Attributes:
-        horizon: number of steps H.
-        controls: number of controls m.
-        num_features: length of phi.
-        features: feature map phi of the state.
-    """
+    """u_h = Theta phi(x_h) + w_h: theta is Theta (controls, features), flattened."""
 
     @property
     def num_params(self) -> int:
-        """m times the number of features."""
         return self.controls * self.num_features
 
     def feedback(self, theta: Float[Array, " params"], state: State) -> Float[Array, " nu"]:
-        """Theta phi(x)."""
         return theta.reshape(self.controls, self.num_features) @ self.features(state)
 
     def score(
@@ -171,8 +156,6 @@ class InitialStatePolicy:
     """Initial-state policy: theta + w determines the initial state, and no control acts.
 
     Attributes:
-        num_params: length of theta.
-        horizon: number of steps H.
         controls: number of controls m, all zero.
         start_at: maps (start, theta + w) to the state that the simulation starts from.
     """
@@ -190,21 +173,17 @@ class InitialStatePolicy:
         return 1, self.num_params
 
     def place(self, theta: Float[Array, " params"], noise: Float[Array, "steps dimensions"], start: State) -> State:
-        """The state after the launch."""
         return self.start_at(start, theta + noise[0])
 
     def feedforward(
         self, theta: Float[Array, " params"], noise: Float[Array, "steps dimensions"]
     ) -> Float[Array, "horizon nu"]:
-        """Nothing acts after the launch."""
         return jnp.zeros((self.horizon, self.controls), theta.dtype)
 
     def feedback(self, theta: Float[Array, " params"], state: State) -> None:
-        """None."""
         return None
 
     def score(
         self, theta: Float[Array, " params"], states: State, noise_gradient: Float[Array, "steps dimensions"]
     ) -> Float[Array, " params"]:
-        """The noise gradient itself."""
         return noise_gradient[0]

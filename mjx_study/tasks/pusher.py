@@ -35,10 +35,8 @@ def pusher(*, horizon: int = HORIZON, model: str | Path = "pusher", **scene_opti
     """Cost sum_h e_h^T Q e_h + R u_h^2 + e_{H+1}^T Q e_{H+1}, with e the state minus the goal.
 
     Args:
-        horizon: number of 5 ms steps.
         model: name or path of a replacement MJCF, with the slide joints `pusher`, `slider` in this order, geoms of
             these names, and a motor on `pusher`.
-        **scene_options: see `load_scene`.
     """
     scene = load_scene(model, **scene_options)
     require(scene, joints=("pusher", "slider"), geoms=("pusher", "slider"), driven=("pusher",))

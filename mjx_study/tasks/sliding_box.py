@@ -36,10 +36,8 @@ def sliding_box(*, horizon: int = HORIZON, model: str | Path = "sliding_box", **
     """Cost sum_h e_h^T Q e_h + R u_h^2 + e_{H+1}^T Q e_{H+1}, with e the horizontal state minus the goal.
 
     Args:
-        horizon: number of 5 ms steps.
         model: name or path of a replacement MJCF, with the slide joints `block`, `height`, `box` in this order, the
             geoms `foot`, `box`, and a motor on `block`.
-        **scene_options: see `load_scene`.
     """
     scene = load_scene(model, **scene_options)
     require(scene, joints=("block", "height", "box"), geoms=("foot", "box"), driven=("block",))

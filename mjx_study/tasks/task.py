@@ -22,8 +22,6 @@ class Recipe:
 
     Attributes:
         learning_rate: learning rate of plain gradient descent.
-        iterations: number of descent steps.
-        samples: batch size.
         decay: power a of the learning rate's decay, learning_rate / i^a at iteration i = 1, 2, ...
     """
 
@@ -60,7 +58,6 @@ class StudyDefaults:
     """How a task is studied unless a study says otherwise.
 
     Attributes:
-        families: contact families.
         stiffnesses: contact stiffnesses [N/m].
         damping: contact damping in families without a damping ratio [N s/m], or None; friction needs some, since it is
             the resistance to slip.
@@ -95,12 +92,10 @@ class StudyDefaults:
 
 
 def no_running_cost(state: State, control: Float[Array, " nu"]) -> Float[Array, ""]:
-    """Zero running cost."""
     return jax.numpy.zeros((), state.qpos.dtype)
 
 
 def no_final_cost(state: State) -> Float[Array, ""]:
-    """Zero final cost."""
     return jax.numpy.zeros((), state.qpos.dtype)
 
 
@@ -110,8 +105,6 @@ class Task:
 
     Attributes:
         name: name on the command line.
-        description: one line.
-        scene: the compiled model.
         horizon: number of steps H.
         policy: maps theta, noise and state to initial state and controls.
         theta: default parameters, where gradients are taken, (params,). A weakly typed array is made a strong one;
@@ -188,11 +181,9 @@ class Task:
         return effective_mass(self.scene, *self.contact_pair)
 
     def draw_start(self, key: Key[Array, ""]) -> State:
-        """The initial state of one sample."""
         return self.start if isinstance(self.start, State) else self.start(key)
 
     def replace(self, **changes) -> "Task":
-        """A copy with some attributes changed."""
         return dataclasses.replace(self, **changes)
 
 

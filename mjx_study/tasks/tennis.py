@@ -37,10 +37,8 @@ def tennis(
     """Cost 0.001 sum_h |u_h|^2 + 100 (|position - target|^2 + |velocity|^2 / 10), the latter of the ball at the end.
 
     Args:
-        horizon: number of 5 ms steps.
         model: name or path of a replacement MJCF, with the joints `ball_x`, `ball_y`, `paddle_x`, `paddle_y`,
             `paddle_angle` in this order and a motor for each of the paddle's, in the same order.
-        adjoint, **scene_options: see `load_scene`.
     """
     host = load_model(model, **scene_options)
     for actuator, joint in enumerate(host.actuator_trnid[:, 0]):

@@ -14,7 +14,6 @@ def check_shapes(task: Task, name: str = "") -> None:
     """Refuse mismatches that broadcasting and clamped indices would let pass; traces only, computes nothing.
 
     Args:
-        task: the task to check.
         name: prefix of messages; by default the task's name.
 
     Raises:

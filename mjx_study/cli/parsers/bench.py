@@ -13,6 +13,5 @@ threads.
 
 
 def add(command: argparse.ArgumentParser) -> None:
-    """Add them."""
     add_task_options(command)
     add_option(command, OPTIONS["samples"], 1000)

@@ -53,7 +53,6 @@ columns of the table:
 
 
 def add(command: argparse.ArgumentParser) -> None:
-    """Add them."""
     add_task_argument(command)
     add_options(command, StudyConfig, "sigma", "cone", "horizon", "model", "timestep")
     add_process_options(command)

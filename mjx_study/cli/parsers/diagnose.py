@@ -24,7 +24,6 @@ derivative is wrong.
 
 
 def add(command: argparse.ArgumentParser) -> None:
-    """Add them."""
     add_task_options(command)
     add_contact_options(command, "the middle one of the task's", many=False, analytic=False)
     add_option(command, OPTIONS["samples"])

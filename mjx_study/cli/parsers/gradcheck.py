@@ -46,7 +46,6 @@ MEAN = {"estimators": ("zobg", "fobg"), "onset": "none", "samples": 1000, "span"
 
 
 def add(command: argparse.ArgumentParser) -> None:
-    """Add them."""
     add_task_argument(command)
     usual = ",".join(f"{each:g}" for each in CHECKED_STIFFNESS)
     add_contact_options(command, analytic=False, stiffness=f"{usual}, or the task's where that is stiffer")

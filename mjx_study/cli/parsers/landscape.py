@@ -33,7 +33,6 @@ quadrature over 1500 rollouts and gradients of each contact model (more where --
 
 
 def add(command: argparse.ArgumentParser) -> None:
-    """Add them."""
     add_task_argument(command)
     add_options(command, StudyConfig, "sigma", "cone", "horizon", "model", "noise")
     add_process_options(command)

@@ -40,7 +40,6 @@ columns of the table:
 
 
 def add(command: argparse.ArgumentParser) -> None:
-    """Add them."""
     add_task_options(command)
     add_theta_option(command, "parameters to start from")
     add_contact_options(command, "the middle one of the task's sweep", many=False)

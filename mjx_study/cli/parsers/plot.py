@@ -22,7 +22,6 @@ examples:
 
 
 def add(command: argparse.ArgumentParser) -> None:
-    """Add them."""
     command.add_argument("folder", type=Path, metavar="FOLDER", help="folder of a study")
     command.add_argument("--output", type=Path, metavar="DIR", help="default: the study's folder")
     command.add_argument("--style", choices=FIGURE_STYLES, default="screen", help="default: screen")

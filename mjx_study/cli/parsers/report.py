@@ -13,6 +13,5 @@ example:
 
 
 def add(command: argparse.ArgumentParser) -> None:
-    """Add them."""
     command.add_argument("folder", type=Path, metavar="FOLDER", help="folder of a study")
     command.add_argument("--output", type=Path, metavar="FILE.html", help="default: FOLDER/report.html")

@@ -30,7 +30,6 @@ examples:
 
 
 def add(command: argparse.ArgumentParser) -> None:
-    """Add them."""
     add_task_options(command)
     add_scene_options(command)
     add_contact_options(command, "the middle one of the task's sweep", many=False, analytic=False)

@@ -49,7 +49,6 @@ TASKS = Option("tasks", str, "TASK", "", many=True)
 
 
 def add(command: argparse.ArgumentParser) -> None:
-    """Add them."""
     choices = f"of: {', '.join(TASK_DESCRIPTIONS)}, or module:name"
     command.add_argument("tasks", nargs="?", type=TASKS.parse, metavar="TASK[,TASK]", help=choices)
     command.add_argument("--config", type=Path, metavar="FILE.toml", help="options from a file; flags go before it")

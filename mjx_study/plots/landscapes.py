@@ -1,0 +1,53 @@
+"""The figure of landscapes: costs along a line, and the slopes that estimators see."""
+
+import json
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from matplotlib.figure import Figure
+
+from mjx_study.plots.panels import a_few, estimators, panels
+from mjx_study.plots.style import STYLE, TITLES, mean_with_band, robust_limits
+
+
+def landscape(part: xr.Dataset, title: str) -> Figure:
+    """Cost and mean cost along the line above, the slope that each estimator sees below; a column for a few models."""
+    models, title = a_few(part), f"{title} at each point (bands: 95 %)"
+    figure, grid = panels(2, len(models), 1.6 + 2.9 * len(models), 6.2, title, sharex=True, sharey="row")
+    slopes, steepest = [], 0.0
+    direction = json.loads(part.attrs["config"])["direction"] or "random"
+    along = f"t, along direction {direction}" if part.attrs["many_parameters"] else "theta"
+    for (above, below), model in zip(grid.T, models, strict=True):
+        one = part.isel(model=model)
+        t = one["position"].values
+        steepest = max(steepest, float(np.nanmax(np.abs(np.gradient(one["smoothed"].values, t)), initial=0.0)))
+        above.plot(t, one["cost"], color="0.55", linewidth=1.2, label="cost without noise")
+        mean_with_band(above, t, one["smoothed"].values, one["smoothed_se"].values, "black", "mean cost with noise")
+        if "exact_slope" in one and bool(one["exact_slope"].notnull().any()):
+            dotted = {"linestyle": ":", "linewidth": 1.2}
+            below.plot(t, one["exact_slope"], color="black", **dotted, label="slope of the mean cost, quadrature")
+            first = STYLE["fobg"][0]
+            below.plot(t, one["exact_first"], color=first, **dotted, label="mean of FoBG, quadrature")
+        for mine, style in estimators(one):
+            slopes.append(mine["slope"].values)
+            mean, error = mine["slope"].values, mine["slope_se"].values
+            mean_with_band(below, t, mean, error, style["color"], f"mean of {style['label']}")
+        family, stiffness = one["contact"].item(), float(one["stiffness"])
+        spring = f"\nK = {stiffness:g} N/m" if stiffness else ""
+        above.set_title(f"{TITLES.get(family, family)}{spring}", fontsize="medium")
+        below.axhline(0, color="0.7", linewidth=0.8)
+        below.set_xlabel(along)
+    low, high = robust_limits(slopes)  # and a slope that is wild beside that of the mean cost leaves the axes
+    if steepest > 0:
+        low, high = max(low, -10 * steepest), min(high, 10 * steepest)
+    grid[1, 0].set_ylim(low, high)
+    grid[0, 0].set_ylabel("cost")
+    grid[1, 0].set_ylabel("slope along the line")
+    legend: dict[str, Any] = {}
+    for axes in grid.flat:
+        found, labels = axes.get_legend_handles_labels()
+        legend |= dict(zip(labels, found, strict=True))
+    columns = max(2, min(len(legend), 2 * len(models)))
+    figure.legend(legend.values(), legend, loc="outside lower center", ncols=columns, frameon=False, fontsize="small")
+    return figure

@@ -1,0 +1,162 @@
+"""What the figures of a study have in common: panels by contact family, and an estimator's line in them."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, Final
+
+import numpy as np
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from scipy import stats
+
+from mjx_study.plots.style import HOLLOW, NO_CONTACT, TITLES, line_with_band, style_of
+from mjx_study.simulation.contact import stable
+
+SWEPT: Final = {
+    "stiffness": "contact stiffness K [N/m]",
+    "timestep": "timestep h [s]",
+    "sigma": "noise sigma",
+    "samples": "samples N in a batch",
+}
+"""Dimensions that can be the axis of a figure, with their labels."""
+MOST_PANELS: Final = 6
+
+
+def panels(
+    rows: int, columns: int, width: float, height: float, title: str, **shared: Any
+) -> tuple[Figure, np.ndarray]:
+    """A figure with a title over a grid of panels; its size is in inches."""
+    figure = Figure(figsize=(width, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    figure.suptitle(title, fontsize="medium")
+    grid = figure.subplots(rows, columns, squeeze=False, **shared)
+    for axes in grid.flat:
+        axes.grid(alpha=0.25)
+    return figure, grid
+
+
+def a_few(part: xr.Dataset) -> list[int]:
+    """Indices of at most `MOST_PANELS` contact models, evenly spread."""
+    return np.unique(np.linspace(0, part.sizes["model"] - 1, MOST_PANELS).round().astype(int)).tolist()
+
+
+def by_family(part: xr.Dataset) -> list[tuple[str, xr.Dataset]]:
+    """Contact models by family, in the order of their stiffness."""
+    contact = part["contact"].values
+    names = dict.fromkeys(contact.tolist())
+    return [(name, part.isel(model=np.flatnonzero(contact == name)).sortby("stiffness")) for name in names]
+
+
+def make_logarithmic(axes: Axes, x: np.ndarray | None) -> None:
+    """A logarithmic y axis over a logarithmic x, or over none; with limits of their own where nothing is positive."""
+    axes.set_yscale("log")
+    if min(axes.get_ylim()) <= 0:
+        axes.set_ylim(0.1, 10)
+    if x is not None:
+        axes.set_xscale("log")
+        if min(axes.get_xlim()) <= 0:
+            axes.set_xlim(min(x) / 1.1, max(x) * 1.1)
+
+
+def note(axes: Axes, x: float, text: str, **style: Any) -> None:
+    """A word along the upper end of a vertical line."""
+    axes.annotate(text, (x, 0.98), xycoords=("data", "axes fraction"), rotation=90, va="top", **style)
+
+
+def positions(rows: xr.Dataset) -> np.ndarray:
+    """Stiffnesses, for a logarithmic axis [N/m]."""
+    return np.where(rows["stiffness"].values > 0, rows["stiffness"].values, NO_CONTACT)
+
+
+def families(part: xr.Dataset) -> list[tuple[str, xr.Dataset]]:
+    """Contact models by family, those of one stiffness together at the end."""
+    found = by_family(part)
+    lines = [(family, rows) for family, rows in found if rows.sizes["model"] > 1]
+    points = [rows for _, rows in found if rows.sizes["model"] == 1]
+    if points:
+        lines.append(("", xr.concat(points, "model", data_vars="minimal", coords="minimal", compat="override")))
+    return lines
+
+
+def against_stiffness(
+    part: xr.Dataset,
+    title: str,
+    ylabel: str,
+    draw: Callable[[Axes, xr.Dataset, np.ndarray], None],
+    *,
+    log: bool = True,
+) -> Figure:
+    """A panel for each contact family."""
+    found = families(part)
+    figure, grid = panels(1, len(found), 1.4 + 3.2 * len(found), 3.7, title, sharey=True)
+    for axes, (family, rows) in zip(grid[0], found, strict=True):
+        if family:
+            x = positions(rows)
+            axes.set(xscale="log", xlabel=SWEPT["stiffness"])
+            axes.set_title(TITLES.get(family, family), fontsize="medium")
+        else:
+            x = np.arange(rows.sizes["model"], dtype=float)
+            labels = [TITLES.get(name, name) for name in rows["contact"].values.tolist()]
+            axes.set_xticks(x, labels, rotation=20, ha="right", fontsize="small")
+            axes.set_xlim(-0.6, len(x) - 0.4)
+        draw(axes, rows, x)
+        if family:
+            shade_unstable((axes,), rows, x)
+        if log:
+            make_logarithmic(axes, x if family else None)
+    grid[0, 0].set_ylabel(ylabel)
+    grid[0, 0].legend(frameon=False, fontsize="small")
+    return figure
+
+
+def estimators(rows: xr.Dataset) -> Iterator[tuple[xr.Dataset, dict[str, Any]]]:
+    for name in rows["estimator"].values.tolist():
+        label, colour, marker = style_of(name)
+        style = {"label": label, "color": colour, "marker": marker, "hollow": name in HOLLOW}
+        yield rows.sel(estimator=name), style
+
+
+def line(axes: Axes, rows: xr.Dataset, x: np.ndarray, y, lower, upper, style: Mapping[str, Any]) -> None:
+    """A line with its band over stiffnesses; points with bars over contact models of one stiffness."""
+    if len(np.unique(rows["contact"].values)) == 1 and len(x) > 1:
+        line_with_band(axes, x, y, lower, upper, **style)
+        return
+    bars = np.nan_to_num([y - lower, upper - y])
+    axes.errorbar(
+        x, y, yerr=bars, color=style["color"], marker=style["marker"], markersize=5, linestyle="none", capsize=3,
+        label=style["label"],
+    )  # fmt: skip
+
+
+def positive(values: Any) -> np.ndarray:
+    array = np.asarray(values, float)
+    return np.where(np.isfinite(array) & (array > 0), array, np.nan)
+
+
+def geometric(values: xr.DataArray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Geometric mean over the seeds, the last dimension, with a 95 % t interval of its logarithm."""
+    logs = np.log(positive(values.transpose(..., "seed")))
+    count = np.sum(np.isfinite(logs), axis=1)
+    usable = count > 0
+    mean, half = np.full(len(logs), np.nan), np.zeros(len(logs))
+    mean[usable] = np.nanmean(logs[usable], axis=1)
+    several = count > 1
+    half[several] = np.nanstd(logs[several], axis=1, ddof=1) / np.sqrt(count[several])
+    half[several] *= stats.t.ppf(0.975, count[several] - 1)
+    return np.exp(mean), np.exp(mean - half), np.exp(mean + half)
+
+
+def shade_unstable(along: Sequence[Axes], rows: xr.Dataset, x: np.ndarray) -> None:
+    """Stiffnesses at which the step gains energy while in contact."""
+    if "solref" not in rows:
+        return
+    known = rows["solref"].transpose("model", "solref_entry").values
+    steady = np.array([np.isnan(each).any() or stable(each.tolist(), float(rows["timestep"])) for each in known])
+    if steady.all() or not np.any(rows["stiffness"].values):
+        return
+    first = int(np.argmin(steady))
+    left = x[first] if first == 0 else float(np.sqrt(x[first - 1] * x[first]))
+    for axes in along:
+        axes.axvspan(left, x[-1] * 1.15, color="0.5", alpha=0.13, linewidth=0, zorder=0)
+    note(along[0], left, "unstable step", fontsize="x-small", color="0.35")
