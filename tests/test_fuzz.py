@@ -124,6 +124,11 @@ def test_the_fuzzer_finds_a_traceback_and_an_exit(folder: Path, monkeypatch: pyt
         monkeypatch.setattr(compare, "plan_study", broken(error))
         with pytest.raises((KeyError, AssertionError, fuzzing.TooSlow)):
             fuzzing.answer(["compare", "pusher"], folder)
-    monkeypatch.setattr(compare, "plan_study", lambda *_: (folder / "policy.json").write_text("mine"))
+
+    def touching(*_: Any, **__: Any) -> None:
+        (folder / "policy.json").write_text("mine")
+        raise ValueError("and refuses")
+
+    monkeypatch.setattr(compare, "plan_study", touching)
     with pytest.raises(AssertionError, match="a file was touched"):
         fuzzing.answer(["compare", "pusher"], folder)
