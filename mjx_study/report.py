@@ -1,29 +1,19 @@
 """A study as one self-contained HTML page: warnings, figures, tables, configuration, and the command that made it."""
 
 import base64
-import html
 import io
 import itertools
 import json
-from collections.abc import Sequence
 from typing import Any, Final
 
+import jinja2
 import numpy as np
 import xarray as xr
+from matplotlib.figure import Figure
 
 from mjx_study.plots.study import SWEPT, plot_study
 from mjx_study.study.run import warnings_of
 
-STYLE: Final = """
-body { font: 15px/1.5 system-ui, sans-serif; max-width: 70rem; margin: 2rem auto; padding: 0 1rem; color: #222; }
-h1 { font-size: 1.6rem; } h2 { font-size: 1.2rem; margin-top: 2.2rem; border-bottom: 1px solid #ccc; }
-table { border-collapse: collapse; font-size: 13px; font-variant-numeric: tabular-nums; }
-th, td { padding: 0.15rem 0.7rem; text-align: right; border-bottom: 1px solid #eee; } th { border-color: #999; }
-td:first-child, th:first-child { text-align: left; }
-.wide { overflow-x: auto; } .warning { background: #fff4d6; padding: 0.4rem 0.8rem; margin: 0.3rem 0; }
-figure { margin: 1.5rem 0; } figure img { max-width: 100%; } figcaption { color: #555; font-size: 13px; }
-code, pre { background: #f4f4f4; padding: 0.1rem 0.3rem; } pre { padding: 0.6rem; overflow-x: auto; }
-"""
 CAPTIONS: Final = {
     "comparison": "Variance of one gradient sample, and relative error of the mean against the reference.",
     "variance": "Variance of one gradient sample; geometric mean over the seeds.",
@@ -64,54 +54,33 @@ COLUMNS: Final = {
 
 def report(dataset: xr.Dataset) -> str:
     config = json.loads(dataset.attrs["config"])
-    tasks = ", ".join(config["tasks"])
-    kind = KINDS[config["kind"]]
-    warnings = warnings_of(dataset)
-    parts = [
-        f"<h1>{_text(tasks)}: {kind} through {dataset.sizes['model']} contact models</h1>",
-        *_paragraphs("warning", warnings),
-        "<h2>Figures</h2>",
-        *_figures(dataset),
-        "<h2>Numbers</h2>",
-        f"<p>{SUMMARY[config['kind']]} <code>results.nc</code> has all numbers.</p>",
-        _numbers(dataset),
-        "<h2>Configuration</h2>",
-        _table(
-            ["option", "value"], [[key, _shown(value)] for key, value in sorted(config.items()) if value is not None]
-        ),
-        "<h2>Provenance</h2>",
-        _table(["what", "value"], _provenance(dataset)),
-        "<h2>To run it again</h2>",
-        _again(dataset),
-    ]
-    head = f'<meta charset="utf-8"><title>{_text(tasks)}: {kind}</title><style>{STYLE}</style>'
-    return f'<!doctype html>\n<html lang="en"><head>{head}</head><body>\n' + "\n".join(parts) + "\n</body></html>\n"
+    pages = jinja2.Environment(loader=jinja2.PackageLoader("mjx_study"), autoescape=True, keep_trailing_newline=True)
+    return pages.get_template("report.html").render(
+        tasks=", ".join(config["tasks"]),
+        kind=KINDS[config["kind"]],
+        models=dataset.sizes["model"],
+        warnings=warnings_of(dataset),
+        figures=[_figure(name, figure) for name, figure in plot_study(dataset).items()],
+        summary=SUMMARY[config["kind"]],
+        numbers=_numbers(dataset),
+        config=[[key, _shown(value)] for key, value in sorted(config.items()) if value is not None],
+        provenance=_provenance(dataset),
+        command=dataset.attrs.get("command"),
+    )
 
 
-def _again(dataset: xr.Dataset) -> str:
-    if command := dataset.attrs.get("command"):
-        return f"<pre>{_text(command)}</pre>"
-    return "<p>It was run from Python: <code>run_study</code> with the configuration above.</p>"
+def _figure(name: str, figure: Figure) -> tuple[str, str, str]:
+    """Its name, caption and image."""
+    file = io.BytesIO()
+    figure.savefig(file, format="png", dpi=110)
+    caption = next(text for key, text in CAPTIONS.items() if name.startswith(key))
+    return name, caption, base64.b64encode(file.getvalue()).decode()
 
 
-def _figures(dataset: xr.Dataset) -> list[str]:
-    found = []
-    for name, figure in plot_study(dataset).items():
-        file = io.BytesIO()
-        figure.savefig(file, format="png", dpi=110)
-        caption = next(text for key, text in CAPTIONS.items() if name.startswith(key))
-        data = base64.b64encode(file.getvalue()).decode()
-        found.append(
-            f'<figure><img alt="{_text(name)}" src="data:image/png;base64,{data}">'
-            f"<figcaption>{_text(caption)}</figcaption></figure>"
-        )
-    return found or ["<p>No figure yet: no cell is computed.</p>"]
-
-
-def _numbers(dataset: xr.Dataset) -> str:
-    """The table of numbers, a row for each cell and estimator."""
+def _numbers(dataset: xr.Dataset) -> tuple[list[str], list[list[str]]] | None:
+    """Titles of the table of numbers, and a row for each cell and estimator."""
     if not dataset.data_vars:
-        return ""
+        return None
     if "smoothed" in dataset:
         dataset = _with_extremes(dataset)
     outer = [name for name in ("task", "timestep", "cone", "sigma") if dataset.sizes[name] > 1]
@@ -128,7 +97,7 @@ def _numbers(dataset: xr.Dataset) -> str:
                 place = [_shown(part[name].item()) for name in outer]
                 rows.append([str(model), *place, str(estimator), *map(_shown, numbers)])
     titles = ["contact model", *(SWEPT.get(name, name) for name in outer), "estimator"]
-    return _table([*titles, *(COLUMNS[name] for name in variables)], rows)
+    return [*titles, *(COLUMNS[name] for name in variables)], rows
 
 
 def _with_extremes(dataset: xr.Dataset) -> xr.Dataset:
@@ -164,23 +133,9 @@ def _provenance(dataset: xr.Dataset) -> list[list[str]]:
     return rows + [["revision", dataset.attrs["revision"]]] if "revision" in dataset.attrs else rows
 
 
-def _paragraphs(kind: str, texts: Sequence[str]) -> list[str]:
-    return [f'<p class="{kind}">{_text(text)}</p>' for text in texts]
-
-
-def _table(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    head = "".join(f"<th>{_text(title)}</th>" for title in titles)
-    body = "\n".join("<tr>" + "".join(f"<td>{_text(cell)}</td>" for cell in row) + "</tr>" for row in rows)
-    return f'<div class="wide"><table><thead><tr>{head}</tr></thead><tbody>\n{body}\n</tbody></table></div>'
-
-
 def _shown(value: Any) -> str:
     if isinstance(value, float):
         return "-" if np.isnan(value) else f"{value:.4g}"
     if isinstance(value, list):
         return ", ".join(_shown(each) for each in value)
     return str(value)
-
-
-def _text(text: str) -> str:
-    return html.escape(str(text))
