@@ -38,7 +38,7 @@ def places() -> dict[Path, Path]:
     own = {Path("README.md"): Path("index.md")}
     own |= {Path(f"{name}.md"): Path(f"{name.lower()}.md") for name in ("CHANGELOG", "CONTRIBUTING")}
     for path in sorted((ROOT / "docs").glob("*")):
-        if path.suffix in (".css", ".gif", ".md", ".png"):
+        if path.suffix in (".css", ".gif", ".js", ".md", ".png"):
             own[path.relative_to(ROOT)] = Path(path.name)
     for path in sorted((ROOT / "notebooks").glob("*.ipynb")):
         own[path.relative_to(ROOT)] = Path("notebooks", f"{path.stem}.md")
@@ -66,7 +66,7 @@ def adapted(text: str, page: Path, own: dict[Path, Path]) -> str:
 
     text = re.sub(r"(!?)\[((?:[^\[\]]|\[[^\]]*\])*)\]\(([^)\s]+)\)", link, text)
     text = re.sub(r"```math\n(.*?)```", lambda found: convert(found[1], display="block"), text, flags=re.DOTALL)
-    text = re.sub(r"\$`([^`]+)`\$", lambda found: convert(found[1]), text)
+    text = re.sub(r"\$`([^`]+)`\$", lambda found: f"<span>{convert(found[1])}</span>", text)
     return re.sub(
         r"```mermaid\n(.*?)```", lambda found: drawn(re.findall(r"(\w+) --> (\w+)", found[1])), text, flags=re.DOTALL
     )
@@ -177,6 +177,10 @@ def main() -> None:
     print(build.stdout, end="")
     if build.returncode or "griffe:" in build.stdout:  # what griffe says of a docstring is no issue to Zensical
         sys.exit("the site has issues")
+    site = ROOT / "build" / "site"
+    (site / "search.js").write_text(
+        f"var __index = {(site / 'search.json').read_text()};"
+    )  # for pages opened from disk
 
 
 if __name__ == "__main__":
