@@ -17,10 +17,10 @@ import mujoco
 import numpy as np
 
 from estimators import ORACLES, Circulation, Estimator, make_estimator, oracles_of, variance_interval
-from estimators.mean_check import NODES, circulations
+from estimators.mean_check import NODES
 from mjx_study.choices import is_file
 from mjx_study.gradcheck import GradcheckPlan, GradcheckReport, gradcheck, plan_gradcheck, plan_scene_gradcheck
-from mjx_study.gradcheck.mean import reach_of
+from mjx_study.gradcheck.mean import MEANS, along_means, reach_of, unmixed
 from mjx_study.objective import MjxObjective, Simulator, chunk_for, simulate
 from mjx_study.runtime import environment, precision
 from mjx_study.simulation.contact import ContactModel, stable, stiffness_from_solref
@@ -89,9 +89,9 @@ class Measured:
     Attributes:
         variance, lower, upper: of one sample, with its 95 % interval [gradient^2].
         seconds: computing time of a sample [s].
-        check: of its mean, along a path; None of zeroth order, which has no bias.
+        paths: checks of its mean along them; none of zeroth order, which has no bias.
         verdict: of its mean: unbiased by theory, or right, biased or undecided by the check.
-        bias: what the mean misses along the path, where something is seen [gradient].
+        bias: what the mean misses along the paths, beyond one standard error [gradient].
         norm: of the mean, without what noise adds to it [gradient].
         lost: samples that are not finite and were left out.
     """
@@ -101,7 +101,7 @@ class Measured:
     lower: float
     upper: float
     seconds: float
-    check: Circulation | None
+    paths: tuple[Circulation, ...]
     verdict: str
     bias: float
     norm: float
@@ -221,11 +221,10 @@ class Diagnosis(Measurement):
         state = "every derivative that exists is right" if self.derivatives.passed else "A DERIVATIVE IS WRONG"
         missing = ", where it was exercised" if self.derivatives.passed and self.derivatives.unexercised else ""
         lines += ["", "derivatives of a step", f"  {state}{missing}", f"  > {command.format('gradcheck')}"]
-        names = ",".join(each.estimator for each in self.estimators if each.check is not None)
+        batch = f"--estimators {','.join(each.estimator for each in self.estimators)} --samples {self.samples}"
         lines += ["", "estimators, by their relative error after a second of computing", *self._estimator_lines()]
-        lines += [f"  > {command.format('gradcheck')} --mean --estimators {names} --samples {self.samples}"]
-        names = ",".join(each.estimator for each in self.estimators)
-        lines += [f"  > {command.format('compare')} --estimators {names} --samples {self.samples}"]
+        lines += [f"  > {command.format('gradcheck')} --mean --direction {MEANS} {batch}"]
+        lines += [f"  > {command.format('compare')} {batch}"]
         lines += ["", "advice"]
         for text, flags in self._advice():
             lines += textwrap.wrap(text, 100, initial_indent="  ", subsequent_indent="    ")
@@ -437,22 +436,19 @@ def _measure(
     samples: int,
     seed: int,
 ) -> list[Measured]:
-    """The estimators on their batches, and their means along a path in the direction of the surest of them."""
-    estimates, task = [estimator(batches) for estimator in chosen], objective.simulator.task
-    surest = min(estimates, key=lambda each: float(each.variance / jnp.sum(each.mean**2)))
+    """The estimators on their batches, and their means along the paths of `along_means`."""
+    task, estimates = objective.simulator.task, [estimator(batches) for estimator in chosen]
     reach = reach_of(task)
-    along = reach * surest.mean / jnp.linalg.norm(surest.mean)
     first = [each for each in chosen if any(ORACLES[oracle].order for oracle in each.needs)]
-    path = task.theta - along, task.theta + along
-    found = circulations(first, objective, *path, jax.random.key(seed), samples)
-    checks: dict[Estimator, Circulation] = dict(zip(first, found, strict=True))
+    found = along_means(first, objective, task.theta, reach, unmixed(chosen, batches), samples, seed)
+    checks: dict[Estimator, tuple[Circulation, ...]] = dict(zip(first, zip(*found, strict=True), strict=True))
     measured = []
     for estimator, estimate in zip(chosen, estimates, strict=True):
         lower, upper = variance_interval(estimate, 0.95)
         squared = float(jnp.sum(estimate.mean**2)) - float(estimate.variance) / samples
-        check = checks.get(estimator)
-        verdict = "unbiased" if check is None else check.verdict()
-        missed = 0.0 if check is None else abs(float(check.gap)) / (2 * reach)
+        paths = checks.get(estimator, ())
+        verdicts = {each.verdict() for each in paths}
+        missed = sum(max(0.0, float(each.gap**2 - each.standard_error**2)) for each in paths)
         measured.append(
             Measured(
                 estimator=estimator.name,
@@ -460,9 +456,9 @@ def _measure(
                 lower=float(lower),
                 upper=float(upper),
                 seconds=sum(seconds[oracle] for oracle in estimator.needs) / samples,
-                check=check,
-                verdict=verdict,
-                bias=missed if verdict == "biased" else 0.0,
+                paths=paths,
+                verdict=next((each for each in ("biased", "undecided", "right") if each in verdicts), "unbiased"),
+                bias=math.sqrt(missed) / (2 * reach),
                 norm=math.sqrt(max(squared, 0.0)),
                 lost=int(estimate.num_nonfinite),
             )

@@ -3,14 +3,17 @@
 import dataclasses
 import math
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from estimators import Differentiation, Evaluation, FirstOrder, ZerothOrder, estimate
 from mjx_study import cli
 from mjx_study.diagnose import Diagnosis, Measured, Touch, diagnose
+from mjx_study.gradcheck.mean import along_means
 from mjx_study.objective import Simulator
 from mjx_study.study.quadrature import Line, grid, means
 from mjx_study.tasks import make_task
@@ -98,7 +101,7 @@ def test_the_command_prints_the_page(tmp_path: Path, capsys: pytest.CaptureFixtu
 
 def planted(**changes: object) -> Measured:
     numbers = {"estimator": "fobg", "variance": 4.0, "lower": 3.0, "upper": 5.0, "seconds": 0.01}
-    return Measured(**(numbers | {"check": None, "verdict": "unbiased", "bias": 0.0, "norm": 2.0, "lost": 0} | changes))  # type: ignore[arg-type]
+    return Measured(**(numbers | {"paths": (), "verdict": "unbiased", "bias": 0.0, "norm": 2.0, "lost": 0} | changes))  # type: ignore[arg-type]
 
 
 def test_the_error_after_a_second_is_that_of_as_many_samples() -> None:
@@ -107,6 +110,36 @@ def test_the_error_after_a_second_is_that_of_as_many_samples() -> None:
     assert planted().error(2.0, 16.0) == pytest.approx(2 * hundred)
     assert planted(bias=0.3).error(2.0) == pytest.approx(math.hypot(0.15, hundred))
     assert planted().error(0.0) == math.inf
+
+
+class Sideways:
+    """10 x + step(y): the derivative is right along the mean gradient, nearly, and misses all of it at right angles."""
+
+    num_params = 2
+
+    def _at(self, theta: Any, keys: Any) -> Any:
+        noise = 0.1 * jax.vmap(lambda key: jax.random.normal(key, (2,)))(keys)
+        at = theta + noise
+        return 10 * at[:, 0] + (at[:, 1] > 0), noise / 0.1**2
+
+    def evaluate(self, theta: Any, keys: Any) -> Evaluation:
+        values, scores = self._at(theta, keys)
+        return Evaluation(values, scores, jnp.zeros(len(keys)))
+
+    def differentiate(self, theta: Any, keys: Any) -> Differentiation:
+        values, scores = self._at(theta, keys)
+        return Differentiation(values, jnp.broadcast_to(jnp.array([10.0, 0.0]), scores.shape))
+
+
+def test_a_bias_at_right_angles_to_the_gradient_is_seen() -> None:
+    objective, chosen = Sideways(), [ZerothOrder(), FirstOrder()]
+    streams = jax.random.split(jax.random.key(1), 2)
+    estimates = [estimate(each, objective, jnp.zeros(2), key, 2000) for each, key in zip(chosen, streams, strict=True)]
+    gradient, aside = (path[0] for path in along_means(chosen[1:], objective, jnp.zeros(2), 0.2, estimates, 4000, 0))
+    assert gradient.verdict() == "right" and aside.verdict() == "biased"
+    mean_slope = math.erf(2 / math.sqrt(2)) / 0.4  # of the step, over four standard deviations
+    assert abs(float(aside.gap)) / 0.4 == pytest.approx(mean_slope, rel=0.05)
+    assert float(aside.difference) == float(gradient.difference)
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 import argparse
 
+from mjx_study.choices import FAMILIES, is_file
 from mjx_study.cli.options import computing, configure_process, print_report, usage_errors
 from mjx_study.cli.parameters import task_of
 from mjx_study.diagnose import diagnose
@@ -12,8 +13,13 @@ def run(options: argparse.Namespace) -> int:
     with usage_errors():
         configure_process(options)
         task = task_of(options)
+        if not is_file(options.task):  # the other commands take several by default
+            options.contact = options.contact or task.defaults.main_family
+            if FAMILIES[options.contact].swept:
+                options.stiffness = options.stiffness or task.defaults.middle_stiffness
     names = ("contact", "stiffness", "damping", "sigma", "horizon", "cone", "model")
     given = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
+    given |= {"seed": options.seed} if options.seed else {}
     flags = "".join(f" --{name} {value:{'g' if isinstance(value, float) else ''}}" for name, value in given.items())
     with computing() as progress, usage_errors():
         found = diagnose(

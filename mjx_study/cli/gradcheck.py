@@ -44,6 +44,7 @@ def _run_mean(options: argparse.Namespace) -> int:
         configure_process(options)
         scene = scene_options(options, "cone", "iterations", "ls_iterations", "horizon", "model")
         task = make_task(options.task, **scene).replace(onset=chosen["onset"])
+        task = task if chosen["sigma"] is None else task.replace(sigma=chosen["sigma"])
         plan = check.plan_gradcheck(
             task, options.contact, options.stiffness, seed=options.seed, damping=options.damping
         )

@@ -11,13 +11,16 @@ from typing import Any, Final
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
 
-from estimators import Estimator
+from estimators import Estimator, GradientEstimate, Objective, oracles_of
 from estimators.mean_check import TOLERANCE, Circulation, circulations
 from mjx_study.objective import Simulator, chunk_for
 from mjx_study.study.configuration import Progress, check_span
 from mjx_study.study.line import direction_of
 from mjx_study.study.resolution import check_estimators
+from mjx_study.study.sampling import cell_keys, draw_batches
 from mjx_study.table import format_table
 from mjx_study.tasks.contact_grid import ContactPoint
 from mjx_study.tasks.task import Task
@@ -26,6 +29,11 @@ HALF_LENGTH: Final = 2.0
 """Of the path to either side of theta, in standard deviations of noise on theta."""
 FEEDBACK: Final = 0.02
 """The same where the noise is on the controls, in the unit of theta."""
+MEANS: Final = "means"
+"""In place of a direction: along the estimators' own means, see `along_means`."""
+MOST_PATHS: Final = 3
+NEGLIGIBLE: Final = 1e-3
+"""Share of a mean at right angles to the others from which a path is taken along it."""
 HEADER: Final = ("contact", "K [N/m]", "estimator", "difference", "gap", "±", "quadrature", "share", "finds", "verdict")
 
 
@@ -61,6 +69,50 @@ def reach_of(task: Task) -> float:
     return HALF_LENGTH * task.sigma if task.policy.additive else FEEDBACK
 
 
+def along_means(
+    estimators: Sequence[Estimator],
+    objective: Objective,
+    theta: Float[Array, " params"],
+    reach: float,
+    estimates: Sequence[GradientEstimate],
+    samples: int,
+    seed: int,
+) -> list[list[Circulation]]:
+    """Check means along up to three paths at right angles, which share the samples; by path and estimator.
+
+    The first path follows the surest of some estimates, the others what the next ones add to it: a bias at right angles
+    to the gradient shows only there. Their differences of the mean cost are replaced by the first path's, so that all
+    gaps are shares of the gradient.
+    """
+    units = _at_right_angles(estimates)
+    each, found = max(2, samples // len(units)), []
+    for unit in units:
+        along = reach * jnp.asarray(unit, theta.dtype)
+        found.append(circulations(estimators, objective, theta - along, theta + along, jax.random.key(seed), each))
+    return [
+        [dataclasses.replace(one, difference=first.difference) for one, first in zip(path, found[0], strict=True)]
+        for path in found
+    ]
+
+
+def _at_right_angles(estimates: Sequence[GradientEstimate]) -> list[np.ndarray]:
+    """Unit vectors that span the means, the surest first; what is negligible is left out."""
+    units: list[np.ndarray] = []
+    for estimate in sorted(estimates, key=lambda each: float(each.variance / jnp.sum(each.mean**2))):
+        left = mean = np.asarray(estimate.mean, float)
+        for unit in units:
+            left = left - (left @ unit) * unit
+        size = float(np.linalg.norm(left))
+        if len(units) < MOST_PATHS and size > NEGLIGIBLE * float(np.linalg.norm(mean)):
+            units.append(left / size)
+    return units or [np.eye(len(np.asarray(estimates[0].mean)))[0]]
+
+
+def unmixed(estimators: Sequence[Estimator], batches: dict[str, Any]) -> list[GradientEstimate]:
+    """The estimates that interpolate nothing: those of one batch."""
+    return [estimator(batches) for estimator in estimators if len(estimator.needs) == 1]
+
+
 def check_mean(
     task: Task,
     cells: Sequence[ContactPoint],
@@ -81,7 +133,7 @@ def check_mean(
         seed: of the samples and of a random direction.
         span: ends of the path, from theta along the direction [unit of theta]; None for two standard deviations of the
             noise to either side, or 0.02 where the noise is on the controls.
-        direction: "random", or the index of a parameter.
+        direction: "random", the index of a parameter, or "means" for the paths of `along_means`.
         tolerance: share of the cost's difference within which a mean is right.
 
     Raises:
@@ -90,15 +142,24 @@ def check_mean(
     check_estimators(estimators, task)
     check_span(span)
     low, high = (-reach_of(task), reach_of(task)) if span is None else span
-    along = jnp.asarray(direction_of(direction, task.policy.num_params, seed), task.theta.dtype)
+    axis = "random" if direction == MEANS else direction
+    along = jnp.asarray(direction_of(axis, task.policy.num_params, seed), task.theta.dtype)
     simulator = Simulator(task, chunk_size=chunk_for(samples, jax.local_devices()))
     found, total, ends = [], len(cells), (task.theta + low * along, task.theta + high * along)
     for index, cell in enumerate(cells):
         progress(index, total, cell.label)
         objective, key = simulator.objective(cell.contact), jax.random.key(seed)
-        numbers = circulations(estimators, objective, *ends, key, samples)
+        if direction == MEANS:
+            batches, _, _ = draw_batches(
+                objective, task.theta, cell_keys(seed, 1), oracles_of(estimators), samples, slice(1)
+            )
+            estimates = unmixed(estimators, jax.tree.map(lambda leaf: leaf[0], batches))
+            paths = along_means(estimators, objective, task.theta, reach_of(task), estimates, samples, seed)
+        else:
+            paths = [circulations(estimators, objective, *ends, key, samples)]
         found += [
             MeanCheck(cell.family, cell.stiffness or 0.0, estimator.name, each, each.verdict(tolerance))
+            for numbers in paths
             for estimator, each in zip(estimators, numbers, strict=True)
         ]
     progress(total, total, "done")

@@ -41,7 +41,14 @@ needs no reference gradient. Columns: that difference; the integral less it, the
 the quadrature's part of that; the gap as a share of the difference, and the least share that would be found for sure.
 "Right" is within 5 %. Exit code 0: all are right. 1: one is biased. 3: none is seen to be, and samples are too few.
 """
-MEAN = {"estimators": ("zobg", "fobg"), "onset": "none", "samples": 1000, "span": None, "direction": "random"}
+MEAN = {
+    "estimators": ("zobg", "fobg"),
+    "onset": "none",
+    "samples": 1000,
+    "sigma": None,
+    "span": None,
+    "direction": "random",
+}
 """Options of --mean, and their defaults."""
 
 
@@ -63,6 +70,8 @@ def add(command: argparse.ArgumentParser) -> None:
         option = dataclasses.replace(OPTIONS[name], line=f"with --mean: {OPTIONS[name].line}")
         if name == "span":
             option = dataclasses.replace(option, many=True, unset="two sigma about theta")
+        if name == "direction":
+            option = dataclasses.replace(option, line=f"{option.line}; or means: three paths that the means span")
         if name == "estimators":
             option = dataclasses.replace(option, many=True)
         add_option(command, option, default, given=False)
