@@ -21,6 +21,7 @@ from jaxtyping import Array, Float, Key
 
 from estimators import Differentiation, Evaluation, Linearisation, StepDifferentiation, StepEvaluation
 from mjx_study.reference.noise import noise_score, split_sample_key, standard_noise
+from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.branches import jump_term
 from mjx_study.simulation.contact import ContactModel, apply_contact
 from mjx_study.simulation.dynamics import State, rollout, step
@@ -104,12 +105,15 @@ def rollout_cost(
         return feedforward[index] if feedback is None else feedforward[index] + feedback
 
     model = apply_contact(task.scene.model, contact)
+    backward = _backward(task, contact)
+    if backward is not None and onset != "none":
+        raise ValueError("the onset term is of exact derivatives: leave onset out, or the contact's backward model")
     first = task.policy.place(theta, noise, start)
     simulated, counts, term = (task.scene, model, first, control_law, task.horizon), None, 0.0
     if onset == "linear":
         states, controls, residuals, counts = corrected_rollout(*simulated)
     else:
-        states, controls, residuals = rollout(*simulated)
+        states, controls, residuals = rollout(*simulated, backward)
     if onset == "jump":
         fixed = jax.lax.stop_gradient((theta, feedforward))
         law = lambda index, state: control_law(index, state, *fixed)  # noqa: E731
@@ -117,6 +121,12 @@ def rollout_cost(
         term, counts = jump_term(task.scene, without_derivative(model), states, controls, law, *costs)
     cost = jnp.sum(jax.vmap(task.running_cost)(_before_each_step(states), controls)) + task.final_cost(_last(states))
     return cost + term, (states, controls, jnp.max(residuals), counts)
+
+
+def _backward(task: Task, contact: ContactModel | None) -> mjx.Model | None:
+    """The model whose derivatives stand in for those of the contact model's own; None for its own."""
+    other = None if contact is None else contact.backward
+    return None if other is None else apply_contact(task.scene.model, other)
 
 
 def simulate(
@@ -244,7 +254,8 @@ class Simulator:
         task = self.task
         start, noise = self._draw(sigma, key_data, noise_scale)
         _, (states, controls, residual, _) = rollout_cost(task, theta, contact, start, noise)
-        model, before, last = apply_contact(task.scene.model, contact), _before_each_step(states), _last(states)
+        model = _backward(task, contact) or apply_contact(task.scene.model, contact)
+        before, last = _before_each_step(states), _last(states)
         sizes = np.cumsum([states.qpos.shape[1], states.qvel.shape[1]])
 
         def state_of(vector, like: State) -> State:
@@ -316,7 +327,7 @@ class MjxObjective:
 
     simulator: Simulator
     contact: ContactModel | None
-    sigma: float
+    sigma: float | Float[Array, ""]
 
     @property
     def num_params(self) -> int:

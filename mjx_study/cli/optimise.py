@@ -22,7 +22,7 @@ from mjx_study.table import format_table
 from mjx_study.tasks import make_task
 from mjx_study.tasks.contact_grid import REFERENCE
 
-WRAPPED = ("contact", "stiffness", "sigma", "cone", "samples")
+WRAPPED = ("contact", "stiffness", "sigma", "cone", "samples", "backward")
 """Options that are one value here, and a list in a study."""
 
 

@@ -159,6 +159,13 @@ def add_estimator_options(command: argparse.ArgumentParser, owner: type[Checked]
     )  # fmt: skip
 
 
+def add_backward_options(command: argparse.ArgumentParser, *, many: bool = True) -> None:
+    """Add the contact model of surrogate derivatives: one or many."""
+    add_option(command, dataclasses.replace(OPTIONS["backward"], many=many), unset="none")
+    for name in ("backward_stiffness", "backward_margin"):
+        add_option(command, OPTIONS[name])
+
+
 def add_process_options(command: argparse.ArgumentParser, seed: int | None = 0) -> None:
     """Seed, precision, devices; the seed is None where a configuration has its default."""
     add_option(command, OPTIONS["seed"], 0, given=seed is not None)

@@ -51,12 +51,15 @@ class ContactModel:
         solimp: MuJoCo's impedance: d_0, d_width, width [m], midpoint, power.
         friction: sliding [1], torsional [m], rolling [m]; None keeps the MJCF's.
         margin: distance at which contact begins [m]; None keeps the MJCF's.
+        backward: contact model whose derivatives stand in for this one's in a rollout (a surrogate gradient); None for
+            exact derivatives.
     """
 
     solref: Float[Array, "*batch 2"]
     solimp: Float[Array, "*batch 5"]
     friction: Float[Array, "*batch 3"] | None = None
     margin: Float[Array, "*batch"] | None = None
+    backward: "ContactModel | None" = None
 
 
 def contact_model(
@@ -206,6 +209,21 @@ def effective_mass(scene: Scene, geom1: str, geom2: str) -> float:
         return 1 / weight
     mu = float(np.max(host.geom_friction[geoms, 0]))
     return 2 * (condim - 1) * float(host.opt.impratio) / (2 * mu**2 * (1 + mu**2) * weight)
+
+
+def soften(contact: ContactModel, factor: float | Array) -> ContactModel:
+    """A contact model with its stiffness times a factor, at the same damping ratio; `backward` likewise.
+
+    Args:
+        contact: in either form of solref.
+        factor: positive.
+    """
+    first, second = contact.solref
+    root = jnp.sqrt(factor)
+    direct = jnp.stack([first * factor, second * root])
+    solref = jnp.where(first > 0, jnp.stack([first / root, second]), direct)
+    backward = None if contact.backward is None else soften(contact.backward, factor)
+    return dataclasses.replace(contact, solref=solref, backward=backward)
 
 
 def apply_contact(model: mjx.Model, contact: ContactModel | None) -> mjx.Model:

@@ -121,8 +121,42 @@ def solved_step(
 ControlLaw = Callable[[Int[Array, ""], State], Float[Array, " nu"]]
 
 
+def surrogate_step(
+    scene: Scene, model: mjx.Model, backward: mjx.Model, state: State, control: Float[Array, " nu"]
+) -> tuple[State, Float[Array, ""]]:
+    """`step` with the derivatives that the step of another model has at the same state and control.
+
+    Args:
+        scene: static part of both models.
+        model: the model to step.
+        backward: the model to differentiate.
+        state: the state before the step.
+        control: actuator controls, in the MJCF's units.
+
+    Returns:
+        As `step`. Derivatives with respect to either model are zero.
+    """
+
+    @jax.custom_jvp
+    def advance(model, backward, state, control):
+        return step(scene, model, state, control)
+
+    @advance.defjvp
+    def _(primals, tangents):
+        _, other, state, control = primals
+        _, change = jax.jvp(partial(step, scene, other), (state, control), tangents[2:])
+        return advance(*primals), change
+
+    return advance(jax.lax.stop_gradient(model), jax.lax.stop_gradient(backward), state, control)
+
+
 def rollout(
-    scene: Scene, model: mjx.Model, start: State, control_law: ControlLaw, horizon: int
+    scene: Scene,
+    model: mjx.Model,
+    start: State,
+    control_law: ControlLaw,
+    horizon: int,
+    backward: mjx.Model | None = None,
 ) -> tuple[State, Float[Array, "horizon nu"], Float[Array, " horizon"]]:
     """Simulate `horizon` steps in closed loop.
 
@@ -131,6 +165,7 @@ def rollout(
         model: the model to step; may be traced.
         control_law: maps (step index, state) to the control of that step.
         horizon: number of steps, at least 1.
+        backward: model whose derivatives every step has, see `surrogate_step`; None for its own.
 
     Returns:
         States `(horizon + 1, ...)` including the initial one, controls `(horizon, nu)`, residuals `(horizon,)`.
@@ -143,7 +178,10 @@ def rollout(
 
     def advance(state: State, index: Int[Array, ""]):
         control = control_law(index, state)
-        following, residual = step(scene, model, state, control)
+        if backward is None:
+            following, residual = step(scene, model, state, control)
+        else:
+            following, residual = surrogate_step(scene, model, backward, state, control)
         return following, (following, control, residual)
 
     if not scene.uses_jacobian:

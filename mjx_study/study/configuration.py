@@ -22,6 +22,8 @@ OF_KIND: Final[dict[str, dict[str, Any]]] = {
         "optimizer": "sgd",
         "learning_rate": None,
         "decay": None,
+        "stiffness_schedule": None,
+        "sigma_schedule": None,
         "evaluation_samples": 200,
         "network": None,
     },
@@ -61,6 +63,8 @@ class StudyConfig(Checked):
         span, direction: range and direction of that line; None for each task's range and a random direction.
         optimizer: name of an optax optimiser, "sgd" by default.
         learning_rate, decay: learning_rate / i^decay at iteration i; None for each task's recipe.
+        stiffness_schedule, sigma_schedule: factors by iteration of a descent, as calls of optax's schedules, on the
+            contact's stiffness (at most 1; the damping ratio stays) and on sigma; None for 1. Costs are at factor 1.
         reference_samples: pairs of rollouts for each reference gradient; None for 600 in studies of gradients.
         evaluation_samples: rollouts for the cost of a final policy; None for 200 in descents.
         seed: random seed.
@@ -77,6 +81,10 @@ class StudyConfig(Checked):
         weights: weights of interpolating estimators, plug_in or cross_fitted.
         onset: none, or first-order gradients with the onset term: linear (`mjx_study.simulation.onset`), or jump, which
             costs four rollouts per onset (`mjx_study.simulation.branches`).
+        backward: contact families whose derivatives stand in for the exact ones in turn, at the same states (surrogate
+            gradients); "none" for the exact ones.
+        backward_stiffness: stiffness of those families [N/m]; None for that of the contact model rolled out.
+        backward_margin: distance at which contact begins in their derivatives [m]; None for the MJCF's.
         horizon: steps; None for each task's.
         model: an MJCF that replaces the task's own; None for the task's.
         chunk_size: samples per device and call; None to choose by the number of samples.
@@ -107,6 +115,8 @@ class StudyConfig(Checked):
     optimizer: str | None = None
     learning_rate: float | None = None
     decay: float | None = None
+    stiffness_schedule: str | None = None
+    sigma_schedule: str | None = None
     reference_samples: int | None = None
     evaluation_samples: int | None = None
     seed: int = 0
@@ -122,6 +132,9 @@ class StudyConfig(Checked):
     tolerance: float = PUBLISHED_TOLERANCE
     weights: str = PLUG_IN
     onset: str = "none"
+    backward: tuple[str, ...] = ("none",)
+    backward_stiffness: float | None = None
+    backward_margin: float | None = None
     horizon: int | None = None
     model: str | None = None
     chunk_size: int | None = None
@@ -140,12 +153,13 @@ class StudyConfig(Checked):
                 if getattr(self, name) is not None:
                     chosen = f"contact {', '.join(self.contact)}" if self.contact else "solref or solimp alone"
                     raise ValueError(f"{chosen} takes no {name}; leave {name} out")
-        for name in ("tasks", "stiffness", "solref", "solimp", "timestep", "cone", "sigma", "samples"):
+        for name in ("tasks", "stiffness", "solref", "solimp", "timestep", "cone", "sigma", "samples", "backward"):
             values = getattr(self, name)
             if values is not None:
                 refuse_repeats(name, values)
             if values == () and name not in ("solref", "solimp"):
                 raise ValueError(f"no {name} given: give at least one, or leave it out")
+        self._check_backward()
         if self.iterations is not None and self.points is not None:
             raise ValueError("iterations are of descents and points of landscapes: give one of them")
         if self.kind is None:
@@ -153,6 +167,15 @@ class StudyConfig(Checked):
             object.__setattr__(self, "kind", of_points if self.iterations is None else "descents")
         self._settle()
         check_span(self.span)
+
+    def _check_backward(self) -> None:
+        """Refuse options of the backward model without one, and onset terms with it."""
+        if not self.surrogate:
+            for name in ("backward_stiffness", "backward_margin"):
+                if getattr(self, name) is not None:
+                    raise ValueError(f"{name} needs a contact family in backward")
+        elif self.onset != "none":
+            raise ValueError("the onset term corrects exact derivatives: leave onset or backward out")
 
     def _settle(self) -> None:
         """Refuse options without effect in this kind of study, and fill in the defaults of its own."""
@@ -168,6 +191,11 @@ class StudyConfig(Checked):
     @property
     def task_names(self) -> list[str]:
         return [which if isinstance(which, str) else which.name for which in self.tasks]
+
+    @property
+    def surrogate(self) -> bool:
+        """Whether any contact model has derivatives of another one."""
+        return any(family != "none" for family in self.backward)
 
     @property
     def batches(self) -> int:

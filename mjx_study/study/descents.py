@@ -22,8 +22,8 @@ from jaxtyping import Array, Float, Key
 
 from estimators import Estimator, Objective, draw
 from mjx_study.objective import Simulator, TracedObjective, simulate
-from mjx_study.simulation.contact import ContactModel
-from mjx_study.study.iteration import Descent, Record, advance, begin, going, make_optimizer
+from mjx_study.simulation.contact import ContactModel, soften
+from mjx_study.study.iteration import Descent, Record, advance, begin, going, make_optimizer, schedule_factors
 from mjx_study.study.plan import StudyCell, StudyPlan, estimators_of
 from mjx_study.study.sampling import rollouts_of
 from mjx_study.study.store import Part
@@ -73,6 +73,9 @@ class Backend:
         self.optimizer = make_optimizer(config.optimizer, self.recipe.learning_rate, self.recipe.decay)
         self.simulator = None if cell.model.analytic else Simulator(self.task, chunk_size=plan.chunk_size)
         self.saving = threading.Lock()
+        iterations = self.recipe.iterations
+        self._stiffness = schedule_factors(config.stiffness_schedule, iterations, most=1.0)
+        self._sigma = self.task.sigma * schedule_factors(config.sigma_schedule, iterations)
         self._iterations: dict[Estimator, Callable[..., tuple[Descent, Record]]] = {}
 
     @property
@@ -89,8 +92,8 @@ class Backend:
 
     def iteration(
         self, estimator: Estimator, model: ContactPoint
-    ) -> Callable[[Descent, Key[Array, " seeds"]], tuple[Descent, Record]]:
-        """An iteration of all seeds under one contact model; compiled once for all of them."""
+    ) -> Callable[[Descent, Key[Array, " seeds"], int], tuple[Descent, Record]]:
+        """An iteration of all seeds under one contact model, by its index; compiled once for all of them."""
 
         def update(state: Descent, drawn: dict[str, Any]) -> tuple[Descent, Record]:
             return advance(state, drawn, estimator, self.optimizer)
@@ -101,15 +104,24 @@ class Backend:
         if self.simulator is not None:
             if estimator not in self._iterations:
                 self._iterations[estimator] = jax.jit(
-                    lambda contact, state, keys: update(
-                        state, jax.vmap(partial(batches, self._traced(contact)))(state.theta, keys)
+                    lambda contact, sigma, state, keys: update(
+                        state, jax.vmap(partial(batches, self._traced(contact, sigma)))(state.theta, keys)
                     )
                 )
-            return partial(self._iterations[estimator], model.contact)
-        compiled = self._iterations.setdefault(estimator, jax.jit(update))
-        reference = self.task.analytic(model.stiffness)
+            simulated = self._iterations[estimator]
 
-        def on_host(state: Descent, keys: Key[Array, " seeds"]) -> tuple[Descent, Record]:
+            def on_device(state: Descent, keys: Key[Array, " seeds"], index: int) -> tuple[Descent, Record]:
+                factor, contact = self._stiffness[index], model.contact
+                contact = contact if contact is None or factor == 1 else soften(contact, factor)
+                return simulated(contact, self._sigma[index], state, keys)
+
+            return on_device
+        compiled = self._iterations.setdefault(estimator, jax.jit(update))
+
+        def on_host(state: Descent, keys: Key[Array, " seeds"], index: int) -> tuple[Descent, Record]:
+            reference = self.task.replace(sigma=float(self._sigma[index])).analytic(
+                model.stiffness * float(self._stiffness[index])
+            )
             drawn = [batches(reference, theta, key) for theta, key in zip(state.theta, keys, strict=True)]
             return compiled(state, jax.tree.map(lambda *leaves: jnp.stack(leaves), *drawn))
 
@@ -136,9 +148,9 @@ class Backend:
             found = jax.device_get(self._observe(theta, model.contact, self._evaluation_keys()))
         return {name: float(np.mean(values, where=np.isfinite(values))) for name, values in sorted(found.items())}
 
-    def _traced(self, contact: ContactModel | None) -> TracedObjective:
+    def _traced(self, contact: ContactModel | None, sigma: Any) -> TracedObjective:
         assert self.simulator is not None
-        return TracedObjective(self.simulator, contact, self.task.sigma)
+        return TracedObjective(self.simulator, contact, sigma)
 
     def _evaluation_keys(self) -> Key[Array, " samples"]:
         key = jax.random.fold_in(jax.random.key(self.config.seed), 2**31 - 1)
@@ -202,7 +214,7 @@ def _begin(
     iterate = backend.iteration(estimator, model)
     already = len(records)
     if already < iterations and bool(jnp.any(going(state))):
-        jax.block_until_ready(iterate(state, keys_of(already)))  # compile; the result is dropped
+        jax.block_until_ready(iterate(state, keys_of(already), already))  # compile; the result is dropped
 
     def descend() -> _Progress:
         nonlocal state
@@ -228,7 +240,7 @@ def _begin(
         while done < iterations:
             if not pending and not bool(jnp.any(going(state))):
                 break
-            state, record = iterate(state, keys_of(done))
+            state, record = iterate(state, keys_of(done), done)
             done += 1
             collect(record)
             if not pending:

@@ -1,11 +1,14 @@
 """One iteration of stochastic gradient descent for several seeds at once, and when a seed stops; pure functions."""
 
+import ast
 import dataclasses
 import inspect
+import math
 from typing import Any, Final
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from jaxtyping import Array, Bool, Float, Int
 
@@ -90,6 +93,44 @@ def _optimizer(name: str, schedule: optax.Schedule) -> optax.GradientTransformat
     except Exception:  # what optax has by this name raises what it likes
         return None
     return optimizer if isinstance(optimizer, optax.GradientTransformation) else None
+
+
+def schedule_factors(text: str | None, iterations: int, most: float = math.inf) -> Float[np.ndarray, " iterations"]:
+    """Factors by iteration, from an optax schedule as text, such as "linear_schedule(0.01, 1, 100)".
+
+    Args:
+        text: a call of a schedule of optax with numbers, lists or further schedules as arguments; None for ones.
+        iterations: how many.
+        most: largest factor allowed.
+
+    Raises:
+        ValueError: not such a call, optax refuses it, or a factor is not positive or too large.
+    """
+    if text is None:
+        return np.ones(iterations)
+    example = "give a schedule of optax, such as linear_schedule(0.01, 1, 100)"
+    try:
+        schedule = _evaluate(ast.parse(text.strip(), mode="eval").body)
+        factors = np.asarray(jax.vmap(schedule)(jnp.arange(iterations)), float)
+    except Exception as error:  # what optax has by this name raises what it likes
+        raise ValueError(f"{text!r} cannot be read ({str(error).splitlines()[0]}): {example}") from None
+    if factors.shape != (iterations,) or not np.all((factors > 0) & (factors <= most)):
+        bound = "positive" if most == math.inf else f"positive and at most {most:g}"
+        raise ValueError(f"factors must be {bound} in all {iterations} iterations; {text} has others")
+    return factors
+
+
+def _evaluate(node: ast.expr) -> Any:
+    """The value of a literal, or of a call of one of optax's schedules; nothing else is run."""
+    if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
+        factory = vars(optax.schedules).get(node.func.id)
+        if not inspect.isfunction(factory):
+            raise ValueError(f"optax has no schedule {node.func.id!r}")
+        named = {str(keyword.arg): _evaluate(keyword.value) for keyword in node.keywords}
+        return factory(*map(_evaluate, node.args), **named)
+    if isinstance(node, ast.List | ast.Tuple):
+        return [_evaluate(each) for each in node.elts]
+    return ast.literal_eval(node)
 
 
 def begin(optimizer: optax.GradientTransformation, theta: Float[Array, " params"], seeds: int) -> Descent:

@@ -2,7 +2,7 @@
 
 import dataclasses
 import itertools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 import jax
@@ -15,13 +15,13 @@ from mjx_study.limits import MOST_CELLS, MOST_PROGRAMS, check_count
 from mjx_study.objective import chunk_for
 from mjx_study.option import OPTIONS, check
 from mjx_study.study.configuration import SAMPLES, StudyConfig
-from mjx_study.study.iteration import make_optimizer
+from mjx_study.study.iteration import make_optimizer, schedule_factors
 from mjx_study.study.line import line_of
 from mjx_study.study.memory import LARGEST_BATCH, bytes_per_sample, check_batches, check_memory, seeds_at_once
 from mjx_study.study.resolution import at_theta, configured_estimators, recipe_of
 from mjx_study.table import digits_to_tell_apart
 from mjx_study.tasks import make_task
-from mjx_study.tasks.contact_grid import ContactPoint, contact_grid, solver_grid
+from mjx_study.tasks.contact_grid import ContactPoint, backward_grid, contact_grid, solver_grid
 from mjx_study.tasks.network import with_network
 from mjx_study.tasks.task import Recipe, Task, check_sigma
 from mjx_study.tasks.validation import check_shapes
@@ -144,6 +144,9 @@ def plan_study(config: StudyConfig, built: Mapping[str, Task] | None = None) -> 
         if config.solref or config.solimp:
             more, also = solver_grid(task, config.solref, config.solimp)
             models, told = models + more, told + also
+        surrogate = config.backward, config.backward_stiffness, config.backward_margin
+        models, also = backward_grid(task, models, *surrogate)
+        told += also
         if not models:
             raise ValueError("no contact model: give at least one contact family, solref or solimp")
         each = len(models) * len(config.sigma or (None,)) * len(counts)
@@ -165,8 +168,11 @@ def plan_study(config: StudyConfig, built: Mapping[str, Task] | None = None) -> 
     check_batches(plan.memory)
     for cell in {cell.group: cell for cell in cells}.values():
         chosen, recipe = estimators_of(plan, cell), groups[cell.group].recipe
+        if config.surrogate and (corrected := [each.name for each in chosen if "corrected" in each.needs]):
+            raise ValueError(f"{corrected[0]} corrects exact derivatives: leave it or backward out")
         if recipe is not None:
             make_optimizer(config.optimizer or "", recipe.learning_rate, recipe.decay)
+            _check_schedules(config, groups[cell.group], chosen)
             history = HISTORY_NUMBERS * config.batches * recipe.iterations
             check_memory(groups[cell.group].task, chosen, config.batches * cell.samples, other=history)
             check_memory(groups[cell.group].task, (), config.evaluation_samples or 0)
@@ -175,6 +181,20 @@ def plan_study(config: StudyConfig, built: Mapping[str, Task] | None = None) -> 
                 raise ValueError("theta has one entry, and the line is its range: give --span")
             line_of(groups[cell.group].task, config.points or 0, config.span, config.direction, config.seed)
     return plan
+
+
+def _check_schedules(config: StudyConfig, group: Group, chosen: Sequence[Estimator]) -> None:
+    """Raises ValueError for a schedule that cannot be read, or that a contact model or an estimator cannot follow."""
+    assert group.recipe is not None
+    schedule_factors(config.sigma_schedule, group.recipe.iterations)
+    schedule_factors(config.stiffness_schedule, group.recipe.iterations, most=1.0)
+    if config.stiffness_schedule and any(
+        not model.stiffness or (model.contact is None and not model.analytic) for model in group.models
+    ):
+        raise ValueError("stiffness_schedule needs contact models with a stiffness; mjcf has none that could be set")
+    fixed = [each.name for each in chosen if hasattr(each, "sigma")]
+    if config.sigma_schedule and fixed:
+        raise ValueError(f"{fixed[0]} holds for one sigma; leave it or the schedule of sigma out")
 
 
 def oracles_of(config: StudyConfig) -> tuple[str, ...]:

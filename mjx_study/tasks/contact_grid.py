@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Generator, Sequence
 from contextlib import contextmanager
 
+import jax.numpy as jnp
 import numpy as np
 
 from mjx_study.choices import DEFAULT_SOLIMP, DEFAULT_SOLREF, FAMILIES, REFERENCE
@@ -76,15 +77,51 @@ def contact_grid(
             cells += [ContactPoint(family, stiffness, None, digits) for stiffness in found]
             continue
         swept = family not in FAMILIES or FAMILIES[family].swept
-        undamped = swept and family in FAMILIES and FAMILIES[family].dampratio == 0
-        own = damping if damping is not None else task.defaults.damping if undamped else None
         for stiffness in stiffnesses if swept else (None,):
             with _warnings_of_contact() as caught:
-                contact = None if family == "mjcf" else _contact(task, family, stiffness, own if swept else None)
+                contact = None if family == "mjcf" else _contact(task, family, stiffness, damping)
                 cell = ContactPoint(family, stiffness or _stiffness(task, contact), contact, digits)
             cells.append(cell)
             messages += [f"{cell.label}: {warning.message}" for warning in caught]
     return tuple(cells), tuple(messages)
+
+
+def backward_grid(
+    task: Task,
+    cells: Sequence[ContactPoint],
+    families: Sequence[str],
+    stiffness: float | None = None,
+    margin: float | None = None,
+) -> tuple[tuple[ContactPoint, ...], tuple[str, ...]]:
+    """Contact models with surrogate derivatives, and the warnings of the models that those are of.
+
+    Args:
+        task: source of the effective mass.
+        cells: contact models to roll out; analytic systems stay as they are.
+        families: those whose derivatives each has in turn, at its own stiffness; "none" for exact derivatives.
+        stiffness: of the families that take one, in place of each cell's own [N/m].
+        margin: distance at which contact begins in them [m]; None for the MJCF's.
+
+    Raises:
+        ValueError: a family needs a stiffness and there is none, or a contact model is the MJCF's.
+    """
+    found, messages = [cell for cell in cells if cell.analytic or "none" in families], []
+    simulated = [cell for cell in cells if not cell.analytic]
+    for family, cell in itertools.product((name for name in families if name != "none"), simulated):
+        if cell.contact is None:
+            raise ValueError(f"contact {cell.family} takes no backward model; give its solref and solimp instead")
+        own = (stiffness or cell.stiffness or None) if FAMILIES[family].swept else None
+        with _warnings_of_contact() as caught:
+            other = _contact(task, family, own, None)
+        if margin is not None:
+            other = dataclasses.replace(other, margin=jnp.asarray(margin, other.solref.dtype))
+        name = f"{cell.family}, backward {family}"
+        name += f" {stiffness:g} N/m" if stiffness is not None and own else ""
+        name += "" if margin is None else f" from {margin:g} m"
+        contact = dataclasses.replace(cell.contact, backward=other)
+        found.append(dataclasses.replace(cell, family=name, contact=contact))
+        messages += [f"{found[-1].label}: {warning.message}" for warning in caught]
+    return tuple(found), tuple(messages)
 
 
 def check_reference(task: Task) -> None:
@@ -140,6 +177,10 @@ def _warnings_of_contact() -> Generator[list[warnings.WarningMessage]]:
 
 
 def _contact(task: Task, family: str, stiffness: float | None, damping: float | None) -> ContactModel:
+    """A family's contact model, with a damping [N s/m] or, where the family has none, the task's."""
+    if damping is None and family in FAMILIES and FAMILIES[family].dampratio == 0:
+        damping = task.defaults.damping
+    damping = None if stiffness is None else damping
     mass = 1.0 if stiffness is None else task.effective_mass
     return family_model(family, task.scene, stiffness=stiffness, damping=damping, effective_mass=mass)
 

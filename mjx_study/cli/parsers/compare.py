@@ -5,6 +5,7 @@ import argparse
 from estimators.catalogue import CATALOGUE
 from mjx_study.choices import FAMILIES
 from mjx_study.cli.options import (
+    add_backward_options,
     add_contact_options,
     add_estimator_options,
     add_folder_options,
@@ -61,5 +62,6 @@ def add(command: argparse.ArgumentParser) -> None:
     add_options(command, StudyConfig, "estimators", "reference_samples", reference_samples={"unset": "600"})
     add_option(command, StudyConfig.option("samples"), SAMPLES)
     add_estimator_options(command, StudyConfig)
+    add_backward_options(command)
     add_options(command, StudyConfig, "confidence", "chunk_size")
     add_folder_options(command)

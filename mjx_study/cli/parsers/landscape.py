@@ -3,6 +3,7 @@
 import argparse
 
 from mjx_study.cli.options import (
+    add_backward_options,
     add_contact_options,
     add_folder_options,
     add_option,
@@ -42,5 +43,6 @@ def add(command: argparse.ArgumentParser) -> None:
     add_option(command, StudyConfig.option("samples"), SAMPLES)
     add_option(command, OPTIONS["points"], POINTS)
     add_options(command, StudyConfig, "span", "direction", "onset", "chunk_size")
+    add_backward_options(command)
     command.add_argument("--no-reference", action="store_true", help="leave out the analytic reference")
     add_folder_options(command)

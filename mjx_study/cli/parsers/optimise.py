@@ -3,6 +3,7 @@
 import argparse
 
 from mjx_study.cli.options import (
+    add_backward_options,
     add_contact_options,
     add_estimator_options,
     add_folder_options,
@@ -48,6 +49,8 @@ def add(command: argparse.ArgumentParser) -> None:
     add_option(command, OPTIONS["samples"].within("[3, 1e7]"))
     add_option(command, OPTIONS["seeds"], SEEDS)
     add_options(command, StudyConfig, "optimizer", "learning_rate", "decay", optimizer={"unset": "sgd"})
+    add_options(command, StudyConfig, "stiffness_schedule", "sigma_schedule")
     add_estimator_options(command, StudyConfig)
+    add_backward_options(command, many=False)
     add_options(command, StudyConfig, "evaluation_samples", "chunk_size", evaluation_samples={"unset": "200"})
     add_folder_options(command)

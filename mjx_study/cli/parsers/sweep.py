@@ -8,6 +8,7 @@ from typing import Any
 
 from mjx_study.choices import TASK_DESCRIPTIONS
 from mjx_study.cli.options import (
+    add_backward_options,
     add_estimator_options,
     add_option,
     add_options,
@@ -62,9 +63,11 @@ def add(command: argparse.ArgumentParser) -> None:
     add_options(command, StudyConfig, "points", points={"line": "landscapes, on N points of a line through theta"})
     add_options(command, StudyConfig, "span", "direction")
     add_options(command, StudyConfig, "optimizer", "learning_rate", "decay", optimizer={"unset": "sgd"})
+    add_options(command, StudyConfig, "stiffness_schedule", "sigma_schedule")
     add_options(command, StudyConfig, "reference_samples", reference_samples={"unset": "600"})
     add_options(command, StudyConfig, "evaluation_samples", evaluation_samples={"unset": "200"})
     add_estimator_options(command, StudyConfig)
+    add_backward_options(command)
     add_options(command, StudyConfig, "horizon", "model", "chunk_size")
     add_process_options(command, seed=None)
     command.add_argument("--output", type=Path, required=True, metavar="DIR", help="folder of the study")
