@@ -11,6 +11,7 @@ import pytest
 
 from mjx_study.objective import Simulator, simulate
 from mjx_study.simulation.contact import contact_model, soften, stiffness_from_solref
+from mjx_study.simulation.dynamics import State
 from mjx_study.study.configuration import StudyConfig
 from mjx_study.study.descents import Backend
 from mjx_study.study.iteration import begin, schedule_factors
@@ -57,8 +58,9 @@ def test_costs_are_of_one_contact_and_derivatives_of_the_other(adjoint: str) -> 
 
 
 def test_a_force_at_a_distance_is_felt_before_contact() -> None:
-    """Across a gap the exact gradient of where the slider ends is zero; that with a margin wider than the gap is not."""
+    """Across a gap the exact gradient of where the slider ends is zero; with a margin wider than the gap it is not."""
     task = make_task("pusher", horizon=3)
+    assert isinstance(task.start, State)
     task = task.replace(
         start=dataclasses.replace(task.start, qpos=task.start.qpos + jnp.array([0.0, 0.05])),
         running_cost=lambda state, control: jnp.zeros(()),
@@ -132,7 +134,7 @@ def test_factors_are_optaxs() -> None:
     np.testing.assert_allclose(schedule_factors(joined, 4), [0.5, 0.5, 1, 0.5], rtol=1e-7)
     cosine = optax.cosine_decay_schedule(1.0, 10, alpha=0.1)
     found = schedule_factors("cosine_decay_schedule(1.0, 10, alpha=0.1)", 12)
-    np.testing.assert_allclose(found, [cosine(index) for index in range(12)], rtol=1e-6)
+    np.testing.assert_allclose(found, jax.vmap(cosine)(jnp.arange(12)), rtol=1e-6)
     np.testing.assert_array_equal(schedule_factors(None, 3), np.ones(3))
 
 
@@ -158,9 +160,13 @@ def test_an_iteration_has_the_stiffness_and_sigma_of_its_schedule(contact: str) 
         "seeds": 1, "samples": (3,), "evaluation_samples": 2, "learning_rate": 1e-3, "iterations": 3,
         "theta": (0.5,) * 10,
     }  # fmt: skip
-    schedules = {"stiffness_schedule": "linear_schedule(1, 0.25, 2)", "sigma_schedule": "linear_schedule(1, 3, 2)"}
+    schedules: dict[str, Any] = {
+        "stiffness_schedule": "linear_schedule(1, 0.25, 2)",
+        "sigma_schedule": "linear_schedule(1, 3, 2)",
+    }
     backends = []
-    for changes in ({"stiffness": (400.0,), **schedules}, {"stiffness": (100.0,), "sigma": (0.3,)}):
+    constant: dict[str, Any] = {"stiffness": (100.0,), "sigma": (0.3,)}
+    for changes in ({"stiffness": (400.0,), **schedules}, constant):
         plan = plan_study(StudyConfig(**common | changes))
         backends.append((Backend(plan, plan.cells[0]), plan))
     records = []
@@ -169,7 +175,7 @@ def test_an_iteration_has_the_stiffness_and_sigma_of_its_schedule(contact: str) 
         state = begin(backend.optimizer, backend.task.theta, 1)
         keys = jax.random.split(jax.random.key(5), 1)
         records.append(backend.iteration(estimator, plan.cells[0].model)(state, keys, 2)[1])
-    scheduled, constant = records
-    np.testing.assert_allclose(scheduled.cost, constant.cost, rtol=1e-12)
-    np.testing.assert_allclose(scheduled.gradient_norm, constant.gradient_norm, rtol=1e-9)
+    scheduled, expected = records
+    np.testing.assert_allclose(scheduled.cost, expected.cost, rtol=1e-12)
+    np.testing.assert_allclose(scheduled.gradient_norm, expected.gradient_norm, rtol=1e-9)
     assert np.all(scheduled.variance > 0)
