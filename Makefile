@@ -79,6 +79,7 @@ dist: $(STAMP) ## Build sdist and wheel into dist, and check what is in them
 	rm -rf build/wheel
 	$(BIN)/python -m pip install --quiet --no-deps --target build/wheel dist/*.whl
 	cd build/wheel && PYTHONPATH= $(CURDIR)/$(BIN)/python -m mjx_study tasks
+	cd build/wheel && PYTHONPATH= $(CURDIR)/$(BIN)/python -c 'import mjx_study as m; [m.make_task(name) for name in m.TASKS]'
 
 format: $(STAMP) ## Put imports and formatting right
 	$(BIN)/ruff check --fix-only .

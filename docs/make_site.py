@@ -95,7 +95,8 @@ def drawn(arrows: list[tuple[str, str]]) -> str:
         f'<text x="{x:.0f}" y="{64 * rows[box] + 21}">{box}</text>'
         for box, x in columns.items()
     ]
-    head = '<marker id="head" viewBox="0 0 8 8" refX="7" refY="4" orient="auto"><path d="M0 0L8 4L0 8z"/></marker>'
+    size = 'viewBox="0 0 8 8" refX="7" refY="4" markerWidth="8" markerHeight="8"'
+    head = f'<marker id="head" {size} orient="auto"><path d="M0 0L8 4L0 8z"/></marker>'
     return (
         f'<svg class="diagram" viewBox="{left:.0f} 0 {right - left:.0f} {bottom}">{head}{"".join(lines + texts)}</svg>'
     )
@@ -131,14 +132,15 @@ def page_of_names(package: str) -> str:
     """Every public name of a package by the module that it comes from."""
     folder = ROOT / package.replace(".", "/")
     source = next(path for path in (folder / "_public.py", folder / "__init__.py") if path.is_file())
-    lines = [f"# {package}", "", (import_module(package).__doc__ or "").strip(), ""]
+    names: dict[str, list[str]] = {}
     for node in ast.parse(source.read_text()).body:
         if isinstance(node, ast.ImportFrom) and node.module:
-            names = [alias.asname or alias.name for alias in node.names]
-            about = (import_module(node.module).__doc__ or "").strip().partition("\n")[0]
-            lines += [f"## {node.module.partition('.')[2]}", "", about, ""]
-            lines += [f"::: {package}.{name}\n" for name in names]
-    return "\n".join(lines)
+            names.setdefault(node.module, []).extend(alias.asname or alias.name for alias in node.names)
+    parts = [f"# {package}", (import_module(package).__doc__ or "").strip()]
+    for module, those in names.items():
+        about = (import_module(module).__doc__ or "").strip().partition("\n")[0]
+        parts += [f"## {module.partition('.')[2]}", about, *(f"::: {package}.{name}" for name in those)]
+    return "\n\n".join(parts)
 
 
 def page_of_commands() -> str:
