@@ -6,6 +6,7 @@ from typing import Final
 import mujoco
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial import ConvexHull, QhullError
 
 from mjx_study.choices import PLANES
 
@@ -114,21 +115,12 @@ def shape_of(model: mujoco.MjModel, geom: int) -> Shape | None:
 
 
 def convex_hull(points: Float[np.ndarray, "points 2"]) -> Float[np.ndarray, "corners 2"]:
-    """Corners of the convex hull in the plane, counter-clockwise (Andrew's monotone chain)."""
-    ordered = points[np.lexsort((points[:, 1], points[:, 0]))].tolist()
-
-    def chain(sequence: list[list[float]]) -> list[list[float]]:
-        kept: list[list[float]] = []
-        for x, y in sequence:
-            while len(kept) > 1:
-                (ax, ay), (bx, by) = kept[-2], kept[-1]
-                if (bx - ax) * (y - ay) > (by - ay) * (x - ax):
-                    break
-                kept.pop()
-            kept.append([x, y])
-        return kept[:-1]
-
-    return np.array(chain(ordered) + chain(ordered[::-1]) or ordered[:1])
+    """Corners of the convex hull in the plane, counter-clockwise; the ends of points on a line."""
+    try:
+        return points[ConvexHull(points).vertices]
+    except QhullError:
+        ordered = points[np.lexsort((points[:, 1], points[:, 0]))]
+        return np.unique(ordered[[0, -1]], axis=0)
 
 
 def _extreme(points: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, "kept 3"]:
