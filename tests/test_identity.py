@@ -3,6 +3,7 @@
 import dataclasses
 import importlib
 import re
+import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -316,32 +317,24 @@ def test_what_differs_is_told() -> None:
 # Git.
 
 
-@pytest.mark.parametrize("kind", ["loose", "packed", "detached", "worktree", "symbolic"])
-def test_the_revision_is_that_of_git(tmp_path: Path, kind: str) -> None:
-    """Folders as git lays them out."""
-    revision, git = "1234567890" * 4, tmp_path / "checkout" / ".git"
-    (git / "refs" / "heads").mkdir(parents=True)
-    (git / "HEAD").write_text("ref: refs/heads/main\n")
-    if kind in ("loose", "worktree"):
-        (git / "refs" / "heads" / "main").write_text(f"{revision}\n")
-    elif kind == "packed":
-        packed = f"# pack-refs with: peeled\n{'0' * 40} refs/tags/v1\n^{'1' * 40}\n{revision} refs/heads/main\n"
-        (git / "packed-refs").write_text(packed)
-    elif kind == "detached":
-        (git / "HEAD").write_text(f"{revision}\n")
-    else:
-        (git / "refs" / "heads" / "main").write_text("ref: refs/heads/other\n")
-        (git / "refs" / "heads" / "other").write_text(f"{revision}\n")
-    root = git.parent
-    if kind == "worktree":
-        root, own = tmp_path / "tree", git / "worktrees" / "tree"
-        root.mkdir()
-        own.mkdir(parents=True)
-        (root / ".git").write_text(f"gitdir: {own}\n")
-        (own / "commondir").write_text("../..\n")
-        (own / "HEAD").write_text("ref: refs/heads/main\n")
-    assert git_revision(root) == revision
-    assert git_revision(tmp_path) is None
-    (git / "refs" / "heads" / "main").unlink(missing_ok=True)
-    if kind not in ("detached", "packed"):
-        assert git_revision(root) is None
+def test_the_revision_is_that_of_git(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In a checkout and in a worktree of it; not in a folder within one, nor before the first commit."""
+    root, tree = tmp_path / "checkout", tmp_path / "tree"
+
+    def git(*arguments: str) -> str:
+        identity = ["-c", "user.name=me", "-c", "user.email=me@example.org", "-c", "commit.gpgsign=false"]
+        return subprocess.run(
+            ["git", "-C", root, *identity, *arguments], check=True, capture_output=True
+        ).stdout.decode()
+
+    (root / "package").mkdir(parents=True)
+    git("init")
+    assert git_revision(root) is None
+    git("commit", "--allow-empty", "--message", "first")
+    revision = git("rev-parse", "HEAD").strip()
+    git("worktree", "add", str(tree))
+    monkeypatch.setenv("GIT_DIR", str(tmp_path))  # as in a hook
+    assert len(revision) == 40 and git_revision(root) == git_revision(tree) == revision
+    assert git_revision(root / "package") is None
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert git_revision(root) is None
