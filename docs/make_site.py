@@ -106,7 +106,7 @@ def parts_of_notebook(path: Path, own: dict[Path, Path]) -> Iterator[str]:
     """A notebook as Markdown; its pictures are left where its page goes."""
     folder, pictures = (PAGES / own[path]).parent, 0
     title, *cells = nbformat.read(ROOT / path, as_version=4).cells
-    yield adapted(title.source, path, own) + f"\n\n[The notebook]({path.name}){{ .notebook download }}"
+    yield adapted(title.source, path, own) + f"\n\n[Download the notebook]({path.name}){{ .notebook download }}"
     for cell in cells:
         if "install" in cell.metadata.get("tags", ()):
             continue
