@@ -55,6 +55,9 @@ SMOOTH: Final = 0.01
 """Impedance at first touch below which force sets in without a jump."""
 WIDTHS: Final = 3.0
 """Steps' travel over which an impedance should rise."""
+LEGEND: Final = (
+    "  zobg: zeroth order; fobg: first order; aobg: both, weighted; _onset: with a term for contact that begins"
+)
 SHOWN: Final = 6
 """Contacts in the text, the least resolved first."""
 
@@ -233,11 +236,11 @@ class Diagnosis(Measurement):
 
     def _contact_lines(self) -> list[str]:
         found = self.onsets.get("onsets", 0)
-        lines = [f"  {found / self.samples:.2g} onsets in a rollout with noise"]
+        lines = [f"  {found / self.samples:.2g} contacts begin in a rollout with noise"]
         if found:
             lines[0] += (
                 f"; the first at a step that varies by {self.onsets['onset_spread']:.2g} steps, "
-                f"each takes {self.onsets['onset_strength']:.0%} of the approach speed in one"
+                f"each takes {self.onsets['onset_strength']:.0%} of the approach speed in one step"
             )
         if not self.touches:
             return [*lines, "  none in the rollout without noise"]
@@ -269,7 +272,7 @@ class Diagnosis(Measurement):
                     f"{1e3 * each.seconds:.3g}",
                 ]
             )
-        return format_table(rows, ["  estimator", "error", "95 % interval", "mean", "ms a sample"])
+        return [*format_table(rows, ["  estimator", "error", "95 % interval", "mean", "ms a sample"]), LEGEND]
 
     def _cautions(self) -> Iterator[str]:
         """What makes numbers on the page mean less."""

@@ -1,6 +1,7 @@
 """diagnose: what it measures of a ball that bounces is what can be said by hand, and what it advises is right."""
 
 import dataclasses
+import json
 import math
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ import pytest
 
 from estimators import Differentiation, Evaluation, FirstOrder, ZerothOrder, estimate
 from mjx_study import cli
+from mjx_study.cli import options
 from mjx_study.diagnose import Diagnosis, Measured, Touch, diagnose
 from mjx_study.gradcheck.mean import along_means
 from mjx_study.objective import Simulator
@@ -19,6 +21,7 @@ from mjx_study.study.quadrature import Line, grid, means
 from mjx_study.tasks import make_task
 from mjx_study.tasks.mjcf import mjcf_task
 
+HELD_OUT = Path(__file__).parents[1] / "docs" / "held_out"
 GRAVITY, HEIGHT, TIMESTEP = 9.81, 0.05, 0.002
 K, B = 3e4, 60.0  # [1/s^2], [1/s]: it bounces
 BALL = """<mujoco><option timestep="{h}"/>
@@ -97,6 +100,35 @@ def test_the_command_prints_the_page(tmp_path: Path, capsys: pytest.CaptureFixtu
     printed = capsys.readouterr().out
     assert "half the squared displacement of the joint after 65 steps, by the initial velocities" in printed
     assert "estimators, by their relative error after a second of computing" in printed
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("model", ["cart", "pendulum", "peg"])
+def test_the_commands_on_the_page_repeat_it(
+    model: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(options, "configure", lambda **_: None)  # JAX takes its devices once per process
+    name, horizon = str(HELD_OUT / f"{model}.xml"), 60
+    told = diagnose(name, make_task(name, horizon=horizon), samples=60, options=f" --horizon {horizon}")
+    commands = [line.removeprefix("  > mjx-study ").split() for line in told.lines() if line.startswith("  > ")]
+    steps, means, batches = commands[:3]
+
+    def document(command: list[str]) -> tuple[int, Any]:
+        code = cli.main([*command, "--json"])
+        return code, json.loads(capsys.readouterr().out)
+
+    assert (document(steps)[0] != 1) == told.derivatives.passed
+    measured = {each.estimator: each for each in told.estimators}
+    gaps: dict[str, list[float]] = {each: [] for each in measured}
+    for check in document(means)[1]["checks"]:
+        gaps[check["estimator"]].append(check["gap"])
+    for each in told.estimators:
+        if each.paths:
+            assert gaps[each.estimator] == pytest.approx([float(path.gap) for path in each.paths], rel=1e-6, abs=1e-12)
+    rows = {row["estimator"]: row for row in document(batches)[1]["rows"]}
+    assert rows.keys() == measured.keys()
+    for estimator, row in rows.items():
+        assert row["variance"] == pytest.approx(measured[estimator].variance, rel=1e-6)
 
 
 def planted(**changes: object) -> Measured:

@@ -164,9 +164,9 @@ def test_malformed_files_are_refused(text: str, message: str, tmp_path: Path) ->
             {"integrator": "implicitfast"},
         ),
         (
-            '<option><flag energy="enable" sleep="enable"/></option>',
-            r"MJX lacks energy, sleep, which here enables; disable them \(--disable-flag energy,sleep\)",
-            {"disable_flags": "energy,sleep"},
+            '<option><flag fwdinv="enable" sleep="enable"/></option>',
+            r"MJX lacks fwdinv, sleep, which here enables; disable them \(--disable-flag fwdinv,sleep\)",
+            {"disable_flags": "fwdinv,sleep"},
         ),
     ],
 )
@@ -181,15 +181,20 @@ def test_options_that_mjx_lacks_are_refused_and_what_is_told_helps(
     assert (int(host.opt.integrator), int(host.opt.solver), host.opt.enableflags) == before
 
 
+def test_energy_that_mjx_would_not_compute_is_left_out() -> None:
+    host = mujoco.MjModel.from_xml_string(floor_scene(FREE_BOX, '<option><flag energy="enable"/></option>'))
+    assert put_scene(host, "here").host.opt.enableflags == 0 < host.opt.enableflags
+
+
 def test_the_command_line_changes_what_is_refused(tmp_path: Path) -> None:
     """The model of a file with everything that a message tells one to give, as `gradcheck` reads it."""
     path = tmp_path / "walker.xml"
-    option = '<option integrator="RK4" solver="PGS"><flag energy="enable" fwdinv="enable"/></option>'
+    option = '<option integrator="RK4" solver="PGS"><flag fwdinv="enable" sleep="enable"/></option>'
     path.write_text(floor_scene(FREE_BOX, option))
     parser = Parser()
     add_scene_options(parser)
-    given = "--solver newton --disable-flag energy,fwdinv --integrator euler".split()
-    for count, message in ((0, "--solver"), (2, "--disable-flag energy,fwdinv"), (4, "--integrator")):
+    given = "--solver newton --disable-flag fwdinv,sleep --integrator euler".split()
+    for count, message in ((0, "--solver"), (2, "--disable-flag fwdinv,sleep"), (4, "--integrator")):
         with pytest.raises(SceneError, match=message):
             load_scene(path, **scene_options(parser.parse_args(given[:count])))
     assert load_scene(path, **scene_options(parser.parse_args(given))).host.opt.enableflags == 0

@@ -167,9 +167,10 @@ def put_scene(host: mujoco.MjModel, name: str, *, adjoint: SceneOption = "auto",
     Raises:
         SceneError: MJX cannot run the model or would ignore part of it, or an option is unknown or out of range.
     """
-    if options:
+    if options or not FLAGS["energy"].disabled(host.opt):
         host = copy.copy(host)
         _set_options(host, options)
+        FLAGS["energy"].disable(host.opt)  # MJX refuses it, and no motion depends on it
     check_model(host, name)
     try:
         model = mjx.put_model(host)
