@@ -34,11 +34,7 @@ def inverse_variance_alpha(
 
 
 def constrained_alpha(
-    variance_zeroth: Scalar,
-    variance_first: Scalar,
-    discrepancy: Scalar,
-    epsilon: float | Scalar,
-    gamma: float | Scalar,
+    variance_zeroth: Scalar, variance_first: Scalar, discrepancy: Scalar, epsilon: float | Scalar, gamma: float | Scalar
 ) -> Scalar:
     """The weight of least variance among those that promise an error of at most gamma.
 
@@ -131,11 +127,7 @@ def choose_alpha(
 
 
 def alpha_order(
-    zeroth: GradientEstimate,
-    first: GradientEstimate,
-    *,
-    gamma: float | Scalar,
-    epsilon: float | Scalar,
+    zeroth: GradientEstimate, first: GradientEstimate, *, gamma: float | Scalar, epsilon: float | Scalar
 ) -> GradientEstimate:
     """Alpha-order batched gradient (AoBG) with the weight of `constrained_alpha`.
 

@@ -92,10 +92,7 @@ CATALOGUE: dict[str, Entry] = {
             "inverse-variance weighting: alpha order with gamma infinite",
         ),
         Entry(
-            "ivw_h",
-            "IVW-H",
-            ("steps", "step_differentiation"),
-            "inverse-variance weights for every step and control",
+            "ivw_h", "IVW-H", ("steps", "step_differentiation"), "inverse-variance weights for every step and control"
         ),
         Entry(
             "total_propagation",

@@ -109,11 +109,7 @@ def oracles_of(estimators: Iterable[Estimator | type[Estimator]], *others: str) 
 
 
 def draw(
-    oracles: Iterable[str],
-    objective: Objective,
-    theta: Float[Array, " params"],
-    key: Key[Array, ""],
-    num_samples: int,
+    oracles: Iterable[str], objective: Objective, theta: Float[Array, " params"], key: Key[Array, ""], num_samples: int
 ) -> dict[str, Any]:
     """Draw batches, those of order 0 from one set of keys and those of order 1 from another.
 

@@ -289,10 +289,7 @@ class AlphaOrder(_OneWeight, entry=CATALOGUE["aobg"]):
 
     def choose(self, zeroth: GradientEstimate, first: GradientEstimate) -> AlphaChoice:
         epsilon = bernstein_epsilon(
-            zeroth,
-            failure_probability=self.failure_probability,
-            variance_proxy=self.variance_proxy,
-            radius=self.radius,
+            zeroth, failure_probability=self.failure_probability, variance_proxy=self.variance_proxy, radius=self.radius
         )
         return choose_alpha(zeroth, first, gamma=self.gamma, epsilon=epsilon)
 

@@ -11,14 +11,7 @@ from estimators.baselines import find_baseline
 from estimators.catalogue import PLUG_IN
 from estimators.cross_fitting import weigh_batches
 from estimators.statistics import finite_rows, summarise
-from estimators.types import (
-    AlphaChoice,
-    Evaluation,
-    GradientEstimate,
-    StepDifferentiation,
-    StepEvaluation,
-    pull_back,
-)
+from estimators.types import AlphaChoice, Evaluation, GradientEstimate, StepDifferentiation, StepEvaluation, pull_back
 
 Controls = Float[Array, "samples steps controls"]
 

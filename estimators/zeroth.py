@@ -50,9 +50,7 @@ def antithetic(plus: Evaluation, minus: Evaluation, baseline: str) -> GradientEs
 
 
 def delta_control_variate(
-    evaluation: Evaluation,
-    gradient: Float[Array, " params"],
-    sigma: float | Float[Array, ""],
+    evaluation: Evaluation, gradient: Float[Array, " params"], sigma: float | Float[Array, ""]
 ) -> GradientEstimate:
     """Zeroth-order estimate of what a linear model of f leaves over, added to the model's gradient.
 

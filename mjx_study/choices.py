@@ -74,16 +74,8 @@ def _constant(impedance: float) -> tuple[float, float, float, float, float]:
 FAMILIES: Final = {
     family.name: family
     for family in (
-        Family(
-            "penalty",
-            "spring K without damping, impedance 1e-4: the penalty method",
-            _constant(MIN_IMPEDANCE),
-        ),
-        Family(
-            "impedance",
-            "spring K without damping, impedance 0.5: half penalty, half constraint",
-            _constant(0.5),
-        ),
+        Family("penalty", "spring K without damping, impedance 1e-4: the penalty method", _constant(MIN_IMPEDANCE)),
+        Family("impedance", "spring K without damping, impedance 0.5: half penalty, half constraint", _constant(0.5)),
         Family("mujoco", "MuJoCo's default impedance (0.9 to 0.95), K critically damped", DEFAULT_SOLIMP, 1.0),
         Family("mujoco_stiff", "impedance 0.99 to 0.9999, K critically damped", STIFF_SOLIMP, 1.0),
         Family(

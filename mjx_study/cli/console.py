@@ -61,10 +61,7 @@ def _debiased(row: Row, value: float, debiased: float, error: float) -> str:
 def columns(confidence: float) -> list[list[Column]]:
     """The comparison's columns: those that identify a row, then the parts of which a table may have one or more."""
     return [
-        [
-            ("K [N/m]", lambda row: number(row.stiffness or None)),
-            ("estimator", lambda row: style_of(row.estimator)[0]),
-        ],
+        [("K [N/m]", lambda row: number(row.stiffness or None)), ("estimator", lambda row: style_of(row.estimator)[0])],
         [
             ("|gradient|", lambda row: number(row.gradient_norm)),
             (f"variance ({confidence:.0%} interval)", _interval),

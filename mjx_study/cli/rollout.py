@@ -29,15 +29,7 @@ from mjx_study.disk import prepare_folder, write_whole
 from mjx_study.files import PolicyFile, read_json
 from mjx_study.limits import MOST_STEPS, check_count
 from mjx_study.plots.style import save_figure
-from mjx_study.render import (
-    Motion,
-    RenderError,
-    animate,
-    check_format,
-    resolve_renderer,
-    strip,
-    stroboscope,
-)
+from mjx_study.render import Motion, RenderError, animate, check_format, resolve_renderer, strip, stroboscope
 from mjx_study.simulation.scene import load_model
 from mjx_study.study.resolution import at_theta
 from mjx_study.table import format_table

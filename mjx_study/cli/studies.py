@@ -9,15 +9,7 @@ from typing import Any
 
 import xarray as xr
 
-from mjx_study.cli.options import (
-    UsageError,
-    attempt,
-    computing,
-    configure_process,
-    finish,
-    print_report,
-    usage_errors,
-)
+from mjx_study.cli.options import UsageError, attempt, computing, configure_process, finish, print_report, usage_errors
 from mjx_study.cli.parameters import theta_of
 from mjx_study.plots.study import plot_study
 from mjx_study.plots.style import save_figures

@@ -17,15 +17,7 @@ from mjx_study.cli.studies import RESUMABLE, announce, study_fields
 from mjx_study.files import read_toml
 from mjx_study.option import OPTIONS
 from mjx_study.study.cluster import connected
-from mjx_study.study.run import (
-    StudyConfig,
-    StudyPlan,
-    load_study,
-    open_store,
-    plan_study,
-    run_study,
-    warnings_of,
-)
+from mjx_study.study.run import StudyConfig, StudyPlan, load_study, open_store, plan_study, run_study, warnings_of
 from mjx_study.study.store import StudyError
 from mjx_study.table import digits_to_tell_apart
 

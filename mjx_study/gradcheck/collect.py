@@ -145,11 +145,7 @@ def _of_state(check: StateCheck, layout: Coordinates) -> list[tuple[_Key, Entry]
 
 
 def _entry(
-    check: StateCheck,
-    layout: Coordinates,
-    name: str,
-    numbers: tuple[float, float | None],
-    gap: float | None = None,
+    check: StateCheck, layout: Coordinates, name: str, numbers: tuple[float, float | None], gap: float | None = None
 ) -> Entry:
     sample = check.sample
     derivative, difference = numbers

@@ -80,12 +80,7 @@ def families(part: xr.Dataset) -> list[tuple[str, xr.Dataset]]:
 
 
 def against_stiffness(
-    part: xr.Dataset,
-    title: str,
-    ylabel: str,
-    draw: Callable[[Axes, xr.Dataset, np.ndarray], None],
-    *,
-    log: bool = True,
+    part: xr.Dataset, title: str, ylabel: str, draw: Callable[[Axes, xr.Dataset, np.ndarray], None], *, log: bool = True
 ) -> Figure:
     """A panel for each contact family."""
     found = families(part)

@@ -111,9 +111,7 @@ def gradients_along(system: System, rollout: Rollout, feedback: Float[np.ndarray
 
 
 def value_and_gradient(
-    system: System,
-    start: Float[np.ndarray, "... states"],
-    controls: Float[np.ndarray, "... horizon controls"],
+    system: System, start: Float[np.ndarray, "... states"], controls: Float[np.ndarray, "... horizon controls"]
 ) -> tuple[Float[np.ndarray, "..."], Float[np.ndarray, "... horizon controls"]]:
     """Total cost of an open loop and its exact gradient with respect to the controls.
 

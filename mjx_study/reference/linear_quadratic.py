@@ -84,10 +84,7 @@ class LinearQuadratic:
         return 2 * state @ self.final_weight
 
     def smoothed(
-        self,
-        start: Float[np.ndarray, " states"],
-        controls: Float[np.ndarray, "horizon controls"],
-        sigma: float,
+        self, start: Float[np.ndarray, " states"], controls: Float[np.ndarray, "horizon controls"], sigma: float
     ) -> Smoothed:
         """F and grad F of an open loop, exactly; theta is `controls`, flattened.
 

@@ -104,12 +104,7 @@ def contact_model(
 
 
 def family_model(
-    name: str,
-    scene: Scene,
-    *,
-    stiffness: float | None = None,
-    damping: float | None = None,
-    effective_mass: float,
+    name: str, scene: Scene, *, stiffness: float | None = None, damping: float | None = None, effective_mass: float
 ) -> ContactModel:
     """The member of a family at a physical stiffness.
 
@@ -135,10 +130,7 @@ def family_model(
     if stiffness is None:
         raise ValueError(f"contact family {name!r} needs a stiffness in N/m")
     solref = solref_from_stiffness(
-        stiffness,
-        damping,
-        effective_mass=effective_mass,
-        dampratio=family.dampratio if damping is None else None,
+        stiffness, damping, effective_mass=effective_mass, dampratio=family.dampratio if damping is None else None
     )
     return contact_model(solref, family.solimp, scene=scene)
 

@@ -208,11 +208,7 @@ def fwd_position(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 
 @jax.jit
 def force_stage(
-    model: mjx.Model,
-    data: mjx.Data,
-    qvel: Float[Array, " nv"],
-    act: Float[Array, " na"],
-    control: Float[Array, " nu"],
+    model: mjx.Model, data: mjx.Data, qvel: Float[Array, " nv"], act: Float[Array, " na"], control: Float[Array, " nu"]
 ) -> mjx.Data:
     data = data.replace(qvel=qvel, act=act, ctrl=control)
     with patched():

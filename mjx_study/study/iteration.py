@@ -142,10 +142,7 @@ def begin(optimizer: optax.GradientTransformation, theta: Float[Array, " params"
 
 
 def advance(
-    state: Descent,
-    batches: dict[str, Any],
-    estimator: Estimator,
-    optimizer: optax.GradientTransformation,
+    state: Descent, batches: dict[str, Any], estimator: Estimator, optimizer: optax.GradientTransformation
 ) -> tuple[Descent, Record]:
     """One iteration of every seed that goes on.
 

@@ -72,8 +72,5 @@ def double_pendulum(
         reference=lambda stiffness: ReferenceObjective(
             DoublePendulum(timestep=scene.timestep), None, horizon, SIGMA, parametrises="start"
         ),
-        defaults=StudyDefaults(
-            recipe=RECIPE,
-            families=("mjcf",),
-        ),
+        defaults=StudyDefaults(recipe=RECIPE, families=("mjcf",)),
     )

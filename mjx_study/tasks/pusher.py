@@ -64,9 +64,5 @@ def pusher(*, horizon: int = HORIZON, model: str | Path = "pusher", **scene_opti
         reference=lambda stiffness: ReferenceObjective(
             Pusher(stiffness, timestep=scene.timestep), (*START, 0.0, 0.0), horizon, SIGMA
         ),
-        defaults=StudyDefaults(
-            gamma=GAMMA,
-            published=Published(GAMMA, RADIUS),
-            recipe=RECIPE,
-        ),
+        defaults=StudyDefaults(gamma=GAMMA, published=Published(GAMMA, RADIUS), recipe=RECIPE),
     )

@@ -4,13 +4,7 @@ import argparse
 from pathlib import Path
 
 from mjx_study.choices import FILM_FORMATS, PLANES, RENDERERS
-from mjx_study.cli.options import (
-    add_contact_options,
-    add_option,
-    add_scene_options,
-    add_task_options,
-    add_theta_option,
-)
+from mjx_study.cli.options import add_contact_options, add_option, add_scene_options, add_task_options, add_theta_option
 from mjx_study.option import OPTIONS
 
 EPILOG = """\
