@@ -114,7 +114,7 @@ def circulations(
         return jnp.stack([estimator(batches).per_sample @ step for estimator in estimators])
 
     def difference(order):
-        keys = jax.random.split(jax.random.split(key)[order], num_samples)
+        keys = jax.random.split(jax.random.split(jax.random.clone(key))[order], num_samples)
         first, last = (objective.evaluate(theta, jax.random.clone(keys)).value for theta in (start, end))
         return last - first
 
