@@ -2,7 +2,7 @@
 
 import stat
 import time
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from pathlib import Path
 from typing import Any
 
@@ -217,9 +217,6 @@ def test_views_are_right_handed(name: str) -> None:
     assert tuple(VIEWS[name].towards) == expected[name]
 
 
-PLANAR = {"gravity": "0 0 0", "x": 1.0, "y": 1.0}
-
-
 @pytest.mark.parametrize(
     ("motion", "view"),
     [
@@ -249,11 +246,6 @@ def test_a_puck_that_slides_on_a_floor_is_seen_from_above() -> None:
       <geom type="cylinder" size=".05 .02" friction=".01"/></body></worldbody></mujoco>"""
     motion = moved(source, puck=[1, 1, 0, 0, 0, 0])
     assert choose_view(motion).name == "xy"
-
-
-def test_an_unknown_view_is_refused() -> None:
-    with pytest.raises(ValueError, match="unknown view 'zx'; choose from auto, xz, xy, yz"):
-        resolve_view(throw(), "zx")
 
 
 def test_a_floor_is_drawn_at_its_height_with_solid_below() -> None:
@@ -409,11 +401,23 @@ def test_a_stroboscope_fades_the_past() -> None:
     assert axes.get_title(loc="left") == "t = 0.000 s to 0.500 s, 0.125 s apart"
 
 
-def test_counts_must_be_positive() -> None:
-    with pytest.raises(ValueError, match="frames must be at least 1, got 0"):
-        strip(throw(), frames=0)
-    with pytest.raises(ValueError, match="poses must be at least 1, got 0"):
-        stroboscope(throw(), poses=0)
+@pytest.mark.parametrize(
+    ("ask", "says"),
+    [
+        (lambda: resolve_view(throw(), "zx"), "unknown view 'zx'; choose from auto, xz, xy, yz"),
+        (lambda: strip(throw(), renderer="povray"), "unknown renderer 'povray'; choose from auto, drawing, opengl"),
+        (lambda: animate(throw(), Path("film.avi")), "unknown format 'avi'; choose from gif, mp4"),
+        (lambda: strip(throw(), frames=0), "frames must be at least 1, got 0"),
+        (lambda: stroboscope(throw(), poses=0), "poses must be at least 1, got 0"),
+        *[
+            (lambda slow=slow: frame_times(throw(), slow), "slow must be a positive")
+            for slow in (0, -1, np.nan, np.inf)
+        ],
+    ],
+)
+def test_what_cannot_be_drawn_is_refused(ask: Callable[[], Any], says: str) -> None:
+    with pytest.raises(ValueError, match=says):
+        ask()
 
 
 def test_times_are_labelled_apart() -> None:
@@ -494,17 +498,6 @@ def test_a_gif_that_would_be_too_large_is_made_smaller() -> None:
     noise = np.random.default_rng(0).integers(0, 255, (12, 480, 640, 3), dtype=np.uint8)
     content = animation._gif(noise, np.full(12, 40), 64)
     assert len(content) <= animation.MOST_BYTES
-
-
-@pytest.mark.parametrize("slow", [0.0, -1.0, np.nan, np.inf])
-def test_slow_must_be_positive(slow: float) -> None:
-    with pytest.raises(ValueError, match="slow must be a positive number"):
-        frame_times(throw(), slow)
-
-
-def test_an_unknown_format_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="unknown format 'avi'; choose from gif, mp4"):
-        animate(throw(), tmp_path / "film.avi")
 
 
 def test_mp4_without_ffmpeg_names_gif(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -598,11 +591,6 @@ def test_a_library_that_fails_badly_does_no_harm(
     with pytest.raises(RenderError, match=reason):
         resolve_renderer("opengl")
     assert capfd.readouterr() == ("", "")
-
-
-def test_an_unknown_renderer_is_refused() -> None:
-    with pytest.raises(ValueError, match="unknown renderer 'povray'; choose from auto, drawing, opengl"):
-        strip(throw(), renderer="povray")
 
 
 def test_backends_to_try(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,7 +15,6 @@ from tests.estimators.statistics_helpers import binomial_standard_error
 summarise = jax.jit(estimators.summarise)
 
 ROWS = np.array([[3.0, 4.0], [0.0, 0.0], [1.0, -1.0], [0.0, 1.0]])  # mean (1, 1)
-SQUARED_DEVIATIONS = np.array([13.0, 2.0, 4.0, 1.0])
 LOGARITHM = np.log(3 / 0.1)
 
 
