@@ -411,7 +411,7 @@ def test_a_stroboscope_fades_the_past() -> None:
         (lambda: stroboscope(throw(), poses=0), "poses must be at least 1, got 0"),
         *[
             (lambda slow=slow: frame_times(throw(), slow), "slow must be a positive")
-            for slow in (0, -1, np.nan, np.inf)
+            for slow in (0.0, -1.0, np.nan, np.inf)
         ],
     ],
 )
