@@ -304,7 +304,12 @@ class Diagnosis(Measurement):
             return
         plain, corrected = by_name["fobg"], by_name["fobg_onset"]
         if plain.verdict == "biased":
-            text = f"plain first order is biased by {plain.bias / self.norm:.0%}, for contact sets in with a jump"
+            smooth = self.touches and all(each.impedance <= SMOOTH for each in self.touches)
+            text = f"plain first order is biased by {plain.bias / self.norm:.0%}, " + (
+                "though impedances rise from 0: something else jumps, such as where corners and edges touch"
+                if smooth
+                else "for contact sets in with a jump"
+            )
             if corrected.verdict == "right":
                 text += ": the onset term corrects that"
             if travel := max((each.speed * timestep for each in self.touches if each.impedance > SMOOTH), default=0.0):

@@ -200,6 +200,13 @@ def test_a_bias_that_the_onset_term_leaves_is_told(found: Diagnosis) -> None:
     assert not any("corrects that" in text for text in told)
 
 
+def test_a_bias_that_no_jump_in_force_explains_is_told(found: Diagnosis) -> None:
+    smooth = tuple(dataclasses.replace(each, impedance=1e-4) for each in found.touches)
+    told = [text for text, _ in dataclasses.replace(found, touches=smooth)._advice()]
+    assert any("though impedances rise from 0" in text for text in told)
+    assert not any("with a jump" in text or "solimp" in text for text in told)
+
+
 def test_an_unstable_step_is_told_first(found: Diagnosis) -> None:
     touch = Touch("a and b", 0.1, 1.0, 0.1, 9.0, 2.0, 0.9, False)
     page = dataclasses.replace(found, touches=(touch, *found.touches)).lines()
