@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+import shlex
 from pathlib import Path
 
 import numpy as np
@@ -122,6 +123,28 @@ def test_a_stopped_run_goes_on_and_a_changed_claim_is_measured_again(tmp_path: P
     assert measured[5:] == ["c"]
 
 
+def test_a_claim_depends_on_the_code_that_measures_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its module, what that imports, and the packages below; other code only where versions are accepted."""
+    claim = dataclasses.replace(CLAIMS["lemma-closed-form"], systems={"step": ("reference",)})
+    made = claim.made_by()
+    assert made == claim.made_by() and made != CLAIMS["ball-over-wall"].made_by()  # of claims.theory, and of .descent
+    measure_ledger([claim], "quick", tmp_path, verdicts=1)
+    path = tmp_path / "parts" / "lemma-closed-form.json"
+    kept = json.loads(path.read_text())
+    planted = kept | {"cases": [kept["cases"][0] | {"estimate": 7.0}]}
+    for changes, accept, again in (
+        ({}, False, False),
+        ({"made_by": "x"}, False, True),
+        ({"made_by": "x"}, True, False),
+    ):
+        path.write_text(json.dumps(planted | changes))
+        document = measure_ledger([claim], "quick", tmp_path, verdicts=1, accept_versions=accept)
+        assert (document["claims"][0]["evidence"][0]["estimate"] != 7.0) == again
+    path.write_text(json.dumps(planted | {"key": "x"}))
+    document = measure_ledger([claim], "quick", tmp_path, verdicts=1, accept_versions=True)
+    assert document["claims"][0]["evidence"][0]["estimate"] != 7.0
+
+
 def test_the_page_is_what_the_code_says() -> None:
     document = json.loads((DOCS / "claims.json").read_text())
     assert (DOCS / "claims.md").read_text() == markdown(document)
@@ -150,7 +173,7 @@ def test_the_picture_has_a_strip_for_each_verdict() -> None:
 def test_the_commands_that_show_claims_exist() -> None:
     parser = cli.parser()
     for claim in CLAIMS.values():
-        name, *rest = claim.show.split()
+        name, *rest = shlex.split(claim.show)
         assert name == "mjx-study"
         parser.parse_args(rest)
 

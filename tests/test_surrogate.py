@@ -85,6 +85,7 @@ def test_a_study_has_every_backward_model_beside_the_exact_one() -> None:
         backward=("none", "smooth_onset", "penalty"), backward_stiffness=50.0, samples=(4,), seeds=2,
         estimators=("zobg", "fobg"), reference_samples=4, theta=(3.0,) * 5,
     )  # fmt: skip
+    assert plan_study(config).compilations == 4  # cost and gradient, exact and not
     data = run_study(config).isel(task=0, timestep=0, cone=0, sigma=0, samples=0)
     assert data["contact"].values.tolist() == [
         "penalty", "mujoco_default", "reference",

@@ -9,14 +9,18 @@ import numpy as np
 from estimators import FirstOrder
 from mjx_study.choices import REFERENCE
 from mjx_study.claims.laboratory import (
+    RELAXATIONS,
     TIMED,
     Laboratory,
+    Slopes,
     Statistic,
     batch,
+    batches,
     difference_of,
     exact,
     log_variance,
     mean_of,
+    ratio_of,
     times_of,
 )
 from mjx_study.claims.ledger import REAL, Claim, above, below, within
@@ -49,6 +53,8 @@ HORIZONS: Final = (400, 2000)
 DOME: Final = "ball_wall:dome, 0.65 rad"
 DAMPED: Final = ("impedance", "mujoco_default", "mujoco_stiff")
 """Families whose force sets in with a jump."""
+RELAXED: Final[dict[str, tuple[str, ...]]] = {f"{HIT}, {name}": DAMPED for name in RELAXATIONS}
+"""Systems whose derivatives are of a relaxed contact."""
 
 
 def study(lab: Laboratory, task: str, **changes):
@@ -178,6 +184,41 @@ def cure_cost(lab: Laboratory, system: str, family: str) -> Statistic:
         for onset in ("linear", "none")
     ]
     return difference_of(found[0], found[1])
+
+
+def _relaxed(lab: Laboratory, system: str, family: str) -> Slopes:
+    """A landscape with the derivatives of the relaxation that the system's name ends with."""
+    where, _, relaxed = system.rpartition(", ")
+    return at(lab, where, family, relaxed=relaxed)
+
+
+def relaxed_bias(lab: Laboratory, system: str, family: str) -> Statistic:
+    """(E[FoBG with relaxed derivatives] - grad F) / grad F."""
+    found = _relaxed(lab, system, family)
+    return exact(found.relative, sum(found.errors), found.points)
+
+
+def relaxed_share(lab: Laboratory, system: str, family: str) -> Statistic:
+    """What relaxed derivatives leave of the bias of exact ones."""
+    found, plain = _relaxed(lab, system, family), at(lab, system.rpartition(", ")[0], family)
+    share = abs(found.relative / plain.relative)
+    slack = (sum(found.errors) + share * sum(plain.errors)) / abs(plain.relative)
+    return exact(share, slack, found.points)
+
+
+def relaxed_cost(lab: Laboratory, system: str, family: str) -> Statistic:
+    """log10 of FoBG's variance with relaxed derivatives over that with exact ones."""
+    places = _relaxed(lab, system, family), at(lab, system.rpartition(", ")[0], family)
+    one, other = (log_variance(batch(FirstOrder(), each, lab.effort.draws)) for each in places)
+    return difference_of(one, other)
+
+
+def onset_or_relaxed(lab: Laboratory, system: str, family: str) -> Statistic:
+    """log10 of FoBG's mean squared error with the onset term over that with relaxed derivatives."""
+    places = at(lab, system.rpartition(", ")[0], family, onset="linear"), _relaxed(lab, system, family)
+    found = [batches([FirstOrder()], each, 200, 2 * lab.effort.batches)[0] for each in places]
+    squared = [(np.asarray(each.mean)[:, 0] - places[0].gradient) ** 2 for each in found]
+    return ratio_of(squared[0], squared[1], "batches")
 
 
 def onset_cost(lab: Laboratory, system: str, family: str) -> Statistic:
@@ -357,6 +398,42 @@ CLAIMS: Final = (
         {HIT: DAMPED},
         cure_cost,
         "mjx-study compare momentum_transfer --contact mujoco_default --estimators zobg,fobg,fobg_onset",
+    ),
+    Claim(
+        "relaxed-backward-helps",
+        "section 6, implicit time-stepping and smoothing (left open)",
+        "Relaxing the contact in the backward pass alone removes more than half of the onset bias.",
+        below("|E[FoBG] - grad F|, with relaxed derivatives over with exact ones", 0.5, 1.0),
+        RELAXED,
+        relaxed_share,
+        "mjx-study landscape momentum_transfer --contact mujoco_default --backward none,smooth_onset",
+    ),
+    Claim(
+        "relaxed-backward-unbiased",
+        "section 6, implicit time-stepping and smoothing (left open)",
+        "Relaxing the contact in the backward pass alone leaves no bias.",
+        within("(E[FoBG with relaxed derivatives] - grad F) / grad F", -NEGLIGIBLE, NEGLIGIBLE),
+        RELAXED,
+        relaxed_bias,
+        "mjx-study landscape momentum_transfer --contact mujoco_default --backward none,smooth_onset",
+    ),
+    Claim(
+        "relaxed-backward-costs",
+        "section 6, implicit time-stepping and smoothing (left open)",
+        "Relaxed derivatives vary more than exact ones.",
+        above("log10 Var[FoBG], with relaxed derivatives over with exact ones", FACTOR, -FACTOR),
+        RELAXED,
+        relaxed_cost,
+        "mjx-study compare momentum_transfer --contact mujoco_default --backward none,smooth_onset",
+    ),
+    Claim(
+        "onset-term-or-relaxing",
+        "this project",
+        "The onset term is more accurate than derivatives of a relaxed contact.",
+        below("log10 of the mean squared error in batches of 200, the onset term's over the relaxed", -FACTOR, FACTOR),
+        RELAXED,
+        onset_or_relaxed,
+        "mjx-study gradcheck momentum_transfer --mean --contact mujoco_default --estimators fobg,fobg_onset",
     ),
     Claim(
         "smooth-onset-costs",

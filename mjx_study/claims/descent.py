@@ -17,14 +17,19 @@ from mjx_study.study.configuration import StudyConfig
 BALL, BAR, SOFT, STIFF = "ball_wall", "momentum_transfer", "pusher, 10 N/m", "pusher, 1000 N/m"
 SPANS: Final = {BALL: (0.0, 1.5), BAR: (0.0, 1.0)}
 """Angles that a descent may reach [rad]."""
+STARTS: Final = {"stiffness_schedule": 0.01, "sigma_schedule": 3.0}
+"""Factors that the schedules begin with."""
+CELL: Final = ("task", "timestep", "cone", "model", "sigma", "samples")
+"""Dimensions of a study that has one cell."""
 LARGEST: Final = 10.0
 """Where a descent diverged, its cost counts as this many times what the best one gained."""
 
 
-def descents(lab: Laboratory, system: str, family: str) -> xr.Dataset:
+def descents(lab: Laboratory, system: str, family: str, schedule: str | None = None) -> xr.Dataset:
     """Descents of ZoBG, FoBG and AoBG by the task's recipe, cut short or not by the effort.
 
-    The ball's is never cut short: zeroth order clears the wall late.
+    The ball's is never cut short: zeroth order clears the wall late. With the name of an option for a schedule, that
+    schedule: the stiffness grows from a hundredth, or sigma shrinks from three times its size, in the first half.
     """
     name, _, stiffness = system.partition(", ")
     task, effort = lab.task(name), lab.effort
@@ -32,11 +37,14 @@ def descents(lab: Laboratory, system: str, family: str) -> xr.Dataset:
     assert recipe is not None
     many = recipe.samples > effort.samples
     share = 1.0 if system == BALL else effort.iterations
+    iterations = max(10, round(share * recipe.iterations))
     common = {
-        "iterations": max(10, round(share * recipe.iterations)),
+        "iterations": iterations,
         "seeds": effort.seeds_of_descents,
         "samples": (effort.samples if many else recipe.samples,),
     }
+    if schedule is not None:
+        common[schedule] = f"linear_schedule({STARTS[schedule]}, 1, {iterations // 2})"
     if name in SPANS:
         contact = (STIFFNESS, *SPANS[name])
         described = lab.tabulated(name, family, *contact) if family != REFERENCE else name
@@ -47,22 +55,31 @@ def descents(lab: Laboratory, system: str, family: str) -> xr.Dataset:
     return lab.study(StudyConfig(tasks=(name,), contact=(family,), **hard, **common))
 
 
-def final(dataset: xr.Dataset, estimator: str) -> np.ndarray:
-    """Costs of the final policies by seed, from 0 at the start to -1 for the best estimator's mean."""
-    cell = dataset.isel(task=0, timestep=0, cone=0, model=0, sigma=0, samples=0)
-    start, costs = float(cell["start_cost"]), cell["final_cost"].transpose("seed", "estimator")
-    finite = costs.where(np.isfinite(costs))
-    best = float(finite.mean("seed").min())
-    scaled = ((costs - start) / (start - best)).sel(estimator=estimator).values
-    return np.clip(np.nan_to_num(scaled, nan=LARGEST, posinf=LARGEST), -LARGEST, LARGEST)
+def scaled(dataset: xr.Dataset, variable: str, estimator: str, like: xr.Dataset | None = None) -> np.ndarray:
+    """Costs of an estimator by seed, from 0 at the start to -1 where the best estimator ends in the mean.
+
+    Args:
+        dataset: a study of descents.
+        variable: "final_cost", or "cost", which is averaged over the iterations.
+        estimator: its name.
+        like: the study that sets the scale; None for this one.
+    """
+    cell, other = (each.isel({name: 0 for name in CELL}) for each in (dataset, dataset if like is None else like))
+    ends, start = other["final_cost"], float(other["start_cost"])
+    best = float(ends.where(np.isfinite(ends)).mean("seed").min())
+    costs = cell[variable].sel(estimator=estimator).transpose(..., "seed").values
+    found = np.clip(np.nan_to_num((costs - start) / (start - best), nan=LARGEST, posinf=LARGEST), -LARGEST, LARGEST)
+    return found if found.ndim == 1 else np.mean(found, axis=0)
+
+
+def final(dataset: xr.Dataset, estimator: str, like: xr.Dataset | None = None) -> np.ndarray:
+    """Where an estimator ends, see `scaled`."""
+    return scaled(dataset, "final_cost", estimator, like)
 
 
 def along(dataset: xr.Dataset, estimator: str) -> np.ndarray:
-    """Costs averaged over the iterations, by seed, on the scale of `final`."""
-    cell = dataset.isel(task=0, timestep=0, cone=0, model=0, sigma=0, samples=0)
-    start, best = float(cell["start_cost"]), float(cell["final_cost"].mean("seed").min())
-    costs = cell["cost"].sel(estimator=estimator).transpose("iteration", "seed").values
-    return np.mean(np.clip(np.nan_to_num((costs - start) / (start - best), nan=LARGEST), -LARGEST, LARGEST), axis=0)
+    """Where an estimator is on the way, see `scaled`."""
+    return scaled(dataset, "cost", estimator)
 
 
 def behind(lab: Laboratory, system: str, family: str) -> Statistic:
@@ -94,17 +111,33 @@ def slower(lab: Laboratory, system: str, family: str) -> Statistic:
 def apart(lab: Laboratory, system: str, family: str) -> Statistic:
     """Distance between the policies that FoBG and ZoBG end at, in standard deviations of the noise."""
     found = descents(lab, system, family)
-    theta = found["theta"].isel(task=0, timestep=0, cone=0, model=0, sigma=0, samples=0, param=0)
+    theta = found["theta"].isel({name: 0 for name in (*CELL, "param")})
     one, other = (theta.sel(estimator=name).values for name in ("fobg", "zobg"))
     return mean_of(np.abs(one - other) / float(found["sigma"].values[0]), "seeds")
+
+
+def curriculum(lab: Laboratory, system: str, family: str) -> Statistic:
+    """How far FoBG ends ahead with a stiffness that grows."""
+    return _scheduled(lab, system, family, "stiffness_schedule", "fobg")
+
+
+def annealing(lab: Laboratory, system: str, family: str) -> Statistic:
+    """How far AoBG ends ahead with a sigma that shrinks."""
+    return _scheduled(lab, system, family, "sigma_schedule", "aobg")
+
+
+def _scheduled(lab: Laboratory, system: str, family: str, schedule: str, estimator: str) -> Statistic:
+    """How far an estimator ends ahead with a schedule, by seed: both descents draw the same noise."""
+    plain, other = descents(lab, system, family), descents(lab, system, family, schedule)
+    return mean_of(final(plain, estimator) - final(other, estimator, plain), "seeds")
 
 
 GAIN: Final = "as a share of what the best gained"
 EVERYWHERE: Final = {
     BALL: (REFERENCE, "penalty", "mujoco_default", "smooth_onset"),
     BAR: (REFERENCE, *FIVE),
-    SOFT: (REFERENCE,),
-    STIFF: (REFERENCE,),
+    SOFT: (REFERENCE, "penalty"),
+    STIFF: (REFERENCE, "penalty"),
 }
 CLAIMS: Final = (
     Claim(
@@ -169,5 +202,23 @@ CLAIMS: Final = (
         EVERYWHERE,
         slower,
         "mjx-study optimise sliding_box --reference",
+    ),
+    Claim(
+        "curriculum-helps",
+        "section 6: a curriculum from soft to stiff contact (left open)",
+        "Contact that stiffens on the way, from a hundredth, lets first order end lower than stiff contact throughout.",
+        above(f"final cost, FoBG's at constant stiffness less the scheduled, {GAIN}", 0.001, -0.001),
+        {STIFF: EVERYWHERE[STIFF]},
+        curriculum,
+        "mjx-study optimise pusher --stiffness 1000 --stiffness-schedule 'linear_schedule(0.01, 1, 250)'",
+    ),
+    Claim(
+        "annealing-helps",
+        "section 6: a schedule of the noise (left open)",
+        "Noise that shrinks on the way, from three times sigma, lets the interpolation end lower.",
+        above(f"final cost, AoBG's at constant sigma less the scheduled, {GAIN}", 0.001, -0.001),
+        {BALL: (REFERENCE,), BAR: (REFERENCE,)},
+        annealing,
+        "mjx-study optimise ball_wall --reference --sigma-schedule 'linear_schedule(3, 1, 100)'",
     ),
 )

@@ -26,13 +26,21 @@ from mjx_study.study.configuration import StudyConfig
 from mjx_study.study.quadrature import Line, means
 from mjx_study.study.run import run_study
 from mjx_study.tasks import make_task
-from mjx_study.tasks.contact_grid import ContactPoint, contact_grid
+from mjx_study.tasks.contact_grid import ContactPoint, backward_grid, contact_grid
 from mjx_study.tasks.task import Task
 
 TIMED: Final = 64
 """Samples per device in a batch that is timed."""
 REPEATS: Final = 12
 """Of what is timed."""
+
+
+RELAXATIONS: Final = {
+    "smooth onset": ("smooth_onset", 1.0, None),
+    "ten times softer": ("mujoco", 0.1, None),
+    "from 1 mm apart": ("smooth_onset", 1.0, 0.001),
+}
+"""Contact models whose derivatives may stand in for exact ones: family, factor on the stiffness, margin [m]."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -198,19 +206,23 @@ class Laboratory:
     def _make_line(self, name: str, timestep: float | None, onset: str) -> Line:
         return Line(self.task(name, timestep, onset))
 
-    def contact(self, task: Task, family: str, stiffness: float) -> ContactPoint:
-        """The contact model of a family."""
+    def contact(self, task: Task, family: str, stiffness: float, relaxed: str | None = None) -> ContactPoint:
+        """The contact model of a family, with the derivatives of one of `RELAXATIONS` or its own."""
         (cell,), _ = contact_grid(task, (family,), (stiffness,))
+        if relaxed is None:
+            return cell
+        other, factor, margin = RELAXATIONS[relaxed]
+        (cell,), _ = backward_grid(task, (cell,), (other,), factor * cell.stiffness, margin)
         return cell
 
     def _landscape(
         self, name: str, family: str, stiffness: float, low: float, high: float, sigma: float,
-        timestep: float | None = None, onset: str = "none",
+        timestep: float | None = None, onset: str = "none", relaxed: str | None = None,
     ) -> Landscape:  # fmt: skip
         """The landscape of a task between two parameters and the noise about them."""
         task = self.task(name, timestep, onset)
         points = np.arange(low - 5.4 * sigma, high + 5.4 * sigma, sigma / self.effort.density)
-        contact = self.contact(task, family, stiffness).contact
+        contact = self.contact(task, family, stiffness, relaxed).contact
         return Landscape(points, *self._line(name, timestep, onset)(points, contact))
 
     def _simulator(self, name: str) -> Simulator:
@@ -231,7 +243,7 @@ class Laboratory:
 
     def slopes(
         self, name: str, family: str, theta: float, *, stiffness: float, sigma: float | None = None,
-        timestep: float | None = None, onset: str = "none",
+        timestep: float | None = None, onset: str = "none", relaxed: str | None = None,
     ) -> Slopes:  # fmt: skip
         """Gradient and means at theta, by quadrature; of the analytic system in closed form."""
         task = self.task(name)
@@ -240,7 +252,7 @@ class Laboratory:
             reference = task.analytic(stiffness)
             assert isinstance(reference, FunctionObjective)
             return closed_form(reference.function, theta, sigma)
-        table = self.landscape(name, family, stiffness, theta, theta, sigma, timestep, onset)
+        table = self.landscape(name, family, stiffness, theta, theta, sigma, timestep, onset, relaxed)
         found = means(table.points, table.values, table.slopes, np.array([theta]), sigma, task.noise)
         slope, first = float(found.slope[0]), float(found.first[0])
         errors = float(found.slope_error[0]) / abs(slope), float(found.first_error[0]) / abs(slope)

@@ -8,7 +8,6 @@ at level 1 - ALPHA / m, with m the number of verdicts of the whole ledger (Bonfe
 
 import dataclasses
 import hashlib
-import inspect
 import json
 import math
 from collections.abc import Callable, Sequence
@@ -21,12 +20,11 @@ from scipy.stats import t as student
 
 from estimators import coverage_interval
 from mjx_study.choices import REFERENCE
-from mjx_study.claims import laboratory
 from mjx_study.claims.laboratory import EFFORTS, Effort, Laboratory, Statistic
 from mjx_study.disk import prepare_folder, write_whole
 from mjx_study.runtime import environment, precision
 from mjx_study.study.configuration import Progress
-from mjx_study.study.identity import VERSIONED
+from mjx_study.study.identity import VERSIONED, code_of
 from mjx_study.study.revision import git_revision
 
 ALPHA: Final = 0.05
@@ -115,11 +113,17 @@ class Claim:
         return [(system, family) for system, families in self.systems.items() for family in families]
 
     def key(self, effort: Effort) -> str:
-        """Digest of what a measurement depends on: the claim, the code that measures it, the effort, the versions."""
-        code = [inspect.getsource(part) for part in (inspect.getmodule(self.measure) or self.measure, laboratory)]
+        """Digest of the claim, the effort and the precision."""
+        return _digest(self.id, self.criterion, self.systems, effort, precision())
+
+    def made_by(self) -> str:
+        """Digest of the code that measures the claim, and of the libraries' versions."""
         versions = [metadata.version(name) for name in VERSIONED if name != "mjx-study"]
-        parts = (self.id, self.criterion, self.systems, code, effort, versions, precision())
-        return hashlib.sha256(repr(parts).encode()).hexdigest()[:16]
+        return _digest(code_of(self.measure.__module__), versions)
+
+
+def _digest(*parts: Any) -> str:
+    return hashlib.sha256(repr(parts).encode()).hexdigest()[:16]
 
 
 def interval_of(statistic: Statistic, level: float) -> Range:
@@ -172,7 +176,7 @@ def measure_ledger(
         progress: told of every case.
         verdicts: of the whole ledger, for the level of the intervals.
         command: that asked for it, to be kept.
-        accept_versions: go on with studies in the folder that other versions began.
+        accept_versions: take measurements in the folder that other code or versions made, and go on with its studies.
 
     Returns:
         The ledger as plain data.
@@ -185,8 +189,10 @@ def measure_ledger(
     for claim in claims:
         path = None if folder is None else folder / "parts" / f"{claim.id}.json"
         kept = json.loads(path.read_text()) if path is not None and path.exists() else {}
-        if kept.get("key") != claim.key(chosen):
-            kept = {"key": claim.key(chosen), "revision": git_revision(), "cases": []}
+        ours = {"key": claim.key(chosen), "made_by": claim.made_by()}
+        decisive = ("key",) if accept_versions else tuple(ours)
+        if any(kept.get(name) != ours[name] for name in decisive):
+            kept = {**ours, "revision": git_revision(), "cases": []}
         for system, family in claim.cases[len(kept["cases"]) :]:
             progress(done + len(kept["cases"]), total, f"{claim.id}: {system}, {family}")
             statistic = claim.measure(lab, system, family)

@@ -46,7 +46,7 @@ SMOOTH: Final = {HIT: (REFERENCE, *FIVE), SHORT: (REFERENCE, *FIVE)}
 
 def at(
     lab: Laboratory, system: str, family: str, *, stiffness: float = STIFFNESS, sigma: float | None = None,
-    timestep: float | None = None, onset: str = "none",
+    timestep: float | None = None, onset: str = "none", relaxed: str | None = None,
 ) -> Slopes:  # fmt: skip
     """A system's landscape under a family, at the angle that its name gives."""
     if system == STEP:
@@ -55,7 +55,9 @@ def at(
         return closed_form(RelaxedHeaviside(0.01), 0.0, 1.0)
     task, _, angle = system.partition(", ")
     theta = float(angle.removesuffix(" rad"))
-    return lab.slopes(task, family, theta, stiffness=stiffness, sigma=sigma, timestep=timestep, onset=onset)
+    return lab.slopes(
+        task, family, theta, stiffness=stiffness, sigma=sigma, timestep=timestep, onset=onset, relaxed=relaxed
+    )
 
 
 def bias(lab: Laboratory, system: str, family: str) -> Statistic:

@@ -36,17 +36,17 @@ MOST_KEPT: Final = 1_000_000
 def compute_gradients(plan: StudyPlan) -> Callable[[StudyCell], dict[str, np.ndarray]]:
     """A function that computes cells and keeps compiled programs between them."""
     config, oracles, objectives = plan.config, oracles_of(plan.config), Objectives(plan)
-    warm: set[tuple[int, bool]] = set()
+    warm: set[Any] = {None}
     soft: dict[tuple[int, float], Array | None] = {}
 
     def compute(cell: StudyCell) -> dict[str, np.ndarray]:
         objective, task = objectives(cell), plan.groups[cell.group].task
         theta = task.theta
         # so that no cell's time holds a compilation
-        if not cell.model.analytic and (cell.group, cell.model.contact is None) not in warm:
+        if (program := plan.program_of(cell)) not in warm:
             for name in dict.fromkeys([*oracles, "differentiation"]):  # the reference's control variate needs it
                 getattr(objective, ORACLES[name].method)(theta, jax.random.split(jax.random.key(0), 1))
-            warm.add((cell.group, cell.model.contact is None))
+            warm.add(program)
         keys = cell_keys(config.seed, config.batches)
         odd, candidate = (
             jax.random.split(stream, size)

@@ -5,6 +5,7 @@ A function enters by its name, its closure and its defaults, and by the source f
 which it imports count as well. Code of this package and of the libraries below it counts by version.
 """
 
+import ast
 import dataclasses
 import enum
 import functools
@@ -26,7 +27,7 @@ import numpy as np
 
 from estimators import find_estimator
 from mjx_study.runtime import precision
-from mjx_study.simulation.scene import Scene
+from mjx_study.simulation.scene import Scene, models_folder
 from mjx_study.study.plan import StudyPlan
 from mjx_study.tasks.task import Task
 
@@ -36,6 +37,10 @@ BY_VERSION: Final = {"mjx_study", "estimators", "mujoco", "jax", "jaxlib", "nump
 """Modules whose code counts by version."""
 IRRELEVANT: Final = re.compile(r"_.*|.*name.*|.*path.*|.*rgba|(tex|mat|skin|light|cam|text)_.*|.*_matid")
 """Fields of MjModel that no number depends on."""
+ABOVE: Final = (
+    "cli", "plots", "render", "gradcheck", "claims", "report.py", "bench.py", "diagnose.py", "accessor.py",
+)  # fmt: skip
+"""Parts of mjx_study that use studies; no number of a study depends on them."""
 ACCEPT: Final = "choose another folder, or accept the mixture by --accept-versions"
 """Advice at the end of messages about other versions."""
 UNREAD: Final = ("description",)
@@ -97,13 +102,38 @@ def differences(theirs: Mapping[str, Any], ours: Mapping[str, Any]) -> str | Non
 
 
 @functools.cache
-def _own_code() -> str:
+def _own_code(without: tuple[str, ...] = ()) -> str:
+    """Digest of this package's source, less some parts of mjx_study."""
     package = Path(__file__).parents[1]
     files = sorted([*package.rglob("*.py"), *(package.parent / "estimators").rglob("*.py")])
+    left_out = [package / part for part in without]
     sha = hashlib.sha256()
     for path in files:
-        sha.update(str(path.relative_to(package.parent)).encode() + b"\0" + path.read_bytes())
+        if not any(path.is_relative_to(part) for part in left_out):
+            sha.update(str(path.relative_to(package.parent)).encode() + b"\0" + path.read_bytes())
     return sha.hexdigest()[:12]
+
+
+@functools.cache
+def code_of(module: str) -> str:
+    """Digest of what a measurement of the ledger rests on: a module, what it imports of its package, the code below.
+
+    Args:
+        module: name of an imported module.
+    """
+    package, found, waiting = module.rpartition(".")[0], {}, [module]
+    while waiting:
+        name = waiting.pop()
+        path = _file(name)
+        if path is None or name in found or not name.startswith(package):
+            continue
+        found[name] = path.read_bytes()
+        imports = [node for node in ast.walk(ast.parse(found[name])) if isinstance(node, ast.ImportFrom)]
+        waiting += [f"{node.module}.{alias.name}" for node in imports for alias in node.names]
+        waiting += [str(node.module) for node in imports]
+    models = sorted(models_folder().rglob("*.xml"))
+    text = repr((sorted(found.items()), [path.read_bytes() for path in models], _own_code(ABOVE)))
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 class _Digest:

@@ -83,18 +83,16 @@ class StudyPlan:
 
     @property
     def compilations(self) -> int:
-        """Number of programs to compile: two for each group, or one for each of its descents."""
-        if self.config.kind != "descents":
-            return 2 * len(self.groups)
-        settings = {(cell.group, cell.sigma, cell.samples) for cell in self.cells}
-        return len(settings) * len(self.config.estimators)
+        """Number of programs to compile: two for each kind of contact of a group, or one for each of its descents."""
+        each = 2 if self.config.kind != "descents" else len(self.config.estimators)
+        return each * len({self.program_of(cell) for cell in self.cells if not cell.model.analytic})
 
     def program_of(self, cell: StudyCell) -> tuple[Any, ...] | None:
         """A key of what is compiled for a cell; None for an analytic system."""
         if cell.model.analytic:
             return None
-        own = (cell.sigma, cell.samples) if self.config.kind == "descents" else (cell.model.contact is None,)
-        return cell.group, *own
+        own = (cell.sigma, cell.samples) if self.config.kind == "descents" else ()
+        return cell.group, *own, jax.tree.structure(cell.model.contact)
 
     @property
     def memory(self) -> int:
