@@ -81,6 +81,7 @@ def interpolate(zeroth: GradientEstimate, first: GradientEstimate, alpha: float 
     alpha the bias is alpha times that of the first-order batch.
 
     Args:
+        zeroth: Zeroth-order estimate, with gbar_0 and sigmahat_0.
         first: First-order estimate from the same number of independent samples.
         alpha: Weight of `first`, in [0, 1].
 
@@ -136,6 +137,8 @@ def alpha_order(
     as given.
 
     Args:
+        zeroth: Zeroth-order estimate, whose mean counts as unbiased.
+        first: First-order estimate from the same number of independent samples.
         gamma: Largest error to accept, [cost/param]; infinity for inverse-variance weighting.
         epsilon: Confidence radius of the zeroth-order mean, [cost/param]; see `bernstein_epsilon`.
 

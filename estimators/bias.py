@@ -46,6 +46,7 @@ def bias_test(first: GradientEstimate, zeroth: GradientEstimate, key: Key[Array,
     event that the batch does not hold, and on strongly skewed samples this one rejects too often: docs/coverage.md.
 
     Args:
+        first: First-order estimate, the one whose bias is tested.
         zeroth: Zeroth-order estimate from independent samples.
         key: For the multipliers; used up.
         num_draws: Of T*, >= 1; 1 / (num_draws + 1) is the least p-value.
@@ -152,6 +153,7 @@ def empirical_bias(estimate: GradientEstimate, reference: Float[Array, " params"
     then looks precise and is wrong. The event here: all but the `num_rare` samples farthest from the median.
 
     Args:
+        estimate: The batch of z, a row per sample, [cost/param].
         reference: E z, from elsewhere, [cost/param].
         num_rare: Samples to set aside, from 0 to the number of samples less 2.
 

@@ -65,6 +65,7 @@ def compare(estimate: GradientEstimate, reference: GradientEstimate) -> Comparis
     An interpolated estimate enters with its weight taken as given.
 
     Args:
+        estimate: The estimate to judge, gbar of N samples.
         reference: An estimate from other samples.
 
     Returns:

@@ -31,6 +31,7 @@ def bernstein_epsilon(
     each example.
 
     Args:
+        estimate: Batch of N samples in d dimensions, of zeroth order in AoBG; non-finite samples are left out.
         failure_probability: In (0, 1).
         variance_proxy: "variance", s2 = sigmahat^2; "second_moment", s2 = (1/N) sum_i ||g_i||^2, which is
             no smaller than (1 - 1/N) sigmahat^2; or "upper_bound", which needs R as a number.

@@ -33,6 +33,7 @@ def discontinuity_gated(
     Args:
         evaluation: Batch of evaluations, for f and the zeroth-order estimate.
         differentiation: Batch of differentiations from the same number of independent samples.
+        baseline: A name in `BASELINES`, for the zeroth-order estimate.
         sigma: Standard deviation of the Gaussian noise, [control].
         tolerance: c in [0, 1); 0.3 as published.
         weights: A name in `WEIGHTS`; of cross-fitted ones the test is made in the other half as well.

@@ -17,8 +17,10 @@ class Oracle:
     """A kind of batch.
 
     Attributes:
+        name: In `ORACLES`, and in an estimator's `needs`.
         order: 0 if only values are needed, 1 if derivatives; batches of one order share their samples.
         method: Of the objective, called with theta and keys.
+        phrase: What messages call the batch.
     """
 
     name: str

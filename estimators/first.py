@@ -34,6 +34,7 @@ def clipped_first_order(differentiation: Differentiation, max_norm: float | Floa
     first-order mean.
 
     Args:
+        differentiation: Batch of differentiations, with grad_theta f_i of every sample.
         max_norm: c > 0, [cost/param].
 
     Reference: Pascanu, Mikolov, Bengio, "On the difficulty of training recurrent neural networks", ICML 2013, there

@@ -30,6 +30,7 @@ def truncated_first_order(linearisation: Linearisation, window: int) -> Gradient
     the horizon is the first-order batched gradient.
 
     Args:
+        linearisation: Batch of linearised rollouts, with the derivatives of every step.
         window: Steps between cuts, >= 1.
 
     Raises:
@@ -58,7 +59,9 @@ def total_propagation(linearisation: Linearisation, baseline: str, weights: str 
     the same rollouts, as published, so that they are not independent.
 
     Args:
+        linearisation: Batch of linearised rollouts, with the derivatives of every step.
         baseline: A name in `BASELINES`, applied step by step.
+        weights: A name in `WEIGHTS`, the source of alpha_h.
 
     Returns:
         The estimate; its `alpha` holds the mean weight.

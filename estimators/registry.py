@@ -124,6 +124,7 @@ def estimate(
 
     Args:
         estimator: One with its options, or a name for one with all of them at their defaults.
+        objective: F, with the methods that the estimator's oracles name.
         theta: Where, [param].
         key: Source of all randomness; used up.
         num_samples: Samples in each batch, >= 1.
@@ -270,6 +271,8 @@ class AlphaOrder(_OneWeight, entry=CATALOGUE["aobg"]):
     """See `estimators.constrained_alpha`.
 
     Attributes:
+        baseline: A name in `BASELINES`, for the zeroth-order batch.
+        weights: A name in `WEIGHTS`, the source of alpha.
         gamma: Largest error to accept, > 0 or infinity, [cost/param].
         failure_probability: Of the confidence radius, in (0, 1); see `bernstein_epsilon`.
         variance_proxy: "variance", "second_moment" or "upper_bound".

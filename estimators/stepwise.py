@@ -25,6 +25,7 @@ def cost_to_go(steps: StepEvaluation, baseline: str) -> GradientEstimate:
     variance.
 
     Args:
+        steps: Batch of evaluations step by step, (samples, steps).
         baseline: A name in `BASELINES`, applied step by step.
 
     Raises:
@@ -69,8 +70,10 @@ def stepwise_inverse_variance(
     the weights as given.
 
     Args:
+        zeroth: Batch of evaluations step by step, (samples, steps).
         first: Batch of differentiations from the same number of independent samples.
         baseline: A name in `BASELINES`, applied step by step.
+        weights: A name in `WEIGHTS`, the source of alpha_h.
 
     Returns:
         The estimate; its `alpha` holds the mean weight.

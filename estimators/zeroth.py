@@ -17,6 +17,7 @@ def zeroth_order(evaluation: Evaluation, baseline: str) -> GradientEstimate:
     (N sigma^2) for |f - b| <= B_V, ||D pi|| <= B_pi and m noise dimensions at each of H steps.
 
     Args:
+        evaluation: Batch of evaluations: values, scores and zero-noise costs.
         baseline: A name in `BASELINES`.
 
     Raises:
@@ -39,6 +40,7 @@ def antithetic(plus: Evaluation, minus: Evaluation, baseline: str) -> GradientEs
     noise, ((f^+ - f^-) / 2) s^+, all of the signal without the even part's variance.
 
     Args:
+        plus: Batch of evaluations, one of each pair.
         minus: The batch of the same starts and the opposite noise.
         baseline: A name in `BASELINES`, applied within each half.
 

@@ -139,6 +139,8 @@ def simulate(
     """One sample's rollout: states including the initial one, controls, cost and largest solver residual.
 
     Args:
+        task: the task; gives the noise's density and standard deviation.
+        theta: parameters of its policy, (params,).
         contact: the contact model; None for the MJCF's own.
         key: key of the sample; draws initial state and noise as in a batch.
         noise_scale: factor on the noise; 0 for a zero-noise rollout.
@@ -296,7 +298,10 @@ class Simulator:
         """Run one of `sample_programs`, see `spread`.
 
         Args:
+            name: key in `sample_programs`.
             theta: parameters, (params,).
+            contact: the contact model; None for the MJCF's own.
+            sigma: standard deviation of the noise, in the unit of what it is added to.
             keys: data of each sample's key.
             noise_scale: factor on each sample's noise.
 

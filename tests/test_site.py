@@ -1,7 +1,10 @@
 """The site has every page once, and what is written for GitHub reads as well there."""
 
+import dataclasses
+import inspect
+import re
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import pytest
 import yaml
@@ -55,6 +58,60 @@ def test_the_page_of_names_has_all_public_ones(package: str) -> None:
     page = make_site.page_of_names(package)
     names = [line.removeprefix("::: ") for line in page.splitlines() if line.startswith("::: ")]
     assert sorted(names) == sorted(f"{package}.{name}" for name in make_site.import_module(package).__all__)
+
+
+def left_out(found: Any) -> set[str]:
+    """What a section of arguments or attributes does not name; nothing where there is no section."""
+    text = inspect.cleandoc(found.__doc__ or "") + "\n"
+    section = re.search(r"^(?:Args|Attributes):\n((?: .*\n|\n)+)", text, re.MULTILINE)
+    if section is None:
+        return set()
+    named = ", ".join(re.findall(r"^ {4}(\S[^:\n]*):", section[1], re.MULTILINE)).replace("*", "").split(", ")
+    if dataclasses.is_dataclass(found):
+        own = {field.name for field in dataclasses.fields(found)}
+    else:
+        own = inspect.signature(found).parameters.keys() - {"self"}
+    return {name for name in own if not name.startswith("_")} - set(named)
+
+
+@pytest.mark.parametrize("package", make_site.PACKAGES)
+def test_a_section_of_arguments_or_attributes_names_all_of_them(package: str) -> None:
+    module = make_site.import_module(package)
+    public = {name: getattr(module, name) for name in module.__all__}
+    for name, owner in list(public.items()):
+        if isinstance(owner, type):
+            methods = inspect.getmembers(owner, inspect.isroutine)
+            public |= {f"{name}.{part}": method for part, method in methods if not part.startswith("_")}
+    assert not {name: missing for name, each in public.items() if (missing := left_out(each))}
+
+
+def test_what_a_section_leaves_out_is_found() -> None:
+    def function(a: int, b: int, *rest: int, c: int = 0, **others: int) -> None:
+        """Of numbers.
+
+        Args:
+            a, b: two numbers, and
+                c: in a line that goes on.
+            *rest: more numbers.
+
+        Raises:
+            others: never.
+        """
+
+    @dataclasses.dataclass
+    class Fields:
+        """Of a class.
+
+        Attributes:
+            one: a number.
+        """
+
+        none: ClassVar[int] = 0
+        one: int
+        two: int
+
+    assert left_out(function) == {"c", "others"}
+    assert left_out(Fields) == {"two"}
 
 
 def test_boxes_of_a_diagram_are_apart_and_arrows_lead_down() -> None:

@@ -35,9 +35,12 @@ class Finding:
     """Entries that are not right for one reason.
 
     Attributes:
+        contact: label of the contact model, as in penalty, K = 100 N/m.
         who: owner of the derivative: `project`, or `mjx.step` for MJX's own.
         verdict: kink, jump, unconverged, zero, nan, engine, wrong, value, engine_mismatch or apart.
         modes: modes of differentiation that show it: forward, reverse, tape.
+        cause: likely reason, in one sentence.
+        entries: all entries concerned, at any of the states; the first is the example in the text.
     """
 
     contact: str

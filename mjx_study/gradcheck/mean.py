@@ -43,6 +43,7 @@ class MeanCheck:
 
     Attributes:
         contact, stiffness: of the contact model [N/m], 0 for one that is not defined by a stiffness.
+        estimator: name of the estimator whose mean is checked.
         circulation: the integral of its mean against the difference of the cost.
         verdict: "right" within `estimators.mean_check.TOLERANCE`, "biased", or "undecided".
     """
@@ -129,12 +130,15 @@ def check_mean(
 
     Args:
         task: at the theta that the path goes through, with its onset treatment.
+        cells: contact models to check the estimators under.
+        estimators: with their options; they share the samples.
         samples: at each of the path's nodes.
         seed: of the samples and of a random direction.
         span: ends of the path, from theta along the direction [unit of theta]; None for two standard deviations of the
             noise to either side, or 0.02 where the noise is on the controls.
         direction: "random", the index of a parameter, or "means" for the paths of `along_means`.
         tolerance: share of the cost's difference within which a mean is right.
+        progress: called with (contact models done, their number, label of the next).
 
     Raises:
         ValueError: an estimator's formula does not hold for the task, or there is no such direction.

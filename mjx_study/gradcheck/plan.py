@@ -23,6 +23,8 @@ class GradcheckPlan:
     Attributes:
         subject: the task; for a file, what `scene_task` makes of it.
         is_task: whether to check its cost.
+        cells: contact models to check, one after the other.
+        warnings: warnings about these contact models.
         states: number of states per contact model.
         seed: random seed of initial states, states and directions.
         stock: whether to check the derivative of `mjx.step` too.
@@ -50,11 +52,13 @@ def plan_gradcheck(
     """Check a task's gradient, and steps along its rollout.
 
     Args:
+        task: the task, in float64, at the theta of its gradient.
         families: contact families; None for the task's own if it has no contact, else for `CONTACT`.
         stiffnesses: stiffnesses for families that take one [N/m]; None for `STIFFNESS`, or the task's if those are in
             another range.
         seed: random seed of initial states, states and directions.
         damping: override of each family's damping [N s/m].
+        states: number of states per contact model, at least 1.
         stock: whether to check the derivative of `mjx.step` too.
 
     Raises:
@@ -87,10 +91,15 @@ def plan_scene_gradcheck(
     """Check steps of any scene.
 
     Args:
+        scene: the scene, in float64, with at least one degree of freedom.
         families: contact families; None for `mjcf`, or for `mujoco` if a stiffness is given.
         stiffnesses: stiffnesses for families that take one [N/m].
+        seed: random seed of the states.
         pair: names of the two geoms whose contact has this stiffness; every contact gets the same solref.
+        damping: override of each family's damping [N s/m].
         horizon: number of steps of the rollout that the states come from.
+        states: number of states per contact model, at least 1.
+        stock: whether to check the derivative of `mjx.step` too.
 
     Raises:
         ValueError: as `plan_gradcheck`, or a stiffness without a pair.

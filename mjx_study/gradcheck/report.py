@@ -21,7 +21,9 @@ class StepCheck:
     """The checks of single steps under one contact model; errors are relative, the worst over the states.
 
     Attributes:
+        contact: name of the contact family.
         stiffness: K [N/m]; 0 if the contact model is not defined by one.
+        states: number of states checked.
         entries: total number of Jacobian entries.
         unresolved: number of entries that differences are too uncertain to judge.
         modes: difference of reverse and forward mode.
@@ -31,6 +33,7 @@ class StepCheck:
         engine_step: difference of the next state from the C engine's, likewise.
         engine: difference of the Jacobian from the C engine's where the steps agree; None if they never do.
         stock: error of the derivative of `mjx.step`; None if not asked for, infinite if it is NaN.
+        residual: largest relative residual of the solver.
         coverage: parts of the model that the states exercise.
         verdict: the gravest of the findings on the project's own derivative.
     """
@@ -62,10 +65,12 @@ class GradcheckReport:
 
     Attributes:
         subject: name of the task or file.
+        summary: size of the model, and what was checked, in one line.
         costs: checks of whole-horizon gradients, one per contact model; empty for a file.
         steps: checks of single steps, one per contact model.
         findings: findings, gravest first.
         warnings: warnings about contact models and about features without a derivative.
+        environment: versions, machine, devices and precision.
     """
 
     subject: str

@@ -110,6 +110,7 @@ def family_model(
 
     Args:
         name: one of `FAMILIES` except "mjcf".
+        scene: gives timestep, integrator and flags.
         stiffness: K [N/m], positive; None for a family that is a single point.
         damping: B [N s/m], not negative; None for the family's damping ratio.
         effective_mass: effective mass of the contact along its normal [kg]; see `effective_mass`.

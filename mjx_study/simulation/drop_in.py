@@ -38,6 +38,7 @@ def step(model: mjx.Model, data: mjx.Data, *, onset: str = "none") -> mjx.Data:
 
     Args:
         model: the model; its array leaves may be traced, batched under `jax.vmap` and differentiated.
+        data: the state before the step, with controls and applied forces.
         onset: "none", or "linear", with which derivatives account for a change of the step at which contact begins;
             then they are with respect to qpos, qvel, act and ctrl only (see `_corrected_step`).
 
@@ -91,6 +92,7 @@ def solver_residual(model: mjx.Model, data: mjx.Data) -> Float[Array, ""]:
     """Relative imbalance of forces that the solver left in the step before, 0 where it has converged; dimensionless.
 
     Args:
+        model: the model that the step was taken with.
         data: the state after `mjx.step`, `mjx.forward` or `step`.
     """
     return constraint.residual(model, data, data.qacc)

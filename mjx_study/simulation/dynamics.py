@@ -72,6 +72,7 @@ def step(scene: Scene, model: mjx.Model, state: State, control: Float[Array, " n
     Args:
         scene: static part of the model; its own contact parameters are not used.
         model: the model to step, `scene.model` with any contact model applied; may be traced.
+        state: the state before the step, with the solver's warm start.
         control: actuator controls, in the MJCF's units.
 
     Returns:
@@ -163,6 +164,7 @@ def rollout(
     Args:
         scene: static part of the model.
         model: the model to step; may be traced.
+        start: the initial state, the first of those returned.
         control_law: maps (step index, state) to the control of that step.
         horizon: number of steps, at least 1.
         backward: model whose derivatives every step has, see `surrogate_step`; None for its own.
@@ -289,6 +291,8 @@ def step_jacobian(
         da/dx = -G_a^{-1} G_x,   dS/dx = S_x + S_a da/dx.
 
     Args:
+        scene: static part of the model; its own contact parameters are not used.
+        model: the model to step, with any contact model applied.
         qpos: positions at the point of linearisation.
         qvel: velocities there.
         act: activations there.

@@ -116,6 +116,7 @@ def plan_study(config: StudyConfig, built: Mapping[str, Task] | None = None) -> 
     """Check a configuration and resolve its defaults, computing nothing.
 
     Args:
+        config: what to study; fields that are None take their defaults.
         built: tasks that the caller has built already, by name; with the configuration's horizon and model, and the
             timestep and cone of the MJCF.
 

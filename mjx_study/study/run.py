@@ -124,6 +124,7 @@ def run_study(
     """Run a study in memory; or with a folder compute what is missing there, beside any process that does the same.
 
     Args:
+        study: a configuration, or what `plan_study` made of it.
         folder: folder of the study, new or begun, or what `open_store` made of it; None to keep it in memory.
         progress: called before every cell, and within descents.
         command: command that asked for it, to be kept with a new study.

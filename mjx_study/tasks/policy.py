@@ -89,6 +89,8 @@ class OpenLoop(NoisyControls):
     Attributes:
         horizon: number of steps H.
         controls: number of controls m; theta has H m entries.
+        additive: True, since the noise is added to theta entry by entry.
+        at_start: False, since theta and the noise act at every step.
     """
 
     additive: bool = dataclasses.field(default=True, init=False)
@@ -156,8 +158,12 @@ class InitialStatePolicy:
     """Initial-state policy: theta + w determines the initial state, and no control acts.
 
     Attributes:
+        num_params: length of theta and of its noise w.
+        horizon: number of steps H.
         controls: number of controls m, all zero.
         start_at: maps (start, theta + w) to the state that the simulation starts from.
+        additive: True, since the noise is added to theta entry by entry.
+        at_start: True, since theta and the noise act on the initial state only.
     """
 
     num_params: int

@@ -22,6 +22,8 @@ class Recipe:
 
     Attributes:
         learning_rate: learning rate of plain gradient descent.
+        iterations: number of descent steps.
+        samples: batch size of the gradient estimate at each step.
         decay: power a of the learning rate's decay, learning_rate / i^a at iteration i = 1, 2, ...
     """
 
@@ -58,6 +60,7 @@ class StudyDefaults:
     """How a task is studied unless a study says otherwise.
 
     Attributes:
+        families: contact families, names in `FAMILIES`.
         stiffnesses: contact stiffnesses [N/m].
         damping: contact damping in families without a damping ratio [N s/m], or None; friction needs some, since it is
             the resistance to slip.
@@ -105,6 +108,8 @@ class Task:
 
     Attributes:
         name: name on the command line.
+        description: one line, for tables and reports.
+        scene: the compiled model; a contact model replaces its contact parameters.
         horizon: number of steps H.
         policy: maps theta, noise and state to initial state and controls.
         theta: default parameters, where gradients are taken, (params,). A weakly typed array is made a strong one;
