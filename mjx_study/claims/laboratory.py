@@ -67,8 +67,8 @@ class Effort:
 
 
 EFFORTS: Final = {
-    "quick": Effort("quick", 40, 100_000, 400, 100, 10, 5, 0.4),
-    "full": Effort("full", 200, 1_000_000, 4000, 400, 20, 10, 1.0),
+    "quick": Effort("quick", 40, 100_000, 400, 100, 10, 12, 0.4),
+    "full": Effort("full", 200, 1_000_000, 4000, 400, 20, 30, 1.0),
 }
 
 
