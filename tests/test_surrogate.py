@@ -39,7 +39,7 @@ def by_hand(task, states, controls) -> np.ndarray:
     return found
 
 
-@pytest.mark.parametrize("adjoint", ["jacobian", "tape"])
+@pytest.mark.parametrize("adjoint", ["jacobian", pytest.param("tape", marks=pytest.mark.slow)])
 def test_costs_are_of_one_contact_and_derivatives_of_the_other(adjoint: str) -> None:
     task = make_task("pusher", horizon=HORIZON, adjoint=adjoint)
     simulator, theta = Simulator(task, chunk_size=1), jnp.linspace(0.1, 0.6, HORIZON)
@@ -57,6 +57,7 @@ def test_costs_are_of_one_contact_and_derivatives_of_the_other(adjoint: str) -> 
     np.testing.assert_allclose(same.differentiate(theta, sample_keys(1)).gradient, plain.gradient, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_force_at_a_distance_is_felt_before_contact() -> None:
     """Across a gap the exact gradient of where the slider ends is zero; with a margin wider than the gap it is not."""
     task = make_task("pusher", horizon=3)
@@ -153,7 +154,7 @@ def test_a_softer_contact_keeps_its_damping_ratio(solref: tuple[float, float]) -
         assert k_of == pytest.approx(k / 4) and b_of == pytest.approx(b / 2)
 
 
-@pytest.mark.parametrize("contact", ["reference", "penalty"])
+@pytest.mark.parametrize("contact", ["reference", pytest.param("penalty", marks=pytest.mark.slow)])
 def test_an_iteration_has_the_stiffness_and_sigma_of_its_schedule(contact: str) -> None:
     """The last of three iterations is that of a study with the scheduled stiffness and noise throughout."""
     common: dict[str, Any] = {
