@@ -366,8 +366,7 @@ def diagnose(
     """
     family, stiffness = family or task.defaults.main_family, stiffness or task.defaults.middle_stiffness
     (cell,), warnings = contact_grid(task, [family], [stiffness], damping)
-    chosen = [make_estimator(name, gamma=task.defaults.gamma, sigma=task.sigma) for name in ESTIMATORS]
-    check_memory(task, chosen, samples or SAMPLES)
+    check_memory(task, _estimators(task), samples or SAMPLES)
     total = 4
     progress(0, total, "rollout without noise")
     touches = _touches(task, cell)
@@ -386,6 +385,10 @@ def diagnose(
         warnings=tuple(warnings),
         options=options,
     )
+
+
+def _estimators(task: Task) -> list[Estimator]:
+    return [make_estimator(name, gamma=task.defaults.gamma, sigma=task.sigma) for name in ESTIMATORS]
 
 
 def _chunk(task: Task, samples: int) -> int:
@@ -407,7 +410,7 @@ def measure(
         seed: of all randomness.
     """
     task = simulator.task
-    chosen = [make_estimator(name, gamma=task.defaults.gamma, sigma=task.sigma) for name in ESTIMATORS]
+    chosen = _estimators(task)
     oracles, objective, keys = oracles_of(chosen, "evaluation"), simulator.objective(contact), cell_keys(seed, 1)
 
     def drawn(count: int):

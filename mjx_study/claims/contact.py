@@ -1,5 +1,6 @@
 """Claims about simulated contact: stiffness, chaos, geometry, friction, and the bias where contact begins."""
 
+import dataclasses
 import math
 from typing import Final
 
@@ -14,13 +15,9 @@ from mjx_study.claims.laboratory import (
     Laboratory,
     Slopes,
     Statistic,
-    batch,
     batches,
-    difference_of,
     exact,
-    log_variance,
     mean_of,
-    ratio_of,
     times_of,
 )
 from mjx_study.claims.ledger import REAL, Claim, above, below, within
@@ -36,7 +33,10 @@ from mjx_study.claims.theory import (
     at,
     bias,
     compared,
+    errors_of,
+    relative,
     signed_bias,
+    variances_of,
 )
 from mjx_study.study.configuration import StudyConfig
 
@@ -151,80 +151,70 @@ def geometry(lab: Laboratory, system: str, family: str) -> Statistic:
 
 def dome(lab: Laboratory, system: str, family: str) -> Statistic:
     """log10 of FoBG's variance on the dome over that at the box, sigma = 0.03 rad."""
-    found = [
-        log_variance(batch(FirstOrder(), at(lab, name, family, sigma=0.03), lab.effort.draws))
-        for name in (system, system.replace(":dome", ""))
-    ]
-    return difference_of(found[0], found[1])
+    names = system, system.replace(":dome", "")
+    return variances_of(lab, *(at(lab, name, family, sigma=0.03) for name in names))
 
 
 def dome_bias(lab: Laboratory, system: str, family: str) -> Statistic:
     """(E[FoBG] - grad F) / grad F on the dome, sigma = 0.03 rad."""
-    found = at(lab, system, family, sigma=0.03)
-    return exact(found.relative, sum(found.errors), found.points)
+    return relative(at(lab, system, family, sigma=0.03))
+
+
+def biases_of(one: Slopes, other: Slopes) -> Statistic:
+    """The relative bias on a landscape, as a share of that on another."""
+    share = one.relative / other.relative
+    slack = (sum(one.errors) + abs(share) * sum(other.errors)) / abs(other.relative)
+    return exact(share, slack, other.points)
 
 
 def timestep(lab: Laboratory, system: str, family: str) -> Statistic:
     """The relative bias at half the timestep, as a share of that at the whole."""
-    whole, half = at(lab, system, family), at(lab, system, family, timestep=HALF_STEP["momentum_transfer"])
-    slack = (sum(half.errors) + abs(half.relative / whole.relative) * sum(whole.errors)) / abs(whole.relative)
-    return exact(half.relative / whole.relative, slack, whole.points)
+    half = at(lab, system, family, timestep=HALF_STEP["momentum_transfer"])
+    return biases_of(half, at(lab, system, family))
 
 
 def cured(lab: Laboratory, system: str, family: str) -> Statistic:
     """(E[FoBG with the onset term] - grad F) / grad F."""
-    found = at(lab, system, family, onset="linear")
-    return exact(found.relative, sum(found.errors), found.points)
+    return relative(at(lab, system, family, onset="linear"))
 
 
 def cure_cost(lab: Laboratory, system: str, family: str) -> Statistic:
     """log10 of FoBG's variance with the onset term over that without."""
-    found = [
-        log_variance(batch(FirstOrder(), at(lab, system, family, onset=onset), lab.effort.draws))
-        for onset in ("linear", "none")
-    ]
-    return difference_of(found[0], found[1])
+    return variances_of(lab, at(lab, system, family, onset="linear"), at(lab, system, family))
 
 
-def _relaxed(lab: Laboratory, system: str, family: str) -> Slopes:
-    """A landscape with the derivatives of the relaxation that the system's name ends with."""
+def _relaxed(lab: Laboratory, system: str, family: str, onset: str = "none") -> tuple[Slopes, Slopes]:
+    """A landscape with the derivatives of the relaxation that the system's name ends with, and one with its own."""
     where, _, relaxed = system.rpartition(", ")
-    return at(lab, where, family, relaxed=relaxed)
+    return at(lab, where, family, relaxed=relaxed), at(lab, where, family, onset=onset)
 
 
 def relaxed_bias(lab: Laboratory, system: str, family: str) -> Statistic:
     """(E[FoBG with relaxed derivatives] - grad F) / grad F."""
-    found = _relaxed(lab, system, family)
-    return exact(found.relative, sum(found.errors), found.points)
+    return relative(_relaxed(lab, system, family)[0])
 
 
 def relaxed_share(lab: Laboratory, system: str, family: str) -> Statistic:
-    """What relaxed derivatives leave of the bias of exact ones."""
-    found, plain = _relaxed(lab, system, family), at(lab, system.rpartition(", ")[0], family)
-    share = abs(found.relative / plain.relative)
-    slack = (sum(found.errors) + share * sum(plain.errors)) / abs(plain.relative)
-    return exact(share, slack, found.points)
+    """What relaxed derivatives leave of the size of the bias of exact ones."""
+    share = biases_of(*_relaxed(lab, system, family))
+    return dataclasses.replace(share, estimate=abs(share.estimate))
 
 
 def relaxed_cost(lab: Laboratory, system: str, family: str) -> Statistic:
     """log10 of FoBG's variance with relaxed derivatives over that with exact ones."""
-    places = _relaxed(lab, system, family), at(lab, system.rpartition(", ")[0], family)
-    one, other = (log_variance(batch(FirstOrder(), each, lab.effort.draws)) for each in places)
-    return difference_of(one, other)
+    return variances_of(lab, *_relaxed(lab, system, family))
 
 
 def onset_or_relaxed(lab: Laboratory, system: str, family: str) -> Statistic:
     """log10 of FoBG's mean squared error with the onset term over that with relaxed derivatives."""
-    places = at(lab, system.rpartition(", ")[0], family, onset="linear"), _relaxed(lab, system, family)
-    found = [batches([FirstOrder()], each, 200, 2 * lab.effort.batches)[0] for each in places]
-    squared = [(np.asarray(each.mean)[:, 0] - places[0].gradient) ** 2 for each in found]
-    return ratio_of(squared[0], squared[1], "batches")
+    relaxed, corrected = _relaxed(lab, system, family, onset="linear")
+    (one,), (other,) = (batches([FirstOrder()], each, 200, 2 * lab.effort.batches) for each in (corrected, relaxed))
+    return errors_of(one, other, corrected.gradient)
 
 
 def onset_cost(lab: Laboratory, system: str, family: str) -> Statistic:
     """log10 of FoBG's variance over that with MuJoCo's default impedance, equally stiff and damped."""
-    found = [log_variance(batch(FirstOrder(), at(lab, system, name), lab.effort.draws)) for name in (family, "mujoco")]
-    return difference_of(found[0], found[1])
+    return variances_of(lab, *(at(lab, system, name) for name in (family, "mujoco")))
 
 
 def softened(lab: Laboratory, system: str, family: str) -> Statistic:

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import estimators
-from estimators import AlphaOrder, FirstOrder, InverseVariance, ZerothOrder, constrained_alpha
+from estimators import AlphaOrder, FirstOrder, GradientEstimate, InverseVariance, ZerothOrder, constrained_alpha
 from mjx_study.choices import REFERENCE
 from mjx_study.claims.laboratory import (
     Laboratory,
@@ -60,6 +60,22 @@ def at(
     )
 
 
+def relative(found: Slopes) -> Statistic:
+    """(E[FoBG] - grad F) / grad F of a landscape."""
+    return exact(found.relative, sum(found.errors), found.points)
+
+
+def variances_of(lab: Laboratory, one: Slopes, other: Slopes) -> Statistic:
+    """log10 of FoBG's variance on a landscape over that on another."""
+    return difference_of(*(log_variance(batch(FirstOrder(), each, lab.effort.draws)) for each in (one, other)))
+
+
+def errors_of(one: GradientEstimate, other: GradientEstimate, gradient: float) -> Statistic:
+    """log10 of the ratio of two mean squared errors over the same batches."""
+    squared = [(np.asarray(each.mean)[:, 0] - gradient) ** 2 for each in (one, other)]
+    return ratio_of(squared[0], squared[1], "batches")
+
+
 def bias(lab: Laboratory, system: str, family: str) -> Statistic:
     """|E[FoBG] - grad F| / |grad F|."""
     found = at(lab, system, family)
@@ -68,8 +84,7 @@ def bias(lab: Laboratory, system: str, family: str) -> Statistic:
 
 def signed_bias(lab: Laboratory, system: str, family: str) -> Statistic:
     """(E[FoBG] - grad F) / grad F."""
-    found = at(lab, system, family)
-    return exact(found.relative, sum(found.errors), found.points)
+    return relative(at(lab, system, family))
 
 
 def zeroth_bias(lab: Laboratory, system: str, family: str) -> Statistic:
@@ -176,9 +191,8 @@ def compared(one: str, other: str, lab: Laboratory, system: str, family: str) ->
     point = at(lab, system, family)
     bounded = AlphaOrder(gamma=abs(point.gradient) / 2)
     known = {"zobg": ZerothOrder(), "fobg": FirstOrder(), "ivw": InverseVariance(), "aobg": bounded}
-    found = batches([known[one], known[other]], point, 200, 2 * lab.effort.batches)
-    squared = [(np.asarray(each.mean)[:, 0] - point.gradient) ** 2 for each in found]
-    return ratio_of(squared[0], squared[1], "batches")
+    first, second = batches([known[one], known[other]], point, 200, 2 * lab.effort.batches)
+    return errors_of(first, second, point.gradient)
 
 
 def ivw_error(lab: Laboratory, system: str, family: str) -> Statistic:
