@@ -490,11 +490,12 @@ def _touches(task: Task, cell: ContactPoint) -> Iterator[Touch]:
         mujoco.mj_forward(host, data)
         now = {tuple(contact.geom): contact for contact in data.contact if contact.dist < contact.includemargin}
         for pair in now.keys() - (now.keys() if before is None else before):
-            yield _touch(host, data, now[pair], index * timestep, timestep)
+            yield touch_of(host, data, now[pair], index * timestep, timestep)
         before = now.keys()
 
 
-def _touch(host: mujoco.MjModel, data: mujoco.MjData, contact: Any, time: float, timestep: float) -> Touch:
+def touch_of(host: mujoco.MjModel, data: mujoco.MjData, contact: Any, time: float, timestep: float) -> Touch:
+    """A contact of the engine's data, which has just begun."""
     solref = np.array(contact.solref)
     if solref[0] > 0 and not host.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_REFSAFE:
         solref[0] = max(solref[0], 2 * timestep)

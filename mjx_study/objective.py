@@ -84,6 +84,7 @@ def rollout_cost(
     start: State,
     noise: Float[Array, "steps dimensions"],
     onset: str = "none",
+    weight: float | Float[Array, ""] = 1.0,
 ) -> tuple[Float[Array, ""], tuple[State, Float[Array, "horizon nu"], Float[Array, ""], OnsetCounts | None]]:
     """Total cost V_1 of one rollout, a pure function of everything that may be traced or differentiated.
 
@@ -93,6 +94,7 @@ def rollout_cost(
         noise: noise of the policy's `noise_shape`.
         onset: "none", or "linear" or "jump" for a derivative with the onset term (see `mjx_study.simulation.onset` and
             `mjx_study.simulation.branches`).
+        weight: factor on the linear onset term; 0 for a derivative without it.
 
     Returns:
         The cost; and the states `(horizon + 1, ...)` including the initial one, the controls, the largest relative
@@ -111,7 +113,7 @@ def rollout_cost(
     first = task.policy.place(theta, noise, start)
     simulated, counts, term = (task.scene, model, first, control_law, task.horizon), None, 0.0
     if onset == "linear":
-        states, controls, residuals, counts = corrected_rollout(*simulated)
+        states, controls, residuals, counts = corrected_rollout(*simulated, weight=weight)
     else:
         states, controls, residuals = rollout(*simulated, backward)
     if onset == "jump":

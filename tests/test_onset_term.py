@@ -138,8 +138,8 @@ def test_every_sample_is_that_of_the_formula(mode) -> None:
         model = apply_contact(scene.model.replace(opt=scene.model.opt.replace(gravity=gravity)), CONTACT)
         return scene, model, initial_state(scene, gap[None], speed[None])
 
-    def last(gap, *case):
-        states, _, _, counts = corrected_rollout(*scene_at(gap, *case), LAW, steps)
+    def last(gap, speed, free, weight):
+        states, _, _, counts = corrected_rollout(*scene_at(gap, speed, free), LAW, steps, weight=weight)
         found = jnp.stack([states.qpos[-1, 0], states.qvel[-1, 0]])
         return found, (found, counts)
 
@@ -150,8 +150,14 @@ def test_every_sample_is_that_of_the_formula(mode) -> None:
         return cost(states.qpos[-1, 0]) + term, counts
 
     def sample(*case):
-        derivative, (value, counts) = mode(last, has_aux=True)(*case)
-        return value, counts, derivative, *jax.grad(last_cost, has_aux=True)(*case)
+        weighted = jax.vmap(lambda weight: mode(last, has_aux=True)(*case, weight))
+        derivative, (value, counts) = weighted(jnp.array([1.0, 0.0]))
+        return (
+            value[0],
+            jax.tree.map(lambda each: each[0], counts),
+            derivative,
+            *jax.grad(last_cost, has_aux=True)(*case),
+        )
 
     batched = jax.vmap(jax.vmap(sample, in_axes=(0, None, None)))
     results = compiled(batched, *(np.array(column) for column in zip(*cases, strict=True)))
@@ -160,7 +166,8 @@ def test_every_sample_is_that_of_the_formula(mode) -> None:
     ):
         ours, of_steps, corrected, term = fall(gaps, steps, timestep, free, start=speed)
         np.testing.assert_allclose(values, ours, rtol=0, atol=1e-12)
-        np.testing.assert_allclose(derivative, corrected, rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(derivative[:, 0], corrected, rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(derivative[:, 1], of_steps, rtol=1e-9, atol=1e-12)
         np.testing.assert_allclose(jumping, 200 * (ours[:, 0] - 0.02) * of_steps[:, 0] + term, rtol=1e-9, atol=1e-9)
         assert np.all(np.abs(of_steps - corrected).max(axis=1) > 0.1)  # the term is no small matter here
         assert np.abs(term).max() > (0.1 if gaps is hit else 0.01)

@@ -102,7 +102,13 @@ def as_row(counts: OnsetCounts | None) -> Float[Array, "*batch 5"] | None:
 
 
 def corrected_rollout(
-    scene: Scene, model: mjx.Model, start: State, control_law: ControlLaw, horizon: int, slots: int = SLOTS
+    scene: Scene,
+    model: mjx.Model,
+    start: State,
+    control_law: ControlLaw,
+    horizon: int,
+    slots: int = SLOTS,
+    weight: float | Float[Array, ""] = 1.0,
 ) -> tuple[State, Float[Array, "horizon nu"], Float[Array, " horizon"], OnsetCounts]:
     """`dynamics.rollout` with the same values, and derivatives that include the onset term.
 
@@ -114,6 +120,7 @@ def corrected_rollout(
         control_law: maps (step index, state) to the control of that step.
         horizon: number of steps, at least 1.
         slots: number of onsets to correct, first ones first.
+        weight: factor on the term; 0 for the derivatives of `dynamics.rollout`.
 
     Returns:
         States `(horizon + 1, ...)` including the initial one, controls `(horizon, nu)`, residuals `(horizon,)`; counts.
@@ -138,6 +145,7 @@ def corrected_rollout(
         observe, jax.lax.stop_gradient(start), jnp.arange(horizon)
     )
     spread, shift, counts = _corrections(scene, model, before, controls, *guards, slots)
+    spread, shift = weight * spread, weight * shift
 
     def follow(state: State, known):
         index, fixed, fixed_control, fixed_after, over_step, spread, shift = known
