@@ -19,6 +19,8 @@ TASK_DESCRIPTIONS: Final = {
     "ball_wall:dome": "throw a ball far, with a wall (dome) in its way; one launch angle",
     "momentum_transfer": "hit a pivoting bar as hard as possible with a ball; one launch angle",
     "tennis": "return balls to a target with a paddle; linear feedback, 3 x 7",
+    "gripper": "push and turn a box with two fingers; a neural network",
+    "landing": "land softly on two legs and stay upright; a neural network",
     "double_pendulum": "chaos without contact; four numbers of the initial state (default)",
     "double_pendulum:published": "chaos without contact; four numbers of the initial state (published)",
 }

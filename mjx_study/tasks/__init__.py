@@ -8,6 +8,8 @@ from estimators.places import MissingModuleError
 from mjx_study.choices import is_file, unknown_task
 from mjx_study.tasks.ball_wall import ball_wall
 from mjx_study.tasks.double_pendulum import double_pendulum
+from mjx_study.tasks.gripper import gripper
+from mjx_study.tasks.landing import landing
 from mjx_study.tasks.mjcf import mjcf_task
 from mjx_study.tasks.momentum_transfer import momentum_transfer
 from mjx_study.tasks.own import own_task, registered_place
@@ -23,6 +25,8 @@ TASKS: Final[dict[str, Callable[..., Task]]] = {
     "ball_wall:dome": partial(ball_wall, "dome"),
     "momentum_transfer": momentum_transfer,
     "tennis": tennis,
+    "gripper": gripper,
+    "landing": landing,
     "double_pendulum": double_pendulum,
     "double_pendulum:published": partial(double_pendulum, "published"),
 }
@@ -68,6 +72,8 @@ __all__ = [
     "TASKS",
     "ball_wall",
     "double_pendulum",
+    "gripper",
+    "landing",
     "make_task",
     "momentum_transfer",
     "pusher",
