@@ -37,7 +37,8 @@ def landing(*, horizon: int = HORIZON, model: str | Path = "landing", **scene_op
 
     Args:
         model: name or path of a replacement MJCF, with the joints `x`, `z`, `pitch`, `front_hip`, `front_knee`,
-            `hind_hip`, `hind_knee` in this order, the geoms `front_foot`, `floor`, and a servo for each of the last four.
+            `hind_hip`, `hind_knee` in this order, the geoms `front_foot`, `floor`, and a servo for each of the last
+            four.
     """
     scene = load_scene(model, **scene_options)
     joints = ("x", "z", "pitch", "front_hip", "front_knee", "hind_hip", "hind_knee")
