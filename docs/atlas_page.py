@@ -28,6 +28,8 @@ TOLERANCE: Final = 0.2
 """Share of the slope within which a mean counts as right."""
 QUANTILE: Final = 2.58
 """Standard errors of the 99 % intervals that verdicts on means need."""
+MARKOV: Final = 40.0
+"""A mean of numbers >= 0 exceeds this many times its expectation with a probability of at most 1/40."""
 GROUPS: Final = {
     "limit": ("(h^2 k + 2 h b) / 4", "stiffness and damping over one step, as a share of the stability limit"),
     "h_b": ("h b", "damping over one step"),
@@ -37,6 +39,7 @@ GROUPS: Final = {
     "travel": ("h v / width", "travel in a step over the depth of the impedance's rise"),
     "crossing": ("h v / spread", "steps' travel over the guard's spread: 1 / onset_spread"),
     "periods": ("T sqrt(k) / 2 pi", "horizon in periods of the contact's spring"),
+    "params": ("P", "number of parameters"),
 }
 """Dimensionless groups: symbol and meaning."""
 COLOURS: Final = {
@@ -58,7 +61,7 @@ def read(path: Path) -> Table:
     table["task"] = [about["programs"][each][0] for each in programs]
     table["timestep"] = [about["programs"][each][1] for each in programs]
     table["contact"] = [about["families"][each] for each in table["family"].astype(int)]
-    duration = np.array(about["durations"])[programs]
+    duration, table["params"] = (np.array(about[name], float)[programs] for name in ("durations", "params"))
     table["h_b"] = table.timestep * table.b
     table["h2_k"] = table.timestep**2 * table.k
     table["limit"] = (table.h2_k + 2 * table.h_b) / 4
@@ -70,14 +73,16 @@ def read(path: Path) -> Table:
     table["ratio"] = table.fobg_variance / table.zobg_variance
     enough = (table.fobg_effective >= ENOUGH_EFFECTIVE) & (table.zobg_effective >= ENOUGH_EFFECTIVE)
     above, below = table.fobg_lower > table.zobg_upper, table.fobg_upper < table.zobg_lower
-    table["above"] = np.where(enough & above, 1.0, np.where(enough & below, 0.0, np.nan))
+    beyond = table.fobg_variance / MARKOV > table.zobg_upper
+    table["above"] = np.where(enough & above | beyond, 1.0, np.where(enough & below, 0.0, np.nan))
     for name in ("fobg", "fobg_onset"):
         table[f"{name}_relative"] = table[f"{name}_bias"].abs() / table.slope.abs()
         table[f"{name}_off"] = _off(table, name)
     added = (table.fobg_bias - table.fobg_onset_bias).abs()
     table["left"] = table.fobg_onset_bias.abs() / added
     table["left_error"] = np.hypot(table.fobg_onset_bias_se, table.slope_se) / added
-    cost = table.gradient_seconds / table.value_seconds
+    cost = (table.gradient_seconds / table.value_seconds).groupby(programs).transform("median")
+    table["cost"] = cost
     saved = table.zobg_variance - table.fobg_variance * cost
     table["worth"] = table.zobg_variance / (table.fobg_variance * cost)
     table["until"] = np.where(saved > 0, saved / table.fobg_bias**2, 0.0)
@@ -195,7 +200,7 @@ def index_table(table: Table) -> str:
     head = ("group", "range", "cells", "variance above", "mean off", "off with the term")
     met, rows = table[_met(table)], []
     for group, (symbol, _) in GROUPS.items():
-        some = table if group in ("limit", "h_b", "h2_k", "impedance", "periods") else met
+        some = table if group in ("limit", "h_b", "h2_k", "impedance", "periods", "params") else met
         values = some[group][np.isfinite(some[group])]
         edges = np.unique(np.quantile(values, np.linspace(0, 1, 5))) if len(values) else np.zeros(0)
         for low, high in zip(edges[:-1], edges[1:], strict=True):
@@ -212,9 +217,32 @@ def bound_table(table: Table) -> str:
     rows = []
     for name, part in table[_plain(table) & (table.onset_spread >= NARROW)].groupby("task"):
         excess = part.left - SHARE_OFF * part.strength
-        told = excess.abs() > QUANTILE * part.left_error
-        rows.append([f"`{name}`", len(part), share((excess[told] <= 0).to_numpy()), f"{part.left.median():.2g}"])
+        told = (excess.abs() > QUANTILE * part.left_error) & np.isfinite(excess)
+        rows.append(
+            [
+                f"`{name}`",
+                len(part),
+                share((excess[told] <= 0).to_numpy()),
+                f"{part.left[np.isfinite(part.left)].median():.2g}",
+            ]
+        )
     return markdown(("task", "cells", "within the bound, where that is decided", "share left, median"), rows)
+
+
+def groups_table(table: Table) -> str:
+    """How well each group alone tells a verdict: the chance that it ranks a cell with it above one without."""
+    met, cured = table[_met(table)], table[_plain(table)]
+    chances = []
+    for group in GROUPS:
+        for some, verdict in ((table, "above"), (met, "fobg_off"), (cured, "fobg_onset_off")):
+            kept = some[np.isfinite(some[group]) & np.isfinite(some[verdict])]
+            ranks, truth = kept[group].rank(), kept[verdict] == 1
+            pairs = int(truth.sum()) * int((~truth).sum())
+            chances.append((ranks[truth].sum() - truth.sum() * (truth.sum() + 1) / 2) / pairs if pairs else np.nan)
+    head = ("group", "", "variance above", "mean off", "off with the term")
+    named = [[f"`{symbol}`", meaning] for symbol, meaning in GROUPS.values()]
+    shown = [f"{each:.2f}" if np.isfinite(each) else "-" for each in chances]
+    return markdown(head, [[*name, *shown[3 * place : 3 * place + 3]] for place, name in enumerate(named)])
 
 
 def timestep_table(table: Table) -> str:
@@ -235,7 +263,7 @@ def cells_table(table: Table) -> str:
         met = part[_met(part)]
         decided = [f"{int(each.notna().sum())} of {len(each)}" for each in (part.above, met.fobg_off)]
         steps = ", ".join(f"{1e3 * each:g}" for each in sorted(part.timestep.unique()))
-        cost = float(np.median(part.gradient_seconds / part.value_seconds))
+        cost = float(part.cost.median())
         rows.append([name if name == "all" else f"`{name}`", steps if name != "all" else "", len(part), *decided])
         rows[-1].append(f"{cost:.2g}" if name != "all" else "")
     head = (
@@ -271,6 +299,7 @@ def markdown(head: Any, rows: Any) -> str:
 
 TABLES: Final = {
     "cells": cells_table,
+    "groups": groups_table,
     "index": index_table,
     "rules": rules_table,
     "bound": bound_table,
@@ -290,7 +319,13 @@ def binned(axes: Axes, values: Any, verdict: Any, colour: str, label: str) -> No
         middle, low, high = coverage_interval(jnp.asarray(chosen), 0.95)
         at = float(np.exp(np.mean(np.log(values.to_numpy()[part]))))
         axes.errorbar(
-            at, middle, np.array([[middle - low], [high - middle]]), color=colour, marker="o", markersize=4, capsize=2
+            at,
+            middle,
+            np.maximum([[middle - low], [high - middle]], 0),
+            color=colour,
+            marker="o",
+            markersize=4,
+            capsize=2,
         )
     axes.plot([], [], color=colour, marker="o", label=label)
 
@@ -312,7 +347,7 @@ def variance_figure(table: Table) -> Figure:
     names = list(dict.fromkeys(table.task))
     figure, axes = panels(2, -(-len(names) // 2))
     for each, name in zip(axes, names, strict=False):
-        scatter(each, table[(table.task == name) & np.isfinite(table.ratio)], "limit", "ratio", (1e-7, 1e7))
+        scatter(each, table[(table.task == name) & table.ratio.notna()], "limit", "ratio", (1e-7, 1e7))
         each.axhline(1, color="black", linewidth=0.6)
         each.axvline(1, color="black", linewidth=0.6, linestyle=":")
         each.set_title(name)
@@ -369,7 +404,13 @@ def timestep_figure(table: Table) -> Figure:
             if points:
                 x, middle, low, high = np.array(points).T
                 each.errorbar(
-                    x, middle, np.array([middle - low, high - middle]), marker="o", markersize=4, capsize=2, label=name
+                    x,
+                    middle,
+                    np.maximum([middle - low, high - middle], 0),
+                    marker="o",
+                    markersize=4,
+                    capsize=2,
+                    label=name,
                 )
         each.set(xscale="log", xlabel="timestep [ms]", title=title, ylim=(-0.03, 1.03))
     axes[0].set_ylabel("share of cells")
@@ -380,7 +421,7 @@ def timestep_figure(table: Table) -> Figure:
 def samples_figure(table: Table) -> Figure:
     """What first order gains in variance times seconds, and after how many rollouts its bias costs it the lead."""
     figure, axes = panels(1, 2, 4.4)
-    scatter(axes[0], table[np.isfinite(table.worth)], "limit", "worth", (1e-7, 1e7))
+    scatter(axes[0], table[table.worth.notna()], "limit", "worth", (1e-7, 1e7))
     axes[0].axhline(1, color="black", linewidth=0.6)
     axes[0].set_ylabel("variance x seconds, zeroth / first order")
     scatter(axes[1], table[_plain(table) & (table.until > 0)], "strength", "until", (1e-1, 1e5))

@@ -1,0 +1,96 @@
+"""docs/atlas.md says what docs/atlas.npz holds; cells are distinct; verdicts and rules tell what was planted."""
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from docs import atlas_page as page
+from docs import make_atlas as atlas
+
+TABLE = page.read(atlas.RESULTS)
+
+
+def test_the_page_says_what_the_file_says() -> None:
+    text = page.PAGE.read_text()
+    assert page.written(text, TABLE) == text
+    assert atlas.RESULTS.stat().st_size < 1.5e6
+
+
+@pytest.mark.slow
+def test_no_two_cells_share_a_contact_model_a_sigma_or_a_theta() -> None:
+    cells = [cell for program in range(len(atlas.PROGRAMS)) for cell in atlas.cells_of(program)]
+    assert len(cells) == atlas.CELLS >= 10_000
+    assert [cell.index for cell in cells] == list(range(len(cells)))
+    for names in (("stiffness",), ("program", "sigma"), ("program", "theta")):
+        assert len({tuple(getattr(cell, name) for name in names) for cell in cells}) > 0.999 * len(cells)
+
+
+def test_the_file_holds_cells_of_the_design() -> None:
+    assert TABLE["index"].is_unique and TABLE["index"].between(0, atlas.CELLS - 1).all()
+    program = int(TABLE.program.iloc[0])
+    cells = {cell.index: cell for cell in atlas.cells_of(program)}
+    for _, row in TABLE[TABLE.program == program].iterrows():
+        cell = cells[int(row["index"])]
+        for name in ("family", "stiffness", "width", "sigma", "theta"):
+            assert row[name] == pytest.approx(getattr(cell, name), rel=2**-atlas.DIGITS)
+
+
+def test_parts_are_joined_and_a_cell_that_was_computed_twice_is_kept_once(tmp_path: Path) -> None:
+    for part, indices in enumerate([[3, 1], [1, 2]]):
+        columns = {"index": np.array(indices, float), "slope": np.array(indices) / 3}
+        atlas.write(tmp_path / f"part-{part}.npz", [columns])
+    assert atlas.condense(tmp_path) == 3
+    assert [path.name for path in tmp_path.iterdir()] == ["atlas.npz"]
+    found = atlas.read(tmp_path / "atlas.npz")
+    np.testing.assert_array_equal(found["index"], [1, 2, 3])
+    np.testing.assert_allclose(found["slope"], np.array([1, 2, 3]) / 3, rtol=2**-atlas.DIGITS)
+
+
+def test_rounding_keeps_what_is_no_number() -> None:
+    np.testing.assert_array_equal(atlas.rounded(np.array([np.nan, np.inf, -np.inf, 0.0])), [np.nan, np.inf, -np.inf, 0])
+
+
+def planted(threshold: float, flipped: float, size: int = 4000) -> page.Table:
+    """Cells whose verdict is 1 above a threshold, but for a share of them."""
+    rng = np.random.default_rng(0)
+    group = np.exp(rng.normal(size=size))
+    verdict = (group > threshold) ^ (rng.random(size) < flipped)
+    table = pd.DataFrame({"index": np.arange(size), "group": group, "verdict": verdict.astype(float)})
+    table.attrs["families"] = ["one"]
+    return table
+
+
+@pytest.mark.parametrize(("threshold", "flipped"), [(0.5, 0.0), (2.0, 0.1)])
+def test_a_rule_is_as_often_right_as_planted_and_its_threshold_is_found(threshold: float, flipped: float) -> None:
+    """Standard error of a share: 0.01 at 1000 cells; the threshold is one of 99 quantiles."""
+    table = planted(threshold, flipped)
+    rule = page.Rule("", "group", threshold, "verdict", lambda table: table.group > 0)
+    fit, test = page.halves(table)
+    assert not set(fit["index"]) & set(test["index"])
+    assert rule.fitted(rule.judged(fit)) == pytest.approx(threshold, rel=0.1)
+    expected = (table.group > threshold).to_numpy()
+    verdict = (table.verdict == 1).to_numpy()
+    holds, holds_not = rule.hits(table, threshold)
+    assert np.mean(holds) == pytest.approx(np.mean(expected[verdict])) and len(holds) + len(holds_not) == len(table)
+    assert np.mean(holds_not) == pytest.approx(np.mean(~expected[~verdict]))
+    assert rule.balanced(table, threshold) > rule.balanced(table, 4 * threshold) + 0.05
+
+
+@pytest.mark.parametrize(
+    ("bias", "error", "uncertain", "effective", "expected"),
+    [
+        (0.0, 0.02, 0.01, 30.0, 0.0),
+        (0.5, 0.02, 0.01, 30.0, 1.0),
+        (-0.5, 0.02, 0.01, 30.0, 1.0),
+        (0.5, 0.2, 0.01, 30.0, np.nan),
+        (0.5, 0.02, 0.5, 30.0, np.nan),
+        (0.5, 0.02, 0.01, 2.0, np.nan),
+        (0.22, 0.02, 0.01, 30.0, np.nan),
+    ],
+)
+def test_a_mean_is_off_where_its_interval_and_the_reference_s_say_so(bias, error, uncertain, effective, expected):
+    columns = {"bias": bias, "bias_se": error, "effective": effective, "lost": 0.0}
+    cell = {f"fobg_{name}": [value] for name, value in columns.items()} | {"slope": [-1.0], "slope_se": [uncertain]}
+    np.testing.assert_array_equal(page._off(pd.DataFrame(cell), "fobg"), [expected])
