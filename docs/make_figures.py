@@ -258,6 +258,24 @@ def tennis_panel() -> Panel:
     return Panel("tennis", "3 x 7 feedback gains", (-2.0, -1.0), (2.1, 2.95), 0.5, draw)
 
 
+def robot_panel(name: str, seed: int, view: str, shown: Sequence[tuple[int, str]], apart: float, **corners) -> Panel:
+    """One sample's rollout without noise, by the policy that a descent starts from: (step, text), side by side."""
+    task = task_of(name)
+    assert callable(task.start)
+    start = jax.tree.map(lambda leaf: leaf[None], task.start(jax.random.key(seed)))
+    qpos = run(task, np.asarray(task.theta)[None], contact_of(task, "mujoco", task.defaults.middle_stiffness), start).qpos[0]
+
+    def draw(axes: Axes) -> None:
+        drawing = drawing_of(task, qpos, view)
+        drawing.scenery(axes)
+        for place, (step, text) in enumerate(shown):
+            for added in drawing.pose(axes, step):
+                added.set_transform(Affine2D().translate(place * apart, 0) + axes.transData)
+            note(axes, place * apart, corners["high"][1] - 0.04 * apart, f"{step * task.scene.timestep:g} s: {text}", va="top")
+
+    return Panel(name, f"neural network, {task.policy.num_params} weights", bar=0.1, draw=draw, **corners)
+
+
 def pendulum_panel() -> Panel:
     task = task_of("double_pendulum", horizon=4000)
     starts = np.asarray(task.theta) + np.array([[0.0, 0, 0, 0], [0.01, 0, 0, 0]])
@@ -290,6 +308,8 @@ def tasks_figure() -> Figure:
         (0.52, 0.285, "over", BLUE),
     ]
     turns = [(0.625, 0.345, "the higher it meets the round top,\nthe less it is thrown back", INK)]
+    knocks = ((0, "apart"), (10, "hit"), (99, "let go"))
+    lands = ((0, "falling"), (45, "landed"), (119, "at rest"))
     rows = [
         [pusher_panel(), sliding_box_panel()],
         [
@@ -297,6 +317,10 @@ def tasks_figure() -> Figure:
             thrown_panel("dome", meets, turns, low=(0.3, -0.05), high=(0.95, 0.4)),
         ],
         [momentum_panel(), tennis_panel(), pendulum_panel()],
+        [
+            robot_panel("gripper", 0, "xy", knocks, 0.2, low=(-0.1, -0.03), high=(0.5, 0.3)),
+            robot_panel("landing", 0, "xz", lands, 0.7, low=(-0.4, -0.05), high=(1.8, 0.65)),
+        ],
     ]
     width, gap, title, margin = 10.0, 0.16, 0.36, 0.06
     heights = [(width - 2 * margin - gap * (len(row) - 1)) / sum(panel.ratio for panel in row) for row in rows]

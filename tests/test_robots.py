@@ -36,12 +36,12 @@ def played(task: Task, seed: int) -> tuple[np.ndarray, list[tuple[State, np.ndar
 def test_contact_is_made_and_broken(name: str) -> None:
     """Made by both tips or feet in every sample, with at most the eight onsets that are corrected; broken in most."""
     task, broken = make_task(name), 0
-    for seed in range(5):
+    for seed in range(3):
         touching, _ = played(task, seed)
         begins, ends = (np.sum(np.diff(touching.astype(int), axis=0) == sign, axis=0) for sign in (1, -1))
         assert not touching[0].any() and len(begins) == 2 and min(begins) >= 1 and sum(begins) <= 8, begins
         broken += sum(ends) >= 1
-    assert broken >= 3
+    assert broken >= 2
 
 
 def test_the_torques_of_landing_are_the_servos() -> None:
