@@ -4,8 +4,10 @@ The baselines get the same policy, initial states, noise, devices and precision:
 
 - stock MJX: `jax.grad` through `mjx.step` with the one solver iteration that reverse mode allows (so its gradient is
   not that of the converged step), in batches that fit in memory;
-- the C engine: centred `mjd_transitionFD` at every step and an adjoint sweep, one thread measured and scaled by the
-  number of devices, as if threading were free; not with quaternions, nor with RK4, which it does not differentiate.
+- the C engine's rollouts: `mujoco.rollout`, open loop, on as many threads as there are devices or cores; float64;
+- the C engine's gradients: centred `mjd_transitionFD` at every step and an adjoint sweep, one thread measured and
+  scaled by the number of devices, as if threading were free; not with quaternions, nor with RK4, which it does not
+  differentiate.
 """
 
 import dataclasses
@@ -18,6 +20,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+from mujoco import rollout
 
 from estimators import FirstOrder, ZerothOrder
 from mjx_study.objective import Simulator, chunk_for, simulate, spread
@@ -49,9 +52,10 @@ class BenchReport:
         rollout_seconds: time of one rollout [s].
         stock_value_seconds: time of a rollout through stock MJX with the same solver budget [s].
         stock_gradient_seconds: time of a gradient through stock MJX with one solver iteration [s].
+        engine_value_seconds: time of a rollout by the C engine [s].
         engine_gradient_seconds: time of a gradient by the C engine's differences on as many threads [s]; None if it has
             none.
-        gradient_memory: temporary memory of all samples' gradients at once [MiB].
+        value_memory, gradient_memory: temporary memory of all samples' rollouts, or gradients, at once [MiB].
     """
 
     task: str
@@ -63,7 +67,9 @@ class BenchReport:
     rollout_seconds: float
     stock_value_seconds: float
     stock_gradient_seconds: float
+    engine_value_seconds: float
     engine_gradient_seconds: float | None
+    value_memory: float
     gradient_memory: float
     environment: dict[str, Any]
 
@@ -73,6 +79,7 @@ class BenchReport:
         ratios = {
             "gradient_per_value": self.gradient_seconds / self.value_seconds,
             "rollouts_over_stock": self.stock_value_seconds / self.rollout_seconds,
+            "rollouts_over_engine": self.engine_value_seconds / self.rollout_seconds,
             "speedup_over_stock": self.stock_gradient_seconds / self.gradient_seconds,
         }
         if self.engine_gradient_seconds is not None:
@@ -100,13 +107,16 @@ class BenchReport:
             *rate("first order (rollout and gradient)", self.gradient_seconds),
             *rate("a rollout", self.rollout_seconds),
             *rate("a rollout through mjx.step", self.stock_value_seconds),
+            *rate("a rollout by the C engine, mujoco.rollout", self.engine_value_seconds),
             *rate("jax.grad through mjx.step, one iteration", self.stock_gradient_seconds),
             *rate("C engine, mjd_transitionFD and adjoint", self.engine_gradient_seconds),
             "ratios of this run:",
             f"  a first-order sample costs {ratios['gradient_per_value']:.2f} zeroth-order samples",
-            f"  rollouts per second: {ratios['rollouts_over_stock']:.2f} x stock mjx.step",
+            f"  rollouts per second: {ratios['rollouts_over_stock']:.2f} x stock mjx.step, "
+            f"{ratios['rollouts_over_engine']:.2f} x the C engine",
             f"  gradients per second: {ratios['speedup_over_stock']:.2f} x stock mjx.step{engine}",
-            f"  memory of {self.samples} gradients at once: {self.gradient_memory:.1f} MiB",
+            f"  memory of {self.samples} rollouts at once: {self.value_memory:.1f} MiB, "
+            f"of their gradients: {self.gradient_memory:.1f} MiB",
         ]
 
 
@@ -140,7 +150,7 @@ def bench(plan: BenchPlan, progress: Progress = lambda done, total, what: None) 
     full = -(-samples // (simulator.chunk_size * len(devices))) * simulator.chunk_size * len(devices)
     key_data = np.resize(jax.random.key_data(keys), (full, 2))  # no padded chunks, as in stock
     noisy = np.ones(full, task.scene.template.qpos.dtype)
-    progress(0, 8, f"{task.name}: compiling stock")
+    progress(0, 12, f"{task.name}: compiling stock")
     stock_samples = min(samples, STOCK_BATCH[devices[0].platform] * len(devices))
     stock_samples, stock_value, stock_gradient = _fitting_stock(task, cell.contact, keys, stock_samples, devices)
     contenders: dict[str, tuple[int, Callable[[], Any]]] = {
@@ -149,6 +159,7 @@ def bench(plan: BenchPlan, progress: Progress = lambda done, total, what: None) 
         "rollout": (full, lambda: simulator.run("value", task.theta, cell.contact, task.sigma, key_data, noisy)),
         "stock_value": (stock_samples, stock_value),
         "stock_gradient": (stock_samples, stock_gradient),
+        "engine_value": engine_rollouts(task, cell.contact, keys[: STOCK_BATCH["cpu"]], len(devices)),
     }
     total = 2 * len(contenders)
     for done, (name, (_, call)) in enumerate(contenders.items()):
@@ -168,7 +179,8 @@ def bench(plan: BenchPlan, progress: Progress = lambda done, total, what: None) 
         contact=cell.label,
         **{f"{name}_seconds": statistics.median(values) for name, values in times.items()},
         engine_gradient_seconds=None if engine is None else engine / len(devices),
-        gradient_memory=simulator.gradient_memory(cell.contact, samples) / 2**20,
+        value_memory=simulator.memory("value", cell.contact, samples) / 2**20,
+        gradient_memory=simulator.memory("gradient", cell.contact, samples) / 2**20,
         environment=environment(),
     )
 
@@ -237,6 +249,30 @@ def _engine_seconds(task: Task, contact: ContactModel | None) -> float | None:
     played = np.asarray(controls, float)
     times = [_seconds(lambda: engine_gradient(task, contact, start, played)) for _ in range(ENGINE_SAMPLES)]
     return statistics.median(times)
+
+
+def engine_rollouts(
+    task: Task, contact: ContactModel | None, keys: jax.Array, threads: int
+) -> tuple[int, Callable[[], np.ndarray]]:
+    """The number of rollouts, and a call that runs them by the C engine.
+
+    Their starts and controls are those of ours, so that a policy with feedback costs the engine nothing.
+
+    Returns:
+        The number, and a function without arguments that returns states `(rollouts, horizon, state)`, a state as in
+        `mujoco.mjtState.mjSTATE_FULLPHYSICS`.
+    """
+    host = engine_model(task.scene, contact)
+    simulated = jax.vmap(lambda key: simulate(task, task.theta, contact, key, 1.0)[:2])
+    states, controls = jax.jit(simulated)(keys)
+    data = [mujoco.MjData(host) for _ in range(threads)]
+    state = mujoco.mjtState.mjSTATE_FULLPHYSICS
+    starts = np.empty((len(keys), mujoco.mj_stateSize(host, state)))
+    for row, qpos, qvel, act in zip(starts, states.qpos[:, 0], states.qvel[:, 0], states.act[:, 0], strict=True):
+        data[0].qpos[:], data[0].qvel[:], data[0].act[:] = qpos, qvel, act
+        mujoco.mj_getState(host, data[0], row, state)
+    played = np.asarray(controls, float)
+    return len(keys), lambda: rollout.rollout(host, data, starts, played, nstep=task.horizon, persistent_pool=True)[0]
 
 
 def engine_gradient(

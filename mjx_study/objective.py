@@ -211,12 +211,12 @@ class Simulator:
             "linearisation": self._sample_linearisation,
         }
 
-    def gradient_memory(self, contact: ContactModel | None, samples: int) -> int:
-        """XLA's planned temporary memory for the gradients of a batch, all chunks at once on all devices [bytes]."""
+    def memory(self, kind: str, contact: ContactModel | None, samples: int) -> int:
+        """XLA's planned temporary memory for a batch of one kind, all chunks at once on all devices [bytes]."""
         dtype = self.task.scene.template.qpos.dtype
         keys = np.asarray(jax.random.key_data(jax.random.split(jax.random.key(0), self.chunk_size)))
         arguments = (self.task.theta, contact, np.asarray(1.0, dtype), keys, np.ones(self.chunk_size, dtype))
-        plan = self._programs["gradient"].lower(*arguments).compile().memory_analysis()  # type: ignore[attr-defined]
+        plan = self._programs[kind].lower(*arguments).compile().memory_analysis()  # type: ignore[attr-defined]
         return plan.temp_size_in_bytes * samples // self.chunk_size
 
     def _draw(self, sigma, key_data, noise_scale) -> tuple[State, Float[Array, "steps dimensions"]]:

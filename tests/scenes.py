@@ -160,13 +160,13 @@ _PLAIN: Final = jax.make_user_context(False)
 
 @contextlib.contextmanager
 def plain_warm_start() -> Generator[None]:
-    """What is traced inside is MJX's own: its solver starts where MJX does, without improving the start.
+    """What is traced inside is MJX's own: its solver, too.
 
     Its terms are MJX's, too, not those that round otherwise and have derivatives. JAX traces again what it has traced
     outside.
     """
     with pytest.MonkeyPatch.context() as patch, _PLAIN(True):
-        patch.setattr(constraint, "PREDICTOR_STEPS", 0)
+        patch.setattr(constraint, "OWN_SOLVER", False)
         patch.setattr(patches, "_REPLACED", {})
         yield
 

@@ -10,7 +10,7 @@ import pytest
 
 from mjx_study import bench, cli
 from mjx_study.cli import options
-from mjx_study.objective import Simulator
+from mjx_study.objective import Simulator, simulate
 from mjx_study.simulation.engine import engine_model
 from mjx_study.tasks import make_task
 from mjx_study.tasks.contact_grid import contact_grid
@@ -23,7 +23,7 @@ def configured(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(options, "configure", lambda **_: None)
 
 
-RATIOS = {"gradient_per_value", "rollouts_over_stock", "speedup_over_stock"}
+RATIOS = {"gradient_per_value", "rollouts_over_stock", "rollouts_over_engine", "speedup_over_stock"}
 
 
 @pytest.mark.parametrize(
@@ -41,7 +41,7 @@ def test_bench_prints_its_ratios_and_the_machine(capsys: pytest.CaptureFixture[s
     document = json.loads(capsys.readouterr().out)
     assert set(document["ratios"]) == RATIOS | ({"speedup_over_engine"} if engine else set())
     assert all(ratio > 0 for ratio in document["ratios"].values())
-    assert document["environment"]["processor"] and document["gradient_memory"] > 0
+    assert document["environment"]["processor"] and document["gradient_memory"] > document["value_memory"] > 0
 
 
 @pytest.mark.slow
@@ -53,6 +53,17 @@ def test_stock_mjx_runs_the_same_samples() -> None:
     values, _ = bench._stock_programs(task, cell.contact, keys, jax.local_devices())
     ours = Simulator(task, chunk_size=2).objective(cell.contact).evaluate(task.theta, jax.random.clone(keys))
     np.testing.assert_allclose(values(), ours.value, rtol=1e-10)
+
+
+def test_the_engines_rollouts_are_ours() -> None:
+    """Same starts, controls and contact: the states after every step, but for what solvers leave over."""
+    task = make_task("tests.carts:cart", horizon=5)
+    keys = jax.random.split(jax.random.key(0), 4)
+    count, run = bench.engine_rollouts(task, None, keys, 2)
+    states, *_ = jax.vmap(lambda key: simulate(task, task.theta, None, key, 1.0))(jax.random.clone(keys))
+    nq = task.scene.host.nq
+    assert count == 4
+    np.testing.assert_allclose(run()[..., 1 : 1 + nq], states.qpos[:, 1:], atol=1e-9)
 
 
 def test_the_engines_rival_computes_a_gradient() -> None:

@@ -6,9 +6,10 @@ MuJoCo's constrained acceleration minimises a convex function, that is, it is th
 
 with `f` the force law of each constraint row. MJX finds it with a `while_loop`, which has no reverse mode, so
 `mjx.step` can be differentiated only with one solver iteration, which gets both the step and its gradient wrong. Here
-MJX's own loop runs to convergence and the derivative comes from the implicit function theorem: one symmetric positive
-definite system in `dG/da = M + J^T f' J`, whatever the solver and its budget. The derivative is only as good as the
-solve has converged; `residual` measures that, and every result carries it.
+a loop runs to convergence, MJX's own or, for few degrees of freedom, a faster one, and the derivative comes from the
+implicit function theorem: one symmetric positive definite system in `dG/da = M + J^T f' J`, whatever the solver and its
+budget. The derivative is only as good as the solve has converged; `residual` measures that, and every result carries
+it.
 
 MJX's constraint rows are private (`Data._impl.efc_*`) and are read only here.
 """
@@ -24,14 +25,19 @@ from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Bool, Float
 
 from mjx_study.simulation._mjx import mjx
+from mjx_study.simulation.linear_algebra import SMALL, product, solve_positive_definite
 from mjx_study.simulation.patches import AT_FIRST_TOUCH, RELAXING, patched
 from mjx_study.simulation.scene import num_constraint_rows
 
 _ELLIPTIC = mujoco.mjtCone.mjCONE_ELLIPTIC
 
-SMALL: Final = 6
-"""Largest number of degrees of freedom for which linear systems are unrolled and the warm start is improved."""
-PREDICTOR_STEPS: Final = 2
+OWN_SOLVER: Final = True
+"""Whether small systems are solved here rather than by MJX; tests compare."""
+NEWTON_STEPS: Final = 30
+LINE_SEARCH_STEPS: Final = 8
+FIRST_LINE_SEARCH_STEPS: Final = 3
+ROUNDINGS: Final = 8
+"""How many roundings of its terms the solver's equation may be off."""
 GENEROUS: Final = (100, 50)
 """Iterations of the solver and of its line search in `solve_to_rounding`."""
 POLISHING_STEPS: Final = 4
@@ -132,17 +138,90 @@ def residual(model: mjx.Model, data: mjx.Data, qacc: Float[Array, " nv"]) -> Flo
 
 
 def run_solver(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]:
-    """The constrained acceleration [m/s^2 or rad/s^2] from MJX's own solver, converged; no reverse mode.
+    """The constrained acceleration [m/s^2 or rad/s^2], from the warm start; no reverse mode.
 
-    Where Newton steps are cheap, `PREDICTOR_STEPS` of them improve the warm start. MJX uses it only if its cost is
-    below that of the unconstrained acceleration; its loop then has little or nothing left to do: twice the speed.
+    Small systems by Newton's method, to rounding; larger ones by MJX's solver, within the model's budget.
     """
     if num_constraint_rows(data) == 0:
         return data.qacc_smooth
-    if model.nv <= SMALL:
-        for _ in range(PREDICTOR_STEPS):
-            data = data.replace(qacc_warmstart=_newton_step(model, data, data.qacc_warmstart))
+    if OWN_SOLVER and model.nv <= SMALL:
+        return _newton(model, data)
     return mjx.solve(model, data).qacc
+
+
+def _newton(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]:
+    """The root of the solver's equation by Newton's method with a line search, to rounding.
+
+    Without a force in any row it is the unconstrained acceleration. The first step is taken without a check, those
+    after it in a loop, which a batch leaves with the last of its samples: seldom after more than one, or four where
+    boxes slip and stick.
+    """
+    rows: Any = data._impl
+    inertia, jacobian = mjx.full_m(model, data), rows.efc_J
+    rounding = ROUNDINGS * jnp.finfo(inertia.dtype).eps
+
+    def force(slack):
+        return row_force(model, data, slack)
+
+    def slack_at(qacc):
+        return product(jacobian, qacc) - rows.efc_aref
+
+    def gap(qacc):
+        return product(inertia, qacc) - data.qfrc_smooth - product(jacobian.T, force(slack_at(qacc)))
+
+    free = jnp.all(force(slack_at(data.qacc_smooth)) == 0)
+
+    def unsolved(qacc):
+        acting, size = jnp.where(force(slack_at(qacc)) != 0, rows.efc_D, 0.0), jnp.abs(qacc)
+        terms = acting * (product(jnp.abs(jacobian), size) + jnp.abs(rows.efc_aref))
+        scale = product(jnp.abs(inertia), size) + jnp.abs(data.qfrc_smooth) + product(jnp.abs(jacobian).T, terms)
+        return ~free & (jnp.sum(jnp.abs(gap(qacc))) > rounding * jnp.sum(scale))
+
+    def advance(qacc, line_search_steps):
+        left, slope = jax.linearize(gap, qacc)
+        step = -solve_positive_definite(jax.vmap(slope)(jnp.eye(model.nv, dtype=qacc.dtype)), left)
+        start, along = slack_at(qacc), product(jacobian, step)
+        constant = jnp.vdot(step, product(inertia, qacc) - data.qfrc_smooth)
+        linear = jnp.vdot(step, product(inertia, step))
+        derivative = lambda x: constant + linear * x - jnp.sum(along * force(start + x * along))  # noqa: E731
+        return qacc + step * _line_search(derivative, line_search_steps, qacc.dtype)
+
+    def again(carry):
+        qacc = advance(carry[0], LINE_SEARCH_STEPS)
+        return qacc, carry[1] + 1, unsolved(qacc)
+
+    first = advance(data.qacc_warmstart, FIRST_LINE_SEARCH_STEPS)
+    qacc, *_ = jax.lax.while_loop(
+        lambda carry: carry[2] & (carry[1] < NEWTON_STEPS), again, (first, 1, unsolved(first))
+    )
+    return jnp.where(free, data.qacc_smooth, qacc)
+
+
+def _line_search(derivative: Callable[[Array], Array], steps: int, dtype: Any) -> Float[Array, ""]:
+    """A multiple of the Newton step that lowers the cost, whose increasing `derivative` along it is negative at 0.
+
+    The whole step, unless the derivative at its end is more than half as large as at the start: contacts have begun,
+    ended or slipped on the way. Then the best of a few steps of Newton's method for the derivative's zero, and of false
+    position where they leave the bracket. Unless cones are elliptic, the derivative is piecewise linear.
+    """
+    low, high, fraction = jnp.zeros((), dtype), jnp.full((), jnp.inf, dtype), jnp.ones((), dtype)
+    at_low = at_high = at_start = derivative(low)
+    best, least, whole = fraction, jnp.abs(at_start) / 2, jnp.asarray(False)
+    for index in range(steps):
+        value, slope = jax.jvp(derivative, (fraction,), (jnp.ones((), dtype),))
+        better = jnp.abs(value) <= least
+        best, least = jnp.where(better, fraction, best), jnp.where(better, jnp.abs(value), least)
+        if index == 0:
+            whole, least = better, jnp.where(better, least, jnp.abs(at_start))
+        above = value > 0
+        low, at_low = jnp.where(above, low, fraction), jnp.where(above, at_low, value)
+        high, at_high = jnp.where(above, fraction, high), jnp.where(above, value, at_high)
+        newton = fraction - value / jnp.where(slope > 0, slope, 1.0)
+        closed = (high < jnp.inf) & (at_high > at_low)
+        chord = low - at_low * jnp.where(closed, high - low, 1.0) / jnp.where(closed, at_high - at_low, 1.0)
+        outside = jnp.where(closed, chord, 2 * fraction)
+        fraction = jnp.where((newton > low) & (newton < high), newton, outside)
+    return jnp.where(whole, 1.0, best)
 
 
 def _newton_step(model: mjx.Model, data: mjx.Data, qacc: Float[Array, " nv"]) -> Float[Array, " nv"]:
@@ -273,26 +352,3 @@ def relaxation_rate(model: mjx.Model, data: mjx.Data, normal: Float[Array, " row
     with patched(RELAXING):
         rows: Any = mjx.make_constraint(model, data)._impl
     return -(normal @ rows.efc_aref) / (normal @ (rows.efc_J @ data.qvel))
-
-
-def solve_positive_definite(
-    matrix: Float[Array, "nv nv"], right_side: Float[Array, "nv ..."]
-) -> Float[Array, "nv ..."]:
-    """Solve with a symmetric positive definite matrix by Cholesky.
-
-    Small systems are unrolled: under `vmap` their entries are whole batches, which a library routine would loop over.
-    """
-    size = matrix.shape[0]
-    if size > SMALL:
-        return jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(matrix), right_side)
-    lower: dict[tuple[int, int], Array] = {}
-    for j in range(size):
-        lower[j, j] = jnp.sqrt(matrix[j, j] - sum(lower[j, k] ** 2 for k in range(j)))
-        for i in range(j + 1, size):
-            lower[i, j] = (matrix[i, j] - sum(lower[i, k] * lower[j, k] for k in range(j))) / lower[j, j]
-    solution = list(right_side)
-    for i in range(size):
-        solution[i] = (solution[i] - sum(lower[i, k] * solution[k] for k in range(i))) / lower[i, i]
-    for i in reversed(range(size)):
-        solution[i] = (solution[i] - sum(lower[k, i] * solution[k] for k in range(i + 1, size))) / lower[i, i]
-    return jnp.stack(solution)

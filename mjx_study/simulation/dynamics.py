@@ -28,6 +28,7 @@ from estimators.pytree import register_pytree
 from mjx_study.simulation import constraint
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.integration import integrate_position
+from mjx_study.simulation.linear_algebra import solve_positive_definite
 from mjx_study.simulation.patches import patched
 from mjx_study.simulation.scene import Scene
 
@@ -325,7 +326,7 @@ def _jacobian(model: mjx.Model, template: mjx.Data, qpos: Array, qvel: Array, ac
     over_inputs = jnp.concatenate([columns(*block) for block in blocks if block[1].size], axis=1)
     over_qacc = columns(lambda x: equations(positioned, qvel, act, control, x), qacc)
     nv = qvel.shape[0]
-    response = -constraint.solve_positive_definite(over_qacc[:nv], over_inputs[:nv])
+    response = -solve_positive_definite(over_qacc[:nv], over_inputs[:nv])
     return over_inputs[nv:] + over_qacc[nv:] @ response, response
 
 

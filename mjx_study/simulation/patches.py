@@ -19,6 +19,7 @@ from jaxtyping import Array, Float
 
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.integration import rotate_quaternion, rotation_between
+from mjx_study.simulation.linear_algebra import SMALL, cholesky, solve_factored
 
 _REFSAFE: Final = int(mujoco.mjtDisableBit.mjDSBL_REFSAFE)
 _UNSEEN: Final = 1e-30  # [m]; its square is still a normal number
@@ -174,6 +175,27 @@ def _positive(length: Float[Array, ""]) -> Float[Array, ""]:
     return length + 1e-12 * (length <= 1e-8)
 
 
+_mjx_factor_m, _mjx_solve_m = (getattr(_module("smooth"), name, None) for name in ("factor_m", "solve_m"))
+
+
+def factored_inertia(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """MJX's factorisation of the inertia, unrolled where it is small and dense."""
+    assert _mjx_factor_m is not None, "`patched` has checked that MJX has it"
+    rows: Any = data._impl
+    if rows.M.ndim != 2 or model.nv > SMALL:
+        return _mjx_factor_m(model, data)
+    return data.tree_replace({"_impl.qLD": cholesky(rows.M)})
+
+
+def solved_inertia(model: mjx.Model, data: mjx.Data, force: Float[Array, " nv"]) -> Float[Array, " nv"]:
+    """MJX's solution of M a = force, likewise."""
+    assert _mjx_solve_m is not None, "`patched` has checked that MJX has it"
+    rows: Any = data._impl
+    if rows.M.ndim != 2 or model.nv > SMALL:
+        return _mjx_solve_m(model, data, force)
+    return solve_factored(rows.qLD, force)
+
+
 Place = tuple[str, str]
 """Module and name of a function of MJX; no module is the package, whose names only callers of MJX use."""
 
@@ -185,6 +207,8 @@ _REPLACED: Final[dict[Place, Callable[..., Any]]] = {
     ("passive", "_spring_damper"): springs_and_dampers,
     ("support", "wrap_inside"): wrap_inside,
     ("collision_sdf", "_cylinder"): cylinder_distance,
+    ("smooth", "factor_m"): factored_inertia,
+    ("smooth", "solve_m"): solved_inertia,
 }
 AT_FIRST_TOUCH: Final = {("constraint", "_kbi"): _touching}
 """Gives every active constraint row the values of first touch."""

@@ -274,7 +274,8 @@ def check_model(host: mujoco.MjModel, name: str = "the model") -> None:
             )
     if flags := lacking(host):
         raise SceneError(
-            f"MJX lacks {', '.join(flags)}, which {name} enables; disable them (--disable-flag {','.join(flags)})"
+            f"MJX lacks {', '.join(flags)}, which {name} enables; disable them in its <option><flag> (rollout and "
+            f"gradcheck: --disable-flag {','.join(flags)})"
         )
     if features := ignored(host):
         raise SceneError(f"MJX would leave out part of {name}: {'; '.join(features)}")
