@@ -151,8 +151,7 @@ def _plain(table: Table) -> Any:
 
 RULES: Final = (
     Rule("unstable step: variance above", "limit", 1.0, "above", lambda table: table.task != ""),
-    Rule("impedance at first touch: mean off", "impedance", SMOOTH, "fobg_off", _met),
-    Rule("onset strength: mean off", "strength", NOTABLE, "fobg_off", _met),
+    Rule("force jumps at first touch: mean off", "strength", SMOOTH, "fobg_off", _met),
     Rule(
         "smooth onset, travel over width: mean off",
         "travel",

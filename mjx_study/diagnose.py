@@ -52,7 +52,7 @@ CHUNK: Final = 16
 ACCURATE: Final = 0.1
 """Relative error that a number of samples is given for."""
 SMOOTH: Final = 0.01
-"""Impedance at first touch below which force sets in without a jump."""
+"""Share of the approach speed lost in the first step below which force sets in without a jump."""
 WIDTHS: Final = 3.0
 """Steps' travel over which an impedance should rise."""
 LEGEND: Final = (
@@ -72,6 +72,7 @@ class Touch:
         stiffness: h^2 k, at full impedance.
         travel: h v over the width of the impedance's rise.
         impedance: d_0, at first touch; 0.9 is MuJoCo's default.
+        jump: h b d_0 / d_width, the share of the approach speed that the damper takes in the first step.
         stable: whether the step in contact is.
     """
 
@@ -82,6 +83,7 @@ class Touch:
     stiffness: float
     travel: float
     impedance: float
+    jump: float
     stable: bool
 
 
@@ -244,7 +246,7 @@ class Diagnosis(Measurement):
             )
         if not self.touches:
             return [*lines, "  none in the rollout without noise"]
-        worst = sorted(self.touches, key=lambda each: (each.stable, -each.damping * each.impedance, -each.travel))
+        worst = sorted(self.touches, key=lambda each: (each.stable, -each.jump, -each.travel))
         header = ["  without noise", "t [s]", "v [m/s]", "h b", "h^2 k", "h v / width", "impedance", "step"]
         rows = [
             [
@@ -304,15 +306,15 @@ class Diagnosis(Measurement):
             return
         plain, corrected = by_name["fobg"], by_name["fobg_onset"]
         if plain.verdict == "biased":
-            smooth = self.touches and all(each.impedance <= SMOOTH for each in self.touches)
+            smooth = self.touches and all(each.jump <= SMOOTH for each in self.touches)
             text = f"plain first order is biased by {plain.bias / self.norm:.0%}, " + (
-                "though impedances rise from 0: something else jumps, such as where corners and edges touch"
+                "though force sets in without a jump: something else jumps, such as where corners and edges touch"
                 if smooth
                 else "for contact sets in with a jump"
             )
             if corrected.verdict == "right":
                 text += ": the onset term corrects that"
-            if travel := max((each.speed * timestep for each in self.touches if each.impedance > SMOOTH), default=0.0):
+            if travel := max((each.speed * timestep for each in self.touches if each.jump > SMOOTH), default=0.0):
                 text += f'; an impedance that rises from 0, solimp="0 0.95 {WIDTHS * travel:.1g}", has no jump'
             yield text, "--onset linear" if corrected.verdict == "right" else ""
         if corrected.verdict == "right":
@@ -514,6 +516,7 @@ def touch_of(host: mujoco.MjModel, data: mujoco.MjData, contact: Any, time: floa
         stiffness=timestep**2 * k,
         travel=timestep * speed / float(contact.solimp[2]),
         impedance=float(contact.solimp[0]),
+        jump=timestep * b * float(contact.solimp[0] / contact.solimp[1]),
         stable=stable(solref.tolist(), timestep),
     )
 
