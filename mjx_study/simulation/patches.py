@@ -184,7 +184,8 @@ def factored_inertia(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     rows: Any = data._impl
     if rows.M.ndim != 2 or model.nv > SMALL:
         return _mjx_factor_m(model, data)
-    return data.tree_replace({"_impl.qLD": cholesky(rows.M)})
+    factored: Any = data.tree_replace({"_impl.qLD": cholesky(rows.M)})
+    return factored
 
 
 def solved_inertia(model: mjx.Model, data: mjx.Data, force: Float[Array, " nv"]) -> Float[Array, " nv"]:
