@@ -2,10 +2,12 @@
 
 from typing import Final
 
-from mjx_study.claims import contact, descent, theory
+from mjx_study.claims import contact, descent, robots, theory
 from mjx_study.claims.ledger import Claim
 
-CLAIMS: Final[dict[str, Claim]] = {claim.id: claim for claim in (*theory.CLAIMS, *contact.CLAIMS, *descent.CLAIMS)}
+CLAIMS: Final[dict[str, Claim]] = {
+    claim.id: claim for claim in (*theory.CLAIMS, *contact.CLAIMS, *descent.CLAIMS, *robots.CLAIMS)
+}
 """By id."""
 VERDICTS: Final = sum(len(claim.cases) for claim in CLAIMS.values())
 """Verdicts of the whole ledger, for all of which the intervals hold at once."""
