@@ -35,10 +35,10 @@ Not everything was fixed before the first numbers were seen. Settled afterwards:
 sizes, the bar's angle of 0.75 rad (at 0.77 rad the bias of the default contact happens to pass through zero), and that
 the ball's descents run their full recipe (zeroth order clears the wall late); the others are cut to 40 % of theirs in
 quick runs, of which there are twelve each (five decided little). The claims on relaxed backward passes were written
-after a look at one landscape of `momentum_transfer`, those on the robot after one of its means.
+after a look at one landscape of `momentum_transfer`, that on the robot after one batch.
 
 Not in the ledger: descents on `sliding_box`, `tennis` ([what they achieve](estimators.md#what-they-achieve)) and the
-robots, `gripper` ([its means](tasks.md#gripper)), friction's slip tolerance and the double pendulum in MJX.
+robots, means of `landing` ([there](tasks.md#landing)), friction's slip tolerance and the double pendulum in MJX.
 """
 
 
