@@ -23,18 +23,6 @@ def test_the_bias_of_first_order_is_found_and_is_gone_with_the_onset_term() -> N
     assert len(lines_of([plain, corrected])) >= 3
 
 
-@pytest.mark.slow
-def test_so_it_is_where_a_network_lands_a_robot() -> None:
-    """Along both means; 200 samples leave a bias of the plain one undecided on the path of heavier tails."""
-    task = make_task("landing")
-    cells, _ = contact_grid(task, ("mujoco_default",))
-    chosen = [make_estimator(name) for name in ("fobg", "fobg_onset")]
-    checks = check_mean(task, cells, chosen, samples=200, seed=0, direction="means")
-    plain, corrected = ([each.verdict for each in checks[start::2]] for start in (0, 1))
-    assert "biased" in plain and "right" not in plain
-    assert "right" in corrected and "biased" not in corrected
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
