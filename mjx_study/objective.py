@@ -25,13 +25,18 @@ from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.branches import jump_term
 from mjx_study.simulation.contact import ContactModel, apply_contact
 from mjx_study.simulation.dynamics import State, rollout, step
-from mjx_study.simulation.onset import OnsetCounts, as_row, corrected_rollout, without_derivative
+from mjx_study.simulation.linear_algebra import SMALL
+from mjx_study.simulation.onset import SLOTS, OnsetCounts, as_row, corrected_rollout, without_derivative
 from mjx_study.tasks.task import Task, check_sigma
 
 MAX_CHUNK: Final = {"cpu": 256, "gpu": 2**15 + 1, "tpu": 2**15 + 1}
 """Largest number of samples per device and call, by backend: a CPU gains little from larger batches, an accelerator
 needs them. It bounds memory (about 40 kB per gradient of 200 steps of a two-joint model). One more than a power of two,
 for the baseline."""
+
+LAPACK_BATCH: Final = 2048
+"""Batch from which jaxlib 0.10.2 divides factorisations of matrices among its threads on CPUs, which never ends where
+two programs do so at a time. Matrices of up to `SMALL` rows do not go to LAPACK."""
 
 
 def spread(
@@ -319,7 +324,15 @@ class Simulator:
         if len(noise_scale) == 0:
             raise ValueError("there is no sample to run: give at least one key")
         shared = theta, contact, np.asarray(sigma, self.task.scene.template.qpos.dtype)
-        return spread(self._programs[name], shared, (keys, noise_scale), self.chunk_size, self.devices)  # type: ignore[attr-defined]
+        devices = self._devices_for(name)
+        return spread(self._programs[name], shared, (keys, noise_scale), self.chunk_size, devices)  # type: ignore[attr-defined]
+
+    def _devices_for(self, name: str) -> tuple[Any, ...]:
+        """The devices, or one where two at a time would wait for each other for ever; see `LAPACK_BATCH`."""
+        corrected = name == "corrected" or self.task.onset != "none"
+        batch = self.chunk_size * (SLOTS if corrected else 1)
+        hangs = self.devices[0].platform == "cpu" and self.task.scene.host.nv > SMALL and batch >= LAPACK_BATCH
+        return self.devices[:1] if hangs else self.devices
 
 
 @dataclasses.dataclass(frozen=True)

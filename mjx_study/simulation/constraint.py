@@ -34,8 +34,7 @@ _ELLIPTIC = mujoco.mjtCone.mjCONE_ELLIPTIC
 OWN_SOLVER: Final = True
 """Whether small systems are solved here rather than by MJX; tests compare."""
 NEWTON_STEPS: Final = 30
-LINE_SEARCH_STEPS: Final = 8
-FIRST_LINE_SEARCH_STEPS: Final = 3
+LINE_SEARCH_STEPS: Final = 4
 ROUNDINGS: Final = 8
 """How many roundings of its terms the solver's equation may be off."""
 GENEROUS: Final = (100, 50)
@@ -152,9 +151,8 @@ def run_solver(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]:
 def _newton(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]:
     """The root of the solver's equation by Newton's method with a line search, to rounding.
 
-    Without a force in any row it is the unconstrained acceleration. The first step is taken without a check, those
-    after it in a loop, which a batch leaves with the last of its samples: seldom after more than one, or four where
-    boxes slip and stick.
+    Without a force in any row it is the unconstrained acceleration. A batch leaves the loop with the last of its samples:
+    seldom after more than two steps, or six where boxes slip and stick.
     """
     rows: Any = data._impl
     inertia, jacobian = mjx.full_m(model, data), rows.efc_J
@@ -169,35 +167,31 @@ def _newton(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]:
     def gap(qacc):
         return product(inertia, qacc) - data.qfrc_smooth - product(jacobian.T, force(slack_at(qacc)))
 
-    free = jnp.all(force(slack_at(data.qacc_smooth)) == 0)
-
     def unsolved(qacc):
         acting, size = jnp.where(force(slack_at(qacc)) != 0, rows.efc_D, 0.0), jnp.abs(qacc)
         terms = acting * (product(jnp.abs(jacobian), size) + jnp.abs(rows.efc_aref))
         scale = product(jnp.abs(inertia), size) + jnp.abs(data.qfrc_smooth) + product(jnp.abs(jacobian).T, terms)
-        return ~free & (jnp.sum(jnp.abs(gap(qacc))) > rounding * jnp.sum(scale))
+        return jnp.sum(jnp.abs(gap(qacc))) > rounding * jnp.sum(scale)
 
-    def advance(qacc, line_search_steps):
+    def advance(qacc):
         left, slope = jax.linearize(gap, qacc)
         step = -solve_positive_definite(jax.vmap(slope)(jnp.eye(model.nv, dtype=qacc.dtype)), left)
         start, along = slack_at(qacc), product(jacobian, step)
         constant = jnp.vdot(step, product(inertia, qacc) - data.qfrc_smooth)
         linear = jnp.vdot(step, product(inertia, step))
         derivative = lambda x: constant + linear * x - jnp.sum(along * force(start + x * along))  # noqa: E731
-        return qacc + step * _line_search(derivative, line_search_steps, qacc.dtype)
+        return qacc + step * _line_search(derivative, qacc.dtype)
 
     def again(carry):
-        qacc = advance(carry[0], LINE_SEARCH_STEPS)
+        qacc = advance(carry[0])
         return qacc, carry[1] + 1, unsolved(qacc)
 
-    first = advance(data.qacc_warmstart, FIRST_LINE_SEARCH_STEPS)
-    qacc, *_ = jax.lax.while_loop(
-        lambda carry: carry[2] & (carry[1] < NEWTON_STEPS), again, (first, 1, unsolved(first))
-    )
-    return jnp.where(free, data.qacc_smooth, qacc)
+    acting = jnp.any(force(slack_at(data.qacc_smooth)) != 0)
+    start = jnp.where(acting, data.qacc_warmstart, data.qacc_smooth)
+    return jax.lax.while_loop(lambda carry: carry[2] & (carry[1] < NEWTON_STEPS), again, (start, 0, acting))[0]
 
 
-def _line_search(derivative: Callable[[Array], Array], steps: int, dtype: Any) -> Float[Array, ""]:
+def _line_search(derivative: Callable[[Array], Array], dtype: Any) -> Float[Array, ""]:
     """A multiple of the Newton step that lowers the cost, whose increasing `derivative` along it is negative at 0.
 
     The whole step, unless the derivative at its end is more than half as large as at the start: contacts have begun,
@@ -207,7 +201,7 @@ def _line_search(derivative: Callable[[Array], Array], steps: int, dtype: Any) -
     low, high, fraction = jnp.zeros((), dtype), jnp.full((), jnp.inf, dtype), jnp.ones((), dtype)
     at_low = at_high = at_start = derivative(low)
     best, least, whole = fraction, jnp.abs(at_start) / 2, jnp.asarray(False)
-    for index in range(steps):
+    for index in range(LINE_SEARCH_STEPS):
         value, slope = jax.jvp(derivative, (fraction,), (jnp.ones((), dtype),))
         better = jnp.abs(value) <= least
         best, least = jnp.where(better, fraction, best), jnp.where(better, jnp.abs(value), least)

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-SMALL: Final = 6
+SMALL: Final = 8
 """Largest number of degrees of freedom for which linear systems are unrolled."""
 
 
