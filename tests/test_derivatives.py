@@ -24,6 +24,7 @@ ROWS = [
     pytest.param("momentum_transfer", "pyramidal", 230, 10000.0, id="momentum_transfer", marks=slow),
     pytest.param("tennis", "pyramidal", 120, 4000.0, id="tennis", marks=slow),
     pytest.param("landing", "elliptic", 60, 5000.0, id="landing", marks=slow),
+    pytest.param("gripper", "elliptic", 30, 1000.0, id="gripper", marks=slow),
 ]
 # Parameters of a rollout in which contact happens, within few steps; those of the task itself otherwise.
 THETA = {"sliding_box": 0.3, "ball_wall": 0.15, "ball_wall:dome": 0.15, "momentum_transfer": 0.3}
