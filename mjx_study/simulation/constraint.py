@@ -151,8 +151,8 @@ def run_solver(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]:
 def _newton(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]:
     """The root of the solver's equation by Newton's method with a line search, to rounding.
 
-    Without a force in any row it is the unconstrained acceleration. A batch leaves the loop with the last of its samples:
-    seldom after more than two steps, or six where boxes slip and stick.
+    Without a force in any row it is the unconstrained acceleration. A batch leaves the loop with the last of its
+    samples: seldom after more than two steps, or six where boxes slip and stick.
     """
     rows: Any = data._impl
     inertia, jacobian = mjx.full_m(model, data), rows.efc_J
