@@ -381,7 +381,7 @@ def onset_figure(table: Table) -> Figure:
             each.scatter(part[group], part.left.clip(1e-3, 10), s=5, label=name, alpha=0.6, linewidths=0)
         each.set(xscale="log", yscale="log", xlabel=GROUPS[group][0], ylim=(1e-3, 10))
     strength = np.geomspace(1e-3, 1, 50)
-    axes[0].plot(strength, SHARE_OFF * strength, color="black", linewidth=0.8, label="bound")
+    axes[0].plot(strength, SHARE_OFF * strength, color="black", linewidth=0.8, label="stated by findings")
     axes[1].axvline(1 / NARROW, color="black", linewidth=0.6, linestyle=":")
     axes[0].set_ylabel("bias left / what the term adds")
     axes[0].legend(markerscale=2, fontsize=7)
@@ -422,9 +422,9 @@ def samples_figure(table: Table) -> Figure:
     figure, axes = panels(1, 2, 4.4)
     scatter(axes[0], table[table.worth.notna()], "limit", "worth", (1e-7, 1e7))
     axes[0].axhline(1, color="black", linewidth=0.6)
-    axes[0].set_ylabel("variance x seconds, zeroth / first order")
+    axes[0].set_ylabel("variance x seconds,\nzeroth / first order")
     scatter(axes[1], table[_plain(table) & (table.until > 0)], "strength", "until", (1e-1, 1e5))
-    axes[1].set_ylabel("rollouts until zeroth order is ahead")
+    axes[1].set_ylabel("rollouts until\nzeroth order is ahead")
     axes[1].legend(markerscale=3, fontsize=7)
     return figure
 
