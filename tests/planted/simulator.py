@@ -140,9 +140,9 @@ CONSTRAINT: Final = (
     ),
     Defect(
         "cholesky-off-by-one",
-        "mjx_study/simulation/constraint.py",
-        "sum(lower[j, k] ** 2 for k in range(j))",
-        "sum(lower[j, k] ** 2 for k in range(1, j))",
+        "mjx_study/simulation/linear_algebra.py",
+        "sum(upper[k][j] ** 2 for k in range(j))",
+        "sum(upper[k][j] ** 2 for k in range(1, j))",
         "an index from 1",
         ("tests/test_constraint.py::test_solve_positive_definite",),
         "slider",
