@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.integration import rotate_quaternion, rotation_between
-from mjx_study.simulation.linear_algebra import SMALL, cholesky, solve_factored
+from mjx_study.simulation.linear_algebra import cholesky, solve_factored
 
 _REFSAFE: Final = int(mujoco.mjtDisableBit.mjDSBL_REFSAFE)
 _UNSEEN: Final = 1e-30  # [m]; its square is still a normal number
@@ -179,10 +179,10 @@ _mjx_factor_m, _mjx_solve_m = (getattr(_module("smooth"), name, None) for name i
 
 
 def factored_inertia(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """MJX's factorisation of the inertia, unrolled where it is small and dense."""
+    """MJX's factorisation of the inertia; dense, by this project's, which is unrolled where it is small."""
     assert _mjx_factor_m is not None, "`patched` has checked that MJX has it"
     rows: Any = data._impl
-    if rows.M.ndim != 2 or model.nv > SMALL:
+    if rows.M.ndim != 2:
         return _mjx_factor_m(model, data)
     factored: Any = data.tree_replace({"_impl.qLD": cholesky(rows.M)})
     return factored
@@ -192,7 +192,7 @@ def solved_inertia(model: mjx.Model, data: mjx.Data, force: Float[Array, " nv"])
     """MJX's solution of M a = force, likewise."""
     assert _mjx_solve_m is not None, "`patched` has checked that MJX has it"
     rows: Any = data._impl
-    if rows.M.ndim != 2 or model.nv > SMALL:
+    if rows.M.ndim != 2:
         return _mjx_solve_m(model, data, force)
     return solve_factored(rows.qLD, force)
 
