@@ -27,6 +27,7 @@ from mjx_study.simulation.contact import ContactModel, apply_contact
 from mjx_study.simulation.dynamics import State, rollout, step
 from mjx_study.simulation.linear_algebra import SMALL
 from mjx_study.simulation.onset import SLOTS, OnsetCounts, as_row, corrected_rollout, without_derivative
+from mjx_study.stopwatch import timed
 from mjx_study.tasks.task import Task, check_sigma
 
 MAX_CHUNK: Final = {"cpu": 256, "gpu": 2**15 + 1, "tpu": 2**15 + 1}
@@ -325,7 +326,12 @@ class Simulator:
             raise ValueError("there is no sample to run: give at least one key")
         shared = theta, contact, np.asarray(sigma, self.task.scene.template.qpos.dtype)
         devices = self._devices_for(name)
-        return spread(self._programs[name], shared, (keys, noise_scale), self.chunk_size, devices)  # type: ignore[attr-defined]
+        with timed(self.program(name, contact), rounds(len(noise_scale), self.chunk_size, len(devices))):
+            return spread(self._programs[name], shared, (keys, noise_scale), self.chunk_size, devices)  # type: ignore[attr-defined]
+
+    def program(self, name: str, contact: ContactModel | None) -> tuple[str, Task, Any, int]:
+        """What the time of a call of one of `sample_programs` depends on: name, task, kind of contact, samples."""
+        return name, self.task, jax.tree.structure(contact), self.chunk_size
 
     def _devices_for(self, name: str) -> tuple[Any, ...]:
         """The devices, or one where two at a time would wait for each other for ever; see `LAPACK_BATCH`."""
@@ -462,9 +468,7 @@ class MjxObjective:
         # Bare key data: drawing the same noise for several rollouts is intended, not a reused key.
         key_data = np.asarray(jax.random.key_data(keys))[rows]
         dtype = self.simulator.task.scene.template.qpos.dtype
-        contact = self.contact
-        if contact is not None and name in ("value", "steps"):  # so that one program serves all contact models
-            contact = dataclasses.replace(contact, backward=None)
+        contact = contact_for(name, self.contact)
         return self.simulator.run(name, theta, contact, self.sigma, key_data, scale.astype(dtype))
 
 
@@ -498,6 +502,18 @@ def _for_all(rows, samples: int):
     """Broadcast rows, one per sample or one for all; on the host without a compilation per size."""
     numpy = np if isinstance(rows, np.ndarray) else jnp
     return numpy.broadcast_to(rows, (samples, *rows.shape[1:]))
+
+
+def contact_for(name: str, contact: ContactModel | None) -> ContactModel | None:
+    """What a program reads of a contact model: no surrogate without derivatives, so that one serves all models."""
+    return (
+        dataclasses.replace(contact, backward=None) if contact is not None and name in ("value", "steps") else contact
+    )
+
+
+def rounds(samples: int, chunk: int, devices: int) -> int:
+    """Calls one after another that samples take, in chunks on several devices at once."""
+    return math.ceil(math.ceil(samples / chunk) / devices)
 
 
 def chunk_for(samples: int, devices: Sequence[Any]) -> int:

@@ -1,5 +1,6 @@
 """A dry run: the cost of a study counted from its plan, with nothing computed or written."""
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -8,6 +9,9 @@ import pytest
 
 from mjx_study import cli
 from mjx_study.cli import options
+from mjx_study.runtime import available_cores
+from mjx_study.study import forecast as forecasts
+from mjx_study.study import times
 from mjx_study.study.configuration import StudyConfig
 from mjx_study.study.forecast import forecast
 from mjx_study.study.plan import plan_study
@@ -20,8 +24,12 @@ DESCENTS = (
 
 
 @pytest.fixture(autouse=True)
-def configured(monkeypatch: pytest.MonkeyPatch) -> None:
+def configured(monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory) -> None:
+    """The process as it is, and no records."""
     monkeypatch.setattr(options, "configure", lambda **_: None)
+    folder = tmp_path_factory.mktemp("cache") / "times"
+    monkeypatch.setattr(times, "times_folder", lambda: folder)
+    monkeypatch.setattr(forecasts, "times_folder", lambda: folder)
 
 
 def test_batches_of_gradients_are_counted() -> None:
@@ -31,7 +39,7 @@ def test_batches_of_gradients_are_counted() -> None:
         reference_samples=10,
     )  # fmt: skip
     found = forecast(plan_study(config))
-    assert (found.cells, found.computed, found.programs, found.seconds) == (2, 0, 2, None)
+    assert (found.cells, found.computed, found.programs) == (2, 0, 2)
     assert found.rollouts == 2 * (3 * (8 + 1 + 8) + 2 * 10 + 100)
     assert found.gradients == 2 * (3 * 8 + 100)
 
@@ -73,15 +81,63 @@ def test_what_is_forecast_is_what_descents_do(tmp_path: Path, capsys: pytest.Cap
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
 
 
-def test_computed_cells_have_a_rate(tmp_path: Path) -> None:
-    """Of two cells, one is taken away; its time is that of the other, per sample."""
+def test_the_time_is_what_the_last_run_of_each_program_took(tmp_path: Path) -> None:
+    """Records of a run are those of its programs; the forecast of the missing cell is the sum of its calls."""
     config = StudyConfig(
-        tasks=("pusher",), contact=("reference",), stiffness=(10.0,), horizon=8, iterations=3, seeds=2, samples=(4, 8),
-        evaluation_samples=5, estimators=("zobg", "fobg"),
+        tasks=("ball_wall",), contact=("mujoco",), stiffness=(500.0, 1000.0, 2000.0), horizon=8, samples=(8,), seeds=3,
+        reference_samples=10, chunk_size=7,
     )  # fmt: skip
-    data = run_study(config, tmp_path)
+    before = forecast(plan_study(config), tmp_path)
+    assert before.basis[times.ROUGH] == pytest.approx(before.seconds) and before.seconds > before.compilation > 0
+    run_study(config, tmp_path)
     assert forecast(plan_study(config), tmp_path).seconds == 0
     (tmp_path / "cells" / "00001.npz").unlink()
     found = forecast(plan_study(config), tmp_path)
-    spent = float(data["seconds"].isel(samples=0).max("iteration").sum())
-    assert found.computed == 1 and found.seconds == pytest.approx(2 * spent)
+    assert found.computed == 2 and found.basis[times.MEASURED] == pytest.approx(found.seconds)
+    records = {each.kind: each for each in times.Rates.read(times.times_folder())._records}
+    assert set(records) == {"value", "gradient", "statistics"} and {each.rows for each in records.values()} > {7}
+    # on two devices: 25 values with their baseline and 20 of the reference; 24 and 100 gradients
+    calls = {"value": 2 + 2, "gradient": 2 + 8, "statistics": 1}
+    assert found.seconds - found.compilation == pytest.approx(sum(records[kind].each * n for kind, n in calls.items()))
+    assert records["value"].calls == 3 * calls["value"] and records["gradient"].calls == 3 * calls["gradient"] + 8
+
+
+def test_other_rows_and_steps_are_scaled() -> None:
+    """With the overhead of a call; a program of other content, by the rough model and what this machine is to it."""
+    rows = times.OVERHEAD["cpu"]
+    own = times.Program("value", "a", steps=10, rows=rows, dof=2, constraints=3)
+    record = times.Record(**vars(own), each=1.0, calls=5, tracing=2.0, compiling=3.0, versions={})
+    rates = times.Rates([record])
+    assert rates.call(own) == (1.0, times.MEASURED) and rates.setup(own) == (2.0, 3.0, False, times.MEASURED)
+    longer = dataclasses.replace(own, steps=20, rows=3 * rows)
+    assert rates.call(longer) == (pytest.approx(4.0), times.SCALED)
+    assert rates.setup(longer) == (pytest.approx(2.0), pytest.approx(3.0), False, times.SCALED)
+    gradient = dataclasses.replace(own, kind="gradient")
+    assert rates.call(gradient) == (pytest.approx(times.FACTORS["gradient"]), times.SCALED)
+    other = dataclasses.replace(own, content="b", steps=30)
+    assert rates.call(other) == (pytest.approx(3.0), times.ROUGH)
+    assert times.Rates([]).call(other) == (pytest.approx(other.rough), times.ROUGH)
+
+
+@pytest.mark.parametrize("damage", [b"", b"{}", b"[1", b'{"each": -1}'])
+def test_a_damaged_record_is_no_record(damage: bytes, tmp_path: Path) -> None:
+    (tmp_path / "x.json").write_bytes(damage)
+    assert times.Rates.read(tmp_path)._records == []
+
+
+def test_a_cache_that_cannot_be_written_fails_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "file").touch()
+    monkeypatch.setattr(times, "times_folder", lambda: tmp_path / "file" / "times")
+    config = StudyConfig(tasks=("pusher",), contact=("reference",), stiffness=(10.0,), horizon=4, samples=(4,), seeds=1)
+    assert run_study(config).attrs["computed_cells"] == 1
+    assert times.Rates.read(times.times_folder())._records == []
+
+
+def test_workers_share_the_cells() -> None:
+    """Cells go to the next free worker, and workers here to the cores that there are."""
+    assert forecasts._side_by_side([3.0, 1.0, 1.0, 2.0], 2) == 4.0 and forecasts._side_by_side([], 2) == 0.0
+    config = StudyConfig(tasks=("pusher",), contact=("penalty",), stiffness=(1.0, 2.0, 3.0), horizon=4)
+    alone, many = (forecast(plan_study(config), cluster=f"slurm:{workers}") for workers in (1, 3))
+    assert (alone.devices, many.devices) == (1, 3) and alone.compilation == many.compilation
+    assert alone.seconds - alone.compilation == pytest.approx(3 * (many.seconds - many.compilation))
+    assert forecast(plan_study(config), cluster="local:1000").devices <= available_cores()

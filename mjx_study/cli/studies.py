@@ -99,7 +99,9 @@ def _compute(plan: StudyPlan, options: argparse.Namespace) -> tuple[xr.Dataset, 
 def announce(plan: StudyPlan, options: argparse.Namespace) -> int:
     """Print what a study would take."""
     with usage_errors():
-        found = forecast(plan, options.output, accept_versions=options.accept_versions)
+        found = forecast(
+            plan, options.output, accept_versions=options.accept_versions, cluster=getattr(options, "cluster", None)
+        )
     warnings = [f"warning: {message}" for message in plan.warnings]
     print_report(options, dataclasses.asdict(found) | {"warnings": list(plan.warnings)}, [*found.lines, *warnings])
     return 0

@@ -23,10 +23,12 @@ from typing import Any, Final
 import numpy as np
 
 from mjx_study.runtime import available_cores, configure, precision
-from mjx_study.study.cells import COMPUTE
+from mjx_study.stopwatch import Stopwatch
+from mjx_study.study.cells import compute_cells
 from mjx_study.study.identity import differences, plan_contents, versions
 from mjx_study.study.plan import StudyPlan, plan_study
 from mjx_study.study.store import Part, StudyError
+from mjx_study.study.times import recording
 
 TRIES: Final = 3
 """Times that a cell is begun before it counts as failed."""
@@ -197,14 +199,14 @@ def _packed(plan: StudyPlan) -> bytes:
 
 def _compute(study: bytes, index: int, kept: Arrays) -> Arrays:
     with _ONE_AT_A_TIME:
-        plan, compute = _prepared(study)
-        cell = plan.cells[index]
-        return compute(cell, Part(kept)) if plan.config.kind == "descents" else compute(cell)
+        plan, compute, watch = _prepared(study)
+        with recording(watch):
+            return compute(plan.cells[index], Part(kept))
 
 
 @functools.lru_cache(maxsize=4)
-def _prepared(study: bytes) -> tuple[StudyPlan, Callable[..., Arrays]]:
-    """The plan and what computes its cells, compiled programs included, on a worker.
+def _prepared(study: bytes) -> tuple[StudyPlan, Callable[..., Arrays], Stopwatch]:
+    """The plan, what computes its cells, compiled programs included, and the times of these, on a worker.
 
     Raises:
         WorkerRefusedError: the numbers would be others than the client's.
@@ -219,7 +221,7 @@ def _prepared(study: bytes) -> tuple[StudyPlan, Callable[..., Arrays]]:
 
         raise WorkerRefusedError(f"the worker {get_worker().address} is refused: {told} ('there' is the client)")
     plan = plan.with_chunk(chunk)
-    return plan, COMPUTE[plan.config.kind](plan)  # type: ignore[index]
+    return plan, compute_cells(plan), Stopwatch()
 
 
 def _set_up(asked: str) -> None:

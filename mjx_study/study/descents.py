@@ -12,6 +12,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 from functools import partial
 from typing import Any, Final
 
@@ -23,11 +24,14 @@ from jaxtyping import Array, Float, Key
 from estimators import Estimator, Objective, draw
 from mjx_study.objective import Simulator, TracedObjective, simulate
 from mjx_study.simulation.contact import ContactModel, soften
+from mjx_study.stopwatch import tell, timed
 from mjx_study.study.iteration import Descent, Record, advance, begin, going, make_optimizer, schedule_factors
 from mjx_study.study.plan import StudyCell, StudyPlan, estimators_of
 from mjx_study.study.sampling import rollouts_of
 from mjx_study.study.store import Part
+from mjx_study.study.times import Program
 from mjx_study.study.variables import HISTORY, METRIC, START
+from mjx_study.study.work import iteration
 from mjx_study.tasks.contact_grid import ContactPoint
 
 REPORT_EVERY: Final = 10
@@ -46,11 +50,19 @@ def compute_descents(plan: StudyPlan) -> Callable[..., dict[str, np.ndarray]]:
             backends[key] = Backend(plan, cell)
         backend, chosen = backends[key], estimators_of(plan, cell)
         kept = dict(part.kept)
-        begun = [_begin(backend, cell.model, index, each, kept, part) for index, each in enumerate(chosen)]
-        with ThreadPoolExecutor(backend.threads) as pool:
+        programs = [iteration(plan, cell, each.needs) for each in chosen]
+        begun = [
+            _begin(backend, cell.model, index, each, program, kept, part)
+            for index, (each, program) in enumerate(zip(chosen, programs, strict=True))
+        ]
+        waiting = nullcontext() if cell.model.analytic else timed("descents")
+        with waiting, ThreadPoolExecutor(backend.threads) as pool:
             each_in_turn = map if backend.threads == 1 else pool.map
             ended = list(each_in_turn(lambda descend: descend(), begun))
-        runs = [_numbers(backend, cell.model, each, run) for each, run in zip(chosen, ended, strict=True)]
+        for program, (_, calls, seconds) in zip(programs, ended, strict=True):
+            if calls and not cell.model.analytic:
+                tell(program, calls, seconds)
+        runs = [_numbers(backend, cell.model, each, run) for each, (run, *_) in zip(chosen, ended, strict=True)]
         found = {name: np.stack([run[name] for run in runs], axis=-1) for name in runs[0] if name != "theta"}
         found["theta"] = np.stack([run["theta"] for run in runs], axis=1)  # (seed, estimator, param)
         mean, error = backend.cost(backend.task.theta, cell.model)
@@ -203,9 +215,19 @@ class _Progress:
 
 
 def _begin(
-    backend: Backend, model: ContactPoint, index: int, estimator: Estimator, kept: dict[str, np.ndarray], part: Part
-) -> Callable[[], _Progress]:
-    """Compile an iteration of all seeds of one estimator; what is returned runs the rest and adds it to `kept`."""
+    backend: Backend,
+    model: ContactPoint,
+    index: int,
+    estimator: Estimator,
+    program: Program,
+    kept: dict[str, np.ndarray],
+    part: Part,
+) -> Callable[[], tuple[_Progress, int, float]]:
+    """Compile an iteration of all seeds of one estimator.
+
+    Returns:
+        A function that runs the rest and adds it to `kept`; it returns all, and the calls and seconds of the rest.
+    """
     seeds, iterations = backend.seeds, backend.recipe.iterations
     run = _Progress.of(kept, index, begin(backend.optimizer, backend.task.theta, seeds))
     state, records, seconds = backend.place(run.state, index), run.records, run.seconds
@@ -214,11 +236,14 @@ def _begin(
     iterate = backend.iteration(estimator, model)
     already = len(records)
     if already < iterations and bool(jnp.any(going(state))):
-        jax.block_until_ready(iterate(state, keys_of(already), already))  # compile; the result is dropped
+        first = keys_of(already)
+        with nullcontext() if model.analytic else timed(program):
+            jax.block_until_ready(iterate(state, first, already))  # compile; the result is dropped
+    before = seconds[-1] if seconds else 0.0
 
-    def descend() -> _Progress:
+    def descend() -> tuple[_Progress, int, float]:
         nonlocal state
-        done, elapsed, pending = already, seconds[-1] if seconds else 0.0, []
+        done, elapsed, pending = already, before, []
         saved = last = time.perf_counter()
 
         def collect(record: Record | None) -> None:
@@ -251,7 +276,7 @@ def _begin(
         collect(None)
         if done > already:
             save()
-        return _Progress(state, records, seconds)
+        return _Progress(state, records, seconds), done - already, elapsed - before
 
     return descend
 

@@ -1,22 +1,20 @@
-"""The cost of a study, from its plan and the cells computed already; computes and writes nothing."""
+"""The cost of a study, from its plan, the cells computed already, and what programs took before; computes nothing."""
 
 import dataclasses
+import heapq
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
 
-import numpy as np
+import jax
 
-from mjx_study.study.configuration import StudyConfig
-from mjx_study.study.gradients import CANDIDATES, MOST_KEPT
-from mjx_study.study.landscapes import QUADRATURE
-from mjx_study.study.plan import StudyCell, StudyPlan, estimators_of, oracles_of
-from mjx_study.study.quadrature import applies
+from mjx_study.runtime import available_cores
+from mjx_study.study.gradients import MOST_KEPT
+from mjx_study.study.plan import StudyCell, StudyPlan, estimators_of
 from mjx_study.study.run import begun_store
-from mjx_study.study.sampling import rollouts_of
-from mjx_study.study.store import Store
+from mjx_study.study.times import BASES, READING, Program, Rates, times_folder
 from mjx_study.study.variables import VARIABLES
+from mjx_study.study.work import calls, iteration, rest, rollouts, setups
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,8 +28,10 @@ class Forecast:
         gradients: rollouts to differentiate, about.
         kept: arrays of all cells [bytes].
         memory: batches of the largest cell at once, about [bytes].
-        seconds: computing time at the rate of the computed cells, without compilation and reference gradients [s];
-            None if there are none, if they have no times, or if descents are to go on.
+        devices: devices of this process, or workers of a cluster, that share the work.
+        seconds: from the beginning of the first cell to the end of the last, about [s].
+        compilation: of these, tracing and compilation, or reading what is compiled already [s].
+        basis: seconds by whence they are (`times.BASES`), of all devices together [s].
     """
 
     cells: int
@@ -41,36 +41,67 @@ class Forecast:
     gradients: int
     kept: int
     memory: int
-    seconds: float | None
+    devices: int
+    seconds: float
+    compilation: float
+    basis: dict[str, float]
 
     @property
     def lines(self) -> list[str]:
-        seconds = (
-            "not known" if self.seconds is None else f"{self.seconds:.3g} s or more, at the rate of the computed cells"
-        )
         return [
             f"cells: {self.cells}, {self.computed} computed, {self.cells - self.computed} to compute",
             f"programs to compile: {self.programs}",
             f"rollouts: about {self.rollouts:.4g}, {self.gradients:.4g} of them differentiated",
             f"arrays kept: {self.kept / 1e6:.3g} MB; batches of a cell: about {self.memory / 1e9:.2g} GB of memory",
-            f"computing time: {seconds}",
+            self._time,
             "nothing was computed or written",
         ]
 
+    @property
+    def _time(self) -> str:
+        total = sum(self.basis.values())
+        if total == 0:
+            return "time: none"
+        shares = {basis: seconds / total for basis, seconds in self.basis.items() if seconds > 0.005 * total}
+        told = ", ".join(f"{basis} ({share:.0%})" if len(shares) > 1 else basis for basis, share in shares.items())
+        return f"time: about {duration(self.seconds)}, of which compilation {duration(self.compilation)}; {told}"
 
-def forecast(plan: StudyPlan, folder: Path | None = None, *, accept_versions: bool = False) -> Forecast:
+
+def duration(seconds: float) -> str:
+    """A time to two digits, in the unit that suits it."""
+    for unit, size in (("days", 86400), ("h", 3600), ("min", 60)):
+        if seconds >= 2 * size:
+            return f"{seconds / size:.2g} {unit}"
+    return f"{seconds:.2g} s"
+
+
+def forecast(
+    plan: StudyPlan, folder: Path | None = None, *, accept_versions: bool = False, cluster: str | None = None
+) -> Forecast:
     """The cost of a plan, in a folder where one is given.
+
+    Args:
+        cluster: as `cluster.connected` takes it; workers at an address are not asked for, and taken as one.
 
     Raises:
         ValueError: the folder holds another study, or one of other versions.
     """
     store = None if folder is None else begun_store(plan, folder, accept_versions=accept_versions)
     longer = store is not None and (store.document["config"].get("iterations") or 0) < plan.iterations
+    if store is not None:
+        plan = plan.with_chunk(store.document["config"]["chunk_size"])
     missing = range(len(plan.cells)) if store is None or longer else store.missing
     cells = [plan.cells[index] for index in missing]
-    counts = [_rollouts(plan, cell) for cell in cells]
+    counts = [rollouts(plan, cell) for cell in cells]
     programs = {program for cell in cells if (program := plan.program_of(cell)) is not None}
     each = len(plan.config.estimators) if plan.config.kind == "descents" else 2
+    time = _Time(Rates.read(times_folder()))
+    devices = len(jax.local_devices()) if cluster is None else _workers(cluster)
+    compilation = time.setup(plan, cells)
+    if cluster is None:
+        spent = sum((time.cell(plan, cell, devices) for cell in cells), 0.0)
+    else:
+        spent = _side_by_side((time.cell(plan, cell, 1) for cell in cells), devices)
     return Forecast(
         cells=len(plan.cells),
         computed=len(plan.cells) - len(cells),
@@ -79,30 +110,66 @@ def forecast(plan: StudyPlan, folder: Path | None = None, *, accept_versions: bo
         gradients=sum(count for _, count in counts),
         kept=sum(_kept(plan, cell) for cell in plan.cells),
         memory=plan.memory,
-        seconds=None if store is None or longer else _seconds(plan, store, cells),
+        devices=devices,
+        seconds=compilation + spent,
+        compilation=compilation,
+        basis=time.basis,
     )
 
 
-def _rollouts(plan: StudyPlan, cell: StudyCell) -> tuple[int, int]:
-    """Rollouts of a cell, and how many of them are differentiated."""
-    config, group = plan.config, plan.groups[cell.group]
+class _Time:
+    """Times of cells, and whence they are."""
 
-    def batches(oracles: Iterable[str]) -> np.ndarray:
-        return np.sum([rollouts_of(oracle, cell.samples, group.task.random_start) for oracle in oracles], axis=0)
+    def __init__(self, rates: Rates):
+        self._rates = rates
+        self.basis = dict.fromkeys(BASES, 0.0)
 
-    if config.kind == "descents":
-        assert group.recipe is not None
-        each = np.sum([batches(estimator.needs) for estimator in estimators_of(plan, cell)], axis=0)
-        evaluations = (config.batches * len(config.estimators) + 1) * (config.evaluation_samples or 0)
-        total = config.batches * group.recipe.iterations * each + [evaluations, 0]
-    elif config.kind == "landscapes":
-        exact = QUADRATURE if not cell.model.analytic and applies(group.task) else 0
-        total = (config.points or 0) * config.batches * batches(oracles_of(config)) + [exact, exact]
-    else:
-        candidates = 0 if cell.model.analytic else CANDIDATES
-        total = config.batches * batches(oracles_of(config))
-        total = total + [2 * (config.reference_samples or 0) + candidates, candidates]
-    return int(total[0]), int(total[1])
+    def setup(self, plan: StudyPlan, cells: Sequence[StudyCell]) -> float:
+        """Seconds of tracing and compilation, one after another."""
+        programs = {key: program for cell in cells for key, program in setups(plan, cell).items()}
+        total, read = 0.0, set()
+        for program in programs.values():
+            tracing, compiling, compiled, basis = self._rates.setup(program)
+            seconds = tracing + compiling * (READING if compiled or program in read else 1)
+            read.add(program)
+            self.basis[basis] += seconds
+            total += seconds
+        return total
+
+    def cell(self, plan: StudyPlan, cell: StudyCell, devices: int) -> float:
+        """Seconds of a cell, without compilation."""
+        counts = calls(plan, cell, devices)
+        own: list[float] = []
+        if plan.config.kind == "descents" and not cell.model.analytic:
+            recipe = plan.groups[cell.group].recipe
+            assert recipe is not None
+            programs = [iteration(plan, cell, each.needs) for each in estimators_of(plan, cell)]
+            own = [self._calls(program, recipe.iterations) for program in programs]
+            for program in programs:
+                counts.pop(program, None)
+        batches = sum((self._calls(program, count) for program, count in counts.items()), 0.0)
+        return batches + _side_by_side(own, devices) + self._calls(rest(plan, cell), 1)
+
+    def _calls(self, program: Program, count: int) -> float:
+        seconds, basis = self._rates.call(program)
+        self.basis[basis] += count * seconds
+        return count * seconds
+
+
+def _side_by_side(seconds: Iterable[float], workers: int) -> float:
+    """When the last of several tasks ends, of which each begins in turn as soon as a worker is free."""
+    ends = [0.0] * workers
+    for each in seconds:
+        heapq.heappush(ends, heapq.heappop(ends) + each)
+    return max(ends)
+
+
+def _workers(cluster: str) -> int:
+    """Workers of a cluster that work at one time; those here share the cores."""
+    kind, _, count = cluster.partition(":")
+    if kind == "local":
+        return min(int(count or available_cores()), available_cores())
+    return int(count or 1) if kind == "slurm" else 1
 
 
 def _kept(plan: StudyPlan, cell: StudyCell) -> int:
@@ -117,27 +184,3 @@ def _kept(plan: StudyPlan, cell: StudyCell) -> int:
     }
     counts = [math.prod(sizes[dim] for dim in each.dims) for each in VARIABLES[str(config.kind)].values()]
     return int(8 * sum(count for count in counts if config.kind != "gradients" or count <= MOST_KEPT))
-
-
-def _seconds(plan: StudyPlan, store: Store, missing: list[StudyCell]) -> float | None:
-    """Computing time of the missing cells, at the rate of the others."""
-    rates = []
-    for index, cell in enumerate(plan.cells):
-        if store.has(index) and (spent := _spent(plan.config, cell, store.read(index))) is not None:
-            rates.append(spent / _size(plan, cell))
-    return float(np.mean(rates)) * sum(_size(plan, cell) for cell in missing) if rates else None
-
-
-def _spent(config: StudyConfig, cell: StudyCell, arrays: dict[str, Any]) -> float | None:
-    """Measured seconds of a cell: descents one after another; the longest of batches that estimators share."""
-    if config.kind == "descents":
-        return float(np.nansum(np.nanmax(arrays["seconds"], axis=0)))
-    if config.kind == "gradients":
-        return float(np.max(arrays["seconds_per_sample"])) * cell.samples * config.batches
-    return None
-
-
-def _size(plan: StudyPlan, cell: StudyCell) -> int:
-    """The work of a cell, to which its time is proportional: samples times steps times iterations."""
-    group = plan.groups[cell.group]
-    return cell.samples * group.task.horizon * (group.recipe.iterations if group.recipe else 1)

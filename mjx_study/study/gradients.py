@@ -152,7 +152,7 @@ def soft_gradient(simulator: Simulator, sigma: float, keys: Key[Array, " samples
     the task has no contact.
     """
     task = simulator.task
-    if task.contact_pair is None or not _takes_candidates(task):
+    if task.contact_pair is None or not takes_candidates(task):
         return None
     (cell,), _ = contact_grid(task, ("penalty",), (min(task.defaults.stiffnesses),))
     objective = simulator.objective(cell.contact, sigma)
@@ -176,7 +176,7 @@ def reference_of(
         pilot: a batch from other keys, which picks among the candidates.
         soft: another candidate, see `soft_gradient`.
     """
-    if not isinstance(objective, MjxObjective) or not _takes_candidates(task):
+    if not isinstance(objective, MjxObjective) or not takes_candidates(task):
         plus, minus = objective.evaluate_pair(task.theta, odd_keys)
         return _antithetic(plus, minus, "zero_noise")
     own = jnp.median(objective.differentiate(task.theta, candidate_keys).gradient, axis=0)
@@ -184,7 +184,7 @@ def reference_of(
     return _reference_gradient(objective.evaluate_odd(task.theta, odd_keys), pilot, candidates, objective.sigma)
 
 
-def _takes_candidates(task: Task) -> bool:
+def takes_candidates(task: Task) -> bool:
     """Whether the reference is of odd parts and a control variate."""
     return task.policy.additive and task.noise == "gaussian"
 

@@ -74,6 +74,13 @@ def contents(tasks: Mapping[str, Iterable[Task]]) -> dict[str, str]:
     return found | {f"source of {name}": digest for name, digest in sorted(sources.items())}
 
 
+def digest_of(value: Any) -> str:
+    """Digest of a value, by content."""
+    digest = _Digest()
+    digest.add(value)
+    return digest.hexdigest()
+
+
 def plan_contents(plan: StudyPlan) -> dict[str, str]:
     """`contents` of a plan's tasks in all their forms, and `estimator_contents` of its estimators."""
     forms: dict[str, list[Task]] = {}

@@ -10,7 +10,7 @@ rule on every second point estimates it.
 
 import dataclasses
 import math
-from typing import Final
+from typing import Any, Final
 
 import jax
 import jax.numpy as jnp
@@ -18,9 +18,10 @@ import numpy as np
 from jaxtyping import Float
 
 from estimators import NOISES
-from mjx_study.objective import rollout_cost, spread
+from mjx_study.objective import rollout_cost, rounds, spread
 from mjx_study.reference.noise import split_sample_key
 from mjx_study.simulation.contact import ContactModel
+from mjx_study.stopwatch import timed
 from mjx_study.tasks.task import Task
 
 TAIL: Final = 1e-6
@@ -74,6 +75,7 @@ class Line:
             return rollout_cost(task, theta[None], contact, start, jnp.zeros(shape, dtype), task.onset)[0]
 
         batched = jax.vmap(jax.value_and_grad(cost), in_axes=(0, None))
+        self._task = task
         self._program = jax.jit(lambda contact, thetas: batched(thetas, contact))
         self._dtype = dtype
 
@@ -81,7 +83,13 @@ class Line:
         self, points: Float[np.ndarray, " points"], contact: ContactModel | None
     ) -> tuple[Float[np.ndarray, " points"], Float[np.ndarray, " points"]]:
         """Cost without noise and its derivative at each point."""
-        return spread(self._program, (contact,), (points.astype(self._dtype),), CHUNK, jax.local_devices())
+        devices = jax.local_devices()
+        with timed(self.program(contact), rounds(len(points), CHUNK, len(devices))):
+            return spread(self._program, (contact,), (points.astype(self._dtype),), CHUNK, devices)
+
+    def program(self, contact: ContactModel | None) -> tuple[str, Task, Any, int]:
+        """What the time of a call depends on, as of `Simulator.program`."""
+        return "quadrature", self._task, jax.tree.structure(contact), CHUNK
 
 
 def grid(low: float, high: float, sigma: float, size: int, noise: str) -> Float[np.ndarray, " size"]:

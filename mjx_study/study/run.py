@@ -21,7 +21,7 @@ from estimators import ENOUGH_EFFECTIVE
 from mjx_study.disk import prepare_folder
 from mjx_study.runtime import environment
 from mjx_study.study.axes import Axes, axes_of, solver_arrays, solver_parameters
-from mjx_study.study.cells import COMPUTE
+from mjx_study.study.cells import compute_cells
 from mjx_study.study.cluster import cells_on, connected
 from mjx_study.study.configuration import Progress, StudyConfig
 from mjx_study.study.dataset import Cells, as_plain, dataset_of, write_dataset
@@ -29,6 +29,7 @@ from mjx_study.study.identity import differences, plan_contents, versions
 from mjx_study.study.plan import StudyCell, StudyPlan, estimators_of, plan_study
 from mjx_study.study.revision import git_revision
 from mjx_study.study.store import Part, Store
+from mjx_study.study.times import recording
 
 WAIT_SECONDS: Final = 0.5
 """Between looks at cells that another process computes."""
@@ -147,11 +148,13 @@ def run_study(
     if folder is None:
         if cluster is not None:
             raise ValueError("a cluster needs a folder for the study")
-        return run.in_memory(as_plain(_document(plan, command)))
+        with recording():
+            return run.in_memory(as_plain(_document(plan, command)))
     if not isinstance(folder, Store):
         folder = open_store(plan, Path(folder), command, accept_versions=accept_versions)
     with ExitStack() as stack:
         client = stack.enter_context(connected(cluster)) if isinstance(cluster, str) else cluster
+        stack.enter_context(recording())
         return run.in_folder(folder, keep_going, client)
 
 
@@ -163,7 +166,7 @@ class _Run:
     def in_memory(self, document: dict[str, Any]) -> xr.Dataset:
         """All cells, none of them written."""
         document["config"]["chunk_size"] = self._plan.chunk_size
-        compute, cells = COMPUTE[self._plan.config.kind](self._plan), {}  # type: ignore[index]
+        compute, cells = compute_cells(self._plan), {}
         for index in range(self._total):
             cells[index] = (self._numbers(compute, index, index, Part()), document["versions"])
         self._progress(self._total, self._total, "done")
@@ -177,7 +180,7 @@ class _Run:
                 store.read(index)  # a damaged file is refused before anything is computed
             else:
                 store.read_part(index)
-        compute = COMPUTE[self._plan.config.kind](self._plan)  # type: ignore[index]
+        compute = compute_cells(self._plan)
         cells = partial(self._cells_here, compute) if client is None else partial(self._cells_there, client)
         computed, held, failed = 0, {}, set()
         unwritten: OSError | None = None
@@ -252,8 +255,6 @@ class _Run:
             self._begun.add(program)
             label += " (compiling first)"
         self._progress(done, self._total, label)
-        if self._plan.config.kind != "descents":
-            return compute(cell)
         within = self._progress if self._total == 1 else lambda *_: self._progress(done, self._total, label)
         return compute(cell, dataclasses.replace(part, report=within))
 

@@ -75,6 +75,21 @@ def rollouts_of(oracle: str, samples: int, random_start: bool) -> tuple[int, int
     return samples * (2 if "pair" in oracle else 1) + baselines, samples * order
 
 
+def calls_of(oracle: str, samples: int, random_start: bool) -> list[tuple[str, int]]:
+    """Programs of `MjxObjective` that make a batch, each with its rows, baselines included."""
+    baselines = samples if random_start else min(samples, 1)
+    return {
+        "evaluation": [("value", samples + baselines)],
+        "pair": [("value", 3 * samples)],
+        "steps": [("steps", samples), ("steps", baselines)],
+        "step_pair": [("steps", 2 * samples), ("steps", baselines)],
+        "differentiation": [("gradient", samples)],
+        "corrected": [("corrected", samples)],
+        "step_differentiation": [("step_gradient", samples)],
+        "linearisation": [("linearisation", samples), ("steps", baselines)],
+    }[oracle]
+
+
 def residuals_of(batch: Any) -> Float[np.ndarray, " rollouts"]:
     """The solver residual of every rollout of a batch of any kind; empty for an analytic system."""
     parts = batch if isinstance(batch, tuple) else (batch,)

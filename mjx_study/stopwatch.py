@@ -1,0 +1,129 @@
+"""Times of compiled programs while a study runs: their calls, and what comes before the first one.
+
+    with Stopwatch().running() as watch:
+        with timed("rollouts", calls=4): ...
+    watch.spent["rollouts"].each
+
+Where no stopwatch runs, `timed` does nothing. Times are of the thread that runs it; what is timed within is left out.
+"""
+
+import dataclasses
+import math
+import time
+from collections.abc import Generator, Hashable
+from contextlib import contextmanager
+from contextvars import ContextVar
+from typing import Any, Final
+
+import jax
+import numpy as np
+
+TRACING: Final = ("/jax/core/compile/jaxpr_trace_duration", "/jax/core/compile/jaxpr_to_mlir_module_duration")
+COMPILING: Final = "/jax/core/compile/backend_compile_duration"
+"""XLA's compilation, or the reading of what is compiled already."""
+SAVED: Final = "/jax/compilation_cache/compile_time_saved_sec"
+"""What compilation would have taken in addition to reading."""
+
+
+@dataclasses.dataclass
+class Spent:
+    """Times of one program [s].
+
+    Attributes:
+        calls, seconds: of calls for which nothing was compiled.
+        first_calls, first: of those for which something was, without that.
+        tracing: the longest tracing.
+        compiling: the longest compilation by XLA, as it is when it is not in the cache.
+    """
+
+    calls: int = 0
+    seconds: float = 0.0
+    first_calls: int = 0
+    first: float = 0.0
+    tracing: float = 0.0
+    compiling: float = 0.0
+
+    def add(self, calls: int, wall: float, tracing: float = 0.0, reading: float = 0.0, compiling: float = 0.0) -> None:
+        if compiling > 0:
+            self.first_calls, self.first = self.first_calls + calls, self.first + max(0.0, wall - tracing - reading)
+            self.tracing, self.compiling = max(self.tracing, tracing), max(self.compiling, compiling)
+        else:
+            self.calls, self.seconds = self.calls + calls, self.seconds + wall
+
+    @property
+    def each(self) -> float:
+        """Seconds per call, of the first ones where there are no others."""
+        return self.seconds / self.calls if self.calls else self.first / max(1, self.first_calls)
+
+
+class Stopwatch:
+    """Times by program, for one thread.
+
+    Attributes:
+        saved: when they were last written [s], by `time.monotonic`.
+    """
+
+    def __init__(self) -> None:
+        self.spent: dict[Hashable, Spent] = {}
+        self.saved = -math.inf
+        self._events = np.zeros(3)  # tracing, reading or compiling, compiling when it is not in the cache
+        self._within = np.zeros(4)  # wall and events of what is timed inside of what is being timed
+
+    @contextmanager
+    def running(self) -> Generator["Stopwatch"]:
+        """Make this the stopwatch of `timed` in this thread."""
+        jax.monitoring.register_event_duration_secs_listener(self._hear)
+        token = _RUNNING.set(self)
+        try:
+            yield self
+        finally:
+            _RUNNING.reset(token)
+            jax.monitoring.unregister_event_duration_listener(self._hear)
+
+    @contextmanager
+    def timed(self, program: Hashable, calls: int) -> Generator[None]:
+        outside, self._within, begun = self._within, np.zeros(4), self._now()
+        whole = True
+        try:
+            yield
+        except BaseException:
+            whole = False
+            raise
+        finally:
+            spent = self._now() - begun
+            own, self._within = spent - self._within, outside + spent
+            if whole:
+                self.spent.setdefault(program, Spent()).add(calls, *map(float, own))
+
+    def _now(self) -> np.ndarray:
+        return np.array([time.perf_counter(), *self._events])
+
+    def _hear(self, event: str, duration_secs: float, **_: Any) -> None:
+        compiling = event == COMPILING
+        self._events += duration_secs * np.array([event in TRACING, compiling, compiling or event == SAVED])
+
+
+_RUNNING: ContextVar[Stopwatch | None] = ContextVar("stopwatch", default=None)
+
+
+@contextmanager
+def timed(program: Hashable, calls: int = 1) -> Generator[None]:
+    """Time calls of a program, if a stopwatch runs; the first time includes what comes before, see `Spent`.
+
+    Args:
+        program: its name, to which several times add up.
+        calls: how many calls one after another.
+    """
+    watch = _RUNNING.get()
+    if watch is None:
+        yield
+    else:
+        with watch.timed(program, calls):
+            yield
+
+
+def tell(program: Hashable, calls: int, seconds: float) -> None:
+    """Add calls that were timed otherwise, as in another thread, if a stopwatch runs."""
+    watch = _RUNNING.get()
+    if watch is not None:
+        watch.spent.setdefault(program, Spent()).add(calls, seconds)

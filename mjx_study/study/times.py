@@ -1,0 +1,251 @@
+"""What programs take: recorded by runs in the cache beside the compiled programs, and read by forecasts.
+
+A program is known by its content (model, costs, kind of policy, noise, onset term, kind of contact, precision and
+processor), the number of steps and the rows of a call. A call takes about steps x (rows + overhead) times a rate. The
+rate is that of the program's own record, or of the same content's with other rows or steps, or a rough one that grows
+with the degrees of freedom and the constraint rows, times what the records of other programs say of this machine.
+"""
+
+import dataclasses
+import functools
+import hashlib
+import json
+import math
+import statistics
+import time
+from collections.abc import Generator, Iterable
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any, Final
+
+import jax
+from pydantic import BaseModel, Field
+
+from mjx_study.disk import write_whole
+from mjx_study.files import read_json
+from mjx_study.runtime import precision, processor_name
+from mjx_study.simulation.scene import num_constraint_rows
+from mjx_study.stopwatch import Spent, Stopwatch
+from mjx_study.study.identity import digest_of, versions
+from mjx_study.tasks.task import Task
+
+OVERHEAD: Final = {"cpu": 25, "gpu": 8000, "tpu": 8000}
+"""Rows that take as long as a call of none, by backend."""
+RATE: Final = {"cpu": 4e-7, "gpu": 5e-9, "tpu": 5e-9}
+"""Time of a step of a rollout, without degrees of freedom and constraints [s per row]."""
+POWERS: Final = (0.6, 0.3)
+"""Powers of 1 + degrees of freedom and 1 + constraint rows to which the time of a step grows."""
+FACTORS: Final = {
+    "value": 1.0, "gradient": 4.0, "corrected": 5.0, "steps": 1.0, "step_gradient": 4.0, "linearisation": 5.0,
+    "quadrature": 4.0,
+}  # fmt: skip
+"""Time of the kinds of batches over that of rollouts."""
+SETUP: Final = (1.0, 2.0)
+"""Tracing and compilation of a program of rollouts without degrees of freedom and constraints [s]; others follow their
+factor's root."""
+STATISTICS: Final = 4e-8
+"""Time of a cell's statistics [s per number held by its batches]."""
+STATISTICS_SETUP: Final = (2.0, 3.0)
+"""Tracing and compilation of a cell's statistics [s]."""
+ANALYTIC: Final = 1e-7
+"""Time of a step of an analytic system [s per row]."""
+SAVE_SECONDS: Final = 5.0
+READING: Final = 0.1
+"""Reading a compiled program over compiling it."""
+BASES: Final[tuple[str, str, str]] = ("measured here", "scaled from what was measured here", "rough: never run here")
+MEASURED, SCALED, ROUGH = BASES
+
+
+@dataclasses.dataclass(frozen=True)
+class Program:
+    """A program, or the statistics of a cell: what the time of a call depends on.
+
+    Attributes:
+        kind: one of `objective.Simulator.sample_programs`; those of an iteration of descents joined by "+"; "analytic"
+            or "statistics".
+        content: digest of what else is compiled, and of the machine.
+        steps: of a rollout; 1 for statistics.
+        rows: rollouts in a call; numbers for statistics.
+        dof, constraints: degrees of freedom and constraint rows.
+    """
+
+    kind: str
+    content: str
+    steps: int
+    rows: int
+    dof: int = 0
+    constraints: int = 0
+
+    @property
+    def work(self) -> float:
+        """To which the time of a call is proportional within one content."""
+        return float(self.steps * (self.rows + OVERHEAD[jax.default_backend()]))
+
+    @property
+    def rough(self) -> float:
+        """Rough time of a call [s]."""
+        if self.kind in ("analytic", "statistics"):
+            return self.work * (ANALYTIC if self.kind == "analytic" else STATISTICS)
+        return self.work * RATE[jax.default_backend()] * self.factor * self._size
+
+    @property
+    def factor(self) -> float:
+        """Time over that of a call of rollouts."""
+        return statistics.fmean(FACTORS.get(part, 1.0) for part in self.kind.split("+"))
+
+    @property
+    def rough_setup(self) -> tuple[float, float]:
+        """Rough times of tracing and compilation [s]."""
+        if self.kind in ("analytic", "statistics"):
+            return STATISTICS_SETUP
+        grown = self._size * sum(FACTORS.get(part, 1.0) ** 0.5 for part in self.kind.split("+"))
+        return SETUP[0] * grown, SETUP[1] * grown
+
+    @property
+    def _size(self) -> float:
+        return float((1 + self.dof) ** POWERS[0] * (1 + self.constraints) ** POWERS[1])
+
+
+class Record(BaseModel):
+    """Times of a program: each call, tracing, and compilation when it is not in the cache [s]."""
+
+    kind: str
+    content: str
+    steps: int = Field(ge=1)
+    rows: int = Field(ge=0)
+    dof: int
+    constraints: int
+    each: float = Field(ge=0, allow_inf_nan=False)
+    calls: int
+    tracing: float = Field(ge=0, allow_inf_nan=False)
+    compiling: float = Field(ge=0, allow_inf_nan=False)
+    versions: dict[str, str]
+
+    @property
+    def program(self) -> Program:
+        return Program(**{field.name: getattr(self, field.name) for field in dataclasses.fields(Program)})
+
+
+def program_of(kind: str, task: Task, contact: Any, rows: int, steps: int | None = None) -> Program:
+    """A program of a task.
+
+    Args:
+        contact: structure of the contact model's arrays.
+        steps: the task's horizon by default.
+    """
+    host = task.scene.host
+    content = _content(task, str(contact))
+    return Program(kind, content, steps or task.horizon, rows, int(host.nv), num_constraint_rows(task.scene.template))
+
+
+def other_program(kind: str, rows: int, *content: str, steps: int = 1) -> Program:
+    """What a cell takes beside its batches."""
+    return Program(kind, _digest(_machine(), *content), steps, rows)
+
+
+@functools.lru_cache(maxsize=32)
+def _content(task: Task, contact: str) -> str:
+    parts = task.scene, task.running_cost, task.final_cost, type(task.policy), task.noise, task.onset
+    return _digest(digest_of(parts), contact, _machine())
+
+
+def _machine() -> str:
+    device = jax.local_devices()[0]
+    return _digest(precision(), device.platform, device.device_kind, processor_name())
+
+
+def _digest(*texts: str) -> str:
+    return hashlib.sha256("\0".join(texts).encode()).hexdigest()[:16]
+
+
+def times_folder() -> Path | None:
+    """Folder of the records, beside the compiled programs; None where these are not kept in a folder."""
+    cache = jax.config.values["jax_compilation_cache_dir"]
+    return None if not cache or "://" in cache else Path(cache) / "times"
+
+
+@contextmanager
+def recording(watch: Stopwatch | None = None) -> Generator[None]:
+    """Measure what programs take within, and keep it for later forecasts; what cannot be written is lost.
+
+    The latest run of a program counts, so that processes at one time need not wait for each other.
+
+    Args:
+        watch: what was measured before within the same process; written again only `SAVE_SECONDS` after the last time.
+    """
+    watch = Stopwatch() if watch is None else watch
+    with watch.running():
+        try:
+            yield
+        finally:
+            if time.monotonic() - watch.saved > SAVE_SECONDS and (folder := times_folder()) is not None:
+                watch.saved = time.monotonic()
+                with suppress(OSError):
+                    folder.mkdir(parents=True, exist_ok=True)
+                    for program, spent in watch.spent.items():
+                        _write(folder, program, spent)
+
+
+def _write(folder: Path, key: Any, spent: Spent) -> None:
+    if isinstance(key, str):
+        return
+    program = key if isinstance(key, Program) else program_of(*key)
+    path = folder / f"{program.kind}-{program.content}-{program.steps}-{program.rows}.json"
+    setup = {"tracing": spent.tracing, "compiling": spent.compiling, "versions": versions()}
+    if not spent.first_calls:  # compiled before
+        with suppress(ValueError):
+            setup = read_json(path, Record).model_dump(include=set(setup))
+    times = {"each": spent.each, "calls": spent.calls or spent.first_calls}
+    record = dataclasses.asdict(program) | times | setup
+    write_whole(path, lambda file: file.write(json.dumps(record).encode()))
+
+
+class Rates:
+    """The times of programs, from records and from the rough model."""
+
+    def __init__(self, records: Iterable[Record]):
+        self._records = list(records)
+        self._own = {record.program: record for record in self._records}
+
+    @classmethod
+    def read(cls, folder: Path | None) -> "Rates":
+        """From a folder; damaged records are passed over."""
+        found = []
+        for path in [] if folder is None else sorted(folder.glob("*.json")):
+            with suppress(ValueError):
+                found.append(read_json(path, Record))
+        return cls(found)
+
+    def call(self, program: Program) -> tuple[float, str]:
+        """Seconds of a call, and whence they are."""
+        if program in self._own:
+            return self._own[program].each, MEASURED
+        if record := self._nearest(program):
+            return record.each * program.rough / record.program.rough, SCALED
+        return program.rough * self._speed(program, lambda record: (record.each, record.program.rough)), ROUGH
+
+    def setup(self, program: Program) -> tuple[float, float, bool, str]:
+        """Seconds of tracing, those of compilation, whether that was done here already, and whence they are."""
+        if record := self._own.get(program):
+            return record.tracing, record.compiling, record.versions == versions(), MEASURED
+        tracing, compiling = program.rough_setup
+        if record := self._nearest(program):
+            rough = record.program.rough_setup
+            return record.tracing * tracing / rough[0], record.compiling * compiling / rough[1], False, SCALED
+        both = lambda record: (record.tracing + record.compiling, sum(record.program.rough_setup))  # noqa: E731
+        speed = self._speed(program, both)
+        return tracing * speed, compiling * speed, False, ROUGH
+
+    def _nearest(self, program: Program) -> Record | None:
+        """The record of the same content with the nearest work, of the same kind if there is one."""
+        same = [each for each in self._records if each.content == program.content and each.each > 0]
+        kind = [each for each in same if each.kind == program.kind] or same
+        return min(kind, key=lambda each: abs(math.log(each.program.work / program.work)), default=None)
+
+    def _speed(self, program: Program, times: Any) -> float:
+        """Measured over rough times: the median of the records of this kind, or of all kinds of rollouts."""
+        kind = [each for each in self._records if each.kind == program.kind]
+        if program.kind in FACTORS or "+" in program.kind:
+            kind = kind or [each for each in self._records if each.dof]
+        ratios = [measured / rough for measured, rough in map(times, kind) if measured > 0]
+        return statistics.median(ratios) if ratios else 1.0

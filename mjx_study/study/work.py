@@ -1,0 +1,127 @@
+"""The work of a cell: which programs it calls and how often, and what it takes beside them."""
+
+import math
+from collections import Counter
+from collections.abc import Iterator
+from typing import Any
+
+import jax
+import numpy as np
+
+from mjx_study.objective import contact_for, rounds
+from mjx_study.study.gradients import CANDIDATES, takes_candidates
+from mjx_study.study.landscapes import QUADRATURE
+from mjx_study.study.memory import LARGEST_BATCH
+from mjx_study.study.plan import StudyCell, StudyPlan, estimators_of, memory_of_seed, oracles_of, seeds_together
+from mjx_study.study.quadrature import CHUNK, applies
+from mjx_study.study.sampling import calls_of, rollouts_of
+from mjx_study.study.times import Program, other_program, program_of
+
+
+def rollouts(plan: StudyPlan, cell: StudyCell) -> tuple[int, int]:
+    """Rollouts of a cell, and how many of them are differentiated, about."""
+    config, group = plan.config, plan.groups[cell.group]
+
+    def batches(oracles: Any) -> np.ndarray:
+        return np.sum([rollouts_of(oracle, cell.samples, group.task.random_start) for oracle in oracles], axis=0)
+
+    if config.kind == "descents":
+        assert group.recipe is not None
+        each = np.sum([batches(estimator.needs) for estimator in estimators_of(plan, cell)], axis=0)
+        total = config.batches * group.recipe.iterations * each + [_evaluations(plan), 0]
+    elif config.kind == "landscapes":
+        exact = QUADRATURE if not cell.model.analytic and applies(group.task) else 0
+        total = (config.points or 0) * config.batches * batches(oracles_of(config)) + [exact, exact]
+    else:
+        candidates = 0 if cell.model.analytic else CANDIDATES
+        total = config.batches * batches(oracles_of(config))
+        total = total + [2 * (config.reference_samples or 0) + candidates, candidates]
+    return int(total[0]), int(total[1])
+
+
+def calls(plan: StudyPlan, cell: StudyCell, devices: int) -> Counter[Program]:
+    """Calls of each program one after another, on several devices at once, those to compile it left out.
+
+    Descents of several estimators are side by side, and their calls in the order of the estimators; those that stop
+    early take less.
+    """
+    found: Counter[Program] = Counter()
+    if cell.model.analytic:
+        return found
+    task, config, recipe = plan.groups[cell.group].task, plan.config, plan.groups[cell.group].recipe
+
+    def batch(program: str, rows: int, times: int = 1) -> None:
+        found[_program(plan, cell, program, plan.chunk_size)] += times * rounds(rows, plan.chunk_size, devices)
+
+    if config.kind == "descents":
+        assert recipe is not None
+        for estimator in estimators_of(plan, cell):
+            found[iteration(plan, cell, estimator.needs)] += recipe.iterations
+        batch("value", calls_of("evaluation", config.evaluation_samples or 0, task.random_start)[0][1], _costs(plan))
+        return found
+    for seeds in _in_turn(config.batches, seeds_together(plan, cell)):
+        for some in _in_turn(seeds, max(1, LARGEST_BATCH // cell.samples)):
+            for oracle in oracles_of(config):
+                for program, rows in calls_of(oracle, some * cell.samples, task.random_start):
+                    batch(program, rows, config.points or 1)
+    if config.kind == "gradients":
+        odd = takes_candidates(task)
+        batch("value", (2 if odd else 3) * (config.reference_samples or 0))
+        if odd:
+            batch("gradient", CANDIDATES)
+    elif applies(task):
+        found[_program(plan, cell, "quadrature", CHUNK)] += rounds(QUADRATURE, CHUNK, devices)
+    return found
+
+
+def iteration(plan: StudyPlan, cell: StudyCell, needs: tuple[str, ...]) -> Program:
+    """The program of an iteration of all seeds of an estimator that needs these oracles."""
+    task = plan.groups[cell.group].task
+    parts = [part for oracle in needs for part in calls_of(oracle, cell.samples, task.random_start)]
+    # chunks of a seed, filled up, one after another for all seeds at once
+    rows = sum(math.ceil(rows / plan.chunk_size) * plan.chunk_size for _, rows in parts) * plan.config.batches
+    return _program(plan, cell, "+".join(name for name, _ in parts), rows)
+
+
+def rest(plan: StudyPlan, cell: StudyCell) -> Program:
+    """What a cell takes beside its programs of rollouts, as one call: statistics, or all of an analytic system."""
+    config, task = plan.config, plan.groups[cell.group].task
+    content = str(config.kind), *config.estimators
+    if cell.model.analytic:
+        return other_program("analytic", rollouts(plan, cell)[0], task.name, *content, steps=task.horizon)
+    if config.kind == "descents":
+        return other_program("statistics", _evaluations(plan) * task.policy.num_params, *content)
+    numbers = memory_of_seed(plan, cell) // 8 * config.batches * (config.points or 1)
+    return other_program("statistics", numbers, *content)
+
+
+def setups(plan: StudyPlan, cell: StudyCell) -> dict[Any, Program]:
+    """Programs that must be compiled before a cell is computed, by what they are compiled for."""
+    own, other = plan.program_of(cell), rest(plan, cell)
+    found: dict[Any, Program] = {other: other}
+    for program in calls(plan, cell, 1):
+        found[own, program] = program
+    if plan.config.kind == "descents" and own is not None:
+        for estimator in estimators_of(plan, cell):
+            found[own, estimator] = found.pop((own, program := iteration(plan, cell, estimator.needs)), program)
+    return found
+
+
+def _program(plan: StudyPlan, cell: StudyCell, kind: str, rows: int) -> Program:
+    contact = contact_for(kind, cell.model.contact)
+    return program_of(kind, plan.groups[cell.group].task, jax.tree.structure(contact), rows)
+
+
+def _costs(plan: StudyPlan) -> int:
+    """Times that the cost of a descent is evaluated: its end for every seed, and its start."""
+    return plan.config.batches * len(plan.config.estimators) + 1
+
+
+def _evaluations(plan: StudyPlan) -> int:
+    return _costs(plan) * (plan.config.evaluation_samples or 0)
+
+
+def _in_turn(count: int, together: int) -> Iterator[int]:
+    """Sizes of the groups in which so many are taken."""
+    for start in range(0, count, together):
+        yield min(together, count - start)
