@@ -39,10 +39,10 @@ from mjx_study.simulation.contact import ContactModel, stable
 from mjx_study.simulation.dynamics import State, initial_state
 from mjx_study.simulation.engine import engine_model
 from mjx_study.simulation.onset import as_row
-from mjx_study.study.gradients import onset_numbers
 from mjx_study.study.line import direction_of
 from mjx_study.study.reference_gradient import reference_gradient
 from mjx_study.study.sampling import unconverged
+from mjx_study.study.tally import onset_numbers
 from mjx_study.study.variables import ONSETS
 from mjx_study.tasks import make_task
 from mjx_study.tasks.contact_grid import contact_grid

@@ -30,9 +30,9 @@ def measure(workers: int, cells: int, seconds: float, programs: int, numbers: in
     import numpy as np
 
     from mjx_study.study import cluster
-    from mjx_study.study.store import Store
+    from mjx_study.study.store import Part, Store
 
-    def sleep(study: bytes, index: int, kept: Any) -> Any:
+    def sleep(study: bytes, index: int, kept: Any, block: Any) -> Any:
         import time
 
         import numpy
@@ -50,13 +50,16 @@ def measure(workers: int, cells: int, seconds: float, programs: int, numbers: in
             return cell % programs
 
     index = {"cells": [{"label": str(cell), "at": {}} for cell in range(cells)], "config": {}}
-    with tempfile.TemporaryDirectory() as name, mock.patch.multiple(cluster, _compute=sleep, _packed=lambda plan: b""):
+    replaced = {"_compute": sleep, "_packed": lambda plan: b"", "Computation": lambda plan: None}
+    replaced["in_blocks"] = lambda plan, index: False
+    with tempfile.TemporaryDirectory() as name, mock.patch.multiple(cluster, **replaced):
         store, writing = Store(Path(name), index), 0.0
         (Path(name) / "cells").mkdir()
         with cluster.connected(f"local:{workers}") as client:
             client.wait_for_workers(workers)
             begun, processor = time.perf_counter(), time.process_time()
-            for done, arrays in cluster.cells_on(client, Plan(), {cell: {} for cell in range(cells)}, lambda _: None):  # type: ignore[arg-type]
+            parts = {cell: Part() for cell in range(cells)}
+            for done, arrays in cluster.cells_on(client, Plan(), parts, lambda _: None):  # type: ignore[arg-type]
                 assert isinstance(arrays, dict) and np.all(arrays["values"] == done)
                 before = time.perf_counter()
                 store.write(done, arrays)

@@ -35,6 +35,7 @@ from estimators.registry import (
     make_estimator,
     register,
 )
+from estimators.rows import Rows
 from estimators.statistics import norm_quantiles, summarise
 from estimators.stepwise import antithetic_cost_to_go, cost_to_go, stepwise_inverse_variance
 from estimators.types import (
@@ -85,6 +86,7 @@ __all__ = [
     "Objective",
     "Oracle",
     "PairedObjective",
+    "Rows",
     "StepDifferentiation",
     "StepEvaluation",
     "StepwiseInverseVariance",

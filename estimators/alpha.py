@@ -5,7 +5,7 @@ from dataclasses import replace
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from estimators.statistics import finite_rows
+from estimators.rows import weigh
 from estimators.types import AlphaChoice, GradientEstimate
 
 Scalar = Float[Array, ""]
@@ -94,22 +94,22 @@ def interpolate(zeroth: GradientEstimate, first: GradientEstimate, alpha: float 
     Reference: Suh et al. 2022, def. of the AoBG and lemmas on its bias and variance (the last line of the
     latter swaps the two variances).
     """
-    if zeroth.per_sample.shape != first.per_sample.shape:
+    if zeroth.samples.shape != first.samples.shape:
         raise ValueError(
             "the two batches must have the same shape (samples, params); "
-            f"got {zeroth.per_sample.shape} zeroth-order and {first.per_sample.shape} first-order; "
+            f"got {zeroth.samples.shape} zeroth-order and {first.samples.shape} first-order; "
             "draw the same number of samples for both"
         )
-    alpha = jnp.asarray(alpha, zeroth.per_sample.dtype)
+    alpha = jnp.asarray(alpha, zeroth.samples.dtype)
 
     linear, squared = (1.0 - alpha, alpha), ((1.0 - alpha) ** 2, alpha**2)
-    per_sample = weigh(linear, zeroth.per_sample, first.per_sample)
+    samples = zeroth.samples.mixed(linear, first.samples)
     return GradientEstimate(
-        per_sample=per_sample,
+        samples=samples,
         mean=weigh(linear, zeroth.mean, first.mean),
         variance=weigh(squared, zeroth.variance, first.variance),
         standard_error=jnp.sqrt(weigh(squared, zeroth.standard_error**2, first.standard_error**2)),
-        num_finite=jnp.sum(finite_rows(per_sample)),
+        num_finite=samples.num_finite,
     )
 
 
@@ -120,7 +120,7 @@ def choose_alpha(
     discrepancy = jnp.linalg.norm(first.mean - zeroth.mean)
     return AlphaChoice(
         alpha=constrained_alpha(zeroth.variance, first.variance, discrepancy, epsilon, gamma),
-        epsilon=jnp.asarray(epsilon, zeroth.per_sample.dtype),
+        epsilon=jnp.asarray(epsilon, zeroth.samples.dtype),
         discrepancy=discrepancy,
         variance_zeroth=zeroth.variance,
         variance_first=first.variance,
@@ -152,13 +152,3 @@ def alpha_order(
     """
     choice = choose_alpha(zeroth, first, gamma=gamma, epsilon=epsilon)
     return replace(interpolate(zeroth, first, choice.alpha), alpha=choice)
-
-
-def weigh(
-    weights: tuple[float | Scalar, float | Scalar], zeroth: Float[Array, "*shape"], first: Float[Array, "*shape"]
-) -> Float[Array, "*shape"]:
-    """Weighted sum in which nothing times NaN is nothing."""
-    weight_zeroth, weight_first = weights
-    return jnp.where(weight_zeroth == 0, 0.0, weight_zeroth * zeroth) + jnp.where(
-        weight_first == 0, 0.0, weight_first * first
-    )

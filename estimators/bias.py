@@ -8,7 +8,8 @@ from jaxtyping import Array, Float, Key
 
 from estimators.effective import effective_samples
 from estimators.pytree import register_pytree
-from estimators.statistics import finite_rows, summarise
+from estimators.rows import finite_rows
+from estimators.statistics import summarise
 from estimators.types import GradientEstimate
 
 
@@ -82,16 +83,14 @@ def _multiplied(
     estimate: GradientEstimate, effective: Float[Array, ""], key: Key[Array, ""], num_draws: int
 ) -> Float[Array, "draws params"]:
     """z_k; the sign that a difference gives is immaterial."""
-    rows = estimate.per_sample
+    dtype = estimate.mean.dtype
     multiplier_key, scale_key = jax.random.split(key)
-    centred = jnp.where(finite_rows(rows)[:, None], rows - estimate.mean[None, :], 0.0)
-    count = estimate.num_finite.astype(rows.dtype)
-    multipliers = jax.random.normal(multiplier_key, (num_draws, rows.shape[0]), rows.dtype)
-    means = jnp.matmul(multipliers, centred, precision="highest") / jnp.sqrt(count * jnp.maximum(count - 1.0, 1.0))
+    means = estimate.samples.perturbed_means(estimate.mean, multiplier_key, num_draws)
+    count = estimate.num_finite.astype(dtype)
     freedom = 2.0 / jnp.maximum(1.0 / jnp.maximum(effective, 1.0) - 1.0 / count, 1e-9)
     # chi^2 / nu as the cube of a normal number, by Wilson and Hilferty
     spread = jnp.sqrt(2.0 / (9.0 * freedom))
-    cube_root = 1.0 - spread**2 + spread * jax.random.normal(scale_key, (num_draws, 1), rows.dtype)
+    cube_root = 1.0 - spread**2 + spread * jax.random.normal(scale_key, (num_draws, 1), dtype)
     return means / jnp.maximum(cube_root, 1e-2) ** 1.5
 
 

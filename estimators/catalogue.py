@@ -7,7 +7,8 @@ PLUG_IN: Final = "plug_in"
 CROSS_FITTED: Final = "cross_fitted"
 WEIGHTS: Final = (PLUG_IN, CROSS_FITTED)
 """Sources of an interpolation's weights."""
-BASELINES: Final = ("none", "zero_noise", "leave_one_out")
+LEAVE_ONE_OUT: Final = "leave_one_out"
+BASELINES: Final = ("none", "zero_noise", LEAVE_ONE_OUT)
 """Baselines of zeroth-order samples."""
 VARIANCE_PROXIES: Final = ("variance", "second_moment", "upper_bound")
 """What may stand for the variance in epsilon."""

@@ -6,7 +6,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from estimators.pytree import register_pytree
-from estimators.statistics import summarise
 from estimators.types import GradientEstimate
 
 Scalar = Float[Array, ""]
@@ -81,7 +80,7 @@ def compare(estimate: GradientEstimate, reference: GradientEstimate) -> Comparis
     cosine = jnp.sum(along_estimate * along_reference)
 
     def propagate(slope: Float[Array, " params"], slope_reference: Float[Array, " params"]) -> Float[Array, ""]:
-        return jnp.sqrt(_variance_along(estimate, slope) + _variance_along(reference, slope_reference))
+        return jnp.sqrt(estimate.samples.variance_along(slope) + reference.samples.variance_along(slope_reference))
 
     def cosine_error(cosine: Scalar, size: Scalar, reference_size: Scalar) -> Scalar:
         across = size * reference_size
@@ -116,10 +115,3 @@ def compare(estimate: GradientEstimate, reference: GradientEstimate) -> Comparis
 def _root(square: Scalar) -> Scalar:
     """NaN for what is not positive."""
     return jnp.sqrt(jnp.where(square > 0, square, jnp.nan))
-
-
-def _variance_along(estimate: GradientEstimate, direction: Float[Array, " params"]) -> Float[Array, ""]:
-    """Variance of the mean's component along a direction."""
-    # A sum, since a matrix product of float32 may be rounded to fewer digits on an accelerator.
-    component = jnp.sum(estimate.per_sample * direction[None, :], axis=1)
-    return summarise(component[:, None]).standard_error[0] ** 2

@@ -7,7 +7,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from estimators.catalogue import MAX_DEVIATION, VARIANCE_PROXIES
-from estimators.statistics import finite_rows
 from estimators.types import GradientEstimate
 
 
@@ -49,8 +48,7 @@ def bernstein_epsilon(
     a matrix of one column.
     """
     check_confidence_arguments(failure_probability, variance_proxy, radius)
-    dtype = estimate.per_sample.dtype
-    finite = finite_rows(estimate.per_sample)
+    dtype = estimate.samples.dtype
     count = estimate.num_finite.astype(dtype)
     if variance_proxy == "variance":
         variance = estimate.variance
@@ -58,11 +56,9 @@ def bernstein_epsilon(
         failure_probability = failure_probability / 2
         variance = variance_upper_bound(estimate, jnp.asarray(radius, dtype), failure_probability)
     else:
-        kept = jnp.where(finite[:, None], estimate.per_sample, 0.0)
-        variance = jnp.sum(kept**2) / count
+        variance = estimate.samples.second_moment()
     if isinstance(radius, str):
-        deviation = jnp.linalg.norm(estimate.per_sample - estimate.mean[None, :], axis=1)
-        bound = jnp.max(jnp.where(finite, deviation, 0.0))
+        bound = estimate.samples.largest_deviation(estimate.mean)
     else:
         bound = jnp.asarray(radius, dtype)
     logarithm = jnp.log(jnp.asarray((estimate.mean.shape[0] + 1) / failure_probability, dtype))
@@ -89,14 +85,9 @@ def variance_upper_bound(
 
     Reference: Hoeffding, "Probability inequalities for sums of bounded random variables", 1963, theorem 1.
     """
-    rows = estimate.per_sample
-    count = rows.shape[0] // 2
-    one, other = rows[0 : 2 * count : 2], rows[1 : 2 * count : 2]
-    finite = finite_rows(one) & finite_rows(other)
     most = 2.0 * radius**2
-    halves = jnp.where(finite, jnp.sum((one - other) ** 2, axis=1) / 2.0, 0.0)
-    pairs = jnp.sum(finite).astype(rows.dtype)
-    share = jnp.clip(jnp.sum(halves) / jnp.maximum(pairs, 1.0) / jnp.where(most > 0, most, 1.0), 0.0, 1.0)
+    halves, pairs = estimate.samples.pair_variance()
+    share = jnp.clip(halves / jnp.maximum(pairs, 1.0) / jnp.where(most > 0, most, 1.0), 0.0, 1.0)
     budget = math.log(1.0 / failure_probability)
 
     def divergence(q: Float[Array, ""]) -> Float[Array, ""]:

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from estimators.catalogue import CROSS_FITTED, PLUG_IN, WEIGHTS
+from estimators.rows import Rows
 from estimators.types import GradientEstimate
 
 FEWEST_SAMPLES: Final = 4
@@ -82,7 +83,7 @@ def _pooled(parts: Sequence[GradientEstimate]) -> GradientEstimate:
         return jnp.asarray(sum(share * value for share, value in zip(shares, values, strict=True)))
 
     return GradientEstimate(
-        per_sample=rows,
+        samples=Rows(rows),
         mean=average(*(part.mean for part in parts)),
         variance=average(*(part.variance for part in parts)),
         standard_error=jnp.sqrt(

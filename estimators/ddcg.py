@@ -8,7 +8,8 @@ from jaxtyping import Array, Float
 from estimators.alpha import interpolate, inverse_variance_alpha
 from estimators.catalogue import PLUG_IN, PUBLISHED_TOLERANCE
 from estimators.cross_fitting import weigh_batches
-from estimators.statistics import finite_rows, summarise
+from estimators.rows import finite_rows
+from estimators.statistics import summarise
 from estimators.stepwise import node_variance
 from estimators.types import AlphaChoice, Evaluation, GradientEstimate, StepDifferentiation, pull_back
 from estimators.zeroth import zeroth_order

@@ -7,7 +7,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from estimators.pytree import register_pytree
-from estimators.statistics import centre, finite_rows
 from estimators.types import GradientEstimate
 
 ENOUGH_EFFECTIVE: Final = 3.0
@@ -46,14 +45,9 @@ def effective_samples(estimate: GradientEstimate) -> EffectiveSamples:
 
     Reference: Kish, "Survey Sampling", 1965, sec. 11.7, with q_i as weights.
     """
-    rows = estimate.per_sample
-    finite = finite_rows(rows)
-    squares = jnp.sum(centre(rows, finite)[1] ** 2, axis=1)
-    largest = jnp.max(jnp.where(finite, jnp.sum(rows**2, axis=1), 0.0))
-    varies = jnp.max(squares) > (8.0 * jnp.finfo(rows.dtype).eps) ** 2 * largest
-    share = squares / jnp.where(varies, jnp.sum(squares), 1.0)
-    count = jnp.where(varies, 1.0 / jnp.where(varies, jnp.sum(share**2), 1.0), 0.0)
+    found = estimate.samples.deviations()
+    count = jnp.where(found.varies, 1.0 / jnp.where(found.varies, found.concentration, 1.0), 0.0)
     undefined = estimate.num_finite < 2
     return EffectiveSamples(
-        jnp.where(undefined, jnp.nan, count), jnp.where(undefined | ~varies, jnp.nan, jnp.max(share))
+        jnp.where(undefined, jnp.nan, count), jnp.where(undefined | ~found.varies, jnp.nan, found.top)
     )

@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Final
 import jax
 from jaxtyping import Array, Float, Key
 
-from estimators.catalogue import Entry
+from estimators.catalogue import LEAVE_ONE_OUT, PLUG_IN, Entry
 from estimators.types import GradientEstimate, Objective
 
 
@@ -60,6 +60,7 @@ class Estimator(ABC):
         needs: Oracles in `ORACLES`, in the order in which `combine` takes their batches.
         gaussian: Whether the formula holds for Gaussian noise only.
         additive: Whether it holds for noise on theta itself only.
+        separable: Whether each row of `parts` depends on the batches' samples of that row alone.
     """
 
     name: ClassVar[str]
@@ -68,6 +69,7 @@ class Estimator(ABC):
     needs: ClassVar[tuple[str, ...]]
     gaussian: ClassVar[bool] = False
     additive: ClassVar[bool] = False
+    separable: ClassVar[bool] = False
 
     def __init_subclass__(cls, entry: Entry | None = None) -> None:
         """Take name, label, needs and description from an entry of the catalogue, where one is given."""
@@ -90,13 +92,36 @@ class Estimator(ABC):
         Raises:
             ValueError: A batch is missing, or batches differ in shape.
         """
+        return self.combine(*self.pick(batches))
+
+    def pick(self, batches: Batches) -> list[Any]:
+        """The batches that are needed, in the order of `needs`.
+
+        Raises:
+            ValueError: One is missing.
+        """
         for oracle in self.needs:
             if batches.get(oracle) is None:
                 method, phrase = ORACLES[oracle].method, ORACLES[oracle].phrase
                 raise ValueError(
                     f"{self.name!r} needs {phrase}; got none; pass what objective.{method} returns as {oracle!r}"
                 )
-        return self.combine(*(batches[oracle] for oracle in self.needs))
+        return [batches[oracle] for oracle in self.needs]
+
+    @property
+    def mergeable(self) -> bool:
+        """Whether a batch may come in blocks: `join` of the merged `parts` of all of them is the estimate."""
+        apart = getattr(self, "baseline", None) != LEAVE_ONE_OUT and getattr(self, "weights", PLUG_IN) == PLUG_IN
+        return self.separable and apart
+
+    def parts(self, *args: Any, **kwargs: Any) -> tuple[GradientEstimate, ...]:
+        """The estimates, one or two, that `join` makes the estimate of; arguments as of `combine`."""
+        return (self.combine(*args, **kwargs),)
+
+    def join(self, *args: Any, **kwargs: Any) -> GradientEstimate:
+        """The estimate from its parts, each an argument."""
+        (estimate,) = args
+        return estimate
 
     @classmethod
     def required(cls) -> tuple[str, ...]:

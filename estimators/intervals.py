@@ -5,7 +5,6 @@ from jax.scipy.special import ndtri
 from jaxtyping import Array, Float
 
 from estimators.effective import effective_samples
-from estimators.statistics import centre, finite_rows
 from estimators.types import GradientEstimate
 
 
@@ -35,19 +34,10 @@ def variance_interval(estimate: GradientEstimate, confidence: float) -> tuple[Fl
     """
     if not 0.0 < confidence < 1.0:
         raise ValueError(f"confidence must lie strictly between 0 and 1; got {confidence}; 0.95 is customary")
-    rows, variance = estimate.per_sample, estimate.variance
-    finite = finite_rows(rows)
-    count = jnp.sum(finite).astype(rows.dtype)
-    squared = jnp.sum(centre(rows, finite)[1] ** 2, axis=1)
-    total = jnp.sum(squared)
-    remaining = total - squared * (count / (count - 1.0))
-    rounding = 4.0 * jnp.sqrt(count) * jnp.finfo(rows.dtype).eps * total  # of a sum of `count` terms
-    exhausted = finite & (remaining <= rounding)
-    # The constant 1/(n-2) drops out of the deviation.
-    log_variance = jnp.log(jnp.where(finite & ~exhausted, remaining, 1.0))
-    deviation = jnp.where(finite, log_variance - jnp.sum(log_variance) / count, 0.0)
-    standard_error = jnp.sqrt((count - 1.0) / count * jnp.sum(deviation**2))
-    standard_error = jnp.where(jnp.any(exhausted), jnp.inf, standard_error)
+    variance, found = estimate.variance, estimate.samples.deviations()
+    count = estimate.samples.num_finite.astype(variance.dtype)
+    total = found.total
+    standard_error = jnp.sqrt(found.log_spread)  # the constant 1/(n-2) drops out of it
     freedom = jnp.maximum(effective_samples(estimate).count - 1.0, 2.0)
     half_width = student_quantile(0.5 + confidence / 2.0, freedom) * standard_error
 

@@ -7,10 +7,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from estimators.alpha import inverse_variance_alpha, weigh
+from estimators.alpha import inverse_variance_alpha
 from estimators.catalogue import PLUG_IN
 from estimators.cross_fitting import weigh_batches
-from estimators.statistics import finite_rows, summarise
+from estimators.rows import finite_rows, weigh
+from estimators.statistics import summarise
 from estimators.stepwise import control_scores, node_variance
 from estimators.types import AlphaChoice, GradientEstimate, Linearisation, pull_back
 

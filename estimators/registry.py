@@ -171,6 +171,8 @@ class _Interpolation(_Baselined):
 class ZerothOrder(_Baselined, entry=CATALOGUE["zobg"]):
     """See `estimators.zeroth_order`."""
 
+    separable = True
+
     def combine(self, evaluation: Evaluation) -> GradientEstimate:
         return zeroth_order(evaluation, self.baseline)
 
@@ -178,6 +180,8 @@ class ZerothOrder(_Baselined, entry=CATALOGUE["zobg"]):
 @register
 class Antithetic(_Baselined, entry=CATALOGUE["zobg_antithetic"]):
     """See `estimators.antithetic`."""
+
+    separable = True
 
     def combine(self, pair: tuple[Evaluation, Evaluation]) -> GradientEstimate:
         return antithetic(*pair, self.baseline)
@@ -187,6 +191,8 @@ class Antithetic(_Baselined, entry=CATALOGUE["zobg_antithetic"]):
 class CostToGo(_Baselined, entry=CATALOGUE["zobg_to_go"]):
     """See `estimators.cost_to_go`."""
 
+    separable = True
+
     def combine(self, steps: StepEvaluation) -> GradientEstimate:
         return cost_to_go(steps, self.baseline)
 
@@ -195,6 +201,8 @@ class CostToGo(_Baselined, entry=CATALOGUE["zobg_to_go"]):
 class AntitheticCostToGo(_Baselined, entry=CATALOGUE["zobg_to_go_antithetic"]):
     """See `estimators.antithetic_cost_to_go`."""
 
+    separable = True
+
     def combine(self, pair: tuple[StepEvaluation, StepEvaluation]) -> GradientEstimate:
         return antithetic_cost_to_go(*pair, self.baseline)
 
@@ -202,6 +210,8 @@ class AntitheticCostToGo(_Baselined, entry=CATALOGUE["zobg_to_go_antithetic"]):
 @register
 class FirstOrder(Estimator, entry=CATALOGUE["fobg"]):
     """See `estimators.first_order`."""
+
+    separable = True
 
     def combine(self, differentiation: Differentiation) -> GradientEstimate:
         return first_order(differentiation)
@@ -220,6 +230,8 @@ class ClippedFirstOrder(Estimator, entry=CATALOGUE["fobg_clipped"]):
     `max_norm` of a sample, > 0, [cost/param].
     """
 
+    separable = True
+
     max_norm: float
 
     def __post_init__(self) -> None:
@@ -237,6 +249,8 @@ class TruncatedFirstOrder(Estimator, entry=CATALOGUE["fobg_truncated"]):
     `window` of steps between cuts of the adjoint, >= 1.
     """
 
+    separable = True
+
     window: int
 
     def __post_init__(self) -> None:
@@ -250,19 +264,32 @@ class TruncatedFirstOrder(Estimator, entry=CATALOGUE["fobg_truncated"]):
 class _OneWeight(_Interpolation):
     """Base of those with one weight for two whole batches."""
 
+    separable = True
+
     @abstractmethod
     def choose(self, zeroth: GradientEstimate, first: GradientEstimate) -> AlphaChoice:
         """The weight."""
 
     def combine(self, evaluation: Evaluation, differentiation: Differentiation) -> GradientEstimate:
-        def choose(evaluation: Evaluation, differentiation: Differentiation) -> AlphaChoice:
-            return self.choose(zeroth_order(evaluation, self.baseline), first_order(differentiation))
+        def choose(*batches: Any) -> AlphaChoice:
+            return self.choose(*self.parts(*batches))
 
-        def mix(choice: AlphaChoice, evaluation: Evaluation, differentiation: Differentiation) -> GradientEstimate:
-            mixed = interpolate(zeroth_order(evaluation, self.baseline), first_order(differentiation), choice.alpha)
-            return replace(mixed, alpha=choice)
+        def mix(choice: AlphaChoice, *batches: Any) -> GradientEstimate:
+            return _mixed(choice, *self.parts(*batches))
 
         return weigh_batches(choose, mix, (evaluation, differentiation), self.weights)
+
+    def parts(
+        self, evaluation: Evaluation, differentiation: Differentiation
+    ) -> tuple[GradientEstimate, GradientEstimate]:
+        return zeroth_order(evaluation, self.baseline), first_order(differentiation)
+
+    def join(self, zeroth: GradientEstimate, first: GradientEstimate) -> GradientEstimate:
+        return _mixed(self.choose(zeroth, first), zeroth, first)
+
+
+def _mixed(choice: AlphaChoice, zeroth: GradientEstimate, first: GradientEstimate) -> GradientEstimate:
+    return replace(interpolate(zeroth, first, choice.alpha), alpha=choice)
 
 
 @register

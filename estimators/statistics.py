@@ -3,13 +3,12 @@
 from collections.abc import Sequence
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+import numpy as np
+from jaxtyping import Array, Float
 
+from estimators.blocks import Merged, Parts
+from estimators.rows import Rows, centre, finite_rows
 from estimators.types import GradientEstimate
-
-
-def finite_rows(per_sample: Float[Array, "samples params"]) -> Bool[Array, " samples"]:
-    return jnp.all(jnp.isfinite(per_sample), axis=1)
 
 
 def summarise(per_sample: Float[Array, "samples params"]) -> GradientEstimate:
@@ -35,7 +34,7 @@ def summarise(per_sample: Float[Array, "samples params"]) -> GradientEstimate:
     count = num_finite.astype(per_sample.dtype)
     spread = jnp.where(count > 1, jnp.sum(centred**2, axis=0) / jnp.maximum(count - 1.0, 1.0), jnp.nan)
     return GradientEstimate(
-        per_sample=per_sample,
+        samples=Rows(per_sample),
         mean=mean,
         variance=jnp.sum(spread),
         standard_error=jnp.sqrt(spread / count),
@@ -58,16 +57,30 @@ def norm_quantiles(estimate: GradientEstimate, probabilities: Sequence[float]) -
     """
     if not all(0.0 <= probability <= 1.0 for probability in probabilities):
         raise ValueError(f"probabilities must lie in [0, 1]; got {list(probabilities)}; a median is 0.5")
-    rows = estimate.per_sample
-    norms = jnp.where(finite_rows(rows), jnp.linalg.norm(rows, axis=1), jnp.nan)
-    return jnp.nanquantile(norms, jnp.asarray(probabilities, rows.dtype))
+    return estimate.samples.norm_quantiles(probabilities)
 
 
-def centre(
-    rows: Float[Array, "samples params"], finite: Bool[Array, " samples"]
-) -> tuple[Float[Array, " params"], Float[Array, "samples params"]]:
-    """The mean of the finite rows, and the rows less it; refined once, so that equal rows centre to zero."""
-    count = jnp.sum(finite).astype(rows.dtype)
-    mean = jnp.sum(jnp.where(finite[:, None], rows, 0.0), axis=0) / count
-    mean = mean + jnp.sum(jnp.where(finite[:, None], rows - mean[None, :], 0.0), axis=0) / count
-    return mean, jnp.where(finite[:, None], rows - mean[None, :], 0.0)
+def merged_estimates(parts: Parts, size: int) -> list[GradientEstimate]:
+    """The estimates of one batch, or of two, from the moments of their samples.
+
+    Args:
+        parts: The moments, of all blocks.
+        size: Samples of each batch, those that are not finite included.
+    """
+    batches = len(parts) if len(parts) == 1 else len(parts) - 1
+    estimates = []
+    for index in range(batches):
+        samples = Merged(parts, tuple(float(index == each) for each in range(batches)), size)
+        count = float(samples.num_finite)
+        spread = np.diag(samples.covariance) / (count - 1) if count > 1 else np.full(samples.shape[1], np.nan)
+        mean = samples.mean if count > 0 else np.full(samples.shape[1], np.nan)
+        estimates.append(
+            GradientEstimate(
+                samples=samples,
+                mean=jnp.asarray(mean),
+                variance=jnp.sum(jnp.asarray(spread)),
+                standard_error=jnp.sqrt(jnp.asarray(spread) / count),
+                num_finite=samples.num_finite,
+            )
+        )
+    return estimates

@@ -10,7 +10,8 @@ from estimators.alpha import inverse_variance_alpha
 from estimators.baselines import find_baseline
 from estimators.catalogue import PLUG_IN
 from estimators.cross_fitting import weigh_batches
-from estimators.statistics import finite_rows, summarise
+from estimators.rows import Rows, finite_rows
+from estimators.statistics import summarise
 from estimators.types import AlphaChoice, Evaluation, GradientEstimate, StepDifferentiation, StepEvaluation, pull_back
 
 Controls = Float[Array, "samples steps controls"]
@@ -112,13 +113,13 @@ def stepwise_inverse_variance(
 
 def sum_independent(one: GradientEstimate, other: GradientEstimate) -> GradientEstimate:
     """The sum of two estimates from independent batches of the same size; row i of one is paired with row i."""
-    per_sample = one.per_sample + other.per_sample
+    samples = Rows(one.per_sample + other.per_sample)
     return GradientEstimate(
-        per_sample=per_sample,
+        samples=samples,
         mean=one.mean + other.mean,
         variance=one.variance + other.variance,
         standard_error=jnp.hypot(one.standard_error, other.standard_error),
-        num_finite=jnp.sum(finite_rows(per_sample)),
+        num_finite=samples.num_finite,
     )
 
 

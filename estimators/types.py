@@ -6,7 +6,9 @@ from typing import Protocol, runtime_checkable
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key
 
+from estimators.blocks import Merged
 from estimators.pytree import register_pytree
+from estimators.rows import Rows
 
 
 @register_pytree
@@ -214,8 +216,8 @@ class GradientEstimate:
     """A gradient estimate with the samples it was made of.
 
     Attributes:
-        per_sample: g_i, [cost/param]. Rows that are not finite stay as they came; the summary leaves them
-            out.
+        samples: g_i, [cost/param], as rows, or merged from blocks that are not kept. Rows that are not finite stay as
+            they came; the summary leaves them out.
         mean: gbar, [cost/param].
         variance: sigmahat^2 = 1/(n-1) sum_i ||g_i - gbar||^2, the trace of the sample covariance,
             [cost^2/param^2].
@@ -226,7 +228,7 @@ class GradientEstimate:
     Reference: Suh et al. 2022, def. of empirical variance.
     """
 
-    per_sample: Float[Array, "samples params"]
+    samples: Rows | Merged
     mean: Float[Array, " params"]
     variance: Float[Array, ""]
     standard_error: Float[Array, " params"]
@@ -236,4 +238,13 @@ class GradientEstimate:
     @property
     def num_nonfinite(self) -> Int[Array, "..."]:
         """The number of rows that were left out."""
-        return self.per_sample.shape[-2] - self.num_finite
+        return self.samples.shape[-2] - self.num_finite
+
+    @property
+    def per_sample(self) -> Float[Array, "*batch samples params"]:
+        """g_i as rows.
+
+        Raises:
+            ValueError: The estimate was merged from blocks.
+        """
+        return self.samples.rows

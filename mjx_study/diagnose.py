@@ -28,9 +28,9 @@ from mjx_study.simulation.engine import engine_model
 from mjx_study.study.configuration import Progress
 from mjx_study.study.dataset import as_plain
 from mjx_study.study.findings import NARROW, NOTABLE, SHARE_OFF
-from mjx_study.study.gradients import onset_numbers
 from mjx_study.study.memory import check_memory
 from mjx_study.study.sampling import cell_keys, draw_batches, unconverged
+from mjx_study.study.tally import onset_numbers
 from mjx_study.study.variables import ONSETS
 from mjx_study.table import format_table
 from mjx_study.tasks.contact_grid import ContactPoint, contact_grid

@@ -271,6 +271,7 @@ OPTIONS: Final[dict[str, Option]] = {
         _number("reference_samples", int, "[3, " + MOST_SAMPLES, "N", "pairs of rollouts for each reference"),
         _number("evaluation_samples", int, "[2, " + MOST_SAMPLES, "N", "rollouts for the cost of a final policy"),
         _number("chunk_size", int, "[1, " + MOST_SAMPLES, "N", "samples per device and call", unset="by the samples"),
+        _number("block_size", int, "[2, " + MOST_SAMPLES, "N", "samples held at once", unset="all, if they fit"),
         _number("confidence", float, "(0, 1)", "P", "confidence level of the intervals"),
         _number("seeds", int, "[1, 100000]", "N", "number of batches, or of descents"),
         _number("iterations", int, "[1, 10000000]", "N", "iterations of the optimiser", unset=TASKS),

@@ -4,6 +4,7 @@ import argparse
 import dataclasses
 import json
 import os
+import re
 import signal
 import sys
 import threading
@@ -171,6 +172,24 @@ def add_process_options(command: argparse.ArgumentParser, seed: int | None = 0) 
     add_option(command, OPTIONS["seed"], 0, given=seed is not None)
     command.add_argument("--precision", choices=PRECISIONS, default="float64", help="default: float64")
     add_option(command, OPTIONS["devices"])
+
+
+def add_cluster_option(command: argparse.ArgumentParser) -> None:
+
+    def cluster(text: str) -> str:
+        """A cluster, as `mjx_study.study.cluster.connected` takes it."""
+        if not re.fullmatch(r"(local|slurm)(:[1-9]\d{0,4})?|(tcp|tls|ws|wss|ucx)://\S+", text):
+            raise argparse.ArgumentTypeError(
+                f"must be local:N, slurm:N or an address such as tcp://host:8786, got {text!r}"
+            )
+        return text
+
+    command.add_argument(
+        "--cluster",
+        type=cluster,
+        metavar="WHERE",
+        help="compute on Dask's workers: local:N processes, slurm:N workers, or a scheduler's tcp://host:port",
+    )
 
 
 def add_study_options(command: argparse.ArgumentParser) -> None:

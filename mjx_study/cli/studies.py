@@ -4,6 +4,7 @@ import argparse
 import dataclasses
 import json
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from mjx_study.cli.options import UsageError, attempt, computing, configure_proc
 from mjx_study.cli.parameters import theta_of
 from mjx_study.plots.study import plot_study
 from mjx_study.plots.style import save_figures
+from mjx_study.study.cluster import connected
 from mjx_study.study.configuration import StudyConfig
 from mjx_study.study.dataset import as_plain
 from mjx_study.study.forecast import forecast
@@ -83,13 +85,19 @@ def _compute(plan: StudyPlan, options: argparse.Namespace) -> tuple[xr.Dataset, 
         UsageError: the folder holds another study, or a damaged one, or cannot be used.
     """
     if options.output is None:
+        if getattr(options, "cluster", None) is not None:
+            raise UsageError("--cluster needs a folder for the study: give --output")
         with computing() as progress:
             return run_study(plan, progress=progress), None
     try:
         with usage_errors():
             store = open_store(plan, options.output, options.command_line, accept_versions=options.accept_versions)
-        with computing(RESUMABLE) as progress:
-            dataset = run_study(plan, store, progress, keep_going=True)
+        with ExitStack() as stack:
+            if (cluster := getattr(options, "cluster", None)) is not None:
+                with usage_errors():
+                    cluster = stack.enter_context(connected(cluster))
+            progress = stack.enter_context(computing(RESUMABLE))
+            dataset = run_study(plan, store, progress, keep_going=True, cluster=cluster)
     except StudyError as error:
         raise UsageError(str(error)) from error
     reason = dataset.attrs.pop("unwritten", None)

@@ -1,32 +1,51 @@
-"""The computation of a cell, by kind of study: from a plan to a function of its cells."""
+"""The computation of a study's cells, whole or in blocks, by kind of study."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, Final
 
 import numpy as np
 
 from mjx_study.stopwatch import timed
+from mjx_study.study.blocks import Arrays, Blocks
 from mjx_study.study.descents import compute_descents
-from mjx_study.study.gradients import compute_gradients
+from mjx_study.study.gradients import Gradients, compute_gradients
 from mjx_study.study.landscapes import compute_landscapes
 from mjx_study.study.plan import StudyCell, StudyPlan
 from mjx_study.study.store import Part
 from mjx_study.study.work import rest
 
-COMPUTE: Final[dict[str | None, Callable[[StudyPlan], Callable[..., dict[str, np.ndarray]]]]] = {
+COMPUTE: Final[dict[str | None, Callable[[StudyPlan], Callable[..., Arrays]]]] = {
     "gradients": compute_gradients,
     "descents": compute_descents,
     "landscapes": compute_landscapes,
 }
 
 
-def compute_cells(plan: StudyPlan) -> Callable[[StudyCell, Part], dict[str, np.ndarray]]:
-    """A function that computes a cell, of descents from its checkpoint on; it keeps what is compiled."""
-    compute = COMPUTE[plan.config.kind](plan)
+class Computation:
+    """A function that computes a plan's cells; it keeps what is compiled."""
 
-    def computed(cell: StudyCell, part: Part) -> dict[str, np.ndarray]:
-        further: Any = (part,) if plan.config.kind == "descents" else ()
-        with timed(rest(plan, cell)):
-            return compute(cell, *further)
+    def __init__(self, plan: StudyPlan):
+        self._plan, self._compute = plan, COMPUTE[plan.config.kind](plan)
 
-    return computed
+    def __call__(self, cell: StudyCell, part: Part) -> Arrays:
+        """A cell, from its checkpoint on, unless it is a landscape."""
+        further: Any = () if self._plan.config.kind == "landscapes" else (part,)
+        with timed(rest(self._plan, cell)):
+            return self._compute(cell, *further)
+
+    def begun(self, cell: StudyCell, kept: Mapping[str, np.ndarray]) -> Blocks:
+        """The blocks of a cell that is several tasks, those of a checkpoint done."""
+        return self._in_blocks.begun(cell, kept)
+
+    def block(self, cell: StudyCell, task: int) -> Arrays:
+        """One of these tasks."""
+        return self._in_blocks.block(cell, task)
+
+    def merged(self, cell: StudyCell, blocks: Blocks) -> Arrays:
+        """The cell, when all of them are done."""
+        return self._in_blocks.merged(cell, blocks)
+
+    @property
+    def _in_blocks(self) -> Gradients:
+        assert isinstance(self._compute, Gradients), "only gradients come in blocks"
+        return self._compute

@@ -1,8 +1,9 @@
 """Cells of a study on many machines, by Dask: workers compute cells and return arrays, the client alone writes.
 
-A worker has one cell at a time, and the next when the client has the arrays of the last, so that a worker that dies
-takes one cell with it, and that cell is known. Workers keep what they compiled, by the content of the study, and a cell
-goes to a worker that has its program if there is one.
+A worker has one task at a time, a cell or a block of a cell whose batches come in blocks, and the next when the client
+has the arrays of the last, so that a worker that dies takes one task with it, and that task is known. Workers keep what
+they compiled, by the content of the study, and a task goes to a worker that has its program if there is one. Blocks are
+merged by the client.
 """
 
 import functools
@@ -24,9 +25,9 @@ import numpy as np
 
 from mjx_study.runtime import available_cores, configure, precision
 from mjx_study.stopwatch import Stopwatch
-from mjx_study.study.cells import compute_cells
+from mjx_study.study.cells import Computation
 from mjx_study.study.identity import differences, plan_contents, versions
-from mjx_study.study.plan import StudyPlan, plan_study
+from mjx_study.study.plan import StudyPlan, blocks_of, plan_study
 from mjx_study.study.store import Part, StudyError
 from mjx_study.study.times import recording
 
@@ -39,6 +40,8 @@ POLL_SECONDS: Final = 1.0
 GPUS: Final = "/dev/nvidia[0-9]*"
 _ONE_AT_A_TIME, _SET_UP = threading.Lock(), threading.Event()
 Arrays = dict[str, np.ndarray]
+Task = tuple[int, int | None]
+"""Index of a cell, and the number of one of its blocks."""
 
 
 class WorkerRefusedError(Exception):
@@ -93,12 +96,12 @@ def _connect(cluster: str, stack: ExitStack) -> Any:
 
 
 def cells_on(
-    client: Any, plan: StudyPlan, kept: Mapping[int, Mapping[str, np.ndarray]], told: Callable[[int], None]
+    client: Any, plan: StudyPlan, parts: Mapping[int, Part], told: Callable[[int], None]
 ) -> Generator[tuple[int, Arrays | str]]:
     """Compute cells on the workers that a cluster has, while they come and go.
 
     Args:
-        kept: the cells to compute, by index, each with the arrays of its checkpoint.
+        parts: the cells to compute, by index, each with its checkpoint, to which blocks are added.
         told: called with the number of workers when it changes.
 
     Yields:
@@ -108,21 +111,25 @@ def cells_on(
         StudyError: a worker has other versions, or the scheduler is lost.
     """
     study = _packed(plan)
-    waiting: dict[Any, deque[int]] = defaultdict(deque)
+    compute = Computation(plan)
+    begun = {index: compute.begun(plan.cells[index], parts[index].kept) for index in parts if in_blocks(plan, index)}
+    waiting: dict[Any, deque[Task]] = defaultdict(deque)
     has: dict[Any, set[str]] = defaultdict(set)  # which workers have a program
-    at: dict[Any, tuple[int, str]] = {}  # by future, its cell and worker
+    at: dict[Any, tuple[Task, str]] = {}  # by future, its task and worker
     ended: queue.SimpleQueue[Any] = queue.SimpleQueue()
-    tries: Counter[int] = Counter()
+    tries: Counter[Task] = Counter()
 
-    def wait(index: int) -> None:
-        waiting[plan.program_of(plan.cells[index])].append(index)
+    def queue_of(task: Task) -> deque[Task]:
+        return waiting[plan.program_of(plan.cells[task[0]])]
 
     def begin(worker: str) -> None:
         for program in _program_for(worker, waiting, has):
-            index = waiting[program].popleft()
+            task = waiting[program].popleft()
             has[program].add(worker)
-            future = client.submit(_compute, study, index, dict(kept[index]), workers=[worker], pure=False)
-            at[future] = index, worker
+            index, block = task
+            kept = dict(parts[index].kept) if block is None else {}
+            future = client.submit(_compute, study, index, kept, block, workers=[worker], pure=False)
+            at[future] = task, worker
             future.add_done_callback(fetch)
 
     def fetch(future: Any) -> None:
@@ -133,16 +140,44 @@ def cells_on(
             outcome = error
         ended.put((future, outcome))
 
-    def tried(index: int, reason: str) -> Generator[tuple[int, str]]:
-        """The failure of a cell, if that was its last try."""
-        tries[index] += 1
-        if tries[index] < TRIES:
-            wait(index)
-        else:
+    def tried(task: Task, reason: str) -> Generator[tuple[int, str]]:
+        """The failure of a cell, if that was the last try of it or of one of its blocks."""
+        index, block = task
+        if block is not None and index not in begun:
+            return  # another of its blocks has failed for good
+        tries[task] += 1
+        if tries[task] >= TRIES:
+            if block is not None:
+                del begun[index]
+                tasks = queue_of(task)
+                rest = [other for other in tasks if other[0] != index]
+                tasks.clear()
+                tasks.extend(rest)
             yield index, reason
+        elif block is None:
+            queue_of(task).append(task)
+        else:
+            queue_of(task).appendleft(task)  # others wait for it to be merged
 
-    for index in kept:
-        wait(index)
+    def ended_with(task: Task, arrays: Arrays) -> Generator[tuple[int, Arrays]]:
+        """The arrays of a cell, if that was its last task."""
+        index, block = task
+        if block is None:
+            yield index, arrays
+        elif index in begun:
+            blocks = begun[index]
+            blocks.add(block, arrays)
+            parts[index].save(blocks.arrays())
+            left = len(blocks.missing)
+            parts[index].report(blocks.tasks - left, blocks.tasks, f"{plan.label(plan.cells[index])}, in blocks")
+            if not left:
+                yield index, compute.merged(plan.cells[index], begun.pop(index))
+
+    for index in parts:
+        tasks = begun[index].missing if index in begun else [None]
+        queue_of((index, None)).extend((index, task) for task in tasks)
+    for index in [index for index, blocks in begun.items() if not blocks.missing]:
+        yield index, compute.merged(plan.cells[index], begun.pop(index))
     looked, count = -math.inf, -1
     try:
         while at or any(waiting.values()):
@@ -150,11 +185,11 @@ def cells_on(
                 workers, looked = set(client.nthreads()), time.monotonic()
                 for holders in has.values():
                     holders &= workers
-                for future, (index, worker) in list(at.items()):
+                for future, (task, worker) in list(at.items()):
                     if worker not in workers:
                         del at[future]
                         future.cancel()
-                        yield from tried(index, f"lost its worker {TRIES} times (killed, crashed or out of memory)")
+                        yield from tried(task, f"lost its worker {TRIES} times (killed, crashed or out of memory)")
                 for worker in workers - {worker for _, worker in at.values()}:
                     begin(worker)
                 if len(workers) != count:
@@ -164,14 +199,14 @@ def cells_on(
                 future, outcome = ended.get(timeout=POLL_SECONDS)
                 if future not in at:
                     continue
-                index, worker = at.pop(future)
+                task, worker = at.pop(future)
                 if isinstance(outcome, WorkerRefusedError):
                     raise StudyError(str(outcome)) from outcome
                 begin(worker)
                 if isinstance(outcome, BaseException):
-                    yield from tried(index, f"{type(outcome).__name__}: {outcome}".partition("\n")[0])
+                    yield from tried(task, f"{type(outcome).__name__}: {outcome}".partition("\n")[0])
                 else:
-                    yield index, outcome
+                    yield from ended_with(task, outcome)
     except OSError as error:
         raise StudyError(f"lost the scheduler ({error}); the same command goes on") from error
     finally:
@@ -179,7 +214,12 @@ def cells_on(
             client.cancel(list(at))
 
 
-def _program_for(worker: str, waiting: Mapping[Any, deque[int]], has: Mapping[Any, set[str]]) -> list[Any]:
+def in_blocks(plan: StudyPlan, index: int) -> bool:
+    """Whether a cell is several tasks."""
+    return blocks_of(plan, plan.cells[index]) > 0
+
+
+def _program_for(worker: str, waiting: Mapping[Any, deque[Any]], has: Mapping[Any, set[str]]) -> list[Any]:
     """The program of the next cell of a worker; none where those that have one will be sooner.
 
     One that it has, otherwise that with the most cells for each worker that has it.
@@ -197,15 +237,16 @@ def _packed(plan: StudyPlan) -> bytes:
     return cloudpickle.dumps((plan.config, plan.chunk_size, precision(), versions(), plan_contents(plan)))
 
 
-def _compute(study: bytes, index: int, kept: Arrays) -> Arrays:
+def _compute(study: bytes, index: int, kept: Arrays, block: int | None) -> Arrays:
     with _ONE_AT_A_TIME:
         plan, compute, watch = _prepared(study)
+        cell = plan.cells[index]
         with recording(watch):
-            return compute(plan.cells[index], Part(kept))
+            return compute(cell, Part(kept)) if block is None else compute.block(cell, block)
 
 
 @functools.lru_cache(maxsize=4)
-def _prepared(study: bytes) -> tuple[StudyPlan, Callable[..., Arrays], Stopwatch]:
+def _prepared(study: bytes) -> tuple[StudyPlan, Computation, Stopwatch]:
     """The plan, what computes its cells, compiled programs included, and the times of these, on a worker.
 
     Raises:
@@ -221,7 +262,7 @@ def _prepared(study: bytes) -> tuple[StudyPlan, Callable[..., Arrays], Stopwatch
 
         raise WorkerRefusedError(f"the worker {get_worker().address} is refused: {told} ('there' is the client)")
     plan = plan.with_chunk(chunk)
-    return plan, compute_cells(plan), Stopwatch()
+    return plan, Computation(plan), Stopwatch()
 
 
 def _set_up(asked: str) -> None:

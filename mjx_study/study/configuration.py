@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 Progress = Callable[[int, int, str], None]
 """Called with (work done, total work, what is being computed)."""
 OF_KIND: Final[dict[str, dict[str, Any]]] = {
-    "gradients": {"reference_samples": 600},
+    "gradients": {"reference_samples": 600, "block_size": None},
     "descents": {
         "iterations": None,
         "optimizer": "sgd",
@@ -88,6 +88,8 @@ class StudyConfig(Checked):
         horizon: steps; None for each task's.
         model: an MJCF that replaces the task's own; None for the task's.
         chunk_size: samples per device and call; None to choose by the number of samples.
+        block_size: samples that are held at once in studies of gradients; larger batches come in blocks whose
+            statistics are merged. None for whole batches where these fit into the limit of memory.
     """
 
     ranges: ClassVar = {"samples": "[3, 1e7]"}
@@ -138,6 +140,7 @@ class StudyConfig(Checked):
     horizon: int | None = None
     model: str | None = None
     chunk_size: int | None = None
+    block_size: int | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()

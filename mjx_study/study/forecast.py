@@ -10,7 +10,7 @@ import jax
 
 from mjx_study.runtime import available_cores
 from mjx_study.study.gradients import MOST_KEPT
-from mjx_study.study.plan import StudyCell, StudyPlan, estimators_of
+from mjx_study.study.plan import StudyCell, StudyPlan, blocks_of, estimators_of
 from mjx_study.study.run import begun_store
 from mjx_study.study.times import BASES, READING, Program, Rates, times_folder
 from mjx_study.study.variables import VARIABLES
@@ -101,7 +101,8 @@ def forecast(
     if cluster is None:
         spent = sum((time.cell(plan, cell, devices) for cell in cells), 0.0)
     else:
-        spent = _side_by_side((time.cell(plan, cell, 1) for cell in cells), devices)
+        tasks = ((time.cell(plan, cell, 1), 1 + blocks_of(plan, cell) * plan.config.batches) for cell in cells)
+        spent = _side_by_side((seconds / count for seconds, count in tasks for _ in range(count)), devices)
     return Forecast(
         cells=len(plan.cells),
         computed=len(plan.cells) - len(cells),

@@ -5,7 +5,8 @@ interpolated estimates combine the two. The same keys are used in every cell, so
 not sampling noise.
 """
 
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any, Final
 
@@ -15,107 +16,163 @@ import numpy as np
 from jaxtyping import Array, Float, Key
 
 import estimators
-from estimators import ORACLES, Estimator, Evaluation, GradientEstimate
+from estimators import ORACLES, Batches, Estimator, Evaluation, GradientEstimate
+from estimators.blocks import THINNED, moments_of
+from estimators.statistics import merged_estimates
 from mjx_study.objective import MjxObjective, Simulator
 from mjx_study.reference import Reference
-from mjx_study.runtime import precision
-from mjx_study.study.memory import BIAS_DRAWS
-from mjx_study.study.plan import StudyCell, StudyPlan, estimators_of, oracles_of, seeds_together
+from mjx_study.study.blocks import REFERENCE, Arrays, Blocks, pack
+from mjx_study.study.memory import BIAS_DRAWS, LARGEST_BATCH
+from mjx_study.study.plan import StudyCell, StudyPlan, block_of, blocks_of, estimators_of, oracles_of, seeds_together
 from mjx_study.study.reference_gradient import reference_gradient
-from mjx_study.study.sampling import Objectives, cell_keys, draw_batches, unconverged
+from mjx_study.study.sampling import Objectives, cell_keys, draw_batches, sample_keys
+from mjx_study.study.store import Part
+from mjx_study.study.tally import Tally, numbers_of, together
 from mjx_study.study.variables import BATCH, GRADIENTS, ONSETS
 from mjx_study.tasks.contact_grid import contact_grid
 from mjx_study.tasks.task import Task
 
 CANDIDATES: Final = 100
 """First-order samples whose median is a candidate for the reference's control variate."""
+PILOT: Final = LARGEST_BATCH
+"""Most samples of the first batch that pick among the candidates."""
 MOST_KEPT: Final = 1_000_000
 """Most numbers in a cell's mean gradients; larger ones are not kept."""
 
 
-def compute_gradients(plan: StudyPlan) -> Callable[[StudyCell], dict[str, np.ndarray]]:
-    """A function that computes cells and keeps compiled programs between them."""
-    config, oracles, objectives = plan.config, oracles_of(plan.config), Objectives(plan)
-    warm: set[Any] = {None}
-    soft: dict[tuple[int, float], Array | None] = {}
+def compute_gradients(plan: StudyPlan) -> "Gradients":
+    """What computes cells, whole or in blocks, and keeps compiled programs between them."""
+    return Gradients(plan)
 
-    def compute(cell: StudyCell) -> dict[str, np.ndarray]:
-        objective, task = objectives(cell), plan.groups[cell.group].task
-        theta = task.theta
-        # so that no cell's time holds a compilation
-        if (program := plan.program_of(cell)) not in warm:
-            for name in dict.fromkeys([*oracles, "differentiation"]):  # the reference's control variate needs it
-                getattr(objective, ORACLES[name].method)(theta, jax.random.split(jax.random.key(0), 1))
-            warm.add(program)
-        keys = cell_keys(config.seed, config.batches)
-        odd, candidate = (
-            jax.random.split(stream, size)
-            for stream, size in zip(keys["reference"], (config.reference_samples or 0, CANDIDATES), strict=True)
-        )
-        softened = cell.group, cell.sigma
-        if softened not in soft and not cell.model.analytic:
-            soft[softened] = soft_gradient(objectives.simulator(cell.group), cell.sigma, candidate)
-        tests, chosen = jax.random.split(keys["test"], config.batches), estimators_of(plan, cell)
-        together = seeds_together(plan, cell)
-        reference, parts, spent, residuals, events = None, [], [], [], []
+
+class Gradients:
+    """The cells of a plan, each an argument."""
+
+    def __init__(self, plan: StudyPlan):
+        self._plan, self._config, self._objectives = plan, plan.config, Objectives(plan)
+        self._warm: set[Any] = {None}
+        self._soft: dict[tuple[int, float], Array | None] = {}
+
+    @property
+    def _keys(self) -> dict[str, Any]:
+        return cell_keys(self._config.seed, self._config.batches)
+
+    def __call__(self, cell: StudyCell, part: Part = Part()) -> Arrays:  # noqa: B008, it is empty
+        """A cell's numbers, from whole batches or from blocks, of which the checkpoint has those that are done."""
+        if not blocks_of(self._plan, cell):
+            return self._whole(cell)
+        blocks = self.begun(cell, part.kept)
+        for task in blocks.missing:
+            part.report(task, blocks.tasks, f"{self._plan.label(cell)}, in blocks")
+            blocks.add(task, self.block(cell, task))
+            part.save(blocks.arrays())
+        return self.merged(cell, blocks)
+
+    def begun(self, cell: StudyCell, kept: Mapping[str, np.ndarray]) -> Blocks:
+        """The blocks of a cell, those of a checkpoint done."""
+        return Blocks(self._config.batches, blocks_of(self._plan, cell), kept)
+
+    def block(self, cell: StudyCell, task: int) -> Arrays:
+        """The arrays of one of the tasks of `Blocks`: the reference's samples, or the summary of a block."""
+        objective, task_of = self._objective(cell), self._plan.groups[cell.group].task
+        if task == REFERENCE:
+            keys = sample_keys(self._keys["order"][0][0], 0, min(cell.samples, PILOT))
+            pilot = objective.evaluate(task_of.theta, keys)
+            return {"reference": np.asarray(self._reference(cell, objective, pilot).per_sample)}
+        chosen, size = estimators_of(self._plan, cell), block_of(self._plan, cell)
+        seed, place = self.begun(cell, {}).place(task)
+        first, every = place * size, math.ceil(cell.samples / THINNED)
+        count, oracles = min(size, cell.samples - first), estimators.oracles_of(chosen)
+        some = slice(seed, seed + 1)
+        drawn, seconds, residuals = draw_batches(objective, task_of.theta, self._keys, oracles, count, some, first)
+        batches = jax.tree.map(lambda leaf: leaf[0], drawn)
+        summary: dict[str, Any] = {name: Tally.of(drawn[name], seconds[name], residuals[name]) for name in oracles}
+        for index, rows in enumerate(jax.device_get(_rows_of_parts(batches, chosen))):
+            summary |= {f"{index}.{part}": each for part, each in enumerate(moments_of(rows, first, every))}
+        return pack(summary)
+
+    def merged(self, cell: StudyCell, blocks: Blocks) -> Arrays:
+        """A cell's numbers from its blocks, all of which are done."""
+        chosen, reference = estimators_of(self._plan, cell), estimators.summarise(jnp.asarray(blocks.reference))
+        tests, parts, tallies = jax.random.split(self._keys["test"], blocks.seeds), [], []
+        for seed in range(blocks.seeds):
+            summary = blocks.whole(seed)
+            estimates = []
+            for index, estimator in enumerate(chosen):
+                found = [each for name, each in summary.items() if name.startswith(f"{index}.")]
+                estimates.append(estimator.join(*merged_estimates(tuple(found), cell.samples)))
+            parts.append(jax.device_get(estimate_numbers(estimates, reference, tests[seed], self._config.confidence)))
+            tallies.append({name: each for name, each in summary.items() if name in estimators.ORACLES})
+        return self._numbers(cell, jax.tree.map(lambda *leaves: np.stack(leaves), *parts), reference, tallies)
+
+    def _whole(self, cell: StudyCell) -> Arrays:
+        config, oracles, keys = self._config, oracles_of(self._config), self._keys
+        objective, theta = self._objective(cell), self._plan.groups[cell.group].task.theta
+        tests, chosen = jax.random.split(keys["test"], config.batches), estimators_of(self._plan, cell)
+        together = seeds_together(self._plan, cell)
+        reference, parts, tallies = None, [], []
         for start in range(0, config.batches, together):
             some = slice(start, start + together)
-            drawn, seconds, residual = draw_batches(objective, theta, keys, oracles, cell.samples, some)
+            drawn, seconds, residuals = draw_batches(objective, theta, keys, oracles, cell.samples, some)
             if reference is None:
-                pilot = jax.tree.map(lambda leaf: leaf[0], drawn["evaluation"])
-                reference = reference_of(task, objective, odd, candidate, pilot, soft.get(softened))
+                pilot = jax.tree.map(lambda leaf: leaf[0, :PILOT], drawn["evaluation"])
+                reference = self._reference(cell, objective, pilot)
             numbers = _seed_numbers(drawn, reference, tests[some], chosen, config.confidence)
             parts.append(jax.device_get(numbers))
-            spent.append(seconds)
-            residuals.append(residual)
-            events.append({name: _events(batch) for name, batch in drawn.items()})
+            tallies.append({name: Tally.of(drawn[name], seconds[name], residuals[name]) for name in oracles})
         assert reference is not None
-        numbers = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
-        arrays = _of_seeds(numbers, config.batches) | _bias(numbers, reference)
-        arrays |= _of_batches(chosen, spent, residuals, events, cell.samples * config.batches)
+        return self._numbers(cell, jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts), reference, tallies)
+
+    def _objective(self, cell: StudyCell) -> MjxObjective | Reference:
+        """The objective of a cell, its programs compiled, so that no time holds a compilation."""
+        objective, theta = self._objectives(cell), self._plan.groups[cell.group].task.theta
+        if (program := self._plan.program_of(cell)) not in self._warm:
+            for name in dict.fromkeys([*oracles_of(self._config), "differentiation"]):  # the control variate needs it
+                getattr(objective, ORACLES[name].method)(theta, jax.random.split(jax.random.key(0), 1))
+            self._warm.add(program)
+        return objective
+
+    def _reference(self, cell: StudyCell, objective: MjxObjective | Reference, pilot: Evaluation) -> GradientEstimate:
+        odd, candidate = (
+            jax.random.split(stream, size)
+            for stream, size in zip(
+                self._keys["reference"], (self._config.reference_samples or 0, CANDIDATES), strict=True
+            )
+        )
+        softened = cell.group, cell.sigma
+        if softened not in self._soft and not cell.model.analytic:
+            self._soft[softened] = soft_gradient(self._objectives.simulator(cell.group), cell.sigma, candidate)
+        task = self._plan.groups[cell.group].task
+        return reference_of(task, objective, odd, candidate, pilot, self._soft.get(softened))
+
+    def _numbers(
+        self, cell: StudyCell, numbers: Any, reference: GradientEstimate, tallies: Sequence[dict[str, Tally]]
+    ) -> Arrays:
+        """All numbers of a cell, from those of its seeds."""
+        samples = cell.samples * self._config.batches
+        arrays = _of_seeds(numbers, self._config.batches) | _bias(numbers, reference)
+        arrays |= _of_batches(estimators_of(self._plan, cell), tallies, samples)
         if arrays["gradient"].size > MOST_KEPT:
             del arrays["gradient"]
         else:
             arrays["reference"] = np.asarray(reference.mean)
         return {name: np.asarray(array, float) for name, array in arrays.items()}
 
-    return compute
-
-
-def _events(batch: Any) -> np.ndarray | None:
-    """Onsets of contact in each rollout of a batch, as in `OnsetCounts`; None where none are looked for."""
-    events = getattr(batch, "events", None)
-    return None if events is None else np.asarray(events).reshape(-1, 5)
-
 
 def _of_batches(
-    chosen: Sequence[Estimator],
-    seconds: Sequence[dict[str, float]],
-    residuals: Sequence[dict[str, np.ndarray]],
-    events: Sequence[dict[str, np.ndarray | None]],
-    samples: int,
+    chosen: Sequence[Estimator], tallies: Sequence[dict[str, Tally]], samples: int
 ) -> dict[str, np.ndarray]:
     """Times, residuals and onset counts of each estimator's batches."""
-    arrays: dict[str, list[Any]] = {"seconds_per_sample": [], "residual": [], "unconverged": [], "events": []}
-    for estimator in chosen:
-        needs = estimator.needs
-        arrays["seconds_per_sample"].append(sum(each[oracle] for each in seconds for oracle in needs) / samples)
-        all_of = np.concatenate([each[oracle] for each in residuals for oracle in needs])
-        arrays["residual"].append(np.max(np.where(np.isfinite(all_of), all_of, np.inf), initial=0.0))
-        arrays["unconverged"].append(unconverged(all_of, precision()))
-        found = [met for each in events for oracle in needs if (met := each[oracle]) is not None]
-        arrays["events"].append(onset_numbers(np.concatenate(found)) if found else np.full(len(ONSETS), np.nan))
-    numbers = np.stack(arrays.pop("events"), axis=-1)
+    told = [together(each[oracle] for each in tallies for oracle in estimator.needs) for estimator in chosen]
+    arrays = {
+        "seconds_per_sample": np.array([each.seconds / samples for each in told]),
+        "residual": np.array([each.residual for each in told]),
+        "unconverged": np.array([each.unconverged for each in told]),
+    }
+    numbers = np.stack([numbers_of(each.onsets) for each in told], axis=-1)
     if np.any(np.isfinite(numbers)):
         arrays |= dict(zip(ONSETS, numbers, strict=True))
-    return {name: np.array(values) for name, values in arrays.items()}
-
-
-def onset_numbers(events: np.ndarray) -> np.ndarray:
-    """`ONSETS` of rollouts."""
-    *counts, strength, first = events[events[:, 0] > 0].T
-    counts, some = [np.sum(each) for each in counts], len(first) > 0
-    return np.array([*counts, np.sqrt(np.mean(strength**2)) if some else np.nan, np.std(first) if some else np.nan])
+    return arrays
 
 
 def _of_seeds(numbers: Sequence[dict[str, Any]], seeds: int) -> dict[str, np.ndarray]:
@@ -202,15 +259,26 @@ def _reference_gradient(
 @partial(jax.jit, static_argnames=("chosen", "confidence"))
 def _seed_numbers(drawn, reference: GradientEstimate, keys: Key[Array, " seeds"], chosen, confidence: float):
     """The numbers of every estimator, with an axis of seeds."""
-    return jax.vmap(lambda batches, key: estimate_numbers(batches, reference, key, chosen, confidence))(drawn, keys)
+
+    def numbers(batches, key):
+        return estimate_numbers([estimator(batches) for estimator in chosen], reference, key, confidence)
+
+    return jax.vmap(numbers)(drawn, keys)
 
 
-def estimate_numbers(batches, reference, key, chosen, confidence):
-    """The numbers of each estimator that are functions of the batches and the reference gradient alone."""
+@partial(jax.jit, static_argnames="chosen")
+def _rows_of_parts(batches: Batches, chosen: tuple[Estimator, ...]) -> list[list[Array]]:
+    """The samples of the parts of each estimator."""
+    return [[part.per_sample for part in each.parts(*each.pick(batches))] for each in chosen]
+
+
+def estimate_numbers(
+    estimates: Sequence[GradientEstimate], reference: GradientEstimate, key: Key[Array, ""], confidence: float
+) -> list[dict[str, Any]]:
+    """The numbers of each estimate that are functions of its samples and of the reference gradient alone."""
     result = []
     reference_effective = estimators.effective_samples(reference).count
-    for estimator in chosen:
-        estimate = estimator(batches)
+    for estimate in estimates:
         lower, upper = estimators.variance_interval(estimate, confidence)
         median, high, most = estimators.norm_quantiles(estimate, (0.5, 0.9, 1.0))
         effective = estimators.effective_samples(estimate)

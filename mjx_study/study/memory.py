@@ -4,7 +4,8 @@ import math
 from collections.abc import Sequence
 from typing import Final
 
-from estimators import Estimator
+from estimators import ESTIMATORS, Estimator
+from estimators.blocks import EXTREMES
 from mjx_study.limits import MOST_GIB
 from mjx_study.tasks.task import Task
 
@@ -35,10 +36,21 @@ def numbers_per_sample(task: Task, oracle: str) -> int:
     return each[oracle]
 
 
-def bytes_per_sample(task: Task, oracles: Sequence[str], estimators: int) -> int:
+def bytes_per_sample(task: Task, oracles: Sequence[str], estimators: int, draws: int = BIAS_DRAWS) -> int:
     """Memory per sample [bytes]: every batch, gradients by every estimator, and the draws of the test for bias."""
     numbers = sum(numbers_per_sample(task, oracle) for oracle in oracles)
-    return 8 * (numbers + 3 * estimators * task.policy.num_params + 2 * BIAS_DRAWS)
+    return 8 * (numbers + 3 * estimators * task.policy.num_params + 2 * draws)
+
+
+def bytes_of_moments(estimators: Sequence[Estimator], params: int) -> int:
+    """Memory of the moments of a block of samples [bytes], see `estimators.blocks.Moments`."""
+    sizes = [(1 + params,) if len(each.needs) == 1 else (1 + params, 1 + params, 3 + 2 * params) for each in estimators]
+    return 8 * sum(size * (size + 6 * EXTREMES) for each in sizes for size in each)
+
+
+def block_for(each: int) -> int:
+    """Samples of a block, an even number that fits into `AT_ONCE` at so many bytes each."""
+    return min(LARGEST_BATCH, max(2, int(AT_ONCE / each) // 2 * 2))
 
 
 def seeds_at_once(memory_of_seed: int, seeds: int) -> int:
@@ -47,14 +59,29 @@ def seeds_at_once(memory_of_seed: int, seeds: int) -> int:
     return math.ceil(seeds / math.ceil(seeds / fitting))
 
 
-def check_batches(needed: int) -> None:
-    """Raises ValueError for batches that need more bytes than `MOST_GIB` says."""
+def check_batches(needed: int, whole: Sequence[str] = ()) -> None:
+    """Refuse batches that need more bytes than `MOST_GIB` says.
+
+    Args:
+        whole: names of estimators that need whole batches, where others would take blocks of them.
+
+    Raises:
+        ValueError: with the limit and what to change.
+    """
     gib = needed / 2**30
     if gib > MOST_GIB:
+        change = "give fewer samples, and more seeds of them"
+        change += f"; or leave out {', '.join(whole)}: {blocks_take(whole)}" if whole else ""
         raise ValueError(
-            f"the batches of a cell would take about {gib:.3g} GiB of memory, and the limit is {MOST_GIB:g} GiB: give "
-            "fewer samples, and more seeds of them"
+            f"the batches of a cell would take about {gib:.3g} GiB of memory, and the limit is {MOST_GIB:g} GiB: "
+            f"{change}"
         )
+
+
+def blocks_take(whole: Sequence[str]) -> str:
+    """Which estimators batches of any size have."""
+    able = [name for name, each in ESTIMATORS.items() if each.separable and name not in whole]
+    return f"batches of any size are for {', '.join(able)}, without leave_one_out and cross_fitted"
 
 
 def check_memory(task: Task, estimators: Sequence[Estimator], samples: int, *, other: int = 0) -> None:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
@@ -11,13 +12,22 @@ import estimators
 from estimators import Estimator, find_estimator
 from estimators.cross_fitting import check_weights
 from mjx_study.choices import REFERENCE
-from mjx_study.limits import MOST_CELLS, MOST_PROGRAMS, check_count
+from mjx_study.limits import MOST_CELLS, MOST_GIB, MOST_PROGRAMS, check_count
 from mjx_study.objective import chunk_for
 from mjx_study.option import OPTIONS, check
 from mjx_study.study.configuration import SAMPLES, StudyConfig
 from mjx_study.study.iteration import make_optimizer, schedule_factors
 from mjx_study.study.line import line_of
-from mjx_study.study.memory import LARGEST_BATCH, bytes_per_sample, check_batches, check_memory, seeds_at_once
+from mjx_study.study.memory import (
+    LARGEST_BATCH,
+    block_for,
+    blocks_take,
+    bytes_of_moments,
+    bytes_per_sample,
+    check_batches,
+    check_memory,
+    seeds_at_once,
+)
 from mjx_study.study.resolution import at_theta, configured_estimators, recipe_of
 from mjx_study.table import digits_to_tell_apart
 from mjx_study.tasks import make_task
@@ -98,7 +108,12 @@ class StudyPlan:
     def memory(self) -> int:
         """Memory of the batches and their statistics held at once in the largest cell, roughly [bytes]."""
         cells = {(cell.group, cell.samples): cell for cell in self.cells}.values()
-        return max(memory_of_seed(self, cell) * seeds_together(self, cell) for cell in cells)
+        return max(
+            memory_of_blocks(self, cell)
+            if blocks_of(self, cell)
+            else memory_of_seed(self, cell) * seeds_together(self, cell)
+            for cell in cells
+        )
 
     @property
     def iterations(self) -> int:
@@ -161,10 +176,10 @@ def plan_study(config: StudyConfig, built: Mapping[str, Task] | None = None) -> 
             cells.append(StudyCell(len(groups), model, sigma, samples))
         groups.append(group)
     together = 1 if config.kind == "descents" else config.batches
-    most = min(LARGEST_BATCH, max(cell.samples for cell in cells) * together)
+    most = min(LARGEST_BATCH, max(min(cell.samples, config.block_size or cell.samples) for cell in cells) * together)
     chunk = chunk_for(most, jax.local_devices()) if config.chunk_size is None else config.chunk_size
     plan = StudyPlan(config, tuple(groups), tuple(cells), chunk, tuple(dict.fromkeys(messages)))
-    check_batches(plan.memory)
+    check_batches(plan.memory, _whole(plan))
     for cell in {cell.group: cell for cell in cells}.values():
         chosen, recipe = estimators_of(plan, cell), groups[cell.group].recipe
         if config.surrogate and (corrected := [each.name for each in chosen if "corrected" in each.needs]):
@@ -180,6 +195,21 @@ def plan_study(config: StudyConfig, built: Mapping[str, Task] | None = None) -> 
                 raise ValueError("theta has one entry, and the line is its range: give --span")
             line_of(groups[cell.group].task, config.points or 0, config.span, config.direction, config.seed)
     return plan
+
+
+def _whole(plan: StudyPlan) -> list[str]:
+    """Names of the estimators that need whole batches, in studies in which others would take blocks.
+
+    Raises:
+        ValueError: blocks are asked for.
+    """
+    if plan.config.kind != "gradients":
+        return []
+    found = [each.name for each in estimators_of(plan, plan.cells[0]) if not each.mergeable]
+    if found and plan.config.block_size is not None:
+        verb = "needs" if len(found) == 1 else "need"
+        raise ValueError(f"{', '.join(found)} {verb} whole batches, leave block_size out: {blocks_take(found)}")
+    return found
 
 
 def _check_schedules(config: StudyConfig, group: Group, chosen: Sequence[Estimator]) -> None:
@@ -205,6 +235,40 @@ def memory_of_seed(plan: StudyPlan, cell: StudyCell) -> int:
     """Memory of the batches of one seed of a cell, and of their statistics [bytes]."""
     each = bytes_per_sample(plan.groups[cell.group].task, oracles_of(plan.config), len(plan.config.estimators))
     return cell.samples * each
+
+
+def block_of(plan: StudyPlan, cell: StudyCell) -> int:
+    """Samples of a seed that are held at once: all of them, or a block.
+
+    Blocks are of batches for which they are asked, and of those that would otherwise be refused.
+    """
+    config, whole = plan.config, cell.samples
+    if config.kind != "gradients":
+        return whole
+    if config.block_size is not None:
+        return min(config.block_size, whole)
+    fits = memory_of_seed(plan, cell) <= MOST_GIB * 2**30
+    if fits or not all(each.mergeable for each in estimators_of(plan, cell)):
+        return whole
+    return min(whole, block_for(_bytes_in_block(plan, cell)))
+
+
+def blocks_of(plan: StudyPlan, cell: StudyCell) -> int:
+    """Number of blocks of each seed; 0 for whole batches."""
+    size = block_of(plan, cell)
+    return 0 if size == cell.samples else math.ceil(cell.samples / size)
+
+
+def memory_of_blocks(plan: StudyPlan, cell: StudyCell) -> int:
+    """Memory of a block, and of the moments that are kept until a batch is whole [bytes]."""
+    moments = bytes_of_moments(estimators_of(plan, cell), plan.groups[cell.group].task.policy.num_params)
+    kept = plan.config.batches + math.ceil(math.log2(blocks_of(plan, cell)))
+    return block_of(plan, cell) * _bytes_in_block(plan, cell) + 2 * kept * moments
+
+
+def _bytes_in_block(plan: StudyPlan, cell: StudyCell) -> int:
+    task, count = plan.groups[cell.group].task, len(plan.config.estimators)
+    return bytes_per_sample(task, oracles_of(plan.config), 2 * count, draws=0)
 
 
 def seeds_together(plan: StudyPlan, cell: StudyCell) -> int:

@@ -21,7 +21,7 @@ from estimators import ENOUGH_EFFECTIVE
 from mjx_study.disk import prepare_folder
 from mjx_study.runtime import environment
 from mjx_study.study.axes import Axes, axes_of, solver_arrays, solver_parameters
-from mjx_study.study.cells import compute_cells
+from mjx_study.study.cells import Computation
 from mjx_study.study.cluster import cells_on, connected
 from mjx_study.study.configuration import Progress, StudyConfig
 from mjx_study.study.dataset import Cells, as_plain, dataset_of, write_dataset
@@ -166,7 +166,7 @@ class _Run:
     def in_memory(self, document: dict[str, Any]) -> xr.Dataset:
         """All cells, none of them written."""
         document["config"]["chunk_size"] = self._plan.chunk_size
-        compute, cells = compute_cells(self._plan), {}
+        compute, cells = Computation(self._plan), {}
         for index in range(self._total):
             cells[index] = (self._numbers(compute, index, index, Part()), document["versions"])
         self._progress(self._total, self._total, "done")
@@ -180,7 +180,7 @@ class _Run:
                 store.read(index)  # a damaged file is refused before anything is computed
             else:
                 store.read_part(index)
-        compute = compute_cells(self._plan)
+        compute = Computation(self._plan)
         cells = partial(self._cells_here, compute) if client is None else partial(self._cells_there, client)
         computed, held, failed = 0, {}, set()
         unwritten: OSError | None = None
@@ -236,13 +236,19 @@ class _Run:
     ) -> Generator[tuple[int, dict[str, np.ndarray] | str]]:
         """Those cells that nobody else computes, on a cluster; why one failed is text."""
         with store.claim(*missing) as ours:
-            kept = {index: store.read_part(index) for index in ours if not store.has(index)}
-            done = self._total - len(kept)
+            waiting = [index for index in ours if not store.has(index)]
+            done = self._total - len(waiting)
 
             def told(workers: int) -> None:
                 self._progress(done, self._total, f"{workers} workers" if workers else "waiting for workers")
 
-            for index, arrays in cells_on(client, self._plan, kept, told):
+            def part(index: int) -> Part:
+                def report(blocks: int, tasks: int, what: str) -> None:
+                    self._progress(*((blocks, tasks) if self._total == 1 else (done, self._total)), what)
+
+                return Part(store.read_part(index), partial(_keep, store, index), report)
+
+            for index, arrays in cells_on(client, self._plan, {index: part(index) for index in waiting}, told):
                 done += 1
                 self._progress(done, self._total, self._plan.label(self._plan.cells[index]))
                 yield index, arrays

@@ -43,10 +43,26 @@ def cell_keys(seed: int, seeds: int) -> dict[str, Any]:
     return {"order": by_order, "reference": (odd, candidate), "test": test}
 
 
+def sample_keys(key: Key[Array, ""], first: int, count: int) -> Key[Array, " count"]:
+    """Keys of some of a batch's samples, each of its index alone: of the first as `jax.random.split` has them."""
+    return jax.vmap(lambda index: jax.random.fold_in(key, index))(jnp.arange(first, first + count, dtype=jnp.uint32))
+
+
 def draw_batches(
-    objective: Any, theta: Array, keys: dict[str, Any], oracles: Sequence[str], samples: int, seeds: slice
+    objective: Any,
+    theta: Array,
+    keys: dict[str, Any],
+    oracles: Sequence[str],
+    samples: int,
+    seeds: slice,
+    first: int = 0,
 ) -> tuple[dict[str, Any], dict[str, float], dict[str, np.ndarray]]:
     """Batches of every oracle, with a leading axis of seeds.
+
+    Args:
+        samples: in each batch.
+        seeds: which.
+        first: index of the first sample, where the batch is part of a larger one.
 
     Returns:
         By oracle: the batch, its computing time [s], and the solver residual of every rollout.
@@ -54,11 +70,11 @@ def draw_batches(
     together = max(1, LARGEST_BATCH // samples)
     drawn, seconds, residuals = {}, {}, {}
     for name in oracles:
-        streams: Key[Array, " seeds"] = keys["order"][ORACLES[name].order][seeds]
+        streams: Key[Array, " seeds"] = jax.random.clone(keys["order"][ORACLES[name].order])[seeds]
         parts, seconds[name] = [], 0.0
         for start in range(0, len(streams), together):
-            some = jax.random.clone(streams[start : start + together])
-            flat = jax.vmap(lambda key: jax.random.split(key, samples))(some).reshape(-1)
+            some = jax.random.clone(streams)[start : start + together]
+            flat = jax.vmap(lambda key: sample_keys(key, first, samples))(some).reshape(-1)
             begun = time.perf_counter()
             batch = jax.block_until_ready(getattr(objective, ORACLES[name].method)(theta, flat))
             seconds[name] += time.perf_counter() - begun

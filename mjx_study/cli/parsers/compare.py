@@ -6,6 +6,7 @@ from estimators.catalogue import CATALOGUE
 from mjx_study.choices import FAMILIES
 from mjx_study.cli.options import (
     add_backward_options,
+    add_cluster_option,
     add_contact_options,
     add_estimator_options,
     add_folder_options,
@@ -63,5 +64,6 @@ def add(command: argparse.ArgumentParser) -> None:
     add_option(command, StudyConfig.option("samples"), SAMPLES)
     add_estimator_options(command, StudyConfig)
     add_backward_options(command)
-    add_options(command, StudyConfig, "confidence", "chunk_size")
+    add_options(command, StudyConfig, "confidence", "chunk_size", "block_size")
     add_folder_options(command)
+    add_cluster_option(command)

@@ -2,13 +2,13 @@
 
 import argparse
 import itertools
-import re
 from pathlib import Path
 from typing import Any
 
 from mjx_study.choices import TASK_DESCRIPTIONS
 from mjx_study.cli.options import (
     add_backward_options,
+    add_cluster_option,
     add_estimator_options,
     add_option,
     add_options,
@@ -68,25 +68,11 @@ def add(command: argparse.ArgumentParser) -> None:
     add_options(command, StudyConfig, "evaluation_samples", evaluation_samples={"unset": "200"})
     add_estimator_options(command, StudyConfig)
     add_backward_options(command)
-    add_options(command, StudyConfig, "horizon", "model", "chunk_size")
+    add_options(command, StudyConfig, "horizon", "model", "chunk_size", "block_size")
     add_process_options(command, seed=None)
     command.add_argument("--output", type=Path, required=True, metavar="DIR", help="folder of the study")
-    command.add_argument(
-        "--cluster",
-        type=cluster,
-        metavar="WHERE",
-        help="compute cells on Dask's workers: local:N processes, slurm:N workers, or a scheduler's tcp://host:port",
-    )
+    add_cluster_option(command)
     add_study_options(command)
-
-
-def cluster(text: str) -> str:
-    """A cluster, as `mjx_study.study.cluster.connected` takes it."""
-    if not re.fullmatch(r"(local|slurm)(:[1-9]\d{0,4})?|(tcp|tls|ws|wss|ucx)://\S+", text):
-        raise argparse.ArgumentTypeError(
-            f"must be local:N, slurm:N or an address such as tcp://host:8786, got {text!r}"
-        )
-    return text
 
 
 def solref(value: Any) -> tuple[tuple[float, ...], ...]:

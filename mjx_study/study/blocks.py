@@ -1,0 +1,101 @@
+"""Batches that come in blocks: what is kept of them, merged two by two in an order that their indices fix.
+
+Blocks are the leaves of a binary tree. Two neighbours are merged as soon as both are there, whatever else is missing,
+so that the result does not depend on the order in which blocks end, and no more is kept than the logarithm of their
+number for each that is late.
+"""
+
+from collections.abc import Mapping
+from functools import reduce
+from typing import Any, Final
+
+import numpy as np
+
+from estimators import ORACLES
+from estimators.blocks import Moments
+from mjx_study.study.tally import Tally
+
+REFERENCE: Final = 0
+"""The task that has the reference; the others are the blocks, seed by seed."""
+Arrays = dict[str, np.ndarray]
+Summary = dict[str, Any]
+"""Of a block: the moments of each estimator's parts by "ESTIMATOR.PART", and the tallies by oracle."""
+
+
+class Blocks:
+    """The blocks of a cell that are done."""
+
+    def __init__(self, seeds: int, blocks: int, kept: Mapping[str, np.ndarray]):
+        """
+        Args:
+            blocks: of each seed.
+            kept: what `arrays` returned of those that were done before.
+        """
+        self.seeds, self.blocks = seeds, blocks
+        self.reference = kept.get("reference")
+        self._held: dict[tuple[int, int, int], Summary] = {}
+        packed: dict[tuple[int, int, int], Arrays] = {}
+        for name, array in kept.items():
+            if name != "reference":
+                seed, level, place, rest = name.split(".", 3)
+                packed.setdefault((int(seed), int(level), int(place)), {})[rest] = array
+        self._held = {node: unpack(arrays) for node, arrays in packed.items()}
+
+    @property
+    def tasks(self) -> int:
+        return 1 + self.seeds * self.blocks
+
+    @property
+    def missing(self) -> list[int]:
+        """Tasks to do, in order."""
+        done = np.zeros((self.seeds, self.blocks), bool)
+        for seed, level, place in self._held:
+            done[seed, place << level : (place + 1) << level] = True
+        return [REFERENCE] * (self.reference is None) + (1 + np.flatnonzero(~done)).tolist()
+
+    def place(self, task: int) -> tuple[int, int]:
+        """Seed and index of a task's block."""
+        return divmod(task - 1, self.blocks)
+
+    def add(self, task: int, arrays: Arrays) -> None:
+        """Take a task's arrays."""
+        if task == REFERENCE:
+            self.reference = arrays["reference"]
+            return
+        (seed, place), level, summary = self.place(task), 0, unpack(arrays)
+        while (other := self._held.pop((seed, level, place ^ 1), None)) is not None:
+            summary = _merged(other, summary) if place % 2 else _merged(summary, other)
+            level, place = level + 1, place // 2
+        self._held[seed, level, place] = summary
+
+    def arrays(self) -> Arrays:
+        """All that is kept, as a checkpoint."""
+        kept = {} if self.reference is None else {"reference": self.reference}
+        for (seed, level, place), summary in self._held.items():
+            kept |= {f"{seed}.{level}.{place}.{name}": array for name, array in pack(summary).items()}
+        return kept
+
+    def whole(self, seed: int) -> Summary:
+        """Of all blocks of a seed, none of which is missing."""
+        nodes = sorted((place << level, summary) for (at, level, place), summary in self._held.items() if at == seed)
+        return reduce(_merged, (summary for _, summary in nodes))
+
+
+def _merged(one: Summary, other: Summary) -> Summary:
+    return {name: each.merged(other[name]) for name, each in one.items()}
+
+
+def pack(summary: Summary) -> Arrays:
+    """A summary as arrays."""
+    return {
+        f"{name}.{field}": np.asarray(array) for name, each in summary.items() for field, array in vars(each).items()
+    }
+
+
+def unpack(arrays: Mapping[str, np.ndarray]) -> Summary:
+    """What `pack` was given."""
+    fields: dict[str, Arrays] = {}
+    for name, array in arrays.items():
+        of, _, field = name.rpartition(".")
+        fields.setdefault(of, {})[field] = array
+    return {of: (Tally if of in ORACLES else Moments)(**each) for of, each in fields.items()}

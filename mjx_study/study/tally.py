@@ -1,0 +1,81 @@
+"""What is told of a batch's rollouts beside their gradients: time, solver residuals, onsets of contact."""
+
+import dataclasses
+from collections.abc import Iterable
+from functools import reduce
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from mjx_study.runtime import precision
+from mjx_study.study.sampling import unconverged
+
+
+@dataclasses.dataclass(frozen=True)
+class Tally:
+    """Of the rollouts of a batch or of a part of it.
+
+    Attributes:
+        seconds: computing time [s].
+        residual: largest relative residual of the solver.
+        unconverged: rollouts in which it is too large.
+        onsets: see `_met`.
+    """
+
+    seconds: np.ndarray
+    residual: np.ndarray
+    unconverged: np.ndarray
+    onsets: Float[np.ndarray, " eight"]
+
+    @classmethod
+    def of(cls, batch: Any, seconds: float, residuals: np.ndarray) -> "Tally":
+        """Of a batch, with the residual of each of its rollouts."""
+        largest = np.max(np.where(np.isfinite(residuals), residuals, np.inf), initial=0.0)
+        events = getattr(batch, "events", None)
+        onsets = _met(np.zeros((0, 5)) if events is None else np.asarray(events, float).reshape(-1, 5))
+        return cls(np.array(seconds), np.asarray(largest), np.array(unconverged(residuals, precision())), onsets)
+
+    def merged(self, other: "Tally") -> "Tally":
+        """Of both."""
+        return Tally(
+            np.asarray(self.seconds + other.seconds),
+            np.asarray(np.maximum(self.residual, other.residual)),
+            np.asarray(self.unconverged + other.unconverged),
+            _of_both(self.onsets, other.onsets),
+        )
+
+
+def together(tallies: Iterable[Tally]) -> Tally:
+    """Of all of some rollouts."""
+    return reduce(Tally.merged, tallies)
+
+
+def _met(events: Float[np.ndarray, "rollouts five"]) -> Float[np.ndarray, " eight"]:
+    """Of rollouts: their number; of those with an onset the number, the sums of the three counts and of the squared
+    strength, and mean and summed squared deviation of the first's step."""
+    met = events[events[:, 0] > 0]
+    first = met[:, 4]
+    mean = np.mean(first) if len(met) else 0.0
+    sums = np.sum(met[:, :3], axis=0)
+    return np.array([len(events), len(met), *sums, np.sum(met[:, 3] ** 2), mean, np.sum((first - mean) ** 2)])
+
+
+def _of_both(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    share, gap = other[1] / max(one[1] + other[1], 1.0), other[6] - one[6]
+    both = one + other
+    both[6], both[7] = one[6] + share * gap, both[7] + one[1] * share * gap**2
+    return both
+
+
+def onset_numbers(events: np.ndarray) -> np.ndarray:
+    """`ONSETS` of rollouts, each with the numbers of `OnsetCounts`."""
+    return numbers_of(_met(events))
+
+
+def numbers_of(onsets: np.ndarray) -> np.ndarray:
+    """`ONSETS` from a tally's; NaN where no onsets are looked for."""
+    rollouts, met, *counts, squares, _, spread = onsets
+    if rollouts == 0:
+        return np.full(5, np.nan)
+    return np.array([*counts, *(np.sqrt(each / met) if met else np.nan for each in (squares, spread))])

@@ -1,0 +1,271 @@
+"""Gradients of more samples than are held at once: in blocks, whose merged statistics are those of the whole batch."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+
+from mjx_study import cli
+from mjx_study.study import gradients
+from mjx_study.study.blocks import REFERENCE, Arrays, Blocks
+from mjx_study.study.cluster import TRIES, connected
+from mjx_study.study.configuration import StudyConfig
+from mjx_study.study.gradients import Gradients, compute_gradients
+from mjx_study.study.plan import StudyPlan, block_of, blocks_of, plan_study
+from mjx_study.study.run import load_study, run_study
+from mjx_study.study.sampling import sample_keys
+from mjx_study.study.store import Store
+from mjx_study.study.variables import MEASURED
+from tests.poison import ACCOUNT, SLOW
+from tests.test_sweep import same
+
+SUBSTITUTES = {"bias_p_value", "variance_lower", "variance_upper"}
+"""Variables that only rows tell to rounding; the first test of numbers has by how much they differ. Those of norms are
+exact up to 16,384 samples."""
+
+
+def config(**changes: Any) -> StudyConfig:
+    common: dict[str, Any] = {"contact": ("reference",), "stiffness": (100.0,), "horizon": 4, "seeds": 2}
+    common |= {"samples": (40,), "block_size": 8, "estimators": ("zobg", "fobg", "aobg"), "reference_samples": 20}
+    return StudyConfig(tasks=("pusher",), **(common | changes))
+
+
+def planned(**changes: Any) -> StudyPlan:
+    return plan_study(config(**changes))
+
+
+def test_keys_follow_from_the_index_alone() -> None:
+    """The 10 million-th as well: no other is drawn, and batches that fit have the keys that they always had."""
+    key = jax.random.key(7)
+    split = jax.random.key_data(jax.random.split(key, 5000))
+    np.testing.assert_array_equal(jax.random.key_data(sample_keys(jax.random.clone(key), 0, 5000)), split)
+    np.testing.assert_array_equal(jax.random.key_data(sample_keys(jax.random.clone(key), 4321, 7)), split[4321:4328])
+    last = jax.random.key_data(sample_keys(jax.random.clone(key), 9_999_990, 10))
+    assert len(np.unique(np.concatenate([split, last]), axis=0)) == 5010
+
+
+def test_blocks_give_the_numbers_of_the_batch() -> None:
+    """Of 4096 samples in eight blocks, every variable."""
+    estimators = ("zobg", "zobg_antithetic", "fobg", "fobg_clipped", "fobg_truncated", "aobg", "ivw")
+    changes: dict[str, Any] = {"samples": (4096,), "estimators": estimators, "max_norm": 50.0, "window": 2}
+    whole, blocks = planned(**changes, block_size=None), planned(**changes, block_size=512)
+    assert blocks_of(whole, whole.cells[0]) == 0 and blocks_of(blocks, blocks.cells[0]) == 8
+    expected, found = (compute_gradients(plan)(plan.cells[0]) for plan in (whole, blocks))
+    assert set(found) == set(expected) > SUBSTITUTES
+    for name in set(expected) - SUBSTITUTES - set(MEASURED):
+        np.testing.assert_allclose(found[name], expected[name], rtol=1e-11, err_msg=name)
+    width = np.log(expected["variance_upper"] / expected["variance_lower"])
+    for end in ("variance_lower", "variance_upper"):
+        assert np.all(np.abs(np.log(found[end] / expected[end])) < 1e-3 * width)
+    # Shares of 999 other draws: five standard errors of the difference of two.
+    middle = (found["bias_p_value"] + expected["bias_p_value"]) / 2
+    error = np.sqrt(2 * middle * (1 - middle) / 999) + 1e-3
+    assert np.all(np.abs(found["bias_p_value"] - expected["bias_p_value"]) < 5 * error)
+    assert np.all(found["seconds_per_sample"] > 0)
+
+
+@pytest.fixture(scope="module")
+def cell() -> tuple[Gradients, StudyPlan, dict[int, Arrays]]:
+    """Eleven blocks, of a single seed, and what each task returns."""
+    plan = planned(samples=(84,), seeds=1)
+    compute = compute_gradients(plan)
+    assert blocks_of(plan, plan.cells[0]) == 11
+    return compute, plan, {task: compute.block(plan.cells[0], task) for task in range(12)}
+
+
+def in_order(computed: tuple[Gradients, StudyPlan, dict[int, Arrays]], order: Any, *, kept: bool = False) -> Blocks:
+    compute, plan, arrays = computed
+    blocks = compute.begun(plan.cells[0], {})
+    for task in order:
+        blocks.add(int(task), arrays[int(task)])
+        if kept:
+            blocks = compute.begun(plan.cells[0], {name: array.copy() for name, array in blocks.arrays().items()})
+    return blocks
+
+
+def test_not_a_bit_depends_on_the_order_or_on_checkpoints(cell: tuple[Gradients, StudyPlan, dict[int, Arrays]]) -> None:
+    compute, plan, _ = cell
+    expected = in_order(cell, range(12))
+    numbers = compute.merged(plan.cells[0], expected)
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        found = in_order(cell, rng.permutation(12), kept=True)
+        assert not found.missing
+        assert {name: array.tobytes() for name, array in found.arrays().items()} == {
+            name: array.tobytes() for name, array in expected.arrays().items()
+        }
+    for name, array in compute.merged(plan.cells[0], found).items():
+        np.testing.assert_array_equal(array, numbers[name], err_msg=name)
+
+
+def test_no_more_is_kept_than_the_logarithm_of_the_blocks(cell: tuple[Gradients, StudyPlan, dict[int, Arrays]]) -> None:
+    for late in range(1, 12):
+        order = [task for task in range(12) if task != late]
+        blocks = in_order(cell, order)
+        assert blocks.missing == [late] and len(blocks._held) <= 4 + 2  # levels, and the rest of 11
+    assert in_order(cell, []).missing == list(range(12))
+    assert in_order(cell, [REFERENCE, 3]).missing == [1, 2, *range(4, 12)]
+
+
+def test_a_study_in_blocks_goes_on_where_it_was_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Stopped in the fourth block: the other process computes the rest, to the same bits."""
+    done: list[int] = []
+    block = Gradients.block
+
+    def stopping(self: Gradients, cell: Any, task: int) -> Arrays:
+        if len(done) == 4:
+            raise KeyboardInterrupt
+        done.append(task)
+        return block(self, cell, task)
+
+    monkeypatch.setattr(Gradients, "block", stopping)
+    with pytest.raises(KeyboardInterrupt):
+        run_study(config(), tmp_path / "study")
+    assert done == [0, 1, 2, 3] and len(list((tmp_path / "study" / "cells").glob("*.part.npz"))) == 1
+    rest: list[int] = []
+    monkeypatch.setattr(Gradients, "block", lambda self, cell, task: rest.append(task) or block(self, cell, task))
+    told: list[str] = []
+    found = run_study(config(), tmp_path / "study", lambda done, total, what: told.append(f"{done} of {total}: {what}"))
+    assert rest == list(range(4, 11)) and not list((tmp_path / "study" / "cells").glob("*.part.npz"))
+    assert any(line.startswith("4 of 11: pusher, ") and line.endswith("N = 40, in blocks") for line in told)
+    assert same(found, run_study(config()))
+
+
+def test_what_needs_whole_batches_is_refused() -> None:
+    able = "batches of any size are for zobg, zobg_antithetic, .*, aobg, .*ivw, without leave_one_out and cross_fitted$"
+    with pytest.raises(ValueError, match=f"^ivw_h, total_propagation need whole batches, leave block_size out: {able}"):
+        planned(estimators=("zobg", "ivw_h", "total_propagation"))
+    for changes in ({"baseline": "leave_one_out"}, {"weights": "cross_fitted", "estimators": ("ivw",)}):
+        with pytest.raises(ValueError, match="needs? whole batches, leave block_size out"):
+            planned(**changes)
+    large: dict[str, Any] = {"samples": (10_000_000,), "block_size": None}
+    with pytest.raises(ValueError, match=f"and more seeds of them; or leave out delta: {able}"):
+        planned(**large, estimators=("zobg", "delta"))
+    with pytest.raises(ValueError, match="block_size is of gradients: leave it out"):
+        planned(points=3, reference_samples=None)
+
+
+def test_ten_million_samples_are_planned_in_blocks() -> None:
+    """Whatever fits comes whole, as before; the memory of what does not fit is that of a block."""
+    plans = [planned(samples=(samples,), block_size=None) for samples in (400, 1_000_000, 5_000_000, 10_000_000)]
+    assert [blocks_of(plan, plan.cells[0]) for plan in plans] == [0, 0, 250, 500]
+    assert plans[2].memory <= plans[3].memory < 1.01 * plans[2].memory < 5e8 < plans[1].memory
+    wide = planned(samples=(10_000_000,), block_size=None, horizon=2000)
+    assert 2 <= block_of(wide, wide.cells[0]) < 20_000 and block_of(wide, wide.cells[0]) % 2 == 0
+
+
+def test_the_first_samples_pick_the_control_variate(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a batch of any size, and whether or not it comes in blocks."""
+    sizes: list[int] = []
+    reference_of = gradients.reference_of
+    monkeypatch.setattr(gradients, "PILOT", 12)
+    monkeypatch.setattr(
+        gradients, "reference_of", lambda *args: sizes.append(len(args[4].value)) or reference_of(*args)
+    )
+    found = [compute_gradients(plan)(plan.cells[0])["reference"] for plan in (planned(), planned(block_size=None))]
+    assert sizes == [12, 12]
+    np.testing.assert_allclose(found[0], found[1], rtol=1e-13)
+
+
+@pytest.fixture(scope="module")
+def workers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+    """A client of two workers."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv(ACCOUNT, str(tmp_path_factory.mktemp("account") / "account"))
+        with connected("local:2") as client:
+            yield client
+
+
+@pytest.mark.slow
+def test_a_killed_worker_costs_its_block_and_nothing_else(workers: Any, tmp_path: Path) -> None:
+    """By SIGKILL, half way; the numbers are those of a run in this process, to the bit."""
+    asked = config(tasks=("tests.poison:poison",), stiffness=(SLOW,), samples=(96,), horizon=None)
+    killed: list[int] = []
+
+    def kill(done: int, total: int, what: str) -> None:
+        if done >= total / 2 and not killed:
+            killed.append(min(workers.run(os.getpid).values()))
+            os.kill(killed[0], signal.SIGKILL)
+
+    found = run_study(asked, tmp_path, kill, cluster=workers)
+    assert killed and killed[0] not in workers.run(os.getpid).values()
+    assert found.attrs["computed_cells"] == 1 and not list((tmp_path / "cells").glob("*.part.npz"))
+    assert same(found, run_study(asked)) and same(load_study(tmp_path), found)
+
+
+@pytest.mark.slow
+def test_a_block_that_fails_takes_its_cell_with_it_and_no_other(workers: Any, tmp_path: Path) -> None:
+    """What was done of the cell is kept."""
+    from tests.poison import RAISE
+
+    asked = config(tasks=("tests.poison:poison",), stiffness=(RAISE, SLOW), samples=(16,), horizon=None)
+    found = run_study(asked, tmp_path, cluster=workers)
+    assert found.attrs["computed_cells"] == 1 == found.attrs["missing_cells"]
+    assert list(Store.open(tmp_path).failures.values()) == ["MemoryError: no memory for the batch"]
+    account = Path(workers.submit(os.environ.get, ACCOUNT, pure=False).result()).read_text().split()
+    assert TRIES <= account.count(str(RAISE)) <= 2 * TRIES  # two workers have a block of it each
+
+
+ARGUMENTS = ["compare", "pusher", "--contact", "reference", "--stiffness", "100", "--horizon", "4", "--samples", "3000",
+             "--block-size", "60", "--estimators", "zobg,fobg,aobg", "--reference-samples", "20"]  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("cluster", [[], ["--cluster", "local:2"]])
+def test_a_killed_command_goes_on_to_the_same_data(cluster: list[str], tmp_path: Path) -> None:
+    """The command itself, killed by SIGKILL after its fifth block."""
+    command = [sys.executable, "-m", "mjx_study", *ARGUMENTS, *cluster, "--output"]
+    folder = tmp_path / "out"
+    running = subprocess.Popen([*command, str(folder)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    part = folder / "cells" / "00000.part.npz"
+    seen: set[int] = set()
+    while len(seen) < 5:
+        assert running.poll() is None, running.communicate()[1]
+        seen |= {part.stat().st_ino} if part.exists() else set()
+        time.sleep(0.01)
+    running.send_signal(signal.SIGKILL)
+    running.communicate()
+    kept = Blocks(1, 50, Store.open(folder).read_part(0)).missing
+    assert 0 < len(kept) < 48
+    last = subprocess.run([*command, str(folder)], capture_output=True, text=True)
+    assert last.returncode == 0, last.stderr
+    assert cli.main([*ARGUMENTS, "--output", str(tmp_path / "undisturbed")]) == 0
+    assert same(load_study(folder), load_study(tmp_path / "undisturbed"))
+
+
+PEAK = """
+import resource, sys
+from mjx_study.runtime import configure
+configure(cpu_devices=1)
+from mjx_study.study import sampling
+from mjx_study.study.gradients import compute_gradients
+from mjx_study.study.plan import plan_study
+from tests.test_sweep_memory import Stub, config
+
+sampling.Simulator = Stub
+plan = plan_study(config(samples=(int(sys.argv[1]),), block_size=10_000, seeds=1, horizon=50))
+before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+compute_gradients(plan)(plan.cells[0])
+print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1e6)
+"""
+
+
+@pytest.mark.slow
+def test_memory_does_not_grow_with_samples() -> None:
+    """50 parameters, three estimators: 160,000 samples take what 40,000 do, and no more than the plan says."""
+    peak = []
+    for samples in ("40000", "160000"):
+        command = [sys.executable, "-c", PEAK, samples]
+        done = subprocess.run(command, capture_output=True, text=True, cwd=Path(__file__).parents[1])
+        assert done.returncode == 0, done.stderr
+        peak.append(float(done.stdout))
+    whole = planned(samples=(160_000,), block_size=None, horizon=50, seeds=1).memory / 1e9
+    assert peak[1] < 1.1 * peak[0] + 0.01 and peak[1] < whole / 4, (peak, whole)
