@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,7 @@ from mjx_study.study.run import load_study, run_study
 from mjx_study.study.sampling import sample_keys
 from mjx_study.study.store import Store
 from mjx_study.study.variables import MEASURED
-from tests.poison import ACCOUNT, SLOW
+from tests.poison import ACCOUNT, RAISE, SLOW
 from tests.test_sweep import same
 
 SUBSTITUTES = {"bias_p_value", "variance_lower", "variance_upper"}
@@ -33,9 +34,15 @@ exact up to 16,384 samples."""
 
 
 def config(**changes: Any) -> StudyConfig:
-    common: dict[str, Any] = {"contact": ("reference",), "stiffness": (100.0,), "horizon": 4, "seeds": 2}
+    common: dict[str, Any] = {
+        "tasks": ("pusher",),
+        "contact": ("reference",),
+        "stiffness": (100.0,),
+        "horizon": 4,
+        "seeds": 2,
+    }
     common |= {"samples": (40,), "block_size": 8, "estimators": ("zobg", "fobg", "aobg"), "reference_samples": 20}
-    return StudyConfig(tasks=("pusher",), **(common | changes))
+    return StudyConfig(**(common | changes))
 
 
 def planned(**changes: Any) -> StudyPlan:
@@ -203,19 +210,17 @@ def test_a_killed_worker_costs_its_block_and_nothing_else(workers: Any, tmp_path
 
 @pytest.mark.slow
 def test_a_block_that_fails_takes_its_cell_with_it_and_no_other(workers: Any, tmp_path: Path) -> None:
-    """What was done of the cell is kept."""
-    from tests.poison import RAISE
-
+    """Each of its tasks is begun at most three times, and when one is for the third, the others are dropped."""
     asked = config(tasks=("tests.poison:poison",), stiffness=(RAISE, SLOW), samples=(16,), horizon=None)
     found = run_study(asked, tmp_path, cluster=workers)
     assert found.attrs["computed_cells"] == 1 == found.attrs["missing_cells"]
     assert list(Store.open(tmp_path).failures.values()) == ["MemoryError: no memory for the batch"]
     account = Path(workers.submit(os.environ.get, ACCOUNT, pure=False).result()).read_text().split()
-    assert TRIES <= account.count(str(RAISE)) <= 2 * TRIES  # two workers have a block of it each
+    assert TRIES <= account.count(str(RAISE)) < 5 * TRIES
 
 
-ARGUMENTS = ["compare", "pusher", "--contact", "reference", "--stiffness", "100", "--horizon", "4", "--samples", "3000",
-             "--block-size", "60", "--estimators", "zobg,fobg,aobg", "--reference-samples", "20"]  # fmt: skip
+ARGUMENTS = ["compare", "pusher", "--contact", "reference", "--stiffness", "100", "--horizon", "4", "--samples", "4000",
+             "--block-size", "20", "--estimators", "zobg,fobg,aobg", "--reference-samples", "20"]  # fmt: skip
 
 
 @pytest.mark.slow
@@ -229,12 +234,12 @@ def test_a_killed_command_goes_on_to_the_same_data(cluster: list[str], tmp_path:
     seen: set[int] = set()
     while len(seen) < 5:
         assert running.poll() is None, running.communicate()[1]
-        seen |= {part.stat().st_ino} if part.exists() else set()
-        time.sleep(0.01)
+        with suppress(FileNotFoundError):
+            seen.add(part.stat().st_mtime_ns)
+        time.sleep(0.005)
     running.send_signal(signal.SIGKILL)
     running.communicate()
-    kept = Blocks(1, 50, Store.open(folder).read_part(0)).missing
-    assert 0 < len(kept) < 48
+    assert 0 < len(Blocks(1, 200, Store.open(folder).read_part(0)).missing) < 198
     last = subprocess.run([*command, str(folder)], capture_output=True, text=True)
     assert last.returncode == 0, last.stderr
     assert cli.main([*ARGUMENTS, "--output", str(tmp_path / "undisturbed")]) == 0
