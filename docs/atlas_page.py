@@ -4,8 +4,9 @@ Everything on the page is made from docs/atlas.npz, which docs/make_atlas.py com
 """
 
 import dataclasses
+import itertools
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -14,11 +15,12 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from estimators import ENOUGH_EFFECTIVE
 from estimators.confidence import coverage_interval
 from mjx_study.diagnose import SMOOTH, WIDTHS
-from mjx_study.study.findings import NARROW, NOTABLE, SHARE_OFF
+from mjx_study.study.findings import NARROW, SHARE_OFF, STRONG
 
 Table = Any
 """A pandas.DataFrame with a row for each cell; pandas comes without types."""
@@ -49,7 +51,20 @@ COLOURS: Final = {
     "mujoco_stiff": "#E69F00",
     "smooth_onset": "#009E73",
 }
+TASKS: Final = {
+    "momentum_transfer": "#0072B2",
+    "ball_wall": "#E69F00",
+    "pusher": "#009E73",
+    "pusher_apart": "#CC79A7",
+    "sliding_box": "#999999",
+    "tennis": "#000000",
+}
+"""Colours, in the order of panels."""
 BINS: Final = 8
+SURE: Final = 5.0
+"""Standard errors from zero from which a slope serves as the unit of a bias."""
+STRENGTHS: Final = (0.03, 0.8)
+"""Onset strengths between which the bound on the term's error is counted apart."""
 
 
 def read(path: Path) -> Table:
@@ -81,8 +96,12 @@ def read(path: Path) -> Table:
     added = (table.fobg_bias - table.fobg_onset_bias).abs()
     table["left"] = table.fobg_onset_bias.abs() / added
     table["left_error"] = np.hypot(table.fobg_onset_bias_se, table.slope_se) / added
-    cost = (table.gradient_seconds / table.value_seconds).groupby(programs).transform("median")
-    table["cost"] = cost
+    excess = table.left - SHARE_OFF * table.strength
+    told = np.isfinite(excess) & (excess.abs() > QUANTILE * table.left_error)
+    table["beyond"] = np.where(told, (excess > 0).astype(float), np.nan)
+    last = table.environment == table.groupby("task").environment.transform("max")
+    spent = (table.gradient_seconds / table.value_seconds).where(last)
+    table["cost"] = cost = spent.groupby(table.task).transform("median")
     saved = table.zobg_variance - table.fobg_variance * cost
     table["worth"] = table.zobg_variance / (table.fobg_variance * cost)
     table["until"] = np.where(saved > 0, saved / table.fobg_bias**2, 0.0)
@@ -140,27 +159,56 @@ class Rule:
         return float(tried[int(np.argmax([self.balanced(table, each) for each in tried]))])
 
 
+def _any(table: Table) -> Any:
+    return table.program >= 0
+
+
 def _met(table: Table) -> Any:
     return table.meets & (table.stable == 1)
 
 
 def _plain(table: Table) -> Any:
-    """Cells where bodies meet, the step is stable, and plain first order is off: there is something to cure."""
+    """Cells where bodies meet, the step is stable, and plain first order is off."""
     return _met(table) & (table.fobg_off == 1)
 
 
+def _curable(table: Table) -> Any:
+    """Of these, the cells where force jumps, so that the onset term adds something."""
+    return _plain(table) & (table.strength > SMOOTH)
+
+
+def _on(where: Callable[[Table], Any], *tasks: str) -> Callable[[Table], Any]:
+    """Cells of some tasks alone."""
+    return lambda table: where(table) & table.task.isin(tasks)
+
+
+def _wide(table: Table) -> Any:
+    """Cells with something to cure where noise is as wide as the term needs."""
+    return _curable(table) & (table.onset_spread >= NARROW)
+
+
+LAUNCHED: Final = ("momentum_transfer", "ball_wall")
+FORCES: Final = ("pusher", "pusher_apart", "sliding_box")
 RULES: Final = (
-    Rule("unstable step: variance above", "limit", 1.0, "above", lambda table: table.task != ""),
+    Rule("unstable step: variance above; launch angle", "limit", 1.0, "above", _on(_any, *LAUNCHED)),
+    Rule("the same, many forces", "limit", 1.0, "above", _on(_any, *FORCES)),
     Rule("force jumps at first touch: mean off", "strength", SMOOTH, "fobg_off", _met),
     Rule(
-        "smooth onset, travel over width: mean off",
+        "smooth onset, travel over width: variance above",
         "travel",
         1 / WIDTHS,
-        "fobg_off",
+        "above",
         lambda table: _met(table) & (table.contact == "smooth_onset"),
     ),
-    Rule("noise narrower than steps: term does not cure", "crossing", 1 / NARROW, "fobg_onset_off", _plain),
-    Rule("bound on the term's error: term does not cure", "strength", 2 * NOTABLE, "fobg_onset_off", _plain),
+    Rule("noise narrower than steps: mean off with the term", "crossing", 1 / NARROW, "fobg_onset_off", _curable),
+    Rule(
+        "strong onset: term beyond its bound, `momentum_transfer`",
+        "strength",
+        STRONG,
+        "beyond",
+        _on(_wide, "momentum_transfer"),
+    ),
+    Rule("the same, `ball_wall`", "strength", STRONG, "beyond", _on(_wide, "ball_wall")),
 )
 
 
@@ -172,10 +220,22 @@ def share(right: np.ndarray) -> str:
     return f"{middle:.0%} ({low:.0%} to {high:.0%}; {len(right)})"
 
 
+def verdicts(part: Table) -> list[Any]:
+    """Decided verdicts of some cells: variance above; mean off, where bodies meet; off with the term, where it acts."""
+    decided = [part.above, part[_met(part)].fobg_off, part[_curable(part)].fobg_onset_off]
+    return [each.dropna().to_numpy() == 1 for each in decided]
+
+
+VERDICTS: Final = ("variance above", "mean off", "off with the term")
+
+
 def halves(table: Table) -> tuple[Table, Table]:
-    """Even and odd points of each family's sequence: no contact model is in both."""
-    even = table["index"] // len(table.attrs["families"]) % 2 == 0
-    return table[even], table[~even]
+    """Two random halves; no contact model is in both.
+
+    Even and odd points would not do: in a Sobol sequence these are the two halves of a dimension, the damping ratio.
+    """
+    first = np.random.default_rng(0).permutation(table["index"].max() + 1)[table["index"]] % 2 == 0
+    return table[first], table[~first]
 
 
 def rules_table(table: Table) -> str:
@@ -196,7 +256,7 @@ def rules_table(table: Table) -> str:
 
 def index_table(table: Table) -> str:
     """What to expect by dimensionless group: each in quarters of its cells."""
-    head = ("group", "range", "cells", "variance above", "mean off", "off with the term")
+    head = ("group", "range", "cells", *VERDICTS)
     met, rows = table[_met(table)], []
     for group, (symbol, _) in GROUPS.items():
         some = table if group in ("limit", "h_b", "h2_k", "impedance", "periods", "params") else met
@@ -204,33 +264,42 @@ def index_table(table: Table) -> str:
         edges = np.unique(np.quantile(values, np.linspace(0, 1, 5))) if len(values) else np.zeros(0)
         for low, high in zip(edges[:-1], edges[1:], strict=True):
             part = some[(some[group] >= low) & ((some[group] < high) | (high == edges[-1]) & (some[group] == high))]
-            inner = part[_met(part)]
-            decided = [part.above, inner.fobg_off, inner[inner.fobg_off == 1].fobg_onset_off]
-            shares = [share(each.dropna().to_numpy() == 1) for each in decided]
-            rows.append([f"`{symbol}`", f"{low:.2g} to {high:.2g}", len(part), *shares])
+            rows.append([f"`{symbol}`", f"{low:.2g} to {high:.2g}", len(part), *map(share, verdicts(part))])
+    return markdown(head, rows)
+
+
+def jump_table(table: Table) -> str:
+    """How often plain first order is off where force jumps at first touch, and where it does not."""
+    rows = []
+    for name in TASKS:
+        part = table[_met(table) & (table.task == name)]
+        jumps = part.strength > SMOOTH
+        rows.append([f"`{name}`"])
+        for some in (part[~jumps], part[jumps]):
+            rows[-1] += [share(some.fobg_off.dropna().to_numpy() == 1), int(some.fobg_off.isna().sum())]
+    head = ("task", "off, no jump", "undecided", "off, force jumps", "undecided")
     return markdown(head, rows)
 
 
 def bound_table(table: Table) -> str:
-    """How often the error that the term leaves is within the bound that findings state."""
+    """How often the error that the term leaves is within the bound that findings state, by onset strength."""
     rows = []
-    for name, part in table[_plain(table) & (table.onset_spread >= NARROW)].groupby("task"):
-        excess = part.left - SHARE_OFF * part.strength
-        told = (excess.abs() > QUANTILE * part.left_error) & np.isfinite(excess)
-        rows.append(
-            [
-                f"`{name}`",
-                len(part),
-                share((excess[told] <= 0).to_numpy()),
-                f"{part.left[np.isfinite(part.left)].median():.2g}",
-            ]
-        )
-    return markdown(("task", "cells", "within the bound, where that is decided", "share left, median"), rows)
+    for name in TASKS:
+        part = table[_wide(table) & (table.task == name)]
+        if not len(part):
+            continue
+        rows.append([f"`{name}`", len(part), f"{part.left[np.isfinite(part.left)].median():.2g}"])
+        for low, high in itertools.pairwise((0, *STRENGTHS, np.inf)):
+            told = part.beyond[(part.strength >= low) & (part.strength < high)].dropna()
+            rows[-1].append(share(told.to_numpy() == 0))
+    inner = [f"{low:g} to {high:g}" for low, high in itertools.pairwise(STRENGTHS)]
+    within = [f"below {STRENGTHS[0]:g}", *inner, f"above {STRENGTHS[-1]:g}"]
+    return markdown(("task", "cells", "share left, median", *within), rows)
 
 
 def groups_table(table: Table) -> str:
     """How well each group alone tells a verdict: the chance that it ranks a cell with it above one without."""
-    met, cured = table[_met(table)], table[_plain(table)]
+    met, cured = table[_met(table)], table[_curable(table)]
     chances = []
     for group in GROUPS:
         for some, verdict in ((table, "above"), (met, "fobg_off"), (cured, "fobg_onset_off")):
@@ -238,7 +307,7 @@ def groups_table(table: Table) -> str:
             ranks, truth = kept[group].rank(), kept[verdict] == 1
             pairs = int(truth.sum()) * int((~truth).sum())
             chances.append((ranks[truth].sum() - truth.sum() * (truth.sum() + 1) / 2) / pairs if pairs else np.nan)
-    head = ("group", "", "variance above", "mean off", "off with the term")
+    head = ("group", "", *VERDICTS)
     named = [[f"`{symbol}`", meaning] for symbol, meaning in GROUPS.values()]
     shown = [f"{each:.2f}" if np.isfinite(each) else "-" for each in chances]
     return markdown(head, [[*name, *shown[3 * place : 3 * place + 3]] for place, name in enumerate(named)])
@@ -248,11 +317,43 @@ def timestep_table(table: Table) -> str:
     """Verdicts by task and timestep."""
     rows = []
     for (name, timestep), part in table.groupby(["task", "timestep"]):
-        inner = part[_met(part)]
-        decided = [part.above, inner.fobg_off, inner[inner.fobg_off == 1].fobg_onset_off]
-        rows.append([f"`{name}`", f"{1e3 * timestep:g} ms", len(part)])
-        rows[-1] += [share(each.dropna().to_numpy() == 1) for each in decided]
-    return markdown(("task", "timestep", "cells", "variance above", "mean off", "off with the term"), rows)
+        rows.append([f"`{name}`", f"{1e3 * timestep:g} ms", len(part), *map(share, verdicts(part))])
+    return markdown(("task", "timestep", "cells", *VERDICTS), rows)
+
+
+def steps_table(table: Table) -> str:
+    """What a smaller step does to contacts that are stable at the largest one, and to the stiffest quarter of all.
+
+    Variances are over the squared gradient and times the number of steps, which is what a second of computing leaves.
+    """
+    rows = []
+    for name, cells in table.groupby("task"):
+        quarter = cells.stiffness.quantile([0.25, 0.75])
+        parts = cells[cells.stiffness <= quarter[0.25]], cells[cells.stiffness >= quarter[0.75]]
+        largest = cells.timestep.max()
+        jumping = cells[_met(cells) & (cells.strength > SMOOTH)]
+        known = jumping[jumping.slope.abs() > SURE * jumping.slope_se]
+        alike = known[largest**2 * known.k + 2 * largest * known.b < 4]
+        for timestep in sorted(cells.timestep.unique()):
+            rows.append([f"`{name}`", f"{1e3 * timestep:g} ms"])
+            for part in parts:
+                left = part.fobg_variance / part.norm**2 / part.timestep
+                medians = left.groupby(part.timestep).median()
+                here = part[part.timestep == timestep]
+                rows[-1].append(share(here.above.dropna().to_numpy() == 1))
+                rows[-1].append(f"{medians[timestep] / medians[largest]:.2g}")
+            biases = alike.fobg_relative[alike.timestep == timestep]
+            rows[-1].append(f"{biases.median():.2g} ({len(biases)})" if len(biases) >= BINS else "-")
+    head = (
+        "task",
+        "timestep",
+        "softest quarter: variance above",
+        "variance x steps",
+        "stiffest quarter: variance above",
+        "variance x steps",
+        "bias, median",
+    )
+    return markdown(head, rows)
 
 
 def cells_table(table: Table) -> str:
@@ -271,24 +372,34 @@ def cells_table(table: Table) -> str:
         "cells",
         "variance decided",
         "mean decided, where bodies meet",
-        "gradient / rollout",
+        "gradients / rollout",
     )
     return markdown(head, rows)
 
 
 def samples_table(table: Table) -> str:
-    """How much first order gains, and how many zeroth-order samples it takes to overtake its bias."""
+    """How much first order gains, and how many rollouts it takes until zeroth order is ahead of its bias."""
     rows = []
-    stable = table[(table.stable == 1) & np.isfinite(table.ratio)]
-    for name, part in stable.groupby("contact", sort=False):
+    for name in TASKS:
+        part = table[(table.task == name) & (table.stable == 1) & np.isfinite(table.ratio)]
         worth = part.worth.quantile([0.25, 0.5, 0.75])
-        off = part[(part.fobg_off == 1) & part.meets]
-        until = off.until.quantile([0.25, 0.5, 0.75]) if len(off) else worth * np.nan
+        off = part[_plain(part)]
         rows.append([f"`{name}`", len(part), *(f"{each:.2g}" for each in worth), len(off)])
-        rows[-1] += [f"{each:.2g}" if np.isfinite(each) else "-" for each in until]
+        some = off.until.quantile([0.25, 0.5, 0.75]) if len(off) >= BINS else worth * np.nan
+        rows[-1] += [f"{each:.2g}" if np.isfinite(each) else "-" for each in some]
     quarters = ("quarter", "median", "three quarters")
-    head = ("contact", "stable cells", *quarters, "of these off", *quarters)
+    head = ("task", "stable cells", *quarters, "of these off", *quarters)
     return markdown(head, rows)
+
+
+def machines_table(table: Table) -> str:
+    """Where the cells were computed."""
+    rows = []
+    for place, each in enumerate(table.attrs["environments"]):
+        versions = [each["versions"][name] for name in ("mujoco", "jax")]
+        cells = int((table.environment == place).sum())
+        rows.append([each["processor"], each["cores"], each["python"], *versions, each["precision"], cells])
+    return markdown(("processor", "cores", "Python", "MuJoCo", "JAX", "precision", "cells"), rows)
 
 
 def markdown(head: Any, rows: Any) -> str:
@@ -297,17 +408,20 @@ def markdown(head: Any, rows: Any) -> str:
 
 
 TABLES: Final = {
+    "machines": machines_table,
     "cells": cells_table,
+    "jump": jump_table,
     "groups": groups_table,
     "index": index_table,
     "rules": rules_table,
     "bound": bound_table,
     "timestep": timestep_table,
+    "steps": steps_table,
     "samples": samples_table,
 }
 
 
-def binned(axes: Axes, values: Any, verdict: Any, colour: str, label: str) -> None:
+def binned(axes: Axes, values: Any, verdict: Any, colour: str) -> None:
     """The share of a verdict in bins of equal numbers of cells, with Wilson intervals."""
     kept = np.isfinite(values) & (values > 0) & np.isfinite(verdict)
     values, verdict = values[kept], verdict[kept]
@@ -326,31 +440,40 @@ def binned(axes: Axes, values: Any, verdict: Any, colour: str, label: str) -> No
             markersize=4,
             capsize=2,
         )
-    axes.plot([], [], color=colour, marker="o", label=label)
 
 
 def panels(rows: int, columns: int, width: float = 3.4, height: float = 2.8) -> tuple[Figure, list[Axes]]:
-    figure = Figure((width * columns, height * rows), layout="constrained")
+    figure = Figure((width * columns, height * rows + 0.3), layout="constrained")
     return figure, list(np.ravel(figure.subplots(rows, columns)))
+
+
+def key(figure: Figure, colours: Mapping[str, str], *more: Line2D) -> None:
+    """A legend below the panels, outside them."""
+    dots = [Line2D([], [], color=colour, marker="o", linewidth=0, label=name) for name, colour in colours.items()]
+    columns = len(dots) if not more else 4
+    figure.legend(handles=[*dots, *more], loc="outside lower center", ncols=columns, frameon=False)
+
+
+def symbol_of(group: str) -> str:
+    return GROUPS[group][0].replace("^2", "²")
 
 
 def scatter(axes: Axes, table: Table, x: str, y: str, limits: tuple[float, float]) -> None:
     """A point for each cell, clipped to the limits, coloured by contact family."""
     for name, part in table.groupby("contact", sort=False):
-        axes.scatter(part[x], part[y].clip(*limits), s=3, color=COLOURS[name], label=name, alpha=0.5, linewidths=0)
-    axes.set(xscale="log", yscale="log", xlabel=GROUPS[x][0] if x in GROUPS else x, ylim=limits)
+        axes.scatter(part[x], part[y].clip(*limits), s=3, color=COLOURS[name], alpha=0.5, linewidths=0)
+    axes.set(xscale="log", yscale="log", xlabel=symbol_of(x), ylim=limits)
 
 
 def variance_figure(table: Table) -> Figure:
     """Ratio of variances against the share of the stability limit, a panel for each task."""
-    names = list(dict.fromkeys(table.task))
-    figure, axes = panels(2, -(-len(names) // 2))
-    for each, name in zip(axes, names, strict=False):
+    figure, axes = panels(2, 3)
+    for each, name in zip(axes, TASKS, strict=True):
         scatter(each, table[(table.task == name) & table.ratio.notna()], "limit", "ratio", (1e-7, 1e7))
         each.axhline(1, color="black", linewidth=0.6)
         each.axvline(1, color="black", linewidth=0.6, linestyle=":")
         each.set_title(name)
-    axes[0].legend(markerscale=3, fontsize=7)
+    key(figure, COLOURS)
     for each in axes[:: len(axes) // 2]:
         each.set_ylabel("variance, first / zeroth order")
     return figure
@@ -364,68 +487,71 @@ def bias_figure(table: Table) -> Figure:
         scatter(axes[place], met, group, "fobg_relative", (1e-3, 1e2))
         axes[place].axhline(TOLERANCE, color="black", linewidth=0.6)
         for name, part in met.groupby("contact", sort=False):
-            binned(axes[place + 4], part[group], part.fobg_off, COLOURS[name], name)
-        axes[place + 4].set(xscale="log", xlabel=GROUPS[group][0], ylim=(-0.03, 1.03))
+            binned(axes[place + 4], part[group], part.fobg_off, COLOURS[name])
+        axes[place + 4].set(xscale="log", xlabel=symbol_of(group), ylim=(-0.03, 1.03))
     axes[0].set_ylabel("relative bias of first order")
     axes[4].set_ylabel(f"share off by more than {TOLERANCE:.0%}")
-    axes[1].legend(markerscale=3, fontsize=7)
+    key(figure, COLOURS)
     return figure
 
 
 def onset_figure(table: Table) -> Figure:
-    """What the onset term leaves of what it adds, where plain first order is off."""
-    some = table[_plain(table)]
+    """What the onset term leaves of what it adds, where force jumps and plain first order is off."""
+    some = table[_curable(table)]
     figure, axes = panels(1, 3)
     for each, group in zip(axes, ("strength", "crossing", "limit"), strict=True):
         for name, part in some.groupby("task", sort=False):
-            each.scatter(part[group], part.left.clip(1e-3, 10), s=5, label=name, alpha=0.6, linewidths=0)
-        each.set(xscale="log", yscale="log", xlabel=GROUPS[group][0], ylim=(1e-3, 10))
-    strength = np.geomspace(1e-3, 1, 50)
-    axes[0].plot(strength, SHARE_OFF * strength, color="black", linewidth=0.8, label="stated by findings")
+            each.scatter(part[group], part.left.clip(1e-3, 10), s=5, color=TASKS[name], alpha=0.6, linewidths=0)
+        each.set(xscale="log", yscale="log", xlabel=symbol_of(group), ylim=(1e-3, 10))
+    strength = np.array([SMOOTH, STRONG])
+    axes[0].plot(strength, SHARE_OFF * strength, color="black", linewidth=0.8)
     axes[1].axvline(1 / NARROW, color="black", linewidth=0.6, linestyle=":")
     axes[0].set_ylabel("bias left / what the term adds")
-    axes[0].legend(markerscale=2, fontsize=7)
+    key(
+        figure,
+        TASKS,
+        Line2D([], [], color="black", linewidth=0.8, label="bound of findings"),
+        Line2D([], [], color="black", linewidth=0.6, linestyle=":", label="narrowest noise"),
+    )
     return figure
 
 
 def timestep_figure(table: Table) -> Figure:
     """Shares of the three verdicts by timestep, a line for each task."""
     figure, axes = panels(1, 3)
-    verdicts = {"variance above": "above", "mean off": "fobg_off", "off with the term": "fobg_onset_off"}
-    for each, (title, column) in zip(axes, verdicts.items(), strict=True):
-        some = table if column == "above" else table[_met(table)] if column == "fobg_off" else table[_plain(table)]
-        for name, part in some.groupby("task", sort=False):
-            points = []
-            for timestep, cells in part.groupby("timestep"):
-                decided = cells[column].dropna().to_numpy() == 1
-                if len(decided) >= BINS:
-                    points.append((1e3 * timestep, *coverage_interval(jnp.asarray(decided), 0.95)))
-            if points:
-                x, middle, low, high = np.array(points).T
-                each.errorbar(
-                    x,
-                    middle,
-                    np.maximum([middle - low, high - middle], 0),
-                    marker="o",
-                    markersize=4,
-                    capsize=2,
-                    label=name,
-                )
+    for name, cells in table.groupby("task", sort=False):
+        steps = [(1e3 * timestep, verdicts(part)) for timestep, part in cells.groupby("timestep")]
+        for place, each in enumerate(axes):
+            decided = [(x, found[place]) for x, found in steps if len(found[place]) >= BINS]
+            if not decided:
+                continue
+            x, middle, low, high = np.array([(x, *coverage_interval(jnp.asarray(told), 0.95)) for x, told in decided]).T
+            bars = np.maximum([middle - low, high - middle], 0)
+            each.errorbar(x, middle, bars, color=TASKS[name], marker="o", markersize=4, capsize=2)
+    ticks = [1e3 * timestep for timestep in sorted(table.timestep.unique())]
+    for each, title in zip(axes, VERDICTS, strict=True):
         each.set(xscale="log", xlabel="timestep [ms]", title=title, ylim=(-0.03, 1.03))
-    axes[0].set_ylabel("share of cells")
-    axes[0].legend(fontsize=7)
+        each.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
+        each.minorticks_off()
+    axes[0].set_ylabel("share of decided cells")
+    key(figure, TASKS)
     return figure
 
 
 def samples_figure(table: Table) -> Figure:
     """What first order gains in variance times seconds, and after how many rollouts its bias costs it the lead."""
     figure, axes = panels(1, 2, 4.4)
-    scatter(axes[0], table[table.worth.notna()], "limit", "worth", (1e-7, 1e7))
+    for each, x, y, some, limits in (
+        (axes[0], "limit", "worth", table[table.worth.notna()], (1e-7, 1e7)),
+        (axes[1], "strength", "until", table[_plain(table)], (1e-1, 1e5)),
+    ):
+        for name, part in some.groupby("task", sort=False):
+            each.scatter(part[x], part[y].clip(*limits), s=3, color=TASKS[name], alpha=0.5, linewidths=0)
+        each.set(xscale="log", yscale="log", xlabel=symbol_of(x), ylim=limits)
     axes[0].axhline(1, color="black", linewidth=0.6)
     axes[0].set_ylabel("variance x seconds,\nzeroth / first order")
-    scatter(axes[1], table[_plain(table) & (table.until > 0)], "strength", "until", (1e-1, 1e5))
     axes[1].set_ylabel("rollouts until\nzeroth order is ahead")
-    axes[1].legend(markerscale=3, fontsize=7)
+    key(figure, TASKS)
     return figure
 
 

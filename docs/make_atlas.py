@@ -457,21 +457,38 @@ def read(path: Path) -> dict[str, np.ndarray]:
         return {name: file[name] for name in file.files if name != "about"}
 
 
+def about(path: Path) -> dict[str, Any]:
+    """What a file says about itself."""
+    with np.load(path) as file:
+        return json.loads(str(file["about"]))
+
+
 def condense(folder: Path) -> int:
-    """Join what the folder holds into atlas.npz, in place of its parts; the number of cells."""
-    paths = sorted(folder.glob("*.npz"))
-    if not paths:
+    """Join what the folder holds into atlas.npz, in place of its parts; the number of cells.
+
+    The column `environment` says on which of `environments` a cell was computed.
+    """
+    joined = folder / RESULTS.name
+    found, environments = [], []
+    if joined.exists():
+        found.append(read(joined))
+        environments += about(joined)["environments"]
+    if parts := sorted(path for path in folder.glob("*.npz") if path != joined):
+        here = json.loads(json.dumps(environment()))
+        if here not in environments:
+            environments.append(here)
+        for columns in map(read, parts):
+            found.append(columns | {"environment": np.full(len(columns["index"]), environments.index(here))})
+    if not found:
         return 0
-    found = [read(path) for path in paths]
     tasks = [task_of(*program) for program in PROGRAMS]
-    about = {"environment": environment(), "samples": SAMPLES, "seed": SEED, "programs": PROGRAMS, "families": FAMILIES}
-    about |= {"durations": [task.horizon * task.scene.timestep for task in tasks]}
-    about |= {"params": [task.policy.num_params for task in tasks]}
-    write(folder / RESULTS.name, found, about=json.dumps(about))
-    for path in paths:
-        if path.name != RESULTS.name:
-            path.unlink()
-    return len(read(folder / RESULTS.name)["index"])
+    told = {"environments": environments, "samples": SAMPLES, "seed": SEED, "programs": PROGRAMS, "families": FAMILIES}
+    told |= {"durations": [task.horizon * task.scene.timestep for task in tasks]}
+    told |= {"params": [task.policy.num_params for task in tasks]}
+    write(joined, found, about=json.dumps(told))
+    for path in parts:
+        path.unlink()
+    return len(read(joined)["index"])
 
 
 def run(folder: Path, workers: int, seconds: float, most: int | None = None, only: Sequence[str] = ("",)) -> None:
@@ -480,6 +497,7 @@ def run(folder: Path, workers: int, seconds: float, most: int | None = None, onl
     folder.mkdir(parents=True, exist_ok=True)
     os.environ["JAX_PLATFORMS"] = "cpu"
     jax.config.update("jax_platforms", "cpu")
+    jax.config.update("jax_enable_x64", True)  # as in the workers, for `environment`
     before = condense(folder)
     done = frozenset(read(folder / RESULTS.name)["index"].tolist()) if before else frozenset()
     chosen = [job for job in jobs() if any(part in job.label for part in only)]

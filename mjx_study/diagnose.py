@@ -27,7 +27,7 @@ from mjx_study.simulation.contact import ContactModel, stable, stiffness_from_so
 from mjx_study.simulation.engine import engine_model
 from mjx_study.study.configuration import Progress
 from mjx_study.study.dataset import as_plain
-from mjx_study.study.findings import NARROW, NOTABLE, SHARE_OFF
+from mjx_study.study.findings import NARROW, NOTABLE, SHARE_OFF, STRONG, linear_error
 from mjx_study.study.memory import check_memory
 from mjx_study.study.sampling import cell_keys, draw_batches, unconverged
 from mjx_study.study.tally import onset_numbers
@@ -324,7 +324,7 @@ class Diagnosis(Measurement):
         if spread < NARROW:
             step = timestep * spread / NARROW
             yield f"the noise is too narrow for onset terms: take a timestep of {step:.1g} s, or more noise", ""
-        elif corrected.bias > explained:
+        elif corrected.bias > explained and strength <= STRONG:
             yield (
                 f"the onset term leaves a bias of {corrected.bias / self.norm:.0%}, which its own error does not "
                 "explain: corners that turn, edges and contacts that end under load have no term",
@@ -333,8 +333,8 @@ class Diagnosis(Measurement):
         elif SHARE_OFF * strength > NOTABLE:
             step = timestep * NOTABLE / (SHARE_OFF * strength)
             yield (
-                f"the linear onset term can be off by {SHARE_OFF * strength:.0%} of what it adds: a timestep of "
-                f"{step:.1g} s makes that {NOTABLE:.0%}; the jump is exact but for the square of the step",
+                f"{linear_error(strength)}: a timestep of {step:.1g} s brings that down to {NOTABLE:.0%}; the jump is "
+                "exact but for the square of the step",
                 "--onset jump",
             )
 

@@ -176,7 +176,8 @@ def test_a_bias_at_right_angles_to_the_gradient_is_seen() -> None:
 
 @pytest.mark.parametrize(
     ("spread", "strength", "expected"),
-    [(0.3, 0.5, "the noise is too narrow"), (2.0, 0.5, "can be off by 25%"), (2.0, 0.05, None)],
+    [(0.3, 0.5, "the noise is too narrow"), (2.0, 0.5, "can be off by 25%"), (2.0, 0.05, None)]
+    + [(2.0, 1.2, "can leave more than it adds")],
 )
 def test_when_the_onset_term_is_not_to_be_trusted(
     found: Diagnosis, spread: float, strength: float, expected: str | None

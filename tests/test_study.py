@@ -11,6 +11,7 @@ import xarray as xr
 
 from estimators import AlphaOrder, InverseVariance
 from mjx_study import disk
+from mjx_study.accessor import StudyAccessor
 from mjx_study.cli import console
 from mjx_study.cli.studies import as_document
 from mjx_study.objective import MjxObjective, Simulator
@@ -182,6 +183,7 @@ def test_zeroth_order_alone_does_not_differentiate_for_itself() -> None:
 
 def test_a_dataset_says_what_a_study_is_good_for(spied) -> None:
     found, _, _ = spied
+    assert isinstance(found.mjx_study, StudyAccessor)
     table = found.mjx_study.table()
     assert len(table) == 78 and set(table["estimator"]) == {"zobg", "fobg", "aobg"}
     assert table["variance_seconds"].notnull().all() and set(found.mjx_study.plot()) == {"comparison"}
@@ -254,6 +256,8 @@ def test_an_onset_term_that_is_not_to_be_trusted_is_told() -> None:
     )
     (strong,) = findings(result(row("fobg_onset", 10, 1, **events | {"onset_strength": 0.25})))
     assert strong.startswith("penalty: the linear onset term can be off by 12% of what it adds, more at ")
+    (beyond,) = findings(result(row("fobg_onset", 10, 1, **events | {"onset_strength": 1.2})))
+    assert beyond.startswith("penalty: the linear onset term can leave more than it adds, more at ")
     assert findings(result(row("fobg_onset", 10, 1, **events | {"onset_strength": 0.0}))) == []
 
 
