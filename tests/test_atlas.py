@@ -69,30 +69,16 @@ def test_sentences_of_the_page_have_the_numbers_of_the_file() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("program", [2, 6])
-def test_cells_are_computed_again_with_the_same_numbers(program: int) -> None:
+def test_cells_are_computed_again_with_the_same_numbers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of either machine; one that rounds otherwise changes chaotic cells, so the median is compared."""
-    cells = list(atlas.cells_of(program))[: atlas.BLOCK]
-    found = atlas.measure(atlas.Programs(atlas.task_of(*atlas.PROGRAMS[program])), cells)
-    kept = TABLE.set_index("index").loc[[cell.index for cell in cells]]
-    for name in ("slope", "zobg_variance", "fobg_variance", "fobg_bias", "onsets"):
+    monkeypatch.delenv("XLA_FLAGS", raising=False)  # without optimisation programs round otherwise
+    atlas.run(tmp_path, 1, 3600.0, atlas.BLOCK, ["momentum_transfer at 0.004", "pusher at 0.0025"])
+    found = atlas.read(tmp_path / atlas.RESULTS.name)
+    kept = TABLE.set_index("index").loc[found["index"]]
+    assert len(kept) == 2 * atlas.BLOCK and set(kept.environment) == {0, 1}
+    for name in ("slope", "zobg_variance", "fobg_variance", "fobg_bias"):
         errors = np.abs(found[name] - kept[name]) / np.abs(kept[name])
-        assert np.median(errors[kept[name] != 0]) < 2**-atlas.DIGITS
-
-
-@pytest.mark.slow
-def test_means_with_a_smooth_onset_are_off_with_many_samples_too(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Six cells of ball_wall at 4 ms; with 64 samples all six seem off."""
-    monkeypatch.setattr(atlas, "SAMPLES", 4096)
-    chosen = (3249, 3294, 3369, 3474, 3529, 3754)
-    assert (TABLE.set_index("index").loc[list(chosen)].fobg_off == 1).all()
-    program = int(TABLE.program[chosen[0]])
-    programs = atlas.Programs(atlas.task_of(*atlas.PROGRAMS[program]))
-    cells = [cell for cell in atlas.cells_of(program) if cell.index in chosen]
-    found = [atlas.measure(programs, [cell]) for cell in cells]
-    relative = sorted(float(np.abs(each["fobg_bias"] / each["slope"])[0]) for each in found)
-    assert relative[0] < 0.2
-    assert relative[1] == pytest.approx(0.93, abs=0.05) and relative[-1] == pytest.approx(4.17, abs=0.2)
+        assert errors[kept[name] != 0].groupby(kept.environment).median().max() <= 2**-atlas.DIGITS
 
 
 @pytest.mark.slow
