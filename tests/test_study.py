@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import xarray as xr
 
+import mjx_study.accessor  # noqa: F401  # registers `Dataset.mjx_study`, which no other import here does
 from estimators import AlphaOrder, InverseVariance
 from mjx_study import disk
-from mjx_study.accessor import StudyAccessor
 from mjx_study.cli import console
 from mjx_study.cli.studies import as_document
 from mjx_study.objective import MjxObjective, Simulator
@@ -183,7 +183,6 @@ def test_zeroth_order_alone_does_not_differentiate_for_itself() -> None:
 
 def test_a_dataset_says_what_a_study_is_good_for(spied) -> None:
     found, _, _ = spied
-    assert isinstance(found.mjx_study, StudyAccessor)
     table = found.mjx_study.table()
     assert len(table) == 78 and set(table["estimator"]) == {"zobg", "fobg", "aobg"}
     assert table["variance_seconds"].notnull().all() and set(found.mjx_study.plot()) == {"comparison"}
