@@ -1,31 +1,346 @@
-"""Measures what docs/scaling.md says of the engine: cells that sleep, on as many local workers as asked for.
+"""Measures what docs/scaling.md says, and draws docs/scaling.png.
 
-    python docs/make_scaling.py --workers 20 --cells 10000 --seconds 0.1
+    python docs/make_scaling.py engine --workers 20 --cells 10000 --seconds 0.1
+    python docs/make_scaling.py cost --seconds 600 --output docs/scaling_cpu.json
+    python docs/make_scaling.py fit docs/scaling_cpu.json
+    python docs/make_scaling.py figure docs/scaling_cpu.json --output docs/scaling.png
 
-What a cell computes is replaced by sleep; the client, Dask, the transfer of arrays and the folder are those of a sweep.
+`engine` runs cells that sleep, on as many local workers as asked for: what a cell computes is replaced by sleep; the
+client, Dask, the transfer of arrays and the folder are those of a sweep.
+
+`cost` times rollouts and gradients against samples, horizon, degrees of freedom, contacts and devices, on whatever JAX
+finds (leave JAX_PLATFORMS unset on an accelerator). Each measurement alternates with one of the same rollouts, so that
+a machine that gets slower slows both; ratios to these are what counts. It prints as it goes, leaves out what does not
+fit into `--seconds`, and goes on where the file ends.
+
+`fit` prints the constants of the rough model of times (mjx_study/study/times.py) that these measurements give.
 """
 
 import argparse
 import json
+import math
+import statistics
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 from unittest import mock
 
+KINDS: Final = ("value", "gradient")
+REPEATS: Final = 7
+LONG: Final = 3.0
+"""Measurements are repeated until they have taken so long [s]."""
+BASE: Final = "pusher"
+HORIZON: Final = 20
+AXES: Final[dict[str, dict[str, tuple[int, ...]]]] = {
+    "cpu": {"samples": (100, 1000, 10_000, 100_000), "chunk": (25, 100, 256)},
+    "gpu": {"samples": (100, 1000, 10_000, 100_000, 1_000_000), "chunk": (512, 4096, 32_768)},
+}
+HORIZONS, CONTACTS, DOF, BODIES = (20, 60, 200), (1, 2, 4, 8), (2, 4, 8, 16), (2,)
 
-def main() -> None:
-    """Print the figures as JSON."""
-    options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    options.add_argument("--workers", type=int, default=20)
-    options.add_argument("--cells", type=int, default=10_000)
-    options.add_argument("--seconds", type=float, default=0.1, help="that a cell sleeps")
-    options.add_argument("--programs", type=int, default=20)
-    options.add_argument("--numbers", type=int, default=1000, help="in the arrays of a cell")
-    print(json.dumps(measure(**vars(options.parse_args()))))
+
+# Models
 
 
-def measure(workers: int, cells: int, seconds: float, programs: int, numbers: int) -> dict[str, Any]:
+def feet(contacts: int) -> str:
+    """A free body on a plane with so many spheres for feet: six degrees of freedom, one contact a foot."""
+    ring = [2 * math.pi * index / contacts for index in range(contacts)]
+    geoms = "".join(
+        f'<geom size="0.05" mass="0.1" pos="{0.3 * math.cos(at):.6f} {0.3 * math.sin(at):.6f} 0"/>' for at in ring
+    )
+    return _mjcf(f'<body pos="0 0 0.049"><freejoint/>{geoms}</body>')
+
+
+def chain(dof: int) -> str:
+    """A hanging chain of so many hinges whose last link touches a plane below: one contact."""
+    body, length = '<geom size="0.05" pos="0 0 -0.1" mass="0.1"/>', 0.1 * dof
+    for index in reversed(range(dof)):
+        at = f"0 0 {length + 0.049:.6f}" if index == 0 else "0 0 -0.1"
+        link = '<geom type="capsule" size="0.01" fromto="0 0 0 0 0 -0.1" mass="0.1" contype="0" conaffinity="0"/>'
+        body = f'<body pos="{at}"><joint axis="0 1 0" damping="0.01"/>{link}{body}</body>'
+    return _mjcf(body)
+
+
+def bodies(count: int) -> str:
+    """So many free spheres beside each other on a plane: six degrees of freedom and one contact each."""
+    return _mjcf(
+        "".join(
+            f'<body pos="{index} 0 0.049"><freejoint/><geom size="0.05" mass="0.1" conaffinity="0"/></body>'
+            for index in range(count)
+        )
+    )
+
+
+def _mjcf(world: str) -> str:
+    return f"""<mujoco><option timestep="0.005"/><worldbody>
+<geom name="floor" type="plane" size="5 5 0.1" contype="0" conaffinity="1"/>{world}</worldbody></mujoco>"""
+
+
+def task_of(mjcf: str, horizon: int) -> Any:
+    """Its task: the displacement after some steps, by the initial velocities."""
+    from mjx_study.tasks.mjcf import mjcf_task
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "model.xml"
+        path.write_text(mjcf)
+        return mjcf_task(path, horizon=horizon)
+
+
+# Measurements
+
+
+class Programs:
+    """What is compiled, and rollouts of the base."""
+
+    def __init__(self) -> None:
+        import jax
+
+        self.devices = jax.local_devices()
+        self.on_cpu = self.devices[0].platform == "cpu"
+        self.chunk = 256 if self.on_cpu else 32_768
+        self._simulators: dict[tuple[Any, ...], Any] = {}
+        self._tasks: dict[tuple[str, int], Any] = {}
+
+    def task(self, model: str, horizon: int) -> Any:
+        """A task of the package, or of an MJCF."""
+        from mjx_study.tasks import make_task
+
+        if (model, horizon) not in self._tasks:
+            made = task_of(model, horizon) if "<" in model else make_task(model, horizon=horizon)
+            self._tasks[model, horizon] = made
+        return self._tasks[model, horizon]
+
+    def run(
+        self,
+        kind: str,
+        samples: int,
+        chunk: int | None = None,
+        model: str = BASE,
+        horizon: int = HORIZON,
+        devices: int = 1,
+        wall: bool = False,
+    ) -> tuple[dict[str, Any], Callable[[], float]]:
+        """What is run, and a call that runs it and returns seconds, on a CPU the processor's unless `wall`."""
+        import jax
+        import numpy as np
+
+        from mjx_study.objective import Simulator, spread
+        from mjx_study.simulation.scene import num_constraint_rows
+        from mjx_study.stopwatch import timed
+
+        task, chunk = self.task(model, horizon), chunk or min(samples, self.chunk)
+        key = model, horizon, chunk
+        if key not in self._simulators:
+            self._simulators[key] = Simulator(task, chunk_size=chunk)
+        simulator = self._simulators[key]
+        keys = np.resize(jax.random.key_data(jax.random.split(jax.random.key(0), min(samples, 10_000))), (samples, 2))
+        noise = np.ones(samples, task.scene.template.qpos.dtype)
+        shared, program = (task.theta, None, np.asarray(task.sigma, noise.dtype)), simulator._programs[kind]
+        clock = time.process_time if self.on_cpu and not wall else time.perf_counter
+
+        def call() -> float:
+            begun = clock()
+            with timed(kind):
+                spread(program, shared, (keys, noise), chunk, self.devices[:devices])
+            return clock() - begun
+
+        sizes = {"dof": int(task.scene.host.nv), "constraints": num_constraint_rows(task.scene.template)}
+        told = {"kind": kind, "samples": samples, "chunk": chunk, "devices": devices, "steps": horizon}
+        return told | sizes, call
+
+
+def compiled(call: Callable[[], float]) -> dict[str, float]:
+    """Compile; seconds of tracing and compilation, none where that was done."""
+    from mjx_study.stopwatch import Stopwatch
+
+    with Stopwatch().running() as watch:
+        call()
+    (spent,) = watch.spent.values()
+    return {"tracing": spent.tracing, "compiling": spent.compiling} if spent.setups else {}
+
+
+def plan(programs: Programs) -> list[tuple[str, int, dict[str, Any]]]:
+    """Axis, place on it, and arguments of `Programs.run`, what matters most first."""
+    axes, chunk = AXES["cpu" if programs.on_cpu else "gpu"], programs.chunk
+    found: list[tuple[str, int, dict[str, Any]]] = []
+    for kind in KINDS:
+        found += [("samples", at, {"kind": kind, "samples": at}) for at in axes["samples"]]
+        found += [("chunk", at, {"kind": kind, "samples": at, "chunk": at}) for at in axes["chunk"]]
+        counts = range(1, 1 + min(8, len(programs.devices)))
+        found += [("devices", at, {"kind": kind, "samples": 16 * chunk, "devices": at, "wall": True}) for at in counts]
+    found += [("horizon", at, {"kind": kind, "samples": chunk, "horizon": at}) for at in HORIZONS for kind in KINDS]
+    others = ("corrected", "steps", "step_gradient", "linearisation")
+    found += [("kind", at, {"kind": kind, "samples": chunk}) for at, kind in enumerate(KINDS + others)]
+    for axis, model, places in (("contacts", feet, CONTACTS), ("dof", chain, DOF), ("bodies", bodies, BODIES)):
+        found += [(axis, at, {"kind": kind, "samples": chunk, "model": model(at)}) for at in places for kind in KINDS]
+    return found
+
+
+def measure_cost(seconds: float, output: Path) -> None:
+    """Time everything that the file does not have; written after each measurement.
+
+    Args:
+        seconds: after which nothing more is begun, of a CPU the processor's.
+    """
+    import jax
+
+    from mjx_study.runtime import configure, environment
+
+    configure()
+    jax.config.update("jax_compilation_cache_dir", None)  # so that everything is compiled
+    programs = Programs()
+    clock = time.process_time if programs.on_cpu else time.perf_counter
+    begun = clock()
+    document: dict[str, Any] = {"environment": environment(), "measured": [], "left_out": []}
+    if output.exists():
+        document |= {"measured": json.loads(output.read_text())["measured"]}
+    _, base = programs.run("value", programs.chunk)
+    per_step = programs.chunk * HORIZON
+    compiled(base)
+    bases: list[float] = []
+    for axis, at, arguments in plan(programs):
+        if any((axis, at, arguments["kind"]) == (row["axis"], row["at"], row["kind"]) for row in document["measured"]):
+            continue
+        if clock() - begun > seconds:
+            document["left_out"].append([axis, at, arguments["kind"]])
+            continue
+        told, call = programs.run(**arguments)
+        found = {"axis": axis, "at": at} | told | compiled(call)
+        pairs = [(base(), call())]
+        while len(pairs) < REPEATS and sum(own for _, own in pairs) < LONG:
+            pairs.append((base(), call()))
+        # in steps of a rollout of the base
+        found["ratio"] = statistics.median(own / other for other, own in pairs) * per_step
+        found["seconds"] = min(own for _, own in pairs)
+        document["measured"].append(found)
+        bases += [other / per_step for other, _ in pairs]
+        document["base"] = {"task": BASE, "steps": HORIZON, "samples": programs.chunk, "step": statistics.median(bases)}
+        output.write_text(json.dumps(document, indent=1) + "\n")
+        print(
+            f"{clock() - begun:6.0f} s  {axis:9} {at:8} {told['kind']:14} {found['seconds']:9.4g} s, a step "
+            f"{found['ratio'] / told['samples'] / told['steps']:8.3g} of a rollout of {BASE}; "
+            f"traced in {found.get('tracing', 0):.2g} s, compiled in {found.get('compiling', 0):.2g} s",
+            flush=True,
+        )
+    print(f"{len(document['left_out'])} left out for lack of time")
+
+
+# Model and figure
+
+
+def fit(document: dict[str, Any]) -> dict[str, Any]:
+    """The constants of the rough model, see `mjx_study.study.times`: of times and of compilation, and their errors.
+
+    Returns:
+        Constants to two digits, and as `spread` the factor by which measured times and those of the model differ, as
+        the largest and as the root mean square of logarithms.
+    """
+    import numpy as np
+
+    rows = document["measured"]
+    for row in rows:
+        row["each"] = row["seconds"] / row["steps"] / math.ceil(row["samples"] / row["chunk"])
+    alone = [row for row in rows if row["devices"] == 1]
+
+    def of(axis: str, kind: str) -> list[dict[str, Any]]:
+        return [row for row in alone if row["axis"] == axis and row["kind"] == kind]
+
+    overheads = []
+    for kind in KINDS:
+        chunks, each = (np.array([row[name] for row in of("chunk", kind)], float) for name in ("chunk", "each"))
+        slope, start = np.polyfit(chunks, each, 1, w=1 / each)
+        overheads.append(max(1.0, start / slope))
+    overhead = two_digits(math.sqrt(math.prod(overheads)))
+    own = of("kind", "value")[0]["ratio"]
+    factors = {row["kind"]: two_digits(row["ratio"] / own) for row in alone if row["axis"] == "kind"}
+    sized = [row for row in alone if row["axis"] in ("contacts", "dof", "bodies", "horizon", "chunk", "samples")]
+
+    def powers(values: Any, rows: Any) -> tuple[Any, Any]:
+        """Constant and powers of 1 + degrees of freedom and 1 + constraint rows; and what is left."""
+        sizes = np.array([[1.0, math.log(1 + row["dof"]), math.log(1 + row["constraints"])] for row in rows])
+        found = np.linalg.lstsq(sizes, np.log(values), rcond=None)[0]
+        return found, np.log(values) - sizes @ found
+
+    times = [row["each"] / (row["chunk"] + overhead) / factors[row["kind"]] for row in sized]
+    (rate, *exponents), left = powers(times, sized)
+    fresh = [row for row in alone if row.get("compiling", 0) > 0]
+    setups = {}
+    for name in ("tracing", "compiling"):
+        own = [row[name] / factors[row["kind"]] ** 0.5 for row in fresh]
+        (constant, *grown), rest = powers(own, fresh)
+        setups[name] = [two_digits(math.exp(constant)), *map(two_digits, grown)]
+        setups[f"spread of {name}"] = apart(rest)
+    return {
+        "overhead": overhead,
+        "rate": two_digits(math.exp(rate)),
+        "powers": [two_digits(power) for power in exponents],
+        "factors": factors,
+        "spread": apart(left),
+    } | setups
+
+
+def two_digits(value: float) -> float:
+    return float(f"{value:.2g}")
+
+
+def apart(logarithms: Any) -> list[float]:
+    """Factors: the largest, and the root mean square."""
+    import numpy as np
+
+    return [two_digits(math.exp(np.max(np.abs(logarithms)))), two_digits(math.exp(np.sqrt(np.mean(logarithms**2))))]
+
+
+PANELS: Final = {
+    "samples": ("samples", "time of a sample"),
+    "horizon": ("steps", "time of a step"),
+    "dof": ("degrees of freedom", "time of a step"),
+    "contacts": ("contacts", "time of a step"),
+    "devices": ("devices", "samples per second"),
+}
+
+
+def draw(documents: list[dict[str, Any]], output: Path) -> None:
+    """One row of panels: an accelerator's lines are dashed."""
+    from matplotlib.figure import Figure
+
+    from mjx_study.disk import write_whole
+    from mjx_study.plots.style import STYLE
+
+    figure = Figure(figsize=(3.0 * len(PANELS), 3.2), layout="constrained")
+    panels = dict(zip(PANELS, figure.subplots(1, len(PANELS)), strict=True))
+    names = {"value": ("rollouts", *STYLE["zobg"]), "gradient": ("gradients", *STYLE["fobg"])}
+    for document, line in zip(documents, ("-", "--", ":"), strict=False):
+        environment = document["environment"]
+        device = environment["processor"] if environment["backend"] == "cpu" else environment["devices"][0]
+        for axis, (label, title) in PANELS.items():
+            for kind, (name, colour, marker) in names.items():
+                rows = [row for row in document["measured"] if row["axis"] == axis and row["kind"] == kind]
+                if not rows:
+                    continue
+                axes, each = panels[axis], [row["ratio"] / row["samples"] / row["steps"] for row in rows]
+                if axis == "devices":
+                    each = [rows[0]["seconds"] / row["seconds"] for row in rows]
+                told = f"{name}, {device}" if len(documents) > 1 else name
+                axes.plot([row["at"] for row in rows], each, line, color=colour, marker=marker, ms=4, label=told)
+                axes.set(xlabel=label, title=title)
+    for axis, axes in panels.items():
+        if axis == "devices":
+            most = max([2, *(row["at"] for each in documents for row in each["measured"] if row["axis"] == axis)])
+            axes.plot([1, most], [1, most], color="0.7", linewidth=0.8, zorder=0)
+            axes.set(ylim=(0, None), xticks=range(1, most + 1), ylabel="over one device")
+        else:
+            axes.set(xscale="log", yscale="log")
+            axes.grid(alpha=0.25)
+    next(iter(panels.values())).set_ylabel(f"over a step of a rollout of {BASE}")
+    next(iter(panels.values())).legend(fontsize=7)
+    write_whole(output, lambda file: figure.savefig(file, format="png", dpi=130))
+
+
+# The engine
+
+
+def measure_engine(workers: int, cells: int, seconds: float, programs: int, numbers: int) -> dict[str, Any]:
     """Run the cells and write them; rates of all of it, and of its parts."""
     import numpy as np
 
@@ -81,6 +396,37 @@ def measure(workers: int, cells: int, seconds: float, programs: int, numbers: in
         "file [bytes]": size,
         "claiming [us/cell]": 1e6 * claimed / cells,
     }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    commands = parser.add_subparsers(dest="command", required=True)
+    engine = commands.add_parser("engine", help="print the figures of the engine as JSON")
+    engine.add_argument("--workers", type=int, default=20)
+    engine.add_argument("--cells", type=int, default=10_000)
+    engine.add_argument("--seconds", type=float, default=0.1, help="that a cell sleeps")
+    engine.add_argument("--programs", type=int, default=20)
+    engine.add_argument("--numbers", type=int, default=1000, help="in the arrays of a cell")
+    cost = commands.add_parser("cost", help="time rollouts and gradients")
+    cost.add_argument(
+        "--seconds", type=float, default=600, help="after which nothing is begun, of a CPU the processor's"
+    )
+    cost.add_argument("--output", type=Path, required=True)
+    fit_command = commands.add_parser("fit", help="print the constants of the model")
+    fit_command.add_argument("measured", type=Path)
+    drawn = commands.add_parser("figure", help="draw")
+    drawn.add_argument("measured", type=Path, nargs="+")
+    drawn.add_argument("--output", type=Path, required=True)
+    options = vars(parser.parse_args())
+    command = options.pop("command")
+    if command == "engine":
+        print(json.dumps(measure_engine(**options)))
+    elif command == "cost":
+        measure_cost(**options)
+    elif command == "fit":
+        print(json.dumps(fit(json.loads(options["measured"].read_text())), indent=1))
+    else:
+        draw([json.loads(path.read_text()) for path in options["measured"]], options["output"])
 
 
 if __name__ == "__main__":

@@ -31,29 +31,48 @@ class Spent:
 
     Attributes:
         calls, seconds: of calls for which nothing was compiled.
-        first_calls, first: of those for which something was, without that.
-        tracing: the longest tracing.
-        compiling: the longest compilation by XLA, as it is when it is not in the cache.
+        setups, first_calls, first: times that something was, with the calls that followed at once, and all their time.
+        traced, read, compiled: of it, by what JAX tells, tracing, compiling or reading what is compiled already, and
+            what compiling would have taken.
     """
 
     calls: int = 0
     seconds: float = 0.0
+    setups: int = 0
     first_calls: int = 0
     first: float = 0.0
-    tracing: float = 0.0
-    compiling: float = 0.0
+    traced: float = 0.0
+    read: float = 0.0
+    compiled: float = 0.0
 
-    def add(self, calls: int, wall: float, tracing: float = 0.0, reading: float = 0.0, compiling: float = 0.0) -> None:
-        if compiling > 0:
-            self.first_calls, self.first = self.first_calls + calls, self.first + max(0.0, wall - tracing - reading)
-            self.tracing, self.compiling = max(self.tracing, tracing), max(self.compiling, compiling)
-        else:
-            self.calls, self.seconds = self.calls + calls, self.seconds + wall
+    def add(self, calls: int, seconds: float, traced: float = 0.0, read: float = 0.0, compiled: float = 0.0) -> None:
+        if compiled == 0:
+            self.calls, self.seconds = self.calls + calls, self.seconds + seconds
+            return
+        self.setups, self.first_calls, self.first = self.setups + 1, self.first_calls + calls, self.first + seconds
+        self.traced, self.read, self.compiled = self.traced + traced, self.read + read, self.compiled + compiled
 
     @property
     def each(self) -> float:
         """Seconds per call, of the first ones where there are no others."""
-        return self.seconds / self.calls if self.calls else self.first / max(1, self.first_calls)
+        if self.calls:
+            return self.seconds / self.calls
+        return max(0.0, self.first - self.traced - self.read) / max(1, self.first_calls)
+
+    @property
+    def tracing(self) -> float:
+        """Seconds before a first call, without compilation."""
+        return self._setup * self.traced / (self.traced + self.read) if self.setups else 0.0
+
+    @property
+    def compiling(self) -> float:
+        """Seconds of a compilation, as if there were no cache."""
+        return self._setup * self.compiled / (self.traced + self.read) if self.setups else 0.0
+
+    @property
+    def _setup(self) -> float:
+        """Seconds of tracing, and of compiling or reading: by this clock, which may be another than JAX's."""
+        return max(0.0, self.first - self.first_calls * self.each) / self.setups
 
 
 class Stopwatch:
@@ -61,7 +80,10 @@ class Stopwatch:
 
     Attributes:
         saved: when they were last written [s], by `time.monotonic`.
+        clock: seconds, the wall's.
     """
+
+    clock = staticmethod(time.perf_counter)
 
     def __init__(self) -> None:
         self.spent: dict[Hashable, Spent] = {}
@@ -96,7 +118,7 @@ class Stopwatch:
                 self.spent.setdefault(program, Spent()).add(calls, *map(float, own))
 
     def _now(self) -> np.ndarray:
-        return np.array([time.perf_counter(), *self._events])
+        return np.array([self.clock(), *self._events])
 
     def _hear(self, event: str, duration_secs: float, **_: Any) -> None:
         compiling = event == COMPILING

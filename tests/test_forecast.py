@@ -2,14 +2,19 @@
 
 import dataclasses
 import json
+import shutil
+import time
 from pathlib import Path
+from typing import Any
 
+import jax
 import numpy as np
 import pytest
 
 from mjx_study import cli
 from mjx_study.cli import options
 from mjx_study.runtime import available_cores
+from mjx_study.stopwatch import Stopwatch
 from mjx_study.study import forecast as forecasts
 from mjx_study.study import times
 from mjx_study.study.configuration import StudyConfig
@@ -141,3 +146,43 @@ def test_workers_share_the_cells() -> None:
     assert (alone.devices, many.devices) == (1, 3) and alone.compilation == many.compilation
     assert alone.seconds - alone.compilation == pytest.approx(3 * (many.seconds - many.compilation))
     assert forecast(plan_study(config), cluster="local:1000").devices <= available_cores()
+
+
+GRADIENTS: dict[str, Any] = {
+    "tasks": ("ball_wall",), "contact": ("mujoco",), "stiffness": (300.0, 1000.0), "horizon": 60
+}  # fmt: skip
+OTHERS: list[dict[str, Any]] = [
+    {"samples": (600,)},
+    {"stiffness": (100.0, 200.0, 400.0, 800.0, 1600.0), "seeds": 20},
+    {"samples": (30,), "horizon": 200, "seeds": 4},
+]
+
+
+@pytest.mark.slow
+def test_the_forecast_is_within_a_factor_of_two(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of the processor's time on one device, after a single recorded run of another shape.
+
+    Without compilation, whose time depends on what the cache has.
+    """
+    one = jax.local_devices()[:1]
+    monkeypatch.setattr(jax, "local_devices", lambda: one)
+    monkeypatch.setattr(Stopwatch, "clock", staticmethod(time.process_time))
+    watches: list[Stopwatch] = []
+    monkeypatch.setattr(times, "Stopwatch", lambda: watches.append(Stopwatch()) or watches[-1])
+    run_study(StudyConfig(**GRADIENTS))
+    kept = times.times_folder()
+    assert kept is not None
+    ratios = []
+    for index, other in enumerate(OTHERS):
+        folder = tmp_path / str(index)
+        shutil.copytree(kept, folder)
+        for module in (times, forecasts):
+            monkeypatch.setattr(module, "times_folder", lambda folder=folder: folder)
+        plan = plan_study(StudyConfig(**GRADIENTS | other))
+        found = forecast(plan)
+        assert found.basis[times.ROUGH] == 0, other
+        run_study(plan)
+        spent = [each for name, each in watches[-1].spent.items() if name != "descents"]
+        calls = sum(each.seconds + each.first_calls * each.each for each in spent)
+        ratios.append((found.seconds - found.compilation) / calls)
+    assert all(0.5 < ratio < 2 for ratio in ratios), [round(ratio, 2) for ratio in ratios]

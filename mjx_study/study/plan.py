@@ -250,7 +250,7 @@ def block_of(plan: StudyPlan, cell: StudyCell) -> int:
     fits = memory_of_seed(plan, cell) <= MOST_GIB * 2**30
     if fits or not all(each.mergeable for each in estimators_of(plan, cell)):
         return whole
-    return min(whole, block_for(_bytes_in_block(plan, cell)))
+    return min(whole, block_for(bytes_in_block(plan, cell)))
 
 
 def blocks_of(plan: StudyPlan, cell: StudyCell) -> int:
@@ -263,10 +263,11 @@ def memory_of_blocks(plan: StudyPlan, cell: StudyCell) -> int:
     """Memory of a block, and of the moments that are kept until a batch is whole [bytes]."""
     moments = bytes_of_moments(estimators_of(plan, cell), plan.groups[cell.group].task.policy.num_params)
     kept = plan.config.batches + math.ceil(math.log2(blocks_of(plan, cell)))
-    return block_of(plan, cell) * _bytes_in_block(plan, cell) + 2 * kept * moments
+    return block_of(plan, cell) * bytes_in_block(plan, cell) + 2 * kept * moments
 
 
-def _bytes_in_block(plan: StudyPlan, cell: StudyCell) -> int:
+def bytes_in_block(plan: StudyPlan, cell: StudyCell) -> int:
+    """Memory of a sample of a block, and of its statistics [bytes]."""
     task, count = plan.groups[cell.group].task, len(plan.config.estimators)
     return bytes_per_sample(task, oracles_of(plan.config), 2 * count, draws=0)
 

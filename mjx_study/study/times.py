@@ -43,12 +43,11 @@ FACTORS: Final = {
 SETUP: Final = (1.0, 2.0)
 """Tracing and compilation of a program of rollouts without degrees of freedom and constraints [s]; others follow their
 factor's root."""
-STATISTICS: Final = 4e-8
-"""Time of a cell's statistics [s per number held by its batches]."""
-STATISTICS_SETUP: Final = (2.0, 3.0)
-"""Tracing and compilation of a cell's statistics [s]."""
-ANALYTIC: Final = 1e-7
-"""Time of a step of an analytic system [s per row]."""
+OTHERS: Final = {"statistics": (2.5e-8, 5e6), "analytic": (1e-7, 1.5e6)}
+"""Time of a cell's statistics [s per number held by its batches], or of an analytic system [s per step of a row], and
+how many take as long as a cell without any."""
+OTHERS_SETUP: Final = (2.0, 3.0)
+"""Tracing and compilation of these [s]."""
 SAVE_SECONDS: Final = 5.0
 READING: Final = 0.1
 """Reading a compiled program over compiling it."""
@@ -79,13 +78,15 @@ class Program:
     @property
     def work(self) -> float:
         """To which the time of a call is proportional within one content."""
+        if self.kind in OTHERS:
+            return self.steps * self.rows + OTHERS[self.kind][1]
         return float(self.steps * (self.rows + OVERHEAD[jax.default_backend()]))
 
     @property
     def rough(self) -> float:
         """Rough time of a call [s]."""
-        if self.kind in ("analytic", "statistics"):
-            return self.work * (ANALYTIC if self.kind == "analytic" else STATISTICS)
+        if self.kind in OTHERS:
+            return self.work * OTHERS[self.kind][0]
         return self.work * RATE[jax.default_backend()] * self.factor * self._size
 
     @property
@@ -96,8 +97,8 @@ class Program:
     @property
     def rough_setup(self) -> tuple[float, float]:
         """Rough times of tracing and compilation [s]."""
-        if self.kind in ("analytic", "statistics"):
-            return STATISTICS_SETUP
+        if self.kind in OTHERS:
+            return OTHERS_SETUP
         grown = self._size * sum(FACTORS.get(part, 1.0) ** 0.5 for part in self.kind.split("+"))
         return SETUP[0] * grown, SETUP[1] * grown
 
@@ -192,7 +193,7 @@ def _write(folder: Path, key: Any, spent: Spent) -> None:
     program = key if isinstance(key, Program) else program_of(*key)
     path = folder / f"{program.kind}-{program.content}-{program.steps}-{program.rows}.json"
     setup = {"tracing": spent.tracing, "compiling": spent.compiling, "versions": versions()}
-    if not spent.first_calls:  # compiled before
+    if not spent.setups:  # compiled before
         with suppress(ValueError):
             setup = read_json(path, Record).model_dump(include=set(setup))
     times = {"each": spent.each, "calls": spent.calls or spent.first_calls}

@@ -12,7 +12,16 @@ from mjx_study.objective import contact_for, rounds
 from mjx_study.study.gradients import CANDIDATES, takes_candidates
 from mjx_study.study.landscapes import QUADRATURE
 from mjx_study.study.memory import LARGEST_BATCH
-from mjx_study.study.plan import StudyCell, StudyPlan, estimators_of, memory_of_seed, oracles_of, seeds_together
+from mjx_study.study.plan import (
+    StudyCell,
+    StudyPlan,
+    blocks_of,
+    bytes_in_block,
+    estimators_of,
+    memory_of_seed,
+    oracles_of,
+    seeds_together,
+)
 from mjx_study.study.quadrature import CHUNK, applies
 from mjx_study.study.sampling import calls_of, rollouts_of
 from mjx_study.study.times import Program, other_program, program_of
@@ -91,6 +100,9 @@ def rest(plan: StudyPlan, cell: StudyCell) -> Program:
         return other_program("analytic", rollouts(plan, cell)[0], task.name, *content, steps=task.horizon)
     if config.kind == "descents":
         return other_program("statistics", _evaluations(plan) * task.policy.num_params, *content)
+    if blocks_of(plan, cell):
+        numbers = cell.samples * bytes_in_block(plan, cell) // 8 * config.batches
+        return other_program("statistics", numbers, *content, "in blocks")
     numbers = memory_of_seed(plan, cell) // 8 * config.batches * (config.points or 1)
     return other_program("statistics", numbers, *content)
 
