@@ -16,11 +16,12 @@ and its derivative is that of the converged step. Two programs compute the deriv
 import dataclasses
 from collections.abc import Callable
 from functools import partial
-from typing import Final
+from typing import Any, Final
 
 import jax
 import jax.numpy as jnp
 import mujoco
+from jax.core import Tracer
 from jax.custom_derivatives import SymbolicZero, zero_from_primal
 from jaxtyping import Array, Float, Int
 
@@ -28,8 +29,9 @@ from estimators.pytree import register_pytree
 from mjx_study.simulation import constraint
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.integration import integrate_position
-from mjx_study.simulation.linear_algebra import solve_positive_definite
+from mjx_study.simulation.linear_algebra import SMALL, product, solve_positive_definite
 from mjx_study.simulation.patches import patched
+from mjx_study.simulation.scalars import traced_part, unrolled
 from mjx_study.simulation.scene import Scene
 
 SAVE_SOLUTION: Final = jax.checkpoint_policies.save_only_these_names("qacc")
@@ -80,7 +82,7 @@ def step(scene: Scene, model: mjx.Model, state: State, control: Float[Array, " n
         The state after the step, and the solver's relative residual (see `constraint.residual`).
     """
     if scene.host.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
-        return _runge_kutta(scene, model, state, control), jnp.zeros_like(state.qpos, shape=())
+        return entry_by_entry(partial(_runge_kutta, scene), model, state, control), jnp.zeros_like(state.qpos, shape=())
     qvel, act, qacc, residual = _update(scene)(
         model, state.qpos, state.qvel, state.act, control, jax.lax.stop_gradient(state.warmstart)
     )
@@ -113,11 +115,22 @@ def solved_step(
     scene: Scene, model: mjx.Model, state: State, control: Float[Array, " nu"]
 ) -> tuple[State, Float[Array, ""], tuple[Float[Array, " guards"], Float[Array, " guards"]]]:
     """`step` without a derivative, and the `constraint.guards` of its contacts and limits before the step."""
+    return entry_by_entry(partial(_solved_step, scene), model, state, control)
+
+
+def _solved_step(scene: Scene, model: mjx.Model, state: State, control: Array):
     data = smooth_stages(scene, model, state, control)
     qacc = constraint.run_solver(model, data.replace(qacc_warmstart=state.warmstart))
     qvel, act = advance_velocity(model, data, qacc)
     qpos = integrate_position(scene.host, state.qpos, qvel, model.opt.timestep)
     return State(qpos, qvel, act, qacc), constraint.residual(model, data, qacc), constraint.guards(model, data)
+
+
+def entry_by_entry(function: Callable[..., Any], model: mjx.Model, *arguments: Any) -> Any:
+    """`function(model, *arguments)`, unrolled where that pays: few degrees of freedom, and a model of constants."""
+    if model.nv <= SMALL and not isinstance(model.body_mass, Tracer):
+        return unrolled(function, model, *arguments)
+    return function(model, *arguments)
 
 
 ControlLaw = Callable[[Int[Array, ""], State], Float[Array, " nu"]]
@@ -239,6 +252,15 @@ def _constrained_update(model: mjx.Model, data: mjx.Data, qvel: Array, act: Arra
     return *advance_velocity(model, data, qacc), qacc, constraint.residual(model, data, qacc)
 
 
+def _solved_update(
+    model: mjx.Model, template: mjx.Data, qpos: Array, qvel: Array, act: Array, control: Array, warmstart: Array
+):
+    """`_constrained_update` without a derivative."""
+    data = force_stage(model, fwd_position(model, template.replace(qpos=qpos)), qvel, act, control)
+    qacc = constraint.run_solver(model, data.replace(qacc_warmstart=warmstart))
+    return *advance_velocity(model, data, qacc), qacc, constraint.residual(model, data, qacc)
+
+
 def _update(scene: Scene):
     """The velocity update (model, qpos, qvel, act, control, warmstart) -> (qvel, act, qacc, residual).
 
@@ -249,27 +271,33 @@ def _update(scene: Scene):
     def tape(model, qpos, qvel, act, control, warmstart):
         return _constrained_update(model, scene.template.replace(qpos=qpos), qvel, act, control, warmstart)
 
-    if not scene.uses_jacobian:
-        return tape
+    return partial(_jacobian_update, scene, tape) if scene.uses_jacobian else tape
 
-    update = jax.custom_jvp(tape)
+
+def _jacobian_update(scene: Scene, tape: Callable[..., tuple[Array, ...]], model: mjx.Model, *inputs: Array):
+    traced_model, whole = traced_part(model)
+
+    @jax.custom_jvp
+    def update(traced, *inputs):
+        return entry_by_entry(_solved_update, whole(traced), scene.template, *inputs)
 
     @partial(update.defjvp, symbolic_zeros=True)
     def _(primals, tangents):
-        model, qpos, qvel, act, control, _ = primals
+        traced, qpos, qvel, act, control, _ = primals
         model_tangents, *inputs, _ = tangents
         if any(not isinstance(leaf, SymbolicZero) for leaf in jax.tree.leaves(model_tangents)):
-            return jax.jvp(tape, primals, jax.tree.map(_instantiate, primals, tangents))
+            through = lambda traced, *inputs: tape(whole(traced), *inputs)  # noqa: E731
+            return jax.jvp(through, primals, jax.tree.map(_instantiate, primals, tangents))
         value = update(*primals)
         inputs = [_instantiate(*pair) for pair in zip(primals[1:5], inputs, strict=True)]
-        over_step, over_qacc = step_jacobian(scene, model, qpos, qvel, act, control, value[2])
+        over_step, over_qacc = step_jacobian(scene, whole(traced), qpos, qvel, act, control, value[2])
         direction = jnp.concatenate(inputs)
-        out, qacc_out = over_step @ direction, over_qacc @ direction
+        out, qacc_out = product(over_step, direction), product(over_qacc, direction)
         nv = qvel.shape[0]
         # The tangent of qacc is for derivatives of this derivative: the Jacobian is a function of qacc.
         return value, (out[:nv], out[nv:], qacc_out, jnp.zeros_like(value[3]))
 
-    return update
+    return update(traced_model, *inputs)
 
 
 def _instantiate(primal, tangent):
@@ -300,7 +328,7 @@ def step_jacobian(
         control: controls there.
         qacc: the converged constrained acceleration there.
     """
-    return _jacobian(model, scene.template, qpos, qvel, act, control, qacc)
+    return entry_by_entry(_jacobian, model, scene.template, qpos, qvel, act, control, qacc)
 
 
 @jax.jit

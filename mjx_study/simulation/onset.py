@@ -47,6 +47,7 @@ from mjx_study.simulation.dynamics import (
     ControlLaw,
     State,
     advance_velocity,
+    entry_by_entry,
     force_stage,
     position_stage,
     rollout,
@@ -55,6 +56,7 @@ from mjx_study.simulation.dynamics import (
     step_jacobian,
 )
 from mjx_study.simulation.integration import difference_position, integrate_position
+from mjx_study.simulation.scalars import traced_part
 from mjx_study.simulation.scene import Scene
 
 SLOTS: Final = 8
@@ -196,7 +198,8 @@ def _corrections(
         pick = lambda leaf: jnp.stack([leaf[index], leaf[index - 1]])  # noqa: E731
         states, inputs = jax.tree.map(pick, before), pick(controls)
         positioned = position_stage(scene, model, before.qpos[index])
-        return onset_term(model, positioned, states, inputs, guard, distance[index, guard], travel[index, guard])
+        here = distance[index, guard], travel[index, guard]
+        return entry_by_entry(onset_term, model, positioned, states, inputs, guard, *here)
 
     here, previous, strength, narrow = jax.vmap(term)(steps, guards)
     keep = used[:, None, None]
@@ -321,13 +324,18 @@ def tangent_of(value: Float[Array, "..."]) -> Float[Array, "..."]:
     return value - jax.lax.stop_gradient(value)
 
 
-@jax.custom_jvp
 def without_derivative(model: mjx.Model) -> mjx.Model:
     """The model; differentiating with respect to it raises TypeError."""
-    return model
+    traced, whole = traced_part(model)
+    return whole(_without_derivative(traced))
 
 
-@partial(without_derivative.defjvp, symbolic_zeros=True)
+@jax.custom_jvp
+def _without_derivative(traced: list[Any]) -> list[Any]:
+    return traced
+
+
+@partial(_without_derivative.defjvp, symbolic_zeros=True)
 def _(primals, tangents):
     if any(not isinstance(leaf, jax.custom_derivatives.SymbolicZero) for leaf in jax.tree.leaves(tangents)):
         raise TypeError("with the onset term derivatives are in states and controls, not in the model")

@@ -1,0 +1,134 @@
+"""Functions computed entry by entry are the functions."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mjx_study.simulation import scalars
+from mjx_study.simulation.scalars import traced_part, unrolled
+
+TABLE = np.arange(12.0).reshape(4, 3) - 5
+ROW = np.array([0.3, -1.2, 2.5])
+
+
+def _newton_root(x):
+    """A loop whose body needs what is computed before it, and a loop within it."""
+    target = jnp.sum(x**2)
+
+    def halved(y):
+        return jax.lax.while_loop(lambda z: z > 4.0, lambda z: z / jnp.maximum(2.0, target / 50), y)
+
+    return jax.lax.while_loop(
+        lambda carry: (carry[1] < 20) & (jnp.abs(carry[0] ** 2 - target) > 1e-12),
+        lambda carry: ((halved(carry[0]) + target / halved(carry[0])) / 2, carry[1] + 1),
+        (target, 0),
+    )
+
+
+FUNCTIONS = {
+    "elementwise": lambda x: jnp.where(x > 0, jnp.sin(x) * x**3, jnp.exp(-x)) + jnp.arctan2(x, 2.0) / jnp.sqrt(1 + x * x),
+    "integers": lambda x: (jnp.floor(x).astype(int) % 3, ~(x > 0) | (x < -1), jnp.sign(x), jnp.clip(x, -1, 1)),
+    "known index": lambda x: jnp.outer(x, x)[jnp.array([2, 0, 2]), 1],
+    "computed index": lambda x: jnp.asarray(TABLE)[jnp.argmax(x)] * x[jnp.argmin(x)],
+    "several computed indices": lambda x: jnp.asarray(TABLE)[jnp.argsort(x)] @ x,
+    "index beyond the end": lambda x: jnp.take(x, jnp.array([1, 7]), mode="clip"),
+    "add to one place twice": lambda x: jnp.zeros((3, 3)).at[jnp.array([0, 2, 0])].add(x[:, None]).at[1, 2].set(x[0]),
+    "set beyond the end": lambda x: x.at[jnp.array([1, 9])].set(4.0),
+    "segments": lambda x: jax.ops.segment_sum(x, jnp.array([1, 1, 0]), 2),
+    "pad, tile and stack": lambda x: (jnp.pad(x, (1, 2)), jnp.tile(x[::-1], 2), jnp.stack([x, -x], 1).T.reshape(-1)),
+    "dynamic slices": lambda x: jax.lax.dynamic_update_slice(TABLE[0], jax.lax.dynamic_slice(x, (2,), (2,)), (0,)),
+    "computed slice": lambda x: jax.lax.dynamic_slice(jnp.outer(x, x), (jnp.argmax(x), 0), (1, 2)),
+    "products": lambda x: jnp.einsum("bij,bjk->bik", jnp.stack([jnp.outer(x, x)] * 2), jnp.ones((2, 3, 2), int)),
+    "sums": lambda x: (jnp.cumsum(x), jax.lax.cumsum(x, reverse=True), jnp.sum(jnp.outer(x, x), 0)),
+    "reductions": lambda x: (jnp.max(x), jnp.min(jnp.outer(x, x), axis=1), jnp.any(x > 1), jnp.all(x > -9)),
+    "first of equals": lambda x: (jnp.argmax(jnp.abs(jnp.round(x)) * 0), jnp.argmin(jnp.outer(x, x), axis=1)),
+    "whole arrays": lambda x: (jnp.sort(x), jnp.linalg.cholesky(jnp.outer(x, x) + 9 * jnp.eye(3))),
+    "loops": _newton_root,
+    "loop of no step": lambda x: jax.lax.fori_loop(0, 0, lambda _, y: y * 2, x),
+    "empty": lambda x: (x[:0], jnp.sum(x[:0]), jnp.zeros((0, 3)) @ x, jnp.zeros((2, 0)) @ x[:0]),
+    "constants": lambda x: (jnp.ones(2), 3, jnp.sum(TABLE)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_the_value_is_the_functions(name):
+    points = np.stack([ROW, ROW[::-1], -2 * ROW, np.zeros(3) + 1])
+    function = FUNCTIONS[name]
+    plain = jax.jit(jax.vmap(function))(points)
+    here = jax.jit(jax.vmap(lambda x: unrolled(function, x)))(points)
+    assert jax.tree.structure(plain) == jax.tree.structure(here)
+    for ours, theirs in zip(jax.tree.leaves(here), jax.tree.leaves(plain), strict=True):
+        assert ours.dtype == theirs.dtype
+        np.testing.assert_allclose(ours, theirs, rtol=1e-14, atol=1e-14)
+
+
+@pytest.mark.parametrize("name", ["elementwise", "computed index", "add to one place twice", "products", "sums"])
+def test_both_modes_differentiate_it(name):
+    def total(function, x):
+        return sum(jnp.sum(jnp.sin(jnp.asarray(leaf, float))) for leaf in jax.tree.leaves(function(x)))
+
+    plain = lambda x: total(FUNCTIONS[name], x)  # noqa: E731
+    here = lambda x: total(lambda y: unrolled(FUNCTIONS[name], y), x)  # noqa: E731
+    for derivative in (jax.grad, jax.jacfwd):
+        np.testing.assert_allclose(jax.jit(derivative(here))(ROW), jax.jit(derivative(plain))(ROW), rtol=1e-13)
+
+
+def _operations(function, *arguments) -> list[str]:
+    jaxpr = jax.make_jaxpr(function)(*arguments)
+    moves = {"slice", "squeeze", "reshape", "broadcast_in_dim", "stack", "concatenate", "convert_element_type"}
+    return [name for each in jaxpr.eqns if (name := each.primitive.name) not in moves]
+
+
+def test_constants_fold_and_what_occurs_twice_or_for_nothing_is_dropped():
+    turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+
+    def function(x):
+        unused = jnp.exp(x)
+        turned = jnp.asarray(turn) @ x
+        return turned, jnp.sin(x[0] * x[1]) + jnp.sin(x[1] * x[0]), jnp.where(turn > 0, unused[0] * 0, 2.0)
+
+    operations = _operations(lambda x: unrolled(function, x), ROW)
+    assert sorted(operations) == ["add", "mul", "neg", "sin"]
+
+
+def test_what_does_not_change_in_a_loop_is_computed_before_it():
+    def function(x):
+        return jax.lax.while_loop(lambda y: y < 9.0, lambda y: y * jnp.cosh(x[0]) + 1, x[1])
+
+    jaxpr = jax.make_jaxpr(lambda x: unrolled(function, x))(ROW)
+    assert "cosh" in [each.primitive.name for each in jaxpr.eqns]
+    (loop,) = (each for each in jaxpr.eqns if each.primitive.name == "while")
+    assert "cosh" not in str(loop.params["body_jaxpr"])
+
+
+def test_a_constant_zero_times_infinity_is_zero():
+    assert jax.jit(lambda x: unrolled(lambda y: jnp.asarray([0.0, 1.0]) * y, x))(jnp.inf).tolist() == [0.0, np.inf]
+
+
+@pytest.mark.parametrize("most", [3, 11])
+def test_what_is_too_large_is_left_as_it_is(monkeypatch, most):
+    monkeypatch.setattr(scalars, "MOST_SCALARS", most)
+    function = lambda x: jnp.outer(x, x) @ jnp.cos(x)  # noqa: E731
+    assert _operations(lambda x: unrolled(function, x), ROW) == _operations(function, ROW)
+
+
+def test_without_anything_traced_the_function_is_called():
+    seen = []
+    unrolled(lambda x: seen.append(x), ROW)
+    assert seen[0] is ROW
+
+
+def test_constants_stay_out_of_what_is_traced():
+    kept = {}
+
+    @jax.jit
+    def function(x):
+        traced, whole = traced_part({"constant": ROW, "input": x})
+        kept["number"] = sum(each is not None for each in traced)
+        again = whole([2 * each if each is not None else None for each in traced])
+        assert again["constant"] is ROW
+        return again["input"]
+
+    assert function(3.0) == 6.0
+    assert kept["number"] == 1
