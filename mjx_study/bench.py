@@ -145,7 +145,7 @@ def bench(plan: BenchPlan, progress: Progress = lambda done, total, what: None) 
     task, samples, cell = plan.task, plan.samples, plan.cell
     devices = jax.local_devices()
     keys = jax.random.split(jax.random.key(0), samples)
-    simulator = Simulator(task, chunk_size=chunk_for(-(-samples // len(devices)), devices[:1]))
+    simulator = Simulator(task, chunk_size=chunk_for(-(-samples // len(devices)), devices[:1], [task]))
     objective = simulator.objective(cell.contact)
     full = -(-samples // (simulator.chunk_size * len(devices))) * simulator.chunk_size * len(devices)
     key_data = np.resize(jax.random.key_data(keys), (full, 2))  # no padded chunks, as in stock

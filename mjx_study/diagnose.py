@@ -397,7 +397,7 @@ def _chunk(task: Task, samples: int) -> int:
     """Samples in a call of a program: on a CPU fewer of larger models, so that the first call takes seconds."""
     devices = jax.local_devices()
     most = max(CHUNK, CHUNK * (CHUNK // task.scene.host.nv) ** 2) if devices[0].platform == "cpu" else samples + 1
-    return min(chunk_for(samples, devices), most)
+    return min(chunk_for(samples, devices, [task]), most)
 
 
 def measure(

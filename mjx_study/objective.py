@@ -30,10 +30,11 @@ from mjx_study.simulation.onset import SLOTS, OnsetCounts, as_row, corrected_rol
 from mjx_study.stopwatch import timed
 from mjx_study.tasks.task import Task, check_sigma
 
-MAX_CHUNK: Final = {"cpu": 256, "gpu": 2**15 + 1, "tpu": 2**15 + 1}
+MAX_CHUNK: Final = {"cpu": 256, "gpu": 2**17 + 1, "tpu": 2**17 + 1}
 """Largest number of samples per device and call, by backend: a CPU gains little from larger batches, an accelerator
-needs them. It bounds memory (about 40 kB per gradient of 200 steps of a two-joint model). One more than a power of two,
-for the baseline."""
+needs them. One more than a power of two, for the baseline."""
+SHARE: Final = 0.25
+"""Most of an accelerator's memory that the gradients of a chunk take."""
 
 LAPACK_BATCH: Final = 2048
 """Batch from which jaxlib 0.10.2 divides factorisations of matrices among its threads on CPUs, which never ends where
@@ -55,9 +56,11 @@ def spread(
         devices: of this process.
 
     Returns:
-        The program's outputs, which have a leading axis of rows, as NumPy arrays.
+        The program's outputs, which have a leading axis of rows: NumPy arrays, or on accelerators arrays of the first.
     """
-    devices = [devices[0] if device.platform == "cpu" else device for device in devices]
+    on_host = devices[0].platform == "cpu"
+    fetched, join = (jax.device_get, np) if on_host else (partial(jax.device_put, device=devices[0]), jnp)
+    devices = [devices[0]] * len(devices) if on_host else devices
     count = len(rows[0])
     chunks = np.minimum(np.arange(math.ceil(count / chunk) * chunk), count - 1).reshape(-1, chunk)
     devices, outputs = devices[: len(chunks)], [None] * len(chunks)
@@ -72,15 +75,15 @@ def spread(
 
     def work(device: Any) -> None:
         for index in others:
-            outputs[index] = jax.device_get(call(device, chunks[index]))
+            outputs[index] = fetched(call(device, chunks[index]))
 
     with ThreadPoolExecutor(len(devices)) as pool:
         workers = [pool.submit(work, device) for device in devices[1:]]
-        outputs[: len(first)] = jax.device_get(first)
+        outputs[: len(first)] = fetched(first)
         work(devices[0])
         for worker in workers:
             worker.result()
-    return jax.tree.map(lambda *leaves: np.concatenate(leaves)[:count], *outputs)
+    return jax.tree.map(lambda *leaves: join.concatenate(leaves)[:count], *outputs)
 
 
 def rollout_cost(
@@ -314,7 +317,7 @@ class Simulator:
             noise_scale: factor on each sample's noise.
 
         Returns:
-            The program's outputs with a leading axis of samples; NumPy arrays.
+            The program's outputs with a leading axis of samples; as `spread` returns them.
 
         Raises:
             ValueError: sigma or theta is invalid, or there is no sample.
@@ -327,7 +330,8 @@ class Simulator:
         shared = theta, contact, np.asarray(sigma, self.task.scene.template.qpos.dtype)
         devices = self._devices_for(name)
         with timed(self.program(name, contact), rounds(len(noise_scale), self.chunk_size, len(devices))):
-            return spread(self._programs[name], shared, (keys, noise_scale), self.chunk_size, devices)  # type: ignore[attr-defined]
+            program = self._programs[name]  # type: ignore[attr-defined]
+            return jax.block_until_ready(spread(program, shared, (keys, noise_scale), self.chunk_size, devices))
 
     def program(self, name: str, contact: ContactModel | None) -> tuple[str, Task, Any, int]:
         """What the time of a call of one of `sample_programs` depends on: name, task, kind of contact, samples."""
@@ -516,11 +520,23 @@ def rounds(samples: int, chunk: int, devices: int) -> int:
     return math.ceil(math.ceil(samples / chunk) / devices)
 
 
-def chunk_for(samples: int, devices: Sequence[Any]) -> int:
+def chunk_for(samples: int, devices: Sequence[Any], tasks: Sequence[Task] = ()) -> int:
     """The chunk size that runs `samples` and their baseline in the fewest evenly filled calls.
 
-    On accelerators as many calls as devices at least; on CPUs it does not depend on their number.
+    On accelerators as many calls as devices at least, and no more samples than gradients of the tasks fit into `SHARE`
+    of the memory; on CPUs it depends on neither.
     """
     platform = devices[0].platform
-    each = math.ceil((samples + 1) / (1 if platform == "cpu" else len(devices)))
-    return math.ceil(each / math.ceil(each / MAX_CHUNK[platform]))
+    most, each = MAX_CHUNK[platform], samples + 1
+    if platform != "cpu":
+        each = math.ceil(each / len(devices))
+        memory = (devices[0].memory_stats() or {}).get("bytes_limit", math.inf)
+        most = max(1, int(min(most, SHARE * memory / max(map(_gradient_bytes, tasks), default=1))))
+    return math.ceil(each / math.ceil(each / most))
+
+
+def _gradient_bytes(task: Task) -> int:
+    """Memory of the states and Jacobians that a gradient stores, about [bytes]."""
+    host = task.scene.host
+    inputs = host.nq + host.nv + host.na + host.nu
+    return 8 * task.horizon * (inputs * (2 * host.nv + host.na) + 2 * inputs)

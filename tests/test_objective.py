@@ -125,10 +125,20 @@ def test_a_sample_depends_on_its_own_key_alone(simulator):
     np.testing.assert_allclose(alone.value[0], straight[0].value[4], rtol=1e-12)
 
 
+def test_a_chunk_of_gradients_fits_into_an_accelerators_memory(simulator):
+    def chunk(gib):
+        device = SimpleNamespace(platform="gpu", memory_stats=lambda: {"bytes_limit": gib * 2**30})
+        return chunk_for(100_000, [device], [simulator.task])
+
+    planned = simulator.memory("gradient", ANY_CONTACT, 1000) / 1000
+    assert chunk(2000) == 100_001
+    assert 0.2 * 2**28 < chunk(1) * planned < 2 * 2**28
+
+
 @pytest.mark.parametrize("platform", ["cpu", "gpu"])
 @pytest.mark.parametrize(("samples", "devices"), [(1, 2), (7, 2), (1000, 2), (1023, 1), (200_000, 3)])
 def test_chunk_for_wastes_less_than_a_call_per_device(samples, devices, platform):
-    device = SimpleNamespace(platform=platform)
+    device = SimpleNamespace(platform=platform, memory_stats=lambda: None)
     chunk, most = chunk_for(samples, [device] * devices), MAX_CHUNK[platform]
     if platform == "cpu":
         assert chunk == chunk_for(samples, [device])

@@ -27,7 +27,7 @@ def _newton_root(x):
 
 
 FUNCTIONS = {
-    "elementwise": lambda x: jnp.where(x > 0, jnp.sin(x) * x**3, jnp.exp(-x)) + jnp.arctan2(x, 2.0) / jnp.sqrt(1 + x * x),
+    "elementwise": lambda x: jnp.where(x > 0, jnp.sin(x) * x**3, jnp.exp(-x)) + jnp.arctan2(x, 2) / jnp.sqrt(1 + x**2),
     "integers": lambda x: (jnp.floor(x).astype(int) % 3, ~(x > 0) | (x < -1), jnp.sign(x), jnp.clip(x, -1, 1)),
     "known index": lambda x: jnp.outer(x, x)[jnp.array([2, 0, 2]), 1],
     "computed index": lambda x: jnp.asarray(TABLE)[jnp.argmax(x)] * x[jnp.argmin(x)],

@@ -148,7 +148,7 @@ def check_mean(
     low, high = (-reach_of(task), reach_of(task)) if span is None else span
     axis = "random" if direction == MEANS else direction
     along = jnp.asarray(direction_of(axis, task.policy.num_params, seed), task.theta.dtype)
-    simulator = Simulator(task, chunk_size=chunk_for(samples, jax.local_devices()))
+    simulator = Simulator(task, chunk_size=chunk_for(samples, jax.local_devices(), [task]))
     found, total, ends = [], len(cells), (task.theta + low * along, task.theta + high * along)
     for index, cell in enumerate(cells):
         progress(index, total, cell.label)

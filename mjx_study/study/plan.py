@@ -177,7 +177,8 @@ def plan_study(config: StudyConfig, built: Mapping[str, Task] | None = None) -> 
         groups.append(group)
     together = 1 if config.kind == "descents" else config.batches
     most = min(LARGEST_BATCH, max(min(cell.samples, config.block_size or cell.samples) for cell in cells) * together)
-    chunk = chunk_for(most, jax.local_devices()) if config.chunk_size is None else config.chunk_size
+    tasks = [group.task for group in groups]
+    chunk = chunk_for(most, jax.local_devices(), tasks) if config.chunk_size is None else config.chunk_size
     plan = StudyPlan(config, tuple(groups), tuple(cells), chunk, tuple(dict.fromkeys(messages)))
     check_batches(plan.memory, _whole(plan))
     for cell in {cell.group: cell for cell in cells}.values():
