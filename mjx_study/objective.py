@@ -69,19 +69,16 @@ def spread(
     def call(device: Any, part: np.ndarray) -> Any:
         return program(*placed[device], *jax.device_put(tuple(array[part] for array in rows), device))
 
-    # In this thread, because tracing patches MJX for the whole process.
-    first = [call(device, part) for device, part in zip(placed, chunks, strict=False)]
-    others = iter(range(len(first), len(chunks)))
+    # Traced in this thread, because tracing patches MJX for the whole process.
+    jax.eval_shape(program, *placed[devices[0]], *(array[chunks[0]] for array in rows))
+    left = iter(range(len(chunks)))
 
     def work(device: Any) -> None:
-        for index in others:
+        for index in left:
             outputs[index] = fetched(call(device, chunks[index]))
 
     with ThreadPoolExecutor(len(devices)) as pool:
-        workers = [pool.submit(work, device) for device in devices[1:]]
-        outputs[: len(first)] = fetched(first)
-        work(devices[0])
-        for worker in workers:
+        for worker in [pool.submit(work, device) for device in devices]:
             worker.result()
     return jax.tree.map(lambda *leaves: join.concatenate(leaves)[:count], *outputs)
 

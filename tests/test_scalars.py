@@ -108,7 +108,7 @@ def test_a_constant_zero_times_infinity_is_zero():
 
 @pytest.mark.parametrize("most", [3, 11])
 def test_what_is_too_large_is_left_as_it_is(monkeypatch, most):
-    monkeypatch.setattr(scalars, "MOST_SCALARS", most)
+    monkeypatch.setitem(scalars.MOST_SCALARS, "cpu", most)
     function = lambda x: jnp.outer(x, x) @ jnp.cos(x)  # noqa: E731
     assert _operations(lambda x: unrolled(function, x), ROW) == _operations(function, ROW)
 

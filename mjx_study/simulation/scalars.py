@@ -19,8 +19,8 @@ from jax import lax
 from jax.core import ShapedArray, Tracer
 from jax.extend.core import Literal
 
-MOST_SCALARS: Final = 6000
-"""Largest number of scalar operations; XLA's time to compile them grows faster than their number."""
+MOST_SCALARS: Final = {"cpu": 12_000, "gpu": 6_000, "tpu": 6_000}
+"""Largest number of scalar operations, by backend; XLA's time to compile them grows faster than their number."""
 UNROLL: Final = True
 """Whether functions are unrolled at all; tests compare."""
 
@@ -93,8 +93,9 @@ def unrolled(function: Callable[..., Any], *arguments: Any) -> Any:
     if not (UNROLL and any(isinstance(leaf, Tracer) for leaf in leaves)):
         return function(*arguments)
     jaxpr, shape = jax.make_jaxpr(function, return_shape=True)(*arguments)
+    most = MOST_SCALARS[jax.default_backend()]
     avals: Any = jaxpr.out_avals
-    graph, values, inputs = _Graph(), {}, []
+    graph, values, inputs = _Graph(2 * most), {}, []
     for leaf in leaves:
         if not isinstance(leaf, Tracer):
             inputs.append(_constants(leaf))
@@ -106,7 +107,7 @@ def unrolled(function: Callable[..., Any], *arguments: Any) -> Any:
     except _TooLargeError:
         return function(*arguments)
     needed = _needed(_entries(outputs))
-    if len(needed) > MOST_SCALARS:
+    if len(needed) > most:
         return function(*arguments)
     _emit(needed, values)
     arrays = [
@@ -132,13 +133,13 @@ def traced_part(tree: Any) -> tuple[list[Any], Callable[[list[Any]], Any]]:
 class _Graph:
     """The operations of a function, each once."""
 
-    def __init__(self) -> None:
-        self._count = 0
+    def __init__(self, most: int):
+        self._count, self._most = 0, most
         self._known: dict[Any, _Node] = {}
 
     def node(self, operation: Any, arguments: tuple[Any, ...], parameters: Any, dtype: Any) -> _Node:
         self._count += 1
-        if self._count > 2 * MOST_SCALARS:
+        if self._count > self._most:
             raise _TooLargeError
         return _Node(self._count, operation, arguments, parameters, dtype)
 
