@@ -74,6 +74,22 @@ def test_both_modes_differentiate_it(name):
         np.testing.assert_allclose(jax.jit(derivative(here))(ROW), jax.jit(derivative(plain))(ROW), rtol=1e-13)
 
 
+def test_a_functions_own_derivative_is_kept():
+    @jax.custom_jvp
+    def length(x):
+        return jnp.sqrt(jnp.sum(x**2))
+
+    @length.defjvp
+    def _(primals, tangents):
+        (x,), (change,) = primals, tangents
+        value = length(x)
+        return value, jnp.where(value > 0, x @ change / jnp.where(value > 0, value, 1.0), 0.0)
+
+    gradient = jax.jit(jax.grad(lambda x: unrolled(lambda y: 2 * length(y * jnp.asarray([1.0, 0.0, 1.0])), x)))
+    np.testing.assert_allclose(gradient(ROW), 2 * np.array([0.3, 0, 2.5]) / np.hypot(0.3, 2.5), rtol=1e-14)
+    np.testing.assert_array_equal(gradient(np.zeros(3)), np.zeros(3))
+
+
 def _operations(function, *arguments) -> list[str]:
     jaxpr = jax.make_jaxpr(function)(*arguments)
     moves = {"slice", "squeeze", "reshape", "broadcast_in_dim", "stack", "concatenate", "convert_element_type"}

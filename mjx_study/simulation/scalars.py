@@ -54,7 +54,7 @@ _OTHERS: Final = (
 _ELEMENTWISE: Final = frozenset((*_NUMPY, *_OTHERS))
 _COMMUTATIVE: Final = frozenset({"add", "add_any", "and", "eq", "max", "min", "mul", "ne", "or"})
 _SAME: Final = frozenset({"copy", "copy_p", "name", "optimization_barrier"})
-_CALLS: Final = {"custom_jvp_call": "call_jaxpr", "closed_call": "call_jaxpr", "jit": "jaxpr", "pjit": "jaxpr"}
+_CALLS: Final = {"closed_call": "call_jaxpr", "jit": "jaxpr", "pjit": "jaxpr"}
 
 
 class _TooLargeError(Exception):
@@ -251,8 +251,7 @@ class _Graph:
         if not any(isinstance(each, _Node) for each in _entries(inputs)):
             with jax.ensure_compile_time_eval():
                 arrays = [_array(each.flat, of) for each, of in zip(inputs, avals, strict=True)]
-                found = equation.primitive.bind(*arrays, **parameters)
-            return [_constants(each) for each in (found if equation.primitive.multiple_results else [found])]
+                return [_constants(each) for each in _whole(equation, arrays)]
         node = self.node("whole", tuple(_entries(inputs)), (equation, avals), None)
         return self.outputs(node, [each.aval for each in equation.outvars])
 
@@ -319,6 +318,14 @@ def _folded(primitive: Any, arguments: tuple[Any, ...], dtype: Any, parameters: 
         return dtype.type(np.asarray(primitive.bind(*map(jnp.asarray, arguments), **parameters)))
 
 
+def _whole(equation: Any, arrays: Sequence[jax.Array]) -> Sequence[jax.Array]:
+    """The outputs of an operation on whole arrays, with its own rule of differentiation where it has one."""
+    parameters = equation.primitive.get_bind_params(equation.params)
+    functions, parameters = parameters if isinstance(parameters, tuple) else ((), parameters)  # by JAX's version
+    found = equation.primitive.bind(*functions, *arrays, **parameters)
+    return found if equation.primitive.multiple_results else [found]
+
+
 def _needed(outputs: Iterable[Any]) -> list[_Node]:
     """The nodes that outputs depend on, arguments first."""
     found: dict[int, _Node] = {}
@@ -350,8 +357,7 @@ def _emit(nodes: Iterable[_Node], values: dict[int, Any]) -> None:
                 equation, avals = node.parameters
                 left = iter(arguments)
                 arrays = [_array(itertools.islice(left, math.prod(aval.shape)), aval) for aval in avals]
-                found = equation.primitive.bind(*arrays, **equation.params)
-                found = found if equation.primitive.multiple_results else [found]
+                found = _whole(equation, arrays)
             case "loop":
                 found = _emit_loop(node, arguments, values)
             case primitive:
