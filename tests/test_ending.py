@@ -17,6 +17,7 @@ from mjx_study.cli import options, studies
 from mjx_study.study import cells as sweep_cells
 from mjx_study.study.plan import StudyCell, StudyPlan
 from mjx_study.study.run import run_study
+from mjx_study.study.store import Part
 from tests.documents import stages_of
 
 SIGNALS = """
@@ -121,10 +122,10 @@ def test_a_full_disk_costs_a_landscape_no_number(tmp_path: Path, capsys: pytest.
 def test_a_full_disk_costs_a_study_nothing_that_was_there(
     tmp_path: Path, full: Callable[[], None], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def compute_of(plan: StudyPlan) -> Callable[[StudyCell], dict[str, np.ndarray]]:
+    def compute_of(plan: StudyPlan) -> Callable[[StudyCell, Part], dict[str, np.ndarray]]:
         seeds = plan.config.batches, len(plan.config.estimators)
 
-        def compute(cell: StudyCell) -> dict[str, np.ndarray]:
+        def compute(cell: StudyCell, part: Part) -> dict[str, np.ndarray]:
             if cell.samples == 8:
                 full()
             numbers = {name: np.ones(seeds) for name in ("variance", "alpha", "relative_error")}

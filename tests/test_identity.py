@@ -23,7 +23,7 @@ from mjx_study.study.identity import contents, differences
 from mjx_study.study.plan import StudyCell, StudyPlan, plan_study
 from mjx_study.study.revision import git_revision
 from mjx_study.study.run import load_study, run_study, warnings_of
-from mjx_study.study.store import Store, StudyError
+from mjx_study.study.store import Part, Store, StudyError
 from mjx_study.tasks import make_task
 from mjx_study.tasks.task import StudyDefaults, Task
 
@@ -147,8 +147,8 @@ SMALL: dict[str, Any] = {
 
 @pytest.fixture
 def stubbed(monkeypatch: pytest.MonkeyPatch) -> None:
-    def compute_of(plan: StudyPlan) -> Callable[[StudyCell], dict[str, np.ndarray]]:
-        return lambda cell: {"residual": np.full(len(plan.config.estimators), cell.model.stiffness)}
+    def compute_of(plan: StudyPlan) -> Callable[[StudyCell, Part], dict[str, np.ndarray]]:
+        return lambda cell, part: {"residual": np.full(len(plan.config.estimators), cell.model.stiffness)}
 
     monkeypatch.setitem(sweep_cells.COMPUTE, "gradients", compute_of)
 

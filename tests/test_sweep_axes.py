@@ -12,6 +12,7 @@ from mjx_study.study import cells as sweep_cells
 from mjx_study.study.configuration import StudyConfig
 from mjx_study.study.plan import StudyCell, StudyPlan, plan_study
 from mjx_study.study.run import load_study, run_study
+from mjx_study.study.store import Part
 from mjx_study.table import digits_to_tell_apart
 
 SMALL: dict[str, Any] = {"tasks": ("pusher",), "contact": ("penalty",), "samples": (4,), "seeds": 1, "horizon": 2}
@@ -21,8 +22,8 @@ SMALL: dict[str, Any] = {"tasks": ("pusher",), "contact": ("penalty",), "samples
 def stubbed(monkeypatch: pytest.MonkeyPatch) -> None:
     """Cells whose numbers say what they were computed with."""
 
-    def compute_of(plan: StudyPlan) -> Callable[[StudyCell], dict[str, np.ndarray]]:
-        def compute(cell: StudyCell) -> dict[str, np.ndarray]:
+    def compute_of(plan: StudyPlan) -> Callable[[StudyCell, Part], dict[str, np.ndarray]]:
+        def compute(cell: StudyCell, part: Part) -> dict[str, np.ndarray]:
             seeds = plan.config.batches, len(plan.config.estimators)
             return {
                 "residual": np.full(seeds[1], cell.model.stiffness),
