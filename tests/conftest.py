@@ -73,3 +73,15 @@ def shared_programs(programs: tuple[dict[Any, Any], dict[Any, Any]]) -> Iterator
         for module in (sampling, descents):
             patch.setattr(module, "Simulator", made)
         yield
+
+
+@pytest.fixture(scope="module")
+def workers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+    """A client of two workers, which tell in a file what they compute of the task `poison`."""
+    from mjx_study.study.cluster import connected
+    from tests.poison import ACCOUNT
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv(ACCOUNT, str(tmp_path_factory.mktemp("account") / "account"))
+        with connected("local:2") as client:
+            yield client

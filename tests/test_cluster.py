@@ -7,7 +7,6 @@ import subprocess
 import sys
 import time
 from collections import deque
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,7 @@ import yaml
 
 from mjx_study import cli
 from mjx_study.study import cluster
-from mjx_study.study.cluster import TRIES, connected
+from mjx_study.study.cluster import TRIES
 from mjx_study.study.configuration import StudyConfig
 from mjx_study.study.run import load_study, run_study, warnings_of
 from mjx_study.study.store import Store, StudyError
@@ -34,15 +33,6 @@ ARGUMENTS = ["tests.poison:poison", "--contact", "reference", "--stiffness", ","
 def config(*stiffness: float, **changes: Any) -> StudyConfig:
     chosen: dict[str, Any] = {"tasks": ("tests.poison:poison",), "contact": ("reference",), "samples": (4,), "seeds": 2}
     return StudyConfig(**(chosen | {"stiffness": stiffness, "reference_samples": 6} | changes))
-
-
-@pytest.fixture(scope="module")
-def workers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
-    """A client of two workers."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv(ACCOUNT, str(tmp_path_factory.mktemp("account") / "account"))
-        with connected("local:2") as client:
-            yield client
 
 
 @pytest.fixture(scope="module")

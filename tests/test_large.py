@@ -5,7 +5,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,7 @@ import pytest
 from mjx_study import cli
 from mjx_study.study import gradients
 from mjx_study.study.blocks import REFERENCE, Arrays, Blocks
-from mjx_study.study.cluster import TRIES, connected
+from mjx_study.study.cluster import TRIES
 from mjx_study.study.configuration import StudyConfig
 from mjx_study.study.gradients import Gradients, compute_gradients
 from mjx_study.study.plan import StudyPlan, block_of, blocks_of, plan_study
@@ -180,15 +179,6 @@ def test_the_first_samples_pick_the_control_variate(monkeypatch: pytest.MonkeyPa
     found = [compute_gradients(plan)(plan.cells[0])["reference"] for plan in (planned(), planned(block_size=None))]
     assert sizes == [12, 12]
     np.testing.assert_allclose(found[0], found[1], rtol=1e-13)
-
-
-@pytest.fixture(scope="module")
-def workers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
-    """A client of two workers."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv(ACCOUNT, str(tmp_path_factory.mktemp("account") / "account"))
-        with connected("local:2") as client:
-            yield client
 
 
 @pytest.mark.slow

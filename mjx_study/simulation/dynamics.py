@@ -245,19 +245,13 @@ def advance_velocity(
     return data.qvel, data.act
 
 
-@jax.jit
-def _constrained_update(model: mjx.Model, data: mjx.Data, qvel: Array, act: Array, control: Array, warmstart: Array):
-    data = force_stage(model, fwd_position(model, data), qvel, act, control)
-    qacc = constraint.solve(model, data.replace(qacc_warmstart=warmstart))
-    return *advance_velocity(model, data, qacc), qacc, constraint.residual(model, data, qacc)
-
-
-def _solved_update(
-    model: mjx.Model, template: mjx.Data, qpos: Array, qvel: Array, act: Array, control: Array, warmstart: Array
+@partial(jax.jit, static_argnames="solve")
+def _constrained_update(
+    model: mjx.Model, data: mjx.Data, qvel: Array, act: Array, control: Array, warmstart: Array, solve=constraint.solve
 ):
-    """`_constrained_update` without a derivative."""
-    data = force_stage(model, fwd_position(model, template.replace(qpos=qpos)), qvel, act, control)
-    qacc = constraint.run_solver(model, data.replace(qacc_warmstart=warmstart))
+    """The velocity update by `constraint.solve`, or by `constraint.run_solver` without its derivative."""
+    data = force_stage(model, fwd_position(model, data), qvel, act, control)
+    qacc = solve(model, data.replace(qacc_warmstart=warmstart))
     return *advance_velocity(model, data, qacc), qacc, constraint.residual(model, data, qacc)
 
 
@@ -278,8 +272,9 @@ def _jacobian_update(scene: Scene, tape: Callable[..., tuple[Array, ...]], model
     traced_model, whole = traced_part(model)
 
     @jax.custom_jvp
-    def update(traced, *inputs):
-        return entry_by_entry(_solved_update, whole(traced), scene.template, *inputs)
+    def update(traced, qpos, *inputs):
+        solved = partial(_constrained_update, solve=constraint.run_solver)
+        return entry_by_entry(solved, whole(traced), scene.template.replace(qpos=qpos), *inputs)
 
     @partial(update.defjvp, symbolic_zeros=True)
     def _(primals, tangents):

@@ -21,8 +21,6 @@ from jax.extend.core import Literal
 
 MOST_SCALARS: Final = {"cpu": 12_000, "gpu": 6_000, "tpu": 6_000}
 """Largest number of scalar operations, by backend; XLA's time to compile them grows faster than their number."""
-UNROLL: Final = True
-"""Whether functions are unrolled at all; tests compare."""
 
 _NUMPY: Final[dict[str, Callable[..., Any]]] = {
     "abs": np.abs,
@@ -90,7 +88,7 @@ def unrolled(function: Callable[..., Any], *arguments: Any) -> Any:
         The function's value.
     """
     leaves = jax.tree.leaves(arguments)
-    if not (UNROLL and any(isinstance(leaf, Tracer) for leaf in leaves)):
+    if not any(isinstance(leaf, Tracer) for leaf in leaves):
         return function(*arguments)
     jaxpr, shape = jax.make_jaxpr(function, return_shape=True)(*arguments)
     most = MOST_SCALARS[jax.default_backend()]
