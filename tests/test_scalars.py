@@ -40,6 +40,7 @@ FUNCTIONS = {
     "dynamic slices": lambda x: jax.lax.dynamic_update_slice(TABLE[0], jax.lax.dynamic_slice(x, (2,), (2,)), (0,)),
     "computed slice": lambda x: jax.lax.dynamic_slice(jnp.outer(x, x), (jnp.argmax(x), 0), (1, 2)),
     "products": lambda x: jnp.einsum("bij,bjk->bik", jnp.stack([jnp.outer(x, x)] * 2), jnp.ones((2, 3, 2), int)),
+    "products of what is computed": lambda x: jnp.outer(x, jnp.sin(x)) @ jnp.stack([x, x**2], 1),
     "sums": lambda x: (jnp.cumsum(x), jax.lax.cumsum(x, reverse=True), jnp.sum(jnp.outer(x, x), 0)),
     "reductions": lambda x: (jnp.max(x), jnp.min(jnp.outer(x, x), axis=1), jnp.any(x > 1), jnp.all(x > -9)),
     "first of equals": lambda x: (jnp.argmax(jnp.abs(jnp.round(x)) * 0), jnp.argmin(jnp.outer(x, x), axis=1)),
@@ -63,7 +64,18 @@ def test_the_value_is_the_functions(name):
         np.testing.assert_allclose(ours, theirs, rtol=1e-14, atol=1e-14)
 
 
-@pytest.mark.parametrize("name", ["elementwise", "computed index", "add to one place twice", "products", "sums"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "elementwise",
+        "computed index",
+        "add to one place twice",
+        "products",
+        "products of what is computed",
+        "sums",
+        "reductions",
+    ],
+)
 def test_both_modes_differentiate_it(name):
     def total(function, x):
         return sum(jnp.sum(jnp.sin(jnp.asarray(leaf, float))) for leaf in jax.tree.leaves(function(x)))

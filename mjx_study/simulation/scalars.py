@@ -52,6 +52,20 @@ _OTHERS: Final = (
 _ELEMENTWISE: Final = frozenset((*_NUMPY, *_OTHERS))
 _COMMUTATIVE: Final = frozenset({"add", "add_any", "and", "eq", "max", "min", "mul", "ne", "or"})
 _SAME: Final = frozenset({"copy", "copy_p", "name", "optimization_barrier"})
+_FUNCTIONS: Final = {
+    lax.add_p: lax.add,
+    lax.and_p: lax.bitwise_and,
+    lax.eq_p: lax.eq,
+    lax.gt_p: lax.gt,
+    lax.lt_p: lax.lt,
+    lax.max_p: lax.max,
+    lax.min_p: lax.min,
+    lax.mul_p: lax.mul,
+    lax.neg_p: lax.neg,
+    lax.or_p: lax.bitwise_or,
+    lax.select_n_p: lax.select_n,
+}
+"""Operations that rules add; these functions give primitives the parameters that they have in this version of JAX."""
 _CALLS: Final = {"closed_call": "call_jaxpr", "jit": "jaxpr", "pjit": "jaxpr"}
 
 
@@ -358,8 +372,10 @@ def _emit(nodes: Iterable[_Node], values: dict[int, Any]) -> None:
                 found = _whole(equation, arrays)
             case "loop":
                 found = _emit_loop(node, arguments, values)
-            case primitive:
+            case primitive if node.parameters:
                 found = primitive.bind(*arguments, **node.parameters)
+            case primitive:
+                found = _FUNCTIONS.get(primitive, primitive.bind)(*arguments)
         values[node.number] = found
 
 
