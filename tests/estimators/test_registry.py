@@ -84,10 +84,12 @@ def test_the_table_is_keyed_by_name():
 
 
 def test_sample_i_depends_on_key_i_alone():
+    # Batches of one size: XLA may round the last lanes of a batch of another size differently, by one ulp.
     keys = jax.random.split(jax.random.key(1), 10)
-    whole = OBJECTIVE.evaluate(jnp.asarray(THETA), jax.random.clone(keys))
-    part = OBJECTIVE.evaluate(jnp.asarray(THETA), keys[3:5])
-    np.testing.assert_array_equal(whole.value[3:5], part.value)
+    others = jax.random.split(jax.random.key(2), 10).at[3:5].set(jax.random.clone(keys)[3:5])
+    one, other = (OBJECTIVE.evaluate(jnp.asarray(THETA), batch).value for batch in (keys, others))
+    np.testing.assert_array_equal(one[3:5], other[3:5])
+    assert not np.isin(np.delete(other, [3, 4]), one).any()
 
 
 def drawn(estimator: Estimator) -> GradientEstimate:
