@@ -30,6 +30,7 @@ from scipy.stats import qmc
 
 from estimators import Evaluation, antithetic, effective_samples, squared_bias_of_means, variance_interval, zeroth_order
 from estimators.statistics import summarise
+from mjx_study.compiled import Compiled
 from mjx_study.diagnose import touch_of
 from mjx_study.disk import write_whole
 from mjx_study.objective import Simulator, rollout_cost, spread
@@ -204,7 +205,7 @@ class Programs:
             def run(along, solref, solimp, sigma, key, scale):
                 return program(along * self.direction, ContactModel(solref, solimp), sigma, key, scale)
 
-            return jax.jit(jax.vmap(run))
+            return Compiled(jax.vmap(run))
 
         self._warm: set[str] = set()
         self._programs = {"value": of_rows(value), "gradients": of_rows(gradients)}

@@ -23,6 +23,7 @@ import numpy as np
 from mujoco import rollout
 
 from estimators import FirstOrder, ZerothOrder
+from mjx_study.compiled import Compiled
 from mjx_study.objective import Simulator, chunk_for, simulate, spread
 from mjx_study.reference.noise import split_sample_key, standard_noise
 from mjx_study.runtime import environment
@@ -228,7 +229,7 @@ def _stock_programs(task: Task, contact: ContactModel | None, keys: Any, devices
         return jnp.sum(values) + task.final_cost(State(last.qpos, last.qvel, last.act, last.qacc_warmstart))
 
     def program(function):
-        return jax.jit(jax.vmap(function, in_axes=(None, None, 0)))
+        return Compiled(jax.vmap(function, in_axes=(None, None, 0)))
 
     budget = int(scene.host.opt.iterations)
     values = program(lambda theta, contact, key: cost(theta, contact, key, budget))

@@ -9,6 +9,7 @@ import dataclasses
 import math
 import textwrap
 from collections.abc import Iterator, Sequence
+from functools import partial
 from typing import Any, Final
 
 import jax
@@ -19,6 +20,7 @@ import numpy as np
 from estimators import ORACLES, Circulation, Estimator, make_estimator, oracles_of, variance_interval
 from estimators.mean_check import NODES
 from mjx_study.choices import is_file
+from mjx_study.compiled import Compiled
 from mjx_study.gradcheck import GradcheckPlan, GradcheckReport, gradcheck, plan_gradcheck, plan_scene_gradcheck
 from mjx_study.gradcheck.mean import MEANS, along_means, reach_of, unmixed
 from mjx_study.objective import MjxObjective, Simulator, chunk_for, simulate
@@ -481,8 +483,9 @@ def _measure(
 
 def _touches(task: Task, cell: ContactPoint) -> Iterator[Touch]:
     """Contacts that begin in the rollout without noise, in the C engine."""
-    run = jax.jit(lambda theta, contact: simulate(task, theta, contact, jax.random.key(0), 0.0))
-    states, *_ = run(task.theta, cell.contact)
+    dtype = task.theta.dtype
+    run = Compiled(partial(simulate, task), "rollout", task)
+    states, *_ = run(task.theta, cell.contact, jax.random.key(0), jnp.zeros((), dtype))
     host = engine_model(task.scene, cell.contact)
     data, timestep, before = mujoco.MjData(host), task.scene.timestep, None
     for index, (qpos, qvel) in enumerate(zip(np.asarray(states.qpos), np.asarray(states.qvel), strict=True)):

@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Array, Float, Key
 
 from estimators import Differentiation, Evaluation, Linearisation, StepDifferentiation, StepEvaluation
+from mjx_study.compiled import Compiled
 from mjx_study.reference.noise import noise_score, split_sample_key, standard_noise
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.branches import jump_term
@@ -41,16 +42,14 @@ LAPACK_BATCH: Final = 2048
 two programs do so at a time. Matrices of up to `SMALL` rows do not go to LAPACK."""
 
 
-def spread(
-    program: Callable[..., Any], shared: Any, rows: Sequence[np.ndarray], chunk: int, devices: Sequence[Any]
-) -> Any:
+def spread(program: Compiled, shared: Any, rows: Sequence[np.ndarray], chunk: int, devices: Sequence[Any]) -> Any:
     """Call a compiled program on chunks of rows, on all devices at once.
 
     On CPUs all chunks run on the first device, called from as many threads as there are devices: those calls run side
     by side, and one compilation serves all cores. (JAX 0.11 crashes as it compiles MJX under `shard_map` or `pmap`.)
 
     Args:
-        program: what `jax.jit` returned, of the shared arguments and one chunk of each array of rows.
+        program: of the shared arguments and one chunk of each array of rows.
         rows: arrays of one length.
         chunk: rows in a call; the last chunk is padded by repeating the last row.
         devices: of this process.
@@ -67,10 +66,10 @@ def spread(
     placed = {device: jax.device_put(shared, device) for device in devices}
 
     def call(device: Any, part: np.ndarray) -> Any:
-        return program(*placed[device], *jax.device_put(tuple(array[part] for array in rows), device))
+        return run(*placed[device], *jax.device_put(tuple(array[part] for array in rows), device))
 
     # Traced in this thread, because tracing patches MJX for the whole process.
-    jax.eval_shape(program, *placed[devices[0]], *(array[chunks[0]] for array in rows))
+    run = program.prepare(*placed[devices[0]], *(array[chunks[0]] for array in rows), platform=devices[0].platform)
     left = iter(range(len(chunks)))
 
     def work(device: Any) -> None:
@@ -191,7 +190,7 @@ class Simulator:
             raise ValueError(f"chunk_size must be at least 1 sample, got {self.chunk_size}")
         object.__setattr__(self, "devices", tuple(self.devices) or tuple(jax.local_devices()))
         batched = {name: jax.vmap(each, (None, None, None, 0, 0)) for name, each in self.sample_programs.items()}
-        object.__setattr__(self, "_programs", {name: jax.jit(each) for name, each in batched.items()})
+        object.__setattr__(self, "_programs", {name: Compiled(each, name, self.task) for name, each in batched.items()})
 
     def objective(self, contact: ContactModel | None, sigma: float | None = None) -> "MjxObjective":
         """The objective under a contact model, with the task's noise level or another."""
@@ -200,7 +199,7 @@ class Simulator:
     @property
     def num_compilations(self) -> int:
         """Number of programs that this simulator has compiled so far."""
-        return sum(program._cache_size() for program in self._programs.values())  # type: ignore[attr-defined]
+        return sum(program.num_compilations for program in self._programs.values())  # type: ignore[attr-defined]
 
     @property
     def sample_programs(self) -> dict[str, Callable[..., Any]]:
@@ -222,7 +221,7 @@ class Simulator:
         dtype = self.task.scene.template.qpos.dtype
         keys = np.asarray(jax.random.key_data(jax.random.split(jax.random.key(0), self.chunk_size)))
         arguments = (self.task.theta, contact, np.asarray(1.0, dtype), keys, np.ones(self.chunk_size, dtype))
-        plan = self._programs[kind].lower(*arguments).compile().memory_analysis()  # type: ignore[attr-defined]
+        plan = self._programs[kind].jitted.lower(*arguments).compile().memory_analysis()  # type: ignore[attr-defined]
         return plan.temp_size_in_bytes * samples // self.chunk_size
 
     def _draw(self, sigma, key_data, noise_scale) -> tuple[State, Float[Array, "steps dimensions"]]:
@@ -485,7 +484,7 @@ class TracedObjective(MjxObjective):
         scale = np.ones(len(rows), dtype) if noise_scale is None else np.asarray(noise_scale, dtype)
         chunk = simulator.chunk_size
         chunks = np.minimum(np.arange(math.ceil(len(rows) / chunk) * chunk), len(rows) - 1).reshape(-1, chunk)
-        program, key_data = simulator._programs[name], jax.random.key_data(keys)  # type: ignore[attr-defined]
+        program, key_data = simulator._programs[name].jitted, jax.random.key_data(keys)  # type: ignore[attr-defined]
         sigma = jnp.asarray(self.sigma, dtype)
 
         def call(chunk):

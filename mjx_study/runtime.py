@@ -6,12 +6,14 @@ import platform
 import sys
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import jax
 import mujoco
 
 from mjx_study.choices import PRECISIONS
+
+_TRACES: Final[list[Path]] = []
 
 
 def configure(*, precision: str = "float64", cpu_devices: int | None = None, cache: str | Path | None = None) -> None:
@@ -36,6 +38,7 @@ def configure(*, precision: str = "float64", cpu_devices: int | None = None, cac
     jax.config.update("jax_num_cpu_devices", devices)
     folder = default_cache() if cache is None else cache
     jax.config.update("jax_compilation_cache_dir", None if folder is None else str(folder))
+    _TRACES[:] = [] if folder is None else [Path(folder) / "traces"]
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
 
@@ -56,6 +59,11 @@ def default_cache() -> Path | None:
     except RuntimeError:
         return None
     return root / "mjx-study" / hashlib.sha256(_processor().encode()).hexdigest()[:12]
+
+
+def traces_folder() -> Path | None:
+    """Folder of the traces of programs that are kept between runs; None unless `configure` set it up."""
+    return _TRACES[0] if _TRACES else None
 
 
 def _processor() -> str:

@@ -1,6 +1,7 @@
 """Cells on Dask's workers: real schedulers and processes, which are killed, poisoned and refused."""
 
 import os
+import pickle
 import shlex
 import signal
 import subprocess
@@ -78,7 +79,9 @@ def test_a_worker_of_other_versions_is_refused(workers: Any, tmp_path: Path, mon
     with pytest.raises(StudyError, match=r"^the worker tcp://\S+ is refused: jax 0\.0 there and \S+ here"):
         run_study(config(1.0), tmp_path, cluster=workers)
     monkeypatch.setattr(cluster, "versions", lambda: ours)
-    monkeypatch.setattr(cluster, "plan_contents", lambda plan: {"precision": "float32"})
+    packed = cluster._packed
+    other = {"precision": "float32"}
+    monkeypatch.setattr(cluster, "_packed", lambda plan: pickle.dumps((*pickle.loads(packed(plan))[:-1], other)))
     with pytest.raises(StudyError, match="is refused: precision float32 there and float64 here"):
         run_study(config(1.0), tmp_path, cluster=workers.scheduler.address)
     monkeypatch.setattr(cluster, "CONNECT_SECONDS", 1)

@@ -427,7 +427,7 @@ def test_memory_of_a_thousand_gradients(large):
     task = pusher_task()
     keys = np.asarray(jax.random.key_data(sample_keys(1000)))
     arguments = (task.theta, penalty(10.0), np.asarray(SIGMA), keys[:500], np.ones(500))
-    plan = large._programs["gradient"].lower(*arguments).compile().memory_analysis()
+    plan = large._programs["gradient"].jitted.lower(*arguments).compile().memory_analysis()
     temporary, output = 2 * plan.temp_size_in_bytes, 2 * plan.output_size_in_bytes  # the plan is of a chunk
     assert 1000 * HORIZON * 8 <= output <= 1000 * (HORIZON + 10) * 8  # gradients, values, residuals
     assert output <= temporary <= 40 * 2**20

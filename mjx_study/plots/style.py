@@ -94,11 +94,15 @@ def fit_to_paper(figure: Figure) -> None:
 
 
 def save_figure(figure: Figure, folder: Path, name: str, formats: Sequence[str] = ("png", "pdf")) -> list[Path]:
-    """Write a figure in some of `FIGURE_FORMATS`; returns the paths."""
-    return [
-        write_whole(folder / f"{name}.{kind}", lambda file, kind=kind: figure.savefig(file, format=kind, dpi=150))
-        for kind in formats
-    ]
+    """Write a figure in some of `FIGURE_FORMATS`, laid out once; returns the paths."""
+    engine, written = figure.get_layout_engine(), []
+    for kind in formats:
+        path = folder / f"{name}.{kind}"
+        written.append(write_whole(path, lambda file, kind=kind: figure.savefig(file, format=kind, dpi=150)))
+        if engine is not None:
+            figure.set_layout_engine("none")
+    figure.set_layout_engine(engine or "none")
+    return written
 
 
 def save_figures(figures: Mapping[str, Figure], folder: Path, formats: Sequence[str] = ("png", "pdf")) -> list[Path]:

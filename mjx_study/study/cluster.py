@@ -23,10 +23,10 @@ from typing import Any, Final
 
 import numpy as np
 
+from mjx_study.identity import differences, versions
 from mjx_study.runtime import available_cores, configure, precision
 from mjx_study.stopwatch import Stopwatch
 from mjx_study.study.cells import Computation
-from mjx_study.study.identity import differences, plan_contents, versions
 from mjx_study.study.plan import StudyPlan, blocks_of, plan_study
 from mjx_study.study.store import Part, StudyError
 from mjx_study.study.times import recording
@@ -234,7 +234,7 @@ def _packed(plan: StudyPlan) -> bytes:
     """What a worker needs: the configuration, and what its own plan must agree with."""
     import cloudpickle
 
-    return cloudpickle.dumps((plan.config, plan.chunk_size, precision(), versions(), plan_contents(plan)))
+    return cloudpickle.dumps((plan.config, plan.chunk_size, precision(), versions(), plan.contents))
 
 
 def _compute(study: bytes, index: int, kept: Arrays, block: int | None) -> Arrays:
@@ -256,7 +256,7 @@ def _prepared(study: bytes) -> tuple[StudyPlan, Computation, Stopwatch]:
     if not _SET_UP.is_set():
         _set_up(asked)
     plan = plan_study(config)
-    ours = versions(), plan_contents(plan)
+    ours = versions(), plan.contents
     if told := differences(*({**one, **other} for one, other in (client, ours))):
         from distributed import get_worker
 

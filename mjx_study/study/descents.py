@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
-from functools import partial
+from functools import cached_property, partial
 from typing import Any, Final
 
 import jax
@@ -22,6 +22,7 @@ import numpy as np
 from jaxtyping import Array, Float, Key
 
 from estimators import Estimator, Objective, draw
+from mjx_study.compiled import Compiled
 from mjx_study.objective import Simulator, TracedObjective, simulate
 from mjx_study.simulation.contact import ContactModel, soften
 from mjx_study.stopwatch import tell, timed
@@ -115,10 +116,12 @@ class Backend:
 
         if self.simulator is not None:
             if estimator not in self._iterations:
-                self._iterations[estimator] = jax.jit(
+                made_of = "descent", estimator, self.optimizer, self.task, self.samples, self.simulator.chunk_size
+                self._iterations[estimator] = Compiled(
                     lambda contact, sigma, state, keys: update(
                         state, jax.vmap(partial(batches, self._traced(contact, sigma)))(state.theta, keys)
-                    )
+                    ),
+                    *made_of,
                 )
             simulated = self._iterations[estimator]
 
@@ -168,16 +171,15 @@ class Backend:
         key = jax.random.fold_in(jax.random.key(self.config.seed), 2**31 - 1)
         return jax.random.split(key, self.config.evaluation_samples or 0)
 
-    @partial(jax.jit, static_argnums=0)
-    def _observe(
-        self, theta: Float[Array, " params"], contact: ContactModel | None, keys: Key[Array, " samples"]
-    ) -> dict[str, Array]:
+    @cached_property
+    def _observe(self) -> Compiled:
+        """The task's metrics of each sample, as a function of theta, contact and keys."""
 
-        def one(key: Key[Array, ""]) -> dict[str, Array]:
+        def one(theta: Float[Array, " params"], contact: ContactModel | None, key: Key[Array, ""]) -> dict[str, Array]:
             states, *_ = simulate(self.task, theta, contact, key, 1.0)
             return self.task.metrics(states)  # type: ignore[misc]
 
-        return jax.vmap(one)(keys)
+        return Compiled(jax.vmap(one, (None, None, 0)), "metrics", self.task)
 
 
 @dataclasses.dataclass

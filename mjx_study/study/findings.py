@@ -92,7 +92,8 @@ def rows_of(dataset: xr.Dataset) -> list[Row]:
     names = [name for name in GRADIENTS if name in dataset and name not in VECTORS]
 
     def along(name: str, *last: str) -> np.ndarray:
-        return dataset[name].broadcast_like(grid).transpose(*outer, *last).values
+        variable = dataset[name].variable
+        return variable.set_dims({**grid.sizes, **variable.sizes}).transpose(*outer, *last).values
 
     scalars, coordinates = ({name: along(name) for name in each} for each in (names, PLACE))
     vectors = {name: along(name, f"{name}_entry") for name in ("solref", "solimp") if name in dataset}

@@ -7,7 +7,7 @@ not sampling noise.
 
 import math
 from collections.abc import Mapping, Sequence
-from functools import partial
+from functools import cache, partial
 from typing import Any, Final
 
 import jax
@@ -19,6 +19,7 @@ import estimators
 from estimators import ORACLES, Batches, Estimator, Evaluation, GradientEstimate
 from estimators.blocks import THINNED, moments_of
 from estimators.statistics import merged_estimates
+from mjx_study.compiled import Compiled
 from mjx_study.objective import MjxObjective, Simulator
 from mjx_study.reference import Reference
 from mjx_study.study.blocks import REFERENCE, Arrays, Blocks, pack
@@ -117,7 +118,7 @@ class Gradients:
             if reference is None:
                 pilot = jax.tree.map(lambda leaf: leaf[0, :PILOT], drawn["evaluation"])
                 reference = self._reference(cell, objective, pilot)
-            numbers = _seed_numbers(drawn, reference, tests[some], chosen, config.confidence)
+            numbers = _seed_numbers(chosen, config.confidence)(drawn, reference, tests[some])
             parts.append(jax.device_get(numbers))
             tallies.append({name: Tally.of(drawn[name], seconds[name], residuals[name]) for name in oracles})
         assert reference is not None
@@ -256,14 +257,14 @@ def _reference_gradient(
     return reference_gradient(odd, pilot, list(candidates), sigma)
 
 
-@partial(jax.jit, static_argnames=("chosen", "confidence"))
-def _seed_numbers(drawn, reference: GradientEstimate, keys: Key[Array, " seeds"], chosen, confidence: float):
-    """The numbers of every estimator, with an axis of seeds."""
+@cache
+def _seed_numbers(chosen: tuple[Estimator, ...], confidence: float) -> Compiled:
+    """The numbers of every estimator with an axis of seeds, as a function of batches, the reference and keys."""
 
-    def numbers(batches, key):
+    def numbers(batches, reference, key):
         return estimate_numbers([estimator(batches) for estimator in chosen], reference, key, confidence)
 
-    return jax.vmap(numbers)(drawn, keys)
+    return Compiled(jax.vmap(numbers, (0, None, 0)), "numbers of seeds", chosen, confidence)
 
 
 @partial(jax.jit, static_argnames="chosen")

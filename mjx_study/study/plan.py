@@ -12,6 +12,7 @@ import estimators
 from estimators import Estimator, find_estimator
 from estimators.cross_fitting import check_weights
 from mjx_study.choices import REFERENCE
+from mjx_study.identity import contents, estimator_contents
 from mjx_study.limits import MOST_CELLS, MOST_GIB, MOST_PROGRAMS, check_count
 from mjx_study.objective import chunk_for
 from mjx_study.option import OPTIONS, check
@@ -119,6 +120,14 @@ class StudyPlan:
     def iterations(self) -> int:
         """Iterations of the longest descent; 0 in other studies."""
         return max((group.recipe.iterations for group in self.groups if group.recipe), default=0)
+
+    @property
+    def contents(self) -> dict[str, str]:
+        """What the numbers are made of, by digest: the tasks in all their forms, and estimators from outside."""
+        forms: dict[str, list[Task]] = {}
+        for group in self.groups:
+            forms.setdefault(group.name, []).append(group.task)
+        return contents(forms) | estimator_contents(*self.config.estimators)
 
     def label(self, cell: StudyCell) -> str:
         """A cell's name in messages."""

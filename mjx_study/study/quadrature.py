@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Float
 
 from estimators import NOISES
+from mjx_study.compiled import Compiled
 from mjx_study.objective import rollout_cost, rounds, spread
 from mjx_study.reference.noise import split_sample_key
 from mjx_study.simulation.contact import ContactModel
@@ -76,7 +77,7 @@ class Line:
 
         batched = jax.vmap(jax.value_and_grad(cost), in_axes=(0, None))
         self._task = task
-        self._program = jax.jit(lambda contact, thetas: batched(thetas, contact))
+        self._program = Compiled(lambda contact, thetas: batched(thetas, contact), "quadrature", task)
         self._dtype = dtype
 
     def __call__(

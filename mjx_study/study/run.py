@@ -19,13 +19,13 @@ import xarray as xr
 
 from estimators import ENOUGH_EFFECTIVE
 from mjx_study.disk import prepare_folder
+from mjx_study.identity import differences, versions
 from mjx_study.runtime import environment
 from mjx_study.study.axes import Axes, axes_of, solver_arrays, solver_parameters
 from mjx_study.study.cells import Computation
 from mjx_study.study.cluster import cells_on, connected
 from mjx_study.study.configuration import Progress, StudyConfig
 from mjx_study.study.dataset import Cells, as_plain, dataset_of, write_dataset
-from mjx_study.study.identity import differences, plan_contents, versions
 from mjx_study.study.plan import StudyCell, StudyPlan, estimators_of, plan_study
 from mjx_study.study.revision import git_revision
 from mjx_study.study.store import Part, Store
@@ -43,7 +43,7 @@ def _document(plan: StudyPlan, command: str | None) -> dict[str, Any]:
     return {
         "config": fields,
         "warnings": list(plan.warnings),
-        "contents": plan_contents(plan),
+        "contents": plan.contents,
         "versions": versions(),
         "environment": environment(),
         "revision": git_revision(),

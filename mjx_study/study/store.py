@@ -25,9 +25,9 @@ from typing import Any, Final
 import numpy as np
 
 from mjx_study.disk import open_regular, prepare_folder, read_whole, write_whole
+from mjx_study.identity import ACCEPT, differences
 from mjx_study.study.dataset import as_plain
 from mjx_study.study.document import read_document, read_format
-from mjx_study.study.identity import ACCEPT, differences
 
 FORMAT: Final = 3
 """Format of the folder; increased when older programs cannot read newer folders."""

@@ -23,10 +23,10 @@ from pydantic import BaseModel, Field
 
 from mjx_study.disk import write_whole
 from mjx_study.files import read_json
+from mjx_study.identity import digest_of, versions
 from mjx_study.runtime import precision, processor_name
 from mjx_study.simulation.scene import num_constraint_rows
 from mjx_study.stopwatch import Spent, Stopwatch
-from mjx_study.study.identity import digest_of, versions
 from mjx_study.tasks.task import Task
 
 OVERHEAD: Final = {"cpu": 25, "gpu": 8000, "tpu": 8000}

@@ -28,7 +28,6 @@ import numpy as np
 from estimators import find_estimator
 from mjx_study.runtime import precision
 from mjx_study.simulation.scene import Scene, models_folder
-from mjx_study.study.plan import StudyPlan
 from mjx_study.tasks.task import Task
 
 VERSIONED: Final = ("mjx-study", "mujoco", "mujoco-mjx", "jax", "jaxlib", "numpy", "optax")
@@ -81,12 +80,15 @@ def digest_of(value: Any) -> str:
     return digest.hexdigest()
 
 
-def plan_contents(plan: StudyPlan) -> dict[str, str]:
-    """`contents` of a plan's tasks in all their forms, and `estimator_contents` of its estimators."""
-    forms: dict[str, list[Task]] = {}
-    for group in plan.groups:
-        forms.setdefault(group.name, []).append(group.task)
-    return contents(forms) | estimator_contents(*plan.config.estimators)
+def trace_contents(made_of: Any) -> str | None:
+    """Digest of what a trace is made of beside its arguments and JAX's settings: values and models to the bit, code.
+
+    Returns:
+        None if code from outside of this package is among it: not everything that such code imports is followed.
+    """
+    digest = _Digest(exact=True)
+    digest.add((made_of, [metadata.version(name) for name in VERSIONED], _own_code(ABOVE)))
+    return None if digest.foreign else digest.hexdigest()
 
 
 def estimator_contents(*names: str) -> dict[str, str]:
@@ -111,7 +113,7 @@ def differences(theirs: Mapping[str, Any], ours: Mapping[str, Any]) -> str | Non
 @functools.cache
 def _own_code(without: tuple[str, ...] = ()) -> str:
     """Digest of this package's source, less some parts of mjx_study."""
-    package = Path(__file__).parents[1]
+    package = Path(__file__).parent
     files = sorted([*package.rglob("*.py"), *(package.parent / "estimators").rglob("*.py")])
     left_out = [package / part for part in without]
     sha = hashlib.sha256()
@@ -144,9 +146,18 @@ def code_of(module: str) -> str:
 
 
 class _Digest:
-    """A digest of values, and of the source files of functions among them."""
+    """A digest of values, and of the source files of functions among them.
 
-    def __init__(self) -> None:
+    Args:
+        exact: to the bit, and of all that a trace may read, where other digests are the same on every processor.
+
+    Attributes:
+        sources: digests of the source files of functions and classes from outside of this package.
+        foreign: whether there are any, those of an interactive session included.
+    """
+
+    def __init__(self, *, exact: bool = False) -> None:
+        self._exact, self.foreign = exact, False
         self._sha = hashlib.sha256()
         self._seen: dict[int, tuple[int, Any]] = {}
         self.sources: dict[str, str] = {}
@@ -209,8 +220,8 @@ class _Digest:
         if isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jax.dtypes.prng_key):
             value = jax.random.key_data(value)
         array = np.asarray(value)
-        self._note("array", array.dtype.kind, str(array.shape))
-        if array.dtype.kind == "f":
+        self._note("array", array.dtype.str if self._exact else array.dtype.kind, str(array.shape))
+        if array.dtype.kind == "f" and not self._exact:
             finite = np.isfinite(array)
             mantissa, exponent = np.frexp(np.where(finite, array, 0).astype(float))
             kind = np.where(finite, 0, np.where(np.isnan(array), 1, np.where(array > 0, 2, 3)))
@@ -220,6 +231,10 @@ class _Digest:
 
     def _scene(self, scene: Scene) -> None:
         """MuJoCo's model, and those of its arrays that someone changed in MJX's."""
+        if self._exact:
+            saved = np.empty(mujoco.mj_sizeModel(scene.host), np.uint8)
+            mujoco.mj_saveModel(scene.host, None, saved)
+            return self._all("scene", (scene.adjoint, saved, scene.model, scene.template))
         self._model(scene.host)
         on_device: Any = scene.model
         for field in dataclasses.fields(on_device):
@@ -260,6 +275,7 @@ class _Digest:
     def _source(self, module: str) -> None:
         """The source file of a module, and of those beside it that it imports."""
         path = _file(module)
+        self.foreign |= not _by_version(module)
         if _by_version(module) or path is None:
             return
         levels = module.count(".") + (path.name == "__init__.py")

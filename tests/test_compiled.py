@@ -1,0 +1,147 @@
+"""Traces that outlive the process: found again to the bit, and never where anything that they are made of differs."""
+
+import dataclasses
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import estimators
+from mjx_study import compiled, identity, objective
+from mjx_study.compiled import Compiled
+from mjx_study.objective import Simulator
+from mjx_study.study import gradients
+from mjx_study.tasks import Task, make_task
+from tests.carts import cart
+
+KEYS = jax.random.split(jax.random.key(0), 2)
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setattr(compiled, "traces_folder", lambda: tmp_path)
+    return tmp_path
+
+
+def pusher(**options: Any) -> Task:
+    return make_task("pusher", horizon=3, **options)
+
+
+def evaluated(task: Task) -> np.ndarray:
+    return np.asarray(Simulator(task, chunk_size=2).objective(None).evaluate(task.theta, jax.random.clone(KEYS)).value)
+
+
+def untraceable(*_: Any, **__: Any) -> Any:
+    raise AssertionError("traced")
+
+
+def test_a_trace_is_found_again_and_gives_the_same_bits(folder: Path, monkeypatch: pytest.MonkeyPatch):
+    first = evaluated(pusher())
+    (path,) = folder.glob("*.trace")
+    assert path.stat().st_size < 100_000
+    monkeypatch.setattr(objective, "rollout_cost", untraceable)
+    np.testing.assert_array_equal(evaluated(pusher()), first)
+    monkeypatch.setattr(compiled, "traces_folder", lambda: None)
+    with pytest.raises(AssertionError, match="traced"):
+        evaluated(pusher())
+
+
+def test_without_a_folder_the_bits_are_the_same(monkeypatch: pytest.MonkeyPatch):
+    kept = evaluated(pusher())
+    monkeypatch.setattr(compiled, "traces_folder", lambda: None)
+    np.testing.assert_array_equal(evaluated(pusher()), kept)
+
+
+def test_a_damaged_file_is_made_again(folder: Path):
+    first = evaluated(pusher())
+    (path,) = folder.glob("*.trace")
+    whole = path.read_bytes()
+    for damaged in (b"", b"nonsense", whole[: len(whole) // 2]):
+        path.write_bytes(damaged)
+        np.testing.assert_array_equal(evaluated(pusher()), first)
+        assert len(path.read_bytes()) == len(whole)
+
+
+def heavier(by: float) -> Task:
+    task = pusher()
+    host = task.scene.host
+    host.body_mass[1] *= by
+    return task.replace(scene=dataclasses.replace(task.scene, host=host))
+
+
+def on_device(task: Task) -> Task:
+    scene = task.scene
+    changed = scene.model.replace(dof_damping=scene.model.dof_damping + 1e-17 + np.spacing(scene.model.dof_damping))
+    return task.replace(scene=dataclasses.replace(scene, model=changed))
+
+
+OTHERS: dict[str, Callable[[], Task]] = {
+    "horizon": lambda: make_task("pusher", horizon=4),
+    "timestep": lambda: pusher(timestep=0.005 * (1 + 2**-52)),
+    "sigma": lambda: pusher().replace(sigma=np.nextafter(pusher().sigma, 1)),
+    "derivatives": lambda: pusher(adjoint="tape"),
+    "onset term": lambda: pusher().replace(onset="linear"),
+    "mass in the engine's model": lambda: heavier(1 + 2**-52),
+    "damping in MJX's model": lambda: on_device(pusher()),
+    "noise": lambda: pusher().replace(noise="laplace"),
+}
+
+
+@pytest.mark.parametrize("other", OTHERS)
+def test_what_differs_in_a_bit_has_a_trace_of_its_own(other: str):
+    same, different = (Compiled(jnp.sin, "rollout", task)._path("form") for task in (pusher(), OTHERS[other]()))
+    assert same is not None and different is not None and same != different
+    assert same == Compiled(jnp.cos, "rollout", pusher())._path("form")
+
+
+def test_code_versions_settings_and_the_form_of_arguments_count(monkeypatch: pytest.MonkeyPatch):
+    def path(form: str = "form") -> Path | None:
+        return Compiled(jnp.sin, "rollout", pusher())._path(form)
+
+    ours = path()
+    assert ours == path() != path("another")
+    with monkeypatch.context() as patch:
+        patch.setattr(identity, "_own_code", lambda without: "other")
+        assert path() != ours
+    version = identity.metadata.version
+    with monkeypatch.context() as patch:
+        patch.setattr(identity.metadata, "version", lambda name: "9" if name == "jaxlib" else version(name))
+        assert path() != ours
+    with jax.numpy_dtype_promotion("strict"):
+        assert path() != ours
+    assert path() == ours
+
+
+def test_code_from_outside_is_traced_in_every_process(folder: Path):
+    evaluated(cart())
+    assert not list(folder.iterdir())
+
+
+def test_statistics_of_seeds_and_structures_come_back(folder: Path):
+    chosen = (estimators.make_estimator("aobg"), estimators.make_estimator("fobg"))
+    task = pusher()
+    simulated = Simulator(task, chunk_size=2).objective(None)
+    keys = jax.random.clone(KEYS)
+    drawn = {
+        "evaluation": simulated.evaluate(task.theta, keys),
+        "differentiation": simulated.differentiate(task.theta, keys),
+    }
+    reference = chosen[1](drawn)
+    arguments = jax.tree.map(lambda leaf: leaf[None], drawn), reference, jax.random.split(jax.random.key(1), 1)
+    with jax.debug_key_reuse(False):
+        first = gradients._seed_numbers(chosen, 0.9)(*arguments)
+        gradients._seed_numbers.cache_clear()
+        again = gradients._seed_numbers(chosen, 0.9)(*arguments)
+    assert len(list(folder.glob("*.trace"))) == 3
+    assert first[0]["alpha"] is not None and first[1]["alpha"] is None
+    jax.tree.map(np.testing.assert_array_equal, again, first)
+
+
+def test_names_say_which_settings_do_not_count():
+    left_out = [name for name in jax.config.values if compiled.UNTRACED.search(name)]
+    assert not [name for name in left_out if re.search("x64|prng|precision|promotion|threefry|nan", name)], left_out
