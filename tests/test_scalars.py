@@ -1,5 +1,7 @@
 """Functions computed entry by entry are the functions."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -102,8 +104,14 @@ def test_a_functions_own_derivative_is_kept():
     np.testing.assert_array_equal(gradient(np.zeros(3)), np.zeros(3))
 
 
+def _inside(function, *arguments):
+    """The jaxpr of a function, or of the one that it calls and nothing else."""
+    jaxpr = jax.make_jaxpr(function)(*arguments).jaxpr
+    return jaxpr.eqns[0].params["jaxpr"].jaxpr if [each.primitive.name for each in jaxpr.eqns] == ["jit"] else jaxpr
+
+
 def _operations(function, *arguments) -> list[str]:
-    jaxpr = jax.make_jaxpr(function)(*arguments)
+    jaxpr = _inside(function, *arguments)
     moves = {"slice", "squeeze", "reshape", "broadcast_in_dim", "stack", "concatenate", "convert_element_type"}
     return [name for each in jaxpr.eqns if (name := each.primitive.name) not in moves]
 
@@ -124,7 +132,7 @@ def test_what_does_not_change_in_a_loop_is_computed_before_it():
     def function(x):
         return jax.lax.while_loop(lambda y: y < 9.0, lambda y: y * jnp.cosh(x[0]) + 1, x[1])
 
-    jaxpr = jax.make_jaxpr(lambda x: unrolled(function, x))(ROW)
+    jaxpr = _inside(lambda x: unrolled(function, x), ROW)
     assert "cosh" in [each.primitive.name for each in jaxpr.eqns]
     (loop,) = (each for each in jaxpr.eqns if each.primitive.name == "while")
     assert "cosh" not in str(loop.params["body_jaxpr"])
@@ -139,6 +147,28 @@ def test_what_is_too_large_is_left_as_it_is(monkeypatch, most):
     monkeypatch.setitem(scalars.MOST_SCALARS, "cpu", most)
     function = lambda x: jnp.outer(x, x) @ jnp.cos(x)  # noqa: E731
     assert _operations(lambda x: unrolled(function, x), ROW) == _operations(function, ROW)
+
+
+def test_a_function_is_written_out_once_for_arguments_of_equal_content(monkeypatch):
+    written = []
+    out = scalars._written_out
+    monkeypatch.setattr(scalars, "_written_out", lambda *given: written.append(given) or out(*given))
+    function = lambda power, table, x: jnp.asarray(table) @ x**power  # noqa: E731
+
+    def at(x, table=ROW, power=2):
+        return jax.jit(lambda x: unrolled(partial(function, power), table, x))(x)
+
+    for _ in range(2):
+        np.testing.assert_allclose(at(ROW), ROW @ ROW**2)
+        np.testing.assert_allclose(jax.vmap(at)(np.stack([ROW, -ROW])), [ROW @ ROW**2] * 2)
+    assert len(written) == 1
+    np.testing.assert_allclose(at(ROW, power=3), ROW @ ROW**3)
+    np.testing.assert_allclose(at(ROW, table=np.nextafter(ROW, 9)), np.nextafter(ROW, 9) @ ROW**2, rtol=1e-15)
+    np.testing.assert_allclose(at(ROW.astype(np.float32)), ROW @ ROW**2, rtol=1e-6)
+    assert len(written) == 4
+    monkeypatch.setattr(scalars, "MOST_KEPT", 1)
+    at(ROW, power=4)
+    assert len(written) == 5 and len(scalars._WRITTEN_OUT) == 1
 
 
 def test_without_anything_traced_the_function_is_called():

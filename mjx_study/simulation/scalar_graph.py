@@ -1,0 +1,212 @@
+"""Graphs of operations between scalars, with constants folded and equal operations once."""
+
+import math
+import typing
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, Final, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+_NUMPY: Final[dict[str, Callable[..., Any]]] = {
+    "abs": np.abs,
+    "add": np.add,
+    "add_any": np.add,
+    "and": np.bitwise_and,
+    "eq": np.equal,
+    "ge": np.greater_equal,
+    "gt": np.greater,
+    "is_finite": np.isfinite,
+    "le": np.less_equal,
+    "lt": np.less,
+    "max": np.maximum,
+    "min": np.minimum,
+    "mul": np.multiply,
+    "ne": np.not_equal,
+    "neg": np.negative,
+    "not": np.invert,
+    "or": np.bitwise_or,
+    "sqrt": np.sqrt,
+    "square": np.square,
+    "sub": np.subtract,
+}
+_OTHERS: Final = (
+    *("acos", "asin", "atan", "atan2", "ceil", "clamp", "convert_element_type", "cos", "cosh", "div", "erf", "exp"),
+    *("expm1", "floor", "integer_pow", "log", "log1p", "logistic", "pow", "rem", "round", "rsqrt", "select_n", "sign"),
+    *("sin", "sinh", "tan", "tanh", "xor"),
+)
+ELEMENTWISE: Final = frozenset((*_NUMPY, *_OTHERS))
+_COMMUTATIVE: Final = frozenset({"add", "add_any", "and", "eq", "max", "min", "mul", "ne", "or"})
+
+
+T = TypeVar("T", bound=Callable[..., Any])
+
+
+def no_type_check(each: T) -> T:
+    """Leaves what is called for every entry out of the types that tests check at run time; they would take longer."""
+    return typing.no_type_check(each)
+
+
+class TooLargeError(Exception):
+    """More scalars than are worth their compilation."""
+
+
+@no_type_check
+class Node:
+    """A scalar that depends on the inputs: an operation, with nodes and NumPy scalars as its arguments.
+
+    `operation` is a JAX primitive or "input", "carry" (of a loop), "whole" (an operation on whole arrays), "loop", or
+    "output" (an entry of what one of the last two returns, its only argument). Arguments have lower numbers.
+    """
+
+    __slots__ = ("arguments", "dtype", "number", "operation", "parameters")
+
+    def __init__(self, number: int, operation: Any, arguments: tuple[Any, ...], parameters: Any, dtype: Any):
+        self.number, self.operation, self.arguments = number, operation, arguments
+        self.parameters, self.dtype = parameters, dtype
+
+
+@no_type_check
+class ScalarGraph:
+    """The operations of a function, each once."""
+
+    def __init__(self, most: int):
+        self._count, self._most = 0, most
+        self._known: dict[Any, Node] = {}
+
+    def node(self, operation: Any, arguments: tuple[Any, ...], parameters: Any, dtype: Any) -> Node:
+        self._count += 1
+        if self._count > self._most:
+            raise TooLargeError
+        return Node(self._count, operation, arguments, parameters, dtype)
+
+    def fresh(self, kind: str, shape: tuple[int, ...], dtype: Any) -> np.ndarray:
+        """An array of nodes without arguments."""
+        return filled(shape, (self.node(kind, (), None, dtype) for _ in range(math.prod(shape))))
+
+    def outputs(self, node: Node, avals: Sequence[Any]) -> list[np.ndarray]:
+        """The entries of what an operation on whole arrays returns."""
+        return [
+            filled(aval.shape, [self.node("output", (node,), (place, at), aval.dtype) for at in np.ndindex(aval.shape)])
+            for place, aval in enumerate(avals)
+        ]
+
+    def scalar(self, primitive: Any, arguments: tuple[Any, ...], dtype: Any, **parameters: Any) -> Any:
+        """One entry of an elementwise operation: a constant, a node that is there, or a new one."""
+        name = primitive.name
+        if not any(isinstance(each, Node) for each in arguments):
+            return _folded(primitive, arguments, dtype, parameters)
+        if (simpler := self._simpler(name, arguments, dtype)) is not None:
+            return simpler
+        if name in _COMMUTATIVE:
+            arguments = tuple(sorted(arguments, key=lambda each: each.number if isinstance(each, Node) else 0))
+        key = name, tuple(map(_identity, arguments)), dtype, str(parameters) if parameters else ""
+        if key not in self._known:
+            self._known[key] = self.node(primitive, arguments, parameters, dtype)
+        return self._known[key]
+
+    def _simpler(self, name: str, arguments: tuple[Any, ...], dtype: Any) -> Any:
+        """A simpler form of an operation with some constant or equal arguments; None if there is none."""
+        match name, arguments:
+            case ("add" | "add_any", (a, b)) if _is(a, 0) or _is(b, 0):
+                return b if _is(a, 0) else a
+            case "sub", (a, b) if _is(b, 0):
+                return a
+            case "sub", (a, b) if _is(a, 0):
+                return self.scalar(lax.neg_p, (b,), dtype)
+            case "mul", (a, b) if _is(a, 0) or _is(b, 0):
+                return dtype.type(0)
+            case ("mul", (a, b)) if _is(a, 1) or _is(b, 1):
+                return b if _is(a, 1) else a
+            case ("mul", (a, b)) if _is(a, -1) or _is(b, -1):
+                return self.scalar(lax.neg_p, (b if _is(a, -1) else a,), dtype)
+            case "div", (a, b) if _is(b, 1) or _is(a, 0):
+                return a
+            case "neg", (a,) if a.operation is lax.neg_p:
+                return a.arguments[0]
+            case ("max" | "min", (a, b)) if a is b:
+                return a
+            case ("and" | "or", (a, b)) if dtype.kind == "b" and not (isinstance(a, Node) and isinstance(b, Node)):
+                constant, other = (b, a) if isinstance(a, Node) else (a, b)
+                return other if bool(constant) == (name == "and") else constant
+            case "select_n", (which, *cases) if not isinstance(which, Node):
+                return cases[int(which)]
+            case "select_n", (_, first, *others) if all(_identity(each) == _identity(first) for each in others):
+                return first
+            case "convert_element_type", (a,) if a.dtype == dtype:
+                return a
+        return None
+
+    def elementwise(self, primitive: Any, inputs: Sequence[np.ndarray], aval: Any, **parameters: Any) -> np.ndarray:
+        spread = [np.broadcast_to(each, aval.shape).flat for each in inputs]
+        entries = zip(*spread, strict=True)
+        return filled(aval.shape, [self.scalar(primitive, each, aval.dtype, **parameters) for each in entries])
+
+    def reduced(self, primitive: Any, rows: np.ndarray, aval: Any) -> np.ndarray:
+        """Combine entries along the last axis; zeros of an empty one."""
+        if not rows.shape[-1]:
+            return constants(np.zeros(aval.shape, aval.dtype))
+        result = rows[..., 0]
+        for at in range(1, rows.shape[-1]):
+            result = self.elementwise(primitive, [result, rows[..., at]], aval)
+        return result
+
+
+@no_type_check
+def constants(value: Any) -> np.ndarray:
+    """An array of NumPy scalars."""
+    array = np.asarray(value)
+    return filled(array.shape, [array[index] for index in np.ndindex(array.shape)])
+
+
+@no_type_check
+def filled(shape: tuple[int, ...], entries: Iterable[Any]) -> np.ndarray:
+    array = np.empty(math.prod(shape), object)
+    for place, each in enumerate(entries):
+        array[place] = each
+    return array.reshape(shape)
+
+
+@no_type_check
+def entries_of(arrays: Iterable[np.ndarray]) -> list[Any]:
+    return [each for array in arrays for each in array.flat]
+
+
+@no_type_check
+def _identity(value: Any) -> Any:
+    return value.number if isinstance(value, Node) else (value.dtype.char, value.tobytes())
+
+
+@no_type_check
+def _is(value: Any, number: int) -> bool:
+    return not isinstance(value, Node) and bool(value == number)
+
+
+@no_type_check
+def _folded(primitive: Any, arguments: tuple[Any, ...], dtype: Any, parameters: dict[str, Any]) -> Any:
+    """An operation between constants."""
+    match primitive.name:
+        case "select_n":
+            return arguments[1 + int(arguments[0])]
+        case "convert_element_type":
+            return arguments[0].astype(dtype)
+        case name if name in _NUMPY:
+            with np.errstate(all="ignore"):
+                return dtype.type(_NUMPY[name](*arguments))
+    with jax.ensure_compile_time_eval():
+        return dtype.type(np.asarray(primitive.bind(*map(jnp.asarray, arguments), **parameters)))
+
+
+@no_type_check
+def needed_for(outputs: Iterable[Any]) -> list[Node]:
+    """The nodes that outputs depend on, arguments first."""
+    found: dict[int, Node] = {}
+    stack = [each for each in outputs if isinstance(each, Node)]
+    while stack:
+        node = stack.pop()
+        if node.number not in found:
+            found[node.number] = node
+            stack += [each for each in node.arguments if isinstance(each, Node)]
+    return [found[number] for number in sorted(found)]

@@ -1,0 +1,273 @@
+"""What operations that move, sum or choose entries do to arrays of scalars.
+
+Each rule is a function (graph, inputs, aval of the output, parameters) -> outputs, or None where the operation is left
+as it is.
+"""
+
+import itertools
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, Final
+
+import numpy as np
+from jax import lax
+from jax.core import ShapedArray
+
+from mjx_study.simulation.scalar_graph import Node, ScalarGraph, constants, filled, no_type_check
+
+Rule = Callable[[ScalarGraph, list[np.ndarray], Any, dict[str, Any]], list[np.ndarray] | None]
+
+
+@no_type_check
+def _broadcast(graph: ScalarGraph, inputs: list[np.ndarray], aval: Any, parameters: dict[str, Any]) -> list[np.ndarray]:
+    shape = [1] * len(aval.shape)
+    for place, size in zip(parameters["broadcast_dimensions"], inputs[0].shape, strict=True):
+        shape[place] = size
+    return [np.broadcast_to(inputs[0].reshape(shape), aval.shape)]
+
+
+@no_type_check
+def _slice(graph: ScalarGraph, inputs: list[np.ndarray], aval: Any, parameters: dict[str, Any]) -> list[np.ndarray]:
+    bounds = parameters["start_indices"], parameters["limit_indices"], parameters["strides"] or (1,) * len(aval.shape)
+    return [inputs[0][tuple(itertools.starmap(slice, zip(*bounds, strict=True)))]]
+
+
+@no_type_check
+def _iota(graph: ScalarGraph, inputs: list[np.ndarray], aval: Any, parameters: dict[str, Any]) -> list[np.ndarray]:
+    return [constants(np.indices(aval.shape)[parameters["dimension"]].astype(aval.dtype))]
+
+
+@no_type_check
+def _pad(
+    graph: ScalarGraph, inputs: list[np.ndarray], aval: Any, parameters: dict[str, Any]
+) -> list[np.ndarray] | None:
+    array, filler = inputs
+    if any(low < 0 or high < 0 or between for low, high, between in parameters["padding_config"]):
+        return None
+    padded = np.full(aval.shape, filler[()], object)
+    lows = [low for low, _, _ in parameters["padding_config"]]
+    padded[tuple(slice(low, low + size) for low, size in zip(lows, array.shape, strict=True))] = array
+    return [padded]
+
+
+@no_type_check
+def _window(inputs: list[np.ndarray], shape: tuple[int, ...], sizes: Sequence[Any]) -> tuple[slice, ...] | None:
+    """Where a dynamic slice lies, if that is known."""
+    starts = [each[()] for each in inputs]
+    if any(isinstance(each, Node) for each in starts):
+        return None
+    first = [min(max(int(at), 0), whole - size) for at, whole, size in zip(starts, shape, sizes, strict=True)]
+    return tuple(slice(at, at + size) for at, size in zip(first, sizes, strict=True))
+
+
+@no_type_check
+def _dynamic_slice(
+    graph: ScalarGraph, inputs: list[np.ndarray], aval: Any, parameters: dict[str, Any]
+) -> list[np.ndarray] | None:
+    window = _window(inputs[1:], inputs[0].shape, parameters["slice_sizes"])
+    return None if window is None else [inputs[0][window]]
+
+
+@no_type_check
+def _dynamic_update_slice(
+    graph: ScalarGraph, inputs: list[np.ndarray], aval: Any, parameters: dict[str, Any]
+) -> list[np.ndarray] | None:
+    array, update, *starts = inputs
+    if (window := _window(starts, array.shape, update.shape)) is None:
+        return None
+    array = array.copy()
+    array[window] = update
+    return [array]
+
+
+@no_type_check
+def _places(
+    shape: tuple[int, ...],
+    indices: np.ndarray,
+    sizes: Sequence[Any],
+    window_dims: Sequence[Any],
+    dropped: Sequence[Any],
+    index_dims: Sequence[Any],
+    batch_dims: tuple[Sequence[Any], Sequence[Any]],
+    clip: bool,
+) -> np.ndarray:
+    """Flat places in an array of some shape that a gather reads or a scatter writes, -1 outside of the array.
+
+    The arguments are those of `jax.lax.GatherDimensionNumbers`: offset_dims, collapsed_slice_dims, start_index_map and
+    the two operand and indices batching dims.
+    """
+    batch, numbers = indices.shape[:-1], np.arange(math.prod(shape)).reshape(shape)
+    kept = [size for dim, size in enumerate(sizes) if dim not in dropped and dim not in batch_dims[0]]
+    found = np.empty((*batch, *kept), np.int64)
+    for at in np.ndindex(*batch):
+        start = np.zeros(len(shape), int)
+        start[list(index_dims)] = indices[at].astype(int)
+        start[list(batch_dims[0])] = [at[dim] for dim in batch_dims[1]]
+        last = np.array(shape) - sizes
+        start = np.clip(start, 0, last) if clip else start
+        inside = np.all((start >= 0) & (start <= last))
+        window = tuple(slice(low, low + size) for low, size in zip(start, sizes, strict=True))
+        found[at] = numbers[window].reshape(kept) if inside else -1
+    return np.moveaxis(found, range(len(batch), found.ndim), window_dims)
+
+
+@no_type_check
+def _gather(
+    graph: ScalarGraph, inputs: list[np.ndarray], aval: Any, parameters: dict[str, Any]
+) -> list[np.ndarray] | None:
+    """By constant indices, or by a single one that is not known: a choice between its values."""
+    array, indices = inputs
+    numbers, sizes = parameters["dimension_numbers"], parameters["slice_sizes"]
+    unknown = {each.number: each for each in indices.flat if isinstance(each, Node)}
+    fill = parameters["fill_value"]
+    if fill is None:
+        fill = (
+            np.nan if np.issubdtype(aval.dtype, np.inexact) else np.iinfo(aval.dtype).min if aval.dtype != bool else 1
+        )
+    pool = np.append(array.reshape(-1), constants(np.asarray(fill, aval.dtype)))
+
+    def picked(value: int) -> np.ndarray:
+        known = filled(indices.shape, (value if isinstance(each, Node) else each for each in indices.flat))
+        return pool[
+            _places(
+                array.shape,
+                known,
+                sizes,
+                numbers.offset_dims,
+                numbers.collapsed_slice_dims,
+                numbers.start_index_map,
+                (numbers.operand_batching_dims, numbers.start_indices_batching_dims),
+                parameters["mode"] == lax.GatherScatterMode.CLIP,
+            )
+        ]
+
+    if not unknown:
+        return [picked(0)]
+    if len(unknown) > 1:
+        return None
+    (index,) = unknown.values()
+    result = picked(-1)  # as outside of the array, or clipped
+    for value in range(max(array.shape, default=0)):
+        here = graph.scalar(lax.eq_p, (index, index.dtype.type(value)), np.dtype(bool))
+        result = graph.elementwise(lax.select_n_p, [filled((), [here]), result, picked(value)], aval)
+    return [result]
+
+
+@no_type_check
+def _scatter(combine: Any) -> Rule:
+    def rule(
+        graph: ScalarGraph, inputs: list[np.ndarray], aval: Any, parameters: dict[str, Any]
+    ) -> list[np.ndarray] | None:
+        array, indices, updates = inputs
+        if any(isinstance(each, Node) for each in indices.flat):
+            return None
+        numbers = parameters["dimension_numbers"]
+        inserted, batching = numbers.inserted_window_dims, numbers.operand_batching_dims
+        windows = iter(updates.shape[dim] for dim in numbers.update_window_dims)
+        sizes = [1 if dim in inserted or dim in batching else next(windows) for dim in range(array.ndim)]
+        places = _places(
+            array.shape,
+            indices,
+            sizes,
+            numbers.update_window_dims,
+            inserted,
+            numbers.scatter_dims_to_operand_dims,
+            (batching, numbers.scatter_indices_batching_dims),
+            parameters["mode"] == lax.GatherScatterMode.CLIP,
+        )
+        result = array.reshape(-1).copy()
+        for place, update in zip(places.flat, updates.flat, strict=True):
+            if place >= 0:
+                both = (result[place], update)
+                result[place] = update if combine is None else graph.scalar(combine, both, aval.dtype)
+        return [result.reshape(array.shape)]
+
+    return rule
+
+
+@no_type_check
+def _reduction(combine: Any) -> Rule:
+    def rule(
+        graph: ScalarGraph, inputs: list[np.ndarray], aval: Any, parameters: dict[str, Any]
+    ) -> list[np.ndarray] | None:
+        (array,), axes = inputs, parameters["axes"]
+        if not array.size and combine is not lax.add_p:
+            return None
+        sizes = [array.shape[axis] for axis in axes]
+        rows = np.moveaxis(array, axes, range(-len(axes), 0)).reshape(*aval.shape, math.prod(sizes))
+        return [graph.reduced(combine, rows, aval)]
+
+    return rule
+
+
+@no_type_check
+def _place_of_extreme(better: Any) -> Rule:
+    def rule(graph: ScalarGraph, inputs: list[np.ndarray], aval: Any, parameters: dict[str, Any]) -> list[np.ndarray]:
+        rows = np.moveaxis(inputs[0], parameters["axes"][0], -1)
+        kind = rows.flat[0].dtype
+        best, place = rows[..., 0], constants(np.zeros(aval.shape, aval.dtype))
+        for at in range(1, rows.shape[-1]):
+            here = graph.elementwise(better, [rows[..., at], best], aval.update(dtype=np.dtype(bool)))
+            best = graph.elementwise(lax.select_n_p, [here, best, rows[..., at]], aval.update(dtype=kind))
+            this = constants(np.full(aval.shape, at, aval.dtype))
+            place = graph.elementwise(lax.select_n_p, [here, place, this], aval)
+        return [place]
+
+    return rule
+
+
+@no_type_check
+def _cumsum(graph: ScalarGraph, inputs: list[np.ndarray], aval: Any, parameters: dict[str, Any]) -> list[np.ndarray]:
+    result = inputs[0].copy()
+    rows = np.moveaxis(np.flip(result, parameters["axis"]) if parameters["reverse"] else result, parameters["axis"], 0)
+    for before, row in itertools.pairwise(rows.reshape(len(rows), -1)):
+        row[:] = [graph.scalar(lax.add_p, each, aval.dtype) for each in zip(before, row, strict=True)]
+    return [result]
+
+
+@no_type_check
+def _dot(graph: ScalarGraph, inputs: list[np.ndarray], aval: Any, parameters: dict[str, Any]) -> list[np.ndarray]:
+    (over, batch), factors = parameters["dimension_numbers"], []
+    for array, summed, shared in zip(inputs, over, batch, strict=True):
+        free = [axis for axis in range(array.ndim) if axis not in (*summed, *shared)]
+        sizes = [math.prod(array.shape[axis] for axis in axes) for axes in (shared, free, summed)]
+        kind = {"new_dtype": aval.dtype, "weak_type": False, "sharding": None}
+        moved = array.transpose([*shared, *free, *summed]).reshape(sizes)
+        entries = [
+            each if each.dtype == aval.dtype else graph.scalar(lax.convert_element_type_p, (each,), aval.dtype, **kind)
+            for each in moved.flat
+        ]
+        factors.append(filled(tuple(sizes), entries))
+    left, right = factors[0][:, :, None], factors[1][:, None]
+    terms = ShapedArray(np.broadcast_shapes(left.shape, right.shape), aval.dtype)
+    products = graph.elementwise(lax.mul_p, [left, right], terms)
+    total = graph.reduced(lax.add_p, products, aval.update(shape=products.shape[:-1]))
+    return [total.reshape(aval.shape)]
+
+
+RULES: Final[dict[str, Rule]] = {
+    **dict.fromkeys(("squeeze", "reshape", "expand_dims"), lambda _, inputs, aval, __: [inputs[0].reshape(aval.shape)]),
+    "argmax": _place_of_extreme(lax.gt_p),
+    "argmin": _place_of_extreme(lax.lt_p),
+    "broadcast_in_dim": _broadcast,
+    "concatenate": lambda _, inputs, __, parameters: [np.concatenate(inputs, parameters["dimension"])],
+    "cumsum": _cumsum,
+    "dot_general": _dot,
+    "dynamic_slice": _dynamic_slice,
+    "dynamic_update_slice": _dynamic_update_slice,
+    "gather": _gather,
+    "iota": _iota,
+    "pad": _pad,
+    "reduce_and": _reduction(lax.and_p),
+    "reduce_max": _reduction(lax.max_p),
+    "reduce_min": _reduction(lax.min_p),
+    "reduce_or": _reduction(lax.or_p),
+    "reduce_sum": _reduction(lax.add_p),
+    "rev": lambda _, inputs, __, parameters: [np.flip(inputs[0], parameters["dimensions"])],
+    "scatter": _scatter(None),
+    "scatter-add": _scatter(lax.add_p),
+    "slice": _slice,
+    "stack": lambda _, inputs, __, parameters: [np.stack(inputs, parameters["axis"])],
+    "tile": lambda _, inputs, __, parameters: [np.tile(inputs[0], parameters["reps"])],
+    "transpose": lambda _, inputs, __, parameters: [inputs[0].transpose(parameters["permutation"])],
+}
