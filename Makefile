@@ -2,7 +2,7 @@
 # 3.11-3.13 with pip and venv, and a package index that pip can reach; nothing else.
 
 PYTHON ?= python3
-PYTEST_ARGS ?= -n 2 --dist loadgroup
+PYTEST_ARGS ?= -n 2 --dist loadfile --no-loadscope-reorder
 LOCK_ARGS ?=
 
 VENV := .venv

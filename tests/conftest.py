@@ -30,13 +30,6 @@ jax.config.update("jax_compilation_cache_dir", CACHE)
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """With xdist, a module's tests run in one process; so do those of modules that share a group and thus programs."""
-    for item in items:
-        if item.get_closest_marker("xdist_group") is None:
-            item.add_marker(pytest.mark.xdist_group(item.nodeid.partition("::")[0]))
-
-
 @pytest.fixture(scope="session")
 def programs() -> tuple[dict[Any, Any], dict[Any, Any]]:
     """Tasks and simulators that `shared_programs` has made."""

@@ -26,7 +26,7 @@ from mjx_study.study.run import load_study
 from mjx_study.tasks import TASKS
 from tests.documents import stages_of
 
-pytestmark = [pytest.mark.usefixtures("shared_programs"), pytest.mark.xdist_group("pusher of four steps")]
+pytestmark = pytest.mark.usefixtures("shared_programs")
 
 SMALL = ["--horizon", "4", "--samples", "8", "--reference-samples", "8", "--chunk-size", "4"]
 MJCF = """<mujoco><worldbody>

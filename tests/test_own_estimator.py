@@ -21,7 +21,7 @@ PAGE = (Path(__file__).parents[1] / "docs" / "estimators.md").read_text()
 (CODE,) = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
 OWN = "my_estimators:SignAgreement"
 
-pytestmark = [pytest.mark.usefixtures("shared_programs"), pytest.mark.xdist_group("pusher of four steps")]
+pytestmark = pytest.mark.usefixtures("shared_programs")
 
 
 @pytest.fixture(autouse=True)

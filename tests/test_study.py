@@ -27,7 +27,7 @@ from mjx_study.study.variables import GRADIENTS
 from mjx_study.tasks import make_task
 from mjx_study.tasks.task import StudyDefaults, Task
 
-pytestmark = [pytest.mark.usefixtures("shared_programs"), pytest.mark.xdist_group("pusher of four steps")]
+pytestmark = pytest.mark.usefixtures("shared_programs")
 
 SMALL: dict[str, Any] = {"horizon": 4, "samples": (8,), "reference_samples": 8, "seeds": 1}
 
