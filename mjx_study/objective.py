@@ -365,12 +365,8 @@ class MjxObjective:
         The baseline, the zero-noise rollout from the same initial state, is run as extra samples whose noise is scaled
         by 0: a single one if the initial state is fixed, otherwise one per sample.
         """
-        samples = len(keys)
-        zero_noise = np.arange(samples if self.simulator.task.random_start else min(samples, 1))
-        scale = np.concatenate([np.ones(samples), np.zeros(len(zero_noise))])
-        values, scores, residuals = self._run("value", theta, keys, np.append(np.arange(samples), zero_noise), scale)
-        baseline = _for_all(values[samples:], samples)
-        return Evaluation(*map(jnp.asarray, (values[:samples], scores[:samples], baseline, residuals[:samples])))
+        (evaluation,) = self._evaluate(theta, keys, (1.0,))
+        return evaluation
 
     def evaluate_odd(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> Evaluation:
         """The part of the objective that is odd in the noise, (f(w) - f(-w)) / 2, from two rollouts per sample.
@@ -393,16 +389,8 @@ class MjxObjective:
     def evaluate_pair(
         self, theta: Float[Array, " params"], keys: Key[Array, " samples"]
     ) -> tuple[Evaluation, Evaluation]:
-        """Two evaluations with opposite noise, sample by sample, from the same initial states; three rollouts each."""
-        samples = len(keys)
-        scale = np.repeat([1.0, -1.0, 0.0], samples)
-        values, scores, residuals = self._run("value", theta, keys, np.tile(np.arange(samples), 3), scale)
-        above, below = slice(samples), slice(samples, 2 * samples)
-        zero_noise = jnp.asarray(values[2 * samples :])
-        plus, minus = (
-            Evaluation(*map(jnp.asarray, (values[part], scores[part], zero_noise, residuals[part])))
-            for part in (above, below)
-        )
+        """Two evaluations with opposite noise, sample by sample, from the same initial states, with one baseline."""
+        plus, minus = self._evaluate(theta, keys, (1.0, -1.0))
         return plus, minus
 
     def differentiate(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> Differentiation:
@@ -440,6 +428,17 @@ class MjxObjective:
         steps = StepEvaluation(*jax.tree.map(jnp.asarray, (to_go, zero_noise, scores, jacobian, residual)))
         return Linearisation(steps, *jax.tree.map(jnp.asarray, derivatives))
 
+    def _evaluate(self, theta, keys, signs: tuple[float, ...]) -> list[Evaluation]:
+        samples, zero_noise = len(keys), self._zero_noise_rows(len(keys))
+        rows = np.append(np.tile(np.arange(samples), len(signs)), zero_noise)
+        scale = np.append(np.repeat(signs, samples), np.zeros(len(zero_noise)))
+        values, scores, residuals = self._run("value", theta, keys, rows, scale)
+        baseline = _for_all(values[len(signs) * samples :], samples)
+        parts = [slice(index * samples, (index + 1) * samples) for index in range(len(signs))]
+        return [
+            Evaluation(*map(jnp.asarray, (values[part], scores[part], baseline, residuals[part]))) for part in parts
+        ]
+
     def _evaluate_steps(self, theta, keys, signs: tuple[float, ...]) -> list[StepEvaluation]:
         samples = len(keys)
         scale = np.repeat(signs, samples)
@@ -455,9 +454,13 @@ class MjxObjective:
 
         return [half(slice(index * samples, (index + 1) * samples)) for index in range(len(signs))]
 
+    def _zero_noise_rows(self, samples: int) -> np.ndarray:
+        """The samples that have a zero-noise rollout of their own: one, if all start in the same state."""
+        return np.arange(samples if self.simulator.task.random_start else min(samples, 1))
+
     def _zero_noise_to_go(self, theta, keys):
         """Costs to go of the zero-noise rollouts, a single one if all samples share it."""
-        rows = np.arange(len(keys) if self.simulator.task.random_start else min(len(keys), 1))
+        rows = self._zero_noise_rows(len(keys))
         (to_go, *_), _ = self._run("steps", theta, keys, rows, np.zeros(len(rows)))
         return _for_all(to_go, len(keys))
 

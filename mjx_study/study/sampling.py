@@ -85,10 +85,8 @@ def draw_batches(
 
 
 def rollouts_of(oracle: str, samples: int, random_start: bool) -> tuple[int, int]:
-    """Rollouts of a batch, and how many of them are differentiated: a pair is two, and order 0 has its baselines."""
-    order = ORACLES[oracle].order
-    baselines = (samples if random_start else 1) if order == 0 or oracle == "linearisation" else 0
-    return samples * (2 if "pair" in oracle else 1) + baselines, samples * order
+    """Rollouts of a batch, baselines included, and how many of them are differentiated."""
+    return sum(rows for _, rows in calls_of(oracle, samples, random_start)), samples * ORACLES[oracle].order
 
 
 def calls_of(oracle: str, samples: int, random_start: bool) -> list[tuple[str, int]]:
@@ -96,7 +94,7 @@ def calls_of(oracle: str, samples: int, random_start: bool) -> list[tuple[str, i
     baselines = samples if random_start else min(samples, 1)
     return {
         "evaluation": [("value", samples + baselines)],
-        "pair": [("value", 3 * samples)],
+        "pair": [("value", 2 * samples + baselines)],
         "steps": [("steps", samples), ("steps", baselines)],
         "step_pair": [("steps", 2 * samples), ("steps", baselines)],
         "differentiation": [("gradient", samples)],
