@@ -9,6 +9,14 @@ STEPWISE, CHOICE = "tests/estimators/test_stepwise.py", "tests/estimators/test_a
 
 OBJECTIVE: Final = (
     Defect(
+        "trace-of-another-model",
+        "mjx_study/identity.py",
+        "(scene.adjoint, saved, scene.model, scene.template)",
+        "(scene.adjoint, scene.template)",
+        "a trace that an earlier run kept for one mass serves another",
+        ("tests/test_compiled.py::test_what_differs_in_a_bit_has_a_trace_of_its_own",),
+    ),
+    Defect(
         "cost-after-the-step",
         "mjx_study/objective.py",
         "return jax.tree.map(lambda leaf: leaf[:-1], states)",
@@ -19,8 +27,8 @@ OBJECTIVE: Final = (
     Defect(
         "baseline-with-noise",
         "mjx_study/objective.py",
-        "np.concatenate([np.ones(samples), np.zeros(len(zero_noise))])",
-        "np.ones(samples + len(zero_noise))",
+        "np.append(np.repeat(signs, samples), np.zeros(len(zero_noise)))",
+        "np.append(np.repeat(signs, samples), np.ones(len(zero_noise)))",
         "still unbiased with one sample less, and no error anywhere",
         ("tests/test_objective.py::test_baseline_is_the_cost_without_noise",),
     ),

@@ -12,6 +12,14 @@ CONE = "tests/test_constraint.py::test_the_elliptic_law_is_the_gradient_of_a_con
 
 DYNAMICS: Final = (
     Defect(
+        "constants-by-shape",
+        "mjx_study/simulation/scalars.py",
+        "return array.shape, array.dtype.str, array.tobytes()",
+        "return array.shape, array.dtype.str",
+        "a graph with the constants of one model serves another of the same shapes",
+        ("tests/test_scalars.py::test_a_function_is_written_out_once_for_arguments_of_equal_content",),
+    ),
+    Defect(
         "frame-without-derivative",
         "mjx_study/simulation/dynamics.py",
         "        return mjx.fwd_position(model, data)\n",
