@@ -21,7 +21,7 @@ from mjx_study.disk import write_whole
 from mjx_study.identity import trace_contents
 from mjx_study.runtime import precision, traces_folder
 
-UNTRACED: Final = re.compile("cache|_dir|log|num_cpu_devices")
+UNTRACED: Final = re.compile("cache|^jax_log|num_cpu_devices")
 """Settings of JAX that no trace depends on."""
 
 

@@ -155,6 +155,11 @@ class Measurement:
         return math.sqrt(self.surest.variance / self.samples)
 
     @property
+    def _too_small(self) -> bool:
+        """Whether the gradient cannot be told from 0."""
+        return self.surest.norm < 2 * self._uncertainty
+
+    @property
     def best(self) -> Measured:
         """The estimator of least error after a second of computing."""
         return self.estimators[0]
@@ -240,7 +245,7 @@ class Diagnosis(Measurement):
 
     def _contact_lines(self) -> list[str]:
         found = self.onsets.get("onsets", 0)
-        lines = [f"  {found / self.samples:.2g} contacts begin in a rollout with noise"]
+        lines = [f"  contacts that begin in a rollout with noise: {found / self.samples:.2g}"]
         if found:
             lines[0] += (
                 f"; the first at a step that varies by {self.onsets['onset_spread']:.2g} steps, "
@@ -286,7 +291,7 @@ class Diagnosis(Measurement):
             yield f"{self.unconverged} rollouts in which the contact solver did not converge"
         if unstable := [each for each in self.touches if not each.stable]:
             yield f"the step in contact is unstable: {unstable[0].pair}, h^2 k = {unstable[0].stiffness:.2g}"
-        if self.surest.norm < 2 * self._uncertainty:
+        if self._too_small:
             yield (
                 f"the gradient is too small to be told from 0 with {self.samples} samples: errors are relative to "
                 f"{self.norm:.2g}"
@@ -302,7 +307,13 @@ class Diagnosis(Measurement):
         """What to do, each with options of `compare` that show it."""
         by_name, timestep = {each.estimator: each for each in self.estimators}, self.task.scene.timestep
         needed = _round(self.samples_needed)
-        yield f"take {self.best.estimator}; a relative error of {ACCURATE:.0%} needs {needed} samples", ""
+        if self._too_small:
+            yield (
+                f"no estimator can be advised: no gradient shows in {self.samples} samples, take more or another theta",
+                "",
+            )
+        else:
+            yield f"take {self.best.estimator}; a relative error of {ACCURATE:.0%} needs {needed} samples", ""
         if not self.onsets.get("onsets"):
             yield "no contact begins: longer rollouts, more noise or another start would say more", ""
             return
@@ -324,8 +335,8 @@ class Diagnosis(Measurement):
         spread, strength = self.onsets["onset_spread"], self.onsets["onset_strength"]
         explained = SHARE_OFF * strength * (plain.bias + corrected.bias)
         if spread < NARROW:
-            step = timestep * spread / NARROW
-            yield f"the noise is too narrow for onset terms: take a timestep of {step:.1g} s, or more noise", ""
+            finer = f"a timestep of {timestep * spread / NARROW:.1g} s, or " if spread > 0 else ""
+            yield f"the noise is too narrow for onset terms: take {finer}more noise", ""
         elif corrected.bias > explained and strength <= STRONG:
             yield (
                 f"the onset term leaves a bias of {corrected.bias / self.norm:.0%}, which its own error does not "

@@ -46,7 +46,7 @@ def _effective(row: Row) -> str:
 def _with_error(value: float, error: float) -> str:
     if not (math.isfinite(value) and math.isfinite(error)):
         return number(value)
-    if value >= 1000:
+    if max(value, error) >= 1000:
         return f"{number(value, 2)} ± {number(error, 2)}"
     return f"{value:.3f} ± {error:.3f}"
 

@@ -182,7 +182,9 @@ class Task:
             ValueError: the task has no contact.
         """
         if self.contact_pair is None:
-            raise ValueError(f"{self.name} has no contact whose stiffness could be set; use the contact family mjcf")
+            raise ValueError(
+                f"{self.name} names no contact whose stiffness could be set (contact_pair); use the contact family mjcf"
+            )
         return effective_mass(self.scene, *self.contact_pair)
 
     def draw_start(self, key: Key[Array, ""]) -> State:
