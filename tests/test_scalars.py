@@ -149,6 +149,14 @@ def test_what_is_too_large_is_left_as_it_is(monkeypatch, most):
     assert _operations(lambda x: unrolled(function, x), ROW) == _operations(function, ROW)
 
 
+def test_what_is_too_large_stays_so_when_its_partial_is_made_anew(monkeypatch):
+    monkeypatch.setitem(scalars.MOST_SCALARS, "cpu", 3)
+    function = lambda power, table, x: table @ jnp.cos(x) ** power  # noqa: E731
+    for _ in range(2):
+        found = jax.jit(lambda x: unrolled(partial(function, 2), TABLE, x))(ROW)
+        np.testing.assert_allclose(found, function(2, TABLE, ROW), rtol=1e-14)
+
+
 def test_a_function_is_written_out_once_for_arguments_of_equal_content(monkeypatch):
     written = []
     out = scalars._written_out

@@ -51,9 +51,9 @@ _FUNCTIONS: Final = {
     lax.select_n_p: lax.select_n,
 }
 """Operations that rules add; these functions give primitives the parameters that they have in this version of JAX."""
-_WRITTEN_OUT: Final[dict[Any, Callable[..., Any]]] = {}
-"""Graphs as functions, by all that they depend on; JAX then batches and differentiates each of them once for all
-programs that it is part of."""
+_WRITTEN_OUT: Final[dict[Any, Callable[..., Any] | None]] = {}
+"""Graphs as functions, by all that they depend on; None for what is too large. JAX batches and differentiates each of
+them once for all programs that it is part of."""
 MOST_KEPT: Final = 64
 """Functions that are kept written out."""
 _CALLS: Final = {"closed_call": "call_jaxpr", "jit": "jaxpr", "pjit": "jaxpr"}
@@ -82,9 +82,9 @@ def unrolled(function: Callable[..., Any], *arguments: Any) -> Any:
     if key not in _WRITTEN_OUT:
         while len(_WRITTEN_OUT) >= MOST_KEPT:
             del _WRITTEN_OUT[next(iter(_WRITTEN_OUT))]
-        _WRITTEN_OUT[key] = _written_out(function, arguments, leaves, most) or function
+        _WRITTEN_OUT[key] = _written_out(function, arguments, leaves, most)
     program = _WRITTEN_OUT[key]
-    return program(*arguments) if program is function else program(*inputs)
+    return function(*arguments) if program is None else program(*inputs)
 
 
 def _name(function: Callable[..., Any]) -> Any:
@@ -133,11 +133,7 @@ def _written_out(
             for output, aval in zip(outputs, jaxpr.out_avals, strict=True)
         ]
 
-    types = [jax.typeof(leaf) for leaf, free in zip(leaves, traced, strict=True) if free]
-    closed = jax.make_jaxpr(program)(
-        *(jax.ShapeDtypeStruct(each.shape, each.dtype, weak_type=each.weak_type) for each in types)
-    )
-    called = jax.jit(jaxpr_as_fun(closed))
+    called = jax.jit(jaxpr_as_fun(jax.make_jaxpr(program)(*(leaf for leaf in leaves if isinstance(leaf, Tracer)))))
     return lambda *free: jax.tree.unflatten(jax.tree.structure(shape), called(*free))
 
 
