@@ -70,7 +70,7 @@ def run_one(
             written, failures = written + paths, [*failures, failure]
     lines = [*lines_of(dataset, document), *(f"warning: {message}" for message in document["warnings"])]
     lines += [f"add --output DIR for {offer}"] if folder is None else []
-    if folder is not None and not dataset.attrs["computed_cells"]:
+    if folder is not None and not dataset.attrs["computed_cells"] and not dataset.attrs["missing_cells"]:
         lines.append(f"nothing was computed: {folder} has held all {len(plan.cells)} cells")
     lines += [f"written to {folder}: {', '.join(path.name for path in written)}"] if written else []
     print_report(options, document, lines)
