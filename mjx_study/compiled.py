@@ -112,9 +112,7 @@ def _read(path: Path) -> Callable[..., Any] | None:
     """The function whose trace is in a file; None if there is none, or none that can be read."""
     try:
         return _load(path.read_bytes())
-    except FileNotFoundError:
-        return None
-    except Exception:  # whatever a damaged file makes of it: the trace is made and written again
+    except Exception:  # also whatever a damaged file makes of it: the trace is made and written again
         return None
 
 

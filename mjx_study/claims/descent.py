@@ -48,8 +48,8 @@ def descents(lab: Laboratory, system: str, family: str, schedule: str | None = N
         "samples": (effort.samples if many else recipe.samples,),
     }
     if system == GAME:
-        common |= {"seeds": GAMES, "samples": (effort.samples // 2,)}
-        common |= {"estimators": ("zobg", "fobg", "aobg", "fobg_onset")}
+        names = ("zobg", "fobg", "aobg", "fobg_onset")
+        common |= {"seeds": GAMES, "samples": (effort.samples // 2,), "estimators": names}
     if schedule is not None:
         common[schedule] = f"linear_schedule({STARTS[schedule]}, 1, {iterations // 2})"
     if name in SPANS:
@@ -91,20 +91,23 @@ def along(dataset: xr.Dataset, estimator: str) -> np.ndarray:
 
 def behind(lab: Laboratory, system: str, family: str) -> Statistic:
     """How far FoBG ends behind ZoBG."""
-    found = descents(lab, system, family)
-    return mean_of(final(found, "fobg") - final(found, "zobg"), "seeds")
+    return _gap(lab, system, family, "fobg", "zobg")
 
 
 def corrected_behind(lab: Laboratory, system: str, family: str) -> Statistic:
     """How far FoBG with the onset term ends behind ZoBG."""
-    found = descents(lab, system, family)
-    return mean_of(final(found, "fobg_onset") - final(found, "zobg"), "seeds")
+    return _gap(lab, system, family, "fobg_onset", "zobg")
 
 
 def ahead(lab: Laboratory, system: str, family: str) -> Statistic:
     """How far FoBG ends ahead of ZoBG."""
+    return _gap(lab, system, family, "zobg", "fobg")
+
+
+def _gap(lab: Laboratory, system: str, family: str, estimator: str, other: str) -> Statistic:
+    """How far an estimator ends behind another."""
     found = descents(lab, system, family)
-    return mean_of(final(found, "zobg") - final(found, "fobg"), "seeds")
+    return mean_of(final(found, estimator) - final(found, other), "seeds")
 
 
 def regret(lab: Laboratory, system: str, family: str) -> Statistic:
