@@ -61,7 +61,7 @@ class Compiled:
             The function of arguments of this form, which threads may call side by side.
         """
         leaves, form = jax.tree.flatten(arguments)
-        types = [leaf if isinstance(leaf, jax.ShapeDtypeStruct) else _type_of(leaf) for leaf in leaves]
+        types = [leaf if isinstance(leaf, jax.ShapeDtypeStruct) else type_of(leaf) for leaf in leaves]
         path = self._path(repr((form, types))) if platform in (None, jax.default_backend()) else None
         if path is None:
             jax.eval_shape(self.jitted, *arguments)
@@ -73,6 +73,27 @@ class Compiled:
     @cached_property
     def _contents(self) -> str | None:
         return trace_contents(self._made_of) if self._made_of else None
+
+    def ahead(self, *types: Any) -> Callable[[], None]:
+        """Trace the function in this thread, or find its trace.
+
+        Args:
+            types: shapes and types of the arguments.
+
+        Returns:
+            What compiles it, in any thread, for JAX's default device; nothing is left to do for the next call.
+        """
+        ready = self.prepare(*types)
+
+        def compile_it() -> None:
+            if isinstance(ready, jax.stages.Compiled):
+                return
+            executable = ready.lower(*types).compile()
+            for path, each in self._ready.items():
+                if each is ready:
+                    self._ready[path] = executable
+
+        return compile_it
 
     def _path(self, form: str) -> Path | None:
         """Where the trace for arguments of a form is kept; None if it is not."""
@@ -103,7 +124,8 @@ class Compiled:
         return _load(kept)
 
 
-def _type_of(leaf: Any) -> jax.ShapeDtypeStruct:
+def type_of(leaf: Any) -> jax.ShapeDtypeStruct:
+    """What a program is compiled for, of an array."""
     kind = jax.typeof(leaf)
     return jax.ShapeDtypeStruct(kind.shape, kind.dtype, weak_type=kind.weak_type)
 

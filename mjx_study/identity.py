@@ -37,9 +37,11 @@ BY_VERSION: Final = {"mjx_study", "estimators", "mujoco", "jax", "jaxlib", "nump
 IRRELEVANT: Final = re.compile(r"_.*|.*name.*|.*path.*|.*rgba|(tex|mat|skin|light|cam|text)_.*|.*_matid")
 """Fields of MjModel that no number depends on."""
 ABOVE: Final = (
-    "cli", "plots", "render", "gradcheck", "claims", "report.py", "bench.py", "diagnose.py", "accessor.py",
+    "cli", "plots", "render", "gradcheck", "claims", "report.py", "bench.py", "diagnose", "accessor.py",
 )  # fmt: skip
 """Parts of mjx_study that use studies; no number of a study depends on them."""
+DIGEST: Final = re.compile("[0-9a-f]{12,64}")
+"""What tells a reader nothing."""
 ACCEPT: Final = "choose another folder, or accept the mixture by --accept-versions"
 """Advice at the end of messages about other versions."""
 UNREAD: Final = ("description",)
@@ -104,10 +106,26 @@ def estimator_contents(*names: str) -> dict[str, str]:
 
 
 def differences(theirs: Mapping[str, Any], ours: Mapping[str, Any]) -> str | None:
-    """The first three entries that differ, as a message tells them; None where none does."""
+    """The first three entries that differ, as a message tells them; None where none does.
+
+    Digests of what only one of the two has come last: another entry says why.
+    """
     different = [name for name in dict(theirs) | dict(ours) if theirs.get(name) != ours.get(name)]
-    told = ", ".join(f"{name} {theirs.get(name)} there and {ours.get(name)} here" for name in different[:3])
-    return told or None
+    different.sort(key=lambda name: _digests(theirs, ours, name) and (name not in theirs or name not in ours))
+    told = [_difference(name, theirs, ours) for name in different[:3]]
+    more = [f"{len(different) - 3} more"] if len(different) > 3 else []
+    return ", ".join(told + more) or None
+
+
+def _digests(theirs: Mapping[str, Any], ours: Mapping[str, Any], name: str) -> bool:
+    return any(DIGEST.fullmatch(str(each.get(name))) for each in (theirs, ours))
+
+
+def _difference(name: str, theirs: Mapping[str, Any], ours: Mapping[str, Any]) -> str:
+    if _digests(theirs, ours, name):
+        return f"{name} differs"
+    there, here = ("none" if each.get(name) is None else each[name] for each in (theirs, ours))
+    return f"{name} {there} there and {here} here"
 
 
 @functools.cache

@@ -10,9 +10,10 @@ Where no stopwatch runs, `timed` does nothing. Times are of the thread that runs
 import dataclasses
 import math
 import time
-from collections.abc import Generator, Hashable
+from collections.abc import Callable, Generator, Hashable
 from contextlib import contextmanager
-from contextvars import ContextVar
+from contextvars import ContextVar, copy_context
+from functools import partial
 from typing import Any, Final
 
 import jax
@@ -121,10 +122,13 @@ class Stopwatch:
         return np.array([self.clock(), *self._events])
 
     def _hear(self, event: str, duration_secs: float, **_: Any) -> None:
+        if _UNHEARD.get():
+            return
         compiling = event == COMPILING
         self._events += duration_secs * np.array([event in TRACING, compiling, compiling or event == SAVED])
 
 
+_UNHEARD: ContextVar[bool] = ContextVar("unheard", default=False)
 _RUNNING: ContextVar[Stopwatch | None] = ContextVar("stopwatch", default=None)
 
 
@@ -149,3 +153,13 @@ def tell(program: Hashable, calls: int, seconds: float) -> None:
     watch = _RUNNING.get()
     if watch is not None:
         watch.spent.setdefault(program, Spent()).add(calls, seconds)
+
+
+def unheard(call: Callable[[], Any]) -> Callable[[], Any]:
+    """The call, for a thread beside those that are timed, so that no program's time has what it compiles."""
+
+    def told() -> Any:
+        _UNHEARD.set(True)
+        return call()
+
+    return partial(copy_context().run, told)

@@ -23,11 +23,25 @@ os.environ["XLA_FLAGS"] = " ".join([*FLAGS, os.environ.get("XLA_FLAGS", "")])
 gc.set_threshold(1_000_000, 20, 50)
 
 CACHE = os.environ.get("JAX_COMPILATION_CACHE_DIR") or str(Path(__file__).parents[1] / ".pytest_cache" / "jax")
-jax.config.update("jax_enable_x64", True)
+SETTINGS = {
+    "jax_enable_x64": True,
+    "jax_debug_key_reuse": True,
+    "jax_compilation_cache_dir": CACHE,
+    "jax_persistent_cache_min_compile_time_secs": 0.5,
+}
 jax.config.update("jax_num_cpu_devices", 2)
-jax.config.update("jax_debug_key_reuse", True)
-jax.config.update("jax_compilation_cache_dir", CACHE)
-jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+for name, value in SETTINGS.items():
+    jax.config.update(name, value)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def settings() -> None:
+    """Each module begins with the same settings, whatever commands the modules before it have run in this process."""
+    from mjx_study import runtime  # not above: type checking is switched on after this file is imported
+
+    for name, value in SETTINGS.items():
+        jax.config.update(name, value)
+    runtime._TRACES.clear()
 
 
 @pytest.fixture(scope="session")

@@ -12,10 +12,12 @@ import numpy as np
 import pytest
 
 import estimators
-from mjx_study import compiled, identity, objective
+from mjx_study import compiled, identity
 from mjx_study.compiled import Compiled
-from mjx_study.objective import Simulator
+from mjx_study.objective import Simulator, programs
 from mjx_study.study import gradients
+from mjx_study.study.configuration import StudyConfig
+from mjx_study.study.run import run_study
 from mjx_study.tasks import Task, make_task
 from tests.carts import cart
 
@@ -44,7 +46,7 @@ def test_a_trace_is_found_again_and_gives_the_same_bits(folder: Path, monkeypatc
     first = evaluated(pusher())
     (path,) = folder.glob("*.trace")
     assert path.stat().st_size < 100_000
-    monkeypatch.setattr(objective, "rollout_cost", untraceable)
+    monkeypatch.setattr(programs, "rollout_cost", untraceable)
     np.testing.assert_array_equal(evaluated(pusher()), first)
     monkeypatch.setattr(compiled, "traces_folder", lambda: None)
     with pytest.raises(AssertionError, match="traced"):
@@ -140,6 +142,20 @@ def test_statistics_of_seeds_and_structures_come_back(folder: Path):
     assert len(list(folder.glob("*.trace"))) == 3
     assert first[0]["alpha"] is not None and first[1]["alpha"] is None
     jax.tree.map(np.testing.assert_array_equal, again, first)
+
+
+@pytest.mark.parametrize("names", [("zobg", "aobg"), ("zobg", "fobg_onset")])
+def test_statistics_are_compiled_for_the_batches_that_come(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, names: tuple[str, ...]
+):
+    """Beside the programs of rollouts, from their forms alone: with another form there would be another trace."""
+    monkeypatch.setattr(gradients, "traces_folder", lambda: folder)
+    gradients._seed_numbers.cache_clear()
+    needs = {oracle for name in names for oracle in estimators.find_estimator(name).needs}
+    chosen = {"contact": ("penalty",), "stiffness": (100.0,), "horizon": 2, "samples": (6,), "seeds": 3}
+    for _ in range(2):  # the second time they are compiled
+        run_study(StudyConfig(tasks=("pusher",), estimators=names, **chosen))
+    assert len(list(folder.glob("*.trace"))) == len(needs | {"differentiation"}) + 1
 
 
 def test_names_say_which_settings_do_not_count():

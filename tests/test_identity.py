@@ -310,8 +310,9 @@ def test_a_run_of_other_versions_needs_a_flag_and_remembers(tmp_path: Path, monk
 
 def test_what_differs_is_told() -> None:
     assert differences({"a": 1, "b": 2}, {"b": 3, "c": 4}) == (
-        "a 1 there and None here, b 2 there and 3 here, c None there and 4 here"
+        "a 1 there and none here, b 2 there and 3 here, c none there and 4 here"
     )
+    assert differences({"model": "0123456789ab"}, {"model": "0123456789ac"}) == "model differs"
     assert differences({"a": [1]}, {"a": [1]}) is None
 
 

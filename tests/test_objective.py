@@ -135,14 +135,16 @@ def test_a_chunk_of_gradients_fits_into_an_accelerators_memory(simulator):
     assert 0.2 * 2**28 < chunk(1) * planned < 2 * 2**28
 
 
-@pytest.mark.parametrize("platform", ["cpu", "gpu"])
+@pytest.mark.parametrize(("samples", "chunk"), [(1, 5), (10, 11), (11, 21), (100, 101), (400, 201), (10**6, 201)])
+def test_chunks_on_a_cpu_are_of_few_sizes_whatever_the_devices(samples, chunk):
+    device = SimpleNamespace(platform="cpu", memory_stats=lambda: None)
+    assert chunk_for(samples, [device]) == chunk_for(samples, [device] * 3) == chunk
+
+
 @pytest.mark.parametrize(("samples", "devices"), [(1, 2), (7, 2), (1000, 2), (1023, 1), (200_000, 3)])
-def test_chunk_for_wastes_less_than_a_call_per_device(samples, devices, platform):
-    device = SimpleNamespace(platform=platform, memory_stats=lambda: None)
-    chunk, most = chunk_for(samples, [device] * devices), MAX_CHUNK[platform]
-    if platform == "cpu":
-        assert chunk == chunk_for(samples, [device])
-        devices = 1
+def test_chunks_on_an_accelerator_waste_less_than_a_call_per_device(samples, devices):
+    device = SimpleNamespace(platform="gpu", memory_stats=lambda: None)
+    chunk, most = chunk_for(samples, [device] * devices), MAX_CHUNK["gpu"]
     calls = -(-(samples + 1) // (chunk * devices))
     assert 1 <= chunk <= most
     assert calls == -(-(samples + 1) // (most * devices))  # no more calls than the largest chunk would take
@@ -409,7 +411,7 @@ def test_a_starved_solver_shows_in_the_residual(monkeypatch):
 
 def test_large_batches_for_lapack_run_on_one_device(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two at a time never end in jaxlib; a batch has a factorisation for every onset that is corrected."""
-    monkeypatch.setattr("mjx_study.objective.SMALL", 0)
+    monkeypatch.setattr("mjx_study.objective.batches.SMALL", 0)
     devices = tuple(jax.local_devices())
     assert len(devices) == 2
     for onset, chunk, expected in (("none", 256, 2), ("linear", 255, 2), ("linear", 256, 1), ("none", 2048, 1)):

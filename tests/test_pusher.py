@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from estimators import first_order, variance_interval, zeroth_order
-from mjx_study.objective import Simulator
+from mjx_study.objective import SamplePrograms, Simulator
 from mjx_study.reference import Pusher, ReferenceObjective, roll_out, value_and_gradient
 from mjx_study.simulation.contact import ContactModel, ContactWarning, family_model
 from tests.pusher_fixtures import (
@@ -66,9 +66,8 @@ def test_effective_mass_is_the_reduced_mass():
 @functools.cache
 def states_program():
     """States of a noise-free rollout, the last included, through the task's own cost function."""
-    simulator = pusher_simulator()
-    key = jax.random.key_data(jax.random.key(0))
-    program = jax.jit(lambda theta, contact: simulator._cost(theta, contact, 1.0, key, 0.0)[1][0])
+    programs, key = SamplePrograms(pusher_task()), jax.random.key_data(jax.random.key(0))
+    program = jax.jit(lambda theta, contact: programs.cost(theta, contact, 1.0, key, 0.0)[1][0])
 
     def states(contact: ContactModel, controls: np.ndarray) -> np.ndarray:
         visited = program(jnp.asarray(controls.ravel()), contact)
@@ -223,12 +222,12 @@ def test_differences_at_an_unstable_stiffness(simulator):
 
 
 def test_reverse_mode_equals_forward_mode(simulator):
-    key = jax.random.key_data(jax.random.key(0))
+    programs, key = SamplePrograms(pusher_task()), jax.random.key_data(jax.random.key(0))
 
     @jax.jit
     def forward(theta, contact, along):
         def value(theta):
-            return simulator._cost(theta, contact, 1.0, key, 0.0)[0]
+            return programs.cost(theta, contact, 1.0, key, 0.0)[0]
 
         return jax.vmap(lambda direction: jax.jvp(value, (theta,), (direction,))[1])(along)
 

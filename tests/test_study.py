@@ -205,7 +205,7 @@ def test_no_variance_is_called_less_on_too_few_effective_samples() -> None:
         doubtful = row("fobg", 10, variance, effective_samples=effective, debiased_error_se=0.01)
         (sentence,) = findings(result(row("zobg", 10, 100), doubtful))
         assert sentence == (
-            "penalty: FoBG's variance is not to be told from so few effective samples at K = 10 N/m (95% intervals)"
+            "penalty: FoBG's variance is undecided (too few effective samples) at K = 10 N/m (95% intervals)"
         )
 
 

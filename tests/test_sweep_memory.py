@@ -13,8 +13,8 @@ import pytest
 from estimators import Differentiation, Evaluation
 from mjx_study.objective import MjxObjective, Simulator
 from mjx_study.simulation.contact import ContactModel
+from mjx_study.study import gradients, sampling
 from mjx_study.study import memory as sweep_memory
-from mjx_study.study import sampling
 from mjx_study.study.configuration import StudyConfig
 from mjx_study.study.gradients import compute_gradients
 from mjx_study.study.plan import memory_of_seed, plan_study, seeds_together
@@ -58,10 +58,11 @@ def config(**changes: Any) -> StudyConfig:
 
 def test_numbers_do_not_depend_on_how_seeds_are_grouped(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sampling, "Simulator", Stub)
+    monkeypatch.setattr(gradients, "traces_folder", lambda: None)
     plan = plan_study(config(samples=(8,), seeds=5, estimators=("zobg",)))
     found = []
     for at_once, groups in ((1e9, 5), (1.0, 1), (2.5 * memory_of_seed(plan, plan.cells[0]), 2)):
-        monkeypatch.setattr(sweep_memory, "AT_ONCE", at_once)
+        monkeypatch.setitem(sweep_memory.AT_ONCE, "cpu", at_once)
         assert seeds_together(plan, plan.cells[0]) == groups
         found.append(compute_gradients(plan)(plan.cells[0]))
     for other in found[1:]:
@@ -73,7 +74,7 @@ def test_numbers_do_not_depend_on_how_seeds_are_grouped(monkeypatch: pytest.Monk
 @pytest.mark.parametrize("kind", [{"iterations": 3}, {"points": 3}, {"estimators": ("zobg", "delta")}])
 def test_a_plan_that_needs_too_much_memory_is_refused(kind: dict[str, Any]) -> None:
     changes = {} if "estimators" in kind else {"reference_samples": None}
-    assert plan_study(config(samples=(100,), **kind, **changes)).memory < sweep_memory.AT_ONCE
+    assert plan_study(config(samples=(100,), **kind, **changes)).memory < sweep_memory.AT_ONCE["cpu"]
     with pytest.raises(ValueError, match="a cell would take about .* GiB of memory, and the limit is 16 GiB"):
         plan_study(config(samples=(100, 10_000_000), **kind, **changes))
 
@@ -87,12 +88,12 @@ PEAK = """
 import resource, sys
 from mjx_study.runtime import configure
 configure(cpu_devices=1)
-from mjx_study.study import sampling
+from mjx_study.study import gradients, sampling
 from mjx_study.study.gradients import compute_gradients
 from mjx_study.study.plan import plan_study
 from tests.test_sweep_memory import Stub, config
 
-sampling.Simulator = Stub
+sampling.Simulator, gradients.traces_folder = Stub, lambda: None
 plan = plan_study(config(samples=(10_000,), seeds=int(sys.argv[1]), horizon=200))
 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 compute_gradients(plan)(plan.cells[0])

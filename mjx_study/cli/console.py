@@ -51,10 +51,20 @@ def _with_error(value: float, error: float) -> str:
     return f"{value:.3f} ± {error:.3f}"
 
 
-def _debiased(row: Row, value: float, debiased: float, error: float) -> str:
-    """A figure as it is, and what is left of it without noise; "-" where noise is all there is."""
+def _debiased(row: Row, value: float, debiased: float, error: float, best: float) -> str:
+    """A figure as it is, and what is left of it without noise; a bound where that is the best, "-" where noise is all
+    there is."""
     plain = f"{value:.3f}" if value < 1000 else number(value, 2)
-    left = "-" if math.isnan(debiased) else _with_error(debiased, error)
+    if math.isnan(debiased):
+        left = "-"
+    elif debiased == best and math.isfinite(error) and error >= 0.005:
+        bound = abs(best - 2 * error)
+        says_nothing = abs(debiased - value) <= 2 * error
+        left = (
+            "-" if says_nothing else f"< {number(bound, 2)}" if best == 0 else f"> {math.floor(100 * bound) / 100:.2f}"
+        )
+    else:
+        left = _with_error(debiased, error)
     return f"{plain} -> {left}{_doubt(row)}"
 
 
@@ -70,9 +80,12 @@ def columns(confidence: float) -> list[list[Column]]:
         [
             (
                 "relative error -> debiased",
-                lambda row: _debiased(row, row.relative_error, row.debiased_error, row.debiased_error_se),
+                lambda row: _debiased(row, row.relative_error, row.debiased_error, row.debiased_error_se, 0.0),
             ),
-            ("cosine -> debiased", lambda row: _debiased(row, row.cosine, row.debiased_cosine, row.debiased_cosine_se)),
+            (
+                "cosine -> debiased",
+                lambda row: _debiased(row, row.cosine, row.debiased_cosine, row.debiased_cosine_se, 1.0),
+            ),
         ],
         [
             ("alpha", lambda row: "-" if row.alpha is None else f"{row.alpha:.3f}"),
@@ -123,6 +136,8 @@ def gradient_lines(dataset: xr.Dataset, document: dict[str, Any]) -> list[str]:
             "of rollouts with a control variate;",
             f"its own relative uncertainty is {low if low == high else f'{low} to {high}'}, and smaller errors cannot "
             "be told from zero.",
+            "After the arrows: what is left without the sampling noise of batch and reference, ± a standard error;",
+            "< and >: none is seen, these are bounds of two standard errors; -: noise is all there is.",
         ]
     if not all(row.believable for row in rows):
         lines.append(

@@ -184,7 +184,8 @@ def put_scene(host: mujoco.MjModel, name: str, *, adjoint: SceneOption = "auto",
     if host.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4 and scene.has_constraints:
         raise SceneError(
             f"{name} combines RK4 with contacts, limits, equalities or friction loss: RK4's stages would solve the "
-            "constraints four times per step without an order to gain; use euler or implicitfast (--integrator)"
+            "constraints four times per step without an order to gain; set integrator to euler or implicitfast "
+            "in its <option> (rollout and gradcheck: --integrator)"
         )
     return scene
 
@@ -270,7 +271,8 @@ def check_model(host: mujoco.MjModel, name: str = "the model") -> None:
         value = int(getattr(host.opt, option))
         if value not in {int(choice) for choice in choices.values()}:
             raise SceneError(
-                f"MJX lacks the {option} that {name} asks for; use one of {', '.join(choices)} (--{option})"
+                f"MJX lacks the {option} that {name} asks for; set one of {', '.join(choices)} in its <option> "
+                f"(rollout and gradcheck: --{option})"
             )
     if flags := lacking(host):
         raise SceneError(

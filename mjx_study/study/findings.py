@@ -52,7 +52,7 @@ INTERPOLATED: Final = ("aobg", "aobg_onset")
 """Estimators with the accuracy bound gamma."""
 VECTORS: Final = ("gradient", "reference")
 BELOW, ABOVE, ALIKE = "below ZoBG's", "above ZoBG's", "not told apart from ZoBG's"
-UNKNOWN: Final = "not to be told from so few effective samples"
+UNKNOWN: Final = "undecided (too few effective samples)"
 """Verdicts on FoBG's variance."""
 COUNTS: Final = ("unconverged", "nonfinite", "onsets", "onsets_bounded", "onsets_missed")
 

@@ -7,6 +7,7 @@ not sampling noise.
 
 import math
 from collections.abc import Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cache, partial
 from typing import Any, Final
 
@@ -19,11 +20,13 @@ import estimators
 from estimators import ORACLES, Batches, Estimator, Evaluation, GradientEstimate
 from estimators.blocks import THINNED, moments_of
 from estimators.statistics import merged_estimates
-from mjx_study.compiled import Compiled
-from mjx_study.objective import MjxObjective, Simulator
+from mjx_study.compiled import Compiled, type_of
+from mjx_study.objective import BlankObjective, MjxObjective, Simulator
 from mjx_study.reference import Reference
+from mjx_study.runtime import traces_folder
+from mjx_study.stopwatch import unheard
 from mjx_study.study.blocks import REFERENCE, Arrays, Blocks, pack
-from mjx_study.study.memory import BIAS_DRAWS, LARGEST_BATCH
+from mjx_study.study.memory import BIAS_DRAWS, LARGEST_BLOCK
 from mjx_study.study.plan import StudyCell, StudyPlan, block_of, blocks_of, estimators_of, oracles_of, seeds_together
 from mjx_study.study.reference_gradient import reference_gradient
 from mjx_study.study.sampling import Objectives, cell_keys, draw_batches, sample_keys
@@ -35,7 +38,7 @@ from mjx_study.tasks.task import Task
 
 CANDIDATES: Final = 100
 """First-order samples whose median is a candidate for the reference's control variate."""
-PILOT: Final = LARGEST_BATCH
+PILOT: Final = LARGEST_BLOCK
 """Most samples of the first batch that pick among the candidates."""
 MOST_KEPT: Final = 1_000_000
 """Most numbers in a cell's mean gradients; larger ones are not kept."""
@@ -53,10 +56,17 @@ class Gradients:
         self._plan, self._config, self._objectives = plan, plan.config, Objectives(plan)
         self._warm: set[Any] = {None}
         self._soft: dict[tuple[int, float], Array | None] = {}
+        self._pool, self._compiling = ThreadPoolExecutor(1), Future[None]()
+        self._compiling.set_result(None)
 
     @property
     def _keys(self) -> dict[str, Any]:
         return cell_keys(self._config.seed, self._config.batches)
+
+    @property
+    def _reference_keys(self) -> tuple[Key[Array, " pairs"], Key[Array, " samples"]]:
+        odd, candidate = self._keys["reference"]
+        return jax.random.split(odd, self._config.reference_samples or 0), jax.random.split(candidate, CANDIDATES)
 
     def __call__(self, cell: StudyCell, part: Part = Part()) -> Arrays:  # noqa: B008, it is empty
         """A cell's numbers, from whole batches or from blocks, of which the checkpoint has those that are done."""
@@ -118,6 +128,7 @@ class Gradients:
             if reference is None:
                 pilot = jax.tree.map(lambda leaf: leaf[0, :PILOT], drawn["evaluation"])
                 reference = self._reference(cell, objective, pilot)
+            self._compiling.result()
             numbers = _seed_numbers(chosen, config.confidence)(drawn, reference, tests[some])
             parts.append(jax.device_get(numbers))
             tallies.append({name: Tally.of(drawn[name], seconds[name], residuals[name]) for name in oracles})
@@ -128,23 +139,41 @@ class Gradients:
         """The objective of a cell, its programs compiled, so that no time holds a compilation."""
         objective, theta = self._objectives(cell), self._plan.groups[cell.group].task.theta
         if (program := self._plan.program_of(cell)) not in self._warm:
+            self._compile_statistics(cell, objective)
             for name in dict.fromkeys([*oracles_of(self._config), "differentiation"]):  # the control variate needs it
                 getattr(objective, ORACLES[name].method)(theta, jax.random.split(jax.random.key(0), 1))
             self._warm.add(program)
         return objective
 
-    def _reference(self, cell: StudyCell, objective: MjxObjective | Reference, pilot: Evaluation) -> GradientEstimate:
-        odd, candidate = (
-            jax.random.split(stream, size)
-            for stream, size in zip(
-                self._keys["reference"], (self._config.reference_samples or 0, CANDIDATES), strict=True
-            )
+    def _compile_statistics(self, cell: StudyCell, objective: MjxObjective | Reference) -> None:
+        """Compile the statistics in another thread, beside the programs of rollouts."""
+        if not isinstance(objective, MjxObjective) or traces_folder() is None or blocks_of(self._plan, cell):
+            return
+        config, task = self._config, self._plan.groups[cell.group].task
+        blank = BlankObjective(**vars(objective))
+        key, seeds = jax.random.split(jax.random.key(0), 1), seeds_together(self._plan, cell)
+        batches = {
+            name: getattr(blank, ORACLES[name].method)(task.theta, jax.random.clone(key)) for name in oracles_of(config)
+        }
+        drawn = jax.tree.map(
+            lambda leaf: jax.ShapeDtypeStruct((seeds, cell.samples, *leaf.shape[1:]), leaf.dtype), batches
         )
+        soft = task.theta if takes_candidates(task) and task.contact_pair is not None else None
+        pilot = blank.evaluate(task.theta, jax.random.split(jax.random.key(0), min(cell.samples, PILOT)))
+        reference = reference_of(task, blank, *self._reference_keys, pilot, soft)
+        keys = jax.random.split(self._keys["test"], config.batches)[:seeds]
+        types = drawn, jax.tree.map(type_of, reference), type_of(keys)
+        statistics = _seed_numbers(estimators_of(self._plan, cell), config.confidence)
+        self._compiling = self._pool.submit(unheard(statistics.ahead(*types)))
+
+    def _reference(self, cell: StudyCell, objective: MjxObjective | Reference, pilot: Evaluation) -> GradientEstimate:
         softened = cell.group, cell.sigma
         if softened not in self._soft and not cell.model.analytic:
-            self._soft[softened] = soft_gradient(self._objectives.simulator(cell.group), cell.sigma, candidate)
+            self._soft[softened] = soft_gradient(
+                self._objectives.simulator(cell.group), cell.sigma, self._reference_keys[1]
+            )
         task = self._plan.groups[cell.group].task
-        return reference_of(task, objective, odd, candidate, pilot, self._soft.get(softened))
+        return reference_of(task, objective, *self._reference_keys, pilot, self._soft.get(softened))
 
     def _numbers(
         self, cell: StudyCell, numbers: Any, reference: GradientEstimate, tallies: Sequence[dict[str, Tally]]
@@ -191,14 +220,19 @@ def _of_seeds(numbers: Sequence[dict[str, Any]], seeds: int) -> dict[str, np.nda
 
 def _bias(numbers: Sequence[dict[str, Any]], reference: GradientEstimate) -> dict[str, np.ndarray]:
     """Each estimator's bias over the norm of the reference, from the means of its seeds."""
-    means = [jnp.asarray(row["gradient"]) for row in numbers]
-    square = float(jnp.sum(reference.mean**2))
+    found = jax.device_get(_biases(np.stack([row["gradient"] for row in numbers]), reference))
+    return {name: np.asarray(each, float) for name, each in found.items()}
+
+
+@jax.jit
+def _biases(means: Float[Array, "estimators seeds params"], reference: GradientEstimate) -> dict[str, Array]:
+    square = jnp.sum(reference.mean**2)
     squared, errors = zip(*(estimators.squared_bias_of_means(each, reference) for each in means), strict=True)
     gaps = [jnp.linalg.norm(jnp.mean(each, axis=0) - reference.mean) for each in means]
     return {
-        "squared_bias": np.array(squared, float) / square,
-        "squared_bias_se": np.array(errors, float) / square,
-        "pooled_error": np.array(gaps, float) / square**0.5,
+        "squared_bias": jnp.stack(squared) / square,
+        "squared_bias_se": jnp.stack(errors) / square,
+        "pooled_error": jnp.stack(gaps) / jnp.sqrt(square),
     }
 
 

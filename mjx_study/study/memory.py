@@ -4,6 +4,8 @@ import math
 from collections.abc import Sequence
 from typing import Final
 
+import jax
+
 from estimators import ESTIMATORS, Estimator
 from estimators.blocks import EXTREMES
 from mjx_study.limits import MOST_GIB
@@ -11,10 +13,19 @@ from mjx_study.tasks.task import Task
 
 BIAS_DRAWS: Final = 999
 """Draws of the test for bias; its smallest p-value is 0.001."""
-LARGEST_BATCH: Final = 20_000
-"""Most samples drawn at once; further seeds are drawn in turn."""
-AT_ONCE: Final = 512e6
-"""Most memory for the batches of several seeds [bytes]; those of a single seed may take more."""
+LARGEST_BATCH: Final = {"cpu": 20_000, "gpu": 2**17, "tpu": 2**17}
+"""Most samples drawn at once, by backend; further seeds are drawn in turn."""
+AT_ONCE: Final = {"cpu": 512e6, "gpu": 8e9, "tpu": 8e9}
+"""Most memory for the batches of several seeds [bytes]; those of a single seed may take more. An accelerator is idle
+unless much is drawn at once."""
+LARGEST_BLOCK: Final = 20_000
+BLOCK_BYTES: Final = 512e6
+"""Most samples of a block, and memory for them; the same everywhere, so that blocks can be computed anywhere."""
+
+
+def largest_batch() -> int:
+    """Most samples drawn at once by JAX's default backend."""
+    return LARGEST_BATCH[jax.default_backend()]
 
 
 def numbers_per_sample(task: Task, oracle: str) -> int:
@@ -49,13 +60,13 @@ def bytes_of_moments(estimators: Sequence[Estimator], params: int) -> int:
 
 
 def block_for(each: int) -> int:
-    """Samples of a block, an even number that fits into `AT_ONCE` at so many bytes each."""
-    return min(LARGEST_BATCH, max(2, int(AT_ONCE / each) // 2 * 2))
+    """Samples of a block, an even number that fits into `BLOCK_BYTES` at so many bytes each."""
+    return min(LARGEST_BLOCK, max(2, int(BLOCK_BYTES / each) // 2 * 2))
 
 
 def seeds_at_once(memory_of_seed: int, seeds: int) -> int:
     """Number of seeds that fit into `AT_ONCE`, in as few and as equal groups as possible; at least one."""
-    fitting = max(1, int(AT_ONCE / memory_of_seed))
+    fitting = max(1, int(AT_ONCE[jax.default_backend()] / memory_of_seed))
     return math.ceil(seeds / math.ceil(seeds / fitting))
 
 

@@ -20,13 +20,13 @@ from mjx_study.study.configuration import SAMPLES, StudyConfig
 from mjx_study.study.iteration import make_optimizer, schedule_factors
 from mjx_study.study.line import line_of
 from mjx_study.study.memory import (
-    LARGEST_BATCH,
     block_for,
     blocks_take,
     bytes_of_moments,
     bytes_per_sample,
     check_batches,
     check_memory,
+    largest_batch,
     seeds_at_once,
 )
 from mjx_study.study.resolution import at_theta, configured_estimators, recipe_of
@@ -185,7 +185,7 @@ def plan_study(config: StudyConfig, built: Mapping[str, Task] | None = None) -> 
             cells.append(StudyCell(len(groups), model, sigma, samples))
         groups.append(group)
     together = 1 if config.kind == "descents" else config.batches
-    most = min(LARGEST_BATCH, max(min(cell.samples, config.block_size or cell.samples) for cell in cells) * together)
+    most = min(largest_batch(), max(min(cell.samples, config.block_size or cell.samples) for cell in cells) * together)
     tasks = [group.task for group in groups]
     chunk = chunk_for(most, jax.local_devices(), tasks) if config.chunk_size is None else config.chunk_size
     plan = StudyPlan(config, tuple(groups), tuple(cells), chunk, tuple(dict.fromkeys(messages)))

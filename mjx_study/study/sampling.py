@@ -2,17 +2,18 @@
 
 import time
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, Final
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Key
+from jaxtyping import Array, Float, Int, Key
 
 from estimators import ORACLES, Linearisation
 from mjx_study.objective import MjxObjective, Simulator
 from mjx_study.reference import Reference
-from mjx_study.study.memory import LARGEST_BATCH
+from mjx_study.study.memory import largest_batch
 from mjx_study.study.plan import StudyCell, StudyPlan
 
 UNCONVERGED: Final = {"float64": 1e-6, "float32": 1e-3}
@@ -43,9 +44,14 @@ def cell_keys(seed: int, seeds: int) -> dict[str, Any]:
     return {"order": by_order, "reference": (odd, candidate), "test": test}
 
 
-def sample_keys(key: Key[Array, ""], first: int, count: int) -> Key[Array, " count"]:
+@partial(jax.jit, static_argnums=2)
+def sample_keys(key: Key[Array, ""], first: int | Int[Array, ""], count: int) -> Key[Array, " count"]:
     """Keys of some of a batch's samples, each of its index alone: of the first as `jax.random.split` has them."""
-    return jax.vmap(lambda index: jax.random.fold_in(key, index))(jnp.arange(first, first + count, dtype=jnp.uint32))
+    indices = jnp.asarray(first, jnp.uint32) + jnp.arange(count, dtype=jnp.uint32)
+    return jax.vmap(lambda index: jax.random.fold_in(key, index))(indices)
+
+
+_keys_of_seeds = jax.jit(jax.vmap(sample_keys, (0, None, None)), static_argnums=2)
 
 
 def draw_batches(
@@ -67,14 +73,14 @@ def draw_batches(
     Returns:
         By oracle: the batch, its computing time [s], and the solver residual of every rollout.
     """
-    together = max(1, LARGEST_BATCH // samples)
+    together = max(1, largest_batch() // samples)
     drawn, seconds, residuals = {}, {}, {}
     for name in oracles:
         streams: Key[Array, " seeds"] = jax.random.clone(keys["order"][ORACLES[name].order])[seeds]
         parts, seconds[name] = [], 0.0
         for start in range(0, len(streams), together):
             some = jax.random.clone(streams)[start : start + together]
-            flat = jax.vmap(lambda key: sample_keys(key, first, samples))(some).reshape(-1)
+            flat = _keys_of_seeds(some, first, samples).reshape(-1)
             begun = time.perf_counter()
             batch = jax.block_until_ready(getattr(objective, ORACLES[name].method)(theta, flat))
             seconds[name] += time.perf_counter() - begun

@@ -29,9 +29,9 @@ from mjx_study.simulation.scene import num_constraint_rows
 from mjx_study.stopwatch import Spent, Stopwatch
 from mjx_study.tasks.task import Task
 
-OVERHEAD: Final = {"cpu": 25, "gpu": 8000, "tpu": 8000}
+OVERHEAD: Final = {"cpu": 25, "gpu": 50_000, "tpu": 50_000}
 """Rows that take as long as a call of none, by backend."""
-RATE: Final = {"cpu": 4e-7, "gpu": 5e-9, "tpu": 5e-9}
+RATE: Final = {"cpu": 4e-7, "gpu": 3.4e-10, "tpu": 3.4e-10}
 """Time of a step of a rollout, without degrees of freedom and constraints [s per row]."""
 POWERS: Final = (0.6, 0.3)
 """Powers of 1 + degrees of freedom and 1 + constraint rows to which the time of a step grows."""
@@ -60,7 +60,7 @@ class Program:
     """A program, or the statistics of a cell: what the time of a call depends on.
 
     Attributes:
-        kind: one of `objective.Simulator.sample_programs`; those of an iteration of descents joined by "+"; "analytic"
+        kind: one of `objective.SamplePrograms`; those of an iteration of descents joined by "+"; "analytic"
             or "statistics".
         content: digest of what else is compiled, and of the machine.
         steps: of a rollout; 1 for statistics.

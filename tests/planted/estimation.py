@@ -18,7 +18,7 @@ OBJECTIVE: Final = (
     ),
     Defect(
         "cost-after-the-step",
-        "mjx_study/objective.py",
+        "mjx_study/objective/cost.py",
         "return jax.tree.map(lambda leaf: leaf[:-1], states)",
         "return jax.tree.map(lambda leaf: leaf[1:], states)",
         "running costs of the states after the steps",
@@ -26,7 +26,7 @@ OBJECTIVE: Final = (
     ),
     Defect(
         "baseline-with-noise",
-        "mjx_study/objective.py",
+        "mjx_study/objective/batches.py",
         "np.append(np.repeat(signs, samples), np.zeros(len(zero_noise)))",
         "np.append(np.repeat(signs, samples), np.ones(len(zero_noise)))",
         "still unbiased with one sample less, and no error anywhere",
@@ -34,7 +34,7 @@ OBJECTIVE: Final = (
     ),
     Defect(
         "costs-so-far",
-        "mjx_study/objective.py",
+        "mjx_study/objective/programs.py",
         "jnp.cumsum(running[::-1])[::-1] + self.task.final_cost",
         "jnp.cumsum(running) + self.task.final_cost",
         "costs up to a step in place of those from it on",

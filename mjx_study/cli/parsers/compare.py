@@ -41,8 +41,8 @@ columns of the table:
   variance        trace of the sample covariance of one gradient sample, with a jackknife interval
   effective (top) samples that this variance rests on, and the share of it that the largest one carries
   relative error  distance of the mean to a reference gradient, over the norm of the reference
-  -> debiased     the same without the noise of the two means, which adds to an error and takes from a cosine;
-                  - where noise is all there is
+  -> debiased     the same without the sampling noise of batch and reference, ± a standard error; < and > where
+                  none is seen: bounds, of two standard errors; - where noise is all there is
   ?               fewer than three effective samples: do not believe the number
   alpha           weight of the first-order batch in AoBG
   epsilon, B      confidence radius of the zeroth-order mean; distance between the two means

@@ -1,0 +1,299 @@
+"""Batches of samples on all devices: the programs of a task, compiled, and the `Objective` that estimators see."""
+
+import dataclasses
+import math
+from typing import Any, Final
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Key
+
+from estimators import Differentiation, Evaluation, Linearisation, StepDifferentiation, StepEvaluation
+from mjx_study.compiled import Compiled
+from mjx_study.objective.chunks import rounds, spread
+from mjx_study.objective.programs import SamplePrograms
+from mjx_study.simulation.contact import ContactModel
+from mjx_study.simulation.linear_algebra import SMALL
+from mjx_study.simulation.onset import SLOTS
+from mjx_study.stopwatch import timed
+from mjx_study.tasks.task import Task, check_sigma
+
+LAPACK_BATCH: Final = 2048
+"""Batch from which jaxlib 0.10.2 divides factorisations of matrices among its threads on CPUs, which never ends where
+two programs do so at a time. Matrices of up to `SMALL` rows do not go to LAPACK."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Simulator:
+    """The compiled programs of a task.
+
+    Attributes:
+        task: the task to simulate; each call replaces its scene's contact parameters.
+        chunk_size: samples per device and call; `chunk_for` chooses one.
+        devices: devices over which samples are spread; by default all local ones.
+    """
+
+    task: Task
+    chunk_size: int
+    devices: tuple[Any, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.chunk_size < 1:
+            raise ValueError(f"chunk_size must be at least 1 sample, got {self.chunk_size}")
+        object.__setattr__(self, "devices", tuple(self.devices) or tuple(jax.local_devices()))
+        batched = {
+            name: jax.vmap(each, (None, None, None, 0, 0)) for name, each in SamplePrograms(self.task).by_name.items()
+        }
+        object.__setattr__(self, "_programs", {name: Compiled(each, name, self.task) for name, each in batched.items()})
+
+    def objective(self, contact: ContactModel | None, sigma: float | None = None) -> "MjxObjective":
+        """The objective under a contact model, with the task's noise level or another."""
+        return MjxObjective(self, contact, self.task.sigma if sigma is None else sigma)
+
+    @property
+    def num_compilations(self) -> int:
+        """Number of programs that this simulator has compiled so far."""
+        return sum(program.num_compilations for program in self._programs.values())  # type: ignore[attr-defined]
+
+    def memory(self, kind: str, contact: ContactModel | None, samples: int) -> int:
+        """XLA's planned temporary memory for a batch of one kind, all chunks at once on all devices [bytes]."""
+        arguments = self._chunk(self.task.theta, contact, 1.0)
+        plan = self._programs[kind].jitted.lower(*arguments).compile().memory_analysis()  # type: ignore[attr-defined]
+        return plan.temp_size_in_bytes * samples // self.chunk_size
+
+    def run(self, name: str, theta: Any, contact: ContactModel | None, sigma: Any, keys: Any, noise_scale: Any) -> Any:
+        """Run one of `SamplePrograms`, see `spread`.
+
+        Args:
+            name: name in `SamplePrograms`.
+            theta: parameters, (params,).
+            contact: the contact model; None for the MJCF's own.
+            sigma: standard deviation of the noise, in the unit of what it is added to.
+            keys: data of each sample's key.
+            noise_scale: factor on each sample's noise.
+
+        Returns:
+            The program's outputs with a leading axis of samples; as `spread` returns them.
+
+        Raises:
+            ValueError: sigma or theta is invalid, or there is no sample.
+        """
+        check_sigma(sigma)
+        if theta.shape != (self.task.policy.num_params,):
+            raise ValueError(f"theta has shape {theta.shape}, the policy needs ({self.task.policy.num_params},)")
+        if len(noise_scale) == 0:
+            raise ValueError("there is no sample to run: give at least one key")
+        shared = theta, contact, np.asarray(sigma, self.task.scene.template.qpos.dtype)
+        devices = self._devices_for(name)
+        with timed(self.program(name, contact), rounds(len(noise_scale), self.chunk_size, len(devices))):
+            program = self._programs[name]  # type: ignore[attr-defined]
+            return jax.block_until_ready(spread(program, shared, (keys, noise_scale), self.chunk_size, devices))
+
+    def form(self, name: str, theta: Any, contact: ContactModel | None, sigma: Any) -> Any:
+        """Shapes and types of what one of `SamplePrograms` returns for a chunk, without running it."""
+        arguments = self._chunk(theta, contact, sigma)
+        program = self._programs[name]  # type: ignore[attr-defined]
+        return jax.eval_shape(program.prepare(*arguments, platform=self.devices[0].platform), *arguments)
+
+    def _chunk(self, theta: Any, contact: ContactModel | None, sigma: Any) -> tuple[Any, ...]:
+        """Arguments of a program for a chunk of equal samples, whose form is that of all chunks."""
+        dtype = self.task.scene.template.qpos.dtype
+        keys = np.zeros((self.chunk_size, 2), np.uint32)
+        return theta, contact, np.asarray(sigma, dtype), keys, np.ones(self.chunk_size, dtype)
+
+    def program(self, name: str, contact: ContactModel | None) -> tuple[str, Task, Any, int]:
+        """What the time of a call of one of `SamplePrograms` depends on: name, task, kind of contact, samples."""
+        return name, self.task, jax.tree.structure(contact), self.chunk_size
+
+    def _devices_for(self, name: str) -> tuple[Any, ...]:
+        """The devices, or one where two at a time would wait for each other for ever; see `LAPACK_BATCH`."""
+        corrected = name == "corrected" or self.task.onset != "none"
+        batch = self.chunk_size * (SLOTS if corrected else 1)
+        hangs = self.devices[0].platform == "cpu" and self.task.scene.host.nv > SMALL and batch >= LAPACK_BATCH
+        return self.devices[:1] if hangs else self.devices
+
+
+@dataclasses.dataclass(frozen=True)
+class MjxObjective:
+    """F(theta) = E V_1 of a task under one contact model; implements `estimators.Objective`.
+
+    Attributes:
+        simulator: the compiled programs, shared by all contact models of a sweep.
+        contact: the contact model; None for the MJCF's own.
+        sigma: standard deviation of the noise, in the unit of what it is added to.
+    """
+
+    simulator: Simulator
+    contact: ContactModel | None
+    sigma: float | Float[Array, ""]
+
+    @property
+    def num_params(self) -> int:
+        return self.simulator.task.policy.num_params
+
+    def evaluate(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> Evaluation:
+        """Values and scores from rollouts alone; the dynamics are not differentiated.
+
+        The baseline, the zero-noise rollout from the same initial state, is run as extra samples whose noise is scaled
+        by 0: a single one if the initial state is fixed, otherwise one per sample.
+        """
+        (evaluation,) = self._evaluate(theta, keys, (1.0,))
+        return evaluation
+
+    def evaluate_odd(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> Evaluation:
+        """The part of the objective that is odd in the noise, (f(w) - f(-w)) / 2, from two rollouts per sample.
+
+        Only the odd part correlates with the score of noise added to theta, so it has the same gradient; the even part,
+        most of the variance of a zeroth-order sample, drops out.
+
+        Raises:
+            ValueError: the policy has feedback, so that the score is not odd in the noise.
+        """
+        if not self.simulator.task.policy.additive:
+            raise ValueError("the odd part of an objective needs a policy whose noise is added to theta")
+        samples = len(keys)
+        scale = np.repeat([1.0, -1.0], samples)
+        values, scores, residuals = self._run("value", theta, keys, np.tile(np.arange(samples), 2), scale)
+        odd = (values[:samples] - values[samples:]) / 2
+        residual = jnp.maximum(residuals[:samples], residuals[samples:])
+        return Evaluation(*map(jnp.asarray, (odd, scores[:samples], jnp.zeros_like(odd), residual)))
+
+    def evaluate_pair(
+        self, theta: Float[Array, " params"], keys: Key[Array, " samples"]
+    ) -> tuple[Evaluation, Evaluation]:
+        """Two evaluations with opposite noise, sample by sample, from the same initial states, with one baseline."""
+        plus, minus = self._evaluate(theta, keys, (1.0, -1.0))
+        return plus, minus
+
+    def differentiate(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> Differentiation:
+        """Values and exact gradients of each sample's cost with respect to theta."""
+        return Differentiation(*jax.tree.map(jnp.asarray, self._run("gradient", theta, keys)))
+
+    def evaluate_steps(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> StepEvaluation:
+        (steps,) = self._evaluate_steps(theta, keys, (1.0,))
+        return steps
+
+    def evaluate_step_pair(
+        self, theta: Float[Array, " params"], keys: Key[Array, " samples"]
+    ) -> tuple[StepEvaluation, StepEvaluation]:
+        plus, minus = self._evaluate_steps(theta, keys, (1.0, -1.0))
+        return plus, minus
+
+    def differentiate_corrected(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> Differentiation:
+        """`differentiate` with the onset term that the task asks for, or the linear one where it asks for none."""
+        return Differentiation(*jax.tree.map(jnp.asarray, self._run("corrected", theta, keys)))
+
+    def differentiate_steps(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> StepDifferentiation:
+        """The rollouts of `differentiate`, with the derivative of each sample's cost with respect to its noise."""
+        return StepDifferentiation(*jax.tree.map(jnp.asarray, self._run("step_gradient", theta, keys)))
+
+    def linearise(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> Linearisation:
+        """The rollouts of `differentiate`, with the derivatives of every step.
+
+        The state is (qpos, qvel, act), so a quaternion counts four.
+        """
+        (terms, residual, derivatives), zero_noise = (
+            self._run("linearisation", theta, keys),
+            self._zero_noise_to_go(theta, keys),
+        )
+        to_go, scores, jacobian = terms
+        steps = StepEvaluation(*jax.tree.map(jnp.asarray, (to_go, zero_noise, scores, jacobian, residual)))
+        return Linearisation(steps, *jax.tree.map(jnp.asarray, derivatives))
+
+    def _evaluate(self, theta, keys, signs: tuple[float, ...]) -> list[Evaluation]:
+        samples, zero_noise = len(keys), self._zero_noise_rows(len(keys))
+        rows = np.append(np.tile(np.arange(samples), len(signs)), zero_noise)
+        scale = np.append(np.repeat(signs, samples), np.zeros(len(zero_noise)))
+        values, scores, residuals = self._run("value", theta, keys, rows, scale)
+        baseline = _for_all(values[len(signs) * samples :], samples)
+        return [
+            Evaluation(value, score, jnp.asarray(baseline), residual)
+            for value, score, residual in _in_turn((values, scores, residuals), samples, len(signs))
+        ]
+
+    def _evaluate_steps(self, theta, keys, signs: tuple[float, ...]) -> list[StepEvaluation]:
+        samples = len(keys)
+        rows, scale = np.tile(np.arange(samples), len(signs)), np.repeat(signs, samples)
+        (to_go, scores, jacobian), residual = self._run("steps", theta, keys, rows, scale)
+        zero_noise = jnp.asarray(self._zero_noise_to_go(theta, keys))
+        return [
+            StepEvaluation(part[0], zero_noise, *part[1:])
+            for part in _in_turn((to_go, scores, jacobian, residual), samples, len(signs))
+        ]
+
+    def _zero_noise_rows(self, samples: int) -> np.ndarray:
+        """The samples that have a zero-noise rollout of their own: one, if all start in the same state."""
+        return np.arange(samples if self.simulator.task.random_start else min(samples, 1))
+
+    def _zero_noise_to_go(self, theta, keys):
+        """Costs to go of the zero-noise rollouts, a single one if all samples share it."""
+        rows = self._zero_noise_rows(len(keys))
+        (to_go, *_), _ = self._run("steps", theta, keys, rows, np.zeros(len(rows)))
+        return _for_all(to_go, len(keys))
+
+    def _run(self, name: str, theta, keys, rows=None, noise_scale=None):
+        """Run a program on rows of the keys, by default each once."""
+        rows = np.arange(len(keys)) if rows is None else rows
+        scale = np.ones(len(rows)) if noise_scale is None else noise_scale
+        # Bare key data: drawing the same noise for several rollouts is intended, not a reused key.
+        key_data = np.asarray(jax.random.key_data(keys))[rows]
+        dtype = self.simulator.task.scene.template.qpos.dtype
+        contact = contact_for(name, self.contact)
+        return self.simulator.run(name, theta, contact, self.sigma, key_data, scale.astype(dtype))
+
+
+@dataclasses.dataclass(frozen=True)
+class BlankObjective(MjxObjective):
+    """The same objective with zeros for every number: the form of its batches, for which programs are traced but not
+    compiled."""
+
+    def _run(self, name: str, theta, keys, rows=None, noise_scale=None):
+        rows = np.arange(len(keys)) if rows is None else rows
+        made = self.simulator.form(name, theta, contact_for(name, self.contact), self.sigma)
+        return jax.tree.map(lambda leaf: np.zeros((len(rows), *leaf.shape[1:]), leaf.dtype), made)
+
+
+@dataclasses.dataclass(frozen=True)
+class TracedObjective(MjxObjective):
+    """The same objective inside a larger compiled program, on one device: nothing returns to the host between batch and
+    estimate."""
+
+    def _run(self, name: str, theta, keys, rows=None, noise_scale=None):
+        simulator = self.simulator
+        rows = np.arange(len(keys)) if rows is None else rows
+        dtype = simulator.task.scene.template.qpos.dtype
+        scale = np.ones(len(rows), dtype) if noise_scale is None else np.asarray(noise_scale, dtype)
+        chunk = simulator.chunk_size
+        chunks = np.minimum(np.arange(math.ceil(len(rows) / chunk) * chunk), len(rows) - 1).reshape(-1, chunk)
+        program, key_data = simulator._programs[name].jitted, jax.random.key_data(keys)  # type: ignore[attr-defined]
+        sigma = jnp.asarray(self.sigma, dtype)
+
+        def call(chunk):
+            drawn, factor = chunk
+            return program(theta, self.contact, sigma, drawn, factor)
+
+        parts = key_data[rows[chunks]], jnp.asarray(scale[chunks])
+        if len(chunks) == 1:
+            return jax.tree.map(lambda leaf: leaf[: len(rows)], call(jax.tree.map(lambda part: part[0], parts)))
+        outputs = jax.lax.map(call, parts)
+        return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[: len(rows)], outputs)
+
+
+def _in_turn(outputs: tuple[Any, ...], samples: int, count: int) -> list[tuple[Any, ...]]:
+    """The outputs of several batches of one size that ran as one; what comes after them is left out."""
+    starts = range(0, count * samples, samples)
+    return [jax.tree.map(lambda leaf, at=at: jnp.asarray(leaf[at : at + samples]), outputs) for at in starts]
+
+
+def _for_all(rows, samples: int):
+    """Broadcast rows, one per sample or one for all; on the host without a compilation per size."""
+    numpy = np if isinstance(rows, np.ndarray) else jnp
+    return numpy.broadcast_to(rows, (samples, *rows.shape[1:]))
+
+
+def contact_for(name: str, contact: ContactModel | None) -> ContactModel | None:
+    """What a program reads of a contact model: no surrogate without derivatives, so that one serves all models."""
+    return (
+        dataclasses.replace(contact, backward=None) if contact is not None and name in ("value", "steps") else contact
+    )

@@ -1,0 +1,97 @@
+"""The cost of one rollout, a pure function of all that may be traced or differentiated."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Key
+
+from mjx_study.reference.noise import split_sample_key, standard_noise
+from mjx_study.simulation._mjx import mjx
+from mjx_study.simulation.branches import jump_term
+from mjx_study.simulation.contact import ContactModel, apply_contact
+from mjx_study.simulation.dynamics import State, rollout
+from mjx_study.simulation.onset import OnsetCounts, corrected_rollout, without_derivative
+from mjx_study.tasks.task import Task
+
+
+def rollout_cost(
+    task: Task,
+    theta: Float[Array, " params"],
+    contact: ContactModel | None,
+    start: State,
+    noise: Float[Array, "steps dimensions"],
+    onset: str = "none",
+    weight: float | Float[Array, ""] = 1.0,
+) -> tuple[Float[Array, ""], tuple[State, Float[Array, "horizon nu"], Float[Array, ""], OnsetCounts | None]]:
+    """Total cost V_1 of one rollout, a pure function of everything that may be traced or differentiated.
+
+    Args:
+        contact: the contact model; None for the MJCF's own.
+        start: the initial state, before the policy acts on it.
+        noise: noise of the policy's `noise_shape`.
+        onset: "none", or "linear" or "jump" for a derivative with the onset term (see `mjx_study.simulation.onset` and
+            `mjx_study.simulation.branches`).
+        weight: factor on the linear onset term; 0 for a derivative without it.
+
+    Returns:
+        The cost; and the states `(horizon + 1, ...)` including the initial one, the controls, the largest relative
+        solver residual, and the counts of onsets (None without the onset term).
+    """
+    feedforward = task.policy.feedforward(theta, noise)
+
+    def control_law(index, state, theta=theta, feedforward=feedforward):
+        feedback = task.policy.feedback(theta, state)
+        return feedforward[index] if feedback is None else feedforward[index] + feedback
+
+    model = apply_contact(task.scene.model, contact)
+    backward = derivative_model(task, contact)
+    if backward is not None and onset != "none":
+        raise ValueError("the onset term is of exact derivatives: leave onset out, or the contact's backward model")
+    first = task.policy.place(theta, noise, start)
+    simulated, counts, term = (task.scene, model, first, control_law, task.horizon), None, 0.0
+    if onset == "linear":
+        states, controls, residuals, counts = corrected_rollout(*simulated, weight=weight)
+    else:
+        states, controls, residuals = rollout(*simulated, backward)
+    if onset == "jump":
+        fixed = jax.lax.stop_gradient((theta, feedforward))
+        law = lambda index, state: control_law(index, state, *fixed)  # noqa: E731
+        costs = task.running_cost, task.final_cost
+        term, counts = jump_term(task.scene, without_derivative(model), states, controls, law, *costs)
+    cost = jnp.sum(jax.vmap(task.running_cost)(before_each_step(states), controls)) + task.final_cost(last_of(states))
+    return cost + term, (states, controls, jnp.max(residuals), counts)
+
+
+def derivative_model(task: Task, contact: ContactModel | None) -> mjx.Model | None:
+    """The model whose derivatives stand in for those of the contact model's own; None for its own."""
+    other = None if contact is None else contact.backward
+    return None if other is None else apply_contact(task.scene.model, other)
+
+
+def simulate(
+    task: Task,
+    theta: Float[Array, " params"],
+    contact: ContactModel | None,
+    key: Key[Array, ""],
+    noise_scale: float | Float[Array, ""],
+) -> tuple[State, Float[Array, "horizon nu"], Float[Array, ""], Float[Array, ""]]:
+    """One sample's rollout: states including the initial one, controls, cost and largest solver residual.
+
+    Args:
+        task: the task; gives the noise's density and standard deviation.
+        theta: parameters of its policy, (params,).
+        contact: the contact model; None for the MJCF's own.
+        key: key of the sample; draws initial state and noise as in a batch.
+        noise_scale: factor on the noise; 0 for a zero-noise rollout.
+    """
+    start_key, noise_key = split_sample_key(key)
+    noise = noise_scale * task.sigma * standard_noise(noise_key, task.policy.noise_shape, theta.dtype, task.noise)
+    cost, (states, controls, residual, _) = rollout_cost(task, theta, contact, task.draw_start(start_key), noise)
+    return states, controls, cost, residual
+
+
+def before_each_step(states: State) -> State:
+    return jax.tree.map(lambda leaf: leaf[:-1], states)
+
+
+def last_of(states: State) -> State:
+    return jax.tree.map(lambda leaf: leaf[-1], states)
