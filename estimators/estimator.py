@@ -2,7 +2,7 @@
 
 import dataclasses
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, ClassVar, Final
 
 import jax
@@ -153,7 +153,21 @@ def draw(
     Raises:
         ValueError: The objective lacks what an oracle calls.
     """
-    keys = [jax.random.split(order_key, num_samples) for order_key in jax.random.split(key)]
+    return draw_at(oracles, objective, theta, sample_keys(key, num_samples))
+
+
+def sample_keys(key: Key[Array, ""], num_samples: int) -> list[Key[Array, " samples"]]:
+    """Keys of the samples of each order, as `draw` makes them of one key."""
+    return [jax.random.split(order_key, num_samples) for order_key in jax.random.split(key)]
+
+
+def draw_at(
+    oracles: Iterable[str],
+    objective: Objective,
+    theta: Float[Array, "*samples params"],
+    keys: Sequence[Key[Array, " samples"]],
+) -> dict[str, Any]:
+    """`draw` with the keys of `sample_keys`; theta may be one for each sample where the objective takes that."""
     batches = {}
     for name in oracles:
         oracle = ORACLES[name]

@@ -99,6 +99,21 @@ def test_seeds_are_those_of_runs_of_one(short: xr.Dataset) -> None:
     assert not np.allclose(both.sel(seed=0), both.sel(seed=1), rtol=1e-6)
 
 
+@pytest.mark.parametrize("task", ["pusher", "tennis"])
+def test_seeds_on_a_reference_do_not_depend_on_those_drawn_with_them(
+    task: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All at once, two at a time, one at a time, and the first alone."""
+    study = on_reference(task, **SHORT | {"seeds": 3, "learning_rate": 1e-5, "estimators": ("aobg",)})
+    together = descend(study)["theta"]
+    for most in (10, 1):
+        monkeypatch.setattr(descents, "TOGETHER", most)
+        np.testing.assert_allclose(descend(study)["theta"], together, rtol=1e-7)
+    alone = descend(dataclasses.replace(study, seeds=1))["theta"]
+    np.testing.assert_allclose(alone.sel(seed=0), together.sel(seed=0), rtol=1e-7)
+    assert not np.allclose(together.sel(seed=0), together.sel(seed=1), rtol=1e-5, atol=0)
+
+
 def test_an_iteration_is_gradient_descent_on_the_estimate() -> None:
     """The first step by hand: theta minus the learning rate times the estimate with the same keys."""
     planned = plan_study(config(estimators=("aobg",), iterations=1))

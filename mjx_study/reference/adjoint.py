@@ -53,23 +53,26 @@ def roll_out(
     system: System,
     start: Float[np.ndarray, "... states"],
     controls: Float[np.ndarray, "... horizon controls"],
-    feedback: Float[np.ndarray, "_ _"] | None = None,
+    feedback: Float[np.ndarray, "*batch _ _"] | None = None,
 ) -> Rollout:
     """Simulate u_h = controls_h + feedback x_h from `start`; the batch axes of start and controls are broadcast.
+
+    There is one feedback matrix, or one for each rollout.
 
     Raises:
         ValueError: the initial state, controls or feedback matrix do not fit the system.
     """
     start, controls = np.asarray(start, float), np.asarray(controls, float)
     _check(system, start, controls, feedback)
-    batch, horizon = np.broadcast_shapes(start.shape[:-1], controls.shape[:-2]), controls.shape[-2]
+    each = () if feedback is None else feedback.shape[:-2]
+    batch, horizon = np.broadcast_shapes(start.shape[:-1], controls.shape[:-2], each), controls.shape[-2]
     state = np.broadcast_to(start, (*batch, system.num_states))
     states = np.empty((*batch, horizon + 1, system.num_states))
     applied = np.array(np.broadcast_to(controls, (*batch, *controls.shape[-2:])))
     states[..., 0, :] = state
     for step in range(horizon):
         if feedback is not None:
-            applied[..., step, :] += state @ feedback.T
+            applied[..., step, :] += np.einsum("...ux,...x->...u", feedback, state)
         state = system.step(state, applied[..., step, :])
         states[..., step + 1, :] = state
     costs = np.empty((*batch, horizon + 1))
@@ -82,7 +85,7 @@ def value_and_gradients(
     system: System,
     start: Float[np.ndarray, "... states"],
     controls: Float[np.ndarray, "... horizon controls"],
-    feedback: Float[np.ndarray, "_ _"] | None = None,
+    feedback: Float[np.ndarray, "*batch _ _"] | None = None,
 ) -> tuple[Float[np.ndarray, "..."], Gradients]:
     """Total cost and its exact gradients with respect to initial state, control sequence and feedback matrix.
 
@@ -93,7 +96,9 @@ def value_and_gradients(
     return rollout.value, gradients_along(system, rollout, feedback)
 
 
-def gradients_along(system: System, rollout: Rollout, feedback: Float[np.ndarray, "_ _"] | None = None) -> Gradients:
+def gradients_along(
+    system: System, rollout: Rollout, feedback: Float[np.ndarray, "*batch _ _"] | None = None
+) -> Gradients:
     """Exact gradients of a rollout's total cost."""
     adjoint = system.final_gradient(rollout.states[..., -1, :])
     cost_states, cost_controls = system.cost_gradients(rollout.states[..., :-1, :], rollout.controls)
@@ -103,7 +108,7 @@ def gradients_along(system: System, rollout: Rollout, feedback: Float[np.ndarray
         gradient[..., step, :] = cost_controls[..., step, :] + np.einsum("...ij,...i->...j", over_control, adjoint)
         adjoint = cost_states[..., step, :] + np.einsum("...ij,...i->...j", over_state, adjoint)
         if feedback is not None:
-            adjoint = adjoint + gradient[..., step, :] @ feedback
+            adjoint = adjoint + np.einsum("...ux,...u->...x", feedback, gradient[..., step, :])
     over_feedback = None
     if feedback is not None:
         over_feedback = np.einsum("...hu,...hx->...ux", gradient, rollout.states[..., :-1, :])
@@ -128,5 +133,5 @@ def _check(system: System, start: np.ndarray, controls: np.ndarray, feedback: np
         raise ValueError(f"the start must end in an axis of {states} states, got shape {start.shape}")
     if controls.ndim < 2 or controls.shape[-1] != inputs:
         raise ValueError(f"controls must be (..., horizon, {inputs}), got shape {controls.shape}")
-    if feedback is not None and feedback.shape != (inputs, states):
+    if feedback is not None and feedback.shape[-2:] != (inputs, states):
         raise ValueError(f"the feedback matrix must be ({inputs}, {states}), got shape {feedback.shape}")

@@ -19,11 +19,16 @@ PARAMETRISATIONS: Final = ("controls", "feedback", "start")
 """Possible meanings of theta in a `ReferenceObjective`."""
 
 Start = tuple[float, ...] | Callable[[Key[Array, ""]], Float[Array, " states"]]
+Theta = Float[Array, "*each params"]
+"""One theta, or one for each sample."""
 
 
 @runtime_checkable
 class Reference(PairedObjective, Protocol):
-    """An Objective with hand-written derivatives, which can also be evaluated without noise."""
+    """An Objective with hand-written derivatives, which can also be evaluated without noise.
+
+    Wherever it takes keys, theta may be one for each of them.
+    """
 
     def value_and_gradient(
         self, theta: Float[Array, " params"], key: Key[Array, ""]
@@ -31,7 +36,7 @@ class Reference(PairedObjective, Protocol):
         """Zero-noise cost and its gradient, from the initial state that `key` draws."""
         ...
 
-    def observe(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> dict[str, np.ndarray]:
+    def observe(self, theta: Theta, keys: Key[Array, " samples"]) -> dict[str, np.ndarray]:
         """Metrics of rollouts beside the cost, by name and sample; empty if there are none."""
         ...
 
@@ -83,34 +88,30 @@ class ReferenceObjective:
         states, controls = self.system.num_states, self.system.num_controls
         return {"controls": self.horizon * controls, "feedback": controls * states, "start": states}[self.parametrises]
 
-    def evaluate(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> Evaluation:
+    def evaluate(self, theta: Theta, keys: Key[Array, " samples"]) -> Evaluation:
         return self._evaluation(theta, *self._draw(keys))
 
-    def evaluate_pair(
-        self, theta: Float[Array, " params"], keys: Key[Array, " samples"]
-    ) -> tuple[Evaluation, Evaluation]:
+    def evaluate_pair(self, theta: Theta, keys: Key[Array, " samples"]) -> tuple[Evaluation, Evaluation]:
         starts, noise = self._draw(keys)
         return self._evaluation(theta, starts, noise), self._evaluation(theta, starts, -noise)
 
-    def evaluate_steps(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> StepEvaluation:
+    def evaluate_steps(self, theta: Theta, keys: Key[Array, " samples"]) -> StepEvaluation:
         return self._steps(theta, *self._draw(keys))[0]
 
-    def evaluate_step_pair(
-        self, theta: Float[Array, " params"], keys: Key[Array, " samples"]
-    ) -> tuple[StepEvaluation, StepEvaluation]:
+    def evaluate_step_pair(self, theta: Theta, keys: Key[Array, " samples"]) -> tuple[StepEvaluation, StepEvaluation]:
         starts, noise = self._draw(keys)
         return self._steps(theta, starts, noise)[0], self._steps(theta, starts, -noise)[0]
 
-    def differentiate(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> Differentiation:
+    def differentiate(self, theta: Theta, keys: Key[Array, " samples"]) -> Differentiation:
         starts, noise = self._draw(keys)
         value, gradient = self._differentiate(theta, starts, noise)
         return Differentiation(jnp.asarray(value), jnp.asarray(gradient.reshape(len(noise), -1)))
 
-    def differentiate_corrected(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> Differentiation:
+    def differentiate_corrected(self, theta: Theta, keys: Key[Array, " samples"]) -> Differentiation:
         """`differentiate`: an analytic system has no onset term, its springs begin without a jump."""
         return self.differentiate(theta, keys)
 
-    def differentiate_steps(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> StepDifferentiation:
+    def differentiate_steps(self, theta: Theta, keys: Key[Array, " samples"]) -> StepDifferentiation:
         starts, noise = self._draw(keys)
         start, controls, *feedback = self._policy(theta, starts, noise)
         rollout = roll_out(self.system, start, controls, *feedback)
@@ -120,14 +121,14 @@ class ReferenceObjective:
             jnp.asarray(rollout.value), jnp.asarray(over_noise), self._policy_jacobian(rollout.states)
         )
 
-    def linearise(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> Linearisation:
+    def linearise(self, theta: Theta, keys: Key[Array, " samples"]) -> Linearisation:
         steps, rollout, feedback = self._steps(theta, *self._draw(keys))
         before, samples = rollout.states[:, :-1], len(rollout.value)
         over_cost = self.system.cost_gradients(before, rollout.controls)
         over_step = self.system.jacobians(before, rollout.controls)
         over_final = self.system.final_gradient(rollout.states[:, -1])
         shape = (samples, self.horizon, self.system.num_controls, self.system.num_states)
-        over_policy = None if feedback is None else jnp.broadcast_to(feedback, shape)
+        over_policy = None if feedback is None else jnp.broadcast_to(feedback[..., None, :, :], shape)
         size = self.system.num_states
         over_start = jnp.broadcast_to(jnp.eye(size), (samples, size, size)) if self.parametrises == "start" else None
         return Linearisation(
@@ -141,7 +142,7 @@ class ReferenceObjective:
             start_jacobian=over_start,
         )
 
-    def observe(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> dict[str, np.ndarray]:
+    def observe(self, theta: Theta, keys: Key[Array, " samples"]) -> dict[str, np.ndarray]:
         if self.metrics is None:
             return {}
         return self.metrics(roll_out(self.system, *self._policy(theta, *self._draw(keys))).states)
@@ -177,8 +178,7 @@ class ReferenceObjective:
         value, baseline = (jnp.asarray(np.broadcast_to(part, noise.shape[:2])) for part in to_go)
         score = jnp.asarray(noise_score(jnp.asarray(noise), self.sigma, self.noise))
         steps = StepEvaluation(value, baseline, score, self._policy_jacobian(rollout.states))
-        gains = np.asarray(theta).reshape(self.system.num_controls, -1) if self.parametrises == "feedback" else None
-        return steps, rollout, gains
+        return steps, rollout, self._shaped(theta) if self.parametrises == "feedback" else None
 
     def _policy_jacobian(self, states):
         """D_theta (Theta x) of every step; None if the noise is added to theta itself."""
@@ -199,15 +199,19 @@ class ReferenceObjective:
 
     def _policy(self, theta, start, noise):
         """Initial state, open-loop controls, and feedback matrix, as arguments of `roll_out`."""
-        theta = np.asarray(theta)
-        if theta.shape != (self.num_params,):
-            raise ValueError(f"theta must have shape ({self.num_params},), got {theta.shape}")
-        controls = (self.horizon, self.system.num_controls)
+        shaped = self._shaped(theta)
         if self.parametrises == "start":
-            return theta + noise[..., 0, :], np.zeros(controls)
+            return shaped + noise[..., 0, :], np.zeros((self.horizon, self.system.num_controls))
         if self.parametrises == "controls":
-            return start, theta.reshape(controls) + noise
-        return start, noise, theta.reshape(self.system.num_controls, self.system.num_states)
+            return start, shaped + noise
+        return start, noise, shaped
+
+    def _shaped(self, theta) -> np.ndarray:
+        """Theta as it enters the policy; one for each sample has an axis of them in front."""
+        states, controls = self.system.num_states, self.system.num_controls
+        shapes = {"start": (states,), "controls": (self.horizon, controls), "feedback": (controls, states)}
+        theta = _checked(theta, self.num_params)
+        return theta.reshape(*theta.shape[:-1], *shapes[self.parametrises])
 
     def _differentiate(self, theta, start, noise):
         value, gradients = value_and_gradients(self.system, *self._policy(theta, start, noise))
@@ -236,40 +240,36 @@ class FunctionObjective:
     def num_params(self) -> int:
         return self.function.num_params
 
-    def evaluate(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> Evaluation:
+    def evaluate(self, theta: Theta, keys: Key[Array, " samples"]) -> Evaluation:
         return self._evaluation(theta, self._noise(keys))
 
-    def evaluate_pair(
-        self, theta: Float[Array, " params"], keys: Key[Array, " samples"]
-    ) -> tuple[Evaluation, Evaluation]:
+    def evaluate_pair(self, theta: Theta, keys: Key[Array, " samples"]) -> tuple[Evaluation, Evaluation]:
         noise = self._noise(keys)
         return self._evaluation(theta, noise), self._evaluation(theta, -noise)
 
-    def evaluate_steps(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> StepEvaluation:
+    def evaluate_steps(self, theta: Theta, keys: Key[Array, " samples"]) -> StepEvaluation:
         """The samples of `evaluate`; there is one step."""
         return _one_step(self.evaluate(theta, keys))
 
-    def evaluate_step_pair(
-        self, theta: Float[Array, " params"], keys: Key[Array, " samples"]
-    ) -> tuple[StepEvaluation, StepEvaluation]:
+    def evaluate_step_pair(self, theta: Theta, keys: Key[Array, " samples"]) -> tuple[StepEvaluation, StepEvaluation]:
         """The samples of `evaluate_pair`; there is one step."""
         plus, minus = self.evaluate_pair(theta, keys)
         return _one_step(plus), _one_step(minus)
 
-    def differentiate(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> Differentiation:
+    def differentiate(self, theta: Theta, keys: Key[Array, " samples"]) -> Differentiation:
         points = self._point(theta) + self._noise(keys)
         return Differentiation(jnp.asarray(self.function.value(points)), jnp.asarray(self.function.gradient(points)))
 
-    def differentiate_corrected(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> Differentiation:
+    def differentiate_corrected(self, theta: Theta, keys: Key[Array, " samples"]) -> Differentiation:
         """`differentiate`: an analytic system has no onset term, its springs begin without a jump."""
         return self.differentiate(theta, keys)
 
-    def differentiate_steps(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> StepDifferentiation:
+    def differentiate_steps(self, theta: Theta, keys: Key[Array, " samples"]) -> StepDifferentiation:
         """The samples of `differentiate`; there is one step."""
         batch = self.differentiate(theta, keys)
         return StepDifferentiation(batch.value, batch.gradient[:, None], None)
 
-    def linearise(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> Linearisation:
+    def linearise(self, theta: Theta, keys: Key[Array, " samples"]) -> Linearisation:
         """f as the final cost of a rollout without steps, whose initial state is theta + w."""
         noise = self._noise(keys)
         samples, size = noise.shape
@@ -293,7 +293,7 @@ class FunctionObjective:
         point = self._point(theta)
         return float(self.function.value(point)), self.function.gradient(point)
 
-    def observe(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> dict[str, np.ndarray]:
+    def observe(self, theta: Theta, keys: Key[Array, " samples"]) -> dict[str, np.ndarray]:
         """Empty: a function has no metric but its value."""
         return {}
 
@@ -307,10 +307,14 @@ class FunctionObjective:
         return self.sigma * np.asarray(batch_noise(keys, (1, self.num_params), self.noise)[1])[:, 0]
 
     def _point(self, theta) -> np.ndarray:
-        point = np.asarray(theta, float)
-        if point.shape != (self.num_params,):
-            raise ValueError(f"theta must have shape ({self.num_params},), got {point.shape}")
-        return point
+        return _checked(theta, self.num_params)
+
+
+def _checked(theta, size: int) -> np.ndarray:
+    theta = np.asarray(theta, float)
+    if theta.ndim > 2 or theta.shape[-1:] != (size,):
+        raise ValueError(f"theta must have shape ({size},), got {theta.shape}")
+    return theta
 
 
 def _one_step(batch: Evaluation) -> StepEvaluation:

@@ -10,7 +10,7 @@ import dataclasses
 import math
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from functools import cached_property, partial
@@ -22,8 +22,10 @@ import numpy as np
 from jaxtyping import Array, Float, Key
 
 from estimators import Estimator, Objective, draw
+from estimators.estimator import draw_at, sample_keys
 from mjx_study.compiled import Compiled
 from mjx_study.objective import Simulator, TracedObjective, simulate
+from mjx_study.reference import Reference
 from mjx_study.simulation.contact import ContactModel, soften
 from mjx_study.stopwatch import tell, timed
 from mjx_study.study.iteration import Descent, Record, advance, begin, going, make_optimizer, schedule_factors
@@ -39,6 +41,8 @@ REPORT_EVERY: Final = 10
 """Iterations between reports of progress, which wait for the device."""
 SAVE_SECONDS: Final = 20.0
 """Seconds between checkpoints."""
+TOGETHER: Final = 1000
+"""Rollouts of an analytic system in one batch; more take memory and save little time."""
 
 
 def compute_descents(plan: StudyPlan) -> Callable[..., dict[str, np.ndarray]]:
@@ -137,10 +141,33 @@ class Backend:
             reference = self.task.replace(sigma=float(self._sigma[index])).analytic(
                 model.stiffness * float(self._stiffness[index])
             )
-            drawn = [batches(reference, theta, key) for theta, key in zip(state.theta, keys, strict=True)]
-            return compiled(state, jax.tree.map(lambda *leaves: jnp.stack(leaves), *drawn))
+            count = max(1, TOGETHER // self.samples)
+            parts = [
+                self._together(
+                    estimator.needs, reference, state.theta[first : first + count], keys[first : first + count]
+                )
+                for first in range(0, self.seeds, count)
+            ]
+            return compiled(state, jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts))
 
         return on_host
+
+    def _together(
+        self,
+        needs: Sequence[str],
+        reference: Reference,
+        theta: Float[Array, "seeds params"],
+        keys: Key[Array, " seeds"],
+    ) -> dict[str, Any]:
+        """Batches of some seeds, drawn as one: NumPy's loops over steps are then run once for all of them."""
+        each = jnp.repeat(theta, self.samples, axis=0)
+        drawn = draw_at(needs, reference, each, [jnp.ravel(part) for part in self._sample_keys(keys)])
+        return jax.tree.map(lambda leaf: leaf.reshape(len(theta), self.samples, *leaf.shape[1:]), drawn)
+
+    @cached_property
+    def _sample_keys(self) -> Callable[[Key[Array, " seeds"]], list[Key[Array, "seeds samples"]]]:
+        """`sample_keys` of several seeds."""
+        return jax.jit(jax.vmap(partial(sample_keys, num_samples=self.samples)))
 
     def cost(self, theta: Float[Array, " params"], model: ContactPoint) -> tuple[float, float]:
         """Mean cost with noise at theta, over samples that are the same for every theta, and its standard error."""

@@ -258,3 +258,19 @@ def test_all_kinds_of_batches_agree(name: str):
     for name in ESTIMATORS:
         estimator = make_estimator(name, gamma=1.0, sigma=objective.sigma, max_norm=1.0, window=2)
         assert np.all(np.isfinite(estimator(batches).mean)), name
+
+
+@table
+def test_theta_may_be_one_for_each_sample(name: str):
+    """As if each were asked for alone, with its own sample."""
+    objective = OBJECTIVES[name]
+    thetas = point(objective) * jnp.array([[1.0], [-0.5], [2.0]])
+    for oracle in ORACLES.values():
+        method = getattr(objective, oracle.method)
+        alone = [method(theta, key[None]) for theta, key in zip(thetas, keys(3), strict=True)]
+        expected = jax.tree.map(lambda *parts: np.concatenate(parts), *alone)
+        jax.tree.map(
+            lambda one, other: np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-12),
+            method(thetas, keys(3)),
+            expected,
+        )
