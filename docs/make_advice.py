@@ -212,7 +212,13 @@ def table(results: list[dict[str, Any]]) -> str:
         row = [f"{what}: {names}", len(some), len(some) - len(decided), f"{sum(good)} of {len(good)}"]
         row += [f"{share:.0%} ({low:.0%} to {high:.0%})", max(each["factor"] for each in decided)]
         lines.append(f"| {' | '.join(map(str, row))} |")
-    return "\n".join([*lines, "", f"*{len(results)} of the {len(list(cases()))} cases of the script were run.*"])
+    factors = [each["factor"] for each in results]
+    within, worst = sum(each <= FACTOR for each in factors), max(factors)
+    note = (
+        f"{len(results)} of the {len(list(cases()))} cases of the script were run. By the factor without its interval, "
+    )
+    note += f"{within} of {len(results)} are within two, undecided ones included; the largest is {worst}."
+    return "\n".join([*lines, "", f"*{note}*"])
 
 
 def write_page() -> None:

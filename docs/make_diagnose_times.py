@@ -5,6 +5,7 @@
 Each file is diagnosed twice, in processes of their own; the first starts with an empty compilation cache.
 """
 
+import json
 import os
 import resource
 import subprocess
@@ -19,7 +20,7 @@ import mujoco
 def run(path: Path, cache: str) -> tuple[float, float, subprocess.CompletedProcess[str]]:
     """Minutes of the wall clock and of the processor."""
     before, begun = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
-    command = [sys.executable, "-m", "mjx_study", "diagnose", str(path), "--devices", "1"]
+    command = [sys.executable, "-m", "mjx_study", "diagnose", str(path), "--devices", "1", "--json"]
     done = subprocess.run(command, capture_output=True, text=True, env=os.environ | {"XDG_CACHE_HOME": cache})
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     computed = after.ru_utime - before.ru_utime + after.ru_stime - before.ru_stime
@@ -27,18 +28,21 @@ def run(path: Path, cache: str) -> tuple[float, float, subprocess.CompletedProce
 
 
 def row(path: Path) -> str:
-    """A line of the table; what came of it is the advice, or the refusal."""
+    """A line of the table; what came of it is the advice, or the refusal.
+
+    Raises:
+        RuntimeError: it ended with a traceback.
+    """
     with tempfile.TemporaryDirectory() as cache:
         cold = run(path, cache)
+        if "Traceback" in cold[2].stderr:
+            raise RuntimeError(cold[2].stderr)
         if not cold[2].stdout:
             return f"| `{path.name}` | | | | | {cold[2].stderr.strip().splitlines()[-1]} |"
         *warm, done = run(path, cache)
     times = [f"{computed:.1f} ({wall:.1f})" for wall, computed in (cold[:2], warm)]
-    page = done.stdout.splitlines()
-    samples = page[1].rpartition(", ")[2].removesuffix(" samples")
-    advice = page[page.index("advice") + 1].strip()
-    freedoms = mujoco.MjModel.from_xml_path(str(path)).nv
-    return f"| `{path.name}` | {freedoms} | {' | '.join(times)} | {samples} | {advice} |"
+    found, freedoms = json.loads(done.stdout), mujoco.MjModel.from_xml_path(str(path)).nv
+    return f"| `{path.name}` | {freedoms} | {' | '.join(times)} | {found['samples']} | {found['advice'][0]} |"
 
 
 def main() -> None:

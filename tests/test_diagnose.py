@@ -8,6 +8,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 
@@ -15,6 +16,8 @@ from estimators import Differentiation, Evaluation, FirstOrder, ZerothOrder, est
 from mjx_study import cli
 from mjx_study.cli import options
 from mjx_study.diagnose import Diagnosis, Measured, Touch, diagnose
+from mjx_study.diagnose.measurement import affordable, chunk_of
+from mjx_study.gradcheck.finding import Finding
 from mjx_study.gradcheck.mean import along_means
 from mjx_study.objective import Simulator
 from mjx_study.study.quadrature import Line, grid, means
@@ -77,7 +80,7 @@ def test_every_statement_has_a_command_and_the_page_is_complete(found: Diagnosis
     assert {command[0] for command in commands} == {"gradcheck", "compare"}
     for command in commands:
         assert cli.parser(command[0]).parse_args(command).task == found.subject
-    text = "\n".join(page)
+    text = " ".join(" ".join(page).split())
     assert "plain first order is biased by" in text and "the onset term corrects that" in text
     assert f"take {found.best.estimator}" in text and max(map(len, page)) < 200
     document = found.as_json()
@@ -111,7 +114,10 @@ def test_the_commands_on_the_page_repeat_it(
     name, horizon = str(HELD_OUT / f"{model}.xml"), 60
     told = diagnose(name, make_task(name, horizon=horizon), samples=60, options=f" --horizon {horizon}")
     commands = [line.removeprefix("  > mjx-study ").split() for line in told.lines() if line.startswith("  > ")]
-    steps, means, batches = commands[:3]
+    steps, means = (command for command in commands if command[0] == "gradcheck")
+    batches = next(
+        command for command in commands if command[0] == "compare" and any("zobg" in part for part in command)
+    )
 
     def document(command: list[str]) -> tuple[int, Any]:
         code = cli.main([*command, "--json"])
@@ -134,6 +140,18 @@ def test_the_commands_on_the_page_repeat_it(
 def planted(**changes: object) -> Measured:
     numbers = {"estimator": "fobg", "variance": 4.0, "lower": 3.0, "upper": 5.0, "seconds": 0.01}
     return Measured(**(numbers | {"paths": (), "verdict": "unbiased", "bias": 0.0, "norm": 2.0, "lost": 0} | changes))  # type: ignore[arg-type]
+
+
+def test_samples_fill_whole_calls_of_what_a_minute_has_room_for() -> None:
+    """Three paths of nine nodes and theta itself: thirty calls, at least."""
+    assert affordable(1e-3, 32) == 500 and affordable(100.0, 8) == affordable(2.0, 8) == 3 * 8 - 1
+    assert affordable(0.5, 8) == 4 * 3 * 8 - 1
+
+
+def test_calls_of_large_models_are_short() -> None:
+    """A call computes all of its samples, so that one of many would take minutes where few are asked for."""
+    quadruped = Path(mujoco.__file__).parent / "mjx" / "test_data" / "barkour_v0" / "assets" / "barkour_v0_mjx.xml"
+    assert chunk_of(make_task("momentum_transfer"), 500) == 32 and chunk_of(make_task(str(quadruped)), 500) == 8
 
 
 def test_the_error_after_a_second_is_that_of_as_many_samples() -> None:
@@ -185,7 +203,8 @@ def test_when_the_onset_term_is_not_to_be_trusted(
     """Unless its mean was measured to be right."""
     onsets = found.onsets | {"onset_spread": spread, "onset_strength": strength}
     right = dataclasses.replace(found, onsets=onsets)
-    assert not [text for text, _ in right._advice() if "narrow" in text or "can be off" in text]
+    told = [text for text, _ in right._advice() if "narrow" in text or "can be off" in text]
+    assert all("right here, by the check of the mean" in text for text in told)
     undecided = tuple(dataclasses.replace(each, verdict="undecided") for each in found.estimators)
     told = [text for text, _ in dataclasses.replace(right, estimators=undecided)._advice()]
     assert any(expected in text for text in told) if expected else len(told) == 1
@@ -206,6 +225,39 @@ def test_a_bias_that_no_jump_in_force_explains_is_told(found: Diagnosis) -> None
     told = [text for text, _ in dataclasses.replace(found, touches=smooth)._advice()]
     assert any("though force sets in without a jump" in text for text in told)
     assert not any("sets in with a jump" in text or "solimp" in text for text in told)
+
+
+def test_nothing_is_advised_where_no_gradient_shows(found: Diagnosis) -> None:
+    unseen = tuple(dataclasses.replace(each, norm=0.0, verdict="undecided") for each in found.estimators)
+    ((text, flags),) = dataclasses.replace(found, estimators=unseen)._advice()
+    assert text.startswith("no estimator can be advised") and not flags
+
+
+def test_a_bias_that_stays_is_not_averaged_away(found: Diagnosis) -> None:
+    """10 % with a bias of 8 % needs variance / 0.06^2 samples, and cannot be had with one of 30 %."""
+    some = found.best.variance / (0.06 * found.norm) ** 2
+
+    def biased(by: float) -> Diagnosis:
+        best = dataclasses.replace(found.best, bias=by * found.norm)
+        return dataclasses.replace(found, estimators=(best, *found.estimators[1:]))
+
+    assert biased(0.08).samples_needed == pytest.approx(some) and biased(0.3).samples_needed == math.inf
+    assert next(biased(0.3)._advice())[0].endswith("its bias of 30% stays, however many samples")
+
+
+def test_a_solver_that_stops_early_is_not_called_a_wrong_derivative(found: Diagnosis) -> None:
+    finding = Finding("mjcf", "project", "unconverged", (), "", ())
+    early = dataclasses.replace(found, derivatives=dataclasses.replace(found.derivatives, findings=(finding,)))
+    page = "\n".join(early.lines())
+    assert "NOT RIGHT: the derivative is taken at another point, because the solver stopped early" in page
+    assert "do not trust a first-order estimate" in page and early.as_json()["derivatives"] == "unconverged"
+
+
+def test_an_interval_without_an_upper_end_has_none(found: Diagnosis) -> None:
+    open_ended = tuple(dataclasses.replace(each, upper=1e30) for each in found.estimators)
+    page = dataclasses.replace(found, estimators=open_ended).lines()
+    assert len([line for line in page if " at least " in line]) == len(found.estimators)
+    assert not any(" at least " in line for line in found.lines())
 
 
 def test_an_unstable_step_is_told_first(found: Diagnosis) -> None:

@@ -18,7 +18,7 @@ columns of the contacts:
 The error after a second of computing is that of one gradient, of as many samples as a second has room for on this
 machine: bias and standard deviation, relative to the gradient. "mean" says whether an estimator's mean integrates to
 the difference of the mean cost along a path, as gradcheck --mean does: right within 5 %, biased by so much, or
-undecided. Without --samples there are 500, or as many as a minute has room for, but 20 at least. Exit code 1 if a
+undecided. Without --samples there are 500, or as many as a minute has room for, but 23 at least. Exit code 1 if a
 derivative is wrong.
 """
 

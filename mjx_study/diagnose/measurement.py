@@ -1,0 +1,215 @@
+"""The five estimators under one contact model: their variances, times and means.
+
+The error of an estimator after a second of computing is sqrt(bias^2 + variance x seconds per sample), relative to the
+gradient: the bias is what the estimator's mean misses of the mean cost's slope along a path (`estimators.circulation`),
+where something is seen.
+"""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from typing import Any, Final
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from estimators import ORACLES, Circulation, Estimator, make_estimator, oracles_of, variance_interval
+from estimators.mean_check import NODES
+from mjx_study.gradcheck.mean import MOST_PATHS, along_means, reach_of, unmixed
+from mjx_study.objective import MjxObjective, Simulator, chunk_for
+from mjx_study.runtime import precision
+from mjx_study.simulation.contact import ContactModel
+from mjx_study.simulation.scene import num_constraint_rows
+from mjx_study.study.sampling import cell_keys, draw_batches, unconverged
+from mjx_study.study.tally import onset_numbers
+from mjx_study.study.variables import ONSETS
+from mjx_study.tasks.task import Task
+
+ESTIMATORS: Final = ("zobg", "fobg", "aobg", "fobg_onset", "aobg_onset")
+SAMPLES: Final = 500
+"""Of each batch, where time allows."""
+BUDGET: Final = 60.0
+"""Time for all batches, compilation apart [s]."""
+CHUNKS: Final = (32, 8)
+"""Samples in a call of a program on a CPU, of a small model and of a large one: a call takes the time of all of them,
+however few are asked for."""
+SMALL: Final = (8, 32)
+"""Most degrees of freedom and constraint rows of a small model."""
+ACCURATE: Final = 0.1
+"""Relative error that a number of samples is given for."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Measured:
+    """An estimator on one batch.
+
+    Attributes:
+        variance, lower, upper: of one sample, with its 95 % interval [gradient^2].
+        seconds: computing time of a sample [s].
+        paths: checks of its mean along them; none of zeroth order, which has no bias.
+        verdict: of its mean: unbiased by theory, or right, biased or undecided by the check.
+        bias: what the mean misses along the paths, beyond one standard error [gradient].
+        norm: of the mean, without what noise adds to it [gradient].
+        lost: samples that are not finite and were left out.
+    """
+
+    estimator: str
+    variance: float
+    lower: float
+    upper: float
+    seconds: float
+    paths: tuple[Circulation, ...]
+    verdict: str
+    bias: float
+    norm: float
+    lost: int
+
+    def error(self, norm: float, variance: float | None = None) -> float:
+        """Error after a second of computing, relative to a gradient of this norm."""
+        spread = (self.variance if variance is None else variance) * self.seconds
+        return math.hypot(self.bias, math.sqrt(spread)) / norm if norm > 0 else math.inf
+
+
+@dataclasses.dataclass(frozen=True)
+class Measurement:
+    """The estimators under one contact model.
+
+    Attributes:
+        onsets: `mjx_study.study.variables.ONSETS` of the first-order batch.
+        unconverged: rollouts in which the solver did not converge.
+        estimators: best first.
+    """
+
+    samples: int
+    onsets: dict[str, float]
+    unconverged: int
+    estimators: tuple[Measured, ...]
+
+    @property
+    def lost(self) -> int:
+        """Samples that are not finite, of the batch with the most."""
+        return max(each.lost for each in self.estimators)
+
+    @property
+    def surest(self) -> Measured:
+        """The estimator of least variance of those without a bias that is seen."""
+        return min((each for each in self.estimators if each.verdict != "biased"), key=lambda each: each.variance)
+
+    @property
+    def norm(self) -> float:
+        """Norm of the gradient; its standard error where that is larger."""
+        return max(self.surest.norm, self._uncertainty)
+
+    @property
+    def _uncertainty(self) -> float:
+        return math.sqrt(self.surest.variance / self.samples)
+
+    @property
+    def _too_small(self) -> bool:
+        """Whether the gradient cannot be told from 0."""
+        return self.surest.norm < 2 * self._uncertainty
+
+    @property
+    def best(self) -> Measured:
+        """The estimator of least error after a second of computing."""
+        return self.estimators[0]
+
+    @property
+    def samples_needed(self) -> float:
+        """By the best, for a relative error of `ACCURATE`; infinite if its bias alone is larger."""
+        left = (ACCURATE * self.norm) ** 2 - self.best.bias**2
+        return self.best.variance / left if left > 0 else math.inf
+
+
+def estimators_of(task: Task) -> list[Estimator]:
+    return [make_estimator(name, gamma=task.defaults.gamma, sigma=task.sigma) for name in ESTIMATORS]
+
+
+def chunk_of(task: Task, samples: int) -> int:
+    """Samples in a call of a program."""
+    devices, size = jax.local_devices(), (task.scene.host.nv, num_constraint_rows(task.scene.template))
+    large = any(number > most for number, most in zip(size, SMALL, strict=True))
+    most = CHUNKS[large] if devices[0].platform == "cpu" else samples + 1
+    return min(chunk_for(samples, devices, [task]), most)
+
+
+def affordable(seconds: float, chunk: int) -> int:
+    """Samples that `BUDGET` has room for, at theta and along all paths; those of one call a path at least.
+
+    Args:
+        seconds: of one call of all programs [s].
+        chunk: samples in it, a baseline included.
+    """
+    calls = max(1, round(BUDGET / (seconds * MOST_PATHS * (NODES + 1))))
+    return min(SAMPLES, MOST_PATHS * chunk * calls - 1)
+
+
+def measure(
+    simulator: Simulator, contact: ContactModel | None, samples: int | None = None, seed: int = 0
+) -> Measurement:
+    """The estimators at the task's theta, without the contacts and the derivatives of a step.
+
+    Args:
+        simulator: what it has compiled serves every contact model.
+        contact: the contact model; None for the MJCF's own.
+        samples: see `diagnose`.
+        seed: of all randomness.
+    """
+    task = simulator.task
+    chosen = estimators_of(task)
+    oracles, objective, keys = oracles_of(chosen, "evaluation"), simulator.objective(contact), cell_keys(seed, 1)
+
+    def drawn(count: int):
+        return draw_batches(objective, task.theta, keys, oracles, count, slice(1))
+
+    drawn(1)  # compiles
+    if samples is None:
+        samples = affordable(sum(drawn(1)[1].values()), simulator.chunk_size)
+    batches, seconds, residuals = drawn(samples)
+    batches = jax.tree.map(lambda leaf: leaf[0], batches)
+    found = _measure(chosen, objective, batches, seconds, samples, seed)
+    events = np.asarray(batches["corrected"].events).reshape(-1, len(ONSETS))
+    onsets = dict(zip(ONSETS, onset_numbers(events).tolist(), strict=True))
+    unsolved = max(unconverged(each, precision()) for each in residuals.values())
+    unordered = Measurement(samples, onsets, unsolved, tuple(found))
+    order = sorted(found, key=lambda each: each.error(unordered.norm))
+    return dataclasses.replace(unordered, estimators=tuple(order))
+
+
+def _measure(
+    chosen: Sequence[Estimator],
+    objective: MjxObjective,
+    batches: Any,
+    seconds: dict[str, float],
+    samples: int,
+    seed: int,
+) -> list[Measured]:
+    """The estimators on their batches, and their means along the paths of `along_means`."""
+    task, estimates = objective.simulator.task, [estimator(batches) for estimator in chosen]
+    reach = reach_of(task)
+    first = [each for each in chosen if any(ORACLES[oracle].order for oracle in each.needs)]
+    found = along_means(first, objective, task.theta, reach, unmixed(chosen, batches), samples, seed)
+    checks: dict[Estimator, tuple[Circulation, ...]] = dict(zip(first, zip(*found, strict=True), strict=True))
+    measured = []
+    for estimator, estimate in zip(chosen, estimates, strict=True):
+        lower, upper = variance_interval(estimate, 0.95)
+        squared = float(jnp.sum(estimate.mean**2)) - float(estimate.variance) / samples
+        paths = checks.get(estimator, ())
+        verdicts = {each.verdict() for each in paths}
+        missed = sum(max(0.0, float(each.gap**2 - each.standard_error**2)) for each in paths)
+        measured.append(
+            Measured(
+                estimator=estimator.name,
+                variance=float(estimate.variance),
+                lower=float(lower),
+                upper=float(upper),
+                seconds=sum(seconds[oracle] for oracle in estimator.needs) / samples,
+                paths=paths,
+                verdict=next((each for each in ("biased", "undecided", "right") if each in verdicts), "unbiased"),
+                bias=math.sqrt(missed) / (2 * reach),
+                norm=math.sqrt(max(squared, 0.0)),
+                lost=int(estimate.num_nonfinite),
+            )
+        )
+    return measured

@@ -1,0 +1,245 @@
+"""The page of a diagnosis, and its advice."""
+
+import dataclasses
+import math
+import shlex
+import textwrap
+from collections.abc import Iterator
+from typing import Any, Final
+
+from mjx_study.diagnose.measurement import ACCURATE, SAMPLES, Measurement
+from mjx_study.diagnose.touch import Touch
+from mjx_study.gradcheck import GradcheckReport
+from mjx_study.gradcheck.diagnosis import MEANING
+from mjx_study.gradcheck.mean import MEANS
+from mjx_study.runtime import environment
+from mjx_study.study.dataset import as_plain
+from mjx_study.study.findings import NARROW, NOTABLE, SHARE_OFF, STRONG, linear_error
+from mjx_study.table import format_table
+from mjx_study.tasks.task import Task
+
+FEW: Final = 100
+"""Samples below which the page says so."""
+SMOOTH: Final = 0.01
+"""Share of the approach speed lost in the first step below which force sets in without a jump."""
+WIDTHS: Final = 3.0
+"""Steps' travel over which an impedance should rise."""
+LEGEND: Final = (
+    "  zobg: zeroth order; fobg: first order; aobg: both, weighted; _onset: with a term for contact that begins"
+)
+BEYOND: Final = 100.0
+"""Upper end of an interval of a relative error from which it says nothing."""
+SHOWN: Final = 6
+"""Contacts in the text, the least resolved first."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Diagnosis(Measurement):
+    """Everything that was measured; `lines` is the page.
+
+    Attributes:
+        subject: as it was named.
+        task: what was studied.
+        contact: label of the contact model.
+        touches: contacts that begin without noise.
+        derivatives: the gradient check.
+        warnings: about the contact model.
+        options: contact options, as a command has them.
+    """
+
+    subject: str
+    task: Task
+    contact: str
+    touches: tuple[Touch, ...]
+    derivatives: GradcheckReport
+    warnings: tuple[str, ...]
+    options: str
+
+    def as_json(self) -> dict[str, Any]:
+        shown = [
+            {
+                "estimator": each.estimator,
+                "variance": each.variance,
+                "seconds_per_sample": each.seconds,
+                "mean": each.verdict,
+                "bias": each.bias / self.norm,
+                "error_after_a_second": each.error(self.norm),
+            }
+            for each in self.estimators
+        ]
+        document = {
+            "subject": self.subject,
+            "cost": self.task.description,
+            "contact": self.contact,
+            "samples": self.samples,
+            "touches": [dataclasses.asdict(each) for each in self.touches],
+            **self.onsets,
+            "nonfinite": self.lost,
+            "unconverged": self.unconverged,
+            "derivatives": "right" if self.derivatives.passed else self._failure,
+            "unexercised": self.derivatives.unexercised,
+            "estimators": shown,
+            "best": self.best.estimator,
+            "gradient_norm": self.norm,
+            "samples_needed": self.samples_needed,
+            "warnings": [*self.warnings, *self._cautions()],
+            "advice": [text for text, _ in self._advice()],
+            "environment": environment(),
+        }
+        return as_plain(document)
+
+    def lines(self) -> list[str]:
+        task, command = self.task, f"mjx-study {{}} {shlex.quote(self.subject)}{self.options}"
+        lines = [f"{self.subject}: {task.description or task.name}", f"contact {self.contact}, {self.samples} samples"]
+        lines += [f"warning: {text}" for text in (*self.warnings, *self._cautions())]
+        lines += ["", "contact", *self._contact_lines()]
+        if self.onsets.get("onsets"):
+            lines += [f"  > {command.format('compare')} --estimators fobg_onset --samples {self.samples} --json"]
+        state = (
+            "every derivative that exists is right"
+            if self.derivatives.passed
+            else f"NOT RIGHT: {MEANING[self._failure]}"
+        )
+        missing = ", where it was exercised" if self.derivatives.passed and self.derivatives.unexercised else ""
+        lines += ["", "derivatives of a step", f"  {state}{missing}", f"  > {command.format('gradcheck')}"]
+        batch = f"--estimators {','.join(each.estimator for each in self.estimators)} --samples {self.samples}"
+        lines += ["", "estimators, by their relative error after a second of computing", *self._estimator_lines()]
+        lines += [f"  > {command.format('gradcheck')} --mean --direction {MEANS} {batch}"]
+        lines += [f"  > {command.format('compare')} {batch}"]
+        lines += ["", "advice"]
+        for text, flags in self._advice():
+            lines += textwrap.wrap(text, 100, initial_indent="  ", subsequent_indent="    ")
+            lines += [f"  > {command.format('compare')} {flags}"] if flags else []
+        return lines
+
+    def _contact_lines(self) -> list[str]:
+        found = self.onsets.get("onsets", 0)
+        lines = [f"  contacts that begin in a rollout with noise: {found / self.samples:.2g}"]
+        if found:
+            lines += [
+                f"  step at which the first begins: standard deviation {self.onsets['onset_spread']:.2g}",
+                f"  approach speed that a contact takes in its first step: {self.onsets['onset_strength']:.0%}",
+            ]
+        if not self.touches:
+            return [*lines, "  contacts that begin in the rollout without noise: 0"]
+        worst = sorted(self.touches, key=lambda each: (each.stable, -each.jump, -each.travel))
+        header = ["  without noise", "t [s]", "v [m/s]", "h b", "h^2 k", "h v / width", "impedance", "step"]
+        rows = [
+            [
+                f"  {each.pair}",
+                f"{each.time:.3g}",
+                *(f"{number:.2g}" for number in (each.speed, each.damping, each.stiffness, each.travel)),
+                f"{each.impedance:g}",
+                "stable" if each.stable else "UNSTABLE",
+            ]
+            for each in worst[:SHOWN]
+        ]
+        more = len(worst) - len(rows)
+        return [*lines, *format_table(rows, header), *([f"  and {more} more"] if more else [])]
+
+    def _estimator_lines(self) -> list[str]:
+        rows = []
+        for each in self.estimators:
+            low, high = (each.error(self.norm, end) for end in (each.lower, each.upper))
+            rows.append(
+                [
+                    f"  {each.estimator}",
+                    f"{each.error(self.norm):.2%}",
+                    f"{low:.2%} to {high:.2%}" if high < BEYOND else f"at least {low:.2%}",
+                    f"off by {each.bias / self.norm:.1%}" if each.verdict == "biased" else each.verdict,
+                    f"{1e3 * each.seconds:.3g}",
+                ]
+            )
+        return [*format_table(rows, ["  estimator", "error", "variance: 95 %", "mean", "ms a sample"]), LEGEND]
+
+    @property
+    def _failure(self) -> str:
+        """Verdict on the gravest of the derivatives that are not right."""
+        return next((finding.verdict for finding in self.derivatives.findings if finding.fails), "wrong")
+
+    def _cautions(self) -> Iterator[str]:
+        """What makes numbers on the page mean less."""
+        if self.lost:
+            yield f"{self.lost} samples are not finite and were left out"
+        if self.unconverged:
+            yield (
+                f"in {self.unconverged} rollouts the contact solver did not converge: their derivatives are not those "
+                "of what is simulated; raise iterations and ls_iterations in the MJCF's <option>"
+            )
+        if unstable := [each for each in self.touches if not each.stable]:
+            yield f"the step in contact is unstable: {unstable[0].pair}, h^2 k = {unstable[0].stiffness:.2g}"
+        if self._too_small:
+            yield (
+                f"the gradient is too small to be told from 0 with {self.samples} samples: errors are relative to "
+                f"{self.norm:.2g}"
+            )
+        if self.samples < FEW:
+            yield f"{self.samples} samples are few: --samples {SAMPLES} takes longer and says more"
+        if undecided := [each.estimator for each in self.estimators if each.verdict == "undecided"]:
+            yield f"the mean of {', '.join(undecided)} could not be judged with {self.samples} samples"
+        if not self.derivatives.passed:
+            yield "derivatives of a step are not right (see below): do not trust a first-order estimate"
+
+    def _advice(self) -> Iterator[tuple[str, str]]:
+        """What to do, each with options of `compare` that show it."""
+        by_name, timestep = {each.estimator: each for each in self.estimators}, self.task.scene.timestep
+        if self._too_small:
+            yield (
+                f"no estimator can be advised: {self.samples} samples do not tell the gradient from 0; take more "
+                "samples, or another start",
+                "",
+            )
+            return
+        if math.isfinite(self.samples_needed):
+            many = _round(self.samples_needed)
+            needed = f"a relative error of {ACCURATE:.0%} needs {many} {'sample' if many == '1' else 'samples'}"
+            needed += f"; its bias of {self.best.bias / self.norm:.1%} stays" if self.best.verdict == "biased" else ""
+        else:
+            needed = f"its bias of {self.best.bias / self.norm:.0%} stays, however many samples"
+        yield f"take {self.best.estimator}; {needed}", ""
+        if not self.onsets.get("onsets"):
+            yield "no contact begins: longer rollouts, more noise or another start would say more", ""
+            return
+        plain, corrected = by_name["fobg"], by_name["fobg_onset"]
+        spread, strength = self.onsets["onset_spread"], self.onsets["onset_strength"]
+        if plain.verdict == "biased":
+            text = f"plain first order is biased by {plain.bias / self.norm:.0%}, "
+            if max([each.jump for each in self.touches] or [strength]) <= SMOOTH:
+                text += "though force sets in without a jump: something else jumps, as where corners and edges touch"
+            elif corrected.verdict == "right":
+                text += "because contact sets in with a jump: the onset term corrects that"
+            else:
+                text += "and contact sets in with a jump, the usual cause"
+            if travel := max((each.speed * timestep for each in self.touches if each.jump > SMOOTH), default=0.0):
+                text += f'; an impedance that rises from 0, solimp="0 0.95 {WIDTHS * travel:.1g}", has no jump'
+            yield text, "--onset linear" if corrected.verdict == "right" else ""
+        if corrected.verdict == "right":
+            if spread < NARROW:
+                text = (
+                    f"the noise is narrow for onset terms (the first contact varies by {spread:.2g} steps, {NARROW:g}"
+                )
+                yield f"{text} are enough in general): right here, by the check of the mean", ""
+            return
+        explained = SHARE_OFF * strength * (plain.bias + corrected.bias)
+        if spread < NARROW:
+            finer = f"a timestep of {timestep * spread / NARROW:.1g} s, or " if spread > 0 else ""
+            yield f"the noise is too narrow for onset terms: take {finer}more noise", ""
+        elif corrected.verdict == "biased" and corrected.bias > explained and strength <= STRONG:
+            yield (
+                f"the onset term leaves a bias of {corrected.bias / self.norm:.0%}, which its own error does not "
+                "explain: corners that turn, edges and contacts that end under load have no term",
+                "",
+            )
+        elif SHARE_OFF * strength > NOTABLE:
+            step = timestep * NOTABLE / (SHARE_OFF * strength)
+            yield (
+                f"{linear_error(strength)}: a timestep of {step:.1g} s brings that down to {NOTABLE:.0%}; the "
+                "error of --onset jump is only of second order in the step",
+                "--onset jump",
+            )
+
+
+def _round(number: float) -> str:
+    """Two significant digits, upwards, with separators."""
+    digits = max(0, math.floor(math.log10(max(number, 1.0))) - 1)
+    return f"{math.ceil(number / 10**digits) * 10**digits:,}"

@@ -1,0 +1,74 @@
+"""Everything that a diagnosis measures, in order."""
+
+from typing import Final
+
+from mjx_study.choices import is_file
+from mjx_study.diagnose.measurement import SAMPLES, chunk_of, estimators_of, measure
+from mjx_study.diagnose.page import Diagnosis
+from mjx_study.diagnose.touch import touches_of
+from mjx_study.gradcheck import GradcheckPlan, gradcheck, plan_gradcheck, plan_scene_gradcheck
+from mjx_study.objective import Simulator
+from mjx_study.study.configuration import Progress
+from mjx_study.study.memory import check_memory
+from mjx_study.tasks.contact_grid import contact_grid
+from mjx_study.tasks.task import Task
+
+STATES: Final = 2
+"""Of the gradient check."""
+
+
+def diagnose(
+    subject: str,
+    task: Task,
+    family: str | None = None,
+    stiffness: float | None = None,
+    *,
+    damping: float | None = None,
+    samples: int | None = None,
+    seed: int = 0,
+    options: str = "",
+    progress: Progress = lambda done, total, what: None,
+) -> Diagnosis:
+    """Measure everything under one contact model.
+
+    Args:
+        subject: as the user named it; of a file the gradient check takes single steps alone.
+        family: contact family; None for the task's main one.
+        stiffness: of the contact [N/m]; None for the task's middle one.
+        damping: of the contact [N s/m]; None for the family's.
+        samples: of each batch, and at each node of the path along which means are checked; None for `SAMPLES`, or as
+            many as `BUDGET` has room for.
+        options: contact options, as a command has them.
+        progress: called before each part.
+
+    Raises:
+        ValueError: there is no such contact model, or the batches do not fit in memory.
+    """
+    family, stiffness = family or task.defaults.main_family, stiffness or task.defaults.middle_stiffness
+    (cell,), warnings = contact_grid(task, [family], [stiffness], damping)
+    check_memory(task, estimators_of(task), samples or SAMPLES)
+    total = 4
+    progress(0, total, "rollout without noise")
+    touches = touches_of(task, cell)
+    progress(1, total, "derivatives of steps")
+    derivatives = gradcheck(_plan(subject, task, family, stiffness, damping, seed))
+    progress(2, total, "estimators")
+    found = measure(Simulator(task, chunk_size=chunk_of(task, samples or SAMPLES)), cell.contact, samples, seed)
+    progress(total, total, "done")
+    return Diagnosis(
+        **vars(found),
+        subject=subject,
+        task=task,
+        contact=cell.label,
+        touches=tuple(touches),
+        derivatives=derivatives,
+        warnings=tuple(warnings),
+        options=options,
+    )
+
+
+def _plan(subject: str, task: Task, family: str, stiffness: float, damping: float | None, seed: int) -> GradcheckPlan:
+    common = {"seed": seed, "damping": damping, "states": STATES}
+    if is_file(subject):
+        return plan_scene_gradcheck(task.scene, [family], None, horizon=task.horizon, **common)
+    return plan_gradcheck(task, [family], [stiffness], **common)
