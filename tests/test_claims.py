@@ -16,7 +16,7 @@ from mjx_study.claims.catalogue import CLAIMS, VERDICTS
 from mjx_study.claims.figure import COLOURS, draw_matrix
 from mjx_study.claims.laboratory import EFFORTS, Laboratory, Statistic, exact, mean_of, ratio_of, share_of
 from mjx_study.claims.ledger import Claim, above, below, deciding_size, interval_of, measure_ledger, within
-from mjx_study.claims.page import markdown, table
+from mjx_study.claims.page import LEGEND, markdown, table
 
 DOCS = Path(__file__).parents[1] / "docs"
 LEVEL = 1 - 0.05 / 200
@@ -161,6 +161,31 @@ def test_the_page_is_what_the_code_says() -> None:
             assert each["verdict"] == claim.criterion.verdict((ends[0], ends[1])), (told["id"], each)
 
 
+def verdicts_of(*paths: Path) -> list[tuple[str, ...]]:
+    """Claim and verdicts of each case, in ledgers of all claims."""
+    ledgers = [json.loads(path.read_text())["claims"] for path in paths]
+    return [
+        (claims[0]["id"], *(each["verdict"] for each in cases))
+        for claims in zip(*ledgers, strict=True)
+        for cases in zip(*(claim["evidence"] for claim in claims), strict=True)
+    ]
+
+
+def test_the_page_names_what_the_quick_ledger_has_otherwise() -> None:
+    pairs = verdicts_of(DOCS / "claims_quick.json", DOCS / "claims.json")
+    told = LEGEND.partition("Both efforts")[2].partition("Not in the ledger")[0]
+    revised = {claim for claim, quick, full in pairs if quick != "undecided" and quick != full}
+    assert {part for part in told.split("`") if part in CLAIMS} == revised
+    assert f"leaves {[quick for _, quick, _ in pairs].count('undecided')} verdicts undecided" in told
+
+
+def test_no_undecided_verdict_lacks_the_sample_size_that_would_decide() -> None:
+    for name in ("claims.json", "claims_quick.json"):
+        document = json.loads((DOCS / name).read_text())
+        evidence = [each for claim in document["claims"] for each in claim["evidence"]]
+        assert all(each["deciding"] > each["samples"] for each in evidence if each["verdict"] == "undecided"), name
+
+
 def test_the_picture_has_a_strip_for_each_verdict() -> None:
     document = json.loads((DOCS / "claims.json").read_text())
     (axes,) = draw_matrix(document).axes
@@ -190,11 +215,6 @@ def test_ids_and_families_are_known(capsys: pytest.CaptureFixture[str]) -> None:
 def test_the_whole_quick_ledger(tmp_path: Path) -> None:
     """The same verdicts as committed, but for those close to a border."""
     assert cli.main(["claims", "--quick", "--output", str(tmp_path)]) == 0
-    found, said = (json.loads((folder / "claims.json").read_text()) for folder in (tmp_path, DOCS))
-    pairs = [
-        (one["verdict"], other["verdict"])
-        for ours, theirs in zip(found["claims"], said["claims"], strict=True)
-        for one, other in zip(ours["evidence"], theirs["evidence"], strict=True)
-    ]
-    assert not [pair for pair in pairs if "undecided" not in pair and pair[0] != pair[1]]
+    pairs = verdicts_of(tmp_path / "claims.json", DOCS / "claims_quick.json")
+    assert not [pair for _, *pair in pairs if "undecided" not in pair and pair[0] != pair[1]]
     assert (tmp_path / "claims.png").stat().st_size > 10_000

@@ -143,7 +143,7 @@ class Landscape:
 
     def _cell(self, x: np.ndarray) -> np.ndarray:
         spacing = self.points[1] - self.points[0]
-        return np.clip(np.rint((x[..., 0] - self.points[0]) / spacing), 0, len(self.points) - 1).astype(int)
+        return np.asarray(np.clip(np.rint((x[..., 0] - self.points[0]) / spacing), 0, len(self.points) - 1), int)
 
 
 @dataclasses.dataclass(frozen=True)
