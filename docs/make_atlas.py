@@ -33,7 +33,7 @@ from estimators.statistics import summarise
 from mjx_study.compiled import Compiled
 from mjx_study.diagnose import touch_of
 from mjx_study.disk import write_whole
-from mjx_study.objective import Simulator, rollout_cost, spread
+from mjx_study.objective import SamplePrograms, rollout_cost, spread
 from mjx_study.reference.noise import batch_noise, noise_score
 from mjx_study.runtime import configure, environment
 from mjx_study.simulation.contact import ContactModel, stable
@@ -187,11 +187,11 @@ class Programs:
 
     def __init__(self, task: Task):
         self.task, self.direction = task, direction_along(task)
-        simulator = Simulator(task, chunk_size=CHUNK)
-        value = simulator.sample_programs["value"]
+        programs = SamplePrograms(task)
+        value = programs.by_name["value"]
 
         def gradients(theta, contact, sigma, key, scale):
-            start, noise = simulator._draw(sigma, key, scale)
+            start, noise = programs.draw(sigma, key, scale)
 
             def cost(theta, weight):
                 value, (_, _, residual, counts) = rollout_cost(task, theta, contact, start, noise, "linear", weight)
