@@ -56,6 +56,7 @@ from mjx_study.simulation.dynamics import (
     step_jacobian,
 )
 from mjx_study.simulation.integration import difference_position, integrate_position
+from mjx_study.simulation.linear_algebra import product
 from mjx_study.simulation.scalars import traced_part
 from mjx_study.simulation.scene import Scene
 
@@ -149,36 +150,34 @@ def corrected_rollout(
     spread, shift, counts = _corrections(scene, model, before, controls, *guards, slots)
     spread, shift = weight * spread, weight * shift
 
-    def follow(state: State, known):
-        index, fixed, fixed_control, fixed_after, over_step, spread, shift = known
+    def follow(change: State, known):
+        index, fixed, fixed_after, over_step, spread, shift = known
+        state = jax.tree.map(lambda value, moved: value + tangent_of(moved), fixed, change)
         control = control_law(index, state)
-        moved = difference_position(scene.host, fixed.qpos, state.qpos)
-        velocity = shift @ (moved - scene.timestep * (state.qvel - fixed.qvel))
-        carried = integrate_position(scene.host, fixed.qpos, velocity, scene.timestep)
-        shifted = State(state.qpos + tangent_of(carried), state.qvel + tangent_of(velocity), state.act, fixed.warmstart)
+        moved = tangent_of(difference_position(scene.host, fixed.qpos, state.qpos))
+        velocity = tangent_along(shift, moved - scene.timestep * change.qvel)
+        carried = tangent_of(integrate_position(scene.host, fixed.qpos, velocity, scene.timestep))
         if jacobian:
-            pairs = (
-                (shifted.qpos, fixed.qpos),
-                (shifted.qvel, fixed.qvel),
-                (shifted.act, fixed.act),
-                (control, fixed_control),
-            )
-            change = over_step @ jnp.concatenate([ours - theirs for ours, theirs in pairs])
-            qvel, act = fixed_after.qvel + change[: scene.host.nv], fixed_after.act + change[scene.host.nv :]
+            inputs = change.qpos + carried, change.qvel + velocity, change.act, tangent_of(control)
+            qvel, act = jnp.split(tangent_along(over_step, jnp.concatenate(inputs)), [scene.host.nv])
         else:
+            shifted = State(state.qpos + carried, state.qvel + velocity, state.act, fixed.warmstart)
             stepped, _ = step(scene, model, shifted, control)
-            qvel, act = fixed_after.qvel + tangent_of(stepped.qvel), fixed_after.act + tangent_of(stepped.act)
-        qvel = qvel + tangent_of(spread @ moved)
-        qpos = fixed_after.qpos + tangent_of(integrate_position(scene.host, shifted.qpos, qvel, scene.timestep))
-        following = State(qpos, qvel, act, fixed_after.warmstart)
-        return following, (following, control)
+            qvel, act = tangent_of(stepped.qvel), tangent_of(stepped.act)
+        qvel = qvel + tangent_along(spread, moved)
+        qpos = integrate_position(
+            scene.host, fixed.qpos + change.qpos + carried, fixed_after.qvel + qvel, scene.timestep
+        )
+        following = State(tangent_of(qpos), qvel, act, jnp.zeros_like(qvel))
+        return following, (following, tangent_of(control))
 
     if not jacobian:
         follow = jax.checkpoint(follow, policy=SAVE_SOLUTION)
-    known = (jnp.arange(horizon), before, controls, after, jacobians, spread, shift)
-    _, (states, controls) = jax.lax.scan(follow, start, known)
+    known = (jnp.arange(horizon), before, after, jacobians, spread, shift)
+    _, (changes, over_controls) = jax.lax.scan(follow, jax.tree.map(tangent_of, start), known)
+    states = jax.tree.map(jnp.add, after, changes)
     trajectory = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), start, states)
-    return trajectory, controls, residuals, counts
+    return trajectory, controls + over_controls, residuals, counts
 
 
 def _corrections(
@@ -194,20 +193,32 @@ def _corrections(
     travel = scene.timestep * speed
     steps, guards, used, found = find_onsets(distance, travel, slots)
 
-    def term(index, guard):
+    def term(index, guard, used):
         pick = lambda leaf: jnp.stack([leaf[index], leaf[index - 1]])  # noqa: E731
         states, inputs = jax.tree.map(pick, before), pick(controls)
         positioned = position_stage(scene, model, before.qpos[index])
         here = distance[index, guard], travel[index, guard]
-        return entry_by_entry(onset_term, model, positioned, states, inputs, guard, *here)
+        terms = entry_by_entry(onset_term, model, positioned, states, inputs, guard, *here)
+        return jax.tree.map(lambda leaf: jnp.where(used, leaf, jnp.zeros_like(leaf)), terms)
 
-    here, previous, strength, narrow = jax.vmap(term)(steps, guards)
-    keep = used[:, None, None]
-    empty = jnp.zeros((len(distance), *here.shape[1:]), here.dtype)
-    spread, shift = (empty.at[steps].add(jnp.where(keep, terms, 0.0)) for terms in (here, previous))
-    filled = jnp.sum(used)
-    strength = jnp.sqrt(jnp.sum(jnp.where(used, strength**2, 0.0)) / jnp.maximum(filled, 1))
-    counts = OnsetCounts(found, jnp.sum(narrow & used), found - filled, strength, first_step(steps, used, here.dtype))
+    def fill(carry):
+        slot, terms = carry
+        some = jnp.minimum(slot + jnp.arange(together), slots - 1)
+        found = jax.vmap(term)(steps[some], guards[some], used[some])
+        return slot + together, jax.tree.map(lambda every, one: every.at[some].set(one), terms, found)
+
+    # Most rollouts have fewer onsets than slots; an accelerator computes all slots in the time of one.
+    together = 1 if jax.default_backend() == "cpu" else slots
+    filled, (size, dtype) = jnp.sum(used), (scene.host.nv, distance.dtype)
+    matrix, number = jnp.zeros((slots, size, size), dtype), jnp.zeros(slots, dtype)
+    terms = matrix, matrix, number, number > 0
+    if slots:
+        _, terms = jax.lax.while_loop(lambda carry: carry[0] < filled, fill, (jnp.zeros_like(filled), terms))
+    here, previous, strength, narrow = terms
+    empty = jnp.zeros((len(distance), size, size), dtype)
+    spread, shift = (empty.at[steps].add(terms) for terms in (here, previous))
+    strength = jnp.sqrt(jnp.sum(strength**2) / jnp.maximum(filled, 1))
+    counts = OnsetCounts(found, jnp.sum(narrow), found - filled, strength, first_step(steps, used, dtype))
     return spread, shift, counts
 
 
@@ -319,9 +330,29 @@ def on_and_off(
     return jax.vmap(advanced)(jnp.array([True, False]))
 
 
+@jax.custom_jvp
 def tangent_of(value: Float[Array, "..."]) -> Float[Array, "..."]:
     """Zero, with the derivative of the value."""
-    return value - jax.lax.stop_gradient(value)
+    return jnp.zeros_like(value)
+
+
+@tangent_of.defjvp
+def _(primals, tangents):
+    return tangent_of(*primals), tangents[0]
+
+
+@jax.custom_jvp
+def tangent_along(matrix: Float[Array, "outputs inputs"], inputs: Float[Array, " inputs"]) -> Float[Array, " outputs"]:
+    """Zero, with the matrix times the derivative of the inputs as its derivative."""
+    return jnp.zeros_like(inputs, shape=matrix.shape[:1])
+
+
+@partial(tangent_along.defjvp, symbolic_zeros=True)
+def _(primals, tangents):
+    change = tangents[1]
+    if isinstance(change, jax.custom_derivatives.SymbolicZero):
+        change = jnp.zeros_like(primals[1])
+    return tangent_along(*primals), product(primals[0], change)
 
 
 def without_derivative(model: mjx.Model) -> mjx.Model:
