@@ -25,7 +25,6 @@ from mjx_study.cli.options import (
     usage_errors,
 )
 from mjx_study.cli.parameters import task_of, theta_of
-from mjx_study.compiled import Compiled
 from mjx_study.disk import prepare_folder, write_whole
 from mjx_study.files import PolicyFile, read_json
 from mjx_study.limits import MOST_STEPS, check_count
@@ -140,7 +139,7 @@ def _load_policy(options: argparse.Namespace) -> PolicyFile:
 
 def _simulate_task(task: Task, cell: ContactPoint, seed: int, noisy: bool) -> Rollout:
     theta = task.theta
-    program = Compiled(partial(objective.simulate, task), "rollout", task)
+    program = objective.compiled_rollout(task)
     outputs = program(theta, cell.contact, jax.random.key(seed), jnp.asarray(float(noisy), theta.dtype))
     states, controls, cost, residual = jax.device_get(outputs)
     facts = {

@@ -2,7 +2,6 @@
 
 import dataclasses
 from collections.abc import Iterator
-from functools import partial
 from typing import Any
 
 import jax
@@ -10,8 +9,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from mjx_study.compiled import Compiled
-from mjx_study.objective import simulate
+from mjx_study.objective import compiled_rollout
 from mjx_study.simulation.contact import stable, stiffness_from_solref
 from mjx_study.simulation.engine import engine_model
 from mjx_study.tasks.contact_grid import ContactPoint
@@ -46,7 +44,7 @@ class Touch:
 def touches_of(task: Task, cell: ContactPoint) -> Iterator[Touch]:
     """Contacts that begin in the rollout without noise, in the C engine."""
     dtype = task.theta.dtype
-    run = Compiled(partial(simulate, task), "rollout", task)
+    run = compiled_rollout(task)
     states, *_ = run(task.theta, cell.contact, jax.random.key(0), jnp.zeros((), dtype))
     host = engine_model(task.scene, cell.contact)
     data, timestep, before = mujoco.MjData(host), task.scene.timestep, None

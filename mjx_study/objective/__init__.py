@@ -7,7 +7,14 @@ call of a program for one device, so that each device leaves the solver's loop i
 not depend on the devices, and neither does a bit of the result.
 """
 
-from mjx_study.objective.batches import BlankObjective, MjxObjective, Simulator, TracedObjective, contact_for
+from mjx_study.objective.batches import (
+    BlankObjective,
+    MjxObjective,
+    Simulator,
+    TracedObjective,
+    compiled_rollout,
+    contact_for,
+)
 from mjx_study.objective.chunks import MAX_CHUNK, chunk_for, rounds, spread
 from mjx_study.objective.cost import rollout_cost, simulate
 from mjx_study.objective.programs import SamplePrograms
@@ -20,6 +27,7 @@ __all__ = [
     "Simulator",
     "TracedObjective",
     "chunk_for",
+    "compiled_rollout",
     "contact_for",
     "rollout_cost",
     "rounds",

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from functools import partial
 from typing import Any, Final
 
 import jax
@@ -12,6 +13,7 @@ from jaxtyping import Array, Float, Key
 from estimators import Differentiation, Evaluation, Linearisation, StepDifferentiation, StepEvaluation
 from mjx_study.compiled import Compiled
 from mjx_study.objective.chunks import rounds, spread
+from mjx_study.objective.cost import simulate
 from mjx_study.objective.programs import SamplePrograms
 from mjx_study.simulation.contact import ContactModel
 from mjx_study.simulation.linear_algebra import SMALL
@@ -22,6 +24,11 @@ from mjx_study.tasks.task import Task, check_sigma
 LAPACK_BATCH: Final = 2048
 """Batch from which jaxlib 0.10.2 divides factorisations of matrices among its threads on CPUs, which never ends where
 two programs do so at a time. Matrices of up to `SMALL` rows do not go to LAPACK."""
+
+
+def compiled_rollout(task: Task) -> Compiled:
+    """`simulate` of a task, a function of (theta, contact, key, noise_scale)."""
+    return Compiled(partial(simulate, task), "rollout", task)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -28,6 +28,11 @@ def largest_batch() -> int:
     return LARGEST_BATCH[jax.default_backend()]
 
 
+def batches_at_once(samples: int) -> int:
+    """Batches of so many samples that are drawn at once."""
+    return max(1, largest_batch() // samples)
+
+
 def numbers_per_sample(task: Task, oracle: str) -> int:
     """Numbers held by one sample of a batch."""
     params, (steps, dimensions) = task.policy.num_params, task.policy.noise_shape

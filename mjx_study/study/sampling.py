@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Int, Key
 from estimators import ORACLES, Linearisation
 from mjx_study.objective import MjxObjective, Simulator
 from mjx_study.reference import Reference
-from mjx_study.study.memory import largest_batch
+from mjx_study.study.memory import batches_at_once
 from mjx_study.study.plan import StudyCell, StudyPlan
 
 UNCONVERGED: Final = {"float64": 1e-6, "float32": 1e-3}
@@ -73,7 +73,7 @@ def draw_batches(
     Returns:
         By oracle: the batch, its computing time [s], and the solver residual of every rollout.
     """
-    together = max(1, largest_batch() // samples)
+    together = batches_at_once(samples)
     drawn, seconds, residuals = {}, {}, {}
     for name in oracles:
         streams: Key[Array, " seeds"] = jax.random.clone(keys["order"][ORACLES[name].order])[seeds]

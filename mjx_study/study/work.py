@@ -11,7 +11,7 @@ import numpy as np
 from mjx_study.objective import contact_for, rounds
 from mjx_study.study.gradients import CANDIDATES, takes_candidates
 from mjx_study.study.landscapes import QUADRATURE
-from mjx_study.study.memory import largest_batch
+from mjx_study.study.memory import batches_at_once
 from mjx_study.study.plan import (
     StudyCell,
     StudyPlan,
@@ -69,7 +69,7 @@ def calls(plan: StudyPlan, cell: StudyCell, devices: int) -> Counter[Program]:
         batch("value", calls_of("evaluation", config.evaluation_samples or 0, task.random_start)[0][1], _costs(plan))
         return found
     for seeds in _in_turn(config.batches, seeds_together(plan, cell)):
-        for some in _in_turn(seeds, max(1, largest_batch() // cell.samples)):
+        for some in _in_turn(seeds, batches_at_once(cell.samples)):
             for oracle in oracles_of(config):
                 for program, rows in calls_of(oracle, some * cell.samples, task.random_start):
                     batch(program, rows, config.points or 1)
