@@ -10,7 +10,6 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Final
 
-import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
@@ -105,7 +104,7 @@ def read(path: Path) -> Table:
     saved = table.zobg_variance - table.fobg_variance * cost
     table["worth"] = table.zobg_variance / (table.fobg_variance * cost)
     table["until"] = np.where(saved > 0, saved / table.fobg_bias**2, 0.0)
-    table.attrs = about
+    table.attrs["environments"] = json.dumps(about["environments"])  # as text: pandas copies it with every column
     return table
 
 
@@ -216,7 +215,7 @@ def share(right: np.ndarray) -> str:
     """A share with its 95 % Wilson interval and the number of cells."""
     if not len(right):
         return "- (0)"
-    middle, low, high = coverage_interval(jnp.asarray(right), 0.95)
+    middle, low, high = coverage_interval(right, 0.95)
     return f"{middle:.0%} ({low:.0%} to {high:.0%}; {len(right)})"
 
 
@@ -395,7 +394,7 @@ def samples_table(table: Table) -> str:
 def machines_table(table: Table) -> str:
     """Where the cells were computed."""
     rows = []
-    for place, each in enumerate(table.attrs["environments"]):
+    for place, each in enumerate(json.loads(table.attrs["environments"])):
         versions = [each["versions"][name] for name in ("mujoco", "jax")]
         cells = int((table.environment == place).sum())
         rows.append([each["processor"], each["cores"], each["python"], *versions, each["precision"], cells])
@@ -429,7 +428,7 @@ def binned(axes: Axes, values: Any, verdict: Any, colour: str) -> None:
         return
     for part in np.array_split(np.argsort(values.to_numpy()), BINS):
         chosen = verdict.to_numpy()[part] == 1
-        middle, low, high = coverage_interval(jnp.asarray(chosen), 0.95)
+        middle, low, high = coverage_interval(chosen, 0.95)
         at = float(np.exp(np.mean(np.log(values.to_numpy()[part]))))
         axes.errorbar(
             at,
@@ -525,7 +524,7 @@ def timestep_figure(table: Table) -> Figure:
             decided = [(x, found[place]) for x, found in steps if len(found[place]) >= BINS]
             if not decided:
                 continue
-            x, middle, low, high = np.array([(x, *coverage_interval(jnp.asarray(told), 0.95)) for x, told in decided]).T
+            x, middle, low, high = np.array([(x, *coverage_interval(told, 0.95)) for x, told in decided]).T
             bars = np.maximum([middle - low, high - middle], 0)
             each.errorbar(x, middle, bars, color=TASKS[name], marker="o", markersize=4, capsize=2)
     ticks = [1e3 * timestep for timestep in sorted(table.timestep.unique())]

@@ -4,6 +4,7 @@ import math
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from estimators.catalogue import MAX_DEVIATION, VARIANCE_PROXIES
@@ -103,7 +104,7 @@ def variance_upper_bound(
     return most * upper
 
 
-def coverage_interval(covered: Bool[Array, " trials"], confidence: float) -> tuple[float, float, float]:
+def coverage_interval(covered: Bool[Array | np.ndarray, " trials"], confidence: float) -> tuple[float, float, float]:
     """How often a bound held, with its Wilson score interval.
 
     Args:
@@ -120,7 +121,7 @@ def coverage_interval(covered: Bool[Array, " trials"], confidence: float) -> tup
         raise ValueError("coverage needs at least one trial; got none")
     if not 0.0 < confidence < 1.0:
         raise ValueError(f"confidence must lie strictly between 0 and 1; got {confidence}; 0.95 is customary")
-    trials, share = len(covered), float(jnp.mean(covered))
+    trials, share = len(covered), float(np.asarray(covered).mean())
     quantile = float(jax.scipy.special.ndtri(0.5 + confidence / 2.0))
     squared = quantile**2 / trials
     centre = (share + squared / 2) / (1 + squared)

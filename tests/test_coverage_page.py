@@ -47,7 +47,9 @@ def test_intervals_and_the_test_for_bias(script: ModuleType, kind: str) -> None:
         same(found, said)
 
 
+@pytest.mark.slow
 def test_rare_samples(script: ModuleType) -> None:
+    """The fast suite has the same case in `test_bias`, by fewer trials."""
     (said,) = [row for row in rows("rare") if row[:2] == ["0.4", "50"]]
     same(script.rare_row(0.4, 50), said)
 

@@ -195,10 +195,11 @@ def test_the_context_is_a_decorator_and_may_be_nested() -> None:
 
 
 def test_the_residual_tells_whether_the_solver_has_converged() -> None:
-    model, data = device(SENSED)
-    start = data.replace(qpos=jnp.array([0.0, 0.0, -5e-4]), qvel=jnp.array([0.3, 0.2, -0.1]))
+    model, data = device(floor_scene(slider(), option(extra='cone="elliptic"')))
+    start = data.replace(qpos=jnp.array([0.0, 0.0, -5e-4]), qvel=jnp.array([0.05, 0.02, -0.01]))
     few = model.replace(opt=model.opt.replace(iterations=1, ls_iterations=1))
-    converged, left = (float(solver_residual(m, jax.jit(step)(m, start))) for m in (model, few))
+    residual = jax.jit(lambda model: solver_residual(model, step(model, start)))
+    converged, left = (float(residual(each)) for each in (model, few))
     assert converged < 1e-8 and left > 1e-4
 
 
@@ -327,10 +328,13 @@ def test_the_onset_term_is_not_for_models() -> None:
         jax.grad(lambda mass: step(model.replace(body_mass=mass), data, onset="linear").qpos[0])(model.body_mass)
 
 
-def test_the_page_runs() -> None:
+@pytest.mark.parametrize("ways", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_the_page_runs(ways: int) -> None:
     """Both ways give the same gradient: friction brakes the ball until it rolls, at 5/7 of its speed."""
     names: dict[str, Any] = {}
     for block in re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL):
-        exec(block, names)
-    np.testing.assert_allclose(names["same"], names["gradient"], rtol=1e-9, atol=1e-15)
+        if ways == 2 or "differentiable_mjx()" not in block:
+            exec(block, names)
+    if ways == 2:
+        np.testing.assert_allclose(names["same"], names["gradient"], rtol=1e-9, atol=1e-15)
     assert 0 < float(names["gradient"][0]) <= 0.1 and float(names["residual"]) < 1e-6

@@ -89,7 +89,7 @@ def test_what_is_forecast_is_what_descents_do(tmp_path: Path, capsys: pytest.Cap
 def test_the_time_is_what_the_last_run_of_each_program_took(tmp_path: Path) -> None:
     """Records of a run are those of its programs; the forecast of the missing cell is the sum of its calls."""
     config = StudyConfig(
-        tasks=("ball_wall",), contact=("mujoco",), stiffness=(500.0, 1000.0, 2000.0), horizon=8, samples=(8,), seeds=3,
+        tasks=("pusher",), contact=("penalty",), stiffness=(50.0, 100.0, 200.0), horizon=2, samples=(8,), seeds=3,
         reference_samples=10, chunk_size=7,
     )  # fmt: skip
     before = forecast(plan_study(config), tmp_path)

@@ -1,5 +1,6 @@
 """Estimates from single steps and from the backward recursion: identities, means, variances, and where they fail."""
 
+from collections.abc import Iterable
 from dataclasses import replace
 
 import jax
@@ -13,6 +14,7 @@ from estimators import (
     ESTIMATORS,
     NOISES,
     Differentiation,
+    Estimator,
     Evaluation,
     GradientEstimate,
     Linearisation,
@@ -36,19 +38,36 @@ HESSIAN = np.array([[1.0, 0.4, 0.0], [0.4, -0.5, 0.3], [0.0, 0.3, 0.8]])
 UNBIASED = [name for name in ESTIMATORS if name not in ("fobg_clipped", "fobg_truncated")]
 
 
-def run(name: str, objective, theta, *, samples: int = SAMPLES, seed: int = 3, **changes) -> GradientEstimate:
+def make(name: str, objective, **changes) -> Estimator:
     options = {"failure_probability": 0.1, "sigma": objective.sigma, "max_norm": 1e9, "window": 99} | changes
-    estimator = estimators.make_estimator(name, **options)
+    return estimators.make_estimator(name, **options)
+
+
+def run(name: str, objective, theta, *, samples: int = SAMPLES, seed: int = 3, **changes) -> GradientEstimate:
+    estimator = make(name, objective, **changes)
     program = jax.jit(lambda key: estimators.estimate(estimator, objective, jnp.asarray(theta), key, samples))
     return program(jax.random.key(seed))
+
+
+def run_all(names: Iterable[str], objective, theta) -> dict[str, GradientEstimate]:
+    """What `run` gives for each, by one program: the batches that several need are drawn once."""
+    chosen = {name: make(name, objective) for name in names}
+
+    @jax.jit
+    def program(key):
+        needed = estimators.oracles_of(chosen.values())
+        drawn = estimators.draw(needed, objective, jnp.asarray(theta), key, SAMPLES)
+        return {name: each({oracle: drawn[oracle] for oracle in each.needs}) for name, each in chosen.items()}
+
+    return program(jax.random.key(3))
 
 
 @pytest.fixture(scope="module")
 def lots() -> dict[str, dict[str, GradientEstimate]]:
     """Every estimator on a feedback policy and on an open loop, both smooth."""
     return {
-        "feedback": {name: run(name, FEEDBACK, THETA) for name in ESTIMATORS if name != "delta"},
-        "open loop": {name: run(name, objectives.quadratic(HESSIAN, 0.7), [1.5, -2.0, 1.0]) for name in ESTIMATORS},
+        "feedback": run_all([name for name in ESTIMATORS if name != "delta"], FEEDBACK, THETA),
+        "open loop": run_all(ESTIMATORS, objectives.quadratic(HESSIAN, 0.7), [1.5, -2.0, 1.0]),
     }
 
 
