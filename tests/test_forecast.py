@@ -133,7 +133,10 @@ def test_a_damaged_record_is_no_record(damage: bytes, tmp_path: Path) -> None:
 def test_a_cache_that_cannot_be_written_fails_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "file").touch()
     monkeypatch.setattr(times, "times_folder", lambda: tmp_path / "file" / "times")
-    config = StudyConfig(tasks=("pusher",), contact=("reference",), stiffness=(10.0,), horizon=4, samples=(4,), seeds=1)
+    config = StudyConfig(
+        tasks=("pusher",), contact=("reference",), stiffness=(10.0,), horizon=2, samples=(8,), seeds=3,
+        reference_samples=10,
+    )  # fmt: skip
     assert run_study(config).attrs["computed_cells"] == 1
     assert times.Rates.read(times.times_folder())._records == []
 
