@@ -4,11 +4,11 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
+import scipy
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from scipy.special import stdtrit
 
 from mjx_study.plots.style import HOLLOW, NO_CONTACT, TITLES, line_with_band, style_of
 from mjx_study.simulation.contact import stable
@@ -138,7 +138,7 @@ def geometric(values: xr.DataArray) -> tuple[np.ndarray, np.ndarray, np.ndarray]
     mean[usable] = np.nanmean(logs[usable], axis=1)
     several = count > 1
     half[several] = np.nanstd(logs[several], axis=1, ddof=1) / np.sqrt(count[several])
-    half[several] *= stdtrit(count[several] - 1, 0.975)
+    half[several] *= scipy.special.stdtrit(count[several] - 1, 0.975)
     return np.exp(mean), np.exp(mean - half), np.exp(mean + half)
 
 

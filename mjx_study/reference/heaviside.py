@@ -12,8 +12,8 @@ import dataclasses
 import math
 
 import numpy as np
+import scipy
 from jaxtyping import Float
-from scipy.special import ndtr
 
 from estimators import NOISES
 from mjx_study.reference.function import Jump, Smoothed
@@ -43,7 +43,7 @@ class Heaviside:
     def smoothed(self, theta: Float[np.ndarray, " 1"], sigma: float) -> Smoothed:
         """F = Phi(theta / sigma); the gradient is all jump term."""
         gradient = np.array([NOISES["gaussian"].density(theta[0] / sigma) / sigma])
-        return Smoothed(float(ndtr(theta[0] / sigma)), gradient, gradient)
+        return Smoothed(float(scipy.special.ndtr(theta[0] / sigma)), gradient, gradient)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,6 +84,6 @@ class RelaxedHeaviside:
         """F and grad F by differences over the ramp, with rounding errors of about 1e-16 / nu."""
         ends = theta + np.array([self.width / 2, -self.width / 2])
         density = NOISES["gaussian"].density
-        upper, lower = (end * ndtr(end / sigma) + sigma * density(end / sigma) for end in ends)
-        slope = (ndtr(ends[0] / sigma) - ndtr(ends[1] / sigma)) / self.width
+        upper, lower = (end * scipy.special.ndtr(end / sigma) + sigma * density(end / sigma) for end in ends)
+        slope = (scipy.special.ndtr(ends[0] / sigma) - scipy.special.ndtr(ends[1] / sigma)) / self.width
         return Smoothed(float((upper - lower) / self.width), np.array([slope]), np.zeros(1))
