@@ -3,20 +3,7 @@
 from estimators.alpha import alpha_order, constrained_alpha, interpolate, inverse_variance_alpha
 from estimators.baselines import BASELINES, leave_one_out, none, zero_noise
 from estimators.bias import BiasTest, EmpiricalBias, bias_test, empirical_bias, squared_bias_of_means
-from estimators.catalogue import VARIANCE_PROXIES, WEIGHTS
-from estimators.comparison import Comparison, compare
-from estimators.confidence import bernstein_epsilon, coverage_interval, variance_upper_bound
-from estimators.cross_fitting import weigh_batches
-from estimators.ddcg import discontinuity_gated
-from estimators.effective import ENOUGH_EFFECTIVE, EffectiveSamples, effective_samples
-from estimators.estimator import ORACLES, Batches, Estimator, Oracle, draw, oracles_of
-from estimators.first import clipped_first_order, first_order
-from estimators.intervals import variance_interval
-from estimators.mean_check import Circulation, circulation
-from estimators.noise import NOISES, NoiseDensity
-from estimators.propagation import total_propagation, truncated_first_order
-from estimators.registry import (
-    ESTIMATORS,
+from estimators.builtin import (
     AlphaOrder,
     Antithetic,
     AntitheticCostToGo,
@@ -30,11 +17,20 @@ from estimators.registry import (
     TotalPropagation,
     TruncatedFirstOrder,
     ZerothOrder,
-    estimate,
-    find_estimator,
-    make_estimator,
-    register,
 )
+from estimators.catalogue import VARIANCE_PROXIES, WEIGHTS
+from estimators.comparison import Comparison, compare
+from estimators.confidence import bernstein_epsilon, coverage_interval, variance_upper_bound
+from estimators.cross_fitting import weigh_batches
+from estimators.ddcg import discontinuity_gated
+from estimators.effective import ENOUGH_EFFECTIVE, EffectiveSamples, effective_samples
+from estimators.estimator import ORACLES, Batches, Estimator, Oracle, draw, oracles_of
+from estimators.first import clipped_first_order, first_order
+from estimators.intervals import variance_interval
+from estimators.mean_check import Circulation, circulation
+from estimators.noise import NOISES, NoiseDensity
+from estimators.propagation import total_propagation, truncated_first_order
+from estimators.registry import ESTIMATORS, estimate, find_estimator, make_estimator, register
 from estimators.rows import Rows
 from estimators.statistics import norm_quantiles, summarise
 from estimators.stepwise import antithetic_cost_to_go, cost_to_go, stepwise_inverse_variance

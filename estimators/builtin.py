@@ -1,0 +1,285 @@
+"""The estimators of this package, each a formula with its options."""
+
+from abc import abstractmethod
+from dataclasses import dataclass, replace
+from typing import Any
+
+import jax.numpy as jnp
+
+from estimators.alpha import choose_alpha, interpolate, inverse_variance_alpha
+from estimators.baselines import find_baseline
+from estimators.catalogue import CATALOGUE, MAX_DEVIATION, PLUG_IN, PUBLISHED_TOLERANCE
+from estimators.confidence import bernstein_epsilon, check_confidence_arguments
+from estimators.cross_fitting import check_weights, weigh_batches
+from estimators.ddcg import discontinuity_gated
+from estimators.estimator import Estimator
+from estimators.first import clipped_first_order, first_order
+from estimators.propagation import total_propagation, truncated_first_order
+from estimators.registry import register
+from estimators.stepwise import antithetic_cost_to_go, cost_to_go, stepwise_inverse_variance
+from estimators.types import (
+    AlphaChoice,
+    Differentiation,
+    Evaluation,
+    GradientEstimate,
+    Linearisation,
+    StepDifferentiation,
+    StepEvaluation,
+)
+from estimators.zeroth import antithetic, delta_control_variate, zeroth_order
+
+
+def _check_positive(name: str, value: float) -> None:
+    if not 0.0 < value < float("inf"):
+        raise ValueError(f"{name} must be positive and finite; got {value}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Baselined(Estimator):
+    """Base of those with a zeroth-order batch; `baseline` is a name in `BASELINES`."""
+
+    baseline: str = "zero_noise"
+
+    def __post_init__(self) -> None:
+        find_baseline(self.baseline)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Interpolation(_Baselined):
+    """Base of those that weigh two batches; `weights` is a name in `WEIGHTS`."""
+
+    weights: str = PLUG_IN
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_weights(self.weights)
+
+
+@register
+class ZerothOrder(_Baselined, entry=CATALOGUE["zobg"]):
+    """See `estimators.zeroth_order`."""
+
+    separable = True
+
+    def combine(self, evaluation: Evaluation) -> GradientEstimate:
+        return zeroth_order(evaluation, self.baseline)
+
+
+@register
+class Antithetic(_Baselined, entry=CATALOGUE["zobg_antithetic"]):
+    """See `estimators.antithetic`."""
+
+    separable = True
+
+    def combine(self, pair: tuple[Evaluation, Evaluation]) -> GradientEstimate:
+        return antithetic(*pair, self.baseline)
+
+
+@register
+class CostToGo(_Baselined, entry=CATALOGUE["zobg_to_go"]):
+    """See `estimators.cost_to_go`."""
+
+    separable = True
+
+    def combine(self, steps: StepEvaluation) -> GradientEstimate:
+        return cost_to_go(steps, self.baseline)
+
+
+@register
+class AntitheticCostToGo(_Baselined, entry=CATALOGUE["zobg_to_go_antithetic"]):
+    """See `estimators.antithetic_cost_to_go`."""
+
+    separable = True
+
+    def combine(self, pair: tuple[StepEvaluation, StepEvaluation]) -> GradientEstimate:
+        return antithetic_cost_to_go(*pair, self.baseline)
+
+
+@register
+class FirstOrder(Estimator, entry=CATALOGUE["fobg"]):
+    """See `estimators.first_order`."""
+
+    separable = True
+
+    def combine(self, differentiation: Differentiation) -> GradientEstimate:
+        return first_order(differentiation)
+
+
+@register
+class OnsetFirstOrder(FirstOrder, entry=CATALOGUE["fobg_onset"]):
+    """See `estimators.first_order`; the batch is corrected where contact begins."""
+
+
+@register
+@dataclass(frozen=True, kw_only=True)
+class ClippedFirstOrder(Estimator, entry=CATALOGUE["fobg_clipped"]):
+    """See `estimators.clipped_first_order`.
+
+    `max_norm` of a sample, > 0, [cost/param].
+    """
+
+    separable = True
+
+    max_norm: float
+
+    def __post_init__(self) -> None:
+        _check_positive("max_norm", self.max_norm)
+
+    def combine(self, differentiation: Differentiation) -> GradientEstimate:
+        return clipped_first_order(differentiation, self.max_norm)
+
+
+@register
+@dataclass(frozen=True, kw_only=True)
+class TruncatedFirstOrder(Estimator, entry=CATALOGUE["fobg_truncated"]):
+    """See `estimators.truncated_first_order`.
+
+    `window` of steps between cuts of the adjoint, >= 1.
+    """
+
+    separable = True
+
+    window: int
+
+    def __post_init__(self) -> None:
+        if self.window < 1:
+            raise ValueError(f"window must be at least 1 step; got {self.window}")
+
+    def combine(self, linearisation: Linearisation) -> GradientEstimate:
+        return truncated_first_order(linearisation, self.window)
+
+
+class _OneWeight(_Interpolation):
+    """Base of those with one weight for two whole batches."""
+
+    separable = True
+
+    @abstractmethod
+    def choose(self, zeroth: GradientEstimate, first: GradientEstimate) -> AlphaChoice:
+        """The weight."""
+
+    def combine(self, evaluation: Evaluation, differentiation: Differentiation) -> GradientEstimate:
+        def choose(*batches: Any) -> AlphaChoice:
+            return self.choose(*self.parts(*batches))
+
+        def mix(choice: AlphaChoice, *batches: Any) -> GradientEstimate:
+            return _mixed(choice, *self.parts(*batches))
+
+        return weigh_batches(choose, mix, (evaluation, differentiation), self.weights)
+
+    def parts(
+        self, evaluation: Evaluation, differentiation: Differentiation
+    ) -> tuple[GradientEstimate, GradientEstimate]:
+        return zeroth_order(evaluation, self.baseline), first_order(differentiation)
+
+    def join(self, zeroth: GradientEstimate, first: GradientEstimate) -> GradientEstimate:
+        return _mixed(self.choose(zeroth, first), zeroth, first)
+
+
+def _mixed(choice: AlphaChoice, zeroth: GradientEstimate, first: GradientEstimate) -> GradientEstimate:
+    return replace(interpolate(zeroth, first, choice.alpha), alpha=choice)
+
+
+@register
+@dataclass(frozen=True, kw_only=True)
+class AlphaOrder(_OneWeight, entry=CATALOGUE["aobg"]):
+    """See `estimators.constrained_alpha`.
+
+    Attributes:
+        baseline: A name in `BASELINES`, for the zeroth-order batch.
+        weights: A name in `WEIGHTS`, the source of alpha.
+        gamma: Largest error to accept, > 0 or infinity, [cost/param].
+        failure_probability: Of the confidence radius, in (0, 1); see `bernstein_epsilon`.
+        variance_proxy: "variance", "second_moment" or "upper_bound".
+        radius: "max_deviation" or a bound >= 0 on ||g_i - E g||, [cost/param].
+    """
+
+    gamma: float = float("inf")
+    failure_probability: float = 0.05
+    variance_proxy: str = "variance"
+    radius: str | float = MAX_DEVIATION
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.gamma > 0.0:
+            raise ValueError(f"gamma must be positive; got {self.gamma}; float('inf') sets no limit")
+        check_confidence_arguments(self.failure_probability, self.variance_proxy, self.radius)
+
+    def choose(self, zeroth: GradientEstimate, first: GradientEstimate) -> AlphaChoice:
+        epsilon = bernstein_epsilon(
+            zeroth, failure_probability=self.failure_probability, variance_proxy=self.variance_proxy, radius=self.radius
+        )
+        return choose_alpha(zeroth, first, gamma=self.gamma, epsilon=epsilon)
+
+
+@register
+class OnsetAlphaOrder(AlphaOrder, entry=CATALOGUE["aobg_onset"]):
+    """See `estimators.choose_alpha`; the first-order batch is corrected where contact begins."""
+
+
+@register
+class InverseVariance(_OneWeight, entry=CATALOGUE["ivw"]):
+    """See `estimators.inverse_variance_alpha`."""
+
+    def choose(self, zeroth: GradientEstimate, first: GradientEstimate) -> AlphaChoice:
+        alpha = inverse_variance_alpha(zeroth.variance, first.variance)
+        discrepancy = jnp.linalg.norm(first.mean - zeroth.mean)
+        return AlphaChoice(alpha, None, discrepancy, zeroth.variance, first.variance)
+
+
+@register
+class StepwiseInverseVariance(_Interpolation, entry=CATALOGUE["ivw_h"]):
+    """See `estimators.stepwise_inverse_variance`."""
+
+    def combine(self, steps: StepEvaluation, differentiation: StepDifferentiation) -> GradientEstimate:
+        return stepwise_inverse_variance(steps, differentiation, self.baseline, self.weights)
+
+
+@register
+class TotalPropagation(_Interpolation, entry=CATALOGUE["total_propagation"]):
+    """See `estimators.total_propagation`."""
+
+    def combine(self, linearisation: Linearisation) -> GradientEstimate:
+        return total_propagation(linearisation, self.baseline, self.weights)
+
+
+@register
+@dataclass(frozen=True, kw_only=True)
+class DiscontinuityGated(_Interpolation, entry=CATALOGUE["ddcg"]):
+    """See `estimators.discontinuity_gated`.
+
+    `sigma` of the noise, > 0, [control], and `tolerance` c of the test, in [0, 1).
+    """
+
+    gaussian = True
+
+    sigma: float
+    tolerance: float = PUBLISHED_TOLERANCE
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _check_positive("sigma", self.sigma)
+        if not 0.0 <= self.tolerance < 1.0:
+            raise ValueError(f"tolerance must lie in [0, 1); got {self.tolerance}")
+
+    def combine(self, evaluation: Evaluation, differentiation: StepDifferentiation) -> GradientEstimate:
+        return discontinuity_gated(evaluation, differentiation, self.baseline, self.sigma, self.tolerance, self.weights)
+
+
+@register
+@dataclass(frozen=True, kw_only=True)
+class DeltaMethod(Estimator, entry=CATALOGUE["delta"]):
+    """See `estimators.delta_control_variate`.
+
+    `sigma` of the noise, > 0, [param].
+    """
+
+    gaussian = additive = True
+
+    sigma: float
+
+    def __post_init__(self) -> None:
+        _check_positive("sigma", self.sigma)
+
+    def combine(self, evaluation: Evaluation, differentiation: Differentiation) -> GradientEstimate:
+        return delta_control_variate(evaluation, first_order(differentiation).mean, self.sigma)
