@@ -41,7 +41,7 @@ def comparison(part: xr.Dataset, title: str) -> Figure:
             line_with_band(below, x, y, lower, upper, **{**style, "label": None})
         floor = positive(rows["reference_uncertainty"])
         below.plot(x, floor, color="0.4", linestyle=":", marker="_", label="uncertainty of the reference")
-        below.axhline(1, color="0.7", linewidth=0.8)
+        below.axhline(1, color="0.7", linewidth=0.8, label="as large as the gradient")
         for panel in (above, below):
             make_logarithmic(panel, x)
         above.set_title(TITLES.get(family, family))
