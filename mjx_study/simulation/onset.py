@@ -347,12 +347,9 @@ def tangent_along(matrix: Float[Array, "outputs inputs"], inputs: Float[Array, "
     return jnp.zeros_like(inputs, shape=matrix.shape[:1])
 
 
-@partial(tangent_along.defjvp, symbolic_zeros=True)
+@tangent_along.defjvp
 def _(primals, tangents):
-    change = tangents[1]
-    if isinstance(change, jax.custom_derivatives.SymbolicZero):
-        change = jnp.zeros_like(primals[1])
-    return tangent_along(*primals), product(primals[0], change)
+    return tangent_along(*primals), product(primals[0], tangents[1])
 
 
 def without_derivative(model: mjx.Model) -> mjx.Model:
