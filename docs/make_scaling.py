@@ -1,12 +1,16 @@
 """Measures what docs/scaling.md says, and draws docs/scaling.png.
 
     python docs/make_scaling.py engine --workers 20 --cells 10000 --seconds 0.1
+    python docs/make_scaling.py workers --workers 1 2 4 --cells 200
     python docs/make_scaling.py cost --seconds 600 --output docs/scaling_cpu.json
     python docs/make_scaling.py fit docs/scaling_cpu.json
     python docs/make_scaling.py figure docs/scaling_cpu.json --output docs/scaling.png
 
 `engine` runs cells that sleep, on as many local workers as asked for: what a cell computes is replaced by sleep; the
 client, Dask, the transfer of arrays and the folder are those of a sweep.
+
+`workers` runs a sweep of the pusher's stiffness on more and more local workers, on each number twice: the first run
+compiles, the second counts. A worker is busy while it computes a cell, by Dask's task stream.
 
 `cost` times rollouts and gradients against samples, horizon, degrees of freedom, contacts and devices, on whatever JAX
 finds (leave JAX_PLATFORMS unset on an accelerator). Each measurement alternates with one of the same rollouts, so that
@@ -398,6 +402,36 @@ def measure_engine(workers: int, cells: int, seconds: float, programs: int, numb
     }
 
 
+def measure_workers(workers: list[int], cells: int, samples: int) -> None:
+    """Print rates of a sweep, and the share of their time that the workers computed, by their number."""
+    import numpy as np
+    from distributed import get_task_stream
+
+    from mjx_study.runtime import configure
+    from mjx_study.study import cluster
+    from mjx_study.study.configuration import StudyConfig
+    from mjx_study.study.plan import plan_study
+    from mjx_study.study.run import run_study
+
+    configure(cpu_devices=1)
+    stiffness = tuple(float(each) for each in np.geomspace(10.0, 1e4, cells))
+    plan = plan_study(
+        StudyConfig(tasks=("pusher",), contact=("penalty",), stiffness=stiffness, samples=(samples,), seeds=1)
+    )
+    for count in workers:
+        with cluster.connected(f"local:{count}") as client, tempfile.TemporaryDirectory() as name:
+            client.wait_for_workers(count)
+            run_study(plan, Path(name) / "cold", cluster=client)
+            with get_task_stream(client) as stream:
+                begun = time.perf_counter()
+                run_study(plan, Path(name) / "warm", cluster=client)
+                wall = time.perf_counter() - begun
+        spans = [part for task in stream.data for part in task["startstops"] if part["action"] == "compute"]
+        computed = sum(part["stop"] - part["start"] for part in spans)
+        told = {"workers": count, "cells": len(plan.cells), "cells per second": len(plan.cells) / wall}
+        print(json.dumps(told | {"seconds per cell": computed / len(spans), "busy": computed / (count * wall)}))
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = parser.add_subparsers(dest="command", required=True)
@@ -407,6 +441,10 @@ def main() -> None:
     engine.add_argument("--seconds", type=float, default=0.1, help="that a cell sleeps")
     engine.add_argument("--programs", type=int, default=20)
     engine.add_argument("--numbers", type=int, default=1000, help="in the arrays of a cell")
+    swept = commands.add_parser("workers", help="print rates of a sweep on local workers, each number's as JSON")
+    swept.add_argument("--workers", type=int, nargs="+", default=[1, 2, 4])
+    swept.add_argument("--cells", type=int, default=200)
+    swept.add_argument("--samples", type=int, default=1000)
     cost = commands.add_parser("cost", help="time rollouts and gradients")
     cost.add_argument(
         "--seconds", type=float, default=600, help="after which nothing is begun, of a CPU the processor's"
@@ -421,6 +459,8 @@ def main() -> None:
     command = options.pop("command")
     if command == "engine":
         print(json.dumps(measure_engine(**options)))
+    elif command == "workers":
+        measure_workers(**options)
     elif command == "cost":
         measure_cost(**options)
     elif command == "fit":

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import psutil
 import pytest
 
 # Compilation is most of a test's time, and rounding does not matter: no optimisation, and XLA's plain emitters, which
@@ -29,6 +30,8 @@ SETTINGS = {
     "jax_compilation_cache_dir": CACHE,
     "jax_persistent_cache_min_compile_time_secs": 0.5,
 }
+MOST = 4 * 2**30
+"""Bytes of a process that keeps what it compiled."""
 jax.config.update("jax_num_cpu_devices", 2)
 for name, value in SETTINGS.items():
     jax.config.update(name, value)
@@ -42,6 +45,17 @@ def settings() -> None:
     for name, value in SETTINGS.items():
         jax.config.update(name, value)
     runtime._TRACES.clear()
+
+
+@pytest.fixture(scope="module", autouse=True)
+def memory(programs: tuple[dict[Any, Any], dict[Any, Any]]) -> Iterator[None]:
+    """What is compiled is dropped between modules once this process has grown: all modules together need 20 GB."""
+    yield
+    if psutil.Process().memory_info().rss > MOST:
+        for kept in programs:
+            kept.clear()
+        jax.clear_caches()
+        gc.collect()
 
 
 @pytest.fixture(scope="session")

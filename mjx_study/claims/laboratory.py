@@ -135,11 +135,11 @@ class Landscape:
 
     def value(self, x: Float[np.ndarray, "*batch 1"]) -> Float[np.ndarray, "*batch"]:
         """Of the cell; beyond the grid that of its end."""
-        return self.values[self._cell(x)]
+        return np.asarray(self.values[self._cell(x)])
 
     def gradient(self, x: Float[np.ndarray, "*batch 1"]) -> Float[np.ndarray, "*batch 1"]:
         """Likewise."""
-        return self.slopes[self._cell(x)][..., None]
+        return np.asarray(self.slopes[self._cell(x)])[..., None]
 
     def _cell(self, x: np.ndarray) -> np.ndarray:
         spacing = self.points[1] - self.points[0]
