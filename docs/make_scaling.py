@@ -426,7 +426,8 @@ def measure_workers(workers: list[int], cells: int, samples: int) -> None:
                 begun = time.perf_counter()
                 run_study(plan, Path(name) / "warm", cluster=client)
                 wall = time.perf_counter() - begun
-        spans = [part for task in stream.data for part in task["startstops"] if part["action"] == "compute"]
+        tasks = stream.data  # type: ignore[attr-defined]  # a coroutine on an asynchronous client only
+        spans = [part for task in tasks for part in task["startstops"] if part["action"] == "compute"]
         computed = sum(part["stop"] - part["start"] for part in spans)
         told = {"workers": count, "cells": len(plan.cells), "cells per second": len(plan.cells) / wall}
         print(json.dumps(told | {"seconds per cell": computed / len(spans), "busy": computed / (count * wall)}))
