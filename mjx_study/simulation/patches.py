@@ -197,6 +197,27 @@ def solved_inertia(model: mjx.Model, data: mjx.Data, force: Float[Array, " nv"])
     return solve_factored(rows.qLD, force)
 
 
+_mjx_body_tree = getattr(_module("scan"), "body_tree", None)
+
+
+def body_tree(model: mjx.Model, of_body: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
+    """MJX's walk along the tree of bodies, which XLA must not fuse across its levels.
+
+    Fused, a body's ancestors are computed again for each of their uses: time that grows exponentially with depth.
+    """
+    assert _mjx_body_tree is not None, "`patched` has checked that MJX has it"
+
+    def of_level(carry: Any, *own: Any) -> Any:
+        leaves, structure = jax.tree.flatten(carry)
+        arrays = [index for index, leaf in enumerate(leaves) if isinstance(leaf, jax.Array)]
+        apart = jax.lax.optimization_barrier([leaves[index] for index in arrays]) if arrays else []
+        for index, leaf in zip(arrays, apart, strict=True):
+            leaves[index] = leaf
+        return of_body(structure.unflatten(leaves), *own)
+
+    return _mjx_body_tree(model, of_level, *arguments, **named)
+
+
 Place = tuple[str, str]
 """Module and name of a function of MJX; no module is the package, whose names only callers of MJX use."""
 
@@ -206,6 +227,7 @@ _REPLACED: Final[dict[Place, Callable[..., Any]]] = {
     ("math", "quat_sub"): rotation_difference,
     ("math", "quat_to_axis_angle"): rotation_vector,
     ("passive", "_spring_damper"): springs_and_dampers,
+    ("scan", "body_tree"): body_tree,
     ("support", "wrap_inside"): wrap_inside,
     ("collision_sdf", "_cylinder"): cylinder_distance,
     ("smooth", "factor_m"): factored_inertia,
