@@ -37,8 +37,8 @@ GROUPS: Final = {
     "h2_k": ("h^2 k", "stiffness over one step"),
     "impedance": ("d_0", "impedance at first touch"),
     "strength": ("onset strength", "share of the approach speed that an onset takes in one step"),
-    "travel": ("h v / width", "travel in a step over the depth of the impedance's rise"),
-    "crossing": ("h v / spread", "steps' travel over the guard's spread: 1 / onset_spread"),
+    "travel": ("h v / width", "travel in one step over the depth of the impedance's rise"),
+    "crossing": ("h v / spread", "one step over the spread of the first onset: 1 / onset_spread"),
     "periods": ("T sqrt(k) / 2 pi", "horizon in periods of the contact's spring"),
     "params": ("P", "number of parameters"),
 }
@@ -190,7 +190,7 @@ LAUNCHED: Final = ("momentum_transfer", "ball_wall")
 FORCES: Final = ("pusher", "pusher_apart", "sliding_box")
 RULES: Final = (
     Rule("unstable step: variance above; launch angle", "limit", 1.0, "above", _on(_any, *LAUNCHED)),
-    Rule("the same, many forces", "limit", 1.0, "above", _on(_any, *FORCES)),
+    Rule("unstable step: variance above; many forces", "limit", 1.0, "above", _on(_any, *FORCES)),
     Rule("force jumps at first touch: mean off", "strength", SMOOTH, "fobg_off", _met),
     Rule(
         "smooth onset, travel over width: variance above",
@@ -207,7 +207,7 @@ RULES: Final = (
         "beyond",
         _on(_wide, "momentum_transfer"),
     ),
-    Rule("the same, `ball_wall`", "strength", STRONG, "beyond", _on(_wide, "ball_wall")),
+    Rule("strong onset: term beyond its bound, `ball_wall`", "strength", STRONG, "beyond", _on(_wide, "ball_wall")),
 )
 
 
@@ -240,7 +240,7 @@ def halves(table: Table) -> tuple[Table, Table]:
 def rules_table(table: Table) -> str:
     """How often the thresholds of diagnose are right, and those fitted to one half, on the other half."""
     fit, test = halves(table)
-    head = ("rule", "threshold", "where it holds", "where it does not", "fitted", "where it holds", "where it does not")
+    head = ("rule", "threshold", "sensitivity", "specificity", "fitted", "sensitivity", "specificity")
     rows = []
     for rule in RULES:
         ours, theirs = rule.judged(fit), rule.judged(test)
@@ -386,8 +386,8 @@ def samples_table(table: Table) -> str:
         rows.append([f"`{name}`", len(part), *(f"{each:.2g}" for each in worth), len(off)])
         some = off.until.quantile([0.25, 0.5, 0.75]) if len(off) >= BINS else worth * np.nan
         rows[-1] += [f"{each:.2g}" if np.isfinite(each) else "-" for each in some]
-    quarters = ("quarter", "median", "three quarters")
-    head = ("task", "stable cells", *quarters, "of these off", *quarters)
+    quartiles = ("lower quartile", "median", "upper quartile")
+    head = ("task", "stable cells", *quartiles, "of these, mean off", *quartiles)
     return markdown(head, rows)
 
 
