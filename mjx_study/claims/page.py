@@ -11,10 +11,11 @@ from mjx_study.table import format_table
 HEAD: Final = """\
 # Which claims survive
 
-Claims of [Suh et al. 2022](https://arxiv.org/abs/2202.00817), answers to the questions that it leaves open, and claims
-of this project, each measured on the analytic references and in MJX's [contact models](contact-models.md). A claim is
-decided by a criterion that stands beside it in the code: the values of one statistic with which it holds, and those
-with which the opposite does.
+Which claims about these gradient estimators hold, and in which contact models? This ledger has claims of [Suh et al.
+2022](https://arxiv.org/abs/2202.00817), answers to the questions that the paper leaves open, and claims of this
+project. Each is measured on the analytic references and in MJX's [contact models](contact-models.md). A criterion next
+to the claim in the code decides it: the values of one statistic for which the claim holds, and those for which the
+opposite does.
 
 ```sh
 mjx-study claims --full --output out           # all of them, in hours, resumable; out/claims.md is this page
@@ -25,33 +26,35 @@ mjx-study claims --only lemma-closed-form      # one, or several separated by co
 ![Verdicts of all claims by contact family](claims.png)
 """
 LEGEND: Final = """\
-The *interval* of the statistic decides: inside the values that are asked for, the claim **holds**; inside those of the
-opposite it is **reversed**; outside the first it **fails**; across a border it is undecided, and the last column says
-how many samples would decide if the estimate stayed. In the picture a square has a strip for each system, in the order
-of the tables. "reference" is the analytic system, "mjcf" a model without contact. Contact is of 10 kN/m
-where no stiffness is named.
+The *interval* of the statistic decides. If it lies inside the range that the claim requires, the claim **holds**; if it
+lies inside the range of the opposite, the claim is **reversed**; if it lies outside the required range, the claim
+**fails**. If the interval crosses a border, the claim is undecided, and the last column says how many samples would
+decide it if the estimate stayed the same. In the picture, a square has a strip for each system, in the order of the
+tables. "reference" is the analytic system, and "mjcf" a model without contact. The contact stiffness is 10 kN/m where
+none is named.
 
-Not everything was fixed before the first numbers were seen. Settled afterwards: the statistics of
+Not everything was fixed before the first numbers were seen. The following were settled afterwards: the statistics of
 `variance-hides-bias` and `bound-helps-at-jumps`, gamma in `aobg-gains-away`, the 2 s of `chaos-crossover`, some batch
-sizes, the bar's angle of 0.75 rad (at 0.77 rad the bias of the default contact happens to pass through zero), and that
-the ball's descents run their full recipe (zeroth order clears the wall late); the others are cut to 40 % of theirs in
-quick runs, which use twelve seeds (with five, little was decided). The claims on relaxed backward passes were written
-after a look at one landscape of `momentum_transfer`, that on the robot after one batch.
+sizes, the bar's angle of 0.75 rad (at 0.77 rad the bias of the default contact happens to pass through zero), and the
+full recipe for the ball's descents (zeroth order clears the wall late). In quick runs, all other descents are cut to
+40 % of their recipes and use twelve seeds (with five, little was decided). The claims on relaxed backward passes were
+written after a look at one landscape of `momentum_transfer`, and the claim on the robot after one batch.
 
 Both efforts have been run; `docs/claims_quick.json` is the quick ledger, which leaves 53 verdicts undecided. The full
-one was measured in parts, by code that changed in between; 67 of its verdicts, measured again by the last of it, came
-out the same to the last digit. What it decides beyond the quick one is mostly where descents scatter or a variance has
-heavy tails. Verdicts of the quick ledger that it does not confirm: under `smooth_onset` the derivative at the wall's
-edge has spikes that neither grid resolves (40 and 200 points to a standard deviation), so that
-`empirical-bias-in-contact` holds on the coarse table and fails on the fine one, and `ivw-inaccurate-at-jumps` becomes
-undecided. In `relaxed-backward-helps` the bias of `impedance` with exact derivatives, 1.0 % on the coarse grid, is
-0.2 % on the fine one, too near to zero to divide by. On `sliding_box` under `mujoco_default` one of thirty first-order
-descents ends far above the others, which leaves `aobg-as-good` undecided. Estimates of quadrature errors are no bounds:
-on the dome under `smooth_onset` the relative bias goes from 0.48 ± 0.67 to -1.2 ± 1.0.
+ledger was measured in parts, by code that changed in between; 67 of its verdicts were measured again by the latest of
+that code and came out the same to the last digit. The verdicts that only the full ledger decides are mostly those
+where descents scatter or a variance has heavy tails. It does not confirm the following verdicts of the quick ledger.
+Under `smooth_onset` the derivative at the wall's edge has spikes that neither grid resolves (40 and 200 points per
+standard deviation), so that `empirical-bias-in-contact` holds on the coarse grid and fails on the fine one, and
+`ivw-inaccurate-at-jumps` becomes undecided. In `relaxed-backward-helps`, the bias of `impedance` with exact derivatives
+is 1.0 % on the coarse grid and 0.2 % on the fine one, too close to zero to divide by. On `sliding_box` under
+`mujoco_default`, one of thirty first-order descents ends far above the others, which leaves `aobg-as-good` undecided.
+Estimates of quadrature errors are not bounds: on the dome under `smooth_onset` the relative bias goes from
+0.48 ± 0.67 to -1.2 ± 1.0.
 
 Not in the ledger: descents on the robots, means of `landing` ([there](tasks.md#landing)), and friction's slip tolerance
-in MJX. Descents on `tennis` are of 12 seeds and of fewer samples than its recipe's: so few that on its reference first
-order diverges, which is left out.
+in MJX. Descents on `tennis` use 12 seeds and fewer samples than the task's recipe. With so few samples, first order
+diverges on the reference, so that case is left out.
 """
 
 
@@ -63,9 +66,9 @@ def told(document: dict[str, Any]) -> str:
         f"Measured with `{document['command'] or 'measure_ledger'}` ({document['effort']['name']} effort) on "
         f"{made['cores']} cores ({made['processor']}), {made['precision']}; {versions}. The ledger has "
         f"{document['verdicts']} verdicts. Each interval is at level {document['level']:.5f}, that is 1 - "
-        f"{document['alpha']:g} / {document['verdicts']} (Bonferroni), so that with probability "
-        f"{1 - document['alpha']:g} or more no interval of the whole ledger misses its value by chance. "
-        "Estimates of quadrature errors, which are no bounds, are added."
+        f"{document['alpha']:g} / {document['verdicts']} (Bonferroni): with a probability of at least "
+        f"{1 - document['alpha']:g}, no interval of the whole ledger misses its value by chance. "
+        "Intervals include estimates of the quadrature error, which are not bounds."
     )
 
 
@@ -137,7 +140,7 @@ def _bold(verdict: str) -> str:
 
 def _deciding(each: dict[str, Any]) -> str:
     if each["deciding"] is None:
-        return "no number that can be told"
+        return "unknown"
     size = float(format(each["deciding"], ".2g"))
     return f"{size:,.0f} {each['of']} in place of {each['samples']:,}"
 
