@@ -1,10 +1,12 @@
 """Prints the table of docs/differentiable-mjx.md: `mjx_study.step` against `mjx.step`, on this machine.
 
     python docs/make_drop_in.py
+    python docs/make_drop_in.py --batch 1024    # on an accelerator
 
 A few minutes on one core, most of it compiling. Stock's gradient is the one it has, of a step of one solver iteration.
 """
 
+import argparse
 import statistics
 import time
 from collections.abc import Callable
@@ -26,29 +28,28 @@ MODELS: Final = {
     "`barkour_v0`, a quadruped": TESTED / "barkour_v0" / "assets" / "barkour_v0_mjx.xml",
     "`humanoid`": TESTED / "humanoid" / "humanoid.xml",
 }
-BATCH: Final = 64
 STEPS: Final = 20
 REPEATS: Final = 9
 SETTLING: Final = 0.3
 """Time before the first state [s], in which bodies fall to the floor."""
 
 
-def start_states(host: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
+def start_states(host: mujoco.MjModel, batch: int) -> tuple[np.ndarray, np.ndarray]:
     """A batch of positions and velocities, in contact where the model has a floor."""
     data, noise = mujoco.MjData(host), np.random.default_rng(0)
     if host.nkey:
         mujoco.mj_resetDataKeyframe(host, data, 0)
     while data.time < SETTLING:
         mujoco.mj_step(host, data)
-    return np.tile(data.qpos, (BATCH, 1)), data.qvel + 0.1 * noise.standard_normal((BATCH, host.nv))
+    return np.tile(data.qpos, (batch, 1)), data.qvel + 0.1 * noise.standard_normal((batch, host.nv))
 
 
-def measured(path: Path) -> dict[str, float]:
+def measured(path: Path, batch: int) -> dict[str, float]:
     """Median seconds of a batch of rollouts and of their gradients, through both steps, interleaved."""
     host = mujoco.MjModel.from_xml_path(str(path))
     model, data = mjx.put_model(host), mjx.make_data(host)
-    qpos, qvel = start_states(host)
-    controls = np.zeros((BATCH, STEPS, host.nu))
+    qpos, qvel = start_states(host, batch)
+    controls = np.zeros((batch, STEPS, host.nu))
 
     def program(step: Callable[..., mjx.Data], iterations: int, gradient: bool) -> Callable[[], Any]:
         stepped = model.replace(opt=model.opt.replace(iterations=iterations))
@@ -82,11 +83,14 @@ def measured(path: Path) -> dict[str, float]:
 
 
 def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--batch", type=int, default=64, help="rollouts at once")
+    batch = parser.parse_args().batch
     mjx_study.configure(cpu_devices=1)
-    print("| model | freedoms | rollouts / stock | gradients / stock, one iteration | the same, budget of the model |")
+    print("| model | DoF | rollouts / stock | gradients / stock, one iteration | the same, budget of the model |")
     print("| --- " * 5 + "|")
     for name, path in MODELS.items():
-        found = measured(path)
+        found = measured(path, batch)
         over = [found["stock"] / found["ours"]]
         over += [found["stock_gradient"] / found[each] for each in ("gradient_once", "gradient")]
         budget = f"{over.pop():.2f} ({found['budget']:g})"

@@ -3,6 +3,8 @@
     python docs/make_scaling.py engine --workers 20 --cells 10000 --seconds 0.1
     python docs/make_scaling.py workers --workers 1 2 4 --cells 200
     python docs/make_scaling.py cost --seconds 600 --output docs/scaling_cpu.json
+    python docs/make_scaling.py devices --tasks pusher tennis --samples 100000 1000000
+    python docs/make_scaling.py busy
     python docs/make_scaling.py fit docs/scaling_cpu.json
     python docs/make_scaling.py figure docs/scaling_cpu.json --output docs/scaling.png
 
@@ -16,6 +18,11 @@ compiles, the second counts. A worker is busy while it computes a cell, by Dask'
 finds (leave JAX_PLATFORMS unset on an accelerator). Each measurement alternates with one of the same rollouts, so that
 a machine that gets slower slows both; ratios to these are what counts. It prints as it goes, leaves out what does not
 fit into `--seconds`, and goes on where the file ends.
+
+`devices` runs gradients and rollouts of tasks on one device and on all, in turn, and compares the results bit for bit.
+
+`busy` sweeps contact models on an accelerator, under JAX's profiler, and prints the share of the time in which one of
+its kernels runs: from the first cell to the last, after a run that compiles.
 
 `fit` prints the constants of the rough model of times (mjx_study/study/times.py) that these measurements give.
 """
@@ -42,6 +49,9 @@ AXES: Final[dict[str, dict[str, tuple[int, ...]]]] = {
     "gpu": {"samples": (100, 1000, 10_000, 100_000, 1_000_000), "chunk": (512, 4096, 32_768)},
 }
 HORIZONS, CONTACTS, DOF, BODIES = (20, 60, 200), (1, 2, 4, 8), (2, 4, 8, 16), (2,)
+COUNTS: Final = (1, 2, 4, 8, 16)
+SPREAD_HORIZON: Final = 200
+"""Steps of what is spread over devices: a call must outlast the launch of the others."""
 
 
 # Models
@@ -171,8 +181,9 @@ def plan(programs: Programs) -> list[tuple[str, int, dict[str, Any]]]:
     for kind in KINDS:
         found += [("samples", at, {"kind": kind, "samples": at}) for at in axes["samples"]]
         found += [("chunk", at, {"kind": kind, "samples": at, "chunk": at}) for at in axes["chunk"]]
-        counts = range(1, 1 + min(8, len(programs.devices)))
-        found += [("devices", at, {"kind": kind, "samples": 16 * chunk, "devices": at, "wall": True}) for at in counts]
+        counts = [at for at in COUNTS if at <= len(programs.devices)]
+        batch = {"kind": kind, "samples": 4 * max(counts) * chunk, "horizon": SPREAD_HORIZON, "wall": True}
+        found += [("devices", at, batch | {"devices": at}) for at in counts]
     found += [("horizon", at, {"kind": kind, "samples": chunk, "horizon": at}) for at in HORIZONS for kind in KINDS]
     others = ("corrected", "steps", "step_gradient", "linearisation")
     found += [("kind", at, {"kind": kind, "samples": chunk}) for at, kind in enumerate(KINDS + others)]
@@ -181,11 +192,12 @@ def plan(programs: Programs) -> list[tuple[str, int, dict[str, Any]]]:
     return found
 
 
-def measure_cost(seconds: float, output: Path) -> None:
+def measure_cost(seconds: float, output: Path, axes: list[str]) -> None:
     """Time everything that the file does not have; written after each measurement.
 
     Args:
         seconds: after which nothing more is begun, of a CPU the processor's.
+        axes: which to measure, and again where the file has them; all that the file lacks by default.
     """
     import jax
 
@@ -198,13 +210,14 @@ def measure_cost(seconds: float, output: Path) -> None:
     begun = clock()
     document: dict[str, Any] = {"environment": environment(), "measured": [], "left_out": []}
     if output.exists():
-        document |= {"measured": json.loads(output.read_text())["measured"]}
+        document |= {"measured": [r for r in json.loads(output.read_text())["measured"] if r["axis"] not in axes]}
     _, base = programs.run("value", programs.chunk)
     per_step = programs.chunk * HORIZON
     compiled(base)
     bases: list[float] = []
     for axis, at, arguments in plan(programs):
-        if any((axis, at, arguments["kind"]) == (row["axis"], row["at"], row["kind"]) for row in document["measured"]):
+        known = ((row["axis"], row["at"], row["kind"]) for row in document["measured"])
+        if (axes and axis not in axes) or (axis, at, arguments["kind"]) in known:
             continue
         if clock() - begun > seconds:
             document["left_out"].append([axis, at, arguments["kind"]])
@@ -228,6 +241,84 @@ def measure_cost(seconds: float, output: Path) -> None:
             flush=True,
         )
     print(f"{len(document['left_out'])} left out for lack of time")
+
+
+def measure_devices(tasks: list[str], samples: list[int]) -> None:
+    """Print the throughput of gradients and rollouts on one device and on all of them; the same chunks on both."""
+    import jax
+    import numpy as np
+
+    from mjx_study.objective import Simulator, spread
+    from mjx_study.runtime import configure, environment
+    from mjx_study.tasks import make_task
+
+    configure()
+    devices = jax.local_devices()
+    print(json.dumps(environment()))
+    for name in tasks:
+        task = make_task(name)
+        for count in samples:
+            # So many calls on each device that the ends of the last ones do not count.
+            chunk = math.ceil(count / len(devices))
+            chunk = math.ceil(chunk / math.ceil(chunk / 50_000))
+            keys = np.resize(jax.random.key_data(jax.random.split(jax.random.key(0), 10_000)), (count, 2))
+            rows = keys, np.ones(count, task.scene.template.qpos.dtype)
+            simulator = Simulator(task, chunk_size=chunk)
+            shared = task.theta, None, np.asarray(task.sigma, rows[1].dtype)
+            for kind in KINDS:
+                program, taken, results = simulator._programs[kind], {1: [], len(devices): []}, {}
+                for repeat in range(REPEATS + 1):
+                    for number in taken:
+                        begun = time.perf_counter()
+                        results[number] = jax.block_until_ready(spread(program, shared, rows, chunk, devices[:number]))
+                        taken[number] += [time.perf_counter() - begun] if repeat else []
+                alone, together = (jax.tree.leaves(jax.device_get(each)) for each in results.values())
+                same = all(np.array_equal(a, b, equal_nan=True) for a, b in zip(alone, together, strict=True))
+                one, every = (statistics.median(each) for each in taken.values())
+                told = {"task": name, "samples": count, "chunk": chunk, "kind": kind, "devices": len(devices)}
+                rates = {number: count * task.horizon / at / 1e6 for number, at in ((1, one), (len(devices), every))}
+                told |= {"million steps per second": rates, "ratio": one / every, "bitwise identical": same}
+                print(json.dumps(told), flush=True)
+
+
+def measure_busy(cells: int, samples: int, seeds: int) -> None:
+    """Print what a compiled sweep takes and the share of that time in which the accelerator runs a kernel."""
+    import jax
+    import numpy as np
+
+    from mjx_study.runtime import configure, environment
+    from mjx_study.study.configuration import StudyConfig
+    from mjx_study.study.plan import plan_study
+    from mjx_study.study.run import run_study
+
+    configure()
+    stiffness = tuple(float(each) for each in np.geomspace(10.0, 1e4, cells))
+    config = StudyConfig(tasks=("pusher",), contact=("penalty",), stiffness=stiffness, samples=(samples,), seeds=seeds)
+    with tempfile.TemporaryDirectory() as name:
+        begun = time.perf_counter()
+        run_study(plan_study(config), Path(name) / "first")
+        first = time.perf_counter() - begun
+        plan = plan_study(config)
+        with jax.profiler.trace(str(Path(name) / "trace")):
+            begun = time.perf_counter()
+            run_study(plan, Path(name) / "second")
+            wall = time.perf_counter() - begun
+        (written,) = Path(name).rglob("*.xplane.pb")
+        profile = jax.profiler.ProfileData.from_file(str(written))
+    spans = sorted(
+        (event.start_ns, event.start_ns + event.duration_ns)
+        for plane in profile.planes
+        if plane.name.startswith("/device:")
+        for line in plane.lines
+        if line.name.startswith("Stream")
+        for event in line.events
+    )
+    busy, end = 0.0, 0.0
+    for start, stop in spans:
+        busy, end = busy + max(0.0, stop - max(start, end)), max(end, stop)
+    told = {"cells": cells, "first run [s]": first, "compiled [s]": wall, "kernels and copies": len(spans)}
+    told |= {"busy": busy / 1e9 / wall, "busy from first to last": busy / (end - spans[0][0]) if spans else 0.0}
+    print(json.dumps(environment() | told))
 
 
 # Model and figure
@@ -300,23 +391,25 @@ PANELS: Final = {
     "horizon": ("steps", "time of a step"),
     "dof": ("degrees of freedom", "time of a step"),
     "contacts": ("contacts", "time of a step"),
-    "devices": ("devices", "samples per second"),
+    "devices": ("devices (CPU: cores)", "samples per second"),
 }
 
 
 def draw(documents: list[dict[str, Any]], output: Path) -> None:
-    """One row of panels: an accelerator's lines are dashed."""
+    """One row of panels: lines of the second machine are dashed, of the third dotted."""
     from matplotlib.figure import Figure
+    from matplotlib.ticker import LogLocator
 
     from mjx_study.disk import write_whole
     from mjx_study.plots.style import STYLE
 
-    figure = Figure(figsize=(3.0 * len(PANELS), 3.2), layout="constrained")
+    figure = Figure(figsize=(2.6 * len(PANELS), 3.2), layout="constrained")
     panels = dict(zip(PANELS, figure.subplots(1, len(PANELS)), strict=True))
     names = {"value": ("rollouts", *STYLE["zobg"]), "gradient": ("gradients", *STYLE["fobg"])}
     for document, line in zip(documents, ("-", "--", ":"), strict=False):
         environment = document["environment"]
-        device = environment["processor"] if environment["backend"] == "cpu" else environment["devices"][0]
+        on_cpu = environment["backend"] == "cpu"
+        device = "one core" if on_cpu else environment["device_kind"].removeprefix("NVIDIA ").split(" ")[0]
         for axis, (label, title) in PANELS.items():
             for kind, (name, colour, marker) in names.items():
                 rows = [row for row in document["measured"] if row["axis"] == axis and row["kind"] == kind]
@@ -325,17 +418,31 @@ def draw(documents: list[dict[str, Any]], output: Path) -> None:
                 axes, each = panels[axis], [row["ratio"] / row["samples"] / row["steps"] for row in rows]
                 if axis == "devices":
                     each = [rows[0]["seconds"] / row["seconds"] for row in rows]
-                told = f"{name}, {device}" if len(documents) > 1 else name
-                axes.plot([row["at"] for row in rows], each, line, color=colour, marker=marker, ms=4, label=told)
+                axes.plot(
+                    [row["at"] for row in rows],
+                    each,
+                    line,
+                    color=colour,
+                    marker=marker,
+                    ms=4,
+                    label=f"{name}, {device}",
+                )
                 axes.set(xlabel=label, title=title)
     for axis, axes in panels.items():
+        places = sorted({row["at"] for each in documents for row in each["measured"] if row["axis"] == axis})
+        axes.set(xscale="log", yscale="log")
         if axis == "devices":
-            most = max([2, *(row["at"] for each in documents for row in each["measured"] if row["axis"] == axis)])
-            axes.plot([1, most], [1, most], color="0.7", linewidth=0.8, zorder=0)
-            axes.set(ylim=(0, None), xticks=range(1, most + 1), ylabel="over one device")
+            axes.plot(places, places, color="0.7", linewidth=0.8, zorder=0)
+            axes.set(ylabel="over one device")
+            axes.set_yticks(places, [str(at) for at in places])
         else:
-            axes.set(xscale="log", yscale="log")
+            low, high = axes.get_ylim()
+            axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if high < 20 * low else (1, 3), numticks=12))
+            axes.yaxis.set_major_formatter("{x:g}")
             axes.grid(alpha=0.25)
+        if axis != "samples":
+            axes.set_xticks(places, [str(at) for at in places])
+        axes.minorticks_off()
     next(iter(panels.values())).set_ylabel(f"over a step of a rollout of {BASE}")
     next(iter(panels.values())).legend(fontsize=7)
     write_whole(output, lambda file: figure.savefig(file, format="png", dpi=130))
@@ -450,7 +557,15 @@ def main() -> None:
     cost.add_argument(
         "--seconds", type=float, default=600, help="after which nothing is begun, of a CPU the processor's"
     )
+    cost.add_argument("--axes", nargs="+", default=[], help="to measure, anew if the file has them; all by default")
     cost.add_argument("--output", type=Path, required=True)
+    spread_over = commands.add_parser("devices", help="print throughput on one device and on all, as JSON")
+    spread_over.add_argument("--tasks", nargs="+", default=["pusher", "tennis"])
+    spread_over.add_argument("--samples", type=int, nargs="+", default=[100_000, 1_000_000])
+    profiled = commands.add_parser("busy", help="print the share of a sweep's time in which kernels run, as JSON")
+    profiled.add_argument("--cells", type=int, default=65)
+    profiled.add_argument("--samples", type=int, default=4000)
+    profiled.add_argument("--seeds", type=int, default=10)
     fit_command = commands.add_parser("fit", help="print the constants of the model")
     fit_command.add_argument("measured", type=Path)
     drawn = commands.add_parser("figure", help="draw")
@@ -464,6 +579,10 @@ def main() -> None:
         measure_workers(**options)
     elif command == "cost":
         measure_cost(**options)
+    elif command == "devices":
+        measure_devices(**options)
+    elif command == "busy":
+        measure_busy(**options)
     elif command == "fit":
         print(json.dumps(fit(json.loads(options["measured"].read_text())), indent=1))
     else:

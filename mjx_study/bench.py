@@ -57,6 +57,8 @@ class BenchReport:
         engine_gradient_seconds: time of a gradient by the C engine's differences on as many threads [s]; None if it has
             none.
         value_memory, gradient_memory: temporary memory of all samples' rollouts, or gradients, at once [MiB].
+        onset_seconds, onset_base_seconds: time of a first-order sample through MuJoCo's default contact, with the
+            linear onset term and without it [s]; None without contact.
     """
 
     task: str
@@ -73,6 +75,8 @@ class BenchReport:
     value_memory: float
     gradient_memory: float
     environment: dict[str, Any]
+    onset_seconds: float | None = None
+    onset_base_seconds: float | None = None
 
     @property
     def ratios(self) -> dict[str, float]:
@@ -85,13 +89,16 @@ class BenchReport:
         }
         if self.engine_gradient_seconds is not None:
             ratios["speedup_over_engine"] = self.engine_gradient_seconds / self.gradient_seconds
+        if self.onset_seconds is not None and self.onset_base_seconds is not None:
+            ratios["onset_per_gradient"] = self.onset_seconds / self.onset_base_seconds
         return ratios
 
     def as_json(self) -> dict[str, Any]:
         return dataclasses.asdict(self) | {"ratios": self.ratios}
 
     def lines(self) -> list[str]:
-        ratios, devices = self.ratios, self.environment["devices"]
+        ratios, machine = self.ratios, self.environment
+        device = machine["processor"] if machine["backend"] == "cpu" else machine["device_kind"]
 
         def rate(label: str, seconds: float | None) -> list[str]:
             if seconds is None:
@@ -99,10 +106,10 @@ class BenchReport:
             return [f"  {label:<46} {1e3 * seconds:8.3f} ms  {self.horizon / seconds / 1e6:8.3f} million steps/s"]
 
         engine = f", {ratios['speedup_over_engine']:.2f} x the C engine" if "speedup_over_engine" in ratios else ""
+        onset = f"  the onset term makes it {ratios.get('onset_per_gradient', 1):.2f} times as expensive"
         return [
             f"{self.task}: {self.samples} samples of {self.horizon} steps, {self.contact}, "
-            f"{self.environment['precision']}, {len(devices)} x {self.environment['backend']} "
-            f"({self.environment['processor']})",
+            f"{machine['precision']}, {len(machine['devices'])} x {machine['backend']} ({device})",
             "per sample:",
             *rate("zeroth order (rollout and baseline)", self.value_seconds),
             *rate("first order (rollout and gradient)", self.gradient_seconds),
@@ -111,8 +118,11 @@ class BenchReport:
             *rate("a rollout by the C engine, mujoco.rollout", self.engine_value_seconds),
             *rate("jax.grad through mjx.step, one iteration", self.stock_gradient_seconds),
             *rate("C engine, mjd_transitionFD and adjoint", self.engine_gradient_seconds),
+            *rate("first order, MuJoCo's default contact", self.onset_base_seconds),
+            *rate("first order with the onset term, likewise", self.onset_seconds),
             "ratios of this run:",
             f"  a first-order sample costs {ratios['gradient_per_value']:.2f} zeroth-order samples",
+            *([onset] if "onset_per_gradient" in ratios else []),
             f"  rollouts per second: {ratios['rollouts_over_stock']:.2f} x stock mjx.step, "
             f"{ratios['rollouts_over_engine']:.2f} x the C engine",
             f"  gradients per second: {ratios['speedup_over_stock']:.2f} x stock mjx.step{engine}",
@@ -126,6 +136,8 @@ class BenchPlan:
     task: Task
     samples: int
     cell: ContactPoint
+    onset: ContactPoint | None
+    """MuJoCo's default contact, whose force sets in with a jump; None without contact."""
 
 
 def plan_bench(task: Task, samples: int) -> BenchPlan:
@@ -138,7 +150,8 @@ def plan_bench(task: Task, samples: int) -> BenchPlan:
         raise ValueError(f"samples must be at least 1, got {samples}")
     check_memory(task, (ZerothOrder(), FirstOrder()), samples)
     (cell,), _ = contact_grid(task, [task.defaults.main_family], [task.defaults.middle_stiffness])
-    return BenchPlan(task, samples, cell)
+    (onset,), _ = contact_grid(task, ["mujoco_default"]) if task.contact_pair else ((None,), ())
+    return BenchPlan(task, samples, cell, onset)
 
 
 def bench(plan: BenchPlan, progress: Progress = lambda done, total, what: None) -> BenchReport:
@@ -151,7 +164,7 @@ def bench(plan: BenchPlan, progress: Progress = lambda done, total, what: None) 
     full = -(-samples // (simulator.chunk_size * len(devices))) * simulator.chunk_size * len(devices)
     key_data = np.resize(jax.random.key_data(keys), (full, 2))  # no padded chunks, as in stock
     noisy = np.ones(full, task.scene.template.qpos.dtype)
-    progress(0, 12, f"{task.name}: compiling stock")
+    progress(0, 1, f"{task.name}: compiling stock")
     stock_samples = min(samples, STOCK_BATCH[devices[0].platform] * len(devices))
     stock_samples, stock_value, stock_gradient = _fitting_stock(task, cell.contact, keys, stock_samples, devices)
     contenders: dict[str, tuple[int, Callable[[], Any]]] = {
@@ -162,6 +175,10 @@ def bench(plan: BenchPlan, progress: Progress = lambda done, total, what: None) 
         "stock_gradient": (stock_samples, stock_gradient),
         "engine_value": engine_rollouts(task, cell.contact, keys[: STOCK_BATCH["cpu"]], len(devices)),
     }
+    if plan.onset is not None:
+        default = simulator.objective(plan.onset.contact)
+        contenders["onset_base"] = samples, lambda: default.differentiate(task.theta, keys)
+        contenders["onset"] = samples, lambda: default.differentiate_corrected(task.theta, keys)
     total = 2 * len(contenders)
     for done, (name, (_, call)) in enumerate(contenders.items()):
         progress(done, total, f"{task.name}: compiling {name.replace('_', ' ')}")
@@ -171,6 +188,7 @@ def bench(plan: BenchPlan, progress: Progress = lambda done, total, what: None) 
         progress(len(contenders) + min(repeat, len(contenders) - 1), total, f"{task.name}: measuring")
         for name, (count, call) in contenders.items():
             times[name].append(_seconds(call) / count)
+    medians = {f"{name}_seconds": statistics.median(values) for name, values in times.items()}
     engine = _engine_seconds(task, cell.contact)
     progress(total, total, "done")
     return BenchReport(
@@ -178,7 +196,7 @@ def bench(plan: BenchPlan, progress: Progress = lambda done, total, what: None) 
         samples=samples,
         horizon=task.horizon,
         contact=cell.label,
-        **{f"{name}_seconds": statistics.median(values) for name, values in times.items()},
+        **medians,
         engine_gradient_seconds=None if engine is None else engine / len(devices),
         value_memory=simulator.memory("value", cell.contact, samples) / 2**20,
         gradient_memory=simulator.memory("gradient", cell.contact, samples) / 2**20,

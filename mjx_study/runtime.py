@@ -95,5 +95,6 @@ def environment() -> dict[str, Any]:
         "cores": available_cores(),
         "devices": [str(device) for device in jax.local_devices()],
         "backend": jax.default_backend(),
+        "device_kind": jax.local_devices()[0].device_kind,
         "precision": precision(),
     }

@@ -27,19 +27,21 @@ RATIOS = {"gradient_per_value", "rollouts_over_stock", "rollouts_over_engine", "
 
 
 @pytest.mark.parametrize(
-    ("task", "engine"),
+    ("task", "further"),
     [
-        ("tests.carts:cart", True),
-        pytest.param("pusher", True, marks=pytest.mark.slow),
-        pytest.param("tennis", True, marks=pytest.mark.slow),
-        pytest.param("double_pendulum", False, marks=pytest.mark.slow),
+        ("tests.carts:cart", {"speedup_over_engine", "onset_per_gradient"}),
+        pytest.param("pusher", {"speedup_over_engine", "onset_per_gradient"}, marks=pytest.mark.slow),
+        pytest.param("tennis", {"speedup_over_engine", "onset_per_gradient"}, marks=pytest.mark.slow),
+        pytest.param("double_pendulum", set(), marks=pytest.mark.slow),
     ],
 )
-def test_bench_prints_its_ratios_and_the_machine(capsys: pytest.CaptureFixture[str], task: str, engine: bool) -> None:
+def test_bench_prints_its_ratios_and_the_machine(
+    capsys: pytest.CaptureFixture[str], task: str, further: set[str]
+) -> None:
     """Open loop, feedback from random starts, and a launch without contact by Runge-Kutta."""
     assert cli.main(["bench", task, "--horizon", "3", "--samples", "6", "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
-    assert set(document["ratios"]) == RATIOS | ({"speedup_over_engine"} if engine else set())
+    assert set(document["ratios"]) == RATIOS | further
     assert all(ratio > 0 for ratio in document["ratios"].values())
     assert document["environment"]["processor"] and document["gradient_memory"] > document["value_memory"] > 0
 
