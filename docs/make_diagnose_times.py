@@ -46,7 +46,7 @@ def row(path: Path) -> str:
 
 
 def main() -> None:
-    print("| MJCF | freedoms | cold | warm | samples | advice |")
+    print("| MJCF | DoF | cold | warm | samples | advice |")
     print("| --- " * 6 + "|")
     for name in sys.argv[1:]:
         print(row(Path(name)), flush=True)

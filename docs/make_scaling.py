@@ -21,8 +21,8 @@ fit into `--seconds`, and goes on where the file ends.
 
 `devices` runs gradients and rollouts of tasks on one device and on all, in turn, and compares the results bit for bit.
 
-`busy` sweeps contact models on an accelerator, under JAX's profiler, and prints the share of the time in which one of
-its kernels runs: from the first cell to the last, after a run that compiles.
+`busy` sweeps contact models on an accelerator and prints the share of a cell's time in which a kernel runs, by JAX's
+profiler.
 
 `fit` prints the constants of the rough model of times (mjx_study/study/times.py) that these measurements give.
 """
@@ -282,7 +282,10 @@ def measure_devices(tasks: list[str], samples: list[int]) -> None:
 
 
 def measure_busy(cells: int, samples: int, seeds: int) -> None:
-    """Print what a compiled sweep takes and the share of that time in which the accelerator runs a kernel."""
+    """Print what a sweep takes, cold and compiled, and the share of the latter in which the accelerator runs a kernel.
+
+    The kernels' time is that of a third run, under JAX's profiler, which slows their launches.
+    """
     import jax
     import numpy as np
 
@@ -294,15 +297,21 @@ def measure_busy(cells: int, samples: int, seeds: int) -> None:
     configure()
     stiffness = tuple(float(each) for each in np.geomspace(10.0, 1e4, cells))
     config = StudyConfig(tasks=("pusher",), contact=("penalty",), stiffness=stiffness, samples=(samples,), seeds=seeds)
+    told: dict[str, Any] = {"cells": cells}
     with tempfile.TemporaryDirectory() as name:
-        begun = time.perf_counter()
-        run_study(plan_study(config), Path(name) / "first")
-        first = time.perf_counter() - begun
-        plan = plan_study(config)
+
+        def run(which: str) -> None:
+            starts: list[float] = []
+            run_study(plan_study(config), Path(name) / which, lambda *_: starts.append(time.perf_counter()))
+            told[f"{which} [s]"], told[f"{which}, a cell [s]"] = (
+                time.perf_counter() - starts[0],
+                statistics.median(np.diff(starts[:-1])),
+            )
+
+        run("cold")
+        run("compiled")
         with jax.profiler.trace(str(Path(name) / "trace")):
-            begun = time.perf_counter()
-            run_study(plan, Path(name) / "second")
-            wall = time.perf_counter() - begun
+            run("profiled")
         (written,) = Path(name).rglob("*.xplane.pb")
         profile = jax.profiler.ProfileData.from_file(str(written))
     spans = sorted(
@@ -316,8 +325,8 @@ def measure_busy(cells: int, samples: int, seeds: int) -> None:
     busy, end = 0.0, 0.0
     for start, stop in spans:
         busy, end = busy + max(0.0, stop - max(start, end)), max(end, stop)
-    told = {"cells": cells, "first run [s]": first, "compiled [s]": wall, "kernels and copies": len(spans)}
-    told |= {"busy": busy / 1e9 / wall, "busy from first to last": busy / (end - spans[0][0]) if spans else 0.0}
+    told |= {"kernels and copies": len(spans), "kernels, a cell [s]": busy / 1e9 / cells}
+    told["busy"] = told["kernels, a cell [s]"] / told["compiled, a cell [s]"]
     print(json.dumps(environment() | told))
 
 

@@ -195,14 +195,16 @@ def cells_on(
                 if len(workers) != count:
                     count = len(workers)
                     told(count)
-            with suppress(queue.Empty):
-                future, outcome = ended.get(timeout=POLL_SECONDS)
-                if future not in at:
-                    continue
-                task, worker = at.pop(future)
-                if isinstance(outcome, WorkerRefusedError):
-                    raise StudyError(str(outcome)) from outcome
-                begin(worker)
+            # All that have ended get their next task before the arrays of any are written, which takes its time.
+            done = []
+            for future, outcome in _all_of(ended):
+                if future in at:
+                    task, worker = at.pop(future)
+                    if isinstance(outcome, WorkerRefusedError):
+                        raise StudyError(str(outcome)) from outcome
+                    begin(worker)
+                    done.append((task, outcome))
+            for task, outcome in done:
                 if isinstance(outcome, BaseException):
                     yield from tried(task, f"{type(outcome).__name__}: {outcome}".partition("\n")[0])
                 else:
@@ -212,6 +214,14 @@ def cells_on(
     finally:
         with suppress(OSError):
             client.cancel(list(at))
+
+
+def _all_of(ended: queue.SimpleQueue[Any]) -> Generator[Any]:
+    """What is in the queue now; waits a while for the first."""
+    with suppress(queue.Empty):
+        yield ended.get(timeout=POLL_SECONDS)
+        for _ in range(ended.qsize()):
+            yield ended.get_nowait()
 
 
 def in_blocks(plan: StudyPlan, index: int) -> bool:
