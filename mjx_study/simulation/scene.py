@@ -25,8 +25,9 @@ _ENUMERATED: Final = {
 SceneOption = str | float | int | Sequence[str]
 ADJOINTS: Final = ("auto", "jacobian", "tape")
 """Ways to differentiate steps (see `Scene.adjoint`)."""
-JACOBIAN_COLUMNS: Final = 32
-"""Largest number of columns (nq + nv + na + nu) for which "auto" forms a step's Jacobian."""
+JACOBIAN_COLUMNS: Final = {"cpu": 20, "gpu": 13, "tpu": 13}
+"""Largest number of columns (nq + nv + na + nu) for which "auto" forms a step's Jacobian, by backend: up to there it was
+the faster one as a rule (docs/performance.md)."""
 _POSITIVE: Final = ("timestep", "iterations", "ls_iterations", "tolerance")
 
 
@@ -54,7 +55,7 @@ class Scene:
             - "tape": automatic differentiation around the implicit solve. The work hardly depends on the number of
               columns; reverse mode runs each step again and, within it, is at the mercy of MJX's own operations
               (fault 13 in `docs/gradient-faults.md`).
-            - "auto": the Jacobian up to `JACOBIAN_COLUMNS` columns, else the tape.
+            - "auto": the Jacobian up to `JACOBIAN_COLUMNS` columns, which depend on the backend, else the tape.
 
             Derivatives with respect to the model always take the tape.
 
@@ -78,7 +79,7 @@ class Scene:
     def uses_jacobian(self) -> bool:
         """Whether steps form their Jacobian; else they use the tape."""
         host = self.host
-        small = host.nq + host.nv + host.na + host.nu <= JACOBIAN_COLUMNS
+        small = host.nq + host.nv + host.na + host.nu <= JACOBIAN_COLUMNS[jax.default_backend()]
         return self.adjoint == "jacobian" or (self.adjoint == "auto" and small and not self._explicit)
 
     @property
