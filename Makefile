@@ -36,7 +36,7 @@ figures: $(STAMP) ## Make the figures and films of docs/ again
 study: $(STAMP) ## Sweep stiffness and draw the README's figures of it again (half an hour; resumable)
 	$(BIN)/python docs/make_study.py
 
-coverage: $(STAMP) ## Measure again what docs/coverage.md says of intervals and tests (a minute)
+coverage: $(STAMP) ## Measure again what docs/coverage.md says of intervals and tests (a few minutes)
 	$(BIN)/python docs/make_coverage.py
 
 test: $(STAMP) ## Run the tests, less the slow ones (PYTEST_ARGS='-k name' in place of two workers)
@@ -60,7 +60,7 @@ test-newer-jax: ## Run the tests of devices on the newest JAX, if there is a Pyt
 		$(NEWEST)/bin/python -c 'import jax; print("JAX", jax.__version__)' && \
 		$(NEWEST)/bin/python -m pytest -p no:cacheprovider $(PYTEST_ARGS) $(addprefix tests/test_,$(NEWEST_TESTS)); fi
 
-defects: $(STAMP) ## Plant defects one at a time; say what catches each, here and in docs/testing.md (half an hour)
+defects: $(STAMP) ## Plant defects one at a time; say what catches each, here and in docs/testing.md (a quarter of an hour)
 	$(BIN)/python -m tests.planted --everything --page docs/testing.md
 
 lint: $(STAMP) ## Check style, formatting and types

@@ -41,8 +41,8 @@ def row(path: Path) -> str:
             return f"| `{path.name}` | | | | | {cold[2].stderr.strip().splitlines()[-1]} |"
         *warm, done = run(path, cache)
     times = [f"{computed:.1f} ({wall:.1f})" for wall, computed in (cold[:2], warm)]
-    found, freedoms = json.loads(done.stdout), mujoco.MjModel.from_xml_path(str(path)).nv
-    return f"| `{path.name}` | {freedoms} | {' | '.join(times)} | {found['samples']} | {found['advice'][0]} |"
+    found, dof = json.loads(done.stdout), mujoco.MjModel.from_xml_path(str(path)).nv
+    return f"| `{path.name}` | {dof} | {' | '.join(times)} | {found['samples']} | {found['advice'][0]} |"
 
 
 def main() -> None:

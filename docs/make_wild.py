@@ -168,7 +168,7 @@ def tables(lines: Iterable[dict[str, Any]]) -> str:
     lines = list(lines)
     singles, batches = ([line for line in lines if bool(line["onset"]) == mean] for mean in (False, True))
     rows = [
-        "| environment | freedoms, steps | budget | stock | at one iteration | here | differences | converged: here |"
+        "| environment | DoF, steps | budget | stock | at one iteration | here | differences | converged: here |"
         " off differences of 1e-6, 1e-7, 1e-8 by |",
         "| --- | --- | --- | --- | --- | --- | --- | --- | --- |",
     ]

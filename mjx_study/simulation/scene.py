@@ -26,8 +26,8 @@ SceneOption = str | float | int | Sequence[str]
 ADJOINTS: Final = ("auto", "jacobian", "tape")
 """Ways to differentiate steps (see `Scene.adjoint`)."""
 JACOBIAN_COLUMNS: Final = {"cpu": 20, "gpu": 13, "tpu": 13}
-"""Largest number of columns (nq + nv + na + nu) for which "auto" forms a step's Jacobian, by backend: up to there it was
-the faster one as a rule (docs/performance.md)."""
+"""Largest number of columns (nq + nv + na + nu) for which "auto" forms a step's Jacobian, by backend: beyond, the tape
+costs less (docs/performance.md)."""
 _POSITIVE: Final = ("timestep", "iterations", "ls_iterations", "tolerance")
 
 
