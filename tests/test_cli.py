@@ -57,7 +57,7 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
 def small_run(shared_programs: None, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     """One small comparison with an output folder, and what it printed."""
     folder = tmp_path_factory.mktemp("out") / "results"
-    command = ["compare", "pusher", *SMALL, "--output", str(folder)]
+    command = ["compare", "pusher", *SMALL, "--output", str(folder), "--details"]
     command += ["--stiffness", "10,1000", "--contact", "penalty,mujoco_default", "--estimators", "zobg,fobg,aobg,ivw"]
     out, told = io.StringIO(), io.StringIO()
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(out), contextlib.redirect_stderr(told):

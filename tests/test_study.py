@@ -313,8 +313,19 @@ def as_json(dataset: xr.Dataset) -> dict[str, Any]:
     return as_document(dataset, console.rows_as_json)
 
 
-def table(dataset: xr.Dataset) -> list[str]:
-    return console.gradient_lines(dataset, as_json(dataset))
+def table(dataset: xr.Dataset, details: bool = True) -> list[str]:
+    return console.gradient_lines(dataset, as_json(dataset), details)
+
+
+def test_the_short_table_says_which_estimator_to_take(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "100")
+    data = result(row("zobg", 10, 1), row("fobg", 10, 1))
+    short, full = table(data, details=False), table(data)
+    (heading,) = [line for line in short if "estimator" in line]
+    for name in ("variance (95% interval)", "relative error -> debiased", "alpha", "ms", "variance x s"):
+        assert name in heading and any(name in line for line in full)
+    for name in ("|gradient|", "effective (top)", "cosine -> debiased", "epsilon", "B", "residual", "nan"):
+        assert name not in heading.split("  ") and any(name in line for line in full)
 
 
 def test_doubtful_numbers_are_marked_in_the_table(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,6 +1,7 @@
 """mjx-study compare."""
 
 import argparse
+from functools import partial
 
 from mjx_study.cli.console import gradient_lines, rows_as_json
 from mjx_study.cli.studies import run_one, study_fields
@@ -9,7 +10,8 @@ from mjx_study.study.plan import StudyPlan, plan_study
 
 
 def run(options: argparse.Namespace) -> int:
-    return run_one(options, _plan, rows_as_json, gradient_lines, "figures and the numbers on disk")
+    lines = partial(gradient_lines, details=options.details)
+    return run_one(options, _plan, rows_as_json, lines, "figures and the numbers on disk")
 
 
 def _plan(options: argparse.Namespace) -> StudyPlan:

@@ -68,42 +68,45 @@ def _debiased(row: Row, value: float, debiased: float, error: float, best: float
     return f"{plain} -> {left}{_doubt(row)}"
 
 
-def columns(confidence: float) -> list[list[Column]]:
-    """The comparison's columns: those that identify a row, then the parts of which a table may have one or more."""
+def columns(confidence: float, details: bool = False) -> list[list[Column]]:
+    """The comparison's columns: those that identify a row, then the parts of which a table may have one or more.
+
+    Args:
+        confidence: of intervals.
+        details: all of them, not only those that say which estimator to take.
+    """
+    variance = f"variance ({confidence:.0%} interval)", _interval
+    error = (
+        "relative error -> debiased",
+        lambda row: _debiased(row, row.relative_error, row.debiased_error, row.debiased_error_se, 0.0),
+    )
+    cosine = (
+        "cosine -> debiased",
+        lambda row: _debiased(row, row.cosine, row.debiased_cosine, row.debiased_cosine_se, 1.0),
+    )
+    alpha = "alpha", lambda row: "-" if row.alpha is None else f"{row.alpha:.3f}"
+    times: list[Column] = [
+        ("ms", lambda row: f"{1e3 * row.seconds_per_sample:.2f}"),
+        ("variance x s", lambda row: number(row.variance_seconds)),
+    ]
+    identity: list[Column] = [
+        ("K [N/m]", lambda row: number(row.stiffness or None)),
+        ("estimator", lambda row: style_of(row.estimator)[0]),
+    ]
+    if not details:
+        return [identity, [variance, error], [alpha, *times]]
     return [
-        [("K [N/m]", lambda row: number(row.stiffness or None)), ("estimator", lambda row: style_of(row.estimator)[0])],
-        [
-            ("|gradient|", lambda row: number(row.gradient_norm)),
-            (f"variance ({confidence:.0%} interval)", _interval),
-            ("effective (top)", _effective),
-        ],
-        [
-            (
-                "relative error -> debiased",
-                lambda row: _debiased(row, row.relative_error, row.debiased_error, row.debiased_error_se, 0.0),
-            ),
-            (
-                "cosine -> debiased",
-                lambda row: _debiased(row, row.cosine, row.debiased_cosine, row.debiased_cosine_se, 1.0),
-            ),
-        ],
-        [
-            ("alpha", lambda row: "-" if row.alpha is None else f"{row.alpha:.3f}"),
-            ("epsilon", lambda row: number(row.epsilon)),
-            ("B", lambda row: number(row.discrepancy)),
-        ],
-        [
-            ("ms", lambda row: f"{1e3 * row.seconds_per_sample:.2f}"),
-            ("variance x s", lambda row: number(row.variance_seconds)),
-            ("residual", lambda row: number(row.residual, 2)),
-            ("nan", lambda row: str(row.nonfinite)),
-        ],
+        identity,
+        [("|gradient|", lambda row: number(row.gradient_norm)), variance, ("effective (top)", _effective)],
+        [error, cosine],
+        [alpha, ("epsilon", lambda row: number(row.epsilon)), ("B", lambda row: number(row.discrepancy))],
+        [*times, ("residual", lambda row: number(row.residual, 2)), ("nan", lambda row: str(row.nonfinite))],
     ]
 
 
-def _blocks(rows: Sequence[Row], confidence: float, width: int) -> list[list[str]]:
+def _blocks(rows: Sequence[Row], shown: list[list[Column]], width: int) -> list[list[str]]:
     """As few tables as the width allows, each with the columns that identify its rows."""
-    identity, *parts = columns(confidence)
+    identity, *parts = shown
     blocks: list[list[Column]] = []
     for part in parts:
         if blocks and len(_table(rows, identity + blocks[-1] + part)[0]) <= width:
@@ -113,9 +116,15 @@ def _blocks(rows: Sequence[Row], confidence: float, width: int) -> list[list[str
     return [_table(rows, identity + block) for block in blocks]
 
 
-def gradient_lines(dataset: xr.Dataset, document: dict[str, Any]) -> list[str]:
-    """A study of gradients as text: configuration, a table for each contact family, findings."""
+def gradient_lines(dataset: xr.Dataset, document: dict[str, Any], details: bool = False) -> list[str]:
+    """A study of gradients as text: configuration, a table for each contact family, findings.
+
+    Args:
+        document: see `as_document`.
+        details: whether tables have all columns.
+    """
     config, rows, lines = document["config"], rows_of(dataset), []
+    shown = columns(config["confidence"], details)
     for resolved, task in zip(document["resolved"], dataset["task"].values.tolist(), strict=True):
         lines.append(
             f"{task}: {', '.join(map(str, config['samples']))} samples in each batch, "
@@ -126,13 +135,13 @@ def gradient_lines(dataset: xr.Dataset, document: dict[str, Any]) -> list[str]:
     width = shutil.get_terminal_size((140, 24)).columns
     for family in dict.fromkeys(row.contact for row in rows):
         lines += ["", f"{family}: {FAMILIES[family].description}" if family in FAMILIES else family]
-        lines += itertools.chain(*_blocks([row for row in rows if row.contact == family], config["confidence"], width))
+        lines += itertools.chain(*_blocks([row for row in rows if row.contact == family], shown, width))
     lines.append("")
     uncertainty = [row.reference_uncertainty for row in rows if math.isfinite(row.reference_uncertainty)]
     if uncertainty:
         low, high = number(min(uncertainty), 2), number(max(uncertainty), 2)
         lines += [
-            f"Errors and cosines are against an unbiased zeroth-order reference, {config['reference_samples']} pairs "
+            f"Errors are against an unbiased zeroth-order reference gradient, {config['reference_samples']} pairs "
             "of rollouts with a control variate;",
             f"its own relative uncertainty is {low if low == high else f'{low} to {high}'}, and smaller errors cannot "
             "be told from zero.",

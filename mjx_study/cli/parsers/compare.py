@@ -39,16 +39,20 @@ contact families (K: from --stiffness):
 
 columns of the table:
   variance        trace of the sample covariance of one gradient sample, with a jackknife interval
-  effective (top) samples that this variance rests on, and the share of it that the largest one carries
   relative error  distance of the mean to a reference gradient, over the norm of the reference
   -> debiased     the same without the sampling noise of batch and reference, ± a standard error; < and > where
                   none is seen: bounds, of two standard errors; - where noise is all there is
   ?               fewer than three effective samples: do not believe the number
   alpha           weight of the first-order batch in AoBG
-  epsilon, B      confidence radius of the zeroth-order mean; distance between the two means
-  residual        largest relative imbalance left by MuJoCo's constraint solver
   ms              computing time of one sample in milliseconds, compilation excluded
   variance x s    variance times that time: the variance that a second of computing leaves
+
+and with --details:
+  |gradient|      norm of the mean gradient
+  effective (top) samples that the variance rests on, and the share of it that the largest one carries
+  cosine          of the mean and the reference gradient, and the same debiased
+  epsilon, B      confidence radius of the zeroth-order mean; distance between the two means
+  residual        largest relative imbalance left by MuJoCo's constraint solver
   nan             samples that overflowed or became NaN; they are left out, and a warning says so
 """
 )
@@ -67,3 +71,4 @@ def add(command: argparse.ArgumentParser) -> None:
     add_options(command, StudyConfig, "confidence", "chunk_size", "block_size")
     add_folder_options(command)
     add_cluster_option(command)
+    command.add_argument("--details", action="store_true", help="print all columns")
