@@ -288,3 +288,20 @@ def test_the_task_of_a_file(tmp_path: Path) -> None:
     assert start.qpos.tolist() == [0.5] and start.qvel.tolist() == [1.0]
     with pytest.raises(ValueError, match="a file already"):
         make_task(str(path), model="other.xml")
+
+
+@pytest.mark.parametrize("actuator", ["", '<actuator><motor joint="x"/></actuator>'])
+def test_what_rests_is_moved_so_that_its_cost_has_a_gradient(actuator: str, tmp_path: Path) -> None:
+    """A cart on a level rail: half the squared displacement is stationary at zero."""
+    path = tmp_path / "cart.xml"
+    path.write_text(
+        f"""<mujoco><worldbody><body><joint name="x" type="slide" axis="1 0 0"/><geom size=".1" mass="2"/></body>
+        </worldbody>{actuator}</mujoco>"""
+    )
+    task = mjcf_task(path, horizon=4)
+    assert set(task.theta.tolist()) == {task.sigma} and "raised by 0.1 since nothing moves" in task.description
+    if not actuator:
+        objective = Simulator(task, chunk_size=4).objective(None, 1e-9)
+        found = objective.differentiate(task.theta, jax.random.split(jax.random.key(0), 2))
+        elapsed = 4 * task.scene.timestep
+        assert jnp.allclose(found.gradient, task.sigma * elapsed**2, rtol=1e-5)

@@ -17,6 +17,8 @@ from mjx_study.tasks.task import StudyDefaults, Task
 
 NOISE: Final = 0.1
 """Standard deviation of the noise: share of the middle actuator's half range, or [m/s, rad/s] of initial velocities."""
+STILL: Final = 1e-9
+"""Displacement below which nothing has moved [m or rad]."""
 _FREE, _BALL = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL)
 
 
@@ -29,7 +31,8 @@ def scene_task(scene: Scene, *, horizon: int = CHECKED_STEPS, pair: tuple[str, s
     """Half the squared displacement of the free bodies, or of the joints where none is free, after some steps.
 
     It starts from the first keyframe, or the reference pose. Parameters are the controls of every step, from the
-    keyframe's; of a model without actuators, what is added to the initial velocity.
+    keyframe's; of a model without actuators, what is added to the initial velocity. Where that leaves everything at
+    rest, and the cost without a gradient, all parameters are raised by one standard deviation of the noise.
 
     Args:
         scene: the scene; its contact parameters are the MJCF's own.
@@ -59,9 +62,12 @@ def scene_task(scene: Scene, *, horizon: int = CHECKED_STEPS, pair: tuple[str, s
     else:
         policy, changed = InitialStatePolicy(host.nv, horizon, 0, push), "initial velocities"
         theta, sigma = np.zeros(host.nv), NOISE
+    told = f"half the squared displacement of {what} after {horizon} steps, by the {changed}"
+    if _rests(host, theta[: host.nu], horizon, measured):
+        theta, told = theta + sigma, f"{told}, which are raised by {sigma:g} since nothing moves otherwise"
     return Task(
         name=scene.name,
-        description=f"half the squared displacement of {what} after {horizon} steps, by the {changed}",
+        description=told,
         scene=scene,
         horizon=horizon,
         policy=policy,
@@ -72,6 +78,17 @@ def scene_task(scene: Scene, *, horizon: int = CHECKED_STEPS, pair: tuple[str, s
         contact_pair=pair,
         defaults=StudyDefaults(families=("mjcf",)),
     )
+
+
+def _rests(host: mujoco.MjModel, control: np.ndarray, horizon: int, measured: np.ndarray) -> bool:
+    """Whether those coordinates end where they begin, in the C engine, under a constant control."""
+    data = mujoco.MjData(host)
+    if host.nkey:
+        mujoco.mj_resetDataKeyframe(host, data, 0)
+    origin, data.ctrl[:] = data.qpos[measured].copy(), control
+    for _ in range(horizon):
+        mujoco.mj_step(host, data)
+    return bool(np.all(np.abs(data.qpos[measured] - origin) < STILL))
 
 
 def _measured(host: mujoco.MjModel) -> tuple[np.ndarray, str]:
