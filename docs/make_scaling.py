@@ -266,7 +266,9 @@ def measure_devices(tasks: list[str], samples: list[int]) -> None:
             simulator = Simulator(task, chunk_size=chunk)
             shared = task.theta, None, np.asarray(task.sigma, rows[1].dtype)
             for kind in KINDS:
-                program, taken, results = simulator._programs[kind], {1: [], len(devices): []}, {}
+                program: Any = simulator._programs[kind]  # type: ignore[attr-defined]
+                taken: dict[int, list[float]] = {1: [], len(devices): []}
+                results: dict[int, Any] = {}
                 for repeat in range(REPEATS + 1):
                     for number in taken:
                         begun = time.perf_counter()
