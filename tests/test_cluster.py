@@ -1,13 +1,17 @@
 """Cells on Dask's workers: real schedulers and processes, which are killed, poisoned and refused."""
 
+import json
 import os
 import pickle
+import random
 import shlex
 import signal
 import subprocess
 import sys
 import time
 from collections import deque
+from collections.abc import Generator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -160,8 +164,8 @@ def parts(path: Path) -> list[dict[str, Any]]:
     return list(yaml.safe_load_all(path.read_text()))
 
 
-def sweep(folder: Path) -> subprocess.Popen[str]:
-    command = [sys.executable, "-m", "mjx_study", "sweep", *ARGUMENTS, "--cluster", "local:2", "--output", str(folder)]
+def sweep(folder: Path, address: str = "local:2") -> subprocess.Popen[str]:
+    command = [sys.executable, "-m", "mjx_study", "sweep", *ARGUMENTS, "--cluster", address, "--output", str(folder)]
     environment = os.environ | {ACCOUNT: str(folder)}
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
 
@@ -184,3 +188,76 @@ def test_a_killed_client_goes_on_to_the_same_data(undisturbed: xr.Dataset, tmp_p
     assert last.returncode == 0, errors
     assert "distributed" not in errors and f"computed {len(STIFFNESSES)}" not in said
     assert same(load_study(folder), undisturbed)
+
+
+@contextmanager
+def engine(folder: Path) -> Generator[tuple[str, dict[str, psutil.Process]]]:
+    """A scheduler and a pair of workers that are restarted when they die, as processes; its address."""
+    known = folder / "scheduler.json"
+    known.unlink(missing_ok=True)
+    dask = [sys.executable, "-m", "distributed.cli.dask_scheduler", "--port", "0", "--no-dashboard"]
+    pair = [sys.executable, "-m", "distributed.cli.dask_worker", "--nworkers", "2", "--nthreads", "1", "--no-dashboard"]
+    started = []
+    try:
+        for command in (dask, pair):
+            file = ["--scheduler-file", str(known)]
+            started.append(subprocess.Popen(command + file, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL))
+            while not known.exists():
+                assert started[0].poll() is None, "the scheduler does not start"
+                time.sleep(0.1)
+        yield (
+            json.loads(known.read_text())["address"],
+            {name: psutil.Process(each.pid) for name, each in zip(("scheduler", "workers"), started, strict=True)},
+        )
+    finally:
+        family = [child for each in started for child in psutil.Process(each.pid).children(recursive=True)]
+        for process in [*started, *family]:
+            with suppress(psutil.NoSuchProcess):
+                process.kill()
+        for process in started:
+            process.wait()
+
+
+def _computes(process: psutil.Process) -> bool:
+    """Whether it is a worker, not the nanny that restarts it or a helper of multiprocessing."""
+    return any("spawn_main" in part for part in process.cmdline())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(20))
+def test_a_kill_at_random_changes_no_number(seed: int, undisturbed: xr.Dataset, tmp_path: Path) -> None:
+    """A worker, the scheduler or the client; no cell that was there is computed again."""
+    draw, folder = random.Random(seed), tmp_path / "out"
+    victim, cells, delay = ("worker", "scheduler", "client")[seed % 3], draw.randrange(6), draw.uniform(0, 0.4)
+
+    def there() -> dict[str, int]:
+        return {path.name: path.stat().st_mtime_ns for path in folder.glob("cells/*.npz")}
+
+    with engine(tmp_path) as (address, processes):
+        running = sweep(folder, address)
+        while len(there()) < cells:
+            assert running.poll() is None, running.communicate()[1]
+            time.sleep(0.02)
+        time.sleep(delay)
+        before = there()
+        if victim == "client":
+            running.kill()
+        elif victim == "scheduler":
+            processes["scheduler"].kill()
+        else:
+            workers = [each for each in processes["workers"].children(recursive=True) if _computes(each)]
+            assert workers
+            draw.choice(workers).kill()
+        errors = running.communicate(timeout=120)[1]
+        told = [line for line in errors.splitlines() if not line.lstrip()[:1].isdigit()]
+        assert "Traceback" not in errors
+        if victim == "scheduler" and running.returncode:
+            assert running.returncode == 2 and "the same command goes on" in told[-1]
+        elif victim == "worker":
+            assert running.returncode == 0, errors
+    with engine(tmp_path) as (address, _):
+        last = sweep(folder, address)
+        said, errors = last.communicate(timeout=120)
+    assert last.returncode == 0, errors
+    assert said and same(load_study(folder), undisturbed)
+    assert before.items() <= there().items(), "a cell was computed again"
