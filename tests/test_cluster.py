@@ -202,7 +202,7 @@ def engine(folder: Path) -> Generator[tuple[str, dict[str, psutil.Process]]]:
         for command in (dask, pair):
             file = ["--scheduler-file", str(known)]
             started.append(subprocess.Popen(command + file, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL))
-            while not known.exists():
+            while not (known.exists() and known.read_text().rstrip().endswith("}")):  # it may be half written
                 assert started[0].poll() is None, "the scheduler does not start"
                 time.sleep(0.1)
         yield (
