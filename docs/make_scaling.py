@@ -305,10 +305,8 @@ def measure_busy(cells: int, samples: int, seeds: int) -> None:
         def run(which: str) -> None:
             starts: list[float] = []
             run_study(plan_study(config), Path(name) / which, lambda *_: starts.append(time.perf_counter()))
-            told[f"{which} [s]"], told[f"{which}, a cell [s]"] = (
-                time.perf_counter() - starts[0],
-                statistics.median(np.diff(starts[:-1])),
-            )
+            told[f"{which} [s]"] = time.perf_counter() - starts[0]
+            told[f"{which}, a cell [s]"] = statistics.median(np.diff(starts[:-1]))
 
         run("cold")
         run("compiled")
@@ -429,15 +427,8 @@ def draw(documents: list[dict[str, Any]], output: Path) -> None:
                 axes, each = panels[axis], [row["ratio"] / row["samples"] / row["steps"] for row in rows]
                 if axis == "devices":
                     each = [rows[0]["seconds"] / row["seconds"] for row in rows]
-                axes.plot(
-                    [row["at"] for row in rows],
-                    each,
-                    line,
-                    color=colour,
-                    marker=marker,
-                    ms=4,
-                    label=f"{name}, {device}",
-                )
+                places, told = [row["at"] for row in rows], f"{name}, {device}"
+                axes.plot(places, each, line, color=colour, marker=marker, ms=4, label=told)
                 axes.set(xlabel=label, title=title)
     for axis, axes in panels.items():
         places = sorted({row["at"] for each in documents for row in each["measured"] if row["axis"] == axis})

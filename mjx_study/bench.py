@@ -106,7 +106,7 @@ class BenchReport:
             return [f"  {label:<46} {1e3 * seconds:8.3f} ms  {self.horizon / seconds / 1e6:8.3f} million steps/s"]
 
         engine = f", {ratios['speedup_over_engine']:.2f} x the C engine" if "speedup_over_engine" in ratios else ""
-        onset = f"  the onset term makes it {ratios.get('onset_per_gradient', 1):.2f} times as expensive"
+        onset = ratios.get("onset_per_gradient")
         return [
             f"{self.task}: {self.samples} samples of {self.horizon} steps, {self.contact}, "
             f"{machine['precision']}, {len(machine['devices'])} x {machine['backend']} ({device})",
@@ -122,7 +122,7 @@ class BenchReport:
             *rate("first order with the onset term, likewise", self.onset_seconds),
             "ratios of this run:",
             f"  a first-order sample costs {ratios['gradient_per_value']:.2f} zeroth-order samples",
-            *([onset] if "onset_per_gradient" in ratios else []),
+            *([] if onset is None else [f"  the onset term makes it {onset:.2f} times as expensive"]),
             f"  rollouts per second: {ratios['rollouts_over_stock']:.2f} x stock mjx.step, "
             f"{ratios['rollouts_over_engine']:.2f} x the C engine",
             f"  gradients per second: {ratios['speedup_over_stock']:.2f} x stock mjx.step{engine}",

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 from mjx_study.choices import CHECKED_STEPS
 from mjx_study.simulation.dynamics import State, initial_state
+from mjx_study.simulation.engine import HostState, host_data, quiet_engine
 from mjx_study.simulation.scene import Scene, load_scene
 from mjx_study.tasks.policy import InitialStatePolicy, OpenLoop
 from mjx_study.tasks.task import StudyDefaults, Task
@@ -63,7 +64,7 @@ def scene_task(scene: Scene, *, horizon: int = CHECKED_STEPS, pair: tuple[str, s
         policy, changed = InitialStatePolicy(host.nv, horizon, 0, push), "initial velocities"
         theta, sigma = np.zeros(host.nv), NOISE
     told = f"half the squared displacement of {what} after {horizon} steps, by the {changed}"
-    if _rests(host, theta[: host.nu], horizon, measured):
+    if _rests(host, start, theta[: host.nu], horizon, measured):
         theta, told = theta + sigma, f"{told}, which are raised by {sigma:g} since nothing moves otherwise"
     return Task(
         name=scene.name,
@@ -80,14 +81,14 @@ def scene_task(scene: Scene, *, horizon: int = CHECKED_STEPS, pair: tuple[str, s
     )
 
 
-def _rests(host: mujoco.MjModel, control: np.ndarray, horizon: int, measured: np.ndarray) -> bool:
+def _rests(host: mujoco.MjModel, start: State, control: np.ndarray, horizon: int, measured: np.ndarray) -> bool:
     """Whether those coordinates end where they begin, in the C engine, under a constant control."""
-    data = mujoco.MjData(host)
-    if host.nkey:
-        mujoco.mj_resetDataKeyframe(host, data, 0)
-    origin, data.ctrl[:] = data.qpos[measured].copy(), control
-    for _ in range(horizon):
-        mujoco.mj_step(host, data)
+    parts = (np.asarray(part) for part in (start.qpos, start.qvel, start.act, control, start.warmstart))
+    data = host_data(host, HostState(*parts))
+    origin = data.qpos[measured].copy()
+    with quiet_engine():
+        for _ in range(horizon):
+            mujoco.mj_step(host, data)
     return bool(np.all(np.abs(data.qpos[measured] - origin) < STILL))
 
 
