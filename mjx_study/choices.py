@@ -1,6 +1,8 @@
 """Names that users choose from, with one line about each; imports nothing that computes."""
 
 import dataclasses
+import difflib
+from collections.abc import Iterable
 from importlib import metadata
 from typing import Final
 
@@ -107,4 +109,15 @@ def unknown_task(name: str, reason: str = "") -> str | None:
     if (name in TASK_DESCRIPTIONS or name in registered or ":" in name or is_file(name)) and not reason:
         return None
     choices = dict.fromkeys([*TASK_DESCRIPTIONS, *registered])
-    return f"unknown task {name!r}; choose from {', '.join(choices)}, module:name of your own, or an MJCF{reason}"
+    return unknown("task", name, choices, ", module:name of your own, or an MJCF") + reason
+
+
+def unknown(label: str, value: str, choices: Iterable[str], more: str = "") -> str:
+    """The message about a value that is none of the choices: the closest one, otherwise all of them and more."""
+    shown = repr(value) if len(value) <= 60 else f"{value[:50]!r}..."
+    return f"unknown {label} {shown}" + (suggestion(value, choices) or f"; choose from {', '.join(choices)}{more}")
+
+
+def suggestion(value: str, choices: Iterable[str]) -> str:
+    """The choice that a misspelt value probably means, as the end of a message; empty if none is close."""
+    return "".join(f"; did you mean {near}?" for near in difflib.get_close_matches(value, list(choices), n=1))

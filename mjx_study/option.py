@@ -12,7 +12,7 @@ from numbers import Integral, Real
 from typing import Any, ClassVar, Final
 
 from estimators.catalogue import BASELINES, CATALOGUE, DENSITIES, VARIANCE_PROXIES, WEIGHTS
-from mjx_study.choices import CONES, FAMILIES, INTEGRATORS, ONSETS, REFERENCE, SOLVERS
+from mjx_study.choices import CONES, FAMILIES, INTEGRATORS, ONSETS, REFERENCE, SOLVERS, unknown
 
 MOST_VALUES: Final = 10_000
 """Most values of one list or range."""
@@ -145,7 +145,7 @@ class Option:
             if self.choices and value not in self.choices and not (self.own and ":" in value):
                 label = self.label or self.name.replace("_", " ")
                 other = ", or give a number" if self.interval else ", or module:name of your own" if self.own else ""
-                raise ValueError(f"unknown {label} {_short(value)}; choose from {', '.join(self.choices)}{other}")
+                raise ValueError(unknown(label, value, self.choices, other))
             return
         whole = self.kind is int
         if isinstance(value, bool) or not isinstance(value, Integral if whole else Real):

@@ -185,14 +185,20 @@ def test_tasks(capsys: pytest.CaptureFixture[str]) -> None:
     assert tasks["double_pendulum"]["effective_mass"] is None
 
 
+OPTION = "unknown option --stifness; did you mean --stiffness? See mjx-study compare --help"
+
+
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (["compare", "puhser"], "unknown task 'puhser'; choose from pusher"),
+        (["compare", "pushr"], "unknown task 'pushr'; did you mean pusher? See mjx-study compare --help"),
+        (["compare", "hop"], "unknown task 'hop'; choose from pusher"),
         (
-            ["compare", "pusher", "--estimators", "zobg,gobg"],
-            "unknown estimator 'gobg'; choose from zobg, zobg_antithetic",
+            ["sweep", "pushr", "--output", "out"],
+            "unknown task 'pushr'; did you mean pusher? See mjx-study sweep --help",
         ),
+        (["compare", "pusher", "--estimators", "zobg,fobgg"], "unknown estimator 'fobgg'; did you mean fobg?"),
+        (["compare", "pusher", "--contact", "penalti"], "unknown contact family 'penalti'; did you mean penalty?"),
         (["compare", "pusher", "--estimators", ""], "no estimator given"),
         (["compare", "pusher", "--contact", "spring"], "unknown contact family 'spring'; choose from penalty"),
         (["compare", "pusher", "--samples", "-5"], "argument --samples: must be at least 3"),
@@ -215,7 +221,7 @@ def test_tasks(capsys: pytest.CaptureFixture[str]) -> None:
             ["compare", "pusher", "--radius", "huge"],
             "unknown radius 'huge'; choose from max_deviation, or give a number",
         ),
-        (["compare", "pusher", "--variance-proxy", "range"], "unknown variance proxy 'range'; choose from variance"),
+        (["compare", "pusher", "--variance-proxy", "std"], "unknown variance proxy 'std'; choose from variance"),
         (
             ["compare", "pusher", "--failure-probability", "2"],
             "--failure-probability: must be positive and less than 1, got 2",
@@ -226,14 +232,19 @@ def test_tasks(capsys: pytest.CaptureFixture[str]) -> None:
         (["compare", "pusher", "--chunk-size", "0"], "--chunk-size: must be at least 1"),
         (["compare", "pusher", "--cone", "square"], "--cone: unknown cone 'square'; choose from pyramidal, elliptic"),
         (["compare", "pusher", "--cone", "elliptic"], "MJX cannot run pusher: condim=1 with ConeType.ELLIPTIC"),
-        (["compare", "pusher", "--precision", "float16"], "invalid choice: 'float16'"),
+        (["compare", "pusher", "--precision", "float16"], "unknown precision 'float16'; did you mean float64?"),
         (["compare", "pusher", "--model", "nowhere.xml"], "no MJCF file at nowhere.xml"),
         (["compare", "pusher", "--model", "tennis_racket"], "no model named 'tennis_racket'; there are ball_wall,"),
-        (["compare", "pusher", "--no-such-option"], "unrecognized arguments"),
+        (["compare", "pusher", "--stifness", "10"], OPTION),
+        (["compare", "--stifness=10", "pusher"], OPTION),
+        (["compare", "pusher", "--no-such-option"], "unknown option --no-such-option. See mjx-study compare --help"),
+        (["compare", "pusher", "more"], "unexpected argument more. See mjx-study compare --help"),
+        (["--versoin"], "unknown option --versoin; did you mean --version? See mjx-study --help"),
         (["compare"], "TASK"),
-        (["explain", "pusher"], "invalid choice: 'explain'"),
+        (["compre", "pusher"], "mjx-study: unknown command 'compre'; did you mean compare? See mjx-study --help"),
+        (["explain", "pusher"], "unknown command 'explain'; choose from compare"),
         ([], "COMMAND"),
-        (["gradcheck", "puhser"], "unknown task"),
+        (["gradcheck", "puhser"], "unknown task 'puhser'; did you mean pusher? See mjx-study gradcheck --help"),
         (["gradcheck", "pusher", "--contact", ""], "no contact model to check"),
         (["bench", "pusher", "--samples", "0"], "--samples: must be at least 1"),
     ],

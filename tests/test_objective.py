@@ -454,7 +454,7 @@ def test_refuses_an_empty_chunk():
 
 
 def test_refuses_an_unknown_task():
-    with pytest.raises(ValueError, match=r"unknown task 'pushr'; choose from .*pusher"):
+    with pytest.raises(ValueError, match=r"unknown task 'pushr'; did you mean pusher\?"):
         make_task("pushr")
 
 

@@ -170,7 +170,7 @@ def test_a_theta_without_a_finite_cost(capsys: pytest.CaptureFixture[str], elsew
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (["puhser"], "unknown task 'puhser'; choose from pusher"),
+        (["puhser"], "unknown task 'puhser'; did you mean pusher?"),
         (["pusher", "--contact", "spring"], "unknown contact family 'spring'; choose from"),
         (["pusher", "--stiffness", "-5"], "--stiffness: must be positive and finite"),
         (["pusher", "--frames", "0"], "--frames: must be at least 1 and at most 100, got 0"),
@@ -178,9 +178,9 @@ def test_a_theta_without_a_finite_cost(capsys: pytest.CaptureFixture[str], elsew
         (["pusher", "--slow", "0"], "--slow: must be positive and at most 1000, got 0"),
         (["pusher", "--sigma", "0.2"], "--sigma has an effect only with --noise"),
         (["pusher", "--sigma", "-1", "--noise"], "--sigma: must be positive"),
-        (["pusher", "--view", "zx"], "invalid choice: 'zx'"),
-        (["pusher", "--renderer", "povray"], "invalid choice: 'povray'"),
-        (["pusher", "--format", "avi"], "invalid choice: 'avi'"),
+        (["pusher", "--view", "zx"], "unknown view 'zx'; choose from auto, xz"),
+        (["pusher", "--renderer", "povray"], "unknown renderer 'povray'; choose from auto"),
+        (["pusher", "--format", "avi"], "unknown format 'avi'; choose from gif, mp4"),
         (["pusher", "--theta", "nowhere.npy"], "cannot read nowhere.npy: No such file or directory"),
         (
             ["pusher", "--theta", "broken.json"],

@@ -5,6 +5,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+from mjx_study.choices import unknown
 from mjx_study.claims.catalogue import CLAIMS, VERDICTS
 from mjx_study.claims.figure import draw_matrix
 from mjx_study.claims.ledger import Claim, measure_ledger
@@ -48,7 +49,7 @@ def _chosen(only: list[str] | None) -> list[Claim]:
     names = [name for part in only or [",".join(CLAIMS)] for name in part.split(",")]
     for name in names:
         if name not in CLAIMS:
-            raise UsageError(f"unknown claim {name!r}; choose from {', '.join(CLAIMS)}")
+            raise UsageError(unknown("claim", name, CLAIMS))
     return [claim for name, claim in CLAIMS.items() if name in names]
 
 

@@ -2,18 +2,19 @@
 
 import argparse
 import dataclasses
+import itertools
 import json
 import os
 import re
 import signal
 import sys
 import threading
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Iterable, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final, NoReturn
 
-from mjx_study.choices import FAMILIES, PRECISIONS, TASK_DESCRIPTIONS, unknown_task
+from mjx_study.choices import FAMILIES, PRECISIONS, TASK_DESCRIPTIONS, suggestion, unknown, unknown_task
 from mjx_study.cli.progress import show_cursor, shown_progress
 from mjx_study.option import OPTIONS, Checked, Option
 from mjx_study.study.configuration import Progress
@@ -29,10 +30,28 @@ class UsageError(ValueError):
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser whose errors are UsageErrors."""
+    """A parser whose errors are UsageErrors, with a suggestion for what is misspelt."""
 
     def error(self, message: str) -> NoReturn:
-        raise UsageError(f"{message} (see {self.prog} --help)")
+        message = re.sub(r"^argument (?!-)\S+: ", "", message)
+        raise UsageError(f"{message}{'' if message.endswith('?') else '.'} See {self.prog} --help")
+
+    def parse_known_args(self, args: Iterable[str] | None = None, namespace: Any = None) -> Any:  # type: ignore[override]
+        """Refuse what is unknown here: the top level would point to its own help."""
+        given, flags = list(args or ()), self._option_string_actions
+        own = itertools.takewhile(lambda text: text.startswith("-") if self._subparsers else text != "--", given)
+        for flag in (text.partition("=")[0] for text in own if text.startswith("--")):
+            if not any(known.startswith(flag) for known in flags):
+                self.error(f"unknown option {flag}{suggestion(flag, flags)}")
+        parsed, extra = super().parse_known_args(given, namespace)
+        if extra:
+            self.error(f"unexpected argument {extra[0]}")
+        return parsed, extra
+
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
+        if action.choices is not None and value not in action.choices:
+            label = str(action.metavar or action.dest).lower()
+            raise argparse.ArgumentError(action, unknown(label, value, action.choices))
 
 
 def refuse_lone_dashes(given: Sequence[str]) -> None:
@@ -95,15 +114,16 @@ def add_task_options(command: argparse.ArgumentParser) -> None:
     add_process_options(command)
 
 
+def known_task(text: str) -> str:
+    """A task's name, unless it is unknown."""
+    if told := unknown_task(text):
+        raise argparse.ArgumentTypeError(told)
+    return text
+
+
 def add_task_argument(command: argparse.ArgumentParser) -> None:
-
-    def read(text: str) -> str:
-        if told := unknown_task(text):
-            raise argparse.ArgumentTypeError(told)
-        return text
-
     named = f"one of: {', '.join(TASK_DESCRIPTIONS)}; module:name of your own; or any MJCF that MJX runs"
-    command.add_argument("task", type=read, metavar="TASK|FILE.xml", help=named)
+    command.add_argument("task", type=known_task, metavar="TASK|FILE.xml", help=named)
 
 
 def add_theta_option(command: argparse.ArgumentParser, purpose: str) -> None:

@@ -14,6 +14,7 @@ from mjx_study.cli.options import (
     add_options,
     add_process_options,
     add_study_options,
+    known_task,
 )
 from mjx_study.option import MOST_VALUES, OPTIONS, Interval, Option
 from mjx_study.study.configuration import StudyConfig
@@ -51,7 +52,7 @@ TASKS = Option("tasks", str, "TASK", "", many=True)
 
 def add(command: argparse.ArgumentParser) -> None:
     choices = f"of: {', '.join(TASK_DESCRIPTIONS)}, or module:name"
-    command.add_argument("tasks", nargs="?", type=TASKS.parse, metavar="TASK[,TASK]", help=choices)
+    command.add_argument("tasks", nargs="?", type=_tasks, metavar="TASK[,TASK]", help=choices)
     command.add_argument("--config", type=Path, metavar="FILE.toml", help="options from a file; flags go before it")
     add_options(command, StudyConfig, "contact", "stiffness", "damping")
     add_option(command, OPTIONS["solref"], read=solref)
@@ -73,6 +74,10 @@ def add(command: argparse.ArgumentParser) -> None:
     command.add_argument("--output", type=Path, required=True, metavar="DIR", help="folder of the study")
     add_cluster_option(command)
     add_study_options(command)
+
+
+def _tasks(text: str) -> tuple[str, ...]:
+    return tuple(map(known_task, TASKS.parse(text)))
 
 
 def solref(value: Any) -> tuple[tuple[float, ...], ...]:
