@@ -16,3 +16,26 @@ def digits_to_tell_apart(values: Iterable[float | int], least: int = 6) -> int:
         (digits for digits in range(least, 17) if len({f"{value:.{digits}g}" for value in distinct}) == len(distinct)),
         17,
     )
+
+
+def count(number: int) -> str:
+    """A count to four digits, in groups of three."""
+    return f"{float(f'{number:.4g}'):,.0f}"
+
+
+def size(number: int | float) -> str:
+    """A number of bytes to two digits, in the unit that suits it."""
+    unit, least = next((each for each in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)) if number >= each[1]), ("bytes", 1))
+    return f"{_rounded(number / least)} {unit}"
+
+
+def duration(seconds: float | int) -> str:
+    """A time to two digits, in the unit that suits it."""
+    longer = (("days", 86400), ("h", 3600), ("min", 60))
+    unit, length = next((each for each in longer if seconds >= 2 * each[1]), ("s", 1))
+    return f"{_rounded(seconds / length)} {unit}"
+
+
+def _rounded(number: float | int) -> str:
+    two_digits = float(f"{number:.2g}")
+    return f"{two_digits:,.0f}" if two_digits >= 10 else f"{two_digits:g}"

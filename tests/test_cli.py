@@ -101,7 +101,8 @@ def test_figures_are_written_whole(small_run: tuple[Path, str]) -> None:
     assert sorted(path.name for path in folder.iterdir()) == kept
     assert (folder / "comparison.png").read_bytes().startswith(b"\x89PNG")
     assert (folder / "comparison.pdf").read_bytes().rstrip().endswith(b"%%EOF")
-    assert "comparison.png" in printed
+    numbers = "results.nc (every number), study.json (the configuration), cells/ (checkpoints)"
+    assert printed.endswith(f"written to {folder}: comparison.png, comparison.pdf, {numbers}\n")
 
 
 def test_what_compare_wrote_can_be_drawn_and_reported(

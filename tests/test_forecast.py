@@ -21,6 +21,7 @@ from mjx_study.study.configuration import StudyConfig
 from mjx_study.study.forecast import forecast
 from mjx_study.study.plan import plan_study
 from mjx_study.study.run import run_study
+from mjx_study.table import count, duration, size
 
 DESCENTS = (
     "optimise pusher --reference --horizon 8 --iterations 3 --seeds 2 --samples 4 --evaluation-samples 5 "
@@ -122,6 +123,18 @@ def test_other_rows_and_steps_are_scaled() -> None:
     other = dataclasses.replace(own, content="b", steps=30)
     assert rates.call(other) == (pytest.approx(3.0), times.ROUGH)
     assert times.Rates([]).call(other) == (pytest.approx(other.rough), times.ROUGH)
+
+
+def test_figures_are_for_people(capsys: pytest.CaptureFixture[str]) -> None:
+    command = "compare pusher --contact penalty,mujoco --stiffness 10:1000:5:log --dry-run"
+    assert cli.main(command.split()) == 0
+    printed = capsys.readouterr().out
+    assert "rollouts: about 21,010, 5,000 of them differentiated\n" in printed
+    assert "arrays kept: 72 kB" in printed and "e+" not in printed
+    assert [count(7), count(1234567)] == ["7", "1,235,000"]
+    assert [size(number) for number in (0, 880, 7630, 2.44e9)] == ["0 bytes", "880 bytes", "7.6 kB", "2.4 GB"]
+    told = [duration(number) for number in (0, 0.314, 115, 130, 5400, 8000, 1e7)]
+    assert told == ["0 s", "0.31 s", "120 s", "2.2 min", "90 min", "2.2 h", "120 days"]
 
 
 @pytest.mark.parametrize("damage", [b"", b"{}", b"[1", b'{"each": -1}'])

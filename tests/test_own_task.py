@@ -196,7 +196,7 @@ def test_packages_register_tasks(write, register) -> None:
     assert make_task("hop", horizon=5).horizon == 5
     assert make_task("hop:high").horizon == 3
     assert refused("hip").startswith("unknown task 'hip'; did you mean hop?")
-    assert "double_pendulum:published, hop, hop:high, other, module:name of your own, or an MJCF" in refused("nowhere")
+    assert "double_pendulum:published, hop, hop:high, other, module:name of your own, or an MJCF" in refused("xyz")
     assert refused("other") == "there is no module 'broken' here or installed"
 
 

@@ -23,6 +23,7 @@ from mjx_study.study.run import open_store, run_study, warnings_of
 from mjx_study.study.store import StudyError
 
 RESUMABLE = "the same command goes on where it stopped"
+KEPT = "results.nc (every number), study.json (the configuration), cells/ (checkpoints)"
 
 
 def study_fields(options: argparse.Namespace) -> dict[str, Any]:
@@ -72,7 +73,8 @@ def run_one(
     lines += [f"add --output DIR for {offer}"] if folder is None else []
     if folder is not None and not dataset.attrs["computed_cells"] and not dataset.attrs["missing_cells"]:
         lines.append(f"nothing was computed: {folder} has held all {len(plan.cells)} cells")
-    lines += [f"written to {folder}: {', '.join(path.name for path in written)}"] if written else []
+    if folder is not None and not unwritten:
+        lines.append(f"written to {folder}: {', '.join([*(path.name for path in written), KEPT])}")
     print_report(options, document, lines)
     return finish(*failures)
 

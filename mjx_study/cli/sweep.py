@@ -19,7 +19,7 @@ from mjx_study.option import OPTIONS
 from mjx_study.study.cluster import connected
 from mjx_study.study.run import StudyConfig, StudyPlan, load_study, open_store, plan_study, run_study, warnings_of
 from mjx_study.study.store import StudyError
-from mjx_study.table import digits_to_tell_apart
+from mjx_study.table import digits_to_tell_apart, size
 
 
 def run(options: argparse.Namespace) -> int:
@@ -99,7 +99,7 @@ def _head(plan: StudyPlan, missing: int) -> list[str]:
         f"cells: {cells}, of which {missing} to compute"
         + (
             f"; {plan.compilations} programs to compile, chunks of {plan.chunk_size} samples, "
-            f"about {plan.memory / 1e9:.2g} GB for the batches of a cell"
+            f"about {size(plan.memory)} for the batches of a cell"
             if missing
             else ""
         ),

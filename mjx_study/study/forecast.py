@@ -15,6 +15,7 @@ from mjx_study.study.run import begun_store
 from mjx_study.study.times import BASES, READING, Program, Rates, times_folder
 from mjx_study.study.variables import VARIABLES
 from mjx_study.study.work import calls, iteration, rest, rollouts, setups
+from mjx_study.table import count, duration, size
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,8 +52,8 @@ class Forecast:
         return [
             f"cells: {self.cells}, {self.computed} computed, {self.cells - self.computed} to compute",
             f"programs to compile: {self.programs}",
-            f"rollouts: about {self.rollouts:.4g}, {self.gradients:.4g} of them differentiated",
-            f"arrays kept: {self.kept / 1e6:.3g} MB; batches of a cell: about {self.memory / 1e9:.2g} GB of memory",
+            f"rollouts: about {count(self.rollouts)}, {count(self.gradients)} of them differentiated",
+            f"arrays kept: {size(self.kept)}; batches of a cell: about {size(self.memory)} of memory",
             self._time,
             "nothing was computed or written",
         ]
@@ -65,14 +66,6 @@ class Forecast:
         shares = {basis: seconds / total for basis, seconds in self.basis.items() if seconds > 0.005 * total}
         told = ", ".join(f"{basis} ({share:.0%})" if len(shares) > 1 else basis for basis, share in shares.items())
         return f"time: about {duration(self.seconds)}, of which compilation {duration(self.compilation)}; {told}"
-
-
-def duration(seconds: float) -> str:
-    """A time to two digits, in the unit that suits it."""
-    for unit, size in (("days", 86400), ("h", 3600), ("min", 60)):
-        if seconds >= 2 * size:
-            return f"{seconds / size:.2g} {unit}"
-    return f"{seconds:.2g} s"
 
 
 def forecast(
