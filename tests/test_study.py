@@ -333,7 +333,7 @@ def test_doubtful_numbers_are_marked_in_the_table(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setenv("COLUMNS", "200")
     sure = row("zobg", 10, 1, relative_error=0.325, debiased_error=0.298, debiased_error_se=0.0098)
     lines = table(result(sure, row("fobg", 20, 1, effective_samples=1.2, top_share=0.9)))
-    (above,) = [line for line in lines if "0.325 -> 0.298 ± 0.010" in line]
+    (above,) = [line for line in lines if "0.325 -> 0.2980 ± 0.0098" in line]
     assert "30 (10%)" in above and "?" not in above
     (below,) = [line for line in lines if "1.2 (90%)" in line]
     assert "(0.5 to 2)?" in below
@@ -397,6 +397,42 @@ def test_a_file_is_whole_or_absent(tmp_path) -> None:
 )
 def test_numbers_are_short(value: float | None, digits: int, shown: str) -> None:
     assert console.number(value, digits) == shown
+
+
+@pytest.mark.parametrize(
+    ("value", "debiased", "error", "shown"),
+    [
+        (0.325, 0.298, 0.0098, "0.325 -> 0.2980 ± 0.0098"),
+        (7.825, 1.684, 10.088, "7.825 -> 2 ± 10"),
+        (0.00047, 0.00031, 0.00012, "4.7e-4 -> 0.00031 ± 0.00012"),
+        (0.0043, 0.0, 0.0002, "0.0043 -> < 4.0e-4"),
+        (0.25, 0.0, 0.01, "0.250 -> < 0.02"),
+        (0.25, 0.0, 0.2, "0.250 -> -"),
+        (3.3e4, 240.0, 4.6e4, "3.3e4 -> 240 ± 4.6e4"),
+    ],
+)
+def test_no_error_is_rounded_to_nothing(value: float, debiased: float, error: float, shown: str) -> None:
+    each = row("fobg", 10, 1, relative_error=value, debiased_error=debiased, debiased_error_se=error)
+    assert any(f"  {shown}  " in line for line in table(result(each)))
+
+
+@pytest.mark.parametrize(
+    ("cosine", "error", "shown"),
+    [(0.9, 0.013, "> 0.97"), (0.9, 0.0004, "> 0.9992"), (0.9, 1e-9, "> 0.9999"), (1.0, 0.0, "1.000 -> 1")],
+)
+def test_a_bound_of_a_cosine_is_rounded_down(cosine: float, error: float, shown: str) -> None:
+    each = row("fobg", 10, 1, cosine=cosine, debiased_cosine=1.0, debiased_cosine_se=error)
+    assert any(f"{shown}  " in line for line in table(result(each)))
+
+
+def test_times_are_no_more_exact_than_the_clock() -> None:
+    lines = table(result(row("fobg", 10, 1.234, seconds_per_sample=3.456e-3)))
+    assert any(re.search(r"  3\.5 +0\.0043($|  )", line) for line in lines)
+
+
+def test_a_single_parameter_has_no_cosine() -> None:
+    headings = [line for line in table(compare(tasks=("ball_wall",))) if "estimator" in line]
+    assert headings and not any("cosine" in heading for heading in headings)
 
 
 @pytest.mark.parametrize(("columns", "tables"), [(200, 1), (80, 3)])

@@ -44,36 +44,39 @@ def _effective(row: Row) -> str:
 
 
 def _with_error(value: float, error: float) -> str:
-    if not (math.isfinite(value) and math.isfinite(error)):
+    """Both to the second digit of the error; each for itself where that takes many characters."""
+    if not (math.isfinite(value) and 0 < error < math.inf):
         return number(value)
-    if max(value, error) >= 1000:
+    if not 1e-4 <= error < 1000:
         return f"{number(value, 2)} ± {number(error, 2)}"
-    return f"{value:.3f} ± {error:.3f}"
+    decimals = max(0, 1 - math.floor(math.log10(error)))
+    return f"{value:.{decimals}f} ± {error:.{decimals}f}"
 
 
 def _debiased(row: Row, value: float, debiased: float, error: float, best: float) -> str:
     """A figure as it is, and what is left of it without noise; a bound where that is the best, "-" where noise is all
     there is."""
-    plain = f"{value:.3f}" if value < 1000 else number(value, 2)
+    plain = f"{value:.3f}" if 0.01 <= abs(value) < 1000 else number(value, 2)
     if math.isnan(debiased):
         left = "-"
-    elif debiased == best and math.isfinite(error) and error >= 0.005:
-        bound = abs(best - 2 * error)
+    elif debiased == best and 0 < error < math.inf:
         says_nothing = abs(debiased - value) <= 2 * error
-        left = (
-            "-" if says_nothing else f"< {number(bound, 2)}" if best == 0 else f"> {math.floor(100 * bound) / 100:.2f}"
-        )
+        decimals = 2 if error >= 0.005 else 4
+        above = best - math.ceil(10**decimals * 2 * error) / 10**decimals
+        bound = f"< {number(2 * error, 2)}" if best == 0 else f"> {above:.{decimals}f}"
+        left = "-" if says_nothing else bound
     else:
         left = _with_error(debiased, error)
     return f"{plain} -> {left}{_doubt(row)}"
 
 
-def columns(confidence: float, details: bool = False) -> list[list[Column]]:
+def columns(confidence: float, details: bool = False, *, scalar: bool = False) -> list[list[Column]]:
     """The comparison's columns: those that identify a row, then the parts of which a table may have one or more.
 
     Args:
         confidence: of intervals.
         details: all of them, not only those that say which estimator to take.
+        scalar: of a single parameter, for which a cosine says nothing.
     """
     variance = f"variance ({confidence:.0%} interval)", _interval
     error = (
@@ -86,8 +89,8 @@ def columns(confidence: float, details: bool = False) -> list[list[Column]]:
     )
     alpha = "alpha", lambda row: "-" if row.alpha is None else f"{row.alpha:.3f}"
     times: list[Column] = [
-        ("ms", lambda row: f"{1e3 * row.seconds_per_sample:.2f}"),
-        ("variance x s", lambda row: number(row.variance_seconds)),
+        ("ms", lambda row: number(1e3 * row.seconds_per_sample, 2)),
+        ("variance x s", lambda row: number(row.variance_seconds, 2)),
     ]
     identity: list[Column] = [
         ("K [N/m]", lambda row: number(row.stiffness or None)),
@@ -98,7 +101,7 @@ def columns(confidence: float, details: bool = False) -> list[list[Column]]:
     return [
         identity,
         [("|gradient|", lambda row: number(row.gradient_norm)), variance, ("effective (top)", _effective)],
-        [error, cosine],
+        [error] if scalar else [error, cosine],
         [alpha, ("epsilon", lambda row: number(row.epsilon)), ("B", lambda row: number(row.discrepancy))],
         [*times, ("residual", lambda row: number(row.residual, 2)), ("nan", lambda row: str(row.nonfinite))],
     ]
@@ -124,7 +127,7 @@ def gradient_lines(dataset: xr.Dataset, document: dict[str, Any], details: bool 
         details: whether tables have all columns.
     """
     config, rows, lines = document["config"], rows_of(dataset), []
-    shown = columns(config["confidence"], details)
+    shown = columns(config["confidence"], details, scalar=dataset.sizes.get("param") == 1)
     for resolved, task in zip(document["resolved"], dataset["task"].values.tolist(), strict=True):
         lines.append(
             f"{task}: {', '.join(map(str, config['samples']))} samples in each batch, "

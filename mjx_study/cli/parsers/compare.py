@@ -50,7 +50,7 @@ columns of the table:
 and with --details:
   |gradient|      norm of the mean gradient
   effective (top) samples that the variance rests on, and the share of it that the largest one carries
-  cosine          of the mean and the reference gradient, and the same debiased
+  cosine          of the mean and the reference gradient, and the same debiased; where parameters are several
   epsilon, B      confidence radius of the zeroth-order mean; distance between the two means
   residual        largest relative imbalance left by MuJoCo's constraint solver
   nan             samples that overflowed or became NaN; they are left out, and a warning says so
