@@ -1,12 +1,14 @@
 """The parts of a model's dynamics that a state exercises: contact by zone, limits, friction loss, equalities."""
 
 import dataclasses
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, Final
 
 import mujoco
 import numpy as np
 
+from mjx_study.gradcheck.reach import NO_FRICTION, contact_parts
 from mjx_study.simulation.scene import Scene
 
 ZONES: Final = ("push", "stick", "slide", "separate")
@@ -26,11 +28,13 @@ class Coverage:
     Attributes:
         counts: number of states by part, for parts that the model has.
         missing: parts that the model has but no state exercises.
+        unreachable: contact, or zones of it, that none of the pairs of geoms can reach, with the number of pairs.
     """
 
     states: int
     counts: dict[str, int]
     missing: tuple[str, ...]
+    unreachable: dict[str, int] = dataclasses.field(default_factory=dict)
 
     def line(self) -> str:
         """The coverage in words; empty if the model has nothing to exercise."""
@@ -42,6 +46,10 @@ class Coverage:
             f"{part} in {self.counts[part]}{f' ({details[part]})' if part in details else ''}"
             for part in ("contact", "limit", "friction loss", "equality")
             if part in self.counts
+        ]
+        parts += [
+            f"{part} out of reach of {'the only pair' if pairs == 1 else f'all {pairs} pairs'} of geoms"
+            for part, pairs in self.unreachable.items()
         ]
         return f"of {self.states} states, {'; '.join(parts)}" if parts else ""
 
@@ -71,32 +79,30 @@ def _zone(contact: Any, kinds: np.ndarray, states: np.ndarray) -> str:
     found = set(states[first : first + (2 * (dim - 1) if pyramid else 1)].tolist())
     if found == {_SATISFIED}:
         return "separate"
-    if found == {_QUADRATIC}:
-        return "push" if dim == 1 else "stick"
-    return "slide"
+    if dim == 1 or contact.friction[0] <= NO_FRICTION:
+        return "push"
+    return "stick" if found == {_QUADRATIC} else "slide"
 
 
-def possible(scene: Scene, host: mujoco.MjModel) -> frozenset[str]:
-    """The parts that a model has, from the constraint rows that MJX allocates and the friction of its contacts."""
+def possible(scene: Scene, host: mujoco.MjModel) -> tuple[frozenset[str], dict[str, int]]:
+    """The parts that a model has, from the constraint rows that MJX allocates; and `Coverage.unreachable`."""
     rows: Any = scene.template._impl
-    parts: set[str] = set()
-    dims = np.asarray(rows.contact.dim)
-    if len(dims):
-        rough = np.any(host.geom_friction[:, 0] > 0) and np.any(dims > 1)
-        parts |= {"contact", "separate"} | ({"stick", "slide"} if rough else {"push"})
+    parts, unreachable = contact_parts(host) if len(rows.contact.dim) else (set(), {})
     parts |= {"limit"} if rows.nl else set()
     parts |= {"friction loss", "held", "slipping"} if rows.nf else set()
     parts |= {"equality"} if rows.ne else set()
-    return frozenset(parts)
+    return frozenset(parts), unreachable
 
 
 OPTIONAL: Final = frozenset({"separate", "contact", "friction loss"})
 """Parts counted but not required: an undamped contact never separates within its margin; the others have parts."""
 
 
-def coverage(parts: frozenset[str], states: Sequence[Collection[str]]) -> Coverage:
+def coverage(
+    parts: frozenset[str], states: Sequence[Collection[str]], unreachable: Mapping[str, int] = MappingProxyType({})
+) -> Coverage:
     counts = {part: sum(part in state for state in states) for part in PARTS if part in parts}
     missing = [part for part, count in counts.items() if not count and part not in OPTIONAL]
     if "contact" in counts and not counts["contact"]:
         missing = ["contact", *(part for part in missing if part not in ZONES)]
-    return Coverage(len(states), counts, tuple(missing))
+    return Coverage(len(states), counts, tuple(missing), dict(unreachable))

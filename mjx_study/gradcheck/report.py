@@ -123,7 +123,7 @@ class GradcheckReport:
             alike.setdefault(missing, []).append(label)
         return [
             f"{', '.join(labels)}: no state exercises {' and '.join(missing)}, whose derivatives are unchecked; more "
-            "--states, a longer --horizon or another --seed may"
+            "--states, a longer --horizon, another --seed or an MJCF whose first keyframe is closer to it may"
             for missing, labels in alike.items()
         ]
 

@@ -78,7 +78,7 @@ def states_of(
     """
     host = converged_host(scene, contact)
     random = np.random.default_rng(seed)
-    parts = possible(scene, host)
+    parts, unreachable = possible(scene, host)
     start = start_of(scene) if visited is None else visited[0]
     at_rest = ", at rest" if visited is None and not start.qvel.any() else ""
     first = Sample(f"start{at_rest}", 0, start, _parts(host, start))
@@ -94,7 +94,7 @@ def states_of(
             break
         chosen.append(sample)
     chosen[1:] = sorted(chosen[1:], key=lambda sample: (len(sample.label.split(",")), sample.index))
-    return chosen, coverage(parts, [sample.parts for sample in chosen])
+    return chosen, coverage(parts, [sample.parts for sample in chosen], unreachable)
 
 
 def _cover(chosen: list[Sample], pool: Iterable[Sample], wanted: frozenset[str], count: int) -> list[Sample]:

@@ -62,6 +62,20 @@ def test_what_is_never_exercised_is_a_warning_and_another_exit_code(
     assert report(unexercised).as_json()["unexercised"] == {"penalty, K = 100 N/m": ["slide"]}
 
 
+def test_what_the_model_cannot_reach_is_told_and_no_gap() -> None:
+    step = dataclasses.replace(
+        STEP, coverage=coverage(PARTS - {"slide"}, [{"contact", "stick", "limit"}], {"slide": 2})
+    )
+    lines = report(step).lines()
+    assert (
+        "of 1 states, contact in 1 (stick 1, separate 0); limit in 1; slide out of reach of all 2 pairs of geoms"
+        in lines
+    )
+    assert lines[-1] == "every derivative that exists is right" and not report(step).unexercised
+    (told,) = report(step).as_json()["steps"]
+    assert told["coverage"]["unreachable"] == {"slide": 2}
+
+
 def test_each_stage_is_a_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     def stages(plan, progress):
         progress(0, 2, "compiling")

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from mjx_study.gradcheck.coverage import Coverage
+from mjx_study.gradcheck.reach import Reach, contact_parts, pairs_of
 from mjx_study.gradcheck.states import Sample, states_of
 from mjx_study.simulation.engine import host_state
 from mjx_study.simulation.scene import Scene, load_scene, put_scene
@@ -73,3 +74,97 @@ def test_a_tasks_own_states_come_first() -> None:
 def test_the_line_of_a_model_without_constraints_is_empty() -> None:
     _, found = sampled('<body><joint type="slide"/><geom size=".1" mass="1"/></body>', 2)
     assert found.line() == "" and found.missing == ()
+
+
+UPRIGHT = '<joint type="slide" axis="0 0 1"/>'
+
+
+def puck(joints: str = UPRIGHT, geom: str = "") -> str:
+    return f'<body pos="0 0 .15">{joints}<geom size=".1" mass="1" {geom}/></body>'
+
+
+@pytest.mark.parametrize("cone", ["pyramidal", "elliptic"])
+def test_a_body_that_can_only_fall_need_not_slide(cone: str) -> None:
+    option = f'<option cone="{cone}"/>'
+    _, found = sampled(FLOOR + puck(), 4, option)
+    assert found.missing == () and found.unreachable == {"slide": 1} and "slide" not in found.counts
+    assert found.line().endswith("; slide out of reach of the only pair of geoms")
+    for more in ('<joint type="slide" axis="1 0 0"/>', '<joint axis="0 1 0"/>'):
+        _, found = sampled(FLOOR + puck(UPRIGHT + more), 4, option)
+        assert not found.unreachable and {"slide"} <= found.counts.keys()
+
+
+def test_balls_on_a_line_cannot_slide() -> None:
+    def on_a_line(offset: float) -> dict[str, int]:
+        other = f'<body pos="0 {offset} .4">{UPRIGHT}<geom size=".1" mass="1"/></body>'
+        return contact_parts(scene(puck() + other).host)[1]
+
+    assert on_a_line(0.0) == {"slide": 1} and on_a_line(0.01) == {}
+
+
+@pytest.mark.parametrize("geom", ['condim="1"', 'friction="0 0 0"'])
+def test_contact_without_friction_pushes(geom: str) -> None:
+    _, found = sampled(FLOOR.replace("/>", f" {geom}/>") + puck("<freejoint/>", geom), 4)
+    assert found.missing == () and not found.unreachable and found.counts["push"]
+
+
+def test_frictionless_contact_beside_friction_is_looked_for() -> None:
+    rail = '<body pos="2 0 9"><joint type="slide" axis="1 0 0"/><geom size=".1" condim="1" priority="1"/></body>'
+    wall = '<geom type="plane" pos="-900 0 0" zaxis="1 0 0" size="1 1 .1"/>'
+    _, found = sampled(FLOOR + puck("<freejoint/>") + rail + wall, 4)
+    assert found.missing == ("push",)
+
+
+@pytest.mark.parametrize(
+    ("height", "joints", "within"),
+    [(1.0, "", False), (0.72, "", False), (0.7, "", True), (1.0, UPRIGHT, True)]
+    + [(1.0, '<joint type="slide" axis="1 0 0"/>', False), (1.0, '<joint axis="0 1 0" pos="0 0 .5"/>', True)],
+)
+def test_a_pole_too_short_for_the_floor_need_not_touch_it(height: float, joints: str, within: bool) -> None:
+    pole = f"""<body pos="0 0 {height}">{joints}<geom size=".05" mass="1" contype="0" conaffinity="0"/>
+      <body><joint axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0 0 .6" size=".1" mass=".2"/></body></body>"""
+    _, found = sampled(FLOOR + pole, 4)
+    assert found.unreachable == ({} if within else {"contact": 1})
+    assert ("contact" in found.counts) is within and ("contact" in found.missing) <= within
+
+
+def chain(random: np.random.Generator) -> mujoco.MjModel:
+    """A chain with joints of any kind beside a plane and a ball, all anywhere."""
+
+    def vector(scale: float = 0.3) -> str:
+        return " ".join(map(str, scale * random.normal(size=3)))
+
+    bodies = ""
+    for _ in range(3):
+        kind = random.choice(["hinge", "hinge", "ball", "slide", "none"])
+        axis = "" if kind == "ball" else f'axis="{random.choice(["1 0 0", "0 1 0", "0 0 1"])}"'
+        pos = "" if kind == "slide" else f'pos="{vector(0.1)}"'
+        joint = "" if kind == "none" else f'<joint type="{kind}" {axis} {pos}/>'
+        geom = f'<geom type="capsule" size=".05" fromto="{vector()} {vector()}" mass="1"/>'
+        bodies += f'<body pos="{vector()}" euler="{vector(30)}">{joint}{geom}'
+    normal = random.choice(["0 0 1", "0 1 0", vector()])
+    still = f"""<geom type="plane" size="1 1 1" pos="{vector(0.8)}" zaxis="{normal}" margin=".02"/>
+      <geom size=".1" pos="{vector(0.8)}"/>"""
+    return mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{still}{bodies}{'</body>' * 3}</worldbody></mujoco>")
+
+
+def test_what_is_called_out_of_reach_is_never_touched() -> None:
+    """100 random chains in 200 random poses each."""
+    random, apart, met = np.random.default_rng(0), 0, 0
+    for _ in range(100):
+        host = chain(random)
+        reach, data = Reach(host), mujoco.MjData(host)
+        within = {frozenset((pair.first, pair.second)): reach.touch(pair) for pair in pairs_of(host)}
+        for _ in range(200):
+            mujoco.mj_integratePos(host, data.qpos, 3 * random.normal(size=host.nv), 1.0)
+            mujoco.mj_fwdPosition(host, data)
+            pairs = [frozenset(contact.geom.tolist()) for contact in data.contact]
+            assert all(within[pair] for pair in pairs)
+            met += len(pairs)
+        apart += sum(not value for value in within.values())
+    assert apart > 50 and met > 1000
+
+
+def test_mocap_bodies_may_bring_anything_together() -> None:
+    tray = '<body pos="0 0 -9" mocap="true"><geom type="plane" size="1 1 1"/></body>'
+    assert contact_parts(scene(tray + puck()).host)[1] == {}
