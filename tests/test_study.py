@@ -252,8 +252,10 @@ def test_an_onset_term_that_is_not_to_be_trusted_is_told() -> None:
     assert findings(result(row("fobg_onset", 10, 1, **events))) == []
     (narrow,) = findings(result(row("fobg_onset", 10, 1, **events | {"onset_spread": 0.4})))
     assert narrow.startswith(
-        "penalty: noise is too narrow for the onset term at K = 10 N/m: the step at which contact "
+        "penalty: the onset term may be off at K = 10 N/m, since the noise is narrow: the step at which contact "
     )
+    both = events | {"onset_spread": 0.4, "onset_strength": 0.25}
+    assert findings(result(row("fobg_onset", 10, 1, **both))) == [narrow]  # narrow noise spoils the jump as much
     (strong,) = findings(result(row("fobg_onset", 10, 1, **events | {"onset_strength": 0.25})))
     assert strong.startswith("penalty: the linear onset term can be off by 12% of what it adds, more at ")
     (beyond,) = findings(result(row("fobg_onset", 10, 1, **events | {"onset_strength": 1.2})))

@@ -236,16 +236,18 @@ def linear_error(strength: float) -> str:
 
 
 def _onset_findings(rows: Sequence[Row]) -> list[str]:
-    """Where the onset term is not to be trusted: its weights need wider noise, the linear one shorter steps."""
+    """Where the onset term may be off: by either treatment where noise is narrow, else the linear one at long steps."""
     found, corrected = [], [row for row in rows if row.onsets]
     narrow = [row for row in corrected if row.onset_spread < NARROW]
     if narrow:
         least = min(row.onset_spread for row in narrow)
         found.append(
-            f"noise is too narrow for the onset term{_at(_stiffnesses(narrow))}: the step at which contact "
-            f"begins has a standard deviation of {least:.2g}, {NARROW} is needed; take a smaller timestep"
+            f"the onset term may be off{_at(_stiffnesses(narrow))}, since the noise is narrow: the step at which "
+            f"contact begins has a standard deviation of {least:.2g}, and {NARROW} is enough in general; take a smaller "
+            "timestep or a larger --sigma, or check the mean (gradcheck --mean)"
         )
-    strong = [row for row in corrected if SHARE_OFF * row.onset_strength > NOTABLE]
+    wide = [row for row in corrected if not row.onset_spread < NARROW]
+    strong = [row for row in wide if SHARE_OFF * row.onset_strength > NOTABLE]
     if strong:
         most = max(row.onset_strength for row in strong)
         found.append(
