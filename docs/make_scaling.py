@@ -396,7 +396,7 @@ def apart(logarithms: Any) -> list[float]:
 
 
 PANELS: Final = {
-    "samples": ("samples", "time of a sample"),
+    "samples": ("samples", "time of a step"),
     "horizon": ("steps", "time of a step"),
     "dof": ("degrees of freedom", "time of a step"),
     "contacts": ("contacts", "time of a step"),
@@ -405,7 +405,7 @@ PANELS: Final = {
 
 
 def draw(documents: list[dict[str, Any]], output: Path) -> None:
-    """One row of panels: lines of the second machine are dashed, of the third dotted."""
+    """One row of panels: lines of the second machine are dashed, of the third dotted; gradients are wide and hollow."""
     from matplotlib.figure import Figure
     from matplotlib.ticker import LogLocator
 
@@ -414,11 +414,15 @@ def draw(documents: list[dict[str, Any]], output: Path) -> None:
 
     figure = Figure(figsize=(2.6 * len(PANELS), 3.2), layout="constrained")
     panels = dict(zip(PANELS, figure.subplots(1, len(PANELS)), strict=True))
-    names = {"value": ("rollouts", *STYLE["zobg"]), "gradient": ("gradients", *STYLE["fobg"])}
+    names = {"gradient": ("gradients", *STYLE["fobg"]), "value": ("rollouts", *STYLE["zobg"])}
+    wide = {"ms": 7.5, "markerfacecolor": "none", "linewidth": 3.0, "alpha": 0.6}
+    units: list[str] = []
     for document, line in zip(documents, ("-", "--", ":"), strict=False):
         environment = document["environment"]
         on_cpu = environment["backend"] == "cpu"
         device = "one core" if on_cpu else environment["device_kind"].removeprefix("NVIDIA ").split(" ")[0]
+        base = document["base"]
+        units.append(f"{base['samples']:,} at once on {device}")
         for axis, (label, title) in PANELS.items():
             for kind, (name, colour, marker) in names.items():
                 rows = [row for row in document["measured"] if row["axis"] == axis and row["kind"] == kind]
@@ -428,7 +432,8 @@ def draw(documents: list[dict[str, Any]], output: Path) -> None:
                 if axis == "devices":
                     each = [rows[0]["seconds"] / row["seconds"] for row in rows]
                 places, told = [row["at"] for row in rows], f"{name}, {device}"
-                axes.plot(places, each, line, color=colour, marker=marker, ms=4, label=told)
+                style = {"ms": 4} if kind == "value" else wide
+                axes.plot(places, each, line, color=colour, marker=marker, label=told, **style)
                 axes.set(xlabel=label, title=title)
     for axis, axes in panels.items():
         places = sorted({row["at"] for each in documents for row in each["measured"] if row["axis"] == axis})
@@ -445,7 +450,9 @@ def draw(documents: list[dict[str, Any]], output: Path) -> None:
         if axis != "samples":
             axes.set_xticks(places, [str(at) for at in places])
         axes.minorticks_off()
-    next(iter(panels.values())).set_ylabel(f"over a step of a rollout of {BASE}")
+    next(iter(panels.values())).set_ylabel("in steps of the unit")
+    unit = f"unit: a step of a rollout of {BASE} of {documents[0]['base']['steps']} steps"
+    figure.supxlabel(f"{unit}, {', '.join(units)}", fontsize="small")
     next(iter(panels.values())).legend(fontsize=7)
     write_whole(output, lambda file: figure.savefig(file, format="png", dpi=130))
 
