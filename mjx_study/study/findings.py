@@ -242,9 +242,9 @@ def _onset_findings(rows: Sequence[Row]) -> list[str]:
     if narrow:
         least = min(row.onset_spread for row in narrow)
         found.append(
-            f"the onset term may be off{_at(_stiffnesses(narrow))}, since the noise is narrow: the step at which contact"
-            f" begins has a standard deviation of {least:.2g}, and {NARROW} is enough in general; take a smaller timestep"
-            " or a larger --sigma, or check the mean (gradcheck --mean)"
+            f"the onset term may be off{_at(_stiffnesses(narrow))}, since the noise is narrow: the step at which "
+            f"contact begins has a standard deviation of {least:.2g}, and {NARROW} is enough in general; take a "
+            "smaller timestep or a larger --sigma, or check the mean (gradcheck --mean)"
         )
     wide = [row for row in corrected if not row.onset_spread < NARROW]
     strong = [row for row in wide if SHARE_OFF * row.onset_strength > NOTABLE]
