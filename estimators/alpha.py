@@ -1,4 +1,4 @@
-"""Interpolation between a zeroth- and a first-order estimate, and the choice of its weight."""
+"""Interpolation between zeroth- and first-order estimates, and the choice of its weight."""
 
 from dataclasses import replace
 
@@ -14,10 +14,10 @@ Scalar = Float[Array, ""]
 def inverse_variance_alpha(
     variance_zeroth: Float[Array, "*nodes"], variance_first: Float[Array, "*nodes"]
 ) -> Float[Array, "*nodes"]:
-    """The weight of least variance: alpha = sigmahat_0^2 / (sigmahat_0^2 + sigmahat_1^2).
+    """Return the inverse-variance weight alpha = sigmahat_0^2 / (sigmahat_0^2 + sigmahat_1^2).
 
-    Where the variances do not decide (both zero, both infinite, either one undefined) it is 0: a first-order
-    batch is trusted on evidence only.
+    It is 0 where the variances do not determine it (both zero, both infinite, or either one undefined): a first-order
+    batch must earn its weight.
 
     Args:
         variance_zeroth: sigmahat_0^2 >= 0, [cost^2/param^2]; one for each weight.
@@ -28,7 +28,7 @@ def inverse_variance_alpha(
 
     Reference: Suh et al. 2022, lemma on the closed form, gamma = infinity.
     """
-    ratio = variance_first / jnp.where(variance_zeroth == 0, 1.0, variance_zeroth)  # not a sum, which can overflow
+    ratio = variance_first / jnp.where(variance_zeroth == 0, 1.0, variance_zeroth)  # a sum of both could overflow
     alpha = jnp.where(variance_zeroth == 0, 0.0, 1.0 / (1.0 + ratio))
     return jnp.where(jnp.isnan(alpha) | jnp.isnan(variance_first), 0.0, alpha)
 
@@ -36,20 +36,20 @@ def inverse_variance_alpha(
 def constrained_alpha(
     variance_zeroth: Scalar, variance_first: Scalar, discrepancy: Scalar, epsilon: float | Scalar, gamma: float | Scalar
 ) -> Scalar:
-    """The weight of least variance among those that promise an error of at most gamma.
+    """Return the minimum-variance weight whose error bound is at most gamma.
 
         min_alpha  alpha^2 sigmahat_1^2 + (1 - alpha)^2 sigmahat_0^2   s.t.  epsilon + alpha B <= gamma
 
-    is solved by the smaller of the inverse-variance weight and (gamma - epsilon)/B. If epsilon > gamma
-    nothing is feasible, and alpha = 0. B = 0 never binds. gamma = infinity is inverse-variance weighting
-    whatever epsilon and B are; otherwise an epsilon or B that is undefined gives 0.
+    The solution is the smaller of the inverse-variance weight and (gamma - epsilon)/B. If epsilon > gamma, nothing is
+    feasible and alpha = 0. B = 0 never binds. gamma = infinity gives inverse-variance weighting for any epsilon and B;
+    for a finite gamma, an undefined epsilon or B gives alpha = 0.
 
     Args:
         variance_zeroth: sigmahat_0^2 >= 0, [cost^2/param^2].
         variance_first: sigmahat_1^2 >= 0, [cost^2/param^2].
         discrepancy: B = ||gbar_1 - gbar_0||, [cost/param].
         epsilon: Confidence radius of the zeroth-order mean, [cost/param].
-        gamma: Largest error to accept, [cost/param].
+        gamma: Largest acceptable error, [cost/param].
 
     Returns:
         alpha in [0, 1].
@@ -72,13 +72,12 @@ def interpolate(zeroth: GradientEstimate, first: GradientEstimate, alpha: float 
     """Alpha-order batched gradient for a given weight.
 
         gbar = alpha gbar_1 + (1 - alpha) gbar_0
-        sigmahat^2 = alpha^2 sigmahat_1^2 + (1 - alpha)^2 sigmahat_0^2,  and so for each squared standard
-        error
+        sigmahat^2 = alpha^2 sigmahat_1^2 + (1 - alpha)^2 sigmahat_0^2,  likewise for squared standard errors
 
-    Assumes that the two batches are independent. Sample i pairs row i of one with row i of the other, an
-    arbitrary pairing that independence allows; the empirical variance of the pairs differs from sigmahat^2 by
-    the batches' chance correlation. A batch of weight 0 is left out altogether, NaN included. For a fixed
-    alpha the bias is alpha times that of the first-order batch.
+    Assumes independent batches. Sample i pairs row i of one batch with row i of the other; by independence, the pairing
+    is arbitrary. The empirical variance of the pairs differs from sigmahat^2 by the chance correlation of the batches.
+    A batch of weight 0 is ignored, NaN included. For a fixed alpha, the bias is alpha times that of the first-order
+    batch.
 
     Args:
         zeroth: Zeroth-order estimate, with gbar_0 and sigmahat_0.
@@ -116,7 +115,7 @@ def interpolate(zeroth: GradientEstimate, first: GradientEstimate, alpha: float 
 def choose_alpha(
     zeroth: GradientEstimate, first: GradientEstimate, *, gamma: float | Scalar, epsilon: float | Scalar
 ) -> AlphaChoice:
-    """The weight of `constrained_alpha` with what it was chosen by; arguments as in `alpha_order`."""
+    """Choose a weight with `constrained_alpha` and record its inputs; arguments as in `alpha_order`."""
     discrepancy = jnp.linalg.norm(first.mean - zeroth.mean)
     return AlphaChoice(
         alpha=constrained_alpha(zeroth.variance, first.variance, discrepancy, epsilon, gamma),
@@ -132,18 +131,17 @@ def alpha_order(
 ) -> GradientEstimate:
     """Alpha-order batched gradient (AoBG) with the weight of `constrained_alpha`.
 
-    Assumes independent batches of the same size. The weight is chosen from the very samples that it weighs,
-    which biases the mean by order 1/N (`weigh_batches` has the remedy), and the variance and standard errors take it
-    as given.
+    Assumes independent batches of the same size. The weight is computed from the samples it is applied to, which biases
+    the mean at order 1/N (`weigh_batches` avoids this). The variance and standard errors treat the weight as fixed.
 
     Args:
-        zeroth: Zeroth-order estimate, whose mean counts as unbiased.
+        zeroth: Zeroth-order estimate, assumed unbiased.
         first: First-order estimate from the same number of independent samples.
-        gamma: Largest error to accept, [cost/param]; infinity for inverse-variance weighting.
+        gamma: Largest acceptable error, [cost/param]; infinity for inverse-variance weighting.
         epsilon: Confidence radius of the zeroth-order mean, [cost/param]; see `bernstein_epsilon`.
 
     Returns:
-        The estimate, its `alpha` filled in.
+        The estimate, with its `alpha`.
 
     Raises:
         ValueError: The batches differ in shape.

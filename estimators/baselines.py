@@ -1,8 +1,8 @@
-"""Baselines: what a zeroth-order sample subtracts from its value.
+"""Baselines, subtracted from the values of zeroth-order samples.
 
-A baseline b_i leaves E[(f_i - b_i) s_i] alone when it does not depend on the noise of sample i, because
-E[s_i] = 0. The mean of the whole batch does depend on it: E[(f_i - fbar) s_i] = (1 - 1/N) grad F, a gradient
-shrunk towards zero. The mean of the *other* samples does not, and so that is the one offered here.
+A baseline b_i leaves E[(f_i - b_i) s_i] unchanged if it does not depend on the noise of sample i, because
+E[s_i] = 0. The batch mean does depend on it: E[(f_i - fbar) s_i] = (1 - 1/N) grad F, a gradient shrunk towards
+zero. The mean of the *other* samples does not, hence `leave_one_out`.
 """
 
 from collections.abc import Callable
@@ -27,7 +27,7 @@ def zero_noise(evaluation: Evaluation) -> Float[Array, " samples"]:
 
 
 def leave_one_out(evaluation: Evaluation) -> Float[Array, " samples"]:
-    """b_i = 1/(N-1) sum_{j != i} f_j, over the values that are finite; 0 where there is no other one.
+    """b_i = 1/(N-1) sum_{j != i} f_j over finite values; 0 if there are no others.
 
     Sharing values makes the samples dependent. Each stays unbiased, but the variance of their mean exceeds
     E[sigmahat^2]/N by ||grad F||^2/(N-1)^2.
@@ -46,10 +46,10 @@ BASELINES: dict[str, Callable[[Evaluation], Float[Array, " samples"]]] = {
 
 
 def find_baseline(name: str) -> Callable[[Evaluation], Float[Array, " samples"]]:
-    """The baseline of that name.
+    """Look up a baseline by name.
 
     Raises:
-        ValueError: there is none.
+        ValueError: No baseline has that name.
     """
     if name not in BASELINES:
         raise ValueError(f"baseline must be one of {', '.join(BASELINES)}; got {name!r}")

@@ -1,4 +1,4 @@
-"""Whether a first-order mean is biased, and how much of it a rare event carries."""
+"""Bias of first-order means, and how much of the mean rare events carry."""
 
 from dataclasses import dataclass
 
@@ -16,13 +16,13 @@ from estimators.types import GradientEstimate
 @register_pytree
 @dataclass(frozen=True)
 class BiasTest:
-    """A test of E[g_1] = E[g_0]. See `bias_test`.
+    """Result of a test of E[g_1] = E[g_0]. See `bias_test`.
 
     Attributes:
         distance: ||gbar_1 - gbar_0||, [cost/param].
-        squared_bias: An unbiased estimate of ||E g_1 - E g_0||^2, which may be negative, [cost^2/param^2].
+        squared_bias: Unbiased estimate of ||E g_1 - E g_0||^2; may be negative, [cost^2/param^2].
         p_value: Probability of a distance at least as large if there is no bias.
-        effective_samples: n_eff of the batch that has fewer; below `ENOUGH_EFFECTIVE` the p-value says nothing.
+        effective_samples: The smaller n_eff of the two batches; below `ENOUGH_EFFECTIVE` the p-value is meaningless.
     """
 
     distance: Float[Array, ""]
@@ -32,35 +32,35 @@ class BiasTest:
 
 
 def bias_test(first: GradientEstimate, zeroth: GradientEstimate, key: Key[Array, ""], *, num_draws: int) -> BiasTest:
-    """Two-sample test of whether a first-order mean estimates another gradient than a zeroth-order one.
+    """Two-sample test of equal means of a first-order and a zeroth-order estimate.
 
         T = ||gbar_1 - gbar_0||,   T* = ||z_1 - z_0||,   z_k = sqrt(nu_k / chi^2_k) sum_i e_ki (g_ki - gbar_k) / n_k
 
-    with independent standard normal multipliers e_ki and chi^2_k of nu_k degrees of freedom. The p-value is the share
-    of draws of T* that reach T, the observed T among them: a multiplier bootstrap, which needs no inverse covariance
-    and so works with more parameters than samples. The chi^2_k allow for the error of the variance, as Student's t
-    does, with nu_k = 2 / (1/n_eff - 1/n) degrees of freedom by the method of moments (n for Gaussian samples in one
-    dimension, 2 k for k rare ones).
+    with independent standard normal multipliers e_ki, and chi^2_k with nu_k degrees of freedom. The p-value is the
+    share of T* that reach T, with T itself counted as a draw: a multiplier bootstrap, which needs no inverse covariance
+    and so works with more parameters than samples. The chi^2_k account for the error of the variance, as Student's t
+    does; nu_k = 2 / (1/n_eff - 1/n) by the method of moments (n for Gaussian samples in one dimension, 2 k for k rare
+    ones).
 
-    Asymptotic all the same. A batch that holds few of the rare samples that carry the gradient underestimates mean
-    and variance together: below `ENOUGH_EFFECTIVE` effective samples, do not believe the result. No test sees a rare
-    event that the batch does not hold, and on strongly skewed samples this one rejects too often: docs/coverage.md.
+    The test is still asymptotic. A batch with few of the rare samples that carry the gradient underestimates both mean
+    and variance: do not trust the result below `ENOUGH_EFFECTIVE` effective samples. No test sees a rare event absent
+    from the batch, and this one rejects too often for strongly skewed samples: docs/coverage.md.
 
     Args:
-        first: First-order estimate, the one whose bias is tested.
+        first: First-order estimate, the one tested for bias.
         zeroth: Zeroth-order estimate from independent samples.
-        key: For the multipliers; used up.
-        num_draws: Of T*, >= 1; 1 / (num_draws + 1) is the least p-value.
+        key: Random key for the multipliers; consumed.
+        num_draws: Number of draws of T*, >= 1; the smallest possible p-value is 1 / (num_draws + 1).
 
     Returns:
-        The test; a p-value of NaN where an estimate has fewer than two finite rows, or all of them equal: they say
-        nothing about how far their mean may be off.
+        The test result. The p-value is NaN if an estimate has fewer than two finite rows or all its rows are equal,
+        since the error of its mean is then unknown.
 
     Raises:
-        ValueError: There is nothing to draw, or the parameters differ in number.
+        ValueError: `num_draws` is below 1, or the numbers of parameters differ.
 
     Reference: Chernozhukov, Chetverikov, Kato, "Gaussian approximations and multiplier bootstrap for maxima of sums
-    of high-dimensional random vectors", Annals of Statistics 41, 2013, there for another norm.
+    of high-dimensional random vectors", Annals of Statistics 41, 2013, for another norm.
     """
     if num_draws < 1:
         raise ValueError(f"num_draws must be at least 1; got {num_draws}; 999 gives p-values down to 0.001")
@@ -82,13 +82,13 @@ def bias_test(first: GradientEstimate, zeroth: GradientEstimate, key: Key[Array,
 def _multiplied(
     estimate: GradientEstimate, effective: Float[Array, ""], key: Key[Array, ""], num_draws: int
 ) -> Float[Array, "draws params"]:
-    """z_k; the sign that a difference gives is immaterial."""
+    """Draws of z_k, up to sign, which is irrelevant to a difference."""
     dtype = estimate.mean.dtype
     multiplier_key, scale_key = jax.random.split(key)
     means = estimate.samples.perturbed_means(estimate.mean, multiplier_key, num_draws)
     count = estimate.num_finite.astype(dtype)
     freedom = 2.0 / jnp.maximum(1.0 / jnp.maximum(effective, 1.0) - 1.0 / count, 1e-9)
-    # chi^2 / nu as the cube of a normal number, by Wilson and Hilferty
+    # Wilson-Hilferty: chi^2 / nu as the cube of a normal variate
     spread = jnp.sqrt(2.0 / (9.0 * freedom))
     cube_root = 1.0 - spread**2 + spread * jax.random.normal(scale_key, (num_draws, 1), dtype)
     return means / jnp.maximum(cube_root, 1e-2) ** 1.5
@@ -97,21 +97,20 @@ def _multiplied(
 def squared_bias_of_means(
     means: Float[Array, "batches params"], reference: GradientEstimate
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """An unbiased estimate of ||E gbar - E g||^2 from the means of independent batches, for any estimator.
+    """Estimate ||E gbar - E g||^2 without bias from the means of independent batches of any estimator.
 
         sum_{i != j} d_i^T d_j / (S (S - 1)) - sum_k se_k^2,   d_i = gbar_i - reference, se its standard error
 
-    The products of different batches leave out the noise of the means, the second term that of the reference, which all
-    share. It may be negative where there is no bias to be seen.
+    Products of different batches are free of the noise of the means; the second term removes the noise of the
+    reference, which all share. The estimate may be negative if the bias is below the noise.
 
     Args:
-        means: Of S >= 3 batches, [cost/param].
-        reference: An unbiased estimate of the gradient from other samples.
+        means: Means of S >= 3 batches, [cost/param].
+        reference: Unbiased estimate of the gradient from other samples.
 
     Returns:
-        The estimate and its standard error, [cost^2/param^2]: a jackknife over the batches, and twice the bias
-        times the reference's error, plus its square, which is the most that the reference can contribute. NaN for
-        fewer batches.
+        The estimate and its standard error, [cost^2/param^2]. The error combines a jackknife over the batches with the
+        largest contribution of the reference: twice the bias times its error, plus its squared error. NaN for S < 3.
     """
     count = means.shape[0]
     if count < 3:
@@ -131,12 +130,12 @@ def squared_bias_of_means(
 @register_pytree
 @dataclass(frozen=True)
 class EmpiricalBias:
-    """(beta, Delta, S)-empirical bias, estimated. See `empirical_bias`.
+    """Estimated (beta, Delta, S)-empirical bias. See `empirical_bias`.
 
     Attributes:
-        beta: Share of the samples that are set aside.
-        discrepancy: Delta = ||mean of the others - reference||, [cost/param].
-        variance: S, the variance of the others, [cost^2/param^2].
+        beta: Share of samples set aside.
+        discrepancy: Delta = ||mean of the remaining samples - reference||, [cost/param].
+        variance: S, the variance of the remaining samples, [cost^2/param^2].
     """
 
     beta: Float[Array, ""]
@@ -145,22 +144,22 @@ class EmpiricalBias:
 
 
 def empirical_bias(estimate: GradientEstimate, reference: Float[Array, " params"], num_rare: int) -> EmpiricalBias:
-    """How a batch that happens to lack its rarest samples looks.
+    """Estimate how a batch looks if it happens to lack its rarest samples.
 
-    A random vector z has (beta, Delta, S)-empirical bias if there is an event of probability at least 1 - beta on which
-    its mean is Delta or more from E z, though its variance is at most S: a batch of fewer than about 1 / beta samples
-    then looks precise and is wrong. The event here: all but the `num_rare` samples farthest from the median.
+    A random vector z has (beta, Delta, S)-empirical bias if, on an event of probability at least 1 - beta, its mean is
+    at least Delta from E z while its variance is at most S: a batch of fewer than about 1 / beta samples then looks
+    precise but is wrong. The event used here is all but the `num_rare` samples farthest from the median.
 
     Args:
-        estimate: The batch of z, a row per sample, [cost/param].
-        reference: E z, from elsewhere, [cost/param].
-        num_rare: Samples to set aside, from 0 to the number of samples less 2.
+        estimate: Batch of z, one row per sample, [cost/param].
+        reference: E z, from an independent source, [cost/param].
+        num_rare: Samples to set aside, from 0 to the number of samples minus 2.
 
     Returns:
-        The three numbers; a lower bound on Delta at that beta as far as this event goes.
+        The three numbers; for this choice of event, Delta is a lower bound at that beta.
 
     Raises:
-        ValueError: Too few samples would be left.
+        ValueError: Fewer than two samples would remain.
 
     Reference: Suh et al. 2022, def. of empirical bias, and the lemma Var z >= Delta_0^2 / beta with Delta_0 =
     max(0, (1 - beta) Delta - beta ||E z||).

@@ -1,7 +1,7 @@
-"""Statistics of samples that come block by block and are not kept: two blocks' make those of both.
+"""Mergeable statistics of samples that arrive block by block and are not kept.
 
-Arrays here are NumPy's, in double precision. No sum is divided among threads, so that the same blocks merged in the
-same order give the same bits on any number of cores.
+Arrays are NumPy's, in double precision. No sum is split among threads, so the same blocks merged in the same order
+give the same bits on any number of cores.
 """
 
 from collections.abc import Sequence
@@ -17,9 +17,9 @@ from estimators.pytree import register_pytree
 from estimators.rows import Deviations
 
 EXTREMES: Final = 32
-"""Samples kept of each kind of extreme."""
+"""Samples kept for each kind of extreme."""
 THINNED: Final = 2**14
-"""Most samples of a batch whose norms are kept; of a larger one every second, every third ..."""
+"""Maximum number of samples of a batch whose norms are kept; larger batches are subsampled at a regular stride."""
 
 Block = Float[np.ndarray, "samples parts params"]
 
@@ -27,20 +27,20 @@ Block = Float[np.ndarray, "samples parts params"]
 @register_pytree
 @dataclass(frozen=True)
 class Moments:
-    """Moments of the rows of one batch, or of two that are paired row by row (parts).
+    """Moments of the rows of one batch, or of two batches paired row by row (parts).
 
-    A feature vector has the products d_i . d_j of a sample's deviations d_i = g_i - gbar_i, and these deviations.
-    Moved to another mean it changes by an affine map, so that its scatter matrix, which holds the moments that
-    statistics need up to the fourth, can be merged.
+    A feature vector holds a sample's deviations d_i = g_i - gbar_i and their products d_i . d_j. A change of mean maps
+    it affinely, so its scatter matrix, which holds all moments up to the fourth that the statistics need, can be
+    merged.
 
     Attributes:
-        count: n, samples whose every entry is finite.
+        count: n, the number of samples with only finite entries.
         mean: gbar of each part, [cost/param].
         products: Means of d_i . d_j, i <= j, [cost^2/param^2].
-        scatter: sum over samples of the outer square of the features less their mean.
-        pairs: Sum of ||z - z'||^2 / 2 over disjoint pairs of neighbours, and their number.
-        extremes: Samples whose deviations or norms are the largest.
-        places: Their indices.
+        scatter: Scatter matrix of the features.
+        pairs: Sum of ||z - z'||^2 / 2 over disjoint pairs of neighbours, and the number of pairs.
+        extremes: Samples with the largest deviations or norms.
+        places: Indices of the extremes.
         thinned: Products g_i . g_j of a subset of the samples, chosen by index.
     """
 
@@ -55,11 +55,11 @@ class Moments:
 
     @classmethod
     def of(cls, block: Block, first: int, every: int) -> "Moments":
-        """The moments of a block.
+        """Compute the moments of a block.
 
         Args:
-            first: Index of its first sample.
-            every: Of which indices the thinned samples are multiples.
+            first: Index of the block's first sample.
+            every: Stride of the thinned samples: those whose index is a multiple of it.
         """
         finite = np.all(np.isfinite(block), axis=(1, 2))
         rows, places = np.asarray(block[finite], float), first + np.flatnonzero(finite)
@@ -84,7 +84,7 @@ class Moments:
         )
 
     def merged(self, other: "Moments") -> "Moments":
-        """Those of both."""
+        """Return the moments of both blocks together."""
         count = int(self.count + other.count)
         share = int(other.count) / max(count, 1)
         mean = self.mean + share * (other.mean - self.mean)
@@ -104,7 +104,7 @@ class Moments:
         )
 
     def _about(self, mean: Float[np.ndarray, "parts params"]) -> tuple[np.ndarray, np.ndarray]:
-        """Mean and scatter matrix of the features of deviations from another mean."""
+        """Mean and scatter matrix of the features for deviations from another mean."""
         shift, size = self.mean - mean, len(self.products)
         slope = np.zeros((size, *shift.shape))
         for index, (i, j) in enumerate(_pairs(len(shift))):
@@ -124,12 +124,12 @@ def _pairs(parts: int) -> list[tuple[int, int]]:
 
 
 def _products(rows: Block) -> Float[np.ndarray, "samples products"]:
-    """Scalar products of each sample's parts."""
+    """Scalar products between the parts of each sample."""
     return np.stack([np.einsum("np,np->n", rows[:, i], rows[:, j]) for i, j in _pairs(rows.shape[1])], axis=1)
 
 
 def _extremes(rows: Block, places: np.ndarray, mean: np.ndarray, products: np.ndarray) -> dict[str, np.ndarray]:
-    """The samples with the largest deviations and norms: of each part, and of their sum at equal spread."""
+    """Samples with the largest deviations and norms, of each part and of their sum at equal spread."""
     sizes = [np.linalg.norm(each, axis=2) for each in (rows - mean, rows)]
     if rows.shape[1] > 1:
         squares = np.array([square for square, (i, j) in zip(products, _pairs(rows.shape[1]), strict=True) if i == j])
@@ -141,42 +141,42 @@ def _extremes(rows: Block, places: np.ndarray, mean: np.ndarray, products: np.nd
 
 
 Parts = tuple[Moments, ...]
-"""Moments of a batch; or of two, of the one, the other, and their pairs."""
+"""Moments of one batch; or, for two batches, of the first, the second, and the pairs."""
 
 
 def moments_of(parts: Sequence[Float[Any, "samples params"]], first: int, every: int) -> Parts:
-    """The moments of one batch's block of rows, or of two batches' blocks; arguments as in `Moments.of`."""
+    """Compute the moments of a block of rows of one batch or two; arguments as in `Moments.of`."""
     rows = [np.asarray(part, float)[:, None] for part in parts]
     rows += [np.concatenate(rows, axis=1)] if len(rows) > 1 else []
     return tuple(Moments.of(each, first, every) for each in rows)
 
 
 def merge(one: Parts, other: Parts) -> Parts:
-    """The moments of two blocks together; to the last bit they depend on which comes first."""
+    """Merge the moments of two blocks; the order affects rounding."""
     return tuple(mine.merged(theirs) for mine, theirs in zip(one, other, strict=True))
 
 
 @dataclass(frozen=True)
 class Merged:
-    """Samples of which the moments are left, with the methods of `estimators.rows.Rows`.
+    """Samples reduced to their moments, with the interface of `estimators.rows.Rows`.
 
-    They are a batch's samples, or two batches' weighed row by row with weights that need not have been known when the
-    samples were there. To rounding as from rows: counts, means, (co)variances, concentration, `second_moment`. What is
-    not:
+    They belong to one batch, or to two batches weighted row by row; the weights need not be known when the samples are
+    drawn. Counts, means, (co)variances, concentration and `second_moment` agree with those from rows up to rounding.
+    The rest is approximate:
 
-    - `top`, `largest_deviation`: from the extremes. Right unless more than `EXTREMES` samples of a block are within
-      twice the distance from the block's mean to the batch's; of a mixture, a lower bound that is right if its
-      largest sample is among the largest of a part or of the sum of both at equal spread.
-    - `log_spread`: exact for the extremes and of second order for the rest, of which each has less than 1/`EXTREMES` of
-      the spread; off by less than that share, relatively, and by about the largest share of a sample without tails.
-    - `norm_quantiles`: of the thinned samples, at most `THINNED`, so that a rank is off by 0.4 % (a standard
-      error, of the median); exact for fewer samples. The largest as `top`.
-    - `perturbed_means`: other draws of the same distribution.
+    - `top`, `largest_deviation`: from the extremes. Exact unless more than `EXTREMES` samples of a block lie within
+      twice the distance between the block's and the batch's mean. For a mixture, a lower bound, exact if its largest
+      sample is among the largest of a part or of the sum of both at equal spread.
+    - `log_spread`: exact for the extremes, second order for the rest, each of which has less than 1/`EXTREMES` of the
+      spread; the relative error is below that share, and about the largest share of any sample if there are no tails.
+    - `norm_quantiles`: from at most `THINNED` thinned samples, so ranks have a standard error of 0.4 % (at the median);
+      exact for fewer samples. The maximum is that of `top`.
+    - `perturbed_means`: different draws from the same distribution.
 
     Attributes:
         parts: As in `Parts`.
-        weights: Of each batch.
-        size: Samples of each batch, those that are not finite included.
+        weights: Weight of each batch.
+        size: Samples per batch, nonfinite ones included.
     """
 
     parts: Parts
@@ -200,7 +200,7 @@ class Merged:
         return jnp.asarray(self._moments.count)
 
     def mixed(self, weights: tuple[Any, Any], other: Any) -> "Merged":
-        """Row by row, one weight times these and another times those of the other batch of the same pair."""
+        """Combine two batches of the same pairing row by row with the given weights."""
         pairs = zip(self.weights, other.weights, strict=True)
         mixture = tuple(float(weights[0]) * one + float(weights[1]) * two for one, two in pairs)
         return Merged(self.parts, mixture, self.size)
@@ -276,7 +276,7 @@ class Merged:
 
     @property
     def _moments(self) -> Moments:
-        """Of the batches that have a weight; nothing times NaN is nothing."""
+        """Moments of the batches with nonzero weight, so that 0 * NaN counts as 0."""
         used = [index for index, weight in enumerate(self.weights) if weight != 0]
         return self.parts[used[0] if len(used) == 1 else -1]
 
@@ -287,7 +287,7 @@ class Merged:
 
     @property
     def _product(self) -> Float[np.ndarray, " products"]:
-        """Weights of the products of parts in the square of a sample."""
+        """Weights of the parts' products in the squared norm of a sample."""
         weights = self._weights
         return np.array([weights[i] * weights[j] * (1 if i == j else 2) for i, j in _pairs(len(weights))])
 
@@ -296,7 +296,7 @@ class Merged:
 
 
 def _log_spread(count: float, far: np.ndarray, concentration: float, eps: float) -> float:
-    """`Deviations.log_spread` from the shares of the extremes, and the sum of the squares of all."""
+    """`Deviations.log_spread` from the shares of the extremes and the sum of squares of all shares."""
     scale = count / (count - 1)
     shares = scale * far
     if np.any(1 - shares <= 4 * np.sqrt(count) * eps):

@@ -1,4 +1,4 @@
-"""The estimators of this package, each a formula with its options."""
+"""The built-in estimators, each a formula with its options."""
 
 from abc import abstractmethod
 from dataclasses import dataclass, replace
@@ -36,7 +36,7 @@ def _check_positive(name: str, value: float) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class _Baselined(Estimator):
-    """Base of those with a zeroth-order batch; `baseline` is a name in `BASELINES`."""
+    """Base of estimators with a zeroth-order batch; `baseline` is a name in `BASELINES`."""
 
     baseline: str = "zero_noise"
 
@@ -46,7 +46,7 @@ class _Baselined(Estimator):
 
 @dataclass(frozen=True, kw_only=True)
 class _Interpolation(_Baselined):
-    """Base of those that weigh two batches; `weights` is a name in `WEIGHTS`."""
+    """Base of estimators that weight two batches; `weights` is a name in `WEIGHTS`."""
 
     weights: str = PLUG_IN
 
@@ -115,7 +115,7 @@ class OnsetFirstOrder(FirstOrder, entry=CATALOGUE["fobg_onset"]):
 class ClippedFirstOrder(Estimator, entry=CATALOGUE["fobg_clipped"]):
     """See `estimators.clipped_first_order`.
 
-    `max_norm` of a sample, > 0, [cost/param].
+    `max_norm` is the largest norm of a sample, > 0, [cost/param].
     """
 
     separable = True
@@ -134,7 +134,7 @@ class ClippedFirstOrder(Estimator, entry=CATALOGUE["fobg_clipped"]):
 class TruncatedFirstOrder(Estimator, entry=CATALOGUE["fobg_truncated"]):
     """See `estimators.truncated_first_order`.
 
-    `window` of steps between cuts of the adjoint, >= 1.
+    `window` is the number of steps between cuts of the adjoint, >= 1.
     """
 
     separable = True
@@ -150,13 +150,13 @@ class TruncatedFirstOrder(Estimator, entry=CATALOGUE["fobg_truncated"]):
 
 
 class _OneWeight(_Interpolation):
-    """Base of those with one weight for two whole batches."""
+    """Base of estimators with a single weight for two batches."""
 
     separable = True
 
     @abstractmethod
     def choose(self, zeroth: GradientEstimate, first: GradientEstimate) -> AlphaChoice:
-        """The weight."""
+        """Choose the weight."""
 
     def combine(self, evaluation: Evaluation, differentiation: Differentiation) -> GradientEstimate:
         def choose(*batches: Any) -> AlphaChoice:
@@ -188,8 +188,8 @@ class AlphaOrder(_OneWeight, entry=CATALOGUE["aobg"]):
     Attributes:
         baseline: A name in `BASELINES`, for the zeroth-order batch.
         weights: A name in `WEIGHTS`, the source of alpha.
-        gamma: Largest error to accept, > 0 or infinity, [cost/param].
-        failure_probability: Of the confidence radius, in (0, 1); see `bernstein_epsilon`.
+        gamma: Largest acceptable error, > 0 or infinity, [cost/param].
+        failure_probability: Failure probability of the confidence radius, in (0, 1); see `bernstein_epsilon`.
         variance_proxy: "variance", "second_moment" or "upper_bound".
         radius: "max_deviation" or a bound >= 0 on ||g_i - E g||, [cost/param].
     """
@@ -248,7 +248,7 @@ class TotalPropagation(_Interpolation, entry=CATALOGUE["total_propagation"]):
 class DiscontinuityGated(_Interpolation, entry=CATALOGUE["ddcg"]):
     """See `estimators.discontinuity_gated`.
 
-    `sigma` of the noise, > 0, [control], and `tolerance` c of the test, in [0, 1).
+    `sigma` is the noise's standard deviation, > 0, [control]; `tolerance` is c of the test, in [0, 1).
     """
 
     gaussian = True
@@ -271,7 +271,7 @@ class DiscontinuityGated(_Interpolation, entry=CATALOGUE["ddcg"]):
 class DeltaMethod(Estimator, entry=CATALOGUE["delta"]):
     """See `estimators.delta_control_variate`.
 
-    `sigma` of the noise, > 0, [param].
+    `sigma` is the noise's standard deviation, > 0, [param].
     """
 
     gaussian = additive = True

@@ -1,4 +1,4 @@
-"""What can be chosen by name, with a line about each; nothing here computes or imports what does."""
+"""Names and one-line descriptions of estimators and their choices, free of imports that compute."""
 
 from dataclasses import dataclass
 from typing import Final
@@ -6,34 +6,34 @@ from typing import Final
 PLUG_IN: Final = "plug_in"
 CROSS_FITTED: Final = "cross_fitted"
 WEIGHTS: Final = (PLUG_IN, CROSS_FITTED)
-"""Sources of an interpolation's weights."""
+"""Where an interpolation's weights come from."""
 LEAVE_ONE_OUT: Final = "leave_one_out"
 BASELINES: Final = ("none", "zero_noise", LEAVE_ONE_OUT)
-"""Baselines of zeroth-order samples."""
+"""Baselines for zeroth-order samples."""
 VARIANCE_PROXIES: Final = ("variance", "second_moment", "upper_bound")
-"""What may stand for the variance in epsilon."""
+"""Choices for the variance in epsilon."""
 MAX_DEVIATION: Final = "max_deviation"
-"""The radius in epsilon that is read off the samples."""
+"""Choice of the radius in epsilon that is computed from the samples."""
 PUBLISHED_TOLERANCE: Final = 0.3
-"""Tolerance of DDCG's test."""
+"""Tolerance of the DDCG test, as published."""
 DENSITIES: Final = {
     "gaussian": "the paper's",
     "logistic": "heavier tails, bounded score",
     "laplace": "a score of constant size, which bounds zeroth-order samples",
     "student": "Student's t with 5 degrees of freedom: rare large steps",
 }
-"""Noise densities, each with a line about it."""
+"""Noise densities, each with a one-line description."""
 
 
 @dataclass(frozen=True)
 class Entry:
-    """An estimator, described.
+    """Description of an estimator.
 
     Attributes:
-        name: On the command line and in `ESTIMATORS`.
-        label: For a legend.
-        needs: Oracles in `ORACLES`, in the order in which `combine` takes their batches.
-        description: One line.
+        name: Name on the command line and in `ESTIMATORS`.
+        label: Legend label.
+        needs: Oracles in `ORACLES`, in the order of the arguments of `combine`.
+        description: One-line description.
         required: Options without a default.
     """
 
@@ -117,4 +117,4 @@ CATALOGUE: dict[str, Entry] = {
         ),
     )
 }
-"""Estimators by name; `register` adds those of one's own."""
+"""Estimators by name; `register` adds user-defined ones."""

@@ -1,4 +1,4 @@
-"""How far an estimate is from a reference, and how sure that is."""
+"""Distance of an estimate from a reference, with its uncertainty."""
 
 from dataclasses import dataclass
 
@@ -14,20 +14,19 @@ Scalar = Float[Array, ""]
 @register_pytree
 @dataclass(frozen=True)
 class Comparison:
-    """How far an estimate is from a reference, with standard errors. See `compare`.
+    """Distance of an estimate from a reference, with standard errors. See `compare`.
 
     Attributes:
         error: ||gbar - gref||, [cost/param].
         relative_error: r = ||gbar - gref|| / ||gref||, noise of both means included.
         relative_error_se: Standard error of r about its own mean.
-        debiased_error: r_d, the same less what noise adds to it: ||E gbar - grad F|| / ||grad F||, estimated.
-        debiased_error_se: Standard error of that.
+        debiased_error: r_d, an estimate of ||E gbar - grad F|| / ||grad F|| with the contribution of noise removed.
+        debiased_error_se: Standard error of r_d.
         cosine: c = gbar . gref / (||gbar|| ||gref||).
         cosine_se: Standard error of c about its own mean.
         debiased_cosine: c_d, the cosine of the angle between E gbar and grad F, estimated.
-        debiased_cosine_se: Standard error of that.
-        reference_uncertainty: sqrt(tr Cov[gref]) / ||gref||, the relative error below which nothing can be
-            told.
+        debiased_cosine_se: Standard error of c_d.
+        reference_uncertainty: sqrt(tr Cov[gref]) / ||gref||, the smallest relative error that can be resolved.
     """
 
     error: Float[Array, ""]
@@ -43,33 +42,33 @@ class Comparison:
 
 
 def compare(estimate: GradientEstimate, reference: GradientEstimate) -> Comparison:
-    """Relative error and cosine against an independent reference, with delta-method standard errors.
+    """Compute relative error and cosine against an independent reference, with delta-method standard errors.
 
     With unit vectors u, v, a along d = gbar - gref, gref, gbar,
 
         se(r)^2 = ( Var[u . g_i]/N + Var[(u + r v) . gref_j]/M ) / ||gref||^2
         se(c)^2 = Var[(v - c a) . g_i]/(N ||gbar||^2) + Var[(a - c v) . gref_j]/(M ||gref||^2)
 
-    where the variances are those of the projected samples. Both are biased, since noise has a length too: r up and
-    |c| down, by many standard errors where there are many parameters. Without the noise of either mean,
+    where the variances are those of the projected samples. Both r and c are biased, since noise has length: r upwards
+    and |c| downwards, by many standard errors if there are many parameters. With the noise of both means removed,
 
         r_d^2 = max(0, q),   q = (||d||^2 - s^2 - t^2) / m,   m = ||gref||^2 - t^2,
-        c_d = gbar . gref / sqrt((||gbar||^2 - s^2) m), cut off at -1 and 1,
+        c_d = gbar . gref / sqrt((||gbar||^2 - s^2) m), clipped to [-1, 1],
         s^2 = sum_k se_k(gbar)^2,   t^2 = sum_k se_k(gref)^2,
         se(q)^2 = 4 ( Var[d . g_i]/N + Var[(d + q gref) . gref_j]/M ) / m^2,
         se(r_d) = min( se(q) / (2 r_d), sqrt(se(q)) )
 
-    and se(c_d) as se(c) with the norms of c_d. First order in the noise; se(q) counts the second order twice, which
-    errs on the safe side near q = 0, where the root has no derivative and the second form of se(r_d) bounds its error.
-    An interpolated estimate enters with its weight taken as given.
+    and se(c_d) is se(c) with the norms of c_d. First order in the noise; se(q) counts the second order twice, which is
+    conservative near q = 0, where the root has no derivative and the second form of se(r_d) bounds its error.
+    For an interpolated estimate the weight is treated as fixed.
 
     Args:
-        estimate: The estimate to judge, gbar of N samples.
-        reference: An estimate from other samples.
+        estimate: Estimate to compare, gbar of N samples.
+        reference: Estimate from other samples, gref of M samples.
 
     Returns:
-        The comparison. A direction that does not exist (a mean or a difference of exactly zero) makes NaN of
-        what needs it; so does, for the debiased numbers, a mean that cannot be told from zero (m <= 0).
+        The comparison. An undefined direction (a mean or difference of exactly zero) makes every dependent number NaN;
+        so does, for the debiased numbers, a reference mean indistinguishable from zero (m <= 0).
     """
     difference = estimate.mean - reference.mean
     error = jnp.linalg.norm(difference)
@@ -113,5 +112,5 @@ def compare(estimate: GradientEstimate, reference: GradientEstimate) -> Comparis
 
 
 def _root(square: Scalar) -> Scalar:
-    """NaN for what is not positive."""
+    """Square root; NaN for nonpositive numbers."""
     return jnp.sqrt(jnp.where(square > 0, square, jnp.nan))

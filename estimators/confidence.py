@@ -1,4 +1,4 @@
-"""How far a batch mean may be from its expectation."""
+"""Confidence bounds on the distance of a batch mean from its expectation."""
 
 import math
 
@@ -23,15 +23,14 @@ def bernstein_epsilon(
         epsilon = sqrt(2 s2 L / N) + 2 R L / (3 N),   L = log((d + 1) / failure_probability)
 
     ||gbar - E g|| <= epsilon with probability at least 1 - failure_probability, if s2 >= E||g_i - E g||^2 and
-    R >= ||g_i - E g|| always (vector Bernstein inequality). Neither can be read off the samples: "variance" and
-    "second_moment" are estimates of s2, and "max_deviation", R = max_i ||g_i - gbar||, is a plug-in and no bound
-    (Gaussian scores have none). Where a bound R is known, "upper_bound" makes the statement rigorous for every N:
-    half of the failure probability goes to s2 = `variance_upper_bound`, half to the inequality. The code published
-    with the paper puts delta = 0.95 into the logarithm in place of a probability of failure, and a constant for R in
-    each example.
+    R >= ||g_i - E g|| always (vector Bernstein inequality). Neither is known from samples: "variance" and
+    "second_moment" estimate s2, and "max_deviation", R = max_i ||g_i - gbar||, is a plug-in, not a bound (Gaussian
+    scores have none). For a known bound R, "upper_bound" is rigorous for every N: half of the failure probability goes
+    to s2 = `variance_upper_bound`, half to the inequality. The code published with the paper uses delta = 0.95 in the
+    logarithm instead of a failure probability, and a constant R in each example.
 
     Args:
-        estimate: Batch of N samples in d dimensions, of zeroth order in AoBG; non-finite samples are left out.
+        estimate: Batch of N samples in d dimensions, zeroth-order in AoBG; nonfinite samples are left out.
         failure_probability: In (0, 1).
         variance_proxy: "variance", s2 = sigmahat^2; "second_moment", s2 = (1/N) sum_i ||g_i||^2, which is
             no smaller than (1 - 1/N) sigmahat^2; or "upper_bound", which needs R as a number.
@@ -77,12 +76,12 @@ def variance_upper_bound(
         n kl(p, q) <= log(1 / failure_probability),    kl(p, q) = p log(p/q) + (1 - p) log((1-p)/(1-q)).
 
     Args:
-        estimate: The estimate; pairs with a row that is not finite are left out.
+        estimate: The estimate; pairs with a nonfinite row are left out.
         radius: R >= ||g_i - E g|| always, [cost/param].
         failure_probability: In (0, 1).
 
     Returns:
-        The bound, [cost^2/param^2]; 2 R^2 where there is no pair.
+        The bound, [cost^2/param^2]; 2 R^2 if there are no pairs.
 
     Reference: Hoeffding, "Probability inequalities for sums of bounded random variables", 1963, theorem 1.
     """
@@ -105,17 +104,17 @@ def variance_upper_bound(
 
 
 def coverage_interval(covered: Bool[Array | np.ndarray, " trials"], confidence: float) -> tuple[float, float, float]:
-    """How often a bound held, with its Wilson score interval.
+    """Share of trials in which a bound held, with its Wilson score interval.
 
     Args:
-        covered: Whether it held, trial by independent trial.
+        covered: Whether the bound held in each independent trial.
         confidence: Nominal coverage of the interval, in (0, 1).
 
     Returns:
-        The share, and the interval's lower and upper end.
+        The share, and the lower and upper ends of the interval.
 
     Raises:
-        ValueError: There is no trial, or the confidence is outside (0, 1).
+        ValueError: There are no trials, or the confidence is outside (0, 1).
     """
     if len(covered) == 0:
         raise ValueError("coverage needs at least one trial; got none")
@@ -130,12 +129,12 @@ def coverage_interval(covered: Bool[Array | np.ndarray, " trials"], confidence: 
 
 
 def check_confidence_arguments(failure_probability: float, variance_proxy: str, radius: object) -> None:
-    """Refuse what `bernstein_epsilon` cannot use.
+    """Validate the arguments of `bernstein_epsilon`.
 
     Args:
         failure_probability: In (0, 1).
-        variance_proxy: "variance" or "second_moment".
-        radius: "max_deviation", a number >= 0, or an array, which is taken as it is.
+        variance_proxy: "variance", "second_moment" or "upper_bound".
+        radius: "max_deviation", a number >= 0, or an array, which is not checked.
 
     Raises:
         ValueError: An argument is outside these ranges.

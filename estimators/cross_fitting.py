@@ -1,4 +1,4 @@
-"""Weights chosen from the samples that they weigh, or from others."""
+"""Interpolation weights, plug-in or cross-fitted."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, Final
@@ -12,34 +12,34 @@ from estimators.rows import Rows
 from estimators.types import GradientEstimate
 
 FEWEST_SAMPLES: Final = 4
-"""Two in each half, for a variance."""
+"""Two in each half, the fewest for a variance."""
 
 
 def weigh_batches(
     choose: Callable[..., Any], mix: Callable[..., GradientEstimate], batches: Sequence[Any], weights: str
 ) -> GradientEstimate:
-    """An interpolated estimate whose weights come from its own samples or from the other half of them.
+    """Interpolate with weights from the samples themselves or from the other half of them.
 
         plug-in:       mix(choose(b), b)
         cross-fitted:  (n_1 mix(choose(b_2), b_1) + n_2 mix(choose(b_1), b_2)) / n
 
-    with b_1 and b_2 the first n_1 = floor(n/2) and the last n_2 samples of every batch. A plug-in weight depends on
-    the samples that it weighs, which biases the mean by order 1/n even where both batches are unbiased. Cross-fitted
-    weights are independent of them, so that the mean is as unbiased as the batches are; choosing from half of the
-    samples costs variance. All that chooses comes from the other half, an accuracy bound's epsilon and B included; a
-    baseline that looks at other samples looks at those of its own half.
+    where b_1 and b_2 are the first n_1 = floor(n/2) and the last n_2 samples of every batch. A plug-in weight depends
+    on the samples it is applied to, which biases the mean at order 1/n even if both batches are unbiased. Cross-fitted
+    weights are independent of them, so the mean is as unbiased as the batches; using half of the samples costs
+    variance. Everything that enters the choice comes from the other half, including epsilon and B of an accuracy bound;
+    a baseline over other samples uses those of its own half.
 
     Args:
-        choose: Of batches, the weights.
-        mix: Of weights and batches, the estimate.
-        batches: Every array has the samples first.
+        choose: Maps batches to weights.
+        mix: Maps weights and batches to an estimate.
+        batches: Batches whose arrays have the samples as first axis.
         weights: A name in `WEIGHTS`.
 
     Returns:
-        The estimate. Cross-fitted, a row is weighed by the other half's weights, and `variance` is the mean of the
-        variances within the halves: n times the variance of the mean at given weights, as for one batch. That leaves
-        out the halves' covariance, the square of the bias that plug-in weights of n/2 samples would have had, and
-        half of it in the mean. `alpha` is the mean of both choices.
+        The estimate. If cross-fitted, each row is weighted by the other half's weights, and `variance` is the mean of
+        the within-half variances: n times the variance of the mean at given weights, as for one batch. This omits the
+        covariance of the halves: the squared bias of plug-in weights from n/2 samples, half of which enters the
+        variance of the mean. `alpha` is the mean of both choices.
 
     Raises:
         ValueError: No weights have that name, or there are too few samples for two halves.
@@ -61,7 +61,7 @@ def weigh_batches(
 
 
 def check_weights(weights: str, samples: int | None = None) -> None:
-    """Refuse a name that is none, and cross-fitted weights of too few samples.
+    """Validate the name of weights and the number of samples for cross-fitting.
 
     Raises:
         ValueError: No weights have that name, or there are too few samples for two halves.
@@ -75,7 +75,7 @@ def check_weights(weights: str, samples: int | None = None) -> None:
 
 
 def _pooled(parts: Sequence[GradientEstimate]) -> GradientEstimate:
-    """The mean over all samples of estimates from independent ones."""
+    """Average estimates from independent samples over all samples."""
     rows = jnp.concatenate([part.per_sample for part in parts])
     shares = [len(part.per_sample) / len(rows) for part in parts]
 

@@ -1,4 +1,4 @@
-"""Inverse-variance weighting that first asks whether the objective looks continuous."""
+"""Inverse-variance weighting gated by a test for discontinuities."""
 
 from dataclasses import replace
 
@@ -27,9 +27,9 @@ def discontinuity_gated(
 
         alpha = alpha_inf   if   tr Cov[grad_w f] >= 2 (1 - c) Var[f] / sigma^2 - 2 ||E grad_w f||^2,   else 0
 
-    with alpha_inf the inverse-variance weight. For a quadratic f and Gaussian noise the two sides are equal at c = 0;
-    a jump adds to Var[f] and nothing to the derivatives, so it makes the right side the larger. There is no accuracy
-    gamma and no radius to choose, and nothing is promised where the test is wrong.
+    where alpha_inf is the inverse-variance weight. For quadratic f and Gaussian noise, both sides are equal at c = 0; a
+    jump adds to Var[f] but not to the derivatives and so increases the right side. There is no accuracy gamma and no
+    radius to choose, and no guarantee if the test is wrong.
 
     Args:
         evaluation: Batch of evaluations, for f and the zeroth-order estimate.
@@ -37,10 +37,10 @@ def discontinuity_gated(
         baseline: A name in `BASELINES`, for the zeroth-order estimate.
         sigma: Standard deviation of the Gaussian noise, [control].
         tolerance: c in [0, 1); 0.3 as published.
-        weights: A name in `WEIGHTS`; of cross-fitted ones the test is made in the other half as well.
+        weights: A name in `WEIGHTS`; if cross-fitted, the test also uses the other half.
 
     Returns:
-        The estimate, its `alpha` filled in.
+        The estimate, with its `alpha`.
 
     Raises:
         ValueError: The tolerance is outside [0, 1), or the batches differ in shape.
@@ -56,7 +56,7 @@ def discontinuity_gated(
         value_variance = node_variance(evaluation.value, jnp.isfinite(evaluation.value))
         scale = jnp.asarray(sigma, over_noise.mean.dtype) ** 2
         expected = 2.0 * (1.0 - tolerance) * value_variance / scale - 2.0 * jnp.sum(over_noise.mean**2)
-        continuous = over_noise.variance >= expected  # False where either is undefined
+        continuous = over_noise.variance >= expected  # False if either is undefined
         alpha = jnp.where(continuous, inverse_variance_alpha(zeroth.variance, first.variance), 0.0)
         return AlphaChoice(alpha, None, None, zeroth.variance, first.variance)
 
@@ -68,7 +68,7 @@ def discontinuity_gated(
 
 
 def _noise_gradients(differentiation: StepDifferentiation) -> Float[Array, "samples noise"]:
-    """grad_w f of each sample; NaN where it or its value is not finite."""
+    """grad_w f of each sample; NaN if it or the sample's value is not finite."""
     gradients = differentiation.noise_gradient.reshape(differentiation.value.shape[0], -1)
     kept = jnp.isfinite(differentiation.value) & finite_rows(gradients)
     return jnp.where(kept[:, None], gradients, jnp.nan)

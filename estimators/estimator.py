@@ -14,13 +14,13 @@ from estimators.types import GradientEstimate, Objective
 
 @dataclasses.dataclass(frozen=True)
 class Oracle:
-    """A kind of batch.
+    """A kind of batch that an objective can produce.
 
     Attributes:
-        name: In `ORACLES`, and in an estimator's `needs`.
-        order: 0 if only values are needed, 1 if derivatives; batches of one order share their samples.
-        method: Of the objective, called with theta and keys.
-        phrase: What messages call the batch.
+        name: Name in `ORACLES` and in an estimator's `needs`.
+        order: 0 if only values are needed, 1 if derivatives are; batches of the same order share their samples.
+        method: Method of the objective, called with theta and keys.
+        phrase: Name of the batch in messages.
     """
 
     name: str
@@ -44,23 +44,23 @@ ORACLES: Final[dict[str, Oracle]] = {
 }
 
 Batches = Mapping[str, Any]
-"""Batches by the name of their oracle."""
+"""Batches by oracle name."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Estimator(ABC):
-    """A formula with its options: a function from batches already drawn, which several estimators can share.
+    """A formula with its options, applied to batches that several estimators can share.
 
-    A subclass is a frozen dataclass whose fields are its options, checked when it is made. It is hashable, so that it
+    A subclass is a frozen dataclass whose fields are its options, checked on construction. Instances are hashable and
     can be static under `jit`.
 
     Attributes:
-        label: For a legend, where that is not the name.
-        description: One line; the first of the docstring, unless the catalogue has it.
-        needs: Oracles in `ORACLES`, in the order in which `combine` takes their batches.
+        label: Legend label, if other than the name.
+        description: One line; by default the first line of the docstring or the catalogue's.
+        needs: Oracles in `ORACLES`, in the order of the arguments of `combine`.
         gaussian: Whether the formula holds for Gaussian noise only.
         additive: Whether it holds for noise on theta itself only.
-        separable: Whether each row of `parts` depends on the batches' samples of that row alone.
+        separable: Whether each row of `parts` depends only on the same row of the batches.
     """
 
     name: ClassVar[str]
@@ -72,7 +72,7 @@ class Estimator(ABC):
     separable: ClassVar[bool] = False
 
     def __init_subclass__(cls, entry: Entry | None = None) -> None:
-        """Take name, label, needs and description from an entry of the catalogue, where one is given."""
+        """Take name, label, needs and description from a catalogue entry, if given."""
         line = (cls.__doc__ or "").partition("\n")[0].removesuffix(".")
         cls.description = line[:1].lower() + line[1:]
         if entry is not None:
@@ -80,14 +80,14 @@ class Estimator(ABC):
 
     @abstractmethod
     def combine(self, *args: Any, **kwargs: Any) -> GradientEstimate:
-        """The estimate from the batches that are needed, each an argument."""
+        """Combine the required batches, one per argument, into an estimate."""
 
     def __call__(self, batches: Batches) -> GradientEstimate:
-        """Make an estimate of batches already drawn.
+        """Compute the estimate from drawn batches.
 
         Args:
-            batches: By the names in `ORACLES`; those of order 0 independent of those of order 1 and of the same size.
-                What is not needed is not looked at.
+            batches: Batches by name in `ORACLES`; those of order 0 and of order 1 are independent and of the same size.
+                Batches that are not required are ignored.
 
         Raises:
             ValueError: A batch is missing, or batches differ in shape.
@@ -95,10 +95,10 @@ class Estimator(ABC):
         return self.combine(*self.pick(batches))
 
     def pick(self, batches: Batches) -> list[Any]:
-        """The batches that are needed, in the order of `needs`.
+        """Return the required batches in the order of `needs`.
 
         Raises:
-            ValueError: One is missing.
+            ValueError: A batch is missing.
         """
         for oracle in self.needs:
             if batches.get(oracle) is None:
@@ -110,16 +110,16 @@ class Estimator(ABC):
 
     @property
     def mergeable(self) -> bool:
-        """Whether a batch may come in blocks: `join` of the merged `parts` of all of them is the estimate."""
+        """Whether batches may come in blocks: the estimate is `join` of all blocks' merged `parts`."""
         apart = getattr(self, "baseline", None) != LEAVE_ONE_OUT and getattr(self, "weights", PLUG_IN) == PLUG_IN
         return self.separable and apart
 
     def parts(self, *args: Any, **kwargs: Any) -> tuple[GradientEstimate, ...]:
-        """The estimates, one or two, that `join` makes the estimate of; arguments as of `combine`."""
+        """Return the one or two estimates that `join` combines; arguments as for `combine`."""
         return (self.combine(*args, **kwargs),)
 
     def join(self, *args: Any, **kwargs: Any) -> GradientEstimate:
-        """The estimate from its parts, each an argument."""
+        """Combine the parts, one per argument, into the estimate."""
         (estimate,) = args
         return estimate
 
@@ -130,7 +130,7 @@ class Estimator(ABC):
 
 
 def oracles_of(estimators: Iterable[Estimator | type[Estimator]], *others: str) -> tuple[str, ...]:
-    """Oracles that some estimators need, and others, in the order of `ORACLES`."""
+    """Return the oracles that the estimators need, plus the others given, in the order of `ORACLES`."""
     needed = {*others, *(oracle for estimator in estimators for oracle in estimator.needs)}
     return tuple(name for name in ORACLES if name in needed)
 
@@ -138,26 +138,26 @@ def oracles_of(estimators: Iterable[Estimator | type[Estimator]], *others: str) 
 def draw(
     oracles: Iterable[str], objective: Objective, theta: Float[Array, " params"], key: Key[Array, ""], num_samples: int
 ) -> dict[str, Any]:
-    """Draw batches, those of order 0 from one set of keys and those of order 1 from another.
+    """Draw batches; those of order 0 and those of order 1 use separate sets of keys.
 
     Args:
-        oracles: Names in `ORACLES`; all of one order share their samples.
-        objective: What to draw from.
-        theta: Where, [param].
-        key: Source of all randomness; used up.
-        num_samples: Samples in each batch, >= 1.
+        oracles: Names in `ORACLES`; those of the same order share their samples.
+        objective: Objective to sample.
+        theta: Parameters, [param].
+        key: Source of all randomness; consumed.
+        num_samples: Samples per batch, >= 1.
 
     Returns:
         The batches by name.
 
     Raises:
-        ValueError: The objective lacks what an oracle calls.
+        ValueError: The objective lacks a method that an oracle calls.
     """
     return draw_at(oracles, objective, theta, sample_keys(key, num_samples))
 
 
 def sample_keys(key: Key[Array, ""], num_samples: int) -> list[Key[Array, " samples"]]:
-    """Keys of the samples of each order, as `draw` makes them of one key."""
+    """Split a key into the sample keys of each order, as `draw` does."""
     return [jax.random.split(order_key, num_samples) for order_key in jax.random.split(key)]
 
 
@@ -167,7 +167,7 @@ def draw_at(
     theta: Float[Array, "*samples params"],
     keys: Sequence[Key[Array, " samples"]],
 ) -> dict[str, Any]:
-    """`draw` with the keys of `sample_keys`; theta may be one for each sample where the objective takes that."""
+    """Draw with keys from `sample_keys`; theta may have one row per sample if the objective supports it."""
     batches = {}
     for name in oracles:
         oracle = ORACLES[name]

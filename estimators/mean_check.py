@@ -1,4 +1,4 @@
-"""Whether an estimator's mean is the gradient of F, told from values of F alone: no reference gradient is needed."""
+"""Check that an estimator's mean is the gradient of F using values of F alone, without a reference gradient."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,25 +16,25 @@ from estimators.statistics import summarise
 from estimators.types import Objective
 
 NODES: Final = 9
-"""Of the quadrature along a path."""
+"""Quadrature nodes along a path."""
 SURE: Final = 3.29
-"""Standard errors of an interval of 99.9 %."""
+"""Half-width of a 99.9 % interval in standard errors."""
 TOLERANCE: Final = 0.05
-"""Share of F's difference within which a mean counts as right."""
+"""Relative error, as a share of F's difference, within which a mean counts as right."""
 
 
 @register_pytree
 @dataclass(frozen=True)
 class Circulation:
-    """The integral of an estimator's mean along a path of theta, against the difference of F. See `circulation`.
+    """Path integral of an estimator's mean, compared with the difference of F. See `circulation`.
 
     Attributes:
         difference: F(end) - F(start), [cost].
-        gap: The integral less the difference, 0 for an unbiased estimator, [cost].
-        standard_error: Of the gap, [cost].
-        quadrature: Error of the integral's quadrature that is seen above its noise, [cost].
-        effective: n_eff behind the gap; below `ENOUGH_EFFECTIVE` the standard error says little.
-        num_nonfinite: Samples that were left out because they are not finite somewhere on the path.
+        gap: The integral minus the difference, 0 for an unbiased estimator, [cost].
+        standard_error: Standard error of the gap, [cost].
+        quadrature: Quadrature error in excess of the noise, [cost].
+        effective: n_eff behind the gap; below `ENOUGH_EFFECTIVE` the standard error means little.
+        num_nonfinite: Samples left out because they are nonfinite somewhere on the path.
     """
 
     difference: Float[Array, ""]
@@ -46,11 +46,11 @@ class Circulation:
 
     @property
     def half_width(self) -> Float[Array, ""]:
-        """Of the interval about the gap: 99.9 %, and the quadrature's error, [cost]."""
+        """Half-width of the 99.9 % interval for the gap, quadrature error included, [cost]."""
         return SURE * self.standard_error + self.quadrature
 
     def verdict(self, tolerance: float = TOLERANCE) -> str:
-        """What the interval says: right (within a share of F's difference), biased, or undecided."""
+        """Return "right" (within a share of F's difference), "biased" or "undecided"."""
         gap, half, within = abs(float(self.gap)), float(self.half_width), tolerance * abs(float(self.difference))
         if (gap > 0 and not float(self.effective) >= ENOUGH_EFFECTIVE) or float(self.quadrature) > within:
             return "undecided"
@@ -67,7 +67,7 @@ def circulation(
     *,
     nodes: int = NODES,
 ) -> Circulation:
-    """Integrate an estimator's mean from one theta to another; see `circulations`."""
+    """Integrate an estimator's mean along a path of theta; see `circulations`."""
     (found,) = circulations([estimator], objective, start, end, key, num_samples, nodes=nodes)
     return found
 
@@ -82,25 +82,25 @@ def circulations(
     *,
     nodes: int = NODES,
 ) -> list[Circulation]:
-    """Integrate the means of estimators, which share their batches, from one theta to another.
+    """Integrate the means of estimators, which share their batches, along a straight path of theta.
 
         sum_j w_j g_i(theta_j)^T (end - start) - (f_i(end) - f_i(start))
 
-    of every sample i, with the same keys everywhere: its mean is 0 if E g = grad F. The nodes are Gauss and Legendre's;
-    the error of the quadrature is the difference to the rule on every second of them, less three standard errors. With
-    one node this is a central difference of the mean cost against the estimator's mean in the middle.
+    for every sample i, with the same keys at all nodes: the mean is 0 if E g = grad F. The nodes are Gauss-Legendre;
+    the quadrature error is the difference from the rule on every second node, minus three standard errors. With one
+    node, this compares a central difference of the mean cost with the estimator's mean at the midpoint.
 
     Args:
-        start, end: Of the path, [param]; a few standard deviations of the noise apart, or less.
-        key: Source of all randomness; used up.
-        num_samples: At every node, >= 2.
-        nodes: Odd.
+        start, end: Ends of the path, [param]; a few standard deviations of the noise apart, or less.
+        key: Source of all randomness; consumed.
+        num_samples: Samples at every node, >= 2.
+        nodes: Number of nodes, odd.
 
     Returns:
-        The difference and the gap of each.
+        One circulation per estimator.
 
     Raises:
-        ValueError: The nodes are not an odd number, or there are too few samples.
+        ValueError: The number of nodes is not odd, or there are too few samples.
     """
     if nodes < 1 or nodes % 2 == 0:
         raise ValueError(f"nodes must be an odd number; got {nodes}")
@@ -142,7 +142,7 @@ def _circulation(
 def path_rule(
     nodes: int,
 ) -> tuple[Float[np.ndarray, " nodes"], Float[np.ndarray, " nodes"], Float[np.ndarray, " nodes"]]:
-    """Nodes on [0, 1], their weights, and weights of an interpolatory rule on every second node."""
+    """Nodes on [0, 1], their weights, and the weights of an interpolatory rule on every second node."""
     points, weights = np.polynomial.legendre.leggauss(nodes)
     coarse, some = np.zeros(nodes), points[::2]
     moments = np.zeros(len(some))

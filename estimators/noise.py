@@ -1,4 +1,4 @@
-"""Noise densities exp(-psi) and their scores grad psi, which is all that a zeroth-order estimate needs of them."""
+"""Noise densities exp(-psi) and their scores grad psi, all that zeroth-order estimates need."""
 
 import math
 from collections.abc import Callable
@@ -25,18 +25,18 @@ STUDENT_PEAK = math.gamma((DEGREES_OF_FREEDOM + 1.0) / 2.0) / (
 
 @dataclass(frozen=True)
 class NoiseDensity:
-    """A symmetric density of mean 0 and variance 1, entry by entry.
+    """A symmetric density of mean 0 and variance 1, applied entry by entry.
 
-    sigma z has the score psi'(z) / sigma. E[psi'] = 0 and E[z psi'] = 1, so that zeroth-order estimates are unbiased
-    under each; E[psi'^2], the Fisher information, scales their variance.
+    sigma z has the score psi'(z) / sigma. E[psi'] = 0 and E[z psi'] = 1 make zeroth-order estimates unbiased;
+    E[psi'^2], the Fisher information, scales their variance.
 
     Attributes:
         name: Key in `NOISES`, and in `estimators.catalogue.DENSITIES`.
-        draw: Samples z from (key, shape, dtype).
+        draw: Draws samples z from (key, shape, dtype).
         score: psi'(z).
-        density: exp(-psi(z)), in NumPy and float64: for quadrature.
-        reach: The |z| beyond which at most a given probability lies; an upper bound.
-        information: E[psi'^2] >= 1; the Gaussian's is least.
+        density: exp(-psi(z)), in NumPy and float64, for quadrature.
+        reach: Upper bound on the |z| exceeded with a given probability.
+        information: E[psi'^2] >= 1, least for the Gaussian.
     """
 
     name: str
@@ -57,7 +57,7 @@ def _student_density(z: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
 
 
 def _student_reach(probability: float) -> float:
-    """From the density without its 1, C (t^2 / n)^(-(n+1)/2): P(|t| > x) <= 2 C n^((n-1)/2) x^-n."""
+    """Bound the tail by the density without its 1, C (t^2 / n)^(-(n+1)/2): P(|t| > x) <= 2 C n^((n-1)/2) x^-n."""
     n = DEGREES_OF_FREEDOM
     return STUDENT_SCALE * (2.0 * STUDENT_PEAK * n ** ((n - 1.0) / 2.0) / probability) ** (1.0 / n)
 

@@ -1,4 +1,4 @@
-"""Users' own estimators and tasks, named `module:name`."""
+"""User-defined estimators and tasks, named `module:name`."""
 
 import importlib
 import inspect
@@ -12,15 +12,15 @@ from types import ModuleType
 
 
 class MissingModuleError(ValueError):
-    """The module of a `module:name` is nowhere to be found."""
+    """The module of a `module:name` cannot be found."""
 
 
 def load_module(name: str) -> ModuleType:
     """Import a module by its dotted name.
 
     Raises:
-        MissingModuleError: There is no such module.
-        ValueError: The module raises.
+        MissingModuleError: The module does not exist.
+        ValueError: Importing the module raises.
     """
     if not all(part.isidentifier() for part in name.split(".")) or name.endswith(".py"):
         raise MissingModuleError(f"{name!r} is no module: write it as in an import, without a folder or .py")
@@ -34,16 +34,16 @@ def load_module(name: str) -> ModuleType:
 
 
 def find_attribute(place: str, noun: str, kind: type) -> object:
-    """The object at a `module:name`.
+    """Return the object at a `module:name`.
 
     Args:
         place: `module:name`.
-        noun: Of what is looked for, for a message.
-        kind: Of what is looked for; a module's own functions and classes may be it as well.
+        noun: What the object is called in messages.
+        kind: Type of object whose names an error lists, besides the module's own functions and classes.
 
     Raises:
-        MissingModuleError: There is no such module.
-        ValueError: The module raises, or has no such name; the message lists what it has.
+        MissingModuleError: The module does not exist.
+        ValueError: Importing the module raises, or it lacks the name; the message lists its names.
     """
     module, _, name = place.partition(":")
     loaded = load_module(module)
@@ -60,7 +60,7 @@ def find_attribute(place: str, noun: str, kind: type) -> object:
 
 
 def described(error: BaseException) -> str:
-    """Type and message in one line, and the innermost line of the user's file that it came through."""
+    """Format an error's type and message in one line, with the innermost line of user code in its traceback."""
     text = f"{type(error).__name__}: {' '.join(str(error).split())}".removesuffix(": ")
     caught, *frames = traceback.extract_tb(error.__traceback__)
     ours = (str(Path(caught.filename).parent), importlib.__file__, "<frozen importlib")
@@ -73,7 +73,7 @@ def described(error: BaseException) -> str:
 
 @contextmanager
 def importable_here() -> Generator[None]:
-    """The current directory in front of where Python looks for modules, as for `python -m`."""
+    """Put the current directory first on the module search path, as `python -m` does."""
     here = str(Path.cwd())
     if here in sys.path or "" in sys.path:
         yield

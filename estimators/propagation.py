@@ -1,4 +1,4 @@
-"""Estimates by a backward recursion over the derivatives of every step."""
+"""Estimates from a backward recursion over the derivatives of every step."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -24,11 +24,11 @@ def truncated_first_order(linearisation: Linearisation, window: int) -> Gradient
     """First-order batched gradient with the adjoint cut every `window` steps.
 
         lambda_h = c_x + phi_x^T lambda_{h+1} + pi_x^T g_h,   g_h = c_u + phi_u^T lambda_{h+1},
-        lambda_{h+1} = 0 in these where h is a multiple of the window
+        with lambda_{h+1} = 0 on the right-hand sides where h is a multiple of the window
 
-    A control then answers for at most `window` steps of cost, and no product of more than `window` Jacobians is
-    formed: less variance where products grow, and a bias, since what it does later is left out. A window of at least
-    the horizon is the first-order batched gradient.
+    A control is then credited with at most `window` steps of cost, and no product of more than `window` Jacobians is
+    formed: less variance where products grow, and a bias, since later effects are left out. A window of at least the
+    horizon gives the first-order batched gradient.
 
     Args:
         linearisation: Batch of linearised rollouts, with the derivatives of every step.
@@ -41,7 +41,7 @@ def truncated_first_order(linearisation: Linearisation, window: int) -> Gradient
         raise ValueError(f"window must be at least 1 step; got {window}")
     horizon = linearisation.cost_state.shape[1]
     keeps = jnp.arange(1, horizon + 1) % window != 0
-    keeps = keeps.at[-1].set(True) if horizon else keeps  # the end of the horizon is no cut
+    keeps = keeps.at[-1].set(True) if horizon else keeps  # the end of the horizon is not a cut
     adjoint, controls, _ = _sweep(
         linearisation, lambda derivative, _: (derivative, jnp.ones((), derivative.dtype)), keeps
     )
@@ -49,15 +49,15 @@ def truncated_first_order(linearisation: Linearisation, window: int) -> Gradient
 
 
 def total_propagation(linearisation: Linearisation, baseline: str, weights: str = PLUG_IN) -> GradientEstimate:
-    """First- and zeroth-order estimates mixed at every step of the backward recursion.
+    """Mix first- and zeroth-order estimates at every step of the backward recursion.
 
         g_h = alpha_h (c_u + phi_u^T lambda_{h+1}) + (1 - alpha_h) grad psi(w_h) (V_h - b_h)
         lambda_h = c_x + phi_x^T lambda_{h+1} + pi_x^T g_h,     g = sum_h D_theta pi^T g_h
 
-    alpha_h is the inverse-variance weight of the two shares D_theta pi^T (...) of the gradient. What has been mixed
-    flows on to earlier steps, so the growth of derivatives over a long horizon stops where values do better; in an
-    open loop nothing flows through the policy, and a step is mixed without effect on others. Both come from
-    the same rollouts, as published, so that they are not independent.
+    alpha_h is the inverse-variance weight of the two contributions D_theta pi^T (...) to the gradient. The mixed
+    adjoint propagates to earlier steps, so derivatives stop growing over a long horizon where values do better; in an
+    open loop nothing propagates through the policy, and steps are mixed independently. Both estimates come from the
+    same rollouts, as published, and so are not independent.
 
     Args:
         linearisation: Batch of linearised rollouts, with the derivatives of every step.
@@ -87,7 +87,7 @@ def total_propagation(linearisation: Linearisation, baseline: str, weights: str 
 def _propagate(
     linearisation: Linearisation, baseline: str, given: Weights | None
 ) -> tuple[Float[Array, "samples params"], Weights]:
-    """The gradient of each sample, and the weights of the steps: those given, or the batch's inverse-variance ones."""
+    """Gradient of each sample, and the weights of the steps: as given, or the batch's inverse-variance weights."""
     steps = linearisation.steps
     scores = control_scores(steps, baseline)
     finite = jnp.isfinite(steps.value_to_go[:, 0]) & finite_rows(scores.reshape(scores.shape[0], -1))
@@ -123,7 +123,7 @@ def _sweep(
     keeps: Bool[Array, " horizon"],
     inputs: object = None,
 ) -> tuple[Adjoint, Float[Array, "samples horizon inputs"], Float[Array, " horizon"]]:
-    """The recursion: the start's adjoint, g_h of every step, and the weights that `node` chose."""
+    """Run the recursion; return the adjoint of the start, g_h of every step, and the weights chosen by `node`."""
 
     def back(adjoint: Adjoint, step):
         keep, cost_state, cost_control, over_state, over_control, policy_state, given = step
@@ -152,7 +152,7 @@ def _sweep(
 def _gradient(
     linearisation: Linearisation, adjoint: Adjoint, controls: Float[Array, "samples horizon inputs"]
 ) -> Float[Array, "samples params"]:
-    """The gradient over theta from the adjoints of start and controls; NaN for a value that is not finite."""
+    """Gradient over theta from the adjoints of start and controls; NaN where the value is nonfinite."""
     if linearisation.start_jacobian is None:
         rows = pull_back(controls, linearisation.steps.policy_jacobian)
     else:

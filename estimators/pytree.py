@@ -1,4 +1,4 @@
-"""Frozen dataclasses as pytrees whose shapes are checked when built, never when rebuilt."""
+"""Frozen dataclasses as pytrees with shapes checked on construction but not on unflattening."""
 
 from collections.abc import Iterable
 from dataclasses import fields
@@ -11,12 +11,11 @@ DataclassT = TypeVar("DataclassT")
 
 
 def register_pytree(dataclass_type: type[DataclassT]) -> type[DataclassT]:
-    """Register a dataclass as a pytree, every field a child.
+    """Register a dataclass as a pytree with every field a child.
 
-    `jax.tree_util.register_dataclass` rebuilds through `__init__`. JAX rebuilds trees around placeholders and
-    around arrays with a batch axis in front (`vmap`, `eval_shape`), and with shape annotations checked at run
-    time that `__init__` would refuse them. Here rebuilding sets the fields and nothing else, so that a
-    constructor in somebody's code is checked and a transformation is not.
+    `jax.tree_util.register_dataclass` rebuilds through `__init__`. JAX rebuilds trees around placeholders and batched
+    arrays (`vmap`, `eval_shape`), which `__init__` would reject under run-time shape checking. Here unflattening only
+    sets the fields: user code that calls the constructor is checked, transformations are not.
     """
     names = tuple(field.name for field in fields(dataclass_type))  # pyright: ignore[reportArgumentType]
 

@@ -1,4 +1,4 @@
-"""Estimators by name, those of this package (`estimators.builtin`) and one's own; and one way to run any of them."""
+"""Built-in (`estimators.builtin`) and user-defined estimators by name, and a uniform way to run them."""
 
 import dataclasses
 from typing import Any, TypeVar
@@ -16,10 +16,10 @@ EstimatorClass = TypeVar("EstimatorClass", bound=type[Estimator])
 
 
 def register(estimator: EstimatorClass) -> EstimatorClass:
-    """Enter a class into `ESTIMATORS` and the catalogue; for use as a decorator, above that of the dataclass.
+    """Add a class to `ESTIMATORS` and the catalogue; a decorator to apply above that of the dataclass.
 
     Raises:
-        ValueError: It needs an oracle that there is not, or another class has its name.
+        ValueError: The class needs an unknown oracle, or its name is taken.
     """
     _check_class(estimator, estimator.__name__)
     if estimator.name in ESTIMATORS:
@@ -32,11 +32,11 @@ def register(estimator: EstimatorClass) -> EstimatorClass:
 
 
 def find_estimator(name: str) -> Estimator | type[Estimator]:
-    """The estimator that a name stands for.
+    """Look up an estimator by name.
 
     Args:
-        name: Key in `ESTIMATORS`, or `module:attribute` of a class or an object of one's own. The current directory
-            counts as importable.
+        name: Key in `ESTIMATORS`, or `module:attribute` for a user-defined class or object, importable from the current
+            directory too.
 
     Raises:
         ValueError: There is no such estimator.
@@ -70,14 +70,14 @@ def _check_class(found: Any, place: str) -> Any:
 
 
 def make_estimator(which: str | Estimator, **options: Any) -> Estimator:
-    """An estimator with its options.
+    """Return an estimator with its options set.
 
     Args:
-        which: As for `find_estimator`; or an object, which is returned as it is.
-        **options: Of this estimator or of others. Those that it does not have, and those that are None, are left out.
+        which: As for `find_estimator`; an object is returned as is.
+        **options: Options of this or other estimators. Those it does not have and those that are None are ignored.
 
     Raises:
-        ValueError: There is no such estimator, or an option that it requires is missing or out of range.
+        ValueError: There is no such estimator, or a required option is missing or out of range.
     """
     found = find_estimator(which) if isinstance(which, str) else which
     if isinstance(found, Estimator):
@@ -97,20 +97,20 @@ def estimate(
     key: Key[Array, ""],
     num_samples: int,
 ) -> GradientEstimate:
-    """Draw the batches that an estimator needs, and no others, and estimate grad F(theta).
+    """Draw only the batches that an estimator needs, and estimate grad F(theta).
 
-    The two orders come from independent keys, and each is the same for every estimator given the same key.
+    The two orders use independent keys; for the same key, each order's samples are the same for every estimator.
 
     Args:
-        estimator: One with its options, or a name for one with all of them at their defaults.
-        objective: F, with the methods that the estimator's oracles name.
-        theta: Where, [param].
-        key: Source of all randomness; used up.
-        num_samples: Samples in each batch, >= 1.
+        estimator: Estimator object, or the name of one whose options are left at their defaults.
+        objective: F, with the methods that the estimator's oracles call.
+        theta: Parameters, [param].
+        key: Source of all randomness; consumed.
+        num_samples: Samples per batch, >= 1.
 
     Raises:
-        ValueError: The name is unknown, an option or a method of the objective is missing, there is no sample to draw,
-            or theta has the wrong length.
+        ValueError: The name is unknown, an option or a method of the objective is missing, `num_samples` is below 1, or
+            theta has the wrong length.
     """
     estimator = make_estimator(estimator)
     if num_samples < 1:

@@ -1,4 +1,4 @@
-"""The samples of an estimate as rows, and what statistics ask of them; `blocks` gives the same without the rows."""
+"""Samples of an estimate as rows, with their statistics; `blocks` offers the same interface without the rows."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ def finite_rows(per_sample: Float[Array, "samples params"]) -> Bool[Array, " sam
 def centre(
     rows: Float[Array, "samples params"], finite: Bool[Array, " samples"]
 ) -> tuple[Float[Array, " params"], Float[Array, "samples params"]]:
-    """The mean of the finite rows, and the rows less it; refined once, so that equal rows centre to zero."""
+    """Return the mean of the finite rows and the centred rows; refined once, so that equal rows centre to zero."""
     count = jnp.sum(finite).astype(rows.dtype)
     mean = jnp.sum(jnp.where(finite[:, None], rows, 0.0), axis=0) / count
     mean = mean + jnp.sum(jnp.where(finite[:, None], rows - mean[None, :], 0.0), axis=0) / count
@@ -30,7 +30,7 @@ def centre(
 def weigh(
     weights: tuple[float | Scalar, float | Scalar], zeroth: Float[Array, "*shape"], first: Float[Array, "*shape"]
 ) -> Float[Array, "*shape"]:
-    """Weighted sum in which nothing times NaN is nothing."""
+    """Weighted sum in which 0 * NaN is 0."""
     weight_zeroth, weight_first = weights
     return jnp.where(weight_zeroth == 0, 0.0, weight_zeroth * zeroth) + jnp.where(
         weight_first == 0, 0.0, weight_first * first
@@ -40,15 +40,15 @@ def weigh(
 @register_pytree
 @dataclass(frozen=True)
 class Deviations:
-    """Statistics of q_i = ||g_i - gbar||^2 over the n finite samples, gbar their own mean.
+    """Statistics of q_i = ||g_i - gbar||^2 over the n finite samples, with gbar their mean.
 
     Attributes:
         total: S = sum_i q_i, [cost^2/param^2].
-        concentration: sum_i (q_i / S)^2, from 1/n to 1; of q_i within rounding, nothing.
+        concentration: sum_i (q_i / S)^2, from 1/n to 1; 0 if all q_i are within rounding.
         top: max_i q_i / S; likewise.
-        varies: Whether any q_i is more than rounding.
+        varies: Whether any q_i exceeds rounding.
         log_spread: (n-1)/n sum_i (l_i - lbar)^2 with l_i = log(S - n/(n-1) q_i), the jackknife variance of log S;
-            infinite where one sample carries all of S.
+            infinite if one sample carries all of S.
     """
 
     total: Scalar
@@ -61,10 +61,10 @@ class Deviations:
 @register_pytree
 @dataclass(frozen=True)
 class Rows:
-    """Samples that are all there.
+    """Samples stored as rows.
 
     Attributes:
-        rows: g_i, [cost/param]. Those that are not finite count for nothing below.
+        rows: g_i, [cost/param]. Nonfinite rows are ignored below.
     """
 
     rows: Float[Array, "samples params"]
@@ -82,7 +82,7 @@ class Rows:
         return jnp.sum(finite_rows(self.rows))
 
     def mixed(self, weights: tuple[float | Scalar, float | Scalar], other: Any) -> "Rows":
-        """Row by row, one weight times these and another times those of an independent batch."""
+        """Combine with an independent batch row by row with the given weights."""
         return Rows(weigh(weights, self.rows, other.rows))
 
     def deviations(self) -> Deviations:
@@ -111,7 +111,7 @@ class Rows:
 
     def variance_along(self, direction: Float[Array, " params"]) -> Scalar:
         """Variance of the mean's component along a direction; NaN for fewer than two finite components."""
-        # A sum, since a matrix product of float32 may be rounded to fewer digits on an accelerator.
+        # A sum, since accelerators may compute float32 matrix products with fewer digits.
         component = jnp.sum(self.rows * direction[None, :], axis=1)[:, None]
         finite = finite_rows(component)
         count = jnp.sum(finite).astype(component.dtype)

@@ -1,4 +1,4 @@
-"""Statistics of per-sample gradients: mean, variance, and quantiles of the norms."""
+"""Statistics of per-sample gradients: mean, variance and norm quantiles."""
 
 from collections.abc import Sequence
 
@@ -12,19 +12,19 @@ from estimators.types import GradientEstimate
 
 
 def summarise(per_sample: Float[Array, "samples params"]) -> GradientEstimate:
-    """Mean, variance and standard error over the n rows that are finite.
+    """Compute mean, variance and standard error over the n finite rows.
 
         gbar = (1/n) sum_i g_i,   sigmahat^2 = 1/(n-1) sum_i ||g_i - gbar||^2
 
-    Other rows are left out and counted. If any were, the mean is that of the samples that could be computed,
-    which is another expectation than the one sought: look at `num_nonfinite` before the mean. Rows that are
-    all equal have a variance of exactly zero.
+    Other rows are left out and counted. If there are any, the mean is conditional on samples that could be computed,
+    not the expectation sought: look at `num_nonfinite` before the mean. Rows that are all equal have a variance of
+    exactly zero.
 
     Args:
         per_sample: g_i, [cost/param].
 
     Returns:
-        The estimate. n = 0 has an undefined (NaN) mean, n < 2 an undefined variance and standard error.
+        The estimate. The mean is NaN for n = 0, the variance and standard error for n < 2.
 
     Reference: Suh et al. 2022, def. of empirical variance.
     """
@@ -43,10 +43,10 @@ def summarise(per_sample: Float[Array, "samples params"]) -> GradientEstimate:
 
 
 def norm_quantiles(estimate: GradientEstimate, probabilities: Sequence[float]) -> Float[Array, " probabilities"]:
-    """Quantiles of ||g_i|| over the finite rows, which show the heavy tail that a variance hides.
+    """Quantiles of ||g_i|| over the finite rows; they reveal heavy tails that a variance hides.
 
     Args:
-        estimate: An estimate with at least one finite row; without one the quantiles are NaN.
+        estimate: The estimate; without finite rows the quantiles are NaN.
         probabilities: Each in [0, 1].
 
     Returns:
@@ -61,11 +61,11 @@ def norm_quantiles(estimate: GradientEstimate, probabilities: Sequence[float]) -
 
 
 def merged_estimates(parts: Parts, size: int) -> list[GradientEstimate]:
-    """The estimates of one batch, or of two, from the moments of their samples.
+    """Build the estimates of one batch or two from the moments of their samples.
 
     Args:
-        parts: The moments, of all blocks.
-        size: Samples of each batch, those that are not finite included.
+        parts: Moments of all blocks.
+        size: Samples per batch, nonfinite ones included.
     """
     batches = len(parts) if len(parts) == 1 else len(parts) - 1
     estimates = []

@@ -1,4 +1,4 @@
-"""Estimates from single steps: costs to go in place of total costs, and a weight for every step."""
+"""Step-by-step estimates: costs to go instead of total costs, and a weight for every step."""
 
 from dataclasses import replace
 
@@ -22,11 +22,10 @@ def cost_to_go(steps: StepEvaluation, baseline: str) -> GradientEstimate:
 
         g_i = sum_h D_theta pi(x_h^i)^T grad psi(w_h^i) (V_h^i - b_h^i)
 
-    The same mean as with total costs, since what came before a step does not depend on its noise, and less
-    variance.
+    Same mean as with total costs, since earlier costs do not depend on a step's noise, and less variance.
 
     Args:
-        steps: Batch of evaluations step by step, (samples, steps).
+        steps: Batch of stepwise evaluations, (samples, steps).
         baseline: A name in `BASELINES`, applied step by step.
 
     Raises:
@@ -38,7 +37,7 @@ def cost_to_go(steps: StepEvaluation, baseline: str) -> GradientEstimate:
 
 
 def antithetic_cost_to_go(plus: StepEvaluation, minus: StepEvaluation, baseline: str) -> GradientEstimate:
-    """`cost_to_go` over pairs of opposite noise; a pair is one sample."""
+    """`cost_to_go` over pairs of opposite noise; each pair is one sample."""
     above, below = (cost_to_go(steps, baseline).per_sample for steps in (plus, minus))
     return summarise((above + below) / 2.0)
 
@@ -66,12 +65,12 @@ def stepwise_inverse_variance(
 
         g_i = sum_h D_theta pi^T [ alpha_h * dV^i/du_h + (1 - alpha_h) * grad psi(w_h^i) (V_h^i - b_h^i) ]
 
-    with alpha_h of each control the inverse-variance weight of the two quantities that it weighs, over the batch.
-    The batches are independent, and each is pulled back through its own states. Variance and standard errors take
-    the weights as given.
+    where alpha_h of each control is the inverse-variance weight, over the batch, of the two quantities that it weights.
+    The batches are independent, and each is pulled back through its own states. Variance and standard errors treat the
+    weights as fixed.
 
     Args:
-        zeroth: Batch of evaluations step by step, (samples, steps).
+        zeroth: Batch of stepwise evaluations, (samples, steps).
         first: Batch of differentiations from the same number of independent samples.
         baseline: A name in `BASELINES`, applied step by step.
         weights: A name in `WEIGHTS`, the source of alpha_h.
@@ -112,7 +111,7 @@ def stepwise_inverse_variance(
 
 
 def sum_independent(one: GradientEstimate, other: GradientEstimate) -> GradientEstimate:
-    """The sum of two estimates from independent batches of the same size; row i of one is paired with row i."""
+    """Sum estimates from independent batches of the same size; row i of one is paired with row i of the other."""
     samples = Rows(one.per_sample + other.per_sample)
     return GradientEstimate(
         samples=samples,
@@ -124,7 +123,7 @@ def sum_independent(one: GradientEstimate, other: GradientEstimate) -> GradientE
 
 
 def _node_variances(samples: Float[Array, "samples steps controls"]) -> Float[Array, "steps controls"]:
-    """Variance over the samples that are finite in every entry."""
+    """Variance over the samples with only finite entries."""
     finite = finite_rows(samples.reshape(samples.shape[0], -1))
     return node_variance(samples, finite)
 

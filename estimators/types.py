@@ -1,4 +1,4 @@
-"""Inputs of an estimator (an objective and its batches) and its output (an estimate)."""
+"""Estimator inputs (objectives and their batches) and outputs (estimates)."""
 
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
@@ -14,17 +14,17 @@ from estimators.rows import Rows
 @register_pytree
 @dataclass(frozen=True)
 class Evaluation:
-    """A batch of rollouts that were evaluated and not differentiated.
+    """A batch of rollouts that were evaluated but not differentiated.
 
-    Let f_i be the value of sample i, noise w_h ~ exp(-psi) and policy pi(x, theta). The score is
-    s_i = sum_h D_theta pi(x_h^i)^T grad psi(w_h^i), for Gaussian noise of standard deviation sigma
+    For the value f_i of sample i, noise w_h ~ exp(-psi) and policy pi(x, theta), the score is
+    s_i = sum_h D_theta pi(x_h^i)^T grad psi(w_h^i); for Gaussian noise of standard deviation sigma,
     s_i = (1/sigma^2) sum_h D_theta pi(x_h^i)^T w_h^i.
 
     Attributes:
         value: f_i, the total cost, [cost].
         score: s_i, [1/param].
-        baseline: The cost of the zero-noise rollout from the same start as sample i, [cost].
-        residual: How far sample i's own numerical solve was from converged, relative; None for closed forms.
+        baseline: Cost of the zero-noise rollout from the start of sample i, [cost].
+        residual: Relative residual of sample i's numerical solves; None for closed forms.
 
     Reference: Suh et al. 2022, appendix, prop. on the policy gradient, where the score must read grad psi(w)
     (the text prints psi(w)).
@@ -39,14 +39,14 @@ class Evaluation:
 @register_pytree
 @dataclass(frozen=True)
 class Differentiation:
-    """A batch of rollouts that were differentiated.
+    """A batch of differentiated rollouts.
 
     Attributes:
         value: f_i, the total cost, [cost].
         gradient: grad_theta f_i at fixed noise, [cost/param].
-        residual: How far sample i's own numerical solve was from converged, relative; None for closed forms.
-        events: Discontinuities that the gradient allows for: their number, how many of them are bounded, how many left
-            out, their strength and the time of the first; None if it allows for none.
+        residual: As in `Evaluation`.
+        events: Counts of the discontinuities included in the gradient (found, bounded, missed), their strength, and the
+            time of the first; None if the gradient includes none by design.
     """
 
     value: Float[Array, " samples"]
@@ -58,17 +58,17 @@ class Differentiation:
 @register_pytree
 @dataclass(frozen=True)
 class StepEvaluation:
-    """A batch of rollouts that were evaluated and not differentiated, step by step.
+    """A batch of rollouts that were evaluated step by step but not differentiated.
 
     Noise acts at S steps in m dimensions: at every step of a policy, or once (S = 1) where theta + w determines
     the initial state.
 
     Attributes:
         value_to_go: V_h^i, the cost from step h on; V_1 is the total, [cost].
-        baseline_to_go: The same of the zero-noise rollout from the same start, [cost].
+        baseline_to_go: Cost to go of the zero-noise rollout from the same start, [cost].
         noise_score: grad psi(w_h^i); w / sigma^2 for Gaussian noise, [1/control].
-        policy_jacobian: D_theta pi(x_h^i), [control/param]; None where theta has one entry for each entry of the
-            noise, in the same order, and acts as it does.
+        policy_jacobian: D_theta pi(x_h^i), [control/param]; None if theta matches the noise entry by entry and acts in
+            the same way.
         residual: As in `Evaluation`.
     """
 
@@ -82,7 +82,7 @@ class StepEvaluation:
 @register_pytree
 @dataclass(frozen=True)
 class StepDifferentiation:
-    """A batch of rollouts that were differentiated with respect to the noise of every step.
+    """A batch of rollouts differentiated with respect to the noise of every step.
 
     Attributes:
         value: V_1^i, the total cost, [cost].
@@ -101,18 +101,18 @@ class StepDifferentiation:
 @register_pytree
 @dataclass(frozen=True)
 class Linearisation:
-    """A batch of rollouts with every derivative that a backward recursion needs.
+    """A batch of rollouts with all derivatives needed by a backward recursion.
 
     Attributes:
-        steps: The same rollouts step by step.
+        steps: The same rollouts, step by step.
         cost_state: Derivative of each step's cost over the state, [cost/state].
-        cost_control: ... and over the control, [cost/control].
+        cost_control: Derivative of each step's cost over the control, [cost/control].
         final_state: Derivative of the final cost, [cost/state].
         over_state: Derivative of each step's next state over the state.
-        over_control: ... and over the control, [state/control].
+        over_control: Derivative of each step's next state over the control, [state/control].
         policy_state: Derivative of the policy over the state, [control/state]; None for an open loop.
-        start_jacobian: Derivative of the start over theta, where theta and the noise act on the start and on nothing
-            else, [state/param]; otherwise None.
+        start_jacobian: Derivative of the start over theta, [state/param], if theta and the noise act on the start only;
+            otherwise None.
     """
 
     steps: StepEvaluation
@@ -129,7 +129,7 @@ def pull_back(
     adjoint: Float[Array, "samples steps controls"],
     policy_jacobian: Float[Array, "samples steps controls params"] | None,
 ) -> Float[Array, "samples params"]:
-    """sum_h D_theta pi(x_h)^T adjoint_h of each sample; the adjoint itself where theta is the noise's own place.
+    """sum_h D_theta pi(x_h)^T adjoint_h of each sample; the adjoint itself if there is no policy Jacobian.
 
     Args:
         adjoint: A quantity per unit of control, such as dV/du_h, [cost/control].
@@ -142,15 +142,14 @@ def pull_back(
 
 @runtime_checkable
 class Objective(Protocol):
-    """A stochastic objective F(theta) = E f(theta, w): two methods, and for most estimators nothing else is needed.
+    """A stochastic objective F(theta) = E f(theta, w); most estimators need only these two methods.
 
-    One key per sample: sample i depends on `keys[i]` alone, so a result does not depend on how samples are
-    chunked or spread over devices.
+    Sample i depends on `keys[i]` alone, so results do not depend on how samples are chunked or spread over devices.
     """
 
     @property
     def num_params(self) -> int:
-        """The length of theta."""
+        """Length of theta."""
         ...
 
     def evaluate(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> Evaluation:
@@ -164,21 +163,21 @@ class Objective(Protocol):
 
 @runtime_checkable
 class PairedObjective(Objective, Protocol):
-    """An objective that can also be evaluated with each sample's noise turned round."""
+    """An objective that can also be evaluated with opposite noise."""
 
     def evaluate_pair(
         self, theta: Float[Array, " params"], keys: Key[Array, " samples"]
     ) -> tuple[Evaluation, Evaluation]:
-        """The batch of `evaluate`, and the one with opposite noise from the same starts."""
+        """Return the batch of `evaluate` and one with opposite noise from the same starts."""
         ...
 
 
 @runtime_checkable
 class StepwiseObjective(Objective, Protocol):
-    """An objective that can also be had step by step; the samples are those of `evaluate` and `differentiate`."""
+    """An objective with stepwise batches; the samples are those of `evaluate` and `differentiate`."""
 
     def evaluate_steps(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> StepEvaluation:
-        """Roll out without differentiating the dynamics, and keep what each step cost."""
+        """Roll out without differentiating the dynamics, and keep the cost of each step."""
         ...
 
     def differentiate_steps(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> StepDifferentiation:
@@ -193,14 +192,14 @@ class StepwiseObjective(Objective, Protocol):
 @register_pytree
 @dataclass(frozen=True)
 class AlphaChoice:
-    """Why an interpolated estimate weighs its two batches as it does.
+    """Weight of an interpolated estimate, and what determined it.
 
     Attributes:
-        alpha: Weight of the first-order batch, in [0, 1]; the mean where there is one for every step.
-        epsilon: Confidence radius of the zeroth-order mean, [cost/param]; None where none was used.
-        discrepancy: B = ||gbar_1 - gbar_0||, [cost/param]; None where it was not used.
-        variance_zeroth: sigmahat_0^2 of one zeroth-order sample, [cost^2/param^2]; None where every step has its own.
-        variance_first: sigmahat_1^2 of one first-order sample, [cost^2/param^2]; None likewise.
+        alpha: Weight of the first-order batch, in [0, 1]; the mean of stepwise weights.
+        epsilon: Confidence radius of the zeroth-order mean, [cost/param]; None if unused.
+        discrepancy: B = ||gbar_1 - gbar_0||, [cost/param]; None if unused.
+        variance_zeroth: sigmahat_0^2 of one zeroth-order sample, [cost^2/param^2]; None for stepwise weights.
+        variance_first: sigmahat_1^2 of one first-order sample, [cost^2/param^2]; None for stepwise weights.
     """
 
     alpha: Float[Array, ""]
@@ -213,17 +212,17 @@ class AlphaChoice:
 @register_pytree
 @dataclass(frozen=True)
 class GradientEstimate:
-    """A gradient estimate with the samples it was made of.
+    """A gradient estimate with its samples.
 
     Attributes:
-        samples: g_i, [cost/param], as rows, or merged from blocks that are not kept. Rows that are not finite stay as
-            they came; the summary leaves them out.
+        samples: g_i, [cost/param], as rows, or merged from blocks that are not kept. Nonfinite rows are kept; the
+            summary leaves them out.
         mean: gbar, [cost/param].
         variance: sigmahat^2 = 1/(n-1) sum_i ||g_i - gbar||^2, the trace of the sample covariance,
             [cost^2/param^2].
-        standard_error: Of each entry of the mean, [cost/param].
-        num_finite: n, the number of rows in which every entry is finite.
-        alpha: What chose the interpolation; None for an estimate from one batch.
+        standard_error: Standard error of each entry of the mean, [cost/param].
+        num_finite: n, the number of rows with only finite entries.
+        alpha: How the interpolation weight was chosen; None for an estimate from one batch.
 
     Reference: Suh et al. 2022, def. of empirical variance.
     """
@@ -237,7 +236,7 @@ class GradientEstimate:
 
     @property
     def num_nonfinite(self) -> Int[Array, "..."]:
-        """The number of rows that were left out."""
+        """Number of rows left out."""
         return self.samples.shape[-2] - self.num_finite
 
     @property

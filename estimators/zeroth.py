@@ -1,4 +1,4 @@
-"""Zeroth-order estimates: from values and scores, never from a derivative of the dynamics."""
+"""Zeroth-order estimates: from values and scores, without derivatives of the dynamics."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -35,13 +35,13 @@ def antithetic(plus: Evaluation, minus: Evaluation, baseline: str) -> GradientEs
 
         g_i = ((f_i^+ - b_i^+) s_i^+ + (f_i^- - b_i^-) s_i^-) / 2
 
-    A pair is one sample. Unbiased where the noise is symmetric. Where the noise is added to theta itself the two
-    scores are opposite, any baseline that a pair shares cancels, and what is left is the part of f that is odd in the
-    noise, ((f^+ - f^-) / 2) s^+, all of the signal without the even part's variance.
+    A pair is one sample. Unbiased for symmetric noise. If the noise is added to theta itself, the two scores are
+    opposite, any baseline shared by a pair cancels, and the part of f that is odd in the noise remains,
+    ((f^+ - f^-) / 2) s^+: all of the signal without the variance of the even part.
 
     Args:
         plus: Batch of evaluations, one of each pair.
-        minus: The batch of the same starts and the opposite noise.
+        minus: Batch with the same starts and the opposite noise.
         baseline: A name in `BASELINES`, applied within each half.
 
     Raises:
@@ -54,23 +54,22 @@ def antithetic(plus: Evaluation, minus: Evaluation, baseline: str) -> GradientEs
 def delta_control_variate(
     evaluation: Evaluation, gradient: Float[Array, " params"], sigma: float | Float[Array, ""]
 ) -> GradientEstimate:
-    """Zeroth-order estimate of what a linear model of f leaves over, added to the model's gradient.
+    """Zeroth-order estimate with a linear model of f as control variate.
 
         g_i = g + (f_i - f_i(0) - sigma^2 s_i . g) s_i
 
-    With f_i(0) the zero-noise value. Unbiased for *any* g that does not depend on the batch, provided that
-    E[s s^T] = I / sigma^2, which holds where the noise is added to the parameters themselves (an open loop,
-    one step) and not for a feedback policy. The closer g is to the gradient of f, the less variance: for
-    linear f and its own gradient, none. A wrong g costs variance only, so references are made this way even
-    where first-order gradients are biased.
+    where f_i(0) is the zero-noise value. Unbiased for *any* g independent of the batch, provided that
+    E[s s^T] = I / sigma^2, which holds if the noise is added to the parameters themselves (an open loop, one step) but
+    not for a feedback policy. The closer g is to the gradient of f, the lower the variance: zero for linear f and its
+    own gradient. A wrong g only costs variance, so references use this even where first-order gradients are biased.
 
     Args:
-        evaluation: The batch, open loop.
+        evaluation: Open-loop batch.
         gradient: g, such as a first-order mean from other samples, [cost/param].
         sigma: Standard deviation of the noise, [param].
     """
     scale = jnp.asarray(sigma, evaluation.score.dtype)
-    # A sum, since a matrix product of float32 may be rounded to fewer digits on an accelerator.
+    # A sum, since accelerators may compute float32 matrix products with fewer digits.
     linear = scale**2 * jnp.sum(evaluation.score * gradient[None, :], axis=1)
     remainder = evaluation.value - evaluation.baseline - linear
     return summarise(gradient[None, :] + remainder[:, None] * evaluation.score)
