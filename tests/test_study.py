@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import xarray as xr
+from matplotlib.patches import Rectangle
 
 import mjx_study.accessor  # noqa: F401  # registers `Dataset.mjx_study`, which no other import here does
 from estimators import AlphaOrder, InverseVariance
@@ -16,6 +17,7 @@ from mjx_study import disk
 from mjx_study.cli import console
 from mjx_study.cli.studies import as_document
 from mjx_study.objective import MjxObjective, Simulator
+from mjx_study.plots.panels import limit
 from mjx_study.plots.study import plot_study
 from mjx_study.plots.style import save_figure
 from mjx_study.study import sampling
@@ -368,6 +370,17 @@ def test_figures_survive_what_cannot_be_drawn(tmp_path) -> None:
         (figure,) = plot_study(study).values()
         for path in save_figure(figure, tmp_path, "figure"):
             assert path.stat().st_size > 1000
+
+
+def test_the_unstable_band_begins_at_the_limit() -> None:
+    """Of an undamped spring of K / 0.05 kg and a step of 10 ms: h^2 k = 4, not the middle of the grid's stiffnesses."""
+    made_up = result(*(row("zobg", stiffness, 1.0) for stiffness in (10, 1000, 50_000)))
+    (figure,) = plot_study(made_up).values()
+    (band,) = [patch for patch in figure.axes[0].patches if isinstance(patch, Rectangle)]
+    assert band.get_x() == pytest.approx(0.05 * 4 / 0.01**2, rel=0.01)
+    k = np.array([10.0, 1000.0, 50_000.0]) / 0.05
+    critical = limit(0.05 * k, np.transpose([-k, -2 * np.sqrt(k)]), 1, 0.01)
+    assert critical == pytest.approx(0.05 * (2 * (math.sqrt(2) - 1) / 0.01) ** 2, rel=0.01)
 
 
 def test_a_file_is_whole_or_absent(tmp_path) -> None:

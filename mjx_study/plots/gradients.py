@@ -16,6 +16,7 @@ from mjx_study.plots.panels import (
     estimators,
     families,
     geometric,
+    legend_below,
     line,
     make_logarithmic,
     note,
@@ -57,8 +58,7 @@ def comparison(part: xr.Dataset, title: str) -> Figure:
         axes[0, 0].set_ylim(np.nanmin(known) / 100, np.nanmax(known) * 100)
     axes[0, 0].set_ylabel("variance of one sample")
     axes[1, 0].set_ylabel(f"relative error of the mean\nof {int(part['samples'])} samples")
-    axes[0, 0].legend(frameon=False)
-    axes[1, 0].legend(frameon=False)
+    legend_below(figure, columns=2 * len(found))
     return figure
 
 

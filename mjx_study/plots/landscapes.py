@@ -1,13 +1,12 @@
 """The figure of landscapes: costs along a line, and the slopes that estimators see."""
 
 import json
-from typing import Any
 
 import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
 
-from mjx_study.plots.panels import a_few, estimators, panels
+from mjx_study.plots.panels import a_few, estimators, legend_below, panels
 from mjx_study.plots.style import STYLE, TITLES, mean_with_band, robust_limits
 
 
@@ -25,10 +24,10 @@ def landscape(part: xr.Dataset, title: str) -> Figure:
         above.plot(t, one["cost"], color="0.55", linewidth=1.2, label="cost without noise")
         mean_with_band(above, t, one["smoothed"].values, one["smoothed_se"].values, "black", "mean cost with noise")
         if "exact_slope" in one and bool(one["exact_slope"].notnull().any()):
-            dotted = {"linestyle": ":", "linewidth": 1.2}
-            below.plot(t, one["exact_slope"], color="black", **dotted, label="slope of the mean cost, quadrature")
-            first = STYLE["fobg"][0]
-            below.plot(t, one["exact_first"], color=first, **dotted, label="mean of FoBG, quadrature")
+            above_all = {"linestyle": "none", "markerfacecolor": "none", "markersize": 4, "zorder": 3}
+            below.plot(t, one["exact_slope"], "ok", **above_all, label="slope of the mean cost, quadrature")
+            first = {"color": STYLE["fobg"][0], "marker": STYLE["fobg"][1]}
+            below.plot(t, one["exact_first"], **first, **above_all, label="mean of FoBG, quadrature")
         for mine, style in estimators(one):
             slopes.append(mine["slope"].values)
             mean, error = mine["slope"].values, mine["slope_se"].values
@@ -44,10 +43,5 @@ def landscape(part: xr.Dataset, title: str) -> Figure:
     grid[1, 0].set_ylim(low, high)
     grid[0, 0].set_ylabel("cost")
     grid[1, 0].set_ylabel("slope along the line")
-    legend: dict[str, Any] = {}
-    for axes in grid.flat:
-        found, labels = axes.get_legend_handles_labels()
-        legend |= dict(zip(labels, found, strict=True))
-    columns = max(2, min(len(legend), 2 * len(models)))
-    figure.legend(legend.values(), legend, loc="outside lower center", ncols=columns, frameon=False, fontsize="small")
+    legend_below(figure, columns=2 * len(models))
     return figure

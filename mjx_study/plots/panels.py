@@ -59,6 +59,15 @@ def make_logarithmic(axes: Axes, x: np.ndarray | None) -> None:
             axes.set_xlim(min(x) / 1.1, max(x) * 1.1)
 
 
+def legend_below(figure: Figure, columns: int) -> None:
+    """One legend of all panels, below them, where it hides nothing."""
+    shown = {
+        label: handle for axes in figure.axes for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)
+    }
+    columns = max(2, min(len(shown), columns))
+    figure.legend(shown.values(), shown, loc="outside lower center", ncols=columns, frameon=False, fontsize="small")
+
+
 def note(axes: Axes, x: float, text: str, **style: Any) -> None:
     """A word along the upper end of a vertical line."""
     axes.annotate(text, (x, 0.98), xycoords=("data", "axes fraction"), rotation=90, va="top", **style)
@@ -142,16 +151,24 @@ def geometric(values: xr.DataArray) -> tuple[np.ndarray, np.ndarray, np.ndarray]
     return np.exp(mean), np.exp(mean - half), np.exp(mean + half)
 
 
+def limit(x: np.ndarray, solref: np.ndarray, first: int, timestep: float) -> float:
+    """Stiffness from which the step is unstable, between two of a family: k grows with K, b with its root or not."""
+    between = np.geomspace(x[max(first - 1, 0)], x[first], 500)
+    k, b = np.interp(between, x, solref[:, 0]), np.interp(np.sqrt(between), np.sqrt(x), solref[:, 1])
+    unstable = (float(at) for at, *each in zip(between, k, b, strict=True) if not stable(each, timestep))
+    return next(unstable, float(x[first]))
+
+
 def shade_unstable(along: Sequence[Axes], rows: xr.Dataset, x: np.ndarray) -> None:
     """Stiffnesses at which the step gains energy while in contact."""
     if "solref" not in rows:
         return
     known = rows["solref"].transpose("model", "solref_entry").values
-    steady = np.array([np.isnan(each).any() or stable(each.tolist(), float(rows["timestep"])) for each in known])
+    timestep = float(rows["timestep"])
+    steady = np.array([np.isnan(each).any() or stable(each.tolist(), timestep) for each in known])
     if steady.all() or not np.any(rows["stiffness"].values):
         return
-    first = int(np.argmin(steady))
-    left = x[first] if first == 0 else float(np.sqrt(x[first - 1] * x[first]))
+    left = limit(x, known, int(np.argmin(steady)), timestep)
     for axes in along:
         axes.axvspan(left, x[-1] * 1.15, color="0.5", alpha=0.13, linewidth=0, zorder=0)
     note(along[0], left, "unstable step", fontsize="x-small", color="0.35")
