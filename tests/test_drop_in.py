@@ -324,7 +324,7 @@ def test_the_onset_term_is_not_for_models() -> None:
         step(model, data, onset="smooth")
     with pytest.raises(ValueError, match="unknown onset 'smooth' of a step"), differentiable_mjx(onset="smooth"):
         pass
-    with pytest.raises(TypeError, match="derivatives are in states and controls, not in the model"):
+    with pytest.raises(TypeError, match="derivatives over states and controls, but not over the model"):
         jax.grad(lambda mass: step(model.replace(body_mass=mass), data, onset="linear").qpos[0])(model.body_mass)
 
 

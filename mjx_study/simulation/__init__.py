@@ -1,1 +1,1 @@
-"""MuJoCo's step with its derivatives: scenes, contact models, the constraint solve, and patches for MJX's faults."""
+"""MuJoCo's step with derivatives: scenes, contact models, the constraint solve, and patches for faults of MJX."""

@@ -1,7 +1,7 @@
-"""Imports `mujoco.mjx` without the lines it prints about NVIDIA Warp.
+"""Import `mujoco.mjx` without its messages about NVIDIA Warp.
 
-MJX announces on standard output that its optional Warp backend is missing, which would corrupt JSON output.
-Those lines are dropped; anything else that the import prints goes to standard error.
+MJX reports a missing optional Warp backend on standard output, which would corrupt JSON output. Those lines are
+dropped; anything else the import prints goes to standard error.
 """
 
 import contextlib

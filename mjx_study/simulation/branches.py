@@ -1,18 +1,18 @@
 r"""The onset term from rollouts in which contact does and does not begin: `--onset jump`.
 
-As in `mjx_study.simulation.onset`, with the jump of the cost itself in place of its linearisation: a rollout in which
-contact begins at step k, with s = phi_k/D of its last step in penetration, adds
+As in `mjx_study.simulation.onset`, but with the jump of the cost itself instead of its linearisation: a rollout in
+which contact begins at step k, with s = phi_k/D of its last step in penetration, adds
 
     ((1 - s) J_k n^T dq_k + s J_{k-1} n^T dq_{k-1}) / D,     J_j = V_{j+1}(on) - V_{j+1}(off),
 
-to the derivative of its cost; dq are the steps' own derivatives. Both J are taken at first touch: of the positions on
-the way from step k - 1 to step k the one with phi = 0, with the velocities of step k and of step k - 1. There step j
-is made once with the contact's rows at first touch and once without them, and the rollout goes on to its end with the
-same noise and feedback, in which whatever begins later begins. Only values of these four rollouts are needed.
+to the derivative of its cost, where dq are the steps' own derivatives. Both J are evaluated at first touch: at the
+position with phi = 0 between steps k - 1 and k, with the velocities of step k and of step k - 1. From there, step j is
+taken once with the contact's rows at first touch and once without them, and each rollout continues to its end with the
+same noise and feedback, later onsets included. Only the values of these four rollouts are needed.
 
-The weights of neighbouring cells add up to 1, and errors of first order in the place of the touch and in the width of
-a cell cancel between the two ends: the error is of second order in the cell's width over the spread of phi. It does not
-depend on the contact's damping or stiffness, as that of the linear term does.
+The weights of neighbouring cells add up to 1, and first-order errors in the touch position and in the cell width cancel
+between the two ends: the error is second order in the ratio of the cell width to the spread of phi. Unlike the error of
+the linear term, it does not depend on the contact's damping or stiffness.
 """
 
 from collections.abc import Callable
@@ -30,8 +30,8 @@ from mjx_study.simulation.onset import SLOTS, OnsetCounts, find_onsets, first_st
 from mjx_study.simulation.scene import Scene
 
 WITHIN: Final = 0.1
-"""Share of the way from the touch to the state in penetration at which the contact's geometry is taken: at the touch
-itself MJX may not have the contact yet."""
+"""Where the contact geometry is evaluated, as a share of the way from the touch to the penetrating state: MJX may not
+report the contact at the touch itself."""
 CostToGo = Callable[[Int[Array, ""], State], Float[Array, ""]]
 RunningCost = Callable[[State, Float[Array, " nu"]], Float[Array, ""]]
 FinalCost = Callable[[State], Float[Array, ""]]
@@ -47,16 +47,16 @@ def jump_term(
     final_cost: FinalCost,
     slots: int = SLOTS,
 ) -> tuple[Float[Array, ""], OnsetCounts]:
-    """Zero, with the onset term as its derivative with respect to whatever the states depend on.
+    """Return zero, with the onset term as its derivative with respect to whatever the states depend on.
 
     Args:
-        states: of `dynamics.rollout`, `(horizon + 1, ...)`, with their derivatives.
-        control_law: of the rollout, independent of what is differentiated.
+        states: states from `dynamics.rollout`, `(horizon + 1, ...)`, with their derivatives.
+        control_law: control law of the rollout, independent of the differentiated inputs.
         running_cost, final_cost: as in `tasks.Task`.
-        slots: number of onsets to correct, first ones first.
+        slots: maximum number of onsets to correct, earliest first.
 
     Returns:
-        The term, to be added to the cost, and counts.
+        The term, to be added to the cost, and the onset counts.
     """
     before, controls = jax.lax.stop_gradient((jax.tree.map(lambda leaf: leaf[:-1], states), controls))
     if not scene.has_constraints:
@@ -89,7 +89,7 @@ def jump_term(
         weight, flag = _weights(scene, model, before, controls, cost_to_go, *place, share)
         return slot + 1, weights.at[slot].set(weight), flags.at[slot].set(flag)
 
-    # not a scan: a batch ends with the last onset of any of its rollouts
+    # not a scan: the loop over a batch ends with the last onset of any rollout
     _, weights, flags = jax.lax.while_loop(lambda carry: carry[0] < filled, fill, (jnp.zeros((), int), weights, flags))
     at = jnp.stack([steps, steps - 1], axis=1)
     moved = jax.vmap(jax.vmap(lambda fixed, here: difference_position(scene.host, fixed, here)))(
@@ -137,7 +137,7 @@ def _weights(
 
 
 def _in_touch(scene: Scene, model: mjx.Model, near: Array, deep: Array, guard: Int[Array, ""]) -> mjx.Data:
-    """The position stage near the touch, or deeper where there is no contact yet: its rows are needed."""
+    """Position stage near the touch, or deeper if MJX reports no contact there, since the contact's rows are needed."""
     first, second = (position_stage(scene, model, qpos) for qpos in (near, deep))
     meets = constraint.guards(model, first)[0][guard] < 0
     return jax.tree.map(lambda one, other: jnp.where(meets, one, other), first, second)

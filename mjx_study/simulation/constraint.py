@@ -1,15 +1,15 @@
-r"""The constraint solve as a differentiable root.
+r"""The constraint solve as differentiable root finding.
 
-MuJoCo's constrained acceleration minimises a convex function, that is, it is the root `a` of
+MuJoCo's constrained acceleration minimises a convex function; equivalently, it is the root `a` of
 
     G(a) = M a - qfrc_smooth - J^T f(J a - aref) = 0,
 
-with `f` the force law of each constraint row. MJX finds it with a `while_loop`, which has no reverse mode, so
-`mjx.step` can be differentiated only with one solver iteration, which gets both the step and its gradient wrong. Here
-a loop runs to convergence, MJX's own or, for few degrees of freedom, a faster one, and the derivative comes from the
-implicit function theorem: one symmetric positive definite system in `dG/da = M + J^T f' J`, whatever the solver and its
-budget. The derivative is only as good as the solve has converged; `residual` measures that, and every result carries
-it.
+with `f` the force law of each constraint row. MJX solves this with a `while_loop`, which has no reverse mode, so
+`mjx.step` is differentiable only with a single solver iteration, which gets both the step and its gradient wrong. Here
+the solver runs to convergence (MJX's own or, for few degrees of freedom, a faster one), and the derivative follows from
+the implicit function theorem: one symmetric positive definite system in `dG/da = M + J^T f' J`, whatever the solver and
+its budget. The derivative is only as good as the solver's convergence, which `residual` measures and every result
+reports.
 
 MJX's constraint rows are private (`Data._impl.efc_*`) and are read only here.
 """
@@ -32,24 +32,24 @@ from mjx_study.simulation.scene import num_constraint_rows
 _ELLIPTIC = mujoco.mjtCone.mjCONE_ELLIPTIC
 
 OWN_SOLVER: Final = True
-"""Whether small systems are solved here rather than by MJX; tests compare."""
+"""Whether small systems use the solver below instead of MJX's; tests compare both."""
 NEWTON_STEPS: Final = 30
 LINE_SEARCH_STEPS: Final = 4
 ROUNDINGS: Final = 8
-"""How many roundings of its terms the solver's equation may be off."""
+"""Tolerance of the solver's equation in rounding errors of its terms."""
 GENEROUS: Final = (100, 50)
-"""Iterations of the solver and of its line search in `solve_to_rounding`."""
+"""Iterations of the solver and its line search in `solve_to_rounding`."""
 POLISHING_STEPS: Final = 4
 EPSILON: Final = 1e-14
 """Relative rounding error of a force in the solver's equation."""
 
 
 def row_force(model: mjx.Model, data: mjx.Data, slack: Float[Array, " rows"]) -> Float[Array, " rows"]:
-    """Force of each constraint row at the slack `J a - aref`: MuJoCo's force law f.
+    """Return the force of each constraint row at the slack `J a - aref`: MuJoCo's force law f.
 
-    With D the inverse regularisation of a row and x its slack: equality -D x; friction loss -D x clipped to
-    +- frictionloss; limit, frictionless and pyramidal contact -D x where x < 0, else 0; elliptic contact by zone of
-    the cone (`_elliptic_force`).
+    With D the inverse regularisation of a row and x its slack, the force is -D x for an equality; -D x clipped to
+    +- frictionloss for friction loss; -D x where x < 0, else 0, for limits and for frictionless and pyramidal contacts;
+    elliptic contacts depend on the zone of the cone (`_elliptic_force`).
 
     Args:
         data: state with its constraint rows, after `mjx.make_constraint`.
@@ -85,9 +85,9 @@ def _elliptic_force(
 ) -> Float[Array, " rows"]:
     """Replace the rows of elliptic contacts in `force`.
 
-    In the scaled slack u = (mu x_n, friction * x_t), N = u_n, T = |u_t|: separated (N >= mu T) no force; sticking
-    (mu N + T <= 0) linear; sliding in between, on the cone, with force -dm mu (N - mu T) along (1, -u_t / T).
-    The branch not taken is evaluated at a safe T, so T = 0 has a finite derivative.
+    With the scaled slack u = (mu x_n, friction * x_t), N = u_n, T = |u_t|: if separated (N >= mu T), no force; if
+    sticking (mu N + T <= 0), linear; if sliding (in between, on the cone), force -dm mu (N - mu T) along (1, -u_t / T).
+    The branch not taken is evaluated at a safe T, so the derivative is finite at T = 0.
     """
     contact = rows.contact
     for index, (condim, address) in enumerate(zip(contact.dim, contact.efc_address, strict=True)):
@@ -137,9 +137,9 @@ def residual(model: mjx.Model, data: mjx.Data, qacc: Float[Array, " nv"]) -> Flo
 
 
 def run_solver(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]:
-    """The constrained acceleration [m/s^2 or rad/s^2], from the warm start; no reverse mode.
+    """Compute the constrained acceleration [m/s^2 or rad/s^2] from the warm start; no reverse mode.
 
-    Small systems by Newton's method, to rounding; larger ones by MJX's solver, within the model's budget.
+    Small systems use Newton's method, to rounding; larger ones use MJX's solver within the model's budget.
     """
     if num_constraint_rows(data) == 0:
         return data.qacc_smooth
@@ -149,10 +149,10 @@ def run_solver(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]:
 
 
 def _newton(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]:
-    """The root of the solver's equation by Newton's method with a line search, to rounding.
+    """Solve the solver's equation to rounding by Newton's method with a line search.
 
-    Without a force in any row it is the unconstrained acceleration. A batch leaves the loop with the last of its
-    samples: seldom after more than two steps, or six where boxes slip and stick.
+    If no row exerts a force, the result is the unconstrained acceleration. The loop over a batch ends with its slowest
+    sample: seldom after more than two steps, or six where boxes stick and slip.
     """
     rows: Any = data._impl
     inertia, jacobian = mjx.full_m(model, data), rows.efc_J
@@ -192,11 +192,11 @@ def _newton(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]:
 
 
 def _line_search(derivative: Callable[[Array], Array], dtype: Any) -> Float[Array, ""]:
-    """A multiple of the Newton step that lowers the cost, whose increasing `derivative` along it is negative at 0.
+    """Return a multiple of the Newton step that lowers the cost, whose increasing `derivative` is negative at 0.
 
-    The whole step, unless the derivative at its end is more than half as large as at the start: contacts have begun,
-    ended or slipped on the way. Then the best of a few steps of Newton's method for the derivative's zero, and of false
-    position where they leave the bracket. Unless cones are elliptic, the derivative is piecewise linear.
+    It is the full step unless the derivative's magnitude at its end exceeds half of that at the start, because contacts
+    began, ended or slipped on the way. Then it is the best of a few Newton steps on the derivative's root, with false
+    position where they leave the bracket. The derivative is piecewise linear unless cones are elliptic.
     """
     low, high, fraction = jnp.zeros((), dtype), jnp.full((), jnp.inf, dtype), jnp.ones((), dtype)
     at_low = at_high = at_start = derivative(low)
@@ -224,16 +224,16 @@ def _newton_step(model: mjx.Model, data: mjx.Data, qacc: Float[Array, " nv"]) ->
 
 
 def with_generous_budget(model: mjx.Model) -> mjx.Model:
-    """The model with a budget generous enough for MJX's solver to run until its cost no longer falls."""
+    """Return the model with a budget large enough for MJX's solver to run until its cost stops decreasing."""
     tolerance = jnp.full_like(model.opt.tolerance, 1e-15)
     return model.replace(opt=model.opt.replace(iterations=GENEROUS[0], ls_iterations=GENEROUS[1], tolerance=tolerance))
 
 
 def solve_to_rounding(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]:
-    """The constrained acceleration to rounding, whatever the model's own budgets; values only.
+    """Compute the constrained acceleration to rounding, ignoring the model's budgets; values only.
 
-    MJX stops where its cost no longer falls, which is the square root of rounding away from the solution and visible in
-    finite differences. Newton steps on the equation itself have no such floor; steps that lead away are rejected.
+    MJX stops when its cost stops decreasing, within the square root of rounding of the solution, which is visible in
+    finite differences. Newton steps on the equation itself have no such floor; diverging steps are rejected.
     """
     if num_constraint_rows(data) == 0:
         return data.qacc_smooth
@@ -251,7 +251,7 @@ def solve_to_rounding(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]:
     for _ in range(POLISHING_STEPS):
         candidate = qacc + step
         following, nearer = newton(candidate)
-        better = nearer < jnp.maximum(distance, floor)  # below the floor a step still follows small changes
+        better = nearer < jnp.maximum(distance, floor)  # below the floor, steps still follow small changes
         qacc, step, distance = (
             jnp.where(better, new, old) for new, old in ((candidate, qacc), (following, step), (nearer, distance))
         )
@@ -261,12 +261,12 @@ def solve_to_rounding(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]:
 def solve(
     model: mjx.Model, data: mjx.Data, solver: Callable[[mjx.Model, mjx.Data], Float[Array, " nv"]] = run_solver
 ) -> Float[Array, " nv"]:
-    """The constrained acceleration with its implicit derivative, exact in forward and reverse mode.
+    """Compute the constrained acceleration with its implicit derivative, exact in forward and reverse mode.
 
     Args:
         model: the model on the device; its array leaves may be traced and differentiated.
         data: state after `mjx.fwd_acceleration`; `qacc_warmstart` starts the loop and is not differentiated.
-        solver: what finds the acceleration.
+        solver: function that computes the acceleration.
 
     Returns:
         qacc [m/s^2 or rad/s^2].
@@ -277,7 +277,7 @@ def solve(
     def tangent_solve(linear_map, right_side):
         return solve_positive_definite(jax.vmap(linear_map)(jnp.eye(model.nv, dtype=right_side.dtype)), right_side)
 
-    # Named, and found outside of the root: JAX stores what is named, and would compute again what the root computes.
+    # Named outside of the root finding: JAX saves named values but would recompute those inside.
     found = checkpoint_name(solver(*jax.lax.stop_gradient((model, data))), "qacc")
     return jax.lax.custom_root(
         f=lambda qacc: imbalance(model, data, qacc),
@@ -288,11 +288,11 @@ def solve(
 
 
 def guard_rows(model: mjx.Model, data: mjx.Data) -> tuple[np.ndarray, np.ndarray]:
-    """Constraint rows of each guard, limits first and then contacts; static.
+    """Map each guard (limits first, then contacts) to its constraint rows; static.
 
     Returns:
-        Weights `(guards, rows)` that combine rows into the guard's normal row (the mean of two opposite edges of a
-        pyramid), and a mask `(guards, rows)` of 0 and 1 for the rows that switch on with the guard.
+        Weights `(guards, rows)` that combine rows into the guard's normal row (the mean of two opposite pyramid edges),
+        and a 0/1 mask `(guards, rows)` of the rows that switch on with the guard.
     """
     rows: Any = data._impl
     spans = [(rows.ne + rows.nf + index, 1, 1) for index in range(rows.nl)]
@@ -307,7 +307,7 @@ def guard_rows(model: mjx.Model, data: mjx.Data) -> tuple[np.ndarray, np.ndarray
 
 
 def guards(model: mjx.Model, data: mjx.Data) -> tuple[Float[Array, " guards"], Float[Array, " guards"]]:
-    """Distance less margin [m or rad] and its rate [m/s or rad/s] for every active limit and contact; else zeros."""
+    """Distance minus margin [m or rad] and its rate [m/s or rad/s] of every active limit and contact; else zeros."""
     weights, members = guard_rows(model, data)
     rows: Any = data._impl
     first = members.argmax(axis=1) if len(members) else np.zeros(0, int)
@@ -315,11 +315,11 @@ def guards(model: mjx.Model, data: mjx.Data) -> tuple[Float[Array, " guards"], F
 
 
 def at_onset(model: mjx.Model, data: mjx.Data, members: Float[Array, " rows"], on: Bool[Array, ""]) -> mjx.Data:
-    """The state with some constraint rows at first touch (no penetration, impedance d_0), or removed.
+    """Return the state with some constraint rows set to first touch (no penetration, impedance d_0), or removed.
 
     Args:
-        members: 1 for these rows, 0 for those left unchanged.
-        on: whether they are active.
+        members: 1 for these rows, 0 for rows left unchanged.
+        on: whether these rows are active.
     """
     with patched(AT_FIRST_TOUCH):
         touching: Any = mjx.make_constraint(model, data)._impl
@@ -337,11 +337,11 @@ def at_onset(model: mjx.Model, data: mjx.Data, members: Float[Array, " rows"], o
 
 
 def relaxation_rate(model: mjx.Model, data: mjx.Data, normal: Float[Array, " rows"]) -> Float[Array, ""]:
-    """max(b, sqrt(k d)) [1/s] of a guard at first touch: how fast its contact changes the speed of approach.
+    """max(b, sqrt(k d)) [1/s] of a guard at first touch: the rate at which contact changes the approach speed.
 
     Args:
-        data: position stage, with the velocity; the guard is moving.
-        normal: the guard's weights of `guard_rows`.
+        data: position stage, with a velocity at which the guard moves.
+        normal: weights of the guard from `guard_rows`.
     """
     with patched(RELAXING):
         rows: Any = mjx.make_constraint(model, data)._impl

@@ -1,21 +1,21 @@
-r"""Contact models: how MuJoCo's soft contact is parametrised, in MuJoCo's own terms and in N/m.
+r"""Contact models: parameters of MuJoCo's soft contact, in MuJoCo's terms and in N/m.
 
 MuJoCo's contact acts on acceleration. Along the normal, with impedance d, penetration r < 0 and unconstrained
 acceleration a_0, the acceleration becomes
 
     a_1 = (1 - d) a_0 - s b v - s^2 k r,        s = d / d_width,    k [1/s^2], b [1/s].
 
-The impedance d = d(r) rises from d_0 at first touch to d_width at the depth `width` and beyond, where s = 1; with
-d_0 = d_width s is 1 throughout, and with d_0 near 0 spring and damper set in gradually.
+The impedance d = d(r) rises from d_0 at first touch to d_width at depth `width` and beyond, where s = 1. With
+d_0 = d_width, s is 1 throughout; with d_0 near 0, spring and damper set in gradually.
 
-For two bodies of effective mass m_eff along the normal, a spring of K [N/m] and a damper of B [N s/m] have
-k = K / m_eff, b = B / m_eff. One family spans the study's question: d -> 0 is the penalty method, a spring added to the
-other forces; d -> 1 is a constraint, which first cancels a_0. Under a static load the spring carries only the share
+For two bodies with effective mass m_eff along the normal, a spring K [N/m] and a damper B [N s/m] correspond to
+k = K / m_eff, b = B / m_eff. One family covers the range of the study: d -> 0 is the penalty method, a spring added to
+the other forces; d -> 1 is a constraint, which first cancels a_0. Under a static load the spring carries only the share
 1 - d, so a resting contact has stiffness K / (1 - d).
 
-MuJoCo writes (k, b) as `solref`: negative numbers are (-k, -b) directly; positive ones are a time constant and a
-damping ratio, k = 1 / (timeconst dampratio)^2, b = 2 / timeconst. All of these are array leaves of `mjx.Model`, so a
-sweep over them is one compiled program.
+MuJoCo encodes (k, b) as `solref`: negative numbers are (-k, -b); positive ones are a time constant and a damping ratio,
+k = 1 / (timeconst dampratio)^2, b = 2 / timeconst. All are array leaves of `mjx.Model`, so sweeps over them compile
+once.
 
 Reference: MuJoCo documentation, Modeling, "Solver parameters".
 """
@@ -38,21 +38,21 @@ from mjx_study.simulation.scene import Scene
 
 
 class ContactWarning(UserWarning):
-    """A contact model that MuJoCo would alter, or that the integrator cannot resolve."""
+    """Warns that MuJoCo would alter a contact model, or that the integrator cannot resolve it."""
 
 
 @register_pytree
 @dataclasses.dataclass(frozen=True)
 class ContactModel:
-    """Parameters applied to every contact of a scene; array leaves, so they can be traced and stacked.
+    """Parameters for every contact of a scene; array leaves, so they can be traced and stacked.
 
     Attributes:
-        solref: MuJoCo's reference: (-k [1/s^2], -b [1/s]) or (time constant [s], damping ratio).
-        solimp: MuJoCo's impedance: d_0, d_width, width [m], midpoint, power.
+        solref: (-k [1/s^2], -b [1/s]) or (time constant [s], damping ratio), as in MuJoCo.
+        solimp: impedance d_0, d_width, width [m], midpoint, power, as in MuJoCo.
         friction: sliding [1], torsional [m], rolling [m]; None keeps the MJCF's.
         margin: distance at which contact begins [m]; None keeps the MJCF's.
-        backward: contact model whose derivatives stand in for this one's in a rollout (a surrogate gradient); None for
-            exact derivatives.
+        backward: contact model whose derivatives replace this one's in a rollout (a surrogate gradient); None for exact
+            derivatives.
     """
 
     solref: Float[Array, "*batch 2"]
@@ -70,20 +70,20 @@ def contact_model(
     *,
     scene: Scene,
 ) -> ContactModel:
-    """A contact model in MuJoCo's own terms, checked against the scene it is meant for.
+    """Create a contact model in MuJoCo's terms, validated against a scene.
 
     Args:
-        solref: both negative or zero, (-k [1/s^2], -b [1/s]); or both positive, (time constant [s], damping ratio).
+        solref: (-k [1/s^2], -b [1/s]), both negative or zero; or (time constant [s], damping ratio), both positive.
         solimp: (d_0, d_width, width [m], midpoint, power), impedances in [1e-4, 0.9999].
-        friction: (sliding, torsional [m], rolling [m]), not negative, or None for the MJCF's.
-        margin: [m], not negative, or None for the MJCF's.
-        scene: gives timestep, integrator and flags.
+        friction: (sliding, torsional [m], rolling [m]), nonnegative, or None for the MJCF's.
+        margin: nonnegative margin [m], or None for the MJCF's.
+        scene: scene with the timestep, integrator and flags.
 
     Raises:
-        ValueError: a value that MuJoCo would replace or clip without an error.
+        ValueError: MuJoCo would silently replace or clip a value.
 
     Warns:
-        ContactWarning: `refsafe` would clip the time constant, or h^2 k is past the integrator's stability limit.
+        ContactWarning: `refsafe` would clip the time constant, or h^2 k exceeds the integrator's stability limit.
     """
     solref, solimp = tuple(map(float, solref)), tuple(map(float, solimp))
     _check_solref(solref)
@@ -106,18 +106,18 @@ def contact_model(
 def family_model(
     name: str, scene: Scene, *, stiffness: float | None = None, damping: float | None = None, effective_mass: float
 ) -> ContactModel:
-    """The member of a family at a physical stiffness.
+    """Create the member of a contact family with a given physical stiffness.
 
     Args:
         name: one of `FAMILIES` except "mjcf".
-        scene: gives timestep, integrator and flags.
-        stiffness: K [N/m], positive; None for a family that is a single point.
-        damping: B [N s/m], not negative; None for the family's damping ratio.
+        scene: scene with the timestep, integrator and flags.
+        stiffness: K [N/m], positive; None for single-point families.
+        damping: B [N s/m], nonnegative; None for the family's damping ratio.
         effective_mass: effective mass of the contact along its normal [kg]; see `effective_mass`.
 
     Raises:
-        ValueError: unknown name, a missing or superfluous stiffness, a value out of range, or the family "mjcf",
-            which stands for no contact model.
+        ValueError: unknown name, missing or superfluous stiffness, value out of range, or the family "mjcf", which has
+            no contact model.
     """
     if name not in FAMILIES:
         raise ValueError(f"unknown contact family {name!r}; choose from {', '.join(FAMILIES)}")
@@ -125,7 +125,7 @@ def family_model(
     if not family.swept and (stiffness is not None or damping is not None):
         raise ValueError(f"contact family {name!r} is a single point and takes no stiffness or damping")
     if family.solimp is None:
-        raise ValueError(f"contact family {name!r} leaves the model as it is: use None in place of a contact model")
+        raise ValueError(f"contact family {name!r} keeps the model unchanged: use None instead of a contact model")
     if family.solref is not None:
         return contact_model(family.solref, family.solimp, scene=scene)
     if stiffness is None:
@@ -139,12 +139,12 @@ def family_model(
 def solref_from_stiffness(
     stiffness: float, damping: float | None = None, *, effective_mass: float, dampratio: float | None = None
 ) -> tuple[float, float]:
-    """The direct solref (-k, -b) of a spring K [N/m] and a damper B [N s/m], or a damping ratio in its place.
+    """Return the direct solref (-k, -b) of a spring K [N/m] with a damper B [N s/m] or a damping ratio.
 
-    k = K / m_eff, b = B / m_eff, and with a damping ratio b = 2 dampratio sqrt(k).
+    k = K / m_eff; b = B / m_eff, or 2 dampratio sqrt(k) for a damping ratio.
 
     Raises:
-        ValueError: stiffness or effective mass not positive, damping negative, or damping given twice.
+        ValueError: stiffness or effective mass not positive, damping negative, or damping given in both ways.
     """
     if not (stiffness > 0 and math.isfinite(stiffness)):
         raise ValueError(f"stiffness must be positive and finite, in N/m; got {stiffness}")
@@ -162,7 +162,7 @@ def solref_from_stiffness(
 
 
 def stiffness_from_solref(solref: Sequence[float], *, effective_mass: float) -> tuple[float, float]:
-    """Spring K [N/m] and damper B [N s/m] of a solref of either sign, at full penetration (impedance d_width).
+    """Return spring K [N/m] and damper B [N s/m] of a solref of either sign at full penetration (impedance d_width).
 
     The inverse of `solref_from_stiffness`; for positive solref K = m_eff / (timeconst dampratio)^2,
     B = 2 m_eff / timeconst.
@@ -178,15 +178,15 @@ def stiffness_from_solref(solref: Sequence[float], *, effective_mass: float) -> 
 
 
 def effective_mass(scene: Scene, geom1: str, geom2: str) -> float:
-    """Effective mass of the contact of two geoms along its normal, in the reference pose [kg].
+    """Return the effective mass [kg] of the contact of two geoms along its normal, in the reference pose.
 
-    MuJoCo scales a contact's force by the inverse weights of its two bodies, m_eff = 1 / (w_1 + w_2). A pyramidal cone
-    has 2 (condim - 1) edges of weight 2 mu^2 (1 + mu^2) (w_1 + w_2) / impratio each, which together act like
+    MuJoCo scales contact forces by the inverse weights of the two bodies, m_eff = 1 / (w_1 + w_2). A pyramidal cone has
+    2 (condim - 1) edges of weight 2 mu^2 (1 + mu^2) (w_1 + w_2) / impratio each, which together act like
 
         m_eff = 2 (condim - 1) impratio / (2 mu^2 (1 + mu^2) (w_1 + w_2))
 
-    in the penalty limit, with mu the larger of the two geoms' friction in the MJCF; explicit pairs and priorities are
-    ignored.
+    in the penalty limit, where mu is the larger friction of the two geoms in the MJCF; explicit pairs and priorities
+    are ignored.
 
     Raises:
         SceneError: unknown geom name.
@@ -205,11 +205,11 @@ def effective_mass(scene: Scene, geom1: str, geom2: str) -> float:
 
 
 def soften(contact: ContactModel, factor: float | Array) -> ContactModel:
-    """A contact model with its stiffness times a factor, at the same damping ratio; `backward` likewise.
+    """Scale the stiffness of a contact model and its `backward` at constant damping ratio.
 
     Args:
-        contact: in either form of solref.
-        factor: positive.
+        contact: contact model with either form of solref.
+        factor: positive factor.
     """
     first, second = contact.solref
     root = jnp.sqrt(factor)
@@ -220,10 +220,10 @@ def soften(contact: ContactModel, factor: float | Array) -> ContactModel:
 
 
 def apply_contact(model: mjx.Model, contact: ContactModel | None) -> mjx.Model:
-    """The model with every geom and explicit pair set to the contact model; pure, and works on traced values.
+    """Apply a contact model to every geom and explicit pair; pure, and works on traced values.
 
-    Both geoms of a pair are set, so MuJoCo's mixing by `solmix` and `priority` has nothing to mix. None leaves the
-    model as the MJCF has it.
+    Both geoms of a pair are set, so MuJoCo's mixing by `solmix` and `priority` has no effect. None leaves the model
+    unchanged.
     """
     if contact is None:
         return model
@@ -286,7 +286,7 @@ def _warn_if_clipped(solref: Sequence[float], scene: Scene) -> None:
 
 
 def stable(solref: Sequence[float], timestep: float) -> bool:
-    """Whether the step of a contact is stable: semi-implicit Euler with k and b is while h^2 k < 4 - 2 h b.
+    """Whether the contact step is stable: for semi-implicit Euler, h^2 k < 4 - 2 h b.
 
     Args:
         solref: as in `contact_model`.

@@ -1,7 +1,7 @@
-"""`mjx.step` with exact derivatives, for code that knows nothing of scenes: as a function, and as a context.
+"""`mjx.step` with exact derivatives, for code without scenes: as a function and as a context manager.
 
-Both are MJX's own pipeline, traced with the patches of `patches` and with `constraint`'s implicit derivative around
-MJX's own solver.
+Both trace MJX's own pipeline with the patches of `patches`, and wrap MJX's own solver in the implicit derivative of
+`constraint`.
 """
 
 import contextlib
@@ -25,29 +25,28 @@ Replacements = dict[Place, Callable[..., mjx.Data]]
 ONSETS: Final = ("none", "linear")
 """Treatments of the onset of contact in the derivatives of a step."""
 STEP_SLOTS: Final = 2
-"""Number of onsets with a term in one step; others are left out."""
+"""Maximum number of onsets with a term per step; others are left out."""
 
 
 def step(model: mjx.Model, data: mjx.Data, *, onset: str = "none") -> mjx.Data:
-    """`mjx.step`, differentiable through contact, in forward and reverse mode, in every array of model and data.
+    """`mjx.step`, differentiable through contact in forward and reverse mode, in every array of model and data.
 
-    Values are those of `mjx.step` to rounding, with the solver's budget of the model. The derivative is that of a
-    converged step, by the implicit function theorem at the acceleration that the solver left; it is only as good as
-    the solver has converged, which `solver_residual` tells. Reverse mode stores a step's inputs and its acceleration,
-    and computes the rest again.
+    Values agree with `mjx.step` to rounding, with the model's solver budget. The derivative is that of a converged
+    step, by the implicit function theorem at the solver's result, and only as good as the solver's convergence, which
+    `solver_residual` reports. Reverse mode stores a step's inputs and acceleration, and recomputes the rest.
 
     Args:
         model: the model; its array leaves may be traced, batched under `jax.vmap` and differentiated.
         data: the state before the step, with controls and applied forces.
-        onset: "none", or "linear", with which derivatives account for a change of the step at which contact begins;
-            then they are with respect to qpos, qvel, act and ctrl only (see `_corrected_step`).
+        onset: "none" or "linear"; "linear" makes derivatives account for a change of the step at which contact begins,
+            and restricts them to qpos, qvel, act and ctrl (see `_corrected_step`).
 
     Returns:
-        The state after the step, with all that `mjx.step` fills in.
+        The state after the step, with every field that `mjx.step` fills in.
 
     Raises:
-        ValueError: unknown onset, or the model is for another implementation than MJX's own in JAX.
-        TypeError: differentiation with respect to the model, with the onset term.
+        ValueError: unknown onset, or the model is not for MJX's JAX implementation.
+        TypeError: differentiation with respect to the model with the onset term.
     """
     _check_onset(onset)
     if model.impl != mjx.Impl.JAX:
@@ -59,16 +58,15 @@ def step(model: mjx.Model, data: mjx.Data, *, onset: str = "none") -> mjx.Data:
 
 @contextlib.contextmanager
 def differentiable_mjx(*, onset: str = "none") -> Generator[None]:
-    """`mjx.step` and `mjx.forward` have the derivatives of `step` in whatever is called, or traced, inside.
+    """Give `mjx.step` and `mjx.forward` the derivatives of `step` in everything called or traced inside.
 
-    For environments that call `mjx.step` themselves. What JAX has traced outside is traced again inside, and the other
-    way round, also behind `jax.jit`; programs that are compiled ahead of time stay what they are. Call the gradient
-    inside: `jax.grad(f)` alone traces nothing yet. Other threads are not affected. A decorator, too:
-    `@differentiable_mjx()`.
+    For environments that call `mjx.step` themselves. Functions traced outside are retraced inside and vice versa, also
+    behind `jax.jit`; programs compiled ahead of time do not change. Call the gradient inside: `jax.grad(f)` alone
+    traces nothing yet. Other threads are not affected. Also works as a decorator: `@differentiable_mjx()`.
 
     Args:
-        onset: as in `step`. With "linear", what was imported from MJX as `step` before, rather than called as
-            `mjx.step`, raises RuntimeError.
+        onset: as in `step`. With "linear", a `step` imported from MJX earlier, rather than called as `mjx.step`, raises
+            RuntimeError.
 
     Raises:
         ValueError: unknown onset.
@@ -84,15 +82,15 @@ def _check_onset(onset: str) -> None:
 
 
 def _uncorrected(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """In place of MJX's integrators, which a step that is not `mjx.step`'s replacement still calls."""
+    """Replaces MJX's integrators to catch steps that bypass the replacement of `mjx.step`."""
     raise RuntimeError("this step would have no onset term: call mjx.step by that name, or mjx_study.step")
 
 
 def solver_residual(model: mjx.Model, data: mjx.Data) -> Float[Array, ""]:
-    """Relative imbalance of forces that the solver left in the step before, 0 where it has converged; dimensionless.
+    """Relative force imbalance left by the solver in the last step, 0 if converged; dimensionless.
 
     Args:
-        model: the model that the step was taken with.
+        model: the model used in the step.
         data: the state after `mjx.step`, `mjx.forward` or `step`.
     """
     return constraint.residual(model, data, data.qacc)
@@ -117,10 +115,10 @@ _REPLACED: Final[dict[str, Replacements]] = {
 
 
 def _corrected_step(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """`mjx.step` with the same values, and derivatives that include the onset term (`onset`).
+    """`mjx.step` with the same values, but derivatives that include the onset term.
 
-    Delta_k stands in for Delta_{k-1}, which the state does not tell: an error of order h of the term. The first
-    `STEP_SLOTS` onsets of the step have a term. None begins at time 0, before which there was no step.
+    Delta_k replaces Delta_{k-1}, which the state does not contain: an error of order h in the term. The first
+    `STEP_SLOTS` onsets of the step are corrected. None begins at time 0, which no step precedes.
     """
     model, timestep = without_derivative(model), model.opt.timestep
     fixed = jax.lax.stop_gradient(data)
@@ -136,7 +134,7 @@ def _corrected_step(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 def _onset_change(
     model: mjx.Model, data: mjx.Data, moved: Float[Array, " nv"], moved_before: Float[Array, " nv"]
 ) -> tuple[Float[Array, " nv"], Float[Array, " nv"]]:
-    """Velocities, before and after the step, that are zero and change where contact begins at another step."""
+    """Zero velocities, before and after the step, that change with the step at which contact begins."""
     return jnp.zeros_like(moved), jnp.zeros_like(moved)
 
 
@@ -150,7 +148,7 @@ def _(primals, tangents):
 
 
 def _step_terms(model: mjx.Model, data: mjx.Data) -> tuple[Float[Array, "nv nv"], Float[Array, "nv nv"]]:
-    """(1 - s) Delta n^T / D and s Delta n^T / D of a step, zero where no contact begins."""
+    """(1 - s) Delta n^T / D and s Delta n^T / D of a step, zero if no contact begins."""
     positioned = fwd_position(model, data)
     distance, speed = constraint.guards(model, positioned)
     travel = model.opt.timestep * speed

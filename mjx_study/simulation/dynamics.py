@@ -1,16 +1,16 @@
 r"""One simulation step and whole rollouts, differentiable through contact.
 
-A step is MJX's own pipeline around the solve of `constraint`. It agrees with `mjx.step` up to the solver's convergence,
-and its derivative is that of the converged step. Two programs compute the derivative:
+A step is MJX's own pipeline around the solve of `constraint`. It agrees with `mjx.step` up to solver convergence, and
+its derivative is that of the converged step. Two programs compute the derivative:
 
-- the *Jacobian* program, by default for models of few coordinates: the Jacobian of the velocity update with respect to
-  state and control by the implicit function theorem, once per step. Reverse mode stores only these nv (nq + nv + nu)
-  numbers per step and replays neither the solver nor the kinematics.
+- the *Jacobian* program, by default for models with few coordinates: the Jacobian of the velocity update with respect
+  to state and control by the implicit function theorem, once per step. Reverse mode stores only these
+  nv (nq + nv + na + nu) numbers per step and replays neither the solver nor the kinematics.
 - the *tape* program, for larger models and for derivatives with respect to model parameters: ordinary automatic
-  differentiation around the implicit solve, each step recomputed in the backward pass (`jax.checkpoint`) with the
-  solver's result saved, so that the solver is not run again.
+  differentiation around the implicit solve, each step recomputed in the backward pass (`jax.checkpoint`) but with the
+  solver's result saved, so that the solver does not run again.
 
-`step` chooses by the scene's `adjoint` and by the inputs being differentiated; both give the same numbers.
+The scene's `adjoint` and the differentiated inputs determine the program; both give the same numbers.
 """
 
 import dataclasses
@@ -35,13 +35,13 @@ from mjx_study.simulation.scalars import traced_part, unrolled
 from mjx_study.simulation.scene import Scene
 
 SAVE_SOLUTION: Final = jax.checkpoint_policies.save_only_these_names("qacc")
-"""Policy of `jax.checkpoint` with which the backward pass computes steps again, but does not run their solver again."""
+"""Policy of `jax.checkpoint` that recomputes steps in the backward pass without running their solver again."""
 
 
 @register_pytree
 @dataclasses.dataclass(frozen=True)
 class State:
-    """The state carried from one step to the next.
+    """State carried from step to step.
 
     Attributes:
         qpos: generalised positions [m or rad; unit quaternions].
@@ -59,7 +59,7 @@ class State:
 def initial_state(
     scene: Scene, qpos: Float[Array, " nq"] | None = None, qvel: Float[Array, " nv"] | None = None
 ) -> State:
-    """A state at rest in the MJCF's reference pose, or at the given `qpos` [m or rad] and `qvel` [m/s or rad/s]."""
+    """Return a state at rest in the MJCF's reference pose, or at `qpos` [m or rad] and `qvel` [m/s or rad/s]."""
     like = scene.template
     return State(
         qpos=like.qpos if qpos is None else jnp.asarray(qpos, like.qpos.dtype),
@@ -93,9 +93,9 @@ def step(scene: Scene, model: mjx.Model, state: State, control: Float[Array, " n
 def exact_step(
     scene: Scene, model: mjx.Model, state: State, control: Float[Array, " nu"]
 ) -> tuple[State, Float[Array, ""], mjx.Data]:
-    """`step` with its constraints solved to rounding, whatever the budgets, and its `smooth_stages`; values only.
+    """`step` with constraints solved to rounding, ignoring budgets, and its `smooth_stages`; values only.
 
-    Finite differences use this step: differences of `step` itself would show where its solver stopped.
+    For finite differences, which would otherwise reflect where the solver of `step` stopped.
     """
     data = smooth_stages(scene, model, state, control).replace(qacc_warmstart=state.warmstart)
     if scene.host.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
@@ -107,14 +107,14 @@ def exact_step(
 
 
 def smooth_stages(scene: Scene, model: mjx.Model, state: State, control: Float[Array, " nu"]) -> mjx.Data:
-    """Everything in a step before the constraint solve: kinematics, contacts, forces, constraint rows."""
+    """Run a step up to the constraint solve: kinematics, contacts, forces, constraint rows."""
     return force_stage(model, position_stage(scene, model, state.qpos), state.qvel, state.act, control)
 
 
 def solved_step(
     scene: Scene, model: mjx.Model, state: State, control: Float[Array, " nu"]
 ) -> tuple[State, Float[Array, ""], tuple[Float[Array, " guards"], Float[Array, " guards"]]]:
-    """`step` without a derivative, and the `constraint.guards` of its contacts and limits before the step."""
+    """`step` without derivatives, and the `constraint.guards` of its contacts and limits before the step."""
     return entry_by_entry(partial(_solved_step, scene), model, state, control)
 
 
@@ -127,7 +127,7 @@ def _solved_step(scene: Scene, model: mjx.Model, state: State, control: Array):
 
 
 def entry_by_entry(function: Callable[..., Any], model: mjx.Model, *arguments: Any) -> Any:
-    """`function(model, *arguments)`, unrolled where that pays: few degrees of freedom, and a model of constants."""
+    """Evaluate `function(model, *arguments)`, unrolled if that pays: few degrees of freedom and a constant model."""
     if model.nv <= SMALL and not isinstance(model.body_mass, Tracer):
         return unrolled(function, model, *arguments)
     return function(model, *arguments)
@@ -139,7 +139,7 @@ ControlLaw = Callable[[Int[Array, ""], State], Float[Array, " nu"]]
 def surrogate_step(
     scene: Scene, model: mjx.Model, backward: mjx.Model, state: State, control: Float[Array, " nu"]
 ) -> tuple[State, Float[Array, ""]]:
-    """`step` with the derivatives that the step of another model has at the same state and control.
+    """`step` with the derivatives of another model's step at the same state and control.
 
     Args:
         scene: static part of both models.
@@ -173,7 +173,7 @@ def rollout(
     horizon: int,
     backward: mjx.Model | None = None,
 ) -> tuple[State, Float[Array, "horizon nu"], Float[Array, " horizon"]]:
-    """Simulate `horizon` steps in closed loop.
+    """Simulate `horizon` closed-loop steps.
 
     Args:
         scene: static part of the model.
@@ -181,7 +181,7 @@ def rollout(
         start: the initial state, the first of those returned.
         control_law: maps (step index, state) to the control of that step.
         horizon: number of steps, at least 1.
-        backward: model whose derivatives every step has, see `surrogate_step`; None for its own.
+        backward: model whose derivatives replace each step's, see `surrogate_step`; None for its own.
 
     Returns:
         States `(horizon + 1, ...)` including the initial one, controls `(horizon, nu)`, residuals `(horizon,)`.
@@ -207,8 +207,8 @@ def rollout(
     return trajectory, controls, residuals
 
 
-# The stages of a step. A Jacobian over qvel, act or ctrl starts after the position stage, so it is cheap. Each stage is
-# jitted so that JAX traces MJX's many operations once rather than for every direction; XLA inlines them again.
+# The stages of a step. A Jacobian over qvel, act or ctrl starts after the position stage and so is cheap. Each stage is
+# jitted so that JAX traces MJX's many operations once rather than per direction; XLA inlines them again.
 
 
 def position_stage(scene: Scene, model: mjx.Model, qpos: Float[Array, " nq"]) -> mjx.Data:
@@ -217,7 +217,7 @@ def position_stage(scene: Scene, model: mjx.Model, qpos: Float[Array, " nq"]) ->
 
 @jax.jit
 def fwd_position(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """MJX's own, patched."""
+    """MJX's `fwd_position`, patched."""
     with patched():
         return mjx.fwd_position(model, data)
 
@@ -228,7 +228,7 @@ def force_stage(
 ) -> mjx.Data:
     data = data.replace(qvel=qvel, act=act, ctrl=control)
     with patched():
-        data = mjx.make_constraint(model, data)  # again: aref depends on qvel
+        data = mjx.make_constraint(model, data)  # again, since aref depends on qvel
         data = mjx.fwd_velocity(model, data)
         data = mjx.fwd_actuation(model, data)
         return mjx.fwd_acceleration(model, data)
@@ -238,7 +238,7 @@ def force_stage(
 def advance_velocity(
     model: mjx.Model, data: mjx.Data, qacc: Float[Array, " nv"]
 ) -> tuple[Float[Array, " nv"], Float[Array, " na"]]:
-    """Velocity and activation after the step, from the constrained acceleration; MJX's own integrators."""
+    """Return velocity and activation after the step, given the constrained acceleration, by MJX's own integrators."""
     data = data.replace(qacc=qacc, qfrc_constraint=constraint.constraint_force(model, data, qacc))
     implicit = model.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     data = mjx.implicit(model, data) if implicit else mjx.euler(model, data)
@@ -249,17 +249,16 @@ def advance_velocity(
 def _constrained_update(
     model: mjx.Model, data: mjx.Data, qvel: Array, act: Array, control: Array, warmstart: Array, solve=constraint.solve
 ):
-    """The velocity update by `constraint.solve`, or by `constraint.run_solver` without its derivative."""
+    """Velocity update by `constraint.solve`, or by `constraint.run_solver` without derivatives."""
     data = force_stage(model, fwd_position(model, data), qvel, act, control)
     qacc = solve(model, data.replace(qacc_warmstart=warmstart))
     return *advance_velocity(model, data, qacc), qacc, constraint.residual(model, data, qacc)
 
 
 def _update(scene: Scene):
-    """The velocity update (model, qpos, qvel, act, control, warmstart) -> (qvel, act, qacc, residual).
+    """Return the velocity update (model, qpos, qvel, act, control, warmstart) -> (qvel, act, qacc, residual).
 
-    Derivatives with respect to state and control use the scene's program; any derivative with respect to the model uses
-    the tape.
+    Derivatives with respect to state and control use the scene's program, those with respect to the model the tape.
     """
 
     def tape(model, qpos, qvel, act, control, warmstart):
@@ -289,7 +288,7 @@ def _jacobian_update(scene: Scene, tape: Callable[..., tuple[Array, ...]], model
         direction = jnp.concatenate(inputs)
         out, qacc_out = product(over_step, direction), product(over_qacc, direction)
         nv = qvel.shape[0]
-        # The tangent of qacc is for derivatives of this derivative: the Jacobian is a function of qacc.
+        # The tangent of qacc is for second derivatives: the Jacobian is a function of qacc.
         return value, (out[:nv], out[nv:], qacc_out, jnp.zeros_like(value[3]))
 
     return update(traced_model, *inputs)
@@ -308,9 +307,9 @@ def step_jacobian(
     control: Float[Array, " nu"],
     qacc: Float[Array, " nv"],
 ) -> tuple[Float[Array, "nv_na inputs"], Float[Array, "nv inputs"]]:
-    r"""Jacobians of (qvel', act') and of qacc with respect to (qpos, qvel, act, control), columns in that order.
+    r"""Compute the Jacobians of (qvel', act') and of qacc over the columns (qpos, qvel, act, control).
 
-    With S the step at a given acceleration a and G(x, a) = 0 the solver's equation,
+    For the step S at a given acceleration a, and the solver's equation G(x, a) = 0,
 
         da/dx = -G_a^{-1} G_x,   dS/dx = S_x + S_a da/dx.
 
@@ -354,7 +353,7 @@ def _jacobian(model: mjx.Model, template: mjx.Data, qpos: Array, qvel: Array, ac
 
 
 def _runge_kutta(scene: Scene, model: mjx.Model, state: State, control: Float[Array, " nu"]) -> State:
-    """Classical fourth-order Runge-Kutta (scenes with constraints are refused when they are loaded)."""
+    """Classical fourth-order Runge-Kutta; scenes with constraints are rejected on loading."""
     timestep = model.opt.timestep
 
     def slopes(qpos, qvel, act):
@@ -375,7 +374,7 @@ def _runge_kutta(scene: Scene, model: mjx.Model, state: State, control: Float[Ar
     qacc = jax.lax.stop_gradient(first[1])
     if state.act.size == 0:
         return State(qpos, qvel, state.act, qacc)
-    # MJX's own advance of the activation, with its clamping
+    # MJX's own activation update, with its clamping
     data = smooth_stages(scene, model, state, control)
     act = mjx.euler(model, data.replace(act_dot=mean[2], qacc=data.qacc_smooth)).act
     return State(qpos, qvel, act, qacc)

@@ -1,4 +1,4 @@
-"""The C engine as an independent implementation: the same model and its states on the host."""
+"""MuJoCo's C engine as an independent implementation: models and states on the host."""
 
 import contextlib
 import copy
@@ -18,7 +18,7 @@ CONVERGED: Final = {"tolerance": 0.0, "iterations": 200, "ls_iterations": 100}
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class HostState:
-    """A state on the host, with its control.
+    """State and control on the host.
 
     Attributes:
         qpos: positions [m or rad; unit quaternions].
@@ -36,7 +36,7 @@ class HostState:
 
 
 def apply_to_host(host: mujoco.MjModel, contact: ContactModel | None) -> None:
-    """Set every geom and pair of a host model to a contact model, in place, as `apply_contact` does on the device."""
+    """Apply a contact model to every geom and pair of a host model in place, as `apply_contact` does on the device."""
     if contact is None:
         return
     for leaf in (host.geom_solref, host.pair_solref):
@@ -53,7 +53,7 @@ def apply_to_host(host: mujoco.MjModel, contact: ContactModel | None) -> None:
 
 
 def converged_host(scene: Scene, contact: ContactModel | None) -> mujoco.MjModel:
-    """A copy of the scene's host model with a contact model, and budgets for full convergence."""
+    """Copy the scene's host model with a contact model and with budgets for full convergence."""
     host = copy.copy(scene.host)
     apply_to_host(host, contact)
     for name, value in CONVERGED.items():
@@ -69,7 +69,7 @@ def host_data(host: mujoco.MjModel, state: HostState) -> mujoco.MjData:
 
 
 def host_state(data: mujoco.MjData) -> HostState:
-    """The state of the engine's data, before a step."""
+    """Return the state held by the engine's data before a step."""
     fields: tuple[Any, ...] = (data.qpos, data.qvel, data.act, data.ctrl, data.qacc_warmstart)
     return HostState(*(np.array(field) for field in fields))
 
@@ -86,7 +86,7 @@ def quiet_engine() -> Generator[None]:
 
 
 def engine_model(scene: Scene, contact: ContactModel | None) -> mujoco.MjModel:
-    """A copy of the scene's host model with a contact model and the scene's own budgets."""
+    """Copy the scene's host model with a contact model and the scene's own budgets."""
     host = copy.copy(scene.host)
     apply_to_host(host, contact)
     return host

@@ -1,8 +1,8 @@
 """Position integration with the true derivative for free and ball joints at rest.
 
-MJX normalises the angular velocity and branches at zero, so its derivative of the orientation with respect to a zero
-angular velocity is silently zero; the true one is half a timestep per component. Here the quaternion is a smooth
-function of the squared angle, with a series at small angles. Values agree with MJX to rounding.
+MJX normalises the angular velocity and branches at zero, so its derivative of the orientation over a zero angular
+velocity is silently zero; the true one is half a timestep per component. Here the quaternion is a smooth function of
+the squared angle, with a series at small angles. Values agree with MJX to rounding.
 """
 
 import jax.numpy as jnp
@@ -21,12 +21,12 @@ def integrate_position(
     qvel: Float[Array, " nv"],
     timestep: Float[Array, ""] | float,
 ) -> Float[Array, " nq"]:
-    """Positions after moving with `qvel` for one timestep.
+    """Integrate positions over a timestep at constant velocity.
 
     Args:
         qpos: positions [m or rad; unit quaternions].
         qvel: velocities [m/s or rad/s], angular ones in the body frame as in MuJoCo.
-        timestep: time to move for [s].
+        timestep: integration time [s].
     """
     parts = []
     for kind, start, velocity in zip(host.jnt_type, host.jnt_qposadr, host.jnt_dofadr, strict=True):
@@ -44,7 +44,7 @@ def integrate_position(
 def difference_position(
     host: mujoco.MjModel | mjx.Model, start: Float[Array, " nq"], end: Float[Array, " nq"]
 ) -> Float[Array, " nv"]:
-    """The velocity that moves from `start` to `end` in unit time, the inverse of `integrate_position`.
+    """Return the velocity that moves from `start` to `end` in unit time, the inverse of `integrate_position`.
 
     Args:
         start, end: positions [m or rad; quaternions of any length].
@@ -62,9 +62,9 @@ def difference_position(
 
 
 def rotation_between(start: Float[Array, " 4"], end: Float[Array, " 4"]) -> Float[Array, " 3"]:
-    """The rotation vector [rad], in the body frame, with which `rotate_quaternion` turns `start` into `end`.
+    """Return the body-frame rotation vector [rad] with which `rotate_quaternion` turns `start` into `end`.
 
-    With (w, u) = start^-1 end of sign w >= 0 it is 2 atan2(|u|, w) u / |u|, a smooth function of u / w below pi.
+    With (w, u) = start^-1 end and sign w >= 0, it is 2 atan2(|u|, w) u / |u|, a smooth function of u / w below pi.
     """
     a, b = start, end
     real = jnp.sum(a * b)
@@ -80,7 +80,7 @@ def rotation_between(start: Float[Array, " 4"], end: Float[Array, " 4"]) -> Floa
 
 
 def rotate_quaternion(quaternion: Float[Array, " 4"], rotation: Float[Array, " 3"]) -> Float[Array, " 4"]:
-    """The unit quaternion after a rotation vector [rad] in the body frame: q exp(rotation / 2), normalised."""
+    """Apply a body-frame rotation vector [rad] to a unit quaternion: q exp(rotation / 2), normalised."""
     square = jnp.sum(rotation**2)
     small = square < _SMALL
     angle = jnp.sqrt(jnp.where(small, 1.0, square))

@@ -1,6 +1,6 @@
-"""Features that MJX 3.17 silently ignores, so that a model would move differently than in the C engine.
+"""Features that MJX 3.17 silently ignores, so that motion would differ from the C engine.
 
-Each was found by comparing one step of MJX with one of C; `docs/gradient-faults.md` shows them.
+Each was found by comparing single steps of MJX and C; see `docs/gradient-faults.md`.
 """
 
 import dataclasses
@@ -11,7 +11,7 @@ import mujoco
 
 @dataclasses.dataclass(frozen=True)
 class Flag:
-    """One of MJCF's <flag>s: a bit of `enableflags`, or of `disableflags`, where it means "disabled"."""
+    """An MJCF <flag>: a bit of `enableflags`, or of `disableflags`, where it means "disabled"."""
 
     bit: int
     optional: bool
@@ -38,12 +38,12 @@ _IMPLICITFAST: Final = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
 
 
 def lacking(host: mujoco.MjModel) -> list[str]:
-    """Names of enabled flags that MJX refuses or, like `sleep`, ignores."""
+    """Names of enabled flags that MJX rejects or, like `sleep`, ignores."""
     return [name for name in _LACKING if not FLAGS[name].disabled(host.opt)]
 
 
 def ignored(host: mujoco.MjModel) -> list[str]:
-    """Features of a model that MJX would ignore, each with the remedy."""
+    """Features of a model that MJX would ignore, each with a remedy."""
     off = {name for name, flag in FLAGS.items() if flag.disabled(host.opt)}
     implicitfast = host.opt.integrator == _IMPLICITFAST
     drag = host.opt.density > 0 or host.opt.viscosity > 0
@@ -81,7 +81,7 @@ def ignored(host: mujoco.MjModel) -> list[str]:
 
 
 def _loses_passive_forces(host: mujoco.MjModel, off: set[str], drag: bool) -> bool:
-    """With springs or dampers disabled, MJX drops every passive force, the C engine only these."""
+    """With springs or dampers disabled, MJX drops all passive forces, the C engine only these."""
     springs = host.jnt_stiffness.any() or host.tendon_stiffness.any()
     dampers = host.dof_damping.any() or host.tendon_damping.any()
     others = drag or (host.body_gravcomp.any() and "gravity" not in off)

@@ -1,7 +1,7 @@
-"""Dense linear algebra of a few rows and columns, unrolled.
+"""Unrolled dense linear algebra for small matrices.
 
-Under `vmap` an entry of a small matrix is a whole batch. Written out, sums and products of entries fuse with what is
-around them; a library's routine for a batch of small matrices is a loop on CPUs, a kernel of its own on accelerators.
+Under `vmap`, an entry of a small matrix is a whole batch. Unrolled, sums and products of entries fuse with surrounding
+operations, whereas library routines for batches of small matrices are loops on CPUs and separate kernels on GPUs.
 """
 
 from typing import Final
@@ -15,12 +15,12 @@ SMALL: Final = 8
 
 
 def product(matrix: Float[Array, "rows columns"], vector: Float[Array, " columns"]) -> Float[Array, " rows"]:
-    """A matrix times a vector, as multiply-adds."""
+    """Multiply a matrix and a vector by multiply-adds."""
     return jnp.sum(matrix * vector, axis=1)
 
 
 def cholesky(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """The upper factor U of a symmetric positive definite matrix U^T U."""
+    """Return the upper factor U of a symmetric positive definite matrix U^T U."""
     size = matrix.shape[0]
     if size > SMALL:
         return jax.scipy.linalg.cholesky(matrix)
@@ -33,7 +33,7 @@ def cholesky(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
 
 
 def solve_factored(upper: Float[Array, "n n"], right_side: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
-    """Solve U^T U x = b for one or several right sides."""
+    """Solve U^T U x = b for one or more right-hand sides."""
     size = upper.shape[0]
     if size > SMALL:
         return jax.scipy.linalg.cho_solve((upper, False), right_side)
@@ -46,5 +46,5 @@ def solve_factored(upper: Float[Array, "n n"], right_side: Float[Array, "n ..."]
 
 
 def solve_positive_definite(matrix: Float[Array, "n n"], right_side: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
-    """Solve with a symmetric positive definite matrix."""
+    """Solve a symmetric positive definite linear system."""
     return solve_factored(cholesky(matrix), right_side)

@@ -1,4 +1,4 @@
-"""Sizes that an MJCF asks for, checked before MuJoCo allocates them: it may end the process or exhaust the memory."""
+"""Check sizes in an MJCF before MuJoCo allocates them, which may abort the process or exhaust memory."""
 
 import math
 from collections.abc import Iterator
@@ -30,7 +30,7 @@ _UNITS: Final = {"K": 2.0**10, "M": 2.0**20, "G": 2.0**30, "T": 2.0**40, "P": 2.
 
 
 def too_large(path: Path) -> str | None:
-    """The first excessive size in an MJCF or a file that it includes; None if there is none, or it is not XML."""
+    """Describe the first excessive size in an MJCF or its includes; None if there is none or it is not XML."""
     files, seen = [path], {path}
     while files:
         found, included = _scan(files.pop())
@@ -55,13 +55,13 @@ def _scan(path: Path) -> tuple[str | None, list[str]]:
                         return f"{what} of {size:.3g} in {path.name}; the limit is {limit:g}", included
             elif element.tag == "replicate":
                 repeats.pop()
-    except (ElementTree.ParseError, OSError, ValueError):  # MuJoCo says what is wrong with it
+    except (ElementTree.ParseError, OSError, ValueError):  # MuJoCo reports what is wrong
         pass
     return None, [name for name in included if name and "\0" not in name]
 
 
 def _sizes(element: ElementTree.Element, repeats: float) -> Iterator[tuple[str, float, float]]:
-    """Description, size and limit of everything an element's attributes ask for."""
+    """Yield description, size and limit of everything that an element's attributes request."""
     tag = str(element.tag)
     for (of, *names), limit in MOST.items():
         if of == tag and all(name in element.attrib for name in names):
@@ -73,7 +73,7 @@ def _sizes(element: ElementTree.Element, repeats: float) -> Iterator[tuple[str, 
 
 
 def _product(text: str) -> float:
-    """Product of an attribute's numbers, such as 10 or 3 3 3 or 2G; 0 if it has none."""
+    """Product of the numbers in an attribute such as 10, 3 3 3 or 2G; 0 if there are none."""
     try:
         numbers = [float(part.rstrip("KMGTPE")) * _UNITS.get(part[-1], 1.0) for part in text.split()]
     except ValueError:

@@ -1,33 +1,32 @@
 r"""Derivatives of rollouts that account for a change of the step at which contact begins.
 
-Where a guard phi (the distance of a contact or a limit, less its margin) falls below zero, MuJoCo's force sets in with
-a jump. The derivative of a rollout holds the index of that step fixed. With noise of smooth density the gradient of the
-mean cost has a second part, from the rollouts at which the index changes:
+Where a guard phi (the distance of a contact or limit minus its margin) falls below zero, MuJoCo's force jumps. The
+derivative of a rollout holds the index of that step fixed. For noise with a smooth density, the gradient of the mean
+cost has a second part, from rollouts at which the index changes:
 
     grad F = E[grad f] - sum_k E[delta(phi_k) J_k grad phi_k],     J_k = V_{k+1}(on) - V_{k+1}(off) at phi_k = 0,
 
 with V the cost to go. A rollout in which contact begins at step k has phi_k in (D, 0], where n = d phi / dq and
 D = phi_k - phi_{k-1} = h n^T v_k. It lies between two others: one in which contact only just begins at step k
 (phi_k = 0), and one in which it would have begun at step k - 1 (phi_{k-1} = 0). If phi is uniform over this cell,
-linear interpolation gives the weights of both, and no additional rollout is needed. With s = phi_k/D and Delta_k the
+linear interpolation gives the weights of both, and no extra rollout is needed. With s = phi_k/D and Delta_k the
 velocity jump after step k,
 
     dx_{k+1} = A_k dx_k + (1 - s) Delta_k (n^T dq_k) / D + s A_k (h Delta_{k-1}, Delta_{k-1}) (n^T dq_{k-1}) / D,
 
-n^T dq_{k-1} = n^T (dq_k - h dv_k). This is the saltation matrix of a time-stepping scheme. Its error falls with h^2;
+where n^T dq_{k-1} = n^T (dq_k - h dv_k). This is the saltation matrix of a time-stepping scheme. Its error is O(h^2);
 the first weight alone (s = 0) leaves an error of h b, where b is the contact's damping [1/s].
 
-Not covered: initial contact; a force that jumps where contact ends (impedance and a pressing force); edges of
-features, where the contact point itself jumps.
+Not covered: initial contact; a force that jumps where contact ends (impedance and a pressing force); edges of features,
+where the contact point itself jumps.
 
-Part of the jump is in proportion to the acceleration a of the guard, not to its speed: at grazing speed Delta/D
-diverges, and the variance of the correction with it. A cell narrower than h |a| / max(b, sqrt(k d)) therefore counts
-as that wide, with b and k the contact's damping and stiffness and d its impedance: bodies slower than that are pressed
-together rather than hit each other. The flux of onsets is in proportion to their speed, so that few are that slow; they
-are counted.
+Part of the jump is proportional to the acceleration a of the guard rather than its speed: at grazing speed, Delta/D and
+with it the variance of the correction diverge. Cells narrower than h |a| / max(b, sqrt(k d)), with b and k the
+contact's damping and stiffness and d its impedance, therefore count as that wide: slower bodies are pressed together
+rather than colliding. The flux of onsets is proportional to their speed, so few are that slow; they are counted.
 
 Reference: Kong, Payne, Zhu, Johnson, "Saltation Matrices: The Essential Tool for Linearizing Hybrid Dynamical Systems"
-(arXiv 2306.06862), for the limit of continuous time.
+(arXiv 2306.06862), for the continuous-time limit.
 """
 
 import dataclasses
@@ -63,11 +62,11 @@ from mjx_study.simulation.scene import Scene
 SLOTS: Final = 8
 """Number of onsets corrected per rollout; later ones are only counted."""
 TOUCHING: Final = 1e-6
-"""Share of a cell: a body closer than this before the step had touched already, so there is no onset."""
+"""Share of a cell: a body closer than this before the step was already touching, so there is no onset."""
 
 
 def check_onset(onset: str) -> None:
-    """Raises ValueError, with the choices, for an unknown treatment of the onset."""
+    """Raise ValueError, listing the choices, for an unknown onset treatment."""
     if onset not in ONSETS:
         raise ValueError(f"unknown onset {onset!r}; choose from {', '.join(ONSETS)}")
 
@@ -75,15 +74,15 @@ def check_onset(onset: str) -> None:
 @register_pytree
 @dataclasses.dataclass(frozen=True)
 class OnsetCounts:
-    """Onsets in a corrected derivative.
+    """Counts of the onsets in a corrected derivative.
 
     Attributes:
         found: number of onsets of contacts and limits.
-        bounded: number of these at grazing speed, whose term is bounded.
-        missed: number of these left uncorrected for lack of slots.
-        strength: share of the approach speed that an onset takes in one step, root mean square over the corrected ones;
-            0 without any, and with the jump, whose error does not depend on it.
-        first: step of the first onset; NaN without any.
+        bounded: number of onsets at grazing speed, whose term is bounded.
+        missed: number of onsets left uncorrected for lack of slots.
+        strength: root-mean-square share of the approach speed that a corrected onset removes in one step; 0 if there is
+            none, and with the jump, whose error does not depend on it.
+        first: step of the first onset; NaN if there is none.
     """
 
     found: Int[Array, "*batch"]
@@ -94,13 +93,13 @@ class OnsetCounts:
 
     @classmethod
     def none(cls, dtype: Any) -> "OnsetCounts":
-        """Of a rollout without constraints."""
+        """Counts of a rollout without constraints."""
         zero = jnp.zeros((), int)
         return cls(zero, zero, zero, jnp.zeros((), dtype), jnp.full((), jnp.nan, dtype))
 
 
 def as_row(counts: OnsetCounts | None) -> Float[Array, "*batch 5"] | None:
-    """The counts in one array, as batches store them."""
+    """Stack the counts in one array, as stored in batches."""
     return None if counts is None else jnp.stack(jax.tree.leaves(counts), axis=-1).astype(float)
 
 
@@ -113,20 +112,20 @@ def corrected_rollout(
     slots: int = SLOTS,
     weight: float | Float[Array, ""] = 1.0,
 ) -> tuple[State, Float[Array, "horizon nu"], Float[Array, " horizon"], OnsetCounts]:
-    """`dynamics.rollout` with the same values, and derivatives that include the onset term.
+    """`dynamics.rollout` with the same values, but derivatives that include the onset term.
 
-    First derivatives with respect to initial state and controls; forward and reverse mode.
+    First derivatives with respect to initial state and controls, in forward and reverse mode.
 
     Args:
         scene: static part of the model.
         model: the model to step; may be traced, but not differentiated.
         control_law: maps (step index, state) to the control of that step.
         horizon: number of steps, at least 1.
-        slots: number of onsets to correct, first ones first.
-        weight: factor on the term; 0 for the derivatives of `dynamics.rollout`.
+        slots: maximum number of onsets to correct, earliest first.
+        weight: factor of the term; 0 gives the derivatives of `dynamics.rollout`.
 
     Returns:
-        States `(horizon + 1, ...)` including the initial one, controls `(horizon, nu)`, residuals `(horizon,)`; counts.
+        States `(horizon + 1, ...)` including the initial one, controls `(horizon, nu)`, residuals `(horizon,)`, counts.
 
     Raises:
         TypeError: differentiation with respect to the model.
@@ -223,7 +222,7 @@ def _corrections(
 
 
 def first_step(steps: Int[Array, " slots"], used: Bool[Array, " slots"], dtype: Any) -> Float[Array, ""]:
-    """Step of the first onset, NaN without any."""
+    """Step of the first onset; NaN if there is none."""
     first = jnp.min(jnp.where(used, steps.astype(dtype), jnp.inf), initial=jnp.inf)
     return jnp.where(jnp.isinf(first), jnp.nan, first)
 
@@ -231,12 +230,12 @@ def first_step(steps: Int[Array, " slots"], used: Bool[Array, " slots"], dtype: 
 def find_onsets(
     distance: Float[Array, "horizon guards"], travel: Float[Array, "horizon guards"], slots: int
 ) -> tuple[Int[Array, " slots"], Int[Array, " slots"], Bool[Array, " slots"], Int[Array, ""]]:
-    """Steps and guards of the first onsets, which slots hold one, and the number of all; slots without one are (1, 0).
+    """Steps and guards of the first onsets, a mask of used slots, and the total number; unused slots hold (1, 0).
 
     Args:
-        distance: of each guard before each step, below zero in contact.
-        travel: of each guard in the step before, by the velocity that it ends with.
-        slots: most onsets to return.
+        distance: distance of each guard before each step, negative in contact.
+        travel: travel of each guard in the preceding step, at that step's final velocity.
+        slots: maximum number of onsets to return.
     """
     begins = onset_begins(distance, travel).at[0].set(False)
     (flat,) = jnp.nonzero(begins.reshape(-1), size=slots, fill_value=begins.size)
@@ -246,7 +245,7 @@ def find_onsets(
 
 
 def onset_begins(distance: Float[Array, "*steps guards"], travel: Float[Array, "*steps guards"]) -> Bool[Array, "..."]:
-    """Whether contact begins at a step, by each guard before it and the guard's travel in the step before that."""
+    """Whether contact begins at a step, from each guard's distance before it and travel in the preceding step."""
     return (distance < 0) & (travel < 0) & (distance - travel > -TOUCHING * travel)
 
 
@@ -261,7 +260,7 @@ def onset_term(
 ) -> tuple[Float[Array, "nv nv"], Float[Array, "nv nv"], Float[Array, ""], Bool[Array, ""]]:
     """(1 - s) Delta_k n^T / D, s Delta_{k-1} n^T / D, share of the approach speed lost, and whether D was bounded.
 
-    Arguments are those of `jump_of_velocity`; its cases are steps k and k - 1, or k for both.
+    Arguments as for `jump_of_velocity`, with steps k and k - 1 as cases, or k for both.
     """
     jumps, normal, least = jump_of_velocity(model, positioned, states, controls, guard)
     share, cell = distance / travel, jnp.minimum(travel, -least)
@@ -273,7 +272,7 @@ def onset_term(
 def jump_of_velocity(
     model: mjx.Model, positioned: mjx.Data, states: State, controls: Float[Array, "cases nu"], guard: Int[Array, ""]
 ) -> tuple[Float[Array, "cases nv"], Float[Array, " nv"], Float[Array, ""]]:
-    """Jump that the onset of one contact or limit causes in the velocity after a step, at first touch.
+    """Compute the jump in the velocity after a step that the onset of a contact or limit causes, at first touch.
 
     Args:
         positioned: position stage of the first case.
@@ -282,8 +281,8 @@ def jump_of_velocity(
         guard: index of the contact or limit, as in `constraint.guard_rows`.
 
     Returns:
-        v'(on) - v'(off) of each case; the derivative of the guard with respect to the velocity coordinates; the first
-        case's least travel.
+        v'(on) - v'(off) of each case; the guard's Jacobian over the velocity coordinates; the first case's least
+        travel.
     """
     rows: Any = positioned._impl
     weights, members = (jnp.asarray(each, rows.efc_J.dtype)[guard] for each in constraint.guard_rows(model, positioned))
@@ -305,7 +304,7 @@ def least_travel(
 
     Args:
         data: position stage, with the velocity.
-        normal: the guard's weights of `constraint.guard_rows`.
+        normal: weights of the guard from `constraint.guard_rows`.
         free: acceleration without the contact.
     """
     rows: Any = data._impl
@@ -315,11 +314,11 @@ def least_travel(
 def on_and_off(
     model: mjx.Model, data: mjx.Data, members: Float[Array, " rows"]
 ) -> tuple[tuple[Float[Array, "2 nv"], Float[Array, "2 na"]], Float[Array, "2 nv"]]:
-    """Velocities and activations after a step, and its accelerations, with some rows at first touch and without them.
+    """Velocities and activations after a step, and its accelerations, with some rows at first touch or removed.
 
     Args:
         data: the state before the constraint solve (`force_stage`), with the solver's warm start.
-        members: 1 for these rows, 0 for those left unchanged.
+        members: 1 for these rows, 0 for rows left unchanged.
     """
 
     def advanced(on):
@@ -332,7 +331,7 @@ def on_and_off(
 
 @jax.custom_jvp
 def tangent_of(value: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Zero, with the derivative of the value."""
+    """Zero, with the derivative of `value`."""
     return jnp.zeros_like(value)
 
 
@@ -343,7 +342,7 @@ def _(primals, tangents):
 
 @jax.custom_jvp
 def tangent_along(matrix: Float[Array, "outputs inputs"], inputs: Float[Array, " inputs"]) -> Float[Array, " outputs"]:
-    """Zero, with the matrix times the derivative of the inputs as its derivative."""
+    """Zero, whose derivative is the matrix times that of the inputs."""
     return jnp.zeros_like(inputs, shape=matrix.shape[:1])
 
 
@@ -353,7 +352,7 @@ def _(primals, tangents):
 
 
 def without_derivative(model: mjx.Model) -> mjx.Model:
-    """The model; differentiating with respect to it raises TypeError."""
+    """Return the model; differentiating with respect to it raises TypeError."""
     traced, whole = traced_part(model)
     return whole(_without_derivative(traced))
 
@@ -366,5 +365,5 @@ def _without_derivative(traced: list[Any]) -> list[Any]:
 @partial(_without_derivative.defjvp, symbolic_zeros=True)
 def _(primals, tangents):
     if any(not isinstance(leaf, jax.custom_derivatives.SymbolicZero) for leaf in jax.tree.leaves(tangents)):
-        raise TypeError("with the onset term derivatives are in states and controls, not in the model")
+        raise TypeError("the onset term has derivatives over states and controls, but not over the model")
     return primals[0], tangents[0]

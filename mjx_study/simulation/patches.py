@@ -1,8 +1,8 @@
-"""Patches for terms of MJX whose value is right but whose derivative is not, evaluated here with safe branches.
+"""Patches for MJX terms with correct values but wrong derivatives, reimplemented with safe branches.
 
 A branch not taken still contributes to a derivative: if it is infinite or NaN, so is the result. And a norm has no
-derivative at zero, where MJX sets it to zero, though a rotation vector made from it is smooth. Values agree with MJX
-to rounding; see `docs/gradient-faults.md`.
+derivative at zero, where MJX sets it to zero, although a rotation vector computed from it is smooth. Values agree with
+MJX to rounding; see `docs/gradient-faults.md`.
 """
 
 import contextlib
@@ -28,13 +28,13 @@ _UNSEEN: Final = 1e-30  # [m]; its square is still a normal number
 def stiffness_damping_impedance(
     model: mjx.Model, solref: Float[Array, " 2"], solimp: Float[Array, " 5"], position: Float[Array, ""]
 ) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
-    """Stiffness k [1/s^2], damping b [1/s] and impedance d of a constraint row, as MuJoCo derives them.
+    """Return stiffness k [1/s^2], damping b [1/s] and impedance d of a constraint row, as in MuJoCo.
 
-    Differentiable where MJX's is not: at a direct solref (-k, 0); in the power of solimp beyond the width; at a
-    non-integer power; at d_0 equal to d_width.
+    Differentiable where MJX is not: at a direct solref (-k, 0), in the power of solimp beyond the width, at noninteger
+    powers, and at d_0 equal to d_width.
 
     Args:
-        model: timestep and flags.
+        model: model with the timestep and flags.
         solref: (time constant [s], damping ratio) or (-k, -b).
         solimp: (d_0, d_width, width, midpoint, power).
         position: position of the row [m or rad].
@@ -58,7 +58,7 @@ def stiffness_damping_impedance(
     rise = jnp.where(below, depth, midpoint) ** power / midpoint ** (power - 1)
     fall = jnp.where(within & ~below, 1 - depth, 1 - midpoint) ** power / (1 - midpoint) ** (power - 1)
     share = jnp.where(below, rise, 1 - fall)
-    # MuJoCo clips to [d_0, d_width], which between the two changes nothing
+    # MuJoCo clips to [d_0, d_width], which has no effect between the two
     impedance = jnp.where(within & (low < high), low + share * (high - low), high)
     return k, b, impedance
 
@@ -66,7 +66,7 @@ def stiffness_damping_impedance(
 def _touching(
     model: mjx.Model, solref: Float[Array, " 2"], solimp: Float[Array, " 5"], position: Float[Array, ""]
 ) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
-    """The same for a row without penetration, whose spring has no force yet."""
+    """The same for a row without penetration, whose spring exerts no force yet."""
     k, b, impedance = stiffness_damping_impedance(model, solref, solimp, jnp.zeros_like(position))
     return jnp.zeros_like(k), b, impedance
 
@@ -74,31 +74,31 @@ def _touching(
 def _relaxing(
     model: mjx.Model, solref: Float[Array, " 2"], solimp: Float[Array, " 5"], position: Float[Array, ""]
 ) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
-    """The same, with the row's relaxation rate in place of its damping."""
+    """The same with the row's relaxation rate instead of its damping."""
     k, b, impedance = stiffness_damping_impedance(model, solref, solimp, jnp.zeros_like(position))
     return jnp.zeros_like(k), jnp.maximum(b, jnp.sqrt(k * impedance)), impedance
 
 
 def rotation_vector(quaternion: Float[Array, " 4"]) -> tuple[Float[Array, " 3"], Float[Array, ""]]:
-    """(rotation vector [rad], 1) instead of MJX's (axis, angle), of which MJX only ever takes the product."""
+    """Return (rotation vector [rad], 1) instead of MJX's (axis, angle), of which MJX only uses the product."""
     still = jnp.zeros_like(quaternion).at[0].set(1.0)
     return rotation_between(still, quaternion), jnp.ones_like(quaternion[0])
 
 
 def rotation_difference(end: Float[Array, " 4"], start: Float[Array, " 4"]) -> Float[Array, " 3"]:
-    """The rotation vector [rad] from `start` to `end`; MJX's `quat_sub`."""
+    """Rotation vector [rad] from `start` to `end`; replaces MJX's `quat_sub`."""
     return rotation_between(start, end)
 
 
 def turned_quaternion(
     quaternion: Float[Array, " 4"], velocity: Float[Array, " 3"], timestep: Float[Array, ""] | float
 ) -> Float[Array, " 4"]:
-    """The unit quaternion after a timestep [s] at an angular velocity [rad/s]; MJX's `quat_integrate`."""
+    """Unit quaternion after a timestep [s] at an angular velocity [rad/s]; replaces MJX's `quat_integrate`."""
     return rotate_quaternion(quaternion, timestep * velocity)
 
 
 def _module(name: str) -> Any:
-    """A module of MJX's implementation, or the package `mujoco.mjx`, by the empty name."""
+    """A module of MJX's implementation, or the package `mujoco.mjx` for the empty name."""
     return sys.modules[f"{mjx.make_constraint.__module__.rpartition('.')[0]}.{name}"] if name else mjx
 
 
@@ -106,10 +106,10 @@ _mjx_spring_damper = getattr(_module("passive"), "_spring_damper", None)
 
 
 def springs_and_dampers(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]:
-    """MJX's springs and dampers [N or N m] of joints and tendons, with a tendon's stiffness at its rest length.
+    """MJX's spring and damper forces [N or N m] of joints and tendons, with tendon stiffness at the rest length.
 
-    A spring with a single rest length rather than a range is linear; MJX composes it of two halves that both have
-    derivative zero where they meet. What is added is zero in value, not in derivative.
+    A spring with a single rest length rather than a range is linear; MJX composes it of two halves that both have zero
+    derivative where they meet. The correction has zero value but nonzero derivative.
     """
     assert _mjx_spring_damper is not None, "`patched` has checked that MJX has it"
     force = _mjx_spring_damper(model, data)
@@ -126,10 +126,10 @@ _mjx_wrap_inside = getattr(_module("support"), "wrap_inside", None)
 
 
 def wrap_inside(*arguments: Any) -> tuple[Float[Array, " 1"], Float[Array, " 4"]]:
-    """MJX's path of a tendon inside a sphere or cylinder: (length along it or -1, points of contact).
+    """MJX's path of a tendon inside a sphere or cylinder: (length along it or -1, contact points).
 
-    The length is always 0; MJX takes the square root of its square, which has no derivative at 0. Here it is
-    negligibly small instead, and differentiable.
+    The length is always 0; MJX takes the square root of its square, which has no derivative at 0. Here it is negligibly
+    small instead, and differentiable.
     """
     assert _mjx_wrap_inside is not None, "`patched` has checked that MJX has it"
     length, points = _mjx_wrap_inside(*arguments)
@@ -143,8 +143,8 @@ _mjx_cylinder = getattr(_module("collision_sdf"), "_cylinder", None)
 def cylinder_distance(position: Float[Array, " 3"], size: Float[Array, " 3"]) -> Float[Array, ""]:
     """MJX's signed distance [m] of a point from a cylinder along z, with size (radius, half length, 0) [m].
 
-    MJX places contacts by its gradient. Where the point is inside, the square root of the branch for points outside is
-    at 0, so that the gradient has no derivative in reverse mode.
+    MJX places contacts by its gradient. For an inside point, the square root in the branch for outside points is at 0,
+    so the gradient has no derivative in reverse mode.
     """
     assert _mjx_cylinder is not None, "`patched` has checked that MJX has it"
     return _mjx_cylinder(position, size)
@@ -166,12 +166,12 @@ def _cylinder_jvp(primals: Any, tangents: Any) -> Any:
 
 
 def _root(square: Float[Array, ""]) -> Float[Array, ""]:
-    """The square root, with derivative 0 at 0."""
+    """Square root, with derivative 0 at 0."""
     return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
 
 
 def _positive(length: Float[Array, ""]) -> Float[Array, ""]:
-    """What MJX divides by in place of a length: not 0."""
+    """Nonzero length to divide by, as in MJX."""
     return length + 1e-12 * (length <= 1e-8)
 
 
@@ -179,7 +179,7 @@ _mjx_factor_m, _mjx_solve_m = (getattr(_module("smooth"), name, None) for name i
 
 
 def factored_inertia(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """MJX's factorisation of the inertia; dense, by this project's, which is unrolled where it is small."""
+    """MJX's factorisation of the inertia; dense ones use this project's, unrolled if small."""
     assert _mjx_factor_m is not None, "`patched` has checked that MJX has it"
     rows: Any = data._impl
     if rows.M.ndim != 2:
@@ -201,9 +201,9 @@ _mjx_body_tree = getattr(_module("scan"), "body_tree", None)
 
 
 def body_tree(model: mjx.Model, of_body: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
-    """MJX's walk along the tree of bodies, which XLA must not fuse across its levels.
+    """MJX's traversal of the body tree, with a barrier against fusion across levels.
 
-    Fused, a body's ancestors are computed again for each of their uses: time that grows exponentially with depth.
+    If fused, XLA recomputes a body's ancestors for each of their uses, in time exponential in the depth.
     """
     assert _mjx_body_tree is not None, "`patched` has checked that MJX has it"
 
@@ -219,7 +219,7 @@ def body_tree(model: mjx.Model, of_body: Callable[..., Any], *arguments: Any, **
 
 
 Place = tuple[str, str]
-"""Module and name of a function of MJX; no module is the package, whose names only callers of MJX use."""
+"""Module and name of an MJX function; the empty module is the package, whose names only callers of MJX use."""
 
 _REPLACED: Final[dict[Place, Callable[..., Any]]] = {
     ("constraint", "_kbi"): stiffness_damping_impedance,
@@ -234,24 +234,24 @@ _REPLACED: Final[dict[Place, Callable[..., Any]]] = {
     ("smooth", "solve_m"): solved_inertia,
 }
 AT_FIRST_TOUCH: Final = {("constraint", "_kbi"): _touching}
-"""Gives every active constraint row the values of first touch."""
+"""Gives every active constraint row its values at first touch."""
 RELAXING: Final = {("constraint", "_kbi"): _relaxing}
-"""Gives every active constraint row a reference acceleration of minus its relaxation rate times its velocity."""
+"""Makes every active row's reference acceleration minus its relaxation rate times its velocity."""
 
 _CHOSEN: Final = jax.make_user_context(())
-"""Pairs of place and function, in this thread; JAX traces again what it has traced with others."""
+"""This thread's pairs of place and function; JAX retraces functions traced with others."""
 
 
 @contextlib.contextmanager
 def patched(also: Mapping[Place, Callable[..., Any]] = MappingProxyType({})) -> Generator[None]:
-    """Patch MJX with the functions of this module, and others, in whatever this thread traces inside.
+    """Patch MJX with this module's and other functions in everything that this thread traces inside.
 
-    MJX has no hook for them: they are called deep inside its pipeline. If a version of MJX lacks one of them, that is
-    an error here rather than a silent return of the fault. The first time leaves a branch in MJX at each place; outside
-    of this context, and in other threads, it takes MJX's own function.
+    MJX has no hook for them, since they are called deep inside its pipeline. If a version of MJX lacks one of them,
+    this raises rather than silently bringing back the fault. The first use leaves a branch in MJX at each place;
+    outside of this context, and in other threads, it takes MJX's own function.
 
     Raises:
-        RuntimeError: MJX has no function of such a name.
+        RuntimeError: MJX lacks one of the functions.
     """
     chosen = {**_REPLACED, **also}
     for place in chosen:

@@ -1,4 +1,4 @@
-"""Graphs of operations between scalars, with constants folded and equal operations once."""
+"""Graphs of scalar operations with constant folding and common subexpression elimination."""
 
 import math
 import typing
@@ -45,20 +45,20 @@ T = TypeVar("T", bound=Callable[..., Any])
 
 
 def no_type_check(each: T) -> T:
-    """Leaves what is called for every entry out of the types that tests check at run time; they would take longer."""
+    """Exclude a function called for every entry from the tests' run-time type checks, which would slow it down."""
     return typing.no_type_check(each)
 
 
 class TooLargeError(Exception):
-    """More scalars than are worth their compilation."""
+    """The graph has too many scalars to be worth compiling."""
 
 
 @no_type_check
 class Node:
-    """A scalar that depends on the inputs: an operation, with nodes and NumPy scalars as its arguments.
+    """A scalar that depends on the inputs: an operation, with nodes and NumPy scalars as arguments.
 
     `operation` is a JAX primitive or "input", "carry" (of a loop), "whole" (an operation on whole arrays), "loop", or
-    "output" (an entry of what one of the last two returns, its only argument). Arguments have lower numbers.
+    "output" (an entry of the result of one of the last two, its only argument). Arguments have lower numbers.
     """
 
     __slots__ = ("arguments", "dtype", "number", "operation", "parameters")
@@ -70,7 +70,7 @@ class Node:
 
 @no_type_check
 class ScalarGraph:
-    """The operations of a function, each once."""
+    """The operations of a function, without duplicates."""
 
     def __init__(self, most: int):
         self._count, self._most = 0, most
@@ -83,18 +83,18 @@ class ScalarGraph:
         return Node(self._count, operation, arguments, parameters, dtype)
 
     def fresh(self, kind: str, shape: tuple[int, ...], dtype: Any) -> np.ndarray:
-        """An array of nodes without arguments."""
+        """Create an array of nodes without arguments."""
         return filled(shape, (self.node(kind, (), None, dtype) for _ in range(math.prod(shape))))
 
     def outputs(self, node: Node, avals: Sequence[Any]) -> list[np.ndarray]:
-        """The entries of what an operation on whole arrays returns."""
+        """Return the output entries of an operation on whole arrays."""
         return [
             filled(aval.shape, [self.node("output", (node,), (place, at), aval.dtype) for at in np.ndindex(aval.shape)])
             for place, aval in enumerate(avals)
         ]
 
     def scalar(self, primitive: Any, arguments: tuple[Any, ...], dtype: Any, **parameters: Any) -> Any:
-        """One entry of an elementwise operation: a constant, a node that is there, or a new one."""
+        """Return one entry of an elementwise operation: a constant, an existing node, or a new one."""
         name = primitive.name
         if not any(isinstance(each, Node) for each in arguments):
             return _folded(primitive, arguments, dtype, parameters)
@@ -108,7 +108,7 @@ class ScalarGraph:
         return self._known[key]
 
     def _simpler(self, name: str, arguments: tuple[Any, ...], dtype: Any) -> Any:
-        """A simpler form of an operation with some constant or equal arguments; None if there is none."""
+        """Simplify an operation with constant or equal arguments; None if impossible."""
         match name, arguments:
             case ("add" | "add_any", (a, b)) if _is(a, 0) or _is(b, 0):
                 return b if _is(a, 0) else a
@@ -145,7 +145,7 @@ class ScalarGraph:
         return filled(aval.shape, [self.scalar(primitive, each, aval.dtype, **parameters) for each in entries])
 
     def reduced(self, primitive: Any, rows: np.ndarray, aval: Any) -> np.ndarray:
-        """Combine entries along the last axis; zeros of an empty one."""
+        """Combine entries along the last axis; an empty axis gives zeros."""
         if not rows.shape[-1]:
             return constants(np.zeros(aval.shape, aval.dtype))
         result = rows[..., 0]
@@ -156,7 +156,7 @@ class ScalarGraph:
 
 @no_type_check
 def constants(value: Any) -> np.ndarray:
-    """An array of NumPy scalars."""
+    """Return an array of NumPy scalars."""
     array = np.asarray(value)
     return filled(array.shape, [array[index] for index in np.ndindex(array.shape)])
 
@@ -186,7 +186,7 @@ def _is(value: Any, number: int) -> bool:
 
 @no_type_check
 def _folded(primitive: Any, arguments: tuple[Any, ...], dtype: Any, parameters: dict[str, Any]) -> Any:
-    """An operation between constants."""
+    """Evaluate an operation on constants."""
     match primitive.name:
         case "select_n":
             return arguments[1 + int(arguments[0])]
@@ -201,7 +201,7 @@ def _folded(primitive: Any, arguments: tuple[Any, ...], dtype: Any, parameters: 
 
 @no_type_check
 def needed_for(outputs: Iterable[Any]) -> list[Node]:
-    """The nodes that outputs depend on, arguments first."""
+    """Return the nodes that the outputs depend on, arguments first."""
     found: dict[int, Node] = {}
     stack = [each for each in outputs if isinstance(each, Node)]
     while stack:

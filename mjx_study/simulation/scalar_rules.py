@@ -1,7 +1,7 @@
-"""What operations that move, sum or choose entries do to arrays of scalars.
+"""Rules for operations that move, sum or select entries of scalar arrays.
 
-Each rule is a function (graph, inputs, aval of the output, parameters) -> outputs, or None where the operation is left
-as it is.
+Each rule is a function (graph, inputs, aval of the output, parameters) -> outputs, or None to leave the operation as it
+is.
 """
 
 import itertools
@@ -52,7 +52,7 @@ def _pad(
 
 @no_type_check
 def _window(inputs: list[np.ndarray], shape: tuple[int, ...], sizes: Sequence[Any]) -> tuple[slice, ...] | None:
-    """Where a dynamic slice lies, if that is known."""
+    """Position of a dynamic slice, if known."""
     starts = [each[()] for each in inputs]
     if any(isinstance(each, Node) for each in starts):
         return None
@@ -91,7 +91,7 @@ def _places(
     batch_dims: tuple[Sequence[Any], Sequence[Any]],
     clip: bool,
 ) -> np.ndarray:
-    """Flat places in an array of some shape that a gather reads or a scatter writes, -1 outside of the array.
+    """Flat indices that a gather reads or a scatter writes in an array, -1 if out of bounds.
 
     The arguments are those of `jax.lax.GatherDimensionNumbers`: offset_dims, collapsed_slice_dims, start_index_map and
     the two operand and indices batching dims.
@@ -115,7 +115,7 @@ def _places(
 def _gather(
     graph: ScalarGraph, inputs: list[np.ndarray], aval: Any, parameters: dict[str, Any]
 ) -> list[np.ndarray] | None:
-    """By constant indices, or by a single one that is not known: a choice between its values."""
+    """Gather by constant indices, or by a single unknown one: a selection among its values."""
     array, indices = inputs
     numbers, sizes = parameters["dimension_numbers"], parameters["slice_sizes"]
     unknown = {each.number: each for each in indices.flat if isinstance(each, Node)}
@@ -146,7 +146,7 @@ def _gather(
     if len(unknown) > 1:
         return None
     (index,) = unknown.values()
-    result = picked(-1)  # as outside of the array, or clipped
+    result = picked(-1)  # out of bounds, or clipped
     for value in range(max(array.shape, default=0)):
         here = graph.scalar(lax.eq_p, (index, index.dtype.type(value)), np.dtype(bool))
         result = graph.elementwise(lax.select_n_p, [filled((), [here]), result, picked(value)], aval)

@@ -1,10 +1,10 @@
-"""Functions of small arrays, written out entry by entry.
+"""Evaluate functions of small arrays entry by entry.
 
-MJX computes with arrays of a few entries (poses, inertias, Jacobians, constraint rows), many of them 0 or 1 whatever
-the state. Batched, each of its thousands of operations is a loop or a kernel of its own, with strided access and
-products of tiny matrices, and constants are computed for every sample. `unrolled` evaluates a function's jaxpr entry by
-entry: it folds constants, computes common subexpressions once, and drops what no output needs. What is left are
-operations between scalars, which under `vmap` are contiguous arrays over the batch, and fuse.
+MJX computes with arrays of a few entries (poses, inertias, Jacobians, constraint rows), many of which are always 0 or
+1. Batched, each of its thousands of operations is a separate loop or kernel with strided access and tiny matrix
+products, and constants are recomputed for every sample. `unrolled` evaluates a function's jaxpr entry by entry: it
+folds constants, eliminates common subexpressions, and drops what no output needs. The remaining scalar operations
+act on contiguous arrays over the batch under `vmap`, and fuse.
 """
 
 import itertools
@@ -34,7 +34,7 @@ from mjx_study.simulation.scalar_graph import (
 from mjx_study.simulation.scalar_rules import RULES
 
 MOST_SCALARS: Final = {"cpu": 12_000, "gpu": 6_000, "tpu": 6_000}
-"""Largest number of scalar operations, by backend; XLA's time to compile them grows faster than their number."""
+"""Maximum number of scalar operations, by backend; XLA's compile time grows faster than linearly in it."""
 
 _SAME: Final = frozenset({"copy", "copy_p", "name", "optimization_barrier"})
 _FUNCTIONS: Final = {
@@ -50,24 +50,24 @@ _FUNCTIONS: Final = {
     lax.or_p: lax.bitwise_or,
     lax.select_n_p: lax.select_n,
 }
-"""Operations that rules add; these functions give primitives the parameters that they have in this version of JAX."""
+"""Functions for operations that rules add; they supply the primitive parameters of the installed JAX version."""
 _WRITTEN_OUT: Final[dict[Any, Callable[..., Any] | None]] = {}
-"""Graphs as functions, by all that they depend on; None for what is too large. JAX batches and differentiates each of
-them once for all programs that it is part of."""
+"""Graphs as functions, keyed by everything they depend on; None if too large. JAX batches and differentiates each of
+them once for all programs that use it."""
 MOST_KEPT: Final = 64
-"""Functions that are kept written out."""
+"""Maximum number of functions in `_WRITTEN_OUT`."""
 _CALLS: Final = {"closed_call": "call_jaxpr", "jit": "jaxpr", "pjit": "jaxpr"}
 
 
 def unrolled(function: Callable[..., Any], *arguments: Any) -> Any:
-    """`function(*arguments)`, computed entry by entry, or as it is if that takes more than `MOST_SCALARS` operations.
+    """Evaluate `function(*arguments)` entry by entry, or as is if that takes more than `MOST_SCALARS` operations.
 
-    Arrays among the arguments that are not traced are constants. The result is the function's up to rounding, except
-    that 0 times infinity or NaN is 0 where the 0 is a constant. Forward and reverse mode differentiate it like the
-    function itself.
+    Untraced arrays among the arguments are constants. The result equals the function's up to rounding, except that 0
+    times infinity or NaN is 0 where the 0 is a constant. Forward and reverse mode differentiate it like the function
+    itself.
 
     Args:
-        function: any function that JAX can trace.
+        function: any traceable function.
         *arguments: pytrees of arrays.
 
     Returns:
@@ -88,7 +88,7 @@ def unrolled(function: Callable[..., Any], *arguments: Any) -> Any:
 
 
 def _name(function: Callable[..., Any]) -> Any:
-    """What is the same for partials of the same function and arguments."""
+    """Return a key shared by partials of the same function and arguments."""
     if isinstance(function, partial):
         return function.func, function.args, tuple(sorted(function.keywords.items()))
     return function
@@ -96,7 +96,7 @@ def _name(function: Callable[..., Any]) -> Any:
 
 @no_type_check
 def _content(leaf: Any) -> Any:
-    """What a graph depends on: the type of what is traced, the value of what is not."""
+    """Return what a graph depends on: the type of traced leaves, the value of others."""
     if isinstance(leaf, Tracer):
         return jax.typeof(leaf)
     array = np.asarray(leaf)
@@ -106,7 +106,7 @@ def _content(leaf: Any) -> Any:
 def _written_out(
     function: Callable[..., Any], arguments: tuple[Any, ...], leaves: Sequence[Any], most: int
 ) -> Callable[..., Any] | None:
-    """The function of those leaves of its arguments that are traced; None if it takes too many operations."""
+    """Build a function of the traced leaves of the arguments; None if it takes too many operations."""
     jaxpr, shape = jax.make_jaxpr(function, return_shape=True)(*arguments)
     graph = ScalarGraph(2 * most)
     traced = [isinstance(leaf, Tracer) for leaf in leaves]
@@ -138,9 +138,9 @@ def _written_out(
 
 
 def traced_part(tree: Any) -> tuple[list[Any], Callable[[list[Any]], Any]]:
-    """The leaves of a pytree that are traced, None for the others, and a function that puts them back.
+    """Return the traced leaves of a pytree, with None for others, and a function that reassembles it.
 
-    What goes through `jax.custom_jvp` is traced inside of it; this keeps constants out of it, so that they fold.
+    `jax.custom_jvp` traces its arguments; this keeps constants out of them, so that they fold.
     """
     leaves, structure = jax.tree.flatten(tree)
 
@@ -154,7 +154,7 @@ def traced_part(tree: Any) -> tuple[list[Any], Callable[[list[Any]], Any]]:
 def _run(
     graph: ScalarGraph, jaxpr: Any, closed: Sequence[np.ndarray], inputs: Sequence[np.ndarray]
 ) -> list[np.ndarray]:
-    """The outputs of a jaxpr; arrays have entries that are nodes or NumPy scalars."""
+    """Evaluate a jaxpr; array entries are nodes or NumPy scalars."""
     values = dict(zip((*jaxpr.constvars, *jaxpr.invars), (*closed, *inputs), strict=True))
 
     def read(atom: Any) -> np.ndarray:
@@ -196,7 +196,7 @@ def _equation(graph: ScalarGraph, equation: Any, inputs: list[np.ndarray]) -> Se
 
 
 def _loop(graph: ScalarGraph, equation: Any, inputs: list[np.ndarray]) -> list[np.ndarray]:
-    """A while loop over scalars; what does not change in it is computed before it."""
+    """While loop over scalars, with loop invariants computed beforehand."""
     parameters, avals = equation.params, [each.aval for each in equation.outvars]
     first, second = parameters["cond_nconsts"], parameters["cond_nconsts"] + parameters["body_nconsts"]
     during = [graph.fresh("carry", aval.shape, aval.dtype) for aval in avals]
@@ -220,9 +220,9 @@ def _loop(graph: ScalarGraph, equation: Any, inputs: list[np.ndarray]) -> list[n
 
 
 def _whole(equation: Any, arrays: Sequence[jax.Array]) -> Sequence[jax.Array]:
-    """The outputs of an operation on whole arrays, with its own rule of differentiation where it has one."""
+    """Apply an operation to whole arrays, with its own differentiation rule if it has one."""
     parameters = equation.primitive.get_bind_params(equation.params)
-    functions, parameters = parameters if isinstance(parameters, tuple) else ((), parameters)  # by JAX's version
+    functions, parameters = parameters if isinstance(parameters, tuple) else ((), parameters)  # depends on JAX version
     found = equation.primitive.bind(*functions, *arrays, **parameters)
     return found if equation.primitive.multiple_results else [found]
 
@@ -235,7 +235,7 @@ def _array(entries: Iterable[Any], aval: Any) -> jax.Array:
 
 @no_type_check
 def _emit(nodes: Iterable[Node], values: dict[int, Any]) -> None:
-    """Compute nodes with JAX, arguments first; `values` has some of them, and in the end all."""
+    """Compute nodes with JAX, arguments first, and add them to `values`."""
     for node in nodes:
         if node.number in values:
             continue

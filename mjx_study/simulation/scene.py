@@ -1,4 +1,4 @@
-"""A scene: one MJCF, compiled by MuJoCo and put on the device for MJX."""
+"""A scene: an MJCF compiled by MuJoCo and put on the device for MJX."""
 
 import copy
 import dataclasses
@@ -26,41 +26,41 @@ SceneOption = str | float | int | Sequence[str]
 ADJOINTS: Final = ("auto", "jacobian", "tape")
 """Ways to differentiate steps (see `Scene.adjoint`)."""
 JACOBIAN_COLUMNS: Final = {"cpu": 20, "gpu": 13, "tpu": 13}
-"""Largest number of columns (nq + nv + na + nu) for which "auto" forms a step's Jacobian, by backend: beyond, the tape
-costs less (docs/performance.md)."""
+"""Maximum number of columns (nq + nv + na + nu) for which "auto" forms a step's Jacobian, by backend; beyond, the tape
+is cheaper (docs/performance.md)."""
 _POSITIVE: Final = ("timestep", "iterations", "ls_iterations", "tolerance")
 
 
 class SceneError(ValueError):
-    """An MJCF that cannot be found, compiled, or run by MJX."""
+    """An MJCF that cannot be found or compiled, or that MJX cannot run."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Scene:
-    """A compiled model on the host and on the device, with an empty `mjx.Data` as template for each step.
+    """A compiled model on the host and on the device, with an empty `mjx.Data` as template for steps.
 
-    Options that are static in MJX (cone, solver, integrator, iteration budgets) are fixed here; contact parameters are
-    array leaves of `model` and are swept without recompiling (see `mjx_study.simulation.contact`).
+    Options that are static in MJX (cone, solver, integrator, iteration budgets) are fixed; contact parameters are array
+    leaves of `model` and can be swept without recompiling (see `mjx_study.simulation.contact`).
 
     Attributes:
-        name: its name in messages.
-        host: the compiled model on the host.
-        model: the same for MJX.
-        template: an empty state.
-        adjoint: how its steps are differentiated; the derivatives are equal to rounding.
+        name: name in messages.
+        host: compiled model on the host.
+        model: the same model for MJX.
+        template: empty `mjx.Data`.
+        adjoint: how steps are differentiated; the derivatives agree to rounding.
 
-            - "jacobian": each step forms its Jacobian, in forward mode, column by column. Reverse mode stores
-              nv (nq + nv + na + nu) numbers per step and replays nothing; the work grows with the number of columns.
-              Not for RK4.
+            - "jacobian": each step forms its Jacobian column by column in forward mode. Reverse mode stores
+              nv (nq + nv + na + nu) numbers per step and replays nothing; the work grows with the number of
+              columns. Not for RK4.
             - "tape": automatic differentiation around the implicit solve. The work hardly depends on the number of
-              columns; reverse mode runs each step again and, within it, is at the mercy of MJX's own operations
-              (fault 13 in `docs/gradient-faults.md`).
+              columns; reverse mode reruns each step and differentiates MJX's own operations in reverse (fault 13 in
+              `docs/gradient-faults.md`).
             - "auto": the Jacobian up to `JACOBIAN_COLUMNS` columns, which depend on the backend, else the tape.
 
-            Derivatives with respect to the model always take the tape.
+            Derivatives with respect to the model always use the tape.
 
     Raises:
-        SceneError: an unknown adjoint, or the Jacobian of RK4.
+        SceneError: unknown adjoint, or "jacobian" with RK4.
     """
 
     name: str
@@ -77,7 +77,7 @@ class Scene:
 
     @property
     def uses_jacobian(self) -> bool:
-        """Whether steps form their Jacobian; else they use the tape."""
+        """Whether steps form their Jacobian rather than using the tape."""
         host = self.host
         small = host.nq + host.nv + host.na + host.nu <= JACOBIAN_COLUMNS[jax.default_backend()]
         return self.adjoint == "jacobian" or (self.adjoint == "auto" and small and not self._explicit)
@@ -92,7 +92,7 @@ class Scene:
 
     @property
     def has_constraints(self) -> bool:
-        """Whether MJX allocates any constraint row (contact, limit, equality or friction loss)."""
+        """Whether MJX allocates any constraint rows (contact, limit, equality or friction loss)."""
         return num_constraint_rows(self.template) > 0
 
     def geom(self, name: str) -> int:
@@ -118,7 +118,7 @@ def num_constraint_rows(data: mjx.Data) -> int:
 
 
 def models_folder() -> Path:
-    """Folder of the shipped MJCF files (beside the package in a checkout)."""
+    """Folder of the shipped MJCF files (next to the package in a checkout)."""
     package = Path(str(resources.files("mjx_study")))
     packaged = package / "models"
     return packaged if packaged.is_dir() else package.parent / "models"
@@ -129,10 +129,10 @@ def model_names() -> list[str]:
 
 
 def load_scene(source: str | Path, *, adjoint: SceneOption = "auto", **options: SceneOption) -> Scene:
-    """Compile an MJCF and put it on the device; see `load_model` for the arguments, and `Scene` for `adjoint`.
+    """Compile an MJCF and put it on the device; see `load_model` for the arguments and `Scene` for `adjoint`.
 
     Raises:
-        SceneError: as `load_model` and `Scene`, or MJX cannot run the model; the message says why.
+        SceneError: as for `load_model` and `Scene`, or MJX cannot run the model; the message says why.
     """
     return put_scene(load_model(source, **options), Path(source).stem, adjoint=adjoint)
 
@@ -142,12 +142,12 @@ def load_model(source: str | Path, **options: SceneOption) -> mujoco.MjModel:
 
     Args:
         source: name of a shipped model (`"pusher"`) or path of an MJCF file.
-        **options: override the file's options: `cone` (pyramidal, elliptic), `solver` (newton, cg), `integrator`
-            (euler, implicitfast, rk4), `timestep` [s], `iterations`, `ls_iterations`, `tolerance`; and
-            `disable_flags`, names of MJCF flags to disable, as a sequence or separated by commas.
+        **options: overrides of the file's options: `cone` (pyramidal, elliptic), `solver` (newton, cg), `integrator`
+            (euler, implicitfast, rk4), `timestep` [s], `iterations`, `ls_iterations`, `tolerance`; and `disable_flags`,
+            MJCF flags to disable, as a sequence or comma-separated.
 
     Raises:
-        SceneError: the file is missing or does not parse, or an option is unknown or out of range.
+        SceneError: the file is missing or invalid, or an option is unknown or out of range.
     """
     path = _find(source)
     if excess := too_large(path):
@@ -163,7 +163,7 @@ def load_model(source: str | Path, **options: SceneOption) -> mujoco.MjModel:
 
 
 def put_scene(host: mujoco.MjModel, name: str, *, adjoint: SceneOption = "auto", **options: SceneOption) -> Scene:
-    """Put a compiled model on the device; with `options` (see `load_model`), a copy of it. `adjoint`: see `Scene`.
+    """Put a compiled model on the device, or a copy with `options` (see `load_model`). `adjoint`: see `Scene`.
 
     Raises:
         SceneError: MJX cannot run the model or would ignore part of it, or an option is unknown or out of range.
@@ -171,7 +171,7 @@ def put_scene(host: mujoco.MjModel, name: str, *, adjoint: SceneOption = "auto",
     if options or not FLAGS["energy"].disabled(host.opt):
         host = copy.copy(host)
         _set_options(host, options)
-        FLAGS["energy"].disable(host.opt)  # MJX refuses it, and no motion depends on it
+        FLAGS["energy"].disable(host.opt)  # MJX rejects it, and it does not affect the motion
     check_model(host, name)
     try:
         model = mjx.put_model(host)
@@ -179,7 +179,7 @@ def put_scene(host: mujoco.MjModel, name: str, *, adjoint: SceneOption = "auto",
     except (NotImplementedError, ValueError, AssertionError) as error:
         reason = str(error) or type(error).__name__
         raise SceneError(f"MJX cannot run {name}: {reason}") from error
-    # `make_data` on a shared host leaves weakly typed leaves; fix their types once so that loops carry them.
+    # `make_data` on a shared host gives weakly typed leaves; fix their types so that loops can carry them.
     template = jax.tree.map(lambda leaf: leaf if isinstance(leaf, np.ndarray) else jax.numpy.asarray(leaf), template)
     scene = Scene(name, host, model, template, str(adjoint))
     if host.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4 and scene.has_constraints:
@@ -205,15 +205,15 @@ def _find(source: str | Path) -> Path:
 
 
 def require(scene: Scene, *, joints: tuple[str, ...], geoms: tuple[str, ...], driven: tuple[str, ...] = ()) -> None:
-    """Refuse a model that a task cannot use.
+    """Reject a model that a task cannot use.
 
     Args:
-        joints: names of all its joints, of one coordinate each, in state order.
-        geoms: names of geoms that it must have.
-        driven: name of the joint that each actuator drives, in control order.
+        joints: names of all its joints, with one coordinate each, in state order.
+        geoms: names of required geoms.
+        driven: joint driven by each actuator, in control order.
 
     Raises:
-        SceneError: a name is missing, or a size or the order is different.
+        SceneError: a name is missing, or a size or the order differs.
     """
     host = scene.host
     indices = [scene.joint(name) for name in joints]
@@ -263,10 +263,10 @@ def _disable_flags(host: mujoco.MjModel, names: SceneOption) -> None:
 
 
 def check_model(host: mujoco.MjModel, name: str = "the model") -> None:
-    """Refuse a model with features that MJX lacks, or would ignore without a word.
+    """Reject a model with features that MJX lacks or would silently ignore.
 
     Raises:
-        SceneError: there are such features; the message names them and what to do.
+        SceneError: there are such features; the message names them and a remedy.
     """
     for option, choices in _ENUMERATED.items():
         value = int(getattr(host.opt, option))
