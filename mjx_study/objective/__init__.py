@@ -1,10 +1,10 @@
-"""(Task, ContactModel) -> the Objective that estimators see.
+"""Turn a task and a contact model into the Objective that estimators take.
 
-Batching, chunks and devices are handled here and nowhere else. A `Simulator` holds the compiled programs of a task, one
-for each kind of batch that estimators ask for; contact parameters, theta, sigma and keys are arguments, so a sweep over
-them compiles nothing new. Samples run in chunks of fixed size that bound memory, on all devices at once: a chunk is one
-call of a program for one device, so that each device leaves the solver's loop independently. What a chunk holds does
-not depend on the devices, and neither does a bit of the result.
+Batching, chunks and devices are handled only here. A `Simulator` holds the compiled programs of a task, one for each
+kind of batch that estimators need; contact parameters, theta, sigma and keys are arguments, so sweeping them compiles
+nothing new. Samples run in fixed-size chunks that bound memory, on all devices at once: each chunk is one call of a
+program on one device, so that devices leave the solver's loop independently. The contents of a chunk do not depend on
+the devices, and neither do the bits of the result.
 """
 
 from mjx_study.objective.batches import (

@@ -1,4 +1,4 @@
-"""Batches of samples on all devices: the programs of a task, compiled, and the `Objective` that estimators see."""
+"""Batches of samples on all devices: a task's compiled programs, and the `Objective` that estimators take."""
 
 import dataclasses
 import math
@@ -22,12 +22,12 @@ from mjx_study.stopwatch import timed
 from mjx_study.tasks.task import Task, check_sigma
 
 LAPACK_BATCH: Final = 2048
-"""Batch from which jaxlib 0.10.2 divides factorisations of matrices among its threads on CPUs, which never ends where
-two programs do so at a time. Matrices of up to `SMALL` rows do not go to LAPACK."""
+"""Batch size from which jaxlib 0.10.2 splits matrix factorisations among its CPU threads, which deadlocks if two
+programs do so at a time. Matrices with up to `SMALL` rows do not use LAPACK."""
 
 
 def compiled_rollout(task: Task) -> Compiled:
-    """`simulate` of a task, a function of (theta, contact, key, noise_scale)."""
+    """Compile `simulate` for a task, as a function of (theta, contact, key, noise_scale)."""
     return Compiled(partial(simulate, task), "rollout", task)
 
 
@@ -37,8 +37,8 @@ class Simulator:
 
     Attributes:
         task: the task to simulate; each call replaces its scene's contact parameters.
-        chunk_size: samples per device and call; `chunk_for` chooses one.
-        devices: devices over which samples are spread; by default all local ones.
+        chunk_size: samples per device and call; see `chunk_for`.
+        devices: devices to spread samples over; by default all local ones.
     """
 
     task: Task
@@ -55,42 +55,42 @@ class Simulator:
         object.__setattr__(self, "_programs", {name: Compiled(each, name, self.task) for name, each in batched.items()})
 
     def objective(self, contact: ContactModel | None, sigma: float | None = None) -> "MjxObjective":
-        """The objective under a contact model, with the task's noise level or another."""
+        """Return the objective for a contact model, with the task's noise level or another."""
         return MjxObjective(self, contact, self.task.sigma if sigma is None else sigma)
 
     @property
     def num_compilations(self) -> int:
-        """Number of programs that this simulator has compiled so far."""
+        """Number of programs compiled by this simulator so far."""
         return sum(program.num_compilations for program in self._programs.values())  # type: ignore[attr-defined]
 
     def memory(self, kind: str, contact: ContactModel | None, samples: int) -> int:
-        """XLA's planned temporary memory for a batch of one kind, all chunks at once on all devices [bytes]."""
+        """XLA's planned temporary memory [bytes] for a batch of one kind, all chunks at once on all devices."""
         arguments = self._chunk(self.task.theta, contact, 1.0)
         plan = self._programs[kind].jitted.lower(*arguments).compile().memory_analysis()  # type: ignore[attr-defined]
         return plan.temp_size_in_bytes * samples // self.chunk_size
 
     def run(self, name: str, theta: Any, contact: ContactModel | None, sigma: Any, keys: Any, noise_scale: Any) -> Any:
-        """Run one of `SamplePrograms`, see `spread`.
+        """Run one of `SamplePrograms` on all samples; see `spread`.
 
         Args:
             name: name in `SamplePrograms`.
             theta: parameters, (params,).
             contact: the contact model; None for the MJCF's own.
-            sigma: standard deviation of the noise, in the unit of what it is added to.
+            sigma: standard deviation of the noise, in the unit of the quantity it is added to.
             keys: data of each sample's key.
-            noise_scale: factor on each sample's noise.
+            noise_scale: noise factor of each sample.
 
         Returns:
-            The program's outputs with a leading axis of samples; as `spread` returns them.
+            The program's outputs with a leading axis of samples, as returned by `spread`.
 
         Raises:
-            ValueError: sigma or theta is invalid, or there is no sample.
+            ValueError: sigma or theta is invalid, or there are no samples.
         """
         check_sigma(sigma)
         if theta.shape != (self.task.policy.num_params,):
             raise ValueError(f"theta has shape {theta.shape}, the policy needs ({self.task.policy.num_params},)")
         if len(noise_scale) == 0:
-            raise ValueError("there is no sample to run: give at least one key")
+            raise ValueError("there are no samples to run: give at least one key")
         shared = theta, contact, np.asarray(sigma, self.task.scene.template.qpos.dtype)
         devices = self._devices_for(name)
         with timed(self.program(name, contact), rounds(len(noise_scale), self.chunk_size, len(devices))):
@@ -98,23 +98,23 @@ class Simulator:
             return jax.block_until_ready(spread(program, shared, (keys, noise_scale), self.chunk_size, devices))
 
     def form(self, name: str, theta: Any, contact: ContactModel | None, sigma: Any) -> Any:
-        """Shapes and types of what one of `SamplePrograms` returns for a chunk, without running it."""
+        """Shapes and types of a chunk's outputs of one of `SamplePrograms`, without running it."""
         arguments = self._chunk(theta, contact, sigma)
         program = self._programs[name]  # type: ignore[attr-defined]
         return jax.eval_shape(program.prepare(*arguments, platform=self.devices[0].platform), *arguments)
 
     def _chunk(self, theta: Any, contact: ContactModel | None, sigma: Any) -> tuple[Any, ...]:
-        """Arguments of a program for a chunk of equal samples, whose form is that of all chunks."""
+        """Program arguments for a chunk of identical samples, with the shapes of any chunk."""
         dtype = self.task.scene.template.qpos.dtype
         keys = np.zeros((self.chunk_size, 2), np.uint32)
         return theta, contact, np.asarray(sigma, dtype), keys, np.ones(self.chunk_size, dtype)
 
     def program(self, name: str, contact: ContactModel | None) -> tuple[str, Task, Any, int]:
-        """What the time of a call of one of `SamplePrograms` depends on: name, task, kind of contact, samples."""
+        """Key for the run time of one of `SamplePrograms`: name, task, kind of contact, samples per call."""
         return name, self.task, jax.tree.structure(contact), self.chunk_size
 
     def _devices_for(self, name: str) -> tuple[Any, ...]:
-        """The devices, or one where two at a time would wait for each other for ever; see `LAPACK_BATCH`."""
+        """All devices, or only one where two would deadlock; see `LAPACK_BATCH`."""
         corrected = name == "corrected" or self.task.onset != "none"
         batch = self.chunk_size * (SLOTS if corrected else 1)
         hangs = self.devices[0].platform == "cpu" and self.task.scene.host.nv > SMALL and batch >= LAPACK_BATCH
@@ -123,12 +123,12 @@ class Simulator:
 
 @dataclasses.dataclass(frozen=True)
 class MjxObjective:
-    """F(theta) = E V_1 of a task under one contact model; implements `estimators.Objective`.
+    """F(theta) = E V_1 of a task with a contact model; implements `estimators.Objective`.
 
     Attributes:
         simulator: the compiled programs, shared by all contact models of a sweep.
         contact: the contact model; None for the MJCF's own.
-        sigma: standard deviation of the noise, in the unit of what it is added to.
+        sigma: standard deviation of the noise, in the unit of the quantity it is added to.
     """
 
     simulator: Simulator
@@ -140,25 +140,26 @@ class MjxObjective:
         return self.simulator.task.policy.num_params
 
     def evaluate(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> Evaluation:
-        """Values and scores from rollouts alone; the dynamics are not differentiated.
+        """Evaluate values and scores by rollouts, without differentiating the dynamics.
 
-        The baseline, the zero-noise rollout from the same initial state, is run as extra samples whose noise is scaled
-        by 0: a single one if the initial state is fixed, otherwise one per sample.
+        The baseline, the zero-noise rollout from the same initial state, runs as extra samples with noise scale 0: a
+        single one if the initial state is fixed, otherwise one per sample.
         """
         (evaluation,) = self._evaluate(theta, keys, (1.0,))
         return evaluation
 
     def evaluate_odd(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> Evaluation:
-        """The part of the objective that is odd in the noise, (f(w) - f(-w)) / 2, from two rollouts per sample.
+        """Evaluate the part of the objective that is odd in the noise, (f(w) - f(-w)) / 2, with two rollouts per
+        sample.
 
-        Only the odd part correlates with the score of noise added to theta, so it has the same gradient; the even part,
+        Only the odd part correlates with the score of noise added to theta, so its gradient is the same; the even part,
         most of the variance of a zeroth-order sample, drops out.
 
         Raises:
-            ValueError: the policy has feedback, so that the score is not odd in the noise.
+            ValueError: the policy has feedback, so the score is not odd in the noise.
         """
         if not self.simulator.task.policy.additive:
-            raise ValueError("the odd part of an objective needs a policy whose noise is added to theta")
+            raise ValueError("the odd part of an objective requires a policy whose noise is added to theta")
         samples = len(keys)
         scale = np.repeat([1.0, -1.0], samples)
         values, scores, residuals = self._run("value", theta, keys, np.tile(np.arange(samples), 2), scale)
@@ -169,12 +170,12 @@ class MjxObjective:
     def evaluate_pair(
         self, theta: Float[Array, " params"], keys: Key[Array, " samples"]
     ) -> tuple[Evaluation, Evaluation]:
-        """Two evaluations with opposite noise, sample by sample, from the same initial states, with one baseline."""
+        """Evaluate pairs of samples with opposite noise, the same initial states and a shared baseline."""
         plus, minus = self._evaluate(theta, keys, (1.0, -1.0))
         return plus, minus
 
     def differentiate(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> Differentiation:
-        """Values and exact gradients of each sample's cost with respect to theta."""
+        """Return each sample's cost and its exact gradient with respect to theta."""
         return Differentiation(*jax.tree.map(jnp.asarray, self._run("gradient", theta, keys)))
 
     def evaluate_steps(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> StepEvaluation:
@@ -188,17 +189,17 @@ class MjxObjective:
         return plus, minus
 
     def differentiate_corrected(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> Differentiation:
-        """`differentiate` with the onset term that the task asks for, or the linear one where it asks for none."""
+        """`differentiate` with the task's onset term, or the linear one if the task has none."""
         return Differentiation(*jax.tree.map(jnp.asarray, self._run("corrected", theta, keys)))
 
     def differentiate_steps(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> StepDifferentiation:
-        """The rollouts of `differentiate`, with the derivative of each sample's cost with respect to its noise."""
+        """Roll out as `differentiate`, with the derivative of each sample's cost with respect to its noise."""
         return StepDifferentiation(*jax.tree.map(jnp.asarray, self._run("step_gradient", theta, keys)))
 
     def linearise(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> Linearisation:
-        """The rollouts of `differentiate`, with the derivatives of every step.
+        """Roll out as `differentiate`, with the derivatives of every step.
 
-        The state is (qpos, qvel, act), so a quaternion counts four.
+        The state is (qpos, qvel, act), so a quaternion counts as four entries.
         """
         (terms, residual, derivatives), zero_noise = (
             self._run("linearisation", theta, keys),
@@ -230,20 +231,20 @@ class MjxObjective:
         ]
 
     def _zero_noise_rows(self, samples: int) -> np.ndarray:
-        """The samples that have a zero-noise rollout of their own: one, if all start in the same state."""
+        """Samples with a zero-noise rollout of their own: just one if all start in the same state."""
         return np.arange(samples if self.simulator.task.random_start else min(samples, 1))
 
     def _zero_noise_to_go(self, theta, keys):
-        """Costs to go of the zero-noise rollouts, a single one if all samples share it."""
+        """Costs to go of the zero-noise rollouts, just one if all samples share it."""
         rows = self._zero_noise_rows(len(keys))
         (to_go, *_), _ = self._run("steps", theta, keys, rows, np.zeros(len(rows)))
         return _for_all(to_go, len(keys))
 
     def _run(self, name: str, theta, keys, rows=None, noise_scale=None):
-        """Run a program on rows of the keys, by default each once."""
+        """Run a program on rows of the keys, by default each row once."""
         rows = np.arange(len(keys)) if rows is None else rows
         scale = np.ones(len(rows)) if noise_scale is None else noise_scale
-        # Bare key data: drawing the same noise for several rollouts is intended, not a reused key.
+        # Raw key data, since sharing noise among several rollouts is intended rather than reuse of a key.
         key_data = np.asarray(jax.random.key_data(keys))[rows]
         dtype = self.simulator.task.scene.template.qpos.dtype
         contact = contact_for(name, self.contact)
@@ -252,8 +253,7 @@ class MjxObjective:
 
 @dataclasses.dataclass(frozen=True)
 class BlankObjective(MjxObjective):
-    """The same objective with zeros for every number: the form of its batches, for which programs are traced but not
-    compiled."""
+    """An objective whose batches hold zeros: their shapes, from programs that are traced but not compiled."""
 
     def _run(self, name: str, theta, keys, rows=None, noise_scale=None):
         rows = np.arange(len(keys)) if rows is None else rows
@@ -263,7 +263,7 @@ class BlankObjective(MjxObjective):
 
 @dataclasses.dataclass(frozen=True)
 class TracedObjective(MjxObjective):
-    """The same objective inside a larger compiled program, on one device: nothing returns to the host between batch and
+    """An objective inside a larger compiled program on one device, without returning to the host between batch and
     estimate."""
 
     def _run(self, name: str, theta, keys, rows=None, noise_scale=None):
@@ -288,19 +288,19 @@ class TracedObjective(MjxObjective):
 
 
 def _in_turn(outputs: tuple[Any, ...], samples: int, count: int) -> list[tuple[Any, ...]]:
-    """The outputs of several batches of one size that ran as one; what comes after them is left out."""
+    """Split concatenated outputs into batches of one size; any further rows are dropped."""
     starts = range(0, count * samples, samples)
     return [jax.tree.map(lambda leaf, at=at: jnp.asarray(leaf[at : at + samples]), outputs) for at in starts]
 
 
 def _for_all(rows, samples: int):
-    """Broadcast rows, one per sample or one for all; on the host without a compilation per size."""
+    """Broadcast rows, one per sample or one for all; on the host, to avoid a compilation per size."""
     numpy = np if isinstance(rows, np.ndarray) else jnp
     return numpy.broadcast_to(rows, (samples, *rows.shape[1:]))
 
 
 def contact_for(name: str, contact: ContactModel | None) -> ContactModel | None:
-    """What a program reads of a contact model: no surrogate without derivatives, so that one serves all models."""
+    """Drop a contact model's surrogate for programs without derivatives, so that one program serves all models."""
     return (
         dataclasses.replace(contact, backward=None) if contact is not None and name in ("value", "steps") else contact
     )

@@ -1,4 +1,4 @@
-"""Samples in chunks: how many a call of a program takes, and calls on all devices at once."""
+"""Chunks of samples: their sizes, and calls on all devices at once."""
 
 import math
 from collections.abc import Sequence
@@ -14,28 +14,28 @@ from mjx_study.compiled import Compiled
 from mjx_study.tasks.task import Task
 
 CPU_CHUNKS: Final = (5, 11, 21, 51, 101, 201)
-"""Numbers of samples in a call on a CPU, which gains little from more: few, so that another number of samples finds its
-programs compiled. One more than round numbers, for the baseline."""
+"""Samples per call on a CPU, which gains little from more. Few choices, so that other sample sizes reuse compiled
+programs; one more than round numbers, for the baseline."""
 MAX_CHUNK: Final = {"cpu": CPU_CHUNKS[-1], "gpu": 2**17 + 1, "tpu": 2**17 + 1}
-"""Largest number of samples per device and call, by backend."""
+"""Maximum number of samples per device and call, by backend."""
 SHARE: Final = 0.25
-"""Most of an accelerator's memory that the gradients of a chunk take."""
+"""Maximum share of an accelerator's memory for the gradients of a chunk."""
 
 
 def spread(program: Compiled, shared: Any, rows: Sequence[np.ndarray], chunk: int, devices: Sequence[Any]) -> Any:
     """Call a compiled program on chunks of rows, on all devices at once.
 
-    On CPUs all chunks run on the first device, called from as many threads as there are devices: those calls run side
-    by side, and one compilation serves all cores. (JAX 0.11 crashes as it compiles MJX under `shard_map` or `pmap`.)
+    On CPUs all chunks run on the first device, called from as many threads as there are devices: these calls run in
+    parallel, and one compilation serves all cores. (JAX 0.11 crashes compiling MJX under `shard_map` or `pmap`.)
 
     Args:
-        program: of the shared arguments and one chunk of each array of rows.
-        rows: arrays of one length.
-        chunk: rows in a call; the last chunk is padded by repeating the last row.
-        devices: of this process.
+        program: function of the shared arguments and one chunk of each array of rows.
+        rows: arrays of equal length.
+        chunk: rows per call; the last chunk is padded with copies of the last row.
+        devices: devices of this process.
 
     Returns:
-        The program's outputs, which have a leading axis of rows: NumPy arrays, or on accelerators arrays of the first.
+        The program's outputs with a leading axis of rows: NumPy arrays, or on accelerators arrays on the first device.
     """
     on_host = devices[0].platform == "cpu"
     fetched, join = (jax.device_get, np) if on_host else (partial(jax.device_put, device=devices[0]), jnp)
@@ -48,7 +48,7 @@ def spread(program: Compiled, shared: Any, rows: Sequence[np.ndarray], chunk: in
     def call(device: Any, part: np.ndarray) -> Any:
         return run(*placed[device], *jax.device_put(tuple(array[part] for array in rows), device))
 
-    # Traced in this thread, because tracing patches MJX for the whole process.
+    # Traced in this thread, since tracing patches MJX for the whole process.
     run = program.prepare(*placed[devices[0]], *(array[chunks[0]] for array in rows), platform=devices[0].platform)
     left = iter(range(len(chunks)))
 
@@ -63,16 +63,16 @@ def spread(program: Compiled, shared: Any, rows: Sequence[np.ndarray], chunk: in
 
 
 def rounds(samples: int, chunk: int, devices: int) -> int:
-    """Calls one after another that samples take, in chunks on several devices at once."""
+    """Number of sequential calls that samples take, in chunks on several devices at once."""
     return math.ceil(math.ceil(samples / chunk) / devices)
 
 
 def chunk_for(samples: int, devices: Sequence[Any], tasks: Sequence[Task] = ()) -> int:
-    """The chunk size for `samples` and their baseline.
+    """Choose the chunk size for `samples` and their baseline.
 
-    On CPUs the least of `CPU_CHUNKS` that holds them, or the largest. On accelerators the evenly filled one of the
-    fewest calls, as many as devices at least, and with no more samples than gradients of the tasks fit into `SHARE` of
-    the memory.
+    On CPUs, the smallest of `CPU_CHUNKS` that holds them, or the largest. On accelerators, the size that needs the
+    fewest calls (at least one per device), evenly filled, with at most as many samples as task gradients fit into
+    `SHARE` of the memory.
     """
     platform = devices[0].platform
     if platform == "cpu":
@@ -84,7 +84,7 @@ def chunk_for(samples: int, devices: Sequence[Any], tasks: Sequence[Task] = ()) 
 
 
 def _gradient_bytes(task: Task) -> int:
-    """Memory of the states and Jacobians that a gradient stores, about [bytes]."""
+    """Approximate memory [bytes] of the states and Jacobians stored for a gradient."""
     host = task.scene.host
     inputs = host.nq + host.nv + host.na + host.nu
     return 8 * task.horizon * (inputs * (2 * host.nv + host.na) + 2 * inputs)

@@ -1,4 +1,4 @@
-"""The cost of one rollout, a pure function of all that may be traced or differentiated."""
+"""The cost of one rollout as a pure function, for tracing and differentiation."""
 
 import jax
 import jax.numpy as jnp
@@ -22,19 +22,19 @@ def rollout_cost(
     onset: str = "none",
     weight: float | Float[Array, ""] = 1.0,
 ) -> tuple[Float[Array, ""], tuple[State, Float[Array, "horizon nu"], Float[Array, ""], OnsetCounts | None]]:
-    """Total cost V_1 of one rollout, a pure function of everything that may be traced or differentiated.
+    """Compute the total cost V_1 of one rollout; everything that may be traced or differentiated is an argument.
 
     Args:
         contact: the contact model; None for the MJCF's own.
         start: the initial state, before the policy acts on it.
-        noise: noise of the policy's `noise_shape`.
+        noise: policy noise, of shape `noise_shape`.
         onset: "none", or "linear" or "jump" for a derivative with the onset term (see `mjx_study.simulation.onset` and
             `mjx_study.simulation.branches`).
-        weight: factor on the linear onset term; 0 for a derivative without it.
+        weight: factor of the linear onset term; 0 for a derivative without it.
 
     Returns:
         The cost; and the states `(horizon + 1, ...)` including the initial one, the controls, the largest relative
-        solver residual, and the counts of onsets (None without the onset term).
+        solver residual, and the onset counts (None without the onset term).
     """
     feedforward = task.policy.feedforward(theta, noise)
 
@@ -45,7 +45,7 @@ def rollout_cost(
     model = apply_contact(task.scene.model, contact)
     backward = derivative_model(task, contact)
     if backward is not None and onset != "none":
-        raise ValueError("the onset term is of exact derivatives: leave onset out, or the contact's backward model")
+        raise ValueError("the onset term requires exact derivatives: omit onset, or the contact's backward model")
     first = task.policy.place(theta, noise, start)
     simulated, counts, term = (task.scene, model, first, control_law, task.horizon), None, 0.0
     if onset == "linear":
@@ -62,7 +62,7 @@ def rollout_cost(
 
 
 def derivative_model(task: Task, contact: ContactModel | None) -> mjx.Model | None:
-    """The model whose derivatives stand in for those of the contact model's own; None for its own."""
+    """Return the model whose derivatives replace those of the contact model; None to keep its own."""
     other = None if contact is None else contact.backward
     return None if other is None else apply_contact(task.scene.model, other)
 
@@ -74,14 +74,14 @@ def simulate(
     key: Key[Array, ""],
     noise_scale: float | Float[Array, ""],
 ) -> tuple[State, Float[Array, "horizon nu"], Float[Array, ""], Float[Array, ""]]:
-    """One sample's rollout: states including the initial one, controls, cost and largest solver residual.
+    """Roll out one sample: states including the initial one, controls, cost and largest solver residual.
 
     Args:
-        task: the task; gives the noise's density and standard deviation.
-        theta: parameters of its policy, (params,).
+        task: the task, with the noise's density and standard deviation.
+        theta: policy parameters, (params,).
         contact: the contact model; None for the MJCF's own.
-        key: key of the sample; draws initial state and noise as in a batch.
-        noise_scale: factor on the noise; 0 for a zero-noise rollout.
+        key: key of the sample; draws the initial state and noise as in a batch.
+        noise_scale: factor of the noise; 0 for a zero-noise rollout.
     """
     start_key, noise_key = split_sample_key(key)
     noise = noise_scale * task.sigma * standard_noise(noise_key, task.policy.noise_shape, theta.dtype, task.noise)

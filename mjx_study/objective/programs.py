@@ -1,4 +1,4 @@
-"""One sample of each kind of batch that estimators ask for, as pure functions."""
+"""Single-sample programs for each kind of batch, as pure functions."""
 
 import dataclasses
 from collections.abc import Callable
@@ -20,7 +20,7 @@ from mjx_study.tasks.task import Task
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class SamplePrograms:
-    """The programs of a task.
+    """The single-sample programs of a task.
 
     Attributes:
         task: the task to simulate; each call replaces its scene's contact parameters.
@@ -30,9 +30,9 @@ class SamplePrograms:
 
     @property
     def by_name(self) -> dict[str, Callable[..., Any]]:
-        """One-sample programs for each kind of batch, as pure functions to be batched.
+        """Return the programs by name, as pure functions to be batched.
 
-        Each takes (theta, contact, sigma, key data, factor on the noise).
+        Each takes (theta, contact, sigma, key data, noise factor).
         """
         return {
             "value": self._sample_value,
@@ -51,7 +51,7 @@ class SamplePrograms:
         return task.draw_start(start_key), noise_scale * sigma * standard
 
     def cost(self, theta, contact, sigma, key_data, noise_scale, onset="none"):
-        """Cost of one rollout, and its states, controls, noise, largest solver residual and onset counts."""
+        """Cost of one rollout, with its states, controls, noise, largest solver residual and onset counts."""
         start, noise = self.draw(sigma, key_data, noise_scale)
         cost, (states, controls, residual, counts) = rollout_cost(self.task, theta, contact, start, noise, onset)
         return cost, (states, controls, noise, residual, counts)
@@ -107,7 +107,7 @@ class SamplePrograms:
         return terms, residual, (*over_cost, over_final, *over_step, over_policy, over_start)
 
     def _step_terms(self, theta, states, controls, noise, sigma):
-        """Costs to go from each step with noise, the noise's scores, and the policy's Jacobian."""
+        """Costs to go from each noisy step, noise scores, and the policy's Jacobian."""
         running = jax.vmap(self.task.running_cost)(before_each_step(states), controls)
         to_go = jnp.cumsum(running[::-1])[::-1] + self.task.final_cost(last_of(states))
         return to_go[: len(noise)], noise_score(noise, sigma, self.task.noise), self._policy_jacobian(theta, states)
@@ -122,5 +122,5 @@ class SamplePrograms:
 
 
 def _coordinates(state: State) -> Float[Array, " states"]:
-    """The state as a vector, without the solver's warm start."""
+    """Return the state as a vector, without the solver's warm start."""
     return jnp.concatenate([state.qpos, state.qvel, state.act])

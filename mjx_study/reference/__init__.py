@@ -1,4 +1,4 @@
-"""The analytic systems: NumPy, float64, hand-written Jacobians; the yardstick for MJX's gradients."""
+"""Analytic systems in NumPy and float64 with hand-written Jacobians, the ground truth for MJX's gradients."""
 
 from mjx_study.reference.adjoint import Gradients, Rollout, roll_out, value_and_gradient, value_and_gradients
 from mjx_study.reference.ball_wall import BallWall

@@ -90,7 +90,7 @@ def value_and_gradients(
     """Total cost and its exact gradients with respect to initial state, control sequence and feedback matrix.
 
     Raises:
-        ValueError: as `roll_out`.
+        ValueError: as for `roll_out`.
     """
     rollout = roll_out(system, start, controls, feedback)
     return rollout.value, gradients_along(system, rollout, feedback)
@@ -99,7 +99,7 @@ def value_and_gradients(
 def gradients_along(
     system: System, rollout: Rollout, feedback: Float[np.ndarray, "*batch _ _"] | None = None
 ) -> Gradients:
-    """Exact gradients of a rollout's total cost."""
+    """Compute the exact gradients of a rollout's total cost."""
     adjoint = system.final_gradient(rollout.states[..., -1, :])
     cost_states, cost_controls = system.cost_gradients(rollout.states[..., :-1, :], rollout.controls)
     gradient = np.empty(rollout.controls.shape)
@@ -121,7 +121,7 @@ def value_and_gradient(
     """Total cost of an open loop and its exact gradient with respect to the controls.
 
     Raises:
-        ValueError: as `roll_out`.
+        ValueError: as for `roll_out`.
     """
     value, gradients = value_and_gradients(system, start, controls)
     return value, gradients.controls

@@ -18,10 +18,10 @@ from mjx_study.reference.function import Jump
 class BallWall:
     """Minus the squared landing distance [m^2] of a point ball launched from the ground at x = 0; x is the angle [rad].
 
-    For every angle, with period 2 pi: launched into the ground (sin <= 0) it stays at 0; launched backwards (cos < 0 <
-    sin) it lands at its range R < 0, where no wall stands; launched forwards it lands at R if that is short of the wall
-    (there y < 0: it never reaches it above ground) or if it clears the top (y >= height); otherwise the inelastic
-    impact drops it at the foot of the wall. The wall has no thickness, so a ball that clears it cannot hit it later.
+    Defined for every angle, with period 2 pi. Launched into the ground (sin <= 0), the ball stays at 0. Launched
+    backwards (cos < 0 < sin), it lands at its range R < 0, where there is no wall. Launched forwards, it lands at R if
+    that is short of the wall (there y < 0) or if it clears the top (y >= height); otherwise the inelastic impact drops
+    it at the foot of the wall. The wall has no thickness, so a ball that clears it cannot hit it later.
 
     Where R reaches d the cost is continuous, because y = 0 there; where y = height it jumps.
 
@@ -73,11 +73,11 @@ class BallWall:
     def jumps(self) -> tuple[Jump, ...]:
         """Jumps where the ball just clears the top; none if it never does."""
         gains = [float(self._range(np.asarray(angle))) ** 2 - self.distance**2 for angle in self._clearing()]
-        signs = (-1, 1)[: len(gains)]  # the cost falls where the ball begins to clear the wall, and rises where it ends
+        signs = (-1, 1)[: len(gains)]  # the cost falls where the ball begins to clear the wall, rises where it stops
         return tuple(Jump(angle, sign * gain) for angle, sign, gain in zip(self._clearing(), signs, gains, strict=True))
 
     def breakpoints(self) -> tuple[float, ...]:
-        """The jumps, the angles that just reach the wall, and those at which the ball starts to fly."""
+        """The jumps, the angles that just reach the wall, and those at which the ball lifts off."""
         reaching = self.gravity * self.distance / self.speed**2
         kinks = (math.asin(reaching) / 2, math.pi / 2 - math.asin(reaching) / 2) if reaching < 1 else ()
         return tuple(sorted((0.0, math.pi, *kinks, *self._clearing())))
@@ -91,6 +91,6 @@ class BallWall:
         discriminant = self.distance**2 - 4 * drop * (drop + self.height)
         if discriminant <= 0:
             return ()
-        # The sum that does not cancel, and the product of the roots for the other.
+        # The root whose sum does not cancel; the other from their product.
         larger = (self.distance + math.sqrt(discriminant)) / (2 * drop)
         return (math.atan((drop + self.height) / (drop * larger)), math.atan(larger))

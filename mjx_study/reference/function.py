@@ -21,7 +21,7 @@ from mjx_study.reference.noise import check_density
 TAIL: Final = 1e-15
 """Probability of noise outside the range of the quadrature."""
 NODES: Final = np.polynomial.legendre.leggauss(64)
-"""Nodes on (-1, 1) and weights of the Gauss-Legendre rule between neighbouring cuts."""
+"""Nodes on (-1, 1) and weights of the Gauss-Legendre rule between adjacent cuts."""
 CORE, PANEL, GROWTH = 8.0, 0.5, 1.25
 """Range of evenly spaced cuts [standard deviations]; their spacing; the growth ratio of the spacing beyond."""
 
@@ -94,10 +94,10 @@ class ClosedForm(Protocol):
 def smoothed(
     function: Function, theta: Float[np.ndarray, " params"], sigma: float, noise: str = "gaussian"
 ) -> Smoothed:
-    """F, grad F and the jump term: in closed form if there is one, else by quadrature to about 1e-12.
+    """Return F, grad F and the jump term, in closed form if available, else by quadrature to about 1e-12.
 
     Quadrature integrates f p and f psi' p / sigma between the breakpoints, where f is smooth. It uses neither the
-    gradient nor the jumps' sizes, so it can be used to check the jump formula above.
+    gradient nor the jump sizes, so it can check the jump formula above.
 
     Args:
         function: f.
@@ -134,27 +134,27 @@ def smoothed(
 
 
 def _cuts(reach: float) -> Float[np.ndarray, " cuts"]:
-    """Ends of the panels for any function, among them 0, where a density may have a kink."""
+    """Panel boundaries for any function, including 0, where a density may have a kink."""
     even = np.arange(0.0, min(CORE, reach), PANEL)
     tail = np.geomspace(even[-1], reach, 1 + math.ceil(math.log(reach / even[-1], GROWTH)))
     return np.concatenate([-tail, -even, even, tail])
 
 
 def _nodes(cuts: Float[np.ndarray, " cuts"]) -> tuple[Float[np.ndarray, " nodes"], Float[np.ndarray, " nodes"]]:
-    """Nodes and weights of the rule between neighbouring cuts."""
+    """Nodes and weights of the rule between adjacent cuts."""
     edges = np.unique(cuts)
     half, (node, weight) = np.diff(edges)[:, None] / 2, NODES
     return (edges[:-1, None] + half * (1 + node)).ravel(), (half * weight).ravel()
 
 
 def check_noise(sigma: float) -> None:
-    """Raises ValueError unless sigma is positive and finite."""
+    """Raise ValueError unless sigma is positive and finite."""
     if not (sigma > 0 and math.isfinite(sigma)):
         raise ValueError(f"sigma must be positive and finite, in the unit of what it is added to; got {sigma}")
 
 
 def _copies(point: float, period: float, centre: float, reach: float) -> Float[np.ndarray, " copies"]:
-    """The point and its periodic copies within reach."""
+    """Return the point and its periodic copies within reach."""
     if math.isinf(period):
         candidates = np.array([point])
     else:

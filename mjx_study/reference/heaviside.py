@@ -1,4 +1,4 @@
-r"""The step function, and Coulomb friction's ramp in its place: both smoothed in closed form by Gaussian noise.
+r"""The step function and its relaxation, the ramp of Coulomb friction, smoothed in closed form by Gaussian noise.
 
 With Phi, phi the standard normal distribution and density,
 

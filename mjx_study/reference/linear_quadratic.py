@@ -1,4 +1,4 @@
-r"""A linear system with a quadratic cost, where every expectation has a closed form.
+r"""A linear system with quadratic cost, where every expectation has a closed form.
 
     x' = A x + B u,   V = sum_h x_h^T Q x_h + u_h^T R u_h + x_{H+1}^T P x_{H+1}
 
@@ -17,7 +17,7 @@ from mjx_study.reference.function import Smoothed, check_noise
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class LinearQuadratic:
-    """A linear-quadratic problem with state and control of any size, in any unit.
+    """A linear-quadratic problem of any size and units.
 
     Attributes:
         transition: A, (states, states).
@@ -86,7 +86,7 @@ class LinearQuadratic:
     def smoothed(
         self, start: Float[np.ndarray, " states"], controls: Float[np.ndarray, "horizon controls"], sigma: float
     ) -> Smoothed:
-        """F and grad F of an open loop, exactly; theta is `controls`, flattened.
+        """Return the exact F and grad F of an open loop; theta is `controls`, flattened.
 
         Raises:
             ValueError: sigma is not positive and finite.
@@ -110,7 +110,7 @@ class LinearQuadratic:
     def quadratic_form(
         self, start: Float[np.ndarray, " states"], horizon: int
     ) -> tuple[Float[np.ndarray, "params params"], Float[np.ndarray, " params"], float]:
-        """M, b and c of V = U^T M U + 2 b^T U + c, U the flattened control sequence."""
+        """M, b and c of V = U^T M U + 2 b^T U + c, with U the flattened control sequence."""
         size = horizon * self.num_controls
         square = np.kron(np.eye(horizon), self.control_weight)
         linear, constant = np.zeros(size), 0.0

@@ -1,8 +1,8 @@
 r"""A ball shot at a pivoting bar, as a function of the launch angle.
 
 A ball of mass m and speed v at angle theta meets the upright bar, a distance d away, at height d tan(theta). With
-restitution e and the bar's inertia I about its foot, the impulse is (1 + e) m v cos / (1 + m (d tan)^2 / I), and the
-bar gets the angular momentum
+restitution e and the bar's inertia I about its foot, the impulse is (1 + e) m v cos / (1 + m (d tan)^2 / I), which
+gives the bar the angular momentum
 
     L = m v d (1 + e) sin(theta) / (1 + (m d^2 / I) tan(theta)^2),   cost -L^2 in units of (m v d)^2.
 """
@@ -23,7 +23,7 @@ class MomentumTransfer:
     Attributes:
         edge: largest angle at which the bar is hit [rad].
         restitution: e; 0 is inelastic.
-        inertia_ratio: m d^2 / I of the bar; 0 is an infinitely heavy one.
+        inertia_ratio: m d^2 / I of the bar; 0 for an infinitely heavy one.
 
     Reference: Suh et al. 2022, "Momentum transfer": -sin^2 up to 45 degrees.
     """
@@ -67,7 +67,7 @@ class MomentumTransfer:
         return (-self.edge, self.edge)
 
     def _wrap(self, x):
-        """The angle, replaced by 0 where the bar is missed, and whether it is hit."""
+        """The angle, replaced by 0 on a miss, and whether the bar is hit."""
         angle = x[..., 0] - self.period * np.round(x[..., 0] / self.period)
         hit = np.abs(angle) <= self.edge
         return np.where(hit, angle, 0.0), hit

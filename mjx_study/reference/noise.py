@@ -1,4 +1,4 @@
-"""From a sample's key to its initial state and noise; the same for MJX and for the reference systems."""
+"""Initial states and noise from sample keys, shared by MJX and the reference systems."""
 
 from functools import partial
 
@@ -10,7 +10,7 @@ from estimators import NOISES, NoiseDensity
 
 
 def split_sample_key(key: Key[Array, ""]) -> tuple[Key[Array, ""], Key[Array, ""]]:
-    """The keys of a sample's initial state and of its noise."""
+    """Split a sample's key into those of its initial state and its noise."""
     start_key, noise_key = jax.random.split(key)
     return start_key, noise_key
 
@@ -18,7 +18,7 @@ def split_sample_key(key: Key[Array, ""]) -> tuple[Key[Array, ""], Key[Array, ""
 def standard_noise(
     noise_key: Key[Array, ""], shape: tuple[int, int], dtype, density: str = "gaussian"
 ) -> Float[Array, "steps dimensions"]:
-    """Unit-variance noise of a whole rollout, (steps, dimensions); a policy adds it times sigma."""
+    """Draw unit-variance noise for a rollout, (steps, dimensions); policies scale it by sigma."""
     return NOISES[density].draw(noise_key, shape, dtype)
 
 
@@ -26,7 +26,7 @@ def standard_noise(
 def batch_noise(
     keys: Key[Array, " samples"], shape: tuple[int, int], density: str
 ) -> tuple[Key[Array, " samples"], Float[Array, "samples steps dimensions"]]:
-    """Keys of the initial states of a batch of samples, and their noise of unit variance."""
+    """Return the initial-state keys and unit-variance noise of a batch of samples."""
 
     def one(key: Key[Array, ""]) -> tuple[Key[Array, ""], Float[Array, "steps dimensions"]]:
         start_key, noise_key = split_sample_key(key)
@@ -43,7 +43,7 @@ def noise_score(
 
 
 def check_density(name: str) -> NoiseDensity:
-    """The noise density of that name.
+    """Look up a noise density by name.
 
     Raises:
         ValueError: unknown name.

@@ -1,4 +1,4 @@
-"""Analytic systems and functions as Objectives: every estimator runs on them unchanged, with MJX's noise."""
+"""Analytic systems and functions as Objectives for any estimator, with MJX's noise."""
 
 import dataclasses
 from collections.abc import Callable
@@ -20,24 +20,24 @@ PARAMETRISATIONS: Final = ("controls", "feedback", "start")
 
 Start = tuple[float, ...] | Callable[[Key[Array, ""]], Float[Array, " states"]]
 Theta = Float[Array, "*each params"]
-"""One theta, or one for each sample."""
+"""One theta, or one per sample."""
 
 
 @runtime_checkable
 class Reference(PairedObjective, Protocol):
-    """An Objective with hand-written derivatives, which can also be evaluated without noise.
+    """An Objective with hand-written derivatives that can also be evaluated without noise.
 
-    Wherever it takes keys, theta may be one for each of them.
+    Methods that take keys also accept one theta per key.
     """
 
     def value_and_gradient(
         self, theta: Float[Array, " params"], key: Key[Array, ""]
     ) -> tuple[float, Float[np.ndarray, " params"]]:
-        """Zero-noise cost and its gradient, from the initial state that `key` draws."""
+        """Zero-noise cost and its gradient, from the initial state drawn with `key`."""
         ...
 
     def observe(self, theta: Theta, keys: Key[Array, " samples"]) -> dict[str, np.ndarray]:
-        """Metrics of rollouts beside the cost, by name and sample; empty if there are none."""
+        """Rollout metrics other than the cost, by name and sample; may be empty."""
         ...
 
 
@@ -45,7 +45,7 @@ class Reference(PairedObjective, Protocol):
 class ReferenceObjective:
     """F(theta) = E V_1 of a policy on an analytic system, with noise w of standard deviation sigma.
 
-    `parametrises` sets the meaning of theta and the place of the noise:
+    `parametrises` determines the meaning of theta and where the noise acts:
 
     - "controls": u_h = theta_h + w_h; theta is (horizon, controls), flattened.
     - "feedback": u_h = Theta x_h + w_h; theta is the matrix Theta, (controls, states), flattened. Score
@@ -54,13 +54,13 @@ class ReferenceObjective:
 
     Attributes:
         system: the system, with its cost.
-        start: the initial state, or its distribution as a function of a key; then each sample draws its own and has its
-            own zero-noise rollout as baseline. None if theta is the initial state.
+        start: initial state, or a function of a key that draws one; each sample then has its own zero-noise rollout as
+            baseline. None if theta is the initial state.
         horizon: number of steps.
-        sigma: standard deviation of the noise, in the unit of what it is added to.
+        sigma: standard deviation of the noise, in the unit of the quantity it is added to.
         parametrises: meaning of theta, see above.
         noise: name of the noise density in `estimators.NOISES`.
-        metrics: numbers of rollouts by name, as a function of their states including the initial one; None for none.
+        metrics: function that computes named metrics from rollout states including the initial one; None for none.
     """
 
     system: System
@@ -79,7 +79,7 @@ class ReferenceObjective:
         if self.horizon < 1:
             raise ValueError(f"horizon must be at least 1 step, got {self.horizon}")
         if (self.start is None) != (self.parametrises == "start"):
-            raise ValueError("give a start, except where theta is the start: then it must be None")
+            raise ValueError("start is required, except that it must be None if theta is the initial state")
         if isinstance(self.start, tuple) and len(self.start) != self.system.num_states:
             raise ValueError(f"the start must have {self.system.num_states} entries, got {len(self.start)}")
 
@@ -108,7 +108,7 @@ class ReferenceObjective:
         return Differentiation(jnp.asarray(value), jnp.asarray(gradient.reshape(len(noise), -1)))
 
     def differentiate_corrected(self, theta: Theta, keys: Key[Array, " samples"]) -> Differentiation:
-        """`differentiate`: an analytic system has no onset term, its springs begin without a jump."""
+        """`differentiate`: an analytic system has no onset term, since its springs set in without a jump."""
         return self.differentiate(theta, keys)
 
     def differentiate_steps(self, theta: Theta, keys: Key[Array, " samples"]) -> StepDifferentiation:
@@ -150,7 +150,7 @@ class ReferenceObjective:
     def value_and_gradient(
         self, theta: Float[Array, " params"], key: Key[Array, ""]
     ) -> tuple[float, Float[np.ndarray, " params"]]:
-        """Zero-noise cost and its gradient, from the initial state that `key` draws for a sample (if it is random)."""
+        """Zero-noise cost and its gradient, from the initial state drawn with `key` if it is random."""
         start = np.asarray(self.start(split_sample_key(key)[0])) if callable(self.start) else self._fixed_start()
         value, gradient = self._differentiate(theta, start, np.zeros(self._noise_shape))
         return float(value), gradient.reshape(-1)
@@ -192,13 +192,13 @@ class ReferenceObjective:
         return np.zeros(self.system.num_states) if self.start is None else np.array(self.start, float)
 
     def _draw(self, keys):
-        """Initial states (a single one if it is fixed) and noise of a batch of samples."""
+        """Initial states (just one if fixed) and noise of a batch of samples."""
         start_keys, noise = batch_noise(keys, self._noise_shape, self.noise)
         start = np.asarray(jax.vmap(self.start)(start_keys)) if callable(self.start) else self._fixed_start()
         return start, self.sigma * np.asarray(noise)
 
     def _policy(self, theta, start, noise):
-        """Initial state, open-loop controls, and feedback matrix, as arguments of `roll_out`."""
+        """Initial state, open-loop controls and feedback matrix, as arguments for `roll_out`."""
         shaped = self._shaped(theta)
         if self.parametrises == "start":
             return shaped + noise[..., 0, :], np.zeros((self.horizon, self.system.num_controls))
@@ -207,7 +207,7 @@ class ReferenceObjective:
         return start, noise, shaped
 
     def _shaped(self, theta) -> np.ndarray:
-        """Theta as it enters the policy; one for each sample has an axis of them in front."""
+        """Theta in the policy's shape, with a leading sample axis if there is one theta per sample."""
         states, controls = self.system.num_states, self.system.num_controls
         shapes = {"start": (states,), "controls": (self.horizon, controls), "feedback": (controls, states)}
         theta = _checked(theta, self.num_params)
@@ -220,7 +220,7 @@ class ReferenceObjective:
 
 @dataclasses.dataclass(frozen=True)
 class FunctionObjective:
-    """F(theta) = E f(theta + w) of a function of the parameters alone, with noise w of standard deviation sigma.
+    """F(theta) = E f(theta + w) for a function of the parameters alone, with noise w of standard deviation sigma.
 
     Attributes:
         function: f.
@@ -248,11 +248,11 @@ class FunctionObjective:
         return self._evaluation(theta, noise), self._evaluation(theta, -noise)
 
     def evaluate_steps(self, theta: Theta, keys: Key[Array, " samples"]) -> StepEvaluation:
-        """The samples of `evaluate`; there is one step."""
+        """The samples of `evaluate` as single steps."""
         return _one_step(self.evaluate(theta, keys))
 
     def evaluate_step_pair(self, theta: Theta, keys: Key[Array, " samples"]) -> tuple[StepEvaluation, StepEvaluation]:
-        """The samples of `evaluate_pair`; there is one step."""
+        """The samples of `evaluate_pair` as single steps."""
         plus, minus = self.evaluate_pair(theta, keys)
         return _one_step(plus), _one_step(minus)
 
@@ -261,11 +261,11 @@ class FunctionObjective:
         return Differentiation(jnp.asarray(self.function.value(points)), jnp.asarray(self.function.gradient(points)))
 
     def differentiate_corrected(self, theta: Theta, keys: Key[Array, " samples"]) -> Differentiation:
-        """`differentiate`: an analytic system has no onset term, its springs begin without a jump."""
+        """`differentiate`: a function has no onset term."""
         return self.differentiate(theta, keys)
 
     def differentiate_steps(self, theta: Theta, keys: Key[Array, " samples"]) -> StepDifferentiation:
-        """The samples of `differentiate`; there is one step."""
+        """The samples of `differentiate` as single steps."""
         batch = self.differentiate(theta, keys)
         return StepDifferentiation(batch.value, batch.gradient[:, None], None)
 
@@ -289,12 +289,12 @@ class FunctionObjective:
     def value_and_gradient(
         self, theta: Float[Array, " params"], key: Key[Array, ""]
     ) -> tuple[float, Float[np.ndarray, " params"]]:
-        """f(theta) and its gradient; a function has no initial state to draw, so the key is not used."""
+        """f(theta) and its gradient; the key is unused, since there is no initial state to draw."""
         point = self._point(theta)
         return float(self.function.value(point)), self.function.gradient(point)
 
     def observe(self, theta: Theta, keys: Key[Array, " samples"]) -> dict[str, np.ndarray]:
-        """Empty: a function has no metric but its value."""
+        """Empty: a function has no metrics other than its value."""
         return {}
 
     def _evaluation(self, theta, noise) -> Evaluation:

@@ -1,11 +1,11 @@
 r"""Time and effect of the collision of a ball with a flat, moving, turning paddle.
 
-Paddle centre p, angle a, tangent t = (cos a, sin a), normal n = (-sin a, cos a). In a step the paddle moves with
+Paddle centre p, angle a, tangent t = (cos a, sin a), normal n = (-sin a, cos a). During a step the paddle moves with
 constant velocity u and spin w, the ball with constant velocity v. With q the ball's centre relative to p, the ball
 touches the face on side s = +-1 when the clearance s n.q - reach falls to 0, where reach = half-height + radius, and
-|t.q| is at most the half-width. Both faces are solid; edges and corners are not: a ball that comes past them is not
-hit, and one that gets between the planes of the faces that way passes through. The paddle is infinitely heavy and
-smooth, so the ball's velocity relative to its surface at the point of contact is mirrored:
+when |t.q| is at most the half-width. Both faces are solid; edges and corners are not: a ball passing beyond them is
+not hit, and one that gets between the planes of the faces that way passes through. The paddle is infinitely heavy and
+smooth, so the ball's velocity relative to its surface at the contact point is mirrored:
 
     m = n.(v - u) - w t.q,   v' = v - 2 m n,   and the clearance changes at the rate s m before, -s m after.
 """
@@ -16,11 +16,11 @@ import numpy as np
 from jaxtyping import Float, Int
 
 SUBDIVISIONS: Final = 8
-"""Number of parts in which a flight is searched for a crossing; entry and exit within one part (a graze) are missed."""
+"""Number of parts of a flight searched for a crossing; entry and exit within one part (a graze) are missed."""
 BISECTIONS: Final = 60
-"""Bisections of such a part, down to neighbouring floating-point numbers."""
+"""Bisections of such a part, down to adjacent floating-point numbers."""
 TOUCHING: Final = 1e-9
-"""Depth inside a face that still counts as outside, for rounding after an impact at the end of a step [m]."""
+"""Depth inside a face that still counts as outside [m], for rounding after an impact at the end of a step."""
 
 
 def frame(angle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -40,14 +40,14 @@ def first_impact(
     reach: float,
     half_width: float,
 ) -> tuple[Int[np.ndarray, " hits"], Float[np.ndarray, " hits"], Float[np.ndarray, " hits"]]:
-    """The first time within `duration` at which a ball crosses the plane of a face from outside, within its width.
+    """Find the first time within `duration` at which a ball crosses a face from outside, within its width.
 
     Returns:
-        Row indices of the balls that are hit, time until impact [s], and the side that is hit, +-1.
+        Row indices of the balls hit, time until impact [s], and the side hit, +-1.
     """
     offset, velocity = state[:, :2] - state[:, 4:6], state[:, 2:4] - control[:, :2]
     nearest = np.hypot(*offset.T) - duration * np.hypot(*velocity.T)
-    near = np.flatnonzero(nearest <= np.hypot(half_width, reach) + TOUCHING)  # the others cannot reach the paddle
+    near = np.flatnonzero(nearest <= np.hypot(half_width, reach) + TOUCHING)  # others cannot reach the paddle
     if len(near) < len(state):
         hits, time, side = first_impact(state[near], control[near], duration[near], reach, half_width)
         return near[hits], time, side
@@ -74,7 +74,7 @@ def first_impact(
     tangent, normal = frame(state[rows, 6] + control[rows, 2] * late)
     along = dot(tangent, offset[rows] + velocity[rows] * late[:, None])
     speed = side[rows] * (dot(normal, velocity[rows]) - control[rows, 2] * along)
-    # A ball that has just been hit may seem to enter by rounding, but it is leaving.
+    # A ball just hit may seem to enter by rounding, but it is leaving.
     hit = (np.abs(along) <= half_width) & (speed < 0)
     return rows[hit], late[hit], side[rows][hit]
 
@@ -101,7 +101,7 @@ def time_slope(
     control: Float[np.ndarray, "samples 3"],
     slope: Float[np.ndarray, "samples 7 inputs"],
 ) -> Float[np.ndarray, "samples inputs"]:
-    """Derivative of the time of impact, given the derivative `slope` of `state` at that time held fixed.
+    """Derivative of the impact time, given the derivative `slope` of `state` at fixed time.
 
     The clearance stays 0: m dT + n.dq - (t.q) da = 0.
     """

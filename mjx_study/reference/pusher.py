@@ -21,7 +21,7 @@ class Pusher(QuadraticCost):
         stiffness: contact stiffness K [N/m].
         timestep: h [s].
         mass: mass of each body [kg].
-        damping: factor on the velocities per step.
+        damping: velocity factor per step.
         distance: distance of the centres at first touch [m].
         goal: target state.
         state_weight: diagonal of Q.

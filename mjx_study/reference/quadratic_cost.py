@@ -1,4 +1,4 @@
-"""A cost shared by several systems: quadratic in the distance from a goal and in the control."""
+"""Quadratic cost in the distance from a goal and in the control, shared by several systems."""
 
 import numpy as np
 from jaxtyping import Float

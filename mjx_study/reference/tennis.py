@@ -1,15 +1,15 @@
 r"""A ball in the plane and a paddle moved by commanded velocities; impacts at their exact times inside the step.
 
-During a step of h the ball flies straight and the paddle moves with its commanded velocity; at an impact the ball's
+During a step h, the ball flies straight and the paddle moves with its commanded velocity; at an impact the ball's
 velocity relative to the paddle's surface is mirrored (see `paddle`), and both continue for the rest of the step. Then
 the ball's velocity is multiplied by `damping`. There is no gravity.
 
 The Jacobian of a step with an impact includes the derivative of the impact time. With the motion y' = f before and f_+
 after, the reflection R and the clearance g, it is the saltation matrix DR + (f_+ - DR f) Dg / (Dg f).
 
-The rollout jumps where an impact moves from one step to the next: the paddle's command changes there abruptly, and the
-ball's velocity with it, by twice the change along the normal (and by twice 1 - damping of the paddle's speed, because
-the damping then acts on the other side of the impact). A first-order estimate misses this, and the paddle's edges.
+The rollout jumps where an impact moves from one step to the next: the paddle's command changes abruptly there, and with
+it the ball's velocity, by twice the change along the normal (and by twice 1 - damping of the paddle's speed, because
+the damping then acts on the other side of the impact). A first-order estimate misses this and the paddle's edges.
 
 Reference: Suh et al. 2022, tennis example, with its published numbers; the impact there is elastic too.
 """
@@ -25,7 +25,7 @@ from mjx_study.reference.paddle import first_impact, reflected, reflected_slope,
 TURNED: Final = 1e-3
 """Bound on the deviation of a velocity that was not reflected [rad]."""
 MAX_IMPACTS: Final = 4
-"""Maximum number of impacts per step; a ball that still approaches the paddle after that passes through."""
+"""Maximum number of impacts per step; a ball still approaching the paddle afterwards passes through."""
 CONTROL_SLOPE: Final = np.eye(3, 10, 7)
 """Derivative of the control with respect to (state, control)."""
 
@@ -40,8 +40,8 @@ class Tennis:
         timestep: h [s].
         radius: radius of the ball [m].
         half_width: half-width of the paddle's faces [m].
-        half_height: distance of the paddle's middle from its faces [m].
-        damping: factor on the ball's velocity per step.
+        half_height: distance from the paddle's middle to its faces [m].
+        damping: velocity factor of the ball per step.
         goal: target state.
         final_weight: diagonal of Q.
         control_weight: R.
@@ -94,7 +94,7 @@ class Tennis:
         return 2 * np.array(self.final_weight) * (state - np.array(self.goal))
 
     def _move(self, state, control, *, differentiate: bool):
-        """State after a step; if asked, its derivative (..., 7, 10) with respect to (state, control); impact counts."""
+        """State after a step; on request, its Jacobian (..., 7, 10) over (state, control); impact counts."""
         batch = state.shape[:-1]
         now, control = np.array(state, float).reshape(-1, 7), np.asarray(control, float).reshape(-1, 3)
         samples = len(now)
@@ -133,7 +133,7 @@ class Tennis:
 def tennis_metrics(
     position: Float[Any, "*batch steps 2"], velocity: Float[Any, "*batch steps 2"]
 ) -> dict[str, Float[Any, "*batch"]]:
-    """Whether the ball was hit, and its final distance from the target [m], from its motion; NumPy or JAX arrays.
+    """Whether the ball was hit, and its final distance from the target [m], from NumPy or JAX trajectories.
 
     Only the paddle turns the ball's velocity.
     """
@@ -146,7 +146,7 @@ def tennis_metrics(
 
 
 def _motion(state, control):
-    """Rate of the state between impacts."""
+    """Time derivative of the state between impacts."""
     return np.concatenate([state[:, 2:4], np.zeros((len(state), 2)), control], axis=-1)
 
 

@@ -6,7 +6,7 @@ from jaxtyping import Array, Float, Key
 
 
 def draw_start(key: Key[Array, ""]) -> Float[Array, " 7"]:
-    """Ball x, y, vx, vy and paddle x, y, angle [m, m/s, rad] of one game.
+    """Draw ball x, y, vx, vy and paddle x, y, angle [m, m/s, rad] of one game.
 
     x ~ U(-2, 2), y ~ N(2, 0.2^2), vx ~ N(-0.2 x, 0.03^2), vy ~ N(-0.2 y, 0.03^2): the ball comes from above, roughly
     towards the origin. Paddle ~ N(0, diag(0.5, 0.05, 0.05)^2).

@@ -1,4 +1,4 @@
-"""The systems of the study, one short file each, with the same parts in the same order."""
+"""The systems of the study, one module each, all structured alike."""
 
 from collections.abc import Callable
 from functools import partial
@@ -30,26 +30,26 @@ TASKS: Final[dict[str, Callable[..., Task]]] = {
     "double_pendulum": double_pendulum,
     "double_pendulum:published": partial(double_pendulum, "published"),
 }
-"""Builders by name; each variant of a system has its own name, such as `ball_wall:dome`."""
+"""Task builders by name; variants of a system have their own names, such as `ball_wall:dome`."""
 
 
 def task_names() -> list[str]:
-    """Names of the tasks of this package."""
+    """Names of the built-in tasks."""
     return list(TASKS)
 
 
 def make_task(name: str, **options: Any) -> Task:
-    """Build a task by name; `options` go to its builder (`cone`, `horizon`, ...).
+    """Build a task by name with `options` for its builder (`cone`, `horizon`, ...).
 
     Args:
-        name: name of a task of this package, else of one registered by an installed package (entry point group
-            `mjx_study.tasks`), else `module:attribute` of a Task or of a function of the options that returns one; or
-            the path of an MJCF, for what `mjx_study.tasks.mjcf.scene_task` makes of it.
+        name: name of a built-in task, or of one registered by an installed package (entry point group
+            `mjx_study.tasks`), or `module:attribute` of a Task or of a function of the options that returns one; or the
+            path of an MJCF, from which `mjx_study.tasks.mjcf.scene_task` makes a task.
         **options: arguments for the builder; a ready-made Task takes none.
 
     Raises:
         ValueError: unknown name; the message lists the choices. Or a user's task cannot be built: its module or
-            function is missing, raises, does not take an option, or returns no Task.
+            function is missing, raises, rejects an option, or does not return a Task.
     """
     if name in TASKS:
         return TASKS[name](**options)

@@ -1,10 +1,10 @@
-"""Throwing a ball as far as possible, with a wall in its way: one launch angle.
+"""Throw a ball as far as possible with a wall in the way; theta is the launch angle.
 
-Lengths are ten times those of Suh et al. 2022 and speeds sqrt(10) times, which keeps the flight's shape; the cost is in
-the paper's lengths. In the paper the ball drops at the wall and stays where it lands; here floor and wall have friction
-5, and the contact is well damped in the families without a damping ratio. The wall is a `box`, or a box with a round
-top, the `dome`, on which the bounce angle varies continuously; the landing point still jumps there, since friction
-holds a ball that grazes the top.
+Lengths are ten times those of Suh et al. 2022 and speeds sqrt(10) times, which preserves the shape of the flight; the
+cost is in the paper's lengths. In the paper the ball drops at the wall and stays where it lands; here floor and wall
+have friction 5, and the contact is strongly damped in families without a damping ratio. The wall is a `box`, or a box
+with a round top, the `dome`, on which the bounce angle varies continuously; the landing point still jumps there, since
+friction holds a ball that grazes the top.
 """
 
 from pathlib import Path

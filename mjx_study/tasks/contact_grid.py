@@ -1,4 +1,4 @@
-"""The contact models of a study: families over stiffnesses, or MuJoCo's own parameters, with their warnings."""
+"""Contact models of a study: families over stiffnesses, or MuJoCo's own parameters, with their warnings."""
 
 import dataclasses
 import itertools
@@ -24,13 +24,13 @@ from mjx_study.tasks.task import Task
 
 @dataclasses.dataclass(frozen=True)
 class ContactPoint:
-    """One contact model of a study.
+    """A contact model of a study.
 
     Attributes:
         family: name of the contact family, "reference", or solref and solimp.
-        stiffness: spring stiffness K [N/m]; 0 if there is no contact.
-        contact: the contact model; None for the MJCF's own, and for the reference.
-        digits: significant digits of the stiffness in messages, enough to tell the models of a sweep apart.
+        stiffness: spring stiffness K [N/m]; 0 without contact.
+        contact: the contact model; None for the MJCF's own and for the reference.
+        digits: significant digits of the stiffness in messages, enough to distinguish the models of a sweep.
     """
 
     family: str
@@ -40,7 +40,7 @@ class ContactPoint:
 
     @property
     def analytic(self) -> bool:
-        """Whether it is the task's analytic system."""
+        """Whether this is the task's analytic system."""
         return self.family == REFERENCE
 
     @property
@@ -54,10 +54,10 @@ def contact_grid(
     stiffnesses: Sequence[float] | None = None,
     damping: float | None = None,
 ) -> tuple[tuple[ContactPoint, ...], tuple[str, ...]]:
-    """The contact models of a sweep, family by family, and their warnings.
+    """Return the contact models of a sweep, family by family, and their warnings.
 
     Args:
-        task: source of the effective mass, and of defaults for arguments that are None.
+        task: source of the effective mass and of defaults for arguments that are None.
         families: names of contact families; "reference" for the analytic system.
         stiffnesses: stiffnesses for families that take one [N/m].
         damping: override of each family's damping [N s/m].
@@ -93,17 +93,17 @@ def backward_grid(
     stiffness: float | None = None,
     margin: float | None = None,
 ) -> tuple[tuple[ContactPoint, ...], tuple[str, ...]]:
-    """Contact models with surrogate derivatives, and the warnings of the models that those are of.
+    """Return contact models with surrogate derivatives, and the warnings of the surrogate models.
 
     Args:
         task: source of the effective mass.
-        cells: contact models to roll out; analytic systems stay as they are.
-        families: those whose derivatives each has in turn, at its own stiffness; "none" for exact derivatives.
-        stiffness: of the families that take one, in place of each cell's own [N/m].
-        margin: distance at which contact begins in them [m]; None for the MJCF's.
+        cells: contact models to roll out; analytic systems are kept unchanged.
+        families: families that supply derivatives, each for every cell at its stiffness; "none" for exact ones.
+        stiffness: stiffness of the families that take one, instead of the cell's [N/m].
+        margin: distance at which contact begins in the surrogates [m]; None for the MJCF's.
 
     Raises:
-        ValueError: a family needs a stiffness and there is none, or a contact model is the MJCF's.
+        ValueError: a family lacks a stiffness, or a contact model is the MJCF's.
     """
     found, messages = [cell for cell in cells if cell.analytic or "none" in families], []
     simulated = [cell for cell in cells if not cell.analytic]
@@ -125,7 +125,7 @@ def backward_grid(
 
 
 def check_reference(task: Task) -> None:
-    """Raises ValueError unless the task has an analytic system that first-order gradients of its kind can run on."""
+    """Raise ValueError unless the task has an analytic system that supports its first-order gradients."""
     if task.reference is None:
         raise ValueError(f"{task.name} has no analytic reference")
     if task.onset != "none":
@@ -135,7 +135,7 @@ def check_reference(task: Task) -> None:
 def solver_grid(
     task: Task, solrefs: Sequence[Sequence[float]], solimps: Sequence[Sequence[float]]
 ) -> tuple[tuple[ContactPoint, ...], tuple[str, ...]]:
-    """Contact models in MuJoCo's own terms, every solref with every solimp, and their warnings.
+    """Return contact models in MuJoCo's terms, every solref with every solimp, and their warnings.
 
     Args:
         task: source of the scene, and of the effective mass for the reported stiffness.
@@ -163,7 +163,7 @@ def solver_grid(
 
 @contextmanager
 def _warnings_of_contact() -> Generator[list[warnings.WarningMessage]]:
-    """Collect the warnings of contact models built inside.
+    """Collect the warnings of contact models built in this context.
 
     Raises:
         ValueError: their numbers are so large or small that arithmetic overflows.
@@ -177,7 +177,7 @@ def _warnings_of_contact() -> Generator[list[warnings.WarningMessage]]:
 
 
 def _contact(task: Task, family: str, stiffness: float | None, damping: float | None) -> ContactModel:
-    """A family's contact model, with a damping [N s/m] or, where the family has none, the task's."""
+    """Build a family's contact model with a damping [N s/m]; by default the task's, if the family has none."""
     if damping is None and family in FAMILIES and FAMILIES[family].dampratio == 0:
         damping = task.defaults.damping
     damping = None if stiffness is None else damping
@@ -186,7 +186,7 @@ def _contact(task: Task, family: str, stiffness: float | None, damping: float | 
 
 
 def _stiffness(task: Task, contact: ContactModel | None) -> float:
-    """Spring stiffness K [N/m] of a contact model not defined by one; 0 if there is no contact."""
+    """Spring stiffness K [N/m] of a contact model not defined by one; 0 without contact."""
     if task.contact_pair is None:
         return 0.0
     if contact is None:

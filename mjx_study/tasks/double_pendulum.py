@@ -1,11 +1,11 @@
 """A double pendulum released from an initial state: chaos instead of contact.
 
-The gradient of the final state with respect to the initial angles and velocities grows with the horizon as trajectories
-separate. There is no contact, so contact families do not apply. The equations of motion are MuJoCo's, integrated by RK4
-with 1 ms steps (those printed by Suh et al. 2022 do not conserve energy); the goal is to hang.
+The gradient of the final state with respect to the initial state grows with the horizon as trajectories diverge. There
+is no contact, so contact families do not apply. The equations of motion are MuJoCo's, integrated by RK4 with 1 ms steps
+(those printed by Suh et al. 2022 do not conserve energy); the goal is the hanging rest position.
 
-Angles are relative here, the second rod's to the first; the published example's are absolute. Its initial state in
-these coordinates is the variant `published`; the default takes the same four numbers as relative ones.
+Angles are relative, the second rod's to the first; those of the published example are absolute. Its initial state in
+these coordinates is the variant `published`; the default uses the same four numbers as relative angles.
 """
 
 import math
@@ -38,7 +38,7 @@ def double_pendulum(
     model: str | Path = "double_pendulum",
     **scene_options: str | float,
 ) -> Task:
-    """Cost |q|^2, with q [rad] the final angles, not wrapped: wrapping would add jumps of its own.
+    """Cost |q|^2, with q [rad] the final angles, not wrapped, since wrapping would add jumps.
 
     Args:
         start: initial state: default or published.

@@ -1,9 +1,8 @@
-"""Pushing and turning a box with a gripper of two fingers: a neural network commands servos.
+"""Push and turn a box with a two-finger gripper; a neural network commands servos.
 
-The palm of 0.5 kg runs on a gantry in the plane of a table, and each finger of 8 cm turns about a hinge. The box of
-0.3 kg starts out of reach, somewhere else in every sample, with dry friction on the table. At the start of an
-optimisation the network's output is constant: the palm goes forward, and the fingers close to less than the box's width
-and knock it away.
+The 0.5 kg palm moves on a gantry in the plane of a table, and each 8 cm finger turns about a hinge. The 0.3 kg box
+starts out of reach, at a random pose in every sample, with dry friction on the table. At the start of an optimisation
+the network's output is constant: the palm advances, the fingers close to less than the box's width and knock it away.
 """
 
 from pathlib import Path
@@ -22,10 +21,10 @@ from mjx_study.tasks.task import Recipe, StudyDefaults, Task
 
 HORIZON: Final = 100
 HIDDEN: Final = (16,)
-GOAL: Final = (0.04, 0.07, 0.3)  # of the box from where it starts on average [m], and its angle [rad]
-LENGTHS: Final = (0.1, 0.1, 1.0)  # of the box's errors: one of them costs 1 [m, m, rad]
-SPREAD: Final = (0.015, 0.005, 0.15)  # of where the box starts, uniformly to either side [m, m, rad]
-SPEED: Final = 0.2  # of the box at the end: so much costs 1 [m/s]; its turning by SPEED / 0.1 m
+GOAL: Final = (0.04, 0.07, 0.3)  # box displacement from its mean start [m], and its angle [rad]
+LENGTHS: Final = (0.1, 0.1, 1.0)  # box errors that cost 1 each [m, m, rad]
+SPREAD: Final = (0.015, 0.005, 0.15)  # half-widths of the box's uniform start distribution [m, m, rad]
+SPEED: Final = 0.2  # final box speed that costs 1 [m/s]; its angular speed is SPEED / 0.1 m
 CONTROL_WEIGHT: Final = 0.001
 COMMAND: Final = (0.0, 1.0, 0.4, 0.4)  # at the start of an optimisation [0.1 m, 0.1 m, rad, rad]
 SIGMA: Final = 0.05  # [0.1 m and rad]
@@ -46,7 +45,7 @@ def gripper(*, horizon: int = HORIZON, model: str | Path = "gripper", **scene_op
     goal, lengths = np.array(GOAL, dtype), np.array(LENGTHS, dtype)
 
     def features(state: State) -> Float[Array, " features"]:
-        """Positions, the box's from the goal, and velocities, all of about 1."""
+        """Positions (the box's relative to the goal) and velocities, all of order 1."""
         error = (state.qpos[4:] - goal) / lengths
         return jnp.concatenate([10 * state.qpos[:2], state.qpos[2:4], error, state.qvel[:2], state.qvel[2:] / 10])
 

@@ -1,9 +1,9 @@
-"""Landing on two legs: a neural network commands the servos of a robot of dog's size that drops onto a floor.
+"""Land on two legs; a neural network commands the servos of a dog-sized robot dropped onto a floor.
 
-The robot of 7.8 kg is planar: a trunk, and a front and a hind leg of two links of 0.2 m, each for a pair. It falls by
-about 0.1 m onto its feet, at up to 1 m/s forward, and is to come to rest softly, upright and at the height of its
-crouch. Height, tilt and velocities at the start are drawn for every sample. At the start of an optimisation the
-network's output is zero: the servos hold the crouch.
+The 7.8 kg robot is planar: a trunk with a front and a hind leg of two 0.2 m links, each standing for a pair. It falls
+about 0.1 m onto its feet, at up to 1 m/s forward, and must come to rest softly, upright and at crouch height. Initial
+height, tilt and velocities are drawn for every sample. At the start of an optimisation the network's output is zero:
+the servos hold the crouch.
 """
 
 from pathlib import Path
@@ -25,7 +25,7 @@ HIDDEN: Final = (16,)
 LOW: Final = (0.0, 0.08, -0.1, 0.0, -0.5, -0.5)  # x, z [m], pitch [rad], and their velocities at the start
 HIGH: Final = (0.0, 0.12, 0.1, 1.0, 0.0, 0.5)
 ERRORS: Final = (0.05, 0.2, 0.5, 0.5, 2.0)  # height [m], pitch [rad], velocities [m/s, m/s, rad/s]: one costs 1 each
-TORQUE: Final = 10.0  # [N m] at one joint throughout costs 1
+TORQUE: Final = 10.0  # constant torque [N m] at one joint that costs 1
 SIGMA: Final = 0.05  # [rad]
 RECIPE: Final = Recipe(0.003, 200, 50)
 
@@ -33,7 +33,7 @@ RECIPE: Final = Recipe(0.003, 200, 50)
 def landing(*, horizon: int = HORIZON, model: str | Path = "landing", **scene_options: str | float) -> Task:
     """Cost |trunk's height, pitch and velocities|^2 at the end, plus the mean over steps of the joints' |torque|^2.
 
-    The joints' torques are what a landing feels like: they carry the feet's forces.
+    Joint torques measure the impact, since they carry the feet's forces.
 
     Args:
         model: name or path of a replacement MJCF, with the joints `x`, `z`, `pitch`, `front_hip`, `front_knee`,
@@ -48,7 +48,7 @@ def landing(*, horizon: int = HORIZON, model: str | Path = "landing", **scene_op
     gain, stiffness, damping = (host.actuator_gainprm[:, 0], host.actuator_biasprm[:, 1], host.actuator_biasprm[:, 2])
 
     def features(state: State) -> Float[Array, " features"]:
-        """All but where it is: height in 0.1 m, velocities in 1 m/s and 10 rad/s."""
+        """All coordinates except the horizontal position: height in 0.1 m, velocities in 1 m/s and 10 rad/s."""
         velocities = state.qvel / jnp.array([1.0, 1.0] + 5 * [10.0], dtype)
         return jnp.concatenate([10 * state.qpos[1:2], state.qpos[2:], velocities])
 

@@ -1,4 +1,4 @@
-"""A task made of an MJCF alone: how far do its bodies come from where they start?"""
+"""A task made from an MJCF alone, with the displacement of its bodies as cost."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,27 +17,27 @@ from mjx_study.tasks.policy import InitialStatePolicy, OpenLoop
 from mjx_study.tasks.task import StudyDefaults, Task
 
 NOISE: Final = 0.1
-"""Standard deviation of the noise: share of the middle actuator's half range, or [m/s, rad/s] of initial velocities."""
+"""Noise level: share of the middle actuator's half range, or [m/s, rad/s] for initial velocities."""
 STILL: Final = 1e-9
-"""Displacement below which nothing has moved [m or rad]."""
+"""Displacement that counts as motion [m or rad]."""
 _FREE, _BALL = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL)
 
 
 def mjcf_task(path: str | Path, *, horizon: int = CHECKED_STEPS, **scene_options: str | float | Sequence[str]) -> Task:
-    """The task of a file; see `scene_task`."""
+    """Make a task from a file; see `scene_task`."""
     return scene_task(load_scene(path, **scene_options), horizon=horizon)
 
 
 def scene_task(scene: Scene, *, horizon: int = CHECKED_STEPS, pair: tuple[str, str] | None = None) -> Task:
-    """Half the squared displacement of the free bodies, or of the joints where none is free, after some steps.
+    """Make a task with half the squared final displacement of free bodies as cost, or of joints if none is free.
 
-    It starts from the first keyframe, or the reference pose. Parameters are the controls of every step, from the
-    keyframe's; of a model without actuators, what is added to the initial velocity. Where that leaves everything at
-    rest, and the cost without a gradient, all parameters are raised by one standard deviation of the noise.
+    The initial state is the first keyframe or the reference pose. The parameters are the controls of every step,
+    initially the keyframe's; without actuators, increments of the initial velocity. If nothing moves then, so that the
+    cost has no gradient, all parameters are raised by one standard deviation of the noise.
 
     Args:
         scene: the scene; its contact parameters are the MJCF's own.
-        pair: names of the two geoms whose contact stiffness is swept; None for none.
+        pair: names of the two geoms whose contact stiffness is swept, or None.
 
     Raises:
         ValueError: nothing in the scene can move.
@@ -82,7 +82,7 @@ def scene_task(scene: Scene, *, horizon: int = CHECKED_STEPS, pair: tuple[str, s
 
 
 def _rests(host: mujoco.MjModel, start: State, control: np.ndarray, horizon: int, measured: np.ndarray) -> bool:
-    """Whether those coordinates end where they begin, in the C engine, under a constant control."""
+    """Whether the coordinates end where they begin under constant control, in the C engine."""
     parts = (np.asarray(part) for part in (start.qpos, start.qvel, start.act, control, start.warmstart))
     data = host_data(host, HostState(*parts))
     origin = data.qpos[measured].copy()
@@ -93,14 +93,14 @@ def _rests(host: mujoco.MjModel, start: State, control: np.ndarray, horizon: int
 
 
 def _measured(host: mujoco.MjModel) -> tuple[np.ndarray, str]:
-    """Indices in qpos of the coordinates whose displacement is the cost, and what they are."""
+    """Indices in qpos of the coordinates whose displacement is the cost, and a description of them."""
     free, balls = (host.jnt_qposadr[host.jnt_type == kind] for kind in (_FREE, _BALL))
     scalar = np.setdiff1d(host.jnt_qposadr, [*free, *balls])
     if len(free):
         return (free[:, None] + np.arange(3)).reshape(-1), _count(len(free), "free body", "free bodies")
     if len(scalar):
         return scalar, _count(len(scalar), "joint", "joints")
-    # the vector part of the quaternion: half the angle, where that is small
+    # the vector part of the quaternion: half the angle if small
     return (balls[:, None] + np.arange(1, 4)).reshape(-1), _count(len(balls), "ball joint", "ball joints")
 
 

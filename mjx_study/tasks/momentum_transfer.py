@@ -1,9 +1,9 @@
-"""Hitting a pivoting bar with a ball so that it turns as fast as possible: one launch angle.
+"""Hit a pivoting bar with a ball so that it turns as fast as possible; theta is the launch angle.
 
-The lever arm grows with the angle up to 45 degrees, past which the ball misses: the best angle lies at the edge of a
-cliff. The bar's angular momentum is measured in units of m v d, so a rigid bar and an inelastic hit give the
--sin^2 theta of Suh et al. 2022. An undamped spring is elastic, which doubles the momentum, and the simulated bar yields
-a little: `MomentumTransfer` has both. The bar points up only, so below 0 the ball misses here but not there.
+The lever arm grows with the angle up to 45 degrees, beyond which the ball misses: the best angle lies at the edge of a
+cliff. The bar's angular momentum is in units of m v d, so a rigid bar and an inelastic impact give the -sin^2 theta of
+Suh et al. 2022. An undamped spring is elastic, which doubles the momentum, and the simulated bar yields slightly:
+`MomentumTransfer` models both. The bar points up only, so below 0 the ball misses here but not in `MomentumTransfer`.
 """
 
 from pathlib import Path

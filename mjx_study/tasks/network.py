@@ -1,4 +1,4 @@
-"""Neural-network policies, for any task with controls."""
+"""Neural-network policies for any task with controls."""
 
 import dataclasses
 from itertools import pairwise
@@ -39,7 +39,7 @@ class Network(Feedback):
         return sum((inputs + 1) * outputs for inputs, outputs in self.shapes)
 
     def initial(self, key: Key[Array, ""], dtype) -> Float[Array, " params"]:
-        """Normal weights of variance 1 / inputs; biases and output layer 0, so that the initial control is zero."""
+        """Draw normal weights of variance 1 / inputs; biases and output layer are 0, so the initial control is zero."""
         parts = []
         for index, (inputs, outputs) in enumerate(self.shapes):
             key, drawn = jax.random.split(key)
@@ -68,16 +68,16 @@ class Network(Feedback):
 
 
 def with_network(task: Task, hidden: tuple[int, ...], key: Key[Array, ""]) -> Task:
-    """A task with a network as its policy.
+    """Replace a task's policy with a network.
 
-    Its input is that of the task's linear feedback, or positions, velocities and activations if there is none.
+    Its input is that of the task's linear feedback, or else positions, velocities and activations.
 
     Args:
         hidden: width of each hidden layer.
         key: random key for the initial weights; consumed.
 
     Raises:
-        ValueError: the task has an initial-state policy or no control, or a layer has no unit.
+        ValueError: the task has an initial-state policy or no controls, or a layer has no units.
     """
     if task.policy.at_start or task.scene.host.nu == 0:
         raise ValueError(f"{task.name} has no control for a network to set: its policy chooses the initial state")

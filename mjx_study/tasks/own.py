@@ -1,4 +1,4 @@
-"""Tasks from outside this package: `module:name` in an importable module, or registered by an installed package."""
+"""User-defined tasks: `module:name` in an importable module, or registered by an installed package."""
 
 import inspect
 from collections.abc import Callable, Sequence
@@ -12,10 +12,10 @@ from mjx_study.tasks.validation import check_shapes
 
 
 def registered_place(name: str) -> str | None:
-    """The `module:name` of a registered task; None for a name that no package registers.
+    """Return the `module:name` of a registered task; None if no package registers the name.
 
     Raises:
-        ValueError: packages register different tasks by this name.
+        ValueError: packages register different tasks under this name.
     """
     places = {f"{point.module}:{point.attr}" for point in metadata.entry_points(group=TASK_GROUP, name=name)}
     if len(places) > 1:
@@ -24,7 +24,7 @@ def registered_place(name: str) -> str | None:
 
 
 def own_task(place: str, options: dict[str, Any]) -> Task:
-    """The task at a place: a Task, or what a function of the options returns.
+    """Return the task at a place: a Task, or the result of a function of the options.
 
     The current directory counts as importable, in the console script too.
 
@@ -33,8 +33,8 @@ def own_task(place: str, options: dict[str, Any]) -> Task:
 
     Raises:
         MissingModuleError: there is no such module.
-        ValueError: the module raises, has neither a Task nor a function of these options that returns one, or the parts
-            of the Task do not fit together.
+        ValueError: the module raises, has neither a Task nor a function of these options that returns one, or the
+            Task's parts do not fit together.
     """
     with importable_here():
         found = find_attribute(place, "task", Task)
@@ -49,7 +49,7 @@ def own_task(place: str, options: dict[str, Any]) -> Task:
 
 
 def _build(place: str, builder: object, options: dict[str, Any]) -> Task:
-    if not callable(builder) or inspect.isbuiltin(builder):  # sys.exit and os.abort would be called for nothing
+    if not callable(builder) or inspect.isbuiltin(builder):  # never call sys.exit or os.abort
         raise ValueError(
             f"{place} is neither a Task nor a function that returns one, but of type {type(builder).__name__}"
         )
@@ -66,7 +66,7 @@ def _build(place: str, builder: object, options: dict[str, Any]) -> Task:
 def _check_arguments(place: str, builder: Callable[..., object], options: dict[str, Any]) -> None:
     try:
         parameters = inspect.signature(builder).parameters.values()
-    except (TypeError, ValueError):  # of some functions that are not Python's
+    except (TypeError, ValueError):  # some non-Python functions have no signature
         return
     named = [p for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)]
     by_keyword = {p.name for p in named if p.kind is not p.POSITIONAL_ONLY}

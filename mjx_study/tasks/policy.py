@@ -1,8 +1,8 @@
-"""Policies: from parameters, noise and state to an initial state and controls.
+"""Policies: map parameters, noise and state to an initial state and controls.
 
-Noise w enters where exploration does: on each control, u_h = pi(x_h, theta) + w_h, or, for an initial-state policy, on
-the parameters themselves, theta + w. Keeping feedforward and feedback apart lets an open loop skip its trivial
-derivative with respect to the state.
+Noise w acts where exploration does: on each control, u_h = pi(x_h, theta) + w_h, or, for an initial-state policy, on
+the parameters themselves, theta + w. Separating feedforward from feedback lets an open loop skip its trivial derivative
+over the state.
 """
 
 import dataclasses
@@ -18,7 +18,7 @@ from mjx_study.simulation.dynamics import State
 
 @runtime_checkable
 class Policy(Protocol):
-    """A parametrised control law, and where noise enters it."""
+    """A parametrised control law with its noise."""
 
     @property
     def num_params(self) -> int:
@@ -27,7 +27,7 @@ class Policy(Protocol):
 
     @property
     def noise_shape(self) -> tuple[int, int]:
-        """Number of steps at which noise is drawn, and its dimension at each."""
+        """Number of steps with noise, and the noise dimension at each."""
         ...
 
     @property
@@ -41,17 +41,17 @@ class Policy(Protocol):
         ...
 
     def place(self, theta: Float[Array, " params"], noise: Float[Array, "steps dimensions"], start: State) -> State:
-        """The initial state, after theta and the noise have acted on it."""
+        """Return the initial state after theta and the noise have acted on it."""
         ...
 
     def feedforward(
         self, theta: Float[Array, " params"], noise: Float[Array, "steps dimensions"]
     ) -> Float[Array, "horizon nu"]:
-        """The part of the controls that does not depend on the state, noise included."""
+        """State-independent part of the controls, noise included."""
         ...
 
     def feedback(self, theta: Float[Array, " params"], state: State) -> Float[Array, " nu"] | None:
-        """The state-dependent part of the control; None if there is none."""
+        """State-dependent part of the control; None if there is none."""
         ...
 
     def score(
@@ -63,7 +63,7 @@ class Policy(Protocol):
 
 @dataclasses.dataclass(frozen=True)
 class NoisyControls:
-    """Base of the policies with noise on the controls.
+    """Base of policies with noise on the controls.
 
     Attributes:
         horizon: number of steps H.
@@ -84,7 +84,7 @@ class NoisyControls:
 
 @dataclasses.dataclass(frozen=True)
 class OpenLoop(NoisyControls):
-    """The control sequence itself: theta is (horizon, controls), flattened.
+    """Open-loop control sequence: theta is (horizon, controls), flattened.
 
     Attributes:
         horizon: number of steps H.
@@ -116,7 +116,7 @@ class OpenLoop(NoisyControls):
 
 @dataclasses.dataclass(frozen=True)
 class Feedback(NoisyControls):
-    """Base of the feedback policies u_h = pi(phi(x_h), theta) + w_h.
+    """Base of feedback policies u_h = pi(phi(x_h), theta) + w_h.
 
     Attributes:
         horizon: number of steps H.
@@ -155,13 +155,13 @@ class LinearFeedback(Feedback):
 
 @dataclasses.dataclass(frozen=True)
 class InitialStatePolicy:
-    """Initial-state policy: theta + w determines the initial state, and no control acts.
+    """Policy that sets the initial state from theta + w and applies no controls.
 
     Attributes:
-        num_params: length of theta and of its noise w.
+        num_params: length of theta and of the noise w.
         horizon: number of steps H.
         controls: number of controls m, all zero.
-        start_at: maps (start, theta + w) to the state that the simulation starts from.
+        start_at: maps (start, theta + w) to the initial state of the simulation.
         additive: True, since the noise is added to theta entry by entry.
         at_start: True, since theta and the noise act on the initial state only.
     """

@@ -1,8 +1,8 @@
-"""Pushing through stiff contact: an open-loop force on the first of two touching bodies.
+"""Push through stiff contact with an open-loop force on the first of two touching bodies.
 
-The numbers are those of Suh et al. 2022 and its published example: two bodies of 0.1 kg, 5 ms, velocity factor 0.99
+Numbers are those of Suh et al. 2022 and its published example: two bodies of 0.1 kg, 5 ms steps, velocity factor 0.99
 per step, 200 forces; only the contact model varies. First-order gradients win at K = 10 N/m and lose from about
-1000 N/m on.
+1000 N/m upwards.
 """
 
 from pathlib import Path

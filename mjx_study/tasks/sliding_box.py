@@ -1,9 +1,9 @@
-"""Dragging a box by friction: an open-loop force on a block that stands on it.
+"""Drag a box by friction with an open-loop force on a block that stands on it.
 
-In Suh et al. 2022 friction is clip(1.8 v, +-0.18) N of the slip v while the block is above the box, and zero past the
-edge. Here it is MuJoCo's Coulomb cone with the same limit, mu m g = 0.18 N, and the contact's damping as the slope:
-1.8 N s/m in the families without a damping ratio. The block's height is a coordinate, so the block rests on the box by
-its weight alone and really falls past the edge. Numbers and horizon are the published example's.
+In Suh et al. 2022, friction is clip(1.8 v, +-0.18) N for a slip v while the block is above the box, and zero past the
+edge. Here it is MuJoCo's Coulomb cone with the same limit, mu m g = 0.18 N, and the contact's damping as the slope,
+1.8 N s/m in families without a damping ratio. The block's height is a coordinate: the block rests on the box by its
+weight alone and really falls past the edge. Numbers and horizon are those of the published example.
 """
 
 from pathlib import Path

@@ -18,13 +18,13 @@ from mjx_study.tasks.policy import Policy
 
 @dataclasses.dataclass(frozen=True)
 class Recipe:
-    """Default settings for optimising a task.
+    """Default settings for the optimisation of a task.
 
     Attributes:
         learning_rate: learning rate of plain gradient descent.
         iterations: number of descent steps.
         samples: batch size of the gradient estimate at each step.
-        decay: power a of the learning rate's decay, learning_rate / i^a at iteration i = 1, 2, ...
+        decay: exponent a of the learning-rate decay, learning_rate / i^a at iteration i = 1, 2, ...
     """
 
     learning_rate: float
@@ -35,14 +35,14 @@ class Recipe:
 
 @dataclasses.dataclass(frozen=True)
 class Published:
-    """The published example's constants in AoBG's bound epsilon + alpha B <= gamma, on the scale of this task's cost.
+    """Constants of the published example in AoBG's bound epsilon + alpha B <= gamma, on this task's cost scale.
 
-    The example uses its confidence 0.95 in the logarithm in place of the Bernstein inequality's probability of failure.
-    The appendix bounds the variance by the second moment, whose printed sum must be a mean.
+    The example uses its confidence 0.95 in the logarithm instead of the Bernstein inequality's failure probability. The
+    appendix bounds the variance by the second moment, whose printed sum must be a mean.
 
     Attributes:
         gamma: accuracy bound, in the unit of the gradient.
-        radius: R in epsilon, a constant per example, in the unit of the gradient.
+        radius: R in epsilon, constant for each example, in the unit of the gradient.
         failure_probability: P in epsilon, as published.
         variance_proxy: s2 in epsilon.
 
@@ -57,18 +57,17 @@ class Published:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class StudyDefaults:
-    """How a task is studied unless a study says otherwise.
+    """Defaults for studies of a task.
 
     Attributes:
         families: contact families, names in `FAMILIES`.
         stiffnesses: contact stiffnesses [N/m].
         damping: contact damping in families without a damping ratio [N s/m], or None; friction needs some, since it is
             the resistance to slip.
-        gamma: AoBG's accuracy bound, in the unit of the gradient; infinite by default, which is inverse-variance
-            weighting.
-        published: AoBG's constants in the published example; None if there are none.
-        recipe: settings of gradient descent; None if all of them must be given.
-        span: range that a landscape over a scalar parameter shows; None for a range about theta.
+        gamma: AoBG's accuracy bound, in the unit of the gradient; infinite by default (inverse-variance weighting).
+        published: AoBG's constants in the published example, or None.
+        recipe: settings of gradient descent; None if they must all be given.
+        span: range of a landscape over a scalar parameter; None for a range about theta.
     """
 
     families: tuple[str, ...] = ("penalty", "mujoco", "mujoco_stiff")
@@ -85,12 +84,12 @@ class StudyDefaults:
 
     @property
     def main_family(self) -> str:
-        """Contact family of a single run: MuJoCo's impedance if it is among the families."""
+        """Contact family of single runs: MuJoCo's impedance if it is among the families."""
         return "mujoco" if "mujoco" in self.families else self.families[0]
 
     @property
     def middle_stiffness(self) -> float:
-        """Stiffness of a single run: the middle one [N/m]."""
+        """Stiffness of single runs [N/m]: the middle one."""
         return self.stiffnesses[len(self.stiffnesses) // 2]
 
 
@@ -112,21 +111,21 @@ class Task:
         scene: the compiled model; a contact model replaces its contact parameters.
         horizon: number of steps H.
         policy: maps theta, noise and state to initial state and controls.
-        theta: default parameters, where gradients are taken, (params,). A weakly typed array is made a strong one;
-            otherwise programs compiled for it would be compiled again for the theta of a descent.
-        sigma: standard deviation of the noise, in the unit of what it is added to.
-        start: initial state, or a distribution over initial states as a function of a key.
-        running_cost: c(state, control) at each step, before it is taken; may be omitted if there is a final cost.
-        final_cost: c(state) after the last step; may be omitted if there is a running cost.
-        contact_pair: names of the two geoms whose contact is swept; None if there is no contact.
-        reference: analytic counterpart of the penalty family, as a function of the stiffness [N/m]; None if there is
-            none. `analytic` gives it the task's noise.
+        theta: default parameters, where gradients are taken, (params,). Weakly typed arrays are made strongly typed to
+            avoid recompilation for the theta of a descent.
+        sigma: standard deviation of the noise, in the unit of the quantity it is added to.
+        start: initial state, or a function of a key that draws one.
+        running_cost: c(state, control) of each step, evaluated before the step; optional if there is a final cost.
+        final_cost: c(state) after the last step; optional if there is a running cost.
+        contact_pair: names of the two geoms whose contact is swept; None without contact.
+        reference: function of the stiffness [N/m] that returns the analytic counterpart of the penalty family, or None;
+            `analytic` adds the task's noise.
         noise: name of the noise density in `estimators.NOISES`.
         onset: treatment of the onset of contact in first-order gradients: "none" for exact derivatives of the steps, or
             "linear" or "jump" to add what those miss (see `mjx_study.simulation.onset` and `.branches`).
-        metrics: numbers of a rollout by name, as a function of its states including the initial one, to report beside
-            the cost; None for none.
-        defaults: how the task is studied unless a study says otherwise.
+        metrics: function that computes named metrics of a rollout, reported along with the cost, from its states
+            including the initial one; None for none.
+        defaults: defaults for studies of the task.
     """
 
     name: str
@@ -165,10 +164,10 @@ class Task:
         return not isinstance(self.start, State)
 
     def analytic(self, stiffness: float) -> Reference:
-        """The reference at a contact stiffness [N/m], with the task's own noise.
+        """Return the reference at a contact stiffness [N/m], with the task's noise.
 
         Raises:
-            ValueError: there is none.
+            ValueError: the task has no reference.
         """
         if self.reference is None:
             raise ValueError(f"{self.name} has no analytic reference")
@@ -195,6 +194,6 @@ class Task:
 
 
 def check_sigma(sigma: float) -> None:
-    """Raises ValueError unless sigma is positive and finite."""
+    """Raise ValueError unless sigma is positive and finite."""
     if not 0 < sigma < math.inf:
         raise ValueError(f"sigma must be positive and finite, in the unit of what it is added to; got {sigma}")

@@ -1,8 +1,8 @@
-"""Returning balls to a target with a paddle: linear feedback from many initial states.
+"""Return balls to a target with a paddle: linear feedback from random initial states.
 
-Numbers are those of Suh et al. 2022 and its published example, with time running ten times as fast: 200 steps of 5 ms
-instead of 50 ms resolve the contact. Policy, commands, noise and cost are in the paper's slow time, so that parameters
-and costs can be compared. A paddle of 1000 times the ball's mass stands for an unstoppable one.
+Numbers are those of Suh et al. 2022 and its published example, but time runs ten times as fast: 200 steps of 5 ms
+instead of 50 ms resolve the contact. Policy, commands, noise and cost use the paper's slow time, so that parameters and
+costs are comparable. A paddle of 1000 times the ball's mass stands for an unstoppable one.
 """
 
 from pathlib import Path

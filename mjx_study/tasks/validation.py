@@ -11,7 +11,7 @@ from mjx_study.tasks.task import Task
 
 
 def check_shapes(task: Task, name: str = "") -> None:
-    """Refuse mismatches that broadcasting and clamped indices would let pass; traces only, computes nothing.
+    """Reject mismatches that broadcasting and clamped indices would hide; traces only, computes nothing.
 
     Args:
         name: prefix of messages; by default the task's name.
