@@ -503,7 +503,8 @@ def measure_engine(workers: int, cells: int, seconds: float, programs: int, numb
             processor = time.process_time() - processor
         size = store.path(0).stat().st_size
         claimed = time.perf_counter()
-        with store.claim(*range(cells)):
+        with store.claims() as claim:
+            assert all(map(claim, range(cells)))
             claimed = time.perf_counter() - claimed
     return {
         "workers": workers,

@@ -30,8 +30,8 @@ def study(folder: Path) -> Store:
     """Begin a study or go on with it, and write what is missing."""
     store = Store.create(folder, DOCUMENT)
     for index in store.missing:
-        with store.claim(index) as ours:
-            if ours:
+        with store.claims() as claim:
+            if claim(index):
                 store.write(index, numbers(index))
     write_dataset(xr.Dataset({"values": ("value", np.arange(3000.0))}), folder / "results.nc")
     return store
@@ -165,7 +165,7 @@ def test_what_is_no_file_is_refused_at_once(tmp_path: Path, kind: str) -> None:
         with pytest.raises(StudyError, match="00002.part.npz is damaged .*; move it away to compute it again"):
             Store.open(folder).read_part(2)
         put_no_file(folder / "study.lock", kind)
-        with pytest.raises(StudyError, match="cannot lock .*study.lock"), Store.open(folder).claim(0):
+        with pytest.raises(StudyError, match="cannot lock .*study.lock"), Store.open(folder).claims():
             pass
         put_no_file(folder / "study.json", kind)
         with pytest.raises(StudyError, match="cannot read .*study.json"):

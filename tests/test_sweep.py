@@ -9,7 +9,9 @@ import re
 import signal
 import subprocess
 import sys
+import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +33,7 @@ from mjx_study.report import report
 from mjx_study.simulation.contact import stiffness_from_solref
 from mjx_study.study import sampling, store
 from mjx_study.study.configuration import StudyConfig
-from mjx_study.study.gradients import compute_gradients
+from mjx_study.study.gradients import Gradients, compute_gradients
 from mjx_study.study.plan import estimators_of, plan_study
 from mjx_study.study.run import load_study, open_store, run_study, warnings_of
 from mjx_study.study.store import Store, StudyError
@@ -168,6 +170,24 @@ def test_a_cell_does_not_depend_on_the_others(undisturbed: Path, tmp_path: Path)
             np.testing.assert_array_equal(array, alone[name], err_msg=name)
 
 
+def test_a_cell_is_sampled_beside_the_statistics_of_the_last_one(undisturbed: Path, tmp_path, monkeypatch) -> None:
+    plan = plan_study(config())
+    begun = [threading.Event() for _ in (*plan.cells, "done")]
+
+    def beside(self: Gradients, call: Callable[[], Any]) -> Any:
+        following = sum(each.is_set() for each in begun)
+
+        def late() -> Any:
+            assert following == len(plan.cells) or begun[following].wait(30), "the next cell waits for statistics"
+            return call()
+
+        return self._statistics.submit(late)
+
+    monkeypatch.setattr(Gradients, "_beside", beside)
+    data = run_study(plan, tmp_path / "study", lambda done, total, what: begun[done].set())
+    assert same(data, load_study(undisturbed))
+
+
 def test_descents_are_labelled(descents: Path) -> None:
     data = load_study(descents)
     assert data["cost"].dims == (
@@ -211,8 +231,8 @@ document = study_document(cells)
 def work():
     store = Store.create(folder, document)
     for index in store.missing:
-        with store.claim(index) as ours:
-            if ours and not store.has(index):
+        with store.claims() as claim:
+            if claim(index) and not store.has(index):
                 time.sleep(0.002)
                 store.write(index, {"values": np.random.default_rng(index).normal(size=100_000)})
 

@@ -1,7 +1,8 @@
 """The computation of a study's cells, whole or in blocks, by kind of study."""
 
 from collections.abc import Callable, Mapping
-from typing import Any, Final
+from concurrent.futures import Future
+from typing import Final
 
 import numpy as np
 
@@ -29,9 +30,21 @@ class Computation:
 
     def __call__(self, cell: StudyCell, part: Part) -> Arrays:
         """A cell, from its checkpoint on, unless it is a landscape."""
-        further: Any = () if self._plan.config.kind == "landscapes" else (part,)
+        return self.end(cell, self.begin(cell, part))
+
+    def begin(self, cell: StudyCell, part: Part) -> Future[Arrays]:
+        """Begin a cell: where its statistics may run beside the sampling of the next one, they may not have ended."""
         with timed(rest(self._plan, cell)):
-            return self._compute(cell, *further)
+            if isinstance(self._compute, Gradients):
+                return self._compute.begin(cell, part)
+            future = Future[Arrays]()
+            future.set_result(self._compute(cell, *(() if self._plan.config.kind == "landscapes" else (part,))))
+            return future
+
+    def end(self, cell: StudyCell, begun: Future[Arrays]) -> Arrays:
+        """Wait for a cell."""
+        with timed(rest(self._plan, cell), calls=0):
+            return begun.result()
 
     def begun(self, cell: StudyCell, kept: Mapping[str, np.ndarray]) -> Blocks:
         """The blocks of a cell that is several tasks, those of a checkpoint done."""

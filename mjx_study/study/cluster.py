@@ -37,6 +37,14 @@ CONNECT_SECONDS: Final = 30
 """Time for a scheduler to answer."""
 POLL_SECONDS: Final = 1.0
 """Between looks at which workers there are."""
+SELDOM: Final = {
+    "distributed.admin.tick.interval": "1s",
+    "distributed.admin.system-monitor.interval": "5s",
+    "distributed.worker.memory.monitor-interval": "1s",
+    "distributed.worker.profile.enabled": False,
+}
+"""What Dask does in this process for each local worker, many times a second by default: with 100 workers, as much as a
+core can do."""
 GPUS: Final = "/dev/nvidia[0-9]*"
 _ONE_AT_A_TIME, _SET_UP = threading.Lock(), threading.Event()
 Arrays = dict[str, np.ndarray]
@@ -71,6 +79,7 @@ def connected(cluster: str) -> Generator[Any]:
 
 def _connect(cluster: str, stack: ExitStack) -> Any:
     """The client, which the stack closes, as it does the workers that are started."""
+    import dask.config
     import distributed
 
     logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what happens to workers is told by us
@@ -79,6 +88,7 @@ def _connect(cluster: str, stack: ExitStack) -> Any:
     address: Any = cluster
     if kind == "local":
         workers = int(count or available_cores())
+        stack.enter_context(dask.config.set(SELDOM))
         local = distributed.LocalCluster(
             n_workers=workers,
             threads_per_worker=1,

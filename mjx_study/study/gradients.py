@@ -6,10 +6,11 @@ not sampling noise.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cache, partial
-from typing import Any, Final
+from threading import Lock
+from typing import Any, Final, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -36,6 +37,7 @@ from mjx_study.study.variables import BATCH, GRADIENTS, ONSETS
 from mjx_study.tasks.contact_grid import contact_grid
 from mjx_study.tasks.task import Task
 
+Result = TypeVar("Result")
 CANDIDATES: Final = 100
 """First-order samples whose median is a candidate for the reference's control variate."""
 PILOT: Final = LARGEST_BLOCK
@@ -56,8 +58,8 @@ class Gradients:
         self._plan, self._config, self._objectives = plan, plan.config, Objectives(plan)
         self._warm: set[Any] = {None}
         self._soft: dict[tuple[int, float], Array | None] = {}
-        self._pool, self._compiling = ThreadPoolExecutor(1), Future[None]()
-        self._compiling.set_result(None)
+        self._pool, self._compiling = ThreadPoolExecutor(1), _done(None)
+        self._device, self._statistics = Lock(), ThreadPoolExecutor(1)
 
     @property
     def _keys(self) -> dict[str, Any]:
@@ -69,7 +71,15 @@ class Gradients:
         return jax.random.split(odd, self._config.reference_samples or 0), jax.random.split(candidate, CANDIDATES)
 
     def __call__(self, cell: StudyCell, part: Part = Part()) -> Arrays:  # noqa: B008, it is empty
-        """A cell's numbers, from whole batches or from blocks, of which the checkpoint has those that are done."""
+        """A cell's numbers, see `begin`."""
+        return self.begin(cell, part).result()
+
+    def begin(self, cell: StudyCell, part: Part) -> Future[Arrays]:
+        """Sample a cell, in whole batches or in blocks; blocks in the checkpoint are not computed again.
+
+        Returns:
+            The cell's numbers: on CPUs they are done, on accelerators their statistics may still be running.
+        """
         if not blocks_of(self._plan, cell):
             return self._whole(cell)
         blocks = self.begun(cell, part.kept)
@@ -77,7 +87,7 @@ class Gradients:
             part.report(task, blocks.tasks, f"{self._plan.label(cell)}, in blocks")
             blocks.add(task, self.block(cell, task))
             part.save(blocks.arrays())
-        return self.merged(cell, blocks)
+        return _done(self.merged(cell, blocks))
 
     def begun(self, cell: StudyCell, kept: Mapping[str, np.ndarray]) -> Blocks:
         """The blocks of a cell, those of a checkpoint done."""
@@ -95,7 +105,8 @@ class Gradients:
         first, every = place * size, math.ceil(cell.samples / THINNED)
         count, oracles = min(size, cell.samples - first), estimators.oracles_of(chosen)
         some = slice(seed, seed + 1)
-        drawn, seconds, residuals = draw_batches(objective, task_of.theta, self._keys, oracles, count, some, first)
+        draw = partial(draw_batches, objective, task_of.theta, self._keys, oracles, count, device=self._device)
+        drawn, seconds, residuals = draw(some, first)
         batches = jax.tree.map(lambda leaf: leaf[0], drawn)
         summary: dict[str, Any] = {name: Tally.of(drawn[name], seconds[name], residuals[name]) for name in oracles}
         for index, rows in enumerate(jax.device_get(_rows_of_parts(batches, chosen))):
@@ -116,24 +127,44 @@ class Gradients:
             tallies.append({name: each for name, each in summary.items() if name in estimators.ORACLES})
         return self._numbers(cell, jax.tree.map(lambda *leaves: np.stack(leaves), *parts), reference, tallies)
 
-    def _whole(self, cell: StudyCell) -> Arrays:
+    def _whole(self, cell: StudyCell) -> Future[Arrays]:
         config, oracles, keys = self._config, oracles_of(self._config), self._keys
         objective, theta = self._objective(cell), self._plan.groups[cell.group].task.theta
         tests, chosen = jax.random.split(keys["test"], config.batches), estimators_of(self._plan, cell)
         together = seeds_together(self._plan, cell)
-        reference, parts, tallies = None, [], []
+        reference: GradientEstimate | None = None
+        parts: list[Future[Any]] = []
+
+        def statistics(drawn: Any, seconds: Any, residuals: Any, keys: Any, compiled: Future[None]) -> Any:
+            compiled.result()
+            with self._device:
+                numbers = jax.block_until_ready(_seed_numbers(chosen, config.confidence)(drawn, reference, keys))
+            tallies = {name: Tally.of(drawn[name], seconds[name], residuals[name]) for name in oracles}
+            return jax.device_get(numbers), tallies
+
+        def all_numbers() -> Arrays:
+            assert reference is not None
+            numbers, tallies = zip(*(part.result() for part in parts), strict=True)
+            joined = jax.tree.map(lambda *leaves: np.concatenate(leaves), *numbers)
+            return self._numbers(cell, joined, reference, tallies)
+
         for start in range(0, config.batches, together):
             some = slice(start, start + together)
-            drawn, seconds, residuals = draw_batches(objective, theta, keys, oracles, cell.samples, some)
+            drawn = draw_batches(objective, theta, keys, oracles, cell.samples, some, device=self._device)
             if reference is None:
-                pilot = jax.tree.map(lambda leaf: leaf[0, :PILOT], drawn["evaluation"])
-                reference = self._reference(cell, objective, pilot)
-            self._compiling.result()
-            numbers = _seed_numbers(chosen, config.confidence)(drawn, reference, tests[some])
-            parts.append(jax.device_get(numbers))
-            tallies.append({name: Tally.of(drawn[name], seconds[name], residuals[name]) for name in oracles})
-        assert reference is not None
-        return self._numbers(cell, jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts), reference, tallies)
+                pilot = jax.tree.map(lambda leaf: leaf[0, :PILOT], drawn[0]["evaluation"])
+                with self._device:
+                    reference = self._reference(cell, objective, pilot)
+            if parts:
+                parts[-1].result()  # no more than two groups of seeds are in memory
+            parts.append(self._beside(partial(statistics, *drawn, tests[some], self._compiling)))
+        return self._beside(all_numbers)
+
+    def _beside(self, call: Callable[[], Result]) -> Future[Result]:
+        """Call in turn, on accelerators in a thread beside the sampling of the next batches."""
+        if jax.default_backend() == "cpu":
+            return _done(call())
+        return self._statistics.submit(unheard(call))
 
     def _objective(self, cell: StudyCell) -> MjxObjective | Reference:
         """The objective of a cell, its programs compiled, so that no time holds a compilation."""
@@ -187,6 +218,12 @@ class Gradients:
         else:
             arrays["reference"] = np.asarray(reference.mean)
         return {name: np.asarray(array, float) for name, array in arrays.items()}
+
+
+def _done(result: Result) -> Future[Result]:
+    future = Future[Result]()
+    future.set_result(result)
+    return future
 
 
 def _of_batches(

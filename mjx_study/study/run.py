@@ -8,7 +8,8 @@ their own; everything else is traced.
 import dataclasses
 import json
 import time
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Iterable, Sequence
+from concurrent.futures import Future
 from contextlib import ExitStack, suppress
 from functools import partial
 from pathlib import Path
@@ -167,8 +168,8 @@ class _Run:
         """All cells, none of them written."""
         document["config"]["chunk_size"] = self._plan.chunk_size
         compute, cells = Computation(self._plan), {}
-        for index in range(self._total):
-            cells[index] = (self._numbers(compute, index, index, Part()), document["versions"])
+        for index, arrays in self._computed(compute, ((index, index, Part()) for index in range(self._total))):
+            cells[index] = arrays, document["versions"]
         self._progress(self._total, self._total, "done")
         return _labelled(document, cells).assign_attrs(computed_cells=self._total)
 
@@ -222,21 +223,29 @@ class _Run:
         return dataset.assign_attrs(computed_cells=computed)
 
     def _cells_here(
-        self, compute: Any, store: Store, missing: Sequence[int]
+        self, compute: Computation, store: Store, missing: Sequence[int]
     ) -> Generator[tuple[int, dict[str, np.ndarray]]]:
-        """Those cells that nobody else computes, one after another in this process."""
-        for place, index in enumerate(missing):
-            with store.claim(index) as ours:
-                if ours and not store.has(index):
-                    part = Part(store.read_part(index), partial(_keep, store, index))
-                    yield index, self._numbers(compute, index, self._total - len(missing) + place, part)
+        """Those cells that nobody else computes, in this process."""
+        with store.claims() as claim:
+            yield from self._computed(
+                compute,
+                (
+                    (
+                        index,
+                        self._total - len(missing) + place,
+                        Part(store.read_part(index), partial(_keep, store, index)),
+                    )
+                    for place, index in enumerate(missing)
+                    if claim(index) and not store.has(index)
+                ),
+            )
 
     def _cells_there(
         self, client: Any, store: Store, missing: Sequence[int]
     ) -> Generator[tuple[int, dict[str, np.ndarray] | str]]:
         """Those cells that nobody else computes, on a cluster; why one failed is text."""
-        with store.claim(*missing) as ours:
-            waiting = [index for index in ours if not store.has(index)]
+        with store.claims() as claim:
+            waiting = [index for index in missing if claim(index) and not store.has(index)]
             done = self._total - len(waiting)
 
             def told(workers: int) -> None:
@@ -253,8 +262,28 @@ class _Run:
                 self._progress(done, self._total, self._plan.label(self._plan.cells[index]))
                 yield index, arrays
 
-    def _numbers(self, compute: Any, index: int, done: int, part: Part) -> dict[str, np.ndarray]:
-        """A cell's numbers, with progress in whole cells, or where there is a single one within it."""
+    def _computed(
+        self, compute: Computation, cells: Iterable[tuple[int, int, Part]]
+    ) -> Generator[tuple[int, dict[str, np.ndarray]]]:
+        """Indices and numbers of cells; each is begun before the statistics of the last one are waited for.
+
+        Args:
+            cells: index, number of cells done before, and checkpoint of each.
+        """
+        last: tuple[int, Future[dict[str, np.ndarray]]] | None = None
+        for index, done, part in cells:
+            begun = self._begin(compute, index, done, part)
+            if last is not None:
+                yield last[0], compute.end(self._plan.cells[last[0]], last[1])
+            last = index, begun
+            if begun.done():
+                yield index, begun.result()
+                last = None
+        if last is not None:
+            yield last[0], compute.end(self._plan.cells[last[0]], last[1])
+
+    def _begin(self, compute: Computation, index: int, done: int, part: Part) -> Future[dict[str, np.ndarray]]:
+        """Begin a cell, with progress in whole cells, or where there is a single one within it."""
         cell = self._plan.cells[index]
         label = self._plan.label(cell)
         if (program := self._plan.program_of(cell)) not in self._begun:
@@ -262,7 +291,7 @@ class _Run:
             label += " (compiling first)"
         self._progress(done, self._total, label)
         within = self._progress if self._total == 1 else lambda *_: self._progress(done, self._total, label)
-        return compute(cell, dataclasses.replace(part, report=within))
+        return compute.begin(cell, dataclasses.replace(part, report=within))
 
 
 def _keep(store: Store, index: int, arrays: dict[str, np.ndarray]) -> None:

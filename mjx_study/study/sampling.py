@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from typing import Any, Final
 
@@ -62,6 +63,8 @@ def draw_batches(
     samples: int,
     seeds: slice,
     first: int = 0,
+    *,
+    device: AbstractContextManager[Any] = nullcontext(),  # noqa: B008, it has no state
 ) -> tuple[dict[str, Any], dict[str, float], dict[str, np.ndarray]]:
     """Batches of every oracle, with a leading axis of seeds.
 
@@ -69,6 +72,7 @@ def draw_batches(
         samples: in each batch.
         seeds: which.
         first: index of the first sample, where the batch is part of a larger one.
+        device: held during each timed call.
 
     Returns:
         By oracle: the batch, its computing time [s], and the solver residual of every rollout.
@@ -81,9 +85,10 @@ def draw_batches(
         for start in range(0, len(streams), together):
             some = jax.random.clone(streams)[start : start + together]
             flat = _keys_of_seeds(some, first, samples).reshape(-1)
-            begun = time.perf_counter()
-            batch = jax.block_until_ready(getattr(objective, ORACLES[name].method)(theta, flat))
-            seconds[name] += time.perf_counter() - begun
+            with device:
+                begun = time.perf_counter()
+                batch = jax.block_until_ready(getattr(objective, ORACLES[name].method)(theta, flat))
+                seconds[name] += time.perf_counter() - begun
             residuals[name] = np.concatenate([residuals.get(name, np.zeros(0)), residuals_of(batch)])
             parts.append(jax.tree.map(lambda leaf: leaf.reshape(-1, samples, *leaf.shape[1:]), batch))
         drawn[name] = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)

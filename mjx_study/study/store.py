@@ -229,10 +229,11 @@ class Store:
         return arrays, json.loads(str(arrays.pop(VERSIONS)))
 
     @contextmanager
-    def claim(self, *indices: int) -> Generator[list[int]]:
-        """Those of some cells that this process may compute; no other may until the block is left or the process dies.
+    def claims(self) -> Generator[Callable[[int], bool]]:
+        """A function that claims a cell for this process; false if another process has it.
 
-        A process may be in one such block at a time: the system takes all its locks when it closes the file once.
+        Claims end with the block or the process. A process may be in one such block at a time: closing the file once
+        releases all of its locks.
         """
         path = self.folder / "study.lock"
         try:
@@ -240,12 +241,14 @@ class Store:
         except OSError as error:
             raise StudyError(f"cannot lock {path}: {_told(error)}") from error
         with os.fdopen(descriptor, "r+b") as file:
-            ours = []
-            for index in indices:
+
+            def claim(index: int) -> bool:
                 with suppress(BlockingIOError, PermissionError):
                     fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB, 1, index)
-                    ours.append(index)
-            yield ours
+                    return True
+                return False
+
+            yield claim
 
     def _place(self, index: int, *, part: bool = False) -> str:
         """Digest of a cell's index and coordinates, and unless it is a checkpoint of the descents' length."""
