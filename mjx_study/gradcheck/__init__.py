@@ -1,8 +1,8 @@
-"""Are the derivatives right? Automatic differentiation against finite differences, the C engine and a closed form.
+"""Check derivatives: automatic differentiation against finite differences, the C engine and a closed form.
 
-A mismatch need not be a wrong derivative: at a kink or a jump of the step there is none, with an unconverged solver it
-is taken at another point, and where MJX places a contact elsewhere the C engine has a different one. The check tells
-these cases apart, for every entry of a step's Jacobian.
+A mismatch need not be a wrong derivative: a step has none at a kink or jump, an unconverged solver differentiates at
+another point, and where MJX places a contact elsewhere, the C engine has a different derivative. The check
+distinguishes these cases for every entry of a step's Jacobian.
 """
 
 from mjx_study.choices import CHECKED_STIFFNESS as STIFFNESS

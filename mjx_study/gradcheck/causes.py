@@ -1,4 +1,4 @@
-"""The likely cause of a finding, in one sentence, from the model and the state."""
+"""Infer the likely cause of a finding, in one sentence, from the model and the state."""
 
 import dataclasses
 from collections.abc import Callable
@@ -15,21 +15,21 @@ from mjx_study.simulation.engine import HostState
 from mjx_study.simulation.scene import num_constraint_rows
 
 NEAR: Final = 2e-6
-"""Distance from a switch below which it counts as the cause; about the shortest difference step [m, rad, relative]."""
+"""Distance below which a switch counts as the cause; about the smallest difference step [m, rad, relative]."""
 UNKNOWN: Final = "unknown"
 _SLIDE, _HINGE = int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE)
-SINGULAR: Final = "the inertia matrix is singular (a body lacks mass, or joints do the same)"
+SINGULAR: Final = "the inertia matrix is singular (a body lacks mass, or joints are redundant)"
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Place:
-    """The place of a finding.
+    """Where a finding occurs.
 
     Attributes:
         layout: the scene and the names of its coordinates.
-        stages: MJX's quantities at the state.
-        qacc: its constrained acceleration.
-        solref: solref of all geoms under the contact model, (geoms, 2).
+        stages: MJX's intermediate quantities at the state.
+        qacc: MJX's constrained acceleration.
+        solref: solref of all geoms with the contact model applied, (geoms, 2).
         solimp: solimp of all geoms, (geoms, 5).
     """
 
@@ -46,7 +46,7 @@ class Place:
 
     @cached_property
     def degenerate(self) -> list[DegenerateContact]:
-        """Contacts placed by a direction that vanishes."""
+        """Contacts placed along a vanishing direction."""
         return degenerate_contacts(self.host, self.state, self.stages["geom"][self.touching()])
 
     def touching(self) -> np.ndarray:
@@ -57,15 +57,15 @@ Rule = Callable[[Place, Coordinate, Coordinate], str | None]
 
 
 def cause_of_fault(place: Place, output: Coordinate, source: Coordinate, *, stock: bool = False) -> str:
-    """The likely reason why a derivative is wrong, zero or NaN here."""
+    """Return the likely reason why a derivative is wrong, zero or NaN."""
     rules = [*_FAULTS, _unrolled_solver] if stock else _FAULTS
     return next((text for rule in rules if (text := rule(place, output, source))), UNKNOWN)
 
 
 def cause_of_kink(place: Place, output: Coordinate, source: Coordinate) -> str:
-    """The switch that makes the step non-smooth here."""
+    """Return the switch that makes the step nonsmooth."""
     rules = (_control_bound, _parameter_bound, _onset, _limit, _row_switch, _friction_loss, _muscle, _degenerate)
-    if output.block == "act":  # which nothing that touches moves
+    if output.block == "act":  # unaffected by contacts
         rules = (_control_bound, _muscle)
     found = next((text for rule in rules if (text := rule(place, output, source))), None)
     return found or "a clip, a maximum or a choice between features switches here"
@@ -240,14 +240,14 @@ def _parameter_bound(place: Place, output: Coordinate, source: Coordinate) -> st
         if entry < 2 and np.any(np.abs(place.solimp[:, 0] - place.solimp[:, 1]) < NEAR):
             return "d_0 equals d_width, and MuJoCo clips the impedance between the two"
     if source.name == "solimp[power]" and np.any(place.solimp[:, 4] == 1):
-        return "solimp's power is 1, the least that MuJoCo takes"
+        return "solimp's power is 1, the smallest that MuJoCo accepts"
     if source.name == "solref[1]" and np.any((place.solref[:, 0] <= 0) & (np.abs(place.solref[:, 1]) < NEAR)):
         return "solref's damping is 0, and MuJoCo interprets a positive number there differently"
     if source.name == "solref[0]" and not place.host.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_REFSAFE:
         if np.any(np.abs(place.solref[:, 0] - 2 * place.host.opt.timestep) < NEAR):
             return "solref's time constant is two timesteps, where MuJoCo clips it"
     if source.block == "contact" and len(np.unique(np.round(place.solimp, 12), axis=0)) > 1:
-        return "of two geoms' parameters MuJoCo takes one or mixes them, and they are at a tie"
+        return "MuJoCo selects or mixes the parameters of two geoms, which tie here"
     return None
 
 

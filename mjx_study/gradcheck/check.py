@@ -1,4 +1,4 @@
-"""The check itself: every contact model, every state, every derivative."""
+"""Run the check: every contact model, every state, every derivative."""
 
 import mujoco
 
@@ -19,7 +19,7 @@ from mjx_study.study.configuration import Progress
 
 
 def gradcheck(plan: GradcheckPlan, progress: Progress = lambda done, total, what: None) -> GradcheckReport:
-    with quiet_engine():  # states on their way to something else may warn
+    with quiet_engine():  # intermediate states may cause warnings
         return _gradcheck(plan, progress)
 
 

@@ -1,4 +1,4 @@
-"""Findings for one contact model, grouped, and its row in the table."""
+"""Group the findings for one contact model, and summarise them in a table row."""
 
 from collections.abc import Sequence
 
@@ -90,7 +90,7 @@ def _of_entries(check: StateCheck, layout: Coordinates) -> list[tuple[_Key, Entr
             verdict = VERDICTS[worst[row, column]]
             smooth = verdict not in ("kink", "jump")
             if who == STOCK and not smooth:
-                continue  # of the step, and so already the project's
+                continue  # inherited from the step, so already attributed to the project
             shown = tuple(mode for mode in modes if check.judged[mode].codes[row, column] == worst[row, column])
             output, source = layout.outputs[row], layout.inputs[column]
             if not smooth:
@@ -108,7 +108,7 @@ def _of_entries(check: StateCheck, layout: Coordinates) -> list[tuple[_Key, Entr
 
 
 def _of_engine(check: StateCheck, layout: Coordinates) -> list[tuple[_Key, Entry]]:
-    """Findings where the C engine's step has the same value but another derivative."""
+    """Findings where the C engine's step has the same value but a different derivative."""
     if check.engine is None:
         return []
     apart = diagnosis.disagreements(check.judged["forward"], check.truth, check.engine, check.engine_truth)

@@ -1,4 +1,4 @@
-"""Compilation of programs that run only a few times and cost mostly compiling: little optimisation, in parallel."""
+"""Fast parallel compilation, with little optimisation, of programs that run only a few times."""
 
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -9,20 +9,20 @@ import jax.numpy as jnp
 from jax.errors import JaxRuntimeError
 
 OPTIONS: Final = {"xla_backend_optimization_level": "0", "xla_cpu_use_fusion_emitters": False}
-"""XLA's options on a CPU: half the compile time of its usual code generator, and fast enough for these checks."""
+"""XLA options on CPUs: half the compile time of the default code generator, and fast enough for these checks."""
 THREADS: Final = 2
-"""Number of programs compiled at once; each takes a core, and up to a gigabyte for a large model."""
+"""Number of programs compiled at once; each takes a core and up to a gigabyte for large models."""
 
 
 class Compiler:
-    """Compiled programs by function and argument shapes; `start` compiles ahead in a separate thread."""
+    """Compiled programs by function and argument shapes; `start` compiles in a background thread."""
 
     def __init__(self) -> None:
         self._pool = ThreadPoolExecutor(THREADS, thread_name_prefix="compile")
         self._programs: dict[Any, Future[Callable[..., Any]]] = {}
 
     def start(self, function: Callable[..., Any], *arguments: Any) -> Future[Callable[..., Any]]:
-        """Trace the function for arguments of these shapes, and compile it in the background."""
+        """Trace the function for the shapes of the arguments, and compile it in the background."""
         shapes = jax.tree.map(lambda leaf: (jnp.shape(leaf), str(jnp.result_type(leaf))), arguments)
         key = (function, str(jax.tree.structure(arguments)), str(shapes))
         if key not in self._programs:
@@ -39,5 +39,5 @@ def _compile(lowered: Any) -> Callable[..., Any]:
         return lowered.compile()
     try:
         return lowered.compile(compiler_options=OPTIONS)
-    except JaxRuntimeError:  # another XLA without these options
+    except JaxRuntimeError:  # an XLA version without these options
         return lowered.compile()

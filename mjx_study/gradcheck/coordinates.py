@@ -1,8 +1,8 @@
-"""The inputs of a step's derivative: one flat vector of small changes of state, control and contact parameters.
+"""Inputs of a step's derivative: a flat vector of small changes of state, control and contact parameters.
 
-Positions change in the tangent space, so quaternions stay unit quaternions; their length is a separate coordinate,
-which together with the tangent space covers every change of a raw quaternion. Parameters change in every geom and pair
-at once, each in units of its own size.
+Positions change in the tangent space, so quaternions stay normalised; their lengths are separate coordinates, which
+together with the tangent space cover every change of a raw quaternion. Parameters change in every geom and pair at
+once, each in units of its own size.
 """
 
 import dataclasses
@@ -33,11 +33,11 @@ _BALL, _FREE = int(mujoco.mjtJoint.mjJNT_BALL), int(mujoco.mjtJoint.mjJNT_FREE)
 
 @dataclasses.dataclass(frozen=True)
 class Coordinate:
-    """One entry of the flat vector, or of a step's output.
+    """An entry of the flat vector or of a step's output.
 
     Attributes:
         block: qpos, quaternion length, qvel, act, ctrl or contact.
-        joint: index of its joint, or -1.
+        joint: index of the joint, or -1.
     """
 
     block: str
@@ -50,12 +50,12 @@ class Coordinate:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Coordinates:
-    """The layout of the flat vector of one scene under one contact model.
+    """Layout of the flat vector for one scene and contact model.
 
     Attributes:
-        inputs: names of its entries, in the order position, quaternion lengths, velocity, activation, control, and
-            contact parameters if the scene has contacts.
-        outputs: names of a step's outputs: position, velocity, activation.
+        inputs: entries in the order position, quaternion lengths, velocity, activation, control, and contact parameters
+            if the scene has contacts.
+        outputs: a step's outputs: position, velocity, activation.
         scales: size of each contact parameter; empty if there are none.
     """
 
@@ -73,13 +73,13 @@ class Coordinates:
         return [index for index, coordinate in enumerate(self.inputs) if coordinate.block in blocks]
 
     def blocks(self) -> list[str]:
-        """The non-empty blocks of inputs, in order."""
+        """The nonempty blocks of inputs, in order."""
         return list(dict.fromkeys(coordinate.block for coordinate in self.inputs))
 
     def state(
         self, base: State, control: Float[Array, " nu"], change: Float[Array, " changes"]
     ) -> tuple[State, Float[Array, " nu"]]:
-        """State and control after a change of the first `num_state` entries."""
+        """Apply a change of the first `num_state` entries to state and control."""
         host = self.scene.host
         starts = np.cumsum([host.nv, len(quaternions(host)), host.nv, host.na])
         tangent, stretch, qvel, act, ctrl = jnp.split(change[: self.num_state], starts)
@@ -91,10 +91,10 @@ class Coordinates:
     def model(
         self, contact: ContactModel | None, scales: Float[Array, " parameters"], change: Float[Array, " parameters"]
     ) -> mjx.Model:
-        """The model with a contact model, its parameters changed in units of `scales`.
+        """Apply a contact model with its parameters changed in units of `scales`.
 
-        Parameters that the contact model sets are changed in it, so that derivatives pass through `apply_contact`; the
-        others are changed in every geom and pair.
+        Parameters set by the contact model are changed there, so that derivatives pass through `apply_contact`; others
+        are changed in every geom and pair.
         """
         model = self.scene.model
         if not len(scales):
@@ -139,7 +139,7 @@ def quaternions(host: mujoco.MjModel) -> list[tuple[int, int]]:
 
 
 def dof_names(host: mujoco.MjModel) -> list[tuple[str, int]]:
-    """A name for each degree of freedom, and its joint."""
+    """Name and joint of each degree of freedom."""
     moves = [f"translation {axis}" for axis in "xyz"]
     turns = [f"rotation {axis}" for axis in "xyz"]
     names: list[tuple[str, int]] = []
@@ -151,7 +151,7 @@ def dof_names(host: mujoco.MjModel) -> list[tuple[str, int]]:
 
 
 def joint_name(host: mujoco.MjModel, joint: int) -> str:
-    """A joint's name, or its body's if it has none."""
+    """A joint's name, or its body's if it is unnamed."""
     name = mujoco.mj_id2name(host, mujoco.mjtObj.mjOBJ_JOINT, joint)
     if name:
         return name
@@ -160,7 +160,7 @@ def joint_name(host: mujoco.MjModel, joint: int) -> str:
 
 
 def geom_label(host: mujoco.MjModel, geom: int) -> str:
-    """A geom's name, or its body's and its type."""
+    """A geom's name, or its body's and its type if it is unnamed."""
     name = mujoco.mj_id2name(host, mujoco.mjtObj.mjOBJ_GEOM, geom)
     if name:
         return name
@@ -182,7 +182,7 @@ def _activation_names(host: mujoco.MjModel) -> list[str]:
 
 
 def _parameter_scales(scene: Scene, contact: ContactModel | None) -> Float[np.ndarray, " parameters"]:
-    """The largest size of each parameter over all geoms, 1 where all are 0."""
+    """Largest size of each parameter over all geoms, 1 if all are 0."""
     rows = scene.template._impl
     if rows.contact.dim.size == 0:  # pyright: ignore[reportAttributeAccessIssue]
         return np.zeros(0)

@@ -1,4 +1,4 @@
-"""The gradient of a task's whole cost: reverse mode against forward mode, finite differences, and a closed form."""
+"""Check the gradient of a task's total cost: reverse against forward mode, finite differences, and a closed form."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -24,23 +24,23 @@ BATCH: Final = 8
 DIFFERENCE_TOLERANCE: Final = 1e-6
 MODES_TOLERANCE: Final = 1e-9
 CLOSED_FORM: Final = 1e-3
-"""Relative distance from the closed form's gradient below which the two agree."""
+"""Relative distance from the closed form's gradient that counts as agreement."""
 GROWTH: Final = 2.0
-"""Factor by which the distance may grow with stiffness, which should bring the two models together."""
+"""Allowed growth of the distance with stiffness, which should bring the two models together."""
 
 
 @dataclasses.dataclass(frozen=True)
 class CostCheck:
-    """The checks of one contact model's whole-horizon gradient; errors are relative to its norm.
+    """Checks of one contact model's whole-horizon gradient; errors are relative to its norm.
 
     Attributes:
         stiffness: K [N/m].
         gradient_norm: norm of the gradient, in cost per unit of theta.
-        modes: difference of reverse and forward mode, along some directions.
-        difference: difference from central differences, along the same directions.
-        one_sided: disagreement of the two one-sided differences at the shortest step.
-        closed_form: distance from the reference system's hand-written gradient, which is of another model of the same
-            system, so that it measures the distance of the two models. None if the contact model has none.
+        modes: difference between reverse and forward mode along some directions.
+        difference: difference from central differences along the same directions.
+        one_sided: disagreement of the two one-sided differences at the smallest step.
+        closed_form: distance from the hand-written gradient of the reference system, a different model of the same
+            system; measures the distance between the models. None without a reference.
         residual: largest relative solver residual of the rollout.
         verdict: right, kink, jump, unconverged, nan or wrong.
     """
@@ -57,7 +57,7 @@ class CostCheck:
 
 
 class CostPrograms:
-    """Zero-noise cost of a task from the initial state that a key draws, compiled for any theta and contact model."""
+    """Zero-noise cost of a task from an initial state drawn by a key, compiled for any theta and contact model."""
 
     def __init__(self, task: Task, seed: int, compiler: Compiler):
         self.task = task
@@ -71,7 +71,7 @@ class CostPrograms:
         self.compiler.start(self._many, np.zeros((BATCH, len(self.task.theta))), contact)
 
     def gradient(self, contact: ContactModel | None, directions: np.ndarray) -> Any:
-        """(states, controls, residual), the gradient by reverse mode, and slopes along directions by forward mode."""
+        """Return (states, controls, residual), the reverse-mode gradient, and forward-mode slopes along directions."""
         return self.compiler.run(self._both_modes, self.task.theta, contact, directions)
 
     def costs(self, contact: ContactModel | None, changes: np.ndarray) -> np.ndarray:
@@ -96,7 +96,7 @@ class CostPrograms:
 
 
 def check_cost(programs: CostPrograms, cell: ContactPoint, seed: int) -> tuple[CostCheck, list[HostState]]:
-    """Check one contact model's gradient; also returns the states of its rollout, each with its control."""
+    """Check one contact model's gradient; also return the states of its rollout with their controls."""
     task = programs.task
     directions = np.random.default_rng(seed).normal(size=(DIRECTIONS, len(task.theta)))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
@@ -134,7 +134,7 @@ def check_cost(programs: CostPrograms, cell: ContactPoint, seed: int) -> tuple[C
 
 
 def judge_closed_forms(checks: Sequence[CostCheck]) -> list[Finding]:
-    """Findings on the distance from the closed form, which may be large but must not grow as the contact stiffens."""
+    """Report distances from the closed form that grow as the contact stiffens; they may be large."""
     known = sorted(
         (check.stiffness, check.closed_form, check.contact) for check in checks if check.closed_form is not None
     )
@@ -152,10 +152,10 @@ def judge_closed_forms(checks: Sequence[CostCheck]) -> list[Finding]:
 
 
 def cost_verdict(*, finite: bool, modes: float, residual: float, excused: list[str | None]) -> str:
-    """The verdict on a gradient.
+    """Return the verdict on a gradient.
 
     Args:
-        excused: kink or jump for each direction whose difference disagrees, or None if nothing excuses it.
+        excused: kink or jump for each direction in which differences disagree, or None if nothing excuses it.
     """
     if not finite:
         return "nan"

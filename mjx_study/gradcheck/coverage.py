@@ -1,4 +1,4 @@
-"""The parts of a model's dynamics that a state exercises: contact by zone, limits, friction loss, equalities."""
+"""Parts of a model's dynamics that a state exercises: contact by zone, limits, friction loss, equalities."""
 
 import dataclasses
 from collections.abc import Collection, Mapping, Sequence
@@ -12,9 +12,9 @@ from mjx_study.gradcheck.reach import NO_FRICTION, contact_parts
 from mjx_study.simulation.scene import Scene
 
 ZONES: Final = ("push", "stick", "slide", "separate")
-"""Zones of a contact: push is frictionless; stick and slide have friction; separate is within margin, without force."""
+"""Contact zones: push is frictionless; stick and slide have friction; separate is within the margin, without force."""
 PARTS: Final = ("contact", *ZONES, "limit", "friction loss", "held", "slipping", "equality")
-"""Parts that a state can exercise; friction loss holds, or slips at its bound."""
+"""Parts that a state can exercise; friction loss is held, or slipping at its bound."""
 _STATE, _KIND = mujoco.mjtConstraintState, mujoco.mjtConstraint
 _LIMITS = (int(_KIND.mjCNSTR_LIMIT_JOINT), int(_KIND.mjCNSTR_LIMIT_TENDON))
 _LOSSES = (int(_KIND.mjCNSTR_FRICTION_DOF), int(_KIND.mjCNSTR_FRICTION_TENDON))
@@ -23,12 +23,12 @@ _SATISFIED, _QUADRATIC = int(_STATE.mjCNSTRSTATE_SATISFIED), int(_STATE.mjCNSTRS
 
 @dataclasses.dataclass(frozen=True)
 class Coverage:
-    """Counts of the states that exercise each part of a model.
+    """Number of states that exercise each part of a model.
 
     Attributes:
-        counts: number of states by part, for parts that the model has.
-        missing: parts that the model has but no state exercises.
-        unreachable: contact, or zones of it, that none of the pairs of geoms can reach, with the number of pairs.
+        counts: number of states by part, for the parts that the model has.
+        missing: parts of the model that no state exercises.
+        unreachable: contact, or zones of it, that no pair of geoms can reach, with the number of pairs.
     """
 
     states: int
@@ -37,7 +37,7 @@ class Coverage:
     unreachable: dict[str, int] = dataclasses.field(default_factory=dict)
 
     def line(self) -> str:
-        """The coverage in words; empty if the model has nothing to exercise."""
+        """Describe the coverage; empty if the model has nothing to exercise."""
         zones = [f"{zone} {self.counts[zone]}" for zone in (*ZONES, "held", "slipping") if zone in self.counts]
         of_contact = ", ".join(zone for zone in zones if zone.split()[0] in ZONES)
         of_loss = ", ".join(zone for zone in zones if zone.split()[0] not in ZONES)
@@ -55,7 +55,7 @@ class Coverage:
 
 
 def exercised(data: mujoco.MjData) -> frozenset[str]:
-    """The parts that are active in a state of the C engine, after its forward pass."""
+    """Parts active in a state of the C engine after its forward pass."""
     kinds, states = np.asarray(data.efc_type), np.asarray(data.efc_state)
     parts = {
         _zone(contact, kinds, states) for contact in data.contact if contact.exclude == 0 and contact.efc_address >= 0
@@ -73,7 +73,7 @@ def exercised(data: mujoco.MjData) -> frozenset[str]:
 
 
 def _zone(contact: Any, kinds: np.ndarray, states: np.ndarray) -> str:
-    """The zone of one contact: that of its row, or for a pyramid by whether all or some of its edges push."""
+    """Zone of a contact: its row's, or for a pyramid by whether all or some of its edges push."""
     first, dim = int(contact.efc_address), int(contact.dim)
     pyramid = kinds[first] == int(_KIND.mjCNSTR_CONTACT_PYRAMIDAL)
     found = set(states[first : first + (2 * (dim - 1) if pyramid else 1)].tolist())
@@ -85,7 +85,7 @@ def _zone(contact: Any, kinds: np.ndarray, states: np.ndarray) -> str:
 
 
 def possible(scene: Scene, host: mujoco.MjModel) -> tuple[frozenset[str], dict[str, int]]:
-    """The parts that a model has, from the constraint rows that MJX allocates; and `Coverage.unreachable`."""
+    """Parts that a model has, from the constraint rows that MJX allocates; and `Coverage.unreachable`."""
     rows: Any = scene.template._impl
     parts, unreachable = contact_parts(host) if len(rows.contact.dim) else (set(), {})
     parts |= {"limit"} if rows.nl else set()
@@ -95,7 +95,7 @@ def possible(scene: Scene, host: mujoco.MjModel) -> tuple[frozenset[str], dict[s
 
 
 OPTIONAL: Final = frozenset({"separate", "contact", "friction loss"})
-"""Parts counted but not required: an undamped contact never separates within its margin; the others have parts."""
+"""Parts counted but not required: undamped contact never separates within its margin; the others have subparts."""
 
 
 def coverage(

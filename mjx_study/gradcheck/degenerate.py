@@ -1,6 +1,6 @@
-"""Contacts whose points are placed by a direction that vanishes, in C as in MJX.
+"""Contacts whose points are placed along a vanishing direction, in C and in MJX.
 
-The step jumps there, and nearby it changes faster than differences can follow.
+The step jumps there, and nearby it changes faster than differences can resolve.
 """
 
 import dataclasses
@@ -14,18 +14,18 @@ from mjx_study.gradcheck.coordinates import LENGTH, Coordinate, Coordinates, geo
 from mjx_study.simulation.engine import HostState, host_data
 
 PARALLEL: Final = 1e-5
-"""Angle [rad] or distance [m] below which two directions or points count as one; contact points turn within less."""
+"""Angle [rad] or distance [m] below which directions or points coincide; contact points turn within less."""
 _PLANE, _SPHERE = int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_SPHERE)
 _CAPSULE, _CYLINDER = int(mujoco.mjtGeom.mjGEOM_CAPSULE), int(mujoco.mjtGeom.mjGEOM_CYLINDER)
 
 
 @dataclasses.dataclass(frozen=True)
 class DegenerateContact:
-    """One such contact, and the entries of a Jacobian that it can excuse.
+    """A degenerate contact, and the Jacobian entries it can excuse.
 
     Attributes:
         movers: joints that move one of its bodies; the step jumps only in their positions.
-        moved: joints of the same kinematic trees, which its force accelerates.
+        moved: joints of the same kinematic trees, accelerated by its force.
     """
 
     cause: str
@@ -33,11 +33,11 @@ class DegenerateContact:
     moved: frozenset[int]
 
     def concerns(self, output: Coordinate, source: Coordinate) -> bool:
-        """Whether the contact's direction enters this entry."""
+        """Whether the contact's direction affects this entry."""
         return source.block in ("qpos", LENGTH) and source.joint in self.movers and output.joint in self.moved
 
     def entries(self, layout: Coordinates) -> Bool[np.ndarray, "outputs inputs"]:
-        """Mask of all entries that the contact's direction enters."""
+        """Mask of all entries that the contact's direction affects."""
         return np.array([[self.concerns(output, source) for source in layout.inputs] for output in layout.outputs])
 
 
@@ -58,7 +58,7 @@ def _cause(host: mujoco.MjModel, data: mujoco.MjData, geoms: tuple[int, ...]) ->
     parallel = float(np.linalg.norm(np.cross(axes[geoms[0]], axes[geoms[1]]))) < PARALLEL
     labels = " and ".join(geom_label(host, geom) for geom in geoms)
     if kinds.keys() == {_SPHERE} and np.linalg.norm(centres[geoms[0]] - centres[geoms[1]]) < PARALLEL:
-        return f"the centres of {labels} coincide, and no direction is the contact's normal"
+        return f"the centres of {labels} coincide, so their contact has no normal direction"
     if parallel and kinds.keys() == {_PLANE, _CYLINDER}:
         upright = geom_label(host, kinds[_CYLINDER])
         return f"{upright} stands upright, and its contact points turn with the direction in which it tilts"

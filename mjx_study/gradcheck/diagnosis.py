@@ -1,4 +1,4 @@
-"""A verdict on each entry of a Jacobian: right, or what is wrong with it, or why there is no derivative."""
+"""Verdict on each entry of a Jacobian: right, what is wrong with it, or why there is no derivative."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -11,19 +11,19 @@ from mjx_study.gradcheck.coordinates import Coordinates
 from mjx_study.gradcheck.differences import Differences
 
 TOLERANCE: Final = 1e-6
-"""Tolerance of an entry relative to the largest in its row and block, plus three uncertainties of the difference."""
+"""Tolerance of an entry relative to the largest in its row and block, plus three difference uncertainties."""
 MODES_TOLERANCE: Final = 1e-6
-"""Tolerated relative difference of forward and reverse mode; rounding alone reaches 1e-7 in ill-conditioned solves."""
+"""Allowed relative difference of forward and reverse mode; rounding alone reaches 1e-7 in ill-conditioned solves."""
 RESIDUAL_TOLERANCE: Final = 1e-6
 FAINT: Final = 1e-3
 """Smallest scale of a row's entries, relative to the largest row of its kind."""
 STEEP: Final = 0.1
-"""Difference of one-sided slopes, relative to the largest of a row, that rounding cannot explain."""
+"""Difference of one-sided slopes, relative to a row's largest entry, that rounding cannot explain."""
 RESOLVED: Final = 1e-5
-"""Relative uncertainty above which a difference is not precise; such entries are left out of the worst error."""
+"""Relative uncertainty above which a difference is imprecise; such entries are left out of the worst error."""
 
 VERDICTS: Final = ("right", "unresolved", "kink", "jump", "unconverged", "zero", "nan", "engine", "wrong", "value")
-"""From right to the gravest; `engine` and `value` concern steps, not entries."""
+"""From right to worst; `engine` and `value` concern steps, not entries."""
 RIGHT, UNRESOLVED, KINK, JUMP, UNCONVERGED, ZERO, NAN, ENGINE, WRONG, VALUE = range(10)
 FAILURES: Final = ("unconverged", "zero", "nan", "engine", "wrong", "value")
 MEANING: Final = {
@@ -42,11 +42,11 @@ MEANING: Final = {
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Judged:
-    """Verdicts of one derivative of one step.
+    """Verdicts on one derivative of a step.
 
     Attributes:
         codes: index into VERDICTS for each entry.
-        error: worst relative error of the right entries that differences resolve.
+        error: worst relative error of right entries that differences resolve.
     """
 
     codes: Int[np.ndarray, "outputs inputs"]
@@ -65,21 +65,21 @@ def judge(
     """Compare a derivative with differences.
 
     Args:
-        layout: layout with the blocks within which entries of a row are compared in size.
-        converged: derivative from a converged start of the solver, which tells an unconverged solve from a wrong
-            derivative; None if the solver had converged.
-        starved: whether the solve is so far from converged that no entry can be called wrong.
-        degenerate: entries that depend on a contact whose direction vanishes; if differences are not smooth either,
-            they reach across a jump.
+        layout: layout whose blocks delimit the comparison of entry sizes within a row.
+        converged: derivative after a converged solve, to distinguish an unconverged solve from a wrong derivative; None
+            if the solver had converged.
+        starved: whether the solve is so far from convergence that no entry can be called wrong.
+        degenerate: entries that depend on a contact with a vanishing direction; where differences are not smooth
+            either, they reach across a jump.
     """
     scale = row_scales(layout, jacobian, truth)
     allowed = TOLERANCE * scale + 3 * truth.uncertainty
     error = np.abs(jacobian - truth.value)
-    right = error <= allowed  # not where it is NaN
+    right = error <= allowed  # False where NaN
     resolved = truth.uncertainty <= RESOLVED * scale
 
     codes = np.full(jacobian.shape, WRONG)
-    # A derivative between the two slopes, or near them, is as good as there is; zero outside of them is not.
+    # A derivative between or near the two slopes is as good as any; zero outside of them is not.
     within = error <= np.maximum(truth.gap, allowed)
     outside = (jacobian == 0) & (np.abs(truth.value) > 0.51 * truth.gap + allowed)
     codes[(jacobian == 0) & ~right] = ZERO
@@ -91,7 +91,7 @@ def judge(
     size = np.maximum(np.abs(jacobian), np.abs(truth.value))
     vague = 3 * truth.uncertainty >= np.maximum(size, TOLERANCE * scale)
     codes[right & vague & (size > 0)] = UNRESOLVED  # two zeros agree, whatever their uncertainty
-    # The mean of two slopes agrees with central differences, and anything agrees with those over a jump.
+    # The mean of two slopes agrees with central differences, and anything agrees with differences over a jump.
     codes[truth.kink & within & ~outside & (~right | (truth.gap > FAINT * scale))] = KINK
     codes[truth.jump & (~right | (truth.gap > STEEP * scale))] = JUMP
     if degenerate is not None:
@@ -104,9 +104,9 @@ def judge(
 def row_scales(
     layout: Coordinates, jacobian: Float[np.ndarray, "outputs inputs"], truth: Differences | None = None
 ) -> Float[np.ndarray, "outputs inputs"]:
-    """Scale of an entry's error: the largest of its row, among derivatives and differences with respect to one block.
+    """Error scale of an entry: the largest derivative or difference in its row over the same block.
 
-    Rows that hardly depend on a block, and so contain only rounding, get `FAINT` of the largest row of their kind.
+    Rows that hardly depend on a block, and so hold only rounding, get `FAINT` of the largest row of their kind.
     """
     scale = np.empty(jacobian.shape)
     size = np.where(np.isfinite(jacobian), np.abs(jacobian), 0.0)
@@ -131,7 +131,7 @@ def modes_apart(
 ) -> float:
     """Largest relative difference of two derivatives where neither is NaN and no jump excuses it.
 
-    Entries far below the largest one may differ by its rounding.
+    Entries far below the largest may differ by its rounding.
     """
     largest = np.nan_to_num(np.abs(first), nan=0.0, posinf=0.0).max(initial=0.0)
     error = np.abs(first - second) / np.maximum(row_scales(layout, first), 1e-6 * largest)
@@ -140,7 +140,7 @@ def modes_apart(
 
 
 def disagreements(ours: Judged, truth: Differences, engine: Judged, engine_truth: Differences) -> np.ndarray:
-    """Mask of entries right by this project's differences and wrong by the C engine's, both smooth."""
+    """Mask of smooth entries that are right by this project's differences but wrong by the C engine's."""
     rough = truth.rough | engine_truth.rough
     return np.isin(ours.codes, (RIGHT, UNRESOLVED)) & np.isin(engine.codes, (ZERO, WRONG)) & ~rough
 
@@ -158,7 +158,7 @@ def worst_error(
     judged: Judged,
     columns: Sequence[int],
 ) -> float:
-    """Worst relative error of all entries, right or wrong, that have a derivative and that differences resolve."""
+    """Worst relative error of all entries, right or wrong, that have a derivative that differences resolve."""
     scale = row_scales(layout, jacobian, truth)
     counted = ~np.isin(judged.codes, (KINK, JUMP)) & (truth.uncertainty <= RESOLVED * scale)
     figures = np.where(counted, np.abs(jacobian - truth.value) / scale, 0.0)[:, list(columns)]
@@ -166,5 +166,5 @@ def worst_error(
 
 
 def worst_verdict(verdicts: Sequence[str]) -> str:
-    """The gravest of some verdicts; right if there are none."""
+    """Return the worst of some verdicts; right if there are none."""
     return max(verdicts, key=VERDICTS.index, default="right")

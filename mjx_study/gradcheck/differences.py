@@ -1,9 +1,9 @@
-"""Finite differences over a ladder of step sizes: the derivative where there is one, else the kind of non-smoothness.
+"""Finite differences over a ladder of step sizes: the derivative if there is one, else the kind of nonsmoothness.
 
-Central differences of a smooth map settle as the step shrinks, until rounding takes over; the plateau between is the
-derivative, and its flatness the uncertainty. The second difference |f(x + h) - 2 f(x) + f(x - h)| shows the rest: it
-falls like h^2 where the map is smooth, like h at a kink, whose two one-sided slopes disagree at every step, and not at
-all at a jump; nor does |f(x + h) - f(x - h)|, which alone shows a jump that is odd about x.
+Central differences of a smooth map converge as the step shrinks, until rounding dominates; the plateau in between is
+the derivative, and its flatness the uncertainty. The second difference |f(x + h) - 2 f(x) + f(x - h)| classifies the
+rest: it falls like h^2 where the map is smooth, like h at a kink, whose one-sided slopes disagree at every step, and
+not at all at a jump; nor does |f(x + h) - f(x - h)|, the only sign of a jump that is odd about x.
 """
 
 import dataclasses
@@ -16,22 +16,22 @@ RATIO: Final = 4.0
 SIZES: Final = tuple(2.5e-4 / RATIO**power for power in range(8))
 """Step sizes [m, rad, ...], down to 1.5e-8; the finest smooth structure of MuJoCo's contact is 1 mm."""
 ROUNDING: Final = 1e-13
-"""Relative noise of a step's output, solved to rounding."""
+"""Relative rounding noise of a step's output, solved to rounding."""
 SMOOTH, KINK = 1.5, 0.5
-"""Powers of h between which the second difference counts as that of a kink, whose power is 1."""
+"""Powers of h between which the second difference indicates a kink, whose power is 1."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Differences:
-    """Jacobian by finite differences, entry by entry.
+    """Jacobian by finite differences, with its uncertainty, entry by entry.
 
     Attributes:
         value: derivative by central differences if there is one, else the mean of the one-sided slopes.
         gap: disagreement of the one-sided slopes at the smallest step not dominated by rounding; at an odd jump, the
             slope of the central difference.
-        kink: entries whose one-sided slopes disagree however small the step.
+        kink: entries whose one-sided slopes disagree at any step size.
         jump: entries where the map itself jumps.
-        nearby: entries with a kink or a jump within the longer steps, but not here.
+        nearby: entries with a kink or jump within the larger steps, but not at the state.
     """
 
     value: Float[np.ndarray, "outputs columns"]
@@ -48,7 +48,7 @@ class Differences:
 
 
 def moves(columns: Float[np.ndarray, "columns inputs"]) -> Float[np.ndarray, "moves inputs"]:
-    """All changes at which `differences` needs outputs: none, then every step size forwards and backwards."""
+    """All changes at which `differences` needs outputs: zero, then every step size forwards and backwards."""
     steps = (np.array(SIZES)[:, None, None] * columns).reshape(-1, columns.shape[1])
     return np.concatenate([np.zeros((1, columns.shape[1])), steps, -steps])
 
@@ -59,17 +59,17 @@ def differences(
     """Evaluate the outputs at `moves`.
 
     Args:
-        outputs: outputs, one row per change.
+        outputs: one row of outputs per change.
         noise_floor: rounding noise of each output, in addition to `ROUNDING`.
     """
     sizes = np.array(SIZES)[:, None, None]
     here, rest = outputs[0], outputs[1:].reshape(2, len(SIZES), -1, outputs.shape[1])
     above, below = rest
     central = (above - below) / (2 * sizes)
-    # one Richardson step: the error in h^2 goes
+    # one Richardson step cancels the h^2 error
     better = (RATIO**2 * central[1:] - central[:-1]) / (RATIO**2 - 1)
     change = np.abs(np.diff(better, axis=0))
-    spread = np.maximum(change[1:], change[:-1])  # three neighbours on the ladder agree this well
+    spread = np.maximum(change[1:], change[:-1])  # agreement of three adjacent sizes
     noise = ROUNDING * np.maximum(np.abs(here), 1e-2) + (0.0 if noise_floor is None else noise_floor)
     spread = spread + noise / sizes[2 : 2 + len(spread)]
     best = np.argmin(spread, axis=0)[None]
@@ -78,12 +78,12 @@ def differences(
 
     power, gap, here_too = _falloff(np.abs(above - 2 * here + below), noise)
     kink, jump = (power < SMOOTH) & (power >= KINK) & here_too, (power < KINK) & here_too
-    # one-sided slopes agree across a jump that is odd about this point, but the first difference does not fall off
+    # one-sided slopes agree across a jump odd about this point, but the first difference does not fall off
     slope_power, steepness, odd_here = _falloff(np.abs(above - below), noise)
     odd = (slope_power < KINK) & odd_here & ~jump
     kink, jump, gap = kink & ~odd, jump | odd, np.where(odd, steepness, gap)
 
-    # ... and only steps that do not reach it see the derivative
+    # ... and only steps too short to reach it see the derivative
     nearby = (power < SMOOTH) & ~here_too
     value = np.where(nearby, central[-2], value)
     uncertainty = np.where(nearby, np.abs(central[-1] - central[-2]) + noise / SIZES[-1], uncertainty)
@@ -91,10 +91,10 @@ def differences(
 
 
 def _falloff(amount: Float[np.ndarray, "sizes columns outputs"], noise: Float[np.ndarray, "..."]):
-    """The power of h with which an amount falls off, the amount over h, and whether its cause is here, not nearby."""
+    """Power of h with which an amount falls off, the amount over h, and whether its cause is here, not nearby."""
     sizes = np.array(SIZES)[:, None, None]
     loud = amount > 100 * noise
-    # the power over the last two ratios in which rounding plays no part
+    # the power over the last two ratios unaffected by rounding
     usable = loud[2:] & loud[1:-1] & loud[:-2]
     last = np.where(usable.any(axis=0), len(usable) - 1 - np.argmax(usable[::-1], axis=0), 0)[None]
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -102,7 +102,7 @@ def _falloff(amount: Float[np.ndarray, "sizes columns outputs"], noise: Float[np
     power = np.where(usable.any(axis=0), np.take_along_axis(power, last, axis=0)[0], np.inf)
     over_size = np.take_along_axis(amount[2:] / sizes[2:], last, axis=0)[0]
     over_size = np.where(usable.any(axis=0), over_size, 0.0)
-    # where the amount falls off below a size, the kink or jump is that far away and not here
+    # an amount that falls off below some size has its kink or jump at that distance, not here
     following = np.take_along_axis(np.concatenate([amount[3:], amount[-1:]]), last, axis=0)[0]
     expected = np.take_along_axis(amount[2:], last, axis=0)[0] * RATIO ** -np.maximum(power, 0.0)
     finest = last[0] >= len(usable) - 2

@@ -1,4 +1,4 @@
-"""Differences between the C engine's step and MJX's, by stage, contact and constraint row."""
+"""Differences between the steps of the C engine and MJX, by stage, contact and constraint row."""
 
 import copy
 from typing import Any, Final
@@ -13,7 +13,7 @@ from mjx_study.gradcheck.coordinates import geom_label
 from mjx_study.simulation.engine import HostState, host_data
 
 TOLERANCE: Final = 1e-8
-"""Relative difference of a quantity above which two implementations count as different."""
+"""Relative difference above which two implementations differ in a quantity."""
 TINY: Final = 1e-12
 """Size below which a constraint row counts as zero."""
 STAGES: Final = {
@@ -40,12 +40,12 @@ def difference_of_engines(
     ours: Float[np.ndarray, " nv"],
     theirs: Float[np.ndarray, " nv"],
 ) -> tuple[str, bool]:
-    """The differences, and whether all of them are documented.
+    """Describe the differences, and tell whether all are documented.
 
     Args:
-        stages: MJX's quantities there.
+        stages: MJX's intermediate quantities at the state.
         ours: MJX's constrained acceleration [m/s^2 or rad/s^2].
-        theirs: the engine's.
+        theirs: the engine's constrained acceleration.
     """
     found, host, data = _kinematics_and_forces(host, state, stages)
     contacts = _contacts(host, data, stages)
@@ -58,19 +58,19 @@ def difference_of_engines(
 
 
 def largest(values: np.ndarray) -> float:
-    """The largest magnitude; 0 if empty."""
+    """Largest magnitude; 0 if empty."""
     return float(np.abs(values).max(initial=0.0))
 
 
 def relative(ours: np.ndarray, theirs: np.ndarray) -> float:
-    """The largest difference, relative to the largest magnitude."""
+    """Largest difference, relative to the largest magnitude."""
     return largest(ours - theirs) / max(largest(theirs), largest(ours), 1e-10)
 
 
 def _kinematics_and_forces(
     host: mujoco.MjModel, state: HostState, stages: dict[str, Any]
 ) -> tuple[list[Found], mujoco.MjModel, mujoco.MjData]:
-    """The first quantity that differs, and the engine's model and data to compare the rest with."""
+    """Return the first quantity that differs, and the engine's model and data for comparing the rest."""
     data = _forward(host, state)
     text = _stage(host, data, stages)
     if not text:
@@ -91,7 +91,7 @@ def _forward(host: mujoco.MjModel, state: HostState) -> mujoco.MjData:
 
 
 def _stage(host: mujoco.MjModel, data: mujoco.MjData, stages: dict[str, Any]) -> str:
-    """The first quantity that differs, and so explains later ones; empty if none does."""
+    """Return the first quantity that differs, which explains later ones; empty if none differs."""
     inertia = np.zeros((host.nv, host.nv))
     mujoco.mj_fullM(host, data, inertia)
     for name, words in STAGES.items():
@@ -111,7 +111,7 @@ def _integration(host: mujoco.MjModel) -> Found:
 
 
 def _contacts(host: mujoco.MjModel, data: mujoco.MjData, stages: dict[str, Any]) -> list[Found]:
-    """Pairs of geoms whose contacts differ in number or place."""
+    """Pairs of geoms whose contacts differ in number or position."""
     ours: dict[tuple[int, ...], list[np.ndarray]] = {}
     theirs: dict[tuple[int, ...], list[np.ndarray]] = {}
     for index in np.flatnonzero(stages["dist"] < stages["margin"]):
@@ -140,10 +140,10 @@ def _contacts(host: mujoco.MjModel, data: mujoco.MjData, stages: dict[str, Any])
 
 
 def _rows(host: mujoco.MjModel, data: mujoco.MjData, stages: dict[str, Any], *, contacts: bool) -> list[Found]:
-    """Kinds of constraint rows that differ, optionally with those of contacts.
+    """Kinds of constraint rows that differ, contact rows included on request.
 
-    MJX sorts its rows by kind and its contacts by dimension, the C engine by objects and pairs of bodies; so rows are
-    matched by their Jacobians, and those with equal Jacobians by the rest. Zero rows count in neither.
+    MJX sorts rows by kind and contacts by dimension, the C engine by objects and pairs of bodies; rows are therefore
+    matched by their Jacobians, and those with equal Jacobians by the rest. Zero rows are ignored in both.
     """
     here = {name: stages[name] for name in ROWS}
     there = {"efc_J": _jacobian(host, data), "efc_aref": data.efc_aref, "efc_D": data.efc_D}
@@ -195,7 +195,7 @@ def _kind(kind: int | np.integer) -> str:
 
 
 def _labels(host: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
-    """The kind of each of the engine's rows, with the type of equalities."""
+    """Kind of each of the engine's rows, with the type of equalities."""
     labels = np.array([_kind(kind) for kind in data.efc_type], dtype=object)
     for row in np.flatnonzero(labels == "equality"):
         labels[row] = f"{mujoco.mjtEq(int(host.eq_type[data.efc_id[row]])).name.removeprefix('mjEQ_').lower()} equality"

@@ -1,4 +1,4 @@
-"""The C engine's step as a function of the same flat vector of changes: an independent map to take differences of."""
+"""The C engine's step over the same flat vector of changes, an independent map for differences."""
 
 from typing import Final
 
@@ -11,11 +11,11 @@ from mjx_study.simulation.contact import ContactModel
 from mjx_study.simulation.engine import HostState, converged_host, host_data
 
 WARMSTARTS: Final = (0.0, 0.5, 1.001)
-"""Other warm starts, relative to the solution, whose results differ only by rounding."""
+"""Alternative warm starts, relative to the solution, whose results differ only by rounding."""
 
 
 class EngineStep:
-    """The engine's step of one scene under one contact model, any integrator, its constraints solved to rounding."""
+    """The engine's step for one scene, contact model and any integrator, with constraints solved to rounding."""
 
     def __init__(self, layout: Coordinates, contact: ContactModel | None):
         self.layout, self.contact = layout, contact
@@ -25,7 +25,7 @@ class EngineStep:
         self._geoms = {name: getattr(self.host, name).copy() for name in fields}
 
     def after(self, base: HostState) -> HostState:
-        """The state after a step; its warm start is the acceleration at the beginning of the step."""
+        """Return the state after a step; its warm start is the acceleration at the beginning of the step."""
         data = host_data(self.host, base)
         mujoco.mj_forward(self.host, data)
         qacc = data.qacc.copy()
@@ -35,7 +35,7 @@ class EngineStep:
     def outputs(
         self, base: HostState, reference: Float[np.ndarray, " nq"], changes: Float[np.ndarray, "batch inputs"]
     ) -> Float[np.ndarray, "batch outputs"]:
-        """(position relative to `reference`, velocity, activation) after a step from each changed state."""
+        """Return (position relative to `reference`, velocity, activation) after a step from each changed state."""
         host, layout = self.host, self.layout
         data = host_data(host, base)
         tangent = np.empty(host.nv)
@@ -50,7 +50,7 @@ class EngineStep:
         return np.array(rows)
 
     def noise(self, base: HostState, reference: Float[np.ndarray, " nq"]) -> Float[np.ndarray, " outputs"]:
-        """Change of the outputs with the solver's warm start, on which they should not depend."""
+        """Change of the outputs with the solver's warm start, which should not affect them."""
         still = np.zeros((1, len(self.layout.inputs)))
         exact = self.outputs(base, reference, still)
         starts = [

@@ -1,4 +1,4 @@
-"""Findings of a check: entries that are not right, grouped by reason."""
+"""Findings of a check: entries that are not right, grouped by cause."""
 
 import dataclasses
 from typing import Final
@@ -11,14 +11,14 @@ OTHERS: Final = {"value": "mjx.step", "engine": "the C engine", "engine_mismatch
 
 @dataclasses.dataclass(frozen=True)
 class Entry:
-    """One entry of one step's Jacobian that is not right.
+    """An entry of a step's Jacobian that is not right.
 
     Attributes:
         index: steps since the start of the rollout.
         time: time since the start of the rollout [s].
-        name: name of the entry, as in d qvel[hinge] / d ctrl[motor].
-        derivative: derivative by automatic differentiation; for a step that differs, the change here.
-        difference: central difference; for a step that differs, the change there; None if there is none.
+        name: name of the entry, such as d qvel[hinge] / d ctrl[motor].
+        derivative: derivative by automatic differentiation; for a differing step, this project's change.
+        difference: central difference, or None; for a differing step, the other implementation's change.
     """
 
     state: str
@@ -32,15 +32,15 @@ class Entry:
 
 @dataclasses.dataclass(frozen=True)
 class Finding:
-    """Entries that are not right for one reason.
+    """Entries that are not right, with a common cause.
 
     Attributes:
-        contact: label of the contact model, as in penalty, K = 100 N/m.
+        contact: label of the contact model, such as penalty, K = 100 N/m.
         who: owner of the derivative: `project`, or `mjx.step` for MJX's own.
         verdict: kink, jump, unconverged, zero, nan, engine, wrong, value, engine_mismatch or apart.
-        modes: modes of differentiation that show it: forward, reverse, tape.
-        cause: likely reason, in one sentence.
-        entries: all entries concerned, at any of the states; the first is the example in the text.
+        modes: differentiation modes that show it: forward, reverse, tape.
+        cause: likely cause, in one sentence.
+        entries: all affected entries, at any state; the text quotes the first as example.
     """
 
     contact: str
@@ -52,11 +52,11 @@ class Finding:
 
     @property
     def fails(self) -> bool:
-        """Whether it makes the check fail: the project's own derivative is not what it should be."""
+        """Whether it fails the check, because the project's own derivative is not as it should be."""
         return self.who == "project" and self.verdict in FAILURES
 
     def line(self) -> str:
-        """The finding in a sentence, with one entry as example."""
+        """Describe the finding in a sentence, with one entry as example."""
         example, states = self.entries[0], len({entry.state for entry in self.entries})
         who = f"{self.who}: " if self.who != "project" else ""
         where = example.state if states == 1 else f"{states} states"
@@ -68,7 +68,7 @@ class Finding:
         return f"{who}{self.verdict} ({count}{modes}), as {example.name} {numbers}: {self.cause}"
 
     def numbers(self, entry: Entry) -> str:
-        """An entry's numbers, with those they are compared with."""
+        """Format an entry's numbers, with those they are compared with."""
         if self.verdict == "jump" and entry.gap:
             return f"= {entry.derivative:.6g}, but differences reach {entry.gap:.2g}"
         other = OTHERS.get(self.verdict, "differences")
@@ -78,6 +78,6 @@ class Finding:
 
 
 def gravity(finding: Finding) -> tuple[bool, bool, int]:
-    """Sort key that puts the gravest findings first."""
+    """Sort key that puts the worst findings first."""
     order = {name: rank for rank, name in enumerate((*reversed(VERDICTS), "engine_mismatch", "apart"))}
     return not finding.fails, finding.who != "project", order[finding.verdict]

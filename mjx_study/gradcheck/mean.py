@@ -1,7 +1,7 @@
-"""Is the mean of an estimator the gradient of the mean cost? Its integral along a path, against the cost's difference.
+"""Check an estimator's mean by its integral along a path, compared with the difference of the mean cost.
 
-The derivative of every step can be right and the mean of first-order gradients wrong all the same: no check of single
-steps sees that.
+The mean of first-order gradients can be wrong even if the derivative of every step is right, which no check of single
+steps reveals.
 """
 
 import dataclasses
@@ -26,25 +26,25 @@ from mjx_study.tasks.contact_grid import ContactPoint
 from mjx_study.tasks.task import Task
 
 HALF_LENGTH: Final = 2.0
-"""Of the path to either side of theta, in standard deviations of noise on theta."""
+"""Length of the path to either side of theta, in standard deviations of noise on theta."""
 FEEDBACK: Final = 0.02
-"""The same where the noise is on the controls, in the unit of theta."""
+"""The same for noise on the controls, in the unit of theta."""
 MEANS: Final = "means"
-"""In place of a direction: along the estimators' own means, see `along_means`."""
+"""Value of `direction` for paths along the estimators' own means, see `along_means`."""
 MOST_PATHS: Final = 3
 NEGLIGIBLE: Final = 1e-3
-"""Share of a mean at right angles to the others from which a path is taken along it."""
+"""Smallest share of a mean orthogonal to the others that warrants a path along it."""
 HEADER: Final = ("contact", "K [N/m]", "estimator", "difference", "gap", "±", "quadrature", "share", "finds", "verdict")
 
 
 @dataclasses.dataclass(frozen=True)
 class MeanCheck:
-    """One estimator under one contact model; `mjx_study.gradcheck.check_mean` makes them.
+    """Check of one estimator for one contact model; made by `mjx_study.gradcheck.check_mean`.
 
     Attributes:
-        contact, stiffness: of the contact model [N/m], 0 for one that is not defined by a stiffness.
+        contact, stiffness: contact model and its stiffness [N/m], 0 if not defined by one.
         estimator: name of the estimator whose mean is checked.
-        circulation: the integral of its mean against the difference of the cost.
+        circulation: integral of its mean, compared with the difference of the cost.
         verdict: "right" within `estimators.mean_check.TOLERANCE`, "biased", or "undecided".
     """
 
@@ -55,7 +55,7 @@ class MeanCheck:
     verdict: str
 
     def as_dict(self) -> dict[str, Any]:
-        """As plain data; the gap and its 99.9 % interval as shares of the difference too."""
+        """Return plain data, including the gap and its 99.9 % interval as shares of the difference."""
         numbers = {name: float(value) for name, value in vars(self.circulation).items()}
         numbers |= {"half_width": float(self.circulation.half_width)}
         scale = abs(numbers["difference"]) or math.nan
@@ -66,7 +66,7 @@ class MeanCheck:
 
 
 def reach_of(task: Task) -> float:
-    """Half the length of a path through a task's theta, unless it is given [unit of theta]."""
+    """Default half length of a path through a task's theta [unit of theta]."""
     return HALF_LENGTH * task.sigma if task.policy.additive else FEEDBACK
 
 
@@ -79,11 +79,11 @@ def along_means(
     samples: int,
     seed: int,
 ) -> list[list[Circulation]]:
-    """Check means along up to three paths at right angles, which share the samples; by path and estimator.
+    """Check means along up to three orthogonal paths, which share the samples; results by path and estimator.
 
-    The first path follows the surest of some estimates, the others what the next ones add to it: a bias at right angles
-    to the gradient shows only there. Their differences of the mean cost are replaced by the first path's, so that all
-    gaps are shares of the gradient.
+    The first path follows the most precise estimate, the others the orthogonal parts of the next ones: only there does
+    a bias orthogonal to the gradient show. Their differences of the mean cost are replaced by the first path's, so that
+    all gaps are shares of the gradient.
     """
     units = _at_right_angles(estimates)
     each, found = max(2, samples // len(units)), []
@@ -97,7 +97,7 @@ def along_means(
 
 
 def _at_right_angles(estimates: Sequence[GradientEstimate]) -> list[np.ndarray]:
-    """Unit vectors that span the means, the surest first; what is negligible is left out."""
+    """Orthonormal vectors that span the means, the most precise first, without negligible parts."""
     units: list[np.ndarray] = []
     for estimate in sorted(estimates, key=lambda each: float(each.variance / jnp.sum(each.mean**2))):
         left = mean = np.asarray(estimate.mean, float)
@@ -110,7 +110,7 @@ def _at_right_angles(estimates: Sequence[GradientEstimate]) -> list[np.ndarray]:
 
 
 def unmixed(estimators: Sequence[Estimator], batches: dict[str, Any]) -> list[GradientEstimate]:
-    """The estimates that interpolate nothing: those of one batch."""
+    """Compute the estimates that use a single batch, without interpolation."""
     return [estimator(batches) for estimator in estimators if len(estimator.needs) == 1]
 
 
@@ -126,22 +126,22 @@ def check_mean(
     tolerance: float = TOLERANCE,
     progress: Progress = lambda done, total, what: None,
 ) -> list[MeanCheck]:
-    """Check every estimator under every contact model.
+    """Check every estimator for every contact model.
 
     Args:
-        task: at the theta that the path goes through, with its onset treatment.
-        cells: contact models to check the estimators under.
-        estimators: with their options; they share the samples.
-        samples: at each of the path's nodes.
-        seed: of the samples and of a random direction.
+        task: task with the theta that the path passes through, and its onset treatment.
+        cells: contact models to check the estimators for.
+        estimators: estimators with their options; they share the samples.
+        samples: samples at each node of the path.
+        seed: random seed of the samples and of a random direction.
         span: ends of the path, from theta along the direction [unit of theta]; None for two standard deviations of the
-            noise to either side, or 0.02 where the noise is on the controls.
+            noise to either side, or 0.02 for noise on the controls.
         direction: "random", the index of a parameter, or "means" for the paths of `along_means`.
         tolerance: share of the cost's difference within which a mean is right.
-        progress: called with (contact models done, their number, label of the next).
+        progress: called with (contact models done, their total number, label of the next).
 
     Raises:
-        ValueError: an estimator's formula does not hold for the task, or there is no such direction.
+        ValueError: an estimator's formula does not apply to the task, or the direction is invalid.
     """
     check_estimators(estimators, task)
     check_span(span)

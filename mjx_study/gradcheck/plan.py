@@ -1,4 +1,4 @@
-"""A validated plan of what to check."""
+"""Validated plan of a check."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -18,12 +18,12 @@ CONTACT: Final = ("penalty", "mujoco", "mujoco_default")
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class GradcheckPlan:
-    """A validated plan of what to check.
+    """Validated plan of a check.
 
     Attributes:
-        subject: the task; for a file, what `scene_task` makes of it.
+        subject: the task; for a file, the result of `scene_task`.
         is_task: whether to check its cost.
-        cells: contact models to check, one after the other.
+        cells: contact models to check in turn.
         warnings: warnings about these contact models.
         states: number of states per contact model.
         seed: random seed of initial states, states and directions.
@@ -49,12 +49,12 @@ def plan_gradcheck(
     states: int = CHECKED_STATES,
     stock: bool = False,
 ) -> GradcheckPlan:
-    """Check a task's gradient, and steps along its rollout.
+    """Plan a check of a task's gradient, and of steps along its rollout.
 
     Args:
-        task: the task, in float64, at the theta of its gradient.
-        families: contact families; None for the task's own if it has no contact, else for `CONTACT`.
-        stiffnesses: stiffnesses for families that take one [N/m]; None for `STIFFNESS`, or the task's if those are in
+        task: the task, in float64, with the theta of its gradient.
+        families: contact families; by default the task's own if it has no contact, else `CONTACT`.
+        stiffnesses: stiffnesses for families that take one [N/m]; by default `STIFFNESS`, or the task's if those are in
             another range.
         seed: random seed of initial states, states and directions.
         damping: override of each family's damping [N s/m].
@@ -62,7 +62,7 @@ def plan_gradcheck(
         stock: whether to check the derivative of `mjx.step` too.
 
     Raises:
-        ValueError: an unusable family or stiffness, too few states, or float32.
+        ValueError: unusable family or stiffness, too few states, or float32.
     """
     _check(task, states)
     if families is None:
@@ -88,29 +88,29 @@ def plan_scene_gradcheck(
     states: int = CHECKED_STATES,
     stock: bool = False,
 ) -> GradcheckPlan:
-    """Check steps of any scene.
+    """Plan a check of the steps of any scene.
 
     Args:
         scene: the scene, in float64, with at least one degree of freedom.
-        families: contact families; None for `mjcf`, or for `mujoco` if a stiffness is given.
+        families: contact families; by default `mjcf`, or `mujoco` if a stiffness is given.
         stiffnesses: stiffnesses for families that take one [N/m].
         seed: random seed of the states.
-        pair: names of the two geoms whose contact has this stiffness; every contact gets the same solref.
+        pair: names of the two geoms whose contact has the stiffness; every contact gets the same solref.
         damping: override of each family's damping [N s/m].
-        horizon: number of steps of the rollout that the states come from.
+        horizon: number of steps of the rollout from which states are taken.
         states: number of states per contact model, at least 1.
         stock: whether to check the derivative of `mjx.step` too.
 
     Raises:
-        ValueError: as `plan_gradcheck`, or a stiffness without a pair.
+        ValueError: as for `plan_gradcheck`, or a stiffness without a pair.
     """
     if families is None:
         families = ("mjcf",) if stiffnesses is None else ("mujoco",)
     swept = any(name in FAMILIES and FAMILIES[name].swept for name in families)
     if swept and stiffnesses is None:
-        raise ValueError("a contact family with a stiffness needs one: give --stiffness in N/m, and --pair")
+        raise ValueError("a contact family with a stiffness requires --stiffness in N/m, and --pair")
     if (swept or stiffnesses is not None) and pair is None:
-        raise ValueError("a stiffness in N/m needs the mass that it acts on: give --pair GEOM,GEOM")
+        raise ValueError("a stiffness in N/m requires the effective mass of a contact: give --pair GEOM,GEOM")
     subject = scene_task(scene, horizon=horizon, pair=pair)
     _check(subject, states)
     cells, messages = contact_grid(subject, families, stiffnesses or (), damping)

@@ -1,8 +1,8 @@
-"""The compiled programs of a check: values for finite differences, and derivatives in both modes.
+"""Compiled programs of a check: values for finite differences, and derivatives in both modes.
 
-Three or four small programs, whatever the number of states, contact models and directions. Steps and directions run one
-by one (`lax.map`), not as a batch: jaxlib's batched Cholesky factorisations share a thread pool with the program that
-waits for them, and two at once deadlock (seen with jaxlib 0.10.2 on two cores).
+There are three or four small programs for any number of states, contact models and directions. Steps and directions run
+one by one (`lax.map`) rather than as a batch: jaxlib's batched Cholesky factorisations share a thread pool with the
+program that waits for them, and two at once deadlock (seen with jaxlib 0.10.2 on two cores).
 """
 
 import dataclasses
@@ -23,18 +23,18 @@ from mjx_study.simulation.engine import HostState
 from mjx_study.simulation.integration import difference_position
 
 BATCH: Final = 64
-"""Steps per call of the program of values."""
+"""Steps per call of the value program."""
 DIRECTIONS: Final = 96
-"""Largest number of directions, forwards or backwards, per call of a program of derivatives."""
+"""Maximum number of directions, forwards or backwards, per call of a derivative program."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Linear:
-    """A step's value and derivative at one state.
+    """Value and derivatives of a step at one state.
 
     Attributes:
         forward: Jacobian (outputs, inputs) by forward mode.
-        tape: Jacobian by reverse mode on the tape, if `reverse` is that of the Jacobian program; else None.
+        tape: reverse-mode Jacobian on the tape, if `reverse` uses the Jacobian program; else None.
     """
 
     qpos: Float[np.ndarray, " nq"]
@@ -46,11 +46,11 @@ class Linear:
 
 @dataclasses.dataclass(frozen=True)
 class Exact:
-    """A step whose constraints are solved to rounding.
+    """A step with constraints solved to rounding.
 
     Attributes:
         after: state after the step, with the constrained acceleration as its warm start.
-        stages: quantities of the step up to the constraint solve, for comparison with the C engine.
+        stages: quantities of the step before the constraint solve, for comparison with the C engine.
         outputs: (position relative to a reference, velocity, activation) after each change.
     """
 
@@ -61,7 +61,7 @@ class Exact:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Setting:
-    """A contact model's arguments to the compiled programs.
+    """Arguments of the compiled programs that describe a contact model.
 
     Attributes:
         contact: the contact model, or None for the MJCF's own.
@@ -72,14 +72,14 @@ class Setting:
 
 
 class Programs:
-    """The compiled programs of one scene; contact models and states are arguments."""
+    """Compiled programs of one scene; contact models and states are arguments."""
 
     def __init__(self, layout: Coordinates, compiler: Compiler | None = None):
         self.layout = layout
         self.compiler = compiler or Compiler()
 
     def start(self, setting: Setting, base: HostState, *, stock: bool) -> None:
-        """Start compiling the programs of `linear`, `exact`, `stock_step` and, if asked for, `stock`."""
+        """Start compiling the programs of `linear`, `exact`, `stock_step` and, on request, `stock`."""
         point, layout = _point(setting, base), self.layout
         rows = [_unit_rows(0, len(layout.inputs)), _unit_rows(0, len(layout.outputs))]
         if self._has_tape:
@@ -94,7 +94,7 @@ class Programs:
     def exact(
         self, setting: Setting, base: HostState, reference: Array, changes: Float[np.ndarray, "batch inputs"]
     ) -> Exact:
-        """The converged step after each change, the first of which is zero; positions relative to `reference`."""
+        """Take the converged step after each change, the first of which is zero; positions relative to `reference`."""
         rows = -(-len(changes) // BATCH) * BATCH
         padded = np.zeros((rows, len(self.layout.inputs)))
         padded[: len(changes)] = changes
@@ -107,7 +107,7 @@ class Programs:
         return Exact(_host(after, base), stages, np.concatenate(outputs)[: len(changes)])
 
     def linear(self, setting: Setting, base: HostState) -> Linear:
-        """Value and derivatives of the project's own step at a state."""
+        """Compute the value and derivatives of the project's own step at a state."""
         tape = self._derivatives(self._tape, setting, base) if self._has_tape else None
         if not self.layout.scene.uses_jacobian:
             assert tape is not None
@@ -115,14 +115,14 @@ class Programs:
         qpos, residual, forward, reverse = self._derivatives(self._jacobian, setting, base)
         if tape is None:
             return Linear(qpos, residual, forward, reverse, None)
-        # over parameters both modes take the tape
+        # over parameters, both modes use the tape
         parameters = self.layout.columns("contact")
         forward = np.concatenate([forward, tape[2][:, parameters]], axis=1)
         reverse = np.concatenate([reverse, tape[3][:, parameters]], axis=1)
         return Linear(qpos, residual, forward, reverse, tape[3])
 
     def stock_step(self, setting: Setting, base: HostState) -> HostState:
-        """The state after `mjx.step`, run to convergence from the warm start."""
+        """Return the state after `mjx.step`, run to convergence from the warm start."""
         return _host(self.compiler.run(self._stock_step, *_point(setting, base)), base)
 
     def stock(self, setting: Setting, base: HostState) -> Float[np.ndarray, "outputs inputs"]:
@@ -133,11 +133,11 @@ class Programs:
 
     @property
     def _has_tape(self) -> bool:
-        """Whether derivatives use the tape: for large scenes, and with respect to contact parameters."""
+        """Whether derivatives use the tape: for large scenes, and over contact parameters."""
         return len(self.layout.scales) > 0 or not self.layout.scene.uses_jacobian
 
     def _derivatives(self, program: Any, setting: Setting, base: HostState) -> tuple[Any, float, Any, Any]:
-        """Position after the step, residual, and the Jacobian in forward and in reverse mode."""
+        """Position after the step, residual, and the Jacobian in forward and reverse mode."""
         layout, point = self.layout, _point(setting, base)
         inputs = len(layout.inputs) if program == self._tape else layout.num_state
         outputs, forward, reverse = len(layout.outputs), [], []
@@ -151,7 +151,7 @@ class Programs:
         return np.asarray(qpos), float(np.asarray(residual)), forward, reverse
 
     def _after(self, step_function, setting, state, control, change, parameters, reference=None):
-        """Outputs after a change, relative to a given position or to that after the step; and the state there."""
+        """Outputs after a change, relative to a given position or that after the step; and the state there."""
         layout = self.layout
         moved, moved_control = layout.state(state, control, change)
         after, *rest = step_function(
@@ -252,6 +252,6 @@ def _host(after: State, base: HostState) -> HostState:
 
 
 def _unit_rows(first: int, size: int) -> Float[np.ndarray, "directions size"]:
-    """Rows of the identity from `first` on, `DIRECTIONS` of them or `size` if fewer, padded with zeros."""
+    """Rows of the identity from `first` on, `DIRECTIONS` or `size` if fewer, padded with zeros."""
     rows = np.eye(size)[first : first + DIRECTIONS]
     return np.pad(rows, ((0, min(DIRECTIONS, size) - len(rows)), (0, 0)))

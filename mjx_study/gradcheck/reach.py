@@ -1,6 +1,6 @@
-"""Which contacts a model can make, from bounds on where its joints can bring its geoms and how these can move there.
+"""Contacts that a model can make, from bounds on where joints can bring geoms and how geoms can move there.
 
-What the bounds do not decide counts as within reach.
+Undecided cases count as within reach.
 """
 
 import dataclasses
@@ -14,23 +14,23 @@ import numpy as np
 
 from mjx_study.simulation._mjx import mjx
 
-_driver: Any = sys.modules[mjx.collision.__module__]  # what it tests for collision is not public
+_driver: Any = sys.modules[mjx.collision.__module__]  # its collision candidates are not public
 _FREE, _SLIDE = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_SLIDE)
 _PLANE, _SPHERE = int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_SPHERE)
 NO_FRICTION: Final = mujoco.mjMINMU
-"""Sliding friction that MuJoCo gives a contact whose geoms have none."""
+"""Sliding friction that MuJoCo assigns to a contact whose geoms have none."""
 ALIGNED: Final = 1e-9
-"""Sine of an angle up to which directions are the same."""
+"""Sine of the angle below which directions coincide."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Pair:
-    """Two geoms that MJX tests for collision.
+    """Two geoms tested by MJX for collision.
 
     Attributes:
         first: the geom whose type has the smaller number.
-        friction: whether their contact has any.
-        margin: upper bound on the distance at which it begins [m].
+        friction: whether their contact has friction.
+        margin: upper bound on the distance at which contact begins [m].
     """
 
     first: int
@@ -53,7 +53,7 @@ def pairs_of(host: mujoco.MjModel) -> Iterator[Pair]:
 
 
 class Reach:
-    """Where a model's joints can bring its geoms; limits are disregarded, since they are soft."""
+    """Regions that a model's joints can bring its geoms to; joint limits are ignored, since they are soft."""
 
     def __init__(self, host: mujoco.MjModel):
         self._host, self._zero = host, mujoco.MjData(host)
@@ -62,7 +62,7 @@ class Reach:
 
     def touch(self, pair: Pair) -> bool:
         """Whether two geoms may come into contact."""
-        if self._host.nmocap:  # which may move anything that is fixed
+        if self._host.nmocap:  # may move anything fixed
             return True
         plane = self._host.geom_type[pair.first] == _PLANE
         centre, radius = self._geoms(pair.first if plane else None)
@@ -74,7 +74,7 @@ class Reach:
         return bool(distance <= pair.margin)
 
     def slide(self, pair: Pair) -> bool:
-        """Whether two geoms may move along their contact: not where they move along its normal alone."""
+        """Whether two geoms may move tangentially to their contact, rather than along its normal alone."""
         host, zero = self._host, self._zero
         one, other = (self._joints(int(host.geom_bodyid[geom])) for geom in (pair.first, pair.second))
         joints, types = sorted(one ^ other), host.geom_type[[pair.first, pair.second]]
@@ -105,8 +105,7 @@ class Reach:
         return found
 
     def _geoms(self, plane: int | None) -> tuple[np.ndarray, np.ndarray]:
-        """Balls that the geoms stay in, centres (ngeom, 3) and radii (ngeom,) [m]; if there is a plane, only along its
-        normal."""
+        """Bounding balls of geoms, centres (ngeom, 3) and radii (ngeom,) [m]; for a plane, only along its normal."""
         if plane not in self._balls:
             self._balls[plane] = self._ball_of_each(None if plane is None else self._normal(plane))
         return self._balls[plane]
@@ -116,7 +115,7 @@ class Reach:
         centre, radius, turning = zero.xpos.copy(), np.zeros(host.nbody), np.zeros(host.nbody, bool)
 
         def follow(body: int, offset: np.ndarray) -> tuple[np.ndarray, float]:
-            """The ball of what is fixed to a body, at an offset from its origin in the reference pose."""
+            """Bounding ball of a point fixed to a body at an offset from its origin in the reference pose."""
             if turning[body]:
                 return centre[body], radius[body] + float(np.linalg.norm(offset))
             return centre[body] + offset, radius[body]
@@ -141,7 +140,7 @@ class Reach:
 
 
 def contact_parts(host: mujoco.MjModel) -> tuple[set[str], dict[str, int]]:
-    """Contact and those of its zones that may be reached; those that cannot, with the number of pairs of geoms."""
+    """Contact zones that may be reached, and those that cannot, with the number of pairs of geoms."""
     reach, had, within = Reach(host), Counter(), set()
     for pair in pairs_of(host):
         had.update({"contact", *(("stick", "slide") if pair.friction else ("push",))})

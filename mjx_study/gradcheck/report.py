@@ -13,29 +13,29 @@ from mjx_study.study.dataset import as_plain
 from mjx_study.table import format_table
 
 SHOWN: Final = 12
-"""Number of findings in the text, unless all are asked for."""
+"""Maximum number of findings in the text, unless all are requested."""
 
 
 @dataclasses.dataclass(frozen=True)
 class StepCheck:
-    """The checks of single steps under one contact model; errors are relative, the worst over the states.
+    """Checks of single steps for one contact model; errors are relative, the worst over the states.
 
     Attributes:
         contact: name of the contact family.
         stiffness: K [N/m]; 0 if the contact model is not defined by one.
         states: number of states checked.
         entries: total number of Jacobian entries.
-        unresolved: number of entries that differences are too uncertain to judge.
-        modes: difference of reverse and forward mode.
+        unresolved: number of entries whose differences are too uncertain to judge.
+        modes: difference between reverse and forward mode.
         differences: error of derivatives with respect to state and control, by central differences.
-        parameters: error of derivatives with respect to contact parameters; None if there are no contacts.
+        parameters: error of derivatives with respect to contact parameters; None without contacts.
         stock_step: difference of the next state from that of `mjx.step`, relative to the step's change.
         engine_step: difference of the next state from the C engine's, likewise.
         engine: difference of the Jacobian from the C engine's where the steps agree; None if they never do.
-        stock: error of the derivative of `mjx.step`; None if not asked for, infinite if it is NaN.
-        residual: largest relative residual of the solver.
+        stock: error of the derivative of `mjx.step`; None if not requested, infinite if NaN.
+        residual: largest relative solver residual.
         coverage: parts of the model that the states exercise.
-        verdict: the gravest of the findings on the project's own derivative.
+        verdict: worst of the findings on the project's own derivative.
     """
 
     contact: str
@@ -68,7 +68,7 @@ class GradcheckReport:
         summary: size of the model, and what was checked, in one line.
         costs: checks of whole-horizon gradients, one per contact model; empty for a file.
         steps: checks of single steps, one per contact model.
-        findings: findings, gravest first.
+        findings: findings, worst first.
         warnings: warnings about contact models and about features without a derivative.
         environment: versions, machine, devices and precision.
     """
@@ -93,11 +93,11 @@ class GradcheckReport:
         return {check.label: check.coverage.missing for check in self.steps if check.coverage.missing}
 
     def as_json(self) -> dict[str, Any]:
-        """The report as plain data; non-finite numbers become None."""
+        """Return the report as plain data; nonfinite numbers become None."""
         return as_plain(dataclasses.asdict(self) | {"passed": self.passed, "unexercised": self.unexercised})
 
     def lines(self, *, verbose: bool = False) -> list[str]:
-        """The report as text; `verbose` lists every entry of every finding."""
+        """Return the report as text; `verbose` lists every entry of every finding."""
         lines = [f"{self.subject}: {self.summary}", ""]
         if self.costs:
             lines += ["gradient of the whole cost", *self._cost_table(), ""]
@@ -109,7 +109,7 @@ class GradcheckReport:
         return [*lines, f"{verdict}, where it was checked" if self.passed and self.unexercised else verdict]
 
     def _coverage_lines(self) -> list[str]:
-        """Coverage, with contact models that have the same line grouped."""
+        """Coverage lines, with contact models that share a line grouped."""
         alike: dict[str, list[str]] = {}
         for check in self.steps:
             alike.setdefault(check.coverage.line(), []).append(check.label)
@@ -117,7 +117,7 @@ class GradcheckReport:
         return ["exercised", *lines, ""] if lines else []
 
     def _gaps(self) -> list[str]:
-        """A warning for each set of parts that no state exercises."""
+        """Warnings about parts that no state exercised, grouped."""
         alike: dict[tuple[str, ...], list[str]] = {}
         for label, missing in self.unexercised.items():
             alike.setdefault(missing, []).append(label)
@@ -158,7 +158,7 @@ class GradcheckReport:
         return _without_empty(rows, [*header, "C engine", "mjx.step", "residual", "unresolved", "verdict"])
 
     def _finding_lines(self, verbose: bool) -> list[str]:
-        """Findings, once per kind and cause, however many contact models show it."""
+        """Findings, one line per kind and cause, whatever the number of contact models that show it."""
         alike: dict[tuple[str, str, str], list[Finding]] = {}
         for finding in self.findings:
             alike.setdefault((finding.who, finding.verdict, finding.cause), []).append(finding)

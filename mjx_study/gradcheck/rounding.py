@@ -1,4 +1,4 @@
-"""Rounding error of a step, which limits the accuracy of its finite differences."""
+"""Rounding error of a step, which limits the accuracy of finite differences."""
 
 from typing import Any, Final
 
@@ -16,8 +16,8 @@ def solution_noise(
 ) -> Float[np.ndarray, " outputs"]:
     """Rounding error of the outputs of a step whose equation M a - q - J^T f(J a) = 0 is solved exactly.
 
-    Each term is rounded, by EPSILON of its size, and the equation's inverse carries that into the acceleration. MJX's
-    integrators then compute the velocity from the forces, M^-1 (q + J^T f), where large ones that cancel leave their
+    Each term is rounded by EPSILON of its size, which the inverse of the equation propagates to the acceleration. MJX's
+    integrators then compute the velocity from the forces, M^-1 (q + J^T f), where large forces that cancel leave their
     rounding.
     """
     jacobian, timestep = stages["efc_J"], layout.scene.timestep

@@ -1,4 +1,4 @@
-"""Every comparison at one state."""
+"""All comparisons at one state."""
 
 import dataclasses
 
@@ -27,10 +27,10 @@ class StateCheck:
         derivatives: derivatives by mode: forward, reverse, tape, or mjx.step.
         truth: finite differences of this project's step.
         judged: verdicts on the derivatives.
-        modes: difference of reverse and forward mode where no jump excuses it.
-        values: comparison of the step with those of `mjx.step` and of the C engine.
+        modes: difference between reverse and forward mode where no jump excuses it.
+        values: comparison of the step with `mjx.step` and the C engine.
         engine_truth: finite differences of the C engine's step.
-        engine: verdicts of these on the forward-mode derivative; None if the two steps differ.
+        engine: verdicts on the forward-mode derivative by `engine_truth`; None if the two steps differ.
     """
 
     sample: Sample
@@ -51,7 +51,7 @@ def check_state(
     """Run all comparisons of a step and its derivatives.
 
     Args:
-        setting: the contact model, and the units of its parameters.
+        setting: the contact model and the units of its parameters.
         stock: whether to differentiate `mjx.step` too.
     """
     layout = programs.layout

@@ -1,4 +1,4 @@
-"""States at which a step is checked: from a rollout, its initial state included, chosen to exercise the whole model."""
+"""States at which to check a step, from a rollout and its initial state, chosen to exercise the whole model."""
 
 import dataclasses
 import itertools
@@ -16,11 +16,11 @@ from mjx_study.simulation.scene import Scene
 SPEED: Final = 0.1
 """Standard deviation of sampled initial velocities [m/s or rad/s]: small, but nothing is at rest or at a tie."""
 FASTER: Final = (1.0, 5.0)
-"""Standard deviations in rollouts that look for parts the first did not reach."""
+"""Standard deviations in rollouts that search for parts the first did not reach."""
 PUSHES: Final = 10
-"""Number of times such a rollout gets new velocities and controls."""
+"""Number of times that new velocities and controls are drawn in such a rollout."""
 CONTROL: Final = 0.3
-"""Standard deviation of sampled controls, relative to half their range; absolute if they have none."""
+"""Standard deviation of sampled controls, relative to half their range; absolute for unlimited controls."""
 POSES: Final = 30
 """Number of random poses tried for parts that no rollout reached."""
 FALL: Final = 50
@@ -49,7 +49,7 @@ class Sample:
 
 
 def start_of(scene: Scene) -> HostState:
-    """The model's own initial state: its first keyframe, or its reference pose at rest."""
+    """Return the model's own initial state: its first keyframe, or its reference pose at rest."""
     data = mujoco.MjData(scene.host)
     if scene.host.nkey:
         mujoco.mj_resetDataKeyframe(scene.host, data, 0)
@@ -64,12 +64,12 @@ def states_of(
     seed: int,
     visited: Sequence[HostState] | None = None,
 ) -> tuple[list[Sample], Coverage]:
-    """`count` states, and the parts of the model that they exercise.
+    """Choose `count` states, and report the parts of the model that they exercise.
 
-    The first is the initial state: users start there, and most faults of a derivative show there. The others come from
-    a rollout, the task's own or one with small random velocities and controls, evenly spaced over its steps, those with
-    active constraints first. If they leave a part of the model unexercised, they are replaced by states that exercise
-    it, from faster rollouts with repeated pushes and from random poses within the joints' limits.
+    The first is the initial state: rollouts start there, and most derivative faults show there. The others come from a
+    rollout, the task's own or one with small random velocities and controls, evenly spaced over its steps, those with
+    active constraints first. If they leave parts of the model unexercised, they are replaced by states that exercise
+    them, from faster rollouts with repeated pushes and from random poses within the joint limits.
 
     Args:
         horizon: number of steps of the rollouts.
@@ -98,11 +98,11 @@ def states_of(
 
 
 def _cover(chosen: list[Sample], pool: Iterable[Sample], wanted: frozenset[str], count: int) -> list[Sample]:
-    """Add samples of a pool, up to `count` in all, until they exercise what is wanted or all that the pool offers."""
+    """Add samples from a pool, up to `count` in all, until they exercise all wanted parts that the pool offers."""
     chosen, seen = list(chosen), []
     iterator = iter(pool)
     while len(chosen) < count and (missing := wanted.difference(*(sample.parts for sample in chosen))):
-        # a pool of one rollout is read to its end; one that goes on for long only while nothing helps
+        # read a single rollout to its end, but a longer pool only until something helps
         while not any(sample.parts & missing for sample in seen):
             more = list(itertools.islice(iterator, LOOK))
             if not more:
@@ -110,12 +110,12 @@ def _cover(chosen: list[Sample], pool: Iterable[Sample], wanted: frozenset[str],
             seen += more
         most = max(len(sample.parts & missing) for sample in seen)
         best = [sample for sample in seen if len(sample.parts & missing) == most]
-        chosen.append(best[len(best) // 2])  # the middle one, far from where the part sets in
+        chosen.append(best[len(best) // 2])  # the middle one, far from where the part becomes active
     return chosen
 
 
 def _spaced(rollout: Sequence[Sample], count: int) -> list[Sample]:
-    """Up to `count` samples, evenly spaced, first among those with active constraints, then among the others."""
+    """Up to `count` evenly spaced samples, first among those with active constraints, then among the others."""
     active = [sample for sample in rollout if sample.parts]
     others = [sample for sample in rollout if not sample.parts]
     if count > len(active):
@@ -130,7 +130,7 @@ def _even(samples: list[Sample], count: int) -> list[Sample]:
 
 
 def _elsewhere(host: mujoco.MjModel, start: HostState, horizon: int, random: np.random.Generator) -> Iterator[Sample]:
-    """States that a rollout from the initial state does not reach."""
+    """Yield states that a rollout from the initial state does not reach."""
     for speed in FASTER:
         every = max(horizon // PUSHES, 1)
         yield from _rollout(
@@ -149,7 +149,7 @@ def _rollout(
     push: Callable[[HostState], HostState] | None = None,
     every: int = 1,
 ) -> Iterator[Sample]:
-    """States of a rollout in the C engine while it stays finite, with pushes at regular intervals."""
+    """Yield the states of a rollout in the C engine while it stays finite, with pushes at regular intervals."""
     data = host_data(host, start)
     for index in range(horizon):
         if push is not None and index % every == 0:
@@ -170,7 +170,7 @@ def _parts(host: mujoco.MjModel, state: HostState) -> frozenset[str]:
 def _stirred(
     host: mujoco.MjModel, state: HostState, random: np.random.Generator, speed: float, control: float = 1.0
 ) -> HostState:
-    """The state with other velocities, controls and activations."""
+    """Return the state with new random velocities, controls and activations."""
     low, high = host.actuator_ctrlrange.T
     limited = host.actuator_ctrllimited.astype(bool)
     half, centre = np.where(limited, (high - low) / 2, 1.0), np.where(limited, (high + low) / 2, 0.0)
@@ -183,7 +183,7 @@ def _stirred(
 
 
 def _posed(host: mujoco.MjModel, state: HostState, random: np.random.Generator) -> HostState:
-    """The state with every limited slide and hinge somewhere in its range, or a little beyond an end of it."""
+    """Return the state with every limited slide and hinge somewhere in its range, or slightly beyond."""
     qpos = state.qpos.copy()
     for joint in np.flatnonzero(host.jnt_limited):
         if int(host.jnt_type[joint]) in _SCALAR:

@@ -1,4 +1,4 @@
-"""Do this project, `mjx.step` and the C engine compute the same step? If not, which of them differs, where, and why."""
+"""Compare the steps of this project, `mjx.step` and the C engine; if they differ, tell which, where and why."""
 
 import dataclasses
 from typing import Any, Final
@@ -19,15 +19,15 @@ STILL: Final = 1e-8
 
 @dataclasses.dataclass(frozen=True)
 class Values:
-    """Differences of the states after one step, all solved to rounding, relative to the step's change.
+    """Differences between the states after one step, all solved to rounding, relative to the step's change.
 
     Attributes:
         stock: difference of this project's state from that of `mjx.step`.
         engine: difference of this project's state from the C engine's.
-        verdict: value (this project's step and that of `mjx.step` differ), engine (they agree, and the C engine's
-            differs for no documented reason), engine_mismatch (for a documented one), or empty.
+        verdict: value (this project and `mjx.step` differ), engine (they agree, and the C engine differs for no
+            documented reason), engine_mismatch (for a documented reason), or empty.
         coordinate: output that differs most, an index into the layout's outputs.
-        numbers: change of this coordinate here, and in the implementation that differs.
+        numbers: change of this coordinate in this project and in the differing implementation.
     """
 
     stock: float
@@ -52,13 +52,13 @@ def compare_values(
     stages: dict[str, Any],
     noise: Float[np.ndarray, " outputs"] | float = 0.0,
 ) -> Values:
-    """Compare one step.
+    """Compare one step across implementations.
 
     Args:
         state: state before the step.
-        ours: this project's state after it; like the others, with the step's acceleration as warm start.
+        ours: this project's next state; like the others, with the step's acceleration as warm start.
         stock: state after `mjx.step`.
-        stages: MJX's quantities at `state`.
+        stages: MJX's intermediate quantities at `state`.
         noise: rounding noise of each output; at rest, all of its change.
     """
     theirs = engine_step.after(state)
@@ -83,7 +83,7 @@ def compare_values(
 
 
 def change(layout: Coordinates, before: HostState, after: HostState) -> Float[np.ndarray, " outputs"]:
-    """The change over a step: position in the tangent space, velocity, activation."""
+    """Change over a step: position in the tangent space, velocity, activation."""
     tangent = np.empty(layout.scene.host.nv)
     mujoco.mj_differentiatePos(layout.scene.host, tangent, 1.0, before.qpos, after.qpos)
     return np.concatenate([tangent, after.qvel - before.qvel, after.act - before.act])
