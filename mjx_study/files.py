@@ -7,6 +7,7 @@ from typing import Annotated, Any, Final, TypeVar
 import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
+from mjx_study.choices import suggestion
 from mjx_study.disk import read_whole
 from mjx_study.option import OPTIONS
 
@@ -70,7 +71,7 @@ def told(error: ValidationError) -> str:
     raised = first.get("ctx", {}).get("error")  # by a validator of ours, to whose message pydantic adds words
     reason = str(raised) if isinstance(raised, ValueError) else first["msg"]
     if first["type"] == "extra_forbidden":
-        reason = "there is no such option"
+        reason = f"there is no such option{suggestion(key, OPTIONS)}"
     more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
     return f"{key}{': ' * bool(key)}{' '.join(reason.split())}{more}"
 
