@@ -15,8 +15,9 @@ import pytest
 from estimators import Differentiation, Evaluation, FirstOrder, ZerothOrder, estimate
 from mjx_study import cli
 from mjx_study.cli import options
-from mjx_study.diagnose import Diagnosis, Measured, Touch, diagnose
+from mjx_study.diagnose import ESTIMATORS, Diagnosis, Measured, Touch, diagnose
 from mjx_study.diagnose.measurement import affordable, chunk_of
+from mjx_study.diagnose.setting import setting_of
 from mjx_study.gradcheck.finding import Finding
 from mjx_study.gradcheck.mean import along_means
 from mjx_study.objective import Simulator
@@ -194,7 +195,11 @@ def test_a_bias_at_right_angles_to_the_gradient_is_seen() -> None:
 
 @pytest.mark.parametrize(
     ("spread", "strength", "expected"),
-    [(0.3, 0.5, "the noise is too narrow"), (2.0, 0.5, "can be off by 25%"), (2.0, 0.05, None)]
+    [
+        (0.3, 0.5, "for fobg_onset and aobg_onset the noise is too narrow"),
+        (2.0, 0.5, "can be off by 25%"),
+        (2.0, 0.05, None),
+    ]
     + [(2.0, 1.2, "can leave more than it adds")],
 )
 def test_when_the_onset_term_is_not_to_be_trusted(
@@ -204,7 +209,7 @@ def test_when_the_onset_term_is_not_to_be_trusted(
     onsets = found.onsets | {"onset_spread": spread, "onset_strength": strength}
     right = dataclasses.replace(found, onsets=onsets)
     told = [text for text, _ in right._advice() if "narrow" in text or "can be off" in text]
-    assert all("right here, by the check of the mean" in text for text in told)
+    assert all("fobg_onset is right here, by the check of the mean" in text for text in told)
     undecided = tuple(dataclasses.replace(each, verdict="undecided") for each in found.estimators)
     told = [text for text, _ in dataclasses.replace(right, estimators=undecided)._advice()]
     assert any(expected in text for text in told) if expected else len(told) == 1
@@ -227,10 +232,100 @@ def test_a_bias_that_no_jump_in_force_explains_is_told(found: Diagnosis) -> None
     assert not any("sets in with a jump" in text or "solimp" in text for text in told)
 
 
-def test_nothing_is_advised_where_no_gradient_shows(found: Diagnosis) -> None:
-    unseen = tuple(dataclasses.replace(each, norm=0.0, verdict="undecided") for each in found.estimators)
-    ((text, flags),) = dataclasses.replace(found, estimators=unseen)._advice()
+def test_nothing_is_advised_or_judged_where_no_gradient_shows(found: Diagnosis) -> None:
+    """Errors are numbers then, not shares of nothing; twice the standard error takes four times the samples."""
+    unseen = dataclasses.replace(found, estimators=tuple(planted(estimator=name, norm=0.1) for name in ESTIMATORS))
+    ((text, flags),) = unseen._advice()
     assert text.startswith("no estimator can be advised") and not flags
+    page, norm_error = unseen.lines(), 2 / math.sqrt(500)
+    assert page[3] == (
+        f"the gradient cannot be told from 0: its norm is 0.1 ± {norm_error:.1g}; --samples 1600 would tell one of 0.1,"
+        " and a larger --sigma may need fewer"
+    )
+    table = page[page.index("estimators, by their error, in the gradient's unit, after a second of computing") :]
+    assert table[2].split()[:4] == ["zobg", "0.20", "0.17", "to"]
+    assert not any("%" in line.replace("95 %", "") for line in table) and not any("right" in line for line in table)
+    document = unseen.as_json()
+    assert not document["resolved"] and document["best"] is None and document["estimators"][0]["bias"] is None
+    assert document["gradient_norm_error"] == pytest.approx(norm_error)
+    right = dataclasses.replace(unseen.best, estimator="fobg", verdict="right")
+    judged = dataclasses.replace(unseen, estimators=(right, *unseen.estimators[1:])).lines()
+    assert any("not judged" in line for line in judged) and any("a smaller --sigma" in line for line in judged)
+
+
+def test_a_gradient_without_any_parameter_in_it_is_told(found: Diagnosis) -> None:
+    nothing = dataclasses.replace(planted(variance=0.0, lower=0.0, upper=0.0, norm=0.0))
+    page = dataclasses.replace(found, estimators=(nothing,)).lines()
+    assert page[3].startswith("the gradient is 0: ")
+
+
+def test_what_the_page_holds_for_is_on_it(found: Diagnosis) -> None:
+    assert found.lines()[2] == (
+        "gaussian noise of sigma = 0.05 m/s, added to the initial velocities; 1 parameter; 65 steps of 0.002 s"
+    )
+    assert next(found._advice())[0].startswith(f"at sigma = 0.05 m/s, take {found.best.estimator}; ")
+    told = found.as_json()
+    assert (told["sigma"], told["sigma_unit"], told["added_to"]) == (0.05, "m/s", "the initial velocities")
+    assert (told["timestep"], told["horizon"], told["params"]) == (TIMESTEP, 65, 1)
+
+
+@pytest.mark.parametrize(
+    ("joint", "actuator", "expected"),
+    [
+        ("hinge", "", "0.1 rad/s, added to the initial velocities; 1 parameter;"),
+        ("free", "", "0.1 m/s or rad/s, added to the initial velocities; 6 parameters;"),
+        ("slide", '<motor joint="x"/>', "0.1 N, added to every control; 2 parameters;"),
+        ("hinge", '<motor joint="x"/>', "0.1 N m, added to every control; 2 parameters;"),
+        ("slide", '<position joint="x" kp="9" kv="1"/>', "0.1 m, added to every control; 2 parameters;"),
+        ("hinge", '<velocity joint="x" kv="3"/>', "0.1 rad/s, added to every control; 2 parameters;"),
+        ("hinge", '<motor joint="x" gear="2"/>', "0.1, added to every control (in its unit); 2 parameters;"),
+    ],
+)
+def test_the_noise_has_the_unit_of_what_it_is_added_to(
+    joint: str, actuator: str, expected: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "one.xml"
+    path.write_text(
+        f"""<mujoco><worldbody><body><joint name="x" type="{joint}"/><geom size=".1" pos=".1 0 0"/></body></worldbody>
+        <actuator>{actuator}</actuator></mujoco>"""
+    )
+    line = setting_of(str(path), make_task(str(path), horizon=2)).line()
+    assert line == f"gaussian noise of sigma = {expected} 2 steps of 0.002 s"
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("momentum_transfer", "gaussian noise of sigma = 0.02 rad, added to theta; 1 parameter; 400 steps of 0.002 s"),
+        ("double_pendulum", "added to theta (in its unit); 4 parameters;"),
+        ("tennis", "sigma = 0.01, added to every control (in its unit); 21 parameters; 200 steps of 0.005 s"),
+    ],
+)
+def test_the_setting_of_a_task(name: str, expected: str) -> None:
+    assert expected in setting_of(name, make_task(name)).line()
+
+
+def test_errors_have_the_digits_that_are_certain(found: Diagnosis) -> None:
+    """After 100 samples a second, of a gradient of 2: standard errors of 6, 75 and 0 % of the error."""
+    each = [planted(estimator=name, lower=low, upper=up) for name, low, up in (("zobg", 3.0, 5.0), ("aobg", 1.0, 40.0))]
+    each.append(planted(lower=4.0, upper=4.0, verdict="biased", bias=1e-5))
+    some = dataclasses.replace(found, estimators=tuple(each), samples=10**6)
+    table = [line.split("  ") for line in some._estimator_lines()]
+    shown = {cells[0]: cells[1:4] for cells in ([cell.strip() for cell in row if cell] for row in table) if cells}
+    assert shown["estimator"] == ["error", "95 % interval", "mean"]
+    assert shown["zobg"][:2] == ["10%", "8.7% to 11%"] and shown["aobg"][:2] == ["10%", "5% to 30%"]
+    assert shown["fobg"] == ["10%", "10% to 10%", "off by 0.00050%"]
+    assert [some._shown(value, 0.0) for value in (0.0, 1.0, 12.345, 3e-9)] == ["0%", "100%", "1200%", "3e-07%"]
+
+
+def test_the_onset_term_is_no_matter_where_plain_first_order_is_best(found: Diagnosis) -> None:
+    onsets = found.onsets | {"onset_spread": 0.3}
+    for verdict in ("right", "undecided"):
+        one = planted(variance=1e-6, norm=found.norm, verdict="right")
+        plain = one, dataclasses.replace(one, estimator="fobg_onset", verdict=verdict)
+        (text,) = [text for text, _ in dataclasses.replace(found, onsets=onsets, estimators=plain)._advice()]
+        assert text.startswith("at sigma = 0.05 m/s, take fobg;")
+        assert not any("could not be judged" in line for line in dataclasses.replace(found, estimators=plain).lines())
 
 
 def test_a_bias_that_stays_is_not_averaged_away(found: Diagnosis) -> None:
@@ -263,7 +358,7 @@ def test_an_interval_without_an_upper_end_has_none(found: Diagnosis) -> None:
 def test_an_unstable_step_is_told_first(found: Diagnosis) -> None:
     touch = Touch("a and b", 0.1, 1.0, 0.1, 9.0, 2.0, 0.9, 0.09, False)
     page = dataclasses.replace(found, touches=(touch, *found.touches)).lines()
-    assert page[2] == "warning: the step in contact is unstable: a and b, h^2 k = 9"
+    assert page[3] == "warning: the step in contact is unstable: a and b, h^2 k = 9"
     assert any("UNSTABLE" in line for line in page)
 
 

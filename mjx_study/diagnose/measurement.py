@@ -36,6 +36,8 @@ CHUNKS: Final = (32, 8)
 however few are asked for."""
 SMALL: Final = (8, 32)
 """Most degrees of freedom and constraint rows of a small model."""
+RESOLVED: Final = 2.0
+"""Standard errors beyond which a gradient is told from 0."""
 ACCURATE: Final = 0.1
 """Relative error that a number of samples is given for."""
 
@@ -64,6 +66,12 @@ class Measured:
     bias: float
     norm: float
     lost: int
+
+    @property
+    def bias_error(self) -> float:
+        """Standard error of the bias, relative to it: of the path that misses most."""
+        most = max(self.paths, key=lambda each: abs(float(each.gap)), default=None)
+        return 0.0 if most is None or not most.gap else float(abs(most.standard_error / most.gap))
 
     def error(self, norm: float, variance: float | None = None) -> float:
         """Error after a second of computing, relative to a gradient of this norm."""
@@ -99,16 +107,17 @@ class Measurement:
     @property
     def norm(self) -> float:
         """Norm of the gradient; its standard error where that is larger."""
-        return max(self.surest.norm, self._uncertainty)
+        return max(self.surest.norm, self.norm_error)
 
     @property
-    def _uncertainty(self) -> float:
+    def norm_error(self) -> float:
+        """Standard error of the norm of the gradient."""
         return math.sqrt(self.surest.variance / self.samples)
 
     @property
-    def _too_small(self) -> bool:
-        """Whether the gradient cannot be told from 0."""
-        return self.surest.norm < 2 * self._uncertainty
+    def resolved(self) -> bool:
+        """Whether the gradient can be told from 0."""
+        return self.surest.norm > RESOLVED * self.norm_error
 
     @property
     def best(self) -> Measured:

@@ -7,7 +7,8 @@ import textwrap
 from collections.abc import Iterator
 from typing import Any, Final
 
-from mjx_study.diagnose.measurement import ACCURATE, SAMPLES, Measurement
+from mjx_study.diagnose.measurement import ACCURATE, RESOLVED, SAMPLES, Measured, Measurement
+from mjx_study.diagnose.setting import Setting
 from mjx_study.diagnose.touch import Touch
 from mjx_study.gradcheck import GradcheckReport
 from mjx_study.gradcheck.diagnosis import MEANING
@@ -27,6 +28,8 @@ WIDTHS: Final = 3.0
 LEGEND: Final = (
     "  zobg: zeroth order; fobg: first order; aobg: both, weighted; _onset: with a term for contact that begins"
 )
+UNSURE: Final = 0.5
+"""Relative standard error beyond which an error has one digit."""
 BEYOND: Final = 100.0
 """Upper end of an interval of a relative error from which it says nothing."""
 SHOWN: Final = 6
@@ -40,6 +43,7 @@ class Diagnosis(Measurement):
     Attributes:
         subject: as it was named.
         task: what was studied.
+        setting: noise and rollout, for which alone the page holds.
         contact: label of the contact model.
         touches: contacts that begin without noise.
         derivatives: the gradient check.
@@ -49,6 +53,7 @@ class Diagnosis(Measurement):
 
     subject: str
     task: Task
+    setting: Setting
     contact: str
     touches: tuple[Touch, ...]
     derivatives: GradcheckReport
@@ -56,14 +61,15 @@ class Diagnosis(Measurement):
     options: str
 
     def as_json(self) -> dict[str, Any]:
+        norm = self.norm if self.resolved else math.nan
         shown = [
             {
                 "estimator": each.estimator,
                 "variance": each.variance,
                 "seconds_per_sample": each.seconds,
                 "mean": each.verdict,
-                "bias": each.bias / self.norm,
-                "error_after_a_second": each.error(self.norm),
+                "bias": each.bias / norm,
+                "error_after_a_second": each.error(1.0) / norm,
             }
             for each in self.estimators
         ]
@@ -72,6 +78,7 @@ class Diagnosis(Measurement):
             "cost": self.task.description,
             "contact": self.contact,
             "samples": self.samples,
+            **dataclasses.asdict(self.setting),
             "touches": [dataclasses.asdict(each) for each in self.touches],
             **self.onsets,
             "nonfinite": self.lost,
@@ -79,9 +86,11 @@ class Diagnosis(Measurement):
             "derivatives": "right" if self.derivatives.passed else self._failure,
             "unexercised": self.derivatives.unexercised,
             "estimators": shown,
-            "best": self.best.estimator,
+            "best": self.best.estimator if self.resolved else None,
             "gradient_norm": self.norm,
-            "samples_needed": self.samples_needed,
+            "gradient_norm_error": self.norm_error,
+            "resolved": self.resolved,
+            "samples_needed": self.samples_needed if self.resolved else None,
             "warnings": [*self.warnings, *self._cautions()],
             "advice": [text for text, _ in self._advice()],
             "environment": environment(),
@@ -91,6 +100,7 @@ class Diagnosis(Measurement):
     def lines(self) -> list[str]:
         task, command = self.task, f"mjx-study {{}} {shlex.quote(self.subject)}{self.options}"
         lines = [f"{self.subject}: {task.description or task.name}", f"contact {self.contact}, {self.samples} samples"]
+        lines += [self.setting.line(), *([] if self.resolved else [self._unresolved()])]
         lines += [f"warning: {text}" for text in (*self.warnings, *self._cautions())]
         lines += ["", "contact", *self._contact_lines()]
         if self.onsets.get("onsets"):
@@ -100,10 +110,12 @@ class Diagnosis(Measurement):
             if self.derivatives.passed
             else f"NOT RIGHT: {MEANING[self._failure]}"
         )
-        missing = ", where it was exercised" if self.derivatives.passed and self.derivatives.unexercised else ""
+        parts = dict.fromkeys(part for parts in self.derivatives.unexercised.values() for part in parts)
+        missing = f"; not exercised: {', '.join(parts)}" if self.derivatives.passed and parts else ""
         lines += ["", "derivatives of a step", f"  {state}{missing}", f"  > {command.format('gradcheck')}"]
         batch = f"--estimators {','.join(each.estimator for each in self.estimators)} --samples {self.samples}"
-        lines += ["", "estimators, by their relative error after a second of computing", *self._estimator_lines()]
+        error = "relative error" if self.resolved else "error, in the gradient's unit,"
+        lines += ["", f"estimators, by their {error} after a second of computing", *self._estimator_lines()]
         lines += [f"  > {command.format('gradcheck')} --mean --direction {MEANS} {batch}"]
         lines += [f"  > {command.format('compare')} {batch}"]
         lines += ["", "advice"]
@@ -140,17 +152,52 @@ class Diagnosis(Measurement):
     def _estimator_lines(self) -> list[str]:
         rows = []
         for each in self.estimators:
-            low, high = (each.error(self.norm, end) for end in (each.lower, each.upper))
+            error, low, high = (each.error(self._scale, end) for end in (None, each.lower, each.upper))
+            unsure = math.hypot((high - low) / 4 / error, self._unsure) if error else 0.0
+            shown, least, most = (self._shown(value, unsure) for value in (error, low, high))
+            mean = f"off by {self._bias(each)}" if each.verdict == "biased" else each.verdict
+            judged = self.resolved or each.verdict in ("biased", "unbiased")
             rows.append(
                 [
                     f"  {each.estimator}",
-                    f"{each.error(self.norm):.2%}",
-                    f"{low:.2%} to {high:.2%}" if high < BEYOND else f"at least {low:.2%}",
-                    f"off by {each.bias / self.norm:.1%}" if each.verdict == "biased" else each.verdict,
+                    shown,
+                    f"{least} to {most}" if high * self._scale <= BEYOND * self.norm else f"at least {least}",
+                    mean if judged else "not judged",
                     f"{1e3 * each.seconds:.3g}",
                 ]
             )
-        return [*format_table(rows, ["  estimator", "error", "variance: 95 %", "mean", "ms a sample"]), LEGEND]
+        return [*format_table(rows, ["  estimator", "error", "95 % interval", "mean", "ms a sample"]), LEGEND]
+
+    @property
+    def _scale(self) -> float:
+        """What errors are relative to: the gradient, where it is told from 0."""
+        return self.norm if self.resolved else 1.0
+
+    @property
+    def _unsure(self) -> float:
+        """Relative standard error of that."""
+        return self.norm_error / self.norm if self.resolved else 0.0
+
+    def _shown(self, error: float, unsure: float) -> str:
+        """An error to two significant digits; to one if its relative standard error is large."""
+        size = float(f"{error * (100 if self.resolved else 1):.{1 if unsure > UNSURE else 2}g}")
+        decimals = 1 - math.floor(math.log10(size)) - (unsure > UNSURE) if size > 0 else 0
+        text = f"{size:.{max(decimals, 0)}f}" if -6 < decimals < 6 else f"{size:g}"
+        return f"{text}{'%' if self.resolved else ''}"
+
+    def _bias(self, estimator: Measured) -> str:
+        return self._shown(estimator.bias / self._scale, math.hypot(estimator.bias_error, self._unsure))
+
+    def _unresolved(self) -> str:
+        """That the gradient is not told from 0, and what would tell it."""
+        if not self.norm:
+            return "the gradient is 0: nothing that the parameters change reaches the cost"
+        needed = _round(self.surest.variance * (RESOLVED / self.norm) ** 2).replace(",", "")
+        other = "larger" if self.surest.estimator == "zobg" else "smaller"
+        return (
+            f"the gradient cannot be told from 0: its norm is {self.surest.norm:.1g} ± {self.norm_error:.1g}; "
+            f"--samples {needed} would tell one of {self.norm:.1g}, and a {other} --sigma may need fewer"
+        )
 
     @property
     def _failure(self) -> str:
@@ -168,42 +215,37 @@ class Diagnosis(Measurement):
             )
         if unstable := [each for each in self.touches if not each.stable]:
             yield f"the step in contact is unstable: {unstable[0].pair}, h^2 k = {unstable[0].stiffness:.2g}"
-        if self._too_small:
-            yield (
-                f"the gradient is too small to be told from 0 with {self.samples} samples: errors are relative to "
-                f"{self.norm:.2g}"
-            )
         if self.samples < FEW:
             yield f"{self.samples} samples are few: --samples {SAMPLES} takes longer and says more"
-        if undecided := [each.estimator for each in self.estimators if each.verdict == "undecided"]:
-            yield f"the mean of {', '.join(undecided)} could not be judged with {self.samples} samples"
+        if self.best.verdict == "undecided" and self.resolved:
+            yield f"the mean of {self.best.estimator} could not be judged with {self.samples} samples"
         if not self.derivatives.passed:
             yield "derivatives of a step are not right (see below): do not trust a first-order estimate"
 
     def _advice(self) -> Iterator[tuple[str, str]]:
         """What to do, each with options of `compare` that show it."""
         by_name, timestep = {each.estimator: each for each in self.estimators}, self.task.scene.timestep
-        if self._too_small:
+        if not self.resolved:
             yield (
-                f"no estimator can be advised: {self.samples} samples do not tell the gradient from 0; take more "
-                "samples, or another start",
+                f"no estimator can be advised: {self.samples} samples do not tell the gradient from 0; another start "
+                "may have one",
                 "",
             )
             return
         if math.isfinite(self.samples_needed):
             many = _round(self.samples_needed)
             needed = f"a relative error of {ACCURATE:.0%} needs {many} {'sample' if many == '1' else 'samples'}"
-            needed += f"; its bias of {self.best.bias / self.norm:.1%} stays" if self.best.verdict == "biased" else ""
+            needed += f"; its bias of {self._bias(self.best)} stays" if self.best.verdict == "biased" else ""
         else:
-            needed = f"its bias of {self.best.bias / self.norm:.0%} stays, however many samples"
-        yield f"take {self.best.estimator}; {needed}", ""
+            needed = f"its bias of {self._bias(self.best)} stays, however many samples"
+        yield f"at {self.setting.level}, take {self.best.estimator}; {needed}", ""
         if not self.onsets.get("onsets"):
             yield "no contact begins: longer rollouts, more noise or another start would say more", ""
             return
         plain, corrected = by_name["fobg"], by_name["fobg_onset"]
         spread, strength = self.onsets["onset_spread"], self.onsets["onset_strength"]
         if plain.verdict == "biased":
-            text = f"plain first order is biased by {plain.bias / self.norm:.0%}, "
+            text = f"plain first order is biased by {self._bias(plain)}, "
             if max([each.jump for each in self.touches] or [strength]) <= SMOOTH:
                 text += "though force sets in without a jump: something else jumps, as where corners and edges touch"
             elif corrected.verdict == "right":
@@ -213,20 +255,22 @@ class Diagnosis(Measurement):
             if travel := max((each.speed * timestep for each in self.touches if each.jump > SMOOTH), default=0.0):
                 text += f'; an impedance that rises from 0, solimp="0 0.95 {WIDTHS * travel:.1g}", has no jump'
             yield text, "--onset linear" if corrected.verdict == "right" else ""
+        elif not self.best.estimator.endswith("_onset"):
+            return  # nobody is advised to use the term
         if corrected.verdict == "right":
             if spread < NARROW:
                 text = (
-                    f"the noise is narrow for onset terms (the first contact varies by {spread:.2g} steps, {NARROW:g}"
+                    f"for onset terms the noise is narrow (the first contact varies by {spread:.2g} steps, {NARROW:g}"
                 )
-                yield f"{text} are enough in general): right here, by the check of the mean", ""
+                yield f"{text} are enough in general): fobg_onset is right here, by the check of the mean", ""
             return
         explained = SHARE_OFF * strength * (plain.bias + corrected.bias)
         if spread < NARROW:
             finer = f"a timestep of {timestep * spread / NARROW:.1g} s, or " if spread > 0 else ""
-            yield f"the noise is too narrow for onset terms: take {finer}more noise", ""
+            yield f"for fobg_onset and aobg_onset the noise is too narrow: take {finer}a larger --sigma", ""
         elif corrected.verdict == "biased" and corrected.bias > explained and strength <= STRONG:
             yield (
-                f"the onset term leaves a bias of {corrected.bias / self.norm:.0%}, which its own error does not "
+                f"the onset term leaves a bias of {self._bias(corrected)}, which its own error does not "
                 "explain: corners that turn, edges and contacts that end under load have no term",
                 "",
             )

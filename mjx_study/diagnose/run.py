@@ -5,6 +5,7 @@ from typing import Final
 from mjx_study.choices import is_file
 from mjx_study.diagnose.measurement import SAMPLES, chunk_of, estimators_of, measure
 from mjx_study.diagnose.page import Diagnosis
+from mjx_study.diagnose.setting import setting_of
 from mjx_study.diagnose.touch import touches_of
 from mjx_study.gradcheck import GradcheckPlan, gradcheck, plan_gradcheck, plan_scene_gradcheck
 from mjx_study.objective import Simulator
@@ -59,6 +60,7 @@ def diagnose(
         **vars(found),
         subject=subject,
         task=task,
+        setting=setting_of(subject, task),
         contact=cell.label,
         touches=tuple(touches),
         derivatives=derivatives,
