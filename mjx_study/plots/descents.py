@@ -1,4 +1,4 @@
-"""Figures of descents: what they achieve, and their way there."""
+"""Figures of descents: the costs they reach, and their progress."""
 
 from collections.abc import Mapping
 from typing import Any, Final
@@ -12,13 +12,13 @@ from mjx_study.plots.panels import a_few, against_stiffness, estimators, line, p
 from mjx_study.plots.style import robust_limits
 
 MOST_DECADES: Final = 1e7
-"""Ratio of the ends of an axis of costs; beyond it a descent counts as diverged."""
+"""Maximum ratio of the ends of a cost axis; beyond it a descent counts as diverged."""
 
 
 def achieved(part: xr.Dataset, title: str) -> Figure | None:
-    """Cost of the final policies above the best one at each contact model; what is far off is at the upper edge."""
+    """Plot final policy costs above the best one of each contact model; outliers are at the upper edge."""
     if part.sizes["model"] < 2:
-        return None  # the table says it
+        return None  # the table shows it
     best = part["final_cost"].min(["seed", "estimator"])
     excess = part["final_cost"] - best
     middle = excess.median("seed").values
@@ -49,7 +49,7 @@ def achieved(part: xr.Dataset, title: str) -> Figure | None:
 
 
 def descent(part: xr.Dataset, title: str) -> Figure:
-    """Cost against iterations, rollouts and seconds, and alpha; a row for each of a few contact models."""
+    """Plot cost against iterations, rollouts and seconds, and alpha; one row for each of a few contact models."""
     models, columns = a_few(part), 4 if bool(part["alpha"].notnull().any()) else 3
     title = f"{title} ({part.sizes['seed']} seeds: median, from least to greatest)"
     figure, grid = panels(len(models), columns, 0.6 + 3.4 * columns, 1.3 + 2.5 * len(models), title)
@@ -85,13 +85,13 @@ def descent(part: xr.Dataset, title: str) -> Figure:
 
 
 def _median_and_range(axes: Axes, x: np.ndarray, values: np.ndarray, style: Mapping[str, Any]) -> None:
-    """Of the seeds, the second dimension."""
+    """Median and range over the seeds, the second dimension."""
     axes.plot(x, np.nanmedian(values, 1), color=style["color"], label=style["label"], linewidth=1.4)
     axes.fill_between(x, np.nanmin(values, 1), np.nanmax(values, 1), color=style["color"], alpha=0.15, lw=0)
 
 
 def _descent_limits(curves: list[np.ndarray], start: float) -> tuple[float, float]:
-    """Limits within which a descent goes down; one that blows up leaves them at the top."""
+    """Axis limits for decreasing costs; a descent that diverges leaves them at the top."""
     low, high = robust_limits(curves)
     room = start - low
     return (low, min(high, start + 2 * room)) if room > 0 else (low, high)

@@ -29,7 +29,7 @@ from mjx_study.plots.style import NO_CONTACT, TITLES, line_with_band
 
 
 def comparison(part: xr.Dataset, title: str) -> Figure:
-    """Variance above, relative error below, with intervals of one batch; a column for each contact family."""
+    """Plot variance above and relative error below, with intervals of one batch; one column per contact family."""
     found, confidence = by_family(part), json.loads(part.attrs["config"])["confidence"]
     title = f"{title}\ngradient estimates (bands: {100 * confidence:.0f} % intervals)"
     figure, axes = panels(2, len(found), 1.2 + 3.4 * len(found), 6.2, title, sharex="col", sharey="row")
@@ -54,7 +54,7 @@ def comparison(part: xr.Dataset, title: str) -> Figure:
         _mark_default(above, family, rows)
         shade_unstable((above, below), rows, x)
     known = positive(part["variance"].isel(seed=0))
-    if np.any(np.isfinite(known)):  # of the variances: an interval may span thirty decades
+    if np.any(np.isfinite(known)):  # limits from the variances, since intervals may span thirty decades
         axes[0, 0].set_ylim(np.nanmin(known) / 100, np.nanmax(known) * 100)
     axes[0, 0].set_ylabel("variance of one sample")
     axes[1, 0].set_ylabel(f"relative error of the mean\nof {int(part['samples'])} samples")
@@ -63,7 +63,7 @@ def comparison(part: xr.Dataset, title: str) -> Figure:
 
 
 def _mark_default(axes: Axes, family: str, rows: xr.Dataset) -> None:
-    """Mark the stiffness of MuJoCo's default time constant among those of its own family."""
+    """Mark the stiffness of MuJoCo's default time constant in its own family."""
     if family != "mujoco" or "solref" not in rows:
         return
     mass = float(rows["stiffness"][0]) / -float(rows["solref"].isel(model=0, solref_entry=0))
@@ -85,7 +85,7 @@ def variance(part: xr.Dataset, title: str) -> Figure:
 
 def bias(part: xr.Dataset, title: str) -> Figure | None:
     if not bool(part["squared_bias"].notnull().any()):
-        return None  # with fewer than three seeds there is no estimate of it
+        return None  # needs at least three seeds
 
     def draw(axes: Axes, rows: xr.Dataset, x: np.ndarray) -> None:
         for mine, style in estimators(rows):
@@ -128,7 +128,7 @@ def alpha(part: xr.Dataset, title: str) -> Figure | None:
 
 
 def error_against_samples(part: xr.Dataset, title: str) -> Figure:
-    """A panel for each contact family, at the middle one of its stiffnesses."""
+    """Plot one panel per contact family, at its middle stiffness."""
     chosen = [rows.isel(model=[rows.sizes["model"] // 2]) for family, rows in families(part) if family]
     chosen += [rows.isel(model=[index]) for family, rows in families(part) if not family
                for index in range(rows.sizes["model"])]  # fmt: skip

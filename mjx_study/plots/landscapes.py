@@ -1,4 +1,4 @@
-"""The figure of landscapes: costs along a line, and the slopes that estimators see."""
+"""Figure of landscapes: costs along a line, and the estimators' mean slopes."""
 
 import json
 
@@ -11,7 +11,7 @@ from mjx_study.plots.style import STYLE, TITLES, mean_with_band, robust_limits
 
 
 def landscape(part: xr.Dataset, title: str) -> Figure:
-    """Cost and mean cost along the line above, the slope that each estimator sees below; a column for a few models."""
+    """Plot cost and mean cost along the line above, estimators' slopes below; one column for each of a few models."""
     models, title = a_few(part), f"{title} at each point (bands: 95 %)"
     figure, grid = panels(2, len(models), 1.6 + 2.9 * len(models), 6.2, title, sharex=True, sharey="row")
     slopes, steepest = [], 0.0
@@ -37,7 +37,7 @@ def landscape(part: xr.Dataset, title: str) -> Figure:
         above.set_title(f"{TITLES.get(family, family)}{spring}", fontsize="medium")
         below.axhline(0, color="0.7", linewidth=0.8)
         below.set_xlabel(along)
-    low, high = robust_limits(slopes)  # and a slope that is wild beside that of the mean cost leaves the axes
+    low, high = robust_limits(slopes)  # slopes far beyond that of the mean cost leave the axes
     if steepest > 0:
         low, high = max(low, -10 * steepest), min(high, 10 * steepest)
     grid[1, 0].set_ylim(low, high)

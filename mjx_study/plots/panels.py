@@ -1,4 +1,4 @@
-"""What the figures of a study have in common: panels by contact family, and an estimator's line in them."""
+"""Shared parts of study figures: panels by contact family, and estimator lines."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Final
@@ -19,14 +19,14 @@ SWEPT: Final = {
     "sigma": "noise sigma",
     "samples": "samples N in a batch",
 }
-"""Dimensions that can be the axis of a figure, with their labels."""
+"""Dimensions that can be a figure's axis, with their labels."""
 MOST_PANELS: Final = 6
 
 
 def panels(
     rows: int, columns: int, width: float, height: float, title: str, **shared: Any
 ) -> tuple[Figure, np.ndarray]:
-    """A figure with a title over a grid of panels; its size is in inches."""
+    """Create a figure with a title over a grid of panels; sizes in inches."""
     figure = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
     figure.suptitle(title, fontsize="medium")
@@ -42,14 +42,14 @@ def a_few(part: xr.Dataset) -> list[int]:
 
 
 def by_family(part: xr.Dataset) -> list[tuple[str, xr.Dataset]]:
-    """Contact models by family, in the order of their stiffness."""
+    """Contact models by family, in order of stiffness."""
     contact = part["contact"].values
     names = dict.fromkeys(contact.tolist())
     return [(name, part.isel(model=np.flatnonzero(contact == name)).sortby("stiffness")) for name in names]
 
 
 def make_logarithmic(axes: Axes, x: np.ndarray | None) -> None:
-    """A logarithmic y axis over a logarithmic x, or over none; with limits of their own where nothing is positive."""
+    """Make y logarithmic over a logarithmic x or none; with fixed limits if nothing is positive."""
     axes.set_yscale("log")
     if min(axes.get_ylim()) <= 0:
         axes.set_ylim(0.1, 10)
@@ -60,7 +60,7 @@ def make_logarithmic(axes: Axes, x: np.ndarray | None) -> None:
 
 
 def legend_below(figure: Figure, columns: int) -> None:
-    """One legend of all panels, below them, where it hides nothing."""
+    """Add one legend for all panels below them, where it hides nothing."""
     shown = {
         label: handle for axes in figure.axes for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)
     }
@@ -69,17 +69,17 @@ def legend_below(figure: Figure, columns: int) -> None:
 
 
 def note(axes: Axes, x: float, text: str, **style: Any) -> None:
-    """A word along the upper end of a vertical line."""
+    """Write a label along the upper end of a vertical line."""
     axes.annotate(text, (x, 0.98), xycoords=("data", "axes fraction"), rotation=90, va="top", **style)
 
 
 def positions(rows: xr.Dataset) -> np.ndarray:
-    """Stiffnesses, for a logarithmic axis [N/m]."""
+    """Stiffnesses for a logarithmic axis [N/m]."""
     return np.where(rows["stiffness"].values > 0, rows["stiffness"].values, NO_CONTACT)
 
 
 def families(part: xr.Dataset) -> list[tuple[str, xr.Dataset]]:
-    """Contact models by family, those of one stiffness together at the end."""
+    """Contact models by family, single-stiffness families grouped at the end."""
     found = by_family(part)
     lines = [(family, rows) for family, rows in found if rows.sizes["model"] > 1]
     points = [rows for _, rows in found if rows.sizes["model"] == 1]
@@ -91,7 +91,7 @@ def families(part: xr.Dataset) -> list[tuple[str, xr.Dataset]]:
 def against_stiffness(
     part: xr.Dataset, title: str, ylabel: str, draw: Callable[[Axes, xr.Dataset, np.ndarray], None], *, log: bool = True
 ) -> Figure:
-    """A panel for each contact family."""
+    """Plot one panel per contact family."""
     found = families(part)
     figure, grid = panels(1, len(found), 1.4 + 3.2 * len(found), 3.7, title, sharey=True)
     for axes, (family, rows) in zip(grid[0], found, strict=True):
@@ -122,7 +122,7 @@ def estimators(rows: xr.Dataset) -> Iterator[tuple[xr.Dataset, dict[str, Any]]]:
 
 
 def line(axes: Axes, rows: xr.Dataset, x: np.ndarray, y, lower, upper, style: Mapping[str, Any]) -> None:
-    """A line with its band over stiffnesses; points with bars over contact models of one stiffness."""
+    """Draw a line with a band over stiffnesses, or points with bars over models of one stiffness."""
     if len(np.unique(rows["contact"].values)) == 1 and len(x) > 1:
         line_with_band(axes, x, y, lower, upper, **style)
         return
@@ -152,7 +152,7 @@ def geometric(values: xr.DataArray) -> tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 def limit(x: np.ndarray, solref: np.ndarray, first: int, timestep: float) -> float:
-    """Stiffness from which the step is unstable, between two of a family: k grows with K, b with its root or not."""
+    """First unstable stiffness between two of a family: k grows with K, b with its square root or not at all."""
     between = np.geomspace(x[max(first - 1, 0)], x[first], 500)
     k, b = np.interp(between, x, solref[:, 0]), np.interp(np.sqrt(between), np.sqrt(x), solref[:, 1])
     unstable = (float(at) for at, *each in zip(between, k, b, strict=True) if not stable(each, timestep))
@@ -160,7 +160,7 @@ def limit(x: np.ndarray, solref: np.ndarray, first: int, timestep: float) -> flo
 
 
 def shade_unstable(along: Sequence[Axes], rows: xr.Dataset, x: np.ndarray) -> None:
-    """Stiffnesses at which the step gains energy while in contact."""
+    """Shade stiffnesses at which the step gains energy while in contact."""
     if "solref" not in rows:
         return
     known = rows["solref"].transpose("model", "solref_entry").values

@@ -1,4 +1,4 @@
-"""Figures of a study from its labelled arrays alone."""
+"""Figures of a study from its Dataset alone."""
 
 import itertools
 import re
@@ -18,11 +18,11 @@ from mjx_study.plots.style import TITLES
 from mjx_study.table import digits_to_tell_apart
 
 MOST_FIGURES: Final = 12
-"""Most figures of one kind; a study with more tasks, timesteps and noises is cut off there."""
+"""Maximum number of figures of one kind; further tasks, timesteps and noises are dropped."""
 
 
 def plot_study(dataset: xr.Dataset) -> dict[str, Figure]:
-    """Every figure that a study has the numbers for, by file name without its ending."""
+    """Plot every figure that a study has data for, by file name without suffix."""
     figures: dict[str, Figure] = {}
     if not dataset.data_vars:
         return figures
@@ -52,7 +52,7 @@ def plot_study(dataset: xr.Dataset) -> dict[str, Figure]:
 
 
 def _quantity(dataset: xr.Dataset) -> str:
-    """The variable that tells what kind of study it is."""
+    """Name of the variable that identifies the kind of study."""
     return next(name for name in ("final_cost", "smoothed", "variance") if name in dataset)
 
 
@@ -61,9 +61,9 @@ def _length(dataset: xr.Dataset, name: str) -> int:
 
 
 def _slices(dataset: xr.Dataset, keep: str = "") -> Iterator[tuple[str, str, xr.Dataset]]:
-    """Parts with one value along every dimension but the contact model's, `keep`'s, and those within a cell.
+    """Yield parts with one value in every dimension except the contact model, `keep`, and those within a cell.
 
-    Gives a suffix for file names, a title, and the part; of several sample counts, the largest unless kept.
+    Each comes with a file-name suffix and a title; of several sample counts, the largest unless kept.
     """
     names = [name for name in ("task", "timestep", "cone", "sigma", "samples") if name != keep]
     choices = [range(dataset.sizes[name]) if name != "samples" else [dataset.sizes[name] - 1] for name in names]
@@ -89,7 +89,7 @@ def _slices(dataset: xr.Dataset, keep: str = "") -> Iterator[tuple[str, str, xr.
 
 
 def _texts(values: np.ndarray) -> list[str]:
-    """Names as they are, numbers in as many digits as tell them apart."""
+    """Names unchanged; numbers with enough digits to distinguish them."""
     if values.dtype.kind not in "iuf":
         return [str(value) for value in values]
     digits = digits_to_tell_apart(values.tolist())
@@ -97,25 +97,25 @@ def _texts(values: np.ndarray) -> list[str]:
 
 
 def _for_file(text: str) -> str:
-    """Part of a file's name from what a study.json says, which may come from anywhere."""
+    """Sanitise text from a study.json, which may come from anywhere, for a file name."""
     return re.sub(r"[^\w.+-]", "-", text)[:60]
 
 
 def _ticks(values: np.ndarray) -> list[str]:
-    """Values in three digits, or in as many as tell them apart."""
+    """Values with three digits, or more to distinguish them."""
     digits = digits_to_tell_apart(values.tolist(), least=3)
     whole = digits == 3
     return [f"{value:.0f}" if whole and 100 <= value < 1e6 else f"{value:.{digits}g}" for value in values.tolist()]
 
 
 def _present(part: xr.Dataset) -> np.ndarray:
-    """Which contact models have numbers."""
+    """Mask of contact models with data."""
     quantity = part[_quantity(part)]
     return np.asarray(quantity.notnull().any([name for name in quantity.dims if name != "model"]))
 
 
 def _ratio_map(part: xr.Dataset, title: str, quantity: str, other: str) -> Figure:
-    """log10 of FoBG over ZoBG over two swept parameters, a panel for each contact family; blue where FoBG is less."""
+    """Plot log10 of FoBG over ZoBG against two swept parameters, one panel per family; blue where FoBG is smaller."""
     found = [(family, rows) for family, rows in families(part) if family] or families(part)
     title = f"{title}\nwhere first order is ahead (blue) and behind (red)"
     figure, grid = panels(1, len(found), 1.8 + 3.2 * len(found), 3.6, title, sharey=True)

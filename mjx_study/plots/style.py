@@ -1,4 +1,4 @@
-"""Colours, names, lines with bands, and file formats common to all figures."""
+"""Colours, names, lines with bands, and file formats shared by all figures."""
 
 import zlib
 from collections.abc import Mapping, Sequence
@@ -13,7 +13,7 @@ from estimators import ESTIMATORS
 from mjx_study.choices import FAMILIES
 from mjx_study.disk import write_whole
 
-# Okabe and Ito's colours, told apart in print and by colour-blind eyes; markers repeat the distinction.
+# Okabe-Ito colours, distinguishable in print and by colour-blind readers; markers repeat the distinction.
 STYLE: Final = {
     "zobg": ("#0072B2", "o"),
     "zobg_antithetic": ("#56B4E9", "v"),
@@ -32,9 +32,9 @@ STYLE: Final = {
     "delta": ("#777777", "d"),
 }
 OTHERS: Final = (("#E69F00", "#56B4E9", "#009E73", "#F0E442", "#0072B2", "#D55E00", "#CC79A7"), "1234+x|_")
-"""Colours and markers of users' own estimators."""
+"""Colours and markers for user-defined estimators."""
 NO_CONTACT: Final = 1.0
-"""Position of a task without contact on a stiffness axis."""
+"""Position of tasks without contact on a stiffness axis."""
 TITLES: Final = {
     "penalty": "penalty (impedance 1e-4)",
     "impedance": "impedance 0.5",
@@ -49,7 +49,7 @@ assert set(TITLES) >= set(FAMILIES)
 
 
 def style_of(name: str) -> tuple[str, str, str]:
-    """Label, colour and marker of an estimator; for a user's own they depend on its name alone."""
+    """Label, colour and marker of an estimator; user-defined ones depend on the name alone."""
     label = (ESTIMATORS[name].label if name in ESTIMATORS else "") or name.rpartition(":")[2]
     colours, markers = OTHERS
     drawn = zlib.crc32(name.encode())
@@ -62,7 +62,7 @@ def mean_with_band(axes: Axes, x, mean, error, color: str, label: str) -> None:
 
 
 def robust_limits(curves: Sequence[np.ndarray]) -> tuple[float, float]:
-    """Axis limits that leave out the most extreme hundredth of the values."""
+    """Axis limits that exclude the most extreme hundredth of the values."""
     values = np.concatenate(curves)
     values = values[np.isfinite(values)]
     low, high = np.quantile(values, [0.005, 0.995]) if len(values) else (-1.0, 1.0)
@@ -76,17 +76,17 @@ STYLES: Final = {
         "font.size": 8.0,
         "axes.linewidth": 0.6,
         "lines.linewidth": 1.0,
-        "pdf.fonttype": 42,  # embedded, and text stays text
+        "pdf.fonttype": 42,  # embedded, keeping text as text
         "svg.fonttype": "none",
     },
 }
 """matplotlib settings by style."""
 COLUMN, PAGE = 3.4, 7.0
-"""Widths of a paper's column and page [in], for figures of one column of panels and of more."""
+"""Widths of a paper's column and page [in], for figures with one column of panels and with more."""
 
 
 def fit_to_paper(figure: Figure) -> None:
-    """Fit a figure to a column or a page and drop its title, which goes into the caption."""
+    """Fit a figure to a column or page and drop its title, which goes into the caption."""
     width, height = figure.get_size_inches()
     wanted = COLUMN if width < 5 else PAGE
     figure.set_size_inches(wanted, height * wanted / width)
@@ -94,7 +94,7 @@ def fit_to_paper(figure: Figure) -> None:
 
 
 def save_figure(figure: Figure, folder: Path, name: str, formats: Sequence[str] = ("png", "pdf")) -> list[Path]:
-    """Write a figure in some of `FIGURE_FORMATS`, laid out once; returns the paths."""
+    """Write a figure in some of `FIGURE_FORMATS` with a single layout; return the paths."""
     engine, written = figure.get_layout_engine(), []
     for kind in formats:
         path = folder / f"{name}.{kind}"
@@ -113,9 +113,9 @@ def save_figures(figures: Mapping[str, Figure], folder: Path, formats: Sequence[
 def line_with_band(
     axes: Axes, x, y, lower, upper, *, color: str, marker: str, label: str | None = None, hollow: bool = False
 ) -> None:
-    """A line with its interval. A curve that may coincide with another is dashed with hollow markers, so both show.
+    """Draw a line with its interval. A curve that may coincide with another is dashed with hollow markers.
 
-    Two points are not joined: nothing was measured between them.
+    Two points are not joined, since nothing was measured in between.
     """
     joined = len(x) > 2
     line = ("--" if hollow else "-") if joined else "none"
@@ -131,4 +131,4 @@ def line_with_band(
 
 
 HOLLOW: Final = ("aobg", "ivw", "ivw_h", "ddcg", "total_propagation")
-"""Interpolating estimators, whose curves may coincide with another's."""
+"""Interpolating estimators, whose curves may coincide with others."""
