@@ -1,7 +1,7 @@
-"""Pictures and films of a motion; nothing here simulates.
+"""Pictures and films of motions; nothing here simulates.
 
-A drawing needs no OpenGL: every geom is projected along a coordinate axis. Where OpenGL works, MuJoCo's own renderer is
-used instead, in a separate process.
+Drawings need no OpenGL: every geom is projected along a coordinate axis. Where OpenGL works, MuJoCo's own renderer runs
+instead, in a separate process.
 """
 
 import mjx_study._matplotlib  # noqa: F401

@@ -1,7 +1,7 @@
-"""Runs MuJoCo's renderer in a separate process: `python _opengl_worker.py FOLDER`.
+"""Run MuJoCo's renderer in a separate process: `python _opengl_worker.py FOLDER`.
 
 An OpenGL library may abort the process, print, or fail at exit, and MuJoCo chooses its backend (MUJOCO_GL) on import.
-So this file is executed by path and imports nothing from this package.
+This file is therefore executed by path and imports nothing from this package.
 
 Reads model.mjb and request.npz (qpos, camera: lookat, distance, azimuth, elevation; width, height), writes images.npy.
 """
@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 
 FINER = 3
-"""Pixels rendered for one of the image, along each axis: edges are smooth."""
+"""Supersampling factor along each axis, for smooth edges."""
 
 
 def main(folder: Path) -> None:

@@ -1,4 +1,4 @@
-"""A motion as a film: a GIF by Pillow, or an MP4 by ffmpeg if it is installed."""
+"""Films of motions: GIFs by Pillow, or MP4s by ffmpeg if installed."""
 
 import io
 import math
@@ -26,7 +26,7 @@ from mjx_study.render.opengl import RenderError, images
 MOST_FRAMES: Final = 120
 FRAMES_PER_SECOND: Final = 25
 LAST_FRAME: Final = 0.5
-"""Extra time for the last frame [s], so that a loop has a visible end."""
+"""Extra time for the last frame [s], so that a loop ends visibly."""
 MOST_BYTES: Final = 1_000_000
 _WIDTH, _TALLEST, _DPI = 6.4, 6.4, 100
 _LABEL: Final = 22  # pixels above a rendered frame; an even number
@@ -35,7 +35,7 @@ _DRAWN_COLOURS, _RENDERED_COLOURS = 64, 128
 
 
 def check_format(name: str) -> None:
-    """Raises ValueError for an unknown format, RenderError for one that cannot be written here."""
+    """Raise ValueError for an unknown format, RenderError for one that cannot be written here."""
     if name not in FILM_FORMATS:
         raise ValueError(f"unknown format {name!r}; choose from {', '.join(FILM_FORMATS)}")
     if name == "mp4" and shutil.which("ffmpeg") is None:
@@ -43,9 +43,9 @@ def check_format(name: str) -> None:
 
 
 def frame_times(motion: Motion, slow: float = 1.0) -> tuple[Int[np.ndarray, " frames"], Int[np.ndarray, " frames"]]:
-    """Indices of the times that become frames, and the duration of each [ms], in GIF's whole hundredths of a second.
+    """Indices of the times of the frames, and the duration of each [ms], in GIF's whole hundredths of a second.
 
-    Together they last `slow` times the motion's duration, plus half a second for the last one.
+    Together they last `slow` times the motion's duration, plus half a second for the last frame.
 
     Raises:
         ValueError: `slow` is not a positive number.
@@ -61,20 +61,20 @@ def frame_times(motion: Motion, slow: float = 1.0) -> tuple[Int[np.ndarray, " fr
 
 
 def animate(motion: Motion, path: Path, *, slow: float = 1.0, view: str = "auto", renderer: str = "auto") -> Path:
-    """Write a film of a motion, in real time if `slow` is 1; the file is complete or absent.
+    """Write a film of a motion, in real time for `slow` = 1; the file is complete or absent.
 
     Args:
-        path: file name that ends in .gif or .mp4.
+        path: file name ending in .gif or .mp4.
         slow: slow-motion factor.
         view: xz, xy, yz, or auto for the one that shows most of the motion.
-        renderer: drawing, opengl, or auto for opengl where it works.
+        renderer: drawing, opengl, or auto for opengl if it works.
 
     Returns:
         The path.
 
     Raises:
-        ValueError: an unknown format, view or renderer, or a bad factor.
-        RenderError: a format or renderer that does not work here.
+        ValueError: unknown format, view or renderer, or invalid factor.
+        RenderError: the format or renderer does not work here.
     """
     kind = path.suffix.removeprefix(".").lower()
     check_format(kind)
@@ -88,7 +88,7 @@ def animate(motion: Motion, path: Path, *, slow: float = 1.0, view: str = "auto"
 
 
 def _drawn(drawing: Drawing, indices: np.ndarray) -> np.ndarray:
-    """Frames of the drawing; fixed parts are drawn once."""
+    """Draw the frames; fixed parts are drawn once."""
     motion, label = drawing.motion, time_label(drawing.motion.time[indices])
     left, right, bottom, top = 0.68, 0.12, 0.5, 0.3
     ratio = float(drawing.bounds.size[0] / drawing.bounds.size[1])
@@ -118,7 +118,7 @@ def _drawn(drawing: Drawing, indices: np.ndarray) -> np.ndarray:
 
 
 def _labelled(drawing: Drawing, indices: np.ndarray, rendered: np.ndarray) -> np.ndarray:
-    """Frames of MuJoCo's renderer, with the time above each."""
+    """Frames from MuJoCo's renderer, with the time above each."""
     label, font = time_label(drawing.motion.time[indices]), ImageFont.load_default(14)
     frames = np.pad(rendered, ((0, 0), (_LABEL, 0), (0, 0), (0, 0)), constant_values=255)
     for frame, index in zip(frames, indices, strict=True):
@@ -129,7 +129,7 @@ def _labelled(drawing: Drawing, indices: np.ndarray, rendered: np.ndarray) -> np
 
 
 def _gif(frames: np.ndarray, lengths: np.ndarray, colours: int) -> bytes:
-    """A looping GIF with one palette; scaled down until it is small enough."""
+    """Encode a looping GIF with one palette, scaled down until it is small enough."""
     images = [Image.fromarray(frame) for frame in frames]
     while True:
         content = _encode(images, lengths, colours)
@@ -147,7 +147,7 @@ def _encode(images: Sequence[Image.Image], lengths: np.ndarray, colours: int) ->
         sheet.paste(image, (0, row * image.height))
     palette = sheet.quantize(colours, Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
     entries = np.reshape(palette.getpalette() or [], (-1, 3))
-    entries[entries.min(axis=1) > _WHITE] = 255  # the mean of white and of what is nearly white
+    entries[entries.min(axis=1) > _WHITE] = 255  # nearly white entries become white
     palette.putpalette(entries.ravel().tolist())
     first, *rest = (image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images)
     buffer = io.BytesIO()
@@ -156,7 +156,7 @@ def _encode(images: Sequence[Image.Image], lengths: np.ndarray, colours: int) ->
 
 
 def _mp4(frames: np.ndarray, lengths: np.ndarray) -> bytes:
-    """MP4 at a constant frame rate, in H.264 or ffmpeg's default codec; width and height are made even."""
+    """Encode an MP4 at constant frame rate, in H.264 or ffmpeg's default codec, with even width and height."""
     repeated = np.repeat(frames, np.maximum(np.round(lengths / np.median(lengths)).astype(int), 1), axis=0)
     rate = len(repeated) * 1000 / lengths.sum()
     height, width = 2 * (frames.shape[1] // 2), 2 * (frames.shape[2] // 2)

@@ -1,4 +1,4 @@
-"""A motion drawn in two dimensions from its model's geometry, with Matplotlib and without OpenGL."""
+"""Two-dimensional drawings of a motion from its model's geometry, with Matplotlib and without OpenGL."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ from mjx_study.render.framing import Bounds, bounds, edges
 from mjx_study.render.motion import DEFAULT_RGBA, Motion
 from mjx_study.render.outline import Shape, View, shape_of
 
-# Okabe and Ito's colours, in an order that keeps neighbours apart.
+# Okabe-Ito colours, ordered to keep neighbours distinct.
 PALETTE: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
 FIXED: Final = "#B4B4B4"
 _WHITE: Final = np.ones(3)
@@ -26,9 +26,9 @@ _FIXED_LAYER, _TRACE_LAYER, _MOVING_LAYER = 1, 2, 3
 
 
 def geom_colours(motion: Motion) -> Float[np.ndarray, "ngeom 4"]:
-    """Colours as in MuJoCo; geoms in its default grey get one by the body, or the mechanism, that they move with.
+    """Colours as in MuJoCo, except that geoms in its default grey are coloured by the body or mechanism they move with.
 
-    A texture is replaced by its mean colour.
+    Textures are replaced by their mean colours.
     """
     model = motion.model
     colours = np.array(model.geom_rgba, float)
@@ -56,7 +56,7 @@ class Drawing:
 
     @cached_property
     def bounds(self) -> Bounds:
-        """The visible part of the plane."""
+        """Visible part of the plane."""
         return bounds(self.motion, self.view)
 
     @cached_property
@@ -77,13 +77,13 @@ class Drawing:
 
     @cached_property
     def _split(self) -> tuple[list[int], list[int]]:
-        """Fixed and moving geoms that have an outline."""
+        """Fixed and moving geoms with an outline."""
         moves = self.motion.moving[self.motion.model.geom_bodyid]
         return [geom for geom in self._shapes if not moves[geom]], [geom for geom in self._shapes if moves[geom]]
 
     @cached_property
     def _spokes(self) -> dict[int, np.ndarray]:
-        """A radius, in its own frame, of every sphere that turns, to make the rotation visible."""
+        """A radius of every rotating sphere, in its own frame, that makes the rotation visible."""
         model, rotation = self.motion.model, self.motion.poses.rotation
         spheres = [geom for geom in self._split[1] if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_SPHERE]
         found = {}
@@ -112,7 +112,7 @@ class Drawing:
         return paths
 
     def scenery(self, axes: Axes, index: int = 0) -> None:
-        """Limits, labels in metres, planes and fixed geoms."""
+        """Set limits and labels in metres, and draw planes and fixed geoms."""
         low, high = self.bounds.low, self.bounds.high
         axes.set_xlim(low[0], high[0])
         axes.set_ylim(low[1], high[1])
@@ -182,7 +182,7 @@ class Drawing:
 
 
 def _ticks(axes: Axes, part: int) -> int:
-    """Number of label intervals that fit an axis: one per 0.42 inch."""
+    """Number of label intervals that fit on an axis: one per 0.42 inch."""
     figure = axes.get_figure(root=True)
     inches = figure.get_size_inches()[part] * axes.get_position().size[part] if figure else 3.0
     return int(np.clip(inches / 0.42, 2, 8))
@@ -197,7 +197,7 @@ def _faded(colour: np.ndarray, strength: float) -> np.ndarray:
 
 
 def _rim(colour: np.ndarray) -> np.ndarray:
-    """A darker tone for outlines and paths; a lighter one for dark colours."""
+    """A darker tone for outlines and paths, or a lighter one for dark colours."""
     return 0.55 * colour if colour @ (0.3, 0.6, 0.1) > 0.22 else _faded(colour, 0.65)
 
 

@@ -1,4 +1,4 @@
-"""A motion as a still: a strip of pictures, or one stroboscopic picture."""
+"""Stills of motions: strips of pictures, or stroboscopic pictures."""
 
 import math
 from typing import Final
@@ -19,14 +19,14 @@ _TARGET_ASPECT: Final = 2.2
 
 
 def strip(motion: Motion, *, frames: int = 6, view: str = "auto", renderer: str = "auto") -> Figure:
-    """Pictures of a motion at evenly spaced times, first and last included, each labelled with its time.
+    """Show a motion at evenly spaced times, first and last included, each picture labelled with its time.
 
     Args:
         frames: number of pictures; fewer if the motion has fewer times.
 
     Raises:
         ValueError: fewer than one picture, or an unknown view or renderer.
-        RenderError: opengl where it does not work.
+        RenderError: opengl does not work here.
     """
     if frames < 1:
         raise ValueError(f"frames must be at least 1, got {frames}")
@@ -66,7 +66,7 @@ def strip(motion: Motion, *, frames: int = 6, view: str = "auto", renderer: str 
 
 
 def stroboscope(motion: Motion, *, poses: int = 9, view: str = "auto") -> Figure:
-    """One drawing with the path and evenly spaced poses, earlier ones fainter.
+    """Draw the path and evenly spaced poses in one picture, earlier poses fainter.
 
     Args:
         poses: number of poses, first and last included.
@@ -100,7 +100,7 @@ def stroboscope(motion: Motion, *, poses: int = 9, view: str = "auto") -> Figure
 
 
 def time_label(times: np.ndarray):
-    """A formatter of times with enough decimals to tell these apart: `t = 0.25 s`."""
+    """Return a formatter with enough decimals to distinguish the times: `t = 0.25 s`."""
     step = float(np.min(np.diff(times))) if len(times) > 1 else 0.01
     decimals = next((n for n in (1, 2, 3) if abs(step - round(step, n)) < 0.02 * step), 3)
     decimals = max(decimals, min(6, math.ceil(-math.log10(step))))
@@ -112,7 +112,7 @@ def _ratio(drawing: Drawing) -> float:
 
 
 def _columns(count: int, ratio: float) -> int:
-    """Number of pictures per row for a page of pleasant shape without gaps."""
+    """Number of pictures per row for a well-proportioned page without gaps."""
 
     def badness(columns: int) -> float:
         rows = math.ceil(count / columns)

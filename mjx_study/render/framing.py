@@ -1,4 +1,4 @@
-"""The view of a motion, and the part of its scene to show."""
+"""View of a motion, and the part of the scene to show."""
 
 import dataclasses
 import functools
@@ -12,15 +12,15 @@ from mjx_study.render.motion import Motion
 from mjx_study.render.outline import VIEWS, View
 
 _SAMPLED_TIMES: Final = 100
-_SURROUNDINGS: Final = 0.35  # of the larger side: how far around the motion fixed things are still shown
-_MARGIN: Final = 0.06  # of the larger side
-_LONGEST: Final = 4.5  # ratio of the sides
-_EDGE_ON: Final = 0.05  # a plane is seen as a line where its normal is this near to the picture's plane
+_SURROUNDINGS: Final = 0.35  # distance around the motion within which fixed geoms are shown, over the larger side
+_MARGIN: Final = 0.06  # relative to the larger side
+_LONGEST: Final = 4.5  # maximum ratio of the sides
+_EDGE_ON: Final = 0.05  # a plane appears as a line if its normal is this close to the picture's plane
 
 
 @dataclasses.dataclass(frozen=True)
 class Bounds:
-    """A rectangle in the picture's plane [m]."""
+    """A rectangle in the plane of the picture [m]."""
 
     low: Float[np.ndarray, " axes"]
     high: Float[np.ndarray, " axes"]
@@ -30,7 +30,7 @@ class Bounds:
         return self.high - self.low
 
     def united(self, other: "Bounds") -> "Bounds":
-        """The smallest rectangle around both."""
+        """Smallest rectangle around both."""
         return Bounds(np.minimum(self.low, other.low), np.maximum(self.high, other.high))
 
     def cut(self, other: "Bounds") -> "Bounds":
@@ -38,7 +38,7 @@ class Bounds:
         return Bounds(np.maximum(self.low, other.low), np.minimum(self.high, other.high))
 
     def grown(self, distance: float) -> "Bounds":
-        """The rectangle with a margin on every side [m]."""
+        """Rectangle with a margin on every side [m]."""
         return Bounds(self.low - distance, self.high + distance)
 
     def overlaps(self, other: "Bounds") -> bool:
@@ -46,7 +46,7 @@ class Bounds:
 
 
 def resolve_view(motion: Motion, name: str) -> View:
-    """A view by name; `auto` for `choose_view`. Raises ValueError, listing the choices, for an unknown name."""
+    """Look up a view by name, or choose it for `auto`. Raises ValueError, listing the choices, for an unknown name."""
     if name == "auto":
         return choose_view(motion)
     if name not in VIEWS:
@@ -55,11 +55,11 @@ def resolve_view(motion: Motion, name: str) -> View:
 
 
 def choose_view(motion: Motion) -> View:
-    """The view whose plane shows most of the motion.
+    """Choose the view whose plane shows most of the motion.
 
     Each axis is scored by the extent of the moving geoms plus the travel of their farthest-moving corner. The vertical
     counts twice, since a view from above hides contact with the ground. The view is along the axis with the lowest
-    score; ties go to the one that keeps the vertical, then to y.
+    score; ties favour keeping the vertical, then viewing along y.
     """
     shown = motion.visible & motion.moving[motion.model.geom_bodyid] & ~_planes(motion.model)
     corners = _corners(motion, shown) if shown.any() else motion.poses.centre[:, motion.moving]
@@ -100,7 +100,7 @@ def bounds(motion: Motion, view: View) -> Bounds:
 
 
 def depths(motion: Motion, view: View) -> tuple[float, float]:
-    """Smallest and largest depth, towards the viewer, that a picture must show [m]."""
+    """Smallest and largest depth towards the viewer that a picture must show [m]."""
     along, geoms = int(np.argmax(np.abs(view.towards))), motion.visible & ~_planes(motion.model) & _wanted(motion)
     if not geoms.any():
         return 0.0, 0.0
@@ -125,7 +125,7 @@ def _planes(model: mujoco.MjModel) -> np.ndarray:
 
 
 def _corners(motion: Motion, geoms: np.ndarray) -> np.ndarray:
-    """Corners (times, points, 3) of the geoms' boxes at some of the times."""
+    """Corners (times, points, 3) of the geoms' bounding boxes at some of the times."""
     times = motion.at(_SAMPLED_TIMES)
     centre, half = motion.model.geom_aabb[geoms, :3], motion.model.geom_aabb[geoms, 3:]
     signs = np.array(np.meshgrid(*[(-1.0, 1.0)] * 3)).reshape(3, 8).T
@@ -140,13 +140,13 @@ def _wanted(motion: Motion) -> np.ndarray:
 
 
 def _swept(motion: Motion, geoms: np.ndarray, axes: list[int]) -> Bounds:
-    """Bounds of some geoms, at least one, over the whole motion."""
+    """Bounds of one or more geoms over the whole motion."""
     model, poses = motion.model, motion.poses
     rotation = poses.rotation[:, geoms][:, :, axes]
     shift = np.einsum("tgij,gj->tgi", rotation, model.geom_aabb[geoms, :3])
     centre = poses.position[:, geoms][:, :, axes] + shift
     half = np.einsum("tgij,gj->tgi", np.abs(rotation), model.geom_aabb[geoms, 3:])
-    # MuJoCo's ball around a geom has the geom's centre: it bounds only a box that has the same.
+    # MuJoCo's bounding sphere has the geom's centre, so it only bounds a box with the same centre.
     centred = ~np.any(model.geom_aabb[geoms, :3], axis=1)
     half = np.minimum(half, np.where(centred, model.geom_rbound[geoms], np.inf)[:, None])
     return Bounds((centre - half).min(axis=(0, 1)), (centre + half).max(axis=(0, 1)))

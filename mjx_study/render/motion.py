@@ -12,7 +12,7 @@ VISIBLE_GROUPS = 3
 """Geom groups that MuJoCo's viewers show by default (0, 1 and 2); collision geometry is usually in 3 and above."""
 
 DEFAULT_RGBA: Final = np.array([0.5, 0.5, 0.5, 1.0], np.float32)
-"""MuJoCo's default colour of a geom; only with it does the material's colour count."""
+"""MuJoCo's default geom colour, the only one that a material's colour overrides."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Motion:
     Attributes:
         time: increasing times [s].
         qpos: generalised positions at these times [m or rad; unit quaternions].
-        focus: geoms that every picture shows, however far they are from the motion.
+        focus: geoms shown in every picture, however far they are from the motion.
     """
 
     model: mujoco.MjModel
@@ -94,7 +94,7 @@ class Motion:
         return Poses(position, rotation.reshape(count, model.ngeom, 3, 3), centre, subtree)
 
     def at(self, count: int) -> Int[np.ndarray, " count"]:
-        """Indices of `count` times spread evenly from the first to the last, or of all if there are fewer."""
+        """Indices of `count` evenly spaced times from first to last, or of all if there are fewer."""
         wanted = np.linspace(self.time[0], self.time[-1], count)
         after = np.clip(np.searchsorted(self.time, wanted), 1, max(len(self.time) - 1, 1))
         if len(self.time) == 1:

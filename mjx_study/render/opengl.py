@@ -1,4 +1,4 @@
-"""A motion rendered by MuJoCo itself, in a separate process, where OpenGL works."""
+"""Rendering by MuJoCo itself, in a separate process, where OpenGL works."""
 
 import copy
 import functools
@@ -21,12 +21,12 @@ from mjx_study.render.drawing import Drawing, geom_colours
 from mjx_study.render.framing import depths
 
 _WORKER: Final = Path(__file__).with_name("_opengl_worker.py")
-_PIXELS: Final = 640  # of the larger side
-_LONGEST: Final = 3.0  # ratio of the sides
+_PIXELS: Final = 640  # length of the larger side
+_LONGEST: Final = 3.0  # maximum ratio of the sides
 _ELEVATION: Final = {"xz": -12.0, "yz": -12.0, "xy": -89.0}
 _AZIMUTH: Final = {"xz": 90.0, "yz": 180.0, "xy": 90.0}
-_FIELD_OF_VIEW: Final = 20.0  # [degrees]; near enough to orthographic that spheres are round
-_SHADOW: Final = 2048  # most pixels of a shadow map; larger ones take seconds per image without a GPU
+_FIELD_OF_VIEW: Final = 20.0  # [degrees]; close enough to orthographic that spheres look round
+_SHADOW: Final = 2048  # maximum pixels of a shadow map; larger ones take seconds per image without a GPU
 _PROBE_SECONDS: Final = 30.0
 _PROBE: Final = """
 import mujoco
@@ -41,15 +41,15 @@ renderer.close()
 
 
 class RenderError(ValueError):
-    """A picture that cannot be made on this machine or in this way."""
+    """A picture cannot be made on this machine or in this way."""
 
 
 def resolve_renderer(name: str) -> str:
-    """`drawing` or `opengl`; auto is opengl where it works.
+    """Resolve a renderer's name to `drawing` or `opengl`; auto is opengl if it works.
 
     Raises:
         ValueError: unknown name.
-        RenderError: opengl where it does not work.
+        RenderError: opengl does not work here.
     """
     if name not in RENDERERS:
         raise ValueError(f"unknown renderer {name!r}; choose from {', '.join(RENDERERS)}")
@@ -64,11 +64,11 @@ def resolve_renderer(name: str) -> str:
 def images(
     drawing: Drawing, indices: Int[np.ndarray, " frames"], renderer: str
 ) -> UInt8[np.ndarray, "frames height width 3"] | None:
-    """MuJoCo's images at some of a motion's times, or None if the renderer is `drawing`.
+    """Render a motion at some of its times with MuJoCo; return None if the renderer is `drawing`.
 
     Raises:
         ValueError: unknown renderer.
-        RenderError: opengl was asked for by name and does not work here, or fails on this model.
+        RenderError: opengl was requested by name and does not work here or fails on this model.
     """
     if resolve_renderer(renderer) == "drawing":
         return None
@@ -81,7 +81,7 @@ def images(
 
 
 def _render(drawing: Drawing, indices: np.ndarray) -> np.ndarray:
-    """Images from a free camera with the same view as the drawing."""
+    """Render with a free camera that has the drawing's view."""
     backend, _ = _backend(_chosen())
     assert backend is not None, "the renderer has been resolved"
     motion, view, shown = drawing.motion, drawing.view, drawing.bounds
@@ -118,13 +118,13 @@ def _render(drawing: Drawing, indices: np.ndarray) -> np.ndarray:
 
 
 def _chosen() -> str:
-    """The backend set by the user, or an empty string."""
+    """Backend set by the user, or an empty string."""
     return os.environ.get("MUJOCO_GL", "").strip().lower()
 
 
 @functools.cache
 def _backend(chosen: str) -> tuple[str | None, str]:
-    """The first backend that renders a small scene, or the reason for none; `chosen` is the user's MUJOCO_GL."""
+    """First backend that renders a small scene, or why there is none; `chosen` is the user's MUJOCO_GL."""
     reasons = []
     for backend in [chosen] if chosen else _candidates(os.environ):
         failure = _run(["-c", _PROBE], backend, timeout=_PROBE_SECONDS)
@@ -135,7 +135,7 @@ def _backend(chosen: str) -> tuple[str | None, str]:
 
 
 def _candidates(environment: Mapping[str, str]) -> list[str]:
-    """Values of MUJOCO_GL to try; without a screen only EGL and OSMesa can work on Linux."""
+    """Values of MUJOCO_GL to try; without a screen, only EGL and OSMesa can work on Linux."""
     if platform.system() != "Linux":
         return [""]
     screen = "DISPLAY" in environment or "WAYLAND_DISPLAY" in environment
@@ -143,7 +143,7 @@ def _candidates(environment: Mapping[str, str]) -> list[str]:
 
 
 def _run(arguments: list[str], backend: str, timeout: float | None) -> str | None:
-    """Run Python with an OpenGL backend, quietly; returns a one-line error, or None."""
+    """Run Python quietly with an OpenGL backend; return a one-line error, or None."""
     command = [sys.executable, "-P", *arguments]
     try:
         done = subprocess.run(

@@ -48,14 +48,14 @@ VIEWS: Final = {name: View(name, *map("xyz".index, name)) for name in PLANES}
 
 @dataclasses.dataclass(frozen=True)
 class Shape:
-    """A geom in its own frame: the convex hull of balls of some radius around points [m].
+    """A geom in its own frame: the convex hull of equal balls around points [m].
 
     Attributes:
         points: corners, ends of an axis, or vertices.
         radius: radius of the balls; 0 for a polyhedron.
-        semi_axes: semi-axes of an ellipsoid, which is not such a hull; None for all others.
-        cell: largest distance between neighbouring points of a height field [m], which is drawn as a profile rather
-            than its hull; None for all others.
+        semi_axes: semi-axes of an ellipsoid, which is not such a hull; None for other geoms.
+        cell: largest distance between adjacent points of a height field [m], which is drawn as a profile rather than
+            its hull; None for other geoms.
     """
 
     points: Float[np.ndarray, "points 3"]
@@ -82,7 +82,7 @@ class Shape:
     def slice(
         self, position: Float[np.ndarray, " 3"], rotation: Float[np.ndarray, "3 3"], view: View, depth: float
     ) -> "Shape":
-        """A height field cut at the depth of the motion, towards the viewer [m]: only the points near it."""
+        """Cut a height field at the motion's depth towards the viewer [m], keeping only points near it."""
         if self.cell is None:
             return self
         distance = np.abs((position + self.points @ rotation.T) @ view.towards - depth)
@@ -90,7 +90,7 @@ class Shape:
 
 
 def shape_of(model: mujoco.MjModel, geom: int) -> Shape | None:
-    """The shape of a geom; None for a plane, which has no outline."""
+    """Return the shape of a geom; None for a plane, which has no outline."""
     kind, size, mesh = Geom(model.geom_type[geom]), model.geom_size[geom], int(model.geom_dataid[geom])
     ends = np.array([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]])
     if kind == Geom.mjGEOM_SPHERE:
@@ -115,7 +115,7 @@ def shape_of(model: mujoco.MjModel, geom: int) -> Shape | None:
 
 
 def convex_hull(points: Float[np.ndarray, "points 2"]) -> Float[np.ndarray, "corners 2"]:
-    """Corners of the convex hull in the plane, counter-clockwise; the ends of points on a line."""
+    """Corners of the planar convex hull, counter-clockwise; the end points if all points are on a line."""
     try:
         return points[ConvexHull(points).vertices]
     except QhullError:
@@ -124,7 +124,7 @@ def convex_hull(points: Float[np.ndarray, "points 2"]) -> Float[np.ndarray, "cor
 
 
 def _extreme(points: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, "kept 3"]:
-    """The points farthest in some direction; with many points, only a sample of directions is searched."""
+    """Points farthest in some direction; for many points, only a sample of directions is searched."""
     if len(points) <= _MESH_POINTS:
         return points
     height = np.linspace(-1, 1, _MESH_POINTS)
@@ -135,7 +135,7 @@ def _extreme(points: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, "kept 3
 
 
 def _terrain(model: mujoco.MjModel, field: int) -> Float[np.ndarray, "points 3"]:
-    """Vertices of a height field, each with its base."""
+    """Vertices of a height field, each with its base point."""
     rows, columns, start = (int(part[field]) for part in (model.hfield_nrow, model.hfield_ncol, model.hfield_adr))
     x, y, height, base = model.hfield_size[field]
     data = model.hfield_data[start : start + rows * columns]
@@ -145,7 +145,7 @@ def _terrain(model: mujoco.MjModel, field: int) -> Float[np.ndarray, "points 3"]
 
 
 def _profile(points: Float[np.ndarray, "points 2"]) -> Float[np.ndarray, "corners 2"]:
-    """The highest point at each position along the horizontal, closed below."""
+    """Highest point at each position along the horizontal, closed below."""
     places = np.unique(np.round(points[:, 0], 6))
     places = places[:: max(1, len(places) // 400)]
     index = np.argmin(np.abs(points[:, :1] - places), axis=1)
