@@ -1,1 +1,1 @@
-"""A ledger of the paper's claims and of this project's own, each measured and given a verdict."""
+"""A ledger of claims by the paper and by this project, each measured and given a verdict."""

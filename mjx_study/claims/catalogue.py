@@ -8,6 +8,6 @@ from mjx_study.claims.ledger import Claim
 CLAIMS: Final[dict[str, Claim]] = {
     claim.id: claim for claim in (*theory.CLAIMS, *contact.CLAIMS, *descent.CLAIMS, *robots.CLAIMS)
 }
-"""By id."""
+"""Claims by id."""
 VERDICTS: Final = sum(len(claim.cases) for claim in CLAIMS.values())
-"""Verdicts of the whole ledger, for all of which the intervals hold at once."""
+"""Number of verdicts in the whole ledger, for which the intervals hold simultaneously."""

@@ -41,7 +41,7 @@ from mjx_study.claims.theory import (
 from mjx_study.study.configuration import StudyConfig
 
 STIFFNESSES: Final = (10.0, 100.0, 1000.0, 1200.0)
-"""Of the pusher's contact [N/m]."""
+"""Contact stiffnesses of the pusher [N/m]."""
 SWEPT: Final = tuple(family for family in REAL if family != "mujoco_default")
 """Families that take a stiffness."""
 CRITICAL: Final = 14.14
@@ -49,23 +49,23 @@ CRITICAL: Final = 14.14
 HALF_STEP: Final = {"pusher": 0.0025, "momentum_transfer": 0.001}
 """Half of the tasks' timesteps [s]."""
 HORIZONS: Final = (400, 2000)
-"""Of the double pendulum [steps of 1 ms]."""
+"""Horizons of the double pendulum [steps of 1 ms]."""
 DOME: Final = "ball_wall:dome, 0.65 rad"
 DAMPED: Final = ("impedance", "mujoco_default", "mujoco_stiff")
 """Families whose force sets in with a jump."""
 RELAXED: Final[dict[str, tuple[str, ...]]] = {f"{HIT}, {name}": DAMPED for name in RELAXATIONS}
-"""Systems whose derivatives are of a relaxed contact."""
+"""Systems with derivatives of a relaxed contact."""
 
 
 def study(lab: Laboratory, task: str, **changes):
-    """A study of ZoBG and FoBG where a task starts; no use is made of its reference gradient."""
+    """Return a study of ZoBG and FoBG at a task's initial theta, without use of its reference gradient."""
     effort, common = lab.effort, {"estimators": ("zobg", "fobg"), "reference_samples": 3}
     common |= {"samples": (effort.samples,), "seeds": effort.seeds}
     return lab.study(StudyConfig(tasks=(task,), **common | changes))
 
 
 def pusher(lab: Laboratory, *, half: bool = False, damping: float | None = None):
-    """The study of the pusher that most claims share, at half the timestep, or critically damped at 1000 N/m."""
+    """Return the pusher study shared by most claims, at half the timestep, or critically damped at 1000 N/m."""
     if damping is not None:
         return study(lab, "pusher", contact=("penalty", "impedance"), stiffness=(1000.0,), damping=damping)
     if half:
@@ -74,7 +74,7 @@ def pusher(lab: Laboratory, *, half: bool = False, damping: float | None = None)
 
 
 def values(dataset, variable: str, family: str, stiffness: float | None, estimator: str) -> np.ndarray:
-    """A variable of one contact model."""
+    """Values of a variable for one contact model."""
     models = dataset["contact"].values == family
     if stiffness is not None and family != "mujoco_default":
         models &= np.isclose(dataset["stiffness"].values, stiffness)
@@ -84,7 +84,7 @@ def values(dataset, variable: str, family: str, stiffness: float | None, estimat
 
 
 def logs(dataset, family: str, stiffness: float | None, estimator: str) -> np.ndarray:
-    """log10 of every batch's variance; 300 where all samples overflowed."""
+    """log10 of each batch's variance; 300 if all samples overflowed."""
     return np.nan_to_num(np.log10(values(dataset, "variance", family, stiffness, estimator)), nan=300.0, posinf=300.0)
 
 
@@ -95,12 +95,12 @@ def ratio(dataset, family: str, stiffness: float | None) -> Statistic:
 
 
 def soft(lab: Laboratory, system: str, family: str) -> Statistic:
-    """At 10 N/m."""
+    """Variance ratio at 10 N/m."""
     return ratio(pusher(lab), family, STIFFNESSES[0])
 
 
 def stiff(lab: Laboratory, system: str, family: str) -> Statistic:
-    """At 1200 N/m."""
+    """Variance ratio at 1200 N/m."""
     return ratio(pusher(lab), family, STIFFNESSES[3])
 
 
@@ -111,7 +111,7 @@ def rate(lab: Laboratory, system: str, family: str) -> Statistic:
 
 
 def finer(lab: Laboratory, system: str, family: str) -> Statistic:
-    """log10 of FoBG's variance at half the timestep over that at the whole, at 1200 N/m."""
+    """log10 of FoBG's variance at half the timestep over that at the full one, at 1200 N/m."""
     parts = [logs(pusher(lab, half=half), family, STIFFNESSES[3], "fobg") for half in (True, False)]
     return mean_of(parts[0] - parts[1], "batches")
 
@@ -119,14 +119,14 @@ def finer(lab: Laboratory, system: str, family: str) -> Statistic:
 def gradient_cost(lab: Laboratory, system: str, family: str) -> Statistic:
     """log10 of the time of a first-order sample over that of a zeroth-order one."""
     objective, theta = lab.objective(system, family, STIFFNESS), lab.task(system).theta
-    keys = jax.random.split(jax.random.key(0), TIMED * len(jax.local_devices()) - 1)  # and a baseline
+    keys = jax.random.split(jax.random.key(0), TIMED * len(jax.local_devices()) - 1)  # leaves room for a baseline
     methods = (objective.differentiate, objective.evaluate)
     one, other = (times_of(lambda method=method: method(theta, jax.random.clone(keys))) for method in methods)
     return mean_of(np.log10(one / other), "batches")
 
 
 def implicit(lab: Laboratory, system: str, family: str) -> Statistic:
-    """log10 of FoBG's variance over that of a spring equally stiff and damped, at 1000 N/m."""
+    """log10 of FoBG's variance over that for an equally stiff and damped spring, at 1000 N/m."""
     if system == "pusher, undamped":
         one, other = (logs(pusher(lab), name, 1000.0, "fobg") for name in (family, "penalty"))
     else:
@@ -137,7 +137,7 @@ def implicit(lab: Laboratory, system: str, family: str) -> Statistic:
 
 
 def chaos(lab: Laboratory, system: str, family: str) -> Statistic:
-    """At a horizon."""
+    """Variance ratio at a horizon."""
     horizon = int(system.partition(", ")[2].removesuffix(" steps"))
     samples = (lab.effort.samples // 2,)
     dataset = study(lab, "double_pendulum", contact=(family,), horizon=horizon, samples=samples)
@@ -150,25 +150,25 @@ def geometry(lab: Laboratory, system: str, family: str) -> Statistic:
 
 
 def dome(lab: Laboratory, system: str, family: str) -> Statistic:
-    """log10 of FoBG's variance on the dome over that at the box, sigma = 0.03 rad."""
+    """log10 of FoBG's variance for the dome over that for the box, sigma = 0.03 rad."""
     names = system, system.replace(":dome", "")
     return variances_of(lab, *(at(lab, name, family, sigma=0.03) for name in names))
 
 
 def dome_bias(lab: Laboratory, system: str, family: str) -> Statistic:
-    """(E[FoBG] - grad F) / grad F on the dome, sigma = 0.03 rad."""
+    """(E[FoBG] - grad F) / grad F for the dome, sigma = 0.03 rad."""
     return relative(at(lab, system, family, sigma=0.03))
 
 
 def biases_of(one: Slopes, other: Slopes) -> Statistic:
-    """The relative bias on a landscape, as a share of that on another."""
+    """Relative bias on one landscape as a share of that on another."""
     share = one.relative / other.relative
     slack = (sum(one.errors) + abs(share) * sum(other.errors)) / abs(other.relative)
     return exact(share, slack, other.points)
 
 
 def timestep(lab: Laboratory, system: str, family: str) -> Statistic:
-    """The relative bias at half the timestep, as a share of that at the whole."""
+    """Relative bias at half the timestep as a share of that at the full one."""
     half = at(lab, system, family, timestep=HALF_STEP["momentum_transfer"])
     return biases_of(half, at(lab, system, family))
 
@@ -184,7 +184,7 @@ def cure_cost(lab: Laboratory, system: str, family: str) -> Statistic:
 
 
 def _relaxed(lab: Laboratory, system: str, family: str, onset: str = "none") -> tuple[Slopes, Slopes]:
-    """A landscape with the derivatives of the relaxation that the system's name ends with, and one with its own."""
+    """Return a landscape with the derivatives of the relaxation named by the system, and one with exact ones."""
     where, _, relaxed = system.rpartition(", ")
     return at(lab, where, family, relaxed=relaxed), at(lab, where, family, onset=onset)
 
@@ -195,7 +195,7 @@ def relaxed_bias(lab: Laboratory, system: str, family: str) -> Statistic:
 
 
 def relaxed_share(lab: Laboratory, system: str, family: str) -> Statistic:
-    """What relaxed derivatives leave of the size of the bias of exact ones."""
+    """Share of the bias of exact derivatives that relaxed ones leave."""
     share = biases_of(*_relaxed(lab, system, family))
     return dataclasses.replace(share, estimate=abs(share.estimate))
 
@@ -213,7 +213,7 @@ def onset_or_relaxed(lab: Laboratory, system: str, family: str) -> Statistic:
 
 
 def onset_cost(lab: Laboratory, system: str, family: str) -> Statistic:
-    """log10 of FoBG's variance over that with MuJoCo's default impedance, equally stiff and damped."""
+    """log10 of FoBG's variance over that for MuJoCo's default impedance, equally stiff and damped."""
     return variances_of(lab, *(at(lab, system, name) for name in (family, "mujoco")))
 
 

@@ -1,4 +1,4 @@
-"""Claims about what gradient descent achieves: the paper's experiments, on the references and in MJX.
+"""Claims about gradient descent: the paper's experiments, on the references and in MJX.
 
 Tasks with one parameter descend on tabulated landscapes of MJX; the others are simulated.
 """
@@ -17,23 +17,22 @@ from mjx_study.study.configuration import StudyConfig
 BALL, BAR, SOFT, STIFF = "ball_wall", "momentum_transfer", "pusher, 10 N/m", "pusher, 1000 N/m"
 SLIDE, GAME = "sliding_box", "tennis"
 SPANS: Final = {BALL: (0.0, 1.5), BAR: (0.0, 1.0)}
-"""Angles that a descent may reach [rad]."""
+"""Range of angles that a descent may reach [rad]."""
 STARTS: Final = {"stiffness_schedule": 0.01, "sigma_schedule": 3.0}
-"""Factors that the schedules begin with."""
+"""Initial factors of the schedules."""
 CELL: Final = ("task", "timestep", "cone", "model", "sigma", "samples")
-"""Dimensions of a study that has one cell."""
+"""Singleton dimensions of a study with one cell."""
 GAMES: Final = 12
-"""Descents of each estimator on tennis, at any effort, of half as many samples as others: they take the longest."""
+"""Number of descents per estimator on tennis, at any effort, with half the usual samples: they take the longest."""
 LARGEST: Final = 10.0
-"""Where a descent diverged, its cost counts as this many times what the best one gained."""
+"""Cost of a diverged descent, as a multiple of the best one's gain."""
 
 
 def descents(lab: Laboratory, system: str, family: str, schedule: str | None = None) -> xr.Dataset:
-    """Descents of ZoBG, FoBG and AoBG by the task's recipe, cut short or not by the effort; of FoBG with onset, too, on
-    tennis.
+    """Descend with ZoBG, FoBG and AoBG, on tennis also with the onset term, by the task's recipe or a share of it.
 
-    The ball's is never cut short: zeroth order clears the wall late. With the name of an option for a schedule, that
-    schedule: the stiffness grows from a hundredth, or sigma shrinks from three times its size, in the first half.
+    The ball's descents are never cut short: zeroth order clears the wall late. `schedule` names a schedule option: the
+    stiffness grows from a hundredth, or sigma shrinks from three times its size, over the first half.
     """
     name, _, stiffness = system.partition(", ")
     task, effort = lab.task(name), lab.effort
@@ -63,13 +62,13 @@ def descents(lab: Laboratory, system: str, family: str, schedule: str | None = N
 
 
 def scaled(dataset: xr.Dataset, variable: str, estimator: str, like: xr.Dataset | None = None) -> np.ndarray:
-    """Costs of an estimator by seed, from 0 at the start to -1 where the best estimator ends in the mean.
+    """Costs of an estimator by seed, scaled to 0 at the start and -1 at the best estimator's mean final cost.
 
     Args:
-        dataset: a study of descents.
+        dataset: study of descents.
         variable: "final_cost", or "cost", which is averaged over the iterations.
-        estimator: its name.
-        like: the study that sets the scale; None for this one.
+        estimator: name of the estimator.
+        like: study that sets the scale; None for `dataset`.
     """
     cell, other = (each.isel({name: 0 for name in CELL}) for each in (dataset, dataset if like is None else like))
     ends, start = other["final_cost"], float(other["start_cost"])
@@ -80,52 +79,52 @@ def scaled(dataset: xr.Dataset, variable: str, estimator: str, like: xr.Dataset 
 
 
 def final(dataset: xr.Dataset, estimator: str, like: xr.Dataset | None = None) -> np.ndarray:
-    """Where an estimator ends, see `scaled`."""
+    """Final costs of an estimator, see `scaled`."""
     return scaled(dataset, "final_cost", estimator, like)
 
 
 def along(dataset: xr.Dataset, estimator: str) -> np.ndarray:
-    """Where an estimator is on the way, see `scaled`."""
+    """Costs of an estimator averaged over its descent, see `scaled`."""
     return scaled(dataset, "cost", estimator)
 
 
 def behind(lab: Laboratory, system: str, family: str) -> Statistic:
-    """How far FoBG ends behind ZoBG."""
+    """Final cost of FoBG minus that of ZoBG."""
     return _gap(lab, system, family, "fobg", "zobg")
 
 
 def corrected_behind(lab: Laboratory, system: str, family: str) -> Statistic:
-    """How far FoBG with the onset term ends behind ZoBG."""
+    """Final cost of FoBG with the onset term minus that of ZoBG."""
     return _gap(lab, system, family, "fobg_onset", "zobg")
 
 
 def ahead(lab: Laboratory, system: str, family: str) -> Statistic:
-    """How far FoBG ends ahead of ZoBG."""
+    """Final cost of ZoBG minus that of FoBG."""
     return _gap(lab, system, family, "zobg", "fobg")
 
 
 def _gap(lab: Laboratory, system: str, family: str, estimator: str, other: str) -> Statistic:
-    """How far an estimator ends behind another."""
+    """Final cost of an estimator minus that of another."""
     found = descents(lab, system, family)
     return mean_of(final(found, estimator) - final(found, other), "seeds")
 
 
 def regret(lab: Laboratory, system: str, family: str) -> Statistic:
-    """How far AoBG ends behind the better of the two."""
+    """Final cost of AoBG minus that of the better of the two."""
     found = descents(lab, system, family)
     better = min(("zobg", "fobg"), key=lambda name: final(found, name).mean())
     return mean_of(final(found, "aobg") - final(found, better), "seeds")
 
 
 def slower(lab: Laboratory, system: str, family: str) -> Statistic:
-    """How far AoBG is behind the better of the two on the way."""
+    """Cost of AoBG during descent minus that of the better of the two."""
     found = descents(lab, system, family)
     better = min(("zobg", "fobg"), key=lambda name: along(found, name).mean())
     return mean_of(along(found, "aobg") - along(found, better), "seeds")
 
 
 def apart(lab: Laboratory, system: str, family: str) -> Statistic:
-    """Distance between the policies that FoBG and ZoBG end at, in standard deviations of the noise."""
+    """Distance between the final policies of FoBG and ZoBG, in standard deviations of the noise."""
     found = descents(lab, system, family)
     theta = found["theta"].isel({name: 0 for name in (*CELL, "param")})
     one, other = (theta.sel(estimator=name).values for name in ("fobg", "zobg"))
@@ -133,17 +132,17 @@ def apart(lab: Laboratory, system: str, family: str) -> Statistic:
 
 
 def curriculum(lab: Laboratory, system: str, family: str) -> Statistic:
-    """How far FoBG ends ahead with a stiffness that grows."""
+    """Gain in FoBG's final cost from a growing stiffness."""
     return _scheduled(lab, system, family, "stiffness_schedule", "fobg")
 
 
 def annealing(lab: Laboratory, system: str, family: str) -> Statistic:
-    """How far AoBG ends ahead with a sigma that shrinks."""
+    """Gain in AoBG's final cost from a shrinking sigma."""
     return _scheduled(lab, system, family, "sigma_schedule", "aobg")
 
 
 def _scheduled(lab: Laboratory, system: str, family: str, schedule: str, estimator: str) -> Statistic:
-    """How far an estimator ends ahead with a schedule, by seed: both descents draw the same noise."""
+    """Gain in an estimator's final cost from a schedule, by seed: both descents draw the same noise."""
     plain, other = descents(lab, system, family), descents(lab, system, family, schedule)
     return mean_of(final(plain, estimator) - final(other, estimator, plain), "seeds")
 

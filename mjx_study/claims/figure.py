@@ -1,4 +1,4 @@
-"""The matrix of verdicts as a picture."""
+"""Matrix of verdicts as a figure."""
 
 from typing import Any, Final
 
@@ -10,11 +10,11 @@ from mjx_study.plots.style import TITLES
 
 COLOURS: Final = {"holds": "#0072B2", "fails": "#E69F00", "reversed": "#D55E00", "undecided": "#DDDDDD"}
 SIGNS: Final = {"holds": "+", "fails": "×", "reversed": "−", "undecided": "?"}
-"""So that verdicts can be told apart without colours."""
+"""Signs that distinguish verdicts without colours."""
 
 
 def draw_matrix(document: dict[str, Any]) -> Figure:
-    """A square for each claim and family, with a strip for each system."""
+    """Draw a square for each claim and family, with a strip for each system."""
     rows = matrix(document)
     shown = columns(rows)
     figure = Figure(figsize=(3.6 + 0.5 * len(shown), 1.9 + 0.24 * len(rows)), layout="constrained")

@@ -1,4 +1,4 @@
-"""Where claims are measured: studies and landscapes that several claims share, and statistics made of them."""
+"""Measurement of claims: studies and landscapes shared by several claims, and statistics computed from them."""
 
 import dataclasses
 import hashlib
@@ -30,9 +30,9 @@ from mjx_study.tasks.contact_grid import ContactPoint, backward_grid, contact_gr
 from mjx_study.tasks.task import Task
 
 TIMED: Final = 64
-"""Samples per device in a batch that is timed."""
+"""Samples per device in a timed batch."""
 REPEATS: Final = 12
-"""Of what is timed."""
+"""Repetitions of a timing."""
 
 
 RELAXATIONS: Final = {
@@ -40,20 +40,20 @@ RELAXATIONS: Final = {
     "ten times softer": ("mujoco", 0.1, None),
     "from 1 mm apart": ("smooth_onset", 1.0, 0.001),
 }
-"""Contact models whose derivatives may stand in for exact ones: family, factor on the stiffness, margin [m]."""
+"""Contact models whose derivatives may replace exact ones: family, stiffness factor, margin [m]."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Effort:
-    """How much is measured.
+    """Amount of measurement.
 
     Attributes:
-        name: on the command line.
-        density: points of a landscape in one standard deviation of the noise.
-        draws: samples where a sample costs nothing.
-        batches: batches where one costs little.
-        samples, seeds: of batches that are simulated.
-        seeds_of_descents, iterations: of descents; iterations as a share of the task's recipe.
+        name: name on the command line.
+        density: points of a landscape per standard deviation of the noise.
+        draws: number of samples if samples are free.
+        batches: number of batches if batches are cheap.
+        samples, seeds: sample and batch numbers for simulated batches.
+        seeds_of_descents, iterations: settings of descents; iterations as a share of the task's recipe.
     """
 
     name: str
@@ -74,15 +74,15 @@ EFFORTS: Final = {
 
 @dataclasses.dataclass(frozen=True)
 class Statistic:
-    """An estimate and what its interval is made of.
+    """An estimate with what its interval is computed from.
 
     Attributes:
         estimate: the value.
         error: its standard error.
         freedom: degrees of freedom of the error.
-        slack: bound on a deterministic error, as of a quadrature.
-        samples, of: how many of what the standard error comes from.
-        trials: if not 0, the estimate is a share of so many trials, and the interval is Wilson's.
+        slack: bound on a deterministic error, such as a quadrature's.
+        samples, of: number and kind of the samples behind the standard error.
+        trials: if not 0, the estimate is a share of this many trials, with a Wilson interval.
     """
 
     estimate: float
@@ -95,19 +95,19 @@ class Statistic:
 
 
 def exact(estimate: float, slack: float = 0.0, points: int = 0) -> Statistic:
-    """A statistic without sampling error, of a quadrature with so many points."""
+    """Statistic without sampling error, from a quadrature with `points` points."""
     return Statistic(float(estimate), slack=float(slack), samples=points, of="points")
 
 
 def mean_of(values: Sequence[float] | np.ndarray, of: str, slack: float = 0.0) -> Statistic:
-    """A mean over independent values, with the t-interval of its standard error."""
+    """Mean of independent values, with the t-interval of its standard error."""
     kept = np.asarray(values, float)
     error = float(np.std(kept, ddof=1) / math.sqrt(len(kept)))
     return Statistic(float(np.mean(kept)), error, float(len(kept) - 1), slack, len(kept), of)
 
 
 def share_of(happened: np.ndarray, of: str) -> Statistic:
-    """A share of independent trials."""
+    """Share of independent trials."""
     return Statistic(float(np.mean(happened)), samples=len(happened), of=of, trials=len(happened))
 
 
@@ -120,12 +120,12 @@ def ratio_of(top: np.ndarray, bottom: np.ndarray, of: str) -> Statistic:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Landscape:
-    """Cost and derivative of a rollout in MJX over one parameter, tabulated; constant in each cell of a fine grid.
+    """Cost and derivative of an MJX rollout over one parameter, tabulated, piecewise constant on a fine grid.
 
-    A `Function`, so that estimators and descents run on it as on an analytic system, with nothing simulated again.
+    A `Function`, so that estimators and descents run on it as on an analytic system, without simulating again.
 
     Attributes:
-        points, values, slopes: the uniform grid, cost and derivative on it.
+        points, values, slopes: uniform grid, with cost and derivative on it.
     """
 
     points: Float[np.ndarray, " size"]
@@ -134,11 +134,11 @@ class Landscape:
     num_params: int = 1
 
     def value(self, x: Float[np.ndarray, "*batch 1"]) -> Float[np.ndarray, "*batch"]:
-        """Of the cell; beyond the grid that of its end."""
+        """Value of the cell; beyond the grid, of its end cell."""
         return np.asarray(self.values[self._cell(x)])
 
     def gradient(self, x: Float[np.ndarray, "*batch 1"]) -> Float[np.ndarray, "*batch 1"]:
-        """Likewise."""
+        """Slope of the cell, likewise."""
         return np.asarray(self.slopes[self._cell(x)])[..., None]
 
     def _cell(self, x: np.ndarray) -> np.ndarray:
@@ -148,14 +148,14 @@ class Landscape:
 
 @dataclasses.dataclass(frozen=True)
 class Slopes:
-    """What is known of a function of one parameter at one theta.
+    """Gradient and first-order mean of a function of one parameter at one theta.
 
     Attributes:
         gradient, first: grad F, and the mean of first-order gradients.
-        errors: of both, by quadrature, over |grad F|.
+        errors: quadrature errors of both, over |grad F|.
         objective: F as an objective for estimators.
-        theta: where.
-        points: of the quadrature; 0 for a closed form.
+        theta: where they are evaluated.
+        points: number of quadrature points; 0 for a closed form.
     """
 
     gradient: float
@@ -172,12 +172,12 @@ class Slopes:
 
 
 class Laboratory:
-    """Measures at one effort, and keeps what is simulated and compiled.
+    """Measures at one effort, and caches simulated and compiled results.
 
     Args:
         effort: how much to measure.
-        folder: of studies, which a later run goes on with; None to keep them in memory.
-        accept_versions: go on with studies that other versions began.
+        folder: folder of studies that later runs resume; None to keep them in memory.
+        accept_versions: resume studies begun by other versions.
     """
 
     def __init__(self, effort: Effort, folder: Path | None = None, accept_versions: bool = False):
@@ -187,7 +187,7 @@ class Laboratory:
         self.tabulated, self.simulator = cache(self._tabulated), cache(self._simulator)
 
     def _study(self, config: StudyConfig) -> xr.Dataset:
-        """A study, computed once."""
+        """Return a study, computed once."""
         folder = None
         if self._folder is not None:
             fields = {field.name: getattr(config, field.name) for field in dataclasses.fields(config)}
@@ -207,7 +207,7 @@ class Laboratory:
         return Line(self.task(name, timestep, onset))
 
     def contact(self, task: Task, family: str, stiffness: float, relaxed: str | None = None) -> ContactPoint:
-        """The contact model of a family, with the derivatives of one of `RELAXATIONS` or its own."""
+        """Contact model of a family, with its own derivatives or those of one of `RELAXATIONS`."""
         (cell,), _ = contact_grid(task, (family,), (stiffness,))
         if relaxed is None:
             return cell
@@ -219,7 +219,7 @@ class Laboratory:
         self, name: str, family: str, stiffness: float, low: float, high: float, sigma: float,
         timestep: float | None = None, onset: str = "none", relaxed: str | None = None,
     ) -> Landscape:  # fmt: skip
-        """The landscape of a task between two parameters and the noise about them."""
+        """Landscape of a task between two parameters, extended by the noise around them."""
         task = self.task(name, timestep, onset)
         points = np.arange(low - 5.4 * sigma, high + 5.4 * sigma, sigma / self.effort.density)
         contact = self.contact(task, family, stiffness, relaxed).contact
@@ -229,14 +229,14 @@ class Laboratory:
         return Simulator(self.task(name), chunk_size=TIMED)
 
     def objective(self, name: str, family: str, stiffness: float) -> Objective:
-        """A task under a family, for what is measured rollout by rollout."""
+        """Task under a family, for measurements by rollouts."""
         task = self.task(name)
         if family == REFERENCE:
             return task.analytic(stiffness)
         return self.simulator(name).objective(self.contact(task, family, stiffness).contact)
 
     def _tabulated(self, name: str, family: str, stiffness: float, low: float, high: float) -> Task:
-        """A task whose analytic system is its landscape under a family."""
+        """Task whose analytic system is its landscape under a family."""
         task = self.task(name)
         sigma, table = task.sigma, self.landscape(name, family, stiffness, low, high, task.sigma)
         return task.replace(name=f"{name}, {family}", reference=lambda stiffness: FunctionObjective(table, sigma))
@@ -245,7 +245,7 @@ class Laboratory:
         self, name: str, family: str, theta: float, *, stiffness: float, sigma: float | None = None,
         timestep: float | None = None, onset: str = "none", relaxed: str | None = None,
     ) -> Slopes:  # fmt: skip
-        """Gradient and means at theta, by quadrature; of the analytic system in closed form."""
+        """Gradient and means at theta by quadrature, or in closed form for the analytic system."""
         task = self.task(name)
         sigma = task.sigma if sigma is None else sigma
         if family == REFERENCE:
@@ -260,7 +260,7 @@ class Laboratory:
 
 
 def times_of(work: Callable[[], Any]) -> np.ndarray:
-    """Times of the same work, repeated, after a first one [s]."""
+    """Time repetitions of the same work after a warm-up [s]."""
     jax.block_until_ready(work())
     found = []
     for _ in range(REPEATS):
@@ -278,12 +278,12 @@ def closed_form(function: Any, theta: float, sigma: float) -> Slopes:
 
 
 def batch(estimator: Estimator, at: Slopes, samples: int) -> GradientEstimate:
-    """A large batch of an estimator."""
+    """Draw a large batch of an estimator."""
     return estimators.estimate(estimator, at.objective, jnp.array([at.theta]), jax.random.key(0), samples)
 
 
 def batches(chosen: Sequence[Estimator], at: Slopes, samples: int, count: int) -> list[GradientEstimate]:
-    """Many independent batches of some estimators, which share them; leaves have a leading axis of batches."""
+    """Draw many independent batches, shared by several estimators; leaves have a leading axis of batches."""
     needs = estimators.oracles_of(chosen)
     drawn = estimators.draw(needs, at.objective, jnp.array([at.theta]), jax.random.key(1), samples * count)
     parts = jax.tree.map(lambda leaf: leaf.reshape(count, samples, *leaf.shape[1:]), drawn)
@@ -291,7 +291,7 @@ def batches(chosen: Sequence[Estimator], at: Slopes, samples: int, count: int) -
 
 
 def log_variance(estimate: GradientEstimate) -> Statistic:
-    """log10 of a batch's variance, with the error of its jackknife interval; that of zero is of 1e-300."""
+    """log10 of a batch's variance, with the error of its jackknife interval; zero variance counts as 1e-300."""
     variance, confidence = max(float(estimate.variance), 1e-300), 0.95
     freedom = jnp.maximum(estimators.effective_samples(estimate).count - 1.0, 2.0)
     half = (
@@ -302,7 +302,7 @@ def log_variance(estimate: GradientEstimate) -> Statistic:
 
 
 def difference_of(one: Statistic, other: Statistic) -> Statistic:
-    """One statistic less an independent other, with Welch and Satterthwaite's degrees of freedom."""
+    """Difference of independent statistics, with Welch-Satterthwaite degrees of freedom."""
     squares = np.array([one.error**2, other.error**2])
     parts = float(np.sum(squares**2 / np.array([one.freedom, other.freedom])))
     freedom = float(np.sum(squares)) ** 2 / parts if parts > 0 else 1e9

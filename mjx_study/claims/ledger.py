@@ -1,9 +1,9 @@
-"""What a claim is, how its verdict follows from a measurement, and how a ledger of claims is measured and kept.
+"""Claims, verdicts from measurements, and measuring and storing a ledger of claims.
 
-A verdict is where an interval lies. A claim names beforehand the values of a statistic with which it holds, and perhaps
-those with which its opposite does; the interval of the measurement lies within the first (holds), within the second
-(reversed), outside the first (fails), or across its border (undecided). All intervals of a ledger hold at once: each is
-at level 1 - ALPHA / m, with m the number of verdicts of the whole ledger (Bonferroni), whichever of them are measured.
+A verdict is determined by an interval. Each claim fixes beforehand the values of a statistic for which it holds, and
+optionally those for which its opposite does. A measured interval within the first means holds; within the second,
+reversed; outside the first, fails; across its border, undecided. All intervals of a ledger hold simultaneously: each
+has level 1 - ALPHA / m, with m the number of verdicts of the whole ledger (Bonferroni), whichever are measured.
 """
 
 import dataclasses
@@ -33,20 +33,20 @@ VERDICTS: Final = ("holds", "fails", "reversed", "undecided")
 FAMILIES: Final = (
     REFERENCE, "penalty", "impedance", "mujoco", "mujoco_default", "mujoco_stiff", "smooth_onset", "mjcf",
 )  # fmt: skip
-"""Columns of the matrix."""
+"""Columns of the verdict matrix."""
 REAL: Final = FAMILIES[1:-1]
-"""Contact families of MJX that are compared; "mjcf" is for what has no contact."""
+"""MJX contact families to compare; "mjcf" is for systems without contact."""
 Range = tuple[float, float]
 
 
 @dataclasses.dataclass(frozen=True)
 class Criterion:
-    """What decides a claim, fixed before it is measured.
+    """Criterion of a claim, fixed before measurement.
 
     Attributes:
-        quantity: the statistic, in words.
-        holds: values with which the claim holds.
-        reversed: values with which its opposite does; None where it has none.
+        quantity: description of the statistic.
+        holds: values for which the claim holds.
+        reversed: values for which its opposite holds; None if it has none.
     """
 
     quantity: str
@@ -54,7 +54,7 @@ class Criterion:
     reversed: Range | None = None
 
     def verdict(self, interval: Range) -> str:
-        """One of `VERDICTS`."""
+        """Return one of `VERDICTS`."""
         low, high = interval
         if not (math.isfinite(low) or math.isfinite(high)):
             return "undecided"
@@ -65,38 +65,38 @@ class Criterion:
         return "fails" if high < self.holds[0] or low > self.holds[1] else "undecided"
 
     def lines(self) -> str:
-        """The ranges in words."""
+        """Describe the ranges."""
         told = f"holds {_range(self.holds)}"
         return told if self.reversed is None else f"{told}, reversed {_range(self.reversed)}"
 
 
 def above(quantity: str, bound: float, opposite: float | None = None) -> Criterion:
-    """A claim that a quantity is above a bound; reversed below another."""
+    """Claim that a quantity is above a bound; reversed below another."""
     return Criterion(quantity, (bound, math.inf), None if opposite is None else (-math.inf, opposite))
 
 
 def below(quantity: str, bound: float, opposite: float | None = None) -> Criterion:
-    """A claim that a quantity is below a bound; reversed above another."""
+    """Claim that a quantity is below a bound; reversed above another."""
     return Criterion(quantity, (-math.inf, bound), None if opposite is None else (opposite, math.inf))
 
 
 def within(quantity: str, low: float, high: float) -> Criterion:
-    """A claim that a quantity lies in a range."""
+    """Claim that a quantity lies in a range."""
     return Criterion(quantity, (low, high))
 
 
 @dataclasses.dataclass(frozen=True)
 class Claim:
-    """A sentence that measurements can refute.
+    """A statement that measurements can refute.
 
     Attributes:
         id: name on the command line.
-        place: where the paper says it, or which of its questions it answers.
+        place: section of the paper that states it, or the open question that it answers.
         statement: one sentence.
-        criterion: what decides it.
-        systems: the contact families under which each system is measured.
-        measure: statistic of a system under a family.
-        show: a command that shows it.
+        criterion: criterion that decides it.
+        systems: systems to measure, each with its contact families.
+        measure: computes the statistic for a system and family.
+        show: command that demonstrates it.
     """
 
     id: str
@@ -109,7 +109,7 @@ class Claim:
 
     @property
     def cases(self) -> list[tuple[str, str]]:
-        """Systems and families; each gets a verdict."""
+        """Pairs of system and family, each with its own verdict."""
         return [(system, family) for system, families in self.systems.items() for family in families]
 
     def key(self, effort: Effort) -> str:
@@ -117,7 +117,7 @@ class Claim:
         return _digest(self.id, self.criterion, self.systems, effort, precision())
 
     def made_by(self) -> str:
-        """Digest of the code that measures the claim, and of the libraries' versions."""
+        """Digest of the code that measures the claim, and of library versions."""
         versions = [metadata.version(name) for name in VERSIONED if name != "mjx-study"]
         return _digest(code_of(self.measure.__module__), versions)
 
@@ -127,7 +127,7 @@ def _digest(*parts: Any) -> str:
 
 
 def interval_of(statistic: Statistic, level: float) -> Range:
-    """A statistic's interval: Student's t with a bound on deterministic error added, or Wilson's of a share."""
+    """Interval of a statistic: Student's t plus the bound on deterministic error, or Wilson's for a share."""
     if statistic.trials:
         covered = jnp.arange(statistic.trials) < round(statistic.estimate * statistic.trials)
         return coverage_interval(covered, level)[1:]
@@ -140,9 +140,9 @@ def interval_of(statistic: Statistic, level: float) -> Range:
 
 
 def deciding_size(statistic: Statistic, criterion: Criterion, level: float) -> int | None:
-    """Samples with which an undecided interval about the same estimate would decide; None if none would.
+    """Samples at which an undecided interval about the same estimate would decide; None if none would.
 
-    The error of samples falls with their square root, that of a quadrature with its points, since it may be at a jump.
+    Sampling errors fall with the square root of samples, quadrature errors with the points, which may straddle a jump.
     """
     low, high = interval_of(statistic, level)
     borders = [border for part in (criterion.holds, criterion.reversed or ()) for border in part if low < border < high]
@@ -167,16 +167,16 @@ def measure_ledger(
     command: str | None = None,
     accept_versions: bool = False,
 ) -> dict[str, Any]:
-    """Measure claims, or take from a folder those that were measured by the same code at the same effort.
+    """Measure claims, or reuse stored measurements made by the same code at the same effort.
 
     Args:
-        claims: what to measure.
+        claims: claims to measure.
         effort: key in `EFFORTS`.
-        folder: where the measurements are kept, one file a claim, and the studies they come from; None for nowhere.
-        progress: told of every case.
-        verdicts: of the whole ledger, for the level of the intervals.
-        command: that asked for it, to be kept.
-        accept_versions: take measurements in the folder that other code or versions made, and go on with its studies.
+        folder: folder for measurements, one file per claim, and the studies behind them; None to store nothing.
+        progress: called for every case.
+        verdicts: number of verdicts in the whole ledger, which sets the level of the intervals.
+        command: command line to record.
+        accept_versions: reuse measurements and resume studies made by other code or versions.
 
     Returns:
         The ledger as plain data.
@@ -216,7 +216,7 @@ def measure_ledger(
 
 
 def _told(claim: Claim, kept: dict[str, Any], level: float) -> dict[str, Any]:
-    """A claim with its evidence, as plain data; what is not finite is None."""
+    """Return a claim with its evidence as plain data; nonfinite numbers become None."""
     evidence = []
     names = [field.name for field in dataclasses.fields(Statistic)]
     for case in kept["cases"]:
@@ -243,7 +243,7 @@ def _told(claim: Claim, kept: dict[str, Any], level: float) -> dict[str, Any]:
 
 
 def matrix(document: dict[str, Any]) -> dict[str, dict[str, list[str]]]:
-    """By claim and family: the verdicts of its systems."""
+    """Verdicts of a claim's systems, by claim and family."""
     found: dict[str, dict[str, list[str]]] = {}
     for claim in document["claims"]:
         row = found.setdefault(claim["id"], {})
@@ -253,7 +253,7 @@ def matrix(document: dict[str, Any]) -> dict[str, dict[str, list[str]]]:
 
 
 def columns(rows: dict[str, dict[str, list[str]]]) -> list[str]:
-    """The families of a matrix that have any verdict."""
+    """Families of a matrix with any verdicts."""
     return [family for family in FAMILIES if any(family in row for row in rows.values())]
 
 

@@ -59,7 +59,7 @@ diverges on the reference, so that case is left out.
 
 
 def told(document: dict[str, Any]) -> str:
-    """What was run, and how sure the intervals are, in one paragraph."""
+    """Describe the run and the confidence of the intervals in one paragraph."""
     made = document["environment"]
     versions = ", ".join(f"{name} {version}" for name, version in made["versions"].items() if name != "mjx-study")
     return (
@@ -73,20 +73,20 @@ def told(document: dict[str, Any]) -> str:
 
 
 def count(document: dict[str, Any]) -> str:
-    """How many verdicts of each kind."""
+    """Count the verdicts of each kind."""
     found = Counter(each["verdict"] for claim in document["claims"] for each in claim["evidence"])
     listed = ", ".join(f"{found[verdict]} {verdict}" for verdict in VERDICTS if found[verdict])
     return f"{len(document['claims'])} claims, {sum(found.values())} verdicts: {listed}"
 
 
 def table(document: dict[str, Any]) -> list[str]:
-    """The matrix for a terminal."""
+    """Format the matrix for a terminal."""
     header, *rows = cells(document)
     return format_table(rows, header)
 
 
 def cells(document: dict[str, Any]) -> list[list[str]]:
-    """The matrix as text: families, then a row for each claim."""
+    """Matrix as text: a row of families, then one for each claim."""
     rows = matrix(document)
     shown = columns(rows)
     summary = [[name, *(_summary(row.get(family, [])) for family in shown)] for name, row in rows.items()]
@@ -94,14 +94,14 @@ def cells(document: dict[str, Any]) -> list[list[str]]:
 
 
 def _summary(verdicts: list[str]) -> str:
-    """A common verdict, or on how many systems the claim holds."""
+    """Common verdict, or the number of systems for which the claim holds."""
     if len(set(verdicts)) < 2:
         return "".join(verdicts[:1])
     return f"{verdicts.count('holds')} of {len(verdicts)} hold"
 
 
 def undecided(document: dict[str, Any]) -> list[str]:
-    """A line for each verdict that is open, with the samples that would decide."""
+    """Return a line for each undecided verdict, with the samples that would decide it."""
     return [
         f"{claim['id']}, {each['system']}, {each['family']}: {_interval(each)}, {_deciding(each)}"
         for claim in document["claims"]
@@ -111,7 +111,7 @@ def undecided(document: dict[str, Any]) -> list[str]:
 
 
 def markdown(document: dict[str, Any]) -> str:
-    """docs/claims.md."""
+    """Return the text of docs/claims.md."""
     header, *rows = cells(document)
     linked = [[f"[{name}](#{name})", *verdicts] for name, *verdicts in rows]
     parts = [HEAD, f"*{count(document)}.* {told(document)}\n", LEGEND, _pipes(header, linked)]

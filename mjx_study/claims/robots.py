@@ -1,4 +1,4 @@
-"""A claim about a robot that lands on two legs: hundreds of weights, several joints and contacts."""
+"""A claim about a robot landing on two legs: hundreds of weights, several joints and contacts."""
 
 from typing import Final
 
@@ -14,7 +14,7 @@ ROBOT: Final = "landing"
 
 
 def variances(lab: Laboratory, system: str, family: str) -> Statistic:
-    """log10 of FoBG's variance over ZoBG's where the task starts, on shared samples."""
+    """log10 of FoBG's variance over ZoBG's at the task's initial theta, on shared samples."""
     task = lab.task(system)
     objective = lab.objective(system, family, task.defaults.middle_stiffness)
     chosen, samples = (FirstOrder(), ZerothOrder()), 2 * lab.effort.samples

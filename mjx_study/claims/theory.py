@@ -1,4 +1,4 @@
-"""Claims about jumps, their relaxations, and the lemmas: closed forms, and landscapes of MJX over one parameter."""
+"""Claims about jumps, their relaxations, and the lemmas, by closed forms and MJX landscapes over one parameter."""
 
 import math
 from typing import Final
@@ -28,18 +28,18 @@ from mjx_study.claims.ledger import Claim, above, below, within
 from mjx_study.reference import Heaviside, RelaxedHeaviside
 
 FIVE: Final = ("penalty", "impedance", "mujoco_default", "mujoco_stiff", "smooth_onset")
-"""Families of the landscapes."""
+"""Contact families of the landscapes."""
 STIFFNESS: Final = 10_000.0
-"""Of the landscapes' contact, for the families that take one [N/m]."""
+"""Contact stiffness of the landscapes, for families that take one [N/m]."""
 HIT, EDGE, SHORT, WALL = (
     "momentum_transfer, 0.5 rad", "momentum_transfer, 0.75 rad", "ball_wall, 0.2 rad", "ball_wall, 0.7 rad",
 )  # fmt: skip
-# Not nearer to the edge: at 0.77 rad the bias of the default contact passes through zero (31 % at 0.76, -13 % at 0.78).
+# Not closer to the edge: at 0.77 rad the bias of the default contact crosses zero (31 % at 0.76, -13 % at 0.78).
 STEP, RAMP = "step", "ramp of 0.01 sigma"
 NEGLIGIBLE: Final = 0.1
-"""Share of the gradient below which a bias counts as none."""
+"""Share of the gradient below which a bias is negligible."""
 FACTOR: Final = math.log10(1.25)
-"""Ratios of variances or errors nearer to 1 than this count as equal."""
+"""Ratios of variances or errors closer to 1 than this count as equal."""
 JUMPS: Final = {STEP: (REFERENCE,), EDGE: (REFERENCE, *FIVE), WALL: (REFERENCE, *FIVE)}
 SMOOTH: Final = {HIT: (REFERENCE, *FIVE), SHORT: (REFERENCE, *FIVE)}
 
@@ -48,7 +48,7 @@ def at(
     lab: Laboratory, system: str, family: str, *, stiffness: float = STIFFNESS, sigma: float | None = None,
     timestep: float | None = None, onset: str = "none", relaxed: str | None = None,
 ) -> Slopes:  # fmt: skip
-    """A system's landscape under a family, at the angle that its name gives."""
+    """Landscape of a system under a family, at the angle given in its name."""
     if system == STEP:
         return closed_form(Heaviside(), 0.5, 1.0)
     if system == RAMP:
@@ -66,7 +66,7 @@ def relative(found: Slopes) -> Statistic:
 
 
 def variances_of(lab: Laboratory, one: Slopes, other: Slopes) -> Statistic:
-    """log10 of FoBG's variance on a landscape over that on another."""
+    """log10 of FoBG's variance on one landscape over that on another."""
     return difference_of(*(log_variance(batch(FirstOrder(), each, lab.effort.draws)) for each in (one, other)))
 
 
@@ -95,7 +95,7 @@ def zeroth_bias(lab: Laboratory, system: str, family: str) -> Statistic:
 
 
 def variances(lab: Laboratory, system: str, family: str) -> Statistic:
-    """log10 of the ratio of a FoBG's variance to a ZoBG's."""
+    """log10 of FoBG's variance over ZoBG's."""
     found = at(lab, system, family)
     one, other = (log_variance(batch(each, found, lab.effort.draws)) for each in (FirstOrder(), ZerothOrder()))
     return difference_of(one, other)
@@ -124,7 +124,7 @@ def missed(lab: Laboratory, system: str, family: str) -> Statistic:
 
 
 def rare(lab: Laboratory, system: str, family: str) -> Statistic:
-    """log10 of the largest Delta_0^2 / beta over the variance, of the distribution that a large batch is."""
+    """log10 of the largest Delta_0^2 / beta over the variance, with a large batch as the distribution."""
     found = batch(FirstOrder(), at(lab, system, family), lab.effort.draws // 10)
     count = len(found.per_sample)
     variance, mean = float(found.variance) * (1 - 1 / count), float(abs(found.mean[0]))
@@ -158,7 +158,7 @@ def bound(lab: Laboratory, system: str, family: str) -> Statistic:
 
 
 def accurate(lab: Laboratory, system: str, family: str) -> Statistic:
-    """Share of the batches of 4000 that promise an error of gamma = |grad F| / 2 and keep it."""
+    """Share of batches of 4000 that keep an error of gamma = |grad F| / 2, among those that promise it."""
     point = at(lab, system, family)
     gamma = abs(point.gradient) / 2
     (found,) = batches([AlphaOrder(gamma=gamma)], point, 4000, lab.effort.batches)
@@ -170,7 +170,7 @@ def accurate(lab: Laboratory, system: str, family: str) -> Statistic:
 
 
 def solution(lab: Laboratory, system: str, family: str) -> Statistic:
-    """Largest distance of the closed form to the best alpha on a grid, over random problems."""
+    """Largest distance of the closed form from the best alpha on a grid, over random problems."""
     random = np.random.default_rng(0)
     zeroth, first, distance, epsilon = random.lognormal(0, 2, (4, 10 * lab.effort.batches))
     gamma = epsilon * (1 + random.lognormal(0, 1, len(epsilon)))
@@ -196,17 +196,17 @@ def compared(one: str, other: str, lab: Laboratory, system: str, family: str) ->
 
 
 def ivw_error(lab: Laboratory, system: str, family: str) -> Statistic:
-    """Inverse-variance weighting against ZoBG."""
+    """log10 of the mean squared error of inverse-variance weighting over ZoBG's."""
     return compared("ivw", "zobg", lab, system, family)
 
 
 def bounded_error(lab: Laboratory, system: str, family: str) -> Statistic:
-    """AoBG against inverse-variance weighting."""
+    """log10 of the mean squared error of AoBG over inverse-variance weighting's."""
     return compared("aobg", "ivw", lab, system, family)
 
 
 def aobg_error(lab: Laboratory, system: str, family: str) -> Statistic:
-    """AoBG against ZoBG."""
+    """log10 of the mean squared error of AoBG over ZoBG's."""
     return compared("aobg", "zobg", lab, system, family)
 
 
