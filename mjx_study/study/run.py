@@ -341,7 +341,7 @@ def warnings_of(dataset: xr.Dataset) -> tuple[str, ...]:
     if "effective_samples" in dataset and (few := int((dataset["effective_samples"] < ENOUGH_EFFECTIVE).sum())):
         found.append(
             f"{few} batches rest on fewer than {ENOUGH_EFFECTIVE:g} effective samples: do not believe their errors, "
-            "p-values and variances (effective_samples says which)"
+            "p-values and variances (marked ? in the table of compare, effective_samples in the data)"
         )
     if "stopped_at" in dataset and bool(dataset["stopped_at"].notnull().any()):
         found.append(f"{int(dataset['stopped_at'].notnull().sum())} descents stopped before their last iteration")
