@@ -1,4 +1,4 @@
-"""Imports matplotlib whatever MPLBACKEND says: figures need no backend, and a wrong one would be an error here."""
+"""Import matplotlib regardless of MPLBACKEND: figures need no backend, and an invalid one would raise here."""
 
 import os
 import sys
@@ -7,7 +7,7 @@ try:
     import matplotlib
 except ValueError:
     for _name in [name for name in sys.modules if name.split(".")[0] == "matplotlib"]:
-        del sys.modules[_name]  # what is half imported
+        del sys.modules[_name]  # the half-imported modules
     _backend = os.environ.pop("MPLBACKEND", "")
     try:
         import matplotlib

@@ -1,4 +1,4 @@
-"""What `mjx_study` offers; the package imports it when one of these names is first asked for."""
+"""Public names of `mjx_study`, imported when one of them is first accessed."""
 
 import mjx_study._matplotlib  # noqa: F401
 from mjx_study.accessor import StudyAccessor

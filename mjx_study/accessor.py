@@ -16,7 +16,7 @@ class StudyAccessor:
         self._dataset = dataset
 
     def table(self) -> pd.DataFrame:
-        """A row for each contact model, seed and estimator; no variables along iterations, points or theta."""
+        """Return a row per contact model, seed and estimator, without variables over iterations, points or theta."""
         if "variance" in self._dataset:
             return pd.DataFrame([row.as_dict() for row in rows_of(self._dataset)])
         long = {"iteration", "point", "param", "solref_entry", "solimp_entry"}

@@ -1,12 +1,12 @@
-"""Cost of rollouts and gradients against the alternatives; rates and ratios of one run.
+"""Benchmark rollouts and gradients against alternatives; rates, and ratios within one run.
 
-The baselines get the same policy, initial states, noise, devices and precision:
+The baselines use the same policy, initial states, noise, devices and precision:
 
-- stock MJX: `jax.grad` through `mjx.step` with the one solver iteration that reverse mode allows (so its gradient is
-  not that of the converged step), in batches that fit in memory;
-- the C engine's rollouts: `mujoco.rollout`, open loop, on as many threads as there are devices or cores; float64;
-- the C engine's gradients: centred `mjd_transitionFD` at every step and an adjoint sweep, one thread measured and
-  scaled by the number of devices, as if threading were free; not with quaternions, nor with RK4, which it does not
+- stock MJX: `jax.grad` through `mjx.step` with a single solver iteration, all that reverse mode allows (so its gradient
+  is not that of the converged step), in batches that fit in memory;
+- the C engine's rollouts: `mujoco.rollout`, open loop, in float64, on as many threads as there are devices or cores;
+- the C engine's gradients: centred `mjd_transitionFD` at every step and an adjoint sweep, measured on one thread and
+  scaled by the number of devices, as if threading were free; not with quaternions or RK4, which it cannot
   differentiate.
 """
 
@@ -39,23 +39,23 @@ from mjx_study.tasks.task import Task
 REPEATS: Final = 5
 ENGINE_SAMPLES: Final = 5
 STOCK_BATCH: Final = {"cpu": 125, "gpu": 32768, "tpu": 32768}
-"""Largest batch per device for stock MJX, whose gradients store every intermediate of every step."""
+"""Maximum batch per device for stock MJX, whose gradients store every intermediate of every step."""
 
 
 @dataclasses.dataclass(frozen=True)
 class BenchReport:
-    """Seconds per sample, memory, and the ratios that follow.
+    """Seconds per sample, memory, and resulting ratios.
 
     Attributes:
         task, samples, horizon: name of the task, number of samples, number of steps.
-        value_seconds: time of a zeroth-order sample, one rollout and its share of the baselines [s].
+        value_seconds: time of a zeroth-order sample: a rollout and its share of the baselines [s].
         gradient_seconds: time of a first-order sample, one rollout and its gradient [s].
         rollout_seconds: time of one rollout [s].
         stock_value_seconds: time of a rollout through stock MJX with the same solver budget [s].
         stock_gradient_seconds: time of a gradient through stock MJX with one solver iteration [s].
         engine_value_seconds: time of a rollout by the C engine [s].
-        engine_gradient_seconds: time of a gradient by the C engine's differences on as many threads [s]; None if it has
-            none.
+        engine_gradient_seconds: time of a gradient by the C engine's differences on as many threads [s]; None if
+            unsupported.
         value_memory, gradient_memory: temporary memory of all samples' rollouts, or gradients, at once [MiB].
         onset_seconds, onset_base_seconds: time of a first-order sample through MuJoCo's default contact, with the
             linear onset term and without it [s]; None without contact.
@@ -80,7 +80,7 @@ class BenchReport:
 
     @property
     def ratios(self) -> dict[str, float]:
-        """Ratios, which can be compared between machines."""
+        """Ratios, comparable between machines."""
         ratios = {
             "gradient_per_value": self.gradient_seconds / self.value_seconds,
             "rollouts_over_stock": self.stock_value_seconds / self.rollout_seconds,
@@ -137,7 +137,7 @@ class BenchPlan:
     samples: int
     cell: ContactPoint
     onset: ContactPoint | None
-    """MuJoCo's default contact, whose force sets in with a jump; None without contact."""
+    """MuJoCo's default contact, whose force jumps at the onset; None without contact."""
 
 
 def plan_bench(task: Task, samples: int) -> BenchPlan:
@@ -155,14 +155,14 @@ def plan_bench(task: Task, samples: int) -> BenchPlan:
 
 
 def bench(plan: BenchPlan, progress: Progress = lambda done, total, what: None) -> BenchReport:
-    """Measure everything, interleaved with the baselines; medians of repeats."""
+    """Measure everything, interleaved with the baselines; report medians of repeats."""
     task, samples, cell = plan.task, plan.samples, plan.cell
     devices = jax.local_devices()
     keys = jax.random.split(jax.random.key(0), samples)
     simulator = Simulator(task, chunk_size=chunk_for(-(-samples // len(devices)), devices[:1], [task]))
     objective = simulator.objective(cell.contact)
     full = -(-samples // (simulator.chunk_size * len(devices))) * simulator.chunk_size * len(devices)
-    key_data = np.resize(jax.random.key_data(keys), (full, 2))  # no padded chunks, as in stock
+    key_data = np.resize(jax.random.key_data(keys), (full, 2))  # avoids padded chunks, as in stock
     noisy = np.ones(full, task.scene.template.qpos.dtype)
     progress(0, 1, f"{task.name}: compiling stock")
     stock_samples = min(samples, STOCK_BATCH[devices[0].platform] * len(devices))
@@ -211,7 +211,7 @@ def _seconds(call: Callable[[], Any]) -> float:
 
 
 def _fitting_stock(task: Task, contact: ContactModel | None, keys: Any, samples: int, devices: Any):
-    """Largest batch, by halving, whose gradients through `mjx.step` fit in memory, and the programs."""
+    """Largest batch, by halving, whose gradients through `mjx.step` fit in memory, with the programs."""
     while True:
         value, gradient = _stock_programs(task, contact, keys[:samples], devices)
         try:
@@ -225,7 +225,7 @@ def _fitting_stock(task: Task, contact: ContactModel | None, keys: Any, samples:
 
 
 def _stock_programs(task: Task, contact: ContactModel | None, keys: Any, devices: Any) -> tuple[Callable[[], Any], ...]:
-    """Programs for costs and gradients of the same samples through `mjx.step`, spread like ours."""
+    """Programs for costs and gradients of the same samples through `mjx.step`, spread like this project's."""
     scene, policy = task.scene, task.policy
     dtype = scene.template.qpos.dtype
 
@@ -258,7 +258,7 @@ def _stock_programs(task: Task, contact: ContactModel | None, keys: Any, devices
 
 
 def _engine_seconds(task: Task, contact: ContactModel | None) -> float | None:
-    """Median time of a gradient by the C engine [s]; None where its differences do not apply."""
+    """Median time of a gradient by the C engine [s]; None if its differences are unsupported."""
     host = task.scene.host
     if host.nq != host.nv or host.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
         return None
@@ -273,12 +273,12 @@ def _engine_seconds(task: Task, contact: ContactModel | None) -> float | None:
 def engine_rollouts(
     task: Task, contact: ContactModel | None, keys: jax.Array, threads: int
 ) -> tuple[int, Callable[[], np.ndarray]]:
-    """The number of rollouts, and a call that runs them by the C engine.
+    """Prepare rollouts by the C engine, and return their number and a function that runs them.
 
-    Their starts and controls are those of ours, so that a policy with feedback costs the engine nothing.
+    Their starts and controls are recorded from this project's rollouts, so feedback costs the engine nothing.
 
     Returns:
-        The number, and a function without arguments that returns states `(rollouts, horizon, state)`, a state as in
+        The number, and a function without arguments that returns states `(rollouts, horizon, state)`, laid out as
         `mujoco.mjtState.mjSTATE_FULLPHYSICS`.
     """
     host = engine_model(task.scene, contact)
@@ -297,9 +297,9 @@ def engine_rollouts(
 def engine_gradient(
     task: Task, contact: ContactModel | None, start: tuple[np.ndarray, np.ndarray], controls: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Gradient of the sum of the final state with respect to initial state and controls, by the C engine.
+    """Compute the gradient of the final state's sum over initial state and controls by the C engine.
 
-    Centred differences of each step, and one adjoint sweep.
+    Uses centred differences of each step and one adjoint sweep.
     """
     host = engine_model(task.scene, contact)
     data = mujoco.MjData(host)

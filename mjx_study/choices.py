@@ -1,4 +1,4 @@
-"""Names that users choose from, with one line about each; imports nothing that computes."""
+"""Names that users choose from, with one-line descriptions; free of imports that compute."""
 
 import dataclasses
 import difflib
@@ -13,7 +13,7 @@ INTEGRATORS: Final = ("euler", "implicitfast", "rk4")
 ONSETS: Final = ("none", "linear", "jump")
 """Treatment of the onset of contact in first-order gradients."""
 REFERENCE: Final = "reference"
-"""Stands for the task's analytic system, without MJX, among contact families."""
+"""Selects the task's analytic system, without MJX, among contact families."""
 TASK_DESCRIPTIONS: Final = {
     "pusher": "push a body through stiff contact; 200 open-loop forces",
     "sliding_box": "drag a box by friction; 400 open-loop forces",
@@ -27,17 +27,17 @@ TASK_DESCRIPTIONS: Final = {
     "double_pendulum:published": "chaos without contact; four numbers of the initial state (published)",
 }
 CHECKED_STIFFNESS: Final = (10.0, 100.0, 1000.0)
-"""Contact stiffnesses that gradcheck takes [N/m]."""
+"""Contact stiffnesses checked by gradcheck [N/m]."""
 CHECKED_STATES: Final = 4
-"""States that gradcheck takes, of each contact model."""
+"""States checked by gradcheck per contact model."""
 CHECKED_STEPS: Final = 200
-"""Steps of the rollout that the states of a file come from."""
+"""Steps of the rollout from which a file's states are taken."""
 FIGURE_FORMATS: Final = ("png", "pdf", "svg")
 FIGURE_STYLES: Final = ("screen", "paper")
 FILM_FORMATS: Final = ("gif", "mp4")
 RENDERERS: Final = ("auto", "drawing", "opengl")
 PLANES: Final = ("xz", "xy", "yz")
-"""Planes of a picture: the axis to the right, and the one that points up."""
+"""Planes of a picture: the axis to the right, and the axis upwards."""
 MIN_IMPEDANCE: Final = 1e-4
 """MuJoCo's mjMINIMP."""
 MAX_IMPEDANCE: Final = 0.9999
@@ -49,14 +49,14 @@ STIFF_SOLIMP: Final = (0.99, 0.9999, 0.001, 0.5, 2.0)
 
 @dataclasses.dataclass(frozen=True)
 class Family:
-    """A line of contact models over stiffness, or a single point of MuJoCo's parameters.
+    """A family of contact models over stiffness, or a single point in MuJoCo's parameters.
 
     Attributes:
         name: name on the command line.
         description: one line for tables and help.
-        solimp: impedance of all its members; None for the MJCF's.
-        dampratio: damping ratio used with a stiffness when no damping is given.
-        solref: fixed reference of a single point; None for a line over stiffness, or for the MJCF's.
+        solimp: impedance of all members; None for the MJCF's.
+        dampratio: damping ratio used with a stiffness if no damping is given.
+        solref: fixed reference of a single point; None for families over stiffness or the MJCF's.
     """
 
     name: str
@@ -104,7 +104,7 @@ def is_file(name: str) -> bool:
 
 
 def unknown_task(name: str, reason: str = "") -> str | None:
-    """The message about a task's name that is unknown, or unusable for a reason; None for a possible one."""
+    """Return an error message for a task name that is unknown, or unusable for a reason; None if it may be valid."""
     registered = sorted({point.name for point in metadata.entry_points(group=TASK_GROUP)})
     if (name in TASK_DESCRIPTIONS or name in registered or ":" in name or is_file(name)) and not reason:
         return None
@@ -113,11 +113,11 @@ def unknown_task(name: str, reason: str = "") -> str | None:
 
 
 def unknown(label: str, value: str, choices: Iterable[str], more: str = "") -> str:
-    """The message about a value that is none of the choices: the closest one, otherwise all of them and more."""
+    """Return the error message for an invalid choice: the closest match, otherwise all choices and `more`."""
     shown = repr(value) if len(value) <= 60 else f"{value[:50]!r}..."
     return f"unknown {label} {shown}" + (suggestion(value, choices) or f"; choose from {', '.join(choices)}{more}")
 
 
 def suggestion(value: str, choices: Iterable[str]) -> str:
-    """The choice that a misspelt value probably means, as the end of a message; empty if none is close."""
+    """Suggest the choice that a misspelt value probably means, as the end of a message; empty if none is close."""
     return "".join(f"; did you mean {near}?" for near in difflib.get_close_matches(value, list(choices), n=1))

@@ -1,8 +1,7 @@
-"""Functions compiled by JAX whose traces outlive the process: tracing a rollout's gradient takes seconds.
+"""JAX-compiled functions whose traces outlive the process, since tracing a rollout's gradient takes seconds.
 
-What XLA compiles is kept by JAX; the trace that leads there is kept here beside it, as StableHLO, under a digest of all
-that it is made of (`identity.trace_contents`). What rests on code from outside of this package is traced in every
-process.
+JAX caches what XLA compiles; the trace before it is cached here as StableHLO, keyed by a digest of everything it
+depends on (`identity.trace_contents`). Traces that depend on code from outside this package are not cached.
 """
 
 import hashlib
@@ -22,19 +21,19 @@ from mjx_study.identity import trace_contents
 from mjx_study.runtime import precision, traces_folder
 
 UNTRACED: Final = re.compile("cache|^jax_log|num_cpu_devices")
-"""Settings of JAX that no trace depends on."""
+"""JAX settings that traces do not depend on."""
 
 
 class Compiled:
-    """A pure function compiled by JAX, once for each form of its arguments: shapes, types and pytrees.
+    """A pure function compiled by JAX once per form of its arguments: shapes, types and pytree structure.
 
     Args:
-        function: of this package, of arrays in pytrees.
-        made_of: its name and all that it closes over, as a task: what determines its trace beside the arguments' form.
-            Without it the trace is not kept.
+        function: function of this package, from pytrees of arrays to pytrees of arrays.
+        made_of: a name and everything that the function captures, such as a task, which together with the form of the
+            arguments determines its trace. Without it the trace is not cached.
 
     Attributes:
-        jitted: what `jax.jit` returns, whose trace is not kept; for use inside of other programs.
+        jitted: the plain `jax.jit` function, whose trace is not cached, for use within other programs.
     """
 
     def __init__(self, function: Callable[..., Any], *made_of: Any):
@@ -47,18 +46,18 @@ class Compiled:
 
     @property
     def num_compilations(self) -> int:
-        """Number of forms of arguments that it was compiled for, in this process."""
+        """Number of argument forms compiled in this process."""
         return sum(each._cache_size() for each in (self.jitted, *self._ready.values()))  # type: ignore[attr-defined]
 
     def prepare(self, *arguments: Any, platform: str | None = None) -> Callable[..., Any]:
-        """Trace the function in this thread, or find its trace.
+        """Trace the function in this thread, or load its cached trace.
 
         Args:
-            arguments: arrays, or what tells their shapes and types (`jax.ShapeDtypeStruct`).
-            platform: of the devices; traces are kept for JAX's default one.
+            arguments: arrays, or their shapes and types (`jax.ShapeDtypeStruct`).
+            platform: platform of the devices; traces are cached for JAX's default one only.
 
         Returns:
-            The function of arguments of this form, which threads may call side by side.
+            A function of arguments of this form, which threads may call in parallel.
         """
         leaves, form = jax.tree.flatten(arguments)
         types = [leaf if isinstance(leaf, jax.ShapeDtypeStruct) else type_of(leaf) for leaf in leaves]
@@ -75,13 +74,13 @@ class Compiled:
         return trace_contents(self._made_of) if self._made_of else None
 
     def ahead(self, *types: Any) -> Callable[[], None]:
-        """Trace the function in this thread, or find its trace.
+        """Trace the function in this thread, or load its cached trace, for compilation ahead of time.
 
         Args:
             types: shapes and types of the arguments.
 
         Returns:
-            What compiles it, in any thread, for JAX's default device; nothing is left to do for the next call.
+            A function that compiles it in any thread for JAX's default device, so that the next call need not.
         """
         ready = self.prepare(*types)
 
@@ -96,7 +95,7 @@ class Compiled:
         return compile_it
 
     def _path(self, form: str) -> Path | None:
-        """Where the trace for arguments of a form is kept; None if it is not."""
+        """Path of the cached trace for a form of arguments; None if it is not cached."""
         folder = traces_folder()
         if folder is None or self._contents is None:
             return None
@@ -105,7 +104,7 @@ class Compiled:
         return folder / f"{hashlib.sha256(text.encode()).hexdigest()[:32]}.trace"
 
     def _export(self, path: Path, types: Sequence[jax.ShapeDtypeStruct], form: Any) -> Callable[..., Any]:
-        """Trace the function and write the trace down; without it if JAX cannot export it."""
+        """Trace the function and cache the trace; only trace it if JAX cannot export it."""
         outputs: list[Any] = []
 
         def of_leaves(*leaves: Any) -> list[Any]:
@@ -115,7 +114,7 @@ class Compiled:
 
         try:
             trace = jax.export.export(jax.jit(of_leaves))(*types).serialize()
-        except ValueError:  # an operation without a stable form
+        except ValueError:  # an operation that cannot be exported
             return self.jitted
         kept = pickle.dumps((bytes(trace), outputs[0]))
         with suppress(OSError):
@@ -125,16 +124,16 @@ class Compiled:
 
 
 def type_of(leaf: Any) -> jax.ShapeDtypeStruct:
-    """What a program is compiled for, of an array."""
+    """Shape and type of an array, as programs are compiled for."""
     kind = jax.typeof(leaf)
     return jax.ShapeDtypeStruct(kind.shape, kind.dtype, weak_type=kind.weak_type)
 
 
 def _read(path: Path) -> Callable[..., Any] | None:
-    """The function whose trace is in a file; None if there is none, or none that can be read."""
+    """Load the function whose trace is in a file; None if the file is missing or unreadable."""
     try:
         return _load(path.read_bytes())
-    except Exception:  # also whatever a damaged file makes of it: the trace is made and written again
+    except Exception:  # a damaged file may raise anything; the trace is then made and written again
         return None
 
 

@@ -1,7 +1,7 @@
-"""Files that are complete or absent, whatever happens to the process that writes them, and reads that never wait.
+"""Atomic file writes, complete or absent whatever happens to the writing process, and nonblocking reads.
 
-A file is written under a temporary name beside its place, locked as long as its writer lives, and moved there when it
-is on the disk. A temporary file whose lock is free was left by a process that died; the next one removes it.
+A file is written under a temporary name in the same folder, locked while its writer lives, and renamed once it is on
+disk. A temporary file with a free lock was left by a process that died; the next one removes it.
 """
 
 import errno
@@ -15,14 +15,14 @@ from pathlib import Path
 from typing import IO, Any, Final
 
 TEMPORARY: Final = ".mjx-study"
-"""Ending of temporary names, by which a program knows its own."""
+"""Suffix by which temporary files are recognised."""
 
 
 def prepare_folder(folder: str | Path) -> Path:
-    """Make sure that results can be written to a folder, before anything is computed; removes what dead writers left.
+    """Ensure that a folder is writable before anything is computed, and remove leftovers of dead writers.
 
     Raises:
-        ValueError: it cannot be created or written to, or is a file.
+        ValueError: the folder cannot be created or written to, or is a file.
     """
     path = Path(folder)
     try:
@@ -36,10 +36,10 @@ def prepare_folder(folder: str | Path) -> Path:
 
 
 def write_whole(path: Path, write: Callable[[IO[bytes]], Any]) -> Path:
-    """Write a file beside its place and move it there, so that it is never half there, after a loss of power either.
+    """Write a file under a temporary name and rename it, so that it is complete or absent, even after a power loss.
 
     Raises:
-        OSError: it cannot be written; what was there before still is.
+        OSError: it cannot be written; any previous content is kept.
     """
     descriptor, temporary = _begin(path)
     try:
@@ -48,29 +48,29 @@ def write_whole(path: Path, write: Callable[[IO[bytes]], Any]) -> Path:
             file.flush()
             os.fsync(file.fileno())
             os.fchmod(file.fileno(), 0o644)
-            os.replace(temporary, path)  # under the lock, so that nobody takes it for a leftover
+            os.replace(temporary, path)  # under the lock, lest it be taken for a leftover
     except BaseException as error:
         with suppress(OSError):
             os.unlink(temporary)
         if isinstance(error, OSError):
-            error.filename = str(path)  # in place of none, or of the temporary one
+            error.filename = str(path)  # instead of none or the temporary one
         raise
     return path
 
 
 def _begin(path: Path) -> tuple[int, str]:
-    """A temporary file for a path, locked."""
+    """Create a locked temporary file for a path."""
     while True:
         descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=TEMPORARY)
-        with suppress(OSError):  # a file system without locks: then nobody removes leftovers either
+        with suppress(OSError):  # on file systems without locks, leftovers are not removed either
             fcntl.flock(descriptor, fcntl.LOCK_EX)
         if os.fstat(descriptor).st_nlink:
             return descriptor, temporary
-        os.close(descriptor)  # removed between its creation and its lock
+        os.close(descriptor)  # removed between creation and locking
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Remove temporary files of processes that died while they wrote; those of live ones are locked and stay."""
+    """Remove temporary files of processes that died while writing; those of live ones are locked and stay."""
     for path in folder.glob(f".*{TEMPORARY}"):
         with suppress(OSError):
             descriptor = os.open(path, os.O_RDWR | os.O_NONBLOCK | os.O_NOFOLLOW | os.O_CLOEXEC)
@@ -83,10 +83,10 @@ def remove_leftovers(folder: Path) -> None:
 
 
 def open_regular(path: Path, flags: int) -> int:
-    """A descriptor of a regular file; opening a pipe, a socket or a device would wait or have effects.
+    """Open a regular file; opening a pipe, socket or device could block or have side effects.
 
     Raises:
-        OSError: it cannot be opened, or is no regular file.
+        OSError: it cannot be opened, or is not a regular file.
     """
     descriptor = os.open(path, flags | os.O_NONBLOCK | os.O_CLOEXEC, 0o644)
     if not stat.S_ISREG(os.fstat(descriptor).st_mode):
@@ -96,10 +96,10 @@ def open_regular(path: Path, flags: int) -> int:
 
 
 def read_whole(path: Path) -> bytes:
-    """The content of a regular file.
+    """Read a regular file.
 
     Raises:
-        OSError: it cannot be read, or is no regular file.
+        OSError: it cannot be read, or is not a regular file.
     """
     with os.fdopen(open_regular(path, os.O_RDONLY), "rb") as file:
         return file.read()

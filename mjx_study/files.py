@@ -1,4 +1,4 @@
-"""Reading files that users supply, checked against a schema; errors name the file and the key in one line."""
+"""Read user-supplied files and validate them against a schema; errors name the file and the key in one line."""
 
 import tomllib
 from pathlib import Path
@@ -12,16 +12,16 @@ from mjx_study.disk import read_whole
 from mjx_study.option import OPTIONS
 
 MOST_BYTES: Final = 100_000_000
-"""Largest file that is read [bytes]."""
+"""Maximum size of a file that is read [bytes]."""
 Schema = TypeVar("Schema", bound=BaseModel)
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 
 def read_bytes(path: Path) -> bytes:
-    """The contents of a file.
+    """Read a file.
 
     Raises:
-        ValueError: it cannot be read, is no regular file, or is larger than `MOST_BYTES`.
+        ValueError: it cannot be read, is not a regular file, or is larger than `MOST_BYTES`.
     """
     try:
         if (size := path.stat().st_size) > MOST_BYTES:
@@ -32,10 +32,10 @@ def read_bytes(path: Path) -> bytes:
 
 
 def read_json(path: Path, schema: type[Schema]) -> Schema:
-    """A JSON file.
+    """Read a JSON file.
 
     Raises:
-        ValueError: as `read_bytes`, or it does not satisfy the schema.
+        ValueError: as for `read_bytes`, or it violates the schema.
     """
     return _validated(path, read_bytes(path), schema)
 
@@ -48,10 +48,10 @@ def _validated(path: Path, content: bytes, schema: Any) -> Any:
 
 
 def read_toml(path: Path, schema: type[BaseModel]) -> dict[str, Any]:
-    """The options that a TOML file sets.
+    """Read the options set by a TOML file.
 
     Raises:
-        ValueError: as `read_bytes`, or it is not TOML, or does not satisfy the schema.
+        ValueError: as for `read_bytes`, or it is not TOML, or violates the schema.
     """
     content = read_bytes(path)
     try:
@@ -64,11 +64,11 @@ def read_toml(path: Path, schema: type[BaseModel]) -> dict[str, Any]:
 
 
 def told(error: ValidationError) -> str:
-    """The first violation of a schema, with its key, and the number of further ones."""
+    """Describe the first violation of a schema, with its key, and count the others."""
     found = error.errors(include_url=False, include_input=False)
     first = found[0]
     key = ".".join(map(str, first["loc"]))
-    raised = first.get("ctx", {}).get("error")  # by a validator of ours, to whose message pydantic adds words
+    raised = first.get("ctx", {}).get("error")  # from a validator of ours; pydantic adds words to its message
     reason = str(raised) if isinstance(raised, ValueError) else first["msg"]
     if first["type"] == "extra_forbidden":
         reason = f"there is no such option{suggestion(key, OPTIONS)}"
@@ -83,7 +83,7 @@ def _option(name: str, kind: Any, interval: str = "") -> Any:
 
 
 class PolicyFile(BaseModel):
-    """A policy written by `optimise`: its parameters and the setting they were found in."""
+    """A policy written by `optimise`: its parameters, and the setting in which they were found."""
 
     model_config = ConfigDict(strict=True)
 
@@ -99,10 +99,10 @@ class PolicyFile(BaseModel):
 
 
 def read_theta(path: Path) -> tuple[tuple[float, ...], str | None]:
-    """Parameters from a policy file, a .json list or a .npy array; with the policy's task.
+    """Read parameters from a policy file, a .json list or a .npy array, with the policy's task.
 
     Raises:
-        ValueError: the file cannot be read, or is none of these.
+        ValueError: the file cannot be read, or has another format.
     """
     if path.suffix != ".json":
         return _read_array(path), None
@@ -118,9 +118,9 @@ def _read_array(path: Path) -> tuple[float, ...]:
     try:
         if magic != np.lib.format.MAGIC_PREFIX:
             raise ValueError("not a .npy file")
-        array = np.load(path, mmap_mode="r", allow_pickle=False)  # an impossible shape allocates nothing
+        array = np.load(path, mmap_mode="r", allow_pickle=False)  # does not allocate an impossible shape
         if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu" or not np.all(np.isfinite(array)):
             raise ValueError("not an array of finite numbers")
         return tuple(np.asarray(array, float).reshape(-1).tolist())
-    except Exception as error:  # numpy raises what it likes
+    except Exception as error:  # numpy may raise anything
         raise ValueError(f"{path} is not a .npy array of finite numbers") from error

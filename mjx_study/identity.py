@@ -1,8 +1,8 @@
-"""What numbers depend on, by content and not by name: the compiled model, the task's parts, and who computes them.
+"""Content-based identity of what results depend on: the compiled model, the task's parts, and the software.
 
-Numbers and arrays enter a digest by value, to twelve digits; the model by MuJoCo's arrays, without names and colours.
-A function enters by its name, its closure and its defaults, and by the source file of its module; files beside that one
-which it imports count as well. Code of this package and of the libraries below it counts by version.
+Numbers and arrays enter a digest by value, to twelve digits; models by MuJoCo's arrays, without names and colours.
+Functions enter by name, closure, defaults and the source file of their module, along with the neighbouring files that
+it imports. Code of this package and of the libraries below it enters by version.
 """
 
 import ast
@@ -31,21 +31,21 @@ from mjx_study.simulation.scene import Scene, models_folder
 from mjx_study.tasks.task import Task
 
 VERSIONED: Final = ("mjx-study", "mujoco", "mujoco-mjx", "jax", "jaxlib", "numpy", "optax")
-"""Packages whose version may change a number."""
+"""Packages whose version may affect results."""
 BY_VERSION: Final = {"mjx_study", "estimators", "mujoco", "jax", "jaxlib", "numpy", "scipy", "optax", "builtins"}
-"""Modules whose code counts by version."""
+"""Modules whose code is identified by version."""
 IRRELEVANT: Final = re.compile(r"_.*|.*name.*|.*path.*|.*rgba|(tex|mat|skin|light|cam|text)_.*|.*_matid")
-"""Fields of MjModel that no number depends on."""
+"""Fields of MjModel that do not affect results."""
 ABOVE: Final = (
     "cli", "plots", "render", "gradcheck", "claims", "report.py", "bench.py", "diagnose", "accessor.py",
 )  # fmt: skip
-"""Parts of mjx_study that use studies; no number of a study depends on them."""
+"""Parts of mjx_study that use studies, and so do not affect their results."""
 DIGEST: Final = re.compile("[0-9a-f]{12,64}")
-"""What tells a reader nothing."""
+"""Digests, which messages do not show."""
 ACCEPT: Final = "choose another folder, or accept the mixture by --accept-versions"
 """Advice at the end of messages about other versions."""
 UNREAD: Final = ("description",)
-"""Fields of a task that no number depends on."""
+"""Fields of a task that do not affect results."""
 
 
 def versions() -> dict[str, str]:
@@ -54,13 +54,13 @@ def versions() -> dict[str, str]:
 
 
 def contents(tasks: Mapping[str, Iterable[Task]]) -> dict[str, str]:
-    """Precision, and digests of what each task is made of.
+    """Return the precision, and digests of everything that tasks consist of.
 
     Args:
-        tasks: by the name that messages give it, the task in all its forms (timesteps, cones).
+        tasks: all variants (timesteps, cones) of each task, by its name in messages.
 
     Returns:
-        By what is digested: "model of NAME", "task NAME", and "source of FILE" for every source file of a task's own.
+        Digests by name: "model of NAME", "task NAME", and "source of FILE" for every source file of a user's task.
     """
     found, sources = {"precision": precision()}, {}
     for name, forms in tasks.items():
@@ -83,10 +83,10 @@ def digest_of(value: Any) -> str:
 
 
 def trace_contents(made_of: Any) -> str | None:
-    """Digest of what a trace is made of beside its arguments and JAX's settings: values and models to the bit, code.
+    """Digest everything a trace depends on except its arguments and JAX's settings: exact values and models, and code.
 
     Returns:
-        None if code from outside of this package is among it: not everything that such code imports is followed.
+        The digest, or None if code from outside this package is involved, whose imports are not all followed.
     """
     digest = _Digest(exact=True)
     digest.add((made_of, [metadata.version(name) for name in VERSIONED], _own_code(ABOVE)))
@@ -94,7 +94,7 @@ def trace_contents(made_of: Any) -> str | None:
 
 
 def estimator_contents(*names: str) -> dict[str, str]:
-    """Digests of those of some estimators that are from outside of this package, and of their source files."""
+    """Digests of the user-defined estimators among those named, and of their source files."""
     found: dict[str, str] = {}
     for name in names:
         digest = _Digest()
@@ -106,9 +106,9 @@ def estimator_contents(*names: str) -> dict[str, str]:
 
 
 def differences(theirs: Mapping[str, Any], ours: Mapping[str, Any]) -> str | None:
-    """The first three entries that differ, as a message tells them; None where none does.
+    """Describe the first three entries that differ in a message; None if none does.
 
-    Digests of what only one of the two has come last: another entry says why.
+    Digests that only one of the two has come last, since another entry gives the reason.
     """
     different = [name for name in dict(theirs) | dict(ours) if theirs.get(name) != ours.get(name)]
     different.sort(key=lambda name: _digests(theirs, ours, name) and (name not in theirs or name not in ours))
@@ -130,7 +130,7 @@ def _difference(name: str, theirs: Mapping[str, Any], ours: Mapping[str, Any]) -
 
 @functools.cache
 def _own_code(without: tuple[str, ...] = ()) -> str:
-    """Digest of this package's source, less some parts of mjx_study."""
+    """Digest of this package's source, except some parts of mjx_study."""
     package = Path(__file__).parent
     files = sorted([*package.rglob("*.py"), *(package.parent / "estimators").rglob("*.py")])
     left_out = [package / part for part in without]
@@ -143,7 +143,7 @@ def _own_code(without: tuple[str, ...] = ()) -> str:
 
 @functools.cache
 def code_of(module: str) -> str:
-    """Digest of what a measurement of the ledger rests on: a module, what it imports of its package, the code below.
+    """Digest the code behind a ledger measurement: a module, its imports from its own package, and the code below.
 
     Args:
         module: name of an imported module.
@@ -164,14 +164,14 @@ def code_of(module: str) -> str:
 
 
 class _Digest:
-    """A digest of values, and of the source files of functions among them.
+    """A digest of values, including the source files of functions among them.
 
     Args:
-        exact: to the bit, and of all that a trace may read, where other digests are the same on every processor.
+        exact: digest values to the bit, with all that a trace may read; otherwise independently of the processor.
 
     Attributes:
-        sources: digests of the source files of functions and classes from outside of this package.
-        foreign: whether there are any, those of an interactive session included.
+        sources: digests of the source files of functions and classes from outside this package.
+        foreign: whether there are any, including those of an interactive session.
     """
 
     def __init__(self, *, exact: bool = False) -> None:
@@ -181,11 +181,11 @@ class _Digest:
         self.sources: dict[str, str] = {}
 
     def hexdigest(self) -> str:
-        """Sixteen digits."""
+        """Return the digest as sixteen hexadecimal digits."""
         return self._sha.hexdigest()[:16]
 
     def add(self, value: Any) -> None:
-        """Enter a value and all that it holds."""
+        """Add a value and everything it contains."""
         if value is None or isinstance(value, bool | int | str | bytes | enum.Enum):
             self._note(type(value).__name__, repr(value))
         elif isinstance(value, float | np.ndarray | np.generic | jax.Array):
@@ -196,7 +196,7 @@ class _Digest:
         elif id(value) in self._seen:
             self._note("again", str(self._seen[id(value)][0]))
         else:
-            self._seen[id(value)] = len(self._seen), value  # kept, so that no other object gets its id
+            self._seen[id(value)] = len(self._seen), value  # kept alive, so that its id is not reused
             self._compound(value)
 
     def _compound(self, value: Any) -> None:
@@ -216,7 +216,7 @@ class _Digest:
             self._all("method", (value.__self__, value.__func__))
         elif isinstance(value, types.FunctionType):
             self._function(value)
-        elif hasattr(value, "__wrapped__"):  # what jit and the like return
+        elif hasattr(value, "__wrapped__"):  # functions wrapped by jit and the like
             self.add(value.__wrapped__)
         elif dataclasses.is_dataclass(value):
             fields = [(field.name, getattr(value, field.name)) for field in dataclasses.fields(value)]
@@ -234,7 +234,7 @@ class _Digest:
             self.add(value)
 
     def _array(self, value: Any) -> None:
-        """Digest an array by value, to 40 bits of mantissa: the last bits depend on the processor."""
+        """Add an array by value, to 40 bits of mantissa, since the last bits depend on the processor."""
         if isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jax.dtypes.prng_key):
             value = jax.random.key_data(value)
         array = np.asarray(value)
@@ -248,7 +248,7 @@ class _Digest:
         self._sha.update(repr(array.tolist()).encode() if array.dtype.kind == "O" else array.tobytes())
 
     def _scene(self, scene: Scene) -> None:
-        """MuJoCo's model, and those of its arrays that someone changed in MJX's."""
+        """Add MuJoCo's model, and the arrays that were changed in MJX's."""
         if self._exact:
             saved = np.empty(mujoco.mj_sizeModel(scene.host), np.uint8)
             mujoco.mj_saveModel(scene.host, None, saved)
@@ -262,7 +262,7 @@ class _Digest:
                     self._all(f"mjx.{field.name}", (ours,))
 
     def _model(self, model: mujoco.MjModel) -> None:
-        """Arrays, options and statistics; what is zero is left out, as fields of a later MuJoCo are."""
+        """Add arrays, options and statistics except zeros, so that new fields of a later MuJoCo do not matter."""
         for part, struct in (("", model), ("opt.", model.opt), ("stat.", model.stat)):
             for name in sorted(set(dir(struct))):
                 value = None if IRRELEVANT.fullmatch(name) else getattr(struct, name)
@@ -278,7 +278,7 @@ class _Digest:
         if versioned:
             return
         self._source(function.__module__)
-        if _file(function.__module__) is None:  # of an interactive session
+        if _file(function.__module__) is None:  # from an interactive session
             self._code(function.__code__)
         for name in sorted(_names(function.__code__)):
             value = function.__globals__.get(name)
@@ -291,7 +291,7 @@ class _Digest:
             self._code(constant) if isinstance(constant, types.CodeType) else self._note(repr(constant))
 
     def _source(self, module: str) -> None:
-        """The source file of a module, and of those beside it that it imports."""
+        """Add the source file of a module, and of neighbouring modules that it imports."""
         path = _file(module)
         self.foreign |= not _by_version(module)
         if _by_version(module) or path is None:
@@ -314,13 +314,13 @@ def _by_version(module: str) -> bool:
 
 
 def _file(module: str) -> Path | None:
-    """Path of a module's source; None in an interactive session, or for compiled modules."""
+    """Path of a module's source; None in an interactive session or for compiled modules."""
     file = getattr(sys.modules.get(module), "__file__", None)
     return Path(file) if file is not None and Path(file).is_file() else None
 
 
 def _beside(other: str, module: str, root: Path) -> bool:
-    """Whether a module is of the same package as another, or a file of the same folder tree."""
+    """Whether a module is in the same package as another, or in the same folder tree."""
     path = _file(other)
     if path is None or other.partition(".")[0] == module.partition(".")[0]:
         return path is not None
@@ -328,15 +328,15 @@ def _beside(other: str, module: str, root: Path) -> bool:
 
 
 def _closure(function: types.FunctionType) -> dict[str, Any]:
-    """Variables that a function closes over, by name."""
+    """Variables captured by a function, by name."""
     held = {}
     for name, cell in zip(function.__code__.co_freevars, function.__closure__ or (), strict=True):
-        with suppress(ValueError):  # a cell that is empty still
+        with suppress(ValueError):  # a cell that is still empty
             held[name] = cell.cell_contents
     return held
 
 
 def _names(code: types.CodeType) -> set[str]:
-    """Global names that a function uses, those of functions within it included."""
+    """Global names used by a function, including those of nested functions."""
     inner = (each for each in code.co_consts if isinstance(each, types.CodeType))
     return set(code.co_names).union(*(_names(each) for each in inner))

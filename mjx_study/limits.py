@@ -1,25 +1,25 @@
-"""Limits on the size of a plan; a larger one is refused before anything is computed."""
+"""Limits on the size of a plan; larger plans are rejected before anything is computed."""
 
 from typing import Final
 
 MOST_MODELS: Final = 5_000
-"""Most contact models of one task."""
+"""Maximum number of contact models per task."""
 MOST_CELLS: Final = 50_000
-"""Most cells of a sweep; each is a file."""
+"""Maximum number of cells in a sweep, each of which is a file."""
 MOST_PROGRAMS: Final = 500
-"""Most programs that a sweep compiles: each timestep, cone and task needs its own."""
+"""Maximum number of programs compiled by a sweep: each timestep, cone and task needs its own."""
 MOST_PARAMS: Final = 10_000_000
-"""Most parameters of a network."""
+"""Maximum number of network parameters."""
 MOST_LAYERS: Final = 100
-"""Most hidden layers of a network."""
+"""Maximum number of hidden layers."""
 MOST_STEPS: Final = 1_000_000
-"""Most steps of a rollout."""
+"""Maximum number of rollout steps."""
 MOST_GIB: Final = 16.0
-"""Most memory for the arrays held at once [GiB], as `mjx_study.study.memory.check_memory` counts them."""
+"""Maximum memory for arrays held at once [GiB], as counted by `mjx_study.study.memory.check_memory`."""
 
 
 def check_count(count: int, what: str, limit: int, change: str) -> None:
-    """Refuse a count above its limit.
+    """Raise an error if a count exceeds its limit.
 
     Raises:
         ValueError: names the limit and what to change.

@@ -1,7 +1,7 @@
 """Every option, described once: name, type, range, unit and one line of help.
 
-The command line, TOML files and configurations in Python are checked against these descriptions. A configuration sets
-the defaults and may narrow a range.
+The command line, TOML files and Python configurations are validated against these descriptions. A configuration sets
+defaults and may narrow ranges.
 """
 
 import dataclasses
@@ -15,12 +15,12 @@ from estimators.catalogue import BASELINES, CATALOGUE, DENSITIES, VARIANCE_PROXI
 from mjx_study.choices import CONES, FAMILIES, INTEGRATORS, ONSETS, REFERENCE, SOLVERS, unknown
 
 MOST_VALUES: Final = 10_000
-"""Most values of one list or range."""
+"""Maximum number of values in a list or range."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Interval:
-    """An interval in the usual notation, such as "(0, 1]"; a square bracket at an infinite end includes infinity."""
+    """An interval in standard notation, such as "(0, 1]"; a square bracket at an infinite end includes infinity."""
 
     text: str
 
@@ -33,7 +33,7 @@ class Interval:
         return float(self.text[1:-1].split(",")[1])
 
     def __contains__(self, value: Any) -> bool:
-        if abs(value) > sys.float_info.max and isinstance(value, Integral):  # larger than any float
+        if abs(value) > sys.float_info.max and isinstance(value, Integral):  # too large for a float
             return False
         above = value >= self.low if self.text[0] == "[" else value > self.low
         below = value <= self.high if self.text[-1] == "]" else value < self.high
@@ -50,20 +50,20 @@ class Interval:
 
 @dataclasses.dataclass(frozen=True)
 class Option:
-    """One option.
+    """Description of an option.
 
     Attributes:
-        name: name of the configuration's field.
+        name: name of the configuration field.
         kind: int, float, str or bool; bool is a flag on the command line.
         metavar: placeholder for a value in the help.
         interval: range of its numbers.
         unit: unit of its numbers.
-        choices: accepted names; beside numbers if it has an interval as well.
-        own: whether it also takes a user's own `module:name`.
-        label: noun for a value in messages; empty for the name.
-        many: whether it takes a list; set by the configuration that holds it.
-        unset: default to show in the help if the configuration has none.
-        flag: flag on the command line; empty for the name.
+        choices: accepted names, in addition to numbers if there is an interval.
+        own: whether it also accepts a user-defined `module:name`.
+        label: noun for a value in messages; by default the name.
+        many: whether it takes a list; set by the configuration that contains it.
+        unset: default shown in the help if the configuration has none.
+        flag: flag on the command line; by default the name.
     """
 
     name: str
@@ -80,7 +80,7 @@ class Option:
     flag: str = ""
 
     def within(self, interval: str) -> "Option":
-        """The option with another range."""
+        """Return the option with another range."""
         return dataclasses.replace(self, interval=Interval(interval))
 
     def check(self, value: Any) -> Any:
@@ -101,10 +101,10 @@ class Option:
         return value
 
     def parse(self, text: str) -> Any:
-        """Parse text: a number, a name, or a list of them, in which numbers may be ranges FROM:TO:COUNT[:log].
+        """Parse text: a number, a name, or a list of them, which may include ranges FROM:TO:COUNT[:log].
 
         Raises:
-            ValueError: as `check`, or not a number.
+            ValueError: as for `check`, or not a number.
         """
         if not self.many:
             return self.check(self._parse_one(text.strip() if self.kind is not str else text))
@@ -114,10 +114,10 @@ class Option:
         return self.check(tuple(each for part in parts for each in self._parse_range(part)))
 
     def read(self, value: Any) -> Any:
-        """Read a value from a file: a number, a name, or a list of them; a list may be text as for `parse`.
+        """Read a value from a file: a number, a name, or a list of them; lists may be text as for `parse`.
 
         Raises:
-            ValueError: as `parse`.
+            ValueError: as for `parse`.
         """
         if not self.many:
             return self._typed(self.check(value))
@@ -126,7 +126,7 @@ class Option:
         return tuple(self._typed(each) for each in self.check(value if isinstance(value, list) else [value]))
 
     def describe(self, default: Any = None) -> str:
-        """Help text: the line, the unit and the default."""
+        """Return the help text: line, unit and default."""
         default = ",".join(map(str, default)) if isinstance(default, tuple) else default
         told = self.unset if default is None else f"{default:g}" if isinstance(default, float) else str(default)
         return self.line + (f" [{self.unit}]" if self.unit else "") + (f" (default: {told})" if told else "")
@@ -169,7 +169,7 @@ class Option:
 
 
 def _whole(value: str | float) -> Any:
-    """A whole number as int, such as 1e5; anything else unchanged."""
+    """Convert a whole number such as 1e5 to int; return anything else unchanged."""
     try:
         return int(float(value)) if float(value).is_integer() else value
     except ValueError:
@@ -177,7 +177,7 @@ def _whole(value: str | float) -> Any:
 
 
 def _plain(value: Any) -> str:
-    """A number in few characters, for messages."""
+    """Format a number briefly for messages."""
     try:
         return f"{int(value)}" if value == int(value) and abs(value) < 1e16 else f"{value:g}"
     except (OverflowError, ValueError):
@@ -185,19 +185,19 @@ def _plain(value: Any) -> str:
 
 
 def _short(value: Any) -> str:
-    """A value's repr, truncated."""
+    """Truncated repr of a value."""
     try:
         text = repr(value)
     except ValueError:  # an integer with more digits than Python prints
-        return "a number of thousands of digits"
+        return "a number with thousands of digits"
     return text if len(text) <= 60 else f"{text[:50]}..."
 
 
 def expand_range(text: str) -> list[float]:
-    """The numbers of FROM:TO:COUNT, evenly spaced, or FROM:TO:COUNT:log, in equal ratios; both ends are exact.
+    """Expand FROM:TO:COUNT (evenly spaced) or FROM:TO:COUNT:log (equal ratios); both ends are exact.
 
     Raises:
-        ValueError: not such a range, or more than `MOST_VALUES` numbers.
+        ValueError: not a range, or more than `MOST_VALUES` numbers.
     """
     parts = text.split(":")
     log = parts[3:] == ["log"]
@@ -298,17 +298,17 @@ OPTIONS: Final[dict[str, Option]] = {
 
 
 class Checked:
-    """Base of a configuration, a frozen dataclass whose fields are options: each is checked when it is made.
+    """Base of configurations: frozen dataclasses whose fields are options, each checked on construction.
 
     Attributes:
-        ranges: intervals of the options that this configuration narrows.
+        ranges: narrower intervals for some of the options.
     """
 
     ranges: ClassVar[dict[str, str]] = {}
 
     @classmethod
     def option(cls, name: str) -> Option:
-        """An option with this configuration's range, and whether it is a list here."""
+        """Return an option with this configuration's range, marked as a list if it is one here."""
         option = OPTIONS[name].within(cls.ranges[name]) if name in cls.ranges else OPTIONS[name]
         return dataclasses.replace(option, many="tuple" in str(cls.__annotations__[name]))
 

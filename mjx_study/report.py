@@ -33,7 +33,7 @@ SUMMARY: Final = {
     "landscapes": "At the largest sample count.",
 }
 PRESENT: Final = ("residual", "rollouts", "unconverged")
-"""For every kind of study, a variable that is finite wherever a cell has been computed."""
+"""For every kind of study, a variable that is finite in every computed cell."""
 COLUMNS: Final = {
     "variance": "variance",
     "effective_samples": "effective samples",
@@ -70,7 +70,7 @@ def report(dataset: xr.Dataset) -> str:
 
 
 def _figure(name: str, figure: Figure) -> tuple[str, str, str]:
-    """Its name, caption and image."""
+    """Name, caption and image of a figure."""
     file = io.BytesIO()
     figure.savefig(file, format="png", dpi=110)
     caption = next(text for key, text in CAPTIONS.items() if name.startswith(key))
@@ -101,7 +101,7 @@ def _numbers(dataset: xr.Dataset) -> tuple[list[str], list[list[str]]] | None:
 
 
 def _with_extremes(dataset: xr.Dataset) -> xr.Dataset:
-    """A landscape summarised by its extremes."""
+    """Summarise a landscape by its extremes."""
     least = dataset["smoothed"].fillna(np.inf).argmin("point")
     found = {
         "least_cost": dataset["smoothed"].min("point"),
@@ -113,7 +113,7 @@ def _with_extremes(dataset: xr.Dataset) -> xr.Dataset:
 
 
 def _reduced(name: str, values: xr.DataArray) -> float:
-    """One number for all seeds, and for the last tenth of the iterations."""
+    """Reduce to one number over all seeds, and over the last tenth of the iterations."""
     array = np.asarray(values.values, float)
     if name == "stopped_at":
         return float(np.sum(np.isfinite(array)))

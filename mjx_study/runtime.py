@@ -1,4 +1,4 @@
-"""Settings of the process: precision, devices, compilation cache. Called explicitly, never at import."""
+"""Process-wide settings: precision, devices, compilation cache. Applied by an explicit call, never on import."""
 
 import hashlib
 import os
@@ -17,12 +17,12 @@ _TRACES: Final[list[Path]] = []
 
 
 def configure(*, precision: str = "float64", cpu_devices: int | None = None, cache: str | Path | None = None) -> None:
-    """Set up JAX for a study and send MuJoCo's warnings to standard error; call it before making any array.
+    """Set up JAX for a study and send MuJoCo's warnings to standard error; call before creating any array.
 
     Args:
         precision: float64 or float32. Stiff contact needs float64: equivalent float32 programs of one rollout differ in
             the second digit.
-        cpu_devices: number of CPU devices, that is, of cores that samples use; None for all.
+        cpu_devices: number of CPU devices, and so of cores that samples use; None for all.
         cache: folder for compiled programs kept between runs; None for `default_cache()`.
 
     Raises:
@@ -44,15 +44,15 @@ def configure(*, precision: str = "float64", cpu_devices: int | None = None, cac
 
 
 def available_cores() -> int:
-    """Cores this process may run on."""
+    """Number of cores this process may run on."""
     affinity = getattr(os, "sched_getaffinity", None)
     return len(affinity(0)) if affinity else os.cpu_count() or 1
 
 
 def default_cache() -> Path | None:
-    """Default folder of compiled programs, `$XDG_CACHE_HOME/mjx-study/<processor>`; None without a home folder.
+    """Default folder for compiled programs, `$XDG_CACHE_HOME/mjx-study/<processor>`; None without a home folder.
 
-    A program compiled for one processor may use instructions that another lacks, so each has its own folder.
+    Programs compiled for one processor may use instructions that another lacks, so each has its own folder.
     """
     try:
         root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
@@ -62,7 +62,7 @@ def default_cache() -> Path | None:
 
 
 def traces_folder() -> Path | None:
-    """Folder of the traces of programs that are kept between runs; None unless `configure` set it up."""
+    """Folder for program traces kept between runs; None unless set up by `configure`."""
     return _TRACES[0] if _TRACES else None
 
 
@@ -81,12 +81,12 @@ def processor_name() -> str:
 
 
 def precision() -> str:
-    """float64 or float32, as JAX is set."""
+    """float64 or float32, as JAX is configured."""
     return "float64" if jax.config.read("jax_enable_x64") else "float32"
 
 
 def environment() -> dict[str, Any]:
-    """Versions, machine, devices and precision, on which results depend beside their configuration."""
+    """Versions, machine, devices and precision: what results depend on besides their configuration."""
     names = ("mjx-study", "mujoco", "mujoco-mjx", "jax", "jaxlib", "numpy")
     return {
         "versions": {name: metadata.version(name) for name in names},

@@ -1,10 +1,10 @@
-"""Times of compiled programs while a study runs: their calls, and what comes before the first one.
+"""Run times of compiled programs during a study: their calls, and the tracing and compilation before the first one.
 
     with Stopwatch().running() as watch:
         with timed("rollouts", calls=4): ...
     watch.spent["rollouts"].each
 
-Where no stopwatch runs, `timed` does nothing. Times are of the thread that runs it; what is timed within is left out.
+Without a running stopwatch, `timed` does nothing. Times are those of its own thread, without nested timings.
 """
 
 import dataclasses
@@ -21,9 +21,9 @@ import numpy as np
 
 TRACING: Final = ("/jax/core/compile/jaxpr_trace_duration", "/jax/core/compile/jaxpr_to_mlir_module_duration")
 COMPILING: Final = "/jax/core/compile/backend_compile_duration"
-"""XLA's compilation, or the reading of what is compiled already."""
+"""JAX's event for XLA compilation, or for reading a compiled program."""
 SAVED: Final = "/jax/compilation_cache/compile_time_saved_sec"
-"""What compilation would have taken in addition to reading."""
+"""JAX's event for the compilation time saved by reading."""
 
 
 @dataclasses.dataclass
@@ -31,10 +31,10 @@ class Spent:
     """Times of one program [s].
 
     Attributes:
-        calls, seconds: of calls for which nothing was compiled.
-        setups, first_calls, first: times that something was, with the calls that followed at once, and all their time.
-        traced, read, compiled: of it, by what JAX tells, tracing, compiling or reading what is compiled already, and
-            what compiling would have taken.
+        calls, seconds: number and total time of calls without compilation.
+        setups, first_calls, first: number of compilations, number of calls timed with them, and their total time.
+        traced, read, compiled: shares of `first` reported by JAX: tracing, compiling or reading a compiled program, and
+            the time that compiling takes without a cache.
     """
 
     calls: int = 0
@@ -55,7 +55,7 @@ class Spent:
 
     @property
     def each(self) -> float:
-        """Seconds per call, of the first ones where there are no others."""
+        """Seconds per call, estimated from first calls if there are no others."""
         if self.calls:
             return self.seconds / self.calls
         return max(0.0, self.first - self.traced - self.read) / max(1, self.first_calls)
@@ -72,7 +72,7 @@ class Spent:
 
     @property
     def _setup(self) -> float:
-        """Seconds of tracing, and of compiling or reading: by this clock, which may be another than JAX's."""
+        """Seconds of tracing, and compiling or reading, by this clock, which may differ from JAX's."""
         return max(0.0, self.first - self.first_calls * self.each) / self.setups
 
 
@@ -80,8 +80,8 @@ class Stopwatch:
     """Times by program, for one thread.
 
     Attributes:
-        saved: when they were last written [s], by `time.monotonic`.
-        clock: seconds, the wall's.
+        saved: time of the last write to disk [s], by `time.monotonic`.
+        clock: wall clock [s].
     """
 
     clock = staticmethod(time.perf_counter)
@@ -89,12 +89,12 @@ class Stopwatch:
     def __init__(self) -> None:
         self.spent: dict[Hashable, Spent] = {}
         self.saved = -math.inf
-        self._events = np.zeros(3)  # tracing, reading or compiling, compiling when it is not in the cache
-        self._within = np.zeros(4)  # wall and events of what is timed inside of what is being timed
+        self._events = np.zeros(3)  # tracing; reading or compiling; compiling as if there were no cache
+        self._within = np.zeros(4)  # wall time and events of nested timings
 
     @contextmanager
     def running(self) -> Generator["Stopwatch"]:
-        """Make this the stopwatch of `timed` in this thread."""
+        """Make this stopwatch the target of `timed` in this thread."""
         jax.monitoring.register_event_duration_secs_listener(self._hear)
         token = _RUNNING.set(self)
         try:
@@ -134,11 +134,11 @@ _RUNNING: ContextVar[Stopwatch | None] = ContextVar("stopwatch", default=None)
 
 @contextmanager
 def timed(program: Hashable, calls: int = 1) -> Generator[None]:
-    """Time calls of a program, if a stopwatch runs; the first time includes what comes before, see `Spent`.
+    """Time calls of a program if a stopwatch runs; the first time includes tracing and compilation, see `Spent`.
 
     Args:
-        program: its name, to which several times add up.
-        calls: how many calls one after another.
+        program: name under which times accumulate.
+        calls: number of consecutive calls.
     """
     watch = _RUNNING.get()
     if watch is None:
@@ -149,14 +149,14 @@ def timed(program: Hashable, calls: int = 1) -> Generator[None]:
 
 
 def tell(program: Hashable, calls: int, seconds: float) -> None:
-    """Add calls that were timed otherwise, as in another thread, if a stopwatch runs."""
+    """Add calls timed elsewhere, such as in another thread, if a stopwatch runs."""
     watch = _RUNNING.get()
     if watch is not None:
         watch.spent.setdefault(program, Spent()).add(calls, seconds)
 
 
 def unheard(call: Callable[[], Any]) -> Callable[[], Any]:
-    """The call, for a thread beside those that are timed, so that no program's time has what it compiles."""
+    """Wrap a call for an untimed thread, so that its compilations are not attributed to any program."""
 
     def told() -> Any:
         _UNHEARD.set(True)

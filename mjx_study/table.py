@@ -4,13 +4,13 @@ from collections.abc import Iterable, Sequence
 
 
 def format_table(rows: Sequence[Sequence[str]], header: Sequence[str]) -> list[str]:
-    """Right-aligned columns two spaces apart."""
+    """Format right-aligned columns two spaces apart."""
     widths = [max(map(len, cells)) for cells in zip(header, *rows, strict=True)]
     return ["  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in (header, *rows)]
 
 
 def digits_to_tell_apart(values: Iterable[float | int], least: int = 6) -> int:
-    """Significant digits, `least` or more, with which different values get different texts; 17 do for any."""
+    """Significant digits, at least `least`, that give different values different texts; 17 suffice for any."""
     distinct = set(values)
     return next(
         (digits for digits in range(least, 17) if len({f"{value:.{digits}g}" for value in distinct}) == len(distinct)),
@@ -19,18 +19,18 @@ def digits_to_tell_apart(values: Iterable[float | int], least: int = 6) -> int:
 
 
 def count(number: int) -> str:
-    """A count to four digits, in groups of three."""
+    """Format a count to four digits, in groups of three."""
     return f"{float(f'{number:.4g}'):,.0f}"
 
 
 def size(number: int | float) -> str:
-    """A number of bytes to two digits, in the unit that suits it."""
+    """Format a number of bytes to two digits, in a suitable unit."""
     unit, least = next((each for each in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)) if number >= each[1]), ("bytes", 1))
     return f"{_rounded(number / least)} {unit}"
 
 
 def duration(seconds: float | int) -> str:
-    """A time to two digits, in the unit that suits it."""
+    """Format a time to two digits, in a suitable unit."""
     longer = (("days", 86400), ("h", 3600), ("min", 60))
     unit, length = next((each for each in longer if seconds >= 2 * each[1]), ("s", 1))
     return f"{_rounded(seconds / length)} {unit}"
