@@ -228,7 +228,7 @@ def force_stage(
 ) -> mjx.Data:
     data = data.replace(qvel=qvel, act=act, ctrl=control)
     with patched():
-        data = mjx.make_constraint(model, data)  # again, since aref depends on qvel
+        data = mjx.make_constraint(model, data)  # again: aref depends on qvel
         data = mjx.fwd_velocity(model, data)
         data = mjx.fwd_actuation(model, data)
         return mjx.fwd_acceleration(model, data)
