@@ -78,7 +78,7 @@ CATALOGUE: dict[str, Entry] = {
             "aobg",
             "AoBG",
             ("evaluation", "differentiation"),
-            "alpha order: the two interpolated within an error of gamma",
+            "alpha order: the two interpolated with an error of at most gamma",
         ),
         Entry(
             "aobg_onset",
@@ -112,7 +112,7 @@ CATALOGUE: dict[str, Entry] = {
             "delta",
             "delta",
             ("evaluation", "differentiation"),
-            "first-order mean and a zeroth-order estimate of what it leaves over; noise on theta itself",
+            "first-order mean plus a zeroth-order estimate of the remainder; noise on theta itself",
             ("sigma",),
         ),
     )

@@ -149,9 +149,7 @@ def check_confidence_arguments(failure_probability: float, variance_proxy: str, 
     if isinstance(radius, str) and radius != MAX_DEVIATION:
         raise ValueError(f"radius must be {MAX_DEVIATION!r} or a number; got {radius!r}")
     if variance_proxy == "upper_bound" and isinstance(radius, str):
-        raise ValueError(
-            f"variance_proxy 'upper_bound' needs a bound on ||g_i - E g|| as radius; got {radius!r}, which is none"
-        )
+        raise ValueError(f"variance_proxy 'upper_bound' requires radius to be a bound on ||g_i - E g||; got {radius!r}")
     if isinstance(radius, int | float) and not 0.0 <= radius < float("inf"):
         raise ValueError(
             f"radius must be finite and not negative; got {radius}; without a bound, pass {MAX_DEVIATION!r}"

@@ -173,6 +173,6 @@ def draw_at(
         oracle = ORACLES[name]
         method = getattr(objective, oracle.method, None)
         if method is None:
-            raise ValueError(f"{type(objective).__name__} has no {oracle.method}, which {oracle.phrase} comes from")
+            raise ValueError(f"{type(objective).__name__} has no method {oracle.method} for {oracle.phrase}")
         batches[name] = method(theta, jax.random.clone(keys[oracle.order]))  # shared on purpose
     return batches

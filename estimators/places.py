@@ -23,7 +23,7 @@ def load_module(name: str) -> ModuleType:
         ValueError: Importing the module raises.
     """
     if not all(part.isidentifier() for part in name.split(".")) or name.endswith(".py"):
-        raise MissingModuleError(f"{name!r} is no module: write it as in an import, without a folder or .py")
+        raise MissingModuleError(f"{name!r} is not a module name: write it as in an import, without a folder or .py")
     importlib.invalidate_caches()
     try:
         return importlib.import_module(name)

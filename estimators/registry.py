@@ -23,7 +23,7 @@ def register(estimator: EstimatorClass) -> EstimatorClass:
     """
     _check_class(estimator, estimator.__name__)
     if estimator.name in ESTIMATORS:
-        raise ValueError(f"there is an estimator {estimator.name!r} already: give this one another name")
+        raise ValueError(f"there is already an estimator {estimator.name!r}: choose another name")
     ESTIMATORS[estimator.name] = estimator
     name, label = estimator.name, estimator.label
     entry = Entry(name, label, estimator.needs, estimator.description, estimator.required())
@@ -59,7 +59,7 @@ def find_estimator(name: str) -> Estimator | type[Estimator]:
 
 def _check_class(found: Any, place: str) -> Any:
     if not isinstance(found, Estimator) and not (isinstance(found, type) and issubclass(found, Estimator)):
-        raise ValueError(f"{place} is neither an Estimator nor a class of them, but of type {type(found).__name__}")
+        raise ValueError(f"{place} is neither an Estimator nor an Estimator class, but of type {type(found).__name__}")
     missing = [part for part in ("name", "needs") if not getattr(found, part, None)]
     missing += sorted(getattr(found, "__abstractmethods__", ()))
     if missing:

@@ -70,7 +70,7 @@ def test_optimise_takes_it_and_goes_on(folder: Path, capsys: pytest.CaptureFixtu
         (None, "unknown|one of zobg, .*, or module:name of your own \\(there is no module 'my_estimators' here or"),
         ("1 +", "importing my_estimators raised SyntaxError"),
         ("def other(): ...", "my_estimators has no 'SignAgreement'; it has other"),
-        ("SignAgreement = 3", "SignAgreement is neither an Estimator nor a class of them, but of type int"),
+        ("SignAgreement = 3", "SignAgreement is neither an Estimator nor an Estimator class, but of type int"),
         (CODE.replace("combine", "mix"), "SignAgreement has no combine: an Estimator needs them"),
         (CODE.replace('"differentiation"', '"gradients"'), "needs gradients; the oracles are evaluation, pair, "),
         (CODE.replace(': str = "zero_noise"', ": str").replace("baseline", "level"), "needs the option level; set it"),
@@ -105,7 +105,7 @@ def test_a_registered_one_has_a_name(monkeypatch: pytest.MonkeyPatch) -> None:
     assert ESTIMATORS["twice"] is Twice and make_estimator("twice") == Twice() != FirstOrder()
     assert CATALOGUE["twice"].label == "FoBG, twice" and StudyConfig.option("estimators").check(("twice",))
     assert style_of("twice")[0] == "FoBG, twice"
-    with pytest.raises(ValueError, match="there is an estimator 'twice' already"):
+    with pytest.raises(ValueError, match="there is already an estimator 'twice'"):
         register(Twice)
     with pytest.raises(ValueError, match="Nameless has no name and no needs"):
         register(type("Nameless", (Estimator,), {"combine": lambda self: None}))

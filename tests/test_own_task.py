@@ -222,7 +222,7 @@ def test_no_such_module(write) -> None:
     assert refused("mine.tasks:hop").endswith("(there is no module 'mine' here or installed)")
     assert refused("ball_wall:dom").startswith("unknown task 'ball_wall:dom'; did you mean ball_wall:dome? (")
     for name in ("mine.py:hop", "folder/mine:hop", ":hop", ".mine:hop"):
-        assert refused(name).endswith("is no module: write it as in an import, without a folder or .py)")
+        assert refused(name).endswith("is not a module name: write it as in an import, without a folder or .py)")
     message = "importing inner raised ModuleNotFoundError: No module named 'nowhere_at_all' (inner.py, line 1)"
     assert refused("inner:hop") == message
 
@@ -237,7 +237,7 @@ def test_no_such_module(write) -> None:
         ("", "mine has no 'hop'; it has no task"),
         ("from math import pi\ndef hip(): ...", "mine has no 'hop'; it has hip"),
         ("hop = 3", "mine:hop is neither a Task nor a function that returns one, but of type int"),
-        ("def hop(): ...", "mine:hop returned no Task, but something of type NoneType"),
+        ("def hop(): ...", "mine:hop returned an object of type NoneType instead of a Task"),
         ("def hop():\n  return 1 / 0", "mine:hop raised ZeroDivisionError: division by zero (mine.py, line 2)"),
         ("def hop(kind): ...", "mine:hop needs kind, which is not given: give it a default"),
         (
@@ -255,7 +255,7 @@ def test_options_that_a_function_does_not_take(write) -> None:
     write("def hop(horizon): ...\ndef hip(*, cone=None, **rest): return rest")
     message = "mine:hop does not take cone and model: give it an argument of this name, or **options"
     assert refused("mine:hop", horizon=3, cone="elliptic", model="a.xml") == message
-    assert refused("mine:hip", horizon=3).endswith("something of type dict")
+    assert refused("mine:hip", horizon=3).endswith("an object of type dict instead of a Task")
 
 
 def test_a_task_takes_no_options(write) -> None:

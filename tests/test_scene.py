@@ -118,7 +118,7 @@ def test_the_adjoint_is_chosen_by_size_or_by_name() -> None:
     chosen = [[put_scene(host, "here", adjoint=name).uses_jacobian for name in ADJOINTS] for host in hosts]
     assert chosen == [[True, True, False], [False, True, False]]
     assert not make_task("tennis", adjoint="tape").scene.uses_jacobian
-    with pytest.raises(SceneError, match="double_pendulum: no Jacobian is formed of RK4's steps"):
+    with pytest.raises(SceneError, match="double_pendulum: the adjoint 'jacobian' does not support RK4"):
         load_scene("double_pendulum", adjoint="jacobian")
 
 

@@ -150,7 +150,7 @@ def _nodes(cuts: Float[np.ndarray, " cuts"]) -> tuple[Float[np.ndarray, " nodes"
 def check_noise(sigma: float) -> None:
     """Raise ValueError unless sigma is positive and finite."""
     if not (sigma > 0 and math.isfinite(sigma)):
-        raise ValueError(f"sigma must be positive and finite, in the unit of what it is added to; got {sigma}")
+        raise ValueError(f"sigma must be positive and finite, in the unit of the quantity it is added to; got {sigma}")
 
 
 def _copies(point: float, period: float, centre: float, reach: float) -> Float[np.ndarray, " copies"]:

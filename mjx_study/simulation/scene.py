@@ -73,7 +73,7 @@ class Scene:
         if self.adjoint not in ADJOINTS:
             raise SceneError(f"unknown adjoint {self.adjoint!r}; choose from {', '.join(ADJOINTS)}")
         if self.adjoint == "jacobian" and self._explicit:
-            raise SceneError(f"{self.name}: no Jacobian is formed of RK4's steps; choose the adjoint auto or tape")
+            raise SceneError(f"{self.name}: the adjoint 'jacobian' does not support RK4; choose auto or tape")
 
     @property
     def uses_jacobian(self) -> bool:

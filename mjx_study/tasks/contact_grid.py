@@ -129,7 +129,7 @@ def check_reference(task: Task) -> None:
     if task.reference is None:
         raise ValueError(f"{task.name} has no analytic reference")
     if task.onset != "none":
-        raise ValueError("the analytic references have no onset term; leave onset out")
+        raise ValueError("the analytic references have no onset term; omit onset")
 
 
 def solver_grid(

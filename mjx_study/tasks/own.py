@@ -59,7 +59,7 @@ def _build(place: str, builder: object, options: dict[str, Any]) -> Task:
     except (Exception, SystemExit) as error:
         raise ValueError(f"{place} raised {described(error)}") from error
     if not isinstance(task, Task):
-        raise ValueError(f"{place} returned no Task, but something of type {type(task).__name__}")
+        raise ValueError(f"{place} returned an object of type {type(task).__name__} instead of a Task")
     return task
 
 

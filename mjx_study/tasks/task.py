@@ -80,7 +80,7 @@ class StudyDefaults:
 
     def __post_init__(self) -> None:
         if not self.stiffnesses:
-            raise ValueError("give at least one stiffness [N/m]; leave stiffnesses out otherwise")
+            raise ValueError("give at least one stiffness [N/m], or omit stiffnesses")
 
     @property
     def main_family(self) -> str:
@@ -196,4 +196,4 @@ class Task:
 def check_sigma(sigma: float) -> None:
     """Raise ValueError unless sigma is positive and finite."""
     if not 0 < sigma < math.inf:
-        raise ValueError(f"sigma must be positive and finite, in the unit of what it is added to; got {sigma}")
+        raise ValueError(f"sigma must be positive and finite, in the unit of the quantity it is added to; got {sigma}")

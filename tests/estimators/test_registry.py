@@ -228,7 +228,7 @@ def test_missing_batches_and_impossible_sizes_are_refused():
             made(name, **{option: None})
         with pytest.raises(ValueError, match=f"'{name}' needs the option {option}; set it"):
             estimate(name, OBJECTIVE, jnp.asarray(THETA), jax.random.key(0), 9)
-    with pytest.raises(ValueError, match="_Bare has no evaluate_pair, which a zeroth-order batch of pairs comes from"):
+    with pytest.raises(ValueError, match="_Bare has no method evaluate_pair for a zeroth-order batch of pairs"):
         estimate("zobg_antithetic", _Bare(), jnp.asarray(THETA), jax.random.key(0), 9)
     with pytest.raises(ValueError, match="at least 1, .* got 0"):
         estimate("zobg", OBJECTIVE, jnp.asarray(THETA), jax.random.key(0), 0)
@@ -244,7 +244,7 @@ def test_missing_batches_and_impossible_sizes_are_refused():
         ("aobg", {"gamma": float("nan")}, "gamma must be positive; got nan"),
         ("aobg", {"failure_probability": 1.5}, "strictly between 0 and 1; got 1.5"),
         ("aobg", {"variance_proxy": "sum"}, "one of variance, second_moment, upper_bound; got 'sum'"),
-        ("aobg", {"variance_proxy": "upper_bound"}, "'upper_bound' needs a bound .* got 'max_deviation'"),
+        ("aobg", {"variance_proxy": "upper_bound"}, "'upper_bound' requires radius .* got 'max_deviation'"),
         ("delta", {"sigma": 0.0}, "sigma must be positive and finite; got 0.0"),
         ("fobg_clipped", {"max_norm": float("inf")}, "max_norm must be positive and finite; got inf"),
         ("fobg_truncated", {"window": 0}, "window must be at least 1 step; got 0"),
