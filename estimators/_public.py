@@ -1,4 +1,4 @@
-"""What `estimators` offers; the package imports it when one of these names is first asked for."""
+"""Public names of `estimators`, imported when one of them is first accessed."""
 
 from estimators.alpha import alpha_order, constrained_alpha, interpolate, inverse_variance_alpha
 from estimators.baselines import BASELINES, leave_one_out, none, zero_noise
