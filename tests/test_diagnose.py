@@ -88,6 +88,15 @@ def test_every_statement_has_a_command_and_the_page_is_complete(found: Diagnosis
     assert document["best"] == found.best.estimator and document["derivatives"] == "right"
 
 
+def test_steps_are_checked_without_noise(found: Diagnosis) -> None:
+    """`gradcheck` takes --sigma only with --mean."""
+    page = dataclasses.replace(found, options=" --sigma 20 --horizon 65").lines()
+    commands = [line for line in page if line.startswith("  > ")]
+    (steps,) = [command for command in commands if "gradcheck" in command and "--mean" not in command]
+    assert steps == f"  > mjx-study gradcheck {found.subject} --horizon 65"
+    assert all("--sigma 20" in command for command in commands if command != steps)
+
+
 @pytest.mark.slow
 def test_the_advised_impedance_avoids_the_bias(found: Diagnosis, tmp_path: Path) -> None:
     (advice,) = (text for text, _ in found._advice() if "solimp" in text)

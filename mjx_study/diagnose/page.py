@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import re
 import shlex
 import textwrap
 from collections.abc import Iterator
@@ -112,7 +113,8 @@ class Diagnosis(Measurement):
         )
         parts = dict.fromkeys(part for parts in self.derivatives.unexercised.values() for part in parts)
         missing = f"; not exercised: {', '.join(parts)}" if self.derivatives.passed and parts else ""
-        lines += ["", "derivatives of a step", f"  {state}{missing}", f"  > {command.format('gradcheck')}"]
+        steps = re.sub(r" --sigma \S+", "", command.format("gradcheck"))  # without noise
+        lines += ["", "derivatives of a step", f"  {state}{missing}", f"  > {steps}"]
         batch = f"--estimators {','.join(each.estimator for each in self.estimators)} --samples {self.samples}"
         error = "relative error" if self.resolved else "error, in the gradient's unit,"
         lines += ["", f"estimators, by their {error} after a second of computing", *self._estimator_lines()]
