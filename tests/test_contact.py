@@ -282,7 +282,7 @@ def test_every_family_builds(name: str) -> None:
     scene, family = load_scene("pusher"), FAMILIES[name]
     mass = effective_mass(scene, "pusher", "slider")
     if family.solimp is None:
-        with pytest.raises(ValueError, match="use None in place of a contact model"):
+        with pytest.raises(ValueError, match="use None instead of a contact model"):
             family_model(name, scene, effective_mass=mass)
         return
     if not family.swept:

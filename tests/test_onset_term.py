@@ -325,5 +325,5 @@ def test_what_has_no_meaning_is_refused() -> None:
         model = apply_contact(scene.model, ContactModel(solref, CONTACT.solimp))
         return corrected_rollout(scene, model, start, lambda index, state: jnp.zeros(0), 2)[0].qpos[-1, 0]
 
-    with pytest.raises(TypeError, match="not in the model"):
+    with pytest.raises(TypeError, match="not over the model"):
         jax.grad(over_model)(CONTACT.solref)

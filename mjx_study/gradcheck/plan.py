@@ -108,7 +108,7 @@ def plan_scene_gradcheck(
         families = ("mjcf",) if stiffnesses is None else ("mujoco",)
     swept = any(name in FAMILIES and FAMILIES[name].swept for name in families)
     if swept and stiffnesses is None:
-        raise ValueError("a contact family with a stiffness requires --stiffness in N/m, and --pair")
+        raise ValueError("a contact family with a stiffness needs one: give --stiffness in N/m, and --pair")
     if (swept or stiffnesses is not None) and pair is None:
         raise ValueError("a stiffness in N/m requires the effective mass of a contact: give --pair GEOM,GEOM")
     subject = scene_task(scene, horizon=horizon, pair=pair)

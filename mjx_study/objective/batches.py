@@ -159,7 +159,7 @@ class MjxObjective:
             ValueError: the policy has feedback, so the score is not odd in the noise.
         """
         if not self.simulator.task.policy.additive:
-            raise ValueError("the odd part of an objective requires a policy whose noise is added to theta")
+            raise ValueError("the odd part of an objective needs a policy whose noise is added to theta")
         samples = len(keys)
         scale = np.repeat([1.0, -1.0], samples)
         values, scores, residuals = self._run("value", theta, keys, np.tile(np.arange(samples), 2), scale)

@@ -79,7 +79,7 @@ class ReferenceObjective:
         if self.horizon < 1:
             raise ValueError(f"horizon must be at least 1 step, got {self.horizon}")
         if (self.start is None) != (self.parametrises == "start"):
-            raise ValueError("start is required, except that it must be None if theta is the initial state")
+            raise ValueError("give a start, or None if theta is the initial state")
         if isinstance(self.start, tuple) and len(self.start) != self.system.num_states:
             raise ValueError(f"the start must have {self.system.num_states} entries, got {len(self.start)}")
 

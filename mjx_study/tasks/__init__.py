@@ -55,7 +55,7 @@ def make_task(name: str, **options: Any) -> Task:
         return TASKS[name](**options)
     if is_file(name):
         if "model" in options:
-            raise ValueError(f"model replaces the MJCF of a task, but {name} is itself a file")
+            raise ValueError(f"model replaces the MJCF of a task, but {name} is a file already")
         return mjcf_task(name, **options)
     place = registered_place(name)
     if place is not None:

@@ -216,7 +216,7 @@ def test_start_as_parameter_is_unbiased(order: str):
         ({"sigma": 0.0}, "sigma must be positive and finite"),
         ({"parametrises": "everything"}, "parametrises is 'everything'; choose from controls, feedback, start"),
         ({"horizon": 0}, "horizon must be at least 1 step, got 0"),
-        ({"parametrises": "start"}, "then it must be None"),
+        ({"parametrises": "start"}, "or None if theta is the initial state"),
         ({"start": None}, "give a start"),
         ({"start": (0.0, 1.0)}, "the start must have 3 entries, got 2"),
     ],
