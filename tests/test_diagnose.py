@@ -390,7 +390,7 @@ def test_the_task_of_a_file(tmp_path: Path) -> None:
     assert arm.theta.tolist() == [2.0] * 3 and arm.sigma == pytest.approx(0.4)
     start = arm.draw_start(jax.random.key(0))
     assert start.qpos.tolist() == [0.5] and start.qvel.tolist() == [1.0]
-    with pytest.raises(ValueError, match="itself a file"):
+    with pytest.raises(ValueError, match="a file already"):
         make_task(str(path), model="other.xml")
 
 
