@@ -162,7 +162,7 @@ def _step_terms(model: mjx.Model, data: mjx.Data) -> tuple[Float[Array, "nv nv"]
         states = State(*(leaf[None] for leaf in (data.qpos, data.qvel, data.act, data.qacc_warmstart)))
 
         def term(guard):
-            return onset_term(model, positioned, states, data.ctrl[None], guard, distance[guard], travel[guard])
+            return onset_term(model, data, states, data.ctrl[None], guard, distance[guard], travel[guard])
 
         here, previous, *_ = jax.vmap(term)(jnp.minimum(chosen, distance.size - 1))
         used = (chosen < distance.size)[:, None, None]

@@ -48,7 +48,7 @@ from mjx_study.simulation.dynamics import (
     advance_velocity,
     entry_by_entry,
     force_stage,
-    position_stage,
+    fwd_position,
     rollout,
     solved_step,
     step,
@@ -195,9 +195,8 @@ def _corrections(
     def term(index, guard, used):
         pick = lambda leaf: jnp.stack([leaf[index], leaf[index - 1]])  # noqa: E731
         states, inputs = jax.tree.map(pick, before), pick(controls)
-        positioned = position_stage(scene, model, before.qpos[index])
         here = distance[index, guard], travel[index, guard]
-        terms = entry_by_entry(onset_term, model, positioned, states, inputs, guard, *here)
+        terms = entry_by_entry(onset_term, model, scene.template, states, inputs, guard, *here)
         return jax.tree.map(lambda leaf: jnp.where(used, leaf, jnp.zeros_like(leaf)), terms)
 
     def fill(carry):
@@ -251,7 +250,7 @@ def onset_begins(distance: Float[Array, "*steps guards"], travel: Float[Array, "
 
 def onset_term(
     model: mjx.Model,
-    positioned: mjx.Data,
+    template: mjx.Data,
     states: State,
     controls: Float[Array, "cases nu"],
     guard: Int[Array, ""],
@@ -260,8 +259,10 @@ def onset_term(
 ) -> tuple[Float[Array, "nv nv"], Float[Array, "nv nv"], Float[Array, ""], Bool[Array, ""]]:
     """(1 - s) Delta_k n^T / D, s Delta_{k-1} n^T / D, share of the approach speed lost, and whether D was bounded.
 
-    Arguments as for `jump_of_velocity`, with steps k and k - 1 as cases, or k for both.
+    Arguments as for `jump_of_velocity`, with steps k and k - 1 as cases, or k for both; `template` has everything but
+    the position.
     """
+    positioned = fwd_position(model, template.replace(qpos=states.qpos[0]))
     jumps, normal, least = jump_of_velocity(model, positioned, states, controls, guard)
     share, cell = distance / travel, jnp.minimum(travel, -least)
     here, previous = (jnp.outer(jump, normal) / cell for jump in (jumps[0], jumps[-1]))
