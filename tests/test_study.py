@@ -40,6 +40,12 @@ def config(**changes: Any) -> StudyConfig:
     return StudyConfig(**chosen)
 
 
+@pytest.fixture(autouse=True)
+def wide(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Tables that no terminal breaks up."""
+    monkeypatch.setenv("COLUMNS", "200")
+
+
 def compare(**changes: Any) -> xr.Dataset:
     return run_study(config(**changes))
 
