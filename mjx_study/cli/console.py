@@ -35,7 +35,7 @@ def _interval(row: Row) -> str:
 
 
 def _doubt(row: Row) -> str:
-    """A mark behind a number that its batch is too small to say."""
+    """Mark for a number that rests on too few effective samples."""
     return "" if row.believable else "?"
 
 
@@ -44,7 +44,7 @@ def _effective(row: Row) -> str:
 
 
 def _with_error(value: float, error: float) -> str:
-    """Both to the second digit of the error; each for itself where that takes many characters."""
+    """Format value and error to the error's second digit, or separately where that takes many characters."""
     if not (math.isfinite(value) and 0 < error < math.inf):
         return number(value)
     if not 1e-4 <= error < 1000:
@@ -71,7 +71,7 @@ def _debiased(row: Row, value: float, debiased: float, error: float, best: float
 
 
 def columns(confidence: float, details: bool = False, *, scalar: bool = False) -> list[list[Column]]:
-    """The comparison's columns: those that identify a row, then the parts of which a table may have one or more.
+    """Columns of the comparison: those that identify a row, then groups that a table keeps together.
 
     Args:
         confidence: of intervals.
@@ -108,7 +108,7 @@ def columns(confidence: float, details: bool = False, *, scalar: bool = False) -
 
 
 def _blocks(rows: Sequence[Row], shown: list[list[Column]], width: int) -> list[list[str]]:
-    """As few tables as the width allows, each with the columns that identify its rows."""
+    """Split the columns into as few tables as the width allows, each with the identifying columns."""
     identity, *parts = shown
     blocks: list[list[Column]] = []
     for part in parts:

@@ -26,11 +26,11 @@ ENDINGS: Final = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated", si
 
 
 class UsageError(ValueError):
-    """A bad option or file: one line, exit code 2."""
+    """Invalid option or file, reported in one line with exit code 2."""
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser whose errors are UsageErrors, with a suggestion for what is misspelt."""
+    """Argument parser that raises UsageError, with suggestions for misspelt names."""
 
     def error(self, message: str) -> NoReturn:
         message = re.sub(r"^argument (?!-)\S+: ", "", message)
@@ -220,7 +220,7 @@ def add_study_options(command: argparse.ArgumentParser) -> None:
 
 
 def configure_process(options: argparse.Namespace) -> None:
-    """Set JAX up as the options ask; a command without such options gets float64 and one device.
+    """Set up JAX from the options; commands without them get float64 and one device.
 
     Raises:
         ValueError: JAX cannot be set up so, as where JAX_PLATFORMS names no platform.
@@ -243,7 +243,7 @@ def configure(**settings: Any) -> None:
 
 @contextmanager
 def usage_errors() -> Generator[None]:
-    """Turns what a user can get wrong into a UsageError; used around checks only, never around computing."""
+    """Turn errors that users can cause into UsageErrors; for checks only, never for computing."""
     try:
         yield
     except (ValueError, OSError) as error:

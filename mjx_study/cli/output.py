@@ -1,4 +1,4 @@
-"""Standard output and standard error as they may be: full, closed, a pipe that nobody reads, of few characters."""
+"""Robust standard output and error: full disks, closed pipes, limited character sets."""
 
 import os
 import sys
@@ -12,7 +12,7 @@ class OutputError(Exception):
 
 @contextmanager
 def written_out() -> Generator[None]:
-    """Standard output around a command: characters that it lacks are escaped, and it is written out at the end.
+    """Run a command with unencodable characters escaped and output flushed at the end.
 
     Raises:
         OutputError: it cannot be written to.

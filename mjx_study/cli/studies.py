@@ -35,7 +35,7 @@ def study_fields(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def as_document(dataset: xr.Dataset, own: Callable[[xr.Dataset], dict[str, Any]]) -> dict[str, Any]:
-    """A study as plain data: its configuration and warnings, and what a command's own function makes of it."""
+    """A study as plain data: configuration, warnings, and the command's own summary."""
     document = {name: json.loads(dataset.attrs[name]) for name in ("config", "resolved", "environment")}
     return as_plain(document | {"warnings": warnings_of(dataset)} | own(dataset))
 

@@ -69,7 +69,7 @@ class Measured:
 
     @property
     def bias_error(self) -> float:
-        """Standard error of the bias, relative to it: of the path that misses most."""
+        """Relative standard error of the bias along the worst path."""
         most = max(self.paths, key=lambda each: abs(float(each.gap)), default=None)
         return 0.0 if most is None or not most.gap else float(abs(most.standard_error / most.gap))
 
@@ -101,7 +101,7 @@ class Measurement:
 
     @property
     def surest(self) -> Measured:
-        """The estimator of least variance of those without a bias that is seen."""
+        """The estimator of least variance among those without visible bias."""
         return min((each for each in self.estimators if each.verdict != "biased"), key=lambda each: each.variance)
 
     @property

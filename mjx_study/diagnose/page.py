@@ -177,7 +177,7 @@ class Diagnosis(Measurement):
 
     @property
     def _unsure(self) -> float:
-        """Relative standard error of that."""
+        """Relative standard error of the scale."""
         return self.norm_error / self.norm if self.resolved else 0.0
 
     def _shown(self, error: float, unsure: float) -> str:
@@ -191,7 +191,7 @@ class Diagnosis(Measurement):
         return self._shown(estimator.bias / self._scale, math.hypot(estimator.bias_error, self._unsure))
 
     def _unresolved(self) -> str:
-        """That the gradient is not told from 0, and what would tell it."""
+        """Lines that say that the gradient is not distinguishable from 0, and what would resolve it."""
         if not self.norm:
             return "the gradient is 0: nothing that the parameters change reaches the cost"
         needed = _round(self.surest.variance * (RESOLVED / self.norm) ** 2).replace(",", "")
@@ -203,11 +203,11 @@ class Diagnosis(Measurement):
 
     @property
     def _failure(self) -> str:
-        """Verdict on the gravest of the derivatives that are not right."""
+        """Verdict on the worst of the wrong derivatives."""
         return next((finding.verdict for finding in self.derivatives.findings if finding.fails), "wrong")
 
     def _cautions(self) -> Iterator[str]:
-        """What makes numbers on the page mean less."""
+        """Caveats about the numbers on the page."""
         if self.lost:
             yield f"{self.lost} samples are not finite and were left out"
         if self.unconverged:

@@ -98,6 +98,10 @@ def against_stiffness(
         if family:
             x = positions(rows)
             axes.set(xscale="log", xlabel=SWEPT["stiffness"])
+            ticks = np.unique(x)
+            if len(ticks) <= 5 and ticks[-1] <= 30 * ticks[0]:  # few powers of ten: label the stiffnesses themselves
+                axes.set_xticks(ticks, [f"{each:.4g}" for each in ticks])
+                axes.minorticks_off()
             axes.set_title(TITLES.get(family, family), fontsize="medium")
         else:
             x = np.arange(rows.sizes["model"], dtype=float)

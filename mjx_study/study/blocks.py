@@ -1,4 +1,4 @@
-"""Batches that come in blocks: what is kept of them, merged two by two in an order that their indices fix.
+"""Batches computed in blocks, whose summaries are merged pairwise in an order fixed by their indices.
 
 Blocks are the leaves of a binary tree. Two neighbours are merged as soon as both are there, whatever else is missing,
 so that the result does not depend on the order in which blocks end, and no more is kept than the logarithm of their
@@ -19,11 +19,11 @@ REFERENCE: Final = 0
 """The task that has the reference; the others are the blocks, seed by seed."""
 Arrays = dict[str, np.ndarray]
 Summary = dict[str, Any]
-"""Of a block: the moments of each estimator's parts by "ESTIMATOR.PART", and the tallies by oracle."""
+"""Summary of a block: moments of each estimator's parts by "ESTIMATOR.PART", and tallies by oracle."""
 
 
 class Blocks:
-    """The blocks of a cell that are done."""
+    """The finished blocks of a cell."""
 
     def __init__(self, seeds: int, blocks: int, kept: Mapping[str, np.ndarray]):
         """
@@ -58,7 +58,7 @@ class Blocks:
         return divmod(task - 1, self.blocks)
 
     def add(self, task: int, arrays: Arrays) -> None:
-        """Take a task's arrays."""
+        """Add the arrays of a finished task."""
         if task == REFERENCE:
             self.reference = arrays["reference"]
             return
@@ -69,14 +69,14 @@ class Blocks:
         self._held[seed, level, place] = summary
 
     def arrays(self) -> Arrays:
-        """All that is kept, as a checkpoint."""
+        """Return the checkpoint."""
         kept = {} if self.reference is None else {"reference": self.reference}
         for (seed, level, place), summary in self._held.items():
             kept |= {f"{seed}.{level}.{place}.{name}": array for name, array in pack(summary).items()}
         return kept
 
     def whole(self, seed: int) -> Summary:
-        """Of all blocks of a seed, none of which is missing."""
+        """Summary of all blocks of a seed, which must be complete."""
         nodes = sorted((place << level, summary) for (at, level, place), summary in self._held.items() if at == seed)
         return reduce(_merged, (summary for _, summary in nodes))
 
@@ -86,14 +86,14 @@ def _merged(one: Summary, other: Summary) -> Summary:
 
 
 def pack(summary: Summary) -> Arrays:
-    """A summary as arrays."""
+    """Flatten a summary into arrays."""
     return {
         f"{name}.{field}": np.asarray(array) for name, each in summary.items() for field, array in vars(each).items()
     }
 
 
 def unpack(arrays: Mapping[str, np.ndarray]) -> Summary:
-    """What `pack` was given."""
+    """Invert `pack`."""
     fields: dict[str, Arrays] = {}
     for name, array in arrays.items():
         of, _, field = name.rpartition(".")

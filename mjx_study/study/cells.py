@@ -23,17 +23,17 @@ COMPUTE: Final[dict[str | None, Callable[[StudyPlan], Callable[..., Arrays]]]] =
 
 
 class Computation:
-    """A function that computes a plan's cells; it keeps what is compiled."""
+    """Computes the cells of a plan and keeps compiled programs."""
 
     def __init__(self, plan: StudyPlan):
         self._plan, self._compute = plan, COMPUTE[plan.config.kind](plan)
 
     def __call__(self, cell: StudyCell, part: Part) -> Arrays:
-        """A cell, from its checkpoint on, unless it is a landscape."""
+        """Compute a cell, resuming from its checkpoint (landscapes have none)."""
         return self.end(cell, self.begin(cell, part))
 
     def begin(self, cell: StudyCell, part: Part) -> Future[Arrays]:
-        """Begin a cell: where its statistics may run beside the sampling of the next one, they may not have ended."""
+        """Sample a cell; on accelerators its statistics may still be running on return."""
         with timed(rest(self._plan, cell)):
             if isinstance(self._compute, Gradients):
                 return self._compute.begin(cell, part)
@@ -42,20 +42,20 @@ class Computation:
             return future
 
     def end(self, cell: StudyCell, begun: Future[Arrays]) -> Arrays:
-        """Wait for a cell."""
+        """Wait for a cell's numbers."""
         with timed(rest(self._plan, cell), calls=0):
             return begun.result()
 
     def begun(self, cell: StudyCell, kept: Mapping[str, np.ndarray]) -> Blocks:
-        """The blocks of a cell that is several tasks, those of a checkpoint done."""
+        """The blocks of a cell that is several tasks, with the finished ones of a checkpoint."""
         return self._in_blocks.begun(cell, kept)
 
     def block(self, cell: StudyCell, task: int) -> Arrays:
-        """One of these tasks."""
+        """Compute one of these tasks."""
         return self._in_blocks.block(cell, task)
 
     def merged(self, cell: StudyCell, blocks: Blocks) -> Arrays:
-        """The cell, when all of them are done."""
+        """The cell's numbers, once all tasks are done."""
         return self._in_blocks.merged(cell, blocks)
 
     @property

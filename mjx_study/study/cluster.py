@@ -43,8 +43,8 @@ SELDOM: Final = {
     "distributed.worker.memory.monitor-interval": "1s",
     "distributed.worker.profile.enabled": False,
 }
-"""What Dask does in this process for each local worker, many times a second by default: with 100 workers, as much as a
-core can do."""
+"""Intervals of Dask's housekeeping, which this process does for every local worker: with 100 workers, the defaults keep
+a core busy."""
 GPUS: Final = "/dev/nvidia[0-9]*"
 _ONE_AT_A_TIME, _SET_UP = threading.Lock(), threading.Event()
 Arrays = dict[str, np.ndarray]
@@ -78,7 +78,7 @@ def connected(cluster: str) -> Generator[Any]:
 
 
 def _connect(cluster: str, stack: ExitStack) -> Any:
-    """The client, which the stack closes, as it does the workers that are started."""
+    """Return the client; the stack closes it and any workers started here."""
     import dask.config
     import distributed
 
@@ -143,7 +143,7 @@ def cells_on(
             future.add_done_callback(fetch)
 
     def fetch(future: Any) -> None:
-        """In a thread of Dask, which waits here if the worker is lost before its arrays have come."""
+        """Runs in a thread of Dask, which blocks here if the worker is lost before its arrays arrive."""
         try:
             outcome = future.result()
         except BaseException as error:  # whatever a cell raises on another machine, or that it is cancelled
@@ -227,7 +227,7 @@ def cells_on(
 
 
 def _all_of(ended: queue.SimpleQueue[Any]) -> Generator[Any]:
-    """What is in the queue now; waits a while for the first."""
+    """Empty the queue, waiting a while for the first item."""
     with suppress(queue.Empty):
         yield ended.get(timeout=POLL_SECONDS)
         for _ in range(ended.qsize()):
@@ -240,7 +240,7 @@ def in_blocks(plan: StudyPlan, index: int) -> bool:
 
 
 def _program_for(worker: str, waiting: Mapping[Any, deque[Any]], has: Mapping[Any, set[str]]) -> list[Any]:
-    """The program of the next cell of a worker; none where those that have one will be sooner.
+    """Choose the program of a worker's next cell; none if workers that have one compiled will be sooner.
 
     One that it has, otherwise that with the most cells for each worker that has it.
     """
@@ -251,7 +251,7 @@ def _program_for(worker: str, waiting: Mapping[Any, deque[Any]], has: Mapping[An
 
 
 def _packed(plan: StudyPlan) -> bytes:
-    """What a worker needs: the configuration, and what its own plan must agree with."""
+    """Pack the configuration, and what a worker's own plan must agree with."""
     import cloudpickle
 
     return cloudpickle.dumps((plan.config, plan.chunk_size, precision(), versions(), plan.contents))
@@ -267,7 +267,7 @@ def _compute(study: bytes, index: int, kept: Arrays, block: int | None) -> Array
 
 @functools.lru_cache(maxsize=4)
 def _prepared(study: bytes) -> tuple[StudyPlan, Computation, Stopwatch]:
-    """The plan, what computes its cells, compiled programs included, and the times of these, on a worker.
+    """The plan, its `Computation` with compiled programs, and a stopwatch, cached on the worker.
 
     Raises:
         WorkerRefusedError: the numbers would be others than the client's.

@@ -229,7 +229,7 @@ def _bias_findings(rows: Sequence[Row], gammas: Mapping[str, float]) -> list[str
 
 
 def linear_error(strength: float) -> str:
-    """What the linear onset term's error can be."""
+    """Bound on the error of the linear onset term."""
     if strength > STRONG:
         return "the linear onset term can leave more than it adds"
     return f"the linear onset term can be off by {SHARE_OFF * strength:.0%} of what it adds"

@@ -112,7 +112,7 @@ def forecast(
 
 
 class _Time:
-    """Times of cells, and whence they are."""
+    """Times of cells, and the basis of each."""
 
     def __init__(self, rates: Rates):
         self._rates = rates

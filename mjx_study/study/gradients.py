@@ -47,12 +47,12 @@ MOST_KEPT: Final = 1_000_000
 
 
 def compute_gradients(plan: StudyPlan) -> "Gradients":
-    """What computes cells, whole or in blocks, and keeps compiled programs between them."""
+    """Return the computation of a plan's cells, whole or in blocks, which keeps compiled programs."""
     return Gradients(plan)
 
 
 class Gradients:
-    """The cells of a plan, each an argument."""
+    """Computes the cells of a plan."""
 
     def __init__(self, plan: StudyPlan):
         self._plan, self._config, self._objectives = plan, plan.config, Objectives(plan)
@@ -161,13 +161,13 @@ class Gradients:
         return self._beside(all_numbers)
 
     def _beside(self, call: Callable[[], Result]) -> Future[Result]:
-        """Call in turn, on accelerators in a thread beside the sampling of the next batches."""
+        """Call in order; on accelerators in a thread, while the next batches are sampled."""
         if jax.default_backend() == "cpu":
             return _done(call())
         return self._statistics.submit(unheard(call))
 
     def _objective(self, cell: StudyCell) -> MjxObjective | Reference:
-        """The objective of a cell, its programs compiled, so that no time holds a compilation."""
+        """The objective of a cell, with its programs compiled, so that measured times exclude compilation."""
         objective, theta = self._objectives(cell), self._plan.groups[cell.group].task.theta
         if (program := self._plan.program_of(cell)) not in self._warm:
             self._compile_statistics(cell, objective)
@@ -177,7 +177,7 @@ class Gradients:
         return objective
 
     def _compile_statistics(self, cell: StudyCell, objective: MjxObjective | Reference) -> None:
-        """Compile the statistics in another thread, beside the programs of rollouts."""
+        """Compile the statistics in another thread, in parallel with the rollouts."""
         if not isinstance(objective, MjxObjective) or traces_folder() is None or blocks_of(self._plan, cell):
             return
         config, task = self._config, self._plan.groups[cell.group].task
@@ -314,7 +314,7 @@ def reference_of(
 
 
 def takes_candidates(task: Task) -> bool:
-    """Whether the reference is of odd parts and a control variate."""
+    """Whether the reference is made from odd parts and a control variate."""
     return task.policy.additive and task.noise == "gaussian"
 
 
@@ -330,7 +330,7 @@ def _reference_gradient(
 
 @cache
 def _seed_numbers(chosen: tuple[Estimator, ...], confidence: float) -> Compiled:
-    """The numbers of every estimator with an axis of seeds, as a function of batches, the reference and keys."""
+    """Compiled statistics of all estimators, batched over seeds: a function of batches, reference and keys."""
 
     def numbers(batches, reference, key):
         return estimate_numbers([estimator(batches) for estimator in chosen], reference, key, confidence)

@@ -144,7 +144,7 @@ def begin(optimizer: optax.GradientTransformation, theta: Float[Array, " params"
 def advance(
     state: Descent, batches: dict[str, Any], estimator: Estimator, optimizer: optax.GradientTransformation
 ) -> tuple[Descent, Record]:
-    """One iteration of every seed that goes on.
+    """Advance every active seed by one iteration.
 
     Args:
         batches: of the estimator's oracles, with an axis of seeds in front of each array.

@@ -1,4 +1,4 @@
-r"""Landscapes of a cell: the cost along a line, what noise makes of it, and which slope each estimator sees.
+r"""Landscapes of a cell: the cost along a line, its mean under noise, and each estimator's slope.
 
 Along a line theta(t) = theta_0 + t * direction (for a scalar parameter, theta = t) and at each point of a grid:
 
@@ -39,7 +39,7 @@ def compute_landscapes(plan: StudyPlan) -> Callable[[StudyCell], dict[str, np.nd
     lines: dict[int, Line] = {}
 
     def exact(cell: StudyCell, position: Float[np.ndarray, " points"], objective: Any) -> Means | None:
-        """Means without sampling, where they can be had."""
+        """Means by quadrature or closed form, where available."""
         task = plan.groups[cell.group].task
         if cell.model.analytic:
             return closed_form(objective, position)
@@ -78,7 +78,7 @@ def compute_landscapes(plan: StudyPlan) -> Callable[[StudyCell], dict[str, np.nd
 
 @partial(jax.jit, static_argnames="chosen")
 def _slopes(batches: dict[str, Any], direction: Array, chosen: tuple[Estimator, ...]):
-    """Costs at a point, and every estimator's slope along the line; what is not finite is left out."""
+    """Costs at a point, and every estimator's slope along the line, without nonfinite samples."""
     evaluation = batches["evaluation"]
     smoothed, smoothed_se = _mean(evaluation.value)
     along = {"slope": [], "slope_se": [], "nonfinite": []}

@@ -89,7 +89,7 @@ class StudyPlan:
     warnings: tuple[str, ...]
 
     def with_chunk(self, size: int) -> "StudyPlan":
-        """The plan with another chunk size, such as that of a study that is begun."""
+        """The plan with another chunk size, such as that of a study begun earlier."""
         return dataclasses.replace(self, chunk_size=size)
 
     @property
@@ -99,7 +99,7 @@ class StudyPlan:
         return each * len({self.program_of(cell) for cell in self.cells if not cell.model.analytic})
 
     def program_of(self, cell: StudyCell) -> tuple[Any, ...] | None:
-        """A key of what is compiled for a cell; None for an analytic system."""
+        """Key of a cell's compiled programs; None for an analytic system."""
         if cell.model.analytic:
             return None
         own = (cell.sigma, cell.samples) if self.config.kind == "descents" else ()
@@ -123,7 +123,7 @@ class StudyPlan:
 
     @property
     def contents(self) -> dict[str, str]:
-        """What the numbers are made of, by digest: the tasks in all their forms, and estimators from outside."""
+        """Digests of what the numbers depend on: the tasks in all their forms, and user-defined estimators."""
         forms: dict[str, list[Task]] = {}
         for group in self.groups:
             forms.setdefault(group.name, []).append(group.task)

@@ -89,7 +89,7 @@ class Line:
             return spread(self._program, (contact,), (points.astype(self._dtype),), CHUNK, devices)
 
     def program(self, contact: ContactModel | None) -> tuple[str, Task, Any, int]:
-        """What the time of a call depends on, as of `Simulator.program`."""
+        """Key of what the time of a call depends on, see `Simulator.program`."""
         return "quadrature", self._task, jax.tree.structure(contact), CHUNK
 
 

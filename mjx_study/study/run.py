@@ -123,7 +123,7 @@ def run_study(
     keep_going: bool = False,
     cluster: Any = None,
 ) -> xr.Dataset:
-    """Run a study in memory; or with a folder compute what is missing there, beside any process that does the same.
+    """Run a study in memory, or compute what a folder lacks, together with any other process doing the same.
 
     Args:
         study: a configuration, or what `plan_study` made of it.
@@ -165,7 +165,7 @@ class _Run:
         self._begun: set[Any] = {None}
 
     def in_memory(self, document: dict[str, Any]) -> xr.Dataset:
-        """All cells, none of them written."""
+        """Compute all cells and write none."""
         document["config"]["chunk_size"] = self._plan.chunk_size
         compute, cells = Computation(self._plan), {}
         for index, arrays in self._computed(compute, ((index, index, Part()) for index in range(self._total))):
@@ -174,7 +174,7 @@ class _Run:
         return _labelled(document, cells).assign_attrs(computed_cells=self._total)
 
     def in_folder(self, store: Store, keep_going: bool, client: Any) -> xr.Dataset:
-        """The cells that a folder lacks, written there; what cannot be written is kept in memory or ends the run."""
+        """Compute and write missing cells; one that cannot be written is kept in memory or ends the run."""
         self._plan = self._plan.with_chunk(store.document["config"]["chunk_size"])
         for index in range(self._total):
             if store.has(index):
@@ -225,7 +225,7 @@ class _Run:
     def _cells_here(
         self, compute: Computation, store: Store, missing: Sequence[int]
     ) -> Generator[tuple[int, dict[str, np.ndarray]]]:
-        """Those cells that nobody else computes, in this process."""
+        """Compute in this process the cells that no other process has claimed."""
         with store.claims() as claim:
             yield from self._computed(
                 compute,
@@ -243,7 +243,7 @@ class _Run:
     def _cells_there(
         self, client: Any, store: Store, missing: Sequence[int]
     ) -> Generator[tuple[int, dict[str, np.ndarray] | str]]:
-        """Those cells that nobody else computes, on a cluster; why one failed is text."""
+        """Compute on a cluster the cells that no other process has claimed; a failure yields its reason as text."""
         with store.claims() as claim:
             waiting = [index for index in missing if claim(index) and not store.has(index)]
             done = self._total - len(waiting)
@@ -265,7 +265,7 @@ class _Run:
     def _computed(
         self, compute: Computation, cells: Iterable[tuple[int, int, Part]]
     ) -> Generator[tuple[int, dict[str, np.ndarray]]]:
-        """Indices and numbers of cells; each is begun before the statistics of the last one are waited for.
+        """Yield indices and numbers of cells; each is begun before waiting for the statistics of the one before.
 
         Args:
             cells: index, number of cells done before, and checkpoint of each.
@@ -295,7 +295,7 @@ class _Run:
 
 
 def _keep(store: Store, index: int, arrays: dict[str, np.ndarray]) -> None:
-    """Keep a part of a cell, if it can be; the cell itself is worth more than its part."""
+    """Write a checkpoint if possible; failing to must not cost the cell."""
     with suppress(OSError):
         store.write_part(index, arrays)
 

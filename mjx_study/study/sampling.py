@@ -47,7 +47,7 @@ def cell_keys(seed: int, seeds: int) -> dict[str, Any]:
 
 @partial(jax.jit, static_argnums=2)
 def sample_keys(key: Key[Array, ""], first: int | Int[Array, ""], count: int) -> Key[Array, " count"]:
-    """Keys of some of a batch's samples, each of its index alone: of the first as `jax.random.split` has them."""
+    """Keys of consecutive samples of a batch, each a function of its index alone."""
     indices = jnp.asarray(first, jnp.uint32) + jnp.arange(count, dtype=jnp.uint32)
     return jax.vmap(lambda index: jax.random.fold_in(key, index))(indices)
 

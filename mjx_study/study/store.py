@@ -280,7 +280,7 @@ def _digest_of_text(document: Mapping[str, Any]) -> str:
 
 
 def _identity(document: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """What must match when a study resumes: all that its numbers depend on, but not the length of descents."""
+    """The parts that must match when a study resumes: all that its numbers depend on, except the length of descents."""
     found = {name: dict(document.get(name, {})) for name in IDENTITY}
     found["config"].pop("iterations", None)
     return found

@@ -1,4 +1,4 @@
-"""What is told of a batch's rollouts beside their gradients: time, solver residuals, onsets of contact."""
+"""Diagnostics of a batch's rollouts: computing time, solver residuals and onsets of contact."""
 
 import dataclasses
 from collections.abc import Iterable
@@ -14,7 +14,7 @@ from mjx_study.study.sampling import unconverged
 
 @dataclasses.dataclass(frozen=True)
 class Tally:
-    """Of the rollouts of a batch or of a part of it.
+    """Diagnostics of a batch's rollouts, or of a part of them.
 
     Attributes:
         seconds: computing time [s].
@@ -30,14 +30,14 @@ class Tally:
 
     @classmethod
     def of(cls, batch: Any, seconds: float, residuals: np.ndarray) -> "Tally":
-        """Of a batch, with the residual of each of its rollouts."""
+        """Summarise a batch, given the residual of each of its rollouts."""
         largest = np.max(np.where(np.isfinite(residuals), residuals, np.inf), initial=0.0)
         events = getattr(batch, "events", None)
         onsets = _met(np.zeros((0, 5)) if events is None else np.asarray(events, float).reshape(-1, 5))
         return cls(np.array(seconds), np.asarray(largest), np.array(unconverged(residuals, precision())), onsets)
 
     def merged(self, other: "Tally") -> "Tally":
-        """Of both."""
+        """Combine with the tally of other rollouts."""
         return Tally(
             np.asarray(self.seconds + other.seconds),
             np.asarray(np.maximum(self.residual, other.residual)),
@@ -47,13 +47,13 @@ class Tally:
 
 
 def together(tallies: Iterable[Tally]) -> Tally:
-    """Of all of some rollouts."""
+    """Merge tallies."""
     return reduce(Tally.merged, tallies)
 
 
 def _met(events: Float[np.ndarray, "rollouts five"]) -> Float[np.ndarray, " eight"]:
-    """Of rollouts: their number; of those with an onset the number, the sums of the three counts and of the squared
-    strength, and mean and summed squared deviation of the first's step."""
+    """Number of rollouts; of those with an onset: their number, sums of the three counts and of the squared strength,
+    and mean and summed squared deviation of the first onset's step."""
     met = events[events[:, 0] > 0]
     first = met[:, 4]
     mean = np.mean(first) if len(met) else 0.0
@@ -69,12 +69,12 @@ def _of_both(one: np.ndarray, other: np.ndarray) -> np.ndarray:
 
 
 def onset_numbers(events: np.ndarray) -> np.ndarray:
-    """`ONSETS` of rollouts, each with the numbers of `OnsetCounts`."""
+    """`ONSETS` from each rollout's `OnsetCounts`."""
     return numbers_of(_met(events))
 
 
 def numbers_of(onsets: np.ndarray) -> np.ndarray:
-    """`ONSETS` from a tally's; NaN where no onsets are looked for."""
+    """`ONSETS` from a tally's sums; NaN without an onset term."""
     rollouts, met, *counts, squares, _, spread = onsets
     if rollouts == 0:
         return np.full(5, np.nan)

@@ -1,4 +1,4 @@
-"""What programs take: recorded by runs in the cache beside the compiled programs, and read by forecasts.
+"""Times of programs, recorded by runs in the cache of compiled programs and read by forecasts.
 
 A program is known by its content (model, costs, kind of policy, noise, onset term, kind of contact, precision and
 processor), the number of steps and the rows of a call. A call takes about steps x (rows + overhead) times a rate. The
@@ -77,7 +77,7 @@ class Program:
 
     @property
     def work(self) -> float:
-        """To which the time of a call is proportional within one content."""
+        """Measure of work: the time of a call is proportional to it within one content."""
         if self.kind in OTHERS:
             return self.steps * self.rows + OTHERS[self.kind][1]
         return float(self.steps * (self.rows + OVERHEAD[jax.default_backend()]))
@@ -140,7 +140,7 @@ def program_of(kind: str, task: Task, contact: Any, rows: int, steps: int | None
 
 
 def other_program(kind: str, rows: int, *content: str, steps: int = 1) -> Program:
-    """What a cell takes beside its batches."""
+    """The work of a cell besides its batches."""
     return Program(kind, _digest(_machine(), *content), steps, rows)
 
 
@@ -160,14 +160,14 @@ def _digest(*texts: str) -> str:
 
 
 def times_folder() -> Path | None:
-    """Folder of the records, beside the compiled programs; None where these are not kept in a folder."""
+    """Folder of the records, in the cache of compiled programs; None without such a folder."""
     cache = jax.config.values["jax_compilation_cache_dir"]
     return None if not cache or "://" in cache else Path(cache) / "times"
 
 
 @contextmanager
 def recording(watch: Stopwatch | None = None) -> Generator[None]:
-    """Measure what programs take within, and keep it for later forecasts; what cannot be written is lost.
+    """Record the times of programs run within, for later forecasts; failures to write are ignored.
 
     The latest run of a program counts, so that processes at one time need not wait for each other.
 
@@ -210,7 +210,7 @@ class Rates:
 
     @classmethod
     def read(cls, folder: Path | None) -> "Rates":
-        """From a folder; damaged records are passed over."""
+        """Read a folder's records, skipping damaged ones."""
         found = []
         for path in [] if folder is None else sorted(folder.glob("*.json")):
             with suppress(ValueError):
@@ -218,7 +218,7 @@ class Rates:
         return cls(found)
 
     def call(self, program: Program) -> tuple[float, str]:
-        """Seconds of a call, and whence they are."""
+        """Seconds of a call, and the basis of the figure (see `BASES`)."""
         if program in self._own:
             return self._own[program].each, MEASURED
         if record := self._nearest(program):
@@ -226,7 +226,7 @@ class Rates:
         return program.rough * self._speed(program, lambda record: (record.each, record.program.rough)), ROUGH
 
     def setup(self, program: Program) -> tuple[float, float, bool, str]:
-        """Seconds of tracing, those of compilation, whether that was done here already, and whence they are."""
+        """Seconds of tracing and of compilation, whether it is compiled here already, and the basis of the figures."""
         if record := self._own.get(program):
             return record.tracing, record.compiling, record.versions == versions(), MEASURED
         tracing, compiling = program.rough_setup

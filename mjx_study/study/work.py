@@ -1,4 +1,4 @@
-"""The work of a cell: which programs it calls and how often, and what it takes beside them."""
+"""The work of a cell: calls of each program, and the rest."""
 
 import math
 from collections import Counter
@@ -28,7 +28,7 @@ from mjx_study.study.times import Program, other_program, program_of
 
 
 def rollouts(plan: StudyPlan, cell: StudyCell) -> tuple[int, int]:
-    """Rollouts of a cell, and how many of them are differentiated, about."""
+    """Approximate number of rollouts of a cell, and of those differentiated."""
     config, group = plan.config, plan.groups[cell.group]
 
     def batches(oracles: Any) -> np.ndarray:
@@ -49,7 +49,7 @@ def rollouts(plan: StudyPlan, cell: StudyCell) -> tuple[int, int]:
 
 
 def calls(plan: StudyPlan, cell: StudyCell, devices: int) -> Counter[Program]:
-    """Calls of each program one after another, on several devices at once, those to compile it left out.
+    """Sequential calls of each program on several devices at once, without those that compile it.
 
     Descents of several estimators are side by side, and their calls in the order of the estimators; those that stop
     early take less.
@@ -93,7 +93,7 @@ def iteration(plan: StudyPlan, cell: StudyCell, needs: tuple[str, ...]) -> Progr
 
 
 def rest(plan: StudyPlan, cell: StudyCell) -> Program:
-    """What a cell takes beside its programs of rollouts, as one call: statistics, or all of an analytic system."""
+    """The work of a cell besides its rollout programs, as one call: statistics, or all of an analytic system."""
     config, task = plan.config, plan.groups[cell.group].task
     content = str(config.kind), *config.estimators
     if cell.model.analytic:
@@ -125,7 +125,7 @@ def _program(plan: StudyPlan, cell: StudyCell, kind: str, rows: int) -> Program:
 
 
 def _costs(plan: StudyPlan) -> int:
-    """Times that the cost of a descent is evaluated: its end for every seed, and its start."""
+    """Number of evaluations of descents' costs: at the end for every seed, and once at the start."""
     return plan.config.batches * len(plan.config.estimators) + 1
 
 
