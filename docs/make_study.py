@@ -1,8 +1,8 @@
-"""Draws docs/variance.png, docs/bias.png, docs/achieved.png and docs/map.png: what the README says about stiffness.
+"""Draws docs/variance.png, docs/bias*.png, docs/achieved.png and docs/map.png: what the README says about stiffness.
 
     python docs/make_study.py
 
-Four sweeps, in results/study/; half an hour on two cores, and it goes on where it was stopped.
+Six sweeps, in results/study/; an hour on two cores, and it goes on where it was stopped.
 """
 
 from pathlib import Path
@@ -37,6 +37,20 @@ SWEEPS: Final = {
         stiffness=decades(3, 5, 5),
         reference_samples=3000,
     ),
+    "bias_gripper": StudyConfig(
+        tasks=("gripper",),
+        contact=("penalty", "mujoco", "smooth_onset"),
+        stiffness=(300.0, 1000.0, 3000.0),
+        samples=(1000,),
+        reference_samples=20_000,
+    ),
+    "bias_landing": StudyConfig(
+        tasks=("landing",),
+        contact=("penalty", "mujoco", "smooth_onset"),
+        stiffness=(1000.0, 3000.0, 10_000.0),
+        samples=(1000,),
+        reference_samples=20_000,
+    ),
     "achieved": StudyConfig(
         tasks=("pusher",),
         contact=("penalty", "mujoco", "mujoco_stiff"),
@@ -53,7 +67,7 @@ SWEEPS: Final = {
         seeds=3,
     ),
 }
-FIGURES: Final = {"map": "map_stiffness_sigma"}
+FIGURES: Final = {"map": "map_stiffness_sigma", "bias_gripper": "bias", "bias_landing": "bias"}
 """Names of figures that are not their sweep's."""
 
 

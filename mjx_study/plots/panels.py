@@ -57,6 +57,10 @@ def make_logarithmic(axes: Axes, x: np.ndarray | None) -> None:
         axes.set_xscale("log")
         if min(axes.get_xlim()) <= 0:
             axes.set_xlim(min(x) / 1.1, max(x) * 1.1)
+        ticks = np.unique(x)
+        if len(ticks) <= 5 and ticks[-1] <= 30 * ticks[0]:  # few powers of ten: label the values themselves
+            axes.set_xticks(ticks, [f"{each:.4g}" for each in ticks])
+            axes.minorticks_off()
 
 
 def legend_below(figure: Figure, columns: int) -> None:
@@ -98,10 +102,6 @@ def against_stiffness(
         if family:
             x = positions(rows)
             axes.set(xscale="log", xlabel=SWEPT["stiffness"])
-            ticks = np.unique(x)
-            if len(ticks) <= 5 and ticks[-1] <= 30 * ticks[0]:  # few powers of ten: label the stiffnesses themselves
-                axes.set_xticks(ticks, [f"{each:.4g}" for each in ticks])
-                axes.minorticks_off()
             axes.set_title(TITLES.get(family, family), fontsize="medium")
         else:
             x = np.arange(rows.sizes["model"], dtype=float)
