@@ -33,7 +33,7 @@ Where a rollout does not reach one that the model has, faster ones and random po
 
 Exit code 0: every derivative that exists is right. 1: one is wrong, NaN, silently zero or unconverged, or the step is
 another than that of mjx.step or, for no documented reason, of the C engine. 3: right, but something that the model has
-was never exercised. Kinks and jumps are properties of the step, and contacts placed differently are no error of a
+and can reach was never exercised. Kinks and jumps are properties of the step, and contacts placed differently are no error of a
 derivative: they are reported, and do not fail.
 
 With --mean: does the mean of an estimator integrate to the difference of the mean cost along a path through theta? It
