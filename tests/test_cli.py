@@ -310,6 +310,6 @@ def test_interruption_leaves_only_what_is_complete(tmp_path: Path) -> None:
     process.send_signal(signal.SIGINT)
     out, err = process.communicate(timeout=120)
     assert process.returncode == 130
-    assert err.strip().splitlines()[-1] == "mjx-study: interrupted; the same command goes on where it stopped"
+    assert err.strip().splitlines()[-1] == "mjx-study: interrupted; the same command resumes where it stopped"
     assert out == "" and "Traceback" not in err
     assert {path.name for path in folder.rglob("*")} <= {"study.json", "study.lock", "cells"}

@@ -252,7 +252,7 @@ def test_a_kill_at_random_changes_no_number(seed: int, undisturbed: xr.Dataset, 
         told = [line for line in errors.splitlines() if not line.lstrip()[:1].isdigit()]
         assert "Traceback" not in errors
         if victim == "scheduler" and running.returncode:
-            assert running.returncode == 2 and "the same command goes on" in told[-1]
+            assert running.returncode == 2 and "the same command resumes" in told[-1]
         elif victim == "worker":
             assert running.returncode == 0, errors
     with engine(tmp_path) as (address, _):

@@ -29,7 +29,7 @@ signal.signal(signal.SIGHUP, signal.SIG_DFL)
 for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
     child = os.fork()
     if child == 0:
-        with options.computing("the same command goes on"):
+        with options.computing("the same command resumes"):
             os.kill(os.getpid(), number)
             time.sleep(5)
         os._exit(1)
@@ -47,7 +47,7 @@ def test_a_signal_ends_a_command_with_one_line_and_its_code() -> None:
     assert done.stdout.split("\n")[:4] == ["130", "143", "129", "goes on"]
     words = ("interrupted", "terminated", "hung up")
     said = [line for line in done.stderr.splitlines() if line.startswith("mjx-study: ")]
-    assert said == [f"mjx-study: {word}; the same command goes on" for word in words]
+    assert said == [f"mjx-study: {word}; the same command resumes" for word in words]
 
 
 @pytest.fixture
@@ -140,6 +140,6 @@ def test_a_full_disk_costs_a_study_nothing_that_was_there(
     assert "computed 1 cells" in out and "1 cells are not computed yet" in out and "results.nc" not in out
     before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
     assert len(before) == 3  # study.json, its lock, and a cell
-    assert ended(capsys, "plot", str(folder)) == "warning: 1 cells are not computed yet; the same command goes on\n"
+    assert ended(capsys, "plot", str(folder)) == "warning: 1 cells are not computed yet; the same command resumes\n"
     assert "written" not in ended(capsys, "report", str(folder))
     assert before == {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}

@@ -197,7 +197,7 @@ def test_other_versions_need_a_flag_and_are_remembered(tmp_path: Path, monkeypat
     other_jax(monkeypatch)
     read = swept(folder)
     assert read.attrs["computed_cells"] == 0  # nothing is left to compute, so nothing is mixed
-    assert any("these numbers are of other versions (jax " in text for text in warnings_of(read))
+    assert any("these numbers were computed with other versions (jax " in text for text in warnings_of(read))
     (folder / "cells" / "00001.npz").unlink()
     with pytest.raises(StudyError, match="with other versions .jax .* there and 99.0 here.; .*--accept-versions"):
         swept(folder)

@@ -228,7 +228,7 @@ def test_bias_is_reported_only_beyond_what_noise_explains() -> None:
     (sentence,) = findings(result(mixed))
     assert sentence == "penalty: AoBG's mean is biased by 1700% at K = 10 N/m (p <= 0.001)"
     (sentence,) = findings(result(mixed, gamma="inf"))
-    assert sentence.endswith("(p <= 0.001): it has no accuracy bound; --gamma sets one")
+    assert sentence.endswith("(p <= 0.001): it has no accuracy bound; set one with --gamma")
 
 
 def joined(dimension: str, values: list[Any], parts: list[xr.Dataset]) -> xr.Dataset:
@@ -293,9 +293,9 @@ def test_a_result_that_means_nothing_says_so() -> None:
     )
     assert not any("never active" in each for each in findings(result(*same[:3], row("fobg", 100, 1.001))))
     (sentence,) = findings(result(row("fobg", 10, 1.0, reference_uncertainty=0.25)))
-    assert sentence.startswith("penalty: the reference's own uncertainty is above 20% at K = 10 N/m: errors and")
+    assert sentence.startswith("penalty: the reference's own uncertainty exceeds 20% at K = 10 N/m: errors and")
     (sentence,) = findings(result(row("aobg", 10, 1.0, alpha=0.0, epsilon=7.0, discrepancy=1.0), gamma=5.0))
-    assert sentence.startswith("penalty: AoBG is ZoBG at K = 10 N/m: its bound gamma is below epsilon")
+    assert sentence.startswith("penalty: AoBG equals ZoBG at K = 10 N/m: its bound gamma is below epsilon")
     assert findings(result(row("aobg", 10, 1.0, alpha=0.3, epsilon=7.0, discrepancy=1.0), gamma=9.0)) == []
 
 
@@ -492,7 +492,7 @@ def test_gradients_are_taken_where_theta_says() -> None:
         built(theta=(1.0,))
     with pytest.raises(ValueError, match="theta must be finite, got nan"):
         built(theta=(float("nan"),) * 4)
-    with pytest.raises(ValueError, match="theta is of a single task"):
+    with pytest.raises(ValueError, match="theta is for a single task"):
         built(theta=(1.0,), tasks=("pusher", "ball_wall"))
 
 
@@ -503,7 +503,7 @@ def test_a_task_in_place_of_a_name() -> None:
     assert plan.groups[0].task.scene is task.scene and plan.groups[0].task.horizon == 7
     assert {cell.sigma for cell in plan.cells} == {0.3}
     assert (estimators_of(plan, plan.cells[0])[2], plan.config.task_names) == (AlphaOrder(gamma=3.0), ["mine"])
-    with pytest.raises(ValueError, match="cone, horizon: only for a task that is built by its name"):
+    with pytest.raises(ValueError, match="cone, horizon: only for a task given by name"):
         plan_study(StudyConfig(tasks=(task,), cone=("elliptic",), horizon=3))
     wrong = task.replace(final_cost=lambda state: state.qpos)
     with pytest.raises(ValueError, match="mine: the final_cost has shape .2,., and a cost is a scalar"):

@@ -104,7 +104,7 @@ def test_a_study_has_every_backward_model_beside_the_exact_one() -> None:
     ("changes", "message"),
     [
         ({"backward_stiffness": 5.0}, "backward_stiffness needs a contact family in backward"),
-        ({"backward": ("penalty",), "onset": "linear"}, "leave onset or backward out"),
+        ({"backward": ("penalty",), "onset": "linear"}, "omit onset or backward"),
         ({"backward": ("penalty",), "estimators": ("fobg_onset",)}, "'?fobg_onset'? corrects exact derivatives"),
         ({"backward": ("penalty",), "contact": ("mjcf",), "stiffness": None}, "contact mjcf takes no backward model"),
         ({"backward": ("soft",)}, "unknown family 'soft'; choose from none, penalty"),
@@ -121,7 +121,7 @@ def test_a_study_has_every_backward_model_beside_the_exact_one() -> None:
             {"iterations": 3, "stiffness_schedule": "constant_schedule(0.5)", "contact": ("mjcf",), "stiffness": None},
             "mjcf has none",
         ),
-        ({"sigma_schedule": "constant_schedule(0.5)"}, "sigma_schedule is of descents: give iterations as well"),
+        ({"sigma_schedule": "constant_schedule(0.5)"}, "sigma_schedule is for descents: give iterations as well"),
     ],
 )
 def test_what_cannot_be_run_is_refused(changes: dict[str, Any], message: str) -> None:

@@ -378,7 +378,7 @@ def test_a_full_disk_leaves_what_is_complete(undisturbed: Path, tmp_path: Path) 
     error = running.stderr
     assert running.returncode == 1, error
     assert json.loads(running.stdout)["computed"] == 0
-    assert "cannot write to" in error and "the same command goes on" in error
+    assert "cannot write to" in error and "the same command resumes" in error
     assert len([line for line in error.splitlines() if "(compiling first)" not in line]) == 1
     assert not list((folder / "cells").iterdir())
     assert run_study(plan_study(config()), folder).attrs["computed_cells"] == 8
@@ -534,23 +534,23 @@ def test_a_file_with_a_value_of_another_kind_gets_one_line(tmp_path: Path, line:
         ({"stiffness": (10.0, 10.0)}, "stiffness given twice: 10.0"),
         ({"samples": (2,)}, "samples must be at least 3"),
         ({"iterations": 3, "points": 3}, "give one of them"),
-        ({"span": (0.0, 1.0)}, "span is of landscapes: give points as well"),
+        ({"span": (0.0, 1.0)}, "span is for landscapes: give points as well"),
         ({"learning_rate": math.nan}, "learning_rate must be positive and finite, got nan"),
-        ({"learning_rate": 0.1}, "learning_rate is of descents: give iterations as well"),
-        ({"optimizer": "adam", "decay": 0.5}, "optimizer and decay are of descents: give iterations as well"),
-        ({"points": 3, "evaluation_samples": 10}, "evaluation_samples is of descents"),
+        ({"learning_rate": 0.1}, "learning_rate is for descents: give iterations as well"),
+        ({"optimizer": "adam", "decay": 0.5}, "optimizer and decay are for descents: give iterations as well"),
+        ({"points": 3, "evaluation_samples": 10}, "evaluation_samples is for descents"),
         ({"iterations": 3, "learning_rate": math.nan}, "learning.rate must be positive and finite, got nan"),
-        ({"iterations": 3, "direction": "0"}, "direction is of landscapes"),
-        ({"iterations": 3, "reference_samples": 9}, "reference_samples is of gradients: leave it out"),
+        ({"iterations": 3, "direction": "0"}, "direction is for landscapes"),
+        ({"iterations": 3, "reference_samples": 9}, "reference_samples is for gradients: omit it"),
         (
             {"contact": (), "solref": ((-1000.0, -5.0),)},
-            "solref or solimp alone takes no stiffness; leave stiffness out",
+            "solref or solimp alone takes no stiffness; omit stiffness",
         ),
-        ({"contact": ("mjcf",), "stiffness": None, "damping": 1.0}, "contact mjcf takes no damping; leave damping out"),
+        ({"contact": ("mjcf",), "stiffness": None, "damping": 1.0}, "contact mjcf takes no damping; omit damping"),
         ({"points": 1}, "points must be at least 2 and at most 100000, got 1"),
         ({"points": 3, "span": (1.0, 0.0)}, "span must be two numbers, the lower one first"),
         ({"points": 3, "direction": "20"}, "direction must be random or a parameter's index, 0 to 19; got 20"),
-        ({"contact": ("mjcf",)}, "contact mjcf takes no stiffness; leave stiffness out"),
+        ({"contact": ("mjcf",)}, "contact mjcf takes no stiffness; omit stiffness"),
         ({"seeds": 0}, "seeds must be at least 1 and at most 100000, got 0"),
         ({"timestep": (2.0,)}, "timestep must be positive and less than 1, got 2"),
         ({"sigma": (-1.0,)}, "sigma must be positive"),

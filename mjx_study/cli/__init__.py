@@ -1,9 +1,9 @@
 """The command line: parse, check, call, print; exit codes.
 
-0 what was asked was done; 1 a check that was asked for failed, or a file could not be written, in one line after the
-numbers; 2 a bad option or file, in one line, with nothing written; 128 + N ended by signal N: 130 interrupted, 143
-terminated, 129 hung up. Each command has two modules: `parsers.NAME` with its options, which imports nothing that
-computes, and `NAME` with `run`, imported when the command runs.
+Exit codes: 0 success; 1 a requested check failed, or a file could not be written (one line after the numbers); 2 an
+invalid option or file (one line, nothing written); 3 `gradcheck` found nothing wrong but could not check everything;
+128 + N ended by signal N (130 interrupted, 143 terminated, 129 hung up). Each command has two modules: `parsers.NAME`
+with its options, which imports nothing that computes, and `NAME` with `run`, imported when the command runs.
 """
 
 import argparse
@@ -18,17 +18,17 @@ from typing import Final
 from mjx_study.cli.options import Parser, UsageError, ending, refuse_lone_dashes
 from mjx_study.cli.output import OutputError, complain, written_out
 
-ENDED = "files that are there are complete"
+ENDED = "existing files are complete"
 EXAMPLES = """\
 start here:
   mjx-study compare pusher                       which estimator, at which contact stiffness? 20 s once compiled
   mjx-study compare pusher --output out          the same, with a figure and the numbers on disk
-  mjx-study optimise pusher --output out         and what does each achieve as gradient descent goes on?
+  mjx-study optimise pusher --output out         what does each estimator achieve in gradient descent?
   mjx-study sweep pusher --output out            many contact models, resumable; then plot out, report out
-  mjx-study landscape ball_wall --output out     the cost, the cost with noise, and the slopes that estimators see
+  mjx-study landscape ball_wall --output out     the cost, its mean under noise, and the slopes that estimators see
   mjx-study rollout tennis                       pictures and a film of a task
   mjx-study gradcheck pusher                     are the derivatives right? exit code 1 if not
-  mjx-study diagnose robot.xml                   any MJCF: what contact does to its gradients, and what to do about it
+  mjx-study diagnose robot.xml                   any MJCF: what contact does to gradients, and what to do about it
   mjx-study bench pusher                         what does a gradient cost on this machine?
 """
 COMMANDS: Final = {
@@ -37,12 +37,12 @@ COMMANDS: Final = {
     "sweep": "sweep contact models, noise and samples; resumable",
     "plot": "draw a study's figures",
     "report": "write a study as one HTML page",
-    "landscape": ("draw the cost along a line of parameters, its smoothed cost and the slope that each estimator sees"),
+    "landscape": ("draw the cost and smoothed cost along a line of parameters, and the slope that each estimator sees"),
     "rollout": "show a rollout: pictures, a film and its numbers",
-    "gradcheck": "check derivatives against differences, the C engine and a closed form",
-    "diagnose": "say of a model whether its gradients are worth having, and which estimator to take",
-    "claims": "measure which claims survive, in which contact models",
-    "bench": "measure what rollouts and gradients cost here",
+    "gradcheck": "check derivatives against finite differences, the C engine and a closed form",
+    "diagnose": "diagnose whether a model's gradients are worth having, and which estimator to use",
+    "claims": "test which claims survive, in which contact models",
+    "bench": "measure what rollouts and gradients cost on this machine",
     "tasks": "list the tasks",
     "estimators": "list the gradient estimators and the noise densities",
 }
@@ -51,7 +51,7 @@ ALIASES: Final = {"optimize": "optimise"}
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code."""
-    # Else XLA prints banners when a program takes minutes to compile; what fails in it raises all the same.
+    # Suppress XLA's banners about programs that take minutes to compile; failures still raise.
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     try:
         with written_out(), ending(ENDED, signal.SIGTERM, signal.SIGHUP):
@@ -75,7 +75,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def parser(chosen: str | None = None) -> argparse.ArgumentParser:
-    """The command line: all of it, or with the options of one command alone."""
+    """Build the command line's parser, with the options of all commands or of one only."""
     root = Parser(
         prog="mjx-study",
         description=f"{metadata.metadata('mjx-study')['Summary']}.",

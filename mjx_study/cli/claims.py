@@ -17,7 +17,7 @@ from mjx_study.plots.style import save_figure
 
 
 def run(options: argparse.Namespace) -> int:
-    """Measure and print."""
+    """Measure the claims and print their verdicts."""
     chosen = _chosen(options.only)
     if options.list:
         listed = [{"id": claim.id, "statement": claim.statement, **_decides(claim)} for claim in chosen]
@@ -58,7 +58,7 @@ def _decides(claim: Claim) -> dict[str, str]:
 
 
 def _write(document: dict[str, Any], folder: Path) -> list[Path]:
-    """The document, the page and the picture."""
+    """Write the document, the page and the figure."""
     texts = {"claims.json": json.dumps(document, indent=1, allow_nan=False) + "\n", "claims.md": markdown(document)}
     written = [
         write_whole(folder / name, lambda file, text=text: file.write(text.encode())) for name, text in texts.items()

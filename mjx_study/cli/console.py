@@ -1,4 +1,4 @@
-"""Printed tables, and numbers with their intervals."""
+"""Format tables, and numbers with their intervals."""
 
 import itertools
 import math
@@ -18,7 +18,7 @@ Column = tuple[str, Callable[[Row], str]]
 
 
 def number(value: float | None, digits: int = 3) -> str:
-    """A number in few characters; `-` for none, `nan` and `inf` as they are."""
+    """Format a number in few characters; `-` for None, `nan` and `inf` unchanged."""
     if value is None:
         return "-"
     if value == 0 or not math.isfinite(value):
@@ -54,8 +54,8 @@ def _with_error(value: float, error: float) -> str:
 
 
 def _debiased(row: Row, value: float, debiased: float, error: float, best: float) -> str:
-    """A figure as it is, and what is left of it without noise; a bound where that is the best, "-" where noise is all
-    there is."""
+    """Format a value and what remains of it without noise: a bound if no error is detected, "-" if noise explains all
+    of it."""
     plain = f"{value:.3f}" if 0.01 <= abs(value) < 1000 else number(value, 2)
     if math.isnan(debiased):
         left = "-"
@@ -74,9 +74,9 @@ def columns(confidence: float, details: bool = False, *, scalar: bool = False) -
     """Columns of the comparison: those that identify a row, then groups that a table keeps together.
 
     Args:
-        confidence: of intervals.
-        details: all of them, not only those that say which estimator to take.
-        scalar: of a single parameter, for which a cosine says nothing.
+        confidence: confidence level of the intervals.
+        details: include all columns, not only those that help to choose an estimator.
+        scalar: for a scalar parameter, where a cosine is meaningless.
     """
     variance = f"variance ({confidence:.0%} interval)", _interval
     error = (
@@ -120,11 +120,11 @@ def _blocks(rows: Sequence[Row], shown: list[list[Column]], width: int) -> list[
 
 
 def gradient_lines(dataset: xr.Dataset, document: dict[str, Any], details: bool = False) -> list[str]:
-    """A study of gradients as text: configuration, a table for each contact family, findings.
+    """Format a study of gradients as text: configuration, a table per contact family, findings.
 
     Args:
         document: see `as_document`.
-        details: whether tables have all columns.
+        details: include all columns.
     """
     config, rows, lines = document["config"], rows_of(dataset), []
     shown = columns(config["confidence"], details, scalar=dataset.sizes.get("param") == 1)
@@ -148,19 +148,19 @@ def gradient_lines(dataset: xr.Dataset, document: dict[str, Any], details: bool 
             "of rollouts with a control variate;",
             f"its own relative uncertainty is {low if low == high else f'{low} to {high}'}, and smaller errors cannot "
             "be told from zero.",
-            "After the arrows: what is left without the sampling noise of batch and reference, ± a standard error;",
-            "< and >: none is seen, these are bounds of two standard errors; -: noise is all there is.",
+            "After the arrows: the same without the sampling noise of batch and reference, ± one standard error;",
+            "< and >: no error is detected, these are bounds of two standard errors; -: noise explains all of it.",
         ]
     if not all(row.believable for row in rows):
         lines.append(
-            f"?: fewer than {ENOUGH_EFFECTIVE:g} effective samples carry the batch's variance; believe neither the "
+            f"?: fewer than {ENOUGH_EFFECTIVE:g} effective samples carry the batch's variance; trust neither the "
             "number nor its error."
         )
     return lines + [f"{sentence}." for sentence in document["findings"]]
 
 
 def rows_as_json(dataset: xr.Dataset) -> dict[str, Any]:
-    """Findings, and a row for each estimate."""
+    """Findings, and a row per estimate."""
     return {"findings": findings(dataset), "rows": [row.as_dict() for row in rows_of(dataset)]}
 
 

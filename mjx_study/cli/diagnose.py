@@ -9,11 +9,11 @@ from mjx_study.diagnose import diagnose
 
 
 def run(options: argparse.Namespace) -> int:
-    """Measure and print; 1 where a derivative is wrong."""
+    """Measure and print; return 1 if a derivative is wrong."""
     with usage_errors():
         configure_process(options)
         task = task_of(options)
-        if not is_file(options.task):  # the other commands take several by default
+        if not is_file(options.task):  # other commands default to several
             options.contact = options.contact or task.defaults.main_family
             if FAMILIES[options.contact].swept:
                 options.stiffness = options.stiffness or task.defaults.middle_stiffness

@@ -15,11 +15,11 @@ from mjx_study.study.resolution import check_estimators
 from mjx_study.tasks import make_task
 
 UNEXERCISED = 3
-"""Exit code where nothing is wrong and something was never exercised."""
+"""Exit code if nothing is wrong but something was never exercised."""
 
 
 def run(options: argparse.Namespace) -> int:
-    """Check and print; 1 where something is wrong, 3 where something was not exercised."""
+    """Check and print; return 1 if something is wrong, 3 if something was not exercised."""
     if options.mean:
         return _run_mean(options)
     if given := _given(options):
@@ -34,7 +34,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _given(options: argparse.Namespace) -> dict[str, Any]:
-    """Options of --mean that are given."""
+    """Options of --mean that were given."""
     return {name: getattr(options, name) for name in MEAN if getattr(options, name) is not None}
 
 
@@ -69,7 +69,7 @@ def _plan(options: argparse.Namespace) -> GradcheckPlan:
         task = make_task(options.task, **chosen)
         return check.plan_gradcheck(task, options.contact, options.stiffness, **common)
     if options.model is not None:
-        raise UsageError("--model replaces the MJCF of a task, and this is a file already")
+        raise UsageError("--model replaces the MJCF of a task, but this is a file already")
     if options.pair is not None and len(options.pair) != 2:
         raise UsageError(f"--pair takes the names of two geoms, got {len(options.pair)}")
     scene = load_scene(options.task, **chosen)

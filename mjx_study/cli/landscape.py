@@ -22,7 +22,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _plan(options: argparse.Namespace) -> StudyPlan:
-    """The task's contact models at the middle stiffness of its sweep, and its analytic reference beside them."""
+    """Plan the task's contact models at the middle stiffness of its sweep, and its analytic reference if it has one."""
     fields, task = study_fields(options), make_task(options.task, **scene_options(options, "horizon", "model"))
     fields.setdefault("contact", task.defaults.families)
     if not options.no_reference and task.reference is not None and fields.get("onset", "none") == "none":
@@ -33,7 +33,7 @@ def _plan(options: argparse.Namespace) -> StudyPlan:
 
 
 def curves(dataset: xr.Dataset) -> dict[str, Any]:
-    """Findings, and a curve for each contact model."""
+    """Findings, and a curve per contact model."""
     found = [
         {"label": label, "contact": one["contact"].item(), "stiffness": one["stiffness"].item() or None}
         | {str(name): one[name].values for name in one if "entry" not in str(one[name].dims)}

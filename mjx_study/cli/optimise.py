@@ -23,20 +23,20 @@ from mjx_study.tasks import make_task
 from mjx_study.tasks.contact_grid import REFERENCE
 
 WRAPPED = ("contact", "stiffness", "sigma", "cone", "samples", "backward")
-"""Options that are one value here, and a list in a study."""
+"""Options with a single value here and a list in a study."""
 
 
 def run(options: argparse.Namespace) -> int:
-    offer = "a figure, the policies, and to go on later"
+    offer = "a figure, the policies, and a run that can be resumed"
     return run_one(options, _plan, descents, _lines, offer, _save_policies)
 
 
 def _plan(options: argparse.Namespace) -> StudyPlan:
-    """One contact model, that of the options or the task's own."""
+    """Plan a single contact model, the given one or the task's own."""
     fields, task = study_fields(options), make_task(options.task, **scene_options(options, "horizon", "model"))
     if options.reference:
         if options.contact not in (None, REFERENCE):
-            raise ValueError(f"--reference is in the place of --contact {options.contact}; leave one of them out")
+            raise ValueError(f"--reference replaces --contact {options.contact}; omit one of them")
         fields["contact"] = REFERENCE
     fields.setdefault("contact", task.defaults.main_family)
     if takes_stiffness((fields["contact"],)):
@@ -46,7 +46,7 @@ def _plan(options: argparse.Namespace) -> StudyPlan:
 
 
 def descents(dataset: xr.Dataset) -> dict[str, Any]:
-    """The descents of every estimator; histories by iteration and seed."""
+    """Descents of every estimator, with histories by iteration and seed."""
     config, resolved = json.loads(dataset.attrs["config"]), json.loads(dataset.attrs["resolved"])[0]
     one = dataset.isel({name: 0 for name in ("task", "timestep", "cone", "model", "sigma", "samples")})
     place = {name: one[name].item() for name in ("contact", "stiffness", "cone", "sigma", "samples")}

@@ -1,4 +1,4 @@
-"""Shared by the commands: options and their checks, one-line errors, and a clean end when interrupted."""
+"""Shared by the commands: options and their checks, one-line errors, and clean interruption."""
 
 import argparse
 import dataclasses
@@ -22,7 +22,7 @@ from mjx_study.study.configuration import Progress
 INTERRUPTED = "nothing was written"
 """Default continuation of "interrupted; ..."."""
 ENDINGS: Final = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated", signal.SIGHUP: "hung up"}
-"""Signals that end a command with one line and exit code 128 + their number."""
+"""Signals that end a command with one line and exit code 128 + the signal's number."""
 
 
 class UsageError(ValueError):
@@ -37,7 +37,7 @@ class Parser(argparse.ArgumentParser):
         raise UsageError(f"{message}{'' if message.endswith('?') else '.'} See {self.prog} --help")
 
     def parse_known_args(self, args: Iterable[str] | None = None, namespace: Any = None) -> Any:  # type: ignore[override]
-        """Refuse what is unknown here: the top level would point to its own help."""
+        """Reject unknown options here, since the top level would point to its own help."""
         given, flags = list(args or ()), self._option_string_actions
         own = itertools.takewhile(lambda text: text.startswith("-") if self._subparsers else text != "--", given)
         for flag in (text.partition("=")[0] for text in own if text.startswith("--")):
@@ -55,7 +55,7 @@ class Parser(argparse.ArgumentParser):
 
 
 def refuse_lone_dashes(given: Sequence[str]) -> None:
-    """Raises UsageError for an option whose value is --, which argparse drops."""
+    """Raise UsageError for an option whose value is --, which argparse drops."""
     for text in given:
         if text.startswith("-") and text.endswith("=--"):
             raise UsageError(f"{text.removesuffix('=--')} needs a value, got --")
@@ -74,9 +74,9 @@ def add_option(
 
     Args:
         default: default value, shown in the help.
-        given: whether the parsed namespace holds the default; otherwise None, for a configuration to fill in.
+        given: whether the parsed namespace holds the default; otherwise it holds None, for a configuration to fill in.
         read: parser of the text; None for the option's own.
-        **changes: changes of the description.
+        **changes: changes to the option's description.
     """
     option = dataclasses.replace(option, **changes)
 
@@ -101,7 +101,7 @@ def add_option(
 
 
 def add_options(command: argparse.ArgumentParser, owner: type[Checked], *names: str, **changes: dict[str, Any]) -> None:
-    """Add options of a configuration by name, with changes of their descriptions."""
+    """Add options of a configuration by name, with changes to their descriptions."""
     for name in names:
         add_option(command, owner.option(name), owner.default(name), given=False, **changes.get(name, {}))
 
@@ -115,7 +115,7 @@ def add_task_options(command: argparse.ArgumentParser) -> None:
 
 
 def known_task(text: str) -> str:
-    """A task's name, unless it is unknown."""
+    """Return a task's name, or raise ArgumentTypeError if it is unknown."""
     if told := unknown_task(text):
         raise argparse.ArgumentTypeError(told)
     return text
@@ -127,17 +127,17 @@ def add_task_argument(command: argparse.ArgumentParser) -> None:
 
 
 def add_theta_option(command: argparse.ArgumentParser, purpose: str) -> None:
-    """`--theta`; `theta_of` reads it."""
+    """Add `--theta`, read by `theta_of`."""
     command.add_argument(
         "--theta",
         metavar="FILE|X[,X]",
-        help=f"{purpose}: a policy that optimise wrote, a .json or .npy file, or the numbers (default: the task's)",
+        help=f"{purpose}: a policy written by optimise, a .json or .npy file, or numbers (default: the task's)",
     )
 
 
 def add_folder_options(command: argparse.ArgumentParser) -> None:
     command.add_argument(
-        "--output", type=Path, metavar="DIR", help="folder of the study: the numbers and the figures; resumable"
+        "--output", type=Path, metavar="DIR", help="folder for the study's numbers and figures; resumable"
     )
     add_study_options(command)
 
@@ -162,7 +162,7 @@ def add_scene_options(command: argparse.ArgumentParser) -> None:
         "--disable-flag",
         metavar="FLAG[,FLAG]",
         dest="disable_flags",
-        help=f"as in the MJCF's <flag>; of: {', '.join(FLAGS)}",
+        help=f"flags to disable, as in the MJCF's <flag>: {', '.join(FLAGS)}",
     )
 
 
@@ -173,7 +173,7 @@ def scene_options(options: argparse.Namespace, *names: str) -> dict[str, Any]:
 
 
 def add_estimator_options(command: argparse.ArgumentParser, owner: type[Checked]) -> None:
-    """The noise, and what estimators let one choose; see `estimators.ESTIMATORS`."""
+    """Add the noise and the estimators' options; see `estimators.ESTIMATORS`."""
     add_options(
         command, owner, "noise", "baseline", "published", "gamma", "failure_probability", "variance_proxy", "radius",
         "max_norm", "window", "tolerance", "weights", "onset",
@@ -188,7 +188,7 @@ def add_backward_options(command: argparse.ArgumentParser, *, many: bool = True)
 
 
 def add_process_options(command: argparse.ArgumentParser, seed: int | None = 0) -> None:
-    """Seed, precision, devices; the seed is None where a configuration has its default."""
+    """Add seed, precision and devices; a seed of None leaves its default to a configuration."""
     add_option(command, OPTIONS["seed"], 0, given=seed is not None)
     command.add_argument("--precision", choices=PRECISIONS, default="float64", help="default: float64")
     add_option(command, OPTIONS["devices"])
@@ -197,7 +197,7 @@ def add_process_options(command: argparse.ArgumentParser, seed: int | None = 0) 
 def add_cluster_option(command: argparse.ArgumentParser) -> None:
 
     def cluster(text: str) -> str:
-        """A cluster, as `mjx_study.study.cluster.connected` takes it."""
+        """Parse a cluster, as for `mjx_study.study.cluster.connected`."""
         if not re.fullmatch(r"(local|slurm)(:[1-9]\d{0,4})?|(tcp|tls|ws|wss|ucx)://\S+", text):
             raise argparse.ArgumentTypeError(
                 f"must be local:N, slurm:N or an address such as tcp://host:8786, got {text!r}"
@@ -208,14 +208,14 @@ def add_cluster_option(command: argparse.ArgumentParser) -> None:
         "--cluster",
         type=cluster,
         metavar="WHERE",
-        help="compute on Dask's workers: local:N processes, slurm:N workers, or a scheduler's tcp://host:port",
+        help="compute on Dask workers: local:N processes, slurm:N workers, or a scheduler's tcp://host:port",
     )
 
 
 def add_study_options(command: argparse.ArgumentParser) -> None:
-    command.add_argument("--dry-run", action="store_true", help="print what it would cost; compute and write nothing")
+    command.add_argument("--dry-run", action="store_true", help="print the expected cost; compute and write nothing")
     command.add_argument(
-        "--accept-versions", action="store_true", help="go on with a folder that other versions of the software began"
+        "--accept-versions", action="store_true", help="resume a folder begun by other versions of the software"
     )
 
 
@@ -223,13 +223,13 @@ def configure_process(options: argparse.Namespace) -> None:
     """Set up JAX from the options; commands without them get float64 and one device.
 
     Raises:
-        ValueError: JAX cannot be set up so, as where JAX_PLATFORMS names no platform.
+        ValueError: JAX cannot be set up like this, for instance because JAX_PLATFORMS names no platform.
     """
     configure(precision=getattr(options, "precision", PRECISIONS[0]), cpu_devices=getattr(options, "devices", 1))
 
 
 def configure(**settings: Any) -> None:
-    """`mjx_study.runtime.configure`, and a look at whether there is a device."""
+    """Call `mjx_study.runtime.configure`, and check that JAX has a device."""
     import jax
 
     from mjx_study.runtime import configure
@@ -252,20 +252,20 @@ def usage_errors() -> Generator[None]:
 
 @contextmanager
 def computing(interrupted: str = INTERRUPTED) -> Generator[Progress]:
-    """Progress around computing; a signal ends the process at once, see `ending`."""
+    """Show progress while computing; a signal ends the process at once, see `ending`."""
     with ending(interrupted, *ENDINGS), shown_progress() as progress:
         yield progress
 
 
 @contextmanager
 def ending(told: str, *signals: signal.Signals) -> Generator[None]:
-    """While inside, any of some signals ends the process at once, with one line and exit code 128 + its number.
+    """Within the context, let signals end the process at once, with one line and exit code 128 + the signal's number.
 
-    An exception would not do: JAX calls back into Python while it traces, and what is raised there may be lost.
-    Nothing is on disk yet, or only what is complete, so there is nothing to undo.
+    Exceptions would not work: JAX calls back into Python while tracing, and exceptions raised there may be lost.
+    Nothing is on disk yet, or only complete files, so there is nothing to undo.
     """
     previous = {number: signal.getsignal(number) for number in signals}
-    # Only the main thread may set a handler, and what a background job or nohup ignores is ignored still.
+    # Only the main thread may set handlers; signals that a background job or nohup ignores stay ignored.
     ours = threading.current_thread() is threading.main_thread()
     caught = [number for number, handler in previous.items() if ours and handler is not signal.SIG_IGN]
     for number in caught:
@@ -284,22 +284,22 @@ def _leave(message: str, code: int) -> NoReturn:
 
 
 def attempt(write: Callable[[], list[Path]]) -> tuple[list[Path], str | None]:
-    """Paths that a function wrote, or the reason why it could not: a full disk must not cost the printed numbers."""
+    """Write files; return their paths, or the reason for a failure: a full disk must not cost the printed numbers."""
     try:
         return write(), None
     except OSError as error:
-        return [], f"cannot write {error.filename or 'a file'}: {error.strerror or error}; what is there is complete"
+        return [], f"cannot write {error.filename or 'a file'}: {error.strerror or error}; existing files are complete"
 
 
 def finish(*unwritten: str | None) -> int:
-    """The exit code once the numbers are printed: 1 where something could not be written, with one line about it."""
+    """Return the exit code after the numbers are printed: 1, with one line, if something could not be written."""
     if failures := [failure for failure in unwritten if failure]:
         print(f"mjx-study: {failures[0]}", file=sys.stderr)
     return int(bool(failures))
 
 
 def print_report(options: argparse.Namespace, document: dict[str, Any], lines: Sequence[str]) -> None:
-    """The document as JSON where that is asked for, otherwise the lines."""
+    """Print the document as JSON if requested, otherwise the lines."""
     if options.json:
         print(json.dumps(document, allow_nan=False))
     else:

@@ -15,8 +15,8 @@ def written_out() -> Generator[None]:
     """Run a command with unencodable characters escaped and output flushed at the end.
 
     Raises:
-        OutputError: it cannot be written to.
-        BrokenPipeError: nobody reads it any more.
+        OutputError: standard output cannot be written to.
+        BrokenPipeError: its reader has gone.
     """
     if hasattr(sys.stdout, "reconfigure"):
         sys.stdout.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
@@ -36,14 +36,14 @@ def written_out() -> Generator[None]:
 
 
 def complain(line: str) -> None:
-    """A line on standard error, where there is one."""
+    """Print a line on standard error, if there is one."""
     if sys.stderr is not None:
         with suppress(OSError):
             print(line, file=sys.stderr, flush=True)
 
 
 def _abandon() -> None:
-    """Nothing more is written to standard output: Python would try again when it ends."""
+    """Discard further standard output, which Python would otherwise try to write again at exit."""
     with suppress(OSError, AttributeError, ValueError):
         nowhere = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nowhere, sys.stdout.fileno())

@@ -1,4 +1,4 @@
-"""The task that options describe, and its policy's parameters: numbers, a file of them, or a policy of optimise."""
+"""The task described by the options, and its parameters: numbers, a file, or a policy written by optimise."""
 
 import argparse
 from pathlib import Path
@@ -15,10 +15,10 @@ def task_of(options: argparse.Namespace) -> Task:
 
 
 def theta_of(options: argparse.Namespace) -> tuple[float, ...] | None:
-    """The parameters that `--theta` gives; None where it is not given.
+    """Return the parameters given by `--theta`; None if it is not given.
 
     Raises:
-        ValueError: the file cannot be read, is of another kind, or is a policy of another task.
+        ValueError: the file cannot be read, is of another kind, or is a policy for another task.
     """
     if options.theta is None:
         return None

@@ -1,4 +1,4 @@
-"""Progress on standard error: a bar on a terminal, a line for each stage elsewhere."""
+"""Progress on standard error: a bar on a terminal, otherwise a line per stage."""
 
 import sys
 import time
@@ -10,7 +10,7 @@ from mjx_study.cli.output import complain
 
 @contextmanager
 def shown_progress() -> Generator[Callable[[int, int, str], None]]:
-    """A bar on a terminal, gone when the work is done; elsewhere a line for each stage, with the elapsed time."""
+    """Show a bar on a terminal until the work is done; otherwise print a line per stage with the elapsed time."""
     if sys.stderr is None or not sys.stderr.isatty():
         yield _stage_lines()
         return
@@ -28,7 +28,7 @@ def shown_progress() -> Generator[Callable[[int, int, str], None]]:
 
 
 def _stage_lines() -> Callable[[int, int, str], None]:
-    """A stage is what has a name of its own; progress within it is not told."""
+    """Print a line for each stage, identified by its name; progress within a stage is not shown."""
     begun, last = time.monotonic(), ""
 
     def report(done: int, total: int, what: str) -> None:
@@ -41,6 +41,6 @@ def _stage_lines() -> Callable[[int, int, str], None]:
 
 
 def show_cursor() -> None:
-    """Bring back the cursor that a progress bar hides, where standard error is a terminal."""
+    """Restore the cursor hidden by a progress bar, if standard error is a terminal."""
     if sys.stderr is not None and sys.stderr.isatty():
         sys.stderr.write("\n\x1b[?25h")

@@ -39,17 +39,17 @@ from mjx_study.tasks.task import Task
 
 PASSIVE_SECONDS = 2.0
 MOST_BODIES = 12
-LARGEST = 1e10  # beyond this MuJoCo itself calls a coordinate bad
+LARGEST = 1e10  # MuJoCo itself considers larger coordinates bad
 
 
 @dataclasses.dataclass(frozen=True)
 class Rollout:
-    """A simulated rollout; there is one control fewer than states.
+    """A simulated rollout, with one control fewer than states.
 
     Attributes:
         qpos, qvel, controls: the trajectory.
-        facts: what is known about it, as JSON has it.
-        focus: geoms to show in any case.
+        facts: what is known about the rollout, as JSON data.
+        focus: geoms to keep in view.
     """
 
     title: str
@@ -67,7 +67,7 @@ class Rollout:
 
     @property
     def lasting(self) -> int:
-        """How many states there are before the first that is not finite."""
+        """Number of states before the first nonfinite one."""
         state = np.concatenate([self.qpos, self.qvel], axis=1)
         good = np.all(np.abs(state) < LARGEST, axis=1)
         return len(good) if good.all() else int(np.argmin(good))
@@ -95,7 +95,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _plan(options: argparse.Namespace):
-    """A function without arguments that simulates what the options ask for, and what there is to warn about."""
+    """Return a function that runs the requested simulation, and warnings."""
     if not is_file(options.task):
         return _plan_task(options)
     unfit = ("contact", "stiffness", "damping", "noise", "sigma", "theta", "policy", "model")
@@ -116,7 +116,7 @@ def _plan_task(options: argparse.Namespace):
                 setattr(options, name, getattr(policy, name) or None)
     task = task_of(options)
     if policy is not None and policy.network is not None:
-        task = with_network(task, tuple(policy.network), jax.random.key(0))  # whose weights theta replaces
+        task = with_network(task, tuple(policy.network), jax.random.key(0))  # theta replaces its weights
     stiffness = task.defaults.middle_stiffness if options.stiffness is None else options.stiffness
     cells, messages = contact_grid(task, (options.contact or task.defaults.main_family,), (stiffness,), options.damping)
     task = at_theta(task, theta_of(options) if policy is None else policy.theta)
@@ -124,10 +124,10 @@ def _plan_task(options: argparse.Namespace):
 
 
 def _load_policy(options: argparse.Namespace) -> PolicyFile:
-    """A policy that optimise wrote.
+    """Load a policy written by optimise.
 
     Raises:
-        ValueError: the file cannot be read, is no policy, or is one of another task; or theta is given too.
+        ValueError: the file cannot be read, is not a policy, or is one for another task; or theta is given too.
     """
     if options.theta is not None:
         raise ValueError("--policy and --theta both say what theta is; give one of them")
@@ -160,8 +160,8 @@ def _simulate_task(task: Task, cell: ContactPoint, seed: int, noisy: bool) -> Ro
 
 
 def _simulate_passive(model: mujoco.MjModel, name: str, steps: int) -> Rollout:
-    """Motion by MuJoCo's C engine from the first keyframe or the reference pose, with constant controls."""
-    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET  # a state that is bad shall be seen
+    """Simulate with MuJoCo's C engine from the first keyframe or the reference pose, with constant controls."""
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET  # show bad states rather than reset them
     data = mujoco.MjData(model)
     if model.nkey:
         mujoco.mj_resetDataKeyframe(model, data, 0)
@@ -177,7 +177,7 @@ def _simulate_passive(model: mujoco.MjModel, name: str, steps: int) -> Rollout:
 def _rollout(
     title: str, model: mujoco.MjModel, qpos: np.ndarray, qvel: np.ndarray, controls: np.ndarray, facts: dict[str, Any]
 ) -> Rollout:
-    """A rollout with the facts that every one has: steps, duration, and where the bodies' centres of mass ended."""
+    """Build a rollout with the common facts: steps, duration, and final positions of the bodies' centres of mass."""
     steps = len(qpos) - 1
     rollout = Rollout(title, model, np.asarray(qpos, float), np.asarray(qvel, float), np.asarray(controls), facts)
     last = rollout.lasting - 1
@@ -193,7 +193,7 @@ def _rollout(
 
 
 def _write(rollout: Rollout, folder: Path, options: argparse.Namespace) -> list[Path]:
-    """Everything that a rollout leaves; what can fail comes first, so that then nothing is written."""
+    """Write all files of a rollout; what can fail comes first, so that a failure leaves nothing."""
     if rollout.lasting == 0:
         raise UsageError(f"{rollout.title}: the first state is not finite")
     motion = Motion(rollout.model, rollout.time[: rollout.lasting], rollout.qpos[: rollout.lasting], rollout.focus)
@@ -225,5 +225,5 @@ def _lines(rollout: Rollout, messages: tuple[str, ...], written: list[Path]) -> 
 
 
 def _stem(task: str) -> str:
-    """The name of a task or an MJCF file as part of a folder's name."""
+    """Name of a task or MJCF file as part of a folder's name."""
     return (Path(task).stem if task.lower().endswith(".xml") else task).replace(":", "-")

@@ -1,4 +1,4 @@
-"""Shared by the commands that run studies: options to configuration, the folder, numbers and figures."""
+"""Shared by the commands that run studies: configuration from options, the folder, numbers and figures."""
 
 import argparse
 import dataclasses
@@ -22,7 +22,7 @@ from mjx_study.study.plan import StudyPlan
 from mjx_study.study.run import open_store, run_study, warnings_of
 from mjx_study.study.store import StudyError
 
-RESUMABLE = "the same command goes on where it stopped"
+RESUMABLE = "the same command resumes where it stopped"
 KEPT = "results.nc (every number), study.json (the configuration), cells/ (checkpoints)"
 
 
@@ -48,12 +48,12 @@ def run_one(
     offer: str,
     also: Callable[[dict[str, Any], Path], list[Path]] = lambda document, folder: [],
 ) -> int:
-    """A command about one study: plan, compute, draw where an output folder is given, print.
+    """Run a command about one study: plan, compute, draw if an output folder is given, print.
 
     Args:
-        planned: the plan that they ask for.
+        planned: returns the plan requested by the options.
         own: see `as_document`.
-        lines_of: the text, of the study and this document.
+        lines_of: formats the study and its document as text.
         offer: what `--output` would add.
         also: writes further files of the document into the folder, and returns their paths.
     """
@@ -72,7 +72,7 @@ def run_one(
     lines = [*lines_of(dataset, document), *(f"warning: {message}" for message in document["warnings"])]
     lines += [f"add --output DIR for {offer}"] if folder is None else []
     if folder is not None and not dataset.attrs["computed_cells"] and not dataset.attrs["missing_cells"]:
-        lines.append(f"nothing was computed: {folder} has held all {len(plan.cells)} cells")
+        lines.append(f"nothing was computed: {folder} already holds all {len(plan.cells)} cells")
     if folder is not None and not unwritten:
         lines.append(f"written to {folder}: {', '.join([*(path.name for path in written), KEPT])}")
     print_report(options, document, lines)
@@ -80,13 +80,13 @@ def run_one(
 
 
 def _compute(plan: StudyPlan, options: argparse.Namespace) -> tuple[xr.Dataset, str | None]:
-    """Run a study, in its folder where one is given; what a full disk refuses is kept in memory.
+    """Run a study, in its folder if one is given; what a full disk rejects is kept in memory.
 
     Returns:
         The numbers, and why they could not be written, if so.
 
     Raises:
-        UsageError: the folder holds another study, or a damaged one, or cannot be used.
+        UsageError: the folder holds another study or a damaged one, or cannot be used.
     """
     if options.output is None:
         if getattr(options, "cluster", None) is not None:
@@ -105,11 +105,11 @@ def _compute(plan: StudyPlan, options: argparse.Namespace) -> tuple[xr.Dataset, 
     except StudyError as error:
         raise UsageError(str(error)) from error
     reason = dataset.attrs.pop("unwritten", None)
-    return dataset, reason and f"{reason}; what is there is complete, and the same command goes on"
+    return dataset, reason and f"{reason}; existing files are complete, and the same command resumes"
 
 
 def announce(plan: StudyPlan, options: argparse.Namespace) -> int:
-    """Print what a study would take."""
+    """Print the forecast cost of a study."""
     with usage_errors():
         found = forecast(
             plan, options.output, accept_versions=options.accept_versions, cluster=getattr(options, "cluster", None)

@@ -47,7 +47,7 @@ def run(options: argparse.Namespace) -> int:
         with usage_errors():
             dataset = load_study(options.output)
         reason = f"cannot write to {options.output}: {error.strerror or error}"
-        unwritten = f"{reason}; what is there is complete, and the same command goes on"
+        unwritten = f"{reason}; existing files are complete, and the same command resumes"
     computed = dataset.attrs.get("computed_cells", missing - dataset.attrs["missing_cells"])
     drawn = f"written to {options.output}: results.nc; mjx-study plot {options.output} draws it"
     lines = [*_tail(dataset, computed, plan), *([drawn] if unwritten is None else [])]
@@ -57,7 +57,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _fields(options: argparse.Namespace) -> dict[str, Any]:
-    """The configuration's fields: flags first, then the file's."""
+    """Fields of the configuration; flags take precedence over the file."""
     merged = ({} if options.config is None else read_toml(options.config, _schema())) | study_fields(options)
     if "tasks" not in merged:
         raise ValueError("no task: name one, or give --config")
@@ -67,7 +67,7 @@ def _fields(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def _schema() -> type[BaseModel]:
-    """Schema of a TOML file: the configuration's fields, as their options read them."""
+    """Schema of a TOML file: the configuration's fields, parsed like their options."""
     own = {"tasks": TASKS.read, "direction": _direction, "solref": solref, "solimp": solimp}
 
     def reader(name: str) -> Callable[[Any], Any]:
@@ -124,7 +124,7 @@ def _document(dataset: xr.Dataset, computed: int, folder: Path) -> dict[str, Any
 
 
 def _tail(dataset: xr.Dataset, computed: int, plan: StudyPlan) -> list[str]:
-    """The end of the output: what was computed, and warnings that the head did not give."""
+    """End of the output: what was computed, and warnings not already in the head."""
     sizes = ", ".join(f"{name} {size}" for name, size in dataset.sizes.items())
     lines = [f"computed {computed} cells; {sizes}"]
     lines += [f"warning: {message}" for message in warnings_of(dataset) if message not in plan.warnings]

@@ -8,7 +8,7 @@ from mjx_study.cli.options import configure_process, print_report, usage_errors
 
 
 def run(options: argparse.Namespace) -> int:
-    """List the tasks; only their numbers, which --json has, need their models."""
+    """List the tasks; only the numbers in --json need their models."""
     lines = [f"{name:<25} {description}" for name, description in TASK_DESCRIPTIONS.items()]
     print_report(options, {"tasks": _rows(options)} if options.json else {}, lines)
     return 0

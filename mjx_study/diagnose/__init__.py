@@ -1,6 +1,6 @@
-"""One page about a model: where contact begins, whether derivatives and means are right, and which estimator to take.
+"""One-page diagnosis of a model: where contact begins, whether derivatives and means are right, which estimator to use.
 
-Every statement is measured here and comes with the command that measures it again.
+Every statement is measured and comes with the command that reproduces it.
 """
 
 from mjx_study.diagnose.measurement import ESTIMATORS, Measured, Measurement, measure

@@ -1,8 +1,8 @@
-"""The five estimators under one contact model: their variances, times and means.
+"""Variances, times and means of the five estimators under one contact model.
 
 The error of an estimator after a second of computing is sqrt(bias^2 + variance x seconds per sample), relative to the
-gradient: the bias is what the estimator's mean misses of the mean cost's slope along a path (`estimators.circulation`),
-where something is seen.
+gradient. The bias is the detectable deviation of the estimator's mean from the mean cost's slope along a path
+(`estimators.circulation`).
 """
 
 import dataclasses
@@ -28,32 +28,32 @@ from mjx_study.tasks.task import Task
 
 ESTIMATORS: Final = ("zobg", "fobg", "aobg", "fobg_onset", "aobg_onset")
 SAMPLES: Final = 500
-"""Of each batch, where time allows."""
+"""Samples per batch, if time allows."""
 BUDGET: Final = 60.0
-"""Time for all batches, compilation apart [s]."""
+"""Time for all batches, compilation excluded [s]."""
 CHUNKS: Final = (32, 8)
-"""Samples in a call of a program on a CPU, of a small model and of a large one: a call takes the time of all of them,
-however few are asked for."""
+"""Samples per program call on a CPU, for small and large models: a call takes the time of all of them, however few are
+requested."""
 SMALL: Final = (8, 32)
-"""Most degrees of freedom and constraint rows of a small model."""
+"""Maximum numbers of degrees of freedom and constraint rows of a small model."""
 RESOLVED: Final = 2.0
-"""Standard errors beyond which a gradient is told from 0."""
+"""Standard errors beyond which a gradient is distinguishable from 0."""
 ACCURATE: Final = 0.1
-"""Relative error that a number of samples is given for."""
+"""Relative error for which the page states a number of samples."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Measured:
-    """An estimator on one batch.
+    """Measurements of an estimator on one batch.
 
     Attributes:
-        variance, lower, upper: of one sample, with its 95 % interval [gradient^2].
-        seconds: computing time of a sample [s].
-        paths: checks of its mean along them; none of zeroth order, which has no bias.
-        verdict: of its mean: unbiased by theory, or right, biased or undecided by the check.
-        bias: what the mean misses along the paths, beyond one standard error [gradient].
-        norm: of the mean, without what noise adds to it [gradient].
-        lost: samples that are not finite and were left out.
+        variance, lower, upper: variance of one sample, with its 95 % interval [gradient^2].
+        seconds: computing time per sample [s].
+        paths: checks of the mean along paths; none for zeroth order, which is unbiased.
+        verdict: verdict on the mean: unbiased by theory, or right, biased or undecided by the check.
+        bias: deviation of the mean along the paths, beyond one standard error [gradient].
+        norm: norm of the mean, without what noise adds to it [gradient].
+        lost: number of excluded nonfinite samples.
     """
 
     estimator: str
@@ -81,12 +81,12 @@ class Measured:
 
 @dataclasses.dataclass(frozen=True)
 class Measurement:
-    """The estimators under one contact model.
+    """Measurements of the estimators under one contact model.
 
     Attributes:
         onsets: `mjx_study.study.variables.ONSETS` of the first-order batch.
-        unconverged: rollouts in which the solver did not converge.
-        estimators: best first.
+        unconverged: number of rollouts in which the solver did not converge.
+        estimators: the estimators, best first.
     """
 
     samples: int
@@ -96,7 +96,7 @@ class Measurement:
 
     @property
     def lost(self) -> int:
-        """Samples that are not finite, of the batch with the most."""
+        """Largest number of nonfinite samples of any estimator."""
         return max(each.lost for each in self.estimators)
 
     @property
@@ -106,7 +106,7 @@ class Measurement:
 
     @property
     def norm(self) -> float:
-        """Norm of the gradient; its standard error where that is larger."""
+        """Norm of the gradient, or its standard error if that is larger."""
         return max(self.surest.norm, self.norm_error)
 
     @property
@@ -116,17 +116,17 @@ class Measurement:
 
     @property
     def resolved(self) -> bool:
-        """Whether the gradient can be told from 0."""
+        """Whether the gradient is distinguishable from 0."""
         return self.surest.norm > RESOLVED * self.norm_error
 
     @property
     def best(self) -> Measured:
-        """The estimator of least error after a second of computing."""
+        """The estimator with the least error after a second of computing."""
         return self.estimators[0]
 
     @property
     def samples_needed(self) -> float:
-        """By the best, for a relative error of `ACCURATE`; infinite if its bias alone is larger."""
+        """Samples the best estimator needs for a relative error of `ACCURATE`; infinite if its bias alone is larger."""
         left = (ACCURATE * self.norm) ** 2 - self.best.bias**2
         return self.best.variance / left if left > 0 else math.inf
 
@@ -136,7 +136,7 @@ def estimators_of(task: Task) -> list[Estimator]:
 
 
 def chunk_of(task: Task, samples: int) -> int:
-    """Samples in a call of a program."""
+    """Number of samples per program call."""
     devices, size = jax.local_devices(), (task.scene.host.nv, num_constraint_rows(task.scene.template))
     large = any(number > most for number, most in zip(size, SMALL, strict=True))
     most = CHUNKS[large] if devices[0].platform == "cpu" else samples + 1
@@ -144,11 +144,11 @@ def chunk_of(task: Task, samples: int) -> int:
 
 
 def affordable(seconds: float, chunk: int) -> int:
-    """Samples that `BUDGET` has room for, at theta and along all paths; those of one call a path at least.
+    """Number of samples that fit into `BUDGET`, at theta and along all paths, but at least one call per path.
 
     Args:
-        seconds: of one call of all programs [s].
-        chunk: samples in it, a baseline included.
+        seconds: time of one call of all programs [s].
+        chunk: number of samples in it, including a baseline.
     """
     calls = max(1, round(BUDGET / (seconds * MOST_PATHS * (NODES + 1))))
     return min(SAMPLES, MOST_PATHS * chunk * calls - 1)
@@ -157,13 +157,13 @@ def affordable(seconds: float, chunk: int) -> int:
 def measure(
     simulator: Simulator, contact: ContactModel | None, samples: int | None = None, seed: int = 0
 ) -> Measurement:
-    """The estimators at the task's theta, without the contacts and the derivatives of a step.
+    """Measure the estimators at the task's theta, without the contacts and step derivatives of a diagnosis.
 
     Args:
-        simulator: what it has compiled serves every contact model.
+        simulator: its compiled programs serve every contact model.
         contact: the contact model; None for the MJCF's own.
         samples: see `diagnose`.
-        seed: of all randomness.
+        seed: random seed.
     """
     task = simulator.task
     chosen = estimators_of(task)
@@ -194,7 +194,7 @@ def _measure(
     samples: int,
     seed: int,
 ) -> list[Measured]:
-    """The estimators on their batches, and their means along the paths of `along_means`."""
+    """Measure estimators on their batches, and their means along the paths of `along_means`."""
     task, estimates = objective.simulator.task, [estimator(batches) for estimator in chosen]
     reach = reach_of(task)
     first = [each for each in chosen if any(ORACLES[oracle].order for oracle in each.needs)]

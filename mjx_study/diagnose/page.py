@@ -1,4 +1,4 @@
-"""The page of a diagnosis, and its advice."""
+"""The page of a diagnosis, with advice."""
 
 import dataclasses
 import math
@@ -21,35 +21,35 @@ from mjx_study.table import format_table
 from mjx_study.tasks.task import Task
 
 FEW: Final = 100
-"""Samples below which the page says so."""
+"""Number of samples below which the page warns."""
 SMOOTH: Final = 0.01
-"""Share of the approach speed lost in the first step below which force sets in without a jump."""
+"""Share of the approach speed lost in the first step below which force counts as setting in without a jump."""
 WIDTHS: Final = 3.0
-"""Steps' travel over which an impedance should rise."""
+"""Recommended width of the impedance's rise, as a multiple of a step's travel."""
 LEGEND: Final = (
     "  zobg: zeroth order; fobg: first order; aobg: both, weighted; _onset: with a term for contact that begins"
 )
 UNSURE: Final = 0.5
-"""Relative standard error beyond which an error has one digit."""
+"""Relative standard error beyond which an error is shown with one digit."""
 BEYOND: Final = 100.0
-"""Upper end of an interval of a relative error from which it says nothing."""
+"""Upper end beyond which the interval of a relative error is uninformative."""
 SHOWN: Final = 6
-"""Contacts in the text, the least resolved first."""
+"""Number of contacts listed in the text, least resolved first."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Diagnosis(Measurement):
-    """Everything that was measured; `lines` is the page.
+    """Everything measured; `lines` formats the page.
 
     Attributes:
-        subject: as it was named.
-        task: what was studied.
-        setting: noise and rollout, for which alone the page holds.
+        subject: the model as named by the user.
+        task: the task studied.
+        setting: noise and rollout; the page holds only for these.
         contact: label of the contact model.
-        touches: contacts that begin without noise.
+        touches: contacts that begin in the zero-noise rollout.
         derivatives: the gradient check.
-        warnings: about the contact model.
-        options: contact options, as a command has them.
+        warnings: warnings about the contact model.
+        options: contact options as command-line flags.
     """
 
     subject: str
@@ -113,7 +113,7 @@ class Diagnosis(Measurement):
         )
         parts = dict.fromkeys(part for parts in self.derivatives.unexercised.values() for part in parts)
         missing = f"; not exercised: {', '.join(parts)}" if self.derivatives.passed and parts else ""
-        steps = re.sub(r" --sigma \S+", "", command.format("gradcheck"))  # without noise
+        steps = re.sub(r" --sigma \S+", "", command.format("gradcheck"))  # steps have no noise
         lines += ["", "derivatives of a step", f"  {state}{missing}", f"  > {steps}"]
         batch = f"--estimators {','.join(each.estimator for each in self.estimators)} --samples {self.samples}"
         error = "relative error" if self.resolved else "error, in the gradient's unit,"
@@ -172,7 +172,7 @@ class Diagnosis(Measurement):
 
     @property
     def _scale(self) -> float:
-        """What errors are relative to: the gradient, where it is told from 0."""
+        """Norm that errors are relative to: the gradient's if it is distinguishable from 0, else 1."""
         return self.norm if self.resolved else 1.0
 
     @property
@@ -181,7 +181,7 @@ class Diagnosis(Measurement):
         return self.norm_error / self.norm if self.resolved else 0.0
 
     def _shown(self, error: float, unsure: float) -> str:
-        """An error to two significant digits; to one if its relative standard error is large."""
+        """Format an error to two significant digits, or to one if its relative standard error is large."""
         size = float(f"{error * (100 if self.resolved else 1):.{1 if unsure > UNSURE else 2}g}")
         decimals = 1 - math.floor(math.log10(size)) - (unsure > UNSURE) if size > 0 else 0
         text = f"{size:.{max(decimals, 0)}f}" if -6 < decimals < 6 else f"{size:g}"
@@ -225,7 +225,7 @@ class Diagnosis(Measurement):
             yield "derivatives of a step are not right (see below): do not trust a first-order estimate"
 
     def _advice(self) -> Iterator[tuple[str, str]]:
-        """What to do, each with options of `compare` that show it."""
+        """Recommendations, each with options of `compare` that demonstrate it."""
         by_name, timestep = {each.estimator: each for each in self.estimators}, self.task.scene.timestep
         if not self.resolved:
             yield (
@@ -258,7 +258,7 @@ class Diagnosis(Measurement):
                 text += f'; an impedance that rises from 0, solimp="0 0.95 {WIDTHS * travel:.1g}", has no jump'
             yield text, "--onset linear" if corrected.verdict == "right" else ""
         elif not self.best.estimator.endswith("_onset"):
-            return  # nobody is advised to use the term
+            return  # the onset term is not recommended
         if corrected.verdict == "right":
             if spread < NARROW:
                 text = (
@@ -286,6 +286,6 @@ class Diagnosis(Measurement):
 
 
 def _round(number: float) -> str:
-    """Two significant digits, upwards, with separators."""
+    """Round up to two significant digits, with thousands separators."""
     digits = max(0, math.floor(math.log10(max(number, 1.0))) - 1)
     return f"{math.ceil(number / 10**digits) * 10**digits:,}"

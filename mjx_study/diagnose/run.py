@@ -1,4 +1,4 @@
-"""Everything that a diagnosis measures, in order."""
+"""Run all measurements of a diagnosis, in order."""
 
 from typing import Final
 
@@ -15,7 +15,7 @@ from mjx_study.tasks.contact_grid import contact_grid
 from mjx_study.tasks.task import Task
 
 STATES: Final = 2
-"""Of the gradient check."""
+"""Number of states in the gradient check."""
 
 
 def diagnose(
@@ -33,13 +33,13 @@ def diagnose(
     """Measure everything under one contact model.
 
     Args:
-        subject: as the user named it; of a file the gradient check takes single steps alone.
+        subject: the model as named by the user; for a file, the gradient check covers single steps only.
         family: contact family; None for the task's main one.
-        stiffness: of the contact [N/m]; None for the task's middle one.
-        damping: of the contact [N s/m]; None for the family's.
-        samples: of each batch, and at each node of the path along which means are checked; None for `SAMPLES`, or as
-            many as `BUDGET` has room for.
-        options: contact options, as a command has them.
+        stiffness: contact stiffness [N/m]; None for the task's middle one.
+        damping: contact damping [N s/m]; None for the family's.
+        samples: samples per batch, and per node of the paths along which means are checked; None for `SAMPLES`, or as
+            many as fit into `BUDGET`.
+        options: contact options as command-line flags.
         progress: called before each part.
 
     Raises:

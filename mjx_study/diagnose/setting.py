@@ -1,4 +1,4 @@
-"""What a diagnosis holds for: the noise, where it is added, and the rollout."""
+"""The setting for which a diagnosis holds: the noise, what it is added to, and the rollout."""
 
 import dataclasses
 from typing import Final
@@ -9,20 +9,20 @@ from mjx_study.choices import is_file
 from mjx_study.tasks.task import Task
 
 UNITS: Final = {"ball_wall": "rad", "ball_wall:dome": "rad", "momentum_transfer": "rad"}
-"""Of theta, by task."""
+"""Unit of theta, by task."""
 _SLIDE, _HINGE = int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE)
 
 
 @dataclasses.dataclass(frozen=True)
 class Setting:
-    """What a diagnosis holds for.
+    """The setting for which a diagnosis holds.
 
     Attributes:
-        noise: name of the density.
-        sigma: its standard deviation.
+        noise: name of the noise density.
+        sigma: standard deviation of the noise.
         sigma_unit: unit of sigma; empty if it is not known.
         added_to: what the noise is added to.
-        timestep: [s].
+        timestep: timestep [s].
         horizon: number of steps.
         params: number of parameters.
     """
@@ -62,7 +62,7 @@ def setting_of(subject: str, task: Task) -> Setting:
 
 
 def _unit_of_control(host: mujoco.MjModel, index: int) -> str:
-    """Unit of a motor's or a servo's control; empty for other actuators, and where a gain or gear scales it."""
+    """Unit of a motor's or servo's control; empty for other actuators, or if a gain or gear scales it."""
     kind = host.jnt_type[host.actuator_trnid[index, 0]] if host.actuator_trntype[index] == 0 else None
     gain, bias = host.actuator_gainprm[index, 0], host.actuator_biasprm[index, :3].tolist()
     if kind not in (_SLIDE, _HINGE) or host.actuator_gear[index, 0] != 1 or host.actuator_dyntype[index]:

@@ -1,4 +1,4 @@
-"""Contacts that begin in the rollout without noise, and how a step resolves each."""
+"""Contacts that begin in the zero-noise rollout, and how well a step resolves each."""
 
 import dataclasses
 from collections.abc import Iterator
@@ -18,16 +18,16 @@ from mjx_study.tasks.task import Task
 
 @dataclasses.dataclass(frozen=True)
 class Touch:
-    """A contact that begins in the rollout without noise, and how its step resolves it.
+    """A contact that begins in the zero-noise rollout, and how well a step resolves it.
 
     Attributes:
-        speed: of approach [m/s]; not positive for one that begins without.
+        speed: approach speed [m/s]; not positive for a contact that begins without approach.
         damping: h b, at full impedance.
         stiffness: h^2 k, at full impedance.
         travel: h v over the width of the impedance's rise.
         impedance: d_0, at first touch; 0.9 is MuJoCo's default.
         jump: h b d_0 / d_width, the share of the approach speed that the damper takes in the first step.
-        stable: whether the step in contact is.
+        stable: whether the step in contact is stable.
     """
 
     pair: str
@@ -42,7 +42,7 @@ class Touch:
 
 
 def touches_of(task: Task, cell: ContactPoint) -> Iterator[Touch]:
-    """Contacts that begin in the rollout without noise, in the C engine."""
+    """Find the contacts that begin in the zero-noise rollout, with the C engine."""
     dtype = task.theta.dtype
     run = compiled_rollout(task)
     states, *_ = run(task.theta, cell.contact, jax.random.key(0), jnp.zeros((), dtype))
@@ -60,7 +60,7 @@ def touches_of(task: Task, cell: ContactPoint) -> Iterator[Touch]:
 
 
 def touch_of(host: mujoco.MjModel, data: mujoco.MjData, contact: Any, time: float, timestep: float) -> Touch:
-    """A contact of the engine's data, which has just begun."""
+    """Describe a contact in the engine's data that has just begun."""
     solref = np.array(contact.solref)
     if solref[0] > 0 and not host.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_REFSAFE:
         solref[0] = max(solref[0], 2 * timestep)

@@ -1,4 +1,4 @@
-"""The grid of a study: coordinates along every dimension, and each cell's index along each."""
+"""The grid of a study: coordinates along every dimension, and each cell's indices."""
 
 import dataclasses
 from collections import Counter, defaultdict
@@ -29,7 +29,7 @@ class Axes:
 
 
 def axes_of(plan: StudyPlan) -> Axes:
-    """The grid of a plan. Values are compared exactly, not by their printed names."""
+    """Return the grid of a plan. Values are compared exactly, not by their printed names."""
     exact = [_exact(plan, cell) for cell in plan.cells]
     values = {name: list(dict.fromkeys(each[name] for each in exact)) for name in exact[0]}
     for name in SORTED:
@@ -42,7 +42,7 @@ def axes_of(plan: StudyPlan) -> Axes:
 
 
 def solver_parameters(cell: StudyCell) -> dict[str, list[float] | None]:
-    """solref and solimp of a cell's contact; None where they are the MJCF's."""
+    """solref and solimp of a cell's contact; None if the MJCF's apply."""
     contact = cell.model.contact
     if contact is None:
         return {"solref": None, "solimp": None}
@@ -50,7 +50,7 @@ def solver_parameters(cell: StudyCell) -> dict[str, list[float] | None]:
 
 
 def solver_arrays(cell: dict[str, Any]) -> dict[str, np.ndarray]:
-    """solref and solimp of a cell of a study.json; NaN where they are the MJCF's."""
+    """solref and solimp of a cell in a study.json; NaN if the MJCF's apply."""
     sizes = {"solref": 2, "solimp": 5}
     return {
         name: np.full(size, np.nan) if cell.get(name) is None else np.array(cell[name]) for name, size in sizes.items()
@@ -70,14 +70,14 @@ def _exact(plan: StudyPlan, cell: StudyCell) -> dict[str, Any]:
 
 
 def _task_names(plan: StudyPlan, configured: list[str]) -> list[str]:
-    """The tasks' own names, or the configuration's where several share one."""
+    """The tasks' own names, or the configuration's where several tasks share one."""
     own = {group.name: group.task.name for group in plan.groups}
     shared = Counter(own[name] for name in configured)
     return [name if shared[own[name]] > 1 else own[name] for name in configured]
 
 
 def _model_names(models: list[tuple[str, float]]) -> list[str]:
-    """Family and stiffness, with enough digits to tell a family's stiffnesses apart."""
+    """Family and stiffness, with enough digits to distinguish a family's stiffnesses."""
     by_family = defaultdict(list)
     for family, stiffness in models:
         by_family[family].append(stiffness)

@@ -1,8 +1,8 @@
 """Batches computed in blocks, whose summaries are merged pairwise in an order fixed by their indices.
 
-Blocks are the leaves of a binary tree. Two neighbours are merged as soon as both are there, whatever else is missing,
-so that the result does not depend on the order in which blocks end, and no more is kept than the logarithm of their
-number for each that is late.
+Blocks are the leaves of a binary tree. Two neighbours are merged as soon as both are available, whatever else is
+missing, so the result does not depend on the order in which blocks finish, and each late block leaves at most
+logarithmically many summaries unmerged.
 """
 
 from collections.abc import Mapping
@@ -16,7 +16,7 @@ from estimators.blocks import Moments
 from mjx_study.study.tally import Tally
 
 REFERENCE: Final = 0
-"""The task that has the reference; the others are the blocks, seed by seed."""
+"""Number of the task that computes the reference; the others are blocks, seed by seed."""
 Arrays = dict[str, np.ndarray]
 Summary = dict[str, Any]
 """Summary of a block: moments of each estimator's parts by "ESTIMATOR.PART", and tallies by oracle."""
@@ -28,8 +28,8 @@ class Blocks:
     def __init__(self, seeds: int, blocks: int, kept: Mapping[str, np.ndarray]):
         """
         Args:
-            blocks: of each seed.
-            kept: what `arrays` returned of those that were done before.
+            blocks: number of blocks per seed.
+            kept: arrays of a checkpoint, as returned by `arrays`.
         """
         self.seeds, self.blocks = seeds, blocks
         self.reference = kept.get("reference")
@@ -47,14 +47,14 @@ class Blocks:
 
     @property
     def missing(self) -> list[int]:
-        """Tasks to do, in order."""
+        """Unfinished tasks, in order."""
         done = np.zeros((self.seeds, self.blocks), bool)
         for seed, level, place in self._held:
             done[seed, place << level : (place + 1) << level] = True
         return [REFERENCE] * (self.reference is None) + (1 + np.flatnonzero(~done)).tolist()
 
     def place(self, task: int) -> tuple[int, int]:
-        """Seed and index of a task's block."""
+        """Seed of a task's block, and its index within the seed."""
         return divmod(task - 1, self.blocks)
 
     def add(self, task: int, arrays: Arrays) -> None:

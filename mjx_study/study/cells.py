@@ -1,4 +1,4 @@
-"""The computation of a study's cells, whole or in blocks, by kind of study."""
+"""Compute a study's cells, whole or in blocks, by kind of study."""
 
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
@@ -47,7 +47,7 @@ class Computation:
             return begun.result()
 
     def begun(self, cell: StudyCell, kept: Mapping[str, np.ndarray]) -> Blocks:
-        """The blocks of a cell that is several tasks, with the finished ones of a checkpoint."""
+        """Blocks of a cell that is split into tasks, with the finished ones of a checkpoint."""
         return self._in_blocks.begun(cell, kept)
 
     def block(self, cell: StudyCell, task: int) -> Arrays:
@@ -60,5 +60,5 @@ class Computation:
 
     @property
     def _in_blocks(self) -> Gradients:
-        assert isinstance(self._compute, Gradients), "only gradients come in blocks"
+        assert isinstance(self._compute, Gradients), "only cells of gradients are split into blocks"
         return self._compute

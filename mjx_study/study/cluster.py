@@ -1,9 +1,8 @@
-"""Cells of a study on many machines, by Dask: workers compute cells and return arrays, the client alone writes.
+"""Compute a study's cells on several machines with Dask: workers return arrays, and only the client writes files.
 
-A worker has one task at a time, a cell or a block of a cell whose batches come in blocks, and the next when the client
-has the arrays of the last, so that a worker that dies takes one task with it, and that task is known. Workers keep what
-they compiled, by the content of the study, and a task goes to a worker that has its program if there is one. Blocks are
-merged by the client.
+A worker has one task at a time, a cell or a block of a cell whose batches are split, and gets the next once the client
+has its arrays. A worker that dies thus loses a single, known task. Workers keep compiled programs by the content of the
+study, and a task goes to a worker that has compiled its program, if there is one. The client merges blocks.
 """
 
 import functools
@@ -32,11 +31,11 @@ from mjx_study.study.store import Part, StudyError
 from mjx_study.study.times import recording
 
 TRIES: Final = 3
-"""Times that a cell is begun before it counts as failed."""
+"""Attempts at a task before its cell counts as failed."""
 CONNECT_SECONDS: Final = 30
-"""Time for a scheduler to answer."""
+"""Timeout for reaching a scheduler."""
 POLL_SECONDS: Final = 1.0
-"""Between looks at which workers there are."""
+"""Interval between polls of the workers."""
 SELDOM: Final = {
     "distributed.admin.tick.interval": "1s",
     "distributed.admin.system-monitor.interval": "5s",
@@ -49,23 +48,23 @@ GPUS: Final = "/dev/nvidia[0-9]*"
 _ONE_AT_A_TIME, _SET_UP = threading.Lock(), threading.Event()
 Arrays = dict[str, np.ndarray]
 Task = tuple[int, int | None]
-"""Index of a cell, and the number of one of its blocks."""
+"""Index of a cell, and number of one of its tasks in `Blocks`; None for a whole cell."""
 
 
 class WorkerRefusedError(Exception):
-    """A worker would not compute the client's numbers."""
+    """A worker's numbers would differ from the client's."""
 
 
 @contextmanager
 def connected(cluster: str) -> Generator[Any]:
-    """A `distributed.Client` of a scheduler's address, or of workers that start now and end with the block.
+    """Connect a `distributed.Client` to a scheduler's address, or to workers that live as long as the context.
 
     Args:
-        cluster: "local:N", N processes here; "slurm:N", N workers as Dask's jobqueue.yaml describes them; or an address
-            such as "tcp://host:8786". Without N, a process per core, or one worker of Slurm.
+        cluster: "local:N", N local processes; "slurm:N", N workers as configured in Dask's jobqueue.yaml; or an address
+            such as "tcp://host:8786". Without N, one process per core, or one Slurm worker.
 
     Raises:
-        ValueError: Dask is not installed, or nothing is reached.
+        ValueError: Dask is not installed, or the cluster cannot be reached.
     """
     with ExitStack() as stack:
         try:
@@ -82,7 +81,7 @@ def _connect(cluster: str, stack: ExitStack) -> Any:
     import dask.config
     import distributed
 
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what happens to workers is told by us
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # this module reports on workers
 
     kind, _, count = cluster.partition(":")
     address: Any = cluster
@@ -108,24 +107,24 @@ def _connect(cluster: str, stack: ExitStack) -> Any:
 def cells_on(
     client: Any, plan: StudyPlan, parts: Mapping[int, Part], told: Callable[[int], None]
 ) -> Generator[tuple[int, Arrays | str]]:
-    """Compute cells on the workers that a cluster has, while they come and go.
+    """Compute cells on a cluster whose workers may come and go.
 
     Args:
-        parts: the cells to compute, by index, each with its checkpoint, to which blocks are added.
-        told: called with the number of workers when it changes.
+        parts: checkpoint of each cell to compute, by index; finished blocks are added to it.
+        told: called with the number of workers whenever it changes.
 
     Yields:
-        Index and arrays of each cell in the order in which they end, or why it failed `TRIES` times.
+        Index and arrays of each cell in order of completion, or the reason why it failed `TRIES` times.
 
     Raises:
-        StudyError: a worker has other versions, or the scheduler is lost.
+        StudyError: a worker has other versions, or the connection to the scheduler is lost.
     """
     study = _packed(plan)
     compute = Computation(plan)
     begun = {index: compute.begun(plan.cells[index], parts[index].kept) for index in parts if in_blocks(plan, index)}
     waiting: dict[Any, deque[Task]] = defaultdict(deque)
-    has: dict[Any, set[str]] = defaultdict(set)  # which workers have a program
-    at: dict[Any, tuple[Task, str]] = {}  # by future, its task and worker
+    has: dict[Any, set[str]] = defaultdict(set)  # workers that have compiled a program
+    at: dict[Any, tuple[Task, str]] = {}  # task and worker of each future
     ended: queue.SimpleQueue[Any] = queue.SimpleQueue()
     tries: Counter[Task] = Counter()
 
@@ -146,15 +145,15 @@ def cells_on(
         """Runs in a thread of Dask, which blocks here if the worker is lost before its arrays arrive."""
         try:
             outcome = future.result()
-        except BaseException as error:  # whatever a cell raises on another machine, or that it is cancelled
+        except BaseException as error:  # any exception on the worker, or a cancellation
             outcome = error
         ended.put((future, outcome))
 
     def tried(task: Task, reason: str) -> Generator[tuple[int, str]]:
-        """The failure of a cell, if that was the last try of it or of one of its blocks."""
+        """Count a failed attempt; yield the cell's failure if it was the last attempt at it or at one of its blocks."""
         index, block = task
         if block is not None and index not in begun:
-            return  # another of its blocks has failed for good
+            return  # another of its blocks has exhausted its attempts
         tries[task] += 1
         if tries[task] >= TRIES:
             if block is not None:
@@ -167,10 +166,10 @@ def cells_on(
         elif block is None:
             queue_of(task).append(task)
         else:
-            queue_of(task).appendleft(task)  # others wait for it to be merged
+            queue_of(task).appendleft(task)  # finished blocks wait to be merged with it
 
     def ended_with(task: Task, arrays: Arrays) -> Generator[tuple[int, Arrays]]:
-        """The arrays of a cell, if that was its last task."""
+        """Yield the arrays of a cell if this was its last task."""
         index, block = task
         if block is None:
             yield index, arrays
@@ -205,7 +204,7 @@ def cells_on(
                 if len(workers) != count:
                     count = len(workers)
                     told(count)
-            # All that have ended get their next task before the arrays of any are written, which takes its time.
+            # Assign new tasks to all idle workers before writing any arrays, which takes time.
             done = []
             for future, outcome in _all_of(ended):
                 if future in at:
@@ -220,7 +219,7 @@ def cells_on(
                 else:
                     yield from ended_with(task, outcome)
     except OSError as error:
-        raise StudyError(f"lost the scheduler ({error}); the same command goes on") from error
+        raise StudyError(f"lost the scheduler ({error}); the same command resumes") from error
     finally:
         with suppress(OSError):
             client.cancel(list(at))
@@ -235,14 +234,14 @@ def _all_of(ended: queue.SimpleQueue[Any]) -> Generator[Any]:
 
 
 def in_blocks(plan: StudyPlan, index: int) -> bool:
-    """Whether a cell is several tasks."""
+    """Whether a cell is split into several tasks."""
     return blocks_of(plan, plan.cells[index]) > 0
 
 
 def _program_for(worker: str, waiting: Mapping[Any, deque[Any]], has: Mapping[Any, set[str]]) -> list[Any]:
     """Choose the program of a worker's next cell; none if workers that have one compiled will be sooner.
 
-    One that it has, otherwise that with the most cells for each worker that has it.
+    Prefers programs that the worker has compiled, then those with the most cells per worker that has them.
     """
     left = {program: len(cells) for program, cells in waiting.items() if cells}
     own = [program for program in left if worker in has[program]]
@@ -270,7 +269,7 @@ def _prepared(study: bytes) -> tuple[StudyPlan, Computation, Stopwatch]:
     """The plan, its `Computation` with compiled programs, and a stopwatch, cached on the worker.
 
     Raises:
-        WorkerRefusedError: the numbers would be others than the client's.
+        WorkerRefusedError: the numbers would differ from the client's.
     """
     config, chunk, asked, *client = pickle.loads(study)
     if not _SET_UP.is_set():
@@ -286,7 +285,7 @@ def _prepared(study: bytes) -> tuple[StudyPlan, Computation, Stopwatch]:
 
 
 def _set_up(asked: str) -> None:
-    """Set a worker's JAX up: one CPU device; of several GPUs, the one that the worker's number picks."""
+    """Set up JAX on a worker: one CPU device, or of several GPUs the one selected by the worker's number."""
     from distributed import get_worker
 
     if (gpu := _gpu(get_worker().name)) is not None:
@@ -296,7 +295,7 @@ def _set_up(asked: str) -> None:
 
 
 def _gpu(worker: Any) -> str | None:
-    """The GPU of a worker whose name is a number or ends with one after a hyphen; None to leave it to JAX."""
+    """GPU of a worker whose name is a number or ends with one after a hyphen; None leaves the choice to JAX."""
     visible, number = os.environ.get("CUDA_VISIBLE_DEVICES"), re.fullmatch(r"(?:.*-)?(\d+)", str(worker))
     gpus = visible.split(",") if visible else [path.removeprefix("/dev/nvidia") for path in sorted(glob(GPUS))]
     return gpus[int(number[1]) % len(gpus)] if number and len(gpus) > 1 else None

@@ -1,4 +1,4 @@
-"""The configuration of a study; `resolution` has what follows from it for a task."""
+"""The configuration of a study; `resolution` derives a task's settings from it."""
 
 import dataclasses
 import math
@@ -29,10 +29,10 @@ OF_KIND: Final[dict[str, dict[str, Any]]] = {
     },
     "landscapes": {"span": None, "direction": None},
 }
-"""Options that only one kind of study has, with their defaults."""
+"""Options specific to one kind of study, with their defaults."""
 ASKED_BY: Final = {"descents": "give iterations as well", "landscapes": "give points as well"}
 SAMPLES: Final = 100
-"""Samples in each batch unless the configuration or a recipe says otherwise."""
+"""Samples per batch unless the configuration or a recipe sets another number."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -41,55 +41,55 @@ class StudyConfig(Checked):
 
     Attributes:
         tasks: names of tasks, or tasks.
-        kind: gradients, descents or landscapes; None to tell it from iterations and points.
+        kind: gradients, descents or landscapes; None to infer it from iterations and points.
         estimators: names of estimators.
-        theta: parameters at which gradients are taken or descents begin; for a single task. None for the task's.
+        theta: parameters at which gradients are estimated or descents start, for a single task; None for the task's.
         network: hidden widths of a network that replaces the task's policy in descents; None for the task's policy.
-        contact: contact families, and "reference" for the analytic system; None for each task's. Empty if only `solref`
-            and `solimp` are wanted.
-        stiffness: contact stiffnesses [N/m], for the families that take one; None for each task's.
+        contact: contact families, and "reference" for the analytic system; None for each task's. Empty to use only
+            `solref` and `solimp`.
+        stiffness: contact stiffnesses [N/m], for the families that have one; None for each task's.
         damping: contact damping [N s/m]; None for each family's.
-        solref, solimp: contact models in MuJoCo's own terms, every solref with every solimp, beside the families;
-            if only one is given, the other is MuJoCo's default.
-        timestep: timesteps [s]; None for the MJCF's. Rollouts last as long as the task's unless horizon is given.
+        solref, solimp: contact models in MuJoCo's own parameters, every solref with every solimp, in addition to the
+            families; if only one is given, the other is MuJoCo's default.
+        timestep: timesteps [s]; None for the MJCF's. Rollouts keep the task's duration unless horizon is given.
         cone: friction cones, pyramidal or elliptic; None for the MJCF's.
         sigma: standard deviations of the noise; None for each task's.
-        samples: batch sizes; None for 100, in descents for each task's recipe.
+        samples: batch sizes; None for 100, or in descents for each task's recipe.
         confidence: confidence level of the intervals within a batch.
-        seeds: number of batches of each size, or of descents; in landscapes, of batches pooled at each point. None for
-            10, in landscapes 1.
-        iterations: steps of a descent; None for each task's recipe.
+        seeds: number of batches per size, or of descents; in landscapes, of batches pooled at each point. None for 10,
+            or 1 in landscapes.
+        iterations: number of iterations of a descent; None for each task's recipe.
         points: number of points of a landscape, on a line through theta; None for no landscapes.
         span, direction: range and direction of that line; None for each task's range and a random direction.
         optimizer: name of an optax optimiser, "sgd" by default.
         learning_rate, decay: learning_rate / i^decay at iteration i; None for each task's recipe.
-        stiffness_schedule, sigma_schedule: factors by iteration of a descent, as calls of optax's schedules, on the
-            contact's stiffness (at most 1; the damping ratio stays) and on sigma; None for 1. Costs are at factor 1.
-        reference_samples: pairs of rollouts for each reference gradient; None for 600 in studies of gradients.
-        evaluation_samples: rollouts for the cost of a final policy; None for 200 in descents.
+        stiffness_schedule, sigma_schedule: factors by iteration of a descent, as calls of optax schedules, of the
+            contact stiffness (at most 1; the damping ratio is kept) and of sigma; None for 1. Evaluations use 1.
+        reference_samples: number of rollout pairs per reference gradient; None for 600 in studies of gradients.
+        evaluation_samples: number of rollouts that evaluate a final policy; None for 200 in descents.
         seed: random seed.
         noise: name of the noise density; None for each task's.
         baseline: baseline of zeroth-order estimates: zero_noise, leave_one_out or none.
-        gamma: accuracy that the alpha-order estimate must keep, in the unit of the gradient; None for each task's.
-        published: take gamma and the next three from the published example, on the scale of the task's cost.
+        gamma: accuracy bound of the alpha-order estimate, in the unit of the gradient; None for each task's.
+        published: use the published example's gamma and next three options, on the scale of the task's cost.
         failure_probability: failure probability of the confidence radius epsilon.
-        variance_proxy: variance in epsilon: variance, second_moment or upper_bound.
+        variance_proxy: variance used in epsilon: variance, second_moment or upper_bound.
         radius: R in epsilon: max_deviation, or a bound in the unit of the gradient.
-        max_norm: largest norm of a sample of the clipped first-order estimate, in the unit of the gradient.
-        window: steps between cuts of the truncated first-order estimate.
+        max_norm: norm at which samples of the clipped first-order estimate are clipped, in the unit of the gradient.
+        window: number of steps between cuts of the truncated first-order estimate.
         tolerance: tolerance of the discontinuity test of "ddcg".
-        weights: weights of interpolating estimators, plug_in or cross_fitted.
-        onset: none, or first-order gradients with the onset term: linear (`mjx_study.simulation.onset`), or jump, which
-            costs four rollouts per onset (`mjx_study.simulation.branches`).
-        backward: contact families whose derivatives stand in for the exact ones in turn, at the same states (surrogate
-            gradients); "none" for the exact ones.
-        backward_stiffness: stiffness of those families [N/m]; None for that of the contact model rolled out.
+        weights: weights of interpolating estimators: plug_in or cross_fitted.
+        onset: onset term of first-order gradients: none, linear (`mjx_study.simulation.onset`), or jump, which costs
+            four rollouts per onset (`mjx_study.simulation.branches`).
+        backward: contact families whose derivatives replace the exact ones at the same states, each in turn (surrogate
+            gradients); "none" for exact derivatives.
+        backward_stiffness: stiffness of these families [N/m]; None for that of the simulated contact model.
         backward_margin: distance at which contact begins in their derivatives [m]; None for the MJCF's.
-        horizon: steps; None for each task's.
+        horizon: number of steps; None for each task's.
         model: an MJCF that replaces the task's own; None for the task's.
-        chunk_size: samples per device and call; None to choose by the number of samples.
-        block_size: samples that are held at once in studies of gradients; larger batches come in blocks whose
-            statistics are merged. None for whole batches where these fit into the limit of memory.
+        chunk_size: samples per device and call; None to choose it by the number of samples.
+        block_size: samples held at once in studies of gradients; larger batches are split into blocks whose statistics
+            are merged. None for whole batches if they fit in the memory limit.
     """
 
     ranges: ClassVar = {"samples": "[3, 1e7]"}
@@ -147,7 +147,7 @@ class StudyConfig(Checked):
         if not self.tasks:
             raise ValueError("no task given")
         if self.theta is not None and len(self.tasks) > 1:
-            raise ValueError("theta is of a single task; give one task, or leave theta out")
+            raise ValueError("theta is for a single task; give one task, or omit theta")
         check_names("estimator", self.estimators, CATALOGUE)
         if self.contact:
             check_names("contact family", self.contact, CONTACTS)
@@ -155,16 +155,16 @@ class StudyConfig(Checked):
             for name in ("stiffness", "damping"):
                 if getattr(self, name) is not None:
                     chosen = f"contact {', '.join(self.contact)}" if self.contact else "solref or solimp alone"
-                    raise ValueError(f"{chosen} takes no {name}; leave {name} out")
+                    raise ValueError(f"{chosen} takes no {name}; omit {name}")
         for name in ("tasks", "stiffness", "solref", "solimp", "timestep", "cone", "sigma", "samples", "backward"):
             values = getattr(self, name)
             if values is not None:
                 refuse_repeats(name, values)
             if values == () and name not in ("solref", "solimp"):
-                raise ValueError(f"no {name} given: give at least one, or leave it out")
+                raise ValueError(f"no {name} given: give at least one, or omit it")
         self._check_backward()
         if self.iterations is not None and self.points is not None:
-            raise ValueError("iterations are of descents and points of landscapes: give one of them")
+            raise ValueError("iterations are for descents and points for landscapes: give one of them")
         if self.kind is None:
             of_points = "gradients" if self.points is None else "landscapes"
             object.__setattr__(self, "kind", of_points if self.iterations is None else "descents")
@@ -172,21 +172,21 @@ class StudyConfig(Checked):
         check_span(self.span)
 
     def _check_backward(self) -> None:
-        """Refuse options of the backward model without one, and onset terms with it."""
+        """Reject options of the backward model without one, and the onset term with one."""
         if not self.surrogate:
             for name in ("backward_stiffness", "backward_margin"):
                 if getattr(self, name) is not None:
                     raise ValueError(f"{name} needs a contact family in backward")
         elif self.onset != "none":
-            raise ValueError("the onset term corrects exact derivatives: leave onset or backward out")
+            raise ValueError("the onset term corrects exact derivatives: omit onset or backward")
 
     def _settle(self) -> None:
-        """Refuse options without effect in this kind of study, and fill in the defaults of its own."""
+        """Reject options of other kinds of study, and fill in the defaults of this kind's own."""
         for kind, options in OF_KIND.items():
             given = [name for name in options if getattr(self, name) is not None]
             if kind != self.kind and given:
                 listed = f"{' and '.join(given)} {'is' if len(given) == 1 else 'are'}"
-                raise ValueError(f"{listed} of {kind}: {ASKED_BY.get(kind, 'leave it out')}")
+                raise ValueError(f"{listed} for {kind}: {ASKED_BY.get(kind, 'omit it')}")
             for name, default in options.items():
                 if kind == self.kind and getattr(self, name) is None:
                     object.__setattr__(self, name, default)
@@ -197,20 +197,20 @@ class StudyConfig(Checked):
 
     @property
     def surrogate(self) -> bool:
-        """Whether any contact model has derivatives of another one."""
+        """Whether any contact model uses the derivatives of another."""
         return any(family != "none" for family in self.backward)
 
     @property
     def batches(self) -> int:
-        """The number of seeds, given or not."""
+        """Number of seeds, given or by default."""
         return self.seeds or (1 if self.kind == "landscapes" else 10)
 
 
 def check_names(label: str, names: Sequence[str], choices: Collection[str]) -> None:
-    """Refuse a selection that is empty or names something twice.
+    """Reject an empty selection or repeated names.
 
     Raises:
-        ValueError: with the choices.
+        ValueError: with the choices, or with the repeated names.
     """
     if not names:
         raise ValueError(f"no {label} given; choose from {', '.join(choices)}")
@@ -218,18 +218,18 @@ def check_names(label: str, names: Sequence[str], choices: Collection[str]) -> N
 
 
 def refuse_repeats(label: str, values: Sequence[object]) -> None:
-    """Raises ValueError for a value that occurs twice."""
+    """Raise ValueError for a value that occurs twice."""
     repeated = {str(value) for value, count in Counter(values).items() if count > 1}
     if repeated:
         raise ValueError(f"{label} given twice: {', '.join(sorted(repeated))}")
 
 
 def check_span(span: Sequence[float] | None) -> None:
-    """Raises ValueError unless it is None or two numbers, the lower one first."""
+    """Raise ValueError unless span is None or two numbers in ascending order."""
     if span is not None and not (len(span) == 2 and 0 < span[1] - span[0] < math.inf):
         raise ValueError(f"span must be two numbers, the lower one first; got {span}")
 
 
 def takes_stiffness(families: Sequence[str]) -> bool:
-    """Whether any of the contact families, "reference" included, takes a stiffness."""
+    """Whether any of the contact families, "reference" included, has a stiffness."""
     return any(family not in FAMILIES or FAMILIES[family].swept for family in families)

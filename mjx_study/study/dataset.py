@@ -1,4 +1,4 @@
-"""The numbers of a study as labelled arrays, from the study's document and its cells."""
+"""Labelled arrays of a study's numbers, assembled from its document and cells."""
 
 import json
 import math
@@ -14,11 +14,11 @@ from mjx_study.study.variables import variables_of
 
 UNITS: Final = {"timestep": "s", "sigma": "unit of what the noise is added to", "samples": "1", "stiffness": "N/m"}
 Cells = Mapping[int, tuple[Mapping[str, np.ndarray], Mapping[str, str]]]
-"""By index of a cell: its arrays by variable, and the versions of the software that computed them."""
+"""Arrays by variable of each cell, by index, with the versions of the software that computed them."""
 
 
 def as_plain(document: Any) -> Any:
-    """A document in JSON's types: arrays and tuples as lists, non-finite numbers null, an infinite gamma as "inf"."""
+    """Convert to JSON types: arrays and tuples to lists, nonfinite numbers to null, an infinite gamma to "inf"."""
     if isinstance(document, Mapping):
         infinite = {"gamma": "inf"} if document.get("gamma") == math.inf else {}
         return {str(key): as_plain(item) for key, item in {**document, **infinite}.items()}
@@ -30,7 +30,7 @@ def as_plain(document: Any) -> Any:
 
 
 def dataset_of(document: Mapping[str, Any], cells: Cells) -> xr.Dataset:
-    """All cells of a study as labelled arrays; NaN where a cell is missing.
+    """Collect all cells of a study in labelled arrays; NaN where a cell is missing.
 
     Args:
         document: contents of a study.json; each cell has the key "at", its index along every outer dimension.
@@ -80,7 +80,7 @@ def dataset_of(document: Mapping[str, Any], cells: Cells) -> xr.Dataset:
 
 
 def _mixture(versions: Sequence[Mapping[str, str]]) -> str:
-    """Packages of which cells were computed with several versions, with these; empty if there are none."""
+    """Packages that differ in version between cells, with these versions; empty if there are none."""
     names = dict.fromkeys(name for each in versions for name in each)
     split = {name: [part for each in versions for part in each.get(name, "none").split(" and ")] for name in names}
     by_name = {name: list(dict.fromkeys(parts)) for name, parts in split.items()}
@@ -88,6 +88,6 @@ def _mixture(versions: Sequence[Mapping[str, str]]) -> str:
 
 
 def write_dataset(dataset: xr.Dataset, path: Path) -> Path:
-    """Write a dataset as NetCDF 3, which every tool reads."""
+    """Write a dataset as NetCDF 3, which every NetCDF tool reads."""
     content = dataset.to_netcdf(engine="scipy")
     return write_whole(path, lambda file: file.write(bytes(content)))

@@ -1,9 +1,9 @@
-"""Gradient descent in a cell: every estimator, several seeds at once, resumed from the last checkpoint.
+"""Gradient descent in a cell: every estimator, several seeds at once, resuming from the last checkpoint.
 
-All seeds of an estimator advance in one compiled program. With MJX, its rollouts and update stay on one device, and the
-estimators advance side by side on as many devices as there are; with an analytic system the rollouts are NumPy's.
-Iteration i of seed s has a key of its own, so that an interrupted run ends bit for bit where an undisturbed one does;
-all estimators share these keys.
+All seeds of an estimator advance in one compiled program. With MJX, its rollouts and updates stay on one device, and
+estimators run in parallel on as many devices as there are; analytic systems are simulated in NumPy. Iteration i of seed
+s has its own random key, so an interrupted run ends bitwise identical to an uninterrupted one; all estimators share
+these keys.
 """
 
 import dataclasses
@@ -38,15 +38,15 @@ from mjx_study.study.work import iteration
 from mjx_study.tasks.contact_grid import ContactPoint
 
 REPORT_EVERY: Final = 10
-"""Iterations between reports of progress, which wait for the device."""
+"""Iterations between progress reports, which wait for the device."""
 SAVE_SECONDS: Final = 20.0
 """Seconds between checkpoints."""
 TOGETHER: Final = 1000
-"""Rollouts of an analytic system in one batch; more take memory and save little time."""
+"""Rollouts of an analytic system per batch; more take memory and save little time."""
 
 
 def compute_descents(plan: StudyPlan) -> Callable[..., dict[str, np.ndarray]]:
-    """A function that computes cells and keeps compiled programs between them."""
+    """Return a function that computes cells and keeps compiled programs between them."""
     backends: dict[tuple[Any, ...], Backend] = {}
 
     def compute(cell: StudyCell, part: Part = Part()) -> dict[str, np.ndarray]:  # noqa: B008, it is empty
@@ -80,7 +80,7 @@ def compute_descents(plan: StudyPlan) -> Callable[..., dict[str, np.ndarray]]:
 
 
 class Backend:
-    """Source of rollouts: MJX, in programs that serve all contact models, or an analytic system on the host."""
+    """Source of rollouts: MJX, in programs shared by all contact models, or an analytic system on the host."""
 
     def __init__(self, plan: StudyPlan, cell: StudyCell):
         group, config = plan.groups[cell.group], plan.config
@@ -97,11 +97,11 @@ class Backend:
 
     @property
     def threads(self) -> int:
-        """Number of estimators to advance side by side."""
+        """Number of estimators to advance in parallel."""
         return 1 if self.simulator is None else len(self.simulator.devices)
 
     def place(self, state: Descent, index: int) -> Descent:
-        """Put the state of an estimator on its device; on CPUs that is always the first, see `spread`."""
+        """Put the state of an estimator on its device; on CPUs always the first, see `spread`."""
         if self.simulator is None:
             return state
         device = self.simulator.devices[index % self.threads]
@@ -110,7 +110,7 @@ class Backend:
     def iteration(
         self, estimator: Estimator, model: ContactPoint
     ) -> Callable[[Descent, Key[Array, " seeds"], int], tuple[Descent, Record]]:
-        """An iteration of all seeds under one contact model, by its index; compiled once for all of them."""
+        """Return an iteration of all seeds under one contact model, by index; compiled once for all contact models."""
 
         def update(state: Descent, drawn: dict[str, Any]) -> tuple[Descent, Record]:
             return advance(state, drawn, estimator, self.optimizer)
@@ -159,18 +159,18 @@ class Backend:
         theta: Float[Array, "seeds params"],
         keys: Key[Array, " seeds"],
     ) -> dict[str, Any]:
-        """Batches of some seeds, drawn as one: NumPy's loops over steps are then run once for all of them."""
+        """Draw the batches of several seeds as one, so that NumPy's loops over steps run once for all."""
         each = jnp.repeat(theta, self.samples, axis=0)
         drawn = draw_at(needs, reference, each, [jnp.ravel(part) for part in self._sample_keys(keys)])
         return jax.tree.map(lambda leaf: leaf.reshape(len(theta), self.samples, *leaf.shape[1:]), drawn)
 
     @cached_property
     def _sample_keys(self) -> Callable[[Key[Array, " seeds"]], list[Key[Array, "seeds samples"]]]:
-        """`sample_keys` of several seeds."""
+        """`sample_keys` over several seeds."""
         return jax.jit(jax.vmap(partial(sample_keys, num_samples=self.samples)))
 
     def cost(self, theta: Float[Array, " params"], model: ContactPoint) -> tuple[float, float]:
-        """Mean cost with noise at theta, over samples that are the same for every theta, and its standard error."""
+        """Mean cost with noise at theta, over samples with the same noise for every theta, and its standard error."""
         objective = (
             self.task.analytic(model.stiffness) if self.simulator is None else self.simulator.objective(model.contact)
         )
@@ -181,7 +181,7 @@ class Backend:
         return float(np.mean(value)), float(np.std(value, ddof=1) / math.sqrt(len(value)))
 
     def metrics(self, theta: Float[Array, " params"], model: ContactPoint) -> dict[str, float]:
-        """The task's metrics in the rollouts of `cost`: means over the finite ones."""
+        """Means of the task's metrics over the rollouts of `cost`, nonfinite values excluded."""
         if self.simulator is None:
             found = self.task.analytic(model.stiffness).observe(theta, self._evaluation_keys())
         elif self.task.metrics is None:
@@ -200,7 +200,7 @@ class Backend:
 
     @cached_property
     def _observe(self) -> Compiled:
-        """The task's metrics of each sample, as a function of theta, contact and keys."""
+        """Program for the task's metrics of each sample, as a function of theta, contact and keys."""
 
         def one(theta: Float[Array, " params"], contact: ContactModel | None, key: Key[Array, ""]) -> dict[str, Array]:
             states, *_ = simulate(self.task, theta, contact, key, 1.0)
@@ -211,7 +211,7 @@ class Backend:
 
 @dataclasses.dataclass
 class _Progress:
-    """A run so far: state, records and seconds, convertible to a checkpoint's arrays."""
+    """Progress of a run: state, records and seconds, convertible to arrays of a checkpoint."""
 
     state: Descent
     records: list[Record]
@@ -219,7 +219,7 @@ class _Progress:
 
     @classmethod
     def of(cls, arrays: Mapping[str, np.ndarray], index: int, start: Descent) -> "_Progress":
-        """A run from a checkpoint, or its start."""
+        """Restore a run from a checkpoint, or begin at its start."""
         if f"seconds_{index}" not in arrays:
             return cls(start, [], [])
         leaves, structure = jax.tree.flatten(start)
@@ -255,7 +255,7 @@ def _begin(
     """Compile an iteration of all seeds of one estimator.
 
     Returns:
-        A function that runs the rest and adds it to `kept`; it returns all, and the calls and seconds of the rest.
+         A function that runs the remaining iterations and adds them to `kept`; it returns the run, calls and seconds.
     """
     seeds, iterations = backend.seeds, backend.recipe.iterations
     run = _Progress.of(kept, index, begin(backend.optimizer, backend.task.theta, seeds))
@@ -267,7 +267,7 @@ def _begin(
     if already < iterations and bool(jnp.any(going(state))):
         first = keys_of(already)
         with nullcontext() if model.analytic else timed(program):
-            jax.block_until_ready(iterate(state, first, already))  # compile; the result is dropped
+            jax.block_until_ready(iterate(state, first, already))  # compile; the result is discarded
     before = seconds[-1] if seconds else 0.0
 
     def descend() -> tuple[_Progress, int, float]:
@@ -330,7 +330,7 @@ def _numbers(backend: Backend, model: ContactPoint, estimator: Estimator, run: _
 
 
 def _padded(values: np.ndarray, length: int) -> np.ndarray:
-    """Values padded with NaN to a length along the first axis."""
+    """Pad values with NaN to a length along the first axis."""
     missing = [(0, length - len(values))] + [(0, 0)] * (values.ndim - 1)
     return np.pad(np.asarray(values, float), missing, constant_values=np.nan)
 

@@ -1,4 +1,4 @@
-"""The schema of a study.json; a file from elsewhere is checked before any of it is used."""
+"""The schema of study.json; files from elsewhere are validated before use."""
 
 import json
 import math
@@ -10,7 +10,7 @@ from mjx_study.files import Finite, told
 from mjx_study.option import OPTIONS
 
 MOST_NUMBERS: Final = 500_000_000
-"""Most numbers of one variable of a study."""
+"""Maximum size of a variable of a study."""
 Name = Annotated[str, Field(min_length=1, max_length=1000)]
 Count = Annotated[int, Field(ge=1, le=10_000_000)]
 
@@ -62,7 +62,7 @@ class _Environment(_Part):
 
 
 class StudyDocument(_Part):
-    """A study.json, as far as it is read; other keys may hold anything."""
+    """The parts of a study.json that are read; other keys may hold anything."""
 
     config: _Config
     contents: dict[str, str]
@@ -103,10 +103,10 @@ class _Format(BaseModel):
 
 
 def read_format(content: bytes | str) -> int:
-    """The format number of a study.json.
+    """Read the format number of a study.json.
 
     Raises:
-        ValueError: it has none.
+        ValueError: there is none.
     """
     try:
         return _Format.model_validate_json(content).format
@@ -115,10 +115,10 @@ def read_format(content: bytes | str) -> int:
 
 
 def read_document(content: bytes | str) -> dict[str, Any]:
-    """A study.json as plain data.
+    """Read a study.json as plain data.
 
     Raises:
-        ValueError: it does not satisfy the schema; the message names the key.
+        ValueError: it violates the schema; the message names the key.
     """
     try:
         StudyDocument.model_validate_json(content)

@@ -1,4 +1,4 @@
-"""Results of a study: a row for each gradient estimate, and findings that the intervals back."""
+"""Results of a study: a row for each gradient estimate, and findings supported by the intervals."""
 
 import itertools
 import json
@@ -16,7 +16,7 @@ from mjx_study.study.variables import GRADIENTS, ONSETS
 from mjx_study.table import digits_to_tell_apart
 
 SURE: Final = 0.001
-"""p-value at which a mean is called biased: the smallest that the test's 999 draws can give."""
+"""p-value at which a mean is called biased: the smallest that the test's 999 draws can yield."""
 BIASED: Final = {
     "fobg": "FoBG",
     "fobg_onset": "FoBG (onset)",
@@ -28,26 +28,26 @@ BIASED: Final = {
 APART: Final = 4.0
 """Standard errors beyond which a mean without a verdict is reported as off."""
 DETECTED: Final = 4.0
-"""Standard errors beyond which two means are called different."""
+"""Standard errors beyond which two means are considered different."""
 NOTABLE: Final = 0.05
-"""Share of the largest slope beyond which a difference without sampling error is reported."""
+"""Share of the largest slope beyond which a difference free of sampling error is reported."""
 UNSURE: Final = 0.2
-"""Relative uncertainty beyond which a reference is too poor to judge errors by."""
+"""Relative uncertainty beyond which a reference is too imprecise to judge errors."""
 SHARE_OFF: Final = 0.5
-"""Error of the linear onset term's mean, as a share of what it adds, over the onset's strength. Of 11 contact models on
-momentum_transfer and ball_wall the largest was 0.48; at random thetas the atlas has larger ones, where contacts graze,
-bodies meet at corners, or an onset is `STRONG`."""
+"""Error of the linear onset term's mean, as a share of what the term adds, over the onset strength. Among 11 contact
+models on momentum_transfer and ball_wall the largest was 0.48; at random thetas the atlas has larger ones, at grazing
+contacts, at corners, or where an onset is `STRONG`."""
 STRONG: Final = 0.9
-"""Onset strength up to which `SHARE_OFF` holds; where an onset takes more of the approach speed in one step, the linear
-term can leave more than it adds. Fitted to one half of the atlas's cells on momentum_transfer; right in 59 of the other
-61."""
+"""Onset strength up to which `SHARE_OFF` holds; where an onset removes more of the approach speed in one step, the
+linear term's error can exceed the term. Fitted to half of the atlas's cells on momentum_transfer; right for 59 of the
+other 61."""
 NARROW: Final = 0.75
-"""Standard deviation of the step of the first onset from which an onset term is right within 1.5 % of what it adds; at
-0.5 it can be off by 60 %."""
+"""Standard deviation of the first onset's step from which an onset term is accurate to 1.5 % of what it adds; at 0.5
+it can be off by 60 %."""
 PLACE: Final = ("task", "timestep", "cone", "sigma", "samples", "model", "seed", "estimator", "contact", "stiffness")
 """Coordinates of a row."""
 SETTING: Final = ("task", "timestep", "cone", "sigma", "samples")
-"""Coordinates that every row of a finding shares."""
+"""Coordinates shared by all rows of a finding."""
 INTERPOLATED: Final = ("aobg", "aobg_onset")
 """Estimators with the accuracy bound gamma."""
 VECTORS: Final = ("gradient", "reference")
@@ -81,12 +81,12 @@ class Row(SimpleNamespace):
 
     @property
     def variance_seconds(self) -> float:
-        """Variance times seconds per sample: the variance left after one second of computing."""
+        """Variance times seconds per sample: the variance remaining after one second of computing."""
         return self.variance * self.seconds_per_sample
 
 
 def rows_of(dataset: xr.Dataset) -> list[Row]:
-    """A row for each computed estimate, ordered by contact model, seed and estimator last."""
+    """Return a row for each computed estimate; contact model, seed and estimator vary fastest."""
     outer = ("task", "timestep", "cone", "sigma", "samples", "model", "seed", "estimator")
     rows, grid = [], dataset["gradient_norm"].transpose(*outer)
     names = [name for name in GRADIENTS if name in dataset and name not in VECTORS]
@@ -113,13 +113,13 @@ def rows_of(dataset: xr.Dataset) -> list[Row]:
 
 
 def findings(dataset: xr.Dataset) -> list[str]:
-    """Findings that the intervals of a study back, as sentences."""
+    """Return the findings supported by a study's intervals, as sentences."""
     kind = json.loads(dataset.attrs["config"])["kind"]
     return {"gradients": _of_gradients, "descents": lambda _: [], "landscapes": _of_landscapes}[kind](dataset)
 
 
 def _of_gradients(dataset: xr.Dataset) -> list[str]:
-    """Where FoBG's variance exceeds ZoBG's, and which means are biased; by task, timestep, cone, noise and samples."""
+    """Report where FoBG's variance exceeds ZoBG's and which means are biased, by the coordinates in `SETTING`."""
     rows, gammas, sentences = rows_of(dataset), gammas_of(dataset), []
     confidence = json.loads(dataset.attrs["config"])["confidence"]
     varied = [name for name in SETTING if len({getattr(row, name) for row in rows}) > 1]
@@ -144,7 +144,7 @@ def _setting(name: str, value: Any) -> str:
 
 
 def gammas_of(dataset: xr.Dataset) -> dict[str, float]:
-    """AoBG's accuracy bound by task; infinite for none."""
+    """AoBG's accuracy bound by task; infinite if there is none."""
     estimators = [entry["estimators"] for entry in json.loads(dataset.attrs["resolved"])]
     options = [given.get("aobg", given.get("aobg_onset", {})) for given in estimators]
     names = dataset["task"].values.tolist()
@@ -152,7 +152,7 @@ def gammas_of(dataset: xr.Dataset) -> dict[str, float]:
 
 
 def _meaningless(rows: Sequence[Row], gammas: Mapping[str, float]) -> list[str]:
-    """Why a result is meaningless: contact never active, reference too uncertain, AoBG's bound below epsilon."""
+    """Report why results mean nothing: contact never active, reference too uncertain, AoBG's bound below epsilon."""
     found = []
     numbers = defaultdict(list)
     for row in rows:
@@ -163,20 +163,20 @@ def _meaningless(rows: Sequence[Row], gammas: Mapping[str, float]) -> list[str]:
     unsure = _stiffnesses([row for row in rows if row.reference_uncertainty > UNSURE])
     if unsure:
         found.append(
-            f"the reference's own uncertainty is above {UNSURE:.0%}{_at(unsure)}: errors and verdicts say "
-            "little there; --reference-samples makes it better"
+            f"the reference's own uncertainty exceeds {UNSURE:.0%}{_at(unsure)}: errors and verdicts mean "
+            "little there; increase --reference-samples"
         )
     bound = [row for row in rows if row.estimator in INTERPOLATED and (row.epsilon or 0.0) > gammas[row.task]]
     if bound:
         found.append(
-            f"AoBG is ZoBG{_at(_stiffnesses(bound))}: its bound gamma is below epsilon, the radius of ZoBG's mean; "
-            "a larger --gamma or more --samples changes that"
+            f"AoBG equals ZoBG{_at(_stiffnesses(bound))}: its bound gamma is below epsilon, the radius of ZoBG's mean; "
+            "increase --gamma or --samples"
         )
     return found
 
 
 def _variance_finding(rows: Sequence[Row], confidence: float) -> list[str]:
-    """FoBG's variance against ZoBG's at each stiffness: the verdict that all seeds share, if most of them have one."""
+    """Compare FoBG's variance with ZoBG's at each stiffness: the verdict shared by all seeds, if most have one."""
     table: dict[float, dict[str, list[Row]]] = defaultdict(lambda: defaultdict(list))
     for row in rows:
         table[row.stiffness][row.estimator].append(row)
@@ -201,9 +201,9 @@ def _order(zeroth: Row, first: Row) -> str:
 
 
 def _bias_findings(rows: Sequence[Row], gammas: Mapping[str, float]) -> list[str]:
-    """Means farther from the reference than any draw of the test, or off but undecided; a sentence each.
+    """Report means farther from the reference than any draw of the test, or off but undecided, in a sentence each.
 
-    Of several seeds the counts are given, and the median of the debiased errors.
+    With several seeds, counts and the median debiased error are given.
     """
     sentences = []
     for estimator in dict.fromkeys(row.estimator for row in rows if row.estimator in BIASED):
@@ -216,7 +216,7 @@ def _bias_findings(rows: Sequence[Row], gammas: Mapping[str, float]) -> list[str
             shares = ", ".join(f"{_share(same)}{_at([stiffness])}{_of(same, seeds)}" for stiffness, same in _by(biased))
             least = max(row.bias_p_value for row in biased)
             free = estimator in INTERPOLATED and math.isinf(gammas[biased[0].task])
-            advice = ": it has no accuracy bound; --gamma sets one" if free else ""
+            advice = ": it has no accuracy bound; set one with --gamma" if free else ""
             sentences.append(f"{mean} biased by {shares} (p <= {least:.3f}){advice}")
         for stiffness, same in _by(off):
             fewest = [min(row.effective_samples, row.reference_effective_samples) for row in same]
@@ -229,21 +229,21 @@ def _bias_findings(rows: Sequence[Row], gammas: Mapping[str, float]) -> list[str
 
 
 def linear_error(strength: float) -> str:
-    """Bound on the error of the linear onset term."""
+    """Describe how large the linear onset term's error can be."""
     if strength > STRONG:
         return "the linear onset term can leave more than it adds"
     return f"the linear onset term can be off by {SHARE_OFF * strength:.0%} of what it adds"
 
 
 def _onset_findings(rows: Sequence[Row]) -> list[str]:
-    """Where the onset term may be off: by either treatment where noise is narrow, else the linear one at long steps."""
+    """Report where the onset term may be off: either kind if noise is narrow, else the linear one at long timesteps."""
     found, corrected = [], [row for row in rows if row.onsets]
     narrow = [row for row in corrected if row.onset_spread < NARROW]
     if narrow:
         least = min(row.onset_spread for row in narrow)
         found.append(
             f"the onset term may be off{_at(_stiffnesses(narrow))}, since the noise is narrow: the step at which "
-            f"contact begins has a standard deviation of {least:.2g}, and {NARROW} is enough in general; take a "
+            f"contact begins has a standard deviation of {least:.2g}, and {NARROW} generally suffices; use a "
             "smaller timestep or a larger --sigma, or check the mean (gradcheck --mean)"
         )
     wide = [row for row in corrected if not row.onset_spread < NARROW]
@@ -275,7 +275,7 @@ def _of(rows: Sequence[Row], seeds: int) -> str:
 
 
 def _share(rows: Sequence[Row]) -> str:
-    """The median debiased error as a share of the reference gradient, in significant digits only."""
+    """Median debiased error as a share of the reference gradient, to significant digits only."""
     share = float(np.median([row.debiased_error for row in rows]))
     error = max(max(row.debiased_error_se, row.reference_uncertainty) for row in rows)
     if not math.isfinite(share):
@@ -284,21 +284,21 @@ def _share(rows: Sequence[Row]) -> str:
 
 
 def _at(stiffnesses: Sequence[float]) -> str:
-    """The stiffnesses, for a sentence; empty without contact."""
+    """Format stiffnesses for a sentence; empty without contact."""
     digits = digits_to_tell_apart(stiffnesses, least=4)
     rounded = (float(f"{value:.{digits}g}") for value in stiffnesses)
     return f" at K = {', '.join(f'{value:.{digits + 2}g}' for value in rounded)} N/m" if any(stiffnesses) else ""
 
 
 def _of_landscapes(dataset: xr.Dataset) -> list[str]:
-    """Where the mean of FoBG differs from the slope of the mean cost."""
+    """Report where the mean of FoBG differs from the slope of the mean cost."""
     return [
         f"{label}: {_gap(one)}" for label, one in curves_of(dataset) if {"zobg", "fobg"} <= set(one["estimator"].values)
     ]
 
 
 def curves_of(dataset: xr.Dataset) -> list[tuple[str, xr.Dataset]]:
-    """The computed cells of a study of landscapes: contact model, and its numbers along the line."""
+    """Computed cells of a study of landscapes: contact model, and its numbers along the line."""
     outer = ("task", "timestep", "cone", "sigma", "samples", "model")
     cells = (
         dataset.isel(dict(zip(outer, place, strict=True)))
@@ -308,7 +308,7 @@ def curves_of(dataset: xr.Dataset) -> list[tuple[str, xr.Dataset]]:
 
 
 def _gap(one: xr.Dataset) -> str:
-    """Where E[FoBG] differs from the slope of the mean cost; by quadrature if there is one."""
+    """Report where E[FoBG] differs from the slope of the mean cost, by quadrature if available."""
     if "exact_slope" in one and bool(one["exact_slope"].notnull().all()):
         first, slope = one["exact_first"].values, one["exact_slope"].values
         largest = float(np.max(np.abs(slope)))

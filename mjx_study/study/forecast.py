@@ -1,4 +1,4 @@
-"""The cost of a study, from its plan, the cells computed already, and what programs took before; computes nothing."""
+"""Forecast the cost of a study from its plan, finished cells and recorded program times, without computing."""
 
 import dataclasses
 import heapq
@@ -20,19 +20,19 @@ from mjx_study.table import count, duration, size
 
 @dataclasses.dataclass(frozen=True)
 class Forecast:
-    """The cost of a study; counts are of the missing cells.
+    """The forecast cost of a study; counts cover the missing cells.
 
     Attributes:
-        computed: number of cells that the folder has.
-        programs: programs of rollouts to compile.
-        rollouts: rollouts to simulate, those that are differentiated included, about.
-        gradients: rollouts to differentiate, about.
-        kept: arrays of all cells [bytes].
-        memory: batches of the largest cell at once, about [bytes].
-        devices: devices of this process, or workers of a cluster, that share the work.
-        seconds: from the beginning of the first cell to the end of the last, about [s].
-        compilation: of these, tracing and compilation, or reading what is compiled already [s].
-        basis: seconds by whence they are (`times.BASES`), of all devices together [s].
+        computed: number of cells already in the folder.
+        programs: number of rollout programs to compile.
+        rollouts: approximate number of rollouts to simulate, including those to differentiate.
+        gradients: approximate number of rollouts to differentiate.
+        kept: size of all cells' arrays [bytes].
+        memory: approximate size of the largest cell's batches held at once [bytes].
+        devices: number of devices of this process, or of a cluster's workers, that share the work.
+        seconds: approximate time from the start of the first cell to the end of the last [s].
+        compilation: the part of it spent on tracing and compilation, or on reading compiled programs [s].
+        basis: time by basis of the estimate (`times.BASES`), summed over all devices [s].
     """
 
     cells: int
@@ -71,13 +71,13 @@ class Forecast:
 def forecast(
     plan: StudyPlan, folder: Path | None = None, *, accept_versions: bool = False, cluster: str | None = None
 ) -> Forecast:
-    """The cost of a plan, in a folder where one is given.
+    """Forecast the cost of a plan, less the finished cells of a folder if one is given.
 
     Args:
-        cluster: as `cluster.connected` takes it; workers at an address are not asked for, and taken as one.
+        cluster: as for `cluster.connected`; an address is not contacted and counts as one worker.
 
     Raises:
-        ValueError: the folder holds another study, or one of other versions.
+        ValueError: the folder holds another study, or one computed with other versions.
     """
     store = None if folder is None else begun_store(plan, folder, accept_versions=accept_versions)
     longer = store is not None and (store.document["config"].get("iterations") or 0) < plan.iterations
@@ -119,7 +119,7 @@ class _Time:
         self.basis = dict.fromkeys(BASES, 0.0)
 
     def setup(self, plan: StudyPlan, cells: Sequence[StudyCell]) -> float:
-        """Seconds of tracing and compilation, one after another."""
+        """Seconds of tracing and compiling all programs in sequence."""
         programs = {key: program for cell in cells for key, program in setups(plan, cell).items()}
         total, read = 0.0, set()
         for program in programs.values():
@@ -131,7 +131,7 @@ class _Time:
         return total
 
     def cell(self, plan: StudyPlan, cell: StudyCell, devices: int) -> float:
-        """Seconds of a cell, without compilation."""
+        """Seconds of a cell, excluding compilation."""
         counts = calls(plan, cell, devices)
         own: list[float] = []
         if plan.config.kind == "descents" and not cell.model.analytic:
@@ -151,7 +151,7 @@ class _Time:
 
 
 def _side_by_side(seconds: Iterable[float], workers: int) -> float:
-    """When the last of several tasks ends, of which each begins in turn as soon as a worker is free."""
+    """Return when the last of several tasks ends if each begins in turn as soon as a worker is free."""
     ends = [0.0] * workers
     for each in seconds:
         heapq.heappush(ends, heapq.heappop(ends) + each)
@@ -159,7 +159,7 @@ def _side_by_side(seconds: Iterable[float], workers: int) -> float:
 
 
 def _workers(cluster: str) -> int:
-    """Workers of a cluster that work at one time; those here share the cores."""
+    """Number of a cluster's workers that run in parallel; local ones share the cores."""
     kind, _, count = cluster.partition(":")
     if kind == "local":
         return min(int(count or available_cores()), available_cores())
@@ -167,7 +167,7 @@ def _workers(cluster: str) -> int:
 
 
 def _kept(plan: StudyPlan, cell: StudyCell) -> int:
-    """Bytes of the arrays of a cell."""
+    """Size of a cell's arrays [bytes]."""
     config, group = plan.config, plan.groups[cell.group]
     sizes = {
         "seed": config.batches,

@@ -1,8 +1,7 @@
-"""Gradient estimates in a cell: every estimator on every seed's batches, against a reference gradient.
+"""Gradient estimates in a cell: every estimator on every seed's batches, compared with a reference gradient.
 
-The estimators of a seed share its batches: those of values and those of derivatives, drawn from independent keys;
-interpolated estimates combine the two. The same keys are used in every cell, so differences between contact models are
-not sampling noise.
+The estimators of a seed share its batches of values and of derivatives, drawn with independent keys; interpolated
+estimates combine both. All cells use the same keys, so differences between contact models are not sampling noise.
 """
 
 import math
@@ -39,11 +38,11 @@ from mjx_study.tasks.task import Task
 
 Result = TypeVar("Result")
 CANDIDATES: Final = 100
-"""First-order samples whose median is a candidate for the reference's control variate."""
+"""Number of first-order samples whose median is a candidate for the reference's control variate."""
 PILOT: Final = LARGEST_BLOCK
-"""Most samples of the first batch that pick among the candidates."""
+"""Maximum number of samples of the first batch used to select among the candidates."""
 MOST_KEPT: Final = 1_000_000
-"""Most numbers in a cell's mean gradients; larger ones are not kept."""
+"""Maximum size of a cell's array of mean gradients; larger ones are not kept."""
 
 
 def compute_gradients(plan: StudyPlan) -> "Gradients":
@@ -71,14 +70,14 @@ class Gradients:
         return jax.random.split(odd, self._config.reference_samples or 0), jax.random.split(candidate, CANDIDATES)
 
     def __call__(self, cell: StudyCell, part: Part = Part()) -> Arrays:  # noqa: B008, it is empty
-        """A cell's numbers, see `begin`."""
+        """Compute a cell's numbers, see `begin`."""
         return self.begin(cell, part).result()
 
     def begin(self, cell: StudyCell, part: Part) -> Future[Arrays]:
-        """Sample a cell, in whole batches or in blocks; blocks in the checkpoint are not computed again.
+        """Sample a cell, in whole batches or in blocks, skipping blocks in the checkpoint.
 
         Returns:
-            The cell's numbers: on CPUs they are done, on accelerators their statistics may still be running.
+            The cell's numbers: complete on CPUs; on accelerators the statistics may still be running.
         """
         if not blocks_of(self._plan, cell):
             return self._whole(cell)
@@ -90,11 +89,11 @@ class Gradients:
         return _done(self.merged(cell, blocks))
 
     def begun(self, cell: StudyCell, kept: Mapping[str, np.ndarray]) -> Blocks:
-        """The blocks of a cell, those of a checkpoint done."""
+        """Blocks of a cell, with the finished ones of a checkpoint."""
         return Blocks(self._config.batches, blocks_of(self._plan, cell), kept)
 
     def block(self, cell: StudyCell, task: int) -> Arrays:
-        """The arrays of one of the tasks of `Blocks`: the reference's samples, or the summary of a block."""
+        """Compute one of the tasks of `Blocks`: the reference's samples, or the summary of a block."""
         objective, task_of = self._objective(cell), self._plan.groups[cell.group].task
         if task == REFERENCE:
             keys = sample_keys(self._keys["order"][0][0], 0, min(cell.samples, PILOT))
@@ -114,7 +113,7 @@ class Gradients:
         return pack(summary)
 
     def merged(self, cell: StudyCell, blocks: Blocks) -> Arrays:
-        """A cell's numbers from its blocks, all of which are done."""
+        """Compute a cell's numbers from its blocks, all of which must be finished."""
         chosen, reference = estimators_of(self._plan, cell), estimators.summarise(jnp.asarray(blocks.reference))
         tests, parts, tallies = jax.random.split(self._keys["test"], blocks.seeds), [], []
         for seed in range(blocks.seeds):
@@ -156,7 +155,7 @@ class Gradients:
                 with self._device:
                     reference = self._reference(cell, objective, pilot)
             if parts:
-                parts[-1].result()  # no more than two groups of seeds are in memory
+                parts[-1].result()  # keep at most two groups of seeds in memory
             parts.append(self._beside(partial(statistics, *drawn, tests[some], self._compiling)))
         return self._beside(all_numbers)
 
@@ -209,7 +208,7 @@ class Gradients:
     def _numbers(
         self, cell: StudyCell, numbers: Any, reference: GradientEstimate, tallies: Sequence[dict[str, Tally]]
     ) -> Arrays:
-        """All numbers of a cell, from those of its seeds."""
+        """Assemble all numbers of a cell from those of its seeds."""
         samples = cell.samples * self._config.batches
         arrays = _of_seeds(numbers, self._config.batches) | _bias(numbers, reference)
         arrays |= _of_batches(estimators_of(self._plan, cell), tallies, samples)
@@ -243,20 +242,20 @@ def _of_batches(
 
 
 def _of_seeds(numbers: Sequence[dict[str, Any]], seeds: int) -> dict[str, np.ndarray]:
-    """Numbers by seed and estimator, NaN for what an estimator does not have; and those of the reference."""
+    """Numbers by seed and estimator, NaN where not applicable, and those of the reference."""
     arrays = {
         name: np.stack([np.full(seeds, np.nan) if row[name] is None else row[name] for row in numbers], axis=1)
         for name, variable in GRADIENTS.items()
         if variable.dims == BATCH
     }
-    first = numbers[0]  # every estimator's row has the reference's numbers, every seed the same
+    first = numbers[0]  # the reference's numbers are the same for every estimator and seed
     shared = ("reference_norm", "reference_uncertainty", "reference_effective_samples")
     arrays["gradient"] = np.stack([row["gradient"] for row in numbers], axis=1)
     return arrays | {name: np.asarray(first[name][0]) for name in shared}
 
 
 def _bias(numbers: Sequence[dict[str, Any]], reference: GradientEstimate) -> dict[str, np.ndarray]:
-    """Each estimator's bias over the norm of the reference, from the means of its seeds."""
+    """Each estimator's bias relative to the norm of the reference, from the means of its seeds."""
     found = jax.device_get(_biases(np.stack([row["gradient"] for row in numbers]), reference))
     return {name: np.asarray(each, float) for name, each in found.items()}
 
@@ -274,11 +273,11 @@ def _biases(means: Float[Array, "estimators seeds params"], reference: GradientE
 
 
 def soft_gradient(simulator: Simulator, sigma: float, keys: Key[Array, " samples"]) -> Float[Array, " params"] | None:
-    """The median first-order gradient under the softest contact that the task sweeps, whatever is compared.
+    """Return the median first-order gradient under the softest contact of the task's sweep, whatever is compared.
 
-    A candidate for the reference's control variate at every contact model: beyond some stiffness first-order gradients
-    are noise, and this one still points where most of the gradient does. None where the reference takes none, or where
-    the task has no contact.
+    It is a candidate for the reference's control variate under every contact model: beyond some stiffness first-order
+    gradients are noise, while this one still points roughly along the gradient. None if the reference uses no
+    candidates or the task has no contact.
     """
     task = simulator.task
     if task.contact_pair is None or not takes_candidates(task):
@@ -296,13 +295,13 @@ def reference_of(
     pilot: Evaluation,
     soft: Float[Array, " params"] | None,
 ) -> GradientEstimate:
-    """The reference gradient of a contact model; it does not depend on which others there are.
+    """Return the reference gradient of a contact model, independent of which others are compared.
 
     Args:
         objective: the task under that contact model, or its analytic system.
-        odd_keys: keys of the pairs of rollouts.
+        odd_keys: keys of the rollout pairs.
         candidate_keys: keys of the first-order samples whose median is a candidate for the control variate.
-        pilot: a batch from other keys, which picks among the candidates.
+        pilot: a batch from other keys, used to select among the candidates.
         soft: another candidate, see `soft_gradient`.
     """
     if not isinstance(objective, MjxObjective) or not takes_candidates(task):
@@ -340,14 +339,14 @@ def _seed_numbers(chosen: tuple[Estimator, ...], confidence: float) -> Compiled:
 
 @partial(jax.jit, static_argnames="chosen")
 def _rows_of_parts(batches: Batches, chosen: tuple[Estimator, ...]) -> list[list[Array]]:
-    """The samples of the parts of each estimator."""
+    """Samples of each estimator's parts."""
     return [[part.per_sample for part in each.parts(*each.pick(batches))] for each in chosen]
 
 
 def estimate_numbers(
     estimates: Sequence[GradientEstimate], reference: GradientEstimate, key: Key[Array, ""], confidence: float
 ) -> list[dict[str, Any]]:
-    """The numbers of each estimate that are functions of its samples and of the reference gradient alone."""
+    """Compute the numbers of each estimate that depend only on its samples and the reference gradient."""
     result = []
     reference_effective = estimators.effective_samples(reference).count
     for estimate in estimates:

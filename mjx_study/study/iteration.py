@@ -1,4 +1,4 @@
-"""One iteration of stochastic gradient descent for several seeds at once, and when a seed stops; pure functions."""
+"""Pure functions for one iteration of stochastic gradient descent over several seeds, and for stopping a seed."""
 
 import ast
 import dataclasses
@@ -16,15 +16,15 @@ from estimators import Estimator, Linearisation, StepEvaluation
 from estimators.pytree import register_pytree
 
 DIVERGED: Final = 1e6
-"""A mean cost this many times the first one's size is a diverged run."""
+"""Ratio of the mean cost to the size of the first one beyond which a run counts as diverged."""
 REASONS: Final = (
     "",
     "no sample of the batch is finite",
     "the gradient estimate is not finite",
     "the parameters are not finite after the update",
-    f"the mean cost is beyond {DIVERGED:g} times the first one's size",
+    f"the mean cost exceeds {DIVERGED:g} times the size of the first one",
 )
-"""Why a seed stopped, by code; 0 for one that goes on."""
+"""Reasons why a seed stopped, by code; 0 while it continues."""
 
 
 @register_pytree
@@ -34,7 +34,7 @@ class Descent:
 
     Attributes:
         theta: parameters of each seed.
-        reason: index into `REASONS`; 0 while a seed goes on, which otherwise stays as it is.
+        reason: index into `REASONS`; 0 while a seed continues. Stopped seeds no longer change.
         first_cost: absolute mean cost of each seed at its first iteration.
     """
 
@@ -51,9 +51,9 @@ class Record:
 
     Attributes:
         cost: mean cost of the batch, before the update.
-        variance: variance of one gradient sample.
-        alpha: weight of the first-order batch; NaN for an estimator of one batch.
-        nonfinite: number of samples left out.
+        variance: variance of a single gradient sample.
+        alpha: weight of the first-order batch; NaN for estimators with a single batch.
+        nonfinite: number of excluded samples.
         residual: largest solver residual in the batch; 0 for an analytic system.
     """
 
@@ -66,10 +66,10 @@ class Record:
 
 
 def make_optimizer(name: str, learning_rate: float, decay: float) -> optax.GradientTransformation:
-    """An optimiser of optax by its name there, with learning rate learning_rate / i^decay at iteration i.
+    """Create an optax optimiser by name, with learning rate learning_rate / i^decay at iteration i.
 
     Raises:
-        ValueError: optax has no such optimiser, or it takes more than a learning rate, or a number is out of range.
+        ValueError: optax has no such optimiser, it needs more than a learning rate, or a number is out of range.
     """
     if not learning_rate > 0 or not learning_rate < float("inf"):
         raise ValueError(f"the learning rate must be positive and finite, got {learning_rate}")
@@ -77,12 +77,12 @@ def make_optimizer(name: str, learning_rate: float, decay: float) -> optax.Gradi
         raise ValueError(f"the decay of the learning rate must be a power from 0 to 2, got {decay}")
     optimizer = _optimizer(name, lambda count: learning_rate / (1.0 + count) ** decay)
     if optimizer is None:
-        raise ValueError(f"optax has no optimiser {name!r} that takes a learning rate; sgd, adam and rmsprop are some")
+        raise ValueError(f"optax has no optimiser {name!r} that takes a learning rate; use sgd, adam or rmsprop, say")
     return optimizer
 
 
 def _optimizer(name: str, schedule: optax.Schedule) -> optax.GradientTransformation | None:
-    """The optimiser of a name in optax; None where it has no learning rate, or needs more than gradients."""
+    """Return optax's optimiser of a name; None if it has no learning rate or needs more than gradients."""
     theta = jax.ShapeDtypeStruct((2,), float)
     try:
         factory = getattr(optax, name)
@@ -90,29 +90,29 @@ def _optimizer(name: str, schedule: optax.Schedule) -> optax.GradientTransformat
             return None
         optimizer = factory(learning_rate=schedule)
         jax.eval_shape(lambda theta: optimizer.update(theta, optimizer.init(theta), theta), theta)
-    except Exception:  # what optax has by this name raises what it likes
+    except Exception:  # whatever optax has by this name may raise anything
         return None
     return optimizer if isinstance(optimizer, optax.GradientTransformation) else None
 
 
 def schedule_factors(text: str | None, iterations: int, most: float = math.inf) -> Float[np.ndarray, " iterations"]:
-    """Factors by iteration, from an optax schedule as text, such as "linear_schedule(0.01, 1, 100)".
+    """Evaluate an optax schedule given as text, such as "linear_schedule(0.01, 1, 100)", at each iteration.
 
     Args:
-        text: a call of a schedule of optax with numbers, lists or further schedules as arguments; None for ones.
-        iterations: how many.
-        most: largest factor allowed.
+        text: call of an optax schedule with numbers, lists or nested schedules as arguments; None for a constant 1.
+        iterations: number of iterations.
+        most: largest allowed factor.
 
     Raises:
-        ValueError: not such a call, optax refuses it, or a factor is not positive or too large.
+        ValueError: the text is not such a call, optax rejects it, or a factor is not positive or too large.
     """
     if text is None:
         return np.ones(iterations)
-    example = "give a schedule of optax, such as linear_schedule(0.01, 1, 100)"
+    example = "give an optax schedule, such as linear_schedule(0.01, 1, 100)"
     try:
         schedule = _evaluate(ast.parse(text.strip(), mode="eval").body)
         factors = np.asarray(jax.vmap(schedule)(jnp.arange(iterations)), float)
-    except Exception as error:  # what optax has by this name raises what it likes
+    except Exception as error:  # whatever optax has by this name may raise anything
         raise ValueError(f"{text!r} cannot be read ({str(error).splitlines()[0]}): {example}") from None
     if factors.shape != (iterations,) or not np.all((factors > 0) & (factors <= most)):
         bound = "positive" if most == math.inf else f"positive and at most {most:g}"
@@ -121,7 +121,7 @@ def schedule_factors(text: str | None, iterations: int, most: float = math.inf) 
 
 
 def _evaluate(node: ast.expr) -> Any:
-    """The value of a literal, or of a call of one of optax's schedules; nothing else is run."""
+    """Evaluate a literal, or a call of one of optax's schedules; nothing else is executed."""
     if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
         factory = vars(optax.schedules).get(node.func.id)
         if not inspect.isfunction(factory):
@@ -134,7 +134,7 @@ def _evaluate(node: ast.expr) -> Any:
 
 
 def begin(optimizer: optax.GradientTransformation, theta: Float[Array, " params"], seeds: int) -> Descent:
-    """All seeds at the same parameters."""
+    """Start all seeds at the same parameters."""
     thetas = jnp.broadcast_to(theta, (seeds, *theta.shape))
     return Descent(
         thetas, jax.vmap(optimizer.init)(thetas), jnp.zeros(seeds, int), jnp.full(seeds, jnp.nan, theta.dtype)
@@ -147,10 +147,10 @@ def advance(
     """Advance every active seed by one iteration.
 
     Args:
-        batches: of the estimator's oracles, with an axis of seeds in front of each array.
+        batches: batches of the estimator's oracles, each array with a leading axis of seeds.
 
     Returns:
-        The state after it, and what it tells.
+        The new state, and the record of the iteration.
     """
     return jax.vmap(lambda state, batches: _advance_one(state, batches, estimator, optimizer))(state, batches)
 
@@ -163,7 +163,7 @@ def _advance_one(state: Descent, batches, estimator, optimizer):
     first_cost = jnp.where(jnp.isnan(state.first_cost), jnp.abs(cost), state.first_cost)
     updates, optimizer_state = optimizer.update(estimate.mean, state.optimizer, state.theta)
     theta: Array = optax.apply_updates(state.theta, updates)  # type: ignore[assignment]
-    # the gravest reason last
+    # the most severe reason last
     reason = jnp.zeros((), int)
     for code, holds in (
         (4, jnp.abs(cost) > DIVERGED * jnp.maximum(first_cost, 1e-12)),
@@ -194,7 +194,7 @@ def _advance_one(state: Descent, batches, estimator, optimizer):
 
 
 def _values(batch) -> tuple[Float[Array, " samples"], Float[Array, " samples"] | None]:
-    """Total costs and residuals of a batch, whatever its kind."""
+    """Total costs and residuals of a batch of any kind."""
     batch = batch[0] if isinstance(batch, tuple) else batch
     batch = batch.steps if isinstance(batch, Linearisation) else batch
     return (batch.value_to_go[:, 0] if isinstance(batch, StepEvaluation) else batch.value), batch.residual

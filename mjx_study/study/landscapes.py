@@ -1,13 +1,13 @@
 r"""Landscapes of a cell: the cost along a line, its mean under noise, and each estimator's slope.
 
-Along a line theta(t) = theta_0 + t * direction (for a scalar parameter, theta = t) and at each point of a grid:
+At each grid point of a line theta(t) = theta_0 + t * direction (for a scalar parameter, theta = t), compute
 
     the cost without noise,  F = E V_1,  E[ZoBG] . direction,  E[FoBG] . direction,
 
-each mean with its standard error. Where F has a slope that E[FoBG] does not see, the cost jumps. The same keys are used
-at every point and for every contact model, so curves are smooth and differences between them are not sampling noise;
-zeroth- and first-order means come from independent keys. For a scalar parameter and a fixed start the means are
-also had without sampling, by quadrature.
+each mean with its standard error. Where F has a slope that E[FoBG] lacks, the cost jumps. All points and contact models
+use the same keys, so curves are smooth and differences between them are not sampling noise; zeroth- and first-order
+means use independent keys. For a scalar parameter and a fixed start, the means are also computed without sampling, by
+quadrature.
 
 Reference: Suh et al. 2022, figure of simple systems, second row.
 """
@@ -30,11 +30,11 @@ from mjx_study.study.quadrature import Line, Means, applies, grid, means
 from mjx_study.study.sampling import Objectives, cell_keys, draw_batches, unconverged
 
 QUADRATURE: Final = 1500
-"""Points of the grid that quadrature uses under Gaussian noise; heavier tails get more."""
+"""Number of quadrature points under Gaussian noise; heavier tails get more."""
 
 
 def compute_landscapes(plan: StudyPlan) -> Callable[[StudyCell], dict[str, np.ndarray]]:
-    """A function that computes a cell; it keeps what is compiled."""
+    """Return a function that computes cells and keeps compiled programs between them."""
     config, oracles, objectives = plan.config, oracles_of(plan.config), Objectives(plan)
     lines: dict[int, Line] = {}
 
@@ -98,7 +98,7 @@ def _mean(sample: Float[Array, " samples"]) -> tuple[Float[Array, ""], Float[Arr
 
 
 def closed_form(reference: Reference, position: Float[np.ndarray, " points"]) -> Means | None:
-    """Means of a function of one parameter; None of any other reference."""
+    """Means of a function of one parameter; None for any other reference."""
     if not isinstance(reference, FunctionObjective) or not isinstance(reference.function, ScalarFunction):
         return None
     points = [smoothed(reference.function, np.array([t]), reference.sigma, reference.noise) for t in position]

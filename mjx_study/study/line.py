@@ -1,4 +1,4 @@
-"""The line through theta along which a landscape runs."""
+"""The line through theta along which a landscape is computed."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -12,7 +12,7 @@ from mjx_study.study.configuration import check_span
 from mjx_study.tasks.task import Task
 
 SPAN_SIGMAS: Final = 10.0
-"""Half the default width of a line through many parameters, in standard deviations of the noise."""
+"""Half the default length of a line through many parameters, in standard deviations of the noise."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -21,7 +21,7 @@ class ThetaLine:
 
     Attributes:
         position: t, in the unit of theta.
-        direction: of unit length, (params,).
+        direction: unit vector, (params,).
     """
 
     position: Float[np.ndarray, " points"]
@@ -30,15 +30,15 @@ class ThetaLine:
 
 
 def line_of(task: Task, points: int, span: Sequence[float] | None, direction: str | None, seed: int) -> ThetaLine:
-    """The line through a task's theta; for a scalar parameter, its range, whatever theta is.
+    """Return the line through a task's theta; for a scalar parameter, its range, whatever theta is.
 
     Args:
         span: first and last t; None for the task's, or 10 sigma to either side.
         direction: "random" or None, or the index of one parameter.
-        seed: of a random direction.
+        seed: random seed of a random direction.
 
     Raises:
-        ValueError: there is no such direction.
+        ValueError: the span or the direction is invalid.
     """
     theta = np.asarray(task.theta, float)
     along = direction_of(direction or "random", len(theta), seed)
@@ -50,7 +50,7 @@ def line_of(task: Task, points: int, span: Sequence[float] | None, direction: st
 
 
 def direction_of(direction: str, params: int, seed: int) -> Float[np.ndarray, " params"]:
-    """A unit vector: random, or of one parameter; as `line_of`."""
+    """Return a unit vector, random or along one parameter; arguments as for `line_of`."""
     if params == 1:
         return np.ones(1)
     if direction == "random":

@@ -1,4 +1,4 @@
-"""Memory of a study's batches: seeds are computed a few at a time, and a plan that needs too much is refused."""
+"""Limit the memory of a study's batches: compute few seeds at a time, and reject plans that need too much."""
 
 import math
 from collections.abc import Sequence
@@ -12,29 +12,29 @@ from mjx_study.limits import MOST_GIB
 from mjx_study.tasks.task import Task
 
 BIAS_DRAWS: Final = 999
-"""Draws of the test for bias; its smallest p-value is 0.001."""
+"""Number of draws of the bias test; its smallest p-value is 0.001."""
 LARGEST_BATCH: Final = {"cpu": 20_000, "gpu": 2**17, "tpu": 2**17}
-"""Most samples drawn at once, by backend; further seeds are drawn in turn."""
+"""Maximum number of samples drawn at once, by backend; further seeds are drawn in turn."""
 AT_ONCE: Final = {"cpu": 512e6, "gpu": 8e9, "tpu": 8e9}
-"""Most memory for the batches of several seeds [bytes]; those of a single seed may take more. An accelerator is idle
-unless much is drawn at once."""
+"""Memory limit for the batches of several seeds [bytes]; those of a single seed may take more. Accelerators idle unless
+many samples are drawn at once."""
 LARGEST_BLOCK: Final = 20_000
 BLOCK_BYTES: Final = 512e6
-"""Most samples of a block, and memory for them; the same everywhere, so that blocks can be computed anywhere."""
+"""Limits on a block's samples and memory [bytes]; the same on all machines, so that any can compute a block."""
 
 
 def largest_batch() -> int:
-    """Most samples drawn at once by JAX's default backend."""
+    """Maximum number of samples drawn at once by JAX's default backend."""
     return LARGEST_BATCH[jax.default_backend()]
 
 
 def batches_at_once(samples: int) -> int:
-    """Batches of so many samples that are drawn at once."""
+    """Number of batches of this many samples that are drawn at once."""
     return max(1, largest_batch() // samples)
 
 
 def numbers_per_sample(task: Task, oracle: str) -> int:
-    """Numbers held by one sample of a batch."""
+    """Count of numbers held per sample of a batch."""
     params, (steps, dimensions) = task.policy.num_params, task.policy.noise_shape
     noise = steps * dimensions * (1 if task.policy.additive else 1 + params)  # scores, and the policy's Jacobian
     states = task.scene.host.nq + task.scene.host.nv + task.scene.host.na
@@ -53,41 +53,41 @@ def numbers_per_sample(task: Task, oracle: str) -> int:
 
 
 def bytes_per_sample(task: Task, oracles: Sequence[str], estimators: int, draws: int = BIAS_DRAWS) -> int:
-    """Memory per sample [bytes]: every batch, gradients by every estimator, and the draws of the test for bias."""
+    """Memory per sample [bytes]: every batch, gradients of every estimator, and the draws of the bias test."""
     numbers = sum(numbers_per_sample(task, oracle) for oracle in oracles)
     return 8 * (numbers + 3 * estimators * task.policy.num_params + 2 * draws)
 
 
 def bytes_of_moments(estimators: Sequence[Estimator], params: int) -> int:
-    """Memory of the moments of a block of samples [bytes], see `estimators.blocks.Moments`."""
+    """Memory of a block's moments [bytes], see `estimators.blocks.Moments`."""
     sizes = [(1 + params,) if len(each.needs) == 1 else (1 + params, 1 + params, 3 + 2 * params) for each in estimators]
     return 8 * sum(size * (size + 6 * EXTREMES) for each in sizes for size in each)
 
 
 def block_for(each: int) -> int:
-    """Samples of a block, an even number that fits into `BLOCK_BYTES` at so many bytes each."""
+    """Number of samples per block, even and within `BLOCK_BYTES`, given the bytes per sample."""
     return min(LARGEST_BLOCK, max(2, int(BLOCK_BYTES / each) // 2 * 2))
 
 
 def seeds_at_once(memory_of_seed: int, seeds: int) -> int:
-    """Number of seeds that fit into `AT_ONCE`, in as few and as equal groups as possible; at least one."""
+    """Number of seeds per group that fits into `AT_ONCE`, at least one, in as few and as equal groups as possible."""
     fitting = max(1, int(AT_ONCE[jax.default_backend()] / memory_of_seed))
     return math.ceil(seeds / math.ceil(seeds / fitting))
 
 
 def check_batches(needed: int, whole: Sequence[str] = ()) -> None:
-    """Refuse batches that need more bytes than `MOST_GIB` says.
+    """Reject batches that need more memory than `MOST_GIB`.
 
     Args:
-        whole: names of estimators that need whole batches, where others would take blocks of them.
+        whole: names of estimators that need whole batches, where others could use blocks.
 
     Raises:
         ValueError: with the limit and what to change.
     """
     gib = needed / 2**30
     if gib > MOST_GIB:
-        change = "give fewer samples, and more seeds of them"
-        change += f"; or leave out {', '.join(whole)}: {blocks_take(whole)}" if whole else ""
+        change = "use fewer samples and more seeds"
+        change += f"; or omit {', '.join(whole)}: {blocks_take(whole)}" if whole else ""
         raise ValueError(
             f"the batches of a cell would take about {gib:.3g} GiB of memory, and the limit is {MOST_GIB:g} GiB: "
             f"{change}"
@@ -95,20 +95,20 @@ def check_batches(needed: int, whole: Sequence[str] = ()) -> None:
 
 
 def blocks_take(whole: Sequence[str]) -> str:
-    """Which estimators batches of any size have."""
+    """Describe which estimators support batches of any size."""
     able = [name for name, each in ESTIMATORS.items() if each.separable and name not in whole]
     return f"batches of any size are for {', '.join(able)}, without leave_one_out and cross_fitted"
 
 
 def check_memory(task: Task, estimators: Sequence[Estimator], samples: int, *, other: int = 0) -> None:
-    """Refuse a plan whose arrays do not fit into `MOST_GIB`.
+    """Reject a plan whose arrays do not fit into `MOST_GIB`.
 
     Args:
-        task: gives the parameters P, steps H, controls m and the size n of the state.
-        estimators: each keeps about three numbers for each of the N samples and P parameters, those that work
-            step by step N H m (P with feedback) more, and those that linearise N H n (n + m).
-        samples: N, those of all batches that are kept at once.
-        other: numbers that are kept beside them.
+        task: determines the numbers of parameters P, steps H and controls m, and the state size n.
+        estimators: each keeps about 3 N P numbers; those that work step by step N H m more (times P with feedback), and
+            those that linearise N H n (n + m) more.
+        samples: N, the number of samples of all batches held at once.
+        other: number of further numbers kept.
 
     Raises:
         ValueError: with the limit and what to change.
@@ -125,5 +125,5 @@ def check_memory(task: Task, estimators: Sequence[Estimator], samples: int, *, o
     if gib > MOST_GIB:
         raise ValueError(
             f"{samples} samples of {params} parameters and {task.horizon} steps need {gib:.3g} GiB of memory, and the "
-            f"limit is {MOST_GIB:g} GiB: take fewer samples, seeds or steps, or share them between several runs"
+            f"limit is {MOST_GIB:g} GiB: use fewer samples, seeds or steps, or split them over several runs"
         )

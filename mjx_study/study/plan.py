@@ -1,4 +1,4 @@
-"""The plan of a study: its configuration checked and resolved into cells, nothing computed."""
+"""Plan a study: check its configuration and resolve it into cells, computing nothing."""
 
 import dataclasses
 import itertools
@@ -38,7 +38,7 @@ from mjx_study.tasks.task import Recipe, Task, check_sigma
 from mjx_study.tasks.validation import check_shapes
 
 HISTORY_NUMBERS: Final = 20
-"""Numbers kept of an iteration of one seed, all estimators together, roughly."""
+"""Approximate count of numbers kept per iteration and seed, over all estimators."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Group:
     Attributes:
         name: the task's name in the configuration, which is unique.
         cone: friction cone, pyramidal or elliptic.
-        recipe: settings of descents; None in other studies.
+        recipe: settings of descents; None in other kinds of study.
     """
 
     name: str
@@ -61,7 +61,7 @@ class Group:
 
 @dataclasses.dataclass(frozen=True)
 class StudyCell:
-    """One cell of a study, kept as one file.
+    """One cell of a study, stored as one file.
 
     Attributes:
         sigma: standard deviation of the noise.
@@ -94,7 +94,7 @@ class StudyPlan:
 
     @property
     def compilations(self) -> int:
-        """Number of programs to compile: two for each kind of contact of a group, or one for each of its descents."""
+        """Number of programs to compile for each kind of contact of a group: two, or in descents one per estimator."""
         each = 2 if self.config.kind != "descents" else len(self.config.estimators)
         return each * len({self.program_of(cell) for cell in self.cells if not cell.model.analytic})
 
@@ -107,7 +107,7 @@ class StudyPlan:
 
     @property
     def memory(self) -> int:
-        """Memory of the batches and their statistics held at once in the largest cell, roughly [bytes]."""
+        """Approximate memory of the batches and statistics held at once in the largest cell [bytes]."""
         cells = {(cell.group, cell.samples): cell for cell in self.cells}.values()
         return max(
             memory_of_blocks(self, cell)
@@ -118,7 +118,7 @@ class StudyPlan:
 
     @property
     def iterations(self) -> int:
-        """Iterations of the longest descent; 0 in other studies."""
+        """Iterations of the longest descent; 0 in other kinds of study."""
         return max((group.recipe.iterations for group in self.groups if group.recipe), default=0)
 
     @property
@@ -141,11 +141,11 @@ def plan_study(config: StudyConfig, built: Mapping[str, Task] | None = None) -> 
 
     Args:
         config: what to study; fields that are None take their defaults.
-        built: tasks that the caller has built already, by name; with the configuration's horizon and model, and the
-            timestep and cone of the MJCF.
+        built: tasks already built by the caller, by name, with the configuration's horizon and model and the MJCF's
+            timestep and cone.
 
     Raises:
-        ValueError: anything about the configuration that cannot be run; the message says what is accepted.
+        ValueError: the configuration cannot be run; the message says what is accepted.
     """
     programs = len(config.tasks) * len(config.timestep or (None,)) * len(config.cone or (None,))
     check_count(programs, "programs", MOST_PROGRAMS, "give fewer tasks, timesteps or cones")
@@ -156,7 +156,7 @@ def plan_study(config: StudyConfig, built: Mapping[str, Task] | None = None) -> 
         task = _build(config, which, timestep, cone, built or {})
         if config.network is not None:
             if REFERENCE in (config.contact or ()):
-                raise ValueError("a network needs MJX: the analytic references take the task's own policy")
+                raise ValueError("a network needs MJX: the analytic references use the task's own policy")
             task = with_network(task, config.network, jax.random.key(config.seed))
         task = at_theta(task, config.theta)
         recipe = recipe_of(config, task) if config.kind == "descents" else None
@@ -193,7 +193,7 @@ def plan_study(config: StudyConfig, built: Mapping[str, Task] | None = None) -> 
     for cell in {cell.group: cell for cell in cells}.values():
         chosen, recipe = estimators_of(plan, cell), groups[cell.group].recipe
         if config.surrogate and (corrected := [each.name for each in chosen if "corrected" in each.needs]):
-            raise ValueError(f"{corrected[0]} corrects exact derivatives: leave it or backward out")
+            raise ValueError(f"{corrected[0]} corrects exact derivatives: omit it or backward")
         if recipe is not None:
             make_optimizer(config.optimizer or "", recipe.learning_rate, recipe.decay)
             _check_schedules(config, groups[cell.group], chosen)
@@ -208,49 +208,49 @@ def plan_study(config: StudyConfig, built: Mapping[str, Task] | None = None) -> 
 
 
 def _whole(plan: StudyPlan) -> list[str]:
-    """Names of the estimators that need whole batches, in studies in which others would take blocks.
+    """Names of estimators that need whole batches, in studies whose batches can be split into blocks.
 
     Raises:
-        ValueError: blocks are asked for.
+        ValueError: such an estimator is combined with a block size.
     """
     if plan.config.kind != "gradients":
         return []
     found = [each.name for each in estimators_of(plan, plan.cells[0]) if not each.mergeable]
     if found and plan.config.block_size is not None:
         verb = "needs" if len(found) == 1 else "need"
-        raise ValueError(f"{', '.join(found)} {verb} whole batches, leave block_size out: {blocks_take(found)}")
+        raise ValueError(f"{', '.join(found)} {verb} whole batches, omit block_size: {blocks_take(found)}")
     return found
 
 
 def _check_schedules(config: StudyConfig, group: Group, chosen: Sequence[Estimator]) -> None:
-    """Raises ValueError for a schedule that cannot be read, or that a contact model or an estimator cannot follow."""
+    """Raise ValueError for a schedule that cannot be read, or that a contact model or estimator does not support."""
     assert group.recipe is not None
     schedule_factors(config.sigma_schedule, group.recipe.iterations)
     schedule_factors(config.stiffness_schedule, group.recipe.iterations, most=1.0)
     if config.stiffness_schedule and any(
         not model.stiffness or (model.contact is None and not model.analytic) for model in group.models
     ):
-        raise ValueError("stiffness_schedule needs contact models with a stiffness; mjcf has none that could be set")
+        raise ValueError("stiffness_schedule needs contact models with a stiffness; mjcf has none to set")
     fixed = [each.name for each in chosen if hasattr(each, "sigma")]
     if config.sigma_schedule and fixed:
-        raise ValueError(f"{fixed[0]} holds for one sigma; leave it or the schedule of sigma out")
+        raise ValueError(f"{fixed[0]} holds for one sigma; omit it or sigma_schedule")
 
 
 def oracles_of(config: StudyConfig) -> tuple[str, ...]:
-    """Kinds of batches that the estimators need, evaluations included."""
+    """Oracles that the estimators need, evaluations included."""
     return estimators.oracles_of(map(find_estimator, config.estimators), "evaluation")
 
 
 def memory_of_seed(plan: StudyPlan, cell: StudyCell) -> int:
-    """Memory of the batches of one seed of a cell, and of their statistics [bytes]."""
+    """Memory of the batches and statistics of one seed of a cell [bytes]."""
     each = bytes_per_sample(plan.groups[cell.group].task, oracles_of(plan.config), len(plan.config.estimators))
     return cell.samples * each
 
 
 def block_of(plan: StudyPlan, cell: StudyCell) -> int:
-    """Samples of a seed that are held at once: all of them, or a block.
+    """Number of a seed's samples held at once: all of them, or a block.
 
-    Blocks are of batches for which they are asked, and of those that would otherwise be refused.
+    Batches are split into blocks if the configuration asks for it, or if they would otherwise be rejected.
     """
     config, whole = plan.config, cell.samples
     if config.kind != "gradients":
@@ -264,26 +264,26 @@ def block_of(plan: StudyPlan, cell: StudyCell) -> int:
 
 
 def blocks_of(plan: StudyPlan, cell: StudyCell) -> int:
-    """Number of blocks of each seed; 0 for whole batches."""
+    """Number of blocks per seed; 0 for whole batches."""
     size = block_of(plan, cell)
     return 0 if size == cell.samples else math.ceil(cell.samples / size)
 
 
 def memory_of_blocks(plan: StudyPlan, cell: StudyCell) -> int:
-    """Memory of a block, and of the moments that are kept until a batch is whole [bytes]."""
+    """Memory of a block, and of the moments kept until a batch is complete [bytes]."""
     moments = bytes_of_moments(estimators_of(plan, cell), plan.groups[cell.group].task.policy.num_params)
     kept = plan.config.batches + math.ceil(math.log2(blocks_of(plan, cell)))
     return block_of(plan, cell) * bytes_in_block(plan, cell) + 2 * kept * moments
 
 
 def bytes_in_block(plan: StudyPlan, cell: StudyCell) -> int:
-    """Memory of a sample of a block, and of its statistics [bytes]."""
+    """Memory per sample of a block, statistics included [bytes]."""
     task, count = plan.groups[cell.group].task, len(plan.config.estimators)
     return bytes_per_sample(task, oracles_of(plan.config), 2 * count, draws=0)
 
 
 def seeds_together(plan: StudyPlan, cell: StudyCell) -> int:
-    """Number of seeds that a cell draws at once: in studies of gradients as many as fit, otherwise all."""
+    """Number of seeds that a cell draws at once: as many as fit in studies of gradients, otherwise all."""
     batches = plan.config.batches
     return seeds_at_once(memory_of_seed(plan, cell), batches) if plan.config.kind == "gradients" else batches
 
@@ -296,7 +296,7 @@ def _build(
     changes = {"onset": config.onset} | ({} if config.noise is None else {"noise": config.noise})
     if isinstance(which, Task):
         if chosen:
-            raise ValueError(f"{', '.join(chosen)}: only for a task that is built by its name; build this one so")
+            raise ValueError(f"{', '.join(chosen)}: only for a task given by name; build this one with it instead")
         check_shapes(which)
         return which.replace(**changes)
     if which in built and timestep is None and cone is None:
@@ -310,6 +310,6 @@ def _build(
 
 
 def estimators_of(plan: StudyPlan, cell: StudyCell) -> tuple[Estimator, ...]:
-    """A cell's estimators with their options, checked against its task."""
+    """Build a cell's estimators with their options, and check them against its task."""
     task = plan.groups[cell.group].task.replace(sigma=cell.sigma)
     return configured_estimators(plan.config, task)

@@ -1,11 +1,11 @@
-r"""Means over the noise of a scalar parameter, without sampling.
+r"""Means over the noise of a scalar parameter by quadrature, without sampling.
 
     F(theta) = E f(theta + w),   F'(theta) = E f(theta + w) psi'(w),   E[FoBG] = E f'(theta + w),
 
-with w of density p = exp(-psi), on one fine uniform grid that serves every theta. f counts as constant in each cell of
-the grid; since psi' p = -p', the cell's weight in F' is p(left end) - p(right end), whatever kink p has in between. The
-error is of second order in the spacing for smooth f, and a spacing times the jump where f jumps; the difference to the
-rule on every second point estimates it.
+with w of density p = exp(-psi), on one fine uniform grid for all theta. f is treated as constant in each grid cell;
+since psi' p = -p', the cell's weight in F' is p(left end) - p(right end), whatever kinks p has in between. The error is
+of second order in the spacing for smooth f, and a spacing times the jump where f jumps; the difference from the rule
+with every second point estimates it.
 """
 
 import dataclasses
@@ -26,20 +26,20 @@ from mjx_study.stopwatch import timed
 from mjx_study.tasks.task import Task
 
 TAIL: Final = 1e-6
-"""Probability of noise beyond what the grid covers, from each end of the line."""
+"""Probability of noise outside the grid, from each end of the line."""
 CHUNK: Final = 256
 """Points per device and call."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Means:
-    """Means at the points of a line, and how far they may be off.
+    """Means at the points of a line, with error estimates.
 
     Attributes:
         smoothed: F.
-        slope: F', what an unbiased estimate has as its mean.
+        slope: F', the mean of an unbiased estimator.
         first: E[FoBG].
-        slope_error, first_error: difference to the rule with every second point.
+        slope_error, first_error: difference from the rule with every second point.
     """
 
     smoothed: Float[np.ndarray, " points"]
@@ -50,12 +50,12 @@ class Means:
 
 
 def applies(task: Task) -> bool:
-    """Whether a rollout depends on theta + w alone, and that is one number: no feedback, and no start that is drawn."""
+    """Whether a rollout depends on theta + w alone, a scalar: no feedback and no random start."""
     return task.policy.num_params == 1 and task.policy.additive and not task.random_start
 
 
 class Line:
-    """Cost and derivative of a task with one parameter, as one compiled program of points and contact model.
+    """Cost and derivative of a task with one parameter, in one compiled program for all points and contact models.
 
     Raises:
         ValueError: quadrature does not apply to the task.
@@ -83,7 +83,7 @@ class Line:
     def __call__(
         self, points: Float[np.ndarray, " points"], contact: ContactModel | None
     ) -> tuple[Float[np.ndarray, " points"], Float[np.ndarray, " points"]]:
-        """Cost without noise and its derivative at each point."""
+        """Zero-noise cost and its derivative at each point."""
         devices = jax.local_devices()
         with timed(self.program(contact), rounds(len(points), CHUNK, len(devices))):
             return spread(self._program, (contact,), (points.astype(self._dtype),), CHUNK, devices)
@@ -94,10 +94,10 @@ class Line:
 
 
 def grid(low: float, high: float, sigma: float, size: int, noise: str) -> Float[np.ndarray, " size"]:
-    """Midpoints of the cells of a uniform grid that covers the line and the noise about it.
+    """Midpoints of the cells of a uniform grid that covers the line and the noise around it.
 
     Args:
-        size: cells in the width that Gaussian noise needs; heavier tails get more of the same width.
+        size: number of cells for Gaussian noise; heavier tails get more cells of the same width.
     """
     needed, gaussian = (high - low + 2 * sigma * NOISES[name].reach(TAIL) for name in (noise, "gaussian"))
     cells = math.ceil(size * needed / gaussian)
@@ -112,14 +112,14 @@ def means(
     sigma: float,
     noise: str,
 ) -> Means:
-    """Means over the noise at each position.
+    """Compute means over the noise at each position.
 
     Args:
-        values, slopes: f and f' on it.
-        position: theta's.
+        values, slopes: f and f' at the grid points.
+        position: values of theta.
 
     Raises:
-        ValueError: the grid is too coarse, or it does not cover the noise.
+        ValueError: the grid is too coarse or does not cover the noise.
     """
     spacing, reach = points[1] - points[0], NOISES[noise].reach(TAIL)
     gap = 0.51 * spacing - reach * sigma

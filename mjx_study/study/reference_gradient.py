@@ -1,12 +1,12 @@
-"""The gradient that estimators are measured against: unbiased for any contact model, with its own uncertainty.
+"""The reference gradient of estimators: unbiased for any contact model, with its own uncertainty.
 
-Zeroth-order, because first-order gradients may be what is wrong; and with two devices against its variance that keep
-it unbiased whatever the contact does:
+It is of zeroth order, since first-order gradients may be wrong, and uses two variance reductions that keep it unbiased
+under any contact:
 
 - only the part of the cost that is odd in the noise is used (two rollouts per sample);
 - a linear control variate w -> slope * w^T g is subtracted and its exact mean, slope * g, added back. Any vector g
-  that is independent of the sample will do. Candidates are medians of first-order gradients, here and at a soft
-  contact, since beyond some stiffness the local ones are noise; a pilot batch picks candidate and slope.
+  independent of the sample is valid. Candidates are medians of first-order gradients, here and under a soft contact,
+  since beyond some stiffness the local ones are noise; a pilot batch selects candidate and slope.
 """
 
 from collections.abc import Sequence
@@ -20,12 +20,12 @@ from estimators import Evaluation, GradientEstimate, delta_control_variate
 def reference_gradient(
     odd: Evaluation, pilot: Evaluation, candidates: Sequence[Float[Array, " params"]], sigma: float
 ) -> GradientEstimate:
-    """An unbiased estimate of grad F from odd parts and the best of several control variates.
+    """Return an unbiased estimate of grad F from odd parts and the best of several control variates.
 
     Args:
-        odd: odd parts of the cost, (f(w) - f(-w)) / 2, of an open loop; their batch is independent of all else here.
-        pilot: another batch, which picks candidate and slope.
-        candidates: vectors g to try, (params,); entries that are not finite disqualify one.
+        odd: odd parts of the open-loop cost, (f(w) - f(-w)) / 2; their batch is independent of the other arguments.
+        pilot: another batch, which selects candidate and slope.
+        candidates: vectors g to try, (params,); those with nonfinite entries are disqualified.
     """
     signal = pilot.value - pilot.baseline
     signal = jnp.where(jnp.isfinite(signal), signal, 0.0)

@@ -1,4 +1,4 @@
-"""A configuration resolved for a task: its estimators, recipe and parameters."""
+"""Resolve a configuration for a task: estimators, recipe and parameters."""
 
 import dataclasses
 from collections.abc import Iterable, Sequence
@@ -13,7 +13,7 @@ from mjx_study.tasks.task import Recipe, Task
 
 
 def recipe_of(config: StudyConfig, task: Task) -> Recipe:
-    """Settings of a task's descents: the configuration's, else those of the task's recipe.
+    """Return the settings of a task's descents: the configuration's, else those of the task's recipe.
 
     Raises:
         ValueError: a setting is missing.
@@ -29,10 +29,10 @@ def recipe_of(config: StudyConfig, task: Task) -> Recipe:
 
 
 def at_theta(task: Task, theta: Sequence[float] | None) -> Task:
-    """The task at other parameters; unchanged for None.
+    """Return the task with other parameters; unchanged for None.
 
     Raises:
-        ValueError: their number is not the policy's, or one is not finite.
+        ValueError: their number differs from the policy's, or one is nonfinite.
     """
     if theta is None:
         return task
@@ -45,11 +45,11 @@ def at_theta(task: Task, theta: Sequence[float] | None) -> Task:
 
 
 def configured_estimators(config: StudyConfig, task: Task) -> tuple[Estimator, ...]:
-    """A configuration's estimators with their options, checked against the task.
+    """Build a configuration's estimators with their options, and check them against the task.
 
     Raises:
-        ValueError: there is no such estimator, an option is out of range or missing, or an estimator cannot run on the
-            task; or published constants are asked for where there are none, or beside others.
+        ValueError: there is no such estimator, an option is out of range or missing, an estimator does not support the
+            task, or published constants are requested where there are none or along with others.
     """
     options = {name: getattr(config, name) for name in ("baseline", "max_norm", "window", "tolerance", "weights")}
     options |= bound_constants(config, task) | {"sigma": task.sigma}
@@ -59,28 +59,28 @@ def configured_estimators(config: StudyConfig, task: Task) -> tuple[Estimator, .
 
 
 def bound_constants(config: StudyConfig, task: Task) -> dict[str, Any]:
-    """Constants of AoBG's bound, from the configuration or the published example.
+    """Return the constants of AoBG's bound, from the configuration or the published example.
 
     Raises:
-        ValueError: the published ones are asked for where there are none, or beside others.
+        ValueError: published constants are requested where there are none, or along with others.
     """
     names = ("gamma", "failure_probability", "variance_proxy", "radius")
     given = {name: getattr(config, name) for name in names}
     if not config.published:
         return given | {"gamma": task.defaults.gamma if config.gamma is None else config.gamma}
     if task.defaults.published is None:
-        raise ValueError(f"{task.name} has no published constants of the bound; leave published out")
+        raise ValueError(f"{task.name} has no published constants of the bound; omit published")
     defaults = {field.name: field.default for field in dataclasses.fields(StudyConfig)}
     if others := [name for name in names if given[name] != defaults[name]]:
-        raise ValueError(f"published sets {', '.join(names)}: leave {', '.join(others)} out")
+        raise ValueError(f"published sets {', '.join(names)}: omit {', '.join(others)}")
     return dataclasses.asdict(task.defaults.published)
 
 
 def check_estimators(estimators: Iterable[Estimator], task: Task) -> None:
-    """Refuse estimators whose formula does not hold for a task.
+    """Reject estimators whose formula does not hold for a task.
 
     Raises:
-        ValueError: the noise is not Gaussian, or not on theta, where the formula needs it.
+        ValueError: the formula needs Gaussian noise, noise on theta or no onset term, and the task differs.
     """
     for estimator in estimators:
         if estimator.gaussian and task.noise != "gaussian":
@@ -91,5 +91,5 @@ def check_estimators(estimators: Iterable[Estimator], task: Task) -> None:
             )
         if task.onset != "none" and "linearisation" in estimator.needs:
             raise ValueError(
-                f"{estimator.name!r} needs the derivatives of single steps, which have no onset term; leave onset out"
+                f"{estimator.name!r} needs the derivatives of single steps, which have no onset term; omit onset"
             )

@@ -1,8 +1,8 @@
-"""Running studies, in memory or cell by cell into a folder that survives being killed.
+"""Run studies, in memory or cell by cell in a folder that survives a kill.
 
 A cell is one task, timestep, cone, contact model, sigma and sample count, with all seeds and estimators. It depends on
-the configuration alone, not on which cells were computed before it or by whom. Timestep and cone need a compilation of
-their own; everything else is traced.
+the configuration alone, not on which cells were computed before it or by whom. Each timestep and cone is compiled
+separately; everything else is traced.
 """
 
 import dataclasses
@@ -33,7 +33,7 @@ from mjx_study.study.store import Part, Store
 from mjx_study.study.times import recording
 
 WAIT_SECONDS: Final = 0.5
-"""Between looks at cells that another process computes."""
+"""Interval between polls of cells that another process computes."""
 
 
 def _document(plan: StudyPlan, command: str | None) -> dict[str, Any]:
@@ -60,7 +60,7 @@ def _document(plan: StudyPlan, command: str | None) -> dict[str, Any]:
 
 
 def _resolved(plan: StudyPlan, axes: Axes) -> list[dict[str, Any]]:
-    """Settings that differ between tasks: noise, horizons, the estimators' options."""
+    """Settings that differ between tasks: noise, horizons and estimator options."""
     found: list[dict[str, Any]] = [{} for _ in axes.values["task"]]
     for cell, at in zip(plan.cells, axes.places, strict=True):
         task, entry = plan.groups[cell.group].task, found[at["task"]]
@@ -81,21 +81,21 @@ def _options(plan: StudyPlan, cell: StudyCell) -> dict[str, dict[str, Any]]:
 
 
 def open_store(plan: StudyPlan, folder: Path, command: str | None = None, *, accept_versions: bool = False) -> Store:
-    """The folder of a plan, new or begun; one that was begun keeps its chunk size unless the plan gives another.
+    """Open a plan's folder, new or begun; a begun one keeps its chunk size unless the configuration sets another.
 
     Args:
-        command: command that asked for it, to be kept; None where no command did.
-        accept_versions: go on with a study that other versions began.
+        command: command line to record; None if no command asked for the study.
+        accept_versions: resume a study begun by other versions.
 
     Raises:
-        ValueError: it cannot be written to, or holds another study.
+        ValueError: the folder is not writable or holds another study.
     """
     document = _document_in(plan, folder, command)
     return Store.create(prepare_folder(folder), document, accept_versions=accept_versions)
 
 
 def begun_store(plan: StudyPlan, folder: Path, *, accept_versions: bool = False) -> Store | None:
-    """The folder of a plan as `open_store` would go on with it, to read; None where nothing is begun.
+    """Open a plan's folder for reading, as `open_store` would resume it; None if nothing is begun.
 
     Raises:
         ValueError: the folder holds another study.
@@ -104,7 +104,7 @@ def begun_store(plan: StudyPlan, folder: Path, *, accept_versions: bool = False)
 
 
 def _document_in(plan: StudyPlan, folder: Path, command: str | None = None) -> dict[str, Any]:
-    """The document of a plan, with the chunk size of what is begun in a folder."""
+    """Document of a plan, with the chunk size of a study begun in the folder."""
     document = _document(plan, command)
     if plan.config.chunk_size is None:
         begun = (folder / "study.json").exists()
@@ -126,23 +126,23 @@ def run_study(
     """Run a study in memory, or compute what a folder lacks, together with any other process doing the same.
 
     Args:
-        study: a configuration, or what `plan_study` made of it.
-        folder: folder of the study, new or begun, or what `open_store` made of it; None to keep it in memory.
+        study: a configuration, or its plan from `plan_study`.
+        folder: folder of the study, new or begun, or a `Store` from `open_store`; None to keep the study in memory.
         progress: called before every cell, and within descents.
-        command: command that asked for it, to be kept with a new study.
-        accept_versions: go on with a study that other versions of JAX, MuJoCo or this package began.
-        keep_going: where a file cannot be written, compute the rest in memory; the attribute `unwritten` says why.
-        cluster: a `distributed.Client`, or what `connected` takes, whose workers compute the cells; needs a folder.
+        command: command line to record with a new study.
+        accept_versions: resume a study begun by other versions of JAX, MuJoCo or this package.
+        keep_going: if a file cannot be written, compute the rest in memory; the attribute `unwritten` gives the reason.
+        cluster: a `distributed.Client`, or an argument of `connected`, whose workers compute the cells; needs a folder.
 
     Returns:
-        All numbers of the study, labelled; the attribute `computed_cells` says how many cells this call computed, and
-        `failed_cells` which could not be computed on the cluster, and why.
+        All numbers of the study, labelled; the attribute `computed_cells` counts the cells computed by this call, and
+        `failed_cells` lists those that failed on the cluster, with reasons.
 
     Raises:
-        ValueError: the configuration cannot be run, the folder holds another study or cannot be written to, or the
-            cluster cannot be reached.
+        ValueError: the configuration cannot be run, the folder holds another study or is not writable, or the cluster
+            cannot be reached.
         StudyError: a file of the study is damaged, or a worker has other versions.
-        OSError: a cell could not be written; what was written before is kept.
+        OSError: a cell could not be written; earlier ones are kept.
     """
     plan = plan_study(study) if isinstance(study, StudyConfig) else study
     run = _Run(plan, progress)
@@ -178,7 +178,7 @@ class _Run:
         self._plan = self._plan.with_chunk(store.document["config"]["chunk_size"])
         for index in range(self._total):
             if store.has(index):
-                store.read(index)  # a damaged file is refused before anything is computed
+                store.read(index)  # reject damaged files before computing anything
             else:
                 store.read_part(index)
         compute = Computation(self._plan)
@@ -283,7 +283,7 @@ class _Run:
             yield last[0], compute.end(self._plan.cells[last[0]], last[1])
 
     def _begin(self, compute: Computation, index: int, done: int, part: Part) -> Future[dict[str, np.ndarray]]:
-        """Begin a cell, with progress in whole cells, or where there is a single one within it."""
+        """Begin a cell, reporting progress in whole cells, or within the cell if it is the only one."""
         cell = self._plan.cells[index]
         label = self._plan.label(cell)
         if (program := self._plan.program_of(cell)) not in self._begun:
@@ -301,16 +301,16 @@ def _keep(store: Store, index: int, arrays: dict[str, np.ndarray]) -> None:
 
 
 def _labelled(document: dict[str, Any], cells: Cells) -> xr.Dataset:
-    """The Dataset, with the parameters of each cell's contact model."""
+    """Build the Dataset, with the parameters of each cell's contact model."""
     solver = [solver_arrays(cell) for cell in document["cells"]]
     return dataset_of(document, {at: ({**arrays, **solver[at]}, by) for at, (arrays, by) in cells.items()})
 
 
 def load_study(folder: str | Path) -> xr.Dataset:
-    """The numbers of a study as labelled arrays, those of an unfinished one too; NaN for what is missing.
+    """Load the numbers of a study, even an unfinished one, as labelled arrays; NaN where missing.
 
-    Dimensions: task, timestep, cone, model (a contact model, with its family as coordinate `contact` and its
-    `stiffness`), sigma, samples, then seed, estimator, iteration, point and param, those that the variables have.
+    Dimensions: task, timestep, cone, model (a contact model, with coordinates `contact` for its family and
+    `stiffness`), sigma, samples, then seed, estimator, iteration, point and param as far as a variable has them.
 
     Raises:
         StudyError: there is no study, or a file of it is damaged.
@@ -320,16 +320,16 @@ def load_study(folder: str | Path) -> xr.Dataset:
 
 
 def warnings_of(dataset: xr.Dataset) -> tuple[str, ...]:
-    """Warnings of a study's plan, and about its numbers."""
+    """Return the warnings of a study's plan and those about its numbers."""
     found = json.loads(dataset.attrs.get("warnings", "[]"))
     if dataset.attrs["missing_cells"]:
-        found.append(f"{dataset.attrs['missing_cells']} cells are not computed yet; the same command goes on")
+        found.append(f"{dataset.attrs['missing_cells']} cells are not computed yet; the same command resumes")
     failed = json.loads(dataset.attrs.get("failed_cells", "{}"))
     found += [f"{label}: failed, {reason}; the same command tries again" for label, reason in failed.items()]
     if dataset.attrs.get("mixed_versions"):
         found.append(f"cells were computed with different versions: {dataset.attrs['mixed_versions']}")
     if told := dataset.attrs.get("other_versions"):
-        found.append(f"these numbers are of other versions ({told}); another folder computes them again")
+        found.append(f"these numbers were computed with other versions ({told}); use another folder to recompute them")
     for name, says in (
         ("nonfinite", "samples overflowed or became NaN and were left out"),
         ("unconverged", "rollouts in which the contact solver did not converge"),
@@ -340,7 +340,7 @@ def warnings_of(dataset: xr.Dataset) -> tuple[str, ...]:
             found.append(f"{count} {says}")
     if "effective_samples" in dataset and (few := int((dataset["effective_samples"] < ENOUGH_EFFECTIVE).sum())):
         found.append(
-            f"{few} batches rest on fewer than {ENOUGH_EFFECTIVE:g} effective samples: do not believe their errors, "
+            f"{few} batches rest on fewer than {ENOUGH_EFFECTIVE:g} effective samples: do not trust their errors, "
             "p-values and variances (marked ? in the table of compare, effective_samples in the data)"
         )
     if "stopped_at" in dataset and bool(dataset["stopped_at"].notnull().any()):
@@ -349,6 +349,6 @@ def warnings_of(dataset: xr.Dataset) -> tuple[str, ...]:
 
 
 def _count(counts: xr.DataArray) -> int:
-    """The total count; where estimators share rollouts, the largest of any estimator."""
+    """Total count; where estimators share rollouts, the largest over estimators."""
     shared = counts.dims and "seed" not in counts.dims and "estimator" in counts.dims and "point" not in counts.dims
     return int(counts.max("estimator").sum() if shared else counts.sum())

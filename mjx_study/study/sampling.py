@@ -1,4 +1,4 @@
-"""Sampling a cell: keys, batches of every oracle over seeds, and solver residuals."""
+"""Sample a cell: keys, batches of every oracle over seeds, and solver residuals."""
 
 import time
 from collections.abc import Sequence
@@ -22,7 +22,7 @@ UNCONVERGED: Final = {"float64": 1e-6, "float32": 1e-3}
 
 
 class Objectives:
-    """The objective of each cell of a plan; compiled programs serve all contact models and noises of a group."""
+    """The objective of each cell of a plan; all contact models and noises of a group share compiled programs."""
 
     def __init__(self, plan: StudyPlan):
         self._plan, self._compiled = plan, {}
@@ -66,16 +66,16 @@ def draw_batches(
     *,
     device: AbstractContextManager[Any] = nullcontext(),  # noqa: B008, it has no state
 ) -> tuple[dict[str, Any], dict[str, float], dict[str, np.ndarray]]:
-    """Batches of every oracle, with a leading axis of seeds.
+    """Draw batches of every oracle, with a leading axis of seeds.
 
     Args:
-        samples: in each batch.
-        seeds: which.
-        first: index of the first sample, where the batch is part of a larger one.
-        device: held during each timed call.
+        samples: number of samples per batch.
+        seeds: slice of the seeds to draw.
+        first: index of the first sample, if the batch is part of a larger one.
+        device: context held during each timed call.
 
     Returns:
-        By oracle: the batch, its computing time [s], and the solver residual of every rollout.
+        By oracle: the batch, its computing time [s], and each rollout's solver residual.
     """
     together = batches_at_once(samples)
     drawn, seconds, residuals = {}, {}, {}
@@ -96,12 +96,12 @@ def draw_batches(
 
 
 def rollouts_of(oracle: str, samples: int, random_start: bool) -> tuple[int, int]:
-    """Rollouts of a batch, baselines included, and how many of them are differentiated."""
+    """Number of rollouts in a batch, baselines included, and how many of them are differentiated."""
     return sum(rows for _, rows in calls_of(oracle, samples, random_start)), samples * ORACLES[oracle].order
 
 
 def calls_of(oracle: str, samples: int, random_start: bool) -> list[tuple[str, int]]:
-    """Programs of `MjxObjective` that make a batch, each with its rows, baselines included."""
+    """Programs of `MjxObjective` called for a batch, each with its number of rows, baselines included."""
     baselines = samples if random_start else min(samples, 1)
     return {
         "evaluation": [("value", samples + baselines)],
@@ -116,12 +116,12 @@ def calls_of(oracle: str, samples: int, random_start: bool) -> list[tuple[str, i
 
 
 def residuals_of(batch: Any) -> Float[np.ndarray, " rollouts"]:
-    """The solver residual of every rollout of a batch of any kind; empty for an analytic system."""
+    """Each rollout's solver residual in a batch of any kind; empty for an analytic system."""
     parts = batch if isinstance(batch, tuple) else (batch,)
     steps = [part.steps if isinstance(part, Linearisation) else part for part in parts]
     return np.concatenate([np.zeros(0) if part.residual is None else np.asarray(part.residual) for part in steps])
 
 
 def unconverged(residuals: np.ndarray, precision: str) -> int:
-    """Number of residuals that are too large or not finite."""
+    """Number of residuals that are too large or nonfinite."""
     return int(np.sum(~(residuals <= UNCONVERGED[precision])))

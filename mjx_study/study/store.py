@@ -2,13 +2,13 @@
 
     study.json       configuration, digests of what the numbers depend on, versions, machine, every cell's coordinates
     cells/00042.npz  one cell's numbers, with digests of these, of the study and of the cell's coordinates
-    cells/00042.part.npz  checkpoint of a descent that has not ended
-    cells/00042.failed    why a cell could not be computed; the next run tries again
+    cells/00042.part.npz  checkpoint of an unfinished cell (descents, or batches in blocks)
+    cells/00042.failed    why a cell could not be computed; the next run retries
     results.nc       all cells as one NetCDF file, written after the last
     study.lock       which cells are being computed, and by which process
 
-Files are moved into place once complete, so that a process may be killed at any moment. Locks are the operating
-system's and end with their process.
+Files are moved into place once complete, so a process may be killed at any time. Locks are the operating system's and
+end with their process.
 """
 
 import dataclasses
@@ -35,11 +35,11 @@ FORMAT: Final = 3
 IDENTITY: Final = ("contents", "config")
 """Parts of study.json that must match when a study resumes."""
 VERSIONS: Final = "versions"
-"""Entry of a cell with the versions that computed it."""
+"""Entry of a cell that records the versions that computed it."""
 
 
 class StudyError(ValueError):
-    """A folder that holds no study, another study, or a damaged file."""
+    """A folder holds no study, another study, or a damaged file."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,7 +57,7 @@ class Part:
 
 
 class Store:
-    """The folder of one study; `Store.create` and `Store.open` make one.
+    """The folder of one study, from `Store.create` or `Store.open`.
 
     Attributes:
         document: contents of study.json.
@@ -70,7 +70,7 @@ class Store:
 
     @classmethod
     def create(cls, folder: Path, document: dict[str, Any], *, accept_versions: bool = False) -> "Store":
-        """Create a study's folder, or open an existing one of the same configuration and contents.
+        """Create a study's folder, or open an existing one with the same configuration and contents.
 
         Args:
             document: `config`, `cells`, and optionally `contents` (digests of what the numbers depend on), `versions`
@@ -97,10 +97,10 @@ class Store:
 
     @classmethod
     def begun(cls, folder: Path, document: dict[str, Any], *, accept_versions: bool = False) -> "Store | None":
-        """The study that a folder has, to read, as `create` would go on with it; None where there is none.
+        """Open a folder's study for reading, as `create` would resume it; None if there is none.
 
         Raises:
-            StudyError: as `create`.
+            StudyError: as for `create`.
         """
         if not (folder / "study.json").exists():
             return None
@@ -171,7 +171,7 @@ class Store:
 
     @property
     def failures(self) -> dict[int, str]:
-        """Why cells that are missing could not be computed."""
+        """Reasons why missing cells could not be computed."""
         paths = sorted((self.folder / "cells").glob("*.failed"))
         return {int(path.stem): path.read_text() for path in paths if not self.has(int(path.stem))}
 
@@ -187,7 +187,7 @@ class Store:
         write_whole(path, lambda file: np.savez(file, digest=digest, **kept))  # type: ignore[arg-type]
 
     def _authors(self, index: int) -> dict[str, str]:
-        """Versions that computed a cell, those of its checkpoint included."""
+        """Versions that computed a cell, including those of its checkpoint."""
         if not self.part_path(index).exists():
             return self._versions
         before = self._read(self.part_path(index), self._place(index, part=True))[1]
@@ -196,19 +196,19 @@ class Store:
         return {name: " and ".join(dict.fromkeys(each)) for name, each in told.items()}
 
     def read(self, index: int) -> dict[str, np.ndarray]:
-        """The numbers of a cell.
+        """Read the numbers of a cell.
 
         Raises:
-            StudyError: the file is damaged, or of another study or place.
+            StudyError: the file is damaged, or belongs to another study or cell.
         """
         return self.read_with_versions(index)[0]
 
     def read_with_versions(self, index: int) -> tuple[dict[str, np.ndarray], dict[str, str]]:
-        """The numbers of a cell, and the versions that computed them; see `read`."""
+        """Read the numbers of a cell and the versions that computed them; see `read`."""
         return self._read(self.path(index), self._place(index))
 
     def read_part(self, index: int) -> dict[str, np.ndarray]:
-        """A cell's checkpoint; empty if there is none. Raises as `read`."""
+        """Read a cell's checkpoint; empty if there is none. Raises as `read`."""
         path = self.part_path(index)
         return self._read(path, self._place(index, part=True))[0] if path.exists() else {}
 
@@ -217,7 +217,7 @@ class Store:
             with np.load(io.BytesIO(read_whole(path)), allow_pickle=False) as stored:
                 arrays = {name: stored[name] for name in stored.files}
             content, study, place = arrays.pop("digest").tolist()
-        except Exception as error:  # numpy, zipfile and zlib raise what they like
+        except Exception as error:  # numpy, zipfile and zlib may raise anything
             raise StudyError(f"{path} is damaged ({_told(error)}); move it away to compute it again") from error
         for wrong, is_that in (
             (study != self._study, "a cell of another study"),
@@ -230,10 +230,10 @@ class Store:
 
     @contextmanager
     def claims(self) -> Generator[Callable[[int], bool]]:
-        """A function that claims a cell for this process; false if another process has it.
+        """Yield a function that claims a cell for this process, and returns False if another process has it.
 
-        Claims end with the block or the process. A process may be in one such block at a time: closing the file once
-        releases all of its locks.
+        Claims end with the context or the process. A process may enter only one such context at a time: closing the
+        file releases all of its locks.
         """
         path = self.folder / "study.lock"
         try:
@@ -251,14 +251,14 @@ class Store:
             yield claim
 
     def _place(self, index: int, *, part: bool = False) -> str:
-        """Digest of a cell's index and coordinates, and unless it is a checkpoint of the descents' length."""
+        """Digest of a cell's index and coordinates and, except for checkpoints, of the descents' length."""
         cell, axes = self.document["cells"][index], self.document.get("axes", {})
         at = {name: axes[name][place] for name, place in cell.get("at", {}).items()}
         iterations = None if part else self.document["config"].get("iterations")
         return _digest_of_text({"index": index, "cell": cell, "at": at, "iterations": iterations})
 
     def read_all(self) -> dict[int, tuple[dict[str, np.ndarray], dict[str, str]]]:
-        """All computed cells with their versions; see `read`."""
+        """Read all computed cells with their versions; see `read`."""
         there = [index for index in range(len(self.document["cells"])) if self.has(index)]
         return {index: self.read_with_versions(index) for index in there}
 

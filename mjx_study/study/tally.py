@@ -19,7 +19,7 @@ class Tally:
     Attributes:
         seconds: computing time [s].
         residual: largest relative residual of the solver.
-        unconverged: rollouts in which it is too large.
+        unconverged: number of rollouts with too large a residual.
         onsets: see `_met`.
     """
 

@@ -1,9 +1,9 @@
 """Times of programs, recorded by runs in the cache of compiled programs and read by forecasts.
 
-A program is known by its content (model, costs, kind of policy, noise, onset term, kind of contact, precision and
+A program is identified by its content (model, costs, kind of policy, noise, onset term, kind of contact, precision and
 processor), the number of steps and the rows of a call. A call takes about steps x (rows + overhead) times a rate. The
-rate is that of the program's own record, or of the same content's with other rows or steps, or a rough one that grows
-with the degrees of freedom and the constraint rows, times what the records of other programs say of this machine.
+rate comes from the program's own record, or from the same content with other rows or steps, or is a rough one that
+grows with degrees of freedom and constraint rows, scaled by this machine's records of other programs.
 """
 
 import dataclasses
@@ -30,41 +30,41 @@ from mjx_study.stopwatch import Spent, Stopwatch
 from mjx_study.tasks.task import Task
 
 OVERHEAD: Final = {"cpu": 25, "gpu": 50_000, "tpu": 50_000}
-"""Rows that take as long as a call of none, by backend."""
+"""Number of rows that take as long as the overhead of a call, by backend."""
 RATE: Final = {"cpu": 4e-7, "gpu": 3.4e-10, "tpu": 3.4e-10}
-"""Time of a step of a rollout, without degrees of freedom and constraints [s per row]."""
+"""Time of a rollout step without degrees of freedom and constraints [s per row]."""
 POWERS: Final = (0.6, 0.3)
-"""Powers of 1 + degrees of freedom and 1 + constraint rows to which the time of a step grows."""
+"""Exponents of 1 + degrees of freedom and 1 + constraint rows in the time of a step."""
 FACTORS: Final = {
     "value": 1.0, "gradient": 4.0, "corrected": 5.0, "steps": 1.0, "step_gradient": 4.0, "linearisation": 5.0,
     "quadrature": 4.0,
 }  # fmt: skip
-"""Time of the kinds of batches over that of rollouts."""
+"""Time of each kind of batch relative to rollouts."""
 SETUP: Final = (1.0, 2.0)
-"""Tracing and compilation of a program of rollouts without degrees of freedom and constraints [s]; others follow their
-factor's root."""
+"""Times of tracing and compilation of a rollout program without degrees of freedom and constraints [s]; other kinds
+scale with the square root of their factor."""
 OTHERS: Final = {"statistics": (2.5e-8, 5e6), "analytic": (1e-7, 1.5e6)}
-"""Time of a cell's statistics [s per number held by its batches], or of an analytic system [s per step of a row], and
-how many take as long as a cell without any."""
+"""Time of a cell's statistics [s per number held by its batches] or of an analytic system [s per step of a row], and
+how many of these take as long as the overhead of a cell."""
 OTHERS_SETUP: Final = (2.0, 3.0)
-"""Tracing and compilation of these [s]."""
+"""Times of tracing and compilation of these [s]."""
 SAVE_SECONDS: Final = 5.0
 READING: Final = 0.1
-"""Reading a compiled program over compiling it."""
+"""Time of reading a compiled program relative to compiling it."""
 BASES: Final[tuple[str, str, str]] = ("measured here", "scaled from what was measured here", "rough: never run here")
 MEASURED, SCALED, ROUGH = BASES
 
 
 @dataclasses.dataclass(frozen=True)
 class Program:
-    """A program, or the statistics of a cell: what the time of a call depends on.
+    """What the time of a call of a program, or of a cell's statistics, depends on.
 
     Attributes:
-        kind: one of `objective.SamplePrograms`; those of an iteration of descents joined by "+"; "analytic"
-            or "statistics".
+        kind: one of `objective.SamplePrograms`, or for an iteration of descents several joined by "+"; "analytic" or
+            "statistics".
         content: digest of what else is compiled, and of the machine.
-        steps: of a rollout; 1 for statistics.
-        rows: rollouts in a call; numbers for statistics.
+        steps: number of steps of a rollout; 1 for statistics.
+        rows: number of rollouts in a call; for statistics, of numbers.
         dof, constraints: degrees of freedom and constraint rows.
     """
 
@@ -84,19 +84,19 @@ class Program:
 
     @property
     def rough(self) -> float:
-        """Rough time of a call [s]."""
+        """Rough estimate of the time of a call [s]."""
         if self.kind in OTHERS:
             return self.work * OTHERS[self.kind][0]
         return self.work * RATE[jax.default_backend()] * self.factor * self._size
 
     @property
     def factor(self) -> float:
-        """Time over that of a call of rollouts."""
+        """Time relative to a call of rollouts."""
         return statistics.fmean(FACTORS.get(part, 1.0) for part in self.kind.split("+"))
 
     @property
     def rough_setup(self) -> tuple[float, float]:
-        """Rough times of tracing and compilation [s]."""
+        """Rough estimates of tracing and compilation times [s]."""
         if self.kind in OTHERS:
             return OTHERS_SETUP
         grown = self._size * sum(FACTORS.get(part, 1.0) ** 0.5 for part in self.kind.split("+"))
@@ -108,7 +108,7 @@ class Program:
 
 
 class Record(BaseModel):
-    """Times of a program: each call, tracing, and compilation when it is not in the cache [s]."""
+    """Recorded times of a program: per call, tracing, and compilation if not cached [s]."""
 
     kind: str
     content: str
@@ -128,7 +128,7 @@ class Record(BaseModel):
 
 
 def program_of(kind: str, task: Task, contact: Any, rows: int, steps: int | None = None) -> Program:
-    """A program of a task.
+    """Return a program of a task.
 
     Args:
         contact: structure of the contact model's arrays.
@@ -169,10 +169,10 @@ def times_folder() -> Path | None:
 def recording(watch: Stopwatch | None = None) -> Generator[None]:
     """Record the times of programs run within, for later forecasts; failures to write are ignored.
 
-    The latest run of a program counts, so that processes at one time need not wait for each other.
+    The latest run of a program counts, so concurrent processes need not wait for each other.
 
     Args:
-        watch: what was measured before within the same process; written again only `SAVE_SECONDS` after the last time.
+        watch: earlier measurements of the same process; written at most every `SAVE_SECONDS`.
     """
     watch = Stopwatch() if watch is None else watch
     with watch.running():
@@ -193,7 +193,7 @@ def _write(folder: Path, key: Any, spent: Spent) -> None:
     program = key if isinstance(key, Program) else program_of(*key)
     path = folder / f"{program.kind}-{program.content}-{program.steps}-{program.rows}.json"
     setup = {"tracing": spent.tracing, "compiling": spent.compiling, "versions": versions()}
-    if not spent.setups:  # compiled before
+    if not spent.setups:  # compiled earlier
         with suppress(ValueError):
             setup = read_json(path, Record).model_dump(include=set(setup))
     times = {"each": spent.each, "calls": spent.calls or spent.first_calls}
@@ -202,7 +202,7 @@ def _write(folder: Path, key: Any, spent: Spent) -> None:
 
 
 class Rates:
-    """The times of programs, from records and from the rough model."""
+    """Times of programs, from records and a rough model."""
 
     def __init__(self, records: Iterable[Record]):
         self._records = list(records)
@@ -238,13 +238,13 @@ class Rates:
         return tracing * speed, compiling * speed, False, ROUGH
 
     def _nearest(self, program: Program) -> Record | None:
-        """The record of the same content with the nearest work, of the same kind if there is one."""
+        """Record of the same content with the nearest work, of the same kind if there is one."""
         same = [each for each in self._records if each.content == program.content and each.each > 0]
         kind = [each for each in same if each.kind == program.kind] or same
         return min(kind, key=lambda each: abs(math.log(each.program.work / program.work)), default=None)
 
     def _speed(self, program: Program, times: Any) -> float:
-        """Measured over rough times: the median of the records of this kind, or of all kinds of rollouts."""
+        """Median ratio of measured to rough times, over records of this kind, else of all kinds of rollouts."""
         kind = [each for each in self._records if each.kind == program.kind]
         if program.kind in FACTORS or "+" in program.kind:
             kind = kind or [each for each in self._records if each.dof]

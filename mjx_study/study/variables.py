@@ -1,4 +1,4 @@
-"""Every quantity of a study: its dimensions within a cell, unit and description."""
+"""The variables of a study: dimensions within a cell, unit and description."""
 
 import dataclasses
 from collections.abc import Iterable
@@ -7,7 +7,7 @@ from typing import Final
 
 @dataclasses.dataclass(frozen=True)
 class Variable:
-    """A quantity of a study.
+    """A variable of a study.
 
     Attributes:
         dims: dimensions within a cell.
@@ -119,7 +119,7 @@ MEASURED: Final = ("seconds", "seconds_per_sample")
 
 
 def variables_of(kind: str, names: Iterable[str]) -> dict[str, Variable]:
-    """The variables of a kind of study, with the metrics among the given names."""
+    """Return the variables of a kind of study, with the metrics among the given names."""
     told = {name: f"{name.partition('metric_')[2]}, mean over the rollouts of a final cost" for name in names}
     metrics = {name: Variable(BATCH, "1", told[name]) for name in told if name.startswith(METRIC)}
     metrics |= {name: Variable((), "1", told[name]) for name in told if name.startswith(START)}
@@ -127,7 +127,7 @@ def variables_of(kind: str, names: Iterable[str]) -> dict[str, Variable]:
 
 
 def markdown_table(kind: str) -> str:
-    """The table of variables in docs/studies.md."""
+    """Format the table of variables in docs/studies.md."""
     rows = [
         f"| `{name}` | {', '.join(variable.dims) or '-'} | {variable.unit} | {variable.description} |"
         for name, variable in VARIABLES[kind].items()

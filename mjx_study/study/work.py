@@ -51,8 +51,7 @@ def rollouts(plan: StudyPlan, cell: StudyCell) -> tuple[int, int]:
 def calls(plan: StudyPlan, cell: StudyCell, devices: int) -> Counter[Program]:
     """Sequential calls of each program on several devices at once, without those that compile it.
 
-    Descents of several estimators are side by side, and their calls in the order of the estimators; those that stop
-    early take less.
+    Descents of several estimators run in parallel, with calls in the order of the estimators; early stops take less.
     """
     found: Counter[Program] = Counter()
     if cell.model.analytic:
@@ -84,10 +83,10 @@ def calls(plan: StudyPlan, cell: StudyCell, devices: int) -> Counter[Program]:
 
 
 def iteration(plan: StudyPlan, cell: StudyCell, needs: tuple[str, ...]) -> Program:
-    """The program of an iteration of all seeds of an estimator that needs these oracles."""
+    """Program of an iteration of all seeds of an estimator that needs these oracles."""
     task = plan.groups[cell.group].task
     parts = [part for oracle in needs for part in calls_of(oracle, cell.samples, task.random_start)]
-    # chunks of a seed, filled up, one after another for all seeds at once
+    # chunks of a seed, padded to full size, in sequence for all seeds at once
     rows = sum(math.ceil(rows / plan.chunk_size) * plan.chunk_size for _, rows in parts) * plan.config.batches
     return _program(plan, cell, "+".join(name for name, _ in parts), rows)
 
@@ -108,7 +107,7 @@ def rest(plan: StudyPlan, cell: StudyCell) -> Program:
 
 
 def setups(plan: StudyPlan, cell: StudyCell) -> dict[Any, Program]:
-    """Programs that must be compiled before a cell is computed, by what they are compiled for."""
+    """Programs to compile before a cell is computed, by what they are compiled for."""
     own, other = plan.program_of(cell), rest(plan, cell)
     found: dict[Any, Program] = {other: other}
     for program in calls(plan, cell, 1):
@@ -134,6 +133,6 @@ def _evaluations(plan: StudyPlan) -> int:
 
 
 def _in_turn(count: int, together: int) -> Iterator[int]:
-    """Sizes of the groups in which so many are taken."""
+    """Yield the sizes of the groups of at most `together` that make up `count`."""
     for start in range(0, count, together):
         yield min(together, count - start)

@@ -7,12 +7,12 @@ from mjx_study.cli.options import add_option
 from mjx_study.option import OPTIONS
 
 EPILOG = """\
-Each claim has a statistic, the values with which it holds, and those with which its opposite does.
-Its interval decides: holds, fails, reversed, or undecided, with the number of samples that would decide. The intervals
-of the whole ledger hold at once with probability 95 % (Bonferroni), whichever claims are run.
+Each claim has a statistic, a range of values for which the claim holds, and a range for which its opposite holds. The
+statistic's confidence interval decides: holds, fails, reversed, or undecided, with the number of samples that would
+decide. All intervals hold at once with probability 95 % (Bonferroni), whichever claims are run.
 
-With --output, measurements are kept as they are made: a run that is stopped goes on, and a claim whose definition or
-code has changed is measured again. The folder gets claims.json, claims.md and claims.png.
+With --output, measurements are saved as they are made: a stopped run can be resumed, and a claim whose definition or
+code has changed is measured again. The folder also gets claims.json, claims.md and claims.png.
 
 examples:
   mjx-study claims --quick --output out
@@ -21,17 +21,17 @@ examples:
 
 
 def add(command: argparse.ArgumentParser) -> None:
-    """Add them."""
+    """Add the options."""
     effort = command.add_mutually_exclusive_group()
-    effort.add_argument("--quick", dest="effort", action="store_const", const="quick", help="minutes; the default")
-    effort.add_argument("--full", dest="effort", action="store_const", const="full", help="hours, narrower intervals")
+    effort.add_argument("--quick", dest="effort", action="store_const", const="quick", help="minutes (default)")
+    effort.add_argument("--full", dest="effort", action="store_const", const="full", help="hours; narrower intervals")
     command.set_defaults(effort="quick")
     command.add_argument(
-        "--only", action="append", metavar="ID[,ID]", help="these claims; may be repeated (default: all of them)"
+        "--only", action="append", metavar="ID[,ID]", help="run only these claims; may be repeated (default: all)"
     )
-    command.add_argument("--output", type=Path, metavar="DIR", help="folder of the ledger; resumable")
-    command.add_argument("--list", action="store_true", help="print the claims and what decides them; measure nothing")
+    command.add_argument("--output", type=Path, metavar="DIR", help="folder for measurements and verdicts; resumable")
+    command.add_argument("--list", action="store_true", help="print the claims and their criteria; measure nothing")
     command.add_argument(
-        "--accept-versions", action="store_true", help="go on with studies in DIR that other versions began"
+        "--accept-versions", action="store_true", help="resume studies in DIR begun by other versions of the software"
     )
     add_option(command, OPTIONS["devices"])

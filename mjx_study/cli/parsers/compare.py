@@ -24,7 +24,7 @@ EPILOG = (
 examples:
   mjx-study compare pusher --stiffness 10,1000 --contact penalty,mujoco_default
   mjx-study compare pusher --estimators zobg,fobg,aobg,ivw --gamma 1000 --samples 1000
-  mjx-study compare pusher --theta out/policy-aobg.json    where a descent ended, in place of where it begins
+  mjx-study compare pusher --theta out/policy-aobg.json    at the end of a descent instead of its start
   mjx-study compare pusher --json > pusher.json
 
 estimators:
@@ -40,20 +40,20 @@ contact families (K: from --stiffness):
 columns of the table:
   variance        trace of the sample covariance of one gradient sample, with a jackknife interval
   relative error  distance of the mean to a reference gradient, over the norm of the reference
-  -> debiased     the same without the sampling noise of batch and reference, ± a standard error; < and > where
-                  none is seen: bounds, of two standard errors; - where noise is all there is
-  ?               fewer than three effective samples: do not believe the number
+  -> debiased     the same without the sampling noise of batch and reference, ± one standard error; < and >: no error
+                  is detected, these are bounds of two standard errors; -: noise explains all of it
+  ?               fewer than three effective samples: do not trust the number
   alpha           weight of the first-order batch in AoBG
   ms              computing time of one sample in milliseconds, compilation excluded
-  variance x s    variance times that time: the variance that a second of computing leaves
+  variance x s    variance times that time: the variance left after one second of computing
 
 and with --details:
   |gradient|      norm of the mean gradient
-  effective (top) samples that the variance rests on, and the share of it that the largest one carries
-  cosine          of the mean and the reference gradient, and the same debiased; where parameters are several
+  effective (top) samples that the variance rests on, and the share of it carried by the largest one
+  cosine          between mean and reference gradient, and the same debiased; for several parameters
   epsilon, B      confidence radius of the zeroth-order mean; distance between the two means
-  residual        largest relative imbalance left by MuJoCo's constraint solver
-  nan             samples that overflowed or became NaN; they are left out, and a warning says so
+  residual        largest relative residual of MuJoCo's constraint solver
+  nan             samples that overflowed or became NaN; they are left out, with a warning
 """
 )
 

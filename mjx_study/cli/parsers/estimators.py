@@ -3,10 +3,10 @@
 import argparse
 
 EPILOG = """\
-What each needs: values (rollouts), pairs (of opposite noise), steps (costs to go), gradients, or derivatives of every
-step. compare and optimise take any of them with --estimators and --estimator.
+The second column says what each needs: values (rollouts), pairs (of opposite noise), steps (costs to go), gradients, or
+derivatives of every step. compare, optimise and sweep accept any of them in --estimators.
 """
 
 
 def add(command: argparse.ArgumentParser) -> None:
-    """None but --json."""
+    """Add no options beyond --json."""

@@ -19,17 +19,17 @@ POINTS, SAMPLES = 41, (100,)
 ESTIMATORS = ("zobg", "fobg")
 EPILOG = """\
 examples:
-  mjx-study landscape ball_wall --output out             the launch angle's whole range, reference and MJX
+  mjx-study landscape ball_wall --output out             the whole range of launch angles, reference and MJX
   mjx-study landscape momentum_transfer --contact penalty,mujoco_default --stiffness 3000,100000
   mjx-study landscape pusher --direction 0 --span=-2,2   the first of 200 forces
 
-Top row of the figure: the cost without noise, and the mean cost with noise (its smoothed objective) with a 95 % band.
-Bottom row: the mean of ZoBG and of FoBG along the line, with theirs. Where the smoothed objective has a slope that the
-mean of FoBG does not have, the cost jumps: a first-order gradient does not see jumps.
+Top row of the figure: the cost without noise, and the mean cost with noise (the smoothed objective) with a 95 % band.
+Bottom row: the means of ZoBG and FoBG along the line, with 95 % bands. Where the smoothed objective has a slope that
+the mean of FoBG lacks, the cost jumps: first-order gradients do not see jumps.
 
-The scalar parameter of an initial-state policy with a fixed start also gets both slopes without sampling error, by
-quadrature over 1500 rollouts and gradients of each contact model (more where --noise has heavy tails), whatever
---points and --samples.
+For a scalar initial-state parameter with a fixed start, both slopes are also computed without sampling error, by
+quadrature over 1500 rollouts and gradients per contact model (more if --noise has heavy tails), whatever --points and
+--samples.
 """
 
 
@@ -44,5 +44,5 @@ def add(command: argparse.ArgumentParser) -> None:
     add_option(command, OPTIONS["points"], POINTS)
     add_options(command, StudyConfig, "span", "direction", "onset", "chunk_size")
     add_backward_options(command)
-    command.add_argument("--no-reference", action="store_true", help="leave out the analytic reference")
+    command.add_argument("--no-reference", action="store_true", help="omit the analytic reference")
     add_folder_options(command)

@@ -17,12 +17,12 @@ from mjx_study.study.configuration import StudyConfig
 
 SEEDS = 3
 EPILOG = """\
-Every estimator starts from the task's theta, or from --theta, and draws the same noise. Without --learning-rate,
---iterations and --samples the task's own are taken, which are the paper's: plain gradient descent.
+Every estimator starts from the task's theta, or from --theta, and draws the same noise. --learning-rate, --iterations
+and --samples default to the task's own, which are the paper's: plain gradient descent.
 
-With --output DIR, a study: its numbers (for plot, report, load_study), descent.png and .pdf (cost against iterations,
-rollouts and seconds; alpha), and the best seed's policy of each estimator (policy-NAME.json, for rollout --policy). The
-same command goes on where it was stopped, at most 20 s before, or with more --iterations.
+With --output DIR, a study is written: its numbers (for plot, report, load_study), descent.png and .pdf (cost against
+iterations, rollouts and seconds; alpha), and each estimator's policy of its best seed (policy-NAME.json, for rollout
+--policy). The same command resumes a stopped run, repeating at most 20 s, or extends it with more --iterations.
 
 examples:
   mjx-study optimise pusher --contact penalty --stiffness 1000 --output out
@@ -34,9 +34,9 @@ examples:
 columns of the table:
   cost        mean cost with noise of the final policy over --evaluation-samples rollouts, the same for all, and its
               standard deviation over seeds
-  hit, ...    what a task counts beside its cost, the mean over the same rollouts
+  hit, ...    what a task counts besides its cost, averaged over the same rollouts
   alpha       mean weight of first-order gradients in the last tenth of the iterations
-  rollouts    simulated per seed, those that were differentiated and baselines included
+  rollouts    number simulated per seed, including differentiated ones and baselines
 """
 
 
@@ -44,7 +44,7 @@ def add(command: argparse.ArgumentParser) -> None:
     add_task_options(command)
     add_theta_option(command, "parameters to start from")
     add_contact_options(command, "the middle one of the task's sweep", many=False)
-    command.add_argument("--reference", action="store_true", help="on the analytic reference in place of MJX")
+    command.add_argument("--reference", action="store_true", help="use the analytic reference instead of MJX")
     add_options(command, StudyConfig, "network", "estimators", "iterations")
     add_option(command, OPTIONS["samples"].within("[3, 1e7]"))
     add_option(command, OPTIONS["seeds"], SEEDS)

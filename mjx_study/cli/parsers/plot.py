@@ -9,10 +9,10 @@ from mjx_study.option import Option
 
 FORMAT = Option("format", str, "FORMAT", f"of: {', '.join(FIGURE_FORMATS)}", choices=FIGURE_FORMATS, many=True)
 EPILOG = """\
-Draws what the study has the numbers for: variance, bias and alpha against stiffness, error against samples, maps over
-two swept parameters; of descents, achieved cost against stiffness, and cost against iterations, rollouts and seconds;
-of landscapes, costs and slopes. Works while the study is still being computed. --style paper is as wide as a column or
-a page, without a title, in 8 point type that is embedded.
+Draws whatever the study has numbers for: variance, bias and alpha against stiffness, error against samples, maps over
+two swept parameters; for descents, achieved cost against stiffness, and cost against iterations, rollouts and seconds;
+for landscapes, costs and slopes. Works while the study is still being computed. --style paper gives column or page
+width, no title, and embedded 8-point type.
 
 examples:
   mjx-study plot out

@@ -4,8 +4,8 @@ import argparse
 from pathlib import Path
 
 EPILOG = """\
-Writes FOLDER/report.html: one page that needs no other file, with warnings, figures, a table, the whole configuration,
-versions and machine, and the command that made it. Works while the study is still being computed.
+Writes FOLDER/report.html: one self-contained page with warnings, figures, a table, the whole configuration, versions
+and machine, and the command that made it. Works while the study is still being computed.
 
 example:
   mjx-study report out

@@ -8,12 +8,12 @@ from mjx_study.cli.options import add_contact_options, add_option, add_scene_opt
 from mjx_study.option import OPTIONS
 
 EPILOG = """\
-Simulates one rollout and shows it: strip.png (pictures at even times), stroboscope.png (one picture with ghosts),
+Simulates one rollout and shows it: strip.png (pictures at equal intervals), stroboscope.png (one picture with ghosts),
 rollout.gif or .mp4, and trajectory.npz (time [s], qpos, qvel, controls). Without OpenGL everything is drawn from the
 model's geometry; with it, strip and film are MuJoCo's own renderings.
 
-TASK may also be an MJCF file of your own (FILE.xml): it moves as MuJoCo's C engine moves it, from its first keyframe if
-it has one, for 2 s unless --horizon says otherwise.
+TASK may also be an MJCF file of your own (FILE.xml): MuJoCo's C engine simulates it, from its first keyframe if it has
+one, for 2 s unless --horizon is given.
 
 examples:
   mjx-study rollout pusher
@@ -27,12 +27,12 @@ def add(command: argparse.ArgumentParser) -> None:
     add_task_options(command)
     add_scene_options(command)
     add_contact_options(command, "the middle one of the task's sweep", many=False, analytic=False)
-    command.add_argument("--noise", action="store_true", help="with the noise of sample --seed (default: none)")
+    command.add_argument("--noise", action="store_true", help="add noise, drawn with --seed (default: none)")
     add_theta_option(command, "parameters")
-    command.add_argument("--policy", type=Path, metavar="FILE", help="a policy that optimise wrote, policy-NAME.json")
+    command.add_argument("--policy", type=Path, metavar="FILE", help="a policy written by optimise, policy-NAME.json")
     add_option(command, OPTIONS["frames"], 6)
-    command.add_argument("--view", choices=["auto", *PLANES], default="auto", help="default: where most happens")
+    command.add_argument("--view", choices=["auto", *PLANES], default="auto", help="default: auto, by the motion")
     command.add_argument("--renderer", choices=RENDERERS, default="auto", help="default: auto, opengl where it works")
-    command.add_argument("--format", choices=FILM_FORMATS, default="gif", help="of the film (default: gif)")
+    command.add_argument("--format", choices=FILM_FORMATS, default="gif", help="format of the film (default: gif)")
     add_option(command, OPTIONS["slow"], 1.0)
     command.add_argument("--output", type=Path, metavar="DIR", help="default: results/TASK-rollout")

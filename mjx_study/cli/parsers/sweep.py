@@ -21,11 +21,11 @@ from mjx_study.study.configuration import StudyConfig
 
 EPILOG = """\
 Every combination of task, contact model, timestep, cone, sigma and number of samples is a cell: all its seeds and
-estimators are computed at once and written to DIR as one file. Stop it when you like, with Ctrl-C or kill -9; the same
-command computes what is missing, to the same numbers. Two of them at once share the work.
+estimators are computed together and written to DIR as one file. Stop whenever you like, with Ctrl-C or kill -9: the
+same command computes what is missing, with the same numbers. Two such processes at once share the work.
 
-Gradients are estimated where each task starts. With --iterations, policies are optimised; with --points, landscapes
-are drawn: the cost along a line, and the slope that every estimator sees.
+Gradients are estimated at each task's initial theta. With --iterations, policies are optimised instead; with --points,
+landscapes are computed: the cost along a line, and the slope that every estimator sees.
 
 Numbers may be lists (10,100,1000) or ranges: FROM:TO:COUNT, or FROM:TO:COUNT:log for equal ratios.
 
@@ -39,7 +39,7 @@ examples:
   mjx-study plot out
   mjx-study report out
 
-A TOML file holds the same options by the names of their flags, with _ for -:
+A TOML file holds the same options under the names of their flags, with _ for -:
   tasks = ["pusher"]
   contact = ["penalty", "mujoco"]
   stiffness = "10:1e5:13:log"
@@ -51,17 +51,17 @@ TASKS = Option("tasks", str, "TASK", "", many=True)
 
 
 def add(command: argparse.ArgumentParser) -> None:
-    choices = f"of: {', '.join(TASK_DESCRIPTIONS)}, or module:name"
+    choices = f"one or more of: {', '.join(TASK_DESCRIPTIONS)}, or module:name"
     command.add_argument("tasks", nargs="?", type=_tasks, metavar="TASK[,TASK]", help=choices)
-    command.add_argument("--config", type=Path, metavar="FILE.toml", help="options from a file; flags go before it")
+    command.add_argument("--config", type=Path, metavar="FILE.toml", help="options from a file; flags take precedence")
     add_options(command, StudyConfig, "contact", "stiffness", "damping")
     add_option(command, OPTIONS["solref"], read=solref)
     add_option(command, OPTIONS["solimp"], read=solimp)
     add_options(command, StudyConfig, "timestep", "cone", "sigma", "samples")
-    add_options(command, StudyConfig, "seeds", "estimators", seeds={"unset": "10; 1 of landscapes"})
+    add_options(command, StudyConfig, "seeds", "estimators", seeds={"unset": "10; 1 for landscapes"})
     add_options(command, StudyConfig, "kind", "network", "confidence")
-    add_options(command, StudyConfig, "iterations", iterations={"line": "optimise policies, N steps each", "unset": ""})
-    add_options(command, StudyConfig, "points", points={"line": "landscapes, on N points of a line through theta"})
+    add_options(command, StudyConfig, "iterations", iterations={"line": "optimise policies, N iterations", "unset": ""})
+    add_options(command, StudyConfig, "points", points={"line": "landscapes, at N points of a line through theta"})
     add_options(command, StudyConfig, "span", "direction")
     add_options(command, StudyConfig, "optimizer", "learning_rate", "decay", optimizer={"unset": "sgd"})
     add_options(command, StudyConfig, "stiffness_schedule", "sigma_schedule")
@@ -71,7 +71,7 @@ def add(command: argparse.ArgumentParser) -> None:
     add_backward_options(command)
     add_options(command, StudyConfig, "horizon", "model", "chunk_size", "block_size")
     add_process_options(command, seed=None)
-    command.add_argument("--output", type=Path, required=True, metavar="DIR", help="folder of the study")
+    command.add_argument("--output", type=Path, required=True, metavar="DIR", help="folder for the study")
     add_cluster_option(command)
     add_study_options(command)
 
@@ -81,7 +81,7 @@ def _tasks(text: str) -> tuple[str, ...]:
 
 
 def solref(value: Any) -> tuple[tuple[float, ...], ...]:
-    """Rows of numbers; of text, the first column's numbers with every one of the second."""
+    """Parse rows of numbers; in text, combine every number of the first column with every one of the second."""
     if not isinstance(value, str):
         return _rows(value)
     columns = [NUMBERS.parse(column) for column in value.split(";")]
@@ -93,7 +93,7 @@ def solref(value: Any) -> tuple[tuple[float, ...], ...]:
 
 
 def solimp(value: Any) -> tuple[tuple[float, ...], ...]:
-    """Rows of numbers; of text, separated by ;."""
+    """Parse rows of numbers, separated by ; in text."""
     return tuple(NUMBERS.parse(part) for part in value.split(";")) if isinstance(value, str) else _rows(value)
 
 

@@ -6,4 +6,4 @@ EPILOG = ""
 
 
 def add(command: argparse.ArgumentParser) -> None:
-    """None but --json."""
+    """Add no options beyond --json."""
