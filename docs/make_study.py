@@ -25,6 +25,16 @@ def decades(first: int, last: int, count: int) -> tuple[float, ...]:
     return tuple(float(f"{10 ** (first + index * (last - first) / (count - 1)):.12g}") for index in range(count))
 
 
+def bias_of_robot(task: str, *stiffness: float) -> StudyConfig:
+    return StudyConfig(
+        tasks=(task,),
+        contact=("penalty", "mujoco", "smooth_onset"),
+        stiffness=stiffness,
+        samples=(1000,),
+        reference_samples=20_000,
+    )
+
+
 SWEEPS: Final = {
     "variance": StudyConfig(
         tasks=("pusher",),
@@ -37,20 +47,8 @@ SWEEPS: Final = {
         stiffness=decades(3, 5, 5),
         reference_samples=3000,
     ),
-    "bias_gripper": StudyConfig(
-        tasks=("gripper",),
-        contact=("penalty", "mujoco", "smooth_onset"),
-        stiffness=(300.0, 1000.0, 3000.0),
-        samples=(1000,),
-        reference_samples=20_000,
-    ),
-    "bias_landing": StudyConfig(
-        tasks=("landing",),
-        contact=("penalty", "mujoco", "smooth_onset"),
-        stiffness=(1000.0, 3000.0, 10_000.0),
-        samples=(1000,),
-        reference_samples=20_000,
-    ),
+    "bias_gripper": bias_of_robot("gripper", 300.0, 1000.0, 3000.0),
+    "bias_landing": bias_of_robot("landing", 1000.0, 3000.0, 10_000.0),
     "achieved": StudyConfig(
         tasks=("pusher",),
         contact=("penalty", "mujoco", "mujoco_stiff"),

@@ -339,8 +339,7 @@ def test_the_short_table_says_which_estimator_to_take(monkeypatch: pytest.Monkey
         assert name not in re.split(r"\s{2,}", heading) and any(name in line for line in full)
 
 
-def test_doubtful_numbers_are_marked_in_the_table(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("COLUMNS", "200")
+def test_doubtful_numbers_are_marked_in_the_table() -> None:
     sure = row("zobg", 10, 1, relative_error=0.325, debiased_error=0.298, debiased_error_se=0.0098)
     lines = table(result(sure, row("fobg", 20, 1, effective_samples=1.2, top_share=0.9)))
     (above,) = [line for line in lines if "0.325 -> 0.2980 ± 0.0098" in line]

@@ -261,10 +261,11 @@ class Diagnosis(Measurement):
             return  # the onset term is not recommended
         if corrected.verdict == "right":
             if spread < NARROW:
-                text = (
-                    f"for onset terms the noise is narrow (the first contact varies by {spread:.2g} steps, {NARROW:g}"
+                yield (
+                    f"for onset terms the noise is narrow (the first contact varies by {spread:.2g} steps, {NARROW:g} "
+                    "are enough in general): fobg_onset is right here, by the check of the mean",
+                    "",
                 )
-                yield f"{text} are enough in general): fobg_onset is right here, by the check of the mean", ""
             return
         explained = SHARE_OFF * strength * (plain.bias + corrected.bias)
         if spread < NARROW:

@@ -9,7 +9,7 @@ import numpy as np
 from mjx_study.stopwatch import timed
 from mjx_study.study.blocks import Arrays, Blocks
 from mjx_study.study.descents import compute_descents
-from mjx_study.study.gradients import Gradients, compute_gradients
+from mjx_study.study.gradients import Gradients, compute_gradients, done
 from mjx_study.study.landscapes import compute_landscapes
 from mjx_study.study.plan import StudyCell, StudyPlan
 from mjx_study.study.store import Part
@@ -37,9 +37,7 @@ class Computation:
         with timed(rest(self._plan, cell)):
             if isinstance(self._compute, Gradients):
                 return self._compute.begin(cell, part)
-            future = Future[Arrays]()
-            future.set_result(self._compute(cell, *(() if self._plan.config.kind == "landscapes" else (part,))))
-            return future
+            return done(self._compute(cell, *(() if self._plan.config.kind == "landscapes" else (part,))))
 
     def end(self, cell: StudyCell, begun: Future[Arrays]) -> Arrays:
         """Wait for a cell's numbers."""

@@ -57,7 +57,7 @@ class Gradients:
         self._plan, self._config, self._objectives = plan, plan.config, Objectives(plan)
         self._warm: set[Any] = {None}
         self._soft: dict[tuple[int, float], Array | None] = {}
-        self._pool, self._compiling = ThreadPoolExecutor(1), _done(None)
+        self._pool, self._compiling = ThreadPoolExecutor(1), done(None)
         self._device, self._statistics = Lock(), ThreadPoolExecutor(1)
 
     @property
@@ -86,7 +86,7 @@ class Gradients:
             part.report(task, blocks.tasks, f"{self._plan.label(cell)}, in blocks")
             blocks.add(task, self.block(cell, task))
             part.save(blocks.arrays())
-        return _done(self.merged(cell, blocks))
+        return done(self.merged(cell, blocks))
 
     def begun(self, cell: StudyCell, kept: Mapping[str, np.ndarray]) -> Blocks:
         """Blocks of a cell, with the finished ones of a checkpoint."""
@@ -104,8 +104,9 @@ class Gradients:
         first, every = place * size, math.ceil(cell.samples / THINNED)
         count, oracles = min(size, cell.samples - first), estimators.oracles_of(chosen)
         some = slice(seed, seed + 1)
-        draw = partial(draw_batches, objective, task_of.theta, self._keys, oracles, count, device=self._device)
-        drawn, seconds, residuals = draw(some, first)
+        drawn, seconds, residuals = draw_batches(
+            objective, task_of.theta, self._keys, oracles, count, some, first, device=self._device
+        )
         batches = jax.tree.map(lambda leaf: leaf[0], drawn)
         summary: dict[str, Any] = {name: Tally.of(drawn[name], seconds[name], residuals[name]) for name in oracles}
         for index, rows in enumerate(jax.device_get(_rows_of_parts(batches, chosen))):
@@ -162,7 +163,7 @@ class Gradients:
     def _beside(self, call: Callable[[], Result]) -> Future[Result]:
         """Call in order; on accelerators in a thread, while the next batches are sampled."""
         if jax.default_backend() == "cpu":
-            return _done(call())
+            return done(call())
         return self._statistics.submit(unheard(call))
 
     def _objective(self, cell: StudyCell) -> MjxObjective | Reference:
@@ -219,7 +220,8 @@ class Gradients:
         return {name: np.asarray(array, float) for name, array in arrays.items()}
 
 
-def _done(result: Result) -> Future[Result]:
+def done(result: Result) -> Future[Result]:
+    """A future that has its result."""
     future = Future[Result]()
     future.set_result(result)
     return future

@@ -8,6 +8,7 @@ separately; everything else is traced.
 import dataclasses
 import json
 import time
+from collections import deque
 from collections.abc import Generator, Iterable, Sequence
 from concurrent.futures import Future
 from contextlib import ExitStack, suppress
@@ -270,17 +271,17 @@ class _Run:
         Args:
             cells: index, number of cells done before, and checkpoint of each.
         """
-        last: tuple[int, Future[dict[str, np.ndarray]]] | None = None
+
+        def end(index: int, begun: Future[dict[str, np.ndarray]]) -> tuple[int, dict[str, np.ndarray]]:
+            return index, compute.end(self._plan.cells[index], begun)
+
+        running: deque[tuple[int, Future[dict[str, np.ndarray]]]] = deque()
         for index, done, part in cells:
-            begun = self._begin(compute, index, done, part)
-            if last is not None:
-                yield last[0], compute.end(self._plan.cells[last[0]], last[1])
-            last = index, begun
-            if begun.done():
-                yield index, begun.result()
-                last = None
-        if last is not None:
-            yield last[0], compute.end(self._plan.cells[last[0]], last[1])
+            running.append((index, self._begin(compute, index, done, part)))
+            while len(running) > 1 or (running and running[0][1].done()):
+                yield end(*running.popleft())
+        for each in running:
+            yield end(*each)
 
     def _begin(self, compute: Computation, index: int, done: int, part: Part) -> Future[dict[str, np.ndarray]]:
         """Begin a cell, reporting progress in whole cells, or within the cell if it is the only one."""
