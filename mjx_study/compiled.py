@@ -5,11 +5,12 @@ depends on (`identity.trace_contents`). Traces that depend on code from outside 
 """
 
 import hashlib
+import os
 import pickle
 import re
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any, Final
 
@@ -22,6 +23,8 @@ from mjx_study.runtime import precision, traces_folder
 
 UNTRACED: Final = re.compile("cache|^jax_log|num_cpu_devices")
 """JAX settings that traces do not depend on."""
+GRAPHS: Final = "FUSION,CUBLAS,CUBLASLT,CUDNN,CUSTOM_CALL,DYNAMIC_SLICE_FUSION,CONDITIONAL,WHILE"
+"""What XLA records in CUDA graphs: its default and whole loops, each step of which the host would launch otherwise."""
 
 
 class Compiled:
@@ -41,13 +44,18 @@ class Compiled:
         self._function, self._made_of = function, made_of
         self._ready: dict[Path, Callable[..., Any]] = {}
 
+    @cached_property
+    def _whole(self) -> Callable[..., Any]:
+        """The function as a program of its own."""
+        return jax.jit(self._function, compiler_options=compiler_options())
+
     def __call__(self, *arguments: Any) -> Any:
         return self.prepare(*arguments)(*arguments)
 
     @property
     def num_compilations(self) -> int:
         """Number of argument forms compiled in this process."""
-        return sum(each._cache_size() for each in (self.jitted, *self._ready.values()))  # type: ignore[attr-defined]
+        return sum(each._cache_size() for each in (self._whole, *self._ready.values()))  # type: ignore[attr-defined]
 
     def prepare(self, *arguments: Any, platform: str | None = None) -> Callable[..., Any]:
         """Trace the function in this thread, or load its cached trace.
@@ -63,8 +71,8 @@ class Compiled:
         types = [leaf if isinstance(leaf, jax.ShapeDtypeStruct) else type_of(leaf) for leaf in leaves]
         path = self._path(repr((form, types))) if platform in (None, jax.default_backend()) else None
         if path is None:
-            jax.eval_shape(self.jitted, *arguments)
-            return self.jitted
+            jax.eval_shape(self._whole, *arguments)
+            return self._whole
         if path not in self._ready:
             self._ready[path] = _read(path) or self._export(path, types, form)
         return self._ready[path]
@@ -115,12 +123,28 @@ class Compiled:
         try:
             trace = jax.export.export(jax.jit(of_leaves))(*types).serialize()
         except ValueError:  # an operation that cannot be exported
-            return self.jitted
+            return self._whole
         kept = pickle.dumps((bytes(trace), outputs[0]))
         with suppress(OSError):
             path.parent.mkdir(parents=True, exist_ok=True)
             write_whole(path, lambda file: file.write(kept))
         return _load(kept)
+
+
+@cache
+def compiler_options() -> dict[str, Any] | None:
+    """XLA's options for programs of this process: `GRAPHS` on GPUs, unless XLA_FLAGS says what to record.
+
+    None on other devices, and if this version of XLA does not know the options.
+    """
+    option = "xla_gpu_enable_command_buffer"
+    if jax.default_backend() != "gpu" or option in os.environ.get("XLA_FLAGS", ""):
+        return None
+    try:
+        jax.jit(lambda x: x + 1, compiler_options={option: GRAPHS}).lower(1.0).compile()
+    except jax.errors.JaxRuntimeError:
+        return None
+    return {option: GRAPHS}
 
 
 def type_of(leaf: Any) -> jax.ShapeDtypeStruct:
@@ -140,4 +164,5 @@ def _read(path: Path) -> Callable[..., Any] | None:
 def _load(kept: bytes) -> Callable[..., Any]:
     trace, outputs = pickle.loads(kept)
     exported, structure = jax.export.deserialize(bytearray(trace)), jax.tree.structure(outputs)
-    return jax.jit(lambda *arguments: structure.unflatten(exported.call(*jax.tree.leaves(arguments))))
+    call = lambda *arguments: structure.unflatten(exported.call(*jax.tree.leaves(arguments)))  # noqa: E731
+    return jax.jit(call, compiler_options=compiler_options())

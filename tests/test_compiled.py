@@ -163,3 +163,18 @@ def test_names_say_which_settings_do_not_count():
     assert not [
         name for name in left_out if re.search("x64|prng|precision|promotion|threefry|nan|linearize|jit|dtype", name)
     ], left_out
+
+
+def test_gpu_programs_run_whole_loops_in_graphs_unless_xla_flags_say_otherwise(monkeypatch: pytest.MonkeyPatch):
+    assert compiled.compiler_options.__wrapped__() is None
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    (recorded,) = compiled.compiler_options.__wrapped__().values()  # its names are known to this XLA, or it were None
+    assert "WHILE" in recorded.split(",")
+    monkeypatch.setenv("XLA_FLAGS", "--xla_gpu_enable_command_buffer=")
+    assert compiled.compiler_options.__wrapped__() is None
+
+
+def test_xla_without_the_options_of_graphs_compiles_without_them(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    monkeypatch.setattr(compiled, "GRAPHS", "FUSION,OF_ANOTHER_VERSION")
+    assert compiled.compiler_options.__wrapped__() is None
