@@ -112,10 +112,11 @@ def unknown_task(name: str, reason: str = "") -> str | None:
     return unknown("task", name, choices, ", module:name of your own, or an MJCF") + reason
 
 
-def unknown(label: str, value: str, choices: Iterable[str], more: str = "") -> str:
+def unknown(label: str, value: object, choices: Iterable[str], more: str = "") -> str:
     """Return the error message for an invalid choice: the closest match, otherwise all choices and `more`."""
-    shown = repr(value) if len(value) <= 60 else f"{value[:50]!r}..."
-    return f"unknown {label} {shown}" + (suggestion(value, choices) or f"; choose from {', '.join(choices)}{more}")
+    text = str(value)
+    shown = repr(value) if len(text) <= 60 else f"{text[:50]!r}..."
+    return f"unknown {label} {shown}" + (suggestion(text, choices) or f"; choose from {', '.join(choices)}{more}")
 
 
 def suggestion(value: str, choices: Iterable[str]) -> str:

@@ -56,6 +56,7 @@ class Option:
         name: name of the configuration field.
         kind: int, float, str or bool; bool is a flag on the command line.
         metavar: placeholder for a value in the help.
+        line: one line for the help, in which {} stands for the choices.
         interval: range of its numbers.
         unit: unit of its numbers.
         choices: accepted names, in addition to numbers if there is an interval.
@@ -129,7 +130,8 @@ class Option:
         """Return the help text: line, unit and default."""
         default = ",".join(map(str, default)) if isinstance(default, tuple) else default
         told = self.unset if default is None else f"{default:g}" if isinstance(default, float) else str(default)
-        return self.line + (f" [{self.unit}]" if self.unit else "") + (f" (default: {told})" if told else "")
+        line = self.line.format(", ".join(self.choices))
+        return line + (f" [{self.unit}]" if self.unit else "") + (f" (default: {told})" if told else "")
 
     def _typed(self, value: Any) -> Any:
         return self.kind(value) if self.kind is float and isinstance(value, Integral) else value
@@ -247,7 +249,7 @@ OPTIONS: Final[dict[str, Option]] = {
         Option("published", bool, "", "use the published example's values of the next four options"),
         _number("gamma", float, "(0, inf]", "G", "AoBG's accuracy bound; inf for none", unset=TASKS),
         _number("failure_probability", float, "(0, 1)", "P", "failure probability of epsilon"),
-        _choice("variance_proxy", VARIANCE_PROXIES, "S2", f"variance in epsilon: {', '.join(VARIANCE_PROXIES)}"),
+        _choice("variance_proxy", VARIANCE_PROXIES, "S2", "variance in epsilon: {}"),
         _number("radius", float, "[0, inf)", "R", "R in epsilon, or max_deviation", choices=("max_deviation",)),
         _number("max_norm", float, "(0, inf)", "G", "fobg_clipped: norm at which samples are clipped"),
         _number("window", int, "[1, 1000000]", "H", "fobg_truncated: steps between cuts"),
@@ -259,10 +261,10 @@ OPTIONS: Final[dict[str, Option]] = {
         _number("backward_margin", float, "(0, inf)", "M", "distance at which it begins", unit="m", unset="the MJCF's"),
         _choice("kind", KINDS, "KIND", "kind of study", unset="from --iterations and --points"),
         _choice("estimators", CATALOGUE, "NAME", "see `mjx-study estimators`", label="estimator", own=True),
-        _choice("contact", CONTACTS, "FAMILY", f"of: {', '.join(CONTACTS)}", label="contact family", unset=TASKS),
+        _choice("contact", CONTACTS, "FAMILY", "of: {}", label="contact family", unset=TASKS),
         _number("stiffness", float, "(0, inf)", "K", "contact stiffness", unit="N/m", unset=TASKS),
         _number("damping", float, "[0, inf)", "B", "contact damping", unit="N s/m", unset="the family's"),
-        _choice("cone", CONES, "CONE", f"friction cone: {', '.join(CONES)}", unset="the MJCF's"),
+        _choice("cone", CONES, "CONE", "friction cone: {}", unset="the MJCF's"),
         _number("timestep", float, "(0, 1)", "H", "timestep", unit="s", unset="the MJCF's"),
         _number("horizon", int, "[1, 1000000]", "H", "number of steps", unset=TASKS),
         Option("model", str, "FILE.xml", "MJCF that replaces the task's own"),
@@ -287,8 +289,8 @@ OPTIONS: Final[dict[str, Option]] = {
         _number("solimp", float, "(-inf, inf)", "D0,D1,W,M,P", "solimp to combine with them; several separated by ;"),
         Option("direction", str, "DIR", "random, or a parameter's index", unset="random"),
         _number("states", int, "[1, 1000]", "N", "states to check"),
-        _choice("integrator", INTEGRATORS, "NAME", f"integrator: {', '.join(INTEGRATORS)}", unset="the MJCF's"),
-        _choice("solver", SOLVERS, "NAME", f"constraint solver: {', '.join(SOLVERS)}", unset="the MJCF's"),
+        _choice("integrator", INTEGRATORS, "NAME", "integrator: {}", unset="the MJCF's"),
+        _choice("solver", SOLVERS, "NAME", "constraint solver: {}", unset="the MJCF's"),
         _number("ls_iterations", int, "[1, 100000]", "N", "iterations of the solver's line search", unset="the MJCF's"),
         _number("frames", int, "[1, 100]", "N", "frames in the film strip"),
         _number("slow", float, "(0, 1000]", "FACTOR", "slow-motion factor"),

@@ -11,7 +11,7 @@ from typing import Any, Final
 import jax
 import mujoco
 
-from mjx_study.choices import PRECISIONS
+from mjx_study.choices import PRECISIONS, unknown
 
 _TRACES: Final[list[Path]] = []
 
@@ -29,7 +29,7 @@ def configure(*, precision: str = "float64", cpu_devices: int | None = None, cac
         ValueError: unknown precision, or fewer than one device.
     """
     if precision not in PRECISIONS:
-        raise ValueError(f"unknown precision {precision!r}; choose from {', '.join(PRECISIONS)}")
+        raise ValueError(unknown("precision", precision, PRECISIONS))
     devices = available_cores() if cpu_devices is None else cpu_devices
     if devices < 1:
         raise ValueError(f"cpu_devices must be at least 1, got {devices}")

@@ -168,6 +168,16 @@ def test_help_teaches(capsys: pytest.CaptureFixture[str]) -> None:
         assert taught in text
 
 
+@pytest.mark.parametrize(("command", "analytic"), [("compare", True), ("diagnose", False), ("gradcheck", False)])
+def test_help_lists_the_families_that_a_command_takes(
+    command: str, analytic: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        cli.main([command, "--help"])
+    families = re.search(r"--contact FAMILY\S*\s+of: ([^(]*)", capsys.readouterr().out)
+    assert families and ("reference" in families[1]) == analytic and "penalty" in families[1]
+
+
 def test_version(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stop:
         cli.main(["--version"])

@@ -91,10 +91,10 @@ def test_numeric_options_reach_mjx() -> None:
     ("options", "message"),
     [
         ({"solver": "pgs"}, "unknown solver 'pgs'; choose from newton, cg"),
-        ({"integrator": "implicit"}, "unknown integrator 'implicit'; choose from euler, implicitfast, rk4"),
+        ({"integrator": "implicit"}, r"unknown integrator 'implicit'; did you mean implicitfast\?"),
         ({"cone": "round"}, "unknown cone 'round'; choose from pyramidal, elliptic"),
         ({"gravity": 1.0}, "unknown option 'gravity'; choose from cone, solver, integrator, timestep"),
-        ({"disable_flags": "energie"}, "unknown flag 'energie'; choose from constraint, .*, energy"),
+        ({"disable_flags": "energie"}, r"unknown flag 'energie'; did you mean energy\?"),
         ({"disable_flags": 1}, "disable_flags must be names of flags, got 1"),
         ({"timestep": 0.0}, "timestep must be a positive number, got 0.0"),
         ({"timestep": -0.1}, "timestep must be a positive number, got -0.1"),

@@ -1,15 +1,12 @@
 """The setting for which a diagnosis holds: the noise, what it is added to, and the rollout."""
 
 import dataclasses
-from typing import Final
 
 import mujoco
 
 from mjx_study.choices import is_file
 from mjx_study.tasks.task import Task
 
-UNITS: Final = {"ball_wall": "rad", "ball_wall:dome": "rad", "momentum_transfer": "rad"}
-"""Unit of theta, by task."""
 _SLIDE, _HINGE = int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE)
 
 
@@ -52,11 +49,9 @@ def setting_of(subject: str, task: Task) -> Setting:
     host = task.scene.host
     if not task.policy.at_start:
         added_to, units = "every control", {_unit_of_control(host, index) for index in range(host.nu)}
-    elif is_file(subject):
-        added_to, units = "the initial velocities", {"m/s" if kind == _SLIDE else "rad/s" for kind in host.jnt_type}
-        units |= {"m/s"} if mujoco.mjtJoint.mjJNT_FREE in host.jnt_type else set()
     else:
-        added_to, units = "theta", {UNITS.get(subject, "")}
+        added_to = "the initial velocities" if is_file(subject) else "theta"
+        units = {getattr(task.policy, "unit", "")}
     unit = "" if "" in units else " or ".join(sorted(units))
     return Setting(task.noise, task.sigma, unit, added_to, task.scene.timestep, task.horizon, task.policy.num_params)
 

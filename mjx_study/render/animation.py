@@ -15,7 +15,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image, ImageDraw, ImageFont
 
-from mjx_study.choices import FILM_FORMATS
+from mjx_study.choices import FILM_FORMATS, unknown
 from mjx_study.disk import write_whole
 from mjx_study.render.drawing import Drawing
 from mjx_study.render.figures import time_label
@@ -37,7 +37,7 @@ _DRAWN_COLOURS, _RENDERED_COLOURS = 64, 128
 def check_format(name: str) -> None:
     """Raise ValueError for an unknown format, RenderError for one that cannot be written here."""
     if name not in FILM_FORMATS:
-        raise ValueError(f"unknown format {name!r}; choose from {', '.join(FILM_FORMATS)}")
+        raise ValueError(unknown("format", name, FILM_FORMATS))
     if name == "mp4" and shutil.which("ffmpeg") is None:
         raise RenderError("mp4 needs ffmpeg, which is not on the PATH; use the format gif")
 

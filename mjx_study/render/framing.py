@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
+from mjx_study.choices import unknown
 from mjx_study.render.motion import Motion
 from mjx_study.render.outline import VIEWS, View
 
@@ -50,7 +51,7 @@ def resolve_view(motion: Motion, name: str) -> View:
     if name == "auto":
         return choose_view(motion)
     if name not in VIEWS:
-        raise ValueError(f"unknown view {name!r}; choose from auto, {', '.join(VIEWS)}")
+        raise ValueError(unknown("view", name, ("auto", *VIEWS)))
     return VIEWS[name]
 
 

@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Int, UInt8
 
-from mjx_study.choices import RENDERERS
+from mjx_study.choices import RENDERERS, unknown
 from mjx_study.render.drawing import Drawing, geom_colours
 from mjx_study.render.framing import depths
 
@@ -52,7 +52,7 @@ def resolve_renderer(name: str) -> str:
         RenderError: opengl does not work here.
     """
     if name not in RENDERERS:
-        raise ValueError(f"unknown renderer {name!r}; choose from {', '.join(RENDERERS)}")
+        raise ValueError(unknown("renderer", name, RENDERERS))
     if name == "drawing":
         return name
     backend, reason = _backend(_chosen())

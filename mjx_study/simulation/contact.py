@@ -32,7 +32,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from estimators.pytree import register_pytree
-from mjx_study.choices import DEFAULT_SOLIMP, FAMILIES, MAX_IMPEDANCE, MIN_IMPEDANCE
+from mjx_study.choices import DEFAULT_SOLIMP, FAMILIES, MAX_IMPEDANCE, MIN_IMPEDANCE, unknown
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.scene import Scene
 
@@ -120,7 +120,7 @@ def family_model(
             no contact model.
     """
     if name not in FAMILIES:
-        raise ValueError(f"unknown contact family {name!r}; choose from {', '.join(FAMILIES)}")
+        raise ValueError(unknown("contact family", name, FAMILIES))
     family = FAMILIES[name]
     if not family.swept and (stiffness is not None or damping is not None):
         raise ValueError(f"contact family {name!r} is a single point and takes no stiffness or damping")

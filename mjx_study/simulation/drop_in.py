@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero, zero_from_primal
 from jaxtyping import Array, Float
 
+from mjx_study.choices import unknown
 from mjx_study.simulation import constraint
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.dynamics import SAVE_SOLUTION, State, fwd_position
@@ -78,7 +79,7 @@ def differentiable_mjx(*, onset: str = "none") -> Generator[None]:
 
 def _check_onset(onset: str) -> None:
     if onset not in ONSETS:
-        raise ValueError(f"unknown onset {onset!r} of a step; choose from {', '.join(ONSETS)}")
+        raise ValueError(unknown("onset of a step", onset, ONSETS))
 
 
 def _uncorrected(model: mjx.Model, data: mjx.Data) -> mjx.Data:

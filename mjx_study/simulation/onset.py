@@ -38,7 +38,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from estimators.pytree import register_pytree
-from mjx_study.choices import ONSETS
+from mjx_study.choices import ONSETS, unknown
 from mjx_study.simulation import constraint
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.dynamics import (
@@ -68,7 +68,7 @@ TOUCHING: Final = 1e-6
 def check_onset(onset: str) -> None:
     """Raise ValueError, listing the choices, for an unknown onset treatment."""
     if onset not in ONSETS:
-        raise ValueError(f"unknown onset {onset!r}; choose from {', '.join(ONSETS)}")
+        raise ValueError(unknown("onset", onset, ONSETS))
 
 
 @register_pytree

@@ -12,7 +12,7 @@ import jax
 import mujoco
 import numpy as np
 
-from mjx_study.choices import CONES, INTEGRATORS, SOLVERS
+from mjx_study.choices import CONES, INTEGRATORS, SOLVERS, unknown
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.limitations import FLAGS, ignored, lacking
 from mjx_study.simulation.mjcf_sizes import too_large
@@ -71,7 +71,7 @@ class Scene:
 
     def __post_init__(self) -> None:
         if self.adjoint not in ADJOINTS:
-            raise SceneError(f"unknown adjoint {self.adjoint!r}; choose from {', '.join(ADJOINTS)}")
+            raise SceneError(unknown("adjoint", self.adjoint, ADJOINTS))
         if self.adjoint == "jacobian" and self._explicit:
             raise SceneError(f"{self.name}: the adjoint 'jacobian' does not support RK4; choose auto or tape")
 
@@ -238,7 +238,7 @@ def _set_options(host: mujoco.MjModel, options: Mapping[str, SceneOption]) -> No
         if name in _ENUMERATED:
             choices = _ENUMERATED[name]
             if value not in choices:
-                raise SceneError(f"unknown {name} {value!r}; choose from {', '.join(choices)}")
+                raise SceneError(unknown(name, value, choices))
             setattr(host.opt, name, choices[str(value)])
         elif name in _POSITIVE:
             number_type = type(getattr(host.opt, name))
@@ -249,8 +249,7 @@ def _set_options(host: mujoco.MjModel, options: Mapping[str, SceneOption]) -> No
         elif name == "disable_flags":
             _disable_flags(host, value)
         else:
-            known = ", ".join([*_ENUMERATED, *_POSITIVE, "disable_flags"])
-            raise SceneError(f"unknown option {name!r}; choose from {known}")
+            raise SceneError(unknown("option", name, [*_ENUMERATED, *_POSITIVE, "disable_flags"]))
 
 
 def _disable_flags(host: mujoco.MjModel, names: SceneOption) -> None:
@@ -258,7 +257,7 @@ def _disable_flags(host: mujoco.MjModel, names: SceneOption) -> None:
         raise SceneError(f"disable_flags must be names of flags, got {names!r}")
     for name in names.split(",") if isinstance(names, str) else names:
         if name not in FLAGS:
-            raise SceneError(f"unknown flag {name!r}; choose from {', '.join(FLAGS)}")
+            raise SceneError(unknown("flag", name, FLAGS))
         FLAGS[name].disable(host.opt)
 
 

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import mujoco
 from jaxtyping import Array, Float
 
-from mjx_study.choices import TASK_DESCRIPTIONS
+from mjx_study.choices import TASK_DESCRIPTIONS, unknown
 from mjx_study.reference import BallWall, FunctionObjective
 from mjx_study.simulation.dynamics import State, initial_state
 from mjx_study.simulation.scene import SceneError, load_model, put_scene, require
@@ -53,7 +53,7 @@ def ball_wall(
         ValueError: unknown variant.
     """
     if variant not in VARIANTS:
-        raise ValueError(f"unknown variant {variant!r} of ball_wall; choose from {', '.join(VARIANTS)}")
+        raise ValueError(unknown("variant of ball_wall", variant, VARIANTS))
     host = load_model(model, **scene_options)
     if variant == "dome":
         _raise_dome(host)
@@ -72,7 +72,7 @@ def ball_wall(
         description=TASK_DESCRIPTIONS[name],
         scene=scene,
         horizon=horizon,
-        policy=InitialStatePolicy(1, horizon, scene.host.nu, start_at),
+        policy=InitialStatePolicy(1, horizon, scene.host.nu, start_at, "rad"),
         theta=jnp.full(1, ANGLE, dtype),
         sigma=SIGMA,
         start=initial_state(scene),

@@ -15,7 +15,7 @@ from typing import Final
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from mjx_study.choices import TASK_DESCRIPTIONS
+from mjx_study.choices import TASK_DESCRIPTIONS, unknown
 from mjx_study.reference import DoublePendulum, ReferenceObjective
 from mjx_study.simulation.dynamics import State, initial_state
 from mjx_study.simulation.scene import load_scene, require
@@ -48,7 +48,7 @@ def double_pendulum(
         ValueError: unknown start.
     """
     if start not in STARTS:
-        raise ValueError(f"unknown start {start!r} of double_pendulum; choose from {', '.join(STARTS)}")
+        raise ValueError(unknown("start of double_pendulum", start, STARTS))
     scene = load_scene(model, **scene_options)
     require(scene, joints=("first", "second"), geoms=())
     dtype = scene.template.qpos.dtype

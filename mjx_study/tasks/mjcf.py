@@ -61,7 +61,7 @@ def scene_task(scene: Scene, *, horizon: int = CHECKED_STEPS, pair: tuple[str, s
         half = np.diff(host.actuator_ctrlrange[limited], axis=1) / 2
         sigma = NOISE * float(np.median(half)) if limited.any() else NOISE
     else:
-        policy, changed = InitialStatePolicy(host.nv, horizon, 0, push), "initial velocities"
+        policy, changed = InitialStatePolicy(host.nv, horizon, 0, push, _unit_of_velocities(host)), "initial velocities"
         theta, sigma = np.zeros(host.nv), NOISE
     told = f"half the squared displacement of {what} after {horizon} steps, by the {changed}"
     if _rests(host, start, theta[: host.nu], horizon, measured):
@@ -90,6 +90,13 @@ def _rests(host: mujoco.MjModel, start: State, control: np.ndarray, horizon: int
         for _ in range(horizon):
             mujoco.mj_step(host, data)
     return bool(np.all(np.abs(data.qpos[measured] - origin) < STILL))
+
+
+def _unit_of_velocities(host: mujoco.MjModel) -> str:
+    kinds = set(host.jnt_type.tolist())
+    linear = kinds & {int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_FREE)}
+    angular = kinds - {int(mujoco.mjtJoint.mjJNT_SLIDE)}
+    return " or ".join(["m/s"] * bool(linear) + ["rad/s"] * bool(angular))
 
 
 def _measured(host: mujoco.MjModel) -> tuple[np.ndarray, str]:

@@ -59,7 +59,7 @@ def momentum_transfer(
         description=TASK_DESCRIPTIONS["momentum_transfer"],
         scene=scene,
         horizon=horizon,
-        policy=InitialStatePolicy(1, horizon, scene.host.nu, start_at),
+        policy=InitialStatePolicy(1, horizon, scene.host.nu, start_at, "rad"),
         theta=jnp.full(1, ANGLE, dtype),
         sigma=SIGMA,
         start=initial_state(scene),

@@ -162,6 +162,7 @@ class InitialStatePolicy:
         horizon: number of steps H.
         controls: number of controls m, all zero.
         start_at: maps (start, theta + w) to the initial state of the simulation.
+        unit: unit of theta; empty if unknown.
         additive: True, since the noise is added to theta entry by entry.
         at_start: True, since theta and the noise act on the initial state only.
     """
@@ -170,6 +171,7 @@ class InitialStatePolicy:
     horizon: int
     controls: int
     start_at: Callable[[State, Float[Array, " params"]], State]
+    unit: str = ""
     additive: bool = dataclasses.field(default=True, init=False)
     at_start: bool = dataclasses.field(default=True, init=False)
 
