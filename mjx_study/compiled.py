@@ -55,7 +55,7 @@ class Compiled:
     @property
     def num_compilations(self) -> int:
         """Number of argument forms compiled in this process."""
-        return sum(each._cache_size() for each in (self._whole, *self._ready.values()))  # type: ignore[attr-defined]
+        return sum(each._cache_size() for each in (self._whole, *self._ready.values()))
 
     def prepare(self, *arguments: Any, platform: str | None = None) -> Callable[..., Any]:
         """Trace the function in this thread, or load its cached trace.
