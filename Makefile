@@ -33,7 +33,7 @@ figures: $(STAMP) ## Make the figures and films of docs/ again
 	for task in ball_wall momentum_transfer tennis double_pendulum; do \
 		cp results/$$task-rollout/rollout.gif docs/film_$$task.gif || exit; done
 
-study: $(STAMP) ## Sweep stiffness and draw the README's figures of it again (an hour; resumable)
+study: $(STAMP) ## Sweep stiffness and draw the README's figures of it again (half an hour; resumable)
 	$(BIN)/python docs/make_study.py
 
 coverage: $(STAMP) ## Measure again what docs/coverage.md says of intervals and tests (a few minutes)

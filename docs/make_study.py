@@ -2,7 +2,7 @@
 
     python docs/make_study.py
 
-Six sweeps, in results/study/; an hour on two cores, and it goes on where it was stopped.
+Six sweeps, in results/study/; half an hour on two cores, and it goes on where it was stopped.
 """
 
 from pathlib import Path
