@@ -5,6 +5,7 @@ aref = -b v - k d r, with the impedance d(r) of solimp and no pulling.
 """
 
 import dataclasses
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -27,14 +28,14 @@ SPEED, GRAVITY = -1.7, -9.81
 BODY = '<body pos="0 0 0.1"><joint type="slide" axis="0 0 1"/><geom name="ball" size="0.1" mass="1" condim="1"/></body>'
 BOX = '<body pos="0 0 0.1"><freejoint/><geom name="box" type="box" size="0.1 0.1 0.1" mass="1"/></body>'
 LAW = lambda index, state: jnp.zeros(0)  # noqa: E731, of no control
-CONTACT = ContactModel(jnp.array([TIMECONST, 1.0]), jnp.array([LOW, HIGH, WIDTH, 0.5, 2.0]))
 
 
 @dataclasses.dataclass(frozen=True)
 class Law:
-    """MuJoCo's contact law of one body; impedances 0 to 1, lengths [m], times [s]."""
+    """MuJoCo's contact law of one body; impedances and damping ratio 0 to 1, lengths [m], times [s]."""
 
     timeconst: float = TIMECONST
+    ratio: float = 1.0
     low: float = LOW
     high: float = HIGH
     width: float = WIDTH
@@ -46,7 +47,16 @@ class Law:
     @property
     def rate(self) -> float:
         """How fast contact changes the speed of approach [1/s]; slower than |a| over this a body grazes."""
-        return max(self.damping, self.low**0.5 / (self.high * self.timeconst))
+        return max(self.damping, (self.low * self.stiffness) ** 0.5)
+
+    @property
+    def stiffness(self) -> float:
+        return 1 / (self.high * self.timeconst * self.ratio) ** 2
+
+    @property
+    def contact(self) -> ContactModel:
+        solimp = jnp.array([self.low, self.high, self.width, 0.5, 2.0])
+        return ContactModel(jnp.array([self.timeconst, self.ratio]), solimp)
 
     def impedance(self, r):
         depth = np.minimum(np.abs(r) / self.width, 1.0)
@@ -56,13 +66,18 @@ class Law:
 
     def force(self, r, v, free):
         """Acceleration by the contact, and its derivatives by gap and speed."""
-        (d, over_d), b, k = self.impedance(r), self.damping, 1 / (self.high * self.timeconst) ** 2
+        (d, over_d), b, k = self.impedance(r), self.damping, self.stiffness
         pull = -b * v - k * d * r - free
         return d * pull, over_d * pull - d * k * (over_d * r + d), -d * b
 
     def touch(self, v, free):
         """The same at first touch, where there is no spring force."""
         return np.maximum(self.low * (-free - self.damping * v), 0.0)
+
+
+DEFAULT = Law()
+BOUNCING = Law(timeconst=0.6, ratio=0.0166)
+"""Contact with so little damping that it ends under the body's weight."""
 
 
 def last_gap(law: Law, r, v, steps: int, timestep: float, free: float):
@@ -78,7 +93,7 @@ def cost(gap):
     return 100 * (gap - 0.02) ** 2
 
 
-def fall(gap, steps: int, timestep: float, free: float, law: Law = Law(), start: float = SPEED):  # noqa: B008, frozen
+def fall(gap, steps: int, timestep: float, free: float, law: Law = DEFAULT, start: float = SPEED):
     """Last gap and speed of falling bodies, by the first gap their derivatives, and the jump term of `cost`.
 
     Returns:
@@ -86,16 +101,20 @@ def fall(gap, steps: int, timestep: float, free: float, law: Law = Law(), start:
     """
     r, v, last_v = gap.copy(), np.full_like(gap, start), np.full_like(gap, start)
     tangents = {False: (np.ones_like(r), np.zeros_like(r)), True: (np.ones_like(r), np.zeros_like(r))}
-    term = np.zeros_like(r)
+    term, never = np.zeros_like(r), np.zeros(r.shape, bool)
+    touched, touched_before, pushed = never, never, never
     for step in range(steps):
         push, over_r, over_v = law.force(r, v, free)
         acts, cell = (r < 0) & (push > 0), timestep * v
-        begins = (r < 0) & (cell < 0) & (r - cell >= 0) & (step > 0)
-        share = np.where(begins, r / np.where(begins, cell, 1.0), 0.0)
-        one, bounded = np.flatnonzero(begins), np.minimum(cell, -timestep * abs(free) / law.rate)
+        ends = touched & pushed & (r >= 0)
+        event = ends | ((r < 0) & (cell < 0) & (r - cell >= 0) & (step > 0))
+        share = np.where(event, r / np.where(event, cell, 1.0), 0.0)
+        before = np.where(ends == touched_before, share, 0.0)  # the gap before, or this contact, was longer than a step
+        fastest = np.maximum(abs(free), np.where(ends, np.abs(free + law.touch(v, free)), 0.0))
+        one, bounded = np.flatnonzero(event), -np.maximum(np.abs(cell), timestep * fastest / law.rate)
         for speed, left, weight, tangent in (
             (v, steps - step - 1, 1 - share, tangents[False][0]),
-            (last_v, steps - step, share, tangents[False][0] - timestep * tangents[False][1]),
+            (last_v, steps - step, before, tangents[False][0] - timestep * tangents[False][1]),
         ):
             on, off = (
                 cost(last_gap(law, timestep * after, after, left, timestep, free))
@@ -106,15 +125,16 @@ def fall(gap, steps: int, timestep: float, free: float, law: Law = Law(), start:
             )
             term[one] += weight[one] * (on - off) * tangent[one] / bounded[one]
         for corrected, (dr, dv) in tangents.items():
-            after, before = (
-                np.where(begins & corrected, part / np.where(begins, bounded, 1.0), 0.0)
+            here, previous = (
+                np.where(event & corrected, part / np.where(event, bounded, 1.0), 0.0)
                 for part in (dr, dr - timestep * dv)
             )
-            extra = timestep * share * law.touch(last_v, free) * before
+            extra = timestep * before * law.touch(last_v, free) * previous
             moved_r, moved_v = dr + timestep * extra, dv + extra
             next_v = moved_v + timestep * np.where(acts, over_r * moved_r + over_v * moved_v, 0.0)
-            next_v = next_v + timestep * (1 - share) * law.touch(v, free) * after
+            next_v = next_v + timestep * (1 - share) * law.touch(v, free) * here
             tangents[corrected] = (moved_r + timestep * next_v, next_v)
+        touched_before, touched, pushed = touched, r < 0, acts
         last_v, v = v, v + timestep * (free + np.where(acts, push, 0.0))
         r = r + timestep * v
     return np.stack([r, v], -1), np.stack(tangents[False], -1), np.stack(tangents[True], -1), term
@@ -131,15 +151,20 @@ def test_every_sample_is_that_of_the_formula(mode) -> None:
     timestep, steps = 2e-3, 60
     scene = scene_of(floor_scene(BODY, option(timestep, "", 'refsafe="disable"'), 'condim="1"'))
     hit, graze = np.linspace(0.0611, 0.0789, 12), np.linspace(5e-5, 3e-4, 12)
-    cases = [(hit, SPEED, 0.0), (hit, SPEED, GRAVITY), (graze, -0.03, GRAVITY)]
+    cases = [
+        (hit, SPEED, 0.0, DEFAULT),
+        (hit, SPEED, GRAVITY, DEFAULT),
+        (graze, -0.03, GRAVITY, DEFAULT),
+        (np.linspace(0.0311, 0.0489, 12), -1.0, GRAVITY, BOUNCING),
+    ]
 
-    def scene_at(gap, speed, free):
+    def scene_at(gap, speed, free, contact):
         gravity = jnp.array([0.0, 0.0, 1.0]) * free
-        model = apply_contact(scene.model.replace(opt=scene.model.opt.replace(gravity=gravity)), CONTACT)
+        model = apply_contact(scene.model.replace(opt=scene.model.opt.replace(gravity=gravity)), contact)
         return scene, model, initial_state(scene, gap[None], speed[None])
 
-    def last(gap, speed, free, weight):
-        states, _, _, counts = corrected_rollout(*scene_at(gap, speed, free), LAW, steps, weight=weight)
+    def last(gap, *case, weight):
+        states, _, _, counts = corrected_rollout(*scene_at(gap, *case), LAW, steps, weight=weight)
         found = jnp.stack([states.qpos[-1, 0], states.qvel[-1, 0]])
         return found, (found, counts)
 
@@ -150,7 +175,7 @@ def test_every_sample_is_that_of_the_formula(mode) -> None:
         return cost(states.qpos[-1, 0]) + term, counts
 
     def sample(*case):
-        weighted = jax.vmap(lambda weight: mode(last, has_aux=True)(*case, weight))
+        weighted = jax.vmap(lambda weight: mode(partial(last, weight=weight), has_aux=True)(*case))
         derivative, (value, counts) = weighted(jnp.array([1.0, 0.0]))
         return (
             value[0],
@@ -159,12 +184,14 @@ def test_every_sample_is_that_of_the_formula(mode) -> None:
             *jax.grad(last_cost, has_aux=True)(*case),
         )
 
-    batched = jax.vmap(jax.vmap(sample, in_axes=(0, None, None)))
-    results = compiled(batched, *(np.array(column) for column in zip(*cases, strict=True)))
-    for (gaps, speed, free), (values, counts, derivative, jumping, jumps) in zip(
+    batched = jax.vmap(jax.vmap(sample, in_axes=(0, None, None, None)))
+    gaps, speeds, frees, laws = zip(*cases, strict=True)
+    contacts = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(law.contact for law in laws))
+    results = compiled(batched, *map(np.array, (gaps, speeds, frees)), contacts)
+    for (gaps, speed, free, law), (values, counts, derivative, jumping, jumps) in zip(
         cases, _unstacked(results, len(cases)), strict=True
     ):
-        ours, of_steps, corrected, term = fall(gaps, steps, timestep, free, start=speed)
+        ours, of_steps, corrected, term = fall(gaps, steps, timestep, free, law, start=speed)
         np.testing.assert_allclose(values, ours, rtol=0, atol=1e-12)
         np.testing.assert_allclose(derivative[:, 0], corrected, rtol=1e-9, atol=1e-12)
         np.testing.assert_allclose(derivative[:, 1], of_steps, rtol=1e-9, atol=1e-12)
@@ -174,12 +201,37 @@ def test_every_sample_is_that_of_the_formula(mode) -> None:
         for each in (counts, jumps):
             assert np.all(each.found == 1) and np.all(each.bounded == (gaps is graze)) and not np.any(each.missed)
             assert np.all((each.first > 0) & (each.first < steps))
-        lost = Law().touch(speed, free) * timestep / -speed
+        lost = law.touch(speed, free) * timestep / -speed
         assert gaps is graze or np.allclose(counts.strength, lost, rtol=0.3)
 
 
 def _unstacked(tree, size: int):
     return [jax.tree.map(lambda leaf, row=row: leaf[row], tree) for row in range(size)]
+
+
+TIMESTEPS = (5e-3, 2.5e-3, 1.25e-3)
+
+
+def errors_of_means(law: Law, free: float, timestep: float) -> np.ndarray:
+    """Relative errors of the means of plain first order, of the linear term and of the jump, by the formula."""
+    spread = 0.05
+    noise = (np.arange(8001) - 4000) / 4000 * 6 * spread
+    weight = np.exp(-((noise / spread) ** 2) / 2)
+    weight /= weight.sum()
+    last, of_steps, linear, jump = fall(0.32 + noise, round(0.25 / timestep), timestep, free, law)
+    value = cost(last[:, 0])
+    slope = weight @ ((value - weight @ value) * noise) / spread**2
+    plain, corrected = (weight @ (200 * (last[:, 0] - 0.02) * tangent[:, 0]) for tangent in (of_steps, linear))
+    return np.abs(np.array([plain, corrected, plain + weight @ jump]) / slope - 1)
+
+
+@pytest.mark.slow
+def test_contact_that_ends_under_force_has_its_share() -> None:
+    """Of a body that bounces under its weight."""
+    plain, linear, jump = np.array([errors_of_means(BOUNCING, GRAVITY, timestep) for timestep in TIMESTEPS]).T
+    assert np.all(plain > 1.2)
+    assert np.all(linear < (0.06, 0.03, 0.01))
+    assert np.all(jump < 0.006)
 
 
 @pytest.mark.parametrize(
@@ -195,19 +247,8 @@ def test_the_error_of_the_mean_falls_with_the_square_of_the_timestep(law: Law, f
 
     Where the impedance changes within a step's travel, the linear term's error falls more slowly, the jump's does not.
     """
-    spread, timesteps = 0.05, (5e-3, 2.5e-3, 1.25e-3)
-    noise = (np.arange(8001) - 4000) / 4000 * 6 * spread
-    weight = np.exp(-((noise / spread) ** 2) / 2)
-    weight /= weight.sum()
-    found = []
-    for timestep in timesteps:
-        last, of_steps, linear, jump = fall(0.32 + noise, round(0.25 / timestep), timestep, free, law)
-        value = cost(last[:, 0])
-        slope = weight @ ((value - weight @ value) * noise) / spread**2
-        plain, corrected = (weight @ (200 * (last[:, 0] - 0.02) * tangent[:, 0]) for tangent in (of_steps, linear))
-        found.append(np.array([plain, corrected, plain + weight @ jump]) / slope - 1)
-    plain, linear, jump = np.abs(found).T
-    rate_linear, rate_jump = (np.polyfit(np.log(timesteps), np.log(each), 1)[0] for each in (linear, jump))
+    plain, linear, jump = np.array([errors_of_means(law, free, timestep) for timestep in TIMESTEPS]).T
+    rate_linear, rate_jump = (np.polyfit(np.log(TIMESTEPS), np.log(each), 1)[0] for each in (linear, jump))
     assert np.all(plain > 2)
     assert np.all(jump < (2e-2, 5e-3, 1e-3)) and rate_jump > 1.7
     assert np.all(linear < 1e-2) and rate_linear > (0.5 if law.low < law.high else 1.6)
@@ -255,7 +296,7 @@ def test_the_error_that_findings_tell_is_not_exceeded() -> None:
     task = make_task("momentum_transfer")
     position, points = np.array([0.4, 0.6]), grid(0.4, 0.6, task.sigma, 800, task.noise)
     plain, linear = (Line(task.replace(onset=onset)) for onset in ("none", "linear"))
-    rest = (0.5, 2.0)  # midpoint and power of the impedance
+    rest, shares = (0.5, 2.0), []  # midpoint and power of the impedance
     for solref, solimp in (
         ((0.03, 0.8), (0.7, 0.9, 0.002, *rest)),
         ((0.012, 1.0), (0.85, 0.95, 0.001, *rest)),
@@ -269,7 +310,30 @@ def test_the_error_that_findings_tell_is_not_exceeded() -> None:
         share = np.abs(found.first - found.slope) / np.abs(found.first - without.first)
         unsure = (found.slope_error + found.first_error + without.first_error) / np.abs(found.first - without.first)
         assert np.all(share < SHARE_OFF * strength + unsure)
-        assert np.all(share > SHARE_OFF * strength / 20)
+        shares.append(np.max(share / strength))
+    assert max(shares) > SHARE_OFF / 10
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("onset", ["linear", "jump"])
+@pytest.mark.parametrize(
+    ("between", "within"),
+    [
+        pytest.param((0.745, 0.79), 0.06, id="clips the wall's corner"),
+        pytest.param((1.2, 1.245), 0.04, id="slides down the wall until friction throws it off"),
+    ],
+)
+def test_contact_that_turns_or_ends_has_its_share(between: tuple[float, float], within: float, onset: str) -> None:
+    """The integral of the gradients is the difference of the cost, to a share of what the term adds.
+
+    With onsets alone, found by straight lines, the linear term was 27 % off in either range.
+    """
+    task = make_task("ball_wall")
+    (cell,), _ = contact_grid(task, ("mujoco_default",))
+    points = np.linspace(*between, 3000)
+    (values, plain), (_, gradients) = (Line(task.replace(onset=each))(points, cell.contact) for each in ("none", onset))
+    added = np.trapezoid(gradients - plain, points)
+    assert abs(np.trapezoid(gradients, points) - (values[-1] - values[0])) < within * abs(added)
 
 
 @pytest.mark.slow
@@ -322,8 +386,8 @@ def test_what_has_no_meaning_is_refused() -> None:
     start = initial_state(scene)
 
     def over_model(solref):
-        model = apply_contact(scene.model, ContactModel(solref, CONTACT.solimp))
+        model = apply_contact(scene.model, ContactModel(solref, DEFAULT.contact.solimp))
         return corrected_rollout(scene, model, start, lambda index, state: jnp.zeros(0), 2)[0].qpos[-1, 0]
 
     with pytest.raises(TypeError, match="not over the model"):
-        jax.grad(over_model)(CONTACT.solref)
+        jax.grad(over_model)(DEFAULT.contact.solref)

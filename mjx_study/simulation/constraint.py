@@ -314,6 +314,14 @@ def guards(model: mjx.Model, data: mjx.Data) -> tuple[Float[Array, " guards"], F
     return (rows.efc_pos - rows.efc_margin)[first], jnp.asarray(weights, rows.efc_J.dtype) @ (rows.efc_J @ data.qvel)
 
 
+def guards_under_force(model: mjx.Model, data: mjx.Data, qacc: Float[Array, " nv"]) -> Bool[Array, " guards"]:
+    """Whether each limit or contact exerts a force at the acceleration `qacc`."""
+    _, members = guard_rows(model, data)
+    rows: Any = data._impl
+    force = jnp.abs(row_force(model, data, rows.efc_J @ qacc - rows.efc_aref))
+    return jnp.asarray(members, force.dtype) @ force > 0
+
+
 def at_onset(model: mjx.Model, data: mjx.Data, members: Float[Array, " rows"], on: Bool[Array, ""]) -> mjx.Data:
     """Return the state with some constraint rows set to first touch (no penetration, impedance d_0), or removed.
 

@@ -19,7 +19,7 @@ from mjx_study.simulation import constraint
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.dynamics import SAVE_SOLUTION, State, fwd_position
 from mjx_study.simulation.integration import difference_position, integrate_position
-from mjx_study.simulation.onset import onset_begins, onset_term, tangent_of, without_derivative
+from mjx_study.simulation.onset import Events, onset_begins, onset_term, tangent_of, without_derivative
 from mjx_study.simulation.patches import Place, patched
 
 Replacements = dict[Place, Callable[..., mjx.Data]]
@@ -163,7 +163,8 @@ def _step_terms(model: mjx.Model, data: mjx.Data) -> tuple[Float[Array, "nv nv"]
         states = State(*(leaf[None] for leaf in (data.qpos, data.qvel, data.act, data.qacc_warmstart)))
 
         def term(guard):
-            return onset_term(model, data, states, data.ctrl[None], guard, distance[guard], travel[guard])
+            event = Events(jnp.zeros((), int), guard, *jnp.array([False, False, True]))
+            return onset_term(model, data, states, data.ctrl[None], event)
 
         here, previous, *_ = jax.vmap(term)(jnp.minimum(chosen, distance.size - 1))
         used = (chosen < distance.size)[:, None, None]

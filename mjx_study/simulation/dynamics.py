@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import mujoco
 from jax.core import Tracer
 from jax.custom_derivatives import SymbolicZero, zero_from_primal
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from estimators.pytree import register_pytree
 from mjx_study.simulation import constraint
@@ -113,8 +113,8 @@ def smooth_stages(scene: Scene, model: mjx.Model, state: State, control: Float[A
 
 def solved_step(
     scene: Scene, model: mjx.Model, state: State, control: Float[Array, " nu"]
-) -> tuple[State, Float[Array, ""], tuple[Float[Array, " guards"], Float[Array, " guards"]]]:
-    """`step` without derivatives, and the `constraint.guards` of its contacts and limits before the step."""
+) -> tuple[State, Float[Array, ""], tuple[Float[Array, " guards"], Float[Array, " guards"], Bool[Array, " guards"]]]:
+    """`step` without derivatives; the `constraint.guards` before the step, and which of them exert a force in it."""
     return entry_by_entry(partial(_solved_step, scene), model, state, control)
 
 
@@ -123,7 +123,8 @@ def _solved_step(scene: Scene, model: mjx.Model, state: State, control: Array):
     qacc = constraint.run_solver(model, data.replace(qacc_warmstart=state.warmstart))
     qvel, act = advance_velocity(model, data, qacc)
     qpos = integrate_position(scene.host, state.qpos, qvel, model.opt.timestep)
-    return State(qpos, qvel, act, qacc), constraint.residual(model, data, qacc), constraint.guards(model, data)
+    guards = *constraint.guards(model, data), constraint.guards_under_force(model, data, qacc)
+    return State(qpos, qvel, act, qacc), constraint.residual(model, data, qacc), guards
 
 
 def entry_by_entry(function: Callable[..., Any], model: mjx.Model, *arguments: Any) -> Any:

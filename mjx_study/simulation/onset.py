@@ -1,6 +1,6 @@
-r"""Derivatives of rollouts that account for a change of the step at which contact begins.
+r"""Derivatives of rollouts that account for a change of the steps at which contact begins and ends.
 
-Where a guard phi (the distance of a contact or limit minus its margin) falls below zero, MuJoCo's force jumps. The
+Where a guard phi (the distance of a contact or limit minus its margin) passes zero, MuJoCo's force may jump. The
 derivative of a rollout holds the index of that step fixed. For noise with a smooth density, the gradient of the mean
 cost has a second part, from rollouts at which the index changes:
 
@@ -15,10 +15,11 @@ velocity jump after step k,
     dx_{k+1} = A_k dx_k + (1 - s) Delta_k (n^T dq_k) / D + s A_k (h Delta_{k-1}, Delta_{k-1}) (n^T dq_{k-1}) / D,
 
 where n^T dq_{k-1} = n^T (dq_k - h dv_k). This is the saltation matrix of a time-stepping scheme. Its error is O(h^2);
-the first weight alone (s = 0) leaves an error of h b, where b is the contact's damping [1/s].
+the first weight alone (s = 0) leaves an error of h b, where b is the contact's damping [1/s]. Where contact ends under
+force, phi_k lies in [0, D), and the terms have the other sign. `at_touch` finds s and the speed at touch where the
+normal turns within the step, and the weights of contacts that are shorter.
 
-Not covered: initial contact; a force that jumps where contact ends (impedance and a pressing force); edges of features,
-where the contact point itself jumps.
+Not covered: initial contact; features of a geom whose contact point jumps.
 
 Part of the jump is proportional to the acceleration a of the guard rather than its speed: at grazing speed, Delta/D and
 with it the variance of the correction diverge. Cells narrower than h |a| / max(b, sqrt(k d)), with b and k the
@@ -63,6 +64,8 @@ SLOTS: Final = 8
 """Number of onsets corrected per rollout; later ones are only counted."""
 TOUCHING: Final = 1e-6
 """Share of a cell: a body closer than this before the step was already touching, so there is no onset."""
+WITHIN: Final = 0.1
+"""Share of the way from the touch to the state in contact at which the contact's geometry is evaluated."""
 
 
 def check_onset(onset: str) -> None:
@@ -146,7 +149,7 @@ def corrected_rollout(
     _, (before, controls, after, residuals, guards, jacobians) = jax.lax.scan(
         observe, jax.lax.stop_gradient(start), jnp.arange(horizon)
     )
-    spread, shift, counts = _corrections(scene, model, before, controls, *guards, slots)
+    spread, shift, counts = _corrections(scene, model, before, controls, guards, slots)
     spread, shift = weight * spread, weight * shift
 
     def follow(change: State, known):
@@ -184,63 +187,95 @@ def _corrections(
     model: mjx.Model,
     before: State,
     controls: Float[Array, "horizon nu"],
-    distance: Float[Array, "horizon guards"],
-    speed: Float[Array, "horizon guards"],
+    guards: tuple[Array, Array, Array],
     slots: int,
 ) -> tuple[Float[Array, "horizon nv nv"], Float[Array, "horizon nv nv"], OnsetCounts]:
-    """(1 - s) Delta_k n^T / D and s Delta_{k-1} n^T / D of every step, zero where no contact begins, and counts."""
-    travel = scene.timestep * speed
-    steps, guards, used, found = find_onsets(distance, travel, slots)
+    """(1 - s) Delta_k n^T / D and s Delta_{k-1} n^T / D of every step, zero without events, and counts."""
+    events, missed = find_events(*guards, scene.timestep, slots)
 
-    def term(index, guard, used):
-        pick = lambda leaf: jnp.stack([leaf[index], leaf[index - 1]])  # noqa: E731
+    def term(event: Events):
+        pick = lambda leaf: jnp.stack([leaf[event.step], leaf[event.step - 1]])  # noqa: E731
         states, inputs = jax.tree.map(pick, before), pick(controls)
-        here = distance[index, guard], travel[index, guard]
-        terms = entry_by_entry(onset_term, model, scene.template, states, inputs, guard, *here)
-        return jax.tree.map(lambda leaf: jnp.where(used, leaf, jnp.zeros_like(leaf)), terms)
+        return entry_by_entry(onset_term, model, scene.template, states, inputs, event)
 
     def fill(carry):
         slot, terms = carry
         some = jnp.minimum(slot + jnp.arange(together), slots - 1)
-        found = jax.vmap(term)(steps[some], guards[some], used[some])
+        found = jax.vmap(term)(jax.tree.map(lambda leaf: leaf[some], events))
         return slot + together, jax.tree.map(lambda every, one: every.at[some].set(one), terms, found)
 
-    # Most rollouts have fewer onsets than slots; an accelerator computes all slots in the time of one.
+    # Most rollouts have fewer events than slots; an accelerator computes all slots in the time of one.
     together = 1 if jax.default_backend() == "cpu" else slots
-    filled, (size, dtype) = jnp.sum(used), (scene.host.nv, distance.dtype)
-    matrix, number = jnp.zeros((slots, size, size), dtype), jnp.zeros(slots, dtype)
-    terms = matrix, matrix, number, number > 0
+    filled, (size, dtype) = jnp.sum(events.used), (scene.host.nv, guards[0].dtype)
+    matrix, flag = jnp.zeros((slots, size, size), dtype), jnp.zeros(slots, bool)
+    terms = matrix, matrix, jnp.zeros(slots, dtype), flag, flag
     if slots:
         _, terms = jax.lax.while_loop(lambda carry: carry[0] < filled, fill, (jnp.zeros_like(filled), terms))
-    here, previous, strength, narrow = terms
-    empty = jnp.zeros((len(distance), size, size), dtype)
-    spread, shift = (empty.at[steps].add(terms) for terms in (here, previous))
-    strength = jnp.sqrt(jnp.sum(strength**2) / jnp.maximum(filled, 1))
-    counts = OnsetCounts(found, jnp.sum(narrow), found - filled, strength, first_step(steps, used, dtype))
-    return spread, shift, counts
+    here, previous, strength, narrow, valid = terms
+    empty = jnp.zeros((len(before.qpos), size, size), dtype)
+    spread, shift = (empty.at[events.step].add(terms) for terms in (here, previous))
+    return spread, shift, events.counts(missed, valid, narrow, strength)
 
 
-def first_step(steps: Int[Array, " slots"], used: Bool[Array, " slots"], dtype: Any) -> Float[Array, ""]:
-    """Step of the first onset; NaN if there is none."""
-    first = jnp.min(jnp.where(used, steps.astype(dtype), jnp.inf), initial=jnp.inf)
-    return jnp.where(jnp.isinf(first), jnp.nan, first)
+@register_pytree
+@dataclasses.dataclass(frozen=True)
+class Events:
+    """Steps at which a contact or limit begins, or ends while it exerts a force, earliest first.
+
+    Attributes:
+        step, guard: index of the step and of the contact or limit, as in `constraint.guard_rows`.
+        ends: whether it ends at that step; otherwise it begins.
+        brief: whether the gap before it, or the contact that ends, lasted one step.
+        used: whether the slot holds an event; others hold step 1, guard 0.
+    """
+
+    step: Int[Array, "*slots"]
+    guard: Int[Array, "*slots"]
+    ends: Bool[Array, "*slots"]
+    brief: Bool[Array, "*slots"]
+    used: Bool[Array, "*slots"]
+
+    def counts(
+        self,
+        missed: Int[Array, ""],
+        valid: Bool[Array, " slots"],
+        narrow: Bool[Array, " slots"],
+        strength: Float[Array, " slots"],
+    ) -> OnsetCounts:
+        """Counts of a rollout, from the number of events without a slot and from what the term says of the others."""
+        begins = valid & ~self.ends
+        onsets = jnp.sum(begins)
+        first = jnp.min(jnp.where(begins, self.step.astype(strength.dtype), jnp.inf), initial=jnp.inf)
+        first = jnp.where(jnp.isinf(first), jnp.nan, first)
+        strength = jnp.sqrt(jnp.sum(jnp.where(begins, strength, 0.0) ** 2) / jnp.maximum(onsets, 1))
+        return OnsetCounts(onsets + missed, jnp.sum(narrow), missed, strength, first)
 
 
-def find_onsets(
-    distance: Float[Array, "horizon guards"], travel: Float[Array, "horizon guards"], slots: int
-) -> tuple[Int[Array, " slots"], Int[Array, " slots"], Bool[Array, " slots"], Int[Array, ""]]:
-    """Steps and guards of the first onsets, a mask of used slots, and the total number; unused slots hold (1, 0).
+def find_events(
+    distance: Float[Array, "horizon guards"],
+    speed: Float[Array, "horizon guards"],
+    under_force: Bool[Array, "horizon guards"],
+    timestep: float | Float[Array, ""],
+    slots: int,
+) -> tuple[Events, Int[Array, ""]]:
+    """Find where contacts and limits may begin, or end under force (`at_touch` says whether they do); count the rest.
 
     Args:
-        distance: distance of each guard before each step, negative in contact.
-        travel: travel of each guard in the preceding step, at that step's final velocity.
-        slots: maximum number of onsets to return.
+        distance, speed: `constraint.guards` before each step.
+        under_force: whether each guard exerts a force in each step.
+        timestep: timestep [s].
+        slots: maximum number of events to return.
     """
-    begins = onset_begins(distance, travel).at[0].set(False)
-    (flat,) = jnp.nonzero(begins.reshape(-1), size=slots, fill_value=begins.size)
-    used = flat < begins.size
-    steps, guards = jnp.divmod(jnp.where(used, flat, begins.shape[1]), begins.shape[1])
-    return steps, guards, used, jnp.sum(begins)
+    active = distance < 0
+    before = jnp.roll(active, 1, axis=0)
+    begins = onset_begins(distance, timestep * speed) | (active & ~before)
+    ends = before & ~active & jnp.roll(under_force, 1, axis=0)
+    brief = ends ^ jnp.roll(active, 2, axis=0).at[:2].set(False)
+    happens = (begins | ends).at[0].set(False)
+    (flat,) = jnp.nonzero(happens.reshape(-1), size=slots, fill_value=happens.size)
+    used = flat < happens.size
+    step, guard = jnp.divmod(jnp.where(used, flat, happens.shape[1]), happens.shape[1])
+    return Events(step, guard, ends[step, guard], brief[step, guard], used), jnp.sum(happens) - jnp.sum(used)
 
 
 def onset_begins(distance: Float[Array, "*steps guards"], travel: Float[Array, "*steps guards"]) -> Bool[Array, "..."]:
@@ -253,25 +288,96 @@ def onset_term(
     template: mjx.Data,
     states: State,
     controls: Float[Array, "cases nu"],
-    guard: Int[Array, ""],
-    distance: Float[Array, ""],
-    travel: Float[Array, ""],
-) -> tuple[Float[Array, "nv nv"], Float[Array, "nv nv"], Float[Array, ""], Bool[Array, ""]]:
-    """(1 - s) Delta_k n^T / D, s Delta_{k-1} n^T / D, share of the approach speed lost, and whether D was bounded.
+    event: Events,
+) -> tuple[Float[Array, "nv nv"], Float[Array, "nv nv"], Float[Array, ""], Bool[Array, ""], Bool[Array, ""]]:
+    """(1 - s) Delta_k n^T / D, s Delta_{k-1} n^T / D, share of the approach speed lost, whether D was bounded, and
+    whether the contact begins or ends by motion within the step; zeros and False otherwise.
 
     Arguments as for `jump_of_velocity`, with steps k and k - 1 as cases, or k for both; `template` has everything but
     the position.
     """
-    positioned = fwd_position(model, template.replace(qpos=states.qpos[0]))
-    jumps, normal, least = jump_of_velocity(model, positioned, states, controls, guard)
-    share, cell = distance / travel, jnp.minimum(travel, -least)
-    here, previous = (jnp.outer(jump, normal) / cell for jump in (jumps[0], jumps[-1]))
+    touch = at_touch(model, template, states.qpos[0], states.qvel[0], event)
+    jumps, normal, least = jump_of_velocity(model, touch.positioned, states, controls, event)
+    cell, valid = -jnp.maximum(jnp.abs(touch.travel), least), touch.valid
+    last, before = touch.weights
+    here, previous = (jnp.outer(jump, normal) / cell for jump in (last * jumps[0], before * jumps[-1]))
     strength = -model.opt.timestep * (normal @ jumps[0]) / cell
-    return (1 - share) * here, share * previous, strength, travel > -least
+    kept = [jnp.where(valid, each, jnp.zeros_like(each)) for each in (here, previous, strength)]
+    return kept[0], kept[1], kept[2], valid & (jnp.abs(touch.travel) < least), valid
+
+
+@dataclasses.dataclass(frozen=True)
+class Touch:
+    """Where the distance of a guard passes zero within the step before k.
+
+    Attributes:
+        share: s, the part of the step since then.
+        weights: weights of the jumps of steps k and k - 1: 1 - s and s, or as in `at_touch`.
+        travel: travel of the guard in a step at the rate that it has there, negative if it closes.
+        positioned: position stage close to it, in contact.
+        valid: whether it passes zero within the step, by motion.
+    """
+
+    share: Float[Array, ""]
+    weights: tuple[Float[Array, ""], Float[Array, ""]]
+    travel: Float[Array, ""]
+    positioned: mjx.Data
+    valid: Bool[Array, ""]
+
+
+def at_touch(
+    model: mjx.Model,
+    template: mjx.Data,
+    qpos: Float[Array, " nq"],
+    qvel: Float[Array, " nv"],
+    event: Events,
+) -> Touch:
+    """Find the touch on the path of the step before k, on which the distance is a parabola.
+
+    A body that passes an edge may be in contact for less than a step. A body slightly ahead of it then misses the edge,
+    and the samples in contact, a share l of a step, must stand for both sides of first touch: their weight is
+    2 (1 - s / l) / l.
+
+    Args:
+        template: everything but the position.
+        qpos, qvel: position and velocity before step k.
+        event: what begins or ends at step k.
+    """
+    timestep, guard, ends = model.opt.timestep, event.guard, event.ends
+
+    def stage(back):
+        data = fwd_position(model, template.replace(qpos=integrate_position(model, qpos, qvel, -timestep * back)))
+        distance, speed = constraint.guards(model, data.replace(qvel=qvel))
+        return (distance[guard], timestep * speed[guard]), data
+
+    def since(distance: Array, travel: Array, curvature: Array) -> tuple[Array, Array]:
+        """Share of a step since the distance was zero, and the travel at that time."""
+        speed = jnp.sqrt(jnp.maximum(travel**2 - 2 * curvature * distance, 0.0))
+        return -2 * distance / jnp.maximum(speed - travel, tiny), -speed
+
+    zero, tiny = jnp.zeros_like(qpos, shape=()), jnp.finfo(qpos.dtype).tiny
+    (distance, travel), (_, curvature), deep = jax.jvp(stage, (zero,), (-jnp.ones_like(zero),), has_aux=True)
+    begun, _ = since(distance, travel, curvature)
+    back = jnp.where(ends, 1.0, (1 - WITHIN) * jnp.minimum(begun, 1.0))
+    at_back, near = stage(back)
+    # MJX may report no contact close to the touch, or another one in its place.
+    chosen = ends | (at_back[0] < 0)
+    choose = lambda one, other: jax.tree.map(partial(jnp.where, chosen), one, other)  # noqa: E731
+    (distance, travel), positioned, back = choose((at_back, near, back), ((distance, travel), deep, zero))
+    more, closing = since(distance, travel, curvature)
+    share = back + jnp.where(ends, distance / jnp.where(travel == 0, 1.0, travel), more)
+    travel = jnp.where(ends, travel, closing)
+    length = jnp.where(curvature > 0, -2 * closing / jnp.where(curvature > 0, curvature, 1.0), jnp.inf)
+    passes = ~ends & (length < 1)
+    length = jnp.where(passes, length, 1.0)
+    last = jnp.where(passes, 2 * jnp.maximum(1 - share / length, 0.0) / length, 1 - share)
+    moves = (distance < 0) & (share > 0) & (share < 1 - TOUCHING) & (~ends | (travel > 0))
+    before = jnp.where(passes | event.brief, 0.0, share)
+    return Touch(share, (last, before), travel, positioned, event.used & moves)
 
 
 def jump_of_velocity(
-    model: mjx.Model, positioned: mjx.Data, states: State, controls: Float[Array, "cases nu"], guard: Int[Array, ""]
+    model: mjx.Model, positioned: mjx.Data, states: State, controls: Float[Array, "cases nu"], event: Events
 ) -> tuple[Float[Array, "cases nv"], Float[Array, " nv"], Float[Array, ""]]:
     """Compute the jump in the velocity after a step that the onset of a contact or limit causes, at first touch.
 
@@ -279,37 +385,42 @@ def jump_of_velocity(
         positioned: position stage of the first case.
         states: velocities and activations of each case.
         controls: controls of each case.
-        guard: index of the contact or limit, as in `constraint.guard_rows`.
+        event: the contact or limit, and whether it ends.
 
     Returns:
         v'(on) - v'(off) of each case; the guard's Jacobian over the velocity coordinates; the first case's least
         travel.
     """
     rows: Any = positioned._impl
-    weights, members = (jnp.asarray(each, rows.efc_J.dtype)[guard] for each in constraint.guard_rows(model, positioned))
+    weights, members = (
+        jnp.asarray(each, rows.efc_J.dtype)[event.guard] for each in constraint.guard_rows(model, positioned)
+    )
 
     def both(qvel, act, control, warmstart):
         forced = force_stage(model, positioned, qvel, act, control).replace(qacc_warmstart=warmstart)
         (after, _), qacc = on_and_off(model, forced, members)
-        return after[0] - after[1], qacc[1]
+        return after[0] - after[1], qacc
 
-    jumps, free = jax.vmap(both)(states.qvel, states.act, controls, states.warmstart)
-    least = least_travel(model, positioned.replace(qvel=states.qvel[0]), weights, free[0])
+    jumps, qacc = jax.vmap(both)(states.qvel, states.act, controls, states.warmstart)
+    least = least_travel(model, positioned.replace(qvel=states.qvel[0]), weights, qacc[0], event.ends)
     return jumps, weights @ rows.efc_J, least
 
 
 def least_travel(
-    model: mjx.Model, data: mjx.Data, normal: Float[Array, " rows"], free: Float[Array, " nv"]
+    model: mjx.Model, data: mjx.Data, normal: Float[Array, " rows"], qacc: Float[Array, "2 nv"], ends: Bool[Array, ""]
 ) -> Float[Array, ""]:
     """Travel of a guard in a step [m or rad] below which its onset counts as grazing: h |a| / max(b, sqrt(k d)).
 
     Args:
         data: position stage, with the velocity.
         normal: weights of the guard from `constraint.guard_rows`.
-        free: acceleration without the contact.
+        qacc: acceleration with and without the contact.
+        ends: whether contact ends.
     """
     rows: Any = data._impl
-    return model.opt.timestep * jnp.abs(normal @ (rows.efc_J @ free)) / constraint.relaxation_rate(model, data, normal)
+    on, off = jnp.abs((qacc @ rows.efc_J.T) @ normal)
+    fastest = jnp.where(ends, jnp.maximum(on, off), off)
+    return model.opt.timestep * fastest / constraint.relaxation_rate(model, data, normal)
 
 
 def on_and_off(
