@@ -27,7 +27,7 @@ SMOOTH: Final = 0.01
 WIDTHS: Final = 3.0
 """Recommended width of the impedance's rise, as a multiple of a step's travel."""
 LEGEND: Final = (
-    "  zobg: zeroth order; fobg: first order; aobg: both, weighted; _onset: with a term for contact that begins"
+    "  zobg: zeroth order; fobg: first order; aobg: both, weighted; _onset: with a term for contact that begins or ends"
 )
 UNSURE: Final = 0.5
 """Relative standard error beyond which an error is shown with one digit."""
