@@ -42,8 +42,10 @@ written after a look at one landscape of `momentum_transfer`, and the claim on t
 
 Both efforts have been run; `docs/claims_quick.json` is the quick ledger, which leaves 53 verdicts undecided. The full
 ledger was measured in parts, by code that changed in between; 67 of its verdicts were measured again by the latest of
-that code and came out the same to the last digit. The verdicts that only the full ledger decides are mostly those
-where descents scatter or a variance has heavy tails. It does not confirm the following verdicts of the quick ledger.
+that code and came out the same to the last digit. The three claims on the onset term's accuracy and cost are newer:
+they were measured again when the term came to cover the end of contact. The verdicts that only the full ledger decides
+are mostly those where descents scatter or a variance has heavy tails. It does not confirm the following verdicts of the
+quick ledger.
 Under `smooth_onset` the derivative at the wall's edge has spikes that neither grid resolves (40 and 200 points per
 standard deviation), so that `empirical-bias-in-contact` holds on the coarse grid and fails on the fine one, and
 `ivw-inaccurate-at-jumps` becomes undecided. In `relaxed-backward-helps`, the bias of `impedance` with exact derivatives
