@@ -9,7 +9,8 @@ from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.branches import jump_term
 from mjx_study.simulation.contact import ContactModel, apply_contact
 from mjx_study.simulation.dynamics import State, rollout
-from mjx_study.simulation.onset import OnsetCounts, corrected_rollout, without_derivative
+from mjx_study.simulation.onset import corrected_rollout, without_derivative
+from mjx_study.simulation.touch import OnsetCounts
 from mjx_study.tasks.task import Task
 
 

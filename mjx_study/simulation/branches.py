@@ -26,8 +26,9 @@ from mjx_study.simulation import constraint
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.dynamics import ControlLaw, State, force_stage, solved_step, step
 from mjx_study.simulation.integration import difference_position, integrate_position
-from mjx_study.simulation.onset import SLOTS, Events, OnsetCounts, at_touch, find_events, least_travel, on_and_off
+from mjx_study.simulation.onset import SLOTS, least_travel, on_and_off
 from mjx_study.simulation.scene import Scene
+from mjx_study.simulation.touch import Events, OnsetCounts, at_touch, find_events
 
 CostToGo = Callable[[Int[Array, ""], State], Float[Array, ""]]
 RunningCost = Callable[[State, Float[Array, " nu"]], Float[Array, ""]]

@@ -19,8 +19,9 @@ from mjx_study.simulation import constraint
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.dynamics import SAVE_SOLUTION, State, fwd_position
 from mjx_study.simulation.integration import difference_position, integrate_position
-from mjx_study.simulation.onset import Events, onset_begins, onset_term, tangent_of, without_derivative
+from mjx_study.simulation.onset import onset_term, tangent_of, without_derivative
 from mjx_study.simulation.patches import Place, patched
+from mjx_study.simulation.touch import Events, onset_begins
 
 Replacements = dict[Place, Callable[..., mjx.Data]]
 ONSETS: Final = ("none", "linear")
