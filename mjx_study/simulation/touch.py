@@ -26,9 +26,9 @@ class OnsetCounts:
     """Counts of the onsets in a corrected derivative.
 
     Attributes:
-        found: number of onsets of contacts and limits.
-        bounded: number of onsets at grazing speed, whose term is bounded.
-        missed: number of onsets left uncorrected for lack of slots.
+        found: number of onsets of contacts and limits, and of the missed events.
+        bounded: number of onsets and ends at grazing speed, whose term is bounded.
+        missed: number of events left uncorrected for lack of slots.
         strength: root-mean-square share of the approach speed that a corrected onset removes in one step; 0 if there is
             none, and with the jump, whose error does not depend on it.
         first: step of the first onset; NaN if there is none.
@@ -143,7 +143,8 @@ def at_touch(
 
     A body that passes an edge may be in contact for less than a step. A body slightly ahead of it then misses the edge,
     and the samples in contact, a share l of a step, must stand for both sides of first touch: their weight is
-    2 (1 - s / l) / l.
+    2 (1 - s / l) / l. After a contact or a gap of one step (`Events.brief`), step k - 1 has no weight, since its
+    boundary is the one that the event before has already counted.
 
     Args:
         template: everything but the position.
