@@ -35,7 +35,7 @@ UNSURE: Final = 0.2
 """Relative uncertainty beyond which a reference is too imprecise to judge errors."""
 SHARE_OFF: Final = 0.5
 """Error of the linear onset term's mean, as a share of what the term adds, over the onset strength. Among 11 contact
-models on momentum_transfer and ball_wall the largest was 0.48; at random thetas the atlas has larger ones, at grazing
+models on momentum_transfer and ball_wall the largest was 0.44; at random thetas the atlas has larger ones, at grazing
 contacts, at corners, or where an onset is `STRONG`."""
 STRONG: Final = 0.9
 """Onset strength up to which `SHARE_OFF` holds; where an onset removes more of the approach speed in one step, the
