@@ -1,8 +1,8 @@
 """Prints the tables of docs/onset-correction.md.
 
-    python docs/make_onset.py            # momentum_transfer and ball_wall, by quadrature; half an hour on one core
-    python docs/make_onset.py tennis     # means along four directions of the gains; an hour on one core
-    python docs/make_onset.py rule       # error of the linear term over the onset strength, 11 contact laws
+python docs/make_onset.py            # momentum_transfer and ball_wall, by quadrature; half an hour on one core
+python docs/make_onset.py tennis     # means along four directions of the gains; an hour on one core
+python docs/make_onset.py rule       # error of the linear term over the onset strength, 11 contact laws
 """
 
 import sys
@@ -71,7 +71,10 @@ def tennis() -> None:
     along = [direction_of("random", plain.policy.num_params, seed) for seed in range(DIRECTIONS)]
     _print("`tennis`, direction", [str(1 + index) for index in range(DIRECTIONS)])
     for reach in REACHES:
-        ends = [[objectives["none"].evaluate(plain.theta + t * each, pairs).value for t in (-reach, reach)] for each in along]
+        ends = [
+            [objectives["none"].evaluate(plain.theta + t * each, pairs).value for t in (-reach, reach)]
+            for each in along
+        ]
         _row(f"difference over ± {reach}", [np.asarray(above - below) / (2 * reach) for below, above in ends])
     zeroth = zeroth_order(objectives["none"].evaluate(plain.theta, keys), "zero_noise").per_sample
     found = {"ZoBG": np.asarray(zeroth)}
@@ -105,7 +108,9 @@ def rule() -> None:
                 strength = dict(zip(ONSETS, onset_numbers(np.asarray(events)), strict=True))["onset_strength"]
                 cases.append(share[at] / strength)
                 cells = (share[at], unsure[at], strength, cases[-1])
-                _print(f"{name}, {1e3 * timestep:g} ms, {angle}, {solref}, {impedance}", [f"{each:.3g}" for each in cells])
+                _print(
+                    f"{name}, {1e3 * timestep:g} ms, {angle}, {solref}, {impedance}", [f"{each:.3g}" for each in cells]
+                )
     print(f"{len(cases)} cases: {min(cases):.2g} to {max(cases):.2g}, median {np.median(cases):.2g}")
 
 

@@ -12,6 +12,7 @@ import pytest
 
 import mjx_study as study
 from mjx_study.simulation._mjx import mjx
+from mjx_study.simulation.contact import apply_contact
 from mjx_study.simulation.drop_in import differentiable_mjx, solver_residual, step
 from mjx_study.simulation.dynamics import initial_state
 from mjx_study.simulation.onset import corrected_rollout
@@ -28,6 +29,7 @@ from tests.scenes import (
     split,
 )
 from tests.test_dynamics import jacobian, prepare
+from tests.test_onset_term import BOUNCING, Law
 
 PAGE = Path(__file__).parents[1] / "docs" / "differentiable-mjx.md"
 MODELS = Path(mjx.__file__).parent / "test_data"
@@ -256,22 +258,29 @@ def test_the_backward_pass_does_not_run_the_solver_again() -> None:
 
 
 @pytest.mark.slow
-def test_the_onset_term_of_a_step_is_that_of_a_rollout() -> None:
+@pytest.mark.parametrize(
+    ("law", "speed", "gaps", "steps"),
+    [
+        # Over a cell: contact begins early or late in a step.
+        pytest.param(Law(), -1.5, 0.035 + 7.5e-4 * (np.arange(4) + 0.3) / 4, 80, id="begins"),
+        pytest.param(BOUNCING, -1.0, np.linspace(0.0311, 0.0489, 7), 400, id="begins and ends under force"),
+    ],
+)
+def test_the_onset_term_of_a_step_is_that_of_a_rollout(law: Law, speed: float, gaps: np.ndarray, steps: int) -> None:
     """To the order of a timestep, 1 %, where the term is four times the rest; both modes, the same values."""
     scene = scene_of(FALLING)
-    start, speed, steps = scene.template, jnp.array([-1.5]), 80
-    gaps = 0.035 + 7.5e-4 * (np.arange(4) + 0.3) / 4  # over a cell: contact begins early or late in a step
+    model, start, qvel = apply_contact(scene.model, law.contact), scene.template, jnp.array([speed])
 
     def by_steps(gap, onset):
         def advance(data, _):
-            return step(scene.model, data, onset=onset), None
+            return step(model, data, onset=onset), None
 
-        last, _ = jax.lax.scan(advance, start.replace(qpos=gap[None], qvel=speed), length=steps)
+        last, _ = jax.lax.scan(advance, start.replace(qpos=gap[None], qvel=qvel), length=steps)
         return last.qpos[0], last.qpos[0]
 
     def by_rollout(gap):
-        state = initial_state(scene, gap[None], speed)
-        return corrected_rollout(scene, scene.model, state, lambda index, state: jnp.zeros(0), steps)[0].qpos[-1, 0]
+        state = initial_state(scene, gap[None], qvel)
+        return corrected_rollout(scene, model, state, lambda index, state: jnp.zeros(0), steps)[0].qpos[-1, 0]
 
     def all_of(gap):
         linear = lambda gap: by_steps(gap, "linear")  # noqa: E731

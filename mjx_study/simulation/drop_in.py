@@ -12,7 +12,7 @@ from typing import Any, Final
 import jax
 import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero, zero_from_primal
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from mjx_study.choices import unknown
 from mjx_study.simulation import constraint
@@ -27,7 +27,7 @@ Replacements = dict[Place, Callable[..., mjx.Data]]
 ONSETS: Final = ("none", "linear")
 """Treatments of the onset of contact in the derivatives of a step."""
 STEP_SLOTS: Final = 2
-"""Maximum number of onsets with a term per step; others are left out."""
+"""Maximum number of contacts and limits with a term per step; others are left out."""
 
 
 def step(model: mjx.Model, data: mjx.Data, *, onset: str = "none") -> mjx.Data:
@@ -40,8 +40,8 @@ def step(model: mjx.Model, data: mjx.Data, *, onset: str = "none") -> mjx.Data:
     Args:
         model: the model; its array leaves may be traced, batched under `jax.vmap` and differentiated.
         data: the state before the step, with controls and applied forces.
-        onset: "none" or "linear"; "linear" makes derivatives account for a change of the step at which contact begins,
-            and restricts them to qpos, qvel, act and ctrl (see `_corrected_step`).
+        onset: "none" or "linear"; "linear" makes derivatives account for a change of the step at which contact begins
+            or ends under force, and restricts them to qpos, qvel, act and ctrl (see `_corrected_step`).
 
     Returns:
         The state after the step, with every field that `mjx.step` fills in.
@@ -53,9 +53,10 @@ def step(model: mjx.Model, data: mjx.Data, *, onset: str = "none") -> mjx.Data:
     _check_onset(onset)
     if model.impl != mjx.Impl.JAX:
         raise ValueError(f"only MJX's implementation in JAX has derivatives, this model is for {model.impl.value}")
-    advance = mjx.step if onset == "none" else _corrected_step
     with patched(_SOLVE):
-        return jax.checkpoint(advance, policy=SAVE_SOLUTION)(model, data)
+        if onset == "none":
+            return jax.checkpoint(mjx.step, policy=SAVE_SOLUTION)(model, data)
+        return jax.checkpoint(_corrected_step, policy=SAVE_SOLUTION)(model, data, _preceding_contact(model, data))
 
 
 @contextlib.contextmanager
@@ -116,16 +117,38 @@ _REPLACED: Final[dict[str, Replacements]] = {
 }
 
 
-def _corrected_step(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+def _preceding_contact(model: mjx.Model, data: mjx.Data) -> Bool[Array, "3 guards"]:
+    """Whether each contact or limit existed before the preceding step, had just begun then, and pushed during it.
+
+    From the constraint rows that the preceding step left in its state; none exists at time 0. After `mjx.forward` the
+    rows are those of the state itself, and no contact is seen to end.
+    """
+    known = jax.lax.stop_gradient(data)
+    rows: Any = known._impl
+    before = known.replace(qvel=known.qvel - model.opt.timestep * known.qacc)
+    distance, speed = constraint.guards(model, before)
+    _, members = constraint.guard_rows(model, known)
+    existed = (distance < 0) & (known.time > 0)
+    begun = onset_begins(distance, model.opt.timestep * speed)
+    pushed = jnp.asarray(members, distance.dtype) @ jnp.abs(rows.efc_force) > 0
+    return jnp.stack([existed, existed & begun, existed & pushed])
+
+
+def _corrected_step(model: mjx.Model, data: mjx.Data, preceding: Bool[Array, "3 guards"]) -> mjx.Data:
     """`mjx.step` with the same values, but derivatives that include the onset term.
 
     Delta_k replaces Delta_{k-1}, which the state does not contain: an error of order h in the term. The first
-    `STEP_SLOTS` onsets of the step are corrected. None begins at time 0, which no step precedes.
+    `STEP_SLOTS` contacts and limits that begin or end in the step are corrected. None does at time 0, which no step
+    precedes.
+
+    Args:
+        preceding: see `_preceding_contact`.
     """
     model, timestep = without_derivative(model), model.opt.timestep
     fixed = jax.lax.stop_gradient(data)
     moved = difference_position(model, fixed.qpos, data.qpos)
-    earlier, later = _onset_change(model, fixed, moved, moved - timestep * (data.qvel - fixed.qvel))
+    moved_before = moved - timestep * (data.qvel - fixed.qvel)
+    earlier, later = _onset_change(model, fixed, preceding, moved, moved_before)
     shifted = integrate_position(model, fixed.qpos, earlier, timestep)
     after = mjx.step(model, data.replace(qpos=data.qpos + tangent_of(shifted), qvel=data.qvel + tangent_of(earlier)))
     spread = integrate_position(model, jax.lax.stop_gradient(after.qpos), later, timestep)
@@ -134,42 +157,49 @@ def _corrected_step(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 
 @jax.custom_jvp
 def _onset_change(
-    model: mjx.Model, data: mjx.Data, moved: Float[Array, " nv"], moved_before: Float[Array, " nv"]
+    model: mjx.Model,
+    data: mjx.Data,
+    preceding: Bool[Array, "3 guards"],
+    moved: Float[Array, " nv"],
+    moved_before: Float[Array, " nv"],
 ) -> tuple[Float[Array, " nv"], Float[Array, " nv"]]:
-    """Zero velocities, before and after the step, that change with the step at which contact begins."""
+    """Zero velocities, before and after the step, that change with the step at which contact begins or ends."""
     return jnp.zeros_like(moved), jnp.zeros_like(moved)
 
 
 @partial(_onset_change.defjvp, symbolic_zeros=True)
 def _(primals, tangents):
-    model, data, moved, _ = primals
-    change, change_before = (zero_from_primal(t) if isinstance(t, SymbolicZero) else t for t in tangents[2:])
-    spread, shift = _step_terms(model, data)
+    model, data, preceding, moved, _ = primals
+    change, change_before = (zero_from_primal(t) if isinstance(t, SymbolicZero) else t for t in tangents[3:])
+    spread, shift = _step_terms(model, data, preceding)
     zero = jnp.zeros_like(moved)
     return (zero, zero), (shift @ change_before, spread @ change)
 
 
-def _step_terms(model: mjx.Model, data: mjx.Data) -> tuple[Float[Array, "nv nv"], Float[Array, "nv nv"]]:
-    """(1 - s) Delta n^T / D and s Delta n^T / D of a step, zero if no contact begins."""
+def _step_terms(
+    model: mjx.Model, data: mjx.Data, preceding: Bool[Array, "3 guards"]
+) -> tuple[Float[Array, "nv nv"], Float[Array, "nv nv"]]:
+    """(1 - s) Delta n^T / D and s Delta n^T / D of a step, zero if no contact begins or ends."""
     positioned = fwd_position(model, data)
     distance, speed = constraint.guards(model, positioned)
-    travel = model.opt.timestep * speed
     none = jnp.zeros((2, model.nv, model.nv), data.qvel.dtype)
     if not distance.size:
         return none[0], none[1]
-    begins = onset_begins(distance, travel) & (data.time > 0)
+    existed, begun, pushed = preceding
+    ends = pushed & (distance >= 0)
+    begins = (onset_begins(distance, model.opt.timestep * speed) | ((distance < 0) & ~existed)) & (data.time > 0)
 
     def terms():
-        (chosen,) = jnp.nonzero(begins, size=min(STEP_SLOTS, distance.size), fill_value=distance.size)
+        (chosen,) = jnp.nonzero(begins | ends, size=min(STEP_SLOTS, distance.size), fill_value=distance.size)
         states = State(*(leaf[None] for leaf in (data.qpos, data.qvel, data.act, data.qacc_warmstart)))
 
         def term(guard):
-            event = Events(jnp.zeros((), int), guard, *jnp.array([False, False, True]))
+            event = Events(jnp.zeros((), int), guard, ends[guard], ends[guard] & begun[guard], jnp.array(True))
             return onset_term(model, data, states, data.ctrl[None], event)
 
         here, previous, *_ = jax.vmap(term)(jnp.minimum(chosen, distance.size - 1))
         used = (chosen < distance.size)[:, None, None]
         return jnp.stack([jnp.sum(jnp.where(used, part, 0.0), axis=0) for part in (here, previous)])
 
-    here, previous = jax.lax.cond(jnp.any(begins), terms, lambda: none)
+    here, previous = jax.lax.cond(jnp.any(begins | ends), terms, lambda: none)
     return here, previous
