@@ -8,6 +8,7 @@ python docs/make_onset.py rule       # error of the linear term over the onset s
 import sys
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from estimators import NOISES, first_order, zeroth_order
@@ -104,7 +105,7 @@ def rule() -> None:
             unsure = (linear.slope_error + linear.first_error) / np.abs(linear.first - plain.first)
             objective = simulator.objective(contact)
             for at, angle in enumerate(angles):
-                events = objective.differentiate_corrected(np.array([angle]), keys).events
+                events = objective.differentiate_corrected(jnp.array([angle]), keys).events
                 strength = dict(zip(ONSETS, onset_numbers(np.asarray(events)), strict=True))["onset_strength"]
                 cases.append(share[at] / strength)
                 cells = (share[at], unsure[at], strength, cases[-1])
