@@ -10,6 +10,7 @@ import sys
 import jax
 import jax.numpy as jnp
 import numpy as np
+from make_atlas import task_of
 
 from estimators import NOISES, first_order, zeroth_order
 from mjx_study.objective import Simulator
@@ -92,8 +93,7 @@ def rule() -> None:
     """Print the error of the linear term as a share of what it adds, over the onset strength."""
     cases = []
     for name, timestep, angles in RULED:
-        base = make_task(name)
-        task = make_task(name, timestep=timestep, horizon=round(base.horizon * base.scene.timestep / timestep))
+        task = task_of(name, timestep)
         lines = [Line(task.replace(onset=onset)) for onset in ("none", "linear")]
         simulator, position = Simulator(task.replace(onset="linear"), CHUNK), np.array(angles)
         points = grid(position.min(), position.max(), task.sigma, POINTS, task.noise)
@@ -136,8 +136,7 @@ def main() -> None:
             _print(f"variance of ZoBG over {onset}", [f"{ratio:.2g}" for ratio in ratios])
     _print("`momentum_transfer`, h", [f"{angle} rad" for angle in ANGLES["momentum_transfer"]])
     for timestep in TIMESTEPS:
-        steps = round(0.002 / timestep * make_task("momentum_transfer").horizon)
-        task = make_task("momentum_transfer", timestep=timestep, horizon=steps)
+        task = task_of("momentum_transfer", timestep)
         for onset in ("linear", "jump"):
             each, _ = measure(task.replace(onset=onset), ANGLES["momentum_transfer"])
             _print(f"{onset}, {1e3 * timestep:g} ms", [f"{error:.2%}" for error in abs(each.first / each.slope - 1)])

@@ -121,7 +121,8 @@ def _preceding_contact(model: mjx.Model, data: mjx.Data) -> Bool[Array, "3 guard
     """Whether each contact or limit existed before the preceding step, had just begun then, and pushed during it.
 
     From the constraint rows that the preceding step left in its state; none exists at time 0. After `mjx.forward` the
-    rows are those of the state itself, and no contact is seen to end.
+    rows are those of the state itself, and no contact is seen to end. The velocity before that step, which tells
+    whether contact had just begun, is approximate where damping is integrated implicitly.
     """
     known = jax.lax.stop_gradient(data)
     rows: Any = known._impl
