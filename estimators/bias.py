@@ -69,10 +69,9 @@ def bias_test(first: GradientEstimate, zeroth: GradientEstimate, key: Key[Array,
     distance = jnp.linalg.norm(first.mean - zeroth.mean)
     noise = sum(jnp.sum(estimate.standard_error**2) for estimate in (first, zeroth))
     effective = [effective_samples(estimate).count for estimate in (first, zeroth)]
-    drawn = sum(
-        _multiplied(estimate, count, stream, num_draws)
-        for estimate, count, stream in zip((first, zeroth), effective, jax.random.split(key), strict=True)
-    )
+    *streams, scale_key = jax.random.split(key, 3)
+    scales = jax.random.normal(scale_key, (2, num_draws, 1), distance.dtype)
+    drawn = sum(map(_multiplied, (first, zeroth), effective, streams, scales))
     reached = jnp.sum(jnp.linalg.norm(drawn, axis=1) >= distance).astype(distance.dtype)
     p_value = (1.0 + reached) / (1.0 + num_draws)
     fewest = jnp.minimum(*effective)
@@ -80,17 +79,15 @@ def bias_test(first: GradientEstimate, zeroth: GradientEstimate, key: Key[Array,
 
 
 def _multiplied(
-    estimate: GradientEstimate, effective: Float[Array, ""], key: Key[Array, ""], num_draws: int
+    estimate: GradientEstimate, effective: Float[Array, ""], key: Key[Array, ""], scales: Float[Array, "draws 1"]
 ) -> Float[Array, "draws params"]:
     """Draws of z_k, up to sign, which is irrelevant to a difference."""
-    dtype = estimate.mean.dtype
-    multiplier_key, scale_key = jax.random.split(key)
-    means = estimate.samples.perturbed_means(estimate.mean, multiplier_key, num_draws)
-    count = estimate.num_finite.astype(dtype)
+    means = estimate.samples.perturbed_means(estimate.mean, key, len(scales))
+    count = estimate.num_finite.astype(estimate.mean.dtype)
     freedom = 2.0 / jnp.maximum(1.0 / jnp.maximum(effective, 1.0) - 1.0 / count, 1e-9)
     # Wilson-Hilferty: chi^2 / nu as the cube of a normal variate
     spread = jnp.sqrt(2.0 / (9.0 * freedom))
-    cube_root = 1.0 - spread**2 + spread * jax.random.normal(scale_key, (num_draws, 1), dtype)
+    cube_root = 1.0 - spread**2 + spread * scales
     return means / jnp.maximum(cube_root, 1e-2) ** 1.5
 
 

@@ -18,6 +18,8 @@ LARGEST_BATCH: Final = {"cpu": 20_000, "gpu": 2**17, "tpu": 2**17}
 AT_ONCE: Final = {"cpu": 512e6, "gpu": 8e9, "tpu": 8e9}
 """Memory limit for the batches of several seeds [bytes]; those of a single seed may take more. Accelerators idle unless
 many samples are drawn at once."""
+PADDED: Final = (100, 400, 1600)
+"""Sizes to which programs pad smaller batches, so that few numbers of samples compile anything."""
 LARGEST_BLOCK: Final = 20_000
 BLOCK_BYTES: Final = 512e6
 """Limits on a block's samples and memory [bytes]; the same on all machines, so that any can compute a block."""
@@ -26,6 +28,11 @@ BLOCK_BYTES: Final = 512e6
 def largest_batch() -> int:
     """Maximum number of samples drawn at once by JAX's default backend."""
     return LARGEST_BATCH[jax.default_backend()]
+
+
+def padded_size(samples: int) -> int:
+    """Smallest size in `PADDED` that holds a batch, or its own."""
+    return next((size for size in PADDED if size >= samples), samples)
 
 
 def batches_at_once(samples: int) -> int:

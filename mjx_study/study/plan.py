@@ -27,6 +27,7 @@ from mjx_study.study.memory import (
     check_batches,
     check_memory,
     largest_batch,
+    padded_size,
     seeds_at_once,
 )
 from mjx_study.study.resolution import at_theta, configured_estimators, recipe_of
@@ -244,7 +245,14 @@ def oracles_of(config: StudyConfig) -> tuple[str, ...]:
 def memory_of_seed(plan: StudyPlan, cell: StudyCell) -> int:
     """Memory of the batches and statistics of one seed of a cell [bytes]."""
     each = bytes_per_sample(plan.groups[cell.group].task, oracles_of(plan.config), len(plan.config.estimators))
-    return cell.samples * each
+    return padded_samples(plan, cell) * each
+
+
+def padded_samples(plan: StudyPlan, cell: StudyCell) -> int:
+    """Number of samples to which whole batches are padded for their statistics: their own unless all estimators are
+    mergeable, and so ignore padding."""
+    mergeable = all(each.mergeable for each in estimators_of(plan, cell))
+    return padded_size(cell.samples) if mergeable else cell.samples
 
 
 def block_of(plan: StudyPlan, cell: StudyCell) -> int:

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Int, Key
 from estimators import ORACLES, Linearisation
 from mjx_study.objective import MjxObjective, Simulator
 from mjx_study.reference import Reference
-from mjx_study.study.memory import batches_at_once
+from mjx_study.study.memory import batches_at_once, padded_size
 from mjx_study.study.plan import StudyCell, StudyPlan
 
 UNCONVERGED: Final = {"float64": 1e-6, "float32": 1e-3}
@@ -84,7 +84,7 @@ def draw_batches(
         parts, seconds[name] = [], 0.0
         for start in range(0, len(streams), together):
             some = jax.random.clone(streams)[start : start + together]
-            flat = _keys_of_seeds(some, first, samples).reshape(-1)
+            flat = _keys_of_seeds(some, first, padded_size(samples))[:, :samples].reshape(-1)
             with device:
                 begun = time.perf_counter()
                 batch = jax.block_until_ready(getattr(objective, ORACLES[name].method)(theta, flat))
