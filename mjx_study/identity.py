@@ -12,6 +12,7 @@ import functools
 import hashlib
 import inspect
 import re
+import subprocess
 import sys
 import types
 from collections.abc import Iterable, Mapping
@@ -51,6 +52,16 @@ UNREAD: Final = ("description",)
 def versions() -> dict[str, str]:
     """Versions of the packages that compute, and a digest of this package's code."""
     return {name: metadata.version(name) for name in VERSIONED} | {"code of mjx-study": _own_code()}
+
+
+def git_revision(root: Path | None = None) -> str | None:
+    """Commit of a checkout, by default this package's; None outside one, before its first commit, or without git."""
+    folder = (Path(__file__).resolve().parents[1] if root is None else root) / ".git"
+    try:
+        found = subprocess.run(["git", f"--git-dir={folder}", "rev-parse", "--verify", "HEAD"], capture_output=True)
+    except OSError:
+        return None
+    return found.stdout.decode().strip() if found.returncode == 0 else None
 
 
 def contents(tasks: Mapping[str, Iterable[Task]]) -> dict[str, str]:

@@ -33,10 +33,12 @@ def dataset_of(document: Mapping[str, Any], cells: Cells) -> xr.Dataset:
     """Collect all cells of a study in labelled arrays; NaN where a cell is missing.
 
     Args:
-        document: contents of a study.json; each cell has the key "at", its index along every outer dimension.
+        document: contents of a study.json; each cell has the key "at", its index along every outer dimension, and
+            solref and solimp of its contact unless the MJCF's apply.
     """
     config, places = document["config"], document["cells"]
     outer = tuple(places[0]["at"])
+    cells = {index: (_solver(places[index]) | dict(arrays), by) for index, (arrays, by) in cells.items()}
     dimensions: dict[str, Sequence[Any]] = dict(document["axes"]) | {
         "estimator": config["estimators"],
         "seed": range(config["seeds"]),
@@ -77,6 +79,11 @@ def dataset_of(document: Mapping[str, Any], cells: Cells) -> xr.Dataset:
     dataset.attrs["missing_cells"] = len(places) - len(cells)
     dataset.attrs["mixed_versions"] = _mixture([versions for _, versions in cells.values()])
     return dataset
+
+
+def _solver(cell: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    sizes = {"solref": 2, "solimp": 5}
+    return {name: np.array(cell.get(name) or [np.nan] * size) for name, size in sizes.items()}
 
 
 def _mixture(versions: Sequence[Mapping[str, str]]) -> str:

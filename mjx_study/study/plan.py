@@ -18,7 +18,6 @@ from mjx_study.objective import chunk_for
 from mjx_study.option import OPTIONS, check
 from mjx_study.study.configuration import SAMPLES, StudyConfig
 from mjx_study.study.iteration import make_optimizer, schedule_factors
-from mjx_study.study.line import line_of
 from mjx_study.study.memory import (
     block_for,
     blocks_take,
@@ -29,7 +28,7 @@ from mjx_study.study.memory import (
     largest_batch,
     seeds_at_once,
 )
-from mjx_study.study.resolution import at_theta, configured_estimators, recipe_of
+from mjx_study.study.resolution import at_theta, configured_estimators, line_of, recipe_of
 from mjx_study.table import digits_to_tell_apart
 from mjx_study.tasks import make_task
 from mjx_study.tasks.contact_grid import ContactPoint, backward_grid, contact_grid, solver_grid

@@ -22,63 +22,17 @@ import xarray as xr
 from estimators import ENOUGH_EFFECTIVE
 from mjx_study.disk import prepare_folder
 from mjx_study.identity import differences, versions
-from mjx_study.runtime import environment
-from mjx_study.study.axes import Axes, axes_of, solver_arrays, solver_parameters
 from mjx_study.study.cells import Computation
 from mjx_study.study.cluster import cells_on, connected
 from mjx_study.study.configuration import Progress, StudyConfig
-from mjx_study.study.dataset import Cells, as_plain, dataset_of, write_dataset
-from mjx_study.study.plan import StudyCell, StudyPlan, estimators_of, plan_study
-from mjx_study.study.revision import git_revision
+from mjx_study.study.dataset import as_plain, dataset_of, write_dataset
+from mjx_study.study.document import document_of
+from mjx_study.study.plan import StudyPlan, plan_study
 from mjx_study.study.store import Part, Store
 from mjx_study.study.times import recording
 
 WAIT_SECONDS: Final = 0.5
 """Interval between polls of cells that another process computes."""
-
-
-def _document(plan: StudyPlan, command: str | None) -> dict[str, Any]:
-    fields = {field.name: getattr(plan.config, field.name) for field in dataclasses.fields(plan.config)}
-    axes = axes_of(plan)
-    fields |= {"tasks": plan.config.task_names, "seeds": plan.config.batches}
-    fields["iterations"] = plan.iterations or None
-    return {
-        "config": fields,
-        "warnings": list(plan.warnings),
-        "contents": plan.contents,
-        "versions": versions(),
-        "environment": environment(),
-        "revision": git_revision(),
-        "command": command,
-        "models": list(axes.models),
-        "axes": axes.values,
-        "resolved": _resolved(plan, axes),
-        "cells": [
-            {"label": plan.label(cell), "at": at} | solver_parameters(cell)
-            for cell, at in zip(plan.cells, axes.places, strict=True)
-        ],
-    }
-
-
-def _resolved(plan: StudyPlan, axes: Axes) -> list[dict[str, Any]]:
-    """Settings that differ between tasks: noise, horizons and estimator options."""
-    found: list[dict[str, Any]] = [{} for _ in axes.values["task"]]
-    for cell, at in zip(plan.cells, axes.places, strict=True):
-        task, entry = plan.groups[cell.group].task, found[at["task"]]
-        entry.setdefault("horizon", [])
-        if task.horizon not in entry["horizon"]:
-            entry["horizon"].append(task.horizon)
-        if "noise" not in entry:
-            recipe = plan.groups[cell.group].recipe
-            settings = {} if recipe is None else dataclasses.asdict(recipe)
-            entry |= {"noise": task.noise, "estimators": _options(plan, cell), "recipe": settings}
-            entry["parameters"] = task.policy.num_params
-    return found
-
-
-def _options(plan: StudyPlan, cell: StudyCell) -> dict[str, dict[str, Any]]:
-    chosen = zip(plan.config.estimators, estimators_of(plan, cell), strict=True)
-    return {name: dataclasses.asdict(estimator) for name, estimator in chosen}
 
 
 def open_store(plan: StudyPlan, folder: Path, command: str | None = None, *, accept_versions: bool = False) -> Store:
@@ -106,7 +60,7 @@ def begun_store(plan: StudyPlan, folder: Path, *, accept_versions: bool = False)
 
 def _document_in(plan: StudyPlan, folder: Path, command: str | None = None) -> dict[str, Any]:
     """Document of a plan, with the chunk size of a study begun in the folder."""
-    document = _document(plan, command)
+    document = document_of(plan, command)
     if plan.config.chunk_size is None:
         begun = (folder / "study.json").exists()
         stored = Store.open(folder).document["config"]["chunk_size"] if begun else plan.chunk_size
@@ -151,7 +105,7 @@ def run_study(
         if cluster is not None:
             raise ValueError("a cluster needs a folder for the study")
         with recording():
-            return run.in_memory(as_plain(_document(plan, command)))
+            return run.in_memory(as_plain(document_of(plan, command)))
     if not isinstance(folder, Store):
         folder = open_store(plan, Path(folder), command, accept_versions=accept_versions)
     with ExitStack() as stack:
@@ -172,7 +126,7 @@ class _Run:
         for index, arrays in self._computed(compute, ((index, index, Part()) for index in range(self._total))):
             cells[index] = arrays, document["versions"]
         self._progress(self._total, self._total, "done")
-        return _labelled(document, cells).assign_attrs(computed_cells=self._total)
+        return dataset_of(document, cells).assign_attrs(computed_cells=self._total)
 
     def in_folder(self, store: Store, keep_going: bool, client: Any) -> xr.Dataset:
         """Compute and write missing cells; one that cannot be written is kept in memory or ends the run."""
@@ -207,7 +161,7 @@ class _Run:
                 self._progress(self._total - len(missing), self._total, "another process computes the rest")
                 time.sleep(WAIT_SECONDS)
         self._progress(self._total, self._total, "done")
-        dataset = _labelled(store.document, store.read_all() | held)
+        dataset = dataset_of(store.document, store.read_all() | held)
         try:
             write_dataset(dataset, store.folder / "results.nc")
         except OSError as error:
@@ -301,12 +255,6 @@ def _keep(store: Store, index: int, arrays: dict[str, np.ndarray]) -> None:
         store.write_part(index, arrays)
 
 
-def _labelled(document: dict[str, Any], cells: Cells) -> xr.Dataset:
-    """Build the Dataset, with the parameters of each cell's contact model."""
-    solver = [solver_arrays(cell) for cell in document["cells"]]
-    return dataset_of(document, {at: ({**arrays, **solver[at]}, by) for at, (arrays, by) in cells.items()})
-
-
 def load_study(folder: str | Path) -> xr.Dataset:
     """Load the numbers of a study, even an unfinished one, as labelled arrays; NaN where missing.
 
@@ -317,7 +265,7 @@ def load_study(folder: str | Path) -> xr.Dataset:
         StudyError: there is no study, or a file of it is damaged.
     """
     store = Store.open(Path(folder))
-    return _labelled(store.document, store.read_all())
+    return dataset_of(store.document, store.read_all())
 
 
 def warnings_of(dataset: xr.Dataset) -> tuple[str, ...]:

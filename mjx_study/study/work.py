@@ -10,7 +10,7 @@ import numpy as np
 
 from mjx_study.objective import contact_for, rounds
 from mjx_study.study.gradients import CANDIDATES, takes_candidates
-from mjx_study.study.landscapes import QUADRATURE
+from mjx_study.study.landscapes import CHUNK, QUADRATURE, applies
 from mjx_study.study.memory import batches_at_once
 from mjx_study.study.plan import (
     StudyCell,
@@ -22,7 +22,6 @@ from mjx_study.study.plan import (
     oracles_of,
     seeds_together,
 )
-from mjx_study.study.quadrature import CHUNK, applies
 from mjx_study.study.sampling import calls_of, rollouts_of
 from mjx_study.study.times import Program, other_program, program_of
 
