@@ -82,7 +82,7 @@ def forecast(
     store = None if folder is None else begun_store(plan, folder, accept_versions=accept_versions)
     longer = store is not None and (store.document["config"].get("iterations") or 0) < plan.iterations
     if store is not None:
-        plan = plan.with_chunk(store.document["config"]["chunk_size"])
+        plan = plan.with_chunk(store.chunk_size)
     missing = range(len(plan.cells)) if store is None or longer else store.missing
     cells = [plan.cells[index] for index in missing]
     counts = [rollouts(plan, cell) for cell in cells]

@@ -52,7 +52,7 @@ CHUNK: Final = 256
 """Quadrature points per device and call."""
 
 
-def compute_landscapes(plan: StudyPlan) -> Callable[[StudyCell], dict[str, np.ndarray]]:
+def compute_landscapes(plan: StudyPlan) -> Callable[..., dict[str, np.ndarray]]:
     """Return a function that computes cells and keeps compiled programs between them."""
     config, oracles, objectives = plan.config, oracles_of(plan.config), Objectives(plan)
     lines: dict[int, Line] = {}
@@ -69,7 +69,7 @@ def compute_landscapes(plan: StudyPlan) -> Callable[[StudyCell], dict[str, np.nd
         points = grid(position[0], position[-1], cell.sigma, QUADRATURE, task.noise)
         return means(points, *lines[cell.group](points, cell.model.contact), position, cell.sigma, task.noise)
 
-    def compute(cell: StudyCell) -> dict[str, np.ndarray]:
+    def compute(cell: StudyCell, part: object = None) -> dict[str, np.ndarray]:
         task, objective = plan.groups[cell.group].task, objectives(cell)
         line = line_of(task, config.points or 0, config.span, config.direction, config.seed)
         chosen = estimators_of(plan, cell)
