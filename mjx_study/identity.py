@@ -37,9 +37,7 @@ BY_VERSION: Final = {"mjx_study", "estimators", "mujoco", "jax", "jaxlib", "nump
 """Modules whose code is identified by version."""
 IRRELEVANT: Final = re.compile(r"_.*|.*name.*|.*path.*|.*rgba|(tex|mat|skin|light|cam|text)_.*|.*_matid")
 """Fields of MjModel that do not affect results."""
-ABOVE: Final = (
-    "cli", "plots", "render", "gradcheck", "claims", "report.py", "bench.py", "diagnose", "accessor.py",
-)  # fmt: skip
+ABOVE: Final = ("cli", "plots", "render", "gradcheck", "claims", "report.py", "bench.py", "diagnose")
 """Parts of mjx_study that use studies, and so do not affect their results."""
 DIGEST: Final = re.compile("[0-9a-f]{12,64}")
 """Digests, which messages do not show."""
@@ -65,14 +63,8 @@ def git_revision(root: Path | None = None) -> str | None:
 
 
 def contents(tasks: Mapping[str, Iterable[Task]]) -> dict[str, str]:
-    """Return the precision, and digests of everything that tasks consist of.
-
-    Args:
-        tasks: all variants (timesteps, cones) of each task, by its name in messages.
-
-    Returns:
-        Digests by name: "model of NAME", "task NAME", and "source of FILE" for every source file of a user's task.
-    """
+    """Return the precision, and digests of everything that tasks consist of, all variants (timesteps, cones) of each
+    together: "model of NAME", "task NAME", and "source of FILE" for every source file of a user's task."""
     found, sources = {"precision": precision()}, {}
     for name, forms in tasks.items():
         models, rest = _Digest(), _Digest()
@@ -96,8 +88,7 @@ def digest_of(value: Any) -> str:
 def trace_contents(made_of: Any) -> str | None:
     """Digest everything a trace depends on except its arguments and JAX's settings: exact values and models, and code.
 
-    Returns:
-        The digest, or None if code from outside this package is involved, whose imports are not all followed.
+    None if code from outside this package is involved, whose imports are not all followed.
     """
     digest = _Digest(exact=True)
     digest.add((made_of, [metadata.version(name) for name in VERSIONED], _own_code(ABOVE)))
@@ -154,11 +145,8 @@ def _own_code(without: tuple[str, ...] = ()) -> str:
 
 @functools.cache
 def code_of(module: str) -> str:
-    """Digest the code behind a ledger measurement: a module, its imports from its own package, and the code below.
-
-    Args:
-        module: name of an imported module.
-    """
+    """Digest the code behind a ledger measurement: an imported module, its imports from its own package, and the code
+    below."""
     package, found, waiting = module.rpartition(".")[0], {}, [module]
     while waiting:
         name = waiting.pop()

@@ -77,12 +77,7 @@ class Spent:
 
 
 class Stopwatch:
-    """Times by program, for one thread.
-
-    Attributes:
-        saved: time of the last write to disk [s], by `time.monotonic`.
-        clock: wall clock [s].
-    """
+    """Times by program, for one thread; `saved` is when they were last written to disk [s], by `time.monotonic`."""
 
     clock = staticmethod(time.perf_counter)
 
@@ -134,12 +129,8 @@ _RUNNING: ContextVar[Stopwatch | None] = ContextVar("stopwatch", default=None)
 
 @contextmanager
 def timed(program: Hashable, calls: int = 1) -> Generator[None]:
-    """Time calls of a program if a stopwatch runs; the first time includes tracing and compilation, see `Spent`.
-
-    Args:
-        program: name under which times accumulate.
-        calls: number of consecutive calls.
-    """
+    """Time consecutive calls of a program if a stopwatch runs; the first time includes tracing and compilation, see
+    `Spent`."""
     watch = _RUNNING.get()
     if watch is None:
         yield

@@ -21,11 +21,8 @@ COMPUTE: Final[dict[str | None, Callable[[StudyPlan], Any]]] = {
 
 
 class Computation:
-    """Computes the cells of a plan and keeps compiled programs.
-
-    Attributes:
-        compute: computes a cell, by kind of study; cells in blocks by the methods of `Gradients`.
-    """
+    """Computes the cells of a plan by `compute`, which keeps compiled programs; for cells in blocks, see
+    `Gradients`."""
 
     def __init__(self, plan: StudyPlan):
         self._plan, self.compute = plan, COMPUTE[plan.config.kind](plan)

@@ -255,11 +255,7 @@ def _compute(study: bytes, index: int, kept: Arrays, block: int | None) -> Array
 
 @functools.lru_cache(maxsize=4)
 def _prepared(study: bytes) -> tuple[StudyPlan, Computation, Stopwatch]:
-    """Set up JAX once; return the plan, its `Computation` with compiled programs, and a stopwatch.
-
-    Raises:
-        WorkerRefusedError: the numbers would differ from the client's.
-    """
+    """Set up JAX once; return the plan, its `Computation` with compiled programs, and a stopwatch."""
     from distributed import get_worker
 
     config, chunk, asked, *client = pickle.loads(study)

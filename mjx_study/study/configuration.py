@@ -207,11 +207,7 @@ class StudyConfig(Checked):
 
 
 def check_names(label: str, names: Sequence[str], choices: Collection[str]) -> None:
-    """Reject an empty selection or repeated names.
-
-    Raises:
-        ValueError: with the choices, or with the repeated names.
-    """
+    """Reject an empty selection, with the choices, or repeated names."""
     if not names:
         raise ValueError(f"no {label} given; choose from {', '.join(choices)}")
     refuse_repeats(label, names)

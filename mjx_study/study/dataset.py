@@ -32,9 +32,8 @@ def as_plain(document: Any) -> Any:
 def dataset_of(document: Mapping[str, Any], cells: Cells) -> xr.Dataset:
     """Collect all cells of a study in labelled arrays; NaN where a cell is missing.
 
-    Args:
-        document: contents of a study.json; each cell has the key "at", its index along every outer dimension, and
-            solref and solimp of its contact unless the MJCF's apply.
+    In the document, each cell has the key "at", its index along every outer dimension, and solref and solimp of its
+    contact unless the MJCF's apply.
     """
     config, places = document["config"], document["cells"]
     outer = tuple(places[0]["at"])

@@ -204,14 +204,8 @@ class Backend:
 
 @dataclasses.dataclass
 class _Run:
-    """Descents of one estimator from all seeds.
-
-    Attributes:
-        index: place of the estimator among those of the cell.
-        program: what the time of an iteration depends on.
-        kept: arrays of the cell's checkpoint, which all estimators' runs add to.
-        part: checkpoint to resume from, and to write.
-    """
+    """Descents of one estimator from all seeds; `index` is its place among those of the cell, whose checkpoint `kept`
+    all add to."""
 
     backend: Backend
     model: ContactPoint

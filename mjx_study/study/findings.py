@@ -201,10 +201,8 @@ def _order(zeroth: Row, first: Row) -> str:
 
 
 def _bias_findings(rows: Sequence[Row], gammas: Mapping[str, float]) -> list[str]:
-    """Report means farther from the reference than any draw of the test, or off but undecided, in a sentence each.
-
-    With several seeds, counts and the median debiased error are given.
-    """
+    """Report means farther from the reference than any draw of the test, or off but undecided, in a sentence each; with
+    several seeds, with counts and the median debiased error."""
     sentences = []
     for estimator in dict.fromkeys(row.estimator for row in rows if row.estimator in BIASED):
         mine = [row for row in rows if row.estimator == estimator]

@@ -151,8 +151,7 @@ def applies(task: Task) -> bool:
 class Line:
     """Cost and derivative of a task with one parameter, in one compiled program for all points and contact models.
 
-    Raises:
-        ValueError: quadrature does not apply to the task.
+    ValueError if quadrature does not apply to the task.
     """
 
     def __init__(self, task: Task):
@@ -184,11 +183,8 @@ class Line:
 
 
 def grid(low: float, high: float, sigma: float, size: int, noise: str) -> Float[np.ndarray, " size"]:
-    """Midpoints of the cells of a uniform grid that covers the line and the noise around it.
-
-    Args:
-        size: number of cells for Gaussian noise; heavier tails get more cells of the same width.
-    """
+    """Midpoints of the cells of a uniform grid that covers the line and the noise around it: `size` cells for Gaussian
+    noise; heavier tails get more cells of the same width."""
     needed, gaussian = (high - low + 2 * sigma * NOISES[name].reach(TAIL) for name in (noise, "gaussian"))
     cells = math.ceil(size * needed / gaussian)
     return (low + high - needed) / 2 + needed * (np.arange(cells) + 0.5) / cells
@@ -202,13 +198,9 @@ def means(
     sigma: float,
     noise: str,
 ) -> Means:
-    """Compute means over the noise at each position, a value of theta.
+    """Compute means over the noise at each position, a value of theta, from f and f' at the grid points.
 
-    Args:
-        values, slopes: f and f' at the grid points.
-
-    Raises:
-        ValueError: the grid is too coarse or does not cover the noise.
+    ValueError if the grid is too coarse or does not cover the noise.
     """
     spacing, reach = points[1] - points[0], NOISES[noise].reach(TAIL)
     gap = 0.51 * spacing - reach * sigma

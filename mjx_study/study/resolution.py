@@ -17,11 +17,8 @@ SPAN_SIGMAS: Final = 10.0
 
 
 def recipe_of(config: StudyConfig, task: Task) -> Recipe:
-    """Return the settings of a task's descents: the configuration's, else those of the task's recipe.
-
-    Raises:
-        ValueError: a setting is missing.
-    """
+    """The settings of a task's descents: the configuration's, else those of the task's recipe; ValueError if one is
+    missing."""
     given = {name: getattr(config, name) for name in ("iterations", "learning_rate", "decay")}
     given |= {"samples": None if config.samples is None else max(config.samples)}
     if (recipe := task.defaults.recipe) is not None:
@@ -33,11 +30,8 @@ def recipe_of(config: StudyConfig, task: Task) -> Recipe:
 
 
 def at_theta(task: Task, theta: Sequence[float] | None) -> Task:
-    """Return the task with other parameters; unchanged for None.
-
-    Raises:
-        ValueError: their number differs from the policy's, or one is nonfinite.
-    """
+    """The task with other parameters, unchanged for None; ValueError for another number than the policy's, or a
+    nonfinite one."""
     if theta is None:
         return task
     values = np.asarray(theta, float)
@@ -51,9 +45,8 @@ def at_theta(task: Task, theta: Sequence[float] | None) -> Task:
 def configured_estimators(config: StudyConfig, task: Task) -> tuple[Estimator, ...]:
     """Build a configuration's estimators with their options, and check them against the task.
 
-    Raises:
-        ValueError: there is no such estimator, an option is out of range or missing, an estimator does not support the
-            task, or published constants are requested where there are none or along with others.
+    ValueError if there is no such estimator, an option is out of range or missing, or an estimator does not support the
+    task.
     """
     options = {name: getattr(config, name) for name in ("baseline", "max_norm", "window", "tolerance", "weights")}
     options |= bound_constants(config, task) | {"sigma": task.sigma}
@@ -63,11 +56,8 @@ def configured_estimators(config: StudyConfig, task: Task) -> tuple[Estimator, .
 
 
 def bound_constants(config: StudyConfig, task: Task) -> dict[str, Any]:
-    """Return the constants of AoBG's bound, from the configuration or the published example.
-
-    Raises:
-        ValueError: published constants are requested where there are none, or along with others.
-    """
+    """The constants of AoBG's bound, from the configuration or the published example; ValueError if there is none, or
+    other constants are given along with it."""
     names = ("gamma", "failure_probability", "variance_proxy", "radius")
     given = {name: getattr(config, name) for name in names}
     if not config.published:
@@ -80,11 +70,8 @@ def bound_constants(config: StudyConfig, task: Task) -> dict[str, Any]:
 
 
 def check_estimators(estimators: Iterable[Estimator], task: Task) -> None:
-    """Reject estimators whose formula does not hold for a task.
-
-    Raises:
-        ValueError: the formula needs Gaussian noise, noise on theta or no onset term, and the task differs.
-    """
+    """Raise ValueError for an estimator that needs Gaussian noise, noise on theta or no onset term, where the task
+    differs."""
     for estimator in estimators:
         if estimator.gaussian and task.noise != "gaussian":
             raise ValueError(f"{estimator.name!r} holds for Gaussian noise only; the noise is {task.noise}")
@@ -111,12 +98,8 @@ def line_of(task: Task, points: int, span: Sequence[float] | None, direction: st
     """Return the line through a task's theta; for a scalar parameter, its range, whatever theta is.
 
     Args:
-        span: first and last t; None for the task's, or 10 sigma to either side.
-        direction: "random" or None, or the index of one parameter.
-        seed: random seed of a random direction.
-
-    Raises:
-        ValueError: the span or the direction is invalid.
+        span: first and last t; None for the task's, or `SPAN_SIGMAS` to either side.
+        direction: "random" (by the seed) or None, or the index of one parameter.
     """
     theta = np.asarray(task.theta, float)
     along = direction_of(direction or "random", len(theta), seed)

@@ -38,12 +38,8 @@ WAIT_SECONDS: Final = 0.5
 def open_store(plan: StudyPlan, folder: Path, command: str | None = None, *, accept_versions: bool = False) -> Store:
     """Open a plan's folder, new or begun; a begun one keeps its chunk size unless the configuration sets another.
 
-    Args:
-        command: command line to record; None if no command asked for the study.
-        accept_versions: resume a study begun by other versions.
-
-    Raises:
-        ValueError: the folder is not writable or holds another study.
+    ValueError if the folder is not writable or holds another study. The command line is recorded, if one asked for the
+    study; `accept_versions` resumes a study begun by other versions.
     """
     document = _document_in(plan, folder, command)
     return Store.create(prepare_folder(folder), document, accept_versions=accept_versions)
@@ -194,11 +190,7 @@ class _Run:
         self, places: Iterable[tuple[int, int]], part_of: Callable[[int], Part]
     ) -> Generator[tuple[int, Arrays]]:
         """Yield indices and numbers of cells; each is begun before waiting for the statistics of the one before.
-
-        Args:
-            places: number of cells done before each, and its index.
-            part_of: returns a cell's checkpoint.
-        """
+        `places` are the number of cells done before each, and its index."""
 
         def end(index: int, begun: Future[Arrays]) -> tuple[int, Arrays]:
             return index, self._compute.end(self._plan.cells[index], begun)

@@ -54,11 +54,7 @@ class Part:
 
 
 class Store:
-    """The folder of one study, from `Store.create` or `Store.open`.
-
-    Attributes:
-        document: contents of study.json.
-    """
+    """The folder of one study, from `Store.create` or `Store.open`, with the contents of study.json."""
 
     def __init__(self, folder: Path, document: dict[str, Any]):
         self.folder, self.document = folder, document
@@ -133,11 +129,8 @@ class Store:
 
     @classmethod
     def open(cls, folder: Path) -> "Store":
-        """Open a study's folder for reading.
-
-        Raises:
-            StudyError: there is no study, or its study.json is damaged or of another format.
-        """
+        """Open a folder for reading; StudyError if it holds no study, or its study.json is damaged or of another
+        format."""
         path = folder / "study.json"
         try:
             content = read_whole(path)
@@ -214,11 +207,8 @@ class Store:
         return {index: self.read_with_versions(index) for index in indices if self.has(index)}
 
     def read_with_versions(self, index: int, *, part: bool = False) -> tuple[dict[str, np.ndarray], dict[str, str]]:
-        """Read the numbers of a cell, or its checkpoint, and the versions that computed them.
-
-        Raises:
-            StudyError: the file is damaged, or belongs to another study or cell.
-        """
+        """Read the numbers of a cell, or its checkpoint, and the versions that computed them; StudyError if the file is
+        damaged, or belongs to another study or cell."""
         path = self.part_path(index) if part else self.path(index)
         try:
             with np.load(io.BytesIO(read_whole(path)), allow_pickle=False) as stored:
