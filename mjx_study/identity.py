@@ -43,8 +43,6 @@ DIGEST: Final = re.compile("[0-9a-f]{12,64}")
 """Digests, which messages do not show."""
 ACCEPT: Final = "choose another folder, or accept the mixture by --accept-versions"
 """Advice at the end of messages about other versions."""
-UNREAD: Final = ("description",)
-"""Fields of a task that do not affect results."""
 
 
 def versions() -> dict[str, str]:
@@ -71,7 +69,7 @@ def contents(tasks: Mapping[str, Iterable[Task]]) -> dict[str, str]:
         for task in forms:
             models.add(task.scene)
             for field in dataclasses.fields(task):
-                if field.name not in ("scene", *UNREAD):
+                if field.name not in ("scene", "description"):  # the latter does not affect results
                     rest.add((field.name, getattr(task, field.name)))
         found |= {f"model of {name}": models.hexdigest(), f"task {name}": rest.hexdigest()}
         sources |= rest.sources
@@ -102,8 +100,8 @@ def estimator_contents(*names: str) -> dict[str, str]:
         digest = _Digest()
         digest.add(find_estimator(name))
         if digest.sources:
-            sources = {f"source of {file}": content for file, content in sorted(digest.sources.items())}
-            found |= {f"estimator {name}": digest.hexdigest()} | sources
+            found[f"estimator {name}"] = digest.hexdigest()
+            found |= {f"source of {file}": content for file, content in sorted(digest.sources.items())}
     return found
 
 
@@ -113,21 +111,14 @@ def differences(theirs: Mapping[str, Any], ours: Mapping[str, Any]) -> str | Non
     Digests that only one of the two has come last, since another entry gives the reason.
     """
     different = [name for name in dict(theirs) | dict(ours) if theirs.get(name) != ours.get(name)]
-    different.sort(key=lambda name: _digests(theirs, ours, name) and (name not in theirs or name not in ours))
-    told = [_difference(name, theirs, ours) for name in different[:3]]
-    more = [f"{len(different) - 3} more"] if len(different) > 3 else []
-    return ", ".join(told + more) or None
-
-
-def _digests(theirs: Mapping[str, Any], ours: Mapping[str, Any], name: str) -> bool:
-    return any(DIGEST.fullmatch(str(each.get(name))) for each in (theirs, ours))
-
-
-def _difference(name: str, theirs: Mapping[str, Any], ours: Mapping[str, Any]) -> str:
-    if _digests(theirs, ours, name):
-        return f"{name} differs"
-    there, here = ("none" if each.get(name) is None else each[name] for each in (theirs, ours))
-    return f"{name} {there} there and {here} here"
+    digests = {name for name in different for each in (theirs, ours) if DIGEST.fullmatch(str(each.get(name)))}
+    different.sort(key=lambda name: name in digests and (name not in theirs or name not in ours))
+    told = []
+    for name in different[:3]:
+        there, here = ("none" if each.get(name) is None else each[name] for each in (theirs, ours))
+        told.append(f"{name} differs" if name in digests else f"{name} {there} there and {here} here")
+    told += [f"{len(different) - 3} more"] if len(different) > 3 else []
+    return ", ".join(told) or None
 
 
 @functools.cache

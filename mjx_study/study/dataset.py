@@ -89,8 +89,8 @@ def _mixture(versions: Sequence[Mapping[str, str]]) -> str:
     """Packages that differ in version between cells, with these versions; empty if there are none."""
     names = dict.fromkeys(name for each in versions for name in each)
     split = {name: [part for each in versions for part in each.get(name, "none").split(" and ")] for name in names}
-    by_name = {name: list(dict.fromkeys(parts)) for name, parts in split.items()}
-    return ", ".join(f"{name} {' and '.join(found)}" for name, found in by_name.items() if len(found) > 1)
+    found = {name: dict.fromkeys(parts) for name, parts in split.items()}
+    return ", ".join(f"{name} {' and '.join(parts)}" for name, parts in found.items() if len(parts) > 1)
 
 
 def write_dataset(dataset: xr.Dataset, path: Path) -> Path:

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
-from estimators import Estimator, Objective, draw
+from estimators import Estimator, draw
 from estimators.estimator import draw_at, sample_keys
 from mjx_study.compiled import Compiled
 from mjx_study.objective import Simulator, TracedObjective, simulate
@@ -113,18 +113,16 @@ class Backend:
         def update(state: Descent, drawn: dict[str, Any]) -> tuple[Descent, Record]:
             return advance(state, drawn, estimator, self.optimizer)
 
-        def batches(objective: Objective, theta: Float[Array, " params"], key: Key[Array, ""]) -> dict[str, Any]:
-            return draw(estimator.needs, objective, theta, key, self.samples)
-
-        if self.simulator is not None:
+        if (simulator := self.simulator) is not None:
             if estimator not in self._iterations:
-                made_of = "descent", estimator, self.optimizer, self.task, self.samples, self.simulator.chunk_size
-                self._iterations[estimator] = Compiled(
-                    lambda contact, sigma, state, keys: update(
-                        state, jax.vmap(partial(batches, self._traced(contact, sigma)))(state.theta, keys)
-                    ),
-                    *made_of,
-                )
+
+                def simulated_update(contact, sigma, state: Descent, keys):
+                    objective = TracedObjective(simulator, contact, sigma)
+                    batches = partial(draw, estimator.needs, objective, num_samples=self.samples)
+                    return update(state, jax.vmap(batches)(state.theta, keys))
+
+                made_of = "descent", estimator, self.optimizer, self.task, self.samples, simulator.chunk_size
+                self._iterations[estimator] = Compiled(simulated_update, *made_of)
             simulated = self._iterations[estimator]
 
             def on_device(state: Descent, keys: Key[Array, " seeds"], index: int) -> tuple[Descent, Record]:
@@ -182,10 +180,6 @@ class Backend:
         else:
             found = jax.device_get(self._observe(theta, model.contact, self._evaluation_keys()))
         return {name: float(np.mean(values, where=np.isfinite(values))) for name, values in sorted(found.items())}
-
-    def _traced(self, contact: ContactModel | None, sigma: Any) -> TracedObjective:
-        assert self.simulator is not None
-        return TracedObjective(self.simulator, contact, sigma)
 
     def _evaluation_keys(self) -> Key[Array, " samples"]:
         key = jax.random.fold_in(jax.random.key(self.config.seed), 2**31 - 1)

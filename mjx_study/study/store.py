@@ -154,7 +154,7 @@ class Store:
         return self.path(index).exists()
 
     def part_path(self, index: int) -> Path:
-        return self.folder / "cells" / f"{index:05d}.part.npz"
+        return self.path(index).with_suffix(".part.npz")
 
     def write(self, index: int, arrays: Mapping[str, np.ndarray]) -> None:
         self._write(index, arrays, self._authors(index))

@@ -57,23 +57,14 @@ MEASURED, SCALED, ROUGH = BASES
 
 @dataclasses.dataclass(frozen=True)
 class Program:
-    """What the time of a call of a program, or of a cell's statistics, depends on.
+    """What the time of a call of a program, or of a cell's statistics, depends on."""
 
-    Attributes:
-        kind: one of `objective.SamplePrograms`, or for an iteration of descents several joined by "+"; "analytic" or
-            "statistics".
-        content: digest of what else is compiled, and of the machine.
-        steps: number of steps of a rollout; 1 for statistics.
-        rows: number of rollouts in a call; for statistics, of numbers.
-        dof, constraints: degrees of freedom and constraint rows.
-    """
-
-    kind: str
-    content: str
-    steps: int
-    rows: int
+    kind: str  # one of `objective.SamplePrograms`, several joined by "+" in descents, or one of `OTHERS`
+    content: str  # digest of what else is compiled, and of the machine
+    steps: int  # of a rollout; 1 for statistics
+    rows: int  # rollouts in a call; for statistics, numbers
     dof: int = 0
-    constraints: int = 0
+    constraints: int = 0  # rows
 
     @property
     def work(self) -> float:
