@@ -21,7 +21,7 @@ from mjx_study.diagnose.setting import setting_of
 from mjx_study.gradcheck.finding import Finding
 from mjx_study.gradcheck.mean import along_means
 from mjx_study.objective import Simulator
-from mjx_study.study.quadrature import Line, grid, means
+from mjx_study.study.landscapes import Line, grid, means
 from mjx_study.tasks import make_task
 from mjx_study.tasks.mjcf import mjcf_task
 

@@ -18,8 +18,7 @@ from estimators import Estimator, GradientEstimate, Objective, oracles_of
 from estimators.mean_check import TOLERANCE, Circulation, circulations
 from mjx_study.objective import Simulator, chunk_for
 from mjx_study.study.configuration import Progress, check_span
-from mjx_study.study.line import direction_of
-from mjx_study.study.resolution import check_estimators
+from mjx_study.study.resolution import check_estimators, direction_of
 from mjx_study.study.sampling import cell_keys, draw_batches
 from mjx_study.table import format_table
 from mjx_study.tasks.contact_grid import ContactPoint

@@ -69,9 +69,7 @@ def draw_batches(
     """Draw batches of every oracle, with a leading axis of seeds.
 
     Args:
-        samples: number of samples per batch.
-        seeds: slice of the seeds to draw.
-        first: index of the first sample, if the batch is part of a larger one.
+        samples, first: number of samples per batch, and index of the first one if the batch is part of a larger one.
         device: context held during each timed call.
 
     Returns:
