@@ -18,7 +18,7 @@ import scipy
 from jaxtyping import Float
 
 from estimators import NOISES
-from mjx_study.reference.noise import check_density
+from mjx_study.reference.noise import check_density, check_sigma
 
 Values = Float[np.ndarray, "*batch"]
 Points = Float[np.ndarray, "*batch params"]
@@ -103,7 +103,7 @@ def smoothed(function: Function, theta: Theta, sigma: float, noise: str = "gauss
         TypeError: the function has neither a closed form for this noise nor a list of breakpoints.
         ValueError: theta does not have num_params entries, sigma is not positive and finite, or the noise is unknown.
     """
-    check_noise(sigma)
+    check_sigma(sigma)
     density = check_density(noise)
     if theta.shape != (function.num_params,):
         raise ValueError(f"theta must have shape ({function.num_params},), got {theta.shape}")
@@ -139,12 +139,6 @@ def _nodes(cuts: Float[np.ndarray, " cuts"]) -> tuple[Float[np.ndarray, " nodes"
     edges = np.unique(cuts)
     half, (node, weight) = np.diff(edges)[:, None] / 2, NODES
     return (edges[:-1, None] + half * (1 + node)).ravel(), (half * weight).ravel()
-
-
-def check_noise(sigma: float) -> None:
-    """Raise ValueError unless sigma is positive and finite."""
-    if not (sigma > 0 and math.isfinite(sigma)):
-        raise ValueError(f"sigma must be positive and finite, in the unit of the quantity it is added to; got {sigma}")
 
 
 def _copies(point: float, period: float, centre: float, reach: float) -> Float[np.ndarray, " copies"]:

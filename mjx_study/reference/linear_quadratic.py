@@ -12,7 +12,8 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float
 
-from mjx_study.reference.function import Smoothed, check_noise
+from mjx_study.reference.function import Smoothed
+from mjx_study.reference.noise import check_sigma
 from mjx_study.reference.system import ControlJacobians, Controls, Costs, StateJacobians, States
 
 
@@ -84,7 +85,7 @@ class LinearQuadratic:
         Raises:
             ValueError: sigma is not positive and finite.
         """
-        check_noise(sigma)
+        check_sigma(sigma)
         theta = controls.reshape(-1)
         square, linear, constant = self.quadratic_form(start, len(controls))
         value = theta @ square @ theta + 2 * linear @ theta + constant + sigma**2 * np.trace(square)
@@ -96,7 +97,7 @@ class LinearQuadratic:
         Raises:
             ValueError: sigma is not positive and finite.
         """
-        check_noise(sigma)
+        check_sigma(sigma)
         square, _, _ = self.quadratic_form(np.zeros(self.num_states), horizon)
         return float(4 * sigma**2 * np.sum(square**2))
 

@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Array, Float, Key
 
 from estimators import Differentiation, Evaluation, Linearisation, PairedObjective, StepDifferentiation, StepEvaluation
-from mjx_study.reference.function import Function, check_noise
-from mjx_study.reference.noise import batch_noise, check_density, noise_score, split_sample_key
+from mjx_study.reference.function import Function
+from mjx_study.reference.noise import batch_noise, check_density, check_sigma, noise_score, split_sample_key
 from mjx_study.reference.system import Rollout, System, gradients_along, roll_out, value_and_gradients
 
 PARAMETRISATIONS: Final = ("controls", "feedback", "start")
@@ -105,7 +105,7 @@ class ReferenceObjective(_Evaluations):
     metrics: Callable[[Float[np.ndarray, "samples steps states"]], dict[str, np.ndarray]] | None = None
 
     def __post_init__(self) -> None:
-        check_noise(self.sigma)
+        check_sigma(self.sigma)
         check_density(self.noise)
         if self.parametrises not in PARAMETRISATIONS:
             raise ValueError(f"parametrises is {self.parametrises!r}; choose from {', '.join(PARAMETRISATIONS)}")
@@ -244,7 +244,7 @@ class FunctionObjective(_Evaluations):
     noise: str = "gaussian"
 
     def __post_init__(self) -> None:
-        check_noise(self.sigma)
+        check_sigma(self.sigma)
         check_density(self.noise)
 
     @property
