@@ -10,7 +10,7 @@ import pytest
 from mjx_study import cli
 from mjx_study.cli import options, sweep
 from mjx_study.reference import DoublePendulum, roll_out
-from mjx_study.reference.adjoint import gradients_along
+from mjx_study.reference.system import gradients_along
 from mjx_study.study.configuration import StudyConfig
 from mjx_study.study.plan import estimators_of, plan_study
 from mjx_study.study.resolution import configured_estimators

@@ -16,6 +16,7 @@ from mjx_study.identity import contents, estimator_contents
 from mjx_study.limits import MOST_CELLS, MOST_GIB, MOST_PROGRAMS, check_count
 from mjx_study.objective import chunk_for
 from mjx_study.option import OPTIONS, check
+from mjx_study.reference.noise import check_sigma
 from mjx_study.study.configuration import SAMPLES, StudyConfig
 from mjx_study.study.iteration import make_optimizer, schedule_factors
 from mjx_study.study.memory import (
@@ -35,8 +36,7 @@ from mjx_study.table import digits_to_tell_apart
 from mjx_study.tasks import make_task
 from mjx_study.tasks.contact_grid import ContactPoint, backward_grid, contact_grid, solver_grid
 from mjx_study.tasks.network import with_network
-from mjx_study.tasks.task import Recipe, Task, check_sigma
-from mjx_study.tasks.validation import check_shapes
+from mjx_study.tasks.task import Recipe, Task, check_shapes
 
 HISTORY_NUMBERS: Final = 20
 """Approximate count of numbers kept per iteration and seed, over all estimators."""

@@ -120,7 +120,7 @@ ESTIMATORS: Final = (
 REFERENCES: Final = (
     Defect(
         "range-slope",
-        "mjx_study/reference/ball_wall.py",
+        "mjx_study/reference/launch.py",
         "slope = 2 * self.speed**2 / self.gravity * np.cos(2 * angle)",
         "slope = self.speed**2 / self.gravity * np.cos(2 * angle)",
         "the inner derivative of sin(2 angle) forgotten",
@@ -128,7 +128,7 @@ REFERENCES: Final = (
     ),
     Defect(
         "adjoint-not-transposed",
-        "mjx_study/reference/adjoint.py",
+        "mjx_study/reference/system.py",
         'cost_states[..., step, :] + np.einsum("...ij,...i->...j", over_state, adjoint)',
         'cost_states[..., step, :] + np.einsum("...ij,...j->...i", over_state, adjoint)',
         "the Jacobian in place of its transpose",
@@ -144,7 +144,7 @@ REFERENCES: Final = (
     ),
     Defect(
         "impact-of-a-fixed-paddle",
-        "mjx_study/reference/paddle.py",
+        "mjx_study/reference/tennis.py",
         "slope[:, :2] - slope[:, 4:6]) - along[:, None] * slope[:, 6]",
         "slope[:, :2] - slope[:, 4:6])",
         "the time of impact without the paddle's turning",
