@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from mjx_study.gradcheck import diagnosis
-from mjx_study.gradcheck.causes import SINGULAR, cause_of_fault, cause_of_kink, singular
+from mjx_study.gradcheck.causes import SINGULAR, cause_of_fault, cause_of_kink
 from mjx_study.gradcheck.coordinates import Coordinates
 from mjx_study.gradcheck.coverage import Coverage
 from mjx_study.gradcheck.diagnosis import ENGINE, NAN, RIGHT, UNRESOLVED, VERDICTS, worst_error, worst_verdict
@@ -135,7 +135,7 @@ def _of_state(check: StateCheck, layout: Coordinates) -> list[tuple[_Key, Entry]
         found.append((("project", "unconverged", (), cause), _entry(check, layout, "", (residual, None))))
     if not check.modes <= diagnosis.MODES_TOLERANCE:
         text = f"the two modes of differentiation disagree by {check.modes:.1e}"
-        cause = f"{text}: {SINGULAR}" if singular(check.place) else text
+        cause = f"{text}: {SINGULAR}" if check.place.singular else text
         found.append((("project", "wrong", (), cause), _entry(check, layout, "", (check.modes, None))))
     if values.verdict:
         name = f"change of {layout.outputs[values.coordinate]}"

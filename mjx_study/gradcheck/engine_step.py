@@ -67,7 +67,7 @@ class EngineStep:
         data.time = 0.0
         data.qpos[:] = base.qpos
         mujoco.mj_integratePos(host, data.qpos, tangent, 1.0)
-        for (_, first), factor in zip(lengths, stretch, strict=True):
+        for (_, first, _), factor in zip(lengths, stretch, strict=True):
             data.qpos[first : first + 4] *= 1 + factor
         data.qvel[:], data.act[:], data.ctrl[:] = base.qvel + qvel, base.act + act, base.control + control
         data.qacc_warmstart[:] = base.warmstart

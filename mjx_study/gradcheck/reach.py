@@ -12,6 +12,7 @@ from typing import Any, Final
 import mujoco
 import numpy as np
 
+from mjx_study.gradcheck.coordinates import joints_above
 from mjx_study.simulation._mjx import mjx
 
 _driver: Any = sys.modules[mjx.collision.__module__]  # its collision candidates are not public
@@ -76,7 +77,7 @@ class Reach:
     def slide(self, pair: Pair) -> bool:
         """Whether two geoms may move tangentially to their contact, rather than along its normal alone."""
         host, zero = self._host, self._zero
-        one, other = (self._joints(int(host.geom_bodyid[geom])) for geom in (pair.first, pair.second))
+        one, other = (joints_above(host, int(host.geom_bodyid[geom])) for geom in (pair.first, pair.second))
         joints, types = sorted(one ^ other), host.geom_type[[pair.first, pair.second]]
         if host.nmocap or any(host.jnt_type[joint] != _SLIDE for joint in joints):
             return True
@@ -93,16 +94,6 @@ class Reach:
 
     def _normal(self, plane: int) -> np.ndarray:
         return self._zero.geom_xmat[plane].reshape(3, 3)[:, 2]
-
-    def _joints(self, body: int) -> set[int]:
-        """Joints between a body and the world."""
-        found: set[int] = set()
-        while body:
-            found |= set(
-                range(self._host.body_jntadr[body], self._host.body_jntadr[body] + self._host.body_jntnum[body])
-            )
-            body = int(self._host.body_parentid[body])
-        return found
 
     def _geoms(self, plane: int | None) -> tuple[np.ndarray, np.ndarray]:
         """Bounding balls of geoms, centres (ngeom, 3) and radii (ngeom,) [m]; for a plane, only along its normal."""

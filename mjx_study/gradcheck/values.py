@@ -118,8 +118,7 @@ def apart(
 def _stillness(host: mujoco.MjModel, qvel: Float[np.ndarray, " nv"]) -> Float[np.ndarray, " nv"]:
     """Angular velocities of free and ball joints that MJX treats as zero; 0 elsewhere."""
     still = np.zeros_like(qvel)
-    for joint, _ in quaternions(host):
-        first = host.jnt_dofadr[joint] + 3 * (host.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE)
+    for _, _, first in quaternions(host):
         speeds = np.abs(qvel[first : first + 3])
         still[first : first + 3] = np.where(speeds.max() <= STILL, speeds, 0.0)
     return still
