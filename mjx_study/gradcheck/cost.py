@@ -33,8 +33,7 @@ class CostPrograms:
     """Zero-noise cost of a task from an initial state drawn by a key, compiled for any theta and contact model."""
 
     def __init__(self, task: Task, seed: int, compiler: Compiler):
-        self.task = task
-        self.compiler = compiler
+        self.task, self.compiler = task, compiler
         self.key = jax.random.key(seed)
         self.start = task.draw_start(split_sample_key(jax.random.clone(self.key))[0])
 
@@ -78,29 +77,19 @@ def check_cost(programs: CostPrograms, cell: ContactPoint, seed: int) -> tuple[C
     modes = float(np.max(np.abs(slopes - directions @ gradient))) / scale
     truth = differences(programs.costs(cell.contact, moves(directions))[:, None])
     error = np.abs(directions @ gradient - truth.value[0])
-    closed_form = _against_closed_form(task, cell, gradient, jax.random.clone(programs.key))
     apart = error > DIFFERENCE_TOLERANCE * scale + 3 * truth.uncertainty[0]
     verdict = cost_verdict(
         finite=bool(np.all(np.isfinite(gradient))),
         modes=modes,
         residual=float(residual),
         excused=[
-            "jump" if jump else "kink" if kink and miss <= gap else None
-            for far, jump, kink, miss, gap in zip(apart, truth.jump[0], truth.kink[0], error, truth.gap[0], strict=True)
-            if far
+            "jump" if jump else "kink" if kink else None
+            for jump, kink in zip(truth.jump[0, apart], (truth.kink[0] & (error <= truth.gap[0]))[apart], strict=True)
         ],
     )
-    check = CostCheck(
-        cell.family,
-        cell.stiffness,
-        norm,
-        modes,
-        float(error.max() / scale),
-        float(truth.gap.max() / scale),
-        closed_form,
-        float(residual),
-        verdict,
-    )
+    closed_form = _against_closed_form(task, cell, gradient, jax.random.clone(programs.key))
+    errors = (modes, float(error.max() / scale), float(truth.gap.max() / scale), closed_form, float(residual))
+    check = CostCheck(cell.family, cell.stiffness, norm, *errors, verdict)
     fields = (states.qpos, states.qvel, states.act, controls, states.warmstart)
     return check, [HostState(*row) for row in zip(*map(np.asarray, fields), strict=False)]  # one state more
 

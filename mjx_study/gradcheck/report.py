@@ -14,6 +14,18 @@ SHOWN: Final = 12
 """Maximum number of findings in the text, unless all are requested."""
 OTHERS: Final = {"value": "mjx.step", "engine": "the C engine", "engine_mismatch": "the C engine"}
 """Source of the compared number, if not finite differences."""
+HEADINGS: Final = {
+    "stiffness": "K [N/m]",
+    "gradient_norm": "|gradient|",
+    "difference": "differences",
+    "one_sided": "one-sided",
+    "closed_form": "closed form",
+    "stock_step": "mjx step",
+    "engine_step": "C step",
+    "engine": "C engine",
+    "stock": "mjx.step",
+}
+"""Headings of tables, where they are not an attribute's name."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -201,8 +213,10 @@ class GradcheckReport:
         """Return the report as text; `verbose` lists every entry of every finding."""
         lines = [f"{self.subject}: {self.summary}", ""]
         if self.costs:
-            lines += ["gradient of the whole cost", *self._cost_table(), ""]
-        lines += ["one step", *self._step_table(), ""]
+            shown = "contact stiffness gradient_norm modes difference one_sided closed_form residual verdict"
+            lines += ["gradient of the whole cost", *_table(self.costs, shown.split()), ""]
+        shown = "contact stiffness states modes differences parameters stock_step engine_step engine stock residual"
+        lines += ["one step", *_table(self.steps, [*shown.split(), "unresolved", "verdict"]), ""]
         lines += self._coverage_lines()
         lines += self._finding_lines(verbose)
         lines += [f"warning: {text}" for text in (*self.warnings, *self._gaps())]
@@ -228,36 +242,6 @@ class GradcheckReport:
             for missing, labels in alike.items()
         ]
 
-    def _cost_table(self) -> list[str]:
-        header = ["contact", "K [N/m]", "|gradient|", "modes", "differences", "one-sided", "closed form", "residual"]
-        rows = [
-            [
-                check.contact,
-                _stiffness(check.stiffness),
-                f"{check.gradient_norm:.4g}",
-                *map(_figure, (check.modes, check.difference, check.one_sided, check.closed_form, check.residual)),
-                _verdict(check.verdict),
-            ]
-            for check in self.costs
-        ]
-        return _without_empty(rows, [*header, "verdict"])
-
-    def _step_table(self) -> list[str]:
-        header = ["contact", "K [N/m]", "states", "modes", "differences", "parameters", "mjx step", "C step"]
-        figures = "modes differences parameters stock_step engine_step engine stock residual".split()
-        rows = [
-            [
-                check.contact,
-                _stiffness(check.stiffness),
-                str(check.states),
-                *(_figure(getattr(check, name)) for name in figures),
-                str(check.unresolved),
-                _verdict(check.verdict),
-            ]
-            for check in self.steps
-        ]
-        return _without_empty(rows, [*header, "C engine", "mjx.step", "residual", "unresolved", "verdict"])
-
     def _finding_lines(self, verbose: bool) -> list[str]:
         """Findings, one line per kind and cause, whatever the number of contact models that show it."""
         alike: dict[tuple[str, str, str], list[Finding]] = {}
@@ -282,18 +266,20 @@ class GradcheckReport:
         return [*lines, ""] if lines else []
 
 
-def _stiffness(value: float) -> str:
-    return f"{value:g}" if value else "-"
+def _table(checks: Sequence[CostCheck | StepCheck], names: Sequence[str]) -> list[str]:
+    """A table of attributes, without empty columns."""
+    columns = {HEADINGS.get(name, name): [_cell(name, getattr(check, name)) for check in checks] for name in names}
+    kept = {heading: cells for heading, cells in columns.items() if set(cells) - {"-"}}
+    return format_table(list(zip(*kept.values(), strict=True)), list(kept))
 
 
-def _verdict(name: str) -> str:
-    return f"right, but {name}s" if name in ("kink", "jump") else name
-
-
-def _figure(value: float | None) -> str:
-    return "-" if value is None else "NaN" if math.isinf(value) or math.isnan(value) else f"{value:.1e}"
-
-
-def _without_empty(rows: Sequence[Sequence[str]], header: Sequence[str]) -> list[str]:
-    kept = [index for index in range(len(header)) if any(row[index] != "-" for row in rows)]
-    return format_table([[row[index] for index in kept] for row in rows], [header[index] for index in kept])
+def _cell(name: str, value: Any) -> str:
+    if name == "verdict":
+        return f"right, but {value}s" if value in ("kink", "jump") else value
+    if name == "stiffness":
+        return f"{value:g}" if value else "-"
+    if name == "gradient_norm":
+        return f"{value:.4g}"
+    if isinstance(value, float):
+        return f"{value:.1e}" if math.isfinite(value) else "NaN"
+    return "-" if value is None else str(value)

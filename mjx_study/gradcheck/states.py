@@ -68,14 +68,10 @@ def states_of(
     """Choose `count` states, and report the parts of the model that they exercise.
 
     The first is the initial state: rollouts start there, and most derivative faults show there. The others come from a
-    rollout, the task's own or one with small random velocities and controls, evenly spaced over its steps, those with
-    active constraints first. If they leave parts of the model unexercised, they are replaced by states that exercise
-    them, from faster rollouts with repeated pushes and from random poses within the joint limits.
-
-    Args:
-        horizon: number of steps of the rollouts.
-        seed: random seed of velocities, controls and poses.
-        visited: states of a task's rollout; None for a rollout in the C engine.
+    rollout of `horizon` steps, the task's own (`visited`) or one in the C engine with small random velocities and
+    controls, evenly spaced over its steps, those with active constraints first. If they leave parts of the model
+    unexercised, they are replaced by states that exercise them, from faster rollouts with repeated pushes and from
+    random poses within the joint limits.
     """
     host = converged_host(scene, contact)
     random = np.random.default_rng(seed)
