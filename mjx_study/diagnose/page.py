@@ -42,12 +42,9 @@ class Diagnosis(Measurement):
 
     Attributes:
         subject: the model as named by the user.
-        task: the task studied.
         setting: noise and rollout; the page holds only for these.
-        contact: label of the contact model.
+        contact, warnings: label of the contact model, and warnings about it.
         touches: contacts that begin in the zero-noise rollout.
-        derivatives: the gradient check.
-        warnings: warnings about the contact model.
         options: contact options as command-line flags.
     """
 

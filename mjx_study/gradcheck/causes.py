@@ -56,11 +56,8 @@ class Place:
     """Where a finding occurs.
 
     Attributes:
-        layout: the scene and the names of its coordinates.
-        stages: MJX's intermediate quantities at the state.
-        qacc: MJX's constrained acceleration.
-        solref: solref of all geoms with the contact model applied, (geoms, 2).
-        solimp: solimp of all geoms, (geoms, 5).
+        stages, qacc: MJX's intermediate quantities at the state, and its constrained acceleration.
+        solref, solimp: parameters of all geoms, with the contact model applied.
     """
 
     layout: Coordinates

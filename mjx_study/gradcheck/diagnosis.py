@@ -52,7 +52,6 @@ def judge(
     """Compare a derivative with differences, and return the index into VERDICTS for each entry.
 
     Args:
-        layout: layout whose blocks delimit the comparison of entry sizes within a row.
         converged: derivative after a converged solve, to distinguish an unconverged solve from a wrong derivative; None
             if the solver had converged.
         starved: whether the solve is so far from convergence that no entry can be called wrong.

@@ -76,7 +76,6 @@ class Linear:
     """Value and derivatives of a step at one state.
 
     Attributes:
-        forward, reverse: Jacobian by either mode.
         tape: reverse-mode Jacobian on the tape, if `reverse` uses the Jacobian program; else None.
     """
 
@@ -93,7 +92,7 @@ class Exact:
 
     Attributes:
         after: state after the step, with the constrained acceleration as its warm start.
-        stages: quantities of the step before the constraint solve, for comparison with the C engine.
+        stages: quantities before the constraint solve.
         outputs: (position relative to a reference, velocity, activation) after each change.
     """
 

@@ -30,13 +30,9 @@ class StateCheck:
     """All results at one state.
 
     Attributes:
-        residual: relative solver residual.
-        derivatives: derivatives by mode: forward, reverse, tape, or mjx.step.
-        truth: finite differences of this project's step.
-        judged: verdicts on the derivatives.
+        derivatives, judged: derivatives by mode (forward, reverse, tape or mjx.step), and verdicts on them.
+        truth, engine_truth: finite differences of this project's step, and of the C engine's.
         modes: difference between reverse and forward mode where no jump excuses it.
-        values: comparison of the step with `mjx.step` and the C engine.
-        engine_truth: finite differences of the C engine's step.
         engine: verdicts on the forward-mode derivative by `engine_truth`; None if the two steps differ.
     """
 

@@ -107,8 +107,7 @@ class Values:
     """Differences between the states after one step, all solved to rounding, relative to the step's change.
 
     Attributes:
-        stock: difference of this project's state from that of `mjx.step`.
-        engine: difference of this project's state from the C engine's.
+        stock, engine: difference of this project's state from that of `mjx.step`, and from the C engine's.
         verdict: value (this project and `mjx.step` differ), engine (they agree, and the C engine differs for no
             documented reason), engine_mismatch (for a documented reason), or empty.
         coordinate: output that differs most, an index into the layout's outputs.
@@ -139,9 +138,7 @@ def compare_values(
     """Compare one step across implementations.
 
     Args:
-        state: state before the step.
-        ours: this project's next state; like the others, with the step's acceleration as warm start.
-        stock: state after `mjx.step`.
+        ours, stock: next states of this project and `mjx.step`, with the step's acceleration as warm start.
         stages: MJX's intermediate quantities at `state`.
         noise: rounding noise of each output; at rest, all of its change.
     """
@@ -217,8 +214,7 @@ def difference_of_engines(
 
     Args:
         stages: MJX's intermediate quantities at the state.
-        ours: MJX's constrained acceleration [m/s^2 or rad/s^2].
-        theirs: the engine's constrained acceleration.
+        ours, theirs: constrained acceleration of MJX and of the engine [m/s^2 or rad/s^2].
     """
     found, data = [], _forward(host, state)
     if text := _stage(host, data, stages):
