@@ -9,7 +9,6 @@ from mjx_study.choices import CHECKED_STEPS, is_file
 from mjx_study.cli.options import UsageError, computing, configure_process, print_report, scene_options, usage_errors
 from mjx_study.cli.parsers.gradcheck import MEAN
 from mjx_study.gradcheck.mean import lines_of
-from mjx_study.gradcheck.plan import GradcheckPlan
 from mjx_study.simulation.scene import load_scene
 from mjx_study.study.resolution import check_estimators
 from mjx_study.tasks import make_task
@@ -59,7 +58,7 @@ def _run_mean(options: argparse.Namespace) -> int:
     return 1 if "biased" in verdicts else UNEXERCISED if "undecided" in verdicts else 0
 
 
-def _plan(options: argparse.Namespace) -> GradcheckPlan:
+def _plan(options: argparse.Namespace) -> check.GradcheckPlan:
     common = {"seed": options.seed, "damping": options.damping, "states": options.states, "stock": options.stock}
     chosen = scene_options(options, "cone", "iterations", "ls_iterations")
     if not is_file(options.task):

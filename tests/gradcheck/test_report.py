@@ -10,9 +10,9 @@ from mjx_study.cli import gradcheck as command
 from mjx_study.cli import options
 from mjx_study.gradcheck import Finding, GradcheckReport, StepCheck
 from mjx_study.gradcheck.check import unoffered
-from mjx_study.gradcheck.cost import CostCheck, judge_closed_forms
+from mjx_study.gradcheck.cost import judge_closed_forms
 from mjx_study.gradcheck.coverage import coverage
-from mjx_study.gradcheck.finding import Entry
+from mjx_study.gradcheck.report import CostCheck, Entry
 from tests.documents import stages_of
 
 PARTS = frozenset({"contact", "stick", "slide", "separate", "limit"})
