@@ -18,7 +18,7 @@ from jaxtyping import Float
 
 import estimators
 from estimators import Estimator, GradientEstimate, Objective
-from estimators.intervals import student_quantile
+from estimators.confidence import student_quantile
 from mjx_study.choices import REFERENCE
 from mjx_study.objective import Simulator
 from mjx_study.reference import FunctionObjective, smoothed

@@ -241,21 +241,6 @@ def _told(claim: Claim, kept: dict[str, Any], level: float) -> dict[str, Any]:
     }
 
 
-def matrix(document: dict[str, Any]) -> dict[str, dict[str, list[str]]]:
-    """Verdicts of a claim's systems, by claim and family."""
-    found: dict[str, dict[str, list[str]]] = {}
-    for claim in document["claims"]:
-        row = found.setdefault(claim["id"], {})
-        for each in claim["evidence"]:
-            row.setdefault(each["family"], []).append(each["verdict"])
-    return found
-
-
-def columns(rows: dict[str, dict[str, list[str]]]) -> list[str]:
-    """Families of a matrix with any verdicts."""
-    return [family for family in FAMILIES if any(family in row for row in rows.values())]
-
-
 def _range(part: Range) -> str:
     low, high = part
     if math.isinf(high):

@@ -6,10 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from mjx_study.choices import unknown
-from mjx_study.claims.catalogue import CLAIMS, VERDICTS
-from mjx_study.claims.figure import draw_matrix
+from mjx_study.claims import CLAIMS, NUM_VERDICTS
 from mjx_study.claims.ledger import Claim, measure_ledger
-from mjx_study.claims.page import count, markdown, table, told, undecided
+from mjx_study.claims.page import count, draw_matrix, markdown, table, told, undecided
 from mjx_study.cli.options import UsageError, attempt, computing, configure_process, finish, print_report, usage_errors
 from mjx_study.cli.studies import RESUMABLE
 from mjx_study.disk import prepare_folder, write_whole
@@ -34,7 +33,7 @@ def run(options: argparse.Namespace) -> int:
             options.effort,
             options.output,
             progress,
-            verdicts=VERDICTS,
+            verdicts=NUM_VERDICTS,
             command=options.command_line,
             accept_versions=options.accept_versions,
         )

@@ -10,7 +10,7 @@ import jax
 
 import estimators
 from estimators import Estimator, find_estimator
-from estimators.cross_fitting import check_weights
+from estimators.alpha import check_weights
 from mjx_study.choices import CONES, REFERENCE
 from mjx_study.identity import contents, estimator_contents
 from mjx_study.limits import MOST_CELLS, MOST_GIB, MOST_PROGRAMS, check_count

@@ -53,7 +53,7 @@ OBJECTIVE: Final = (
 ESTIMATORS: Final = (
     Defect(
         "mean-of-all-as-baseline",
-        "estimators/baselines.py",
+        "estimators/orders.py",
         "(jnp.sum(value) - value) / jnp.maximum(num_others, 1.0)",
         "jnp.sum(value) / (num_others + 1.0)",
         "the batch's mean depends on the sample: biased by 1/N",
@@ -93,7 +93,7 @@ ESTIMATORS: Final = (
     ),
     Defect(
         "control-variate-scale",
-        "estimators/zeroth.py",
+        "estimators/orders.py",
         "linear = scale**2 * jnp.sum",
         "linear = scale * jnp.sum",
         "sigma in place of its square: unbiased still, but no longer a control variate",
@@ -101,7 +101,7 @@ ESTIMATORS: Final = (
     ),
     Defect(
         "pairs-as-samples",
-        "estimators/zeroth.py",
+        "estimators/orders.py",
         "return summarise((above + below) / 2.0)",
         "return summarise(jnp.concatenate([above, below]))",
         "the halves of a pair are not independent: the same mean, another standard error",
@@ -109,7 +109,7 @@ ESTIMATORS: Final = (
     ),
     Defect(
         "cut-one-step-early",
-        "estimators/propagation.py",
+        "estimators/stepwise.py",
         "jnp.arange(1, horizon + 1) % window != 0",
         "jnp.arange(horizon) % window != 0",
         "windows counted from the wrong end",
