@@ -19,7 +19,7 @@ from scipy.integrate import quad
 from estimators import NOISES, Differentiation, Evaluation
 from mjx_study import cli
 from mjx_study.cli import options, studies
-from mjx_study.cli.landscape import curves
+from mjx_study.cli.console import curves
 from mjx_study.cli.studies import as_document
 from mjx_study.reference import BallWall, FunctionObjective, Heaviside, Quadratic, smoothed
 from mjx_study.simulation.dynamics import State
