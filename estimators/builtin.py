@@ -107,7 +107,7 @@ class FirstOrder(Estimator, entry=CATALOGUE["fobg"]):
 
 @register
 class OnsetFirstOrder(FirstOrder, entry=CATALOGUE["fobg_onset"]):
-    """See `estimators.first_order`; the batch is corrected where contact begins."""
+    """See `estimators.first_order`; the batch is corrected where contact begins and ends."""
 
 
 @register
@@ -214,7 +214,7 @@ class AlphaOrder(_OneWeight, entry=CATALOGUE["aobg"]):
 
 @register
 class OnsetAlphaOrder(AlphaOrder, entry=CATALOGUE["aobg_onset"]):
-    """See `estimators.choose_alpha`; the first-order batch is corrected where contact begins."""
+    """See `estimators.choose_alpha`; the first-order batch is corrected where contact begins and ends."""
 
 
 @register

@@ -105,7 +105,7 @@ def estimate(
         estimator: Estimator object, or the name of one whose options are left at their defaults.
         objective: F, with the methods that the estimator's oracles call.
         theta: Parameters, [param].
-        key: Source of all randomness; consumed.
+        key: Random key; consumed.
         num_samples: Samples per batch, >= 1.
 
     Raises:

@@ -77,7 +77,9 @@ def make_optimizer(name: str, learning_rate: float, decay: float) -> optax.Gradi
         raise ValueError(f"the decay of the learning rate must be a power from 0 to 2, got {decay}")
     optimizer = _optimizer(name, lambda count: learning_rate / (1.0 + count) ** decay)
     if optimizer is None:
-        raise ValueError(f"optax has no optimiser {name!r} that takes a learning rate; use sgd, adam or rmsprop, say")
+        raise ValueError(
+            f"optax has no optimiser {name!r} that takes a learning rate; use for example sgd, adam or rmsprop"
+        )
     return optimizer
 
 

@@ -57,7 +57,7 @@ MEASURED, SCALED, ROUGH = BASES
 
 @dataclasses.dataclass(frozen=True)
 class Program:
-    """What the time of a call of a program, or of a cell's statistics, depends on.
+    """Quantities that determine the time of a call of a program, or of a cell's statistics.
 
     Attributes:
         kind: one of `objective.SamplePrograms`, or for an iteration of descents several joined by "+"; "analytic" or

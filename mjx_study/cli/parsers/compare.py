@@ -49,7 +49,7 @@ columns of the table:
 
 and with --details:
   |gradient|      norm of the mean gradient
-  effective (top) samples that the variance rests on, and the share of it carried by the largest one
+  effective (top) effective number of samples behind the variance, and the share of the largest
   cosine          between mean and reference gradient, and the same debiased; for several parameters
   epsilon, B      confidence radius of the zeroth-order mean; distance between the two means
   residual        largest relative residual of MuJoCo's constraint solver
