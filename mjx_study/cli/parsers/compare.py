@@ -23,7 +23,7 @@ EPILOG = (
     """\
 examples:
   mjx-study compare pusher --stiffness 10,1000 --contact penalty,mujoco_default
-  mjx-study compare pusher --estimators zobg,fobg,aobg,ivw --gamma 1000 --samples 1000
+  mjx-study compare momentum_transfer --contact mujoco_default --theta 0.5 --estimators zobg,fobg,aobg,ivw --gamma 0.5
   mjx-study compare pusher --theta out/policy-aobg.json    at the end of a descent instead of its start
   mjx-study compare pusher --json > pusher.json
 
