@@ -111,7 +111,7 @@ class FirstOrder(_Formula, entry=CATALOGUE["fobg"]):
 
 @register
 class OnsetFirstOrder(FirstOrder, entry=CATALOGUE["fobg_onset"]):
-    """See `estimators.first_order`; the batch is corrected where contact begins."""
+    """See `estimators.first_order`; the batch is corrected where contact begins and ends."""
 
 
 @register
@@ -209,7 +209,7 @@ class AlphaOrder(_OneWeight, entry=CATALOGUE["aobg"]):
 
 @register
 class OnsetAlphaOrder(AlphaOrder, entry=CATALOGUE["aobg_onset"]):
-    """See `estimators.choose_alpha`; the first-order batch is corrected where contact begins."""
+    """See `estimators.choose_alpha`; the first-order batch is corrected where contact begins and ends."""
 
 
 @register

@@ -59,7 +59,7 @@ CATALOGUE: dict[str, Entry] = {
             "costs to go over pairs of opposite noise",
         ),
         Entry("fobg", "FoBG", ("differentiation",), "first order: gradients of the samples"),
-        Entry("fobg_onset", "FoBG, onset", ("corrected",), "first order, corrected where contact begins"),
+        Entry("fobg_onset", "FoBG, onset", ("corrected",), "first order, corrected where contact begins and ends"),
         Entry(
             "fobg_clipped",
             "FoBG, clipped",
@@ -84,7 +84,7 @@ CATALOGUE: dict[str, Entry] = {
             "aobg_onset",
             "AoBG, onset",
             ("evaluation", "corrected"),
-            "alpha order, its first-order batch corrected where contact begins",
+            "alpha order, its first-order batch corrected where contact begins and ends",
         ),
         Entry(
             "ivw",

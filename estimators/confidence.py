@@ -21,7 +21,7 @@ ENOUGH_EFFECTIVE: Final = 3.0
 @register_pytree
 @dataclass(frozen=True)
 class EffectiveSamples:
-    """How evenly the samples share the variance of a batch. See `effective_samples`.
+    """Number of samples that carry the variance of a batch, and the largest share. See `effective_samples`.
 
     Attributes:
         count: From 1, where one sample carries all of the variance, to n; 0 if the variance is zero.

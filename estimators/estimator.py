@@ -38,7 +38,7 @@ ORACLES: Final[dict[str, Oracle]] = {
         Oracle("steps", 0, "evaluate_steps", "a zeroth-order batch step by step"),
         Oracle("step_pair", 0, "evaluate_step_pair", "a zeroth-order batch of pairs step by step"),
         Oracle("differentiation", 1, "differentiate", "a first-order batch"),
-        Oracle("corrected", 1, "differentiate_corrected", "a first-order batch corrected where contact begins"),
+        Oracle("corrected", 1, "differentiate_corrected", "a first-order batch with the onset term"),
         Oracle("step_differentiation", 1, "differentiate_steps", "a first-order batch step by step"),
         Oracle("linearisation", 1, "linearise", "a first-order batch with the derivatives of its steps"),
     )
@@ -216,7 +216,7 @@ def draw(
 
     Args:
         theta: Parameters, [param].
-        key: Source of all randomness; consumed.
+        key: Random key; consumed.
         num_samples: Samples per batch, >= 1.
 
     Raises:
@@ -262,7 +262,7 @@ def estimate(
         estimator: Estimator object, or the name of one whose options are left at their defaults.
         objective: F, with the methods that the estimator's oracles call.
         theta: Parameters, [param].
-        key: Source of all randomness; consumed.
+        key: Random key; consumed.
         num_samples: Samples per batch, >= 1.
 
     Raises:

@@ -92,7 +92,7 @@ def circulations(
 
     Args:
         start, end: Ends of the path, [param]; a few standard deviations of the noise apart, or less.
-        key: Source of all randomness; consumed.
+        key: Random key; consumed.
         num_samples: Samples at every node, >= 2.
         nodes: Number of nodes, odd.
 

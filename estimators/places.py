@@ -38,7 +38,7 @@ def find_attribute(place: str, noun: str, kind: type) -> object:
 
     Args:
         place: `module:name`.
-        noun: What the object is called in messages.
+        noun: Name of the object in messages.
         kind: Type of object whose names an error lists, besides the module's own functions and classes.
 
     Raises:

@@ -24,7 +24,7 @@ from mjx_study.runtime import precision, traces_folder
 UNTRACED: Final = re.compile("cache|^jax_log|num_cpu_devices")
 """JAX settings that traces do not depend on."""
 GRAPHS: Final = "FUSION,CUBLAS,CUBLASLT,CUDNN,CUSTOM_CALL,DYNAMIC_SLICE_FUSION,CONDITIONAL,WHILE"
-"""What XLA records in CUDA graphs: its default and whole loops, each step of which the host would launch otherwise."""
+"""Operations that XLA records in CUDA graphs: its default ones and whole loops, whose steps the host would launch."""
 
 
 class Compiled:

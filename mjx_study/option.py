@@ -261,7 +261,7 @@ OPTIONS: Final[dict[str, Option]] = {
         _number("backward_margin", float, "(0, inf)", "M", "distance at which it begins", unit="m", unset="the MJCF's"),
         _choice("kind", KINDS, "KIND", "kind of study", unset="from --iterations and --points"),
         _choice("estimators", CATALOGUE, "NAME", "see `mjx-study estimators`", label="estimator", own=True),
-        _choice("contact", CONTACTS, "FAMILY", "of: {}", label="contact family", unset=TASKS),
+        _choice("contact", CONTACTS, "FAMILY", "contact family: {}", label="contact family", unset=TASKS),
         _number("stiffness", float, "(0, inf)", "K", "contact stiffness", unit="N/m", unset=TASKS),
         _number("damping", float, "[0, inf)", "B", "contact damping", unit="N s/m", unset="the family's"),
         _choice("cone", CONES, "CONE", "friction cone: {}", unset="the MJCF's"),

@@ -174,7 +174,7 @@ def test_help_lists_the_families_that_a_command_takes(
 ) -> None:
     with pytest.raises(SystemExit):
         cli.main([command, "--help"])
-    families = re.search(r"--contact FAMILY\S*\s+of: ([^(]*)", capsys.readouterr().out)
+    families = re.search(r"--contact FAMILY\S*\s+contact family: ([^(]*)", capsys.readouterr().out)
     assert families and ("reference" in families[1]) == analytic and "penalty" in families[1]
 
 

@@ -12,7 +12,7 @@ EPILOG = (
     """\
 examples:
   mjx-study compare pusher --stiffness 10,1000 --contact penalty,mujoco_default
-  mjx-study compare pusher --estimators zobg,fobg,aobg,ivw --gamma 1000 --samples 1000
+  mjx-study compare momentum_transfer --contact mujoco_default --theta 0.5 --estimators zobg,fobg,aobg,ivw --gamma 0.5
   mjx-study compare pusher --theta out/policy-aobg.json    at the end of a descent instead of its start
   mjx-study compare pusher --json > pusher.json
 
@@ -38,7 +38,7 @@ columns of the table:
 
 and with --details:
   |gradient|      norm of the mean gradient
-  effective (top) samples that the variance rests on, and the share of it carried by the largest one
+  effective (top) effective number of samples behind the variance, and the share of the largest
   cosine          between mean and reference gradient, and the same debiased; for several parameters
   epsilon, B      confidence radius of the zeroth-order mean; distance between the two means
   residual        largest relative residual of MuJoCo's constraint solver

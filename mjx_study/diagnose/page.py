@@ -268,7 +268,7 @@ class Diagnosis(Measurement):
         elif corrected.verdict == "biased" and corrected.bias > explained and strength <= STRONG:
             yield (
                 f"the onset term leaves a bias of {self._bias(corrected)}, which its own error does not "
-                "explain: corners that turn, edges and contacts that end under load have no term",
+                "explain; the usual causes are corners, edges, grazing and rolling contact",
                 "",
             )
         elif SHARE_OFF * strength > NOTABLE:

@@ -78,7 +78,9 @@ def make_optimizer(name: str, learning_rate: float, decay: float) -> optax.Gradi
             jax.eval_shape(lambda theta: made.update(theta, made.init(theta), theta), theta)
             optimizer = made
     if not isinstance(optimizer, optax.GradientTransformation):
-        raise ValueError(f"optax has no optimiser {name!r} that takes a learning rate; use sgd, adam or rmsprop, say")
+        raise ValueError(
+            f"optax has no optimiser {name!r} that takes a learning rate; use for example sgd, adam or rmsprop"
+        )
     return optimizer
 
 

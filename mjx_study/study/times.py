@@ -57,7 +57,7 @@ MEASURED, SCALED, ROUGH = BASES
 
 @dataclasses.dataclass(frozen=True)
 class Program:
-    """What the time of a call of a program, or of a cell's statistics, depends on."""
+    """Quantities that determine the time of a call of a program, or of a cell's statistics."""
 
     kind: str  # one of `objective.SamplePrograms`, several joined by "+" in descents, or one of `OTHERS`
     content: str  # digest of what else is compiled, and of the machine
