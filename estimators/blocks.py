@@ -27,20 +27,17 @@ Block = Float[np.ndarray, "samples parts params"]
 @register_pytree
 @dataclass(frozen=True)
 class Moments:
-    """Moments of the rows of one batch, or of two batches paired row by row (parts).
+    """Moments of the finite rows of one batch, or of two batches paired row by row (parts).
 
     A feature vector holds a sample's deviations d_i = g_i - gbar_i and their products d_i . d_j. A change of mean maps
     it affinely, so its scatter matrix, which holds all moments up to the fourth that the statistics need, can be
     merged.
 
     Attributes:
-        count: n, the number of samples with only finite entries.
-        mean: gbar of each part, [cost/param].
         products: Means of d_i . d_j, i <= j, [cost^2/param^2].
         scatter: Scatter matrix of the features.
         pairs: Sum of ||z - z'||^2 / 2 over disjoint pairs of neighbours, and the number of pairs.
-        extremes: Samples with the largest deviations or norms.
-        places: Indices of the extremes.
+        extremes, places: Samples with the largest deviations or norms, and their indices.
         thinned: Products g_i . g_j of a subset of the samples, chosen by index.
     """
 
@@ -55,19 +52,15 @@ class Moments:
 
     @classmethod
     def of(cls, block: Block, first: int, every: int) -> "Moments":
-        """Compute the moments of a block.
-
-        Args:
-            first: Index of the block's first sample.
-            every: Stride of the thinned samples: those whose index is a multiple of it.
-        """
+        """Moments of a block whose first sample has index `first`; indices in `thinned` are multiples of `every`."""
         finite = np.all(np.isfinite(block), axis=(1, 2))
         rows, places = np.asarray(block[finite], float), first + np.flatnonzero(finite)
         half = len(block) // 2
         apart = block[0 : 2 * half : 2] - block[1 : 2 * half : 2]
         both = finite[0 : 2 * half : 2] & finite[1 : 2 * half : 2]
-        mean = np.zeros(rows.shape[1:]) if len(rows) == 0 else np.mean(rows, axis=0)
+        mean = np.zeros(rows.shape[1:])
         if len(rows):
+            mean = np.mean(rows, axis=0)
             mean = mean + np.mean(rows - mean, axis=0)
         deviations = rows - mean
         products = _products(deviations)
@@ -173,10 +166,7 @@ class Merged:
       exact for fewer samples. The maximum is that of `top`.
     - `perturbed_means`: different draws from the same distribution.
 
-    Attributes:
-        parts: As in `Parts`.
-        weights: Weight of each batch.
-        size: Samples per batch, nonfinite ones included.
+    `size` is the number of samples per batch, nonfinite ones included.
     """
 
     parts: Parts
@@ -201,8 +191,8 @@ class Merged:
 
     def mixed(self, weights: tuple[Any, Any], other: Any) -> "Merged":
         """Combine two batches of the same pairing row by row with the given weights."""
-        pairs = zip(self.weights, other.weights, strict=True)
-        mixture = tuple(float(weights[0]) * one + float(weights[1]) * two for one, two in pairs)
+        share, rest = map(float, weights)
+        mixture = tuple(share * one + rest * two for one, two in zip(self.weights, other.weights, strict=True))
         return Merged(self.parts, mixture, self.size)
 
     @property

@@ -29,7 +29,7 @@ from estimators.stepwise import (
     total_propagation,
     truncated_first_order,
 )
-from estimators.types import AlphaChoice, Differentiation, Evaluation, GradientEstimate
+from estimators.types import AlphaChoice, Differentiation, Evaluation, GradientEstimate, StepEvaluation
 
 
 def _check_positive(name: str, value: float) -> None:
@@ -82,7 +82,10 @@ class Antithetic(_Baselined, entry=CATALOGUE["zobg_antithetic"]):
     """See `estimators.antithetic`."""
 
     separable = True
-    formula = staticmethod(lambda pair, baseline: antithetic(*pair, baseline))
+
+    @staticmethod
+    def formula(pair: tuple[Evaluation, Evaluation], baseline: str) -> GradientEstimate:
+        return antithetic(*pair, baseline)
 
 
 @register
@@ -98,7 +101,10 @@ class AntitheticCostToGo(_Baselined, entry=CATALOGUE["zobg_to_go_antithetic"]):
     """See `estimators.antithetic_cost_to_go`."""
 
     separable = True
-    formula = staticmethod(lambda pair, baseline: antithetic_cost_to_go(*pair, baseline))
+
+    @staticmethod
+    def formula(pair: tuple[StepEvaluation, StepEvaluation], baseline: str) -> GradientEstimate:
+        return antithetic_cost_to_go(*pair, baseline)
 
 
 @register

@@ -27,15 +27,8 @@ DENSITIES: Final = {
 
 @dataclass(frozen=True)
 class Entry:
-    """Description of an estimator.
-
-    Attributes:
-        name: Name on the command line and in `ESTIMATORS`.
-        label: Legend label.
-        needs: Oracles in `ORACLES`, in the order of the arguments of `combine`.
-        description: One-line description.
-        required: Options without a default.
-    """
+    """An estimator's name on the command line, label in legends, oracles in the order of the arguments of `combine`,
+    one-line description, and options without a default."""
 
     name: str
     label: str

@@ -21,6 +21,7 @@ SURE: Final = 3.29
 """Half-width of a 99.9 % interval in standard errors."""
 TOLERANCE: Final = 0.05
 """Relative error, as a share of F's difference, within which a mean counts as right."""
+Nodes = Float[np.ndarray, " nodes"]
 
 
 @register_pytree
@@ -67,7 +68,7 @@ def circulation(
     *,
     nodes: int = NODES,
 ) -> Circulation:
-    """Integrate an estimator's mean along a path of theta; see `circulations`."""
+    """Integrate an estimator's mean along a path of theta; see `estimators.mean_check.circulations`."""
     (found,) = circulations([estimator], objective, start, end, key, num_samples, nodes=nodes)
     return found
 
@@ -93,14 +94,8 @@ def circulations(
     Args:
         start, end: Ends of the path, [param]; a few standard deviations of the noise apart, or less.
         key: Random key; consumed.
-        num_samples: Samples at every node, >= 2.
-        nodes: Number of nodes, odd.
-
-    Returns:
-        One circulation per estimator.
-
-    Raises:
-        ValueError: The number of nodes is not odd, or there are too few samples.
+        num_samples: Samples at every node, >= 2; fewer are a ValueError.
+        nodes: Number of nodes, odd; an even one is a ValueError.
     """
     if nodes < 1 or nodes % 2 == 0:
         raise ValueError(f"nodes must be an odd number; got {nodes}")
@@ -122,26 +117,20 @@ def circulations(
     orders = [max(ORACLES[oracle].order for oracle in estimator.needs) for estimator in estimators]
     differences = {order: difference(order) for order in set(orders)}
     weights, rough = jnp.asarray(weights, slopes.dtype), jnp.asarray(weights - coarse, slopes.dtype)
-    return [
-        _circulation(differences[order], weights @ each, rough @ each)
-        for order, each in zip(orders, slopes, strict=True)
-    ]
+
+    def compared(order: int, slope: Float[Array, "nodes samples"]) -> Circulation:
+        expected, apart = differences[order], rough @ slope
+        gap = weights @ slope - expected
+        found = summarise(jnp.stack([gap, expected, apart], axis=1))
+        quadrature = jnp.maximum(jnp.abs(found.mean[2]) - 3 * found.standard_error[2], 0.0)
+        count = effective_samples(summarise(jnp.where(jnp.isfinite(apart), gap, jnp.nan)[:, None])).count
+        lost = found.num_nonfinite
+        return Circulation(found.mean[1], found.mean[0], found.standard_error[0], quadrature, count, lost)
+
+    return [compared(*each) for each in zip(orders, slopes, strict=True)]
 
 
-def _circulation(
-    difference: Float[Array, " samples"], integral: Float[Array, " samples"], rough: Float[Array, " samples"]
-) -> Circulation:
-    gap = integral - difference
-    found = summarise(jnp.stack([gap, difference, rough], axis=1))
-    quadrature = jnp.maximum(jnp.abs(found.mean[2]) - 3 * found.standard_error[2], 0.0)
-    alone = summarise(jnp.where(jnp.isfinite(rough), gap, jnp.nan)[:, None])
-    count = effective_samples(alone).count
-    return Circulation(found.mean[1], found.mean[0], found.standard_error[0], quadrature, count, found.num_nonfinite)
-
-
-def path_rule(
-    nodes: int,
-) -> tuple[Float[np.ndarray, " nodes"], Float[np.ndarray, " nodes"], Float[np.ndarray, " nodes"]]:
+def path_rule(nodes: int) -> tuple[Nodes, Nodes, Nodes]:
     """Nodes on [0, 1], their weights, and the weights of an interpolatory rule on every second node."""
     points, weights = np.polynomial.legendre.leggauss(nodes)
     coarse, some = np.zeros(nodes), points[::2]

@@ -8,36 +8,16 @@ from collections.abc import Generator
 from contextlib import contextmanager, suppress
 from operator import attrgetter
 from pathlib import Path
-from types import ModuleType
 
 
 class MissingModuleError(ValueError):
     """The module of a `module:name` cannot be found."""
 
 
-def load_module(name: str) -> ModuleType:
-    """Import a module by its dotted name.
-
-    Raises:
-        MissingModuleError: The module does not exist.
-        ValueError: Importing the module raises.
-    """
-    if not all(part.isidentifier() for part in name.split(".")) or name.endswith(".py"):
-        raise MissingModuleError(f"{name!r} is not a module name: write it as in an import, without a folder or .py")
-    importlib.invalidate_caches()
-    try:
-        return importlib.import_module(name)
-    except (Exception, SystemExit) as error:
-        if isinstance(error, ModuleNotFoundError) and f"{name}.".startswith(f"{error.name}."):
-            raise MissingModuleError(f"there is no module {error.name!r} here or installed") from error
-        raise ValueError(f"importing {name} raised {described(error)}") from error
-
-
 def find_attribute(place: str, noun: str, kind: type) -> object:
     """Return the object at a `module:name`.
 
     Args:
-        place: `module:name`.
         noun: Name of the object in messages.
         kind: Type of object whose names an error lists, besides the module's own functions and classes.
 
@@ -46,7 +26,15 @@ def find_attribute(place: str, noun: str, kind: type) -> object:
         ValueError: Importing the module raises, or it lacks the name; the message lists its names.
     """
     module, _, name = place.partition(":")
-    loaded = load_module(module)
+    if not all(part.isidentifier() for part in module.split(".")) or module.endswith(".py"):
+        raise MissingModuleError(f"{module!r} is not a module name: write it as in an import, without a folder or .py")
+    importlib.invalidate_caches()
+    try:
+        loaded = importlib.import_module(module)
+    except (Exception, SystemExit) as error:
+        if isinstance(error, ModuleNotFoundError) and f"{module}.".startswith(f"{error.name}."):
+            raise MissingModuleError(f"there is no module {error.name!r} here or installed") from error
+        raise ValueError(f"importing {module} raised {described(error)}") from error
     try:
         return attrgetter(name)(loaded)
     except AttributeError:

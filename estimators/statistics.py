@@ -12,19 +12,13 @@ from estimators.types import GradientEstimate
 
 
 def summarise(per_sample: Float[Array, "samples params"]) -> GradientEstimate:
-    """Compute mean, variance and standard error over the n finite rows.
+    """Compute mean, variance and standard error over the n finite rows g_i of `per_sample`, [cost/param].
 
         gbar = (1/n) sum_i g_i,   sigmahat^2 = 1/(n-1) sum_i ||g_i - gbar||^2
 
     Other rows are left out and counted. If there are any, the mean is conditional on samples that could be computed,
     not the expectation sought: look at `num_nonfinite` before the mean. Rows that are all equal have a variance of
-    exactly zero.
-
-    Args:
-        per_sample: g_i, [cost/param].
-
-    Returns:
-        The estimate. The mean is NaN for n = 0, the variance and standard error for n < 2.
+    exactly zero. The mean is NaN for n = 0, the variance and standard error for n < 2.
 
     Reference: Suh et al. 2022, def. of empirical variance.
     """
@@ -43,17 +37,12 @@ def summarise(per_sample: Float[Array, "samples params"]) -> GradientEstimate:
 
 
 def norm_quantiles(estimate: GradientEstimate, probabilities: Sequence[float]) -> Float[Array, " probabilities"]:
-    """Quantiles of ||g_i|| over the finite rows; they reveal heavy tails that a variance hides.
+    """Quantiles of ||g_i|| over the finite rows, [cost/param]; they reveal heavy tails that a variance hides.
+
+    They are interpolated linearly, and NaN without finite rows.
 
     Args:
-        estimate: The estimate; without finite rows the quantiles are NaN.
-        probabilities: Each in [0, 1].
-
-    Returns:
-        The quantiles, linearly interpolated, [cost/param].
-
-    Raises:
-        ValueError: A probability is outside [0, 1].
+        probabilities: Each in [0, 1]; else a ValueError.
     """
     if not all(0.0 <= probability <= 1.0 for probability in probabilities):
         raise ValueError(f"probabilities must lie in [0, 1]; got {list(probabilities)}; a median is 0.5")
@@ -61,13 +50,8 @@ def norm_quantiles(estimate: GradientEstimate, probabilities: Sequence[float]) -
 
 
 def merged_estimates(parts: Parts, size: int) -> list[GradientEstimate]:
-    """Build the estimates of one batch or two from the moments of their samples.
-
-    Args:
-        parts: Moments of all blocks.
-        size: Samples per batch, nonfinite ones included.
-    """
-    batches = len(parts) if len(parts) == 1 else len(parts) - 1
+    """Build the estimates of one batch or two of `size` samples, nonfinite ones included, from the merged moments."""
+    batches = 1 if len(parts) == 1 else 2
     estimates = []
     for index in range(batches):
         samples = Merged(parts, tuple(float(index == each) for each in range(batches)), size)

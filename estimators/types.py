@@ -58,7 +58,7 @@ class Differentiation:
 @register_pytree
 @dataclass(frozen=True)
 class StepEvaluation:
-    """A batch of rollouts that were evaluated step by step but not differentiated.
+    """A batch of rollouts that were evaluated step by step but not differentiated; `residual` as in `Evaluation`.
 
     Noise acts at S steps in m dimensions: at every step of a policy, or once (S = 1) where theta + w determines
     the initial state.
@@ -69,7 +69,6 @@ class StepEvaluation:
         noise_score: grad psi(w_h^i); w / sigma^2 for Gaussian noise, [1/control].
         policy_jacobian: D_theta pi(x_h^i), [control/param]; None if theta matches the noise entry by entry and acts in
             the same way.
-        residual: As in `Evaluation`.
     """
 
     value_to_go: Float[Array, "samples steps"]
@@ -84,11 +83,11 @@ class StepEvaluation:
 class StepDifferentiation:
     """A batch of rollouts differentiated with respect to the noise of every step.
 
+    `policy_jacobian` is as in `StepEvaluation`, `residual` and `events` as in `Differentiation`.
+
     Attributes:
         value: V_1^i, the total cost, [cost].
         noise_gradient: dV_1^i / dw_h, which is dV_1^i / du_h, [cost/control].
-        policy_jacobian: As in `StepEvaluation`.
-        residual, events: As in `Differentiation`.
     """
 
     value: Float[Array, " samples"]
@@ -105,11 +104,9 @@ class Linearisation:
 
     Attributes:
         steps: The same rollouts, step by step.
-        cost_state: Derivative of each step's cost over the state, [cost/state].
-        cost_control: Derivative of each step's cost over the control, [cost/control].
+        cost_state, cost_control: Derivatives of each step's cost, [cost/state] and [cost/control].
         final_state: Derivative of the final cost, [cost/state].
-        over_state: Derivative of each step's next state over the state.
-        over_control: Derivative of each step's next state over the control, [state/control].
+        over_state, over_control: Derivatives of each step's next state, the latter [state/control].
         policy_state: Derivative of the policy over the state, [control/state]; None for an open loop.
         start_jacobian: Derivative of the start over theta, [state/param], if theta and the noise act on the start only;
             otherwise None.
@@ -131,9 +128,7 @@ def pull_back(
 ) -> Float[Array, "samples params"]:
     """sum_h D_theta pi(x_h)^T adjoint_h of each sample; the adjoint itself if there is no policy Jacobian.
 
-    Args:
-        adjoint: A quantity per unit of control, such as dV/du_h, [cost/control].
-        policy_jacobian: As in `StepEvaluation`.
+    The adjoint is a quantity per unit of control, such as dV/du_h, [cost/control].
     """
     if policy_jacobian is None:
         return adjoint.reshape(adjoint.shape[0], -1)
@@ -154,11 +149,9 @@ class Objective(Protocol):
 
     def evaluate(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> Evaluation:
         """Roll out without differentiating the dynamics."""
-        ...
 
     def differentiate(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> Differentiation:
         """Roll out and differentiate every sample with respect to theta."""
-        ...
 
 
 @runtime_checkable
@@ -169,7 +162,6 @@ class PairedObjective(Objective, Protocol):
         self, theta: Float[Array, " params"], keys: Key[Array, " samples"]
     ) -> tuple[Evaluation, Evaluation]:
         """Return the batch of `evaluate` and one with opposite noise from the same starts."""
-        ...
 
 
 @runtime_checkable
@@ -178,15 +170,12 @@ class StepwiseObjective(Objective, Protocol):
 
     def evaluate_steps(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> StepEvaluation:
         """Roll out without differentiating the dynamics, and keep the cost of each step."""
-        ...
 
     def differentiate_steps(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> StepDifferentiation:
         """Roll out and differentiate every sample with respect to its noise."""
-        ...
 
     def linearise(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> Linearisation:
         """Roll out and keep the derivatives of every step."""
-        ...
 
 
 @register_pytree
@@ -198,8 +187,8 @@ class AlphaChoice:
         alpha: Weight of the first-order batch, in [0, 1]; the mean of stepwise weights.
         epsilon: Confidence radius of the zeroth-order mean, [cost/param]; None if unused.
         discrepancy: B = ||gbar_1 - gbar_0||, [cost/param]; None if unused.
-        variance_zeroth: sigmahat_0^2 of one zeroth-order sample, [cost^2/param^2]; None for stepwise weights.
-        variance_first: sigmahat_1^2 of one first-order sample, [cost^2/param^2]; None for stepwise weights.
+        variance_zeroth, variance_first: sigmahat_0^2 and sigmahat_1^2 of one sample, [cost^2/param^2]; None for
+            stepwise weights.
     """
 
     alpha: Float[Array, ""]
@@ -241,9 +230,5 @@ class GradientEstimate:
 
     @property
     def per_sample(self) -> Float[Array, "*batch samples params"]:
-        """g_i as rows.
-
-        Raises:
-            ValueError: The estimate was merged from blocks.
-        """
+        """g_i as rows; a ValueError if the estimate was merged from blocks."""
         return self.samples.rows

@@ -22,19 +22,18 @@ from estimators.confidence import student_quantile
 from mjx_study.choices import REFERENCE
 from mjx_study.objective import Simulator
 from mjx_study.reference import FunctionObjective, smoothed
+from mjx_study.simulation.contact import ContactModel
 from mjx_study.study.configuration import StudyConfig
 from mjx_study.study.landscapes import Line, means
 from mjx_study.study.run import run_study
 from mjx_study.tasks import make_task
-from mjx_study.tasks.contact_grid import ContactPoint, backward_grid, contact_grid
+from mjx_study.tasks.contact_grid import backward_grid, contact_grid
 from mjx_study.tasks.task import Task
 
 TIMED: Final = 64
 """Samples per device in a timed batch."""
 REPEATS: Final = 12
 """Repetitions of a timing."""
-
-
 RELAXATIONS: Final = {
     "smooth onset": ("smooth_onset", 1.0, None),
     "ten times softer": ("mujoco", 0.1, None),
@@ -120,12 +119,10 @@ def ratio_of(top: np.ndarray, bottom: np.ndarray, of: str) -> Statistic:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Landscape:
-    """Cost and derivative of an MJX rollout over one parameter, tabulated, piecewise constant on a fine grid.
+    """Cost and derivative of an MJX rollout over one parameter, on a fine uniform grid, piecewise constant.
 
     A `Function`, so that estimators and descents run on it as on an analytic system, without simulating again.
-
-    Attributes:
-        points, values, slopes: uniform grid, with cost and derivative on it.
+    Beyond the grid, its end cells go on.
     """
 
     points: Float[np.ndarray, " size"]
@@ -134,11 +131,9 @@ class Landscape:
     num_params: int = 1
 
     def value(self, x: Float[np.ndarray, "*batch 1"]) -> Float[np.ndarray, "*batch"]:
-        """Value of the cell; beyond the grid, of its end cell."""
         return np.asarray(self.values[self._cell(x)])
 
     def gradient(self, x: Float[np.ndarray, "*batch 1"]) -> Float[np.ndarray, "*batch 1"]:
-        """Slope of the cell, likewise."""
         return np.asarray(self.slopes[self._cell(x)])[..., None]
 
     def _cell(self, x: np.ndarray) -> np.ndarray:
@@ -148,14 +143,9 @@ class Landscape:
 
 @dataclasses.dataclass(frozen=True)
 class Slopes:
-    """Gradient and first-order mean of a function of one parameter at one theta.
+    """Gradient of F, and the mean of first-order gradients, at one theta; F as an objective has one parameter.
 
-    Attributes:
-        gradient, first: grad F, and the mean of first-order gradients.
-        errors: quadrature errors of both, over |grad F|.
-        objective: F as an objective for estimators.
-        theta: where they are evaluated.
-        points: number of quadrature points; 0 for a closed form.
+    `errors` are the quadrature errors of both over |grad F|, from this number of points; 0 for a closed form.
     """
 
     gradient: float
@@ -174,20 +164,17 @@ class Slopes:
 class Laboratory:
     """Measures at one effort, and caches simulated and compiled results.
 
-    Args:
-        effort: how much to measure.
-        folder: folder of studies that later runs resume; None to keep them in memory.
-        accept_versions: resume studies begun by other versions.
+    The studies are kept in `folder`, if given, and resumed; with `accept_versions`, also those begun by other versions.
     """
 
     def __init__(self, effort: Effort, folder: Path | None = None, accept_versions: bool = False):
         self.effort, self._folder, self._accept = effort, folder, accept_versions
         self.study, self.task = cache(self._study), cache(self._task)
-        self._line, self.landscape = cache(self._make_line), cache(self._landscape)
-        self.tabulated, self.simulator = cache(self._tabulated), cache(self._simulator)
+        self.tabulated, self.landscape = cache(self._tabulated), cache(self._landscape)
+        self._line = cache(lambda name, timestep, onset: Line(self.task(name, timestep, onset)))
+        self._simulator = cache(lambda name: Simulator(self.task(name), chunk_size=TIMED))
 
     def _study(self, config: StudyConfig) -> xr.Dataset:
-        """Return a study, computed once."""
         folder = None
         if self._folder is not None:
             fields = {field.name: getattr(config, field.name) for field in dataclasses.fields(config)}
@@ -203,17 +190,13 @@ class Laboratory:
             task = make_task(name, timestep=timestep, horizon=horizon)
         return task.replace(onset=onset)
 
-    def _make_line(self, name: str, timestep: float | None, onset: str) -> Line:
-        return Line(self.task(name, timestep, onset))
-
-    def contact(self, task: Task, family: str, stiffness: float, relaxed: str | None = None) -> ContactPoint:
+    def _contact(self, task: Task, family: str, stiffness: float, relaxed: str | None = None) -> ContactModel | None:
         """Contact model of a family, with its own derivatives or those of one of `RELAXATIONS`."""
         (cell,), _ = contact_grid(task, (family,), (stiffness,))
-        if relaxed is None:
-            return cell
-        other, factor, margin = RELAXATIONS[relaxed]
-        (cell,), _ = backward_grid(task, (cell,), (other,), factor * cell.stiffness, margin)
-        return cell
+        if relaxed is not None:
+            other, factor, margin = RELAXATIONS[relaxed]
+            (cell,), _ = backward_grid(task, (cell,), (other,), factor * cell.stiffness, margin)
+        return cell.contact
 
     def _landscape(
         self, name: str, family: str, stiffness: float, low: float, high: float, sigma: float,
@@ -222,18 +205,15 @@ class Laboratory:
         """Landscape of a task between two parameters, extended by the noise around them."""
         task = self.task(name, timestep, onset)
         points = np.arange(low - 5.4 * sigma, high + 5.4 * sigma, sigma / self.effort.density)
-        contact = self.contact(task, family, stiffness, relaxed).contact
+        contact = self._contact(task, family, stiffness, relaxed)
         return Landscape(points, *self._line(name, timestep, onset)(points, contact))
-
-    def _simulator(self, name: str) -> Simulator:
-        return Simulator(self.task(name), chunk_size=TIMED)
 
     def objective(self, name: str, family: str, stiffness: float) -> Objective:
         """Task under a family, for measurements by rollouts."""
         task = self.task(name)
         if family == REFERENCE:
             return task.analytic(stiffness)
-        return self.simulator(name).objective(self.contact(task, family, stiffness).contact)
+        return self._simulator(name).objective(self._contact(task, family, stiffness))
 
     def _tabulated(self, name: str, family: str, stiffness: float, low: float, high: float) -> Task:
         """Task whose analytic system is its landscape under a family."""
@@ -292,11 +272,10 @@ def batches(chosen: Sequence[Estimator], at: Slopes, samples: int, count: int) -
 
 def log_variance(estimate: GradientEstimate) -> Statistic:
     """log10 of a batch's variance, with the error of its jackknife interval; zero variance counts as 1e-300."""
-    variance, confidence = max(float(estimate.variance), 1e-300), 0.95
+    variance, confidence, half = max(float(estimate.variance), 1e-300), 0.95, 0.0
     freedom = jnp.maximum(estimators.effective_samples(estimate).count - 1.0, 2.0)
-    half = (
-        math.log10(float(estimators.variance_interval(estimate, confidence)[1]) / variance) if variance > 1e-300 else 0
-    )
+    if variance > 1e-300:
+        half = math.log10(float(estimators.variance_interval(estimate, confidence)[1]) / variance)
     error = half / float(student_quantile(0.5 + confidence / 2, freedom))
     return Statistic(math.log10(variance), error, float(freedom), samples=len(estimate.per_sample), of="samples")
 

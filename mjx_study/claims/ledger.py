@@ -40,13 +40,7 @@ Range = tuple[float, float]
 
 @dataclasses.dataclass(frozen=True)
 class Criterion:
-    """Criterion of a claim, fixed before measurement.
-
-    Attributes:
-        quantity: description of the statistic.
-        holds: values for which the claim holds.
-        reversed: values for which its opposite holds; None if it has none.
-    """
+    """Criterion of a claim, fixed before measurement: a statistic, and its values for which claim or opposite hold."""
 
     quantity: str
     holds: Range
@@ -70,17 +64,16 @@ class Criterion:
 
 
 def above(quantity: str, bound: float, opposite: float | None = None) -> Criterion:
-    """Claim that a quantity is above a bound; reversed below another."""
+    """Criterion that a quantity is above a bound; reversed below another."""
     return Criterion(quantity, (bound, math.inf), None if opposite is None else (-math.inf, opposite))
 
 
 def below(quantity: str, bound: float, opposite: float | None = None) -> Criterion:
-    """Claim that a quantity is below a bound; reversed above another."""
+    """Criterion that a quantity is below a bound; reversed above another."""
     return Criterion(quantity, (-math.inf, bound), None if opposite is None else (opposite, math.inf))
 
 
 def within(quantity: str, low: float, high: float) -> Criterion:
-    """Claim that a quantity lies in a range."""
     return Criterion(quantity, (low, high))
 
 
@@ -91,10 +84,8 @@ class Claim:
     Attributes:
         id: name on the command line.
         place: section of the paper that states it, or the open question that it answers.
-        statement: one sentence.
-        criterion: criterion that decides it.
         systems: systems to measure, each with its contact families.
-        measure: computes the statistic for a system and family.
+        measure: computes the statistic of the criterion for a system and family.
         show: command that demonstrates it.
     """
 
@@ -166,19 +157,15 @@ def measure_ledger(
     command: str | None = None,
     accept_versions: bool = False,
 ) -> dict[str, Any]:
-    """Measure claims, or reuse stored measurements made by the same code at the same effort.
+    """Measure claims, or reuse stored measurements made by the same code at the same effort; the ledger as plain data.
 
     Args:
-        claims: claims to measure.
         effort: key in `EFFORTS`.
         folder: folder for measurements, one file per claim, and the studies behind them; None to store nothing.
         progress: called for every case.
         verdicts: number of verdicts in the whole ledger, which sets the level of the intervals.
         command: command line to record.
         accept_versions: reuse measurements and resume studies made by other code or versions.
-
-    Returns:
-        The ledger as plain data.
     """
     chosen = EFFORTS[effort]
     if folder is not None:
@@ -201,7 +188,6 @@ def measure_ledger(
         done += len(claim.cases)
         found.append(_told(claim, kept, 1 - ALPHA / verdicts))
     progress(total, total, "done")
-    revisions = sorted({entry["revision"] or "unknown" for entry in found})
     return {
         "effort": dataclasses.asdict(chosen),
         "alpha": ALPHA,
@@ -209,7 +195,7 @@ def measure_ledger(
         "level": 1 - ALPHA / verdicts,
         "command": command,
         "environment": environment(),
-        "revisions": revisions,
+        "revisions": sorted({entry["revision"] or "unknown" for entry in found}),
         "claims": found,
     }
 
@@ -217,9 +203,8 @@ def measure_ledger(
 def _told(claim: Claim, kept: dict[str, Any], level: float) -> dict[str, Any]:
     """Return a claim with its evidence as plain data; nonfinite numbers become None."""
     evidence = []
-    names = [field.name for field in dataclasses.fields(Statistic)]
     for case in kept["cases"]:
-        statistic = Statistic(**{name: case[name] for name in names})
+        statistic = Statistic(**{field.name: case[field.name] for field in dataclasses.fields(Statistic)})
         interval = interval_of(statistic, level)
         verdict = claim.criterion.verdict(interval)
         size = deciding_size(statistic, claim.criterion, level) if verdict == "undecided" else None

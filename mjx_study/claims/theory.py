@@ -131,9 +131,9 @@ def friction(lab: Laboratory, system: str, family: str) -> Statistic:
     points = [closed_form(RelaxedHeaviside(float(width)), 0.0, 1.0) for width in widths]
     found = [log_variance(batch(FirstOrder(), point, 4 * lab.effort.draws)) for point in points]
     x = np.log10(widths) - np.mean(np.log10(widths))
-    weights = x / np.sum(x**2)
-    error = math.sqrt(sum((weight * each.error) ** 2 for weight, each in zip(weights, found, strict=True)))
-    estimate = float(sum(weight * each.estimate for weight, each in zip(weights, found, strict=True)))
+    shares = list(zip(x / np.sum(x**2), found, strict=True))
+    error = math.sqrt(sum((weight * each.error) ** 2 for weight, each in shares))
+    estimate = float(sum(weight * each.estimate for weight, each in shares))
     return Statistic(estimate, error, min(each.freedom for each in found), samples=4 * lab.effort.draws, of="samples")
 
 
