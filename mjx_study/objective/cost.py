@@ -28,7 +28,6 @@ def rollout_cost(
     Args:
         contact: the contact model; None for the MJCF's own.
         start: the initial state, before the policy acts on it.
-        noise: policy noise, of shape `noise_shape`.
         onset: "none", or "linear" or "jump" for a derivative with the onset term (see `mjx_study.simulation.onset` and
             `mjx_study.simulation.branches`).
         weight: factor of the linear onset term; 0 for a derivative without it.

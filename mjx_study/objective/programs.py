@@ -20,20 +20,13 @@ from mjx_study.tasks.task import Task
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class SamplePrograms:
-    """The single-sample programs of a task.
-
-    Attributes:
-        task: the task to simulate; each call replaces its scene's contact parameters.
-    """
+    """The single-sample programs of a task; each call replaces its scene's contact parameters."""
 
     task: Task
 
     @property
     def by_name(self) -> dict[str, Callable[..., Any]]:
-        """Return the programs by name, as pure functions to be batched.
-
-        Each takes (theta, contact, sigma, key data, noise factor).
-        """
+        """Programs by name: pure functions of (theta, contact, sigma, key data, noise factor), to be batched."""
         return {
             "value": self._sample_value,
             "gradient": self._sample_gradient,

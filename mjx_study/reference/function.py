@@ -94,8 +94,6 @@ def smoothed(function: Function, theta: Theta, sigma: float, noise: str = "gauss
     gradient nor the jump sizes, so it can check the jump formula above.
 
     Args:
-        function: f.
-        theta: point of evaluation.
         sigma: standard deviation of the noise.
         noise: name of the noise density in `estimators.NOISES`.
 

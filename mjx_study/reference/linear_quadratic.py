@@ -80,11 +80,7 @@ class LinearQuadratic:
     def smoothed(
         self, start: Float[np.ndarray, " states"], controls: Float[np.ndarray, "horizon controls"], sigma: float
     ) -> Smoothed:
-        """Return the exact F and grad F of an open loop; theta is `controls`, flattened.
-
-        Raises:
-            ValueError: sigma is not positive and finite.
-        """
+        """The exact F and grad F of an open loop; theta is `controls`, flattened."""
         check_sigma(sigma)
         theta = controls.reshape(-1)
         square, linear, constant = self.quadratic_form(start, len(controls))
@@ -92,11 +88,7 @@ class LinearQuadratic:
         return Smoothed(float(value), 2 * (square @ theta + linear), np.zeros(len(theta)))
 
     def first_order_variance(self, horizon: int, sigma: float) -> float:
-        """Variance E|g - E g|^2 = 4 sigma^2 tr(M^2) of an open loop's first-order sample, for any theta and start.
-
-        Raises:
-            ValueError: sigma is not positive and finite.
-        """
+        """Variance E|g - E g|^2 = 4 sigma^2 tr(M^2) of an open loop's first-order sample, for any theta and start."""
         check_sigma(sigma)
         square, _, _ = self.quadratic_form(np.zeros(self.num_states), horizon)
         return float(4 * sigma**2 * np.sum(square**2))

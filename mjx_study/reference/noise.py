@@ -44,11 +44,7 @@ def noise_score(
 
 
 def check_density(name: str) -> NoiseDensity:
-    """Look up a noise density by name.
-
-    Raises:
-        ValueError: unknown name.
-    """
+    """Look up a noise density by name; a ValueError if there is none."""
     if name not in NOISES:
         raise ValueError(f"the noise density must be one of {', '.join(NOISES)}; got {name!r}")
     return NOISES[name]

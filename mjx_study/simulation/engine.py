@@ -50,7 +50,6 @@ def host_data(host: mujoco.MjModel, state: HostState) -> mujoco.MjData:
 
 
 def host_state(data: mujoco.MjData) -> HostState:
-    """Return the state held by the engine's data before a step."""
     fields: tuple[Any, ...] = (data.qpos, data.qvel, data.act, data.ctrl, data.qacc_warmstart)
     return HostState(*(np.array(field) for field in fields))
 

@@ -21,12 +21,9 @@ def integrate_position(
     qvel: Float[Array, " nv"],
     timestep: Float[Array, ""] | float,
 ) -> Float[Array, " nq"]:
-    """Integrate positions over a timestep at constant velocity.
+    """Integrate positions [m or rad; unit quaternions] over a timestep [s] at constant velocity [m/s or rad/s].
 
-    Args:
-        qpos: positions [m or rad; unit quaternions].
-        qvel: velocities [m/s or rad/s], angular ones in the body frame as in MuJoCo.
-        timestep: integration time [s].
+    Angular velocities are in the body frame, as in MuJoCo.
     """
     parts = []
     for kind, start, velocity in zip(host.jnt_type, host.jnt_qposadr, host.jnt_dofadr, strict=True):
@@ -44,10 +41,9 @@ def integrate_position(
 def difference_position(
     host: mujoco.MjModel | mjx.Model, start: Float[Array, " nq"], end: Float[Array, " nq"]
 ) -> Float[Array, " nv"]:
-    """Return the velocity that moves from `start` to `end` in unit time, the inverse of `integrate_position`.
+    """Velocity that moves from `start` to `end` in unit time, the inverse of `integrate_position`.
 
-    Args:
-        start, end: positions [m or rad; quaternions of any length].
+    Quaternions may have any length.
     """
     parts = []
     for kind, first in zip(host.jnt_type, host.jnt_qposadr, strict=True):

@@ -31,13 +31,7 @@ def stiffness_damping_impedance(
     """Return stiffness k [1/s^2], damping b [1/s] and impedance d of a constraint row, as in MuJoCo.
 
     Differentiable where MJX is not: at a direct solref (-k, 0), in the power of solimp beyond the width, at noninteger
-    powers, and at d_0 equal to d_width.
-
-    Args:
-        model: model with the timestep and flags.
-        solref: (time constant [s], damping ratio) or (-k, -b).
-        solimp: (d_0, d_width, width, midpoint, power).
-        position: position of the row [m or rad].
+    powers, and at d_0 equal to d_width. The position of the row is in m or rad.
 
     Reference: MuJoCo documentation, Modeling, "Solver parameters".
     """

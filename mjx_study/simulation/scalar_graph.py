@@ -156,7 +156,6 @@ class ScalarGraph:
 
 @no_type_check
 def constants(value: Any) -> np.ndarray:
-    """Return an array of NumPy scalars."""
     array = np.asarray(value)
     return filled(array.shape, [array[index] for index in np.ndindex(array.shape)])
 

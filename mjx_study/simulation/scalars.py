@@ -65,13 +65,6 @@ def unrolled(function: Callable[..., Any], *arguments: Any) -> Any:
     Untraced arrays among the arguments are constants. The result equals the function's up to rounding, except that 0
     times infinity or NaN is 0 where the 0 is a constant. Forward and reverse mode differentiate it like the function
     itself.
-
-    Args:
-        function: any traceable function.
-        *arguments: pytrees of arrays.
-
-    Returns:
-        The function's value.
     """
     leaves, structure = jax.tree.flatten(arguments)
     inputs = [leaf for leaf in leaves if isinstance(leaf, Tracer)]
@@ -88,7 +81,7 @@ def unrolled(function: Callable[..., Any], *arguments: Any) -> Any:
 
 
 def _name(function: Callable[..., Any]) -> Any:
-    """Return a key shared by partials of the same function and arguments."""
+    """Key shared by partials of the same function and arguments."""
     if isinstance(function, partial):
         return function.func, function.args, tuple(sorted(function.keywords.items()))
     return function

@@ -205,15 +205,12 @@ def _find(source: str | Path) -> Path:
 
 
 def require(scene: Scene, *, joints: tuple[str, ...], geoms: tuple[str, ...], driven: tuple[str, ...] = ()) -> None:
-    """Reject a model that a task cannot use.
+    """Reject a model that a task cannot use, since a name is missing, or a size or the order differs.
 
     Args:
         joints: names of all its joints, with one coordinate each, in state order.
         geoms: names of required geoms.
         driven: joint driven by each actuator, in control order.
-
-    Raises:
-        SceneError: a name is missing, or a size or the order differs.
     """
     host = scene.host
     indices = [scene.joint(name) for name in joints]

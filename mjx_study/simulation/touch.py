@@ -29,9 +29,9 @@ class OnsetCounts:
     """Counts of the onsets in a corrected derivative.
 
     Attributes:
-        found: number of onsets of contacts and limits, and of the missed events.
-        bounded: number of onsets and ends at grazing speed, whose term is bounded.
-        missed: number of events left uncorrected for lack of slots.
+        found: onsets of contacts and limits, and missed events.
+        bounded: onsets and ends at grazing speed, whose term is bounded.
+        missed: events left uncorrected for lack of slots.
         strength: root-mean-square share of the approach speed that a corrected onset removes in one step; 0 if there is
             none, and with the jump, whose error does not depend on it.
         first: step of the first onset; NaN if there is none.

@@ -65,9 +65,6 @@ def contact_grid(
         families: names of contact families; "reference" for the analytic system.
         stiffnesses: stiffnesses for families that take one [N/m].
         damping: override of each family's damping [N s/m].
-
-    Raises:
-        ValueError: a family is unknown, or a stiffness or damping is out of range.
     """
     points, messages = [], []
     stiffnesses = task.defaults.stiffnesses if stiffnesses is None else stiffnesses
@@ -99,7 +96,6 @@ def backward_grid(
     """Return contact models with surrogate derivatives, and the warnings of the surrogate models.
 
     Args:
-        task: source of the effective mass.
         points: contact models to roll out; analytic systems are kept unchanged.
         families: families that supply derivatives, each for every model at its stiffness; "none" for exact ones.
         stiffness: stiffness of the families that take one, instead of the model's [N/m].
@@ -139,13 +135,7 @@ def check_reference(task: Task) -> None:
 def solver_grid(task: Task, solrefs: Sequence[Sequence[float]], solimps: Sequence[Sequence[float]]) -> Grid:
     """Return contact models in MuJoCo's terms, every solref with every solimp.
 
-    Args:
-        task: source of the scene, and of the effective mass for the reported stiffness.
-        solrefs: pairs of numbers; empty for MuJoCo's default.
-        solimps: tuples of five numbers; empty for MuJoCo's default.
-
-    Raises:
-        ValueError: MuJoCo would silently alter a value.
+    Empty sequences stand for MuJoCo's defaults. A value that MuJoCo would silently alter is a ValueError.
     """
     points, messages = [], []
     digits = digits_to_tell_apart(itertools.chain(*solrefs, *solimps))

@@ -11,11 +11,7 @@ from mjx_study.tasks.task import Task, check_shapes
 
 
 def registered_place(name: str) -> str | None:
-    """Return the `module:name` of a registered task; None if no package registers the name.
-
-    Raises:
-        ValueError: packages register different tasks under this name.
-    """
+    """The `module:name` of a registered task, or None; a ValueError if packages register different ones so named."""
     places = {f"{point.module}:{point.attr}" for point in metadata.entry_points(group=TASK_GROUP, name=name)}
     if len(places) > 1:
         raise ValueError(f"task {name!r} is registered more than once; choose from {', '.join(sorted(places))}")
@@ -26,9 +22,6 @@ def own_task(place: str, options: dict[str, Any]) -> Task:
     """Return the task at a place: a Task, or the result of a function of the options.
 
     The current directory counts as importable, in the console script too.
-
-    Args:
-        options: arguments for the function; a ready-made Task takes none.
 
     Raises:
         MissingModuleError: there is no such module.

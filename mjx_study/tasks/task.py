@@ -163,22 +163,14 @@ class Task:
         return not isinstance(self.start, State)
 
     def analytic(self, stiffness: float) -> Reference:
-        """Return the reference at a contact stiffness [N/m], with the task's noise.
-
-        Raises:
-            ValueError: the task has no reference.
-        """
+        """The reference at a contact stiffness [N/m], with the task's noise; a ValueError if there is none."""
         if self.reference is None:
             raise ValueError(f"{self.name} has no analytic reference")
         return dataclasses.replace(self.reference(stiffness), sigma=self.sigma, noise=self.noise)  # type: ignore[type-var]
 
     @property
     def effective_mass(self) -> float:
-        """Effective mass of the swept contact along its normal [kg].
-
-        Raises:
-            ValueError: the task has no contact.
-        """
+        """Effective mass of the swept contact along its normal [kg]; a ValueError if the task has none."""
         if self.contact_pair is None:
             raise ValueError(
                 f"{self.name} names no contact whose stiffness could be set (contact_pair); use the contact family mjcf"
@@ -193,13 +185,9 @@ class Task:
 
 
 def check_shapes(task: Task, name: str = "") -> None:
-    """Reject mismatches that broadcasting and clamped indices would hide; traces only, computes nothing.
+    """Raise ValueError for mismatches that broadcasting and clamped indices would hide; traces only.
 
-    Args:
-        name: prefix of messages; by default the task's name.
-
-    Raises:
-        ValueError: a part raises, or its shape or dtype is not what the simulation needs.
+    The name, by default the task's, begins the message.
     """
     name = name or task.name
     policy, dtype = task.policy, task.scene.template.qpos.dtype
