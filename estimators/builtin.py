@@ -215,7 +215,7 @@ class AlphaOrder(_OneWeight, entry=CATALOGUE["aobg"]):
 
 @register
 class OnsetAlphaOrder(AlphaOrder, entry=CATALOGUE["aobg_onset"]):
-    """See `estimators.choose_alpha`; the first-order batch is corrected where contact begins and ends."""
+    """See `estimators.alpha_order`; the first-order batch is corrected where contact begins and ends."""
 
 
 @register
