@@ -19,11 +19,7 @@ TEMPORARY: Final = ".mjx-study"
 
 
 def prepare_folder(folder: str | Path) -> Path:
-    """Ensure that a folder is writable before anything is computed, and remove leftovers of dead writers.
-
-    Raises:
-        ValueError: the folder cannot be created or written to, or is a file.
-    """
+    """Ensure before computing that a folder is writable, else ValueError; remove leftovers of dead writers."""
     path = Path(folder)
     try:
         path.mkdir(parents=True, exist_ok=True)
@@ -38,10 +34,7 @@ def prepare_folder(folder: str | Path) -> Path:
 def write_whole(path: Path, content: bytes | Callable[[IO[bytes]], Any]) -> Path:
     """Write a file, given its content or a function that writes it, under a temporary name, and rename it.
 
-    It is complete or absent, even after a power loss.
-
-    Raises:
-        OSError: it cannot be written; any previous content is kept.
+    It is complete or absent, even after a power loss. On an OSError any previous content is kept.
     """
     descriptor, temporary = _begin(path)
     try:
@@ -85,11 +78,7 @@ def remove_leftovers(folder: Path) -> None:
 
 
 def open_regular(path: Path, flags: int) -> int:
-    """Open a regular file; opening a pipe, socket or device could block or have side effects.
-
-    Raises:
-        OSError: it cannot be opened, or is not a regular file.
-    """
+    """Open a regular file; opening a pipe, socket or device, an OSError here, could block or have side effects."""
     descriptor = os.open(path, flags | os.O_NONBLOCK | os.O_CLOEXEC, 0o644)
     if not stat.S_ISREG(os.fstat(descriptor).st_mode):
         os.close(descriptor)
@@ -98,10 +87,6 @@ def open_regular(path: Path, flags: int) -> int:
 
 
 def read_whole(path: Path) -> bytes:
-    """Read a regular file.
-
-    Raises:
-        OSError: it cannot be read, or is not a regular file.
-    """
+    """Read a regular file; OSError as for `open_regular`."""
     with os.fdopen(open_regular(path, os.O_RDONLY), "rb") as file:
         return file.read()

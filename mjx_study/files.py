@@ -18,11 +18,7 @@ Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 
 def read_bytes(path: Path) -> bytes:
-    """Read a file.
-
-    Raises:
-        ValueError: it cannot be read, is not a regular file, or is larger than `MOST_BYTES`.
-    """
+    """Read a regular file of at most `MOST_BYTES`; anything else is a ValueError."""
     try:
         if (size := path.stat().st_size) > MOST_BYTES:
             raise ValueError(f"{path} has {size} bytes; the limit is {MOST_BYTES}")
@@ -32,11 +28,7 @@ def read_bytes(path: Path) -> bytes:
 
 
 def read_json(path: Path, schema: type[Schema]) -> Schema:
-    """Read a JSON file.
-
-    Raises:
-        ValueError: as for `read_bytes`, or it violates the schema.
-    """
+    """Read a JSON file; ValueError as for `read_bytes`, or if it violates the schema."""
     return _validated(path, read_bytes(path), schema)
 
 
@@ -48,11 +40,7 @@ def _validated(path: Path, content: bytes, schema: Any) -> Any:
 
 
 def read_toml(path: Path, schema: type[BaseModel]) -> dict[str, Any]:
-    """Read the options set by a TOML file.
-
-    Raises:
-        ValueError: as for `read_bytes`, or it is not TOML, or violates the schema.
-    """
+    """Read the options set by a TOML file; ValueError as for `read_json`, or if it is not TOML."""
     content = read_bytes(path)
     try:
         found = schema.model_validate(tomllib.loads(content.decode()))
@@ -99,11 +87,7 @@ class PolicyFile(BaseModel):
 
 
 def read_theta(path: Path) -> tuple[tuple[float, ...], str | None]:
-    """Read parameters from a policy file, a .json list or a .npy array, with the policy's task.
-
-    Raises:
-        ValueError: the file cannot be read, or has another format.
-    """
+    """Read parameters from a policy file, a .json list or a .npy array, with the policy's task; else ValueError."""
     if path.suffix != ".json":
         return _read_array(path), None
     content = read_bytes(path)

@@ -19,10 +19,6 @@ MOST_GIB: Final = 16.0
 
 
 def check_count(count: int, what: str, limit: int, change: str) -> None:
-    """Raise an error if a count exceeds its limit.
-
-    Raises:
-        ValueError: names the limit and what to change.
-    """
+    """Raise a ValueError that names the limit and what to change if a count exceeds it."""
     if count > limit:
         raise ValueError(f"{count} {what} are planned, and the limit is {limit}: {change}")

@@ -16,6 +16,13 @@ from mjx_study.choices import CONES, FAMILIES, INTEGRATORS, ONSETS, REFERENCE, S
 
 MOST_VALUES: Final = 10_000
 """Maximum number of values in a list or range."""
+WANTED: Final = {
+    bool: (bool, "true or false"),
+    str: (str, "text"),
+    int: (Integral, "a whole number"),
+    float: (Real, "a number"),
+}
+"""Type of a value by its option's kind, and the words for it."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,7 +71,6 @@ class Option:
         label: noun for a value in messages; by default the name.
         many: whether it takes a list; set by the configuration that contains it.
         unset: default shown in the help if the configuration has none.
-        flag: flag on the command line; by default the name.
     """
 
     name: str
@@ -78,48 +84,30 @@ class Option:
     label: str = ""
     many: bool = False
     unset: str = ""
-    flag: str = ""
 
     def within(self, interval: str) -> "Option":
         """Return the option with another range."""
         return dataclasses.replace(self, interval=Interval(interval))
 
     def check(self, value: Any) -> Any:
-        """Check a value, or every value of a list, and return it.
-
-        Raises:
-            ValueError: wrong type or out of range; the message is meant to follow the option's name.
-        """
-        if not self.many:
-            self._check_one(value)
-            return value
-        if not isinstance(value, tuple | list):
+        """Check and return a value, or a list with all its values; a ValueError's text follows the option's name."""
+        if self.many and not isinstance(value, tuple | list):
             raise ValueError(f"must be a list, got {_short(value)}")
-        if len(value) > MOST_VALUES:
+        if self.many and len(value) > MOST_VALUES:
             raise ValueError(f"must be at most {MOST_VALUES} values, got {len(value)}")
-        for each in value:
+        for each in value if self.many else (value,):
             self._check_one(each)
         return value
 
     def parse(self, text: str) -> Any:
-        """Parse text: a number, a name, or a list of them, which may include ranges FROM:TO:COUNT[:log].
-
-        Raises:
-            ValueError: as for `check`, or not a number.
-        """
+        """Parse and check text: a number, a name, or a list of them, which may include ranges FROM:TO:COUNT[:log]."""
         if not self.many:
             return self.check(self._parse_one(text.strip() if self.kind is not str else text))
         parts = [part.strip() for part in text.split(",") if part.strip()]
-        if self.kind is str:
-            return self.check(tuple(parts))
-        return self.check(tuple(each for part in parts for each in self._parse_range(part)))
+        return self.check(tuple(each for part in parts for each in self._parse_part(part)))
 
     def read(self, value: Any) -> Any:
-        """Read a value from a file: a number, a name, or a list of them; lists may be text as for `parse`.
-
-        Raises:
-            ValueError: as for `parse`.
-        """
+        """Read and check a value from a file: a number, a name, or a list of them; lists may be text as for `parse`."""
         if not self.many:
             return self._typed(self.check(value))
         if isinstance(value, str):
@@ -137,22 +125,15 @@ class Option:
         return self.kind(value) if self.kind is float and isinstance(value, Integral) else value
 
     def _check_one(self, value: Any) -> None:
-        if self.kind is bool:
-            if not isinstance(value, bool):
-                raise ValueError(f"must be true or false, got {_short(value)}")
-            return
-        if self.kind is str or (self.choices and isinstance(value, str)):
-            if not isinstance(value, str):
-                raise ValueError(f"must be text, got {_short(value)}")
-            if self.choices and value not in self.choices and not (self.own and ":" in value):
+        wanted, words = WANTED[self.kind]
+        if self.choices and isinstance(value, str):
+            if value not in self.choices and not (self.own and ":" in value):
                 label = self.label or self.name.replace("_", " ")
                 other = ", or give a number" if self.interval else ", or module:name of your own" if self.own else ""
                 raise ValueError(unknown(label, value, self.choices, other))
-            return
-        whole = self.kind is int
-        if isinstance(value, bool) or not isinstance(value, Integral if whole else Real):
-            raise ValueError(f"must be a {'whole ' * whole}number, got {_short(value)}")
-        if self.interval is not None and value not in self.interval:
+        elif not isinstance(value, wanted) or (isinstance(value, bool) and self.kind is not bool):
+            raise ValueError(f"must be {words}, got {_short(value)}")
+        elif self.interval is not None and value not in self.interval:
             raise ValueError(f"must be {self.interval}, got {_plain(value)}")
 
     def _parse_one(self, text: str) -> Any:
@@ -163,8 +144,8 @@ class Option:
         except ValueError:
             return _whole(text) if self.kind is int else text
 
-    def _parse_range(self, text: str) -> list[Any]:
-        if ":" not in text:
+    def _parse_part(self, text: str) -> list[Any]:
+        if self.kind is str or ":" not in text:
             return [self._parse_one(text)]
         values = expand_range(text)
         return [_whole(value) for value in values] if self.kind is int else values
@@ -196,11 +177,7 @@ def _short(value: Any) -> str:
 
 
 def expand_range(text: str) -> list[float]:
-    """Expand FROM:TO:COUNT (evenly spaced) or FROM:TO:COUNT:log (equal ratios); both ends are exact.
-
-    Raises:
-        ValueError: not a range, or more than `MOST_VALUES` numbers.
-    """
+    """Expand FROM:TO:COUNT (evenly spaced) or FROM:TO:COUNT:log (equal ratios); both ends are exact."""
     parts = text.split(":")
     log = parts[3:] == ["log"]
     try:
@@ -232,7 +209,6 @@ def _choice(name: str, choices: Collection[str], metavar: str, line: str, **more
     return Option(name, str, metavar, line, choices=choices, **more)
 
 
-MOST_SAMPLES: Final = "10000000]"
 TASKS: Final = "the task's"
 KINDS: Final = ("gradients", "descents", "landscapes")
 """Kinds of study."""
@@ -269,15 +245,15 @@ OPTIONS: Final[dict[str, Option]] = {
         _number("horizon", int, "[1, 1000000]", "H", "number of steps", unset=TASKS),
         Option("model", str, "FILE.xml", "MJCF that replaces the task's own"),
         _number("theta", float, "(-inf, inf)", "X", "policy parameters", unset=TASKS),
-        _number("samples", int, "[1, " + MOST_SAMPLES, "N", "samples in each batch", unset=TASKS),
-        _number("reference_samples", int, "[3, " + MOST_SAMPLES, "N", "pairs of rollouts for each reference"),
-        _number("evaluation_samples", int, "[2, " + MOST_SAMPLES, "N", "rollouts for the cost of a final policy"),
-        _number("chunk_size", int, "[1, " + MOST_SAMPLES, "N", "samples per device and call", unset="by the samples"),
-        _number("block_size", int, "[2, " + MOST_SAMPLES, "N", "samples held at once", unset="all, if they fit"),
+        _number("samples", int, "[1, 1e7]", "N", "samples in each batch", unset=TASKS),
+        _number("reference_samples", int, "[3, 1e7]", "N", "pairs of rollouts for each reference", unset="600"),
+        _number("evaluation_samples", int, "[2, 1e7]", "N", "rollouts for the cost of a final policy", unset="200"),
+        _number("chunk_size", int, "[1, 1e7]", "N", "samples per device and call", unset="by the samples"),
+        _number("block_size", int, "[2, 1e7]", "N", "samples held at once", unset="all, if they fit"),
         _number("confidence", float, "(0, 1)", "P", "confidence level of the intervals"),
         _number("seeds", int, "[1, 100000]", "N", "number of batches, or of descents"),
         _number("iterations", int, "[1, 10000000]", "N", "iterations of the optimiser", unset=TASKS),
-        Option("optimizer", str, "NAME", "optax optimiser"),
+        Option("optimizer", str, "NAME", "optax optimiser", unset="sgd"),
         _number("learning_rate", float, "(0, inf)", "R", "learning rate", unset=TASKS),
         _number("decay", float, "[0, 2]", "A", "learning rate / i^A", unset=TASKS),
         Option("stiffness_schedule", str, "CALL", "factor on the stiffness by iteration, an optax schedule", unset="1"),
@@ -329,11 +305,7 @@ class Checked:
 
 
 def check(option: Option, value: Any) -> Any:
-    """Check a value and return it.
-
-    Raises:
-        ValueError: names the option.
-    """
+    """Check a value and return it; a ValueError names the option."""
     try:
         return option.check(value)
     except ValueError as error:

@@ -53,7 +53,7 @@ def add(command: Parser) -> None:
     command.add_process_options()
     command.add_contact_options()
     command.add_theta_option("parameters at which gradients are taken")
-    command.add_fields("estimators", "reference_samples", reference_samples={"unset": "600"})
+    command.add_fields("estimators", "reference_samples")
     command.add_option(StudyConfig.option("samples"), (400,))
     command.add_estimator_options()
     command.add_backward_options()

@@ -69,10 +69,7 @@ def _doubt(row: Row) -> str:
 def columns(confidence: float, details: bool = False, *, scalar: bool = False) -> list[list[Column]]:
     """Columns of the comparison: those that identify a row, then groups that a table keeps together.
 
-    Args:
-        confidence: confidence level of the intervals.
-        details: include all columns, not only those that help to choose an estimator.
-        scalar: for a scalar parameter, where a cosine is meaningless.
+    A scalar parameter has no cosine.
     """
 
     def interval(row: Row) -> str:

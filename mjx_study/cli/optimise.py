@@ -43,11 +43,10 @@ def add(command: Parser) -> None:
     command.add_flag("--reference", "use the analytic reference instead of MJX")
     command.add_fields("network", "estimators", "iterations", "samples", samples={"many": False})
     command.add_option("seeds", 3)
-    command.add_fields("optimizer", "learning_rate", "decay", optimizer={"unset": "sgd"})
-    command.add_fields("stiffness_schedule", "sigma_schedule")
+    command.add_fields("optimizer", "learning_rate", "decay", "stiffness_schedule", "sigma_schedule")
     command.add_estimator_options()
     command.add_backward_options(many=False)
-    command.add_fields("evaluation_samples", "chunk_size", evaluation_samples={"unset": "200"})
+    command.add_fields("evaluation_samples", "chunk_size")
     command.add_folder_options()
 
 

@@ -67,12 +67,9 @@ class Parser(argparse.ArgumentParser):
         read: Callable[[str], Any] | None = None,
         **changes: Any,
     ) -> None:
-        """Add an option, described by its name or with changes.
+        """Add an option with changes to its description, and its own parser or another one.
 
-        Args:
-            default: default value, shown in the help.
-            given: whether the parsed namespace holds the default; otherwise None, for a configuration to fill in.
-            read: parser of the text; None for the option's own.
+        Unless `given`, the parsed namespace does not hold the default, which a configuration fills in.
         """
         option = dataclasses.replace(OPTIONS[option] if isinstance(option, str) else option, **changes)
 
@@ -205,11 +202,7 @@ def task_of(options: argparse.Namespace) -> "mjx_study.tasks.task.Task":
 
 
 def theta_of(options: argparse.Namespace) -> tuple[float, ...] | None:
-    """Return the parameters given by `--theta`; None if it is not given.
-
-    Raises:
-        ValueError: the file cannot be read, is of another kind, or is a policy for another task.
-    """
+    """Return the parameters given by `--theta`; None if it is not given. A policy must be for the task."""
     from mjx_study.files import read_theta
 
     if options.theta is None:
@@ -225,16 +218,12 @@ def theta_of(options: argparse.Namespace) -> tuple[float, ...] | None:
 
 
 def configure_process(options: argparse.Namespace) -> None:
-    """Set up JAX from the options; commands without them get float64 and one device.
-
-    Raises:
-        ValueError: JAX cannot be set up like this, for instance because JAX_PLATFORMS names no platform.
-    """
+    """Set up JAX from the options; commands without them get float64 and one device."""
     configure(precision=getattr(options, "precision", PRECISIONS[0]), cpu_devices=getattr(options, "devices", 1))
 
 
 def configure(**settings: Any) -> None:
-    """Call `mjx_study.runtime.configure`, and check that JAX has a device."""
+    """Call `mjx_study.runtime.configure`; ValueError if JAX has no device, for instance by JAX_PLATFORMS."""
     import jax
 
     from mjx_study.runtime import configure

@@ -29,9 +29,7 @@ class OutputError(Exception):
 def written_out() -> Generator[None]:
     """Run a command with unencodable characters escaped and output flushed at the end.
 
-    Raises:
-        OutputError: standard output cannot be written to.
-        BrokenPipeError: its reader has gone.
+    BrokenPipeError if the reader of standard output has gone, OutputError if it cannot be written to otherwise.
     """
     if hasattr(sys.stdout, "reconfigure"):
         sys.stdout.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
@@ -133,11 +131,7 @@ def attempt(write: Callable[[], list[Path]]) -> tuple[list[Path], str | None]:
 def print_report(
     options: argparse.Namespace, document: dict[str, Any], lines: Sequence[str], *unwritten: str | None
 ) -> int:
-    """Print the document as JSON if requested, otherwise the lines.
-
-    Returns:
-        The exit code: 1, with one line, if something could not be written.
-    """
+    """Print the document as JSON or the lines; return the exit code, 1 with one line for what could not be written."""
     print(json.dumps(document, allow_nan=False) if options.json else "\n".join(lines))
     failures = list(filter(None, unwritten))
     for failure in failures[:1]:

@@ -83,11 +83,7 @@ def run_one(
 
 
 def _compute(plan: StudyPlan, options: argparse.Namespace) -> tuple[xr.Dataset, str | None]:
-    """Run a study, in its folder if one is given; what a full disk rejects is kept in memory.
-
-    Returns:
-        The numbers, and why they could not be written, if so.
-    """
+    """Run a study, in its folder if one is given; a full disk costs no number, and its reason is returned as well."""
     if options.output is None:
         if getattr(options, "cluster", None) is not None:
             raise UsageError("--cluster needs a folder for the study: give --output")

@@ -3,6 +3,7 @@
 import itertools
 import re
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -10,9 +11,8 @@ import xarray as xr
 from matplotlib.colors import TwoSlopeNorm
 from matplotlib.figure import Figure
 
-from mjx_study.plots.descents import achieved, descent
+from mjx_study.plots.descents import achieved, descent, landscape
 from mjx_study.plots.gradients import alpha, bias, comparison, error_against_samples, variance
-from mjx_study.plots.landscapes import landscape
 from mjx_study.plots.panels import SWEPT, families, panels, positive
 from mjx_study.plots.style import TITLES
 from mjx_study.table import digits_to_tell_apart
@@ -26,6 +26,12 @@ def plot_study(dataset: xr.Dataset) -> dict[str, Figure]:
     figures: dict[str, Figure] = {}
     if not dataset.data_vars:
         return figures
+
+    def add(kind: str, draw: Callable[[xr.Dataset, str], Figure | None], keep: str = "") -> None:
+        for suffix, title, part in itertools.islice(_slices(dataset, keep), MOST_FIGURES):
+            if (figure := draw(part, title)) is not None:
+                figures[kind + suffix] = figure
+
     quantity = _quantity(dataset)
     kinds: dict[str, Callable[[xr.Dataset, str], Figure | None]] = {
         "final_cost": {"achieved": achieved, "descent": descent},
@@ -35,29 +41,20 @@ def plot_study(dataset: xr.Dataset) -> dict[str, Figure]:
         "smoothed": {"landscape": landscape},
     }[quantity]
     for kind, draw in kinds.items():
-        for suffix, title, part in itertools.islice(_slices(dataset), MOST_FIGURES):
-            figure = draw(part, title)
-            if figure is not None:
-                figures[kind + suffix] = figure
+        add(kind, draw)
     if quantity == "variance" and dataset.sizes["samples"] > 1:
-        for suffix, title, part in itertools.islice(_slices(dataset, keep="samples"), MOST_FIGURES):
-            figures["error_against_samples" + suffix] = error_against_samples(part, title)
+        add("error_against_samples", error_against_samples, keep="samples")
     if quantity == "smoothed":
         return figures
-    pair = [name for name in SWEPT if _length(dataset, name) > 1][:2]
+    pair = [name for name in SWEPT if len(np.unique(dataset[name].values)) > 1][:2]
     if len(pair) == 2 and {"zobg", "fobg"} <= set(dataset["estimator"].values.tolist()):
-        for suffix, title, part in itertools.islice(_slices(dataset, keep=pair[1]), MOST_FIGURES):
-            figures[f"map_{pair[0]}_{pair[1]}{suffix}"] = _ratio_map(part, title, quantity, pair[1])
+        add(f"map_{pair[0]}_{pair[1]}", partial(_ratio_map, quantity=quantity, other=pair[1]), keep=pair[1])
     return figures
 
 
 def _quantity(dataset: xr.Dataset) -> str:
     """Name of the variable that identifies the kind of study."""
     return next(name for name in ("final_cost", "smoothed", "variance") if name in dataset)
-
-
-def _length(dataset: xr.Dataset, name: str) -> int:
-    return len(np.unique(dataset[name].values))
 
 
 def _slices(dataset: xr.Dataset, keep: str = "") -> Iterator[tuple[str, str, xr.Dataset]]:
@@ -76,7 +73,8 @@ def _slices(dataset: xr.Dataset, keep: str = "") -> Iterator[tuple[str, str, xr.
         if part.sizes["model"] == 0:
             continue
         values = {name: texts[name][index] for name, index in zip(names, picked, strict=True)}
-        suffix = "".join(f"_{_for_file(values[name])}" for name in varied)
+        # The texts are from a study.json, which may come from anywhere.
+        suffix = "".join("_" + re.sub(r"[^\w.+-]", "-", values[name])[:60] for name in varied)
         suffix += f"_{len(taken)}" if suffix in taken else ""
         taken.add(suffix)
         told = [values["task"]] + [
@@ -94,11 +92,6 @@ def _texts(values: np.ndarray) -> list[str]:
         return [str(value) for value in values]
     digits = digits_to_tell_apart(values.tolist())
     return [f"{value:.{digits}g}" for value in values.tolist()]
-
-
-def _for_file(text: str) -> str:
-    """Sanitise text from a study.json, which may come from anywhere, for a file name."""
-    return re.sub(r"[^\w.+-]", "-", text)[:60]
 
 
 def _ticks(values: np.ndarray) -> list[str]:
