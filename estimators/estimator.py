@@ -147,13 +147,23 @@ def register(estimator: EstimatorClass) -> EstimatorClass:
     return estimator
 
 
-def find_estimator(name: str) -> Estimator | type[Estimator]:
+def name_of(estimator: str | Estimator) -> str:
+    """Name by which `find_estimator` finds an estimator's class; a name is its own."""
+    if isinstance(estimator, str):
+        return estimator
+    own = type(estimator)
+    return own.name if ESTIMATORS.get(own.name) is own else f"{own.__module__}:{own.__qualname__}"
+
+
+def find_estimator(name: str | Estimator) -> Estimator | type[Estimator]:
     """Look up an estimator by name; an unknown one is a ValueError.
 
     Args:
         name: Key in `ESTIMATORS`, or `module:attribute` for a user-defined class or object, importable from the current
-            directory too.
+            directory too. An estimator is its own.
     """
+    if isinstance(name, Estimator):
+        return name
     if name in ESTIMATORS:
         return ESTIMATORS[name]
     reason = ""

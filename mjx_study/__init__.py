@@ -4,11 +4,21 @@ A study of gradient estimators through MuJoCo MJX: scenes, contact models in phy
 tasks as objectives, and comparisons of estimators over them. Call `configure` first for float64 and all cores.
 """
 
+import sys
 from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from mjx_study._public import *  # noqa: F403
+
+_spec = find_spec("estimators")
+if _spec is None or _spec.origin is None or Path(_spec.origin).parent.parent != Path(__file__).parent.parent:
+    raise ImportError(
+        f"{_spec and _spec.origin} hides the package `estimators` of mjx-study: rename it, or work in another folder"
+    )
+estimators = sys.modules["mjx_study.estimators"] = import_module("estimators")
 
 
 def __getattr__(name: str) -> Any:

@@ -26,7 +26,8 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from estimators import find_estimator
+from estimators import Estimator, find_estimator
+from estimators.estimator import name_of
 from mjx_study.runtime import precision
 from mjx_study.simulation.scene import Scene, models_folder
 from mjx_study.tasks.task import Task
@@ -93,14 +94,14 @@ def trace_contents(made_of: Any) -> str | None:
     return None if digest.foreign else digest.hexdigest()
 
 
-def estimator_contents(*names: str) -> dict[str, str]:
-    """Digests of the user-defined estimators among those named, and of their source files."""
+def estimator_contents(*chosen: str | Estimator) -> dict[str, str]:
+    """Digests of those estimators that are given as objects or user-defined, and of their source files."""
     found: dict[str, str] = {}
-    for name in names:
+    for each in chosen:
         digest = _Digest()
-        digest.add(find_estimator(name))
-        if digest.sources:
-            found[f"estimator {name}"] = digest.hexdigest()
+        digest.add(find_estimator(each))
+        if digest.sources or isinstance(each, Estimator):
+            found[f"estimator {name_of(each)}"] = digest.hexdigest()
             found |= {f"source of {file}": content for file, content in sorted(digest.sources.items())}
     return found
 

@@ -294,9 +294,13 @@ class Checked:
     def default(cls, name: str) -> Any:
         return next(field.default for field in dataclasses.fields(cls) if field.name == name)  # type: ignore[arg-type]
 
+    def _named(self, name: str) -> Any:
+        """Value of a field as options describe it, with names in place of objects."""
+        return getattr(self, name)
+
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):  # type: ignore[arg-type]
-            value = getattr(self, field.name)
+            value = self._named(field.name)
             if field.name in ("solref", "solimp"):
                 for row in value:
                     check(self.option(field.name), row)

@@ -91,3 +91,17 @@ def test_descriptions_are_of_what_there_is() -> None:
     assert list(choices.TASK_DESCRIPTIONS) == list(TASKS)
     assert choices.FIGURE_STYLES == tuple(STYLES)
     assert (choices.MIN_IMPEDANCE, choices.MAX_IMPEDANCE) == (mujoco.mjMINIMP, mujoco.mjMAXIMP)
+
+
+def test_the_estimators_are_also_a_part_of_the_package() -> None:
+    import mjx_study.estimators
+
+    assert mjx_study.estimators is estimators
+
+
+def test_a_file_that_hides_the_estimators_is_told_in_one_line(tmp_path: Path) -> None:
+    (tmp_path / "estimators.py").write_text("raise SystemExit('not to be run')")
+    command = [sys.executable, "-c", "import mjx_study"]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)
+    told = f"ImportError: {tmp_path / 'estimators.py'} hides the package `estimators` of mjx-study: rename it, or work"
+    assert done.returncode == 1 and told in done.stderr.splitlines()[-1]

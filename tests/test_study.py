@@ -1,7 +1,9 @@
 """Comparisons: what is shared, what is compiled, what the findings say, what a plan refuses."""
 
+import json
 import math
 import re
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -12,7 +14,15 @@ import xarray as xr
 from matplotlib.patches import Rectangle
 
 import mjx_study.report  # noqa: F401  # registers `Dataset.mjx_study`, which no other import here does
-from estimators import AlphaOrder, InverseVariance
+from estimators import (
+    AlphaOrder,
+    Differentiation,
+    DiscontinuityGated,
+    FirstOrder,
+    GradientEstimate,
+    InverseVariance,
+    summarise,
+)
 from mjx_study import disk
 from mjx_study.cli import console
 from mjx_study.cli.studies import as_document
@@ -26,6 +36,7 @@ from mjx_study.study.dataset import dataset_of
 from mjx_study.study.findings import Row, findings, rows_of
 from mjx_study.study.plan import estimators_of, plan_study
 from mjx_study.study.run import run_study, warnings_of
+from mjx_study.study.store import StudyError
 from mjx_study.study.variables import GRADIENTS
 from mjx_study.tasks import make_task
 from mjx_study.tasks.task import StudyDefaults, Task
@@ -188,6 +199,35 @@ def test_zeroth_order_alone_does_not_differentiate_for_itself() -> None:
     found = compare(stiffness=(10.0,), contact=("penalty",), estimators=("zobg",))
     assert [row.estimator for row in rows_of(found)] == ["zobg"]
     assert rows_of(found)[0].alpha is None
+
+
+class Half(FirstOrder):
+    """Half of the first-order gradient."""
+
+    name = "half"
+
+    def combine(self, differentiation: Differentiation) -> GradientEstimate:
+        return summarise(differentiation.gradient / 2)
+
+
+def test_estimators_as_objects_have_their_own_options(tmp_path: Path) -> None:
+    """And what a folder holds of them is compared by content."""
+    chosen = {"contact": ("reference",), "horizon": 3, "samples": (20,), "seeds": 3}
+    named = compare(estimators=("fobg", "aobg"), gamma=3.0, **chosen)
+    own = config(estimators=("fobg", AlphaOrder(gamma=3.0), Half()), **chosen)
+    given = run_study(own, tmp_path)
+    assert given.estimator.values.tolist() == ["fobg", "aobg", f"{__name__}:Half"]
+    assert json.loads(given.attrs["resolved"])[0]["estimators"]["aobg"]["gamma"] == 3.0
+    for name in ("gradient", "relative_error", "alpha"):
+        np.testing.assert_array_equal(given[name].isel(estimator=slice(2)), named[name], name)
+    np.testing.assert_allclose(given.gradient.isel(estimator=2), given.gradient.isel(estimator=0) / 2)
+    run_study(own, tmp_path)
+    with pytest.raises(StudyError, match="estimator aobg differs"):
+        run_study(config(estimators=("fobg", AlphaOrder(gamma=4.0), Half()), **chosen), tmp_path)
+    with pytest.raises(ValueError, match="'ddcg' holds for another sigma"):
+        plan_study(config(estimators=(DiscontinuityGated(sigma=7.0),), **chosen))
+    with pytest.raises(ValueError, match="estimator given twice: aobg"):
+        config(estimators=("aobg", AlphaOrder()), **chosen)
 
 
 def test_a_dataset_says_what_a_study_is_good_for(spied) -> None:

@@ -187,8 +187,8 @@ def _sweep_head(plan: StudyPlan, missing: int) -> list[str]:
         f"about {size(plan.memory)} for the batches of a cell"
     )
     return [
-        f"{', '.join(config.task_names)}: {kind.get(str(config.kind), config.kind)}, {', '.join(config.estimators)}, "
-        f"seeds {config.batches}",
+        f"{', '.join(config.task_names)}: {kind.get(str(config.kind), config.kind)}, "
+        f"{', '.join(config.estimator_names)}, seeds {config.batches}",
         f"contact models: {len(models)}, timestep {_listed(group.timestep for group in plan.groups)} s, "
         f"{', '.join(dict.fromkeys(group.cone for group in plan.groups))} cone, "
         f"sigma {_listed(cell.sigma for cell in plan.cells)}, {_listed(cell.samples for cell in plan.cells)} samples",

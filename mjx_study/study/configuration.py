@@ -11,6 +11,7 @@ from mjx_study.choices import FAMILIES
 from mjx_study.option import Checked
 
 if TYPE_CHECKING:
+    import estimators.estimator
     import mjx_study.tasks.task
 
 Progress = Callable[[int, int, str], None]
@@ -42,7 +43,7 @@ class StudyConfig(Checked):
     Attributes:
         tasks: names of tasks, or tasks.
         kind: gradients, descents or landscapes; None to infer it from iterations and points.
-        estimators: names of estimators.
+        estimators: names of estimators, or estimators, which have options of their own.
         theta: parameters at which gradients are estimated or descents start, for a single task; None for the task's.
         network: hidden widths of a network that replaces the task's policy in descents; None for the task's policy.
         contact: contact families, and "reference" for the analytic system; None for each task's. Empty to use only
@@ -96,7 +97,7 @@ class StudyConfig(Checked):
 
     tasks: tuple[Union[str, "mjx_study.tasks.task.Task"], ...]
     kind: str | None = None
-    estimators: tuple[str, ...] = ("zobg", "fobg", "aobg")
+    estimators: tuple[Union[str, "estimators.estimator.Estimator"], ...] = ("zobg", "fobg", "aobg")
     theta: tuple[float, ...] | None = None
     network: tuple[int, ...] | None = None
     contact: tuple[str, ...] | None = None
@@ -150,7 +151,7 @@ class StudyConfig(Checked):
             raise ValueError("theta is for a single task; give one task, or omit theta")
         if not self.estimators:
             raise ValueError(f"no estimator given; choose from {', '.join(CATALOGUE)}")
-        refuse_repeats("estimator", self.estimators)
+        refuse_repeats("estimator", self.estimator_names)
         refuse_repeats("contact family", self.contact or ())
         if self.contact is not None and not takes_stiffness(self.contact):
             for name in ("stiffness", "damping"):
@@ -185,6 +186,17 @@ class StudyConfig(Checked):
             for name, default in options.items():
                 if kind == self.kind and getattr(self, name) is None:
                     object.__setattr__(self, name, default)
+
+    def _named(self, name: str) -> Any:
+        return self.estimator_names if name == "estimators" else super()._named(name)
+
+    @property
+    def estimator_names(self) -> tuple[str, ...]:
+        if all(isinstance(each, str) for each in self.estimators):
+            return self.estimators  # type: ignore[return-value]
+        from estimators.estimator import name_of  # imports JAX, which the command line's help does without
+
+        return tuple(map(name_of, self.estimators))
 
     @property
     def task_names(self) -> list[str]:

@@ -136,7 +136,8 @@ def document_of(plan: StudyPlan, command: str | None) -> dict[str, Any]:
     index = {name: {value: place for place, value in enumerate(along)} for name, along in axes.items()}
     places = [{name: index[name][value] for name, value in each.items()} for each in exact]
     fields = {field.name: getattr(plan.config, field.name) for field in dataclasses.fields(plan.config)}
-    fields |= {"tasks": plan.config.task_names, "seeds": plan.config.batches, "iterations": plan.iterations or None}
+    fields |= {"tasks": plan.config.task_names, "estimators": plan.config.estimator_names}
+    fields |= {"seeds": plan.config.batches, "iterations": plan.iterations or None}
     return {
         "config": fields,
         "warnings": list(plan.warnings),
@@ -176,7 +177,7 @@ def _resolved(plan: StudyPlan, places: list[dict[str, int]], tasks: int) -> list
         if group.task.horizon not in horizons:
             horizons.append(group.task.horizon)
         if "noise" not in entry:
-            chosen = zip(plan.config.estimators, estimators_of(plan, cell), strict=True)
+            chosen = zip(plan.config.estimator_names, estimators_of(plan, cell), strict=True)
             entry["noise"] = group.task.noise
             entry["estimators"] = {name: dataclasses.asdict(estimator) for name, estimator in chosen}
             entry["recipe"] = {} if group.recipe is None else dataclasses.asdict(group.recipe)

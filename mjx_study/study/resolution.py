@@ -43,14 +43,17 @@ def at_theta(task: Task, theta: Sequence[float] | None) -> Task:
 
 
 def configured_estimators(config: StudyConfig, task: Task) -> tuple[Estimator, ...]:
-    """Build a configuration's estimators with their options, and check them against the task.
+    """Build a configuration's estimators with their options, except those that it holds, and check them against the
+    task.
 
     ValueError if there is no such estimator, an option is out of range or missing, or an estimator does not support the
     task.
     """
     options = {name: getattr(config, name) for name in ("baseline", "max_norm", "window", "tolerance", "weights")}
     options |= bound_constants(config, task) | {"sigma": task.sigma}
-    found = tuple(make_estimator(name, **options) for name in config.estimators)
+    found = tuple(
+        each if isinstance(each, Estimator) else make_estimator(each, **options) for each in config.estimators
+    )
     check_estimators(found, task)
     return found
 
@@ -73,6 +76,8 @@ def check_estimators(estimators: Iterable[Estimator], task: Task) -> None:
     """Raise ValueError for an estimator that needs Gaussian noise, noise on theta or no onset term, where the task
     differs."""
     for estimator in estimators:
+        if getattr(estimator, "sigma", task.sigma) != task.sigma:
+            raise ValueError(f"{estimator.name!r} holds for another sigma than {task.sigma:g}")
         if estimator.gaussian and task.noise != "gaussian":
             raise ValueError(f"{estimator.name!r} holds for Gaussian noise only; the noise is {task.noise}")
         if estimator.additive and not task.policy.additive:

@@ -93,7 +93,7 @@ def iteration(plan: StudyPlan, cell: StudyCell, needs: tuple[str, ...]) -> Progr
 def rest(plan: StudyPlan, cell: StudyCell) -> Program:
     """The work of a cell besides its rollout programs, as one call: statistics, or all of an analytic system."""
     config, task = plan.config, plan.groups[cell.group].task
-    content = str(config.kind), *config.estimators
+    content = str(config.kind), *config.estimator_names
     if cell.model.analytic:
         return other_program("analytic", rollouts(plan, cell)[0], task.name, *content, steps=task.horizon)
     if config.kind == "descents":
