@@ -149,9 +149,11 @@ class Objective(Protocol):
 
     def evaluate(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> Evaluation:
         """Roll out without differentiating the dynamics."""
+        ...
 
     def differentiate(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> Differentiation:
         """Roll out and differentiate every sample with respect to theta."""
+        ...
 
 
 @runtime_checkable
@@ -162,6 +164,7 @@ class PairedObjective(Objective, Protocol):
         self, theta: Float[Array, " params"], keys: Key[Array, " samples"]
     ) -> tuple[Evaluation, Evaluation]:
         """Return the batch of `evaluate` and one with opposite noise from the same starts."""
+        ...
 
 
 @runtime_checkable
@@ -170,12 +173,15 @@ class StepwiseObjective(Objective, Protocol):
 
     def evaluate_steps(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> StepEvaluation:
         """Roll out without differentiating the dynamics, and keep the cost of each step."""
+        ...
 
     def differentiate_steps(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> StepDifferentiation:
         """Roll out and differentiate every sample with respect to its noise."""
+        ...
 
     def linearise(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> Linearisation:
         """Roll out and keep the derivatives of every step."""
+        ...
 
 
 @register_pytree
