@@ -72,7 +72,7 @@ class Simulator:
     def memory(self, kind: str, contact: ContactModel | None, samples: int) -> int:
         """XLA's planned temporary memory [bytes] for a batch of one kind, all chunks at once on all devices."""
         arguments = self._chunk(self.task.theta, contact, 1.0)
-        plan = self._programs[kind].jitted.lower(*arguments).compile().memory_analysis()
+        plan: Any = self._programs[kind].jitted.lower(*arguments).compile().memory_analysis()
         return plan.temp_size_in_bytes * samples // self.chunk_size
 
     def run(self, name: str, theta: Any, contact: ContactModel | None, sigma: Any, keys: Any, noise_scale: Any) -> Any:
@@ -293,5 +293,6 @@ def _for_all(rows, samples: int):
 
 def contact_for(name: str, contact: ContactModel | None) -> ContactModel | None:
     """Drop a contact model's surrogate for programs without derivatives, so that one program serves all models."""
-    with_derivatives = contact is None or name not in ("value", "steps")
-    return contact if with_derivatives else dataclasses.replace(contact, backward=None)
+    if contact is None or name not in ("value", "steps"):
+        return contact
+    return dataclasses.replace(contact, backward=None)

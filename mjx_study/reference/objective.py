@@ -145,8 +145,16 @@ class ReferenceObjective(_Evaluations):
         shape = (samples, self.horizon, self.system.num_controls, size)
         over_policy = jnp.broadcast_to(feedback[0][..., None, :, :], shape) if feedback else None
         over_start = jnp.broadcast_to(jnp.eye(size), (samples, size, size)) if self.parametrises == "start" else None
-        derivatives = map(jnp.asarray, (*over_cost, over_final, *over_step))
-        return Linearisation(self._steps_along(rollout, theta, starts, noise), *derivatives, over_policy, over_start)
+        return Linearisation(
+            steps=self._steps_along(rollout, theta, starts, noise),
+            cost_state=jnp.asarray(over_cost[0]),
+            cost_control=jnp.asarray(over_cost[1]),
+            final_state=jnp.asarray(over_final),
+            over_state=jnp.asarray(over_step[0]),
+            over_control=jnp.asarray(over_step[1]),
+            policy_state=over_policy,
+            start_jacobian=over_start,
+        )
 
     def observe(self, theta: Theta, keys: Keys) -> dict[str, np.ndarray]:
         return {} if self.metrics is None else self.metrics(self._roll_out(theta, *self._draw(keys)).states)
