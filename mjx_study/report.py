@@ -157,9 +157,10 @@ def _reduced(name: str, values: xr.DataArray) -> float:
 def _provenance(dataset: xr.Dataset) -> list[list[str]]:
     environment = json.loads(dataset.attrs["environment"])
     versions = environment.pop("versions")
-    rows = [[name, _shown(value)] for name, value in environment.items()]
-    rows += [[name, version] for name, version in versions.items()]
-    return rows + [["revision", dataset.attrs["revision"]]] if "revision" in dataset.attrs else rows
+    found = environment | versions
+    if "revision" in dataset.attrs:
+        found["revision"] = dataset.attrs["revision"]
+    return [[name, _shown(value)] for name, value in found.items()]
 
 
 def _shown(value: Any) -> str:

@@ -7,11 +7,11 @@ from typing import Any, Final
 from mjx_study.stopwatch import timed
 from mjx_study.study.blocks import Arrays
 from mjx_study.study.descents import compute_descents
+from mjx_study.study.forecast import rest
 from mjx_study.study.gradients import Gradients, compute_gradients, done
 from mjx_study.study.landscapes import compute_landscapes
 from mjx_study.study.plan import StudyCell, StudyPlan
 from mjx_study.study.store import Part
-from mjx_study.study.work import rest
 
 COMPUTE: Final[dict[str | None, Callable[[StudyPlan], Any]]] = {
     "gradients": compute_gradients,

@@ -28,13 +28,13 @@ from mjx_study.objective import Simulator, TracedObjective, simulate
 from mjx_study.reference import Reference
 from mjx_study.simulation.contact import ContactModel, soften
 from mjx_study.stopwatch import tell, timed
+from mjx_study.study.forecast import iteration
 from mjx_study.study.iteration import Descent, Record, advance, begin, going, make_optimizer, schedule_factors
 from mjx_study.study.plan import StudyCell, StudyPlan, estimators_of
 from mjx_study.study.sampling import rollouts_of
 from mjx_study.study.store import Part
 from mjx_study.study.times import Program
 from mjx_study.study.variables import HISTORY, METRIC, START
-from mjx_study.study.work import iteration
 from mjx_study.tasks.contact_grid import ContactPoint
 
 REPORT_EVERY: Final = 10

@@ -19,7 +19,6 @@ from typing import Any, Final
 import xarray as xr
 
 from estimators import ENOUGH_EFFECTIVE
-from mjx_study.disk import prepare_folder
 from mjx_study.identity import differences, versions
 from mjx_study.study.blocks import Arrays
 from mjx_study.study.cells import Computation
@@ -28,35 +27,11 @@ from mjx_study.study.configuration import Progress, StudyConfig
 from mjx_study.study.dataset import as_plain, dataset_of, write_dataset
 from mjx_study.study.document import document_of
 from mjx_study.study.plan import StudyPlan, plan_study
-from mjx_study.study.store import Part, Store
+from mjx_study.study.store import Part, Store, open_store
 from mjx_study.study.times import recording
 
 WAIT_SECONDS: Final = 0.5
 """Interval between polls of cells that another process computes."""
-
-
-def open_store(plan: StudyPlan, folder: Path, command: str | None = None, *, accept_versions: bool = False) -> Store:
-    """Open a plan's folder, new or begun; a begun one keeps its chunk size unless the configuration sets another.
-
-    ValueError if the folder is not writable or holds another study. The command line is recorded, if one asked for the
-    study; `accept_versions` resumes a study begun by other versions.
-    """
-    document = _document_in(plan, folder, command)
-    return Store.create(prepare_folder(folder), document, accept_versions=accept_versions)
-
-
-def begun_store(plan: StudyPlan, folder: Path, *, accept_versions: bool = False) -> Store | None:
-    """Open a plan's folder for reading, as `open_store` would resume it; None if nothing is begun."""
-    return Store.begun(folder, _document_in(plan, folder), accept_versions=accept_versions)
-
-
-def _document_in(plan: StudyPlan, folder: Path, command: str | None = None) -> dict[str, Any]:
-    """Document of a plan, with the chunk size of a study begun in the folder."""
-    document = document_of(plan, command)
-    if plan.config.chunk_size is None:
-        begun = (folder / "study.json").exists()
-        document["config"]["chunk_size"] = Store.open(folder).chunk_size if begun else plan.chunk_size
-    return document
 
 
 def run_study(
@@ -107,7 +82,8 @@ def run_study(
 class _Run:
     def __init__(self, plan: StudyPlan, progress: Progress):
         self._plan, self._progress, self._total = plan, progress, len(plan.cells)
-        self._compute, self._begun = Computation(plan), {None}
+        self._compute = Computation(plan)
+        self._begun: set[Any] = {None}
 
     def in_memory(self, document: dict[str, Any]) -> xr.Dataset:
         """Compute all cells and write none."""

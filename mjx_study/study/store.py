@@ -27,7 +27,8 @@ import numpy as np
 from mjx_study.disk import open_regular, prepare_folder, read_whole, write_whole
 from mjx_study.identity import ACCEPT, differences
 from mjx_study.study.dataset import as_plain
-from mjx_study.study.document import read_document, read_format
+from mjx_study.study.document import document_of, read_document, read_format
+from mjx_study.study.plan import StudyPlan
 
 FORMAT: Final = 3
 """Format of the folder; increased when older programs cannot read newer folders."""
@@ -257,6 +258,30 @@ class Store:
     @property
     def missing(self) -> list[int]:
         return [index for index in range(len(self.document["cells"])) if not self.has(index)]
+
+
+def open_store(plan: StudyPlan, folder: Path, command: str | None = None, *, accept_versions: bool = False) -> Store:
+    """Open a plan's folder, new or begun; a begun one keeps its chunk size unless the configuration sets another.
+
+    ValueError if the folder is not writable or holds another study. The command line is recorded, if one asked for the
+    study; `accept_versions` resumes a study begun by other versions.
+    """
+    document = _document_in(plan, folder, command)
+    return Store.create(prepare_folder(folder), document, accept_versions=accept_versions)
+
+
+def begun_store(plan: StudyPlan, folder: Path, *, accept_versions: bool = False) -> Store | None:
+    """Open a plan's folder for reading, as `open_store` would resume it; None if nothing is begun."""
+    return Store.begun(folder, _document_in(plan, folder), accept_versions=accept_versions)
+
+
+def _document_in(plan: StudyPlan, folder: Path, command: str | None = None) -> dict[str, Any]:
+    """Document of a plan, with the chunk size of a study begun in the folder."""
+    document = document_of(plan, command)
+    if plan.config.chunk_size is None:
+        begun = (folder / "study.json").exists()
+        document["config"]["chunk_size"] = Store.open(folder).chunk_size if begun else plan.chunk_size
+    return document
 
 
 def _digest(arrays: Mapping[str, np.ndarray]) -> str:

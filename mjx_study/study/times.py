@@ -117,12 +117,10 @@ class Record(BaseModel):
         return Program(**{field.name: getattr(self, field.name) for field in dataclasses.fields(Program)})
 
 
-def program_of(kind: str, task: Task, contact: Any, rows: int, steps: int | None = None) -> Program:
-    """Return a program of a task, given the structure of the contact model's arrays; its horizon is the default of
-    `steps`."""
-    host = task.scene.host
-    content = _content(task, str(contact))
-    return Program(kind, content, steps or task.horizon, rows, int(host.nv), num_constraint_rows(task.scene.template))
+def program_of(kind: str, task: Task, contact: Any, rows: int) -> Program:
+    """Return a program of a task, given the structure of the contact model's arrays."""
+    content, dof = _content(task, str(contact)), int(task.scene.host.nv)
+    return Program(kind, content, task.horizon, rows, dof, num_constraint_rows(task.scene.template))
 
 
 def other_program(kind: str, rows: int, *content: str, steps: int = 1) -> Program:

@@ -15,6 +15,8 @@ class Variable:
 
 
 BATCH: Final = ("seed", "estimator")
+EACH: Final = ("estimator",)
+LINE: Final = ("point",)
 GRADIENTS: Final = {
     "gradient_norm": Variable(BATCH, "gradient", "norm of the mean"),
     "variance": Variable(BATCH, "gradient^2", "variance of one sample, the trace of the covariance"),
@@ -39,22 +41,20 @@ GRADIENTS: Final = {
     "bias_p_value": Variable(BATCH, "1", "p-value of no bias against the reference"),
     "nonfinite": Variable(BATCH, "1", "nonfinite samples, left out"),
     "pooled_error": Variable(
-        ("estimator",), "1", "distance from the mean over all seeds to the reference, over the norm of the reference"
+        EACH, "1", "distance from the mean over all seeds to the reference, over the norm of the reference"
     ),
-    "squared_bias": Variable(
-        ("estimator",), "1", "unbiased estimate of the squared bias, over the reference's squared norm"
-    ),
-    "squared_bias_se": Variable(("estimator",), "1", "standard error of squared_bias"),
-    "residual": Variable(("estimator",), "1", "largest relative residual of the constraint solver"),
-    "unconverged": Variable(("estimator",), "1", "rollouts whose solver residual is too large"),
-    "seconds_per_sample": Variable(("estimator",), "s", "computing time of one sample, measured; compilation excluded"),
-    "onsets": Variable(("estimator",), "1", "onsets of contact in the first-order batches"),
-    "onsets_bounded": Variable(("estimator",), "1", "onsets at grazing speed, with a bounded term"),
-    "onsets_missed": Variable(("estimator",), "1", "onsets without a term"),
+    "squared_bias": Variable(EACH, "1", "unbiased estimate of the squared bias, over the reference's squared norm"),
+    "squared_bias_se": Variable(EACH, "1", "standard error of squared_bias"),
+    "residual": Variable(EACH, "1", "largest relative residual of the constraint solver"),
+    "unconverged": Variable(EACH, "1", "rollouts whose solver residual is too large"),
+    "seconds_per_sample": Variable(EACH, "s", "computing time of one sample, measured; compilation excluded"),
+    "onsets": Variable(EACH, "1", "onsets of contact in the first-order batches"),
+    "onsets_bounded": Variable(EACH, "1", "onsets at grazing speed, with a bounded term"),
+    "onsets_missed": Variable(EACH, "1", "onsets without a term"),
     "onset_strength": Variable(
-        ("estimator",), "1", "share of the approach speed that an onset takes in a step, root mean square"
+        EACH, "1", "share of the approach speed that an onset takes in a step, root mean square"
     ),
-    "onset_spread": Variable(("estimator",), "1", "standard deviation of the step of a rollout's first onset"),
+    "onset_spread": Variable(EACH, "1", "standard deviation of the step of a rollout's first onset"),
     "reference_norm": Variable((), "gradient", "norm of the reference gradient"),
     "reference_uncertainty": Variable((), "1", "standard error of the reference, over its norm"),
     "reference_effective_samples": Variable((), "1", "effective number of samples behind the reference's variance"),
@@ -82,23 +82,23 @@ DESCENTS: Final = {
     "alpha": Variable(STEP, "1", "weight of the first-order batch"),
     "nonfinite": Variable(STEP, "1", "nonfinite samples, left out"),
     "residual": Variable(STEP, "1", "largest relative residual of the constraint solver"),
-    "rollouts": Variable(("estimator",), "1", "rollouts simulated in one iteration of one seed"),
+    "rollouts": Variable(EACH, "1", "rollouts simulated in one iteration of one seed"),
     "seconds": Variable(("iteration", "estimator"), "s", "time since the start, measured; compilation excluded"),
     "theta": Variable((*BATCH, "param"), "unit of theta", "parameters of the final policy"),
 }
 LANDSCAPES: Final = {
-    "position": Variable(("point",), "unit of theta", "t in theta_0 + t direction"),
-    "cost": Variable(("point",), "cost", "cost without noise; the mean over initial states if these are random"),
-    "smoothed": Variable(("point",), "cost", "mean cost with noise"),
-    "smoothed_se": Variable(("point",), "cost", "standard error of smoothed"),
+    "position": Variable(LINE, "unit of theta", "t in theta_0 + t direction"),
+    "cost": Variable(LINE, "cost", "cost without noise; the mean over initial states if these are random"),
+    "smoothed": Variable(LINE, "cost", "mean cost with noise"),
+    "smoothed_se": Variable(LINE, "cost", "standard error of smoothed"),
     "slope": Variable(("estimator", "point"), "gradient", "mean of the estimator along the line"),
     "slope_se": Variable(("estimator", "point"), "gradient", "standard error of slope"),
     "nonfinite": Variable(("estimator", "point"), "1", "nonfinite samples, left out"),
-    "exact_smoothed": Variable(("point",), "cost", "smoothed without sampling error, where a quadrature is available"),
-    "exact_slope": Variable(("point",), "gradient", "slope of exact_smoothed, the mean of an unbiased estimator"),
-    "exact_first": Variable(("point",), "gradient", "mean of first-order gradients, without sampling error"),
-    "exact_slope_error": Variable(("point",), "gradient", "quadrature error of exact_slope"),
-    "exact_first_error": Variable(("point",), "gradient", "quadrature error of exact_first"),
+    "exact_smoothed": Variable(LINE, "cost", "smoothed without sampling error, where a quadrature is available"),
+    "exact_slope": Variable(LINE, "gradient", "slope of exact_smoothed, the mean of an unbiased estimator"),
+    "exact_first": Variable(LINE, "gradient", "mean of first-order gradients, without sampling error"),
+    "exact_slope_error": Variable(LINE, "gradient", "quadrature error of exact_slope"),
+    "exact_first_error": Variable(LINE, "gradient", "quadrature error of exact_first"),
     "residual": Variable((), "1", "largest relative residual of the constraint solver"),
     "unconverged": Variable((), "1", "rollouts whose solver residual is too large"),
 }
