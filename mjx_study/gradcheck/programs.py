@@ -166,48 +166,51 @@ class Programs:
         forward, reverse = np.concatenate(pushed)[:inputs].T, np.concatenate(pulled)[:outputs]
         return Linear(np.asarray(qpos), float(residual), forward, reverse)
 
-    def _model(self, setting, change):
-        """The model after a change of state and parameters, or of the state alone."""
-        num_state, scales = self.layout.num_state, setting.scales
-        parameters = change[num_state:] if len(change) > num_state else jnp.zeros(len(scales))
-        return self.layout.model(setting.contact, scales, parameters)
-
-    def _after(self, step_function, point, change, reference=None):
+    def _after(self, step_function, point, change, parameters, reference=None):
         """Outputs after a change, relative to a given position or that after the step; and the state there."""
-        setting, state, control = point
-        moved, moved_control = self.layout.state(state, control, change)
-        after, *rest = step_function(self.layout.scene, self._model(setting, change), moved, moved_control)
+        layout, (setting, state, control) = self.layout, point
+        moved, moved_control = layout.state(state, control, change)
+        after, *rest = step_function(layout.scene, layout.model(*setting, parameters), moved, moved_control)
         reference = jax.lax.stop_gradient(after.qpos) if reference is None else reference
-        tangent = difference_position(self.layout.scene.host, reference, after.qpos)
+        tangent = difference_position(layout.scene.host, reference, after.qpos)
         return jnp.concatenate([tangent, after.qvel, after.act]), (after, *rest)
 
     def _exact(self, point, reference, changes):
         def one(change):
-            output, (after, _, data) = self._after(exact_step, point, change, reference)
-            return output, after, _stages(self._model(point[0], change), data)
+            parameters = change[self.layout.num_state :]
+            output, (after, _, data) = self._after(exact_step, point, change, parameters, reference)
+            return output, after, _stages(self.layout.model(*point[0], parameters), data)
 
         return jax.lax.map(one, changes)
 
     def _linear(self, point, push_rows, pull_rows):
         """Position after the step, residual, and derivatives along rows, forwards and backwards."""
-        still = jnp.zeros(push_rows.shape[1])
-        _, push, (after, residual) = jax.linearize(lambda x: self._after(step, point, x), still, has_aux=True)
+        num_state, still, fixed = self.layout.num_state, jnp.zeros(len(self.layout.inputs)), None
+        if push_rows.shape[1] < len(still):
+            still, fixed = jnp.split(still, [num_state])
+
+        def output(change):
+            return self._after(step, point, change, change[num_state:] if fixed is None else fixed)
+
+        _, push, (after, residual) = jax.linearize(output, still, has_aux=True)
         pull = jax.linear_transpose(push, still)
         return after.qpos, residual, jax.lax.map(push, push_rows), jax.lax.map(lambda row: pull(row)[0], pull_rows)
 
     def _stock(self, point, push_rows):
-        still = jnp.zeros(push_rows.shape[1])
-        _, push = jax.linearize(lambda change: self._after(_mjx_step, point, change)[0], still)
+        def output(change):
+            return self._after(_mjx_step, point, change, change[self.layout.num_state :])[0]
+
+        _, push = jax.linearize(output, jnp.zeros(len(self.layout.inputs)))
         return jax.lax.map(push, push_rows)
 
     def _stock_step(self, point):
-        setting, state, control = point
-        model = constraint.with_generous_budget(self._model(setting, jnp.zeros(self.layout.num_state)))
-        return _mjx_step(self.layout.scene, model, state, control)[0]
+        layout, (setting, state, control) = self.layout, point
+        model = constraint.with_generous_budget(layout.model(*setting, jnp.zeros(len(layout.scales))))
+        return _mjx_step(layout.scene, model, state, control)[0]
 
 
-def _stages(model: mjx.Model, data: mjx.Data) -> dict[str, Any]:
-    rows: Any = data._impl
+def _stages(model: mjx.Model, data: Any) -> dict[str, Any]:
+    rows = data._impl
     own = {name: getattr(data, name) for name in STAGES if name != "qM"}
     constraints = ("efc_type", "efc_J", "efc_aref", "efc_D", "efc_frictionloss")
     contacts = {name: jnp.asarray(getattr(rows.contact, name)) for name in ("dist", "pos", "frame", "geom")}

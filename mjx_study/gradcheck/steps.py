@@ -144,8 +144,10 @@ def collect(cell: ContactPoint, layout: Coordinates, checks: Sequence[StateCheck
     groups: dict[tuple[str, str, tuple[str, ...], str], list[Entry]] = defaultdict(list)
     for check in checks:
         label, index = check.sample.label, check.sample.index
-        for key, *entry in (*_of_entries(check, layout), *_of_engine(check, layout), *_of_state(check, layout)):
-            groups[key].append(Entry(label, index, index * layout.scene.timestep, *entry))
+        found = (*_of_entries(check, layout), *_of_engine(check, layout), *_of_state(check, layout))
+        for key, name, derivative, difference, gap in found:
+            time = index * layout.scene.timestep
+            groups[key].append(Entry(label, index, time, name, derivative, difference, gap))
     return [Finding(cell.label, *key, tuple(entries)) for key, entries in groups.items()]
 
 
@@ -185,8 +187,8 @@ def _of_engine(check: StateCheck, layout: Coordinates) -> Iterator[_Found]:
     apart = diagnosis.disagreements(check.judged["forward"], check.truth, check.engine, check.engine_truth)
     key = ("project", VERDICTS[ENGINE], (), "the derivative is that of this step, and the C engine's has another")
     for row, column in np.argwhere(apart).tolist():
-        numbers = (float(each[row, column]) for each in (check.derivatives["forward"], check.engine_truth.value))
-        yield key, f"d {layout.outputs[row]} / d {layout.inputs[column]}", *numbers, None
+        ours, theirs = (float(each[row, column]) for each in (check.derivatives["forward"], check.engine_truth.value))
+        yield key, f"d {layout.outputs[row]} / d {layout.inputs[column]}", ours, theirs, None
 
 
 def _of_state(check: StateCheck, layout: Coordinates) -> Iterator[_Found]:

@@ -122,7 +122,7 @@ def _label(axes: Axes, drawing: Drawing, *, below: bool = True, left: bool = Tru
         axes.set_ylabel(f"{vertical} [m]", labelpad=2, **_SMALL)
 
 
-def time_label(times: np.ndarray) -> Callable[[float], str]:
+def time_label(times: np.ndarray) -> Callable[[Any], str]:
     """Return a formatter with enough decimals to distinguish the times: `t = 0.25 s`."""
     step = float(np.min(np.diff(times))) if len(times) > 1 else 0.01
     decimals = next((places for places in (1, 2, 3) if abs(step - round(step, places)) < 0.02 * step), 3)
