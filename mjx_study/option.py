@@ -16,7 +16,7 @@ from mjx_study.choices import CONES, FAMILIES, INTEGRATORS, ONSETS, REFERENCE, S
 
 MOST_VALUES: Final = 10_000
 """Maximum number of values in a list or range."""
-WANTED: Final = {
+WANTED: Final[dict[type, tuple[type, str]]] = {
     bool: (bool, "true or false"),
     str: (str, "text"),
     int: (Integral, "a whole number"),

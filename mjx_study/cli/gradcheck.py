@@ -1,6 +1,7 @@
 """mjx-study gradcheck."""
 
 import argparse
+from typing import Any
 
 from mjx_study.choices import CHECKED_STATES, CHECKED_STEPS, CHECKED_STIFFNESS, is_file
 from mjx_study.cli.options import Parser, UsageError, configure_process, given_options, scene_options, usage_errors
@@ -62,7 +63,7 @@ def add(command: Parser) -> None:
     command.add_option("states", CHECKED_STATES)
     command.add_flag("--stock", "also check the derivative of mjx.step itself")
     command.add_flag("--mean", "check the means of estimators instead of derivatives")
-    changes = {
+    changes: dict[str, dict[str, Any]] = {
         "estimators": {"many": True},
         "span": {"many": True, "unset": "two sigma about theta"},
     }

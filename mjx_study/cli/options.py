@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from mjx_study.choices import FAMILIES, PRECISIONS, TASK_DESCRIPTIONS, suggestion, unknown, unknown_task
-from mjx_study.option import OPTIONS, Option
+from mjx_study.option import CONTACTS, OPTIONS, Option
 from mjx_study.study.configuration import StudyConfig
 
 if TYPE_CHECKING:
@@ -118,7 +118,7 @@ class Parser(argparse.ArgumentParser):
     ) -> None:
         """Add the contact models: one or many, with or without the analytic reference."""
         self.add_option("stiffness", many=many, unset=stiffness)
-        self.add_option("contact", many=many, **({} if analytic else {"choices": tuple(FAMILIES)}))
+        self.add_option("contact", many=many, choices=CONTACTS if analytic else tuple(FAMILIES))
         self.add_option("damping")
 
     def add_scene_options(self) -> None:
