@@ -40,8 +40,8 @@ from mjx_study.simulation.contact import ContactModel, stable
 from mjx_study.simulation.dynamics import State, initial_state
 from mjx_study.simulation.engine import engine_model
 from mjx_study.simulation.onset import as_row
-from mjx_study.study.line import direction_of
 from mjx_study.study.reference_gradient import reference_gradient
+from mjx_study.study.resolution import direction_of
 from mjx_study.study.sampling import unconverged
 from mjx_study.study.tally import onset_numbers
 from mjx_study.study.variables import ONSETS

@@ -42,7 +42,7 @@ from mjx_study.render.drawing import PALETTE, Drawing
 from mjx_study.runtime import configure
 from mjx_study.simulation.contact import ContactModel, contact_model, solref_from_stiffness
 from mjx_study.simulation.dynamics import State, initial_state
-from mjx_study.study.quadrature import Line, grid, means
+from mjx_study.study.landscapes import Line, grid, means
 from mjx_study.tasks import make_task
 from mjx_study.tasks.contact_grid import contact_grid
 from mjx_study.tasks.task import Task

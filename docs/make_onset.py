@@ -16,8 +16,8 @@ from estimators import NOISES, first_order, zeroth_order
 from mjx_study.objective import Simulator
 from mjx_study.runtime import configure
 from mjx_study.simulation.contact import contact_model, family_model
-from mjx_study.study.line import direction_of
-from mjx_study.study.quadrature import Line, Means, grid, means
+from mjx_study.study.landscapes import Line, Means, grid, means
+from mjx_study.study.resolution import direction_of
 from mjx_study.study.tally import onset_numbers
 from mjx_study.study.variables import ONSETS
 from mjx_study.tasks import make_task

@@ -10,7 +10,7 @@ from typing import Final
 
 from make_figures import save
 
-from mjx_study.cli.progress import shown_progress
+from mjx_study.cli.output import shown_progress
 from mjx_study.plots.study import plot_study
 from mjx_study.runtime import configure
 from mjx_study.study.configuration import StudyConfig

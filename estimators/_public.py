@@ -1,8 +1,6 @@
 """Public names of `estimators`, imported when one of them is first accessed."""
 
-from estimators.alpha import alpha_order, constrained_alpha, interpolate, inverse_variance_alpha
-from estimators.baselines import BASELINES, leave_one_out, none, zero_noise
-from estimators.bias import BiasTest, EmpiricalBias, bias_test, empirical_bias, squared_bias_of_means
+from estimators.alpha import alpha_order, constrained_alpha, interpolate, inverse_variance_alpha, weigh_batches
 from estimators.builtin import (
     AlphaOrder,
     Antithetic,
@@ -19,21 +17,60 @@ from estimators.builtin import (
     ZerothOrder,
 )
 from estimators.catalogue import VARIANCE_PROXIES, WEIGHTS
-from estimators.comparison import Comparison, compare
-from estimators.confidence import bernstein_epsilon, coverage_interval, variance_upper_bound
-from estimators.cross_fitting import weigh_batches
-from estimators.ddcg import discontinuity_gated
-from estimators.effective import ENOUGH_EFFECTIVE, EffectiveSamples, effective_samples
-from estimators.estimator import ORACLES, Batches, Estimator, Oracle, draw, oracles_of
-from estimators.first import clipped_first_order, first_order
-from estimators.intervals import variance_interval
+from estimators.comparison import (
+    BiasTest,
+    Comparison,
+    EmpiricalBias,
+    bias_test,
+    compare,
+    empirical_bias,
+    squared_bias_of_means,
+)
+from estimators.confidence import (
+    ENOUGH_EFFECTIVE,
+    EffectiveSamples,
+    bernstein_epsilon,
+    coverage_interval,
+    effective_samples,
+    variance_interval,
+    variance_upper_bound,
+)
+from estimators.estimator import (
+    ESTIMATORS,
+    ORACLES,
+    Batches,
+    Estimator,
+    Oracle,
+    draw,
+    estimate,
+    find_estimator,
+    make_estimator,
+    oracles_of,
+    register,
+)
 from estimators.mean_check import Circulation, circulation
 from estimators.noise import NOISES, NoiseDensity
-from estimators.propagation import total_propagation, truncated_first_order
-from estimators.registry import ESTIMATORS, estimate, find_estimator, make_estimator, register
+from estimators.orders import (
+    BASELINES,
+    antithetic,
+    clipped_first_order,
+    delta_control_variate,
+    first_order,
+    leave_one_out,
+    none,
+    zero_noise,
+    zeroth_order,
+)
 from estimators.rows import Rows
 from estimators.statistics import norm_quantiles, summarise
-from estimators.stepwise import antithetic_cost_to_go, cost_to_go, stepwise_inverse_variance
+from estimators.stepwise import (
+    antithetic_cost_to_go,
+    cost_to_go,
+    discontinuity_gated,
+    stepwise_inverse_variance,
+    total_propagation,
+    truncated_first_order,
+)
 from estimators.types import (
     AlphaChoice,
     Differentiation,
@@ -47,85 +84,19 @@ from estimators.types import (
     StepwiseObjective,
     pull_back,
 )
-from estimators.zeroth import antithetic, delta_control_variate, zeroth_order
 
 __all__ = [
-    "BASELINES",
-    "ENOUGH_EFFECTIVE",
-    "ESTIMATORS",
-    "NOISES",
-    "ORACLES",
-    "VARIANCE_PROXIES",
-    "WEIGHTS",
-    "AlphaChoice",
-    "AlphaOrder",
-    "Antithetic",
-    "AntitheticCostToGo",
-    "Batches",
-    "Circulation",
-    "BiasTest",
-    "ClippedFirstOrder",
-    "Comparison",
-    "CostToGo",
-    "DeltaMethod",
-    "Differentiation",
-    "DiscontinuityGated",
-    "EffectiveSamples",
-    "EmpiricalBias",
-    "Estimator",
-    "Evaluation",
-    "FirstOrder",
-    "GradientEstimate",
-    "InverseVariance",
-    "Linearisation",
-    "NoiseDensity",
-    "Objective",
-    "Oracle",
-    "PairedObjective",
-    "Rows",
-    "StepDifferentiation",
-    "StepEvaluation",
-    "StepwiseInverseVariance",
-    "StepwiseObjective",
-    "TotalPropagation",
-    "TruncatedFirstOrder",
-    "ZerothOrder",
-    "alpha_order",
-    "antithetic",
-    "antithetic_cost_to_go",
-    "bernstein_epsilon",
-    "bias_test",
-    "circulation",
-    "clipped_first_order",
-    "compare",
-    "constrained_alpha",
-    "cost_to_go",
-    "coverage_interval",
-    "delta_control_variate",
-    "discontinuity_gated",
-    "draw",
-    "effective_samples",
-    "empirical_bias",
-    "estimate",
-    "find_estimator",
-    "first_order",
-    "interpolate",
-    "inverse_variance_alpha",
-    "leave_one_out",
-    "make_estimator",
-    "none",
-    "norm_quantiles",
-    "oracles_of",
-    "pull_back",
-    "register",
-    "squared_bias_of_means",
-    "stepwise_inverse_variance",
-    "summarise",
-    "total_propagation",
-    "truncated_first_order",
-    "variance_interval",
-    "variance_upper_bound",
-    "weigh_batches",
-    "zero_noise",
+    "BASELINES", "ENOUGH_EFFECTIVE", "ESTIMATORS", "NOISES", "ORACLES", "VARIANCE_PROXIES", "WEIGHTS", "AlphaChoice",
+    "AlphaOrder", "Antithetic", "AntitheticCostToGo", "Batches", "BiasTest", "Circulation", "ClippedFirstOrder",
+    "Comparison", "CostToGo", "DeltaMethod", "Differentiation", "DiscontinuityGated", "EffectiveSamples",
+    "EmpiricalBias", "Estimator", "Evaluation", "FirstOrder", "GradientEstimate", "InverseVariance", "Linearisation",
+    "NoiseDensity", "Objective", "Oracle", "PairedObjective", "Rows", "StepDifferentiation", "StepEvaluation",
+    "StepwiseInverseVariance", "StepwiseObjective", "TotalPropagation", "TruncatedFirstOrder", "ZerothOrder",
+    "alpha_order", "antithetic", "antithetic_cost_to_go", "bernstein_epsilon", "bias_test", "circulation",
+    "clipped_first_order", "compare", "constrained_alpha", "cost_to_go", "coverage_interval", "delta_control_variate",
+    "discontinuity_gated", "draw", "effective_samples", "empirical_bias", "estimate", "find_estimator", "first_order",
+    "interpolate", "inverse_variance_alpha", "leave_one_out", "make_estimator", "none", "norm_quantiles", "oracles_of",
+    "pull_back", "register", "squared_bias_of_means", "stepwise_inverse_variance", "summarise", "total_propagation",
+    "truncated_first_order", "variance_interval", "variance_upper_bound", "weigh_batches", "zero_noise",
     "zeroth_order",
-]
+]  # fmt: skip

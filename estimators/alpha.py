@@ -1,20 +1,26 @@
-"""Interpolation between zeroth- and first-order estimates, and the choice of its weight."""
+"""Interpolation between zeroth- and first-order estimates: its weight, and weights plug-in or cross-fitted."""
 
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import Any, Final
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from estimators.rows import weigh
+from estimators.catalogue import CROSS_FITTED, PLUG_IN, WEIGHTS
+from estimators.rows import Rows, weigh
 from estimators.types import AlphaChoice, GradientEstimate
 
+FEWEST_SAMPLES: Final = 4
+"""Two in each half, the fewest for a variance."""
 Scalar = Float[Array, ""]
 
 
 def inverse_variance_alpha(
     variance_zeroth: Float[Array, "*nodes"], variance_first: Float[Array, "*nodes"]
 ) -> Float[Array, "*nodes"]:
-    """Return the inverse-variance weight alpha = sigmahat_0^2 / (sigmahat_0^2 + sigmahat_1^2).
+    """Return the inverse-variance weight alpha = sigmahat_0^2 / (sigmahat_0^2 + sigmahat_1^2), in [0, 1].
 
     It is 0 where the variances do not determine it (both zero, both infinite, or either one undefined): a first-order
     batch must earn its weight.
@@ -22,9 +28,6 @@ def inverse_variance_alpha(
     Args:
         variance_zeroth: sigmahat_0^2 >= 0, [cost^2/param^2]; one for each weight.
         variance_first: sigmahat_1^2 >= 0, [cost^2/param^2].
-
-    Returns:
-        alpha in [0, 1].
 
     Reference: Suh et al. 2022, lemma on the closed form, gamma = infinity.
     """
@@ -36,7 +39,7 @@ def inverse_variance_alpha(
 def constrained_alpha(
     variance_zeroth: Scalar, variance_first: Scalar, discrepancy: Scalar, epsilon: float | Scalar, gamma: float | Scalar
 ) -> Scalar:
-    """Return the minimum-variance weight whose error bound is at most gamma.
+    """Return the minimum-variance weight, in [0, 1], whose error bound is at most gamma.
 
         min_alpha  alpha^2 sigmahat_1^2 + (1 - alpha)^2 sigmahat_0^2   s.t.  epsilon + alpha B <= gamma
 
@@ -50,9 +53,6 @@ def constrained_alpha(
         discrepancy: B = ||gbar_1 - gbar_0||, [cost/param].
         epsilon: Confidence radius of the zeroth-order mean, [cost/param].
         gamma: Largest acceptable error, [cost/param].
-
-    Returns:
-        alpha in [0, 1].
 
     Reference: Suh et al. 2022, eq. of the robust interpolation and lemma on its closed form. The stationarity
     condition in that proof must read 2 alpha sigmahat_1^2 - 2 (1 - alpha) sigmahat_0^2 + lambda B = 0
@@ -69,7 +69,7 @@ def constrained_alpha(
 
 
 def interpolate(zeroth: GradientEstimate, first: GradientEstimate, alpha: float | Scalar) -> GradientEstimate:
-    """Alpha-order batched gradient for a given weight.
+    """Alpha-order batched gradient for a given weight of `first`, in [0, 1]; its `alpha` is None.
 
         gbar = alpha gbar_1 + (1 - alpha) gbar_0
         sigmahat^2 = alpha^2 sigmahat_1^2 + (1 - alpha)^2 sigmahat_0^2,  likewise for squared standard errors
@@ -78,14 +78,6 @@ def interpolate(zeroth: GradientEstimate, first: GradientEstimate, alpha: float 
     is arbitrary. The empirical variance of the pairs differs from sigmahat^2 by the chance correlation of the batches.
     A batch of weight 0 is ignored, NaN included. For a fixed alpha, the bias is alpha times that of the first-order
     batch.
-
-    Args:
-        zeroth: Zeroth-order estimate, with gbar_0 and sigmahat_0.
-        first: First-order estimate from the same number of independent samples.
-        alpha: Weight of `first`, in [0, 1].
-
-    Returns:
-        The estimate; its `alpha` is None.
 
     Raises:
         ValueError: The batches differ in shape.
@@ -112,6 +104,11 @@ def interpolate(zeroth: GradientEstimate, first: GradientEstimate, alpha: float 
     )
 
 
+def apply_choice(choice: AlphaChoice, zeroth: GradientEstimate, first: GradientEstimate) -> GradientEstimate:
+    """Interpolate with a chosen weight, and keep the choice."""
+    return replace(interpolate(zeroth, first, choice.alpha), alpha=choice)
+
+
 def choose_alpha(
     zeroth: GradientEstimate, first: GradientEstimate, *, gamma: float | Scalar, epsilon: float | Scalar
 ) -> AlphaChoice:
@@ -136,17 +133,79 @@ def alpha_order(
 
     Args:
         zeroth: Zeroth-order estimate, assumed unbiased.
-        first: First-order estimate from the same number of independent samples.
         gamma: Largest acceptable error, [cost/param]; infinity for inverse-variance weighting.
         epsilon: Confidence radius of the zeroth-order mean, [cost/param]; see `bernstein_epsilon`.
-
-    Returns:
-        The estimate, with its `alpha`.
 
     Raises:
         ValueError: The batches differ in shape.
 
     Reference: Suh et al. 2022, sec. "alpha-order gradient estimator".
     """
-    choice = choose_alpha(zeroth, first, gamma=gamma, epsilon=epsilon)
-    return replace(interpolate(zeroth, first, choice.alpha), alpha=choice)
+    return apply_choice(choose_alpha(zeroth, first, gamma=gamma, epsilon=epsilon), zeroth, first)
+
+
+def weigh_batches(
+    choose: Callable[..., Any], mix: Callable[..., GradientEstimate], batches: Sequence[Any], weights: str
+) -> GradientEstimate:
+    """Interpolate with weights from the samples themselves or from the other half of them.
+
+        plug-in:       mix(choose(b), b)
+        cross-fitted:  (n_1 mix(choose(b_2), b_1) + n_2 mix(choose(b_1), b_2)) / n
+
+    where b_1 and b_2 are the first n_1 = floor(n/2) and the last n_2 samples of every batch. A plug-in weight depends
+    on the samples it is applied to, which biases the mean at order 1/n even if both batches are unbiased. Cross-fitted
+    weights are independent of them, so the mean is as unbiased as the batches; using half of the samples costs
+    variance. Everything that enters the choice comes from the other half, including epsilon and B of an accuracy bound;
+    a baseline over other samples uses those of its own half.
+
+    Args:
+        choose: Maps batches to weights.
+        mix: Maps weights and batches to an estimate.
+        batches: Batches whose arrays have the samples as first axis.
+        weights: A name in `WEIGHTS`.
+
+    Returns:
+        The estimate. If cross-fitted, each row is weighted by the other half's weights, and `variance` is the mean of
+        the within-half variances: n times the variance of the mean at given weights, as for one batch. This omits the
+        covariance of the halves: the squared bias of plug-in weights from n/2 samples, half of which enters the
+        variance of the mean. `alpha` is the mean of both choices.
+
+    Raises:
+        ValueError: No weights have that name, or there are too few samples for two halves.
+
+    Reference: Chernozhukov et al., "Double/debiased machine learning for treatment and structural parameters",
+    Econometrics Journal 21, 2018.
+    """
+    samples = len(jax.tree.leaves(batches)[0])
+    check_weights(weights, samples)
+    if weights == PLUG_IN:
+        return mix(choose(*batches), *batches)
+    first, second = (
+        jax.tree.map(lambda leaf, part=part: leaf[part], tuple(batches))
+        for part in (slice(samples // 2), slice(samples // 2, None))
+    )
+    return _pooled(mix(choose(*second), *first), mix(choose(*first), *second))
+
+
+def check_weights(weights: str, samples: int | None = None) -> None:
+    """Validate the name of weights and, if given, the number of samples for cross-fitting."""
+    if weights not in WEIGHTS:
+        raise ValueError(f"weights must be one of {', '.join(WEIGHTS)}; got {weights!r}")
+    if weights == CROSS_FITTED and samples is not None and samples < FEWEST_SAMPLES:
+        raise ValueError(
+            f"cross-fitted weights need at least {FEWEST_SAMPLES} samples, two in each half; got {samples}"
+        )
+
+
+def _pooled(*parts: GradientEstimate) -> GradientEstimate:
+    """Average estimates from independent samples over all samples."""
+    rows = jnp.concatenate([part.per_sample for part in parts])
+    shares = [len(part.per_sample) / len(rows) for part in parts]
+
+    def average(*values: Array) -> Array:
+        return jnp.asarray(sum(share * value for share, value in zip(shares, values, strict=True)))
+
+    mean, variance, alpha = jax.tree.map(average, *((part.mean, part.variance, part.alpha) for part in parts))
+    squares = sum((share * part.standard_error) ** 2 for share, part in zip(shares, parts, strict=True))
+    num_finite = jnp.asarray(sum(part.num_finite for part in parts))
+    return GradientEstimate(Rows(rows), mean, variance, jnp.sqrt(squares), num_finite, alpha)

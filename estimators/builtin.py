@@ -1,32 +1,35 @@
 """The built-in estimators, each a formula with its options."""
 
 from abc import abstractmethod
-from dataclasses import dataclass, replace
-from typing import Any
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from typing import Any, ClassVar
 
 import jax.numpy as jnp
 
-from estimators.alpha import choose_alpha, interpolate, inverse_variance_alpha
-from estimators.baselines import find_baseline
+from estimators.alpha import apply_choice, check_weights, choose_alpha, inverse_variance_alpha, weigh_batches
 from estimators.catalogue import CATALOGUE, MAX_DEVIATION, PLUG_IN, PUBLISHED_TOLERANCE
 from estimators.confidence import bernstein_epsilon, check_confidence_arguments
-from estimators.cross_fitting import check_weights, weigh_batches
-from estimators.ddcg import discontinuity_gated
-from estimators.estimator import Estimator
-from estimators.first import clipped_first_order, first_order
-from estimators.propagation import total_propagation, truncated_first_order
-from estimators.registry import register
-from estimators.stepwise import antithetic_cost_to_go, cost_to_go, stepwise_inverse_variance
-from estimators.types import (
-    AlphaChoice,
-    Differentiation,
-    Evaluation,
-    GradientEstimate,
-    Linearisation,
-    StepDifferentiation,
-    StepEvaluation,
+from estimators.estimator import Estimator, register
+from estimators.orders import (
+    antithetic,
+    clipped_first_order,
+    delta_control_variate,
+    find_baseline,
+    first_order,
+    zeroth_order,
 )
-from estimators.zeroth import antithetic, delta_control_variate, zeroth_order
+from estimators.stepwise import (
+    antithetic_cost_to_go,
+    check_tolerance,
+    check_window,
+    cost_to_go,
+    discontinuity_gated,
+    stepwise_inverse_variance,
+    total_propagation,
+    truncated_first_order,
+)
+from estimators.types import AlphaChoice, Differentiation, Evaluation, GradientEstimate
 
 
 def _check_positive(name: str, value: float) -> None:
@@ -35,7 +38,18 @@ def _check_positive(name: str, value: float) -> None:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Baselined(Estimator):
+class _Formula(Estimator):
+    """Base of estimators that apply `formula` to their batches, with their options as keywords."""
+
+    formula: ClassVar[Callable[..., GradientEstimate]]
+
+    def combine(self, *args: Any, **kwargs: Any) -> GradientEstimate:
+        options = {field.name: getattr(self, field.name) for field in fields(self)}
+        return type(self).formula(*args, **kwargs, **options)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Baselined(_Formula):
     """Base of estimators with a zeroth-order batch; `baseline` is a name in `BASELINES`."""
 
     baseline: str = "zero_noise"
@@ -60,9 +74,7 @@ class ZerothOrder(_Baselined, entry=CATALOGUE["zobg"]):
     """See `estimators.zeroth_order`."""
 
     separable = True
-
-    def combine(self, evaluation: Evaluation) -> GradientEstimate:
-        return zeroth_order(evaluation, self.baseline)
+    formula = staticmethod(zeroth_order)
 
 
 @register
@@ -70,9 +82,7 @@ class Antithetic(_Baselined, entry=CATALOGUE["zobg_antithetic"]):
     """See `estimators.antithetic`."""
 
     separable = True
-
-    def combine(self, pair: tuple[Evaluation, Evaluation]) -> GradientEstimate:
-        return antithetic(*pair, self.baseline)
+    formula = staticmethod(lambda pair, baseline: antithetic(*pair, baseline))
 
 
 @register
@@ -80,9 +90,7 @@ class CostToGo(_Baselined, entry=CATALOGUE["zobg_to_go"]):
     """See `estimators.cost_to_go`."""
 
     separable = True
-
-    def combine(self, steps: StepEvaluation) -> GradientEstimate:
-        return cost_to_go(steps, self.baseline)
+    formula = staticmethod(cost_to_go)
 
 
 @register
@@ -90,19 +98,15 @@ class AntitheticCostToGo(_Baselined, entry=CATALOGUE["zobg_to_go_antithetic"]):
     """See `estimators.antithetic_cost_to_go`."""
 
     separable = True
-
-    def combine(self, pair: tuple[StepEvaluation, StepEvaluation]) -> GradientEstimate:
-        return antithetic_cost_to_go(*pair, self.baseline)
+    formula = staticmethod(lambda pair, baseline: antithetic_cost_to_go(*pair, baseline))
 
 
 @register
-class FirstOrder(Estimator, entry=CATALOGUE["fobg"]):
+class FirstOrder(_Formula, entry=CATALOGUE["fobg"]):
     """See `estimators.first_order`."""
 
     separable = True
-
-    def combine(self, differentiation: Differentiation) -> GradientEstimate:
-        return first_order(differentiation)
+    formula = staticmethod(first_order)
 
 
 @register
@@ -112,41 +116,36 @@ class OnsetFirstOrder(FirstOrder, entry=CATALOGUE["fobg_onset"]):
 
 @register
 @dataclass(frozen=True, kw_only=True)
-class ClippedFirstOrder(Estimator, entry=CATALOGUE["fobg_clipped"]):
+class ClippedFirstOrder(_Formula, entry=CATALOGUE["fobg_clipped"]):
     """See `estimators.clipped_first_order`.
 
     `max_norm` is the largest norm of a sample, > 0, [cost/param].
     """
 
     separable = True
+    formula = staticmethod(clipped_first_order)
 
     max_norm: float
 
     def __post_init__(self) -> None:
         _check_positive("max_norm", self.max_norm)
 
-    def combine(self, differentiation: Differentiation) -> GradientEstimate:
-        return clipped_first_order(differentiation, self.max_norm)
-
 
 @register
 @dataclass(frozen=True, kw_only=True)
-class TruncatedFirstOrder(Estimator, entry=CATALOGUE["fobg_truncated"]):
+class TruncatedFirstOrder(_Formula, entry=CATALOGUE["fobg_truncated"]):
     """See `estimators.truncated_first_order`.
 
     `window` is the number of steps between cuts of the adjoint, >= 1.
     """
 
     separable = True
+    formula = staticmethod(truncated_first_order)
 
     window: int
 
     def __post_init__(self) -> None:
-        if self.window < 1:
-            raise ValueError(f"window must be at least 1 step; got {self.window}")
-
-    def combine(self, linearisation: Linearisation) -> GradientEstimate:
-        return truncated_first_order(linearisation, self.window)
+        check_window(self.window)
 
 
 class _OneWeight(_Interpolation):
@@ -163,7 +162,7 @@ class _OneWeight(_Interpolation):
             return self.choose(*self.parts(*batches))
 
         def mix(choice: AlphaChoice, *batches: Any) -> GradientEstimate:
-            return _mixed(choice, *self.parts(*batches))
+            return apply_choice(choice, *self.parts(*batches))
 
         return weigh_batches(choose, mix, (evaluation, differentiation), self.weights)
 
@@ -173,11 +172,7 @@ class _OneWeight(_Interpolation):
         return zeroth_order(evaluation, self.baseline), first_order(differentiation)
 
     def join(self, zeroth: GradientEstimate, first: GradientEstimate) -> GradientEstimate:
-        return _mixed(self.choose(zeroth, first), zeroth, first)
-
-
-def _mixed(choice: AlphaChoice, zeroth: GradientEstimate, first: GradientEstimate) -> GradientEstimate:
-    return replace(interpolate(zeroth, first, choice.alpha), alpha=choice)
+        return apply_choice(self.choose(zeroth, first), zeroth, first)
 
 
 @register
@@ -231,16 +226,14 @@ class InverseVariance(_OneWeight, entry=CATALOGUE["ivw"]):
 class StepwiseInverseVariance(_Interpolation, entry=CATALOGUE["ivw_h"]):
     """See `estimators.stepwise_inverse_variance`."""
 
-    def combine(self, steps: StepEvaluation, differentiation: StepDifferentiation) -> GradientEstimate:
-        return stepwise_inverse_variance(steps, differentiation, self.baseline, self.weights)
+    formula = staticmethod(stepwise_inverse_variance)
 
 
 @register
 class TotalPropagation(_Interpolation, entry=CATALOGUE["total_propagation"]):
     """See `estimators.total_propagation`."""
 
-    def combine(self, linearisation: Linearisation) -> GradientEstimate:
-        return total_propagation(linearisation, self.baseline, self.weights)
+    formula = staticmethod(total_propagation)
 
 
 @register
@@ -252,6 +245,7 @@ class DiscontinuityGated(_Interpolation, entry=CATALOGUE["ddcg"]):
     """
 
     gaussian = True
+    formula = staticmethod(discontinuity_gated)
 
     sigma: float
     tolerance: float = PUBLISHED_TOLERANCE
@@ -259,16 +253,12 @@ class DiscontinuityGated(_Interpolation, entry=CATALOGUE["ddcg"]):
     def __post_init__(self) -> None:
         super().__post_init__()
         _check_positive("sigma", self.sigma)
-        if not 0.0 <= self.tolerance < 1.0:
-            raise ValueError(f"tolerance must lie in [0, 1); got {self.tolerance}")
-
-    def combine(self, evaluation: Evaluation, differentiation: StepDifferentiation) -> GradientEstimate:
-        return discontinuity_gated(evaluation, differentiation, self.baseline, self.sigma, self.tolerance, self.weights)
+        check_tolerance(self.tolerance)
 
 
 @register
 @dataclass(frozen=True, kw_only=True)
-class DeltaMethod(Estimator, entry=CATALOGUE["delta"]):
+class DeltaMethod(_Formula, entry=CATALOGUE["delta"]):
     """See `estimators.delta_control_variate`.
 
     `sigma` is the noise's standard deviation, > 0, [param].
@@ -281,5 +271,6 @@ class DeltaMethod(Estimator, entry=CATALOGUE["delta"]):
     def __post_init__(self) -> None:
         _check_positive("sigma", self.sigma)
 
-    def combine(self, evaluation: Evaluation, differentiation: Differentiation) -> GradientEstimate:
-        return delta_control_variate(evaluation, first_order(differentiation).mean, self.sigma)
+    @staticmethod
+    def formula(evaluation: Evaluation, differentiation: Differentiation, sigma: float) -> GradientEstimate:
+        return delta_control_variate(evaluation, first_order(differentiation).mean, sigma)

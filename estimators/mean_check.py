@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
-from estimators.effective import ENOUGH_EFFECTIVE, effective_samples
+from estimators.confidence import ENOUGH_EFFECTIVE, effective_samples
 from estimators.estimator import ORACLES, Estimator, draw, oracles_of
 from estimators.pytree import register_pytree
 from estimators.statistics import summarise

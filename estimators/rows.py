@@ -121,12 +121,12 @@ class Rows:
     def perturbed_means(
         self, mean: Float[Array, " params"], key: Key[Array, ""], num_draws: int
     ) -> Float[Array, "draws params"]:
-        """sum_i e_i (g_i - gbar) / sqrt(n (n - 1)) with independent standard normal e_i."""
+        """sum_i e_i (g_i - gbar) / sqrt(n (n - 1)) with independent standard normal e_i, the same for any padding."""
         rows, finite = self.rows, finite_rows(self.rows)
         centred = jnp.where(finite[:, None], rows - mean[None, :], 0.0)
         count = jnp.sum(finite).astype(rows.dtype)
-        multipliers = jax.random.normal(key, (num_draws, rows.shape[0]), rows.dtype)
-        return jnp.matmul(multipliers, centred, precision="highest") / jnp.sqrt(count * jnp.maximum(count - 1.0, 1.0))
+        multipliers = jax.random.normal(key, (rows.shape[0], num_draws), rows.dtype)
+        return jnp.matmul(multipliers.T, centred, precision="highest") / jnp.sqrt(count * jnp.maximum(count - 1.0, 1.0))
 
     def norm_quantiles(self, probabilities: Sequence[float]) -> Float[Array, " probabilities"]:
         """Quantiles of ||g_i||, linearly interpolated."""

@@ -1,20 +1,32 @@
-"""Step-by-step estimates: costs to go instead of total costs, and a weight for every step."""
+"""Estimates from batches step by step: costs to go, weights of single steps, a test for jumps, backward recursions."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from estimators.alpha import inverse_variance_alpha
-from estimators.baselines import find_baseline
-from estimators.catalogue import PLUG_IN
-from estimators.cross_fitting import weigh_batches
-from estimators.rows import Rows, finite_rows
+from estimators.alpha import apply_choice, inverse_variance_alpha, weigh_batches
+from estimators.catalogue import PLUG_IN, PUBLISHED_TOLERANCE
+from estimators.orders import find_baseline, zeroth_order
+from estimators.rows import Rows, finite_rows, weigh
 from estimators.statistics import summarise
-from estimators.types import AlphaChoice, Evaluation, GradientEstimate, StepDifferentiation, StepEvaluation, pull_back
+from estimators.types import (
+    AlphaChoice,
+    Evaluation,
+    GradientEstimate,
+    Linearisation,
+    StepDifferentiation,
+    StepEvaluation,
+    pull_back,
+)
 
 Controls = Float[Array, "samples steps controls"]
+StepWeights = Float[Array, "steps controls"]
+Adjoint = Float[Array, "samples states"]
+Inputs = Float[Array, "samples inputs"]
+Weights = Float[Array, "*horizon"]
 
 
 def cost_to_go(steps: StepEvaluation, baseline: str) -> GradientEstimate:
@@ -25,11 +37,7 @@ def cost_to_go(steps: StepEvaluation, baseline: str) -> GradientEstimate:
     Same mean as with total costs, since earlier costs do not depend on a step's noise, and less variance.
 
     Args:
-        steps: Batch of stepwise evaluations, (samples, steps).
-        baseline: A name in `BASELINES`, applied step by step.
-
-    Raises:
-        ValueError: No baseline has that name.
+        baseline: A name in `BASELINES`, applied step by step; another is a ValueError.
 
     Reference: Suh et al. 2022, appendix on the policy gradient.
     """
@@ -42,12 +50,8 @@ def antithetic_cost_to_go(plus: StepEvaluation, minus: StepEvaluation, baseline:
     return summarise((above + below) / 2.0)
 
 
-def control_scores(steps: StepEvaluation, baseline: str) -> Float[Array, "samples steps controls"]:
-    """grad psi(w_h^i) (V_h^i - b_h^i), a zeroth-order sample of dV/du_h, [cost/control].
-
-    Raises:
-        ValueError: No baseline has that name.
-    """
+def control_scores(steps: StepEvaluation, baseline: str) -> Controls:
+    """grad psi(w_h^i) (V_h^i - b_h^i), a zeroth-order sample of dV/du_h, [cost/control]."""
     found = find_baseline(baseline)
 
     def advantage(value: Float[Array, " samples"], zero_noise: Float[Array, " samples"]) -> Float[Array, " samples"]:
@@ -58,28 +62,32 @@ def control_scores(steps: StepEvaluation, baseline: str) -> Float[Array, "sample
     return steps.noise_score * advantages[:, :, None]
 
 
+def node_variance(samples: Float[Array, "samples ..."], finite: Bool[Array, " samples"]) -> Float[Array, "..."]:
+    """Variance of each entry over the samples marked as finite; NaN for fewer than two."""
+    mask = finite.reshape(-1, *(1,) * (samples.ndim - 1))
+    count = jnp.sum(finite).astype(samples.dtype)
+    mean = jnp.sum(jnp.where(mask, samples, 0.0), axis=0) / count
+    squares = jnp.sum(jnp.where(mask, (samples - mean[None]) ** 2, 0.0), axis=0)
+    return jnp.where(count > 1, squares / jnp.maximum(count - 1.0, 1.0), jnp.nan)
+
+
 def stepwise_inverse_variance(
     zeroth: StepEvaluation, first: StepDifferentiation, baseline: str, weights: str = PLUG_IN
 ) -> GradientEstimate:
-    """Inverse-variance weights for every step and control (IVW-H).
+    """Inverse-variance weights for every step and control (IVW-H); the estimate's `alpha` holds their mean.
 
         g_i = sum_h D_theta pi^T [ alpha_h * dV^i/du_h + (1 - alpha_h) * grad psi(w_h^i) (V_h^i - b_h^i) ]
 
     where alpha_h of each control is the inverse-variance weight, over the batch, of the two quantities that it weights.
-    The batches are independent, and each is pulled back through its own states. Variance and standard errors treat the
-    weights as fixed.
+    The batches are independent and of the same size, and each is pulled back through its own states. Variance and
+    standard errors treat the weights as fixed.
 
     Args:
-        zeroth: Batch of stepwise evaluations, (samples, steps).
-        first: Batch of differentiations from the same number of independent samples.
         baseline: A name in `BASELINES`, applied step by step.
         weights: A name in `WEIGHTS`, the source of alpha_h.
 
-    Returns:
-        The estimate; its `alpha` holds the mean weight.
-
     Raises:
-        ValueError: The batches differ in shape, or no baseline has that name.
+        ValueError: The batches differ in shape, or a name is unknown.
 
     Reference: Onoda, Parmas, Yaguchi, Matsuo, arXiv 2604.18161, ICLR 2026.
     """
@@ -94,44 +102,212 @@ def stepwise_inverse_variance(
         kept = jnp.isfinite(first.value)[:, None, None]
         return control_scores(zeroth, baseline), jnp.where(kept, first.noise_gradient, jnp.nan)
 
-    def choose(zeroth: StepEvaluation, first: StepDifferentiation) -> Float[Array, "steps controls"]:
-        return inverse_variance_alpha(*(_node_variances(part) for part in parts(zeroth, first)))
+    def choose(zeroth: StepEvaluation, first: StepDifferentiation) -> StepWeights:
+        variances = (node_variance(part, finite_rows(_flat(part))) for part in parts(zeroth, first))
+        return inverse_variance_alpha(*variances)
 
-    def mix(
-        alpha: Float[Array, "steps controls"], zeroth: StepEvaluation, first: StepDifferentiation
-    ) -> GradientEstimate:
+    def mix(alpha: StepWeights, zeroth: StepEvaluation, first: StepDifferentiation) -> GradientEstimate:
         lower, upper = (
             summarise(pull_back(jnp.where(weight == 0, 0.0, weight[None] * part), batch.policy_jacobian))
             for weight, part, batch in zip((1.0 - alpha, alpha), parts(zeroth, first), (zeroth, first), strict=True)
         )
-        choice = AlphaChoice(jnp.mean(alpha), None, None, None, None)
-        return replace(sum_independent(lower, upper), alpha=choice)
+        samples = Rows(lower.per_sample + upper.per_sample)
+        return GradientEstimate(
+            samples=samples,
+            mean=lower.mean + upper.mean,
+            variance=lower.variance + upper.variance,
+            standard_error=jnp.hypot(lower.standard_error, upper.standard_error),
+            num_finite=samples.num_finite,
+            alpha=AlphaChoice(jnp.mean(alpha)),
+        )
 
     return weigh_batches(choose, mix, (zeroth, first), weights)
 
 
-def sum_independent(one: GradientEstimate, other: GradientEstimate) -> GradientEstimate:
-    """Sum estimates from independent batches of the same size; row i of one is paired with row i of the other."""
-    samples = Rows(one.per_sample + other.per_sample)
-    return GradientEstimate(
-        samples=samples,
-        mean=one.mean + other.mean,
-        variance=one.variance + other.variance,
-        standard_error=jnp.hypot(one.standard_error, other.standard_error),
-        num_finite=samples.num_finite,
+def _flat(samples: Controls) -> Float[Array, "samples entries"]:
+    return samples.reshape(samples.shape[0], -1)
+
+
+def discontinuity_gated(
+    evaluation: Evaluation,
+    differentiation: StepDifferentiation,
+    baseline: str,
+    sigma: float | Float[Array, ""],
+    tolerance: float = PUBLISHED_TOLERANCE,
+    weights: str = PLUG_IN,
+) -> GradientEstimate:
+    """Discontinuity detection by composite gradients (DDCG).
+
+        alpha = alpha_inf   if   tr Cov[grad_w f] >= 2 (1 - c) Var[f] / sigma^2 - 2 ||E grad_w f||^2,   else 0
+
+    where alpha_inf is the inverse-variance weight. For quadratic f and Gaussian noise, both sides are equal at c = 0; a
+    jump adds to Var[f] but not to the derivatives and so increases the right side. There is no accuracy gamma and no
+    radius to choose, and no guarantee if the test is wrong.
+
+    Args:
+        evaluation: For f and the zeroth-order estimate.
+        differentiation: Batch of the same number of independent samples.
+        baseline: A name in `BASELINES`, for the zeroth-order estimate.
+        sigma: Standard deviation of the Gaussian noise, [control].
+        tolerance: c in [0, 1); 0.3 as published.
+        weights: A name in `WEIGHTS`; if cross-fitted, the test also uses the other half.
+
+    Raises:
+        ValueError: The tolerance is outside [0, 1), or the batches differ in shape.
+
+    Reference: Onoda, Parmas, Yaguchi, Matsuo, arXiv 2604.18161, ICLR 2026.
+    """
+    check_tolerance(tolerance)
+
+    def parts(evaluation: Evaluation, differentiation: StepDifferentiation) -> tuple[GradientEstimate, ...]:
+        first = summarise(pull_back(_noise_gradients(differentiation), differentiation.policy_jacobian))
+        return zeroth_order(evaluation, baseline), first
+
+    def choose(evaluation: Evaluation, differentiation: StepDifferentiation) -> AlphaChoice:
+        zeroth, first = parts(evaluation, differentiation)
+        over_noise = summarise(_flat(_noise_gradients(differentiation)))
+        value_variance = node_variance(evaluation.value, jnp.isfinite(evaluation.value))
+        scale = jnp.asarray(sigma, over_noise.mean.dtype) ** 2
+        expected = 2.0 * (1.0 - tolerance) * value_variance / scale - 2.0 * jnp.sum(over_noise.mean**2)
+        continuous = over_noise.variance >= expected  # False if either is undefined
+        alpha = jnp.where(continuous, inverse_variance_alpha(zeroth.variance, first.variance), 0.0)
+        return AlphaChoice(alpha, variance_zeroth=zeroth.variance, variance_first=first.variance)
+
+    def mix(choice: AlphaChoice, evaluation: Evaluation, differentiation: StepDifferentiation) -> GradientEstimate:
+        return apply_choice(choice, *parts(evaluation, differentiation))
+
+    return weigh_batches(choose, mix, (evaluation, differentiation), weights)
+
+
+def check_tolerance(tolerance: float) -> None:
+    if not 0.0 <= tolerance < 1.0:
+        raise ValueError(f"tolerance must lie in [0, 1); got {tolerance}")
+
+
+def _noise_gradients(differentiation: StepDifferentiation) -> Controls:
+    """grad_w f of each sample; NaN if it or the sample's value is not finite."""
+    gradients = differentiation.noise_gradient
+    kept = jnp.isfinite(differentiation.value) & finite_rows(_flat(gradients))
+    return jnp.where(kept[:, None, None], gradients, jnp.nan)
+
+
+def truncated_first_order(linearisation: Linearisation, window: int) -> GradientEstimate:
+    """First-order batched gradient with the adjoint cut every `window` >= 1 steps; a ValueError if below.
+
+        lambda_h = c_x + phi_x^T lambda_{h+1} + pi_x^T g_h,   g_h = c_u + phi_u^T lambda_{h+1},
+        with lambda_{h+1} = 0 on the right-hand sides where h is a multiple of the window
+
+    A control is then credited with at most `window` steps of cost, and no product of more than `window` Jacobians is
+    formed: less variance where products grow, and a bias, since later effects are left out. A window of at least the
+    horizon gives the first-order batched gradient.
+    """
+    check_window(window)
+    horizon = linearisation.cost_state.shape[1]
+    keeps = jnp.arange(1, horizon + 1) % window != 0
+    keeps = keeps.at[-1].set(True) if horizon else keeps  # the end of the horizon is not a cut
+    adjoint, controls, _ = _sweep(linearisation, keeps)
+    return summarise(_gradient(linearisation, adjoint, controls))
+
+
+def check_window(window: int) -> None:
+    if window < 1:
+        raise ValueError(f"window must be at least 1 step; got {window}")
+
+
+def total_propagation(linearisation: Linearisation, baseline: str, weights: str = PLUG_IN) -> GradientEstimate:
+    """Mix first- and zeroth-order estimates at every step of the backward recursion; `alpha` holds the mean weight.
+
+        g_h = alpha_h (c_u + phi_u^T lambda_{h+1}) + (1 - alpha_h) grad psi(w_h) (V_h - b_h)
+        lambda_h = c_x + phi_x^T lambda_{h+1} + pi_x^T g_h,     g = sum_h D_theta pi^T g_h
+
+    alpha_h is the inverse-variance weight of the two contributions D_theta pi^T (...) to the gradient. The mixed
+    adjoint propagates to earlier steps, so derivatives stop growing over a long horizon where values do better; in an
+    open loop nothing propagates through the policy, and steps are mixed independently. Both estimates come from the
+    same rollouts, as published, and so are not independent.
+
+    Args:
+        baseline: A name in `BASELINES`, applied step by step; another is a ValueError.
+        weights: A name in `WEIGHTS`, the source of alpha_h.
+
+    Reference: Parmas, Rasmussen, Peters, Doya, "PIPPS: Flexible model-based policy search robust to the curse of
+    chaos", ICML 2018, where noise acts on states; here it acts on controls.
+    """
+
+    def choose(linearisation: Linearisation) -> Weights:
+        return _propagate(linearisation, baseline, None)[1]
+
+    def mix(alphas: Weights, linearisation: Linearisation) -> GradientEstimate:
+        rows, _ = _propagate(linearisation, baseline, alphas)
+        return replace(summarise(rows), alpha=AlphaChoice(jnp.mean(alphas)))
+
+    return weigh_batches(choose, mix, (linearisation,), weights)
+
+
+def _propagate(
+    linearisation: Linearisation, baseline: str, given: Weights | None
+) -> tuple[Float[Array, "samples params"], Weights]:
+    """Gradient of each sample, and the weights of the steps: as given, or the batch's inverse-variance weights."""
+    steps = linearisation.steps
+    scores = control_scores(steps, baseline)
+    finite = jnp.isfinite(steps.value_to_go[:, 0]) & finite_rows(_flat(scores))
+
+    def mix(derivative: Inputs, node: tuple[Inputs, Array | None, Array | None]) -> tuple[Inputs, Array]:
+        score, jacobian, alpha = node
+        if alpha is None:
+            usable = finite & finite_rows(derivative)
+            shares = [
+                pull_back(part[:, None], None if jacobian is None else jacobian[:, None])
+                for part in (score, derivative)
+            ]
+            alpha = inverse_variance_alpha(*(jnp.sum(node_variance(share, usable)) for share in shares))
+        return weigh((1.0 - alpha, alpha), score, derivative), alpha
+
+    keeps = jnp.ones(linearisation.cost_state.shape[1], bool)
+    if linearisation.start_jacobian is None:
+        jacobian = None if steps.policy_jacobian is None else jnp.moveaxis(steps.policy_jacobian, 1, 0)
+        adjoint, controls, alphas = _sweep(linearisation, keeps, mix, (jnp.moveaxis(scores, 1, 0), jacobian, given))
+        rows = _gradient(linearisation, adjoint, controls)
+    else:  # theta acts once, before the first step
+        adjoint, controls, _ = _sweep(linearisation, keeps)
+        rows, alphas = mix(_gradient(linearisation, adjoint, controls), (scores[:, 0], None, given))
+    return jnp.where(finite[:, None], rows, jnp.nan), alphas
+
+
+def _sweep(
+    linearisation: Linearisation,
+    keeps: Bool[Array, " horizon"],
+    node: Callable[..., tuple[Inputs, Float[Array, ""]]] | None = None,
+    inputs: object = None,
+) -> tuple[Adjoint, Float[Array, "samples horizon inputs"], Float[Array, " horizon"]]:
+    """Run the recursion; return the adjoint of the start, g_h of every step, and the weights chosen by `node`.
+
+    `node` maps a step's derivative and its part of `inputs` to g_h and a weight; without one, g_h is the derivative.
+    """
+
+    def back(adjoint: Adjoint, step):
+        keep, cost_state, cost_control, over_state, over_control, policy_state, given = step
+        adjoint = jnp.where(keep, adjoint, 0.0)
+        derivative = cost_control + jnp.einsum("isc,is->ic", over_control, adjoint, precision="highest")
+        mixed, weight = node(derivative, given) if node else (derivative, jnp.ones((), derivative.dtype))
+        adjoint = cost_state + jnp.einsum("ist,is->it", over_state, adjoint, precision="highest")
+        if policy_state is not None:
+            adjoint = adjoint + jnp.einsum("ics,ic->is", policy_state, mixed, precision="highest")
+        return adjoint, (mixed, weight)
+
+    names = ("cost_state", "cost_control", "over_state", "over_control", "policy_state")
+    by_step = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 1, 0), [getattr(linearisation, name) for name in names])
+    adjoint, (controls, weights) = jax.lax.scan(
+        back, linearisation.final_state, (keeps, *by_step, inputs), reverse=True
     )
+    return adjoint, jnp.moveaxis(controls, 0, 1), weights
 
 
-def _node_variances(samples: Float[Array, "samples steps controls"]) -> Float[Array, "steps controls"]:
-    """Variance over the samples with only finite entries."""
-    finite = finite_rows(samples.reshape(samples.shape[0], -1))
-    return node_variance(samples, finite)
-
-
-def node_variance(samples: Float[Array, "samples ..."], finite: Bool[Array, " samples"]) -> Float[Array, "..."]:
-    """Variance of each entry over the samples marked as finite; NaN for fewer than two."""
-    mask = finite.reshape(-1, *(1,) * (samples.ndim - 1))
-    count = jnp.sum(finite).astype(samples.dtype)
-    mean = jnp.sum(jnp.where(mask, samples, 0.0), axis=0) / count
-    squares = jnp.sum(jnp.where(mask, (samples - mean[None]) ** 2, 0.0), axis=0)
-    return jnp.where(count > 1, squares / jnp.maximum(count - 1.0, 1.0), jnp.nan)
+def _gradient(
+    linearisation: Linearisation, adjoint: Adjoint, controls: Float[Array, "samples horizon inputs"]
+) -> Float[Array, "samples params"]:
+    """Gradient over theta from the adjoints of start and controls; NaN where the value is nonfinite."""
+    if linearisation.start_jacobian is None:
+        rows = pull_back(controls, linearisation.steps.policy_jacobian)
+    else:
+        rows = jnp.einsum("isp,is->ip", linearisation.start_jacobian, adjoint, precision="highest")
+    return jnp.where(jnp.isfinite(linearisation.steps.value_to_go[:, :1]), rows, jnp.nan)

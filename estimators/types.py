@@ -203,10 +203,10 @@ class AlphaChoice:
     """
 
     alpha: Float[Array, ""]
-    epsilon: Float[Array, ""] | None
-    discrepancy: Float[Array, ""] | None
-    variance_zeroth: Float[Array, ""] | None
-    variance_first: Float[Array, ""] | None
+    epsilon: Float[Array, ""] | None = None
+    discrepancy: Float[Array, ""] | None = None
+    variance_zeroth: Float[Array, ""] | None = None
+    variance_first: Float[Array, ""] | None = None
 
 
 @register_pytree

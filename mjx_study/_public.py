@@ -1,10 +1,10 @@
 """Public names of `mjx_study`, imported when one of them is first accessed."""
 
 import mjx_study._matplotlib  # noqa: F401
-from mjx_study.accessor import StudyAccessor
 from mjx_study.choices import FAMILIES
 from mjx_study.objective import MjxObjective, Simulator, simulate
 from mjx_study.plots.study import plot_study
+from mjx_study.report import StudyAccessor
 from mjx_study.runtime import configure
 from mjx_study.simulation.contact import (
     ContactModel,

@@ -42,84 +42,68 @@ STOCK_BATCH: Final = {"cpu": 125, "gpu": 32768, "tpu": 32768}
 """Maximum batch per device for stock MJX, whose gradients store every intermediate of every step."""
 
 
+TIMED: Final = {
+    "value": "zeroth order (rollout and baseline)",
+    "gradient": "first order (rollout and gradient)",
+    "rollout": "a rollout",
+    "stock_value": "a rollout through mjx.step",  # with the same solver budget
+    "engine_value": "a rollout by the C engine, mujoco.rollout",
+    "stock_gradient": "jax.grad through mjx.step, one iteration",
+    "engine_gradient": "C engine, mjd_transitionFD and adjoint",
+    "onset_base": "first order, MuJoCo's default contact",
+    "onset": "first order with the onset term, likewise",
+}
+"""What is timed, per sample."""
+RATIOS: Final = {
+    "gradient_per_value": ("gradient", "value"),
+    "rollouts_over_stock": ("stock_value", "rollout"),
+    "rollouts_over_engine": ("engine_value", "rollout"),
+    "speedup_over_stock": ("stock_gradient", "gradient"),
+    "speedup_over_engine": ("engine_gradient", "gradient"),
+    "onset_per_gradient": ("onset", "onset_base"),
+}
+"""Ratios of times, comparable between machines."""
+
+
 @dataclasses.dataclass(frozen=True)
 class BenchReport:
-    """Seconds per sample, memory, and resulting ratios.
-
-    Attributes:
-        task, samples, horizon: name of the task, number of samples, number of steps.
-        value_seconds: time of a zeroth-order sample: a rollout and its share of the baselines [s].
-        gradient_seconds: time of a first-order sample, one rollout and its gradient [s].
-        rollout_seconds: time of one rollout [s].
-        stock_value_seconds: time of a rollout through stock MJX with the same solver budget [s].
-        stock_gradient_seconds: time of a gradient through stock MJX with one solver iteration [s].
-        engine_value_seconds: time of a rollout by the C engine [s].
-        engine_gradient_seconds: time of a gradient by the C engine's differences on as many threads [s]; None if
-            unsupported.
-        value_memory, gradient_memory: temporary memory of all samples' rollouts, or gradients, at once [MiB].
-        onset_seconds, onset_base_seconds: time of a first-order sample through MuJoCo's default contact, with the
-            linear onset term and without it [s]; None without contact.
-    """
+    """Seconds per sample of what `TIMED` names and applies, and temporary memory of all samples' rollouts, or
+    gradients, at once [MiB]."""
 
     task: str
     samples: int
     horizon: int
     contact: str
-    value_seconds: float
-    gradient_seconds: float
-    rollout_seconds: float
-    stock_value_seconds: float
-    stock_gradient_seconds: float
-    engine_value_seconds: float
-    engine_gradient_seconds: float | None
+    seconds: dict[str, float]
     value_memory: float
     gradient_memory: float
     environment: dict[str, Any]
-    onset_seconds: float | None = None
-    onset_base_seconds: float | None = None
 
     @property
     def ratios(self) -> dict[str, float]:
-        """Ratios, comparable between machines."""
-        ratios = {
-            "gradient_per_value": self.gradient_seconds / self.value_seconds,
-            "rollouts_over_stock": self.stock_value_seconds / self.rollout_seconds,
-            "rollouts_over_engine": self.engine_value_seconds / self.rollout_seconds,
-            "speedup_over_stock": self.stock_gradient_seconds / self.gradient_seconds,
-        }
-        if self.engine_gradient_seconds is not None:
-            ratios["speedup_over_engine"] = self.engine_gradient_seconds / self.gradient_seconds
-        if self.onset_seconds is not None and self.onset_base_seconds is not None:
-            ratios["onset_per_gradient"] = self.onset_seconds / self.onset_base_seconds
-        return ratios
+        """The ratios of `RATIOS` that apply."""
+        seconds = self.seconds
+        return {name: seconds[one] / seconds[other] for name, (one, other) in RATIOS.items() if one in seconds}
 
     def as_json(self) -> dict[str, Any]:
-        return dataclasses.asdict(self) | {"ratios": self.ratios}
+        fields = {name: value for name, value in vars(self).items() if name != "seconds"}
+        return fields | {f"{name}_seconds": self.seconds.get(name) for name in TIMED} | {"ratios": self.ratios}
 
     def lines(self) -> list[str]:
         ratios, machine = self.ratios, self.environment
         device = machine["processor"] if machine["backend"] == "cpu" else machine["device_kind"]
-
-        def rate(label: str, seconds: float | None) -> list[str]:
-            if seconds is None:
-                return []
-            return [f"  {label:<46} {1e3 * seconds:8.3f} ms  {self.horizon / seconds / 1e6:8.3f} million steps/s"]
-
+        rates = {name: self.horizon / seconds / 1e6 for name, seconds in self.seconds.items()}
         engine = f", {ratios['speedup_over_engine']:.2f} x the C engine" if "speedup_over_engine" in ratios else ""
         onset = ratios.get("onset_per_gradient")
         return [
             f"{self.task}: {self.samples} samples of {self.horizon} steps, {self.contact}, "
             f"{machine['precision']}, {len(machine['devices'])} x {machine['backend']} ({device})",
             "per sample:",
-            *rate("zeroth order (rollout and baseline)", self.value_seconds),
-            *rate("first order (rollout and gradient)", self.gradient_seconds),
-            *rate("a rollout", self.rollout_seconds),
-            *rate("a rollout through mjx.step", self.stock_value_seconds),
-            *rate("a rollout by the C engine, mujoco.rollout", self.engine_value_seconds),
-            *rate("jax.grad through mjx.step, one iteration", self.stock_gradient_seconds),
-            *rate("C engine, mjd_transitionFD and adjoint", self.engine_gradient_seconds),
-            *rate("first order, MuJoCo's default contact", self.onset_base_seconds),
-            *rate("first order with the onset term, likewise", self.onset_seconds),
+            *(
+                f"  {label:<46} {1e3 * self.seconds[name]:8.3f} ms  {rates[name]:8.3f} million steps/s"
+                for name, label in TIMED.items()
+                if name in rates
+            ),
             "ratios of this run:",
             f"  a first-order sample costs {ratios['gradient_per_value']:.2f} zeroth-order samples",
             *([] if onset is None else [f"  the onset term makes it {onset:.2f} times as expensive"]),
@@ -141,11 +125,7 @@ class BenchPlan:
 
 
 def plan_bench(task: Task, samples: int) -> BenchPlan:
-    """Plan a benchmark.
-
-    Raises:
-        ValueError: fewer than one sample.
-    """
+    """Plan a benchmark; ValueError for fewer than one sample."""
     if samples < 1:
         raise ValueError(f"samples must be at least 1, got {samples}")
     check_memory(task, (ZerothOrder(), FirstOrder()), samples)
@@ -188,16 +168,16 @@ def bench(plan: BenchPlan, progress: Progress = lambda done, total, what: None) 
         progress(len(contenders) + min(repeat, len(contenders) - 1), total, f"{task.name}: measuring")
         for name, (count, call) in contenders.items():
             times[name].append(_seconds(call) / count)
-    medians = {f"{name}_seconds": statistics.median(values) for name, values in times.items()}
-    engine = _engine_seconds(task, cell.contact)
+    seconds = {name: statistics.median(values) for name, values in times.items()}
+    if (engine := _engine_seconds(task, cell.contact)) is not None:
+        seconds["engine_gradient"] = engine / len(devices)
     progress(total, total, "done")
     return BenchReport(
         task=task.name,
         samples=samples,
         horizon=task.horizon,
         contact=cell.label,
-        **medians,
-        engine_gradient_seconds=None if engine is None else engine / len(devices),
+        seconds=seconds,
         value_memory=simulator.memory("value", cell.contact, samples) / 2**20,
         gradient_memory=simulator.memory("gradient", cell.contact, samples) / 2**20,
         environment=environment(),
@@ -273,13 +253,10 @@ def _engine_seconds(task: Task, contact: ContactModel | None) -> float | None:
 def engine_rollouts(
     task: Task, contact: ContactModel | None, keys: jax.Array, threads: int
 ) -> tuple[int, Callable[[], np.ndarray]]:
-    """Prepare rollouts by the C engine, and return their number and a function that runs them.
+    """Prepare rollouts by the C engine, and return their number and a function that runs them and returns states
+    `(rollouts, horizon, state)`, laid out as `mujoco.mjtState.mjSTATE_FULLPHYSICS`.
 
     Their starts and controls are recorded from this project's rollouts, so feedback costs the engine nothing.
-
-    Returns:
-        The number, and a function without arguments that returns states `(rollouts, horizon, state)`, laid out as
-        `mujoco.mjtState.mjSTATE_FULLPHYSICS`.
     """
     host = engine_model(task.scene, contact)
     simulated = jax.vmap(lambda key: simulate(task, task.theta, contact, key, 1.0)[:2])
@@ -297,10 +274,8 @@ def engine_rollouts(
 def engine_gradient(
     task: Task, contact: ContactModel | None, start: tuple[np.ndarray, np.ndarray], controls: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Compute the gradient of the final state's sum over initial state and controls by the C engine.
-
-    Uses centred differences of each step and one adjoint sweep.
-    """
+    """Gradient of the final state's sum over initial state and controls, by centred differences of each of the C
+    engine's steps and one adjoint sweep."""
     host = engine_model(task.scene, contact)
     data = mujoco.MjData(host)
     data.qpos[:], data.qvel[:] = start

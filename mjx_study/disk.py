@@ -35,8 +35,10 @@ def prepare_folder(folder: str | Path) -> Path:
     return path
 
 
-def write_whole(path: Path, write: Callable[[IO[bytes]], Any]) -> Path:
-    """Write a file under a temporary name and rename it, so that it is complete or absent, even after a power loss.
+def write_whole(path: Path, content: bytes | Callable[[IO[bytes]], Any]) -> Path:
+    """Write a file, given its content or a function that writes it, under a temporary name, and rename it.
+
+    It is complete or absent, even after a power loss.
 
     Raises:
         OSError: it cannot be written; any previous content is kept.
@@ -44,7 +46,7 @@ def write_whole(path: Path, write: Callable[[IO[bytes]], Any]) -> Path:
     descriptor, temporary = _begin(path)
     try:
         with os.fdopen(descriptor, "wb") as file:
-            write(file)
+            content(file) if callable(content) else file.write(content)
             file.flush()
             os.fsync(file.fileno())
             os.fchmod(file.fileno(), 0o644)

@@ -12,6 +12,7 @@ import functools
 import hashlib
 import inspect
 import re
+import subprocess
 import sys
 import types
 from collections.abc import Iterable, Mapping
@@ -36,16 +37,12 @@ BY_VERSION: Final = {"mjx_study", "estimators", "mujoco", "jax", "jaxlib", "nump
 """Modules whose code is identified by version."""
 IRRELEVANT: Final = re.compile(r"_.*|.*name.*|.*path.*|.*rgba|(tex|mat|skin|light|cam|text)_.*|.*_matid")
 """Fields of MjModel that do not affect results."""
-ABOVE: Final = (
-    "cli", "plots", "render", "gradcheck", "claims", "report.py", "bench.py", "diagnose", "accessor.py",
-)  # fmt: skip
+ABOVE: Final = ("cli", "plots", "render", "gradcheck", "claims", "report.py", "bench.py", "diagnose")
 """Parts of mjx_study that use studies, and so do not affect their results."""
 DIGEST: Final = re.compile("[0-9a-f]{12,64}")
 """Digests, which messages do not show."""
 ACCEPT: Final = "choose another folder, or accept the mixture by --accept-versions"
 """Advice at the end of messages about other versions."""
-UNREAD: Final = ("description",)
-"""Fields of a task that do not affect results."""
 
 
 def versions() -> dict[str, str]:
@@ -53,22 +50,26 @@ def versions() -> dict[str, str]:
     return {name: metadata.version(name) for name in VERSIONED} | {"code of mjx-study": _own_code()}
 
 
+def git_revision(root: Path | None = None) -> str | None:
+    """Commit of a checkout, by default this package's; None outside one, before its first commit, or without git."""
+    folder = (Path(__file__).resolve().parents[1] if root is None else root) / ".git"
+    try:
+        found = subprocess.run(["git", f"--git-dir={folder}", "rev-parse", "--verify", "HEAD"], capture_output=True)
+    except OSError:
+        return None
+    return found.stdout.decode().strip() if found.returncode == 0 else None
+
+
 def contents(tasks: Mapping[str, Iterable[Task]]) -> dict[str, str]:
-    """Return the precision, and digests of everything that tasks consist of.
-
-    Args:
-        tasks: all variants (timesteps, cones) of each task, by its name in messages.
-
-    Returns:
-        Digests by name: "model of NAME", "task NAME", and "source of FILE" for every source file of a user's task.
-    """
+    """Return the precision, and digests of everything that tasks consist of, all variants (timesteps, cones) of each
+    together: "model of NAME", "task NAME", and "source of FILE" for every source file of a user's task."""
     found, sources = {"precision": precision()}, {}
     for name, forms in tasks.items():
         models, rest = _Digest(), _Digest()
         for task in forms:
             models.add(task.scene)
             for field in dataclasses.fields(task):
-                if field.name not in ("scene", *UNREAD):
+                if field.name not in ("scene", "description"):  # the latter does not affect results
                     rest.add((field.name, getattr(task, field.name)))
         found |= {f"model of {name}": models.hexdigest(), f"task {name}": rest.hexdigest()}
         sources |= rest.sources
@@ -85,8 +86,7 @@ def digest_of(value: Any) -> str:
 def trace_contents(made_of: Any) -> str | None:
     """Digest everything a trace depends on except its arguments and JAX's settings: exact values and models, and code.
 
-    Returns:
-        The digest, or None if code from outside this package is involved, whose imports are not all followed.
+    None if code from outside this package is involved, whose imports are not all followed.
     """
     digest = _Digest(exact=True)
     digest.add((made_of, [metadata.version(name) for name in VERSIONED], _own_code(ABOVE)))
@@ -100,8 +100,8 @@ def estimator_contents(*names: str) -> dict[str, str]:
         digest = _Digest()
         digest.add(find_estimator(name))
         if digest.sources:
-            sources = {f"source of {file}": content for file, content in sorted(digest.sources.items())}
-            found |= {f"estimator {name}": digest.hexdigest()} | sources
+            found[f"estimator {name}"] = digest.hexdigest()
+            found |= {f"source of {file}": content for file, content in sorted(digest.sources.items())}
     return found
 
 
@@ -111,21 +111,14 @@ def differences(theirs: Mapping[str, Any], ours: Mapping[str, Any]) -> str | Non
     Digests that only one of the two has come last, since another entry gives the reason.
     """
     different = [name for name in dict(theirs) | dict(ours) if theirs.get(name) != ours.get(name)]
-    different.sort(key=lambda name: _digests(theirs, ours, name) and (name not in theirs or name not in ours))
-    told = [_difference(name, theirs, ours) for name in different[:3]]
-    more = [f"{len(different) - 3} more"] if len(different) > 3 else []
-    return ", ".join(told + more) or None
-
-
-def _digests(theirs: Mapping[str, Any], ours: Mapping[str, Any], name: str) -> bool:
-    return any(DIGEST.fullmatch(str(each.get(name))) for each in (theirs, ours))
-
-
-def _difference(name: str, theirs: Mapping[str, Any], ours: Mapping[str, Any]) -> str:
-    if _digests(theirs, ours, name):
-        return f"{name} differs"
-    there, here = ("none" if each.get(name) is None else each[name] for each in (theirs, ours))
-    return f"{name} {there} there and {here} here"
+    digests = {name for name in different for each in (theirs, ours) if DIGEST.fullmatch(str(each.get(name)))}
+    different.sort(key=lambda name: name in digests and (name not in theirs or name not in ours))
+    told = []
+    for name in different[:3]:
+        there, here = ("none" if each.get(name) is None else each[name] for each in (theirs, ours))
+        told.append(f"{name} differs" if name in digests else f"{name} {there} there and {here} here")
+    told += [f"{len(different) - 3} more"] if len(different) > 3 else []
+    return ", ".join(told) or None
 
 
 @functools.cache
@@ -143,11 +136,8 @@ def _own_code(without: tuple[str, ...] = ()) -> str:
 
 @functools.cache
 def code_of(module: str) -> str:
-    """Digest the code behind a ledger measurement: a module, its imports from its own package, and the code below.
-
-    Args:
-        module: name of an imported module.
-    """
+    """Digest the code behind a ledger measurement: an imported module, its imports from its own package, and the code
+    below."""
     package, found, waiting = module.rpartition(".")[0], {}, [module]
     while waiting:
         name = waiting.pop()

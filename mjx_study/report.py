@@ -1,17 +1,19 @@
-"""A study as one self-contained HTML page: warnings, figures, tables, configuration, and the command that made it."""
+"""A study as one self-contained HTML page: warnings, figures, tables, configuration, and the command that made it; and
+the methods of its Dataset."""
 
 import base64
 import io
-import itertools
 import json
 from typing import Any, Final
 
 import jinja2
 import numpy as np
+import pandas as pd
 import xarray as xr
 from matplotlib.figure import Figure
 
 from mjx_study.plots.study import SWEPT, plot_study
+from mjx_study.study.findings import findings, rows_of
 from mjx_study.study.run import warnings_of
 
 CAPTIONS: Final = {
@@ -26,12 +28,13 @@ CAPTIONS: Final = {
     "landscape": "Cost along a line through theta, and the slope that the mean of each estimator has there.",
     "descent": "Cost against iterations, rollouts and seconds.",
 }
-KINDS: Final = {"gradients": "gradient estimates", "descents": "gradient descent", "landscapes": "landscapes"}
-SUMMARY: Final = {
-    "gradients": "Medians over the seeds, at the largest sample count.",
-    "descents": "Medians over the seeds, at the largest sample count.",
-    "landscapes": "At the largest sample count.",
+MEDIANS: Final = "Medians over the seeds, at the largest sample count."
+KINDS: Final = {
+    "gradients": ("gradient estimates", MEDIANS),
+    "descents": ("gradient descent", MEDIANS),
+    "landscapes": ("landscapes", "At the largest sample count."),
 }
+"""Title, and what the numbers in the table are, by kind of study."""
 PRESENT: Final = ("residual", "rollouts", "unconverged")
 """For every kind of study, a variable that is finite in every computed cell."""
 COLUMNS: Final = {
@@ -52,16 +55,45 @@ COLUMNS: Final = {
 }
 
 
+@xr.register_dataset_accessor("mjx_study")
+class StudyAccessor:
+    """Methods of a study's Dataset: `data.mjx_study.table()`, `.findings()`, `.warnings()`, `.plot()`, `.report()`."""
+
+    def __init__(self, dataset: xr.Dataset):
+        self._dataset = dataset
+
+    def table(self) -> pd.DataFrame:
+        """Return a row per contact model, seed and estimator, without variables over iterations, points or theta."""
+        if "variance" in self._dataset:
+            return pd.DataFrame([row.as_dict() for row in rows_of(self._dataset)])
+        long = {"iteration", "point", "param", "solref_entry", "solimp_entry"}
+        short = [name for name, variable in self._dataset.data_vars.items() if not long & set(variable.dims)]
+        return self._dataset[short].to_dataframe().reset_index()
+
+    def findings(self) -> list[str]:
+        return findings(self._dataset)
+
+    def warnings(self) -> tuple[str, ...]:
+        return warnings_of(self._dataset)
+
+    def plot(self) -> dict[str, Figure]:
+        return plot_study(self._dataset)
+
+    def report(self) -> str:
+        return report(self._dataset)
+
+
 def report(dataset: xr.Dataset) -> str:
     config = json.loads(dataset.attrs["config"])
+    title, summary = KINDS[config["kind"]]
     pages = jinja2.Environment(loader=jinja2.PackageLoader("mjx_study"), autoescape=True, keep_trailing_newline=True)
     return pages.get_template("report.html").render(
         tasks=", ".join(config["tasks"]),
-        kind=KINDS[config["kind"]],
+        kind=title,
         models=dataset.sizes["model"],
         warnings=warnings_of(dataset),
         figures=[_figure(name, figure) for name, figure in plot_study(dataset).items()],
-        summary=SUMMARY[config["kind"]],
+        summary=summary,
         numbers=_numbers(dataset),
         config=[[key, _shown(value)] for key, value in sorted(config.items()) if value is not None],
         provenance=_provenance(dataset),
@@ -83,19 +115,16 @@ def _numbers(dataset: xr.Dataset) -> tuple[list[str], list[list[str]]] | None:
         return None
     if "smoothed" in dataset:
         dataset = _with_extremes(dataset)
-    outer = [name for name in ("task", "timestep", "cone", "sigma") if dataset.sizes[name] > 1]
+    axes = ("task", "timestep", "cone", "sigma", "model", "estimator")
+    outer = [name for name in axes[:4] if dataset.sizes[name] > 1]
     variables = [name for name in COLUMNS if name in dataset]
     last = dataset.isel(samples=-1)
     rows = []
-    for picked in itertools.product(*(range(dataset.sizes[name]) for name in outer)):
-        part = last.isel(dict(zip(outer, picked, strict=True)))
-        part = part.squeeze([name for name in ("task", "timestep", "cone", "sigma") if name in part.dims])
-        for model, estimator in itertools.product(part["model"].values, part["estimator"].values):
-            one = part.sel(model=model, estimator=estimator)
-            numbers = [_reduced(name, one[name]) for name in variables]
-            if any(np.isfinite(one[name]).all() for name in PRESENT if name in one):
-                place = [_shown(part[name].item()) for name in outer]
-                rows.append([str(model), *place, str(estimator), *map(_shown, numbers)])
+    for picked in np.ndindex(*(dataset.sizes[name] for name in axes)):
+        one = last.isel(dict(zip(axes, picked, strict=True)))
+        if any(np.isfinite(one[name]).all() for name in PRESENT if name in one):
+            place = [_shown(one[name].item()) for name in ("model", *outer, "estimator")]
+            rows.append([*place, *(_shown(_reduced(name, one[name])) for name in variables)])
     titles = ["contact model", *(SWEPT.get(name, name) for name in outer), "estimator"]
     return [*titles, *(COLUMNS[name] for name in variables)], rows
 

@@ -10,8 +10,9 @@ Without a running stopwatch, `timed` does nothing. Times are those of its own th
 import dataclasses
 import math
 import time
+from collections import defaultdict
 from collections.abc import Callable, Generator, Hashable
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from contextvars import ContextVar, copy_context
 from functools import partial
 from typing import Any, Final
@@ -28,23 +29,16 @@ SAVED: Final = "/jax/compilation_cache/compile_time_saved_sec"
 
 @dataclasses.dataclass
 class Spent:
-    """Times of one program [s].
-
-    Attributes:
-        calls, seconds: number and total time of calls without compilation.
-        setups, first_calls, first: number of compilations, number of calls timed with them, and their total time.
-        traced, read, compiled: shares of `first` reported by JAX: tracing, compiling or reading a compiled program, and
-            the time that compiling takes without a cache.
-    """
+    """Times of one program [s]."""
 
     calls: int = 0
-    seconds: float = 0.0
-    setups: int = 0
-    first_calls: int = 0
-    first: float = 0.0
-    traced: float = 0.0
-    read: float = 0.0
-    compiled: float = 0.0
+    seconds: float = 0.0  # of calls without compilation
+    setups: int = 0  # compilations
+    first_calls: int = 0  # calls timed with them
+    first: float = 0.0  # total time of these, of which JAX reports:
+    traced: float = 0.0  # tracing
+    read: float = 0.0  # compiling, or reading a compiled program
+    compiled: float = 0.0  # what compiling takes without a cache
 
     def add(self, calls: int, seconds: float, traced: float = 0.0, read: float = 0.0, compiled: float = 0.0) -> None:
         if compiled == 0:
@@ -77,17 +71,12 @@ class Spent:
 
 
 class Stopwatch:
-    """Times by program, for one thread.
-
-    Attributes:
-        saved: time of the last write to disk [s], by `time.monotonic`.
-        clock: wall clock [s].
-    """
+    """Times by program, for one thread; `saved` is when they were last written to disk [s], by `time.monotonic`."""
 
     clock = staticmethod(time.perf_counter)
 
     def __init__(self) -> None:
-        self.spent: dict[Hashable, Spent] = {}
+        self.spent: dict[Hashable, Spent] = defaultdict(Spent)
         self.saved = -math.inf
         self._events = np.zeros(3)  # tracing; reading or compiling; compiling as if there were no cache
         self._within = np.zeros(4)  # wall time and events of nested timings
@@ -106,17 +95,15 @@ class Stopwatch:
     @contextmanager
     def timed(self, program: Hashable, calls: int) -> Generator[None]:
         outside, self._within, begun = self._within, np.zeros(4), self._now()
-        whole = True
+        whole = False
         try:
             yield
-        except BaseException:
-            whole = False
-            raise
+            whole = True
         finally:
             spent = self._now() - begun
             own, self._within = spent - self._within, outside + spent
             if whole:
-                self.spent.setdefault(program, Spent()).add(calls, *map(float, own))
+                self.spent[program].add(calls, *map(float, own))
 
     def _now(self) -> np.ndarray:
         return np.array([self.clock(), *self._events])
@@ -134,25 +121,17 @@ _RUNNING: ContextVar[Stopwatch | None] = ContextVar("stopwatch", default=None)
 
 @contextmanager
 def timed(program: Hashable, calls: int = 1) -> Generator[None]:
-    """Time calls of a program if a stopwatch runs; the first time includes tracing and compilation, see `Spent`.
-
-    Args:
-        program: name under which times accumulate.
-        calls: number of consecutive calls.
-    """
+    """Time consecutive calls of a program if a stopwatch runs; the first time includes tracing and compilation, see
+    `Spent`."""
     watch = _RUNNING.get()
-    if watch is None:
+    with nullcontext() if watch is None else watch.timed(program, calls):
         yield
-    else:
-        with watch.timed(program, calls):
-            yield
 
 
 def tell(program: Hashable, calls: int, seconds: float) -> None:
     """Add calls timed elsewhere, such as in another thread, if a stopwatch runs."""
-    watch = _RUNNING.get()
-    if watch is not None:
-        watch.spent.setdefault(program, Spent()).add(calls, seconds)
+    if (watch := _RUNNING.get()) is not None:
+        watch.spent[program].add(calls, seconds)
 
 
 def unheard(call: Callable[[], Any]) -> Callable[[], Any]:

@@ -25,8 +25,8 @@ import pytest
 from hypothesis import strategies as st
 
 from estimators import ESTIMATORS
-from mjx_study import cli
-from mjx_study.cli import bench, gradcheck, landscape, optimise, options, parameters, rollout, studies, sweep
+from mjx_study import bench, cli, gradcheck, tasks
+from mjx_study.cli import motions, options, studies
 from mjx_study.option import OPTIONS
 from mjx_study.simulation.contact import FAMILIES
 from mjx_study.study import plan as sweep_plan
@@ -54,9 +54,9 @@ def stub(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(options, "configure", lambda **_: None)
     mujoco.set_mju_user_warning(lambda message: print(f"MuJoCo: {message}", file=sys.stderr))  # as `configure` does
     for module, names in (
-        (studies, ("_compute",)), (sweep, ("open_store", "run_study")),
-        (gradcheck.check, ("gradcheck",)), (bench.benchmark, ("bench",)),
-        (rollout, ("_simulate_task", "_simulate_passive")),
+        (studies, ("_compute", "open_store", "run_study")),
+        (gradcheck, ("gradcheck",)), (bench, ("bench",)),
+        (motions, ("_simulate_task", "_simulate_passive")),
     ):  # fmt: skip
         for name in names:
             monkeypatch.setattr(module, name, planned)
@@ -64,7 +64,7 @@ def stub(monkeypatch: pytest.MonkeyPatch) -> None:
     for command in COMMANDS:
         flags_of(command)  # outside of strategies: building a parser uses the random module
     built = functools.lru_cache(maxsize=256)(make_task)
-    for module in (parameters, sweep_plan, gradcheck, landscape, optimise):
+    for module in (tasks, sweep_plan):
         monkeypatch.setattr(module, "make_task", built)
 
 

@@ -11,12 +11,10 @@ import pytest
 from matplotlib.colors import to_hex
 
 from mjx_study import cli
-from mjx_study.claims import ledger
-from mjx_study.claims.catalogue import CLAIMS, VERDICTS
-from mjx_study.claims.figure import COLOURS, draw_matrix
+from mjx_study.claims import CLAIMS, NUM_VERDICTS, ledger
 from mjx_study.claims.laboratory import EFFORTS, Laboratory, Statistic, exact, mean_of, ratio_of, share_of
 from mjx_study.claims.ledger import Claim, above, below, deciding_size, interval_of, measure_ledger, within
-from mjx_study.claims.page import LEGEND, markdown, table
+from mjx_study.claims.page import COLOURS, LEGEND, draw_matrix, markdown, table
 
 DOCS = Path(__file__).parents[1] / "docs"
 LEVEL = 1 - 0.05 / 200
@@ -77,11 +75,11 @@ def test_the_sample_size_that_would_decide() -> None:
 
 @pytest.mark.parametrize("name", ["lemma-closed-form", "ramp-looks-like-a-jump", "jump-without-variance"])
 def test_analytic_claims_hold(name: str) -> None:
-    document = measure_ledger([CLAIMS[name]], "quick", verdicts=VERDICTS)
+    document = measure_ledger([CLAIMS[name]], "quick", verdicts=NUM_VERDICTS)
     (claim,) = document["claims"]
     assert {each["verdict"] for each in claim["evidence"]} == {"holds"}
-    assert document["level"] == 1 - 0.05 / VERDICTS
-    assert f"1 - 0.05 / {VERDICTS} (Bonferroni)" in markdown(document)
+    assert document["level"] == 1 - 0.05 / NUM_VERDICTS
+    assert f"1 - 0.05 / {NUM_VERDICTS} (Bonferroni)" in markdown(document)
 
 
 def test_a_wrong_estimator_is_seen() -> None:
@@ -93,7 +91,7 @@ def test_a_wrong_estimator_is_seen() -> None:
 
     claim = dataclasses.replace(CLAIMS["zobg-unbiased"], systems={"step": ("reference",)})
     for measure, verdict in ((claim.measure, "holds"), (off, "fails")):
-        document = measure_ledger([dataclasses.replace(claim, measure=measure)], "quick", verdicts=VERDICTS)
+        document = measure_ledger([dataclasses.replace(claim, measure=measure)], "quick", verdicts=NUM_VERDICTS)
         assert document["claims"][0]["evidence"][0]["verdict"] == verdict
 
 
@@ -149,7 +147,7 @@ def test_the_page_is_what_the_code_says() -> None:
     document = json.loads((DOCS / "claims.json").read_text())
     assert (DOCS / "claims.md").read_text() == markdown(document)
     assert [claim["id"] for claim in document["claims"]] == list(CLAIMS)
-    assert document["verdicts"] == VERDICTS and document["effort"]["name"] in EFFORTS
+    assert document["verdicts"] == NUM_VERDICTS and document["effort"]["name"] in EFFORTS
     for told in document["claims"]:
         claim = CLAIMS[told["id"]]
         said = (claim.place, claim.statement, claim.criterion.quantity, claim.criterion.lines(), claim.show)

@@ -16,9 +16,9 @@ import jax.numpy as jnp
 import pytest
 
 from mjx_study import cli
-from mjx_study.cli import compare as compare_command
 from mjx_study.cli import options
 from mjx_study.plots.style import PAGE
+from mjx_study.study import plan as plan_module
 from mjx_study.study.configuration import StudyConfig
 from mjx_study.study.findings import rows_of
 from mjx_study.study.plan import StudyPlan, plan_study
@@ -149,7 +149,7 @@ def test_one_nan_sample_does_not_poison_the_table(
         task = group.task.replace(final_cost=final_cost)
         return dataclasses.replace(plan, groups=(dataclasses.replace(group, task=task),))
 
-    monkeypatch.setattr(compare_command, "plan_study", with_a_nan)
+    monkeypatch.setattr(plan_module, "plan_study", with_a_nan)
     arguments = ["compare", "pusher", *SMALL, "--samples", "32", "--stiffness", "10", "--contact", "penalty"]
     assert cli.main(arguments) == 0
     printed = capsys.readouterr().out

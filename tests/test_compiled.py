@@ -3,6 +3,7 @@
 import dataclasses
 import re
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -134,14 +135,18 @@ def test_statistics_of_seeds_and_structures_come_back(folder: Path):
         "differentiation": simulated.differentiate(task.theta, keys),
     }
     reference = chosen[1](drawn)
-    arguments = jax.tree.map(lambda leaf: leaf[None], drawn), reference, jax.random.split(jax.random.key(1), 1)
+    batches, samples = jax.tree.map(lambda leaf: leaf[None], drawn), np.asarray(len(keys))
+    others = samples, reference, jax.random.split(jax.random.key(1), 1)
     with jax.debug_key_reuse(False):
-        first = gradients._seed_numbers(chosen, 0.9)(*arguments)
+        first = gradients._seed_numbers(chosen, 0.9)(batches, *others)
         gradients._seed_numbers.cache_clear()
-        again = gradients._seed_numbers(chosen, 0.9)(*arguments)
-    assert len(list(folder.glob("*.trace"))) == 3
+        again = gradients._seed_numbers(chosen, 0.9)(batches, *others)
+        assert len(list(folder.glob("*.trace"))) == 3
+        padded = jax.tree.map(lambda leaf: gradients._padded(leaf, 2 * len(keys)), batches)
+        filled = gradients._seed_numbers(chosen, 0.9)(padded, *others)
     assert first[0]["alpha"] is not None and first[1]["alpha"] is None
     jax.tree.map(np.testing.assert_array_equal, again, first)
+    jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-12), filled, first)  # padding is not counted
 
 
 @pytest.mark.parametrize("names", [("zobg", "aobg"), ("zobg", "fobg_onset")])
@@ -152,9 +157,9 @@ def test_statistics_are_compiled_for_the_batches_that_come(
     monkeypatch.setattr(gradients, "traces_folder", lambda: folder)
     gradients._seed_numbers.cache_clear()
     needs = {oracle for name in names for oracle in estimators.find_estimator(name).needs}
-    chosen = {"contact": ("penalty",), "stiffness": (100.0,), "horizon": 2, "samples": (6,), "seeds": 3}
-    for _ in range(2):  # the second time they are compiled
-        run_study(StudyConfig(tasks=("pusher",), estimators=names, **chosen))
+    chosen = {"contact": ("penalty",), "stiffness": (100.0,), "horizon": 2, "seeds": 3}
+    for samples in (6, 6, 5):  # the second time they are compiled; other sizes are padded to the same
+        run_study(StudyConfig(tasks=("pusher",), estimators=names, samples=(samples,), **chosen))
     assert len(list(folder.glob("*.trace"))) == len(needs | {"differentiation"}) + 1
 
 

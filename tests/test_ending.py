@@ -22,20 +22,20 @@ from tests.documents import stages_of
 
 SIGNALS = """
 import os, signal, sys, time
-from mjx_study.cli import options
+from mjx_study.cli import output
 
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a background job's children ignore it
 signal.signal(signal.SIGHUP, signal.SIG_DFL)
 for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
     child = os.fork()
     if child == 0:
-        with options.computing("the same command resumes"):
+        with output.computing("the same command resumes"):
             os.kill(os.getpid(), number)
             time.sleep(5)
         os._exit(1)
     print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
 signal.signal(signal.SIGHUP, signal.SIG_IGN)  # nohup
-with options.computing():
+with output.computing():
     os.kill(os.getpid(), signal.SIGHUP)
 print("goes on")
 """

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from mjx_study.cli import compare
+from mjx_study.study import plan as plan_module
 from mjx_study.study import run as sweep
 from mjx_study.study.configuration import StudyConfig
 from mjx_study.study.plan import plan_study
@@ -121,7 +121,7 @@ def test_the_fuzzer_finds_a_traceback_and_an_exit(folder: Path, monkeypatch: pyt
         return plan
 
     for error in (KeyError("theta"), SystemExit(0), fuzzing.TooSlow()):
-        monkeypatch.setattr(compare, "plan_study", broken(error))
+        monkeypatch.setattr(plan_module, "plan_study", broken(error))
         with pytest.raises((KeyError, AssertionError, fuzzing.TooSlow)):
             fuzzing.answer(["compare", "pusher"], folder)
 
@@ -129,6 +129,6 @@ def test_the_fuzzer_finds_a_traceback_and_an_exit(folder: Path, monkeypatch: pyt
         (folder / "policy.json").write_text("mine")
         raise ValueError("and refuses")
 
-    monkeypatch.setattr(compare, "plan_study", touching)
+    monkeypatch.setattr(plan_module, "plan_study", touching)
     with pytest.raises(AssertionError, match="a file was touched"):
         fuzzing.answer(["compare", "pusher"], folder)

@@ -16,13 +16,12 @@ import xarray as xr
 
 from mjx_study import identity
 from mjx_study.disk import write_whole
-from mjx_study.identity import contents, differences
+from mjx_study.identity import contents, differences, git_revision
 from mjx_study.simulation.scene import models_folder
 from mjx_study.study import cells as sweep_cells
 from mjx_study.study import store
 from mjx_study.study.configuration import StudyConfig
 from mjx_study.study.plan import StudyCell, StudyPlan, plan_study
-from mjx_study.study.revision import git_revision
 from mjx_study.study.run import load_study, run_study, warnings_of
 from mjx_study.study.store import Part, Store, StudyError
 from mjx_study.tasks import make_task

@@ -19,7 +19,7 @@ from scipy.integrate import quad
 from estimators import NOISES, Differentiation, Evaluation
 from mjx_study import cli
 from mjx_study.cli import options, studies
-from mjx_study.cli.landscape import curves
+from mjx_study.cli.console import curves
 from mjx_study.cli.studies import as_document
 from mjx_study.reference import BallWall, FunctionObjective, Heaviside, Quadratic, smoothed
 from mjx_study.simulation.dynamics import State
@@ -27,10 +27,9 @@ from mjx_study.study import landscapes, sampling
 from mjx_study.study import plan as plan_module
 from mjx_study.study.configuration import StudyConfig
 from mjx_study.study.findings import curves_of, findings
-from mjx_study.study.landscapes import closed_form, compute_landscapes
-from mjx_study.study.line import line_of
+from mjx_study.study.landscapes import Line, applies, closed_form, compute_landscapes, grid, means
 from mjx_study.study.plan import StudyPlan, plan_study
-from mjx_study.study.quadrature import Line, applies, grid, means
+from mjx_study.study.resolution import line_of
 from mjx_study.study.run import load_study, run_study
 from mjx_study.tasks import make_task
 from mjx_study.tasks.policy import InitialStatePolicy, LinearFeedback

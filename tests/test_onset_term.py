@@ -18,7 +18,7 @@ from mjx_study.simulation.contact import ContactModel, apply_contact, contact_mo
 from mjx_study.simulation.dynamics import initial_state, rollout
 from mjx_study.simulation.onset import check_onset, corrected_rollout
 from mjx_study.study.findings import SHARE_OFF
-from mjx_study.study.quadrature import Line, grid, means
+from mjx_study.study.landscapes import Line, grid, means
 from mjx_study.tasks import make_task
 from mjx_study.tasks.contact_grid import contact_grid
 from tests.scenes import floor_scene, option, scene_of

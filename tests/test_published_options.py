@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from mjx_study import cli
-from mjx_study.cli import options, sweep
+from mjx_study.cli import options
+from mjx_study.cli.studies import sweep_fields
 from mjx_study.reference import DoublePendulum, roll_out
-from mjx_study.reference.adjoint import gradients_along
+from mjx_study.reference.system import gradients_along
 from mjx_study.study.configuration import StudyConfig
 from mjx_study.study.plan import estimators_of, plan_study
 from mjx_study.study.resolution import configured_estimators
@@ -82,7 +83,7 @@ def test_a_file_of_options_may_ask_for_them(tmp_path: Path, value: str, kept: bo
     path = tmp_path / "study.toml"
     path.write_text(f'tasks = ["pusher"]\npublished = {value}\n')
     parsed = cli.parser().parse_args(["sweep", "--config", str(path), "--output", "x"])
-    assert sweep._fields(parsed)["published"] is kept
+    assert sweep_fields(parsed)["published"] is kept
 
 
 def test_what_they_do_to_the_weight_of_first_order_gradients() -> None:

@@ -18,7 +18,7 @@ import pytest
 
 from estimators import first_order, variance_interval, zeroth_order
 from mjx_study.objective import SamplePrograms, Simulator
-from mjx_study.reference import Pusher, ReferenceObjective, roll_out, value_and_gradient
+from mjx_study.reference import Pusher, ReferenceObjective, roll_out, value_and_gradients
 from mjx_study.simulation.contact import ContactModel, ContactWarning, family_model
 from tests.pusher_fixtures import (
     DATA,
@@ -53,7 +53,7 @@ def mujoco_default() -> ContactModel:
 
 
 def gradient_of(system: Pusher, controls: np.ndarray) -> np.ndarray:
-    return value_and_gradient(system, START, controls)[1].ravel()
+    return value_and_gradients(system, START, controls)[1].controls.ravel()
 
 
 # Rollouts

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from estimators import first_order, variance_interval, zeroth_order
-from mjx_study.reference import Pusher, ReferenceObjective, System, roll_out, value_and_gradient
+from mjx_study.reference import Pusher, ReferenceObjective, System, roll_out, value_and_gradients
 from tests.pusher_fixtures import (
     HORIZON,
     INPUTS,
@@ -64,7 +64,7 @@ def test_cost_gradients_against_differences():
 @pytest.mark.parametrize("make", [Pusher, ImpedancePusher])
 def test_adjoint_gradient_against_differences(make, stiffness, name):
     system, controls, step = make(stiffness), INPUTS[name], 1e-3
-    gradient = value_and_gradient(system, START, controls)[1].ravel()
+    gradient = value_and_gradients(system, START, controls)[1].controls.ravel()
     events = contact_events(system, controls)
     for direction in directions(6, (0, 50, HORIZON - 1)):
         shifted = [controls + sign * step * direction[:, None] for sign in (1, -1)]
@@ -98,12 +98,12 @@ def test_contact_only_pushes():
 def test_batch_equals_loop(make):
     system = make(1000.0)
     controls = 0.1 + 0.1 * np.random.default_rng(3).standard_normal((4, HORIZON, 1))
-    values, gradients = value_and_gradient(system, START, controls)
-    for one, value, gradient in zip(controls, values, gradients, strict=True):
-        alone_value, alone_gradient = value_and_gradient(system, START, one)
+    values, gradients = value_and_gradients(system, START, controls)
+    for one, value, gradient in zip(controls, values, gradients.controls, strict=True):
+        alone_value, alone = value_and_gradients(system, START, one)
         # Sums over a batch may be vectorised in another order; this K amplifies rounding by the gradient's growth.
         assert value == pytest.approx(alone_value, rel=1e-9)
-        assert relative(gradient, alone_gradient) < 1e-6
+        assert relative(gradient, alone.controls) < 1e-6
 
 
 def reference_variances(stiffness: float, seed: int):

@@ -17,19 +17,17 @@ from mjx_study.render import (
     Motion,
     RenderError,
     animate,
-    animation,
     choose_view,
+    figures,
     opengl,
     resolve_renderer,
     resolve_view,
     strip,
     stroboscope,
 )
-from mjx_study.render.animation import frame_times
-from mjx_study.render.drawing import FIXED, PALETTE, Drawing, geom_colours
-from mjx_study.render.figures import time_label
-from mjx_study.render.framing import bounds, edges
-from mjx_study.render.outline import CIRCLE, View, convex_hull, shape_of
+from mjx_study.render.drawing import CIRCLE, FIXED, PALETTE, Drawing, convex_hull, geom_colours, shape_of
+from mjx_study.render.figures import frame_times, time_label
+from mjx_study.render.motion import View, bounds, edges
 
 XZ, XY, YZ = VIEWS["xz"], VIEWS["xy"], VIEWS["yz"]
 TETRAHEDRON = '<asset><mesh name="tetrahedron" vertex="0 0 0 .3 0 0 0 .3 0 0 0 .4"/></asset>'
@@ -496,8 +494,8 @@ def test_a_motion_of_one_state_is_a_film_of_one_frame(tmp_path: Path) -> None:
 
 def test_a_gif_that_would_be_too_large_is_made_smaller() -> None:
     noise = np.random.default_rng(0).integers(0, 255, (12, 480, 640, 3), dtype=np.uint8)
-    content = animation._gif(noise, np.full(12, 40), 64)
-    assert len(content) <= animation.MOST_BYTES
+    content = figures._gif(noise, np.full(12, 40), 64)
+    assert len(content) <= figures.MOST_BYTES
 
 
 def test_mp4_without_ffmpeg_names_gif(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

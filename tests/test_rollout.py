@@ -13,8 +13,8 @@ import pytest
 from PIL import Image, ImageSequence
 
 from mjx_study import cli
+from mjx_study.cli import motions, rollout
 from mjx_study.cli import options as shared
-from mjx_study.cli import rollout
 from mjx_study.objective import Simulator
 from mjx_study.render import RenderError
 from mjx_study.simulation.engine import quiet_engine
@@ -233,7 +233,7 @@ def test_a_film_that_fails_leaves_nothing(monkeypatch: pytest.MonkeyPatch, elsew
     def fail(*_: object, **__: object) -> Path:
         raise RenderError("ffmpeg cannot write an mp4 here")
 
-    monkeypatch.setattr(rollout, "animate", fail)
+    monkeypatch.setattr(motions, "animate", fail)
     with pytest.raises(shared.UsageError, match="ffmpeg cannot write an mp4 here"):
         call(*SHORT, "--output", "out")
     assert list((elsewhere / "out").iterdir()) == []
@@ -243,7 +243,7 @@ def test_a_start_that_is_not_finite_is_refused(monkeypatch: pytest.MonkeyPatch) 
     task = make_task("pusher", horizon=2)
     start = task.draw_start(jax.random.key(0))
     lost = type(start)(jnp.full(2, jnp.nan), start.qvel, start.act, start.warmstart)
-    monkeypatch.setattr(rollout, "task_of", lambda options: task.replace(start=lost))
+    monkeypatch.setattr(motions, "task_of", lambda options: task.replace(start=lost))
     with pytest.raises(shared.UsageError, match="pusher: .*: the first state is not finite"):
         call(*SHORT, "--output", "out")
 

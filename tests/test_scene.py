@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from mjx_study.choices import CONES, INTEGRATORS, SOLVERS
-from mjx_study.cli.options import Parser, add_scene_options, scene_options
+from mjx_study.cli.options import Parser, scene_options
 from mjx_study.simulation.dynamics import State
 from mjx_study.simulation.limitations import FLAGS
 from mjx_study.simulation.scene import (
@@ -192,7 +192,7 @@ def test_the_command_line_changes_what_is_refused(tmp_path: Path) -> None:
     option = '<option integrator="RK4" solver="PGS"><flag fwdinv="enable" sleep="enable"/></option>'
     path.write_text(floor_scene(FREE_BOX, option))
     parser = Parser()
-    add_scene_options(parser)
+    parser.add_scene_options()
     given = "--solver newton --disable-flag fwdinv,sleep --integrator euler".split()
     for count, message in ((0, "--solver"), (2, "--disable-flag fwdinv,sleep"), (4, "--integrator")):
         with pytest.raises(SceneError, match=message):

@@ -11,7 +11,7 @@ import pytest
 import xarray as xr
 from matplotlib.patches import Rectangle
 
-import mjx_study.accessor  # noqa: F401  # registers `Dataset.mjx_study`, which no other import here does
+import mjx_study.report  # noqa: F401  # registers `Dataset.mjx_study`, which no other import here does
 from estimators import AlphaOrder, InverseVariance
 from mjx_study import disk
 from mjx_study.cli import console

@@ -25,8 +25,8 @@ import estimators
 from estimators import AlphaOrder, DiscontinuityGated
 from mjx_study import cli
 from mjx_study.cli import options
-from mjx_study.cli.parsers.sweep import solimp, solref
-from mjx_study.cli.sweep import _fields
+from mjx_study.cli.studies import sweep_fields
+from mjx_study.cli.sweep import solimp, solref
 from mjx_study.objective import Simulator, simulate
 from mjx_study.plots import study as study_plots
 from mjx_study.report import report
@@ -492,7 +492,7 @@ def test_a_file_and_flags_are_one_configuration(tmp_path: Path) -> None:
     path = tmp_path / "study.toml"
     path.write_text('tasks = ["pusher"]\nstiffness = "10:1000:3:log"\nsamples = [4, 8]\nseeds = 2\nhorizon = 9\n')
     parsed = cli.parser().parse_args(["sweep", "--config", str(path), "--seeds", "3", "--output", "x"])
-    assert StudyConfig(**_fields(parsed)) == StudyConfig(
+    assert StudyConfig(**sweep_fields(parsed)) == StudyConfig(
         tasks=("pusher",), stiffness=(10.0, 100.0, 1000.0), samples=(4, 8), seeds=3, horizon=9
     )
 
@@ -517,9 +517,9 @@ def test_a_file_with_a_value_of_another_kind_gets_one_line(tmp_path: Path, line:
     path = tmp_path / "study.toml"
     path.write_text(f'tasks = ["pusher"]\n{line}\n')
     with pytest.raises(ValueError, match=re.escape(says)):
-        _fields(cli.parser().parse_args(["sweep", "--config", str(path), "--output", "x"]))
+        sweep_fields(cli.parser().parse_args(["sweep", "--config", str(path), "--output", "x"]))
     path.write_text('tasks = ["pusher"]\npoints = 3\ndirection = 3\ngamma = 5\n')
-    fields = _fields(cli.parser().parse_args(["sweep", "--config", str(path), "--output", "x"]))
+    fields = sweep_fields(cli.parser().parse_args(["sweep", "--config", str(path), "--output", "x"]))
     assert fields["direction"] == "3" and fields["gamma"] == 5
 
 
@@ -653,7 +653,7 @@ def test_the_example_of_the_page_runs(undisturbed: Path, tmp_path: Path, monkeyp
     assert found["ahead"].dims == ("model",) and bool(found["ahead"].all())  # so few steps are calm at any stiffness
     (tmp_path / "study.toml").write_text(toml)
     parsed = cli.parser().parse_args(["sweep", "--config", "study.toml", "--output", "x"])
-    assert len(plan_study(StudyConfig(**_fields(parsed))).cells) == 52
+    assert len(plan_study(StudyConfig(**sweep_fields(parsed))).cells) == 52
     assert all(f"`{name}`" in page for name in load_study(tmp_path / "out").variables)
     assert all(markdown_table(kind) in page for kind in VARIABLES)
 

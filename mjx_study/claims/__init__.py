@@ -1,1 +1,11 @@
 """A ledger of claims by the paper and by this project, each measured and given a verdict."""
+
+from typing import Final
+
+from mjx_study.claims import contact, descent, theory
+from mjx_study.claims.ledger import Claim
+
+CLAIMS: Final[dict[str, Claim]] = {claim.id: claim for claim in (*theory.CLAIMS, *contact.CLAIMS, *descent.CLAIMS)}
+"""Claims by id, in the order of the ledger."""
+NUM_VERDICTS: Final = sum(len(claim.cases) for claim in CLAIMS.values())
+"""Number of verdicts in the whole ledger, for which the intervals hold simultaneously."""

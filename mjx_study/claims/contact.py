@@ -2,10 +2,11 @@
 
 import dataclasses
 import math
-from typing import Final
+from typing import Any, Final
 
 import jax
 import numpy as np
+import xarray as xr
 
 from estimators import FirstOrder
 from mjx_study.choices import REFERENCE
@@ -34,8 +35,7 @@ from mjx_study.claims.theory import (
     bias,
     compared,
     errors_of,
-    relative,
-    signed_bias,
+    relative_bias,
     variances_of,
 )
 from mjx_study.study.configuration import StudyConfig
@@ -51,20 +51,22 @@ HALF_STEP: Final = {"pusher": 0.0025, "momentum_transfer": 0.001}
 HORIZONS: Final = (400, 2000)
 """Horizons of the double pendulum [steps of 1 ms]."""
 DOME: Final = "ball_wall:dome, 0.65 rad"
+DOME_SIGMA: Final = 0.03
+"""Noise of the claims on the dome [rad]."""
 DAMPED: Final = ("impedance", "mujoco_default", "mujoco_stiff")
 """Families whose force sets in with a jump."""
 RELAXED: Final[dict[str, tuple[str, ...]]] = {f"{HIT}, {name}": DAMPED for name in RELAXATIONS}
 """Systems with derivatives of a relaxed contact."""
 
 
-def study(lab: Laboratory, task: str, **changes):
+def study(lab: Laboratory, task: str, **changes: Any) -> xr.Dataset:
     """Return a study of ZoBG and FoBG at a task's initial theta, without use of its reference gradient."""
     effort, common = lab.effort, {"estimators": ("zobg", "fobg"), "reference_samples": 3}
     common |= {"samples": (effort.samples,), "seeds": effort.seeds}
     return lab.study(StudyConfig(tasks=(task,), **common | changes))
 
 
-def pusher(lab: Laboratory, *, half: bool = False, damping: float | None = None):
+def pusher(lab: Laboratory, *, half: bool = False, damping: float | None = None) -> xr.Dataset:
     """Return the pusher study shared by most claims, at half the timestep, or critically damped at 1000 N/m."""
     if damping is not None:
         return study(lab, "pusher", contact=("penalty", "impedance"), stiffness=(1000.0,), damping=damping)
@@ -73,51 +75,38 @@ def pusher(lab: Laboratory, *, half: bool = False, damping: float | None = None)
     return study(lab, "pusher", contact=(REFERENCE, *REAL), stiffness=STIFFNESSES)
 
 
-def values(dataset, variable: str, family: str, stiffness: float | None, estimator: str) -> np.ndarray:
-    """Values of a variable for one contact model."""
+def logs(dataset: xr.Dataset, family: str, stiffness: float | None, estimator: str) -> np.ndarray:
+    """log10 of each batch's variance for one contact model; 300 if all samples overflowed."""
     models = dataset["contact"].values == family
     if stiffness is not None and family != "mujoco_default":
         models &= np.isclose(dataset["stiffness"].values, stiffness)
     (model,) = np.flatnonzero(models)
-    found = dataset[variable].isel(model=model, task=0, timestep=0, cone=0, sigma=0, samples=0)
-    return np.atleast_1d(found.sel(estimator=estimator).values)
+    found = dataset["variance"].isel(model=model, task=0, timestep=0, cone=0, sigma=0, samples=0)
+    variances = np.atleast_1d(found.sel(estimator=estimator).values)
+    return np.nan_to_num(np.log10(variances), nan=300.0, posinf=300.0)
 
 
-def logs(dataset, family: str, stiffness: float | None, estimator: str) -> np.ndarray:
-    """log10 of each batch's variance; 300 if all samples overflowed."""
-    return np.nan_to_num(np.log10(values(dataset, "variance", family, stiffness, estimator)), nan=300.0, posinf=300.0)
-
-
-def ratio(dataset, family: str, stiffness: float | None) -> Statistic:
+def ratio(dataset: xr.Dataset, family: str, stiffness: float | None) -> Statistic:
     """Mean over batches of log10 of FoBG's variance over ZoBG's."""
     one, other = (logs(dataset, family, stiffness, name) for name in ("fobg", "zobg"))
     return mean_of(one - other, "batches")
 
 
-def soft(lab: Laboratory, system: str, family: str) -> Statistic:
-    """Variance ratio at 10 N/m."""
-    return ratio(pusher(lab), family, STIFFNESSES[0])
-
-
 def stiff(lab: Laboratory, system: str, family: str) -> Statistic:
-    """Variance ratio at 1200 N/m."""
     return ratio(pusher(lab), family, STIFFNESSES[3])
 
 
 def rate(lab: Laboratory, system: str, family: str) -> Statistic:
-    """log10 of FoBG's variance per decade of stiffness, from 10 to 1000 N/m."""
     ends = [logs(pusher(lab), family, stiffness, "fobg") for stiffness in STIFFNESSES[::2]]
     return mean_of((ends[1] - ends[0]) / 2, "batches")
 
 
 def finer(lab: Laboratory, system: str, family: str) -> Statistic:
-    """log10 of FoBG's variance at half the timestep over that at the full one, at 1200 N/m."""
-    parts = [logs(pusher(lab, half=half), family, STIFFNESSES[3], "fobg") for half in (True, False)]
-    return mean_of(parts[0] - parts[1], "batches")
+    fine, usual = (logs(pusher(lab, half=half), family, STIFFNESSES[3], "fobg") for half in (True, False))
+    return mean_of(fine - usual, "batches")
 
 
 def gradient_cost(lab: Laboratory, system: str, family: str) -> Statistic:
-    """log10 of the time of a first-order sample over that of a zeroth-order one."""
     objective, theta = lab.objective(system, family, STIFFNESS), lab.task(system).theta
     keys = jax.random.split(jax.random.key(0), TIMED * len(jax.local_devices()) - 1)  # leaves room for a baseline
     methods = (objective.differentiate, objective.evaluate)
@@ -126,7 +115,6 @@ def gradient_cost(lab: Laboratory, system: str, family: str) -> Statistic:
 
 
 def implicit(lab: Laboratory, system: str, family: str) -> Statistic:
-    """log10 of FoBG's variance over that for an equally stiff and damped spring, at 1000 N/m."""
     if system == "pusher, undamped":
         one, other = (logs(pusher(lab), name, 1000.0, "fobg") for name in (family, "penalty"))
     else:
@@ -144,20 +132,9 @@ def chaos(lab: Laboratory, system: str, family: str) -> Statistic:
     return ratio(dataset, family, None)
 
 
-def geometry(lab: Laboratory, system: str, family: str) -> Statistic:
-    """log10 of FoBG's mean squared error over ZoBG's, in batches of 200."""
-    return compared("fobg", "zobg", lab, system, family)
-
-
 def dome(lab: Laboratory, system: str, family: str) -> Statistic:
-    """log10 of FoBG's variance for the dome over that for the box, sigma = 0.03 rad."""
     names = system, system.replace(":dome", "")
-    return variances_of(lab, *(at(lab, name, family, sigma=0.03) for name in names))
-
-
-def dome_bias(lab: Laboratory, system: str, family: str) -> Statistic:
-    """(E[FoBG] - grad F) / grad F for the dome, sigma = 0.03 rad."""
-    return relative(at(lab, system, family, sigma=0.03))
+    return variances_of(lab, *(at(lab, name, family, sigma=DOME_SIGMA) for name in names))
 
 
 def biases_of(one: Slopes, other: Slopes) -> Statistic:
@@ -168,18 +145,11 @@ def biases_of(one: Slopes, other: Slopes) -> Statistic:
 
 
 def timestep(lab: Laboratory, system: str, family: str) -> Statistic:
-    """Relative bias at half the timestep as a share of that at the full one."""
     half = at(lab, system, family, timestep=HALF_STEP["momentum_transfer"])
     return biases_of(half, at(lab, system, family))
 
 
-def cured(lab: Laboratory, system: str, family: str) -> Statistic:
-    """(E[FoBG with the onset term] - grad F) / grad F."""
-    return relative(at(lab, system, family, onset="linear"))
-
-
 def cure_cost(lab: Laboratory, system: str, family: str) -> Statistic:
-    """log10 of FoBG's variance with the onset term over that without."""
     return variances_of(lab, at(lab, system, family, onset="linear"), at(lab, system, family))
 
 
@@ -190,35 +160,26 @@ def _relaxed(lab: Laboratory, system: str, family: str, onset: str = "none") -> 
 
 
 def relaxed_bias(lab: Laboratory, system: str, family: str) -> Statistic:
-    """(E[FoBG with relaxed derivatives] - grad F) / grad F."""
-    return relative(_relaxed(lab, system, family)[0])
+    where, _, relaxed = system.rpartition(", ")
+    return relative_bias(lab, where, family, relaxed=relaxed)
 
 
 def relaxed_share(lab: Laboratory, system: str, family: str) -> Statistic:
-    """Share of the bias of exact derivatives that relaxed ones leave."""
     share = biases_of(*_relaxed(lab, system, family))
     return dataclasses.replace(share, estimate=abs(share.estimate))
 
 
-def relaxed_cost(lab: Laboratory, system: str, family: str) -> Statistic:
-    """log10 of FoBG's variance with relaxed derivatives over that with exact ones."""
-    return variances_of(lab, *_relaxed(lab, system, family))
-
-
 def onset_or_relaxed(lab: Laboratory, system: str, family: str) -> Statistic:
-    """log10 of FoBG's mean squared error with the onset term over that with relaxed derivatives."""
     relaxed, corrected = _relaxed(lab, system, family, onset="linear")
     (one,), (other,) = (batches([FirstOrder()], each, 200, 2 * lab.effort.batches) for each in (corrected, relaxed))
     return errors_of(one, other, corrected.gradient)
 
 
 def onset_cost(lab: Laboratory, system: str, family: str) -> Statistic:
-    """log10 of FoBG's variance over that for MuJoCo's default impedance, equally stiff and damped."""
     return variances_of(lab, *(at(lab, system, name) for name in (family, "mujoco")))
 
 
 def softened(lab: Laboratory, system: str, family: str) -> Statistic:
-    """|grad F at 3 kN/m over that at 30 kN/m - 1|."""
     one, other = (at(lab, system, family, stiffness=stiffness) for stiffness in (3e3, 3e4))
     share = one.gradient / other.gradient
     return exact(abs(share - 1), one.errors[0] * abs(share) + abs(share) * other.errors[0], one.points)
@@ -233,7 +194,7 @@ CLAIMS: Final = (
         "While contact is soft (10 N/m), the first-order estimate has the lower variance.",
         below(RATIO, -FACTOR, FACTOR),
         {"pusher, 10 N/m": (REFERENCE, *SWEPT)},
-        soft,
+        lambda lab, system, family: ratio(pusher(lab), family, STIFFNESSES[0]),
         STIFFNESS_COMMAND,
     ),
     Claim(
@@ -314,7 +275,7 @@ CLAIMS: Final = (
         "On the dome the first-order estimate is unbiased.",
         within("(E[FoBG] - grad F) / grad F, sigma = 0.03 rad", -NEGLIGIBLE, NEGLIGIBLE),
         {DOME: FIVE},
-        dome_bias,
+        lambda lab, system, family: relative_bias(lab, system, family, sigma=DOME_SIGMA),
         "mjx-study landscape ball_wall:dome --contact penalty,smooth_onset",
     ),
     Claim(
@@ -332,7 +293,7 @@ CLAIMS: Final = (
         "At the edge of a wall or a bar first order remains the less accurate of the two, implicit contact or not.",
         above("log10 of the mean squared error, FoBG's over ZoBG's, in batches of 200", FACTOR, -FACTOR),
         {WALL: (REFERENCE, *FIVE), EDGE: (REFERENCE, *FIVE)},
-        geometry,
+        lambda lab, system, family: compared(lab, system, family, "fobg", "zobg"),
         "mjx-study compare ball_wall --contact penalty,mujoco_default,mujoco_stiff",
     ),
     Claim(
@@ -359,7 +320,7 @@ CLAIMS: Final = (
         "That bias can turn the sign of the mean.",
         below("(E[FoBG] - grad F) / grad F", -1.0),
         {HIT: DAMPED},
-        signed_bias,
+        relative_bias,
         "mjx-study landscape momentum_transfer --contact mujoco_default",
     ),
     Claim(
@@ -377,7 +338,7 @@ CLAIMS: Final = (
         "With the onset term the first-order estimate is unbiased.",
         within("(E[FoBG with the term] - grad F) / grad F", -NEGLIGIBLE, NEGLIGIBLE),
         {HIT: FIVE},
-        cured,
+        lambda lab, system, family: relative_bias(lab, system, family, onset="linear"),
         "mjx-study gradcheck momentum_transfer --mean --contact mujoco_default --estimators fobg,fobg_onset",
     ),
     Claim(
@@ -413,7 +374,7 @@ CLAIMS: Final = (
         "Relaxed derivatives vary more than exact ones.",
         above("log10 Var[FoBG], with relaxed derivatives over with exact ones", FACTOR, -FACTOR),
         RELAXED,
-        relaxed_cost,
+        lambda lab, system, family: variances_of(lab, *_relaxed(lab, system, family)),
         "mjx-study compare momentum_transfer --contact mujoco_default --backward none,smooth_onset",
     ),
     Claim(

@@ -1,17 +1,20 @@
-"""Claims about gradient descent: the paper's experiments, on the references and in MJX.
+"""Claims about gradient descent: the paper's experiments, on the references and in MJX. And one about a robot.
 
 Tasks with one parameter descend on tabulated landscapes of MJX; the others are simulated.
 """
 
 from typing import Final
 
+import jax
 import numpy as np
 import xarray as xr
 
+import estimators
+from estimators import FirstOrder, ZerothOrder
 from mjx_study.choices import REFERENCE
-from mjx_study.claims.laboratory import Laboratory, Statistic, mean_of
+from mjx_study.claims.laboratory import Laboratory, Statistic, difference_of, log_variance, mean_of
 from mjx_study.claims.ledger import Claim, above, below
-from mjx_study.claims.theory import FIVE, STIFFNESS
+from mjx_study.claims.theory import FACTOR, FIVE, STIFFNESS
 from mjx_study.study.configuration import StudyConfig
 
 BALL, BAR, SOFT, STIFF = "ball_wall", "momentum_transfer", "pusher, 10 N/m", "pusher, 1000 N/m"
@@ -78,49 +81,21 @@ def scaled(dataset: xr.Dataset, variable: str, estimator: str, like: xr.Dataset 
     return found if found.ndim == 1 else np.mean(found, axis=0)
 
 
-def final(dataset: xr.Dataset, estimator: str, like: xr.Dataset | None = None) -> np.ndarray:
-    """Final costs of an estimator, see `scaled`."""
-    return scaled(dataset, "final_cost", estimator, like)
+def gap(lab: Laboratory, system: str, family: str, estimator: str, other: str) -> Statistic:
+    """Final cost of an estimator minus that of another."""
+    found = descents(lab, system, family)
+    return mean_of(scaled(found, "final_cost", estimator) - scaled(found, "final_cost", other), "seeds")
 
 
-def along(dataset: xr.Dataset, estimator: str) -> np.ndarray:
-    """Costs of an estimator averaged over its descent, see `scaled`."""
-    return scaled(dataset, "cost", estimator)
+def regret(lab: Laboratory, system: str, family: str, variable: str = "final_cost") -> Statistic:
+    """Cost of AoBG, at the end or during descent, minus that of the better of the two; see `scaled`."""
+    found = descents(lab, system, family)
+    better = min(("zobg", "fobg"), key=lambda name: scaled(found, variable, name).mean())
+    return mean_of(scaled(found, variable, "aobg") - scaled(found, variable, better), "seeds")
 
 
 def behind(lab: Laboratory, system: str, family: str) -> Statistic:
-    """Final cost of FoBG minus that of ZoBG."""
-    return _gap(lab, system, family, "fobg", "zobg")
-
-
-def corrected_behind(lab: Laboratory, system: str, family: str) -> Statistic:
-    """Final cost of FoBG with the onset term minus that of ZoBG."""
-    return _gap(lab, system, family, "fobg_onset", "zobg")
-
-
-def ahead(lab: Laboratory, system: str, family: str) -> Statistic:
-    """Final cost of ZoBG minus that of FoBG."""
-    return _gap(lab, system, family, "zobg", "fobg")
-
-
-def _gap(lab: Laboratory, system: str, family: str, estimator: str, other: str) -> Statistic:
-    """Final cost of an estimator minus that of another."""
-    found = descents(lab, system, family)
-    return mean_of(final(found, estimator) - final(found, other), "seeds")
-
-
-def regret(lab: Laboratory, system: str, family: str) -> Statistic:
-    """Final cost of AoBG minus that of the better of the two."""
-    found = descents(lab, system, family)
-    better = min(("zobg", "fobg"), key=lambda name: final(found, name).mean())
-    return mean_of(final(found, "aobg") - final(found, better), "seeds")
-
-
-def slower(lab: Laboratory, system: str, family: str) -> Statistic:
-    """Cost of AoBG during descent minus that of the better of the two."""
-    found = descents(lab, system, family)
-    better = min(("zobg", "fobg"), key=lambda name: along(found, name).mean())
-    return mean_of(along(found, "aobg") - along(found, better), "seeds")
+    return gap(lab, system, family, "fobg", "zobg")
 
 
 def apart(lab: Laboratory, system: str, family: str) -> Statistic:
@@ -131,20 +106,21 @@ def apart(lab: Laboratory, system: str, family: str) -> Statistic:
     return mean_of(np.abs(one - other) / float(found["sigma"].values[0]), "seeds")
 
 
-def curriculum(lab: Laboratory, system: str, family: str) -> Statistic:
-    """Gain in FoBG's final cost from a growing stiffness."""
-    return _scheduled(lab, system, family, "stiffness_schedule", "fobg")
-
-
-def annealing(lab: Laboratory, system: str, family: str) -> Statistic:
-    """Gain in AoBG's final cost from a shrinking sigma."""
-    return _scheduled(lab, system, family, "sigma_schedule", "aobg")
-
-
-def _scheduled(lab: Laboratory, system: str, family: str, schedule: str, estimator: str) -> Statistic:
+def gained(lab: Laboratory, system: str, family: str, schedule: str, estimator: str) -> Statistic:
     """Gain in an estimator's final cost from a schedule, by seed: both descents draw the same noise."""
     plain, other = descents(lab, system, family), descents(lab, system, family, schedule)
-    return mean_of(final(plain, estimator) - final(other, estimator, plain), "seeds")
+    costs = scaled(plain, "final_cost", estimator), scaled(other, "final_cost", estimator, plain)
+    return mean_of(costs[0] - costs[1], "seeds")
+
+
+def robot_variances(lab: Laboratory, system: str, family: str) -> Statistic:
+    """log10 of FoBG's variance over ZoBG's at the task's initial theta, on shared samples."""
+    task = lab.task(system)
+    objective = lab.objective(system, family, task.defaults.middle_stiffness)
+    chosen, samples = (FirstOrder(), ZerothOrder()), 2 * lab.effort.samples
+    drawn = estimators.draw(estimators.oracles_of(chosen), objective, task.theta, jax.random.key(0), samples)
+    first, zeroth = (log_variance(estimator(drawn)) for estimator in chosen)
+    return difference_of(first, zeroth)
 
 
 GAIN: Final = "as a share of what the best gained"
@@ -190,7 +166,7 @@ CLAIMS: Final = (
         "For soft springs (10 N/m) first order outperforms zeroth order.",
         above(f"final cost, ZoBG's less FoBG's, {GAIN}", 0.001, -0.001),
         {SOFT: EVERYWHERE[SOFT]},
-        ahead,
+        lambda lab, system, family: gap(lab, system, family, "zobg", "fobg"),
         "mjx-study optimise pusher --contact penalty --stiffness 10",
     ),
     Claim(
@@ -226,7 +202,7 @@ CLAIMS: Final = (
         "With the onset term first-order descent ends where zeroth order does.",
         below(f"final cost, FoBG's with onset less ZoBG's, {GAIN}", 0.02),
         {GAME: EVERYWHERE[GAME]},
-        corrected_behind,
+        lambda lab, system, family: gap(lab, system, family, "fobg_onset", "zobg"),
         "mjx-study optimise tennis --contact mujoco_default --samples 200 --estimators zobg,fobg,fobg_onset",
     ),
     Claim(
@@ -244,7 +220,7 @@ CLAIMS: Final = (
         "At equal iterations the interpolation is ahead of the better of the two on the way.",
         below(f"cost averaged over the iterations, AoBG's less the better one's, {GAIN}", -0.001, 0.001),
         EVERYWHERE,
-        slower,
+        lambda lab, system, family: regret(lab, system, family, "cost"),
         "mjx-study optimise sliding_box --reference",
     ),
     Claim(
@@ -253,7 +229,7 @@ CLAIMS: Final = (
         "Contact that stiffens on the way, from a hundredth, lets first order end lower than stiff contact throughout.",
         above(f"final cost, FoBG's at constant stiffness less the scheduled, {GAIN}", 0.001, -0.001),
         {STIFF: EVERYWHERE[STIFF]},
-        curriculum,
+        lambda lab, system, family: gained(lab, system, family, "stiffness_schedule", "fobg"),
         "mjx-study optimise pusher --stiffness 1000 --stiffness-schedule 'linear_schedule(0.01, 1, 250)'",
     ),
     Claim(
@@ -262,7 +238,16 @@ CLAIMS: Final = (
         "Noise that shrinks on the way, from three times sigma, lets the interpolation end lower.",
         above(f"final cost, AoBG's at constant sigma less the scheduled, {GAIN}", 0.001, -0.001),
         {BALL: (REFERENCE,), BAR: (REFERENCE,)},
-        annealing,
+        lambda lab, system, family: gained(lab, system, family, "sigma_schedule", "aobg"),
         "mjx-study optimise ball_wall --reference --sigma-schedule 'linear_schedule(3, 1, 100)'",
+    ),
+    Claim(
+        "robot-favours-fobg",
+        "this project",
+        "Of a neural network that lands a robot on two legs, the first-order estimate has the lower variance.",
+        below("log10 Var[FoBG] / Var[ZoBG]", -FACTOR, FACTOR),
+        {"landing": ("penalty", "mujoco_default", "smooth_onset")},
+        robot_variances,
+        "mjx-study compare landing --contact penalty,mujoco_default,smooth_onset",
     ),
 )

@@ -18,12 +18,12 @@ from jaxtyping import Float
 
 import estimators
 from estimators import Estimator, GradientEstimate, Objective
-from estimators.intervals import student_quantile
+from estimators.confidence import student_quantile
 from mjx_study.choices import REFERENCE
 from mjx_study.objective import Simulator
 from mjx_study.reference import FunctionObjective, smoothed
 from mjx_study.study.configuration import StudyConfig
-from mjx_study.study.quadrature import Line, means
+from mjx_study.study.landscapes import Line, means
 from mjx_study.study.run import run_study
 from mjx_study.tasks import make_task
 from mjx_study.tasks.contact_grid import ContactPoint, backward_grid, contact_grid

@@ -22,10 +22,9 @@ from estimators import coverage_interval
 from mjx_study.choices import REFERENCE
 from mjx_study.claims.laboratory import EFFORTS, Effort, Laboratory, Statistic
 from mjx_study.disk import prepare_folder, write_whole
-from mjx_study.identity import VERSIONED, code_of
+from mjx_study.identity import VERSIONED, code_of, git_revision
 from mjx_study.runtime import environment, precision
 from mjx_study.study.configuration import Progress
-from mjx_study.study.revision import git_revision
 
 ALPHA: Final = 0.05
 """Probability that any interval of a ledger misses its value."""
@@ -240,21 +239,6 @@ def _told(claim: Claim, kept: dict[str, Any], level: float) -> dict[str, Any]:
         "revision": kept["revision"],
         "evidence": evidence,
     }
-
-
-def matrix(document: dict[str, Any]) -> dict[str, dict[str, list[str]]]:
-    """Verdicts of a claim's systems, by claim and family."""
-    found: dict[str, dict[str, list[str]]] = {}
-    for claim in document["claims"]:
-        row = found.setdefault(claim["id"], {})
-        for each in claim["evidence"]:
-            row.setdefault(each["family"], []).append(each["verdict"])
-    return found
-
-
-def columns(rows: dict[str, dict[str, list[str]]]) -> list[str]:
-    """Families of a matrix with any verdicts."""
-    return [family for family in FAMILIES if any(family in row for row in rows.values())]
 
 
 def _range(part: Range) -> str:

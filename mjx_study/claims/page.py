@@ -1,11 +1,15 @@
-"""A measured ledger as text: a table for the terminal, and docs/claims.md."""
+"""A measured ledger as text, for the terminal and docs/claims.md, and as a figure."""
 
 import math
 from collections import Counter
 from collections.abc import Sequence
 from typing import Any, Final
 
-from mjx_study.claims.ledger import VERDICTS, columns, matrix
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+
+from mjx_study.claims.ledger import FAMILIES, VERDICTS
+from mjx_study.plots.style import TITLES
 from mjx_study.table import format_table
 
 HEAD: Final = """\
@@ -58,6 +62,9 @@ Not in the ledger: descents on the robots, means of `landing` ([there](tasks.md#
 in MJX. Descents on `tennis` use 12 seeds and fewer samples than the task's recipe. With so few samples, first order
 diverges on the reference, so that case is left out.
 """
+COLOURS: Final = {"holds": "#0072B2", "fails": "#E69F00", "reversed": "#D55E00", "undecided": "#DDDDDD"}
+SIGNS: Final = {"holds": "+", "fails": "×", "reversed": "−", "undecided": "?"}
+"""Signs that distinguish verdicts without colours."""
 
 
 def told(document: dict[str, Any]) -> str:
@@ -87,10 +94,19 @@ def table(document: dict[str, Any]) -> list[str]:
     return format_table(rows, header)
 
 
+def matrix(document: dict[str, Any]) -> tuple[dict[str, dict[str, list[str]]], list[str]]:
+    """Verdicts of a claim's systems, by claim and family; and the families with any verdicts, which are its columns."""
+    rows: dict[str, dict[str, list[str]]] = {}
+    for claim in document["claims"]:
+        row = rows.setdefault(claim["id"], {})
+        for each in claim["evidence"]:
+            row.setdefault(each["family"], []).append(each["verdict"])
+    return rows, [family for family in FAMILIES if any(family in row for row in rows.values())]
+
+
 def cells(document: dict[str, Any]) -> list[list[str]]:
     """Matrix as text: a row of families, then one for each claim."""
-    rows = matrix(document)
-    shown = columns(rows)
+    rows, shown = matrix(document)
     summary = [[name, *(_summary(row.get(family, [])) for family in shown)] for name, row in rows.items()]
     return [["", *shown], *summary]
 
@@ -122,11 +138,12 @@ def markdown(document: dict[str, Any]) -> str:
             f"## {claim['id']}\n\n{claim['statement']} *({claim['place']}.)*\n\n"
             f"- Statistic: {claim['quantity']}; {claim['criterion']}.\n- Shown by `{claim['show']}`.\n"
         )
-        rows = [
-            [each["system"], f"`{each['family']}`", _number(each["estimate"]), _interval(each), _bold(each["verdict"])]
-            + [_deciding(each) if each["verdict"] == "undecided" else ""]
-            for each in claim["evidence"]
-        ]
+        rows = []
+        for each in claim["evidence"]:
+            decided = each["verdict"] != "undecided"
+            verdict, size = (f"**{each['verdict']}**", "") if decided else ("undecided", _deciding(each))
+            number = _number(each["estimate"])
+            rows.append([each["system"], f"`{each['family']}`", number, _interval(each), verdict, size])
         parts.append(_pipes(("system", "contact", "estimate", "interval", "verdict", "would decide"), rows))
     return "\n".join(parts)
 
@@ -134,10 +151,6 @@ def markdown(document: dict[str, Any]) -> str:
 def _pipes(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     lines = [f"| {' | '.join(header)} |", f"|{' --- |' * len(header)}", *(f"| {' | '.join(row)} |" for row in rows)]
     return "\n".join(lines) + "\n"
-
-
-def _bold(verdict: str) -> str:
-    return verdict if verdict == "undecided" else f"**{verdict}**"
 
 
 def _deciding(each: dict[str, Any]) -> str:
@@ -154,3 +167,32 @@ def _interval(each: dict[str, Any]) -> str:
 def _number(value: float | None, absent: float = math.inf) -> str:
     value = absent if value is None else value
     return f"{value:.3g}"
+
+
+def draw_matrix(document: dict[str, Any]) -> Figure:
+    """Draw a square for each claim and family, with a strip for each system."""
+    rows, shown = matrix(document)
+    figure = Figure(figsize=(3.6 + 0.5 * len(shown), 1.9 + 0.24 * len(rows)), layout="constrained")
+    axes = figure.subplots()
+    for down, row in enumerate(rows.values()):
+        for across, family in enumerate(shown):
+            verdicts = row.get(family, [])
+            for index, verdict in enumerate(verdicts):
+                width = 0.92 / len(verdicts)
+                left = across - 0.46 + index * width
+                axes.add_patch(Rectangle((left, down - 0.44), width, 0.88, color=COLOURS[verdict], linewidth=0))
+                colour = "black" if verdict == "undecided" else "white"
+                middle = left + width / 2
+                axes.text(middle, down, SIGNS[verdict], ha="center", va="center", color=colour, fontsize=8)
+    axes.set_xlim(-0.5, len(shown) - 0.5)
+    axes.set_ylim(len(rows) - 0.5, -0.5)
+    axes.set_xticks(range(len(shown)), [TITLES[name] for name in shown], rotation=40, ha="left", fontsize=8)
+    axes.set_yticks(range(len(rows)), list(rows), fontsize=8)
+    axes.xaxis.tick_top()
+    axes.tick_params(length=0)
+    for spine in axes.spines.values():
+        spine.set_visible(False)
+    handles = [Rectangle((0, 0), 1, 1, color=COLOURS[verdict]) for verdict in VERDICTS]
+    labels = [f"{SIGNS[verdict]} {verdict}" for verdict in VERDICTS]
+    figure.legend(handles, labels, loc="outside lower center", ncols=len(VERDICTS), frameon=False, fontsize=8)
+    return figure

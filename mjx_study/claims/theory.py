@@ -1,7 +1,8 @@
 """Claims about jumps, their relaxations, and the lemmas, by closed forms and MJX landscapes over one parameter."""
 
+import dataclasses
 import math
-from typing import Final
+from typing import Any, Final
 
 import jax
 import jax.numpy as jnp
@@ -44,24 +45,19 @@ JUMPS: Final = {STEP: (REFERENCE,), EDGE: (REFERENCE, *FIVE), WALL: (REFERENCE, 
 SMOOTH: Final = {HIT: (REFERENCE, *FIVE), SHORT: (REFERENCE, *FIVE)}
 
 
-def at(
-    lab: Laboratory, system: str, family: str, *, stiffness: float = STIFFNESS, sigma: float | None = None,
-    timestep: float | None = None, onset: str = "none", relaxed: str | None = None,
-) -> Slopes:  # fmt: skip
-    """Landscape of a system under a family, at the angle given in its name."""
+def at(lab: Laboratory, system: str, family: str, stiffness: float = STIFFNESS, **changes: Any) -> Slopes:
+    """Landscape of a system under a family, at the angle given in its name; changes as for `Laboratory.slopes`."""
     if system == STEP:
         return closed_form(Heaviside(), 0.5, 1.0)
     if system == RAMP:
         return closed_form(RelaxedHeaviside(0.01), 0.0, 1.0)
     task, _, angle = system.partition(", ")
-    theta = float(angle.removesuffix(" rad"))
-    return lab.slopes(
-        task, family, theta, stiffness=stiffness, sigma=sigma, timestep=timestep, onset=onset, relaxed=relaxed
-    )
+    return lab.slopes(task, family, float(angle.removesuffix(" rad")), stiffness=stiffness, **changes)
 
 
-def relative(found: Slopes) -> Statistic:
+def relative_bias(lab: Laboratory, system: str, family: str, **changes: Any) -> Statistic:
     """(E[FoBG] - grad F) / grad F of a landscape."""
+    found = at(lab, system, family, **changes)
     return exact(found.relative, sum(found.errors), found.points)
 
 
@@ -78,49 +74,42 @@ def errors_of(one: GradientEstimate, other: GradientEstimate, gradient: float) -
 
 def bias(lab: Laboratory, system: str, family: str) -> Statistic:
     """|E[FoBG] - grad F| / |grad F|."""
-    found = at(lab, system, family)
-    return exact(abs(found.relative), sum(found.errors), found.points)
-
-
-def signed_bias(lab: Laboratory, system: str, family: str) -> Statistic:
-    """(E[FoBG] - grad F) / grad F."""
-    return relative(at(lab, system, family))
+    found = relative_bias(lab, system, family)
+    return dataclasses.replace(found, estimate=abs(found.estimate))
 
 
 def zeroth_bias(lab: Laboratory, system: str, family: str) -> Statistic:
-    """(mean of ZoBG - grad F) / grad F."""
     found = at(lab, system, family)
     rows = batch(ZerothOrder(), found, 4 * lab.effort.draws).per_sample[:, 0]
     return mean_of(np.asarray(rows) / found.gradient - 1, "samples", found.errors[0])
 
 
 def variances(lab: Laboratory, system: str, family: str) -> Statistic:
-    """log10 of FoBG's variance over ZoBG's."""
     found = at(lab, system, family)
     one, other = (log_variance(batch(each, found, lab.effort.draws)) for each in (FirstOrder(), ZerothOrder()))
     return difference_of(one, other)
 
 
 def silent(lab: Laboratory, system: str, family: str) -> Statistic:
-    """Share of batches of 10 whose first-order gradients are all exactly zero."""
     (found,) = batches([FirstOrder()], at(lab, system, family), 10, 10 * lab.effort.batches)
     return share_of(np.all(np.asarray(found.per_sample) == 0, axis=(1, 2)), "batches")
 
 
+def missed(lab: Laboratory, point: Slopes, truth: float, samples: int, quantile: float) -> Statistic:
+    """Share of batches whose own interval for the first-order mean, with a quantile of Student's t, misses a number."""
+    (found,) = batches([FirstOrder()], point, samples, 5 * lab.effort.batches)
+    gap = np.abs(np.asarray(found.mean)[:, 0] - truth)
+    return share_of(gap > quantile * np.asarray(found.standard_error)[:, 0], "batches")
+
+
 def blind(lab: Laboratory, system: str, family: str) -> Statistic:
-    """Share of batches of 100 whose own 95 % interval misses grad F."""
     point = at(lab, system, family)
-    (found,) = batches([FirstOrder()], point, 100, 5 * lab.effort.batches)
-    gap = np.abs(np.asarray(found.mean)[:, 0] - point.gradient)
-    return share_of(gap > 1.984 * np.asarray(found.standard_error)[:, 0], "batches")
+    return missed(lab, point, point.gradient, 100, 1.984)
 
 
-def missed(lab: Laboratory, system: str, family: str) -> Statistic:
-    """Share of batches of 50 whose 95 % interval misses the mean of first-order gradients."""
+def overconfident(lab: Laboratory, system: str, family: str) -> Statistic:
     point = at(lab, system, family)
-    (found,) = batches([FirstOrder()], point, 50, 5 * lab.effort.batches)
-    gap = np.abs(np.asarray(found.mean)[:, 0] - point.first)
-    return share_of(gap > 2.01 * np.asarray(found.standard_error)[:, 0], "batches")
+    return missed(lab, point, point.first, 50, 2.01)
 
 
 def rare(lab: Laboratory, system: str, family: str) -> Statistic:
@@ -186,28 +175,13 @@ def solution(lab: Laboratory, system: str, family: str) -> Statistic:
     return exact(worst)
 
 
-def compared(one: str, other: str, lab: Laboratory, system: str, family: str) -> Statistic:
+def compared(lab: Laboratory, system: str, family: str, one: str, other: str) -> Statistic:
     """log10 of the ratio of two estimators' mean squared errors, over batches of 200; gamma is |grad F| / 2."""
     point = at(lab, system, family)
     bounded = AlphaOrder(gamma=abs(point.gradient) / 2)
     known = {"zobg": ZerothOrder(), "fobg": FirstOrder(), "ivw": InverseVariance(), "aobg": bounded}
     first, second = batches([known[one], known[other]], point, 200, 2 * lab.effort.batches)
     return errors_of(first, second, point.gradient)
-
-
-def ivw_error(lab: Laboratory, system: str, family: str) -> Statistic:
-    """log10 of the mean squared error of inverse-variance weighting over ZoBG's."""
-    return compared("ivw", "zobg", lab, system, family)
-
-
-def bounded_error(lab: Laboratory, system: str, family: str) -> Statistic:
-    """log10 of the mean squared error of AoBG over inverse-variance weighting's."""
-    return compared("aobg", "ivw", lab, system, family)
-
-
-def aobg_error(lab: Laboratory, system: str, family: str) -> Statistic:
-    """log10 of the mean squared error of AoBG over ZoBG's."""
-    return compared("aobg", "zobg", lab, system, family)
 
 
 SLOPES: Final = "mjx-study landscape {} --contact penalty,mujoco_default,smooth_onset"
@@ -254,7 +228,7 @@ CLAIMS: Final = (
         "Away from jumps of the cost the first-order estimate is unbiased.",
         within("(E[FoBG] - grad F) / grad F", -NEGLIGIBLE, NEGLIGIBLE),
         {RAMP: (REFERENCE,), **SMOOTH},
-        signed_bias,
+        relative_bias,
         SLOPES.format("momentum_transfer"),
     ),
     Claim(
@@ -272,7 +246,7 @@ CLAIMS: Final = (
         "At the edge of a contact, batches of first-order gradients look more certain than they are.",
         above("share of batches of 50 whose 95 % interval misses E[FoBG]", 0.1),
         {RAMP: (REFERENCE,), EDGE: FIVE, WALL: FIVE},
-        missed,
+        overconfident,
         SLOPES.format("ball_wall"),
     ),
     Claim(
@@ -326,7 +300,7 @@ CLAIMS: Final = (
         "Near jumps inverse-variance weighting alone is less accurate than zeroth order.",
         above("log10 of the mean squared error, IVW's over ZoBG's", FACTOR, -FACTOR),
         JUMPS,
-        ivw_error,
+        lambda lab, system, family: compared(lab, system, family, "ivw", "zobg"),
         "mjx-study compare ball_wall --estimators zobg,fobg,ivw",
     ),
     Claim(
@@ -335,7 +309,7 @@ CLAIMS: Final = (
         "Near jumps the interpolation bounded by gamma, here |grad F| / 2, beats inverse-variance weighting.",
         below("log10 of the mean squared error, AoBG's over IVW's", -FACTOR, FACTOR),
         JUMPS,
-        bounded_error,
+        lambda lab, system, family: compared(lab, system, family, "aobg", "ivw"),
         "mjx-study compare ball_wall --estimators zobg,fobg,aobg,ivw",
     ),
     Claim(
@@ -344,7 +318,7 @@ CLAIMS: Final = (
         "Away from jumps the interpolation, with the same bound, is more accurate than zeroth order.",
         below("log10 of the mean squared error, AoBG's over ZoBG's", -FACTOR, FACTOR),
         SMOOTH,
-        aobg_error,
+        lambda lab, system, family: compared(lab, system, family, "aobg", "zobg"),
         "mjx-study compare momentum_transfer --estimators zobg,fobg,aobg",
     ),
 )

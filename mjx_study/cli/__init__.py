@@ -2,8 +2,8 @@
 
 Exit codes: 0 success; 1 a requested check failed, or a file could not be written (one line after the numbers); 2 an
 invalid option or file (one line, nothing written); 3 `gradcheck` found nothing wrong but could not check everything;
-128 + N ended by signal N (130 interrupted, 143 terminated, 129 hung up). Each command has two modules: `parsers.NAME`
-with its options, which imports nothing that computes, and `NAME` with `run`, imported when the command runs.
+128 + N ended by signal N (130 interrupted, 143 terminated, 129 hung up). Each command is a module: `EPILOG` for its
+help, `add` for its options, and `run`, which alone imports what computes.
 """
 
 import argparse
@@ -15,8 +15,8 @@ from collections.abc import Sequence
 from importlib import import_module, metadata
 from typing import Final
 
-from mjx_study.cli.options import Parser, UsageError, ending, refuse_lone_dashes
-from mjx_study.cli.output import OutputError, complain, written_out
+from mjx_study.cli.options import Parser, UsageError, refuse_lone_dashes
+from mjx_study.cli.output import OutputError, complain, ending, written_out
 
 ENDED = "existing files are complete"
 EXAMPLES = """\
@@ -93,9 +93,9 @@ def parser(chosen: str | None = None) -> argparse.ArgumentParser:
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
         if chosen in (None, name):
-            module = import_module(f"mjx_study.cli.parsers.{name}")
+            module = import_module(f"mjx_study.cli.{name}")
             command.epilog = module.EPILOG
-            command.add_argument("--json", action="store_true", help="print the numbers as JSON on standard output")
+            command.add_flag("--json", "print the numbers as JSON on standard output")
             module.add(command)
             command.set_defaults(command=name)
     return root

@@ -3,27 +3,59 @@
 import argparse
 import json
 from pathlib import Path
-from typing import Any
 
 from mjx_study.choices import unknown
-from mjx_study.claims.catalogue import CLAIMS, VERDICTS
-from mjx_study.claims.figure import draw_matrix
-from mjx_study.claims.ledger import Claim, measure_ledger
-from mjx_study.claims.page import count, markdown, table, told, undecided
-from mjx_study.cli.options import UsageError, attempt, computing, configure_process, finish, print_report, usage_errors
-from mjx_study.cli.studies import RESUMABLE
-from mjx_study.disk import prepare_folder, write_whole
-from mjx_study.plots.style import save_figure
+from mjx_study.cli.options import Parser, UsageError, configure_process, usage_errors
+from mjx_study.cli.output import RESUMABLE, attempt, computing, print_report
+
+EPILOG = """\
+Each claim has a statistic, a range of values for which the claim holds, and a range for which its opposite holds. The
+statistic's confidence interval decides: holds, fails, reversed, or undecided, with the number of samples that would
+decide. All intervals hold at once with probability 95 % (Bonferroni), whichever claims are run.
+
+With --output, measurements are saved as they are made: a stopped run can be resumed, and a claim whose definition or
+code has changed is measured again. The folder also gets claims.json, claims.md and claims.png.
+
+examples:
+  mjx-study claims --quick --output out
+  mjx-study claims --only lemma-closed-form,friction-variance
+"""
+
+
+def add(command: Parser) -> None:
+    effort = command.add_mutually_exclusive_group()
+    effort.add_argument("--quick", dest="effort", action="store_const", const="quick", help="minutes (default)")
+    effort.add_argument("--full", dest="effort", action="store_const", const="full", help="hours; narrower intervals")
+    command.set_defaults(effort="quick")
+    only = "run only these claims; may be repeated (default: all)"
+    command.add_argument("--only", action="append", metavar="ID[,ID]", help=only)
+    command.add_argument("--output", type=Path, metavar="DIR", help="folder for measurements and verdicts; resumable")
+    command.add_flag("--list", "print the claims and their criteria; measure nothing")
+    command.add_flag("--accept-versions", "resume studies in DIR begun by other versions of the software")
+    command.add_option("devices")
 
 
 def run(options: argparse.Namespace) -> int:
     """Measure the claims and print their verdicts."""
-    chosen = _chosen(options.only)
+    from mjx_study.claims import CLAIMS, NUM_VERDICTS
+    from mjx_study.claims.ledger import measure_ledger
+    from mjx_study.claims.page import count, draw_matrix, markdown, table, told, undecided
+    from mjx_study.disk import prepare_folder, write_whole
+    from mjx_study.plots.style import save_figure
+
+    names = [name for part in options.only or CLAIMS for name in part.split(",")]
+    for name in names:
+        if name not in CLAIMS:
+            raise UsageError(unknown("claim", name, CLAIMS))
+    chosen = [claim for name, claim in CLAIMS.items() if name in names]
     if options.list:
-        listed = [{"id": claim.id, "statement": claim.statement, **_decides(claim)} for claim in chosen]
+        listed = [
+            {"id": claim.id, "statement": claim.statement, "quantity": claim.criterion.quantity}
+            | {"criterion": claim.criterion.lines(), "place": claim.place}
+            for claim in chosen
+        ]
         lines = [f"{each['id']}\n  {each['statement']}\n  {each['quantity']}: {each['criterion']}" for each in listed]
-        print_report(options, {"claims": listed}, lines)
-        return 0
+        return print_report(options, {"claims": listed}, lines)
     with usage_errors():
         configure_process(options)
         if options.output is not None:
@@ -34,33 +66,20 @@ def run(options: argparse.Namespace) -> int:
             options.effort,
             options.output,
             progress,
-            verdicts=VERDICTS,
+            verdicts=NUM_VERDICTS,
             command=options.command_line,
             accept_versions=options.accept_versions,
         )
-    written, failure = attempt(lambda: _write(document, options.output)) if options.output else ([], None)
+
+    def write() -> list[Path]:
+        texts = {
+            "claims.json": json.dumps(document, indent=1, allow_nan=False) + "\n",
+            "claims.md": markdown(document),
+        }
+        written = [write_whole(options.output / name, text.encode()) for name, text in texts.items()]
+        return [*written, *save_figure(draw_matrix(document), options.output, "claims", ("png",))]
+
+    written, failure = attempt(write) if options.output else ([], None)
     lines = [*table(document), "", count(document), told(document)]
     lines += [f"undecided: {line}" for line in undecided(document)]
-    print_report(options, document, [*lines, *(f"written: {path}" for path in written)])
-    return finish(failure)
-
-
-def _chosen(only: list[str] | None) -> list[Claim]:
-    names = [name for part in only or [",".join(CLAIMS)] for name in part.split(",")]
-    for name in names:
-        if name not in CLAIMS:
-            raise UsageError(unknown("claim", name, CLAIMS))
-    return [claim for name, claim in CLAIMS.items() if name in names]
-
-
-def _decides(claim: Claim) -> dict[str, str]:
-    return {"quantity": claim.criterion.quantity, "criterion": claim.criterion.lines(), "place": claim.place}
-
-
-def _write(document: dict[str, Any], folder: Path) -> list[Path]:
-    """Write the document, the page and the figure."""
-    texts = {"claims.json": json.dumps(document, indent=1, allow_nan=False) + "\n", "claims.md": markdown(document)}
-    written = [
-        write_whole(folder / name, lambda file, text=text: file.write(text.encode())) for name, text in texts.items()
-    ]
-    return [*written, *save_figure(draw_matrix(document), folder, "claims", ("png",))]
+    return print_report(options, document, [*lines, *(f"written: {path}" for path in written)], failure)

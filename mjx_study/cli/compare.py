@@ -3,16 +3,73 @@
 import argparse
 from functools import partial
 
-from mjx_study.cli.console import gradient_lines, rows_as_json
-from mjx_study.cli.studies import run_one, study_fields
+from estimators.catalogue import CATALOGUE
+from mjx_study.choices import FAMILIES
+from mjx_study.cli.options import Parser
 from mjx_study.study.configuration import StudyConfig
-from mjx_study.study.plan import StudyPlan, plan_study
+
+EPILOG = (
+    """\
+examples:
+  mjx-study compare pusher --stiffness 10,1000 --contact penalty,mujoco_default
+  mjx-study compare momentum_transfer --contact mujoco_default --theta 0.5 --estimators zobg,fobg,aobg,ivw --gamma 0.5
+  mjx-study compare pusher --theta out/policy-aobg.json    at the end of a descent instead of its start
+  mjx-study compare pusher --json > pusher.json
+
+estimators:
+"""
+    + "\n".join(f"  {item.name:<21} {item.description}" for item in CATALOGUE.values())
+    + """
+
+contact families (K: from --stiffness):
+"""
+    + "\n".join(f"  {item.name:<15} {item.description}" for item in FAMILIES.values())
+    + """
+
+columns of the table:
+  variance        trace of the sample covariance of one gradient sample, with a jackknife interval
+  relative error  distance of the mean to a reference gradient, over the norm of the reference
+  -> debiased     the same without the sampling noise of batch and reference, ± one standard error; < and >: no error
+                  is detected, these are bounds of two standard errors; -: noise explains all of it
+  ?               fewer than three effective samples: do not trust the number
+  alpha           weight of the first-order batch in AoBG
+  ms              computing time of one sample in milliseconds, compilation excluded
+  variance x s    variance times that time: the variance left after one second of computing
+
+and with --details:
+  |gradient|      norm of the mean gradient
+  effective (top) effective number of samples behind the variance, and the share of the largest
+  cosine          between mean and reference gradient, and the same debiased; for several parameters
+  epsilon, B      confidence radius of the zeroth-order mean; distance between the two means
+  residual        largest relative residual of MuJoCo's constraint solver
+  nan             samples that overflowed or became NaN; they are left out, with a warning
+"""
+)
+
+
+def add(command: Parser) -> None:
+    command.add_task_argument()
+    command.add_fields("sigma", "cone", "horizon", "model", "timestep")
+    command.add_process_options()
+    command.add_contact_options()
+    command.add_theta_option("parameters at which gradients are taken")
+    command.add_fields("estimators", "reference_samples", reference_samples={"unset": "600"})
+    command.add_option(StudyConfig.option("samples"), (400,))
+    command.add_estimator_options()
+    command.add_backward_options()
+    command.add_fields("confidence", "chunk_size", "block_size")
+    command.add_folder_options()
+    command.add_cluster_option()
+    command.add_flag("--details", "print all columns")
 
 
 def run(options: argparse.Namespace) -> int:
+    from mjx_study.cli.console import gradient_lines, rows_as_json
+    from mjx_study.cli.studies import run_one, study_fields
+    from mjx_study.study.plan import StudyPlan, plan_study
+
+    def planned() -> StudyPlan:
+        return plan_study(StudyConfig(**study_fields(options), seeds=1))
+
     lines = partial(gradient_lines, details=options.details)
-    return run_one(options, _plan, rows_as_json, lines, "figures and the numbers on disk")
-
-
-def _plan(options: argparse.Namespace) -> StudyPlan:
-    return plan_study(StudyConfig(**study_fields(options), seeds=1))
+    return run_one(options, planned, rows_as_json, lines, "figures and the numbers on disk")

@@ -1,17 +1,21 @@
-"""Format tables, and numbers with their intervals."""
+"""Studies as the commands print them: text, and plain data for JSON."""
 
 import itertools
+import json
 import math
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
+import numpy as np
 import xarray as xr
 
 from estimators import ENOUGH_EFFECTIVE
-from mjx_study.choices import FAMILIES
+from mjx_study.choices import FAMILIES, REFERENCE
 from mjx_study.plots.style import style_of
-from mjx_study.study.findings import Row, findings, rows_of
+from mjx_study.study.findings import Row, curves_of, findings, rows_of
+from mjx_study.study.iteration import REASONS
+from mjx_study.study.variables import HISTORY, METRIC, START
 from mjx_study.table import format_table
 
 Column = tuple[str, Callable[[Row], str]]
@@ -28,19 +32,6 @@ def number(value: float | None, digits: int = 3) -> str:
         return f"{rounded:.0f}" if abs(rounded) >= 10 ** (digits - 1) else f"{rounded:.{digits}g}"
     mantissa, exponent = f"{value:.1e}".split("e")
     return f"{mantissa}e{int(exponent)}"
-
-
-def _interval(row: Row) -> str:
-    return f"{number(row.variance)} ({number(row.variance_lower, 2)} to {number(row.variance_upper, 2)}){_doubt(row)}"
-
-
-def _doubt(row: Row) -> str:
-    """Mark for a number that rests on too few effective samples."""
-    return "" if row.believable else "?"
-
-
-def _effective(row: Row) -> str:
-    return number(row.effective_samples, 2) + (f" ({row.top_share:.0%})" if row.effective_samples else "")
 
 
 def _with_error(value: float, error: float) -> str:
@@ -70,6 +61,11 @@ def _debiased(row: Row, value: float, debiased: float, error: float, best: float
     return f"{plain} -> {left}{_doubt(row)}"
 
 
+def _doubt(row: Row) -> str:
+    """Mark of a number that rests on too few effective samples."""
+    return "" if row.believable else "?"
+
+
 def columns(confidence: float, details: bool = False, *, scalar: bool = False) -> list[list[Column]]:
     """Columns of the comparison: those that identify a row, then groups that a table keeps together.
 
@@ -78,7 +74,15 @@ def columns(confidence: float, details: bool = False, *, scalar: bool = False) -
         details: include all columns, not only those that help to choose an estimator.
         scalar: for a scalar parameter, where a cosine is meaningless.
     """
-    variance = f"variance ({confidence:.0%} interval)", _interval
+
+    def interval(row: Row) -> str:
+        bounds = f"{number(row.variance_lower, 2)} to {number(row.variance_upper, 2)}"
+        return f"{number(row.variance)} ({bounds}){_doubt(row)}"
+
+    def effective(row: Row) -> str:
+        return number(row.effective_samples, 2) + (f" ({row.top_share:.0%})" if row.effective_samples else "")
+
+    variance = f"variance ({confidence:.0%} interval)", interval
     error = (
         "relative error -> debiased",
         lambda row: _debiased(row, row.relative_error, row.debiased_error, row.debiased_error_se, 0.0),
@@ -100,32 +104,35 @@ def columns(confidence: float, details: bool = False, *, scalar: bool = False) -
         return [identity, [variance, error], [alpha, *times]]
     return [
         identity,
-        [("|gradient|", lambda row: number(row.gradient_norm)), variance, ("effective (top)", _effective)],
+        [("|gradient|", lambda row: number(row.gradient_norm)), variance, ("effective (top)", effective)],
         [error] if scalar else [error, cosine],
         [alpha, ("epsilon", lambda row: number(row.epsilon)), ("B", lambda row: number(row.discrepancy))],
         [*times, ("residual", lambda row: number(row.residual, 2)), ("nan", lambda row: str(row.nonfinite))],
     ]
 
 
-def _blocks(rows: Sequence[Row], shown: list[list[Column]], width: int) -> list[list[str]]:
+def _blocks(rows: Sequence[Row], shown: list[list[Column]], width: int) -> Iterator[list[str]]:
     """Split the columns into as few tables as the width allows, each with the identifying columns."""
     identity, *parts = shown
-    blocks: list[list[Column]] = []
+    block: list[Column] = []
     for part in parts:
-        if blocks and len(_table(rows, identity + blocks[-1] + part)[0]) <= width:
-            blocks[-1] += part
-        else:
-            blocks.append(list(part))
-    return [_table(rows, identity + block) for block in blocks]
+        if block and len(_table(rows, identity + block + part)[0]) > width:
+            yield _table(rows, identity + block)
+            block = []
+        block = block + part
+    yield _table(rows, identity + block)
+
+
+def _table(rows: Sequence[Row], table: Sequence[Column]) -> list[str]:
+    cells = [[show(row) for _, show in table] for row in rows]
+    for (previous, current), row in zip(itertools.pairwise(rows), cells[1:], strict=True):
+        if previous.stiffness == current.stiffness:
+            row[0] = ""
+    return format_table(cells, [heading for heading, _ in table])
 
 
 def gradient_lines(dataset: xr.Dataset, document: dict[str, Any], details: bool = False) -> list[str]:
-    """Format a study of gradients as text: configuration, a table per contact family, findings.
-
-    Args:
-        document: see `as_document`.
-        details: include all columns.
-    """
+    """Format a study of gradients and its document: configuration, a table per contact family, findings."""
     config, rows, lines = document["config"], rows_of(dataset), []
     shown = columns(config["confidence"], details, scalar=dataset.sizes.get("param") == 1)
     for resolved, task in zip(document["resolved"], dataset["task"].values.tolist(), strict=True):
@@ -164,9 +171,120 @@ def rows_as_json(dataset: xr.Dataset) -> dict[str, Any]:
     return {"findings": findings(dataset), "rows": [row.as_dict() for row in rows_of(dataset)]}
 
 
-def _table(rows: Sequence[Row], table: Sequence[Column]) -> list[str]:
-    cells = [[show(row) for _, show in table] for row in rows]
-    for previous, current in reversed(list(zip(range(len(rows)), range(1, len(rows)), strict=False))):
-        if rows[previous].stiffness == rows[current].stiffness:
-            cells[current][0] = ""
-    return format_table(cells, [heading for heading, _ in table])
+def curves(dataset: xr.Dataset) -> dict[str, Any]:
+    """Findings, and a curve per contact model."""
+    found = [
+        {"label": label, "contact": one["contact"].item(), "stiffness": one["stiffness"].item() or None}
+        | {str(name): one[name].values for name in one if "entry" not in str(one[name].dims)}
+        for label, one in curves_of(dataset)
+    ]
+    return {"findings": findings(dataset), "estimators": dataset["estimator"].values, "curves": found}
+
+
+def curve_lines(dataset: xr.Dataset, document: dict[str, Any]) -> list[str]:
+    config, found = document["config"], curves_of(dataset)
+    low, high = found[0][1]["position"].values[[0, -1]]
+    where = f"t, along direction {config['direction'] or 'random'}," if dataset.attrs["many_parameters"] else "theta"
+    samples, sigmas = ([f"{value:g}" for value in dataset[name].values] for name in ("samples", "sigma"))
+    lines = [
+        f"{', '.join(config['tasks'])}: {where} from {low:.3g} to {high:.3g} in {config['points']} points, "
+        f"sigma {', '.join(sigmas)},",
+        f"{', '.join(samples)} samples at each, seed {config['seed']}, {document['environment']['precision']}",
+        "",
+        "where the mean cost is least on the line:",
+    ]
+    rows = []
+    for label, one in found:
+        smoothed, error = one["smoothed"].values, one["smoothed_se"].values
+        best = int(np.nanargmin(smoothed)) if np.any(np.isfinite(smoothed)) else 0
+        least = f"{number(smoothed[best], 4)} ± {number(error[best], 1)}"
+        rows.append([label, f"{one['position'].values[best]:.3g}", least])
+    return [*lines, *format_table(rows, ["contact", "at", "mean cost"]), "", *document["findings"]]
+
+
+def descents(dataset: xr.Dataset) -> dict[str, Any]:
+    """Descents of every estimator, with histories by iteration and seed."""
+    config, resolved = json.loads(dataset.attrs["config"]), json.loads(dataset.attrs["resolved"])[0]
+    one = dataset.isel({name: 0 for name in ("task", "timestep", "cone", "model", "sigma", "samples")})
+    place = {name: one[name].item() for name in ("contact", "stiffness", "cone", "sigma", "samples")}
+    place["stiffness"] = place["stiffness"] or None
+    return {
+        "config": config | resolved["recipe"] | place | {"task": config["tasks"][0], "noise": resolved["noise"]},
+        "start_cost": [one["start_cost"].item(), one["start_cost_se"].item()],
+        "start_metrics": {str(name)[len(START) :]: one[name].item() for name in one if str(name).startswith(START)},
+        "runs": [_run(one.sel(estimator=name)) for name in config["estimators"]],
+    }
+
+
+def _run(one: xr.Dataset) -> dict[str, Any]:
+    final, stopped_at = one["final_cost"].values, one["stopped_at"].values
+    known = np.flatnonzero(np.isfinite(one["seconds"].values))
+    length = int(known[-1]) + 1 if len(known) else 0
+    stopped = [
+        {"seed": seed, "iteration": int(stopped_at[seed]), "reason": REASONS[int(one["reason"].values[seed])]}
+        for seed in np.flatnonzero(np.isfinite(stopped_at)).tolist()
+    ]
+    return {
+        "estimator": one["estimator"].item(),
+        "final_cost": final,
+        "final_cost_se": one["final_cost_se"].values,
+        "metrics": {str(name)[len(METRIC) :]: one[name].values for name in one if str(name).startswith(METRIC)},
+        "best_seed": int(np.nanargmin(final)) if np.any(np.isfinite(final)) else 0,
+        "stopped": stopped,
+        "rollouts_per_iteration": int(one["rollouts"]),
+        "seconds": one["seconds"].values[:length],
+        "history": {name: one[name].transpose("iteration", "seed").values[:length] for name in HISTORY},
+        "theta": one["theta"].transpose("seed", "param").values,
+    }
+
+
+def descent_lines(dataset: xr.Dataset, document: dict[str, Any]) -> list[str]:
+    config = document["config"]
+    where = "analytic reference" if config["contact"] == REFERENCE else config["contact"]
+    if config["contact"] != REFERENCE and config["stiffness"]:
+        where = f"{where}, K = {config['stiffness']:g} N/m"
+    metrics = "".join(f", {name} {number(value, 3)}" for name, value in document["start_metrics"].items())
+    decay = f" / i^{config['decay']:g}" if config["decay"] else ""
+    mean, error = document["start_cost"]
+    lines = [
+        f"{config['task']}: {where}; {config['optimizer']}, learning rate {config['learning_rate']:g}{decay}, "
+        f"{config['iterations']} iterations",
+        f"{config['samples']} samples in each batch, {config['seeds']} seeds from {config['seed']}, "
+        f"sigma {config['sigma']:g}; cost at the start {number(mean, 4)} ± {number(error, 2)}{metrics}",
+        "",
+        *format_table(
+            [_row(run) for run in document["runs"]],
+            ["estimator", "cost", "best", *document["start_metrics"], "alpha", "rollouts", "seconds"],
+        ),
+    ]
+    for run in document["runs"]:
+        for stop in run["stopped"]:
+            label, _, _ = style_of(run["estimator"])
+            lines.append(f"{label}, seed {stop['seed']}: stopped at iteration {stop['iteration']}, {stop['reason']}")
+    return lines
+
+
+def _row(run: dict[str, Any]) -> list[str]:
+    costs = _finite(run["final_cost"])
+    length = len(run["seconds"])
+    weights = _finite([weight for row in run["history"]["alpha"][-max(1, length // 10) :] for weight in row])
+    return [
+        style_of(run["estimator"])[0],
+        _mean_and_spread(costs, 4),
+        number(float(np.min(costs)), 4) if len(costs) else "nan",
+        *(_mean_and_spread(_finite(values), 3) for values in run["metrics"].values()),
+        f"{np.mean(weights):.3f}" if len(weights) else "-",
+        str(run["rollouts_per_iteration"] * length),
+        f"{run['seconds'][-1]:.1f}" if length else "-",
+    ]
+
+
+def _finite(values: list[float | None]) -> np.ndarray:
+    return np.array([value for value in values if value is not None and math.isfinite(value)])
+
+
+def _mean_and_spread(values: np.ndarray, digits: int) -> str:
+    if len(values) == 0:
+        return "nan"
+    spread = f" ± {number(float(np.std(values, ddof=1)), 2)}" if len(values) > 1 else ""
+    return number(float(np.mean(values)), digits) + spread

@@ -3,8 +3,13 @@
 import argparse
 
 from estimators.catalogue import CATALOGUE, DENSITIES
-from mjx_study.cli.options import print_report
+from mjx_study.cli.options import Parser
+from mjx_study.cli.output import print_report
 
+EPILOG = """\
+The second column says what each needs: values (rollouts), pairs (of opposite noise), steps (costs to go), gradients, or
+derivatives of every step. compare, optimise and sweep accept any of them in --estimators.
+"""
 WORDS = {
     "evaluation": "values",
     "pair": "pairs",
@@ -17,29 +22,20 @@ WORDS = {
 }
 
 
+def add(command: Parser) -> None:
+    """Add no options beyond --json."""
+
+
 def run(options: argparse.Namespace) -> int:
-    entries = [
-        {
-            "name": item.name,
-            "description": item.description,
-            "needs": list(item.needs),
-            "requires": [f"--{name.replace('_', '-')}" for name in item.required if name != "sigma"],
-        }
-        for item in CATALOGUE.values()
-    ]
-    densities = [{"name": name, "description": line} for name, line in DENSITIES.items()]
-    rows = [[entry["name"], _needs(entry), entry["description"]] for entry in entries]
-    width = max(len(row[0]) for row in rows), max(len(row[1]) for row in rows)
-    lines = [f"{name:<{width[0]}}  {needs:<{width[1]}}  {description}" for name, needs, description in rows]
-    lines += [
-        "",
-        "noise densities (--noise)",
-        *(f"{item['name']:<{width[0]}}  {item['description']}" for item in densities),
-    ]
-    print_report(options, {"estimators": entries, "noises": densities}, lines)
-    return 0
-
-
-def _needs(entry) -> str:
-    words = " + ".join(WORDS[name] for name in entry["needs"])
-    return f"{words}, {', '.join(entry['requires'])}" if entry["requires"] else words
+    entries, rows = [], []
+    for name, item in CATALOGUE.items():
+        flags = [f"--{option.replace('_', '-')}" for option in item.required if option != "sigma"]
+        needs = " + ".join(WORDS[oracle] for oracle in item.needs)
+        entries.append({"name": name, "description": item.description, "needs": list(item.needs), "requires": flags})
+        rows.append((name, ", ".join([needs, *flags]), item.description))
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = [f"{name:<{widths[0]}}  {needs:<{widths[1]}}  {description}" for name, needs, description in rows]
+    lines += ["", "noise densities (--noise)"]
+    lines += [f"{name:<{widths[0]}}  {description}" for name, description in DENSITIES.items()]
+    densities = [{"name": name, "description": description} for name, description in DENSITIES.items()]
+    return print_report(options, {"estimators": entries, "noises": densities}, lines)

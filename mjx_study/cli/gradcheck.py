@@ -1,79 +1,132 @@
 """mjx-study gradcheck."""
 
 import argparse
-from typing import Any
 
-from estimators import make_estimator
-from mjx_study import gradcheck as check
-from mjx_study.choices import CHECKED_STEPS, is_file
-from mjx_study.cli.options import UsageError, computing, configure_process, print_report, scene_options, usage_errors
-from mjx_study.cli.parsers.gradcheck import MEAN
-from mjx_study.gradcheck.mean import lines_of
-from mjx_study.gradcheck.plan import GradcheckPlan
-from mjx_study.simulation.scene import load_scene
-from mjx_study.study.resolution import check_estimators
-from mjx_study.tasks import make_task
+from mjx_study.choices import CHECKED_STATES, CHECKED_STEPS, CHECKED_STIFFNESS, is_file
+from mjx_study.cli.options import Parser, UsageError, configure_process, given_options, scene_options, usage_errors
+from mjx_study.cli.output import computing, print_report
+from mjx_study.option import OPTIONS, Option
 
 UNEXERCISED = 3
 """Exit code if nothing is wrong but something was never exercised."""
+PAIR = Option("pair", str, "GEOM,GEOM", "for files: pair of geoms that the stiffness is for", many=True)
+EPILOG = """\
+Columns, all relative errors, each the worst over the states:
+  modes        reverse mode against forward mode
+  differences  derivatives with respect to state and control, against central differences
+  parameters   the same with respect to solref, solimp and friction, through the contact model
+  one-sided    disagreement of the two one-sided differences: 0 where the map is smooth
+  closed form  against a hand-derived gradient of the task's analytic counterpart, a different model of the same system
+  mjx step     the state after a step, against mjx.step run to convergence
+  C step       the same against the C engine; contacts may be placed differently
+  C engine     the Jacobian against differences of the C engine's step, where the steps agree
+  mjx.step     with --stock, the derivative of mjx.step itself: what you get without this project
+  residual     the solver's residual; the derivative is only as good as this
+  unresolved   number of entries for which differences are too uncertain to decide
+
+Below the table, what the states exercise: contacts that push, stick, slide or separate, limits, friction loss,
+equalities. If the rollout does not reach one that the model has, faster states and random poses are searched.
+
+Exit code 0: every derivative that exists is right. 1: one is wrong, NaN, silently zero or unconverged, or the step
+differs from mjx.step or, for no documented reason, from the C engine. 3: right, but something that the model has and
+can reach was never exercised. Kinks and jumps are properties of the step, and differently placed contacts are not
+derivative errors: both are reported but do not fail.
+
+With --mean: does an estimator's mean integrate to the difference of the mean cost along a path through theta? No
+reference gradient is needed. Columns: that difference; the integral minus it (the gap), the half-width of its 99.9 %
+interval, and the quadrature's part of that; the gap as a share of the difference, and the smallest share certain to be
+detected. "Right" is within 5 %. Exit code 0: all are right. 1: one is biased. 3: undecided, too few samples.
+"""
+MEAN = {
+    "estimators": ("zobg", "fobg"),
+    "onset": "none",
+    "samples": 1000,
+    "sigma": None,
+    "span": None,
+    "direction": "random",
+}
+"""Options of --mean, with their defaults."""
+
+
+def add(command: Parser) -> None:
+    command.add_task_argument()
+    usual = ",".join(f"{each:g}" for each in CHECKED_STIFFNESS)
+    command.add_contact_options(f"{usual}, or the task's if stiffer", analytic=False)
+    command.add_option(PAIR)
+    command.add_option("cone")
+    command.add_scene_options()
+    command.add_option("iterations", line="iterations of the solver", unset="the MJCF's")
+    command.add_option("ls_iterations")
+    command.add_option("horizon", unset=f"the task's; {CHECKED_STEPS} for a file")
+    command.add_option("model")
+    command.add_option("states", CHECKED_STATES)
+    command.add_flag("--stock", "also check the derivative of mjx.step itself")
+    command.add_flag("--mean", "check the means of estimators instead of derivatives")
+    changes = {
+        "estimators": {"many": True},
+        "span": {"many": True, "unset": "two sigma about theta"},
+    }
+    for name, default in MEAN.items():
+        more = "; or means: three paths that the means span" if name == "direction" else ""
+        line = f"with --mean: {OPTIONS[name].line}{more}"
+        command.add_option(name, default, given=False, line=line, **changes.get(name, {}))
+    command.add_flag("--verbose", "print every entry of every finding")
+    command.add_process_options()
 
 
 def run(options: argparse.Namespace) -> int:
     """Check and print; return 1 if something is wrong, 3 if something was not exercised."""
+    from mjx_study.gradcheck import gradcheck, plan_gradcheck, plan_scene_gradcheck
+    from mjx_study.simulation.scene import load_scene
+    from mjx_study.tasks import make_task
+
     if options.mean:
         return _run_mean(options)
-    if given := _given(options):
+    if given := given_options(options, *MEAN):
         raise UsageError(f"--{next(iter(given))} is for --mean")
+    common = {name: getattr(options, name) for name in ("seed", "damping", "states", "stock")}
     with usage_errors():
         configure_process(options)
-        plan = _plan(options)
+        chosen = scene_options(options, "cone", "iterations", "ls_iterations")
+        if not is_file(options.task):
+            if options.pair is not None:
+                raise UsageError("--pair is for files; a task has its own")
+            task = make_task(options.task, **chosen, **given_options(options, "horizon", "model"))
+            plan = plan_gradcheck(task, options.contact, options.stiffness, **common)
+        else:
+            if options.model is not None:
+                raise UsageError("--model replaces the MJCF of a task, but this is a file already")
+            if options.pair is not None and len(options.pair) != 2:
+                raise UsageError(f"--pair takes the names of two geoms, got {len(options.pair)}")
+            scene = load_scene(options.task, **chosen)
+            common |= {"pair": options.pair, "horizon": CHECKED_STEPS if options.horizon is None else options.horizon}
+            plan = plan_scene_gradcheck(scene, options.contact, options.stiffness, **common)
     with computing() as progress:
-        report = check.gradcheck(plan, progress)
+        report = gradcheck(plan, progress)
     print_report(options, report.as_json(), report.lines(verbose=options.verbose))
     return 1 if not report.passed else UNEXERCISED if report.unexercised else 0
 
 
-def _given(options: argparse.Namespace) -> dict[str, Any]:
-    """Options of --mean that were given."""
-    return {name: getattr(options, name) for name in MEAN if getattr(options, name) is not None}
-
-
 def _run_mean(options: argparse.Namespace) -> int:
-    chosen = MEAN | _given(options)
+    from estimators import make_estimator
+    from mjx_study.gradcheck import check_mean, plan_gradcheck
+    from mjx_study.gradcheck.mean import lines_of
+    from mjx_study.study.resolution import check_estimators
+    from mjx_study.tasks import make_task
+
+    chosen = MEAN | given_options(options, *MEAN)
     with usage_errors():
         configure_process(options)
         scene = scene_options(options, "cone", "iterations", "ls_iterations", "horizon", "model")
         task = make_task(options.task, **scene).replace(onset=chosen["onset"])
         task = task if chosen["sigma"] is None else task.replace(sigma=chosen["sigma"])
-        plan = check.plan_gradcheck(
-            task, options.contact, options.stiffness, seed=options.seed, damping=options.damping
-        )
+        plan = plan_gradcheck(task, options.contact, options.stiffness, seed=options.seed, damping=options.damping)
         found = [make_estimator(name, gamma=task.defaults.gamma, sigma=task.sigma) for name in chosen["estimators"]]
         check_estimators(found, task)
     path = {name: chosen[name] for name in ("samples", "span", "direction")}
     with computing() as progress:
-        checks = check.check_mean(task, plan.cells, found, seed=options.seed, progress=progress, **path)
+        checks = check_mean(task, plan.cells, found, seed=options.seed, progress=progress, **path)
     document = {"checks": [each.as_dict() for each in checks], "warnings": list(plan.warnings)}
     print_report(options, document, [*lines_of(checks), *(f"warning: {text}" for text in plan.warnings)])
     verdicts = {each.verdict for each in checks}
     return 1 if "biased" in verdicts else UNEXERCISED if "undecided" in verdicts else 0
-
-
-def _plan(options: argparse.Namespace) -> GradcheckPlan:
-    common = {"seed": options.seed, "damping": options.damping, "states": options.states, "stock": options.stock}
-    chosen = scene_options(options, "cone", "iterations", "ls_iterations")
-    if not is_file(options.task):
-        if options.pair is not None:
-            raise UsageError("--pair is for files; a task has its own")
-        chosen |= {name: getattr(options, name) for name in ("horizon", "model") if getattr(options, name) is not None}
-        task = make_task(options.task, **chosen)
-        return check.plan_gradcheck(task, options.contact, options.stiffness, **common)
-    if options.model is not None:
-        raise UsageError("--model replaces the MJCF of a task, but this is a file already")
-    if options.pair is not None and len(options.pair) != 2:
-        raise UsageError(f"--pair takes the names of two geoms, got {len(options.pair)}")
-    scene = load_scene(options.task, **chosen)
-    horizon = CHECKED_STEPS if options.horizon is None else options.horizon
-    return check.plan_scene_gradcheck(
-        scene, options.contact, options.stiffness, pair=options.pair, horizon=horizon, **common
-    )

@@ -1,9 +1,24 @@
-"""Robust standard output and error: full disks, closed pipes, limited character sets."""
+"""What a command writes: standard output and error, progress, the line and the exit code with which it ends."""
 
+import argparse
+import json
 import os
+import signal
 import sys
-from collections.abc import Generator
+import threading
+import time
+from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any, Final, NoReturn
+
+from mjx_study.study.configuration import Progress
+
+RESUMABLE: Final = "the same command resumes where it stopped"
+INTERRUPTED: Final = "nothing was written"
+"""Default continuation of "interrupted; ..."."""
+ENDINGS: Final = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated", signal.SIGHUP: "hung up"}
+"""Signals that end a command with one line and exit code 128 + the signal's number."""
 
 
 class OutputError(Exception):
@@ -29,7 +44,10 @@ def written_out() -> Generator[None]:
     except OSError as error:
         if error.filename is not None:
             raise OutputError(f"cannot write {error.filename}: {error.strerror}") from error
-        _abandon()
+        with suppress(OSError, AttributeError, ValueError):  # else Python would try to write the rest again at exit
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(nowhere, sys.stdout.fileno())
+            os.close(nowhere)
         if isinstance(error, BrokenPipeError):
             raise
         raise OutputError(f"cannot write to standard output: {error.strerror or error}") from error
@@ -42,9 +60,86 @@ def complain(line: str) -> None:
             print(line, file=sys.stderr, flush=True)
 
 
-def _abandon() -> None:
-    """Discard further standard output, which Python would otherwise try to write again at exit."""
-    with suppress(OSError, AttributeError, ValueError):
-        nowhere = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(nowhere, sys.stdout.fileno())
-        os.close(nowhere)
+@contextmanager
+def computing(interrupted: str = INTERRUPTED) -> Generator[Progress]:
+    """Show progress while computing; a signal ends the process at once, see `ending`."""
+    with ending(interrupted, *ENDINGS), shown_progress() as progress:
+        yield progress
+
+
+@contextmanager
+def ending(told: str, *signals: signal.Signals) -> Generator[None]:
+    """Within the context, let signals end the process at once, with one line and exit code 128 + the signal's number.
+
+    Exceptions would not work: JAX calls back into Python while tracing, and exceptions raised there may be lost.
+    Nothing is on disk yet, or only complete files, so there is nothing to undo.
+    """
+    previous = {number: signal.getsignal(number) for number in signals}
+    # Only the main thread may set handlers; signals that a background job or nohup ignores stay ignored.
+    ours = threading.current_thread() is threading.main_thread()
+    caught = [number for number, handler in previous.items() if ours and handler is not signal.SIG_IGN]
+    for number in caught:
+        signal.signal(number, lambda code, _: _leave(f"mjx-study: {ENDINGS[signal.Signals(code)]}; {told}", code))
+    try:
+        yield
+    finally:
+        for number in caught:
+            signal.signal(number, previous[number])
+
+
+def _leave(message: str, code: int) -> NoReturn:
+    if sys.stderr is not None and sys.stderr.isatty():
+        sys.stderr.write("\n\x1b[?25h")  # the cursor that a progress bar hides
+    print(message, file=sys.stderr, flush=True)
+    os._exit(128 + code)
+
+
+@contextmanager
+def shown_progress() -> Generator[Progress]:
+    """Show a bar on a terminal until the work is done; otherwise print a line per stage with the elapsed time."""
+    if sys.stderr is None or not sys.stderr.isatty():
+        yield _stage_lines()
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("starting", total=None)
+        yield lambda done, total, what: bar.update(task, completed=done, total=total, description=what)
+
+
+def _stage_lines() -> Progress:
+    """Print a line for each stage, identified by its name; progress within a stage is not shown."""
+    begun, last = time.monotonic(), ""
+
+    def report(done: int, total: int, what: str) -> None:
+        nonlocal last
+        if what != last:
+            complain(f"{time.monotonic() - begun:7.1f} s  [{done}/{total}] {what}")
+            last = what
+
+    return report
+
+
+def attempt(write: Callable[[], list[Path]]) -> tuple[list[Path], str | None]:
+    """Write files; return their paths, or the reason for a failure: a full disk must not cost the printed numbers."""
+    try:
+        return write(), None
+    except OSError as error:
+        return [], f"cannot write {error.filename or 'a file'}: {error.strerror or error}; existing files are complete"
+
+
+def print_report(
+    options: argparse.Namespace, document: dict[str, Any], lines: Sequence[str], *unwritten: str | None
+) -> int:
+    """Print the document as JSON if requested, otherwise the lines.
+
+    Returns:
+        The exit code: 1, with one line, if something could not be written.
+    """
+    print(json.dumps(document, allow_nan=False) if options.json else "\n".join(lines))
+    failures = list(filter(None, unwritten))
+    for failure in failures[:1]:
+        print(f"mjx-study: {failure}", file=sys.stderr)
+    return int(bool(failures))

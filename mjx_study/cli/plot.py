@@ -1,16 +1,41 @@
 """mjx-study plot."""
 
 import argparse
+from pathlib import Path
 
-from mjx_study._matplotlib import matplotlib
-from mjx_study.cli.options import attempt, finish, print_report, usage_errors
-from mjx_study.disk import prepare_folder
-from mjx_study.plots.study import plot_study
-from mjx_study.plots.style import STYLES, fit_to_paper, save_figures
-from mjx_study.study.run import load_study, warnings_of
+from mjx_study.choices import FIGURE_FORMATS, FIGURE_STYLES
+from mjx_study.cli.options import Parser, usage_errors
+from mjx_study.cli.output import attempt, print_report
+from mjx_study.option import Option
+
+FORMAT = Option("format", str, "FORMAT", f"of: {', '.join(FIGURE_FORMATS)}", choices=FIGURE_FORMATS, many=True)
+EPILOG = """\
+Draws whatever the study has numbers for: variance, bias and alpha against stiffness, error against samples, maps over
+two swept parameters; for descents, achieved cost against stiffness, and cost against iterations, rollouts and seconds;
+for landscapes, costs and slopes. Works while the study is still being computed. --style paper gives column or page
+width, no title, and embedded 8-point type.
+
+examples:
+  mjx-study plot out
+  mjx-study plot out --output figures
+  mjx-study plot out --style paper --format pdf,svg
+"""
+
+
+def add(command: Parser) -> None:
+    command.add_argument("folder", type=Path, metavar="FOLDER", help="folder of a study")
+    command.add_argument("--output", type=Path, metavar="DIR", help="default: the study's folder")
+    command.add_argument("--style", choices=FIGURE_STYLES, default="screen", help="default: screen")
+    command.add_option(FORMAT, FORMAT.parse("png,pdf"))
 
 
 def run(options: argparse.Namespace) -> int:
+    from mjx_study._matplotlib import matplotlib
+    from mjx_study.disk import prepare_folder
+    from mjx_study.plots.study import plot_study
+    from mjx_study.plots.style import STYLES, fit_to_paper, save_figures
+    from mjx_study.study.run import load_study, warnings_of
+
     with usage_errors():
         dataset = load_study(options.folder)
         folder = prepare_folder(options.output or options.folder)
@@ -20,7 +45,6 @@ def run(options: argparse.Namespace) -> int:
             fit_to_paper(figure)
         written, unwritten = attempt(lambda: save_figures(figures, folder, options.format))
     warnings = list(warnings_of(dataset))
-    document = {"written": [str(path) for path in written], "warnings": warnings}
     names = ", ".join(path.name for path in written if path.suffix == f".{options.format[0]}")
     others = ", ".join(kind.upper() for kind in options.format[1:])
     lines = [f"warning: {message}" for message in warnings]
@@ -28,5 +52,5 @@ def run(options: argparse.Namespace) -> int:
         lines.append("nothing to draw yet")
     elif written:
         lines.append(f"written to {folder}: {names}{f' (and as {others})' if others else ''}")
-    print_report(options, document, lines)
-    return finish(unwritten)
+    document = {"written": [str(path) for path in written], "warnings": warnings}
+    return print_report(options, document, lines, unwritten)

@@ -3,35 +3,39 @@
 import argparse
 import dataclasses
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import xarray as xr
+from pydantic import BaseModel, BeforeValidator, ConfigDict, create_model
 
-from mjx_study.cli.options import UsageError, attempt, computing, configure_process, finish, print_report, usage_errors
-from mjx_study.cli.parameters import theta_of
+from mjx_study.cli.options import UsageError, configure_process, given_options, theta_of, usage_errors
+from mjx_study.cli.output import RESUMABLE, attempt, computing, print_report
+from mjx_study.cli.sweep import TASKS, solimp, solref
+from mjx_study.files import read_toml
+from mjx_study.option import OPTIONS
 from mjx_study.plots.study import plot_study
 from mjx_study.plots.style import save_figures
 from mjx_study.study.cluster import connected
 from mjx_study.study.configuration import StudyConfig
 from mjx_study.study.dataset import as_plain
 from mjx_study.study.forecast import forecast
-from mjx_study.study.plan import StudyPlan
-from mjx_study.study.run import open_store, run_study, warnings_of
-from mjx_study.study.store import StudyError
+from mjx_study.study.plan import StudyPlan, plan_study
+from mjx_study.study.run import load_study, open_store, run_study, warnings_of
+from mjx_study.study.store import Store, StudyError
+from mjx_study.table import digits_to_tell_apart, size
 
-RESUMABLE = "the same command resumes where it stopped"
 KEPT = "results.nc (every number), study.json (the configuration), cells/ (checkpoints)"
+INTACT = "existing files are complete, and the same command resumes"
 
 
 def study_fields(options: argparse.Namespace) -> dict[str, Any]:
     """Fields of a `StudyConfig` set by the options."""
-    given = {field.name: getattr(options, field.name, None) for field in dataclasses.fields(StudyConfig)}
-    given |= {"theta": theta_of(options)} if hasattr(options, "theta") else {}
-    given |= {"tasks": (options.task,)} if hasattr(options, "task") else {}
-    return {name: value for name, value in given.items() if value is not None}
+    fields = given_options(options, *(field.name for field in dataclasses.fields(StudyConfig)))
+    fields |= {"theta": theta_of(options)} if "theta" in fields else {}
+    return fields | ({"tasks": (options.task,)} if hasattr(options, "task") else {})
 
 
 def as_document(dataset: xr.Dataset, own: Callable[[xr.Dataset], dict[str, Any]]) -> dict[str, Any]:
@@ -42,7 +46,7 @@ def as_document(dataset: xr.Dataset, own: Callable[[xr.Dataset], dict[str, Any]]
 
 def run_one(
     options: argparse.Namespace,
-    planned: Callable[[argparse.Namespace], StudyPlan],
+    planned: Callable[[], StudyPlan],
     own: Callable[[xr.Dataset], dict[str, Any]],
     lines_of: Callable[[xr.Dataset, dict[str, Any]], list[str]],
     offer: str,
@@ -59,9 +63,9 @@ def run_one(
     """
     with usage_errors():
         configure_process(options)
-        plan = planned(options)
+        plan = planned()
     if options.dry_run:
-        return announce(plan, options)
+        return _announce(plan, options)
     dataset, unwritten = _compute(plan, options)
     document, folder, failures = as_document(dataset, own), options.output, [unwritten]
     written: list[Path] = []
@@ -75,8 +79,7 @@ def run_one(
         lines.append(f"nothing was computed: {folder} already holds all {len(plan.cells)} cells")
     if folder is not None and not unwritten:
         lines.append(f"written to {folder}: {', '.join([*(path.name for path in written), KEPT])}")
-    print_report(options, document, lines)
-    return finish(*failures)
+    return print_report(options, document, lines, *failures)
 
 
 def _compute(plan: StudyPlan, options: argparse.Namespace) -> tuple[xr.Dataset, str | None]:
@@ -84,36 +87,121 @@ def _compute(plan: StudyPlan, options: argparse.Namespace) -> tuple[xr.Dataset, 
 
     Returns:
         The numbers, and why they could not be written, if so.
-
-    Raises:
-        UsageError: the folder holds another study or a damaged one, or cannot be used.
     """
     if options.output is None:
         if getattr(options, "cluster", None) is not None:
             raise UsageError("--cluster needs a folder for the study: give --output")
         with computing() as progress:
             return run_study(plan, progress=progress), None
+    dataset = _compute_in(_store(plan, options), plan, options, keep_going=True)
+    reason = dataset.attrs.pop("unwritten", None)
+    return dataset, reason and f"{reason}; {INTACT}"
+
+
+def _store(plan: StudyPlan, options: argparse.Namespace) -> Store:
+    with usage_errors():
+        return open_store(plan, options.output, options.command_line, accept_versions=options.accept_versions)
+
+
+def _compute_in(store: Store, plan: StudyPlan, options: argparse.Namespace, *, keep_going: bool) -> xr.Dataset:
     try:
-        with usage_errors():
-            store = open_store(plan, options.output, options.command_line, accept_versions=options.accept_versions)
         with ExitStack() as stack:
             if (cluster := getattr(options, "cluster", None)) is not None:
                 with usage_errors():
                     cluster = stack.enter_context(connected(cluster))
             progress = stack.enter_context(computing(RESUMABLE))
-            dataset = run_study(plan, store, progress, keep_going=True, cluster=cluster)
+            return run_study(plan, store, progress, keep_going=keep_going, cluster=cluster)
     except StudyError as error:
         raise UsageError(str(error)) from error
-    reason = dataset.attrs.pop("unwritten", None)
-    return dataset, reason and f"{reason}; existing files are complete, and the same command resumes"
 
 
-def announce(plan: StudyPlan, options: argparse.Namespace) -> int:
+def _announce(plan: StudyPlan, options: argparse.Namespace) -> int:
     """Print the forecast cost of a study."""
+    cluster = getattr(options, "cluster", None)
     with usage_errors():
-        found = forecast(
-            plan, options.output, accept_versions=options.accept_versions, cluster=getattr(options, "cluster", None)
-        )
-    warnings = [f"warning: {message}" for message in plan.warnings]
-    print_report(options, dataclasses.asdict(found) | {"warnings": list(plan.warnings)}, [*found.lines, *warnings])
-    return 0
+        found = forecast(plan, options.output, accept_versions=options.accept_versions, cluster=cluster)
+    lines = [*found.lines, *(f"warning: {message}" for message in plan.warnings)]
+    return print_report(options, dataclasses.asdict(found) | {"warnings": list(plan.warnings)}, lines)
+
+
+def run_sweep(options: argparse.Namespace) -> int:
+    with usage_errors():
+        configure_process(options)
+        plan = plan_study(StudyConfig(**sweep_fields(options)))
+    if options.dry_run:
+        return _announce(plan, options)
+    store, folder, unwritten = _store(plan, options), options.output, None
+    with usage_errors():
+        missing = len(store.missing)
+    if not options.json:
+        print("\n".join(_sweep_head(plan, missing)), flush=True)
+    try:
+        dataset = _compute_in(store, plan, options, keep_going=False)
+    except OSError as error:
+        with usage_errors():
+            dataset = load_study(folder)
+        unwritten = f"cannot write to {folder}: {error.strerror or error}; {INTACT}"
+    computed = dataset.attrs.get("computed_cells", missing - dataset.attrs["missing_cells"])
+    sizes = ", ".join(f"{name} {length}" for name, length in dataset.sizes.items())
+    lines = [f"computed {computed} cells; {sizes}"]
+    lines += [f"warning: {message}" for message in warnings_of(dataset) if message not in plan.warnings]
+    lines += [f"written to {folder}: results.nc; mjx-study plot {folder} draws it"] if unwritten is None else []
+    document = {
+        "folder": str(folder),
+        "computed": computed,
+        "cells": {name: int(length) for name, length in dataset.sizes.items()},
+        "variables": [str(name) for name in dataset.data_vars],
+        "warnings": list(warnings_of(dataset)),
+    }
+    failed = len(json.loads(dataset.attrs.get("failed_cells", "{}")))
+    failure = f"{failed} cells failed; the warnings say why" if failed else None
+    return print_report(options, document, lines, unwritten, failure)
+
+
+def sweep_fields(options: argparse.Namespace) -> dict[str, Any]:
+    """Fields of a sweep's configuration; flags take precedence over the file."""
+    fields = ({} if options.config is None else read_toml(options.config, _schema())) | study_fields(options)
+    if "tasks" not in fields:
+        raise ValueError("no task: name one, or give --config")
+    if fields.get("solref") or fields.get("solimp"):
+        fields.setdefault("contact", ())
+    return fields
+
+
+def _schema() -> type[BaseModel]:
+    """Schema of a TOML file: the configuration's fields, parsed like their options."""
+    own = {"tasks": TASKS.read, "direction": _direction, "solref": solref, "solimp": solimp}
+    names = [field.name for field in dataclasses.fields(StudyConfig)]
+    readers = {name: own[name] if name in own else StudyConfig.option(name).read for name in names}
+    fields = {name: (Annotated[Any, BeforeValidator(read)], None) for name, read in readers.items()}
+    return create_model("Sweep", __config__=ConfigDict(extra="forbid"), **fields)  # type: ignore[call-overload]
+
+
+def _direction(value: Any) -> str:
+    return OPTIONS["direction"].read(str(value) if isinstance(value, int) and not isinstance(value, bool) else value)
+
+
+def _sweep_head(plan: StudyPlan, missing: int) -> list[str]:
+    config = plan.config
+    lengths = _listed(group.recipe.iterations for group in plan.groups if group.recipe)
+    kind = {"descents": f"descents of {lengths} iterations", "landscapes": f"{config.points} points"}
+    models = {(cell.model.family, cell.model.stiffness) for cell in plan.cells}
+    work = missing and (
+        f"; {plan.compilations} programs to compile, chunks of {plan.chunk_size} samples, "
+        f"about {size(plan.memory)} for the batches of a cell"
+    )
+    return [
+        f"{', '.join(config.task_names)}: {kind.get(str(config.kind), config.kind)}, {', '.join(config.estimators)}, "
+        f"seeds {config.batches}",
+        f"contact models: {len(models)}, timestep {_listed(group.timestep for group in plan.groups)} s, "
+        f"{', '.join(dict.fromkeys(group.cone for group in plan.groups))} cone, "
+        f"sigma {_listed(cell.sigma for cell in plan.cells)}, {_listed(cell.samples for cell in plan.cells)} samples",
+        f"cells: {len(plan.cells)}, of which {missing} to compute{work or ''}",
+        *(f"warning: {message}" for message in plan.warnings),
+    ]
+
+
+def _listed(values: Iterable[float]) -> str:
+    distinct = list(dict.fromkeys(values))
+    digits = digits_to_tell_apart(distinct)
+    return ", ".join(f"{value:.{digits}g}" for value in distinct)

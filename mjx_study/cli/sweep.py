@@ -1,131 +1,97 @@
 """mjx-study sweep."""
 
 import argparse
-import dataclasses
-import json
-from collections.abc import Callable, Iterable
-from contextlib import ExitStack
+import itertools
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-import xarray as xr
-from pydantic import BaseModel, BeforeValidator, ConfigDict, create_model
+from mjx_study.choices import TASK_DESCRIPTIONS
+from mjx_study.cli.options import Parser, known_task
+from mjx_study.option import MOST_VALUES, Interval, Option
 
-from mjx_study.cli.options import UsageError, computing, configure_process, finish, print_report, usage_errors
-from mjx_study.cli.parsers.sweep import TASKS, solimp, solref
-from mjx_study.cli.studies import RESUMABLE, announce, study_fields
-from mjx_study.files import read_toml
-from mjx_study.option import OPTIONS
-from mjx_study.study.cluster import connected
-from mjx_study.study.run import StudyConfig, StudyPlan, load_study, open_store, plan_study, run_study, warnings_of
-from mjx_study.study.store import StudyError
-from mjx_study.table import digits_to_tell_apart, size
+EPILOG = """\
+Every combination of task, contact model, timestep, cone, sigma and number of samples is a cell: all its seeds and
+estimators are computed together and written to DIR as one file. Stop whenever you like, with Ctrl-C or kill -9: the
+same command computes what is missing, with the same numbers. Two such processes at once share the work.
+
+Gradients are estimated at each task's initial theta. With --iterations, policies are optimised instead; with --points,
+landscapes are computed: the cost along a line, and the slope that every estimator sees.
+
+Numbers may be lists (10,100,1000) or ranges: FROM:TO:COUNT, or FROM:TO:COUNT:log for equal ratios.
+
+examples:
+  mjx-study sweep pusher --stiffness 10:1e5:13:log --contact penalty,mujoco --output out
+  mjx-study sweep pusher --stiffness 10:1e4:7:log --iterations 500 --samples 10 --seeds 5 --output descents
+  mjx-study sweep momentum_transfer --contact mujoco,smooth_onset --points 31 --timestep 0.001,0.002 --output slopes
+  mjx-study sweep pusher,ball_wall --timestep 0.001,0.0025,0.005 --samples 30,100,300 --output steps
+  mjx-study sweep ball_wall --solref='-1e5:-1e3:5:log;-10' --solimp 0.9,0.95,0.001,0.5,2 --output solref
+  mjx-study sweep --config study.toml --output out
+  mjx-study plot out
+  mjx-study report out
+
+A TOML file holds the same options under the names of their flags, with _ for -:
+  tasks = ["pusher"]
+  contact = ["penalty", "mujoco"]
+  stiffness = "10:1e5:13:log"
+  samples = [30, 100]
+  seeds = 10
+"""
+NUMBERS = Option("numbers", float, "X", "", Interval("(-inf, inf)"), many=True)
+TASKS = Option("tasks", str, "TASK", "", many=True)
+
+
+def add(command: Parser) -> None:
+    choices = f"one or more of: {', '.join(TASK_DESCRIPTIONS)}, or module:name"
+    command.add_argument("tasks", nargs="?", type=_tasks, metavar="TASK[,TASK]", help=choices)
+    command.add_argument("--config", type=Path, metavar="FILE.toml", help="options from a file; flags take precedence")
+    command.add_fields("contact", "stiffness", "damping")
+    command.add_option("solref", read=solref)
+    command.add_option("solimp", read=solimp)
+    command.add_fields("timestep", "cone", "sigma", "samples")
+    command.add_fields("seeds", "estimators", "kind", "network", "confidence", seeds={"unset": "10; 1 for landscapes"})
+    command.add_fields("iterations", iterations={"line": "optimise policies, N iterations", "unset": ""})
+    command.add_fields("points", points={"line": "landscapes, at N points of a line through theta"})
+    command.add_fields("span", "direction", "optimizer", "learning_rate", "decay", optimizer={"unset": "sgd"})
+    command.add_fields("stiffness_schedule", "sigma_schedule")
+    command.add_fields("reference_samples", reference_samples={"unset": "600"})
+    command.add_fields("evaluation_samples", evaluation_samples={"unset": "200"})
+    command.add_estimator_options()
+    command.add_backward_options()
+    command.add_fields("horizon", "model", "chunk_size", "block_size")
+    command.add_process_options(seed=None)
+    command.add_argument("--output", type=Path, required=True, metavar="DIR", help="folder for the study")
+    command.add_cluster_option()
+    command.add_resume_options()
 
 
 def run(options: argparse.Namespace) -> int:
-    with usage_errors():
-        configure_process(options)
-        plan = plan_study(StudyConfig(**_fields(options)))
-    if options.dry_run:
-        return announce(plan, options)
-    with usage_errors():
-        store = open_store(plan, options.output, options.command_line, accept_versions=options.accept_versions)
-        missing = len(store.missing)
-    if not options.json:
-        print("\n".join(_head(plan, missing)), flush=True)
-    unwritten = None
-    try:
-        with ExitStack() as stack:
-            if options.cluster is not None:
-                with usage_errors():
-                    options.cluster = stack.enter_context(connected(options.cluster))
-            progress = stack.enter_context(computing(RESUMABLE))
-            dataset = run_study(plan, store, progress, cluster=options.cluster)
-    except StudyError as error:
-        raise UsageError(str(error)) from error
-    except OSError as error:
-        with usage_errors():
-            dataset = load_study(options.output)
-        reason = f"cannot write to {options.output}: {error.strerror or error}"
-        unwritten = f"{reason}; existing files are complete, and the same command resumes"
-    computed = dataset.attrs.get("computed_cells", missing - dataset.attrs["missing_cells"])
-    drawn = f"written to {options.output}: results.nc; mjx-study plot {options.output} draws it"
-    lines = [*_tail(dataset, computed, plan), *([drawn] if unwritten is None else [])]
-    print_report(options, _document(dataset, computed, options.output), lines)
-    failed = len(json.loads(dataset.attrs.get("failed_cells", "{}")))
-    return finish(unwritten, f"{failed} cells failed; the warnings say why" if failed else None)
+    from mjx_study.cli.studies import run_sweep
+
+    return run_sweep(options)
 
 
-def _fields(options: argparse.Namespace) -> dict[str, Any]:
-    """Fields of the configuration; flags take precedence over the file."""
-    merged = ({} if options.config is None else read_toml(options.config, _schema())) | study_fields(options)
-    if "tasks" not in merged:
-        raise ValueError("no task: name one, or give --config")
-    if merged.get("solref") or merged.get("solimp"):
-        merged.setdefault("contact", ())
-    return merged
+def _tasks(text: str) -> tuple[str, ...]:
+    return tuple(map(known_task, TASKS.parse(text)))
 
 
-def _schema() -> type[BaseModel]:
-    """Schema of a TOML file: the configuration's fields, parsed like their options."""
-    own = {"tasks": TASKS.read, "direction": _direction, "solref": solref, "solimp": solimp}
-
-    def reader(name: str) -> Callable[[Any], Any]:
-        return own[name] if name in own else StudyConfig.option(name).read
-
-    fields = {
-        field.name: (Annotated[Any, BeforeValidator(reader(field.name))], None)
-        for field in dataclasses.fields(StudyConfig)
-    }
-    return create_model("Sweep", __config__=ConfigDict(extra="forbid"), **fields)  # type: ignore[call-overload]
+def solref(value: Any) -> tuple[tuple[float, ...], ...]:
+    """Parse rows of numbers; in text, combine every number of the first column with every one of the second."""
+    if not isinstance(value, str):
+        return _rows(value)
+    columns = [NUMBERS.parse(column) for column in value.split(";")]
+    if len(columns) != 2:
+        raise ValueError("must be two columns separated by ;, such as -1000,-10000;-5")
+    if len(columns[0]) * len(columns[1]) > MOST_VALUES:
+        raise ValueError(f"must be at most {MOST_VALUES} contact models, got {len(columns[0]) * len(columns[1])}")
+    return tuple(itertools.product(*columns))
 
 
-def _direction(value: Any) -> str:
-    return OPTIONS["direction"].read(str(value) if isinstance(value, int) and not isinstance(value, bool) else value)
+def solimp(value: Any) -> tuple[tuple[float, ...], ...]:
+    """Parse rows of numbers, separated by ; in text."""
+    return tuple(NUMBERS.parse(part) for part in value.split(";")) if isinstance(value, str) else _rows(value)
 
 
-def _head(plan: StudyPlan, missing: int) -> list[str]:
-    config, cells = plan.config, len(plan.cells)
-    lengths = _listed(group.recipe.iterations for group in plan.groups if group.recipe)
-    kind = {"descents": f"descents of {lengths} iterations", "landscapes": f"{config.points} points"}
-    lines = [
-        f"{', '.join(config.task_names)}: {kind.get(str(config.kind), config.kind)}, {', '.join(config.estimators)}, "
-        f"seeds {config.batches}",
-        f"contact models: {len({(c.model.family, c.model.stiffness) for c in plan.cells})}, "
-        f"timestep {_listed(group.timestep for group in plan.groups)} s, "
-        f"{', '.join(dict.fromkeys(group.cone for group in plan.groups))} cone, "
-        f"sigma {_listed(cell.sigma for cell in plan.cells)}, "
-        f"{_listed(cell.samples for cell in plan.cells)} samples",
-        f"cells: {cells}, of which {missing} to compute"
-        + (
-            f"; {plan.compilations} programs to compile, chunks of {plan.chunk_size} samples, "
-            f"about {size(plan.memory)} for the batches of a cell"
-            if missing
-            else ""
-        ),
-    ]
-    return lines + [f"warning: {message}" for message in plan.warnings]
-
-
-def _listed(values: Iterable[float]) -> str:
-    distinct = list(dict.fromkeys(values))
-    digits = digits_to_tell_apart(distinct)
-    return ", ".join(f"{value:.{digits}g}" for value in distinct)
-
-
-def _document(dataset: xr.Dataset, computed: int, folder: Path) -> dict[str, Any]:
-    return {
-        "folder": str(folder),
-        "computed": computed,
-        "cells": {name: int(size) for name, size in dataset.sizes.items()},
-        "variables": [str(name) for name in dataset.data_vars],
-        "warnings": list(warnings_of(dataset)),
-    }
-
-
-def _tail(dataset: xr.Dataset, computed: int, plan: StudyPlan) -> list[str]:
-    """End of the output: what was computed, and warnings not already in the head."""
-    sizes = ", ".join(f"{name} {size}" for name, size in dataset.sizes.items())
-    lines = [f"computed {computed} cells; {sizes}"]
-    lines += [f"warning: {message}" for message in warnings_of(dataset) if message not in plan.warnings]
-    return lines
+def _rows(value: Any) -> tuple[tuple[float, ...], ...]:
+    if not isinstance(value, list):
+        raise ValueError(f"must be a list of lists of numbers, got {value!r:.60}")
+    return tuple(NUMBERS.read(row) for row in value)

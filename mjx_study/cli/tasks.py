@@ -4,14 +4,20 @@ import argparse
 from typing import Any
 
 from mjx_study.choices import TASK_DESCRIPTIONS
-from mjx_study.cli.options import configure_process, print_report, usage_errors
+from mjx_study.cli.options import Parser, configure_process, usage_errors
+from mjx_study.cli.output import print_report
+
+EPILOG = ""
+
+
+def add(command: Parser) -> None:
+    """Add no options beyond --json."""
 
 
 def run(options: argparse.Namespace) -> int:
     """List the tasks; only the numbers in --json need their models."""
     lines = [f"{name:<25} {description}" for name, description in TASK_DESCRIPTIONS.items()]
-    print_report(options, {"tasks": _rows(options)} if options.json else {}, lines)
-    return 0
+    return print_report(options, {"tasks": _rows(options)} if options.json else {}, lines)
 
 
 def _rows(options: argparse.Namespace) -> list[dict[str, Any]]:

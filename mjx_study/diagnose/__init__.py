@@ -6,7 +6,7 @@ Every statement is measured and comes with the command that reproduces it.
 from mjx_study.diagnose.measurement import ESTIMATORS, Measured, Measurement, measure
 from mjx_study.diagnose.page import SMOOTH, WIDTHS, Diagnosis
 from mjx_study.diagnose.run import diagnose
-from mjx_study.diagnose.touch import Touch, touch_of
+from mjx_study.diagnose.setting import Touch, touch_of
 
 __all__ = [
     "ESTIMATORS",

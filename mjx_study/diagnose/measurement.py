@@ -7,7 +7,6 @@ gradient. The bias is the detectable deviation of the estimator's mean from the 
 
 import dataclasses
 import math
-from collections.abc import Sequence
 from typing import Any, Final
 
 import jax
@@ -17,7 +16,7 @@ import numpy as np
 from estimators import ORACLES, Circulation, Estimator, make_estimator, oracles_of, variance_interval
 from estimators.mean_check import NODES
 from mjx_study.gradcheck.mean import MOST_PATHS, along_means, reach_of, unmixed
-from mjx_study.objective import MjxObjective, Simulator, chunk_for
+from mjx_study.objective import Simulator, chunk_for
 from mjx_study.runtime import precision
 from mjx_study.simulation.contact import ContactModel
 from mjx_study.simulation.scene import num_constraint_rows
@@ -177,7 +176,13 @@ def measure(
         samples = affordable(sum(drawn(1)[1].values()), simulator.chunk_size)
     batches, seconds, residuals = drawn(samples)
     batches = jax.tree.map(lambda leaf: leaf[0], batches)
-    found = _measure(chosen, objective, batches, seconds, samples, seed)
+    reach, first = reach_of(task), [each for each in chosen if any(ORACLES[oracle].order for oracle in each.needs)]
+    along = along_means(first, objective, task.theta, reach, unmixed(chosen, batches), samples, seed)
+    paths: dict[Estimator, tuple[Circulation, ...]] = dict(zip(first, zip(*along, strict=True), strict=True))
+    found = [
+        _measured(each, batches, sum(seconds[oracle] for oracle in each.needs), paths.get(each, ()), reach, samples)
+        for each in chosen
+    ]
     events = np.asarray(batches["corrected"].events).reshape(-1, len(ONSETS))
     onsets = dict(zip(ONSETS, onset_numbers(events).tolist(), strict=True))
     unsolved = max(unconverged(each, precision()) for each in residuals.values())
@@ -186,39 +191,24 @@ def measure(
     return dataclasses.replace(unordered, estimators=tuple(order))
 
 
-def _measure(
-    chosen: Sequence[Estimator],
-    objective: MjxObjective,
-    batches: Any,
-    seconds: dict[str, float],
-    samples: int,
-    seed: int,
-) -> list[Measured]:
-    """Measure estimators on their batches, and their means along the paths of `along_means`."""
-    task, estimates = objective.simulator.task, [estimator(batches) for estimator in chosen]
-    reach = reach_of(task)
-    first = [each for each in chosen if any(ORACLES[oracle].order for oracle in each.needs)]
-    found = along_means(first, objective, task.theta, reach, unmixed(chosen, batches), samples, seed)
-    checks: dict[Estimator, tuple[Circulation, ...]] = dict(zip(first, zip(*found, strict=True), strict=True))
-    measured = []
-    for estimator, estimate in zip(chosen, estimates, strict=True):
-        lower, upper = variance_interval(estimate, 0.95)
-        squared = float(jnp.sum(estimate.mean**2)) - float(estimate.variance) / samples
-        paths = checks.get(estimator, ())
-        verdicts = {each.verdict() for each in paths}
-        missed = sum(max(0.0, float(each.gap**2 - each.standard_error**2)) for each in paths)
-        measured.append(
-            Measured(
-                estimator=estimator.name,
-                variance=float(estimate.variance),
-                lower=float(lower),
-                upper=float(upper),
-                seconds=sum(seconds[oracle] for oracle in estimator.needs) / samples,
-                paths=paths,
-                verdict=next((each for each in ("biased", "undecided", "right") if each in verdicts), "unbiased"),
-                bias=math.sqrt(missed) / (2 * reach),
-                norm=math.sqrt(max(squared, 0.0)),
-                lost=int(estimate.num_nonfinite),
-            )
-        )
-    return measured
+def _measured(
+    estimator: Estimator, batches: Any, seconds: float, paths: tuple[Circulation, ...], reach: float, samples: int
+) -> Measured:
+    """Measure an estimator on its batches, given the time that they took and checks of its mean along paths."""
+    estimate = estimator(batches)
+    lower, upper = variance_interval(estimate, 0.95)
+    squared = float(jnp.sum(estimate.mean**2)) - float(estimate.variance) / samples
+    verdicts = {each.verdict() for each in paths}
+    missed = sum(max(0.0, float(each.gap**2 - each.standard_error**2)) for each in paths)
+    return Measured(
+        estimator=estimator.name,
+        variance=float(estimate.variance),
+        lower=float(lower),
+        upper=float(upper),
+        seconds=seconds / samples,
+        paths=paths,
+        verdict=next((each for each in ("biased", "undecided", "right") if each in verdicts), "unbiased"),
+        bias=math.sqrt(missed) / (2 * reach),
+        norm=math.sqrt(max(squared, 0.0)),
+        lost=int(estimate.num_nonfinite),
+    )

@@ -9,8 +9,7 @@ from collections.abc import Iterator
 from typing import Any, Final
 
 from mjx_study.diagnose.measurement import ACCURATE, RESOLVED, SAMPLES, Measured, Measurement
-from mjx_study.diagnose.setting import Setting
-from mjx_study.diagnose.touch import Touch
+from mjx_study.diagnose.setting import Setting, Touch
 from mjx_study.gradcheck import GradcheckReport
 from mjx_study.gradcheck.diagnosis import MEANING
 from mjx_study.gradcheck.mean import MEANS
@@ -43,12 +42,9 @@ class Diagnosis(Measurement):
 
     Attributes:
         subject: the model as named by the user.
-        task: the task studied.
         setting: noise and rollout; the page holds only for these.
-        contact: label of the contact model.
+        contact, warnings: label of the contact model, and warnings about it.
         touches: contacts that begin in the zero-noise rollout.
-        derivatives: the gradient check.
-        warnings: warnings about the contact model.
         options: contact options as command-line flags.
     """
 
@@ -63,17 +59,6 @@ class Diagnosis(Measurement):
 
     def as_json(self) -> dict[str, Any]:
         norm = self.norm if self.resolved else math.nan
-        shown = [
-            {
-                "estimator": each.estimator,
-                "variance": each.variance,
-                "seconds_per_sample": each.seconds,
-                "mean": each.verdict,
-                "bias": each.bias / norm,
-                "error_after_a_second": each.error(1.0) / norm,
-            }
-            for each in self.estimators
-        ]
         document = {
             "subject": self.subject,
             "cost": self.task.description,
@@ -86,7 +71,17 @@ class Diagnosis(Measurement):
             "unconverged": self.unconverged,
             "derivatives": "right" if self.derivatives.passed else self._failure,
             "unexercised": self.derivatives.unexercised,
-            "estimators": shown,
+            "estimators": [
+                {
+                    "estimator": each.estimator,
+                    "variance": each.variance,
+                    "seconds_per_sample": each.seconds,
+                    "mean": each.verdict,
+                    "bias": each.bias / norm,
+                    "error_after_a_second": each.error(1.0) / norm,
+                }
+                for each in self.estimators
+            ],
             "best": self.best.estimator if self.resolved else None,
             "gradient_norm": self.norm,
             "gradient_norm_error": self.norm_error,
@@ -106,15 +101,14 @@ class Diagnosis(Measurement):
         lines += ["", "contact", *self._contact_lines()]
         if self.onsets.get("onsets"):
             lines += [f"  > {command.format('compare')} --estimators fobg_onset --samples {self.samples} --json"]
-        state = (
-            "every derivative that exists is right"
-            if self.derivatives.passed
-            else f"NOT RIGHT: {MEANING[self._failure]}"
-        )
-        parts = dict.fromkeys(part for parts in self.derivatives.unexercised.values() for part in parts)
-        missing = f"; not exercised: {', '.join(parts)}" if self.derivatives.passed and parts else ""
+        if self.derivatives.passed:
+            parts = dict.fromkeys(part for parts in self.derivatives.unexercised.values() for part in parts)
+            missing = f"; not exercised: {', '.join(parts)}" if parts else ""
+            state = f"every derivative that exists is right{missing}"
+        else:
+            state = f"NOT RIGHT: {MEANING[self._failure]}"
         steps = re.sub(r" --sigma \S+", "", command.format("gradcheck"))  # steps have no noise
-        lines += ["", "derivatives of a step", f"  {state}{missing}", f"  > {steps}"]
+        lines += ["", "derivatives of a step", f"  {state}", f"  > {steps}"]
         batch = f"--estimators {','.join(each.estimator for each in self.estimators)} --samples {self.samples}"
         error = "relative error" if self.resolved else "error, in the gradient's unit,"
         lines += ["", f"estimators, by their {error} after a second of computing", *self._estimator_lines()]

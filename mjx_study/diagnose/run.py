@@ -5,9 +5,8 @@ from typing import Final
 from mjx_study.choices import is_file
 from mjx_study.diagnose.measurement import SAMPLES, chunk_of, estimators_of, measure
 from mjx_study.diagnose.page import Diagnosis
-from mjx_study.diagnose.setting import setting_of
-from mjx_study.diagnose.touch import touches_of
-from mjx_study.gradcheck import GradcheckPlan, gradcheck, plan_gradcheck, plan_scene_gradcheck
+from mjx_study.diagnose.setting import setting_of, touches_of
+from mjx_study.gradcheck import gradcheck, plan_gradcheck, plan_scene_gradcheck
 from mjx_study.objective import Simulator
 from mjx_study.study.configuration import Progress
 from mjx_study.study.memory import check_memory
@@ -48,29 +47,26 @@ def diagnose(
     family, stiffness = family or task.defaults.main_family, stiffness or task.defaults.middle_stiffness
     (cell,), warnings = contact_grid(task, [family], [stiffness], damping)
     check_memory(task, estimators_of(task), samples or SAMPLES)
-    total = 4
-    progress(0, total, "rollout without noise")
-    touches = touches_of(task, cell)
-    progress(1, total, "derivatives of steps")
-    derivatives = gradcheck(_plan(subject, task, family, stiffness, damping, seed))
-    progress(2, total, "estimators")
+    progress(0, 4, "rollout without noise")
+    touches = tuple(touches_of(task, cell))
+    progress(1, 4, "derivatives of steps")
+    common = {"seed": seed, "damping": damping, "states": STATES}
+    if is_file(subject):
+        plan = plan_scene_gradcheck(task.scene, [family], None, horizon=task.horizon, **common)
+    else:
+        plan = plan_gradcheck(task, [family], [stiffness], **common)
+    derivatives = gradcheck(plan)
+    progress(2, 4, "estimators")
     found = measure(Simulator(task, chunk_size=chunk_of(task, samples or SAMPLES)), cell.contact, samples, seed)
-    progress(total, total, "done")
+    progress(4, 4, "done")
     return Diagnosis(
         **vars(found),
         subject=subject,
         task=task,
         setting=setting_of(subject, task),
         contact=cell.label,
-        touches=tuple(touches),
+        touches=touches,
         derivatives=derivatives,
         warnings=tuple(warnings),
         options=options,
     )
-
-
-def _plan(subject: str, task: Task, family: str, stiffness: float, damping: float | None, seed: int) -> GradcheckPlan:
-    common = {"seed": seed, "damping": damping, "states": STATES}
-    if is_file(subject):
-        return plan_scene_gradcheck(task.scene, [family], None, horizon=task.horizon, **common)
-    return plan_gradcheck(task, [family], [stiffness], **common)

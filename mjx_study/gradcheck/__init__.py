@@ -6,11 +6,9 @@ distinguishes these cases for every entry of a step's Jacobian.
 """
 
 from mjx_study.choices import CHECKED_STIFFNESS as STIFFNESS
-from mjx_study.gradcheck.check import gradcheck
-from mjx_study.gradcheck.finding import Finding
+from mjx_study.gradcheck.check import CONTACT, GradcheckPlan, gradcheck, plan_gradcheck, plan_scene_gradcheck
 from mjx_study.gradcheck.mean import MeanCheck, check_mean
-from mjx_study.gradcheck.plan import CONTACT, GradcheckPlan, plan_gradcheck, plan_scene_gradcheck
-from mjx_study.gradcheck.report import GradcheckReport, StepCheck
+from mjx_study.gradcheck.report import Finding, GradcheckReport, StepCheck
 
 __all__ = [
     "CONTACT",

@@ -1,32 +1,148 @@
-"""Run the check: every contact model, every state, every derivative."""
+"""Plan and run a check: every contact model, every state, every derivative."""
 
+import dataclasses
+import itertools
+from collections.abc import Sequence
+from typing import Final
+
+import jax.numpy as jnp
 import mujoco
 
-from mjx_study.gradcheck.collect import collect, step_check
-from mjx_study.gradcheck.compiling import Compiler
+from mjx_study.choices import CHECKED_STATES, CHECKED_STEPS, FAMILIES
+from mjx_study.choices import CHECKED_STIFFNESS as STIFFNESS
 from mjx_study.gradcheck.coordinates import coordinates
-from mjx_study.gradcheck.cost import CostCheck, CostPrograms, check_cost, judge_closed_forms
-from mjx_study.gradcheck.engine_step import EngineStep
-from mjx_study.gradcheck.finding import Finding, gravity
-from mjx_study.gradcheck.plan import GradcheckPlan
-from mjx_study.gradcheck.programs import Programs, Setting
-from mjx_study.gradcheck.report import GradcheckReport, StepCheck
-from mjx_study.gradcheck.state_check import check_state
+from mjx_study.gradcheck.cost import CostPrograms, check_cost, judge_closed_forms
+from mjx_study.gradcheck.programs import Compiler, Programs, Setting
+from mjx_study.gradcheck.report import CostCheck, Finding, GradcheckReport, StepCheck, gravity
 from mjx_study.gradcheck.states import start_of, states_of
+from mjx_study.gradcheck.steps import check_state, collect, step_check
+from mjx_study.gradcheck.values import EngineStep
 from mjx_study.runtime import environment
 from mjx_study.simulation.engine import quiet_engine
+from mjx_study.simulation.scene import Scene
 from mjx_study.study.configuration import Progress
+from mjx_study.tasks.contact_grid import ContactPoint, contact_grid
+from mjx_study.tasks.mjcf import scene_task
+from mjx_study.tasks.task import Task
+
+CONTACT: Final = ("penalty", "mujoco", "mujoco_default")
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
+class GradcheckPlan:
+    """Validated plan of a check.
+
+    Attributes:
+        subject: the task; for a file, the result of `scene_task`.
+        is_task: whether to check its cost.
+        cells: contact models to check in turn.
+        warnings: warnings about these contact models.
+        states: number of states per contact model.
+        seed: random seed of initial states, states and directions.
+        stock: whether to check the derivative of `mjx.step` too.
+    """
+
+    subject: Task
+    is_task: bool
+    cells: tuple[ContactPoint, ...]
+    warnings: tuple[str, ...]
+    states: int
+    seed: int
+    stock: bool
+
+
+def plan_gradcheck(
+    task: Task,
+    families: Sequence[str] | None,
+    stiffnesses: Sequence[float] | None,
+    *,
+    seed: int,
+    damping: float | None = None,
+    states: int = CHECKED_STATES,
+    stock: bool = False,
+) -> GradcheckPlan:
+    """Plan a check of a task's gradient, and of steps along its rollout.
+
+    Args:
+        task: the task, in float64, with the theta of its gradient.
+        families: contact families; by default the task's own if it has no contact, else `CONTACT`.
+        stiffnesses: stiffnesses for families that take one [N/m]; by default `STIFFNESS`, or the task's if those are in
+            another range.
+        seed: random seed of initial states, states and directions.
+        damping: override of each family's damping [N s/m].
+        states: number of states per contact model, at least 1.
+        stock: whether to check the derivative of `mjx.step` too.
+
+    Raises:
+        ValueError: unusable family or stiffness, too few states, or float32.
+    """
+    _check(task, states)
+    if families is None:
+        families = ("mjcf",) if task.contact_pair is None else CONTACT
+    if stiffnesses is None:
+        own = task.defaults.stiffnesses
+        stiffnesses = STIFFNESS if min(STIFFNESS) <= max(own) else own
+    cells, messages = contact_grid(task, families, stiffnesses, damping)
+    if not cells:
+        raise ValueError("no contact model to check: give at least one stiffness and one contact family")
+    return GradcheckPlan(task, True, cells, messages, states, seed, stock)
+
+
+def plan_scene_gradcheck(
+    scene: Scene,
+    families: Sequence[str] | None = None,
+    stiffnesses: Sequence[float] | None = None,
+    *,
+    seed: int,
+    pair: tuple[str, str] | None = None,
+    damping: float | None = None,
+    horizon: int = CHECKED_STEPS,
+    states: int = CHECKED_STATES,
+    stock: bool = False,
+) -> GradcheckPlan:
+    """Plan a check of the steps of any scene; other arguments as for `plan_gradcheck`.
+
+    Args:
+        scene: the scene, in float64, with at least one degree of freedom.
+        families: contact families; by default `mjcf`, or `mujoco` if a stiffness is given.
+        pair: names of the two geoms whose contact has the stiffness; every contact gets the same solref.
+        horizon: number of steps of the rollout from which states are taken.
+
+    Raises:
+        ValueError: as for `plan_gradcheck`, or a stiffness without a pair.
+    """
+    if families is None:
+        families = ("mjcf",) if stiffnesses is None else ("mujoco",)
+    swept = any(name in FAMILIES and FAMILIES[name].swept for name in families)
+    if swept and stiffnesses is None:
+        raise ValueError("a contact family with a stiffness needs one: give --stiffness in N/m, and --pair")
+    if (swept or stiffnesses is not None) and pair is None:
+        raise ValueError("a stiffness in N/m requires the effective mass of a contact: give --pair GEOM,GEOM")
+    subject = scene_task(scene, horizon=horizon, pair=pair)
+    _check(subject, states)
+    cells, messages = contact_grid(subject, families, stiffnesses or (), damping)
+    return GradcheckPlan(subject, False, cells, messages, states, seed, stock)
+
+
+def _check(task: Task, states: int) -> None:
+    if task.scene.template.qpos.dtype != jnp.float64:
+        raise ValueError("gradcheck compares with differences and needs float64; leave --precision at its default")
+    if task.scene.host.nv == 0:
+        raise ValueError(f"{task.scene.name} has no degree of freedom: there is nothing to differentiate")
+    if states < 1:
+        raise ValueError(f"states must be at least 1, got {states}")
+
+
+@quiet_engine()  # intermediate states may cause warnings
 def gradcheck(plan: GradcheckPlan, progress: Progress = lambda done, total, what: None) -> GradcheckReport:
-    with quiet_engine():  # intermediate states may cause warnings
-        return _gradcheck(plan, progress)
-
-
-def _gradcheck(plan: GradcheckPlan, progress: Progress) -> GradcheckReport:
+    """Run all checks of a plan; `progress` is called with (parts done, their total number, the next)."""
     task, compiler = plan.subject, Compiler()
-    work = _Work(progress, 1 + len(plan.cells) * (plan.states + plan.is_task))
-    work.step("compiling")
+    done, total = itertools.count(), 1 + len(plan.cells) * (plan.states + plan.is_task)
+
+    def begin(what: str) -> None:
+        progress(min(next(done), total), total, what)
+
+    begin("compiling")
     layouts = [coordinates(task.scene, cell.contact) for cell in plan.cells]
     programs = Programs(layouts[0], compiler)
     settings = [Setting(cell.contact, layout.scales) for cell, layout in zip(plan.cells, layouts, strict=True)]
@@ -40,19 +156,19 @@ def _gradcheck(plan: GradcheckPlan, progress: Progress) -> GradcheckReport:
     for cell, layout, setting in zip(plan.cells, layouts, settings, strict=True):
         visited = None
         if costs is not None:
-            work.step(f"{cell.label}: gradient of the cost")
+            begin(f"{cell.label}: gradient of the cost")
             cost, visited = check_cost(costs, cell, plan.seed)
             cost_checks.append(cost)
         samples, coverage = states_of(task.scene, cell.contact, plan.states, task.horizon, plan.seed, visited)
         engine_step = EngineStep(layout, cell.contact)
         checks = []
         for sample in samples:
-            work.step(f"{cell.label}: {sample.label}")
+            begin(f"{cell.label}: {sample.label}")
             checks.append(check_state(programs, engine_step, setting, sample, stock=plan.stock))
         found = collect(cell, programs.layout, checks)
         step_checks.append(step_check(cell, programs.layout, checks, found, coverage))
         findings += found
-    work.end()
+    progress(total, total, "done")
     findings += judge_closed_forms(cost_checks)
     return GradcheckReport(
         subject=task.name,
@@ -65,21 +181,9 @@ def _gradcheck(plan: GradcheckPlan, progress: Progress) -> GradcheckReport:
     )
 
 
-class _Work:
-    def __init__(self, progress: Progress, total: int):
-        self.progress, self.total, self.done = progress, total, 0
-
-    def step(self, what: str) -> None:
-        self.progress(min(self.done, self.total), self.total, what)
-        self.done += 1
-
-    def end(self) -> None:
-        self.progress(self.total, self.total, "done")
-
-
 def _summary(plan: GradcheckPlan) -> str:
     host = plan.subject.scene.host
-    parts = [_count(host.nv, "degree", "of freedom")]
+    parts = [f"{_count(host.nv, 'degree')} of freedom"]
     parts += [_count(number, noun) for number, noun in ((host.na, "activation"), (host.nu, "control")) if number]
     taken = f"{_count(plan.states, 'state')} along {_count(plan.subject.horizon, 'step')} of {host.opt.timestep:g} s"
     return f"{', '.join(parts)}; {taken}"
@@ -95,5 +199,5 @@ def unoffered(host: mujoco.MjModel) -> list[str]:
     return notes
 
 
-def _count(number: int, noun: str, rest: str = "") -> str:
-    return f"{number} {noun}{'' if number == 1 else 's'}{rest and ' ' + rest}"
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}{'' if number == 1 else 's'}"

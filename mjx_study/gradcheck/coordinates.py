@@ -6,8 +6,7 @@ once, each in units of its own size.
 """
 
 import dataclasses
-from collections.abc import Sequence
-from typing import Final
+from typing import Any, Final
 
 import jax.numpy as jnp
 import mujoco
@@ -84,7 +83,7 @@ class Coordinates:
         starts = np.cumsum([host.nv, len(quaternions(host)), host.nv, host.na])
         tangent, stretch, qvel, act, ctrl = jnp.split(change[: self.num_state], starts)
         qpos = integrate_position(host, base.qpos, tangent, 1.0)
-        for index, (_, first) in enumerate(quaternions(host)):
+        for index, (_, first, _) in enumerate(quaternions(host)):
             qpos = qpos.at[first : first + 4].multiply(1 + stretch[index])
         return dataclasses.replace(base, qpos=qpos, qvel=base.qvel + qvel, act=base.act + act), control + ctrl
 
@@ -115,76 +114,60 @@ class Coordinates:
 
 def coordinates(scene: Scene, contact: ContactModel | None) -> Coordinates:
     host = scene.host
-    dofs = dof_names(host)
-    activations = _activation_names(host)
-    inputs = [
-        *(Coordinate("qpos", *dof) for dof in dofs),
-        *(Coordinate(LENGTH, joint_name(host, joint), joint) for joint, _ in quaternions(host)),
-        *(Coordinate("qvel", *dof) for dof in dofs),
-        *(Coordinate("act", name) for name in activations),
-        *(Coordinate("ctrl", _name(host, mujoco.mjtObj.mjOBJ_ACTUATOR, "actuator", i)) for i in range(host.nu)),
-    ]
+    dofs = [(name, joint) for joint in range(host.njnt) for name in _dof_names(host, joint)]
+    actuators = [host.actuator(index).name or f"actuator {index}" for index in range(host.nu)]
+    spans = zip(host.actuator_actadr.tolist(), host.actuator_actnum.tolist(), actuators, strict=True)
+    activations = sorted((first + entry, name) for first, count, name in spans for entry in range(count))
+    positions = [Coordinate("qpos", *dof) for dof in dofs]
+    velocities = [Coordinate("qvel", *dof) for dof in dofs]
+    acts = [Coordinate("act", name) for _, name in activations]
+    lengths = [Coordinate(LENGTH, joint_name(host, joint), joint) for joint, *_ in quaternions(host)]
     scales = _parameter_scales(scene, contact)
-    if len(scales):
-        inputs += [Coordinate("contact", name) for name in PARAMETERS]
-    outputs = [*(Coordinate("qpos", *dof) for dof in dofs), *(Coordinate("qvel", *dof) for dof in dofs)]
-    outputs += [Coordinate("act", name) for name in activations]
-    return Coordinates(scene, tuple(inputs), tuple(outputs), scales)
+    inputs = [*positions, *lengths, *velocities, *acts, *(Coordinate("ctrl", name) for name in actuators)]
+    inputs += [Coordinate("contact", name) for name in PARAMETERS[: len(scales)]]
+    return Coordinates(scene, tuple(inputs), (*positions, *velocities, *acts), scales)
 
 
-def quaternions(host: mujoco.MjModel) -> list[tuple[int, int]]:
-    """Joint and first qpos index of each quaternion."""
-    pairs = enumerate(zip(host.jnt_type.tolist(), host.jnt_qposadr.tolist(), strict=True))
-    return [(joint, first + 3 * (kind == _FREE)) for joint, (kind, first) in pairs if kind in (_FREE, _BALL)]
+def quaternions(host: mujoco.MjModel) -> list[tuple[int, int, int]]:
+    """Joint, first qpos index and first degree of freedom of each quaternion."""
+    joints = enumerate(zip(host.jnt_type.tolist(), host.jnt_qposadr.tolist(), host.jnt_dofadr.tolist(), strict=True))
+    moved = {_BALL: 0, _FREE: 3}
+    return [(joint, qpos + moved[kind], dof + moved[kind]) for joint, (kind, qpos, dof) in joints if kind in moved]
 
 
-def dof_names(host: mujoco.MjModel) -> list[tuple[str, int]]:
-    """Name and joint of each degree of freedom."""
-    moves = [f"translation {axis}" for axis in "xyz"]
-    turns = [f"rotation {axis}" for axis in "xyz"]
-    names: list[tuple[str, int]] = []
-    for joint, kind in enumerate(host.jnt_type):
-        name = joint_name(host, joint)
-        parts: Sequence[str] = {_FREE: [*moves, *turns], _BALL: turns}.get(int(kind), [""])
-        names += [(f"{name}, {part}" if part else name, joint) for part in parts]
-    return names
+def joints_above(host: mujoco.MjModel, body: int) -> set[int]:
+    """Joints between a body and the world."""
+    found: set[int] = set()
+    while body:
+        first = int(host.body_jntadr[body])
+        found.update(range(first, first + int(host.body_jntnum[body])))
+        body = int(host.body_parentid[body])
+    return found
+
+
+def _dof_names(host: mujoco.MjModel, joint: int) -> list[str]:
+    name, kind = joint_name(host, joint), int(host.jnt_type[joint])
+    parts = {_FREE: ("translation", "rotation"), _BALL: ("rotation",)}.get(kind)
+    return [f"{name}, {part} {axis}" for part in parts for axis in "xyz"] if parts else [name]
 
 
 def joint_name(host: mujoco.MjModel, joint: int) -> str:
     """A joint's name, or its body's if it is unnamed."""
-    name = mujoco.mj_id2name(host, mujoco.mjtObj.mjOBJ_JOINT, joint)
-    if name:
-        return name
-    body = mujoco.mj_id2name(host, mujoco.mjtObj.mjOBJ_BODY, int(host.jnt_bodyid[joint]))
-    return f"joint {joint} of {body}" if body else f"joint {joint}"
+    body = host.body(host.jnt_bodyid[joint]).name
+    return host.joint(joint).name or (f"joint {joint} of {body}" if body else f"joint {joint}")
 
 
 def geom_label(host: mujoco.MjModel, geom: int) -> str:
     """A geom's name, or its body's and its type if it is unnamed."""
-    name = mujoco.mj_id2name(host, mujoco.mjtObj.mjOBJ_GEOM, geom)
-    if name:
-        return name
-    body = mujoco.mj_id2name(host, mujoco.mjtObj.mjOBJ_BODY, int(host.geom_bodyid[geom])) or "body"
+    body = host.body(host.geom_bodyid[geom]).name or "body"
     kind = mujoco.mjtGeom(int(host.geom_type[geom])).name.removeprefix("mjGEOM_").lower()
-    return f"the {kind} of {body}"
-
-
-def _name(host: mujoco.MjModel, kind: mujoco.mjtObj, noun: str, index: int) -> str:
-    return mujoco.mj_id2name(host, kind, index) or f"{noun} {index}"
-
-
-def _activation_names(host: mujoco.MjModel) -> list[str]:
-    names = [""] * host.na
-    for index, (first, count) in enumerate(zip(host.actuator_actadr, host.actuator_actnum, strict=True)):
-        for entry in range(max(int(count), 0) if first >= 0 else 0):
-            names[first + entry] = _name(host, mujoco.mjtObj.mjOBJ_ACTUATOR, "actuator", index)
-    return names
+    return host.geom(geom).name or f"the {kind} of {body}"
 
 
 def _parameter_scales(scene: Scene, contact: ContactModel | None) -> Float[np.ndarray, " parameters"]:
-    """Largest size of each parameter over all geoms, 1 if all are 0."""
-    rows = scene.template._impl
-    if rows.contact.dim.size == 0:  # pyright: ignore[reportAttributeAccessIssue]
+    """Largest size of each parameter over all geoms, 1 if all are 0; empty without contacts."""
+    rows: Any = scene.template._impl
+    if rows.contact.dim.size == 0:
         return np.zeros(0)
     model = apply_contact(scene.model, contact)
     leaves = [np.asarray(leaf) for leaf in (model.geom_solref, model.geom_solimp, model.geom_friction)]

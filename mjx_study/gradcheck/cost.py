@@ -1,6 +1,5 @@
 """Check the gradient of a task's total cost: reverse against forward mode, finite differences, and a closed form."""
 
-import dataclasses
 from collections.abc import Sequence
 from typing import Any, Final
 
@@ -8,9 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_study.gradcheck.compiling import Compiler
+from mjx_study.gradcheck.diagnosis import worst_verdict
 from mjx_study.gradcheck.differences import differences, moves
-from mjx_study.gradcheck.finding import Entry, Finding
+from mjx_study.gradcheck.programs import Compiler
+from mjx_study.gradcheck.report import CostCheck, Entry, Finding
 from mjx_study.objective import rollout_cost
 from mjx_study.reference.noise import split_sample_key
 from mjx_study.simulation.contact import ContactModel
@@ -29,39 +29,11 @@ GROWTH: Final = 2.0
 """Allowed growth of the distance with stiffness, which should bring the two models together."""
 
 
-@dataclasses.dataclass(frozen=True)
-class CostCheck:
-    """Checks of one contact model's whole-horizon gradient; errors are relative to its norm.
-
-    Attributes:
-        stiffness: K [N/m].
-        gradient_norm: norm of the gradient, in cost per unit of theta.
-        modes: difference between reverse and forward mode along some directions.
-        difference: difference from central differences along the same directions.
-        one_sided: disagreement of the two one-sided differences at the smallest step.
-        closed_form: distance from the hand-written gradient of the reference system, a different model of the same
-            system; measures the distance between the models. None without a reference.
-        residual: largest relative solver residual of the rollout.
-        verdict: right, kink, jump, unconverged, nan or wrong.
-    """
-
-    contact: str
-    stiffness: float
-    gradient_norm: float
-    modes: float
-    difference: float
-    one_sided: float
-    closed_form: float | None
-    residual: float
-    verdict: str
-
-
 class CostPrograms:
     """Zero-noise cost of a task from an initial state drawn by a key, compiled for any theta and contact model."""
 
     def __init__(self, task: Task, seed: int, compiler: Compiler):
-        self.task = task
-        self.compiler = compiler
+        self.task, self.compiler = task, compiler
         self.key = jax.random.key(seed)
         self.start = task.draw_start(split_sample_key(jax.random.clone(self.key))[0])
 
@@ -75,11 +47,9 @@ class CostPrograms:
         return self.compiler.run(self._both_modes, self.task.theta, contact, directions)
 
     def costs(self, contact: ContactModel | None, changes: np.ndarray) -> np.ndarray:
-        theta = np.asarray(self.task.theta)
-        rows = -(-len(changes) // BATCH) * BATCH
-        thetas = np.broadcast_to(theta, (rows, len(theta))).copy()
-        thetas[: len(changes)] += changes
-        chunks = [self.compiler.run(self._many, part, contact) for part in thetas.reshape(-1, BATCH, len(theta))]
+        thetas = np.asarray(self.task.theta) + np.pad(changes, ((0, -len(changes) % BATCH), (0, 0)))
+        parts = thetas.reshape(-1, BATCH, thetas.shape[1])
+        chunks = [self.compiler.run(self._many, part, contact) for part in parts]
         return np.concatenate(chunks)[: len(changes)]
 
     def _both_modes(self, theta, contact, directions):
@@ -107,40 +77,29 @@ def check_cost(programs: CostPrograms, cell: ContactPoint, seed: int) -> tuple[C
     modes = float(np.max(np.abs(slopes - directions @ gradient))) / scale
     truth = differences(programs.costs(cell.contact, moves(directions))[:, None])
     error = np.abs(directions @ gradient - truth.value[0])
-    closed_form = _against_closed_form(task, cell, gradient, jax.random.clone(programs.key))
     apart = error > DIFFERENCE_TOLERANCE * scale + 3 * truth.uncertainty[0]
     verdict = cost_verdict(
         finite=bool(np.all(np.isfinite(gradient))),
         modes=modes,
         residual=float(residual),
         excused=[
-            "jump" if jump else "kink" if kink and miss <= gap else None
-            for far, jump, kink, miss, gap in zip(apart, truth.jump[0], truth.kink[0], error, truth.gap[0], strict=True)
-            if far
+            "jump" if jump else "kink" if kink else None
+            for jump, kink in zip(truth.jump[0, apart], (truth.kink[0] & (error <= truth.gap[0]))[apart], strict=True)
         ],
     )
-    check = CostCheck(
-        cell.family,
-        cell.stiffness,
-        norm,
-        modes,
-        float(error.max() / scale),
-        float(truth.gap.max() / scale),
-        closed_form,
-        float(residual),
-        verdict,
-    )
-    return check, _host_states(states, controls)
+    closed_form = _against_closed_form(task, cell, gradient, jax.random.clone(programs.key))
+    errors = (modes, float(error.max() / scale), float(truth.gap.max() / scale), closed_form, float(residual))
+    check = CostCheck(cell.family, cell.stiffness, norm, *errors, verdict)
+    fields = (states.qpos, states.qvel, states.act, controls, states.warmstart)
+    return check, [HostState(*row) for row in zip(*map(np.asarray, fields), strict=False)]  # one state more
 
 
 def judge_closed_forms(checks: Sequence[CostCheck]) -> list[Finding]:
     """Report distances from the closed form that grow as the contact stiffens; they may be large."""
-    known = sorted(
-        (check.stiffness, check.closed_form, check.contact) for check in checks if check.closed_form is not None
-    )
+    known = sorted((each.stiffness, each.closed_form, each.contact) for each in checks if each.closed_form is not None)
     findings = []
     for stiffness, distance, contact in known:
-        softest, nearest = known[0][0], known[0][1]
+        softest, nearest, _ = known[0]
         grows = distance > max(CLOSED_FORM, GROWTH * nearest)
         if not distance <= CLOSED_FORM:
             text = f"the gradient is {distance:.1e} of its norm from the closed form's"
@@ -152,18 +111,14 @@ def judge_closed_forms(checks: Sequence[CostCheck]) -> list[Finding]:
 
 
 def cost_verdict(*, finite: bool, modes: float, residual: float, excused: list[str | None]) -> str:
-    """Return the verdict on a gradient.
-
-    Args:
-        excused: kink or jump for each direction in which differences disagree, or None if nothing excuses it.
-    """
+    """Return the verdict on a gradient; `excused` is kink, jump or None for each direction in which it is off."""
     if not finite:
         return "nan"
     if not residual <= DIFFERENCE_TOLERANCE:
         return "unconverged"
     if not modes <= MODES_TOLERANCE or None in excused:
         return "wrong"
-    return max((name for name in excused if name), key=("kink", "jump").index, default="right")
+    return worst_verdict([name for name in excused if name])
 
 
 def _against_closed_form(task: Task, cell: ContactPoint, gradient: np.ndarray, key: Any) -> float | None:
@@ -172,9 +127,3 @@ def _against_closed_form(task: Task, cell: ContactPoint, gradient: np.ndarray, k
     exact = np.asarray(task.reference(cell.stiffness).value_and_gradient(task.theta, key)[1])
     size = float(np.linalg.norm(exact))
     return float(np.linalg.norm(gradient - exact)) / (size if size > 0 else 1.0)
-
-
-def _host_states(states: Any, controls: Any) -> list[HostState]:
-    qpos, qvel, act, warmstart = map(np.asarray, (states.qpos, states.qvel, states.act, states.warmstart))
-    controls = np.asarray(controls)
-    return [HostState(qpos[i], qvel[i], act[i], controls[i], warmstart[i]) for i in range(len(controls))]

@@ -1,6 +1,5 @@
 """Verdict on each entry of a Jacobian: right, what is wrong with it, or why there is no derivative."""
 
-import dataclasses
 from collections.abc import Sequence
 from typing import Final
 
@@ -38,19 +37,7 @@ MEANING: Final = {
     "engine_mismatch": "the step of MJX differs from that of the C engine, as documented",
     "apart": "the analytic counterpart is another model of the same system, approached as contact stiffens",
 }
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class Judged:
-    """Verdicts on one derivative of a step.
-
-    Attributes:
-        codes: index into VERDICTS for each entry.
-        error: worst relative error of right entries that differences resolve.
-    """
-
-    codes: Int[np.ndarray, "outputs inputs"]
-    error: float
+Codes = Int[np.ndarray, "outputs inputs"]
 
 
 def judge(
@@ -61,11 +48,10 @@ def judge(
     *,
     starved: bool = False,
     degenerate: Bool[np.ndarray, "outputs inputs"] | None = None,
-) -> Judged:
-    """Compare a derivative with differences.
+) -> Codes:
+    """Compare a derivative with differences, and return the index into VERDICTS for each entry.
 
     Args:
-        layout: layout whose blocks delimit the comparison of entry sizes within a row.
         converged: derivative after a converged solve, to distinguish an unconverged solve from a wrong derivative; None
             if the solver had converged.
         starved: whether the solve is so far from convergence that no entry can be called wrong.
@@ -76,8 +62,6 @@ def judge(
     allowed = TOLERANCE * scale + 3 * truth.uncertainty
     error = np.abs(jacobian - truth.value)
     right = error <= allowed  # False where NaN
-    resolved = truth.uncertainty <= RESOLVED * scale
-
     codes = np.full(jacobian.shape, WRONG)
     # A derivative between or near the two slopes is as good as any; zero outside of them is not.
     within = error <= np.maximum(truth.gap, allowed)
@@ -97,8 +81,7 @@ def judge(
     if degenerate is not None:
         codes[degenerate & truth.rough & ~right] = JUMP
     codes[~np.isfinite(jacobian)] = NAN
-    figures = np.where(right & resolved, error / scale, 0.0)
-    return Judged(codes, float(figures.max(initial=0.0)))
+    return codes
 
 
 def row_scales(
@@ -139,28 +122,27 @@ def modes_apart(
     return float(np.nan_to_num(error, nan=0.0).max(initial=0.0))
 
 
-def disagreements(ours: Judged, truth: Differences, engine: Judged, engine_truth: Differences) -> np.ndarray:
+def disagreements(ours: Codes, truth: Differences, engine: Codes, engine_truth: Differences) -> np.ndarray:
     """Mask of smooth entries that are right by this project's differences but wrong by the C engine's."""
     rough = truth.rough | engine_truth.rough
-    return np.isin(ours.codes, (RIGHT, UNRESOLVED)) & np.isin(engine.codes, (ZERO, WRONG)) & ~rough
+    return np.isin(ours, (RIGHT, UNRESOLVED)) & np.isin(engine, (ZERO, WRONG)) & ~rough
 
 
-def resolved_by(ours: Judged, engine: Judged) -> Judged:
+def resolved_by(ours: Codes, engine: Codes) -> Codes:
     """Verdicts in which unresolved entries count as right if the C engine's differences confirm them."""
-    both = (ours.codes == UNRESOLVED) & (engine.codes == RIGHT)
-    return dataclasses.replace(ours, codes=np.where(both, RIGHT, ours.codes))
+    return np.where((ours == UNRESOLVED) & (engine == RIGHT), RIGHT, ours)
 
 
 def worst_error(
     layout: Coordinates,
     jacobian: Float[np.ndarray, "outputs inputs"],
     truth: Differences,
-    judged: Judged,
+    codes: Codes,
     columns: Sequence[int],
 ) -> float:
     """Worst relative error of all entries, right or wrong, that have a derivative that differences resolve."""
     scale = row_scales(layout, jacobian, truth)
-    counted = ~np.isin(judged.codes, (KINK, JUMP)) & (truth.uncertainty <= RESOLVED * scale)
+    counted = ~np.isin(codes, (KINK, JUMP)) & (truth.uncertainty <= RESOLVED * scale)
     figures = np.where(counted, np.abs(jacobian - truth.value) / scale, 0.0)[:, list(columns)]
     return float("inf") if np.isnan(figures).any() else float(figures.max(initial=0.0))
 

@@ -7,16 +7,20 @@ not at all at a jump; nor does |f(x + h) - f(x - h)|, the only sign of a jump th
 """
 
 import dataclasses
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from jaxtyping import Bool, Float
+
+from mjx_study.gradcheck.coordinates import Coordinates
 
 RATIO: Final = 4.0
 SIZES: Final = tuple(2.5e-4 / RATIO**power for power in range(8))
 """Step sizes [m, rad, ...], down to 1.5e-8; the finest smooth structure of MuJoCo's contact is 1 mm."""
 ROUNDING: Final = 1e-13
 """Relative rounding noise of a step's output, solved to rounding."""
+EPSILON: Final = 1e-15
+"""A few rounding errors of a float64."""
 SMOOTH, KINK = 1.5, 0.5
 """Powers of h between which the second difference indicates a kink, whose power is 1."""
 
@@ -32,6 +36,7 @@ class Differences:
         kink: entries whose one-sided slopes disagree at any step size.
         jump: entries where the map itself jumps.
         nearby: entries with a kink or jump within the larger steps, but not at the state.
+        rough: entries where the map is not smooth over the steps taken: any of the three.
     """
 
     value: Float[np.ndarray, "outputs columns"]
@@ -43,7 +48,6 @@ class Differences:
 
     @property
     def rough(self) -> Bool[np.ndarray, "outputs columns"]:
-        """Entries where the map is not smooth over the steps taken."""
         return self.kink | self.jump | self.nearby
 
 
@@ -54,14 +58,9 @@ def moves(columns: Float[np.ndarray, "columns inputs"]) -> Float[np.ndarray, "mo
 
 
 def differences(
-    outputs: Float[np.ndarray, "moves outputs"], noise_floor: Float[np.ndarray, " outputs"] | None = None
+    outputs: Float[np.ndarray, "moves outputs"], noise_floor: Float[np.ndarray, " outputs"] | float = 0.0
 ) -> Differences:
-    """Evaluate the outputs at `moves`.
-
-    Args:
-        outputs: one row of outputs per change.
-        noise_floor: rounding noise of each output, in addition to `ROUNDING`.
-    """
+    """Differences of the outputs at `moves`, one row per change; the noise floor is in addition to `ROUNDING`."""
     sizes = np.array(SIZES)[:, None, None]
     here, rest = outputs[0], outputs[1:].reshape(2, len(SIZES), -1, outputs.shape[1])
     above, below = rest
@@ -70,7 +69,7 @@ def differences(
     better = (RATIO**2 * central[1:] - central[:-1]) / (RATIO**2 - 1)
     change = np.abs(np.diff(better, axis=0))
     spread = np.maximum(change[1:], change[:-1])  # agreement of three adjacent sizes
-    noise = ROUNDING * np.maximum(np.abs(here), 1e-2) + (0.0 if noise_floor is None else noise_floor)
+    noise = ROUNDING * np.maximum(np.abs(here), 1e-2) + noise_floor
     spread = spread + noise / sizes[2 : 2 + len(spread)]
     best = np.argmin(spread, axis=0)[None]
     value = np.take_along_axis(better[1:-1], best, axis=0)[0]
@@ -108,3 +107,24 @@ def _falloff(amount: Float[np.ndarray, "sizes columns outputs"], noise: Float[np
     finest = last[0] >= len(usable) - 2
     here_too = finest | (following > expected / RATIO) | (expected <= 200 * noise)
     return power, over_size, here_too
+
+
+def solution_noise(
+    layout: Coordinates, stages: dict[str, Any], qacc: Float[np.ndarray, " nv"]
+) -> Float[np.ndarray, " outputs"]:
+    """Rounding error of the outputs of a step whose equation M a - q - J^T f(J a) = 0 is solved exactly.
+
+    Each term is rounded by EPSILON of its size, which the inverse of the equation propagates to the acceleration. MJX's
+    integrators then compute the velocity from the forces, M^-1 (q + J^T f), where large forces that cancel leave their
+    rounding.
+    """
+    jacobian, timestep = stages["efc_J"], layout.scene.timestep
+    weighted = stages["efc_D"][:, None] * np.abs(jacobian)
+    size = np.abs(stages["qM"]) @ np.abs(qacc) + np.abs(stages["qM"] @ stages["qacc_smooth"])
+    size += weighted.T @ (np.abs(jacobian) @ np.abs(qacc) + np.abs(stages["efc_aref"]))
+    matrices = stages["qM"] + jacobian.T @ (stages["efc_D"][:, None] * jacobian), stages["qM"]
+    if not all(np.all(np.isfinite(matrix)) and np.linalg.cond(matrix) < 1 / EPSILON for matrix in matrices):
+        return np.zeros(len(layout.outputs))
+    velocity = timestep * EPSILON * sum(np.abs(np.linalg.inv(matrix)) for matrix in matrices) @ size
+    activation = np.zeros(len(layout.outputs) - 2 * len(velocity))
+    return np.concatenate([timestep * velocity, velocity, activation])

@@ -18,8 +18,8 @@ from estimators import Estimator, GradientEstimate, Objective, oracles_of
 from estimators.mean_check import TOLERANCE, Circulation, circulations
 from mjx_study.objective import Simulator, chunk_for
 from mjx_study.study.configuration import Progress, check_span
-from mjx_study.study.line import direction_of
-from mjx_study.study.resolution import check_estimators
+from mjx_study.study.dataset import as_plain
+from mjx_study.study.resolution import check_estimators, direction_of
 from mjx_study.study.sampling import cell_keys, draw_batches
 from mjx_study.table import format_table
 from mjx_study.tasks.contact_grid import ContactPoint
@@ -57,12 +57,11 @@ class MeanCheck:
     def as_dict(self) -> dict[str, Any]:
         """Return plain data, including the gap and its 99.9 % interval as shares of the difference."""
         numbers = {name: float(value) for name, value in vars(self.circulation).items()}
-        numbers |= {"half_width": float(self.circulation.half_width)}
         scale = abs(numbers["difference"]) or math.nan
-        numbers |= {"relative_gap": numbers["gap"] / scale, "detectable": 2 * numbers["half_width"] / scale}
-        finite = {name: value if math.isfinite(value) else None for name, value in numbers.items()}
+        numbers |= {"half_width": float(self.circulation.half_width), "relative_gap": numbers["gap"] / scale}
+        numbers |= {"detectable": 2 * numbers["half_width"] / scale}
         named = {"contact": self.contact, "stiffness": self.stiffness, "estimator": self.estimator}
-        return named | finite | {"verdict": self.verdict}
+        return as_plain(named | numbers | {"verdict": self.verdict})
 
 
 def reach_of(task: Task) -> float:
@@ -85,11 +84,11 @@ def along_means(
     a bias orthogonal to the gradient show. Their differences of the mean cost are replaced by the first path's, so that
     all gaps are shares of the gradient.
     """
-    units = _at_right_angles(estimates)
-    each, found = max(2, samples // len(units)), []
-    for unit in units:
-        along = reach * jnp.asarray(unit, theta.dtype)
-        found.append(circulations(estimators, objective, theta - along, theta + along, jax.random.key(seed), each))
+    paths = [reach * jnp.asarray(unit, theta.dtype) for unit in _at_right_angles(estimates)]
+    each = max(2, samples // len(paths))
+    found = [
+        circulations(estimators, objective, theta - along, theta + along, jax.random.key(seed), each) for along in paths
+    ]
     return [
         [dataclasses.replace(one, difference=first.difference) for one, first in zip(path, found[0], strict=True)]
         for path in found
@@ -149,9 +148,9 @@ def check_mean(
     axis = "random" if direction == MEANS else direction
     along = jnp.asarray(direction_of(axis, task.policy.num_params, seed), task.theta.dtype)
     simulator = Simulator(task, chunk_size=chunk_for(samples, jax.local_devices(), [task]))
-    found, total, ends = [], len(cells), (task.theta + low * along, task.theta + high * along)
+    found, ends = [], (task.theta + low * along, task.theta + high * along)
     for index, cell in enumerate(cells):
-        progress(index, total, cell.label)
+        progress(index, len(cells), cell.label)
         objective, key = simulator.objective(cell.contact), jax.random.key(seed)
         if direction == MEANS:
             batches, _, _ = draw_batches(
@@ -166,17 +165,16 @@ def check_mean(
             for numbers in paths
             for estimator, each in zip(estimators, numbers, strict=True)
         ]
-    progress(total, total, "done")
+    progress(len(cells), len(cells), "done")
     return found
 
 
 def lines_of(checks: Sequence[MeanCheck]) -> list[str]:
+    formats = {"difference": ".3g", "gap": ".3g", "half_width": ".3g", "quadrature": ".3g"}
+    formats |= {"relative_gap": ".1%", "detectable": ".1%"}
     rows = []
     for check in checks:
-        told = check.as_dict()
-        numbers = [told[name] for name in ("difference", "gap", "half_width", "quadrature")]
-        shown = ["-" if value is None else f"{value:.3g}" for value in numbers]
-        shares = ["-" if told[name] is None else f"{told[name]:.1%}" for name in ("relative_gap", "detectable")]
-        stiffness = f"{check.stiffness:g}" if check.stiffness else "-"
-        rows.append([check.contact, stiffness, check.estimator, *shown, *shares, check.verdict])
+        told, stiffness = check.as_dict(), f"{check.stiffness:g}" if check.stiffness else "-"
+        shown = ["-" if told[name] is None else f"{told[name]:{style}}" for name, style in formats.items()]
+        rows.append([check.contact, stiffness, check.estimator, *shown, check.verdict])
     return format_table(rows, list(HEADER))

@@ -6,15 +6,18 @@ program that waits for them, and two at once deadlock (seen with jaxlib 0.10.2 o
 """
 
 import dataclasses
-from typing import Any, Final
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any, Final, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.errors import JaxRuntimeError
 from jaxtyping import Array, Float
 
-from mjx_study.gradcheck.compiling import Compiler
 from mjx_study.gradcheck.coordinates import Coordinates
+from mjx_study.gradcheck.values import STAGES
 from mjx_study.simulation import constraint
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.contact import ContactModel
@@ -22,10 +25,50 @@ from mjx_study.simulation.dynamics import State, exact_step, step
 from mjx_study.simulation.engine import HostState
 from mjx_study.simulation.integration import difference_position
 
+OPTIONS: Final = {"xla_backend_optimization_level": "0", "xla_cpu_use_fusion_emitters": False}
+"""XLA options on CPUs: half the compile time of the default code generator, and fast enough for these checks."""
+THREADS: Final = 2
+"""Number of programs compiled at once; each takes a core and up to a gigabyte for large models."""
 BATCH: Final = 64
 """Steps per call of the value program."""
 DIRECTIONS: Final = 96
 """Maximum number of directions, forwards or backwards, per call of a derivative program."""
+
+
+class Compiler:
+    """Programs by function and argument shapes, compiled fast, with little optimisation, in background threads."""
+
+    def __init__(self) -> None:
+        self._pool = ThreadPoolExecutor(THREADS, thread_name_prefix="compile")
+        self._programs: dict[Any, Future[Callable[..., Any]]] = {}
+
+    def start(self, function: Callable[..., Any], *arguments: Any) -> Future[Callable[..., Any]]:
+        """Trace the function for the shapes of the arguments, and compile it in the background."""
+        shapes = jax.tree.map(lambda leaf: (jnp.shape(leaf), str(jnp.result_type(leaf))), arguments)
+        key = (function, str(jax.tree.structure(arguments)), str(shapes))
+        if key not in self._programs:
+            lowered = jax.jit(function).lower(*arguments)
+            self._programs[key] = self._pool.submit(_compile, lowered)
+        return self._programs[key]
+
+    def run(self, function: Callable[..., Any], *arguments: Any) -> Any:
+        return self.start(function, *arguments).result()(*arguments)
+
+
+def _compile(lowered: Any) -> Callable[..., Any]:
+    if jax.default_backend() == "cpu":
+        try:
+            return lowered.compile(compiler_options=OPTIONS)
+        except JaxRuntimeError:  # an XLA version without these options
+            pass
+    return lowered.compile()
+
+
+class Setting(NamedTuple):
+    """A contact model, None for the MJCF's own, and the units of its parameters."""
+
+    contact: ContactModel | None
+    scales: Float[np.ndarray, " parameters"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,7 +76,6 @@ class Linear:
     """Value and derivatives of a step at one state.
 
     Attributes:
-        forward: Jacobian (outputs, inputs) by forward mode.
         tape: reverse-mode Jacobian on the tape, if `reverse` uses the Jacobian program; else None.
     """
 
@@ -41,7 +83,7 @@ class Linear:
     residual: float
     forward: Float[np.ndarray, "outputs inputs"]
     reverse: Float[np.ndarray, "outputs inputs"]
-    tape: Float[np.ndarray, "outputs inputs"] | None
+    tape: Float[np.ndarray, "outputs inputs"] | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,7 +92,7 @@ class Exact:
 
     Attributes:
         after: state after the step, with the constrained acceleration as its warm start.
-        stages: quantities of the step before the constraint solve, for comparison with the C engine.
+        stages: quantities before the constraint solve.
         outputs: (position relative to a reference, velocity, activation) after each change.
     """
 
@@ -59,178 +101,118 @@ class Exact:
     outputs: Float[np.ndarray, "batch outputs"]
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Setting:
-    """Arguments of the compiled programs that describe a contact model.
-
-    Attributes:
-        contact: the contact model, or None for the MJCF's own.
-    """
-
-    contact: ContactModel | None
-    scales: Float[np.ndarray, " parameters"]
-
-
 class Programs:
     """Compiled programs of one scene; contact models and states are arguments."""
 
     def __init__(self, layout: Coordinates, compiler: Compiler | None = None):
         self.layout = layout
         self.compiler = compiler or Compiler()
+        # Small scenes have a Jacobian over the state; derivatives of large ones, and over parameters, use the tape.
+        inputs = len(layout.inputs)
+        self._sizes = sorted({layout.num_state if layout.scene.uses_jacobian else inputs, inputs})
 
     def start(self, setting: Setting, base: HostState, *, stock: bool) -> None:
         """Start compiling the programs of `linear`, `exact`, `stock_step` and, on request, `stock`."""
-        point, layout = _point(setting, base), self.layout
-        rows = [_unit_rows(0, len(layout.inputs)), _unit_rows(0, len(layout.outputs))]
-        if self._has_tape:
-            self.compiler.start(self._tape, *point, *rows)
-        if layout.scene.uses_jacobian:
-            self.compiler.start(self._jacobian, *point, _unit_rows(0, layout.num_state), rows[1])
-        self.compiler.start(self._exact, *point, jnp.asarray(base.qpos), np.zeros((BATCH, len(layout.inputs))))
-        self.compiler.start(self._stock_step, *point)
+        point, inputs, outputs = _point(setting, base), len(self.layout.inputs), len(self.layout.outputs)
+        for size in reversed(self._sizes):
+            self.compiler.start(self._linear, point, _unit_rows(0, size), _unit_rows(0, outputs))
+        self.compiler.start(self._exact, point, jnp.asarray(base.qpos), np.zeros((BATCH, inputs)))
+        self.compiler.start(self._stock_step, point)
         if stock:
-            self.compiler.start(self._stock, *point, rows[0])
+            self.compiler.start(self._stock, point, _unit_rows(0, inputs))
 
     def exact(
         self, setting: Setting, base: HostState, reference: Array, changes: Float[np.ndarray, "batch inputs"]
     ) -> Exact:
         """Take the converged step after each change, the first of which is zero; positions relative to `reference`."""
-        rows = -(-len(changes) // BATCH) * BATCH
-        padded = np.zeros((rows, len(self.layout.inputs)))
-        padded[: len(changes)] = changes
-        outputs, first = [], None
-        for chunk in padded.reshape(-1, BATCH, padded.shape[1]):
-            output, after, stages = self.compiler.run(self._exact, *_point(setting, base), reference, chunk)
-            outputs.append(np.asarray(output))
-            first = first or (after, stages)
-        after, stages = jax.tree.map(lambda leaf: np.asarray(leaf)[0], first)
-        return Exact(_host(after, base), stages, np.concatenate(outputs)[: len(changes)])
+        point = _point(setting, base)
+        padded = np.pad(changes, ((0, -len(changes) % BATCH), (0, 0)))
+        chunks = padded.reshape(-1, BATCH, padded.shape[1])
+        found = [self.compiler.run(self._exact, point, reference, chunk) for chunk in chunks]
+        after, stages = jax.tree.map(lambda leaf: np.asarray(leaf)[0], found[0][1:])
+        outputs = np.concatenate([np.asarray(output) for output, *_ in found])
+        return Exact(_host(after, base), stages, outputs[: len(changes)])
 
     def linear(self, setting: Setting, base: HostState) -> Linear:
         """Compute the value and derivatives of the project's own step at a state."""
-        tape = self._derivatives(self._tape, setting, base) if self._has_tape else None
-        if not self.layout.scene.uses_jacobian:
-            assert tape is not None
-            return Linear(*tape, None)
-        qpos, residual, forward, reverse = self._derivatives(self._jacobian, setting, base)
-        if tape is None:
-            return Linear(qpos, residual, forward, reverse, None)
-        # over parameters, both modes use the tape
-        parameters = self.layout.columns("contact")
-        forward = np.concatenate([forward, tape[2][:, parameters]], axis=1)
-        reverse = np.concatenate([reverse, tape[3][:, parameters]], axis=1)
-        return Linear(qpos, residual, forward, reverse, tape[3])
+        found = [self._derivatives(size, setting, base) for size in self._sizes]
+        own, tape = found[0], found[-1]
+        if own is tape:
+            return own
+        parameters = self.layout.columns("contact")  # over which both modes use the tape
+        forward = np.concatenate([own.forward, tape.forward[:, parameters]], axis=1)
+        reverse = np.concatenate([own.reverse, tape.reverse[:, parameters]], axis=1)
+        return Linear(own.qpos, own.residual, forward, reverse, tape.reverse)
 
     def stock_step(self, setting: Setting, base: HostState) -> HostState:
         """Return the state after `mjx.step`, run to convergence from the warm start."""
-        return _host(self.compiler.run(self._stock_step, *_point(setting, base)), base)
+        return _host(self.compiler.run(self._stock_step, _point(setting, base)), base)
 
     def stock(self, setting: Setting, base: HostState) -> Float[np.ndarray, "outputs inputs"]:
+        """Jacobian of `mjx.step` by forward mode."""
         inputs, point = len(self.layout.inputs), _point(setting, base)
         pushes = [_unit_rows(first, inputs) for first in range(0, inputs, DIRECTIONS)]
-        rows = [np.asarray(self.compiler.run(self._stock, *point, push)) for push in pushes]
+        rows = [np.asarray(self.compiler.run(self._stock, point, push)) for push in pushes]
         return np.concatenate(rows)[:inputs].T
 
-    @property
-    def _has_tape(self) -> bool:
-        """Whether derivatives use the tape: for large scenes, and over contact parameters."""
-        return len(self.layout.scales) > 0 or not self.layout.scene.uses_jacobian
+    def _derivatives(self, inputs: int, setting: Setting, base: HostState) -> Linear:
+        """Derivatives with respect to the first inputs."""
+        outputs, point = len(self.layout.outputs), _point(setting, base)
+        found = [
+            self.compiler.run(self._linear, point, _unit_rows(first, inputs), _unit_rows(first, outputs))
+            for first in range(0, max(inputs, outputs), DIRECTIONS)
+        ]
+        (qpos, *_), (residual, *_), pushed, pulled = zip(*found, strict=True)
+        forward, reverse = np.concatenate(pushed)[:inputs].T, np.concatenate(pulled)[:outputs]
+        return Linear(np.asarray(qpos), float(residual), forward, reverse)
 
-    def _derivatives(self, program: Any, setting: Setting, base: HostState) -> tuple[Any, float, Any, Any]:
-        """Position after the step, residual, and the Jacobian in forward and reverse mode."""
-        layout, point = self.layout, _point(setting, base)
-        inputs = len(layout.inputs) if program == self._tape else layout.num_state
-        outputs, forward, reverse = len(layout.outputs), [], []
-        qpos = residual = None
-        for first in range(0, max(inputs, outputs), DIRECTIONS):
-            rows = _unit_rows(first, inputs), _unit_rows(first, outputs)
-            qpos, residual, pushed, pulled = self.compiler.run(program, *point, *rows)
-            forward.append(np.asarray(pushed))
-            reverse.append(np.asarray(pulled))
-        forward, reverse = np.concatenate(forward)[:inputs].T, np.concatenate(reverse)[:outputs]
-        return np.asarray(qpos), float(np.asarray(residual)), forward, reverse
+    def _model(self, setting, change):
+        """The model after a change of state and parameters, or of the state alone."""
+        num_state, scales = self.layout.num_state, setting.scales
+        parameters = change[num_state:] if len(change) > num_state else jnp.zeros(len(scales))
+        return self.layout.model(setting.contact, scales, parameters)
 
-    def _after(self, step_function, setting, state, control, change, parameters, reference=None):
+    def _after(self, step_function, point, change, reference=None):
         """Outputs after a change, relative to a given position or that after the step; and the state there."""
-        layout = self.layout
-        moved, moved_control = layout.state(state, control, change)
-        after, *rest = step_function(
-            layout.scene, layout.model(setting[0], setting[1], parameters), moved, moved_control
-        )
+        setting, state, control = point
+        moved, moved_control = self.layout.state(state, control, change)
+        after, *rest = step_function(self.layout.scene, self._model(setting, change), moved, moved_control)
         reference = jax.lax.stop_gradient(after.qpos) if reference is None else reference
-        tangent = difference_position(layout.scene.host, reference, after.qpos)
+        tangent = difference_position(self.layout.scene.host, reference, after.qpos)
         return jnp.concatenate([tangent, after.qvel, after.act]), (after, *rest)
 
-    def _exact(self, setting, state, control, reference, changes):
+    def _exact(self, point, reference, changes):
         def one(change):
-            parameters = change[self.layout.num_state :]
-            output, (after, _, data) = self._after(exact_step, setting, state, control, change, parameters, reference)
-            model = self.layout.model(setting[0], setting[1], parameters)
-            return output, after, _stages(model, data)
+            output, (after, _, data) = self._after(exact_step, point, change, reference)
+            return output, after, _stages(self._model(point[0], change), data)
 
         return jax.lax.map(one, changes)
 
-    def _jacobian(self, setting, state, control, push_rows, pull_rows):
-        still = jnp.zeros(len(self.layout.inputs))
-        own, parameters = jnp.split(still, [self.layout.num_state])
-        return _linearise(
-            lambda change: self._after(step, setting, state, control, change, parameters), own, push_rows, pull_rows
-        )
+    def _linear(self, point, push_rows, pull_rows):
+        """Position after the step, residual, and derivatives along rows, forwards and backwards."""
+        still = jnp.zeros(push_rows.shape[1])
+        _, push, (after, residual) = jax.linearize(lambda x: self._after(step, point, x), still, has_aux=True)
+        pull = jax.linear_transpose(push, still)
+        return after.qpos, residual, jax.lax.map(push, push_rows), jax.lax.map(lambda row: pull(row)[0], pull_rows)
 
-    def _tape(self, setting, state, control, push_rows, pull_rows):
-        num_state = self.layout.num_state
-
-        def output(change):
-            return self._after(step, setting, state, control, change, change[num_state:])
-
-        return _linearise(output, jnp.zeros(len(self.layout.inputs)), push_rows, pull_rows)
-
-    def _stock(self, setting, state, control, push_rows):
-        num_state = self.layout.num_state
-
-        def output(change):
-            return self._after(_mjx_step, setting, state, control, change, change[num_state:])[0]
-
-        _, push = jax.linearize(output, jnp.zeros(len(self.layout.inputs)))
+    def _stock(self, point, push_rows):
+        still = jnp.zeros(push_rows.shape[1])
+        _, push = jax.linearize(lambda change: self._after(_mjx_step, point, change)[0], still)
         return jax.lax.map(push, push_rows)
 
-    def _stock_step(self, setting, state, control):
-        scene, parameters = self.layout.scene, jnp.zeros(len(self.layout.scales))
-        model = constraint.with_generous_budget(self.layout.model(setting[0], setting[1], parameters))
-        return _mjx_step(scene, model, state, control)[0]
+    def _stock_step(self, point):
+        setting, state, control = point
+        model = constraint.with_generous_budget(self._model(setting, jnp.zeros(self.layout.num_state)))
+        return _mjx_step(self.layout.scene, model, state, control)[0]
 
 
 def _stages(model: mjx.Model, data: mjx.Data) -> dict[str, Any]:
     rows: Any = data._impl
-    contacts = rows.contact
-    return {
-        "xpos": data.xpos,
-        "ten_length": data.ten_length,
-        "actuator_length": data.actuator_length,
-        "qM": mjx.full_m(model, data),
-        "qfrc_bias": data.qfrc_bias,
-        "qfrc_passive": data.qfrc_passive,
-        "qfrc_actuator": data.qfrc_actuator,
-        "act_dot": data.act_dot,
-        "qacc_smooth": data.qacc_smooth,
-        "dist": contacts.dist,
-        "margin": contacts.includemargin,
-        "pos": contacts.pos,
-        "frame": contacts.frame,
-        "geom": jnp.asarray(contacts.geom),
-        "efc_type": jnp.asarray(rows.efc_type),
-        "efc_J": rows.efc_J,
-        "efc_aref": rows.efc_aref,
-        "efc_D": rows.efc_D,
-        "efc_frictionloss": rows.efc_frictionloss,
-    }
-
-
-def _linearise(output, point, push_rows, pull_rows):
-    """Position after the step, residual, and derivatives along rows, forwards and backwards."""
-    _, push, (after, residual) = jax.linearize(output, point, has_aux=True)
-    pull = jax.linear_transpose(push, point)
-    return after.qpos, residual, jax.lax.map(push, push_rows), jax.lax.map(lambda row: pull(row)[0], pull_rows)
+    own = {name: getattr(data, name) for name in STAGES if name != "qM"}
+    constraints = ("efc_type", "efc_J", "efc_aref", "efc_D", "efc_frictionloss")
+    contacts = {name: jnp.asarray(getattr(rows.contact, name)) for name in ("dist", "pos", "frame", "geom")}
+    own |= {name: jnp.asarray(getattr(rows, name)) for name in constraints}
+    return own | contacts | {"qM": mjx.full_m(model, data), "margin": rows.contact.includemargin}
 
 
 def _mjx_step(scene, model, state, control):
@@ -241,9 +223,9 @@ def _mjx_step(scene, model, state, control):
     return State(data.qpos, data.qvel, data.act, data.qacc), jnp.zeros(())
 
 
-def _point(setting: Setting, base: HostState) -> tuple[Any, State, Array]:
+def _point(setting: Setting, base: HostState) -> tuple[Setting, State, Array]:
     arrays = (jnp.asarray(part) for part in (base.qpos, base.qvel, base.act, base.warmstart))
-    return (setting.contact, setting.scales), State(*arrays), jnp.asarray(base.control)
+    return setting, State(*arrays), jnp.asarray(base.control)
 
 
 def _host(after: State, base: HostState) -> HostState:

@@ -5,15 +5,128 @@ import math
 from collections.abc import Sequence
 from typing import Any, Final
 
-from mjx_study.gradcheck.cost import CostCheck
 from mjx_study.gradcheck.coverage import Coverage
-from mjx_study.gradcheck.diagnosis import FAILURES, MEANING
-from mjx_study.gradcheck.finding import Finding
+from mjx_study.gradcheck.diagnosis import FAILURES, MEANING, VERDICTS
 from mjx_study.study.dataset import as_plain
 from mjx_study.table import format_table
 
 SHOWN: Final = 12
 """Maximum number of findings in the text, unless all are requested."""
+OTHERS: Final = {"value": "mjx.step", "engine": "the C engine", "engine_mismatch": "the C engine"}
+"""Source of the compared number, if not finite differences."""
+HEADINGS: Final = {
+    "stiffness": "K [N/m]",
+    "gradient_norm": "|gradient|",
+    "difference": "differences",
+    "one_sided": "one-sided",
+    "closed_form": "closed form",
+    "stock_step": "mjx step",
+    "engine_step": "C step",
+    "engine": "C engine",
+    "stock": "mjx.step",
+}
+"""Headings of tables, where they are not an attribute's name."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Entry:
+    """An entry of a step's Jacobian that is not right.
+
+    Attributes:
+        index: steps since the start of the rollout.
+        time: time since the start of the rollout [s].
+        name: name of the entry, such as d qvel[hinge] / d ctrl[motor].
+        derivative: derivative by automatic differentiation; for a differing step, this project's change.
+        difference: central difference, or None; for a differing step, the other implementation's change.
+    """
+
+    state: str
+    index: int
+    time: float
+    name: str
+    derivative: float
+    difference: float | None
+    gap: float | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Finding:
+    """Entries that are not right, with a common cause.
+
+    Attributes:
+        contact: label of the contact model, such as penalty, K = 100 N/m.
+        who: owner of the derivative: `project`, or `mjx.step` for MJX's own.
+        verdict: kink, jump, unconverged, zero, nan, engine, wrong, value, engine_mismatch or apart.
+        modes: differentiation modes that show it: forward, reverse, tape.
+        cause: likely cause, in one sentence.
+        entries: all affected entries, at any state; the text quotes the first as example.
+    """
+
+    contact: str
+    who: str
+    verdict: str
+    modes: tuple[str, ...]
+    cause: str
+    entries: tuple[Entry, ...]
+
+    @property
+    def fails(self) -> bool:
+        """Whether it fails the check, because the project's own derivative is not as it should be."""
+        return self.who == "project" and self.verdict in FAILURES
+
+    def line(self) -> str:
+        """Describe the finding in a sentence, with one entry as example."""
+        example, states = self.entries[0], len({entry.state for entry in self.entries})
+        who = f"{self.who}: " if self.who != "project" else ""
+        where = example.state if states == 1 else f"{states} states"
+        count = where if len(self.entries) == 1 else f"{len(self.entries)} entries, {where}"
+        modes = f", {' and '.join(self.modes)} mode" if self.who == "project" and len(self.modes) in (1, 2) else ""
+        if not example.name:
+            return f"{who}{self.verdict} ({count}): {self.cause}"
+        numbers = self.numbers(example)
+        return f"{who}{self.verdict} ({count}{modes}), as {example.name} {numbers}: {self.cause}"
+
+    def numbers(self, entry: Entry) -> str:
+        """Format an entry's numbers, with those they are compared with."""
+        if self.verdict == "jump" and entry.gap:
+            return f"= {entry.derivative:.6g}, but differences reach {entry.gap:.2g}"
+        other = OTHERS.get(self.verdict, "differences")
+        there = "" if entry.difference is None else f", {other} {entry.difference:.6g}"
+        gap = f" (one-sided apart by {entry.gap:.2g})" if entry.gap else ""
+        return f"= {entry.derivative:.6g}{there}{gap}"
+
+
+def gravity(finding: Finding) -> tuple[bool, bool, int]:
+    """Sort key that puts the worst findings first."""
+    order = {name: rank for rank, name in enumerate((*reversed(VERDICTS), "engine_mismatch", "apart"))}
+    return not finding.fails, finding.who != "project", order[finding.verdict]
+
+
+@dataclasses.dataclass(frozen=True)
+class CostCheck:
+    """Checks of one contact model's whole-horizon gradient; errors are relative to its norm.
+
+    Attributes:
+        stiffness: K [N/m].
+        gradient_norm: norm of the gradient, in cost per unit of theta.
+        modes: difference between reverse and forward mode along some directions.
+        difference: difference from central differences along the same directions.
+        one_sided: disagreement of the two one-sided differences at the smallest step.
+        closed_form: distance from the hand-written gradient of the reference system, a different model of the same
+            system; measures the distance between the models. None without a reference.
+        residual: largest relative solver residual of the rollout.
+        verdict: right, kink, jump, unconverged, nan or wrong.
+    """
+
+    contact: str
+    stiffness: float
+    gradient_norm: float
+    modes: float
+    difference: float
+    one_sided: float
+    closed_form: float | None
+    residual: float
+    verdict: str
 
 
 @dataclasses.dataclass(frozen=True)
@@ -100,8 +213,10 @@ class GradcheckReport:
         """Return the report as text; `verbose` lists every entry of every finding."""
         lines = [f"{self.subject}: {self.summary}", ""]
         if self.costs:
-            lines += ["gradient of the whole cost", *self._cost_table(), ""]
-        lines += ["one step", *self._step_table(), ""]
+            shown = "contact stiffness gradient_norm modes difference one_sided closed_form residual verdict"
+            lines += ["gradient of the whole cost", *_table(self.costs, shown.split()), ""]
+        shown = "contact stiffness states modes differences parameters stock_step engine_step engine stock residual"
+        lines += ["one step", *_table(self.steps, [*shown.split(), "unresolved", "verdict"]), ""]
         lines += self._coverage_lines()
         lines += self._finding_lines(verbose)
         lines += [f"warning: {text}" for text in (*self.warnings, *self._gaps())]
@@ -127,36 +242,6 @@ class GradcheckReport:
             for missing, labels in alike.items()
         ]
 
-    def _cost_table(self) -> list[str]:
-        header = ["contact", "K [N/m]", "|gradient|", "modes", "differences", "one-sided", "closed form", "residual"]
-        rows = [
-            [
-                check.contact,
-                _stiffness(check.stiffness),
-                f"{check.gradient_norm:.4g}",
-                *map(_figure, (check.modes, check.difference, check.one_sided, check.closed_form, check.residual)),
-                _verdict(check.verdict),
-            ]
-            for check in self.costs
-        ]
-        return _without_empty(rows, [*header, "verdict"])
-
-    def _step_table(self) -> list[str]:
-        header = ["contact", "K [N/m]", "states", "modes", "differences", "parameters", "mjx step", "C step"]
-        figures = "modes differences parameters stock_step engine_step engine stock residual".split()
-        rows = [
-            [
-                check.contact,
-                _stiffness(check.stiffness),
-                str(check.states),
-                *(_figure(getattr(check, name)) for name in figures),
-                str(check.unresolved),
-                _verdict(check.verdict),
-            ]
-            for check in self.steps
-        ]
-        return _without_empty(rows, [*header, "C engine", "mjx.step", "residual", "unresolved", "verdict"])
-
     def _finding_lines(self, verbose: bool) -> list[str]:
         """Findings, one line per kind and cause, whatever the number of contact models that show it."""
         alike: dict[tuple[str, str, str], list[Finding]] = {}
@@ -181,18 +266,20 @@ class GradcheckReport:
         return [*lines, ""] if lines else []
 
 
-def _stiffness(value: float) -> str:
-    return f"{value:g}" if value else "-"
+def _table(checks: Sequence[CostCheck | StepCheck], names: Sequence[str]) -> list[str]:
+    """A table of attributes, without empty columns."""
+    columns = {HEADINGS.get(name, name): [_cell(name, getattr(check, name)) for check in checks] for name in names}
+    kept = {heading: cells for heading, cells in columns.items() if set(cells) - {"-"}}
+    return format_table(list(zip(*kept.values(), strict=True)), list(kept))
 
 
-def _verdict(name: str) -> str:
-    return f"right, but {name}s" if name in ("kink", "jump") else name
-
-
-def _figure(value: float | None) -> str:
-    return "-" if value is None else "NaN" if math.isinf(value) or math.isnan(value) else f"{value:.1e}"
-
-
-def _without_empty(rows: Sequence[Sequence[str]], header: Sequence[str]) -> list[str]:
-    kept = [index for index in range(len(header)) if any(row[index] != "-" for row in rows)]
-    return format_table([[row[index] for index in kept] for row in rows], [header[index] for index in kept])
+def _cell(name: str, value: Any) -> str:
+    if name == "verdict":
+        return f"right, but {value}s" if value in ("kink", "jump") else value
+    if name == "stiffness":
+        return f"{value:g}" if value else "-"
+    if name == "gradient_norm":
+        return f"{value:.4g}"
+    if isinstance(value, float):
+        return f"{value:.1e}" if math.isfinite(value) else "NaN"
+    return "-" if value is None else str(value)

@@ -3,6 +3,7 @@
 import dataclasses
 import itertools
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
 from typing import Final
 
 import mujoco
@@ -49,7 +50,7 @@ class Sample:
 
 
 def start_of(scene: Scene) -> HostState:
-    """Return the model's own initial state: its first keyframe, or its reference pose at rest."""
+    """The model's first keyframe, or its reference pose at rest."""
     data = mujoco.MjData(scene.host)
     if scene.host.nkey:
         mujoco.mj_resetDataKeyframe(scene.host, data, 0)
@@ -67,14 +68,10 @@ def states_of(
     """Choose `count` states, and report the parts of the model that they exercise.
 
     The first is the initial state: rollouts start there, and most derivative faults show there. The others come from a
-    rollout, the task's own or one with small random velocities and controls, evenly spaced over its steps, those with
-    active constraints first. If they leave parts of the model unexercised, they are replaced by states that exercise
-    them, from faster rollouts with repeated pushes and from random poses within the joint limits.
-
-    Args:
-        horizon: number of steps of the rollouts.
-        seed: random seed of velocities, controls and poses.
-        visited: states of a task's rollout; None for a rollout in the C engine.
+    rollout of `horizon` steps, the task's own (`visited`) or one in the C engine with small random velocities and
+    controls, evenly spaced over its steps, those with active constraints first. If they leave parts of the model
+    unexercised, they are replaced by states that exercise them, from faster rollouts with repeated pushes and from
+    random poses within the joint limits.
     """
     host = converged_host(scene, contact)
     random = np.random.default_rng(seed)
@@ -88,11 +85,10 @@ def states_of(
         rollout = [Sample(f"step {index}", index, state, _parts(host, state)) for index, state in enumerate(visited)]
     chosen = _cover([first], rollout[1:], parts - OPTIONAL, count)
     chosen = _cover(chosen, _elsewhere(host, start, horizon, random), parts - OPTIONAL, count)
-    chosen += _spaced([sample for sample in rollout[1:] if sample not in chosen], count - len(chosen))
-    for sample in _elsewhere(host, start, horizon, random):
-        if len(chosen) == count:
-            break
-        chosen.append(sample)
+    rest = [sample for sample in rollout[1:] if sample not in chosen]
+    for pool in ([sample for sample in rest if sample.parts], [sample for sample in rest if not sample.parts]):
+        chosen += _even(pool, count - len(chosen))
+    chosen += itertools.islice(_elsewhere(host, start, horizon, random), count - len(chosen))
     chosen[1:] = sorted(chosen[1:], key=lambda sample: (len(sample.label.split(",")), sample.index))
     return chosen, coverage(parts, [sample.parts for sample in chosen], unreachable)
 
@@ -114,16 +110,8 @@ def _cover(chosen: list[Sample], pool: Iterable[Sample], wanted: frozenset[str],
     return chosen
 
 
-def _spaced(rollout: Sequence[Sample], count: int) -> list[Sample]:
-    """Up to `count` evenly spaced samples, first among those with active constraints, then among the others."""
-    active = [sample for sample in rollout if sample.parts]
-    others = [sample for sample in rollout if not sample.parts]
-    if count > len(active):
-        return active + _even(others, count - len(active))
-    return _even(active, count)
-
-
 def _even(samples: list[Sample], count: int) -> list[Sample]:
+    """Up to `count` evenly spaced samples."""
     if count >= len(samples):
         return samples
     return [samples[int(round(place))] for place in np.linspace(0, len(samples) - 1, count + 2)[1:-1]]
@@ -132,10 +120,8 @@ def _even(samples: list[Sample], count: int) -> list[Sample]:
 def _elsewhere(host: mujoco.MjModel, start: HostState, horizon: int, random: np.random.Generator) -> Iterator[Sample]:
     """Yield states that a rollout from the initial state does not reach."""
     for speed in FASTER:
-        every = max(horizon // PUSHES, 1)
-        yield from _rollout(
-            host, start, horizon, f", pushed to {speed:g}", lambda s, v=speed: _stirred(host, s, random, v), every
-        )
+        push = partial(_stirred, host, random=random, speed=speed)
+        yield from _rollout(host, start, horizon, f", pushed to {speed:g}", push)
     for number in range(POSES):
         pose = _stirred(host, _posed(host, start, random), random, FASTER[number % len(FASTER)])
         yield from _rollout(host, pose, FALL, f", from pose {number}")
@@ -147,12 +133,11 @@ def _rollout(
     horizon: int,
     label: str = "",
     push: Callable[[HostState], HostState] | None = None,
-    every: int = 1,
 ) -> Iterator[Sample]:
-    """Yield the states of a rollout in the C engine while it stays finite, with pushes at regular intervals."""
+    """Yield the states of a rollout in the C engine while it stays finite, with `PUSHES` pushes if any."""
     data = host_data(host, start)
     for index in range(horizon):
-        if push is not None and index % every == 0:
+        if push is not None and index % max(horizon // PUSHES, 1) == 0:
             data = host_data(host, push(host_state(data)))
         before = host_state(data)
         mujoco.mj_step(host, data)
@@ -185,9 +170,8 @@ def _stirred(
 def _posed(host: mujoco.MjModel, state: HostState, random: np.random.Generator) -> HostState:
     """Return the state with every limited slide and hinge somewhere in its range, or slightly beyond."""
     qpos = state.qpos.copy()
-    for joint in np.flatnonzero(host.jnt_limited):
-        if int(host.jnt_type[joint]) in _SCALAR:
-            low, high = host.jnt_range[joint]
-            share = random.choice([-BEYOND, 1 + BEYOND, random.uniform()])
-            qpos[host.jnt_qposadr[joint]] = low + share * (high - low)
+    for joint in np.flatnonzero(host.jnt_limited & np.isin(host.jnt_type, _SCALAR)):
+        low, high = host.jnt_range[joint]
+        share = random.choice([-BEYOND, 1 + BEYOND, random.uniform()])
+        qpos[host.jnt_qposadr[joint]] = low + share * (high - low)
     return dataclasses.replace(state, qpos=qpos)

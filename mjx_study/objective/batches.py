@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from functools import partial
+from functools import cached_property, partial
 from typing import Any, Final
 
 import jax
@@ -15,12 +15,15 @@ from mjx_study.compiled import Compiled
 from mjx_study.objective.chunks import rounds, spread
 from mjx_study.objective.cost import simulate
 from mjx_study.objective.programs import SamplePrograms
+from mjx_study.reference.noise import check_sigma
 from mjx_study.simulation.contact import ContactModel
 from mjx_study.simulation.linear_algebra import SMALL
 from mjx_study.simulation.onset import SLOTS
 from mjx_study.stopwatch import timed
-from mjx_study.tasks.task import Task, check_sigma
+from mjx_study.tasks.task import Task
 
+Theta = Float[Array, " params"]
+Keys = Key[Array, " samples"]
 LAPACK_BATCH: Final = 2048
 """Batch size from which jaxlib 0.10.2 splits matrix factorisations among its CPU threads, which deadlocks if two
 programs do so at a time. Matrices with up to `SMALL` rows do not use LAPACK."""
@@ -49,10 +52,13 @@ class Simulator:
         if self.chunk_size < 1:
             raise ValueError(f"chunk_size must be at least 1 sample, got {self.chunk_size}")
         object.__setattr__(self, "devices", tuple(self.devices) or tuple(jax.local_devices()))
-        batched = {
-            name: jax.vmap(each, (None, None, None, 0, 0)) for name, each in SamplePrograms(self.task).by_name.items()
+
+    @cached_property
+    def _programs(self) -> dict[str, Compiled]:
+        return {
+            name: Compiled(jax.vmap(each, (None, None, None, 0, 0)), name, self.task)
+            for name, each in SamplePrograms(self.task).by_name.items()
         }
-        object.__setattr__(self, "_programs", {name: Compiled(each, name, self.task) for name, each in batched.items()})
 
     def objective(self, contact: ContactModel | None, sigma: float | None = None) -> "MjxObjective":
         """Return the objective for a contact model, with the task's noise level or another."""
@@ -61,27 +67,20 @@ class Simulator:
     @property
     def num_compilations(self) -> int:
         """Number of programs compiled by this simulator so far."""
-        return sum(program.num_compilations for program in self._programs.values())  # type: ignore[attr-defined]
+        return sum(program.num_compilations for program in self._programs.values())
 
     def memory(self, kind: str, contact: ContactModel | None, samples: int) -> int:
         """XLA's planned temporary memory [bytes] for a batch of one kind, all chunks at once on all devices."""
         arguments = self._chunk(self.task.theta, contact, 1.0)
-        plan = self._programs[kind].jitted.lower(*arguments).compile().memory_analysis()  # type: ignore[attr-defined]
+        plan = self._programs[kind].jitted.lower(*arguments).compile().memory_analysis()
         return plan.temp_size_in_bytes * samples // self.chunk_size
 
     def run(self, name: str, theta: Any, contact: ContactModel | None, sigma: Any, keys: Any, noise_scale: Any) -> Any:
-        """Run one of `SamplePrograms` on all samples; see `spread`.
+        """Run one of `SamplePrograms` on all samples; outputs as returned by `spread`.
 
         Args:
-            name: name in `SamplePrograms`.
-            theta: parameters, (params,).
-            contact: the contact model; None for the MJCF's own.
-            sigma: standard deviation of the noise, in the unit of the quantity it is added to.
             keys: data of each sample's key.
             noise_scale: noise factor of each sample.
-
-        Returns:
-            The program's outputs with a leading axis of samples, as returned by `spread`.
 
         Raises:
             ValueError: sigma or theta is invalid, or there are no samples.
@@ -94,14 +93,14 @@ class Simulator:
         shared = theta, contact, np.asarray(sigma, self.task.scene.template.qpos.dtype)
         devices = self._devices_for(name)
         with timed(self.program(name, contact), rounds(len(noise_scale), self.chunk_size, len(devices))):
-            program = self._programs[name]  # type: ignore[attr-defined]
-            return jax.block_until_ready(spread(program, shared, (keys, noise_scale), self.chunk_size, devices))
+            return jax.block_until_ready(
+                spread(self._programs[name], shared, (keys, noise_scale), self.chunk_size, devices)
+            )
 
     def form(self, name: str, theta: Any, contact: ContactModel | None, sigma: Any) -> Any:
         """Shapes and types of a chunk's outputs of one of `SamplePrograms`, without running it."""
         arguments = self._chunk(theta, contact, sigma)
-        program = self._programs[name]  # type: ignore[attr-defined]
-        return jax.eval_shape(program.prepare(*arguments, platform=self.devices[0].platform), *arguments)
+        return jax.eval_shape(self._programs[name].prepare(*arguments, platform=self.devices[0].platform), *arguments)
 
     def _chunk(self, theta: Any, contact: ContactModel | None, sigma: Any) -> tuple[Any, ...]:
         """Program arguments for a chunk of identical samples, with the shapes of any chunk."""
@@ -139,7 +138,7 @@ class MjxObjective:
     def num_params(self) -> int:
         return self.simulator.task.policy.num_params
 
-    def evaluate(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> Evaluation:
+    def evaluate(self, theta: Theta, keys: Keys) -> Evaluation:
         """Evaluate values and scores by rollouts, without differentiating the dynamics.
 
         The baseline, the zero-noise rollout from the same initial state, runs as extra samples with noise scale 0: a
@@ -148,7 +147,7 @@ class MjxObjective:
         (evaluation,) = self._evaluate(theta, keys, (1.0,))
         return evaluation
 
-    def evaluate_odd(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> Evaluation:
+    def evaluate_odd(self, theta: Theta, keys: Keys) -> Evaluation:
         """Evaluate the part of the objective that is odd in the noise, (f(w) - f(-w)) / 2, with two rollouts per
         sample.
 
@@ -161,51 +160,44 @@ class MjxObjective:
         if not self.simulator.task.policy.additive:
             raise ValueError("the odd part of an objective needs a policy whose noise is added to theta")
         samples = len(keys)
-        scale = np.repeat([1.0, -1.0], samples)
-        values, scores, residuals = self._run("value", theta, keys, np.tile(np.arange(samples), 2), scale)
+        rows, scale = np.tile(np.arange(samples), 2), np.repeat([1.0, -1.0], samples)
+        values, scores, residuals = self._run("value", theta, keys, rows, scale)
         odd = (values[:samples] - values[samples:]) / 2
         residual = jnp.maximum(residuals[:samples], residuals[samples:])
         return Evaluation(*map(jnp.asarray, (odd, scores[:samples], jnp.zeros_like(odd), residual)))
 
-    def evaluate_pair(
-        self, theta: Float[Array, " params"], keys: Key[Array, " samples"]
-    ) -> tuple[Evaluation, Evaluation]:
+    def evaluate_pair(self, theta: Theta, keys: Keys) -> tuple[Evaluation, Evaluation]:
         """Evaluate pairs of samples with opposite noise, the same initial states and a shared baseline."""
         plus, minus = self._evaluate(theta, keys, (1.0, -1.0))
         return plus, minus
 
-    def differentiate(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> Differentiation:
+    def differentiate(self, theta: Theta, keys: Keys) -> Differentiation:
         """Return each sample's cost and its exact gradient with respect to theta."""
         return Differentiation(*jax.tree.map(jnp.asarray, self._run("gradient", theta, keys)))
 
-    def evaluate_steps(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> StepEvaluation:
+    def evaluate_steps(self, theta: Theta, keys: Keys) -> StepEvaluation:
         (steps,) = self._evaluate_steps(theta, keys, (1.0,))
         return steps
 
-    def evaluate_step_pair(
-        self, theta: Float[Array, " params"], keys: Key[Array, " samples"]
-    ) -> tuple[StepEvaluation, StepEvaluation]:
+    def evaluate_step_pair(self, theta: Theta, keys: Keys) -> tuple[StepEvaluation, StepEvaluation]:
         plus, minus = self._evaluate_steps(theta, keys, (1.0, -1.0))
         return plus, minus
 
-    def differentiate_corrected(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> Differentiation:
+    def differentiate_corrected(self, theta: Theta, keys: Keys) -> Differentiation:
         """`differentiate` with the task's onset term, or the linear one if the task has none."""
         return Differentiation(*jax.tree.map(jnp.asarray, self._run("corrected", theta, keys)))
 
-    def differentiate_steps(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> StepDifferentiation:
+    def differentiate_steps(self, theta: Theta, keys: Keys) -> StepDifferentiation:
         """Roll out as `differentiate`, with the derivative of each sample's cost with respect to its noise."""
         return StepDifferentiation(*jax.tree.map(jnp.asarray, self._run("step_gradient", theta, keys)))
 
-    def linearise(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> Linearisation:
+    def linearise(self, theta: Theta, keys: Keys) -> Linearisation:
         """Roll out as `differentiate`, with the derivatives of every step.
 
         The state is (qpos, qvel, act), so a quaternion counts as four entries.
         """
-        (terms, residual, derivatives), zero_noise = (
-            self._run("linearisation", theta, keys),
-            self._zero_noise_to_go(theta, keys),
-        )
-        to_go, scores, jacobian = terms
+        (to_go, scores, jacobian), residual, derivatives = self._run("linearisation", theta, keys)
+        zero_noise = self._zero_noise_to_go(theta, keys)
         steps = StepEvaluation(*jax.tree.map(jnp.asarray, (to_go, zero_noise, scores, jacobian, residual)))
         return Linearisation(steps, *jax.tree.map(jnp.asarray, derivatives))
 
@@ -273,7 +265,7 @@ class TracedObjective(MjxObjective):
         scale = np.ones(len(rows), dtype) if noise_scale is None else np.asarray(noise_scale, dtype)
         chunk = simulator.chunk_size
         chunks = np.minimum(np.arange(math.ceil(len(rows) / chunk) * chunk), len(rows) - 1).reshape(-1, chunk)
-        program, key_data = simulator._programs[name].jitted, jax.random.key_data(keys)  # type: ignore[attr-defined]
+        program, key_data = simulator._programs[name].jitted, jax.random.key_data(keys)
         sigma = jnp.asarray(self.sigma, dtype)
 
         def call(chunk):
@@ -301,6 +293,5 @@ def _for_all(rows, samples: int):
 
 def contact_for(name: str, contact: ContactModel | None) -> ContactModel | None:
     """Drop a contact model's surrogate for programs without derivatives, so that one program serves all models."""
-    return (
-        dataclasses.replace(contact, backward=None) if contact is not None and name in ("value", "steps") else contact
-    )
+    with_derivatives = contact is None or name not in ("value", "steps")
+    return contact if with_derivatives else dataclasses.replace(contact, backward=None)

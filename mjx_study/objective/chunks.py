@@ -32,7 +32,6 @@ def spread(program: Compiled, shared: Any, rows: Sequence[np.ndarray], chunk: in
         program: function of the shared arguments and one chunk of each array of rows.
         rows: arrays of equal length.
         chunk: rows per call; the last chunk is padded with copies of the last row.
-        devices: devices of this process.
 
     Returns:
         The program's outputs with a leading axis of rows: NumPy arrays, or on accelerators arrays on the first device.

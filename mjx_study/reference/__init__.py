@@ -1,20 +1,23 @@
 """Analytic systems in NumPy and float64 with hand-written Jacobians, the ground truth for MJX's gradients."""
 
-from mjx_study.reference.adjoint import Gradients, Rollout, roll_out, value_and_gradient, value_and_gradients
-from mjx_study.reference.ball_wall import BallWall
 from mjx_study.reference.double_pendulum import DoublePendulum
-from mjx_study.reference.function import ClosedForm, Function, Jump, ScalarFunction, Smoothed, smoothed
-from mjx_study.reference.heaviside import Heaviside, RelaxedHeaviside
+from mjx_study.reference.function import (
+    ClosedForm,
+    Function,
+    Heaviside,
+    Jump,
+    Quadratic,
+    RelaxedHeaviside,
+    ScalarFunction,
+    Smoothed,
+    smoothed,
+)
+from mjx_study.reference.launch import BallWall, MomentumTransfer
 from mjx_study.reference.linear_quadratic import LinearQuadratic
-from mjx_study.reference.momentum_transfer import MomentumTransfer
 from mjx_study.reference.objective import PARAMETRISATIONS, FunctionObjective, Reference, ReferenceObjective
-from mjx_study.reference.pusher import Pusher
-from mjx_study.reference.quadratic import Quadratic
-from mjx_study.reference.quadratic_cost import QuadraticCost
-from mjx_study.reference.sliding_box import SlidingBox
-from mjx_study.reference.system import System
-from mjx_study.reference.tennis import Tennis, tennis_metrics
-from mjx_study.reference.tennis_start import draw_start
+from mjx_study.reference.system import Gradients, QuadraticCost, Rollout, System, roll_out, value_and_gradients
+from mjx_study.reference.tennis import Tennis, draw_start, tennis_metrics
+from mjx_study.reference.two_bodies import Pusher, SlidingBox
 
 __all__ = [
     "PARAMETRISATIONS",
@@ -44,6 +47,5 @@ __all__ = [
     "roll_out",
     "smoothed",
     "tennis_metrics",
-    "value_and_gradient",
     "value_and_gradients",
 ]

@@ -15,6 +15,8 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float
 
+from mjx_study.reference.system import ControlJacobians, Controls, Costs, StateJacobians, States
+
 
 @dataclasses.dataclass(frozen=True)
 class DoublePendulum:
@@ -39,9 +41,7 @@ class DoublePendulum:
     num_states: int = 4
     num_controls: int = 0
 
-    def step(
-        self, state: Float[np.ndarray, "*batch 4"], control: Float[np.ndarray, "*batch 0"]
-    ) -> Float[np.ndarray, "*batch 4"]:
+    def step(self, state: States, control: Controls) -> States:
         h = self.timestep
         first = self._rate(state)
         second = self._rate(state + h / 2 * first)
@@ -49,9 +49,7 @@ class DoublePendulum:
         fourth = self._rate(state + h * third)
         return state + h / 6 * (first + 2 * second + 2 * third + fourth)
 
-    def jacobians(
-        self, state: Float[np.ndarray, "*batch 4"], control: Float[np.ndarray, "*batch 0"]
-    ) -> tuple[Float[np.ndarray, "*batch 4 4"], Float[np.ndarray, "*batch 4 0"]]:
+    def jacobians(self, state: States, control: Controls) -> tuple[StateJacobians, ControlJacobians]:
         """Derivatives of `step`, by the chain rule through its four stages."""
         h, identity = self.timestep, np.eye(4)
         rate, slope = self._rate(state), self._rate_jacobian(state)
@@ -63,7 +61,7 @@ class DoublePendulum:
             total = total + weight * slope
         return identity + h / 6 * total, np.zeros((*state.shape, 0))
 
-    def energy(self, state: Float[np.ndarray, "*batch 4"]) -> Float[np.ndarray, "*batch"]:
+    def energy(self, state: States) -> Costs:
         """Kinetic plus potential energy, the latter 0 at the pivot's height [J]."""
         first, second, mixed = self._inertia(state)
         v1, v2 = state[..., 2], state[..., 3]
@@ -71,10 +69,10 @@ class DoublePendulum:
         height = -self.length * (2 * np.cos(state[..., 0]) + np.cos(state[..., 0] + state[..., 1]))
         return np.asarray(kinetic + self.mass * self.gravity * height)
 
-    def accelerations(self, state: Float[np.ndarray, "*batch 4"]) -> Float[np.ndarray, "*batch 2"]:
+    def accelerations(self, state: States) -> Float[np.ndarray, "*batch 2"]:
         return self._solve(state, self._torques(state)[..., None])[..., 0]
 
-    def acceleration_jacobian(self, state: Float[np.ndarray, "*batch 4"]) -> Float[np.ndarray, "*batch 2 4"]:
+    def acceleration_jacobian(self, state: States) -> Float[np.ndarray, "*batch 2 4"]:
         """Derivative of `accelerations`: M da = dr - dM a, with r the right side above."""
         q1, q2, v1, v2 = np.moveaxis(state, -1, 0)
         sine, cosine, pull = np.sin(q2), np.cos(q2), self.gravity / self.length
@@ -91,21 +89,17 @@ class DoublePendulum:
         )
         return self._solve(state, np.stack([np.stack(row, axis=-1) for row in rows], axis=-2))
 
-    def cost(
-        self, state: Float[np.ndarray, "*batch 4"], control: Float[np.ndarray, "*batch 0"]
-    ) -> Float[np.ndarray, "*batch"]:
+    def cost(self, state: States, control: Controls) -> Costs:
         return np.zeros(state.shape[:-1])
 
-    def cost_gradients(
-        self, state: Float[np.ndarray, "*batch 4"], control: Float[np.ndarray, "*batch 0"]
-    ) -> tuple[Float[np.ndarray, "*batch 4"], Float[np.ndarray, "*batch 0"]]:
+    def cost_gradients(self, state: States, control: Controls) -> tuple[States, Controls]:
         return np.zeros(state.shape), np.zeros(control.shape)
 
-    def final_cost(self, state: Float[np.ndarray, "*batch 4"]) -> Float[np.ndarray, "*batch"]:
+    def final_cost(self, state: States) -> Costs:
         """|(q1, q2) - goal|^2 [rad^2]."""
         return np.asarray(np.sum((state[..., :2] - np.array(self.goal)) ** 2, axis=-1))
 
-    def final_gradient(self, state: Float[np.ndarray, "*batch 4"]) -> Float[np.ndarray, "*batch 4"]:
+    def final_gradient(self, state: States) -> States:
         """2 ((q1, q2) - goal), and 0 for the velocities."""
         error = state[..., :2] - np.array(self.goal)
         return np.concatenate([2 * error, np.zeros(error.shape)], axis=-1)

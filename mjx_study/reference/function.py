@@ -1,4 +1,4 @@
-r"""Scalar functions of a few parameters, with jumps and kinks, and their smoothing by noise.
+r"""Functions of a few parameters, with jumps and kinks, and their smoothing by noise.
 
     F(theta) = E f(theta + w),   w = sigma z, the entries of z independent with density p = exp(-psi) of variance 1
 
@@ -14,9 +14,15 @@ import math
 from typing import Final, Protocol, runtime_checkable
 
 import numpy as np
+import scipy
 from jaxtyping import Float
 
-from mjx_study.reference.noise import check_density
+from estimators import NOISES
+from mjx_study.reference.noise import check_density, check_sigma
+
+Values = Float[np.ndarray, "*batch"]
+Points = Float[np.ndarray, "*batch params"]
+Theta = Float[np.ndarray, " params"]
 
 TAIL: Final = 1e-15
 """Probability of noise outside the range of the quadrature."""
@@ -39,61 +45,49 @@ class Smoothed:
     """F at a point, its gradient, and the part of the gradient due to jumps."""
 
     value: float
-    gradient: Float[np.ndarray, " params"]
-    jump_term: Float[np.ndarray, " params"]
+    gradient: Theta
+    jump_term: Theta
 
 
 @runtime_checkable
 class Function(Protocol):
-    """A function of the parameters alone, with a hand-written gradient; leading axes are a batch."""
+    """A function of the parameters alone, with a hand-written gradient; leading axes are a batch.
+
+    At a kink or a jump, the gradient is that of the branch that the value takes.
+    """
 
     @property
     def num_params(self) -> int: ...
-
-    def value(self, x: Float[np.ndarray, "*batch params"]) -> Float[np.ndarray, "*batch"]:
-        """f(x)."""
-        ...
-
-    def gradient(self, x: Float[np.ndarray, "*batch params"]) -> Float[np.ndarray, "*batch params"]:
-        """Gradient of f; at a kink or a jump, that of the branch that `value` takes."""
-        ...
+    def value(self, x: Points) -> Values: ...
+    def gradient(self, x: Points) -> Points: ...
 
 
 @runtime_checkable
 class ScalarFunction(Function, Protocol):
-    """A function of one parameter with known jumps and kinks."""
+    """A function of one parameter with known jumps and kinks: all, or those of one period.
+
+    The period is infinite if there is none. Breakpoints are all points where f is not smooth, jumps included.
+    """
 
     @property
-    def period(self) -> float:
-        """Period of f; infinity if it has none."""
-        ...
-
-    def jumps(self) -> tuple[Jump, ...]:
-        """All jumps, or those of one period."""
-        ...
-
-    def breakpoints(self) -> tuple[float, ...]:
-        """All points where f is not smooth, jumps included, or those of one period."""
-        ...
+    def period(self) -> float: ...
+    def jumps(self) -> tuple[Jump, ...]: ...
+    def breakpoints(self) -> tuple[float, ...]: ...
 
 
 @runtime_checkable
 class ClosedForm(Protocol):
-    """A function smoothed in closed form, without quadrature."""
+    """A function smoothed in closed form, without quadrature.
+
+    The closed form holds for Gaussian noise, or with `any_noise` for every density of variance sigma^2.
+    """
 
     @property
-    def any_noise(self) -> bool:
-        """Whether the closed form holds for every density of variance sigma^2, not only for Gaussian noise."""
-        ...
-
-    def smoothed(self, theta: Float[np.ndarray, " params"], sigma: float) -> Smoothed:
-        """F, grad F and the jump term."""
-        ...
+    def any_noise(self) -> bool: ...
+    def smoothed(self, theta: Theta, sigma: float) -> Smoothed: ...
 
 
-def smoothed(
-    function: Function, theta: Float[np.ndarray, " params"], sigma: float, noise: str = "gaussian"
-) -> Smoothed:
+def smoothed(function: Function, theta: Theta, sigma: float, noise: str = "gaussian") -> Smoothed:
     """Return F, grad F and the jump term, in closed form if available, else by quadrature to about 1e-12.
 
     Quadrature integrates f p and f psi' p / sigma between the breakpoints, where f is smooth. It uses neither the
@@ -109,7 +103,7 @@ def smoothed(
         TypeError: the function has neither a closed form for this noise nor a list of breakpoints.
         ValueError: theta does not have num_params entries, sigma is not positive and finite, or the noise is unknown.
     """
-    check_noise(sigma)
+    check_sigma(sigma)
     density = check_density(noise)
     if theta.shape != (function.num_params,):
         raise ValueError(f"theta must have shape ({function.num_params},), got {theta.shape}")
@@ -147,12 +141,6 @@ def _nodes(cuts: Float[np.ndarray, " cuts"]) -> tuple[Float[np.ndarray, " nodes"
     return (edges[:-1, None] + half * (1 + node)).ravel(), (half * weight).ravel()
 
 
-def check_noise(sigma: float) -> None:
-    """Raise ValueError unless sigma is positive and finite."""
-    if not (sigma > 0 and math.isfinite(sigma)):
-        raise ValueError(f"sigma must be positive and finite, in the unit of the quantity it is added to; got {sigma}")
-
-
 def _copies(point: float, period: float, centre: float, reach: float) -> Float[np.ndarray, " copies"]:
     """Return the point and its periodic copies within reach."""
     if math.isinf(period):
@@ -161,3 +149,110 @@ def _copies(point: float, period: float, centre: float, reach: float) -> Float[n
         first, last = math.ceil((centre - reach - point) / period), math.floor((centre + reach - point) / period)
         candidates = point + period * np.arange(first, last + 1)
     return candidates[np.abs(candidates - centre) < reach]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Quadratic:
+    """x^T A x / 2 + b^T x + c, the benchmark on which every unbiased estimator must agree.
+
+    Attributes:
+        matrix: A, (params, params), symmetric.
+        linear: b.
+        offset: c.
+    """
+
+    matrix: Float[np.ndarray, "..."]
+    linear: Theta
+    offset: float = 0.0
+    any_noise: bool = dataclasses.field(default=True, init=False)
+
+    def __post_init__(self) -> None:
+        size = len(self.linear)
+        if self.matrix.shape != (size, size) or not np.array_equal(self.matrix, self.matrix.T):
+            raise ValueError(f"matrix must be symmetric of shape ({size}, {size}), to match linear; got {self.matrix}")
+
+    @property
+    def num_params(self) -> int:
+        return len(self.linear)
+
+    def value(self, x: Points) -> Values:
+        return np.asarray(np.einsum("...i,ij,...j->...", x, self.matrix, x) / 2 + x @ self.linear + self.offset)
+
+    def gradient(self, x: Points) -> Points:
+        return x @ self.matrix + self.linear
+
+    def smoothed(self, theta: Theta, sigma: float) -> Smoothed:
+        """F = f + sigma^2 tr A / 2, grad F = grad f."""
+        value = float(self.value(theta)) + sigma**2 * np.trace(self.matrix) / 2
+        return Smoothed(float(value), self.gradient(theta), np.zeros(self.num_params))
+
+
+@dataclasses.dataclass(frozen=True)
+class Heaviside:
+    """1 where x >= 0, else 0."""
+
+    num_params: int = 1
+    period: float = math.inf
+    any_noise: bool = dataclasses.field(default=False, init=False)
+
+    def value(self, x: Points) -> Values:
+        return np.asarray(x[..., 0] >= 0, float)
+
+    def gradient(self, x: Points) -> Points:
+        return np.zeros(x.shape)
+
+    def jumps(self) -> tuple[Jump, ...]:
+        return (Jump(0.0, 1.0),)
+
+    def breakpoints(self) -> tuple[float, ...]:
+        return (0.0,)
+
+    def smoothed(self, theta: Theta, sigma: float) -> Smoothed:
+        """With Phi, phi the normal distribution: F = Phi(theta / sigma), and its gradient is all jump term."""
+        gradient = np.array([NOISES["gaussian"].density(theta[0] / sigma) / sigma])
+        return Smoothed(float(scipy.special.ndtr(theta[0] / sigma)), gradient, gradient)
+
+
+@dataclasses.dataclass(frozen=True)
+class RelaxedHeaviside:
+    """clip(x / width + 1/2, 0, 1), continuous: the ramp of Coulomb friction.
+
+    Attributes:
+        width: nu, the slip tolerance; in the unit of x.
+
+    Reference: Suh et al. 2022, Coulomb friction example, whose slope 2 t / nu does not meet the step at +-nu / 2.
+    """
+
+    width: float
+    num_params: int = 1
+    period: float = math.inf
+    any_noise: bool = dataclasses.field(default=False, init=False)
+
+    def __post_init__(self) -> None:
+        if not (self.width > 0 and math.isfinite(self.width)):
+            raise ValueError(f"width must be positive and finite, got {self.width}")
+
+    def value(self, x: Points) -> Values:
+        return np.asarray(np.clip(x[..., 0] / self.width + 0.5, 0.0, 1.0))
+
+    def gradient(self, x: Points) -> Points:
+        return np.where(np.abs(x) < self.width / 2, 1 / self.width, 0.0)
+
+    def jumps(self) -> tuple[Jump, ...]:
+        return ()
+
+    def breakpoints(self) -> tuple[float, ...]:
+        return (-self.width / 2, self.width / 2)
+
+    def smoothed(self, theta: Theta, sigma: float) -> Smoothed:
+        r"""F and grad F by differences over the ramp, with rounding errors of about 1e-16 / nu.
+
+            F = (G(theta + nu/2) - G(theta - nu/2)) / nu,   grad F = (Phi(. + nu/2) - Phi(. - nu/2)) / nu
+
+        with G(a) = E max(a + w, 0) = a Phi(a / sigma) + sigma phi(a / sigma).
+        """
+        ends = theta + np.array([self.width / 2, -self.width / 2])
+        density = NOISES["gaussian"].density
+        upper, lower = (end * scipy.special.ndtr(end / sigma) + sigma * density(end / sigma) for end in ends)
+        slope = (scipy.special.ndtr(ends[0] / sigma) - scipy.special.ndtr(ends[1] / sigma)) / self.width
+        return Smoothed(float((upper - lower) / self.width), np.array([slope]), np.zeros(1))

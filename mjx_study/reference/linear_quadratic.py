@@ -12,7 +12,9 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float
 
-from mjx_study.reference.function import Smoothed, check_noise
+from mjx_study.reference.function import Smoothed
+from mjx_study.reference.noise import check_sigma
+from mjx_study.reference.system import ControlJacobians, Controls, Costs, StateJacobians, States
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -55,32 +57,24 @@ class LinearQuadratic:
     def num_controls(self) -> int:
         return self.control.shape[1]
 
-    def step(
-        self, state: Float[np.ndarray, "*batch states"], control: Float[np.ndarray, "*batch controls"]
-    ) -> Float[np.ndarray, "*batch states"]:
+    def step(self, state: States, control: Controls) -> States:
         return state @ self.transition.T + control @ self.control.T
 
-    def jacobians(
-        self, state: Float[np.ndarray, "*batch states"], control: Float[np.ndarray, "*batch controls"]
-    ) -> tuple[Float[np.ndarray, "*batch states states"], Float[np.ndarray, "*batch states controls"]]:
+    def jacobians(self, state: States, control: Controls) -> tuple[StateJacobians, ControlJacobians]:
         batch = state.shape[:-1]
         over_state = np.broadcast_to(self.transition, (*batch, *self.transition.shape))
         return over_state, np.broadcast_to(self.control, (*batch, *self.control.shape))
 
-    def cost(
-        self, state: Float[np.ndarray, "*batch states"], control: Float[np.ndarray, "*batch controls"]
-    ) -> Float[np.ndarray, "*batch"]:
+    def cost(self, state: States, control: Controls) -> Costs:
         return np.asarray(_form(self.state_weight, state) + _form(self.control_weight, control))
 
-    def cost_gradients(
-        self, state: Float[np.ndarray, "*batch states"], control: Float[np.ndarray, "*batch controls"]
-    ) -> tuple[Float[np.ndarray, "*batch states"], Float[np.ndarray, "*batch controls"]]:
+    def cost_gradients(self, state: States, control: Controls) -> tuple[States, Controls]:
         return 2 * state @ self.state_weight, 2 * control @ self.control_weight
 
-    def final_cost(self, state: Float[np.ndarray, "*batch states"]) -> Float[np.ndarray, "*batch"]:
+    def final_cost(self, state: States) -> Costs:
         return np.asarray(_form(self.final_weight, state))
 
-    def final_gradient(self, state: Float[np.ndarray, "*batch states"]) -> Float[np.ndarray, "*batch states"]:
+    def final_gradient(self, state: States) -> States:
         return 2 * state @ self.final_weight
 
     def smoothed(
@@ -91,7 +85,7 @@ class LinearQuadratic:
         Raises:
             ValueError: sigma is not positive and finite.
         """
-        check_noise(sigma)
+        check_sigma(sigma)
         theta = controls.reshape(-1)
         square, linear, constant = self.quadratic_form(start, len(controls))
         value = theta @ square @ theta + 2 * linear @ theta + constant + sigma**2 * np.trace(square)
@@ -103,7 +97,7 @@ class LinearQuadratic:
         Raises:
             ValueError: sigma is not positive and finite.
         """
-        check_noise(sigma)
+        check_sigma(sigma)
         square, _, _ = self.quadratic_form(np.zeros(self.num_states), horizon)
         return float(4 * sigma**2 * np.sum(square**2))
 

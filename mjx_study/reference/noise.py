@@ -1,5 +1,6 @@
 """Initial states and noise from sample keys, shared by MJX and the reference systems."""
 
+import math
 from functools import partial
 
 import jax
@@ -51,3 +52,9 @@ def check_density(name: str) -> NoiseDensity:
     if name not in NOISES:
         raise ValueError(f"the noise density must be one of {', '.join(NOISES)}; got {name!r}")
     return NOISES[name]
+
+
+def check_sigma(sigma: float) -> None:
+    """Raise ValueError unless sigma is positive and finite."""
+    if not 0 < sigma < math.inf:
+        raise ValueError(f"sigma must be positive and finite, in the unit of the quantity it is added to; got {sigma}")

@@ -1,8 +1,10 @@
 """Analytic systems and functions as Objectives for any estimator, with MJX's noise."""
 
 import dataclasses
+import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import Final, Protocol, runtime_checkable
+from typing import Any, Final, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -10,10 +12,9 @@ import numpy as np
 from jaxtyping import Array, Float, Key
 
 from estimators import Differentiation, Evaluation, Linearisation, PairedObjective, StepDifferentiation, StepEvaluation
-from mjx_study.reference.adjoint import gradients_along, roll_out, value_and_gradients
-from mjx_study.reference.function import Function, check_noise
-from mjx_study.reference.noise import batch_noise, check_density, noise_score, split_sample_key
-from mjx_study.reference.system import System
+from mjx_study.reference.function import Function
+from mjx_study.reference.noise import batch_noise, check_density, check_sigma, noise_score, split_sample_key
+from mjx_study.reference.system import Rollout, System, gradients_along, roll_out, value_and_gradients
 
 PARAMETRISATIONS: Final = ("controls", "feedback", "start")
 """Possible meanings of theta in a `ReferenceObjective`."""
@@ -21,6 +22,7 @@ PARAMETRISATIONS: Final = ("controls", "feedback", "start")
 Start = tuple[float, ...] | Callable[[Key[Array, ""]], Float[Array, " states"]]
 Theta = Float[Array, "*each params"]
 """One theta, or one per sample."""
+Keys = Key[Array, " samples"]
 
 
 @runtime_checkable
@@ -33,16 +35,47 @@ class Reference(PairedObjective, Protocol):
     def value_and_gradient(
         self, theta: Float[Array, " params"], key: Key[Array, ""]
     ) -> tuple[float, Float[np.ndarray, " params"]]:
-        """Zero-noise cost and its gradient, from the initial state drawn with `key`."""
+        """Zero-noise cost and its gradient, from the initial state drawn with `key` if it is random."""
         ...
 
-    def observe(self, theta: Theta, keys: Key[Array, " samples"]) -> dict[str, np.ndarray]:
+    def observe(self, theta: Theta, keys: Keys) -> dict[str, np.ndarray]:
         """Rollout metrics other than the cost, by name and sample; may be empty."""
         ...
 
 
+class _Evaluations(ABC):
+    """Evaluations of an objective, from those for given initial states and noise."""
+
+    @abstractmethod
+    def _draw(self, keys) -> tuple[Any, np.ndarray]: ...
+    @abstractmethod
+    def _evaluation(self, theta, starts, noise) -> Evaluation: ...
+    @abstractmethod
+    def _steps(self, theta, starts, noise) -> StepEvaluation: ...
+    @abstractmethod
+    def differentiate(self, theta: Theta, keys: Keys) -> Differentiation: ...
+
+    def evaluate(self, theta: Theta, keys: Keys) -> Evaluation:
+        return self._evaluation(theta, *self._draw(keys))
+
+    def evaluate_pair(self, theta: Theta, keys: Keys) -> tuple[Evaluation, Evaluation]:
+        starts, noise = self._draw(keys)
+        return self._evaluation(theta, starts, noise), self._evaluation(theta, starts, -noise)
+
+    def evaluate_steps(self, theta: Theta, keys: Keys) -> StepEvaluation:
+        return self._steps(theta, *self._draw(keys))
+
+    def evaluate_step_pair(self, theta: Theta, keys: Keys) -> tuple[StepEvaluation, StepEvaluation]:
+        starts, noise = self._draw(keys)
+        return self._steps(theta, starts, noise), self._steps(theta, starts, -noise)
+
+    def differentiate_corrected(self, theta: Theta, keys: Keys) -> Differentiation:
+        """`differentiate`: analytic systems, whose springs set in without a jump, and functions have no onset term."""
+        return self.differentiate(theta, keys)
+
+
 @dataclasses.dataclass(frozen=True)
-class ReferenceObjective:
+class ReferenceObjective(_Evaluations):
     """F(theta) = E V_1 of a policy on an analytic system, with noise w of standard deviation sigma.
 
     `parametrises` determines the meaning of theta and where the noise acts:
@@ -72,7 +105,7 @@ class ReferenceObjective:
     metrics: Callable[[Float[np.ndarray, "samples steps states"]], dict[str, np.ndarray]] | None = None
 
     def __post_init__(self) -> None:
-        check_noise(self.sigma)
+        check_sigma(self.sigma)
         check_density(self.noise)
         if self.parametrises not in PARAMETRISATIONS:
             raise ValueError(f"parametrises is {self.parametrises!r}; choose from {', '.join(PARAMETRISATIONS)}")
@@ -85,35 +118,15 @@ class ReferenceObjective:
 
     @property
     def num_params(self) -> int:
-        states, controls = self.system.num_states, self.system.num_controls
-        return {"controls": self.horizon * controls, "feedback": controls * states, "start": states}[self.parametrises]
+        return math.prod(self._shape)
 
-    def evaluate(self, theta: Theta, keys: Key[Array, " samples"]) -> Evaluation:
-        return self._evaluation(theta, *self._draw(keys))
-
-    def evaluate_pair(self, theta: Theta, keys: Key[Array, " samples"]) -> tuple[Evaluation, Evaluation]:
-        starts, noise = self._draw(keys)
-        return self._evaluation(theta, starts, noise), self._evaluation(theta, starts, -noise)
-
-    def evaluate_steps(self, theta: Theta, keys: Key[Array, " samples"]) -> StepEvaluation:
-        return self._steps(theta, *self._draw(keys))[0]
-
-    def evaluate_step_pair(self, theta: Theta, keys: Key[Array, " samples"]) -> tuple[StepEvaluation, StepEvaluation]:
-        starts, noise = self._draw(keys)
-        return self._steps(theta, starts, noise)[0], self._steps(theta, starts, -noise)[0]
-
-    def differentiate(self, theta: Theta, keys: Key[Array, " samples"]) -> Differentiation:
+    def differentiate(self, theta: Theta, keys: Keys) -> Differentiation:
         starts, noise = self._draw(keys)
         value, gradient = self._differentiate(theta, starts, noise)
         return Differentiation(jnp.asarray(value), jnp.asarray(gradient.reshape(len(noise), -1)))
 
-    def differentiate_corrected(self, theta: Theta, keys: Key[Array, " samples"]) -> Differentiation:
-        """`differentiate`: an analytic system has no onset term, since its springs set in without a jump."""
-        return self.differentiate(theta, keys)
-
-    def differentiate_steps(self, theta: Theta, keys: Key[Array, " samples"]) -> StepDifferentiation:
-        starts, noise = self._draw(keys)
-        start, controls, *feedback = self._policy(theta, starts, noise)
+    def differentiate_steps(self, theta: Theta, keys: Keys) -> StepDifferentiation:
+        start, controls, *feedback = self._policy(theta, *self._draw(keys))
         rollout = roll_out(self.system, start, controls, *feedback)
         gradients = gradients_along(self.system, rollout, *feedback)
         over_noise = gradients.start[:, None] if self.parametrises == "start" else gradients.controls
@@ -121,39 +134,36 @@ class ReferenceObjective:
             jnp.asarray(rollout.value), jnp.asarray(over_noise), self._policy_jacobian(rollout.states)
         )
 
-    def linearise(self, theta: Theta, keys: Key[Array, " samples"]) -> Linearisation:
-        steps, rollout, feedback = self._steps(theta, *self._draw(keys))
-        before, samples = rollout.states[:, :-1], len(rollout.value)
+    def linearise(self, theta: Theta, keys: Keys) -> Linearisation:
+        starts, noise = self._draw(keys)
+        start, controls, *feedback = self._policy(theta, starts, noise)
+        rollout = roll_out(self.system, start, controls, *feedback)
+        before, samples, size = rollout.states[:, :-1], len(rollout.value), self.system.num_states
         over_cost = self.system.cost_gradients(before, rollout.controls)
         over_step = self.system.jacobians(before, rollout.controls)
         over_final = self.system.final_gradient(rollout.states[:, -1])
-        shape = (samples, self.horizon, self.system.num_controls, self.system.num_states)
-        over_policy = None if feedback is None else jnp.broadcast_to(feedback[..., None, :, :], shape)
-        size = self.system.num_states
+        shape = (samples, self.horizon, self.system.num_controls, size)
+        over_policy = jnp.broadcast_to(feedback[0][..., None, :, :], shape) if feedback else None
         over_start = jnp.broadcast_to(jnp.eye(size), (samples, size, size)) if self.parametrises == "start" else None
-        return Linearisation(
-            steps=steps,
-            cost_state=jnp.asarray(over_cost[0]),
-            cost_control=jnp.asarray(over_cost[1]),
-            final_state=jnp.asarray(over_final),
-            over_state=jnp.asarray(over_step[0]),
-            over_control=jnp.asarray(over_step[1]),
-            policy_state=over_policy,
-            start_jacobian=over_start,
-        )
+        derivatives = map(jnp.asarray, (*over_cost, over_final, *over_step))
+        return Linearisation(self._steps_along(rollout, theta, starts, noise), *derivatives, over_policy, over_start)
 
-    def observe(self, theta: Theta, keys: Key[Array, " samples"]) -> dict[str, np.ndarray]:
-        if self.metrics is None:
-            return {}
-        return self.metrics(roll_out(self.system, *self._policy(theta, *self._draw(keys))).states)
+    def observe(self, theta: Theta, keys: Keys) -> dict[str, np.ndarray]:
+        return {} if self.metrics is None else self.metrics(self._roll_out(theta, *self._draw(keys)).states)
 
     def value_and_gradient(
         self, theta: Float[Array, " params"], key: Key[Array, ""]
     ) -> tuple[float, Float[np.ndarray, " params"]]:
-        """Zero-noise cost and its gradient, from the initial state drawn with `key` if it is random."""
         start = np.asarray(self.start(split_sample_key(key)[0])) if callable(self.start) else self._fixed_start()
         value, gradient = self._differentiate(theta, start, np.zeros(self._noise_shape))
         return float(value), gradient.reshape(-1)
+
+    @property
+    def _shape(self) -> tuple[int, ...]:
+        """Shape of theta in the policy."""
+        states, controls = self.system.num_states, self.system.num_controls
+        shapes = {"start": (states,), "controls": (self.horizon, controls), "feedback": (controls, states)}
+        return shapes[self.parametrises]
 
     @property
     def _noise_shape(self) -> tuple[int, int]:
@@ -161,24 +171,28 @@ class ReferenceObjective:
             return (1, self.system.num_states)
         return (self.horizon, self.system.num_controls)
 
+    def _roll_out(self, theta, starts, noise) -> Rollout:
+        return roll_out(self.system, *self._policy(theta, starts, noise))
+
+    def _zero_noise(self, theta, starts, noise) -> Rollout:
+        return self._roll_out(theta, starts, np.zeros(noise.shape[1:]))
+
     def _evaluation(self, theta, starts, noise) -> Evaluation:
-        rollout = roll_out(self.system, *self._policy(theta, starts, noise))
-        zero_noise = roll_out(self.system, *self._policy(theta, starts, np.zeros(noise.shape[1:])))
+        rollout, zero_noise = self._roll_out(theta, starts, noise), self._zero_noise(theta, starts, noise)
         score = np.asarray(noise_score(jnp.asarray(noise), self.sigma, self.noise))
         if self.parametrises == "feedback":
             score = np.einsum("shu,shx->sux", score, rollout.states[:, :-1])
         baseline = np.broadcast_to(zero_noise.value, len(noise))
         return Evaluation(jnp.asarray(rollout.value), jnp.asarray(score.reshape(len(noise), -1)), jnp.asarray(baseline))
 
-    def _steps(self, theta, starts, noise):
-        """Step evaluation; rollout; feedback matrix, or None."""
-        rollout = roll_out(self.system, *self._policy(theta, starts, noise))
-        zero_noise = roll_out(self.system, *self._policy(theta, starts, np.zeros(noise.shape[1:])))
-        to_go = (part.value_to_go[..., : noise.shape[1]] for part in (rollout, zero_noise))
+    def _steps(self, theta, starts, noise) -> StepEvaluation:
+        return self._steps_along(self._roll_out(theta, starts, noise), theta, starts, noise)
+
+    def _steps_along(self, rollout: Rollout, theta, starts, noise) -> StepEvaluation:
+        to_go = (part.value_to_go[..., : noise.shape[1]] for part in (rollout, self._zero_noise(theta, starts, noise)))
         value, baseline = (jnp.asarray(np.broadcast_to(part, noise.shape[:2])) for part in to_go)
         score = jnp.asarray(noise_score(jnp.asarray(noise), self.sigma, self.noise))
-        steps = StepEvaluation(value, baseline, score, self._policy_jacobian(rollout.states))
-        return steps, rollout, self._shaped(theta) if self.parametrises == "feedback" else None
+        return StepEvaluation(value, baseline, score, self._policy_jacobian(rollout.states))
 
     def _policy_jacobian(self, states):
         """D_theta (Theta x) of every step; None if the noise is added to theta itself."""
@@ -198,20 +212,14 @@ class ReferenceObjective:
         return start, self.sigma * np.asarray(noise)
 
     def _policy(self, theta, start, noise):
-        """Initial state, open-loop controls and feedback matrix, as arguments for `roll_out`."""
-        shaped = self._shaped(theta)
+        """Initial state, open-loop controls and feedback matrix, if any, as arguments for `roll_out`."""
+        theta = _checked(theta, self.num_params)
+        shaped = theta.reshape(*theta.shape[:-1], *self._shape)  # with a sample axis if there is one theta per sample
         if self.parametrises == "start":
             return shaped + noise[..., 0, :], np.zeros((self.horizon, self.system.num_controls))
         if self.parametrises == "controls":
             return start, shaped + noise
         return start, noise, shaped
-
-    def _shaped(self, theta) -> np.ndarray:
-        """Theta in the policy's shape, with a leading sample axis if there is one theta per sample."""
-        states, controls = self.system.num_states, self.system.num_controls
-        shapes = {"start": (states,), "controls": (self.horizon, controls), "feedback": (controls, states)}
-        theta = _checked(theta, self.num_params)
-        return theta.reshape(*theta.shape[:-1], *shapes[self.parametrises])
 
     def _differentiate(self, theta, start, noise):
         value, gradients = value_and_gradients(self.system, *self._policy(theta, start, noise))
@@ -219,8 +227,11 @@ class ReferenceObjective:
 
 
 @dataclasses.dataclass(frozen=True)
-class FunctionObjective:
+class FunctionObjective(_Evaluations):
     """F(theta) = E f(theta + w) for a function of the parameters alone, with noise w of standard deviation sigma.
+
+    Its samples are also rollouts: of a single step, or, in `linearise`, without steps and from theta + w, with f as the
+    final cost. There is no initial state to draw, and there are no metrics.
 
     Attributes:
         function: f.
@@ -233,53 +244,30 @@ class FunctionObjective:
     noise: str = "gaussian"
 
     def __post_init__(self) -> None:
-        check_noise(self.sigma)
+        check_sigma(self.sigma)
         check_density(self.noise)
 
     @property
     def num_params(self) -> int:
         return self.function.num_params
 
-    def evaluate(self, theta: Theta, keys: Key[Array, " samples"]) -> Evaluation:
-        return self._evaluation(theta, self._noise(keys))
-
-    def evaluate_pair(self, theta: Theta, keys: Key[Array, " samples"]) -> tuple[Evaluation, Evaluation]:
-        noise = self._noise(keys)
-        return self._evaluation(theta, noise), self._evaluation(theta, -noise)
-
-    def evaluate_steps(self, theta: Theta, keys: Key[Array, " samples"]) -> StepEvaluation:
-        """The samples of `evaluate` as single steps."""
-        return _one_step(self.evaluate(theta, keys))
-
-    def evaluate_step_pair(self, theta: Theta, keys: Key[Array, " samples"]) -> tuple[StepEvaluation, StepEvaluation]:
-        """The samples of `evaluate_pair` as single steps."""
-        plus, minus = self.evaluate_pair(theta, keys)
-        return _one_step(plus), _one_step(minus)
-
-    def differentiate(self, theta: Theta, keys: Key[Array, " samples"]) -> Differentiation:
-        points = self._point(theta) + self._noise(keys)
+    def differentiate(self, theta: Theta, keys: Keys) -> Differentiation:
+        points = self._point(theta) + self._draw(keys)[1]
         return Differentiation(jnp.asarray(self.function.value(points)), jnp.asarray(self.function.gradient(points)))
 
-    def differentiate_corrected(self, theta: Theta, keys: Key[Array, " samples"]) -> Differentiation:
-        """`differentiate`: a function has no onset term."""
-        return self.differentiate(theta, keys)
-
-    def differentiate_steps(self, theta: Theta, keys: Key[Array, " samples"]) -> StepDifferentiation:
-        """The samples of `differentiate` as single steps."""
+    def differentiate_steps(self, theta: Theta, keys: Keys) -> StepDifferentiation:
         batch = self.differentiate(theta, keys)
         return StepDifferentiation(batch.value, batch.gradient[:, None], None)
 
-    def linearise(self, theta: Theta, keys: Key[Array, " samples"]) -> Linearisation:
-        """f as the final cost of a rollout without steps, whose initial state is theta + w."""
-        noise = self._noise(keys)
+    def linearise(self, theta: Theta, keys: Keys) -> Linearisation:
+        _, noise = self._draw(keys)
         samples, size = noise.shape
         none = jnp.zeros((samples, 0, size))
-        final = jnp.asarray(self.function.gradient(self._point(theta) + noise))
         return Linearisation(
-            steps=_one_step(self._evaluation(theta, noise)),
+            steps=self._steps(theta, None, noise),
             cost_state=none,
             cost_control=none[:, :, :0],
-            final_state=final,
+            final_state=jnp.asarray(self.function.gradient(self._point(theta) + noise)),
             over_state=jnp.zeros((samples, 0, size, size)),
             over_control=jnp.zeros((samples, 0, size, 0)),
             policy_state=None,
@@ -289,22 +277,24 @@ class FunctionObjective:
     def value_and_gradient(
         self, theta: Float[Array, " params"], key: Key[Array, ""]
     ) -> tuple[float, Float[np.ndarray, " params"]]:
-        """f(theta) and its gradient; the key is unused, since there is no initial state to draw."""
         point = self._point(theta)
         return float(self.function.value(point)), self.function.gradient(point)
 
-    def observe(self, theta: Theta, keys: Key[Array, " samples"]) -> dict[str, np.ndarray]:
-        """Empty: a function has no metrics other than its value."""
+    def observe(self, theta: Theta, keys: Keys) -> dict[str, np.ndarray]:
         return {}
 
-    def _evaluation(self, theta, noise) -> Evaluation:
+    def _evaluation(self, theta, starts, noise) -> Evaluation:
         point = self._point(theta)
         baseline = np.broadcast_to(self.function.value(point), len(noise))
         score = noise_score(jnp.asarray(noise), self.sigma, self.noise)
         return Evaluation(*map(jnp.asarray, (self.function.value(point + noise), score, baseline)))
 
-    def _noise(self, keys) -> np.ndarray:
-        return self.sigma * np.asarray(batch_noise(keys, (1, self.num_params), self.noise)[1])[:, 0]
+    def _steps(self, theta, starts, noise) -> StepEvaluation:
+        batch = self._evaluation(theta, starts, noise)
+        return StepEvaluation(batch.value[:, None], batch.baseline[:, None], batch.score[:, None], None)
+
+    def _draw(self, keys) -> tuple[None, np.ndarray]:
+        return None, self.sigma * np.asarray(batch_noise(keys, (1, self.num_params), self.noise)[1])[:, 0]
 
     def _point(self, theta) -> np.ndarray:
         return _checked(theta, self.num_params)
@@ -315,7 +305,3 @@ def _checked(theta, size: int) -> np.ndarray:
     if theta.ndim > 2 or theta.shape[-1:] != (size,):
         raise ValueError(f"theta must have shape ({size},), got {theta.shape}")
     return theta
-
-
-def _one_step(batch: Evaluation) -> StepEvaluation:
-    return StepEvaluation(batch.value[:, None], batch.baseline[:, None], batch.score[:, None], None)

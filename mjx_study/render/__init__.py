@@ -5,12 +5,9 @@ instead, in a separate process.
 """
 
 import mjx_study._matplotlib  # noqa: F401
-from mjx_study.render.animation import animate, check_format
-from mjx_study.render.figures import strip, stroboscope
-from mjx_study.render.framing import choose_view, resolve_view
-from mjx_study.render.motion import Motion
+from mjx_study.render.figures import animate, check_format, strip, stroboscope
+from mjx_study.render.motion import VIEWS, Motion, choose_view, resolve_view
 from mjx_study.render.opengl import RenderError, resolve_renderer
-from mjx_study.render.outline import VIEWS
 
 __all__ = [
     "VIEWS",

@@ -29,6 +29,7 @@ def main(folder: Path) -> None:
     camera.distance, camera.azimuth, camera.elevation = (
         float(request[name]) for name in ("distance", "azimuth", "elevation")
     )
+    has_sky = np.any(model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX)  # without one the background is black
     images = np.empty((len(request["qpos"]), height, width, 3), np.uint8)
     renderer = mujoco.Renderer(model, *fine)
     for image, qpos in zip(images, request["qpos"], strict=True):
@@ -36,7 +37,7 @@ def main(folder: Path) -> None:
         mujoco.mj_forward(model, data)
         renderer.update_scene(data, camera)
         rendered = renderer.render()
-        if not _has_sky(model):
+        if not has_sky:
             renderer.enable_segmentation_rendering()
             nothing = renderer.render()[:, :, 0] < 0
             renderer.disable_segmentation_rendering()
@@ -45,11 +46,6 @@ def main(folder: Path) -> None:
     renderer.close()
     with (folder / "images.npy").open("wb") as file:
         np.save(file, images)
-
-
-def _has_sky(model: mujoco.MjModel) -> bool:
-    """Whether a model has a skybox; without one the background would be black."""
-    return bool(np.any(model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX))
 
 
 if __name__ == "__main__":

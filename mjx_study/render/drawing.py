@@ -10,41 +10,131 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.colors import to_rgb
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
+from scipy.spatial import ConvexHull, QhullError
 
-from mjx_study.render.framing import Bounds, bounds, edges
-from mjx_study.render.motion import DEFAULT_RGBA, Motion
-from mjx_study.render.outline import Shape, View, shape_of
+from mjx_study.render.motion import CORNERS, DEFAULT_RGBA, Bounds, Motion, View, bounds, edges
 
 # Okabe-Ito colours, ordered to keep neighbours distinct.
 PALETTE: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
 FIXED: Final = "#B4B4B4"
-_WHITE: Final = np.ones(3)
+_ANGLE: Final = np.linspace(0, 2 * np.pi, 97)[:-1]
+CIRCLE: Final = np.stack([np.cos(_ANGLE), np.sin(_ANGLE)], axis=1)
+"""Points of a unit circle; circles are drawn as this polygon."""
+_MESH_POINTS: Final = 400
 _MOST_TRACES: Final = 6
 _FIXED_LAYER, _TRACE_LAYER, _MOVING_LAYER = 1, 2, 3
+Geom = mujoco.mjtGeom
 
 
-def geom_colours(motion: Motion) -> Float[np.ndarray, "ngeom 4"]:
-    """Colours as in MuJoCo, except that geoms in its default grey are coloured by the body or mechanism they move with.
+@dataclasses.dataclass(frozen=True)
+class Shape:
+    """A geom in its own frame: the convex hull of equal balls around points [m].
 
-    Textures are replaced by their mean colours.
+    Attributes:
+        points: corners, ends of an axis, or vertices.
+        radius: radius of the balls; 0 for a polyhedron.
+        semi_axes: semi-axes of an ellipsoid, which is not such a hull; None for other geoms.
+        cell: largest distance between adjacent points of a height field [m], which is drawn as a profile rather than
+            its hull; None for other geoms.
     """
-    model = motion.model
-    colours = np.array(model.geom_rgba, float)
-    bodies = np.flatnonzero(motion.moving)
-    by_tree = len(bodies) > len(PALETTE)
-    order = {int(body): int(model.body_treeid[body]) if by_tree else rank for rank, body in enumerate(bodies)}
-    for geom in range(model.ngeom):
-        if np.any(model.geom_rgba[geom] != DEFAULT_RGBA):
-            continue
-        if model.geom_matid[geom] >= 0:
-            colours[geom] = _material_colour(model, int(model.geom_matid[geom]))
-        elif (body := int(model.geom_bodyid[geom])) in order:
-            colours[geom, :3] = _faded(_rgb(PALETTE[order[body] % len(PALETTE)]), 0.85)
-        else:
-            colours[geom, :3] = _rgb(FIXED)
-    return np.clip(colours, 0, 1)
+
+    points: Float[np.ndarray, "points 3"]
+    radius: float = 0.0
+    semi_axes: Float[np.ndarray, " 3"] | None = None
+    cell: float | None = None
+
+    def outline(
+        self, position: Float[np.ndarray, " 3"], rotation: Float[np.ndarray, "3 3"], view: View
+    ) -> Float[np.ndarray, "corners 2"]:
+        """Corners of the projection [m], counter-clockwise; curves become inscribed polygons."""
+        centre, projection = position[view.plane], rotation[view.plane]
+        if self.semi_axes is not None:
+            # The point of an ellipsoid A S^2 that is farthest along u is A A^T u / |A^T u|.
+            pulled = CIRCLE @ (projection * self.semi_axes)
+            return centre + pulled @ (projection * self.semi_axes).T / np.linalg.norm(pulled, axis=1, keepdims=True)
+        flat = centre + self.points @ projection.T
+        if self.cell is not None and projection[1, 2] > 0.9:
+            return _profile(flat)
+        if self.radius:
+            flat = (flat[:, None] + self.radius * CIRCLE).reshape(-1, 2)
+        return convex_hull(flat)
+
+    def slice(
+        self, position: Float[np.ndarray, " 3"], rotation: Float[np.ndarray, "3 3"], view: View, depth: float
+    ) -> "Shape":
+        """Cut a height field at the motion's depth towards the viewer [m], keeping only points near it."""
+        if self.cell is None:
+            return self
+        distance = np.abs((position + self.points @ rotation.T) @ view.towards - depth)
+        return dataclasses.replace(self, points=self.points[distance <= distance.min() + 0.5 * self.cell])
+
+
+def shape_of(model: mujoco.MjModel, geom: int) -> Shape | None:
+    """Return the shape of a geom; None for a plane, which has no outline."""
+    kind, size, mesh = Geom(model.geom_type[geom]), model.geom_size[geom], int(model.geom_dataid[geom])
+    ends = np.array([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]])
+    if kind == Geom.mjGEOM_SPHERE:
+        return Shape(np.zeros((1, 3)), radius=float(size[0]))
+    if kind == Geom.mjGEOM_CAPSULE:
+        return Shape(ends * size[1], radius=float(size[0]))
+    if kind == Geom.mjGEOM_ELLIPSOID:
+        return Shape(np.zeros((1, 3)), semi_axes=np.array(size))
+    if kind == Geom.mjGEOM_CYLINDER:
+        ring = np.pad(size[0] * CIRCLE, ((0, 0), (0, 1)))
+        return Shape(np.concatenate([ring + end * size[1] for end in ends]))
+    if kind == Geom.mjGEOM_BOX:
+        return Shape(CORNERS * size)
+    if kind in (Geom.mjGEOM_MESH, Geom.mjGEOM_SDF) and mesh >= 0:
+        start = int(model.mesh_vertadr[mesh])
+        return Shape(_extreme(model.mesh_vert[start : start + int(model.mesh_vertnum[mesh])].astype(float)))
+    if kind == Geom.mjGEOM_HFIELD:
+        spacing = 2 * model.hfield_size[mesh, :2] / (model.hfield_ncol[mesh] - 1, model.hfield_nrow[mesh] - 1)
+        return Shape(_terrain(model, mesh), cell=float(spacing.max()))
+    return None
+
+
+def convex_hull(points: Float[np.ndarray, "points 2"]) -> Float[np.ndarray, "corners 2"]:
+    """Corners of the planar convex hull, counter-clockwise; the end points if all points are on a line."""
+    try:
+        return points[ConvexHull(points).vertices]
+    except QhullError:
+        ordered = points[np.lexsort((points[:, 1], points[:, 0]))]
+        return np.unique(ordered[[0, -1]], axis=0)
+
+
+def _extreme(points: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, "kept 3"]:
+    """Points farthest in some direction; for many points, only a sample of directions is searched."""
+    if len(points) <= _MESH_POINTS:
+        return points
+    height = np.linspace(-1, 1, _MESH_POINTS)
+    turn = np.pi * (1 + 5**0.5) * np.arange(_MESH_POINTS)
+    across = np.sqrt(1 - height**2)
+    directions = np.stack([across * np.cos(turn), across * np.sin(turn), height], axis=1)
+    return points[np.unique(np.argmax(points @ directions.T, axis=0))]
+
+
+def _terrain(model: mujoco.MjModel, field: int) -> Float[np.ndarray, "points 3"]:
+    """Vertices of a height field, each with its base point."""
+    rows, columns, start = (int(part[field]) for part in (model.hfield_nrow, model.hfield_ncol, model.hfield_adr))
+    x, y, height, base = model.hfield_size[field]
+    data = model.hfield_data[start : start + rows * columns]
+    ys, xs = np.meshgrid(np.linspace(-y, y, rows), np.linspace(-x, x, columns), indexing="ij")
+    top = np.stack([xs.ravel(), ys.ravel(), height * data], axis=1)
+    return np.concatenate([top, top * (1, 1, 0) - (0, 0, base)])
+
+
+def _profile(points: Float[np.ndarray, "points 2"]) -> Float[np.ndarray, "corners 2"]:
+    """Highest point at each position along the horizontal, closed below."""
+    places = np.unique(np.round(points[:, 0], 6))
+    places = places[:: max(1, len(places) // 400)]
+    index = np.argmin(np.abs(points[:, :1] - places), axis=1)
+    highest = np.full(len(places), -np.inf)
+    np.maximum.at(highest, index, points[:, 1])
+    bottom = points[:, 1].min()
+    return np.array([[places[0], bottom], [places[-1], bottom], *np.stack([places, highest], axis=1)[::-1]])
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -64,12 +154,11 @@ class Drawing:
         motion, poses = self.motion, self.motion.poses
         depths = poses.centre[:, motion.moving] @ self.view.towards
         depth = float(depths.mean()) if depths.size else 0.0
-        shapes = {}
-        for geom in np.flatnonzero(motion.visible).tolist():
-            shape = shape_of(motion.model, geom)
-            if shape is not None:
-                shapes[geom] = shape.slice(poses.position[0, geom], poses.rotation[0, geom], self.view, depth)
-        return shapes
+        return {
+            geom: shape.slice(poses.position[0, geom], poses.rotation[0, geom], self.view, depth)
+            for geom in np.flatnonzero(motion.visible).tolist()
+            if (shape := shape_of(motion.model, geom)) is not None
+        }
 
     @cached_property
     def _colours(self) -> np.ndarray:
@@ -78,36 +167,35 @@ class Drawing:
     @cached_property
     def _split(self) -> tuple[list[int], list[int]]:
         """Fixed and moving geoms with an outline."""
-        moves = self.motion.moving[self.motion.model.geom_bodyid]
+        moves = self.motion.moving_geoms
         return [geom for geom in self._shapes if not moves[geom]], [geom for geom in self._shapes if moves[geom]]
 
     @cached_property
     def _spokes(self) -> dict[int, np.ndarray]:
         """A radius of every rotating sphere, in its own frame, that makes the rotation visible."""
         model, rotation = self.motion.model, self.motion.poses.rotation
-        spheres = [geom for geom in self._split[1] if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_SPHERE]
-        found = {}
-        for geom in spheres:
-            if np.abs(rotation[:, geom] - rotation[0, geom]).max() > 0.02:
-                up = np.eye(3)[self.view.up]
-                found[geom] = model.geom_size[geom, 0] * (rotation[0, geom].T @ up)
-        return found
+        up = np.eye(3)[self.view.up]
+        return {
+            geom: model.geom_size[geom, 0] * (rotation[0, geom].T @ up)
+            for geom in self._split[1]
+            if model.geom_type[geom] == Geom.mjGEOM_SPHERE
+            and np.abs(rotation[:, geom] - rotation[0, geom]).max() > 0.02
+        }
 
     @cached_property
     def _paths(self) -> list[tuple[np.ndarray, np.ndarray]]:
         """Path (times, 2) and colour of each moving body, or of each mechanism if there are many bodies."""
-        model, poses = self.motion.model, self.motion.poses
-        bodies = np.flatnonzero(self.motion.moving)
-        centres = poses.centre
+        model, moving = self.motion.model, self.motion.moving
+        bodies, centres = np.flatnonzero(moving), self.motion.poses.centre
         if len(bodies) > _MOST_TRACES:
-            bodies = np.array([body for body in bodies if not self.motion.moving[model.body_parentid[body]]], int)
-            centres = poses.subtree
+            bodies, centres = np.flatnonzero(moving & ~moving[model.body_parentid]), self.motion.poses.subtree
         paths = []
         for body in bodies:
             tree = int(model.body_treeid[body])
-            mine = [geom for geom in self._split[1] if model.geom_bodyid[geom] == body]
-            mine = mine or [geom for geom in self._split[1] if model.body_treeid[model.geom_bodyid[geom]] == tree]
-            colour = self._colours[mine[0], :3] if mine else _rgb(PALETTE[0])
+            geoms = [(geom, model.geom_bodyid[geom]) for geom in self._split[1]]
+            mine = [geom for geom, its in geoms if its == body]
+            mine = mine or [geom for geom, its in geoms if model.body_treeid[its] == tree]
+            colour = self._colours[mine[0], :3] if mine else np.array(to_rgb(PALETTE[0]))
             paths.append((centres[:, body][:, self.view.plane], _rim(colour)))
         return paths
 
@@ -134,19 +222,11 @@ class Drawing:
         self._draw(axes, self._split[0], index, 1.0, _FIXED_LAYER)
 
     def pose(self, axes: Axes, index: int, strength: float = 1.0) -> list[PolyCollection | LineCollection]:
-        """Draw the moving geoms at one time; `strength` from 0 to 1 fades them from white.
-
-        Returns:
-            The artists added to the axes.
-        """
+        """Draw the moving geoms at one time, faded from white by `strength` in (0, 1]; return the added artists."""
         return self._draw(axes, self._split[1], index, strength, _MOVING_LAYER)
 
     def trace(self, axes: Axes, indices: Sequence[int] | slice = slice(None), strength: float = 1.0) -> list[Line2D]:
-        """Draw paths of the centres of mass over some of the times.
-
-        Returns:
-            The artists added to the axes.
-        """
+        """Draw paths of the centres of mass over some of the times; return the added artists."""
         lines = []
         for path, colour in self._paths:
             shown = path[indices]
@@ -169,12 +249,12 @@ class Drawing:
         added: list[PolyCollection | LineCollection] = [
             PolyCollection(outlines, facecolors=faces, edgecolors=rims, linewidths=0.8, zorder=layer)
         ]
-        spokes = [(geom, self._spokes[geom]) for geom in ordered if geom in self._spokes]
-        if spokes:
-            centres = [poses.position[index, geom] for geom, _ in spokes]
-            ends = [poses.position[index, geom] + poses.rotation[index, geom] @ radius for geom, radius in spokes]
+        turning = [geom for geom in ordered if geom in self._spokes]
+        if turning:
+            centres = poses.position[index, turning]
+            ends = [poses.position[index, geom] + poses.rotation[index, geom] @ self._spokes[geom] for geom in turning]
             lines = np.stack([centres, ends], axis=1)[:, :, self.view.plane]
-            colours = [_faded(_rim(self._colours[geom, :3]), strength) for geom, _ in spokes]
+            colours = [_faded(_rim(self._colours[geom, :3]), strength) for geom in turning]
             added.append(LineCollection(list(lines), colors=colours, linewidths=0.8, zorder=layer))
         for collection in added:
             axes.add_collection(collection, autolim=False)
@@ -188,12 +268,29 @@ def _ticks(axes: Axes, part: int) -> int:
     return int(np.clip(inches / 0.42, 2, 8))
 
 
-def _rgb(text: str) -> np.ndarray:
-    return np.array([int(text[start : start + 2], 16) for start in (1, 3, 5)]) / 255
+def geom_colours(motion: Motion) -> Float[np.ndarray, "ngeom 4"]:
+    """Colours as in MuJoCo, except that geoms in its default grey are coloured by the body or mechanism they move with.
+
+    Textures are replaced by their mean colours.
+    """
+    model = motion.model
+    colours = np.array(model.geom_rgba, float)
+    bodies = np.flatnonzero(motion.moving)
+    by_tree = len(bodies) > len(PALETTE)
+    order = {int(body): int(model.body_treeid[body]) if by_tree else rank for rank, body in enumerate(bodies)}
+    for geom in np.flatnonzero(np.all(model.geom_rgba == DEFAULT_RGBA, axis=1)):
+        if model.geom_matid[geom] >= 0:
+            colours[geom] = _material_colour(model, int(model.geom_matid[geom]))
+        elif (body := int(model.geom_bodyid[geom])) in order:
+            colours[geom, :3] = _faded(np.array(to_rgb(PALETTE[order[body] % len(PALETTE)])), 0.85)
+        else:
+            colours[geom, :3] = to_rgb(FIXED)
+    return np.clip(colours, 0, 1)
 
 
 def _faded(colour: np.ndarray, strength: float) -> np.ndarray:
-    return strength * colour + (1 - strength) * _WHITE
+    """A mixture with white."""
+    return strength * colour + (1 - strength)
 
 
 def _rim(colour: np.ndarray) -> np.ndarray:
@@ -209,5 +306,5 @@ def _material_colour(model: mujoco.MjModel, material: int) -> np.ndarray:
         channels, start = int(model.tex_nchannel[texture]), int(model.tex_adr[texture])
         count = int(model.tex_width[texture]) * int(model.tex_height[texture]) * channels
         pixels = model.tex_data[start : start + count].reshape(-1, channels)
-        rgba[:3] *= np.resize(pixels.mean(axis=0) / 255, 3) if channels < 3 else pixels[:, :3].mean(axis=0) / 255
+        rgba[:3] *= np.resize(pixels[:, :3].mean(axis=0) / 255, 3)
     return rgba

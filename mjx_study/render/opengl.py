@@ -10,7 +10,7 @@ import sys
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import mujoco
 import numpy as np
@@ -18,7 +18,7 @@ from jaxtyping import Int, UInt8
 
 from mjx_study.choices import RENDERERS, unknown
 from mjx_study.render.drawing import Drawing, geom_colours
-from mjx_study.render.framing import depths
+from mjx_study.render.motion import depths
 
 _WORKER: Final = Path(__file__).with_name("_opengl_worker.py")
 _PIXELS: Final = 640  # length of the larger side
@@ -101,16 +101,9 @@ def _render(drawing: Drawing, indices: np.ndarray) -> np.ndarray:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         mujoco.mj_saveModel(model, str(folder / "model.mjb"), None)
-        np.savez(
-            folder / "request.npz",
-            qpos=motion.qpos[indices],
-            lookat=lookat,
-            distance=distance,
-            azimuth=_AZIMUTH[view.name],
-            elevation=_ELEVATION[view.name],
-            width=width,
-            height=height,
-        )
+        request: dict[str, Any] = {"qpos": motion.qpos[indices], "width": width, "height": height, "lookat": lookat}
+        request |= {"distance": distance, "azimuth": _AZIMUTH[view.name], "elevation": _ELEVATION[view.name]}
+        np.savez(folder / "request.npz", **request)
         failure = _run([str(_WORKER), name], backend, timeout=None)
         if failure is not None:
             raise RenderError(f"MuJoCo's renderer failed ({failure}); use the renderer drawing")

@@ -24,27 +24,26 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mjx_study.simulation import constraint
 from mjx_study.simulation._mjx import mjx
-from mjx_study.simulation.dynamics import ControlLaw, State, force_stage, solved_step, step
+from mjx_study.simulation.constraint import Scalar
+from mjx_study.simulation.dynamics import Control, ControlLaw, Controls, State, force_stage, solved_step, step
 from mjx_study.simulation.integration import difference_position, integrate_position
 from mjx_study.simulation.onset import SLOTS, least_travel, on_and_off
 from mjx_study.simulation.scene import Scene
 from mjx_study.simulation.touch import Events, OnsetCounts, at_touch, find_events
 
-CostToGo = Callable[[Int[Array, ""], State], Float[Array, ""]]
-RunningCost = Callable[[State, Float[Array, " nu"]], Float[Array, ""]]
-FinalCost = Callable[[State], Float[Array, ""]]
+CostToGo = Callable[[Int[Array, ""], State], Scalar]
 
 
 def jump_term(
     scene: Scene,
     model: mjx.Model,
     states: State,
-    controls: Float[Array, "horizon nu"],
+    controls: Controls,
     control_law: ControlLaw,
-    running_cost: RunningCost,
-    final_cost: FinalCost,
+    running_cost: Callable[[State, Control], Scalar],
+    final_cost: Callable[[State], Scalar],
     slots: int = SLOTS,
-) -> tuple[Float[Array, ""], OnsetCounts]:
+) -> tuple[Scalar, OnsetCounts]:
     """Return zero, with the onset term as its derivative with respect to whatever the states depend on.
 
     Args:
@@ -52,9 +51,6 @@ def jump_term(
         control_law: control law of the rollout, independent of the differentiated inputs.
         running_cost, final_cost: as in `tasks.Task`.
         slots: maximum number of onsets to correct, earliest first.
-
-    Returns:
-        The term, to be added to the cost, and the onset counts.
     """
     before, controls = jax.lax.stop_gradient((jax.tree.map(lambda leaf: leaf[:-1], states), controls))
     if not scene.has_constraints:
@@ -95,12 +91,7 @@ def jump_term(
 
 
 def _weights(
-    scene: Scene,
-    model: mjx.Model,
-    before: State,
-    controls: Float[Array, "horizon nu"],
-    cost_to_go: CostToGo,
-    event: Events,
+    scene: Scene, model: mjx.Model, before: State, controls: Controls, cost_to_go: CostToGo, event: Events
 ) -> tuple[Float[Array, "2 nv"], Bool[Array, " 2"]]:
     """(1 - s) J_k n / D and s J_{k-1} n / D of one event; whether its cell is too narrow, and whether it is valid."""
     host, timestep = scene.host, scene.timestep

@@ -29,6 +29,10 @@ from mjx_study.simulation.linear_algebra import SMALL, product, solve_positive_d
 from mjx_study.simulation.patches import AT_FIRST_TOUCH, RELAXING, patched
 from mjx_study.simulation.scene import num_constraint_rows
 
+Scalar = Float[Array, ""]
+Qvel = Float[Array, " nv"]
+Rows = Float[Array, " rows"]
+Solver = Callable[[mjx.Model, mjx.Data], Qvel]
 _ELLIPTIC = mujoco.mjtCone.mjCONE_ELLIPTIC
 
 OWN_SOLVER: Final = True
@@ -44,19 +48,12 @@ EPSILON: Final = 1e-14
 """Relative rounding error of a force in the solver's equation."""
 
 
-def row_force(model: mjx.Model, data: mjx.Data, slack: Float[Array, " rows"]) -> Float[Array, " rows"]:
-    """Return the force of each constraint row at the slack `J a - aref`: MuJoCo's force law f.
+def row_force(model: mjx.Model, data: mjx.Data, slack: Rows) -> Rows:
+    """Force of each constraint row [N or N m] at the slack J a - aref [m/s^2 or rad/s^2]: MuJoCo's force law f.
 
     With D the inverse regularisation of a row and x its slack, the force is -D x for an equality; -D x clipped to
     +- frictionloss for friction loss; -D x where x < 0, else 0, for limits and for frictionless and pyramidal contacts;
     elliptic contacts depend on the zone of the cone (`_elliptic_force`).
-
-    Args:
-        data: state with its constraint rows, after `mjx.make_constraint`.
-        slack: J a - aref [m/s^2 or rad/s^2].
-
-    Returns:
-        Force of each row [N or N m].
 
     Reference: MuJoCo documentation, Computation, "Constraint model".
     """
@@ -71,18 +68,10 @@ def row_force(model: mjx.Model, data: mjx.Data, slack: Float[Array, " rows"]) ->
     kind[: rows.ne] = 2
     kind[rows.ne : rows.ne + rows.nf] = 1
     force = jnp.where(kind == 2, linear, jnp.where(kind == 1, friction, unilateral))
-    if model.opt.cone == _ELLIPTIC:
-        force = _elliptic_force(model, rows, slack, linear, force)
-    return force
+    return _elliptic_force(model, rows, slack, linear, force) if model.opt.cone == _ELLIPTIC else force
 
 
-def _elliptic_force(
-    model: mjx.Model,
-    rows: Any,
-    slack: Float[Array, " rows"],
-    linear: Float[Array, " rows"],
-    force: Float[Array, " rows"],
-) -> Float[Array, " rows"]:
+def _elliptic_force(model: mjx.Model, rows: Any, slack: Rows, linear: Rows, force: Rows) -> Rows:
     """Replace the rows of elliptic contacts in `force`.
 
     With the scaled slack u = (mu x_n, friction * x_t), N = u_n, T = |u_t|: if separated (N >= mu T), no force; if
@@ -113,21 +102,18 @@ def _elliptic_force(
     return force
 
 
-def constraint_force(model: mjx.Model, data: mjx.Data, qacc: Float[Array, " nv"]) -> Float[Array, " nv"]:
+def constraint_force(model: mjx.Model, data: mjx.Data, qacc: Qvel) -> Qvel:
     """Joint-space constraint force J^T f(J a - aref) [N or N m] at the acceleration `qacc`."""
     rows: Any = data._impl
     return rows.efc_J.T @ row_force(model, data, rows.efc_J @ qacc - rows.efc_aref)
 
 
-def imbalance(model: mjx.Model, data: mjx.Data, qacc: Float[Array, " nv"]) -> Float[Array, " nv"]:
-    """Left side of the solver's equation, G(a) = M a - qfrc_smooth - J^T f(J a - aref) [N or N m].
-
-    `data` needs its position, velocity and smooth-force stages and its constraint rows.
-    """
+def imbalance(model: mjx.Model, data: mjx.Data, qacc: Qvel) -> Qvel:
+    """Left side of the solver's equation, G(a) = M a - qfrc_smooth - J^T f(J a - aref) [N or N m]."""
     return mjx.mul_m(model, data, qacc) - data.qfrc_smooth - constraint_force(model, data, qacc)
 
 
-def residual(model: mjx.Model, data: mjx.Data, qacc: Float[Array, " nv"]) -> Float[Array, ""]:
+def residual(model: mjx.Model, data: mjx.Data, qacc: Qvel) -> Scalar:
     """Relative imbalance |G(a)| / (|M a| + |qfrc_smooth| + |J^T f|), 0 where all are 0; dimensionless."""
     inertial = mjx.mul_m(model, data, qacc)
     constraint = constraint_force(model, data, qacc)
@@ -136,7 +122,7 @@ def residual(model: mjx.Model, data: mjx.Data, qacc: Float[Array, " nv"]) -> Flo
     return jnp.where(scale > 0, gap / jnp.where(scale > 0, scale, 1.0), 0.0)
 
 
-def run_solver(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]:
+def run_solver(model: mjx.Model, data: mjx.Data) -> Qvel:
     """Compute the constrained acceleration [m/s^2 or rad/s^2] from the warm start; no reverse mode.
 
     Small systems use Newton's method, to rounding; larger ones use MJX's solver within the model's budget.
@@ -148,7 +134,7 @@ def run_solver(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]:
     return mjx.solve(model, data).qacc
 
 
-def _newton(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]:
+def _newton(model: mjx.Model, data: mjx.Data) -> Qvel:
     """Solve the solver's equation to rounding by Newton's method with a line search.
 
     If no row exerts a force, the result is the unconstrained acceleration. The loop over a batch ends with its slowest
@@ -175,7 +161,7 @@ def _newton(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]:
 
     def advance(qacc):
         left, slope = jax.linearize(gap, qacc)
-        step = -solve_positive_definite(jax.vmap(slope)(jnp.eye(model.nv, dtype=qacc.dtype)), left)
+        step = -_solve_linear(slope, left)
         start, along = slack_at(qacc), product(jacobian, step)
         constant = jnp.vdot(step, product(inertia, qacc) - data.qfrc_smooth)
         linear = jnp.vdot(step, product(inertia, step))
@@ -191,7 +177,11 @@ def _newton(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]:
     return jax.lax.while_loop(lambda carry: carry[2] & (carry[1] < NEWTON_STEPS), again, (start, 0, acting))[0]
 
 
-def _line_search(derivative: Callable[[Array], Array], dtype: Any) -> Float[Array, ""]:
+def _solve_linear(linear_map: Callable[[Array], Array], right_side: Array) -> Array:
+    return solve_positive_definite(jax.vmap(linear_map)(jnp.eye(len(right_side), dtype=right_side.dtype)), right_side)
+
+
+def _line_search(derivative: Callable[[Array], Array], dtype: Any) -> Scalar:
     """Return a multiple of the Newton step that lowers the cost, whose increasing `derivative` is negative at 0.
 
     It is the full step unless the derivative's magnitude at its end exceeds half of that at the start, because contacts
@@ -218,18 +208,13 @@ def _line_search(derivative: Callable[[Array], Array], dtype: Any) -> Float[Arra
     return jnp.where(whole, 1.0, best)
 
 
-def _newton_step(model: mjx.Model, data: mjx.Data, qacc: Float[Array, " nv"]) -> Float[Array, " nv"]:
-    gap, linear_map = jax.linearize(lambda x: imbalance(model, data, x), qacc)
-    return qacc - solve_positive_definite(jax.vmap(linear_map)(jnp.eye(model.nv, dtype=qacc.dtype)), gap)
-
-
 def with_generous_budget(model: mjx.Model) -> mjx.Model:
     """Return the model with a budget large enough for MJX's solver to run until its cost stops decreasing."""
     tolerance = jnp.full_like(model.opt.tolerance, 1e-15)
     return model.replace(opt=model.opt.replace(iterations=GENEROUS[0], ls_iterations=GENEROUS[1], tolerance=tolerance))
 
 
-def solve_to_rounding(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]:
+def solve_to_rounding(model: mjx.Model, data: mjx.Data) -> Qvel:
     """Compute the constrained acceleration to rounding, ignoring the model's budgets; values only.
 
     MJX stops when its cost stops decreasing, within the square root of rounding of the solution, which is visible in
@@ -241,7 +226,8 @@ def solve_to_rounding(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]:
 
     def newton(x):
         """Newton step from x, and the distance of x from the solution in the dimensionless stiffness norm."""
-        step = _newton_step(model, data, x) - x
+        gap, linear_map = jax.linearize(lambda qacc: imbalance(model, data, qacc), x)
+        step = x - _solve_linear(linear_map, gap) - x
         return step, jnp.abs(jnp.vdot(imbalance(model, data, x), step))
 
     terms = (mjx.mul_m(model, data, qacc), data.qfrc_smooth, constraint_force(model, data, qacc))
@@ -258,41 +244,28 @@ def solve_to_rounding(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]:
     return qacc
 
 
-def solve(
-    model: mjx.Model, data: mjx.Data, solver: Callable[[mjx.Model, mjx.Data], Float[Array, " nv"]] = run_solver
-) -> Float[Array, " nv"]:
-    """Compute the constrained acceleration with its implicit derivative, exact in forward and reverse mode.
+def solve(model: mjx.Model, data: mjx.Data, solver: Solver = run_solver) -> Qvel:
+    """Constrained acceleration [m/s^2 or rad/s^2] with its implicit derivative, exact in forward and reverse mode.
 
-    Args:
-        model: the model on the device; its array leaves may be traced and differentiated.
-        data: state after `mjx.fwd_acceleration`; `qacc_warmstart` starts the loop and is not differentiated.
-        solver: function that computes the acceleration.
-
-    Returns:
-        qacc [m/s^2 or rad/s^2].
+    Model and data, after `mjx.fwd_acceleration`, may be traced and differentiated, except for the warm start.
     """
     if num_constraint_rows(data) == 0:
         return data.qacc_smooth
-
-    def tangent_solve(linear_map, right_side):
-        return solve_positive_definite(jax.vmap(linear_map)(jnp.eye(model.nv, dtype=right_side.dtype)), right_side)
-
     # Named outside of the root finding: JAX saves named values but would recompute those inside.
     found = checkpoint_name(solver(*jax.lax.stop_gradient((model, data))), "qacc")
     return jax.lax.custom_root(
         f=lambda qacc: imbalance(model, data, qacc),
         initial_guess=found,
         solve=lambda _, solution: solution,
-        tangent_solve=tangent_solve,
+        tangent_solve=_solve_linear,
     )
 
 
 def guard_rows(model: mjx.Model, data: mjx.Data) -> tuple[np.ndarray, np.ndarray]:
-    """Map each guard (limits first, then contacts) to its constraint rows; static.
+    """Map each guard (limits first, then contacts) to its constraint rows; static, both `(guards, rows)`.
 
-    Returns:
-        Weights `(guards, rows)` that combine rows into the guard's normal row (the mean of two opposite pyramid edges),
-        and a 0/1 mask `(guards, rows)` of the rows that switch on with the guard.
+    The weights combine rows into the guard's normal row (the mean of two opposite pyramid edges); the 0/1 mask tells
+    the rows that switch on with the guard.
     """
     rows: Any = data._impl
     spans = [(rows.ne + rows.nf + index, 1, 1) for index in range(rows.nl)]
@@ -314,21 +287,15 @@ def guards(model: mjx.Model, data: mjx.Data) -> tuple[Float[Array, " guards"], F
     return (rows.efc_pos - rows.efc_margin)[first], jnp.asarray(weights, rows.efc_J.dtype) @ (rows.efc_J @ data.qvel)
 
 
-def guards_under_force(model: mjx.Model, data: mjx.Data, qacc: Float[Array, " nv"]) -> Bool[Array, " guards"]:
-    """Whether each limit or contact exerts a force at the acceleration `qacc`."""
+def guards_under_force(model: mjx.Model, data: mjx.Data, qacc: Qvel) -> Bool[Array, " guards"]:
     _, members = guard_rows(model, data)
     rows: Any = data._impl
     force = jnp.abs(row_force(model, data, rows.efc_J @ qacc - rows.efc_aref))
     return jnp.asarray(members, force.dtype) @ force > 0
 
 
-def at_onset(model: mjx.Model, data: mjx.Data, members: Float[Array, " rows"], on: Bool[Array, ""]) -> mjx.Data:
-    """Return the state with some constraint rows set to first touch (no penetration, impedance d_0), or removed.
-
-    Args:
-        members: 1 for these rows, 0 for rows left unchanged.
-        on: whether these rows are active.
-    """
+def at_onset(model: mjx.Model, data: mjx.Data, members: Rows, on: Bool[Array, ""]) -> mjx.Data:
+    """The state with the rows of `members` set to first touch (no penetration, impedance d_0) if `on`, else removed."""
     with patched(AT_FIRST_TOUCH):
         touching: Any = mjx.make_constraint(model, data)._impl
     rows: Any = data._impl
@@ -344,12 +311,10 @@ def at_onset(model: mjx.Model, data: mjx.Data, members: Float[Array, " rows"], o
     return changed
 
 
-def relaxation_rate(model: mjx.Model, data: mjx.Data, normal: Float[Array, " rows"]) -> Float[Array, ""]:
-    """max(b, sqrt(k d)) [1/s] of a guard at first touch: the rate at which contact changes the approach speed.
+def relaxation_rate(model: mjx.Model, data: mjx.Data, normal: Rows) -> Scalar:
+    """max(b, sqrt(k d)) [1/s] of a guard with these weights at first touch: the rate at which contact slows it down.
 
-    Args:
-        data: position stage, with a velocity at which the guard moves.
-        normal: weights of the guard from `guard_rows`.
+    The data are at the position stage, with a velocity at which the guard moves.
     """
     with patched(RELAXING):
         rows: Any = mjx.make_constraint(model, data)._impl

@@ -146,15 +146,15 @@ def solref_from_stiffness(
     Raises:
         ValueError: stiffness or effective mass not positive, damping negative, or damping given in both ways.
     """
-    if not (stiffness > 0 and math.isfinite(stiffness)):
+    if not 0 < stiffness < math.inf:
         raise ValueError(f"stiffness must be positive and finite, in N/m; got {stiffness}")
-    if not (effective_mass > 0 and math.isfinite(effective_mass)):
+    if not 0 < effective_mass < math.inf:
         raise ValueError(f"effective mass must be positive and finite, in kg; got {effective_mass}")
     if damping is not None and dampratio is not None:
         raise ValueError("give damping in N s/m or a damping ratio, not both")
-    if damping is not None and not (damping >= 0 and math.isfinite(damping)):
+    if damping is not None and not 0 <= damping < math.inf:
         raise ValueError(f"damping must be >= 0 and finite, in N s/m; got {damping}")
-    if dampratio is not None and not (dampratio >= 0 and math.isfinite(dampratio)):
+    if dampratio is not None and not 0 <= dampratio < math.inf:
         raise ValueError(f"damping ratio must be >= 0 and finite; got {dampratio}")
     k = stiffness / effective_mass
     b = 2 * (dampratio or 0.0) * math.sqrt(k) if damping is None else damping / effective_mass
@@ -205,12 +205,7 @@ def effective_mass(scene: Scene, geom1: str, geom2: str) -> float:
 
 
 def soften(contact: ContactModel, factor: float | Array) -> ContactModel:
-    """Scale the stiffness of a contact model and its `backward` at constant damping ratio.
-
-    Args:
-        contact: contact model with either form of solref.
-        factor: positive factor.
-    """
+    """Scale the stiffness of a contact model and its `backward` by a positive factor, at constant damping ratio."""
     first, second = contact.solref
     root = jnp.sqrt(factor)
     direct = jnp.stack([first * factor, second * root])
@@ -225,27 +220,33 @@ def apply_contact(model: mjx.Model, contact: ContactModel | None) -> mjx.Model:
     Both geoms of a pair are set, so MuJoCo's mixing by `solmix` and `priority` has no effect. None leaves the model
     unchanged.
     """
-    if contact is None:
-        return model
 
-    def fill(leaf, value):
+    def filled(name, value):
+        leaf = getattr(model, name)
         return jnp.broadcast_to(value, leaf.shape).astype(jnp.result_type(leaf))
 
-    changes = {
-        "geom_solref": fill(model.geom_solref, contact.solref),
-        "geom_solimp": fill(model.geom_solimp, contact.solimp),
-        "pair_solref": fill(model.pair_solref, contact.solref),
-        "pair_solimp": fill(model.pair_solimp, contact.solimp),
-    }
+    return model.replace(**{name: filled(name, value) for name, value in _arrays_of(contact).items()})
+
+
+def apply_to_host(host: mujoco.MjModel, contact: ContactModel | None) -> None:
+    """`apply_contact` to a host model, in place."""
+    for name, value in _arrays_of(contact).items():
+        getattr(host, name)[:] = np.asarray(value)
+
+
+def _arrays_of(contact: ContactModel | None) -> dict[str, Array]:
+    """The model's arrays that a contact model sets, with the value of each of their rows."""
+    if contact is None:
+        return {}
+    values = {f"{of}_{name}": getattr(contact, name) for of in ("geom", "pair") for name in ("solref", "solimp")}
     if contact.friction is not None:
         sliding, torsional, rolling = contact.friction
-        changes["geom_friction"] = fill(model.geom_friction, contact.friction)
         pair = jnp.stack([sliding, sliding, torsional, rolling, rolling])
-        changes["pair_friction"] = fill(model.pair_friction, pair)
+        values |= {"geom_friction": contact.friction, "pair_friction": pair}
     if contact.margin is not None:
-        changes["geom_margin"] = fill(model.geom_margin, contact.margin / 2)  # MuJoCo adds the margins of two geoms
-        changes["pair_margin"] = fill(model.pair_margin, contact.margin)
-    return model.replace(**changes)
+        # MuJoCo adds the margins of two geoms
+        values |= {"geom_margin": contact.margin / 2, "pair_margin": contact.margin}
+    return values
 
 
 def _check_solref(solref: Sequence[float]) -> None:
@@ -286,25 +287,20 @@ def _warn_if_clipped(solref: Sequence[float], scene: Scene) -> None:
 
 
 def stable(solref: Sequence[float], timestep: float) -> bool:
-    """Whether the contact step is stable: for semi-implicit Euler, h^2 k < 4 - 2 h b.
-
-    Args:
-        solref: as in `contact_model`.
-        timestep: h [s].
-    """
+    """Whether the contact step of h = `timestep` [s] is stable: for semi-implicit Euler, h^2 k < 4 - 2 h b."""
     k, b = stiffness_from_solref(solref, effective_mass=1.0)
     return bool(timestep**2 * k < 4 - 2 * timestep * b)
 
 
 def _warn_if_unstable(solref: Sequence[float], timestep: float) -> None:
+    if stable(solref, timestep):
+        return
     k, b = stiffness_from_solref(solref, effective_mass=1.0)
-    limit = 4 - 2 * timestep * b
-    if not stable(solref, timestep):
-        dampratio = b / (2 * math.sqrt(k)) if k > 0 else 0.0
-        share = (2 * (math.sqrt(dampratio**2 + 1) - dampratio)) ** 2 / (timestep**2 * k) if k > 0 else 0.0
-        warnings.warn(
-            f"h^2 k = {timestep**2 * k:.3g} is not below 4 - 2 h b = {limit:.3g}: the step gains energy while in "
-            f"contact; it is stable up to {share:.0%} of this stiffness at h = {timestep:g} s",
-            ContactWarning,
-            stacklevel=3,
-        )
+    dampratio = b / (2 * math.sqrt(k)) if k > 0 else 0.0
+    share = (2 * (math.sqrt(dampratio**2 + 1) - dampratio)) ** 2 / (timestep**2 * k) if k > 0 else 0.0
+    warnings.warn(
+        f"h^2 k = {timestep**2 * k:.3g} is not below 4 - 2 h b = {4 - 2 * timestep * b:.3g}: the step gains energy "
+        f"while in contact; it is stable up to {share:.0%} of this stiffness at h = {timestep:g} s",
+        ContactWarning,
+        stacklevel=3,
+    )

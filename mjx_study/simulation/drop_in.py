@@ -17,13 +17,14 @@ from jaxtyping import Array, Bool, Float
 from mjx_study.choices import unknown
 from mjx_study.simulation import constraint
 from mjx_study.simulation._mjx import mjx
-from mjx_study.simulation.dynamics import SAVE_SOLUTION, State, fwd_position
+from mjx_study.simulation.dynamics import SAVE_SOLUTION, Qvel, State, fwd_position
 from mjx_study.simulation.integration import difference_position, integrate_position
 from mjx_study.simulation.onset import onset_term, tangent_of, without_derivative
 from mjx_study.simulation.patches import Place, patched
 from mjx_study.simulation.touch import Events, onset_begins
 
 Replacements = dict[Place, Callable[..., mjx.Data]]
+Preceding = Bool[Array, "3 guards"]
 ONSETS: Final = ("none", "linear")
 """Treatments of the onset of contact in the derivatives of a step."""
 STEP_SLOTS: Final = 2
@@ -117,7 +118,7 @@ _REPLACED: Final[dict[str, Replacements]] = {
 }
 
 
-def _preceding_contact(model: mjx.Model, data: mjx.Data) -> Bool[Array, "3 guards"]:
+def _preceding_contact(model: mjx.Model, data: mjx.Data) -> Preceding:
     """Whether each contact or limit existed before the preceding step, had just begun then, and pushed during it.
 
     From the constraint rows that the preceding step left in its state; none exists at time 0. After `mjx.forward` the
@@ -135,15 +136,12 @@ def _preceding_contact(model: mjx.Model, data: mjx.Data) -> Bool[Array, "3 guard
     return jnp.stack([existed, existed & begun, existed & pushed])
 
 
-def _corrected_step(model: mjx.Model, data: mjx.Data, preceding: Bool[Array, "3 guards"]) -> mjx.Data:
+def _corrected_step(model: mjx.Model, data: mjx.Data, preceding: Preceding) -> mjx.Data:
     """`mjx.step` with the same values, but derivatives that include the onset term.
 
     Delta_k replaces Delta_{k-1}, which the state does not contain: an error of order h in the term. The first
     `STEP_SLOTS` contacts and limits that begin or end in the step are corrected. None does at time 0, which no step
     precedes.
-
-    Args:
-        preceding: see `_preceding_contact`.
     """
     model, timestep = without_derivative(model), model.opt.timestep
     fixed = jax.lax.stop_gradient(data)
@@ -158,12 +156,8 @@ def _corrected_step(model: mjx.Model, data: mjx.Data, preceding: Bool[Array, "3 
 
 @jax.custom_jvp
 def _onset_change(
-    model: mjx.Model,
-    data: mjx.Data,
-    preceding: Bool[Array, "3 guards"],
-    moved: Float[Array, " nv"],
-    moved_before: Float[Array, " nv"],
-) -> tuple[Float[Array, " nv"], Float[Array, " nv"]]:
+    model: mjx.Model, data: mjx.Data, preceding: Preceding, moved: Qvel, moved_before: Qvel
+) -> tuple[Qvel, Qvel]:
     """Zero velocities, before and after the step, that change with the step at which contact begins or ends."""
     return jnp.zeros_like(moved), jnp.zeros_like(moved)
 
@@ -178,7 +172,7 @@ def _(primals, tangents):
 
 
 def _step_terms(
-    model: mjx.Model, data: mjx.Data, preceding: Bool[Array, "3 guards"]
+    model: mjx.Model, data: mjx.Data, preceding: Preceding
 ) -> tuple[Float[Array, "nv nv"], Float[Array, "nv nv"]]:
     """(1 - s) Delta n^T / D and s Delta n^T / D of a step, zero if no contact begins or ends."""
     positioned = fwd_position(model, data)

@@ -28,6 +28,7 @@ from jaxtyping import Array, Bool, Float, Int
 from estimators.pytree import register_pytree
 from mjx_study.simulation import constraint
 from mjx_study.simulation._mjx import mjx
+from mjx_study.simulation.constraint import Qvel, Scalar
 from mjx_study.simulation.integration import integrate_position
 from mjx_study.simulation.linear_algebra import SMALL, product, solve_positive_definite
 from mjx_study.simulation.patches import patched
@@ -36,6 +37,12 @@ from mjx_study.simulation.scene import Scene
 
 SAVE_SOLUTION: Final = jax.checkpoint_policies.save_only_these_names("qacc")
 """Policy of `jax.checkpoint` that recomputes steps in the backward pass without running their solver again."""
+
+
+Qpos = Float[Array, " nq"]
+Act = Float[Array, " na"]
+Control = Float[Array, " nu"]
+Controls = Float[Array, "horizon nu"]
 
 
 @register_pytree
@@ -56,9 +63,7 @@ class State:
     warmstart: Float[Array, "*batch nv"]
 
 
-def initial_state(
-    scene: Scene, qpos: Float[Array, " nq"] | None = None, qvel: Float[Array, " nv"] | None = None
-) -> State:
+def initial_state(scene: Scene, qpos: Qpos | None = None, qvel: Qvel | None = None) -> State:
     """Return a state at rest in the MJCF's reference pose, or at `qpos` [m or rad] and `qvel` [m/s or rad/s]."""
     like = scene.template
     return State(
@@ -69,7 +74,7 @@ def initial_state(
     )
 
 
-def step(scene: Scene, model: mjx.Model, state: State, control: Float[Array, " nu"]) -> tuple[State, Float[Array, ""]]:
+def step(scene: Scene, model: mjx.Model, state: State, control: Control) -> tuple[State, Scalar]:
     """Advance by one timestep.
 
     Args:
@@ -83,48 +88,49 @@ def step(scene: Scene, model: mjx.Model, state: State, control: Float[Array, " n
     """
     if scene.host.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
         return entry_by_entry(partial(_runge_kutta, scene), model, state, control), jnp.zeros_like(state.qpos, shape=())
-    qvel, act, qacc, residual = _update(scene)(
-        model, state.qpos, state.qvel, state.act, control, jax.lax.stop_gradient(state.warmstart)
+    update = _jacobian_update if scene.uses_jacobian else _tape_update
+    qvel, act, qacc, residual = update(
+        scene, model, state.qpos, state.qvel, state.act, control, jax.lax.stop_gradient(state.warmstart)
     )
     qpos = integrate_position(scene.host, state.qpos, qvel, model.opt.timestep)
     return State(qpos, qvel, act, jax.lax.stop_gradient(qacc)), jax.lax.stop_gradient(residual)
 
 
-def exact_step(
-    scene: Scene, model: mjx.Model, state: State, control: Float[Array, " nu"]
-) -> tuple[State, Float[Array, ""], mjx.Data]:
+def exact_step(scene: Scene, model: mjx.Model, state: State, control: Control) -> tuple[State, Scalar, mjx.Data]:
     """`step` with constraints solved to rounding, ignoring budgets, and its `smooth_stages`; values only.
 
     For finite differences, which would otherwise reflect where the solver of `step` stopped.
     """
-    data = smooth_stages(scene, model, state, control).replace(qacc_warmstart=state.warmstart)
     if scene.host.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
-        return *step(scene, model, state, control), data
-    qacc = constraint.solve_to_rounding(model, data)
-    qvel, act = advance_velocity(model, data, qacc)
-    qpos = integrate_position(scene.host, state.qpos, qvel, model.opt.timestep)
-    return State(qpos, qvel, act, qacc), constraint.residual(model, data, qacc), data
+        return *step(scene, model, state, control), smooth_stages(scene, model, state, control)
+    return _solved(constraint.solve_to_rounding, scene, model, state, control)
 
 
-def smooth_stages(scene: Scene, model: mjx.Model, state: State, control: Float[Array, " nu"]) -> mjx.Data:
+def smooth_stages(scene: Scene, model: mjx.Model, state: State, control: Control) -> mjx.Data:
     """Run a step up to the constraint solve: kinematics, contacts, forces, constraint rows."""
     return force_stage(model, position_stage(scene, model, state.qpos), state.qvel, state.act, control)
 
 
 def solved_step(
-    scene: Scene, model: mjx.Model, state: State, control: Float[Array, " nu"]
-) -> tuple[State, Float[Array, ""], tuple[Float[Array, " guards"], Float[Array, " guards"], Bool[Array, " guards"]]]:
+    scene: Scene, model: mjx.Model, state: State, control: Control
+) -> tuple[State, Scalar, tuple[Float[Array, " guards"], Float[Array, " guards"], Bool[Array, " guards"]]]:
     """`step` without derivatives; the `constraint.guards` before the step, and which of them exert a force in it."""
     return entry_by_entry(partial(_solved_step, scene), model, state, control)
 
 
 def _solved_step(scene: Scene, model: mjx.Model, state: State, control: Array):
-    data = smooth_stages(scene, model, state, control)
-    qacc = constraint.run_solver(model, data.replace(qacc_warmstart=state.warmstart))
+    after, residual, data = _solved(constraint.run_solver, scene, model, state, control)
+    guards = *constraint.guards(model, data), constraint.guards_under_force(model, data, after.warmstart)
+    return after, residual, guards
+
+
+def _solved(solver: constraint.Solver, scene: Scene, model: mjx.Model, state: State, control: Array):
+    """State after a step, residual, and `smooth_stages`; no derivatives."""
+    data = smooth_stages(scene, model, state, control).replace(qacc_warmstart=state.warmstart)
+    qacc = solver(model, data)
     qvel, act = advance_velocity(model, data, qacc)
     qpos = integrate_position(scene.host, state.qpos, qvel, model.opt.timestep)
-    guards = *constraint.guards(model, data), constraint.guards_under_force(model, data, qacc)
-    return State(qpos, qvel, act, qacc), constraint.residual(model, data, qacc), guards
+    return State(qpos, qvel, act, qacc), constraint.residual(model, data, qacc), data
 
 
 def entry_by_entry(function: Callable[..., Any], model: mjx.Model, *arguments: Any) -> Any:
@@ -134,23 +140,15 @@ def entry_by_entry(function: Callable[..., Any], model: mjx.Model, *arguments: A
     return function(model, *arguments)
 
 
-ControlLaw = Callable[[Int[Array, ""], State], Float[Array, " nu"]]
+ControlLaw = Callable[[Int[Array, ""], State], Control]
 
 
 def surrogate_step(
-    scene: Scene, model: mjx.Model, backward: mjx.Model, state: State, control: Float[Array, " nu"]
-) -> tuple[State, Float[Array, ""]]:
-    """`step` with the derivatives of another model's step at the same state and control.
+    scene: Scene, model: mjx.Model, backward: mjx.Model, state: State, control: Control
+) -> tuple[State, Scalar]:
+    """`step`, with the derivatives over state and control of another model's step, `backward`, at the same point.
 
-    Args:
-        scene: static part of both models.
-        model: the model to step.
-        backward: the model to differentiate.
-        state: the state before the step.
-        control: actuator controls, in the MJCF's units.
-
-    Returns:
-        As `step`. Derivatives with respect to either model are zero.
+    Derivatives with respect to either model are zero.
     """
 
     @jax.custom_jvp
@@ -173,7 +171,7 @@ def rollout(
     control_law: ControlLaw,
     horizon: int,
     backward: mjx.Model | None = None,
-) -> tuple[State, Float[Array, "horizon nu"], Float[Array, " horizon"]]:
+) -> tuple[State, Controls, Float[Array, " horizon"]]:
     """Simulate `horizon` closed-loop steps.
 
     Args:
@@ -212,7 +210,7 @@ def rollout(
 # jitted so that JAX traces MJX's many operations once rather than per direction; XLA inlines them again.
 
 
-def position_stage(scene: Scene, model: mjx.Model, qpos: Float[Array, " nq"]) -> mjx.Data:
+def position_stage(scene: Scene, model: mjx.Model, qpos: Qpos) -> mjx.Data:
     return fwd_position(model, scene.template.replace(qpos=qpos))
 
 
@@ -224,9 +222,7 @@ def fwd_position(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 
 
 @jax.jit
-def force_stage(
-    model: mjx.Model, data: mjx.Data, qvel: Float[Array, " nv"], act: Float[Array, " na"], control: Float[Array, " nu"]
-) -> mjx.Data:
+def force_stage(model: mjx.Model, data: mjx.Data, qvel: Qvel, act: Act, control: Control) -> mjx.Data:
     data = data.replace(qvel=qvel, act=act, ctrl=control)
     with patched():
         data = mjx.make_constraint(model, data)  # again: aref depends on qvel
@@ -236,9 +232,7 @@ def force_stage(
 
 
 @jax.jit
-def advance_velocity(
-    model: mjx.Model, data: mjx.Data, qacc: Float[Array, " nv"]
-) -> tuple[Float[Array, " nv"], Float[Array, " na"]]:
+def advance_velocity(model: mjx.Model, data: mjx.Data, qacc: Qvel) -> tuple[Qvel, Act]:
     """Return velocity and activation after the step, given the constrained acceleration, by MJX's own integrators."""
     data = data.replace(qacc=qacc, qfrc_constraint=constraint.constraint_force(model, data, qacc))
     implicit = model.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
@@ -256,19 +250,13 @@ def _constrained_update(
     return *advance_velocity(model, data, qacc), qacc, constraint.residual(model, data, qacc)
 
 
-def _update(scene: Scene):
-    """Return the velocity update (model, qpos, qvel, act, control, warmstart) -> (qvel, act, qacc, residual).
-
-    Derivatives with respect to state and control use the scene's program, those with respect to the model the tape.
-    """
-
-    def tape(model, qpos, qvel, act, control, warmstart):
-        return _constrained_update(model, scene.template.replace(qpos=qpos), qvel, act, control, warmstart)
-
-    return partial(_jacobian_update, scene, tape) if scene.uses_jacobian else tape
+def _tape_update(scene: Scene, model: mjx.Model, qpos: Array, *inputs: Array):
+    """Velocity update (qpos, qvel, act, control, warmstart) -> (qvel, act, qacc, residual)."""
+    return _constrained_update(model, scene.template.replace(qpos=qpos), *inputs)
 
 
-def _jacobian_update(scene: Scene, tape: Callable[..., tuple[Array, ...]], model: mjx.Model, *inputs: Array):
+def _jacobian_update(scene: Scene, model: mjx.Model, *inputs: Array):
+    """`_tape_update` with derivatives by the Jacobian program, except with respect to the model."""
     traced_model, whole = traced_part(model)
 
     @jax.custom_jvp
@@ -281,7 +269,7 @@ def _jacobian_update(scene: Scene, tape: Callable[..., tuple[Array, ...]], model
         traced, qpos, qvel, act, control, _ = primals
         model_tangents, *inputs, _ = tangents
         if any(not isinstance(leaf, SymbolicZero) for leaf in jax.tree.leaves(model_tangents)):
-            through = lambda traced, *inputs: tape(whole(traced), *inputs)  # noqa: E731
+            through = lambda traced, *inputs: _tape_update(scene, whole(traced), *inputs)  # noqa: E731
             return jax.jvp(through, primals, jax.tree.map(_instantiate, primals, tangents))
         value = update(*primals)
         inputs = [_instantiate(*pair) for pair in zip(primals[1:5], inputs, strict=True)]
@@ -300,13 +288,7 @@ def _instantiate(primal, tangent):
 
 
 def step_jacobian(
-    scene: Scene,
-    model: mjx.Model,
-    qpos: Float[Array, " nq"],
-    qvel: Float[Array, " nv"],
-    act: Float[Array, " na"],
-    control: Float[Array, " nu"],
-    qacc: Float[Array, " nv"],
+    scene: Scene, model: mjx.Model, qpos: Qpos, qvel: Qvel, act: Act, control: Control, qacc: Qvel
 ) -> tuple[Float[Array, "nv_na inputs"], Float[Array, "nv inputs"]]:
     r"""Compute the Jacobians of (qvel', act') and of qacc over the columns (qpos, qvel, act, control).
 
@@ -317,10 +299,7 @@ def step_jacobian(
     Args:
         scene: static part of the model; its own contact parameters are not used.
         model: the model to step, with any contact model applied.
-        qpos: positions at the point of linearisation.
-        qvel: velocities there.
-        act: activations there.
-        control: controls there.
+        qpos, qvel, act, control: the point of linearisation.
         qacc: the converged constrained acceleration there.
     """
     return entry_by_entry(_jacobian, model, scene.template, qpos, qvel, act, control, qacc)
@@ -353,7 +332,7 @@ def _jacobian(model: mjx.Model, template: mjx.Data, qpos: Array, qvel: Array, ac
     return over_inputs[nv:] + over_qacc[nv:] @ response, response
 
 
-def _runge_kutta(scene: Scene, model: mjx.Model, state: State, control: Float[Array, " nu"]) -> State:
+def _runge_kutta(scene: Scene, model: mjx.Model, state: State, control: Control) -> State:
     """Classical fourth-order Runge-Kutta; scenes with constraints are rejected on loading."""
     timestep = model.opt.timestep
 

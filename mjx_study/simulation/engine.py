@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from mjx_study.simulation.contact import ContactModel
+from mjx_study.simulation.contact import ContactModel, apply_to_host
 from mjx_study.simulation.scene import Scene
 
 CONVERGED: Final = {"tolerance": 0.0, "iterations": 200, "ls_iterations": 100}
@@ -18,15 +18,7 @@ CONVERGED: Final = {"tolerance": 0.0, "iterations": 200, "ls_iterations": 100}
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class HostState:
-    """State and control on the host.
-
-    Attributes:
-        qpos: positions [m or rad; unit quaternions].
-        qvel: velocities [m/s or rad/s].
-        act: activations.
-        control: controls.
-        warmstart: acceleration of the previous step [m/s^2 or rad/s^2].
-    """
+    """State and control on the host, in the units of `dynamics.State`."""
 
     qpos: Float[np.ndarray, " nq"]
     qvel: Float[np.ndarray, " nv"]
@@ -35,27 +27,16 @@ class HostState:
     warmstart: Float[np.ndarray, " nv"]
 
 
-def apply_to_host(host: mujoco.MjModel, contact: ContactModel | None) -> None:
-    """Apply a contact model to every geom and pair of a host model in place, as `apply_contact` does on the device."""
-    if contact is None:
-        return
-    for leaf in (host.geom_solref, host.pair_solref):
-        leaf[:] = np.asarray(contact.solref)
-    for leaf in (host.geom_solimp, host.pair_solimp):
-        leaf[:] = np.asarray(contact.solimp)
-    if contact.friction is not None:
-        friction = np.asarray(contact.friction)
-        host.geom_friction[:] = friction
-        host.pair_friction[:] = friction[[0, 0, 1, 2, 2]]
-    if contact.margin is not None:
-        host.geom_margin[:] = float(contact.margin) / 2  # MuJoCo adds the margins of two geoms
-        host.pair_margin[:] = float(contact.margin)
+def engine_model(scene: Scene, contact: ContactModel | None) -> mujoco.MjModel:
+    """Copy the scene's host model with a contact model and the scene's own budgets."""
+    host = copy.copy(scene.host)
+    apply_to_host(host, contact)
+    return host
 
 
 def converged_host(scene: Scene, contact: ContactModel | None) -> mujoco.MjModel:
     """Copy the scene's host model with a contact model and with budgets for full convergence."""
-    host = copy.copy(scene.host)
-    apply_to_host(host, contact)
+    host = engine_model(scene, contact)
     for name, value in CONVERGED.items():
         setattr(host.opt, name, value)
     return host
@@ -83,10 +64,3 @@ def quiet_engine() -> Generator[None]:
         yield
     finally:
         mujoco.set_mju_user_warning(before)
-
-
-def engine_model(scene: Scene, contact: ContactModel | None) -> mujoco.MjModel:
-    """Copy the scene's host model with a contact model and the scene's own budgets."""
-    host = copy.copy(scene.host)
-    apply_to_host(host, contact)
-    return host

@@ -40,9 +40,11 @@ from jaxtyping import Array, Bool, Float, Int
 from mjx_study.choices import ONSETS, unknown
 from mjx_study.simulation import constraint
 from mjx_study.simulation._mjx import mjx
+from mjx_study.simulation.constraint import Rows, Scalar
 from mjx_study.simulation.dynamics import (
     SAVE_SOLUTION,
     ControlLaw,
+    Controls,
     State,
     advance_velocity,
     entry_by_entry,
@@ -63,7 +65,6 @@ SLOTS: Final = 8
 
 
 def check_onset(onset: str) -> None:
-    """Raise ValueError, listing the choices, for an unknown onset treatment."""
     if onset not in ONSETS:
         raise ValueError(unknown("onset", onset, ONSETS))
 
@@ -80,25 +81,16 @@ def corrected_rollout(
     control_law: ControlLaw,
     horizon: int,
     slots: int = SLOTS,
-    weight: float | Float[Array, ""] = 1.0,
-) -> tuple[State, Float[Array, "horizon nu"], Float[Array, " horizon"], OnsetCounts]:
+    weight: float | Scalar = 1.0,
+) -> tuple[State, Controls, Float[Array, " horizon"], OnsetCounts]:
     """`dynamics.rollout` with the same values, but derivatives that include the onset term.
 
     First derivatives with respect to initial state and controls, in forward and reverse mode.
 
     Args:
-        scene: static part of the model.
-        model: the model to step; may be traced, but not differentiated.
-        control_law: maps (step index, state) to the control of that step.
-        horizon: number of steps, at least 1.
+        model: the model to step; may be traced, but not differentiated (TypeError).
         slots: maximum number of onsets to correct, earliest first.
         weight: factor of the term; 0 gives the derivatives of `dynamics.rollout`.
-
-    Returns:
-        States `(horizon + 1, ...)` including the initial one, controls `(horizon, nu)`, residuals `(horizon,)`, counts.
-
-    Raises:
-        TypeError: differentiation with respect to the model.
     """
     if not scene.has_constraints:
         return *rollout(scene, model, start, control_law, horizon), OnsetCounts.none(start.qpos.dtype)
@@ -150,12 +142,7 @@ def corrected_rollout(
 
 
 def _corrections(
-    scene: Scene,
-    model: mjx.Model,
-    before: State,
-    controls: Float[Array, "horizon nu"],
-    guards: tuple[Array, Array, Array],
-    slots: int,
+    scene: Scene, model: mjx.Model, before: State, controls: Controls, guards: tuple[Array, Array, Array], slots: int
 ) -> tuple[Float[Array, "horizon nv nv"], Float[Array, "horizon nv nv"], OnsetCounts]:
     """(1 - s) Delta_k n^T / D and s Delta_{k-1} n^T / D of every step, zero without events, and counts."""
     events, missed = find_events(*guards, scene.timestep, slots)
@@ -185,68 +172,47 @@ def _corrections(
 
 
 def onset_term(
-    model: mjx.Model,
-    template: mjx.Data,
-    states: State,
-    controls: Float[Array, "cases nu"],
-    event: Events,
-) -> tuple[Float[Array, "nv nv"], Float[Array, "nv nv"], Float[Array, ""], Bool[Array, ""], Bool[Array, ""]]:
+    model: mjx.Model, template: mjx.Data, states: State, controls: Float[Array, "cases nu"], event: Events
+) -> tuple[Float[Array, "nv nv"], Float[Array, "nv nv"], Scalar, Bool[Array, ""], Bool[Array, ""]]:
     """(1 - s) Delta_k n^T / D, s Delta_{k-1} n^T / D, share of the approach speed lost, whether D was bounded, and
     whether the contact begins or ends by motion within the step; zeros and False otherwise.
 
-    Arguments as for `jump_of_velocity`, with steps k and k - 1 as cases, or k for both; `template` has everything but
-    the position.
-    """
-    touch = at_touch(model, template, states.qpos[0], states.qvel[0], event)
-    jumps, normal, least = jump_of_velocity(model, touch.positioned, states, controls, event)
-    cell, valid = -jnp.maximum(jnp.abs(touch.travel), least), touch.valid
-    last, before = touch.weights
-    here, previous = (jnp.outer(jump, normal) / cell for jump in (last * jumps[0], before * jumps[-1]))
-    strength = -model.opt.timestep * (normal @ jumps[0]) / cell
-    kept = [jnp.where(valid, each, jnp.zeros_like(each)) for each in (here, previous, strength)]
-    return kept[0], kept[1], kept[2], valid & (jnp.abs(touch.travel) < least), valid
-
-
-def jump_of_velocity(
-    model: mjx.Model, positioned: mjx.Data, states: State, controls: Float[Array, "cases nu"], event: Events
-) -> tuple[Float[Array, "cases nv"], Float[Array, " nv"], Float[Array, ""]]:
-    """Compute the jump in the velocity after a step that the onset of a contact or limit causes, at first touch.
+    Delta is v'(on) - v'(off) at first touch.
 
     Args:
-        positioned: position stage of the first case.
-        states: velocities and activations of each case.
-        controls: controls of each case.
+        template: everything but the position.
+        states, controls: velocities and activations before steps k and k - 1, and their controls; or of k for both.
         event: the contact or limit, and whether it ends.
-
-    Returns:
-        v'(on) - v'(off) of each case; the guard's Jacobian over the velocity coordinates; the first case's least
-        travel.
     """
+    touch = at_touch(model, template, states.qpos[0], states.qvel[0], event)
+    positioned = touch.positioned
     rows: Any = positioned._impl
     weights, members = (
         jnp.asarray(each, rows.efc_J.dtype)[event.guard] for each in constraint.guard_rows(model, positioned)
     )
 
-    def both(qvel, act, control, warmstart):
+    def jump(qvel, act, control, warmstart):
         forced = force_stage(model, positioned, qvel, act, control).replace(qacc_warmstart=warmstart)
         (after, _), qacc = on_and_off(model, forced, members)
         return after[0] - after[1], qacc
 
-    jumps, qacc = jax.vmap(both)(states.qvel, states.act, controls, states.warmstart)
+    jumps, qacc = jax.vmap(jump)(states.qvel, states.act, controls, states.warmstart)
     least = least_travel(model, positioned.replace(qvel=states.qvel[0]), weights, qacc[0], event.ends)
-    return jumps, weights @ rows.efc_J, least
+    normal = weights @ rows.efc_J
+    cell, valid = -jnp.maximum(jnp.abs(touch.travel), least), touch.valid
+    last, before = touch.weights
+    here, previous = (jnp.outer(jump, normal) / cell for jump in (last * jumps[0], before * jumps[-1]))
+    strength = -model.opt.timestep * (normal @ jumps[0]) / cell
+    here, previous, strength = (jnp.where(valid, each, jnp.zeros_like(each)) for each in (here, previous, strength))
+    return here, previous, strength, valid & (jnp.abs(touch.travel) < least), valid
 
 
 def least_travel(
-    model: mjx.Model, data: mjx.Data, normal: Float[Array, " rows"], qacc: Float[Array, "2 nv"], ends: Bool[Array, ""]
-) -> Float[Array, ""]:
+    model: mjx.Model, data: mjx.Data, normal: Rows, qacc: Float[Array, "2 nv"], ends: Bool[Array, ""]
+) -> Scalar:
     """Travel of a guard in a step [m or rad] below which its onset counts as grazing: h |a| / max(b, sqrt(k d)).
 
-    Args:
-        data: position stage, with the velocity.
-        normal: weights of the guard from `constraint.guard_rows`.
-        qacc: acceleration with and without the contact.
-        ends: whether contact ends.
+    Arguments as for `constraint.relaxation_rate`; the acceleration with and without the contact; whether contact ends.
     """
     rows: Any = data._impl
     on, off = jnp.abs((qacc @ rows.efc_J.T) @ normal)
@@ -255,13 +221,11 @@ def least_travel(
 
 
 def on_and_off(
-    model: mjx.Model, data: mjx.Data, members: Float[Array, " rows"]
+    model: mjx.Model, data: mjx.Data, members: Rows
 ) -> tuple[tuple[Float[Array, "2 nv"], Float[Array, "2 na"]], Float[Array, "2 nv"]]:
-    """Velocities and activations after a step, and its accelerations, with some rows at first touch or removed.
+    """Velocities and activations after a step, and its accelerations, with the rows of `members` on or off.
 
-    Args:
-        data: the state before the constraint solve (`force_stage`), with the solver's warm start.
-        members: 1 for these rows, 0 for rows left unchanged.
+    See `constraint.at_onset`; the data are those of `force_stage`, with the solver's warm start.
     """
 
     def advanced(on):

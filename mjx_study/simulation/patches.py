@@ -63,17 +63,13 @@ def stiffness_damping_impedance(
     return k, b, impedance
 
 
-def _touching(
-    model: mjx.Model, solref: Float[Array, " 2"], solimp: Float[Array, " 5"], position: Float[Array, ""]
-) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
+def _touching(model: mjx.Model, solref: Array, solimp: Array, position: Array) -> tuple[Array, Array, Array]:
     """The same for a row without penetration, whose spring exerts no force yet."""
     k, b, impedance = stiffness_damping_impedance(model, solref, solimp, jnp.zeros_like(position))
     return jnp.zeros_like(k), b, impedance
 
 
-def _relaxing(
-    model: mjx.Model, solref: Float[Array, " 2"], solimp: Float[Array, " 5"], position: Float[Array, ""]
-) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
+def _relaxing(model: mjx.Model, solref: Array, solimp: Array, position: Array) -> tuple[Array, Array, Array]:
     """The same with the row's relaxation rate instead of its damping."""
     k, b, impedance = stiffness_damping_impedance(model, solref, solimp, jnp.zeros_like(position))
     return jnp.zeros_like(k), jnp.maximum(b, jnp.sqrt(k * impedance)), impedance
@@ -102,17 +98,13 @@ def _module(name: str) -> Any:
     return sys.modules[f"{mjx.make_constraint.__module__.rpartition('.')[0]}.{name}"] if name else mjx
 
 
-_mjx_spring_damper = getattr(_module("passive"), "_spring_damper", None)
-
-
 def springs_and_dampers(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]:
     """MJX's spring and damper forces [N or N m] of joints and tendons, with tendon stiffness at the rest length.
 
     A spring with a single rest length rather than a range is linear; MJX composes it of two halves that both have zero
     derivative where they meet. The correction has zero value but nonzero derivative.
     """
-    assert _mjx_spring_damper is not None, "`patched` has checked that MJX has it"
-    force = _mjx_spring_damper(model, data)
+    force = _ORIGINAL["passive", "_spring_damper"](model, data)
     if model.ntendon == 0 or model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_SPRING):
         return force
     shortest, longest = model.tendon_lengthspring.T
@@ -122,21 +114,14 @@ def springs_and_dampers(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]
     return force + rows.ten_J.T @ (stiffness * (shortest - data.ten_length))
 
 
-_mjx_wrap_inside = getattr(_module("support"), "wrap_inside", None)
-
-
 def wrap_inside(*arguments: Any) -> tuple[Float[Array, " 1"], Float[Array, " 4"]]:
     """MJX's path of a tendon inside a sphere or cylinder: (length along it or -1, contact points).
 
     The length is always 0; MJX takes the square root of its square, which has no derivative at 0. Here it is negligibly
     small instead, and differentiable.
     """
-    assert _mjx_wrap_inside is not None, "`patched` has checked that MJX has it"
-    length, points = _mjx_wrap_inside(*arguments)
+    length, points = _ORIGINAL["support", "wrap_inside"](*arguments)
     return jnp.where(length < 0, length, _UNSEEN), points
-
-
-_mjx_cylinder = getattr(_module("collision_sdf"), "_cylinder", None)
 
 
 @jax.custom_jvp
@@ -146,12 +131,11 @@ def cylinder_distance(position: Float[Array, " 3"], size: Float[Array, " 3"]) ->
     MJX places contacts by its gradient. For an inside point, the square root in the branch for outside points is at 0,
     so the gradient has no derivative in reverse mode.
     """
-    assert _mjx_cylinder is not None, "`patched` has checked that MJX has it"
-    return _mjx_cylinder(position, size)
+    return _ORIGINAL["collision_sdf", "_cylinder"](position, size)
 
 
 @cylinder_distance.defjvp
-def _cylinder_jvp(primals: Any, tangents: Any) -> Any:
+def _(primals: Any, tangents: Any) -> Any:
     position, size = primals
     square = position[0] ** 2 + position[1] ** 2
     radius, height = _root(square), jnp.abs(position[2])
@@ -175,29 +159,21 @@ def _positive(length: Float[Array, ""]) -> Float[Array, ""]:
     return length + 1e-12 * (length <= 1e-8)
 
 
-_mjx_factor_m, _mjx_solve_m = (getattr(_module("smooth"), name, None) for name in ("factor_m", "solve_m"))
-
-
 def factored_inertia(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """MJX's factorisation of the inertia; dense ones use this project's, unrolled if small."""
-    assert _mjx_factor_m is not None, "`patched` has checked that MJX has it"
     rows: Any = data._impl
     if rows.M.ndim != 2:
-        return _mjx_factor_m(model, data)
+        return _ORIGINAL["smooth", "factor_m"](model, data)
     factored: Any = data.tree_replace({"_impl.qLD": cholesky(rows.M)})
     return factored
 
 
 def solved_inertia(model: mjx.Model, data: mjx.Data, force: Float[Array, " nv"]) -> Float[Array, " nv"]:
     """MJX's solution of M a = force, likewise."""
-    assert _mjx_solve_m is not None, "`patched` has checked that MJX has it"
     rows: Any = data._impl
     if rows.M.ndim != 2:
-        return _mjx_solve_m(model, data, force)
+        return _ORIGINAL["smooth", "solve_m"](model, data, force)
     return solve_factored(rows.qLD, force)
-
-
-_mjx_body_tree = getattr(_module("scan"), "body_tree", None)
 
 
 def body_tree(model: mjx.Model, of_body: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
@@ -205,17 +181,14 @@ def body_tree(model: mjx.Model, of_body: Callable[..., Any], *arguments: Any, **
 
     If fused, XLA recomputes a body's ancestors for each of their uses, in time exponential in the depth.
     """
-    assert _mjx_body_tree is not None, "`patched` has checked that MJX has it"
 
     def of_level(carry: Any, *own: Any) -> Any:
         leaves, structure = jax.tree.flatten(carry)
-        arrays = [index for index, leaf in enumerate(leaves) if isinstance(leaf, jax.Array)]
-        apart = jax.lax.optimization_barrier([leaves[index] for index in arrays]) if arrays else []
-        for index, leaf in zip(arrays, apart, strict=True):
-            leaves[index] = leaf
-        return of_body(structure.unflatten(leaves), *own)
+        arrays = {index: leaf for index, leaf in enumerate(leaves) if isinstance(leaf, jax.Array)}
+        apart = jax.lax.optimization_barrier(arrays) if arrays else {}
+        return of_body(structure.unflatten(apart.get(index, leaf) for index, leaf in enumerate(leaves)), *own)
 
-    return _mjx_body_tree(model, of_level, *arguments, **named)
+    return _ORIGINAL["scan", "body_tree"](model, of_level, *arguments, **named)
 
 
 Place = tuple[str, str]
@@ -233,6 +206,8 @@ _REPLACED: Final[dict[Place, Callable[..., Any]]] = {
     ("smooth", "factor_m"): factored_inertia,
     ("smooth", "solve_m"): solved_inertia,
 }
+_ORIGINAL: Final[dict[Place, Any]] = {place: getattr(_module(place[0]), place[1], None) for place in _REPLACED}
+"""MJX's own functions; `patched` checks that there are all of them."""
 AT_FIRST_TOUCH: Final = {("constraint", "_kbi"): _touching}
 """Gives every active constraint row its values at first touch."""
 RELAXING: Final = {("constraint", "_kbi"): _relaxing}

@@ -15,11 +15,13 @@ from jax.core import ShapedArray
 
 from mjx_study.simulation.scalar_graph import Node, ScalarGraph, constants, filled, no_type_check
 
-Rule = Callable[[ScalarGraph, list[np.ndarray], Any, dict[str, Any]], list[np.ndarray] | None]
+Arrays = list[np.ndarray]
+Parameters = dict[str, Any]
+Rule = Callable[[ScalarGraph, Arrays, Any, Parameters], Arrays | None]
 
 
 @no_type_check
-def _broadcast(graph: ScalarGraph, inputs: list[np.ndarray], aval: Any, parameters: dict[str, Any]) -> list[np.ndarray]:
+def _broadcast(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: Parameters) -> Arrays:
     shape = [1] * len(aval.shape)
     for place, size in zip(parameters["broadcast_dimensions"], inputs[0].shape, strict=True):
         shape[place] = size
@@ -27,20 +29,13 @@ def _broadcast(graph: ScalarGraph, inputs: list[np.ndarray], aval: Any, paramete
 
 
 @no_type_check
-def _slice(graph: ScalarGraph, inputs: list[np.ndarray], aval: Any, parameters: dict[str, Any]) -> list[np.ndarray]:
+def _slice(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: Parameters) -> Arrays:
     bounds = parameters["start_indices"], parameters["limit_indices"], parameters["strides"] or (1,) * len(aval.shape)
     return [inputs[0][tuple(itertools.starmap(slice, zip(*bounds, strict=True)))]]
 
 
 @no_type_check
-def _iota(graph: ScalarGraph, inputs: list[np.ndarray], aval: Any, parameters: dict[str, Any]) -> list[np.ndarray]:
-    return [constants(np.indices(aval.shape)[parameters["dimension"]].astype(aval.dtype))]
-
-
-@no_type_check
-def _pad(
-    graph: ScalarGraph, inputs: list[np.ndarray], aval: Any, parameters: dict[str, Any]
-) -> list[np.ndarray] | None:
+def _pad(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: Parameters) -> Arrays | None:
     array, filler = inputs
     if any(low < 0 or high < 0 or between for low, high, between in parameters["padding_config"]):
         return None
@@ -61,17 +56,13 @@ def _window(inputs: list[np.ndarray], shape: tuple[int, ...], sizes: Sequence[An
 
 
 @no_type_check
-def _dynamic_slice(
-    graph: ScalarGraph, inputs: list[np.ndarray], aval: Any, parameters: dict[str, Any]
-) -> list[np.ndarray] | None:
+def _dynamic_slice(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: Parameters) -> Arrays | None:
     window = _window(inputs[1:], inputs[0].shape, parameters["slice_sizes"])
     return None if window is None else [inputs[0][window]]
 
 
 @no_type_check
-def _dynamic_update_slice(
-    graph: ScalarGraph, inputs: list[np.ndarray], aval: Any, parameters: dict[str, Any]
-) -> list[np.ndarray] | None:
+def _dynamic_update_slice(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: Parameters) -> Arrays | None:
     array, update, *starts = inputs
     if (window := _window(starts, array.shape, update.shape)) is None:
         return None
@@ -82,43 +73,32 @@ def _dynamic_update_slice(
 
 @no_type_check
 def _places(
-    shape: tuple[int, ...],
-    indices: np.ndarray,
-    sizes: Sequence[Any],
-    window_dims: Sequence[Any],
-    dropped: Sequence[Any],
-    index_dims: Sequence[Any],
-    batch_dims: tuple[Sequence[Any], Sequence[Any]],
-    clip: bool,
+    shape: tuple[int, ...], indices: np.ndarray, sizes: Sequence[Any], numbers: lax.GatherDimensionNumbers, mode: Any
 ) -> np.ndarray:
-    """Flat indices that a gather reads or a scatter writes in an array, -1 if out of bounds.
-
-    The arguments are those of `jax.lax.GatherDimensionNumbers`: offset_dims, collapsed_slice_dims, start_index_map and
-    the two operand and indices batching dims.
-    """
-    batch, numbers = indices.shape[:-1], np.arange(math.prod(shape)).reshape(shape)
-    kept = [size for dim, size in enumerate(sizes) if dim not in dropped and dim not in batch_dims[0]]
+    """Flat indices that a gather reads or a scatter writes in an array, -1 if out of bounds."""
+    batch, flat = indices.shape[:-1], np.arange(math.prod(shape)).reshape(shape)
+    dropped = (*numbers.collapsed_slice_dims, *numbers.operand_batching_dims)
+    kept = [size for dim, size in enumerate(sizes) if dim not in dropped]
     found = np.empty((*batch, *kept), np.int64)
     for at in np.ndindex(*batch):
         start = np.zeros(len(shape), int)
-        start[list(index_dims)] = indices[at].astype(int)
-        start[list(batch_dims[0])] = [at[dim] for dim in batch_dims[1]]
+        start[list(numbers.start_index_map)] = indices[at].astype(int)
+        start[list(numbers.operand_batching_dims)] = [at[dim] for dim in numbers.start_indices_batching_dims]
         last = np.array(shape) - sizes
-        start = np.clip(start, 0, last) if clip else start
+        start = np.clip(start, 0, last) if mode == lax.GatherScatterMode.CLIP else start
         inside = np.all((start >= 0) & (start <= last))
         window = tuple(slice(low, low + size) for low, size in zip(start, sizes, strict=True))
-        found[at] = numbers[window].reshape(kept) if inside else -1
-    return np.moveaxis(found, range(len(batch), found.ndim), window_dims)
+        found[at] = flat[window].reshape(kept) if inside else -1
+    return np.moveaxis(found, range(len(batch), found.ndim), numbers.offset_dims)
 
 
 @no_type_check
-def _gather(
-    graph: ScalarGraph, inputs: list[np.ndarray], aval: Any, parameters: dict[str, Any]
-) -> list[np.ndarray] | None:
+def _gather(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: Parameters) -> Arrays | None:
     """Gather by constant indices, or by a single unknown one: a selection among its values."""
     array, indices = inputs
-    numbers, sizes = parameters["dimension_numbers"], parameters["slice_sizes"]
     unknown = {each.number: each for each in indices.flat if isinstance(each, Node)}
+    if len(unknown) > 1:
+        return None
     fill = parameters["fill_value"]
     if fill is None:
         fill = (
@@ -128,23 +108,11 @@ def _gather(
 
     def picked(value: int) -> np.ndarray:
         known = filled(indices.shape, (value if isinstance(each, Node) else each for each in indices.flat))
-        return pool[
-            _places(
-                array.shape,
-                known,
-                sizes,
-                numbers.offset_dims,
-                numbers.collapsed_slice_dims,
-                numbers.start_index_map,
-                (numbers.operand_batching_dims, numbers.start_indices_batching_dims),
-                parameters["mode"] == lax.GatherScatterMode.CLIP,
-            )
-        ]
+        given = parameters["slice_sizes"], parameters["dimension_numbers"], parameters["mode"]
+        return pool[_places(array.shape, known, *given)]
 
     if not unknown:
         return [picked(0)]
-    if len(unknown) > 1:
-        return None
     (index,) = unknown.values()
     result = picked(-1)  # out of bounds, or clipped
     for value in range(max(array.shape, default=0)):
@@ -155,26 +123,22 @@ def _gather(
 
 @no_type_check
 def _scatter(combine: Any) -> Rule:
-    def rule(
-        graph: ScalarGraph, inputs: list[np.ndarray], aval: Any, parameters: dict[str, Any]
-    ) -> list[np.ndarray] | None:
+    def rule(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: Parameters) -> Arrays | None:
         array, indices, updates = inputs
         if any(isinstance(each, Node) for each in indices.flat):
             return None
-        numbers = parameters["dimension_numbers"]
-        inserted, batching = numbers.inserted_window_dims, numbers.operand_batching_dims
-        windows = iter(updates.shape[dim] for dim in numbers.update_window_dims)
-        sizes = [1 if dim in inserted or dim in batching else next(windows) for dim in range(array.ndim)]
-        places = _places(
-            array.shape,
-            indices,
-            sizes,
-            numbers.update_window_dims,
-            inserted,
-            numbers.scatter_dims_to_operand_dims,
-            (batching, numbers.scatter_indices_batching_dims),
-            parameters["mode"] == lax.GatherScatterMode.CLIP,
+        given = parameters["dimension_numbers"]
+        numbers = lax.GatherDimensionNumbers(
+            given.update_window_dims,
+            given.inserted_window_dims,
+            given.scatter_dims_to_operand_dims,
+            given.operand_batching_dims,
+            given.scatter_indices_batching_dims,
         )
+        windows = iter(updates.shape[dim] for dim in numbers.offset_dims)
+        dropped = (*numbers.collapsed_slice_dims, *numbers.operand_batching_dims)
+        sizes = [1 if dim in dropped else next(windows) for dim in range(array.ndim)]
+        places = _places(array.shape, indices, sizes, numbers, parameters["mode"])
         result = array.reshape(-1).copy()
         for place, update in zip(places.flat, updates.flat, strict=True):
             if place >= 0:
@@ -187,9 +151,7 @@ def _scatter(combine: Any) -> Rule:
 
 @no_type_check
 def _reduction(combine: Any) -> Rule:
-    def rule(
-        graph: ScalarGraph, inputs: list[np.ndarray], aval: Any, parameters: dict[str, Any]
-    ) -> list[np.ndarray] | None:
+    def rule(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: Parameters) -> Arrays | None:
         (array,), axes = inputs, parameters["axes"]
         if not array.size and combine is not lax.add_p:
             return None
@@ -202,7 +164,7 @@ def _reduction(combine: Any) -> Rule:
 
 @no_type_check
 def _place_of_extreme(better: Any) -> Rule:
-    def rule(graph: ScalarGraph, inputs: list[np.ndarray], aval: Any, parameters: dict[str, Any]) -> list[np.ndarray]:
+    def rule(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: Parameters) -> Arrays:
         rows = np.moveaxis(inputs[0], parameters["axes"][0], -1)
         kind = rows.flat[0].dtype
         best, place = rows[..., 0], constants(np.zeros(aval.shape, aval.dtype))
@@ -217,7 +179,7 @@ def _place_of_extreme(better: Any) -> Rule:
 
 
 @no_type_check
-def _cumsum(graph: ScalarGraph, inputs: list[np.ndarray], aval: Any, parameters: dict[str, Any]) -> list[np.ndarray]:
+def _cumsum(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: Parameters) -> Arrays:
     result = inputs[0].copy()
     rows = np.moveaxis(np.flip(result, parameters["axis"]) if parameters["reverse"] else result, parameters["axis"], 0)
     for before, row in itertools.pairwise(rows.reshape(len(rows), -1)):
@@ -226,7 +188,7 @@ def _cumsum(graph: ScalarGraph, inputs: list[np.ndarray], aval: Any, parameters:
 
 
 @no_type_check
-def _dot(graph: ScalarGraph, inputs: list[np.ndarray], aval: Any, parameters: dict[str, Any]) -> list[np.ndarray]:
+def _dot(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: Parameters) -> Arrays:
     (over, batch), factors = parameters["dimension_numbers"], []
     for array, summed, shared in zip(inputs, over, batch, strict=True):
         free = [axis for axis in range(array.ndim) if axis not in (*summed, *shared)]
@@ -256,7 +218,9 @@ RULES: Final[dict[str, Rule]] = {
     "dynamic_slice": _dynamic_slice,
     "dynamic_update_slice": _dynamic_update_slice,
     "gather": _gather,
-    "iota": _iota,
+    "iota": lambda _, __, aval, parameters: [
+        constants(np.indices(aval.shape)[parameters["dimension"]].astype(aval.dtype))
+    ],
     "pad": _pad,
     "reduce_and": _reduction(lax.and_p),
     "reduce_max": _reduction(lax.max_p),

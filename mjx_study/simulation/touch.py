@@ -11,13 +11,16 @@ from jaxtyping import Array, Bool, Float, Int
 from estimators.pytree import register_pytree
 from mjx_study.simulation import constraint
 from mjx_study.simulation._mjx import mjx
-from mjx_study.simulation.dynamics import fwd_position
+from mjx_study.simulation.dynamics import Qpos, Qvel, Scalar, fwd_position
 from mjx_study.simulation.integration import integrate_position
 
 TOUCHING: Final = 1e-6
 """Share of a cell: a body closer than this before the step was already touching, so there is no onset."""
 WITHIN: Final = 0.1
 """Share of the way from the touch to the state in contact at which the contact's geometry is evaluated."""
+
+
+Flags = Bool[Array, " slots"]
 
 
 @register_pytree
@@ -66,11 +69,7 @@ class Events:
     used: Bool[Array, "*slots"]
 
     def counts(
-        self,
-        missed: Int[Array, ""],
-        valid: Bool[Array, " slots"],
-        narrow: Bool[Array, " slots"],
-        strength: Float[Array, " slots"],
+        self, missed: Int[Array, ""], valid: Flags, narrow: Flags, strength: Float[Array, " slots"]
     ) -> OnsetCounts:
         """Counts of a rollout, from the number of events without a slot and from what the term says of the others."""
         begins = valid & ~self.ends
@@ -93,7 +92,6 @@ def find_events(
     Args:
         distance, speed: `constraint.guards` before each step.
         under_force: whether each guard exerts a force in each step.
-        timestep: timestep [s].
         slots: maximum number of events to return.
     """
     active = distance < 0
@@ -125,20 +123,14 @@ class Touch:
         valid: whether it passes zero within the step, by motion.
     """
 
-    share: Float[Array, ""]
-    weights: tuple[Float[Array, ""], Float[Array, ""]]
-    travel: Float[Array, ""]
+    share: Scalar
+    weights: tuple[Scalar, Scalar]
+    travel: Scalar
     positioned: mjx.Data
     valid: Bool[Array, ""]
 
 
-def at_touch(
-    model: mjx.Model,
-    template: mjx.Data,
-    qpos: Float[Array, " nq"],
-    qvel: Float[Array, " nv"],
-    event: Events,
-) -> Touch:
+def at_touch(model: mjx.Model, template: mjx.Data, qpos: Qpos, qvel: Qvel, event: Events) -> Touch:
     """Find the touch on the path of the step before k, on which the distance is a parabola.
 
     A body that passes an edge may be in contact for less than a step. A body slightly ahead of it then misses the edge,
@@ -146,10 +138,7 @@ def at_touch(
     2 (1 - s / l) / l. After a contact or a gap of one step (`Events.brief`), step k - 1 has no weight, since its
     boundary is the one that the event before has already counted.
 
-    Args:
-        template: everything but the position.
-        qpos, qvel: position and velocity before step k.
-        event: what begins or ends at step k.
+    Position and velocity are those before step k, at which the event begins or ends; the template has everything else.
     """
     timestep, guard, ends = model.opt.timestep, event.guard, event.ends
 

@@ -1,13 +1,11 @@
-"""Compute a study's cells, whole or in blocks, by kind of study."""
+"""Compute a study's cells, by kind of study."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from concurrent.futures import Future
-from typing import Final
-
-import numpy as np
+from typing import Any, Final
 
 from mjx_study.stopwatch import timed
-from mjx_study.study.blocks import Arrays, Blocks
+from mjx_study.study.blocks import Arrays
 from mjx_study.study.descents import compute_descents
 from mjx_study.study.gradients import Gradients, compute_gradients, done
 from mjx_study.study.landscapes import compute_landscapes
@@ -15,7 +13,7 @@ from mjx_study.study.plan import StudyCell, StudyPlan
 from mjx_study.study.store import Part
 from mjx_study.study.work import rest
 
-COMPUTE: Final[dict[str | None, Callable[[StudyPlan], Callable[..., Arrays]]]] = {
+COMPUTE: Final[dict[str | None, Callable[[StudyPlan], Any]]] = {
     "gradients": compute_gradients,
     "descents": compute_descents,
     "landscapes": compute_landscapes,
@@ -23,10 +21,11 @@ COMPUTE: Final[dict[str | None, Callable[[StudyPlan], Callable[..., Arrays]]]] =
 
 
 class Computation:
-    """Computes the cells of a plan and keeps compiled programs."""
+    """Computes the cells of a plan by `compute`, which keeps compiled programs; for cells in blocks, see
+    `Gradients`."""
 
     def __init__(self, plan: StudyPlan):
-        self._plan, self._compute = plan, COMPUTE[plan.config.kind](plan)
+        self._plan, self.compute = plan, COMPUTE[plan.config.kind](plan)
 
     def __call__(self, cell: StudyCell, part: Part) -> Arrays:
         """Compute a cell, resuming from its checkpoint (landscapes have none)."""
@@ -35,28 +34,11 @@ class Computation:
     def begin(self, cell: StudyCell, part: Part) -> Future[Arrays]:
         """Sample a cell; on accelerators its statistics may still be running on return."""
         with timed(rest(self._plan, cell)):
-            if isinstance(self._compute, Gradients):
-                return self._compute.begin(cell, part)
-            return done(self._compute(cell, *(() if self._plan.config.kind == "landscapes" else (part,))))
+            if isinstance(self.compute, Gradients):
+                return self.compute.begin(cell, part)
+            return done(self.compute(cell, part))
 
     def end(self, cell: StudyCell, begun: Future[Arrays]) -> Arrays:
         """Wait for a cell's numbers."""
         with timed(rest(self._plan, cell), calls=0):
             return begun.result()
-
-    def begun(self, cell: StudyCell, kept: Mapping[str, np.ndarray]) -> Blocks:
-        """Blocks of a cell that is split into tasks, with the finished ones of a checkpoint."""
-        return self._in_blocks.begun(cell, kept)
-
-    def block(self, cell: StudyCell, task: int) -> Arrays:
-        """Compute one of these tasks."""
-        return self._in_blocks.block(cell, task)
-
-    def merged(self, cell: StudyCell, blocks: Blocks) -> Arrays:
-        """The cell's numbers, once all tasks are done."""
-        return self._in_blocks.merged(cell, blocks)
-
-    @property
-    def _in_blocks(self) -> Gradients:
-        assert isinstance(self._compute, Gradients), "only cells of gradients are split into blocks"
-        return self._compute

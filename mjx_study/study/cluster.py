@@ -20,11 +20,10 @@ from contextlib import ExitStack, contextmanager, suppress
 from glob import glob
 from typing import Any, Final
 
-import numpy as np
-
 from mjx_study.identity import differences, versions
 from mjx_study.runtime import available_cores, configure, precision
 from mjx_study.stopwatch import Stopwatch
+from mjx_study.study.blocks import Arrays
 from mjx_study.study.cells import Computation
 from mjx_study.study.plan import StudyPlan, blocks_of, plan_study
 from mjx_study.study.store import Part, StudyError
@@ -46,7 +45,6 @@ SELDOM: Final = {
 a core busy."""
 GPUS: Final = "/dev/nvidia[0-9]*"
 _ONE_AT_A_TIME, _SET_UP = threading.Lock(), threading.Event()
-Arrays = dict[str, np.ndarray]
 Task = tuple[int, int | None]
 """Index of a cell, and number of one of its tasks in `Blocks`; None for a whole cell."""
 
@@ -66,42 +64,35 @@ def connected(cluster: str) -> Generator[Any]:
     Raises:
         ValueError: Dask is not installed, or the cluster cannot be reached.
     """
-    with ExitStack() as stack:
+    kind, _, count = cluster.partition(":")
+    address: Any = cluster
+    with ExitStack() as stack:  # closes the client and any workers started here
         try:
-            client = _connect(cluster, stack)
+            import dask.config
+            import distributed
+
+            logging.getLogger("distributed").setLevel(logging.CRITICAL)  # this module reports on workers
+            if kind == "local":
+                stack.enter_context(dask.config.set(SELDOM))
+                local = distributed.LocalCluster(
+                    n_workers=int(count or available_cores()),
+                    threads_per_worker=1,
+                    processes=True,
+                    dashboard_address="127.0.0.1:0",
+                    silence_logs=logging.CRITICAL,
+                )
+                address = stack.enter_context(local)
+            elif kind == "slurm":
+                from dask_jobqueue.slurm import SLURMCluster
+
+                address = stack.enter_context(SLURMCluster())
+                address.scale(int(count or 1))
+            client = stack.enter_context(distributed.Client(address, timeout=CONNECT_SECONDS, set_as_default=False))
         except ImportError as error:
             raise ValueError(f"a cluster needs Dask ({error}): pip install 'mjx-study[cluster]'") from error
         except OSError as error:
             raise ValueError(f"cannot reach the cluster {cluster}: {error}") from error
         yield client
-
-
-def _connect(cluster: str, stack: ExitStack) -> Any:
-    """Return the client; the stack closes it and any workers started here."""
-    import dask.config
-    import distributed
-
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # this module reports on workers
-
-    kind, _, count = cluster.partition(":")
-    address: Any = cluster
-    if kind == "local":
-        workers = int(count or available_cores())
-        stack.enter_context(dask.config.set(SELDOM))
-        local = distributed.LocalCluster(
-            n_workers=workers,
-            threads_per_worker=1,
-            processes=True,
-            dashboard_address="127.0.0.1:0",
-            silence_logs=logging.CRITICAL,
-        )
-        address = stack.enter_context(local)
-    elif kind == "slurm":
-        from dask_jobqueue.slurm import SLURMCluster
-
-        address = stack.enter_context(SLURMCluster())
-        address.scale(int(count or 1))
-    return stack.enter_context(distributed.Client(address, timeout=CONNECT_SECONDS, set_as_default=False))
 
 
 def cells_on(
@@ -119,17 +110,20 @@ def cells_on(
     Raises:
         StudyError: a worker has other versions, or the connection to the scheduler is lost.
     """
-    study = _packed(plan)
-    compute = Computation(plan)
-    begun = {index: compute.begun(plan.cells[index], parts[index].kept) for index in parts if in_blocks(plan, index)}
+    study, computation = _packed(plan), Computation(plan)
+    begun = {
+        index: computation.compute.begun(plan.cells[index], part.kept)
+        for index, part in parts.items()
+        if blocks_of(plan, plan.cells[index])
+    }
     waiting: dict[Any, deque[Task]] = defaultdict(deque)
     has: dict[Any, set[str]] = defaultdict(set)  # workers that have compiled a program
     at: dict[Any, tuple[Task, str]] = {}  # task and worker of each future
     ended: queue.SimpleQueue[Any] = queue.SimpleQueue()
     tries: Counter[Task] = Counter()
 
-    def queue_of(task: Task) -> deque[Task]:
-        return waiting[plan.program_of(plan.cells[task[0]])]
+    def program_of(index: int) -> Any:
+        return plan.program_of(plan.cells[index])
 
     def begin(worker: str) -> None:
         for program in _program_for(worker, waiting, has):
@@ -155,18 +149,18 @@ def cells_on(
         if block is not None and index not in begun:
             return  # another of its blocks has exhausted its attempts
         tries[task] += 1
+        tasks = waiting[program_of(index)]
         if tries[task] >= TRIES:
-            if block is not None:
-                del begun[index]
-                tasks = queue_of(task)
-                rest = [other for other in tasks if other[0] != index]
-                tasks.clear()
-                tasks.extend(rest)
+            begun.pop(index, None)
+            waiting[program_of(index)] = deque(other for other in tasks if other[0] != index)
             yield index, reason
         elif block is None:
-            queue_of(task).append(task)
+            tasks.append(task)
         else:
-            queue_of(task).appendleft(task)  # finished blocks wait to be merged with it
+            tasks.appendleft(task)  # finished blocks wait to be merged with it
+
+    def merged(index: int) -> tuple[int, Arrays]:
+        return index, computation.compute.merged(plan.cells[index], begun.pop(index))
 
     def ended_with(task: Task, arrays: Arrays) -> Generator[tuple[int, Arrays]]:
         """Yield the arrays of a cell if this was its last task."""
@@ -180,13 +174,13 @@ def cells_on(
             left = len(blocks.missing)
             parts[index].report(blocks.tasks - left, blocks.tasks, f"{plan.label(plan.cells[index])}, in blocks")
             if not left:
-                yield index, compute.merged(plan.cells[index], begun.pop(index))
+                yield merged(index)
 
     for index in parts:
         tasks = begun[index].missing if index in begun else [None]
-        queue_of((index, None)).extend((index, task) for task in tasks)
-    for index in [index for index, blocks in begun.items() if not blocks.missing]:
-        yield index, compute.merged(plan.cells[index], begun.pop(index))
+        waiting[program_of(index)].extend((index, task) for task in tasks)
+        if not tasks:
+            yield merged(index)
     looked, count = -math.inf, -1
     try:
         while at or any(waiting.values()):
@@ -233,11 +227,6 @@ def _all_of(ended: queue.SimpleQueue[Any]) -> Generator[Any]:
             yield ended.get_nowait()
 
 
-def in_blocks(plan: StudyPlan, index: int) -> bool:
-    """Whether a cell is split into several tasks."""
-    return blocks_of(plan, plan.cells[index]) > 0
-
-
 def _program_for(worker: str, waiting: Mapping[Any, deque[Any]], has: Mapping[Any, set[str]]) -> list[Any]:
     """Choose the program of a worker's next cell; none if workers that have one compiled will be sooner.
 
@@ -258,40 +247,29 @@ def _packed(plan: StudyPlan) -> bytes:
 
 def _compute(study: bytes, index: int, kept: Arrays, block: int | None) -> Arrays:
     with _ONE_AT_A_TIME:
-        plan, compute, watch = _prepared(study)
+        plan, computation, watch = _prepared(study)
         cell = plan.cells[index]
         with recording(watch):
-            return compute(cell, Part(kept)) if block is None else compute.block(cell, block)
+            return computation(cell, Part(kept)) if block is None else computation.compute.block(cell, block)
 
 
 @functools.lru_cache(maxsize=4)
 def _prepared(study: bytes) -> tuple[StudyPlan, Computation, Stopwatch]:
-    """The plan, its `Computation` with compiled programs, and a stopwatch, cached on the worker.
+    """Set up JAX once; return the plan, its `Computation` with compiled programs, and a stopwatch."""
+    from distributed import get_worker
 
-    Raises:
-        WorkerRefusedError: the numbers would differ from the client's.
-    """
     config, chunk, asked, *client = pickle.loads(study)
     if not _SET_UP.is_set():
-        _set_up(asked)
+        if (gpu := _gpu(get_worker().name)) is not None:
+            os.environ["CUDA_VISIBLE_DEVICES"] = gpu
+        configure(precision=asked, cpu_devices=1)
+        _SET_UP.set()
     plan = plan_study(config)
     ours = versions(), plan.contents
     if told := differences(*({**one, **other} for one, other in (client, ours))):
-        from distributed import get_worker
-
         raise WorkerRefusedError(f"the worker {get_worker().address} is refused: {told} ('there' is the client)")
     plan = plan.with_chunk(chunk)
     return plan, Computation(plan), Stopwatch()
-
-
-def _set_up(asked: str) -> None:
-    """Set up JAX on a worker: one CPU device, or of several GPUs the one selected by the worker's number."""
-    from distributed import get_worker
-
-    if (gpu := _gpu(get_worker().name)) is not None:
-        os.environ["CUDA_VISIBLE_DEVICES"] = gpu
-    configure(precision=asked, cpu_devices=1)
-    _SET_UP.set()
 
 
 def _gpu(worker: Any) -> str | None:

@@ -3,12 +3,12 @@
 import dataclasses
 import math
 from collections import Counter
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Union
 
 from estimators.catalogue import CATALOGUE, PLUG_IN, PUBLISHED_TOLERANCE
 from mjx_study.choices import FAMILIES
-from mjx_study.option import CONTACTS, Checked
+from mjx_study.option import Checked
 
 if TYPE_CHECKING:
     import mjx_study.tasks.task
@@ -148,9 +148,10 @@ class StudyConfig(Checked):
             raise ValueError("no task given")
         if self.theta is not None and len(self.tasks) > 1:
             raise ValueError("theta is for a single task; give one task, or omit theta")
-        check_names("estimator", self.estimators, CATALOGUE)
-        if self.contact:
-            check_names("contact family", self.contact, CONTACTS)
+        if not self.estimators:
+            raise ValueError(f"no estimator given; choose from {', '.join(CATALOGUE)}")
+        refuse_repeats("estimator", self.estimators)
+        refuse_repeats("contact family", self.contact or ())
         if self.contact is not None and not takes_stiffness(self.contact):
             for name in ("stiffness", "damping"):
                 if getattr(self, name) is not None:
@@ -158,11 +159,14 @@ class StudyConfig(Checked):
                     raise ValueError(f"{chosen} takes no {name}; omit {name}")
         for name in ("tasks", "stiffness", "solref", "solimp", "timestep", "cone", "sigma", "samples", "backward"):
             values = getattr(self, name)
-            if values is not None:
-                refuse_repeats(name, values)
+            refuse_repeats(name, values or ())
             if values == () and name not in ("solref", "solimp"):
                 raise ValueError(f"no {name} given: give at least one, or omit it")
-        self._check_backward()
+        if self.surrogate and self.onset != "none":
+            raise ValueError("the onset term corrects exact derivatives: omit onset or backward")
+        for name in () if self.surrogate else ("backward_stiffness", "backward_margin"):
+            if getattr(self, name) is not None:
+                raise ValueError(f"{name} needs a contact family in backward")
         if self.iterations is not None and self.points is not None:
             raise ValueError("iterations are for descents and points for landscapes: give one of them")
         if self.kind is None:
@@ -170,15 +174,6 @@ class StudyConfig(Checked):
             object.__setattr__(self, "kind", of_points if self.iterations is None else "descents")
         self._settle()
         check_span(self.span)
-
-    def _check_backward(self) -> None:
-        """Reject options of the backward model without one, and the onset term with one."""
-        if not self.surrogate:
-            for name in ("backward_stiffness", "backward_margin"):
-                if getattr(self, name) is not None:
-                    raise ValueError(f"{name} needs a contact family in backward")
-        elif self.onset != "none":
-            raise ValueError("the onset term corrects exact derivatives: omit onset or backward")
 
     def _settle(self) -> None:
         """Reject options of other kinds of study, and fill in the defaults of this kind's own."""
@@ -204,17 +199,6 @@ class StudyConfig(Checked):
     def batches(self) -> int:
         """Number of seeds, given or by default."""
         return self.seeds or (1 if self.kind == "landscapes" else 10)
-
-
-def check_names(label: str, names: Sequence[str], choices: Collection[str]) -> None:
-    """Reject an empty selection or repeated names.
-
-    Raises:
-        ValueError: with the choices, or with the repeated names.
-    """
-    if not names:
-        raise ValueError(f"no {label} given; choose from {', '.join(choices)}")
-    refuse_repeats(label, names)
 
 
 def refuse_repeats(label: str, values: Sequence[object]) -> None:

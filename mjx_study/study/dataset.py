@@ -32,11 +32,12 @@ def as_plain(document: Any) -> Any:
 def dataset_of(document: Mapping[str, Any], cells: Cells) -> xr.Dataset:
     """Collect all cells of a study in labelled arrays; NaN where a cell is missing.
 
-    Args:
-        document: contents of a study.json; each cell has the key "at", its index along every outer dimension.
+    In the document, each cell has the key "at", its index along every outer dimension, and solref and solimp of its
+    contact unless the MJCF's apply.
     """
     config, places = document["config"], document["cells"]
     outer = tuple(places[0]["at"])
+    cells = {index: (_solver(places[index]) | dict(arrays), by) for index, (arrays, by) in cells.items()}
     dimensions: dict[str, Sequence[Any]] = dict(document["axes"]) | {
         "estimator": config["estimators"],
         "seed": range(config["seeds"]),
@@ -79,12 +80,17 @@ def dataset_of(document: Mapping[str, Any], cells: Cells) -> xr.Dataset:
     return dataset
 
 
+def _solver(cell: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    sizes = {"solref": 2, "solimp": 5}
+    return {name: np.array(cell.get(name) or [np.nan] * size) for name, size in sizes.items()}
+
+
 def _mixture(versions: Sequence[Mapping[str, str]]) -> str:
     """Packages that differ in version between cells, with these versions; empty if there are none."""
     names = dict.fromkeys(name for each in versions for name in each)
     split = {name: [part for each in versions for part in each.get(name, "none").split(" and ")] for name in names}
-    by_name = {name: list(dict.fromkeys(parts)) for name, parts in split.items()}
-    return ", ".join(f"{name} {' and '.join(found)}" for name, found in by_name.items() if len(found) > 1)
+    found = {name: dict.fromkeys(parts) for name, parts in split.items()}
+    return ", ".join(f"{name} {' and '.join(parts)}" for name, parts in found.items() if len(parts) > 1)
 
 
 def write_dataset(dataset: xr.Dataset, path: Path) -> Path:

@@ -10,7 +10,7 @@ import dataclasses
 import math
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from functools import cached_property, partial
@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
-from estimators import Estimator, Objective, draw
+from estimators import Estimator, draw
 from estimators.estimator import draw_at, sample_keys
 from mjx_study.compiled import Compiled
 from mjx_study.objective import Simulator, TracedObjective, simulate
@@ -53,23 +53,21 @@ def compute_descents(plan: StudyPlan) -> Callable[..., dict[str, np.ndarray]]:
         key = (cell.group, cell.sigma, cell.samples, cell.model.stiffness if cell.model.analytic else None)
         if key not in backends:
             backends[key] = Backend(plan, cell)
-        backend, chosen = backends[key], estimators_of(plan, cell)
-        kept = dict(part.kept)
-        programs = [iteration(plan, cell, each.needs) for each in chosen]
-        begun = [
-            _begin(backend, cell.model, index, each, program, kept, part)
-            for index, (each, program) in enumerate(zip(chosen, programs, strict=True))
+        backend, kept = backends[key], dict(part.kept)
+        runs = [
+            _Run(backend, cell.model, each, index, iteration(plan, cell, each.needs), kept, part)
+            for index, each in enumerate(estimators_of(plan, cell))
         ]
         waiting = nullcontext() if cell.model.analytic else timed("descents")
         with waiting, ThreadPoolExecutor(backend.threads) as pool:
             each_in_turn = map if backend.threads == 1 else pool.map
-            ended = list(each_in_turn(lambda descend: descend(), begun))
-        for program, (_, calls, seconds) in zip(programs, ended, strict=True):
-            if calls and not cell.model.analytic:
-                tell(program, calls, seconds)
-        runs = [_numbers(backend, cell.model, each, run) for each, (run, *_) in zip(chosen, ended, strict=True)]
-        found = {name: np.stack([run[name] for run in runs], axis=-1) for name in runs[0] if name != "theta"}
-        found["theta"] = np.stack([run["theta"] for run in runs], axis=1)  # (seed, estimator, param)
+            list(each_in_turn(_Run.descend, runs))
+        for run in runs:
+            if (calls := len(run.seconds) - run.already) and not cell.model.analytic:
+                tell(run.program, calls, run.seconds[-1] - run.before)
+        numbers = [run.numbers() for run in runs]
+        found = {name: np.stack([each[name] for each in numbers], axis=-1) for name in numbers[0] if name != "theta"}
+        found["theta"] = np.stack([each["theta"] for each in numbers], axis=1)  # (seed, estimator, param)
         mean, error = backend.cost(backend.task.theta, cell.model)
         start = backend.metrics(backend.task.theta, cell.model)
         found |= {"start_cost": np.array(mean), "start_cost_se": np.array(error)}
@@ -115,18 +113,16 @@ class Backend:
         def update(state: Descent, drawn: dict[str, Any]) -> tuple[Descent, Record]:
             return advance(state, drawn, estimator, self.optimizer)
 
-        def batches(objective: Objective, theta: Float[Array, " params"], key: Key[Array, ""]) -> dict[str, Any]:
-            return draw(estimator.needs, objective, theta, key, self.samples)
-
-        if self.simulator is not None:
+        if (simulator := self.simulator) is not None:
             if estimator not in self._iterations:
-                made_of = "descent", estimator, self.optimizer, self.task, self.samples, self.simulator.chunk_size
-                self._iterations[estimator] = Compiled(
-                    lambda contact, sigma, state, keys: update(
-                        state, jax.vmap(partial(batches, self._traced(contact, sigma)))(state.theta, keys)
-                    ),
-                    *made_of,
-                )
+
+                def simulated_update(contact, sigma, state: Descent, keys):
+                    objective = TracedObjective(simulator, contact, sigma)
+                    batches = partial(draw, estimator.needs, objective, num_samples=self.samples)
+                    return update(state, jax.vmap(batches)(state.theta, keys))
+
+                made_of = "descent", estimator, self.optimizer, self.task, self.samples, simulator.chunk_size
+                self._iterations[estimator] = Compiled(simulated_update, *made_of)
             simulated = self._iterations[estimator]
 
             def on_device(state: Descent, keys: Key[Array, " seeds"], index: int) -> tuple[Descent, Record]:
@@ -136,18 +132,13 @@ class Backend:
 
             return on_device
         compiled = self._iterations.setdefault(estimator, jax.jit(update))
+        count = max(1, TOGETHER // self.samples)
 
         def on_host(state: Descent, keys: Key[Array, " seeds"], index: int) -> tuple[Descent, Record]:
-            reference = self.task.replace(sigma=float(self._sigma[index])).analytic(
-                model.stiffness * float(self._stiffness[index])
-            )
-            count = max(1, TOGETHER // self.samples)
-            parts = [
-                self._together(
-                    estimator.needs, reference, state.theta[first : first + count], keys[first : first + count]
-                )
-                for first in range(0, self.seeds, count)
-            ]
+            task = self.task.replace(sigma=float(self._sigma[index]))
+            reference = task.analytic(model.stiffness * float(self._stiffness[index]))
+            groups = [slice(first, first + count) for first in range(0, self.seeds, count)]
+            parts = [self._together(estimator.needs, reference, state.theta[some], keys[some]) for some in groups]
             return compiled(state, jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts))
 
         return on_host
@@ -190,10 +181,6 @@ class Backend:
             found = jax.device_get(self._observe(theta, model.contact, self._evaluation_keys()))
         return {name: float(np.mean(values, where=np.isfinite(values))) for name, values in sorted(found.items())}
 
-    def _traced(self, contact: ContactModel | None, sigma: Any) -> TracedObjective:
-        assert self.simulator is not None
-        return TracedObjective(self.simulator, contact, sigma)
-
     def _evaluation_keys(self) -> Key[Array, " samples"]:
         key = jax.random.fold_in(jax.random.key(self.config.seed), 2**31 - 1)
         return jax.random.split(key, self.config.evaluation_samples or 0)
@@ -210,131 +197,107 @@ class Backend:
 
 
 @dataclasses.dataclass
-class _Progress:
-    """Progress of a run: state, records and seconds, convertible to arrays of a checkpoint."""
+class _Run:
+    """Descents of one estimator from all seeds; `index` is its place among those of the cell, whose checkpoint `kept`
+    all add to."""
 
-    state: Descent
-    records: list[Record]
-    seconds: list[float]
+    backend: Backend
+    model: ContactPoint
+    estimator: Estimator
+    index: int
+    program: Program
+    kept: dict[str, np.ndarray]
+    part: Part
 
-    @classmethod
-    def of(cls, arrays: Mapping[str, np.ndarray], index: int, start: Descent) -> "_Progress":
-        """Restore a run from a checkpoint, or begin at its start."""
-        if f"seconds_{index}" not in arrays:
-            return cls(start, [], [])
-        leaves, structure = jax.tree.flatten(start)
-        state = structure.unflatten([jnp.asarray(arrays[f"state_{index}_{leaf}"]) for leaf in range(len(leaves))])
-        columns = [arrays[f"history_{index}_{name}"] for name in HISTORY]
-        records = [Record(*map(jnp.asarray, row)) for row in zip(*columns, strict=True)]
-        return cls(state, records, list(map(float, arrays[f"seconds_{index}"])))
+    def __post_init__(self) -> None:
+        """Begin at the start, or restore a run from its checkpoint; and compile an iteration."""
+        backend, index = self.backend, self.index
+        self.state = begin(backend.optimizer, backend.task.theta, backend.seeds)
+        self.records: list[Record] = []
+        self.seconds: list[float] = []
+        if f"seconds_{index}" in self.kept:
+            leaves, structure = jax.tree.flatten(self.state)
+            kept = [jnp.asarray(self.kept[f"state_{index}_{leaf}"]) for leaf in range(len(leaves))]
+            self.state = structure.unflatten(kept)
+            columns = [self.kept[f"history_{index}_{name}"] for name in HISTORY]
+            self.records += [Record(*map(jnp.asarray, row)) for row in zip(*columns, strict=True)]
+            self.seconds += map(float, self.kept[f"seconds_{index}"])
+        self.already, self.before = len(self.records), self.seconds[-1] if self.seconds else 0.0
+        self.state = backend.place(self.state, index)
+        seeds = jnp.arange(backend.seeds)
+        keys = jax.vmap(lambda seed: jax.random.fold_in(jax.random.key(backend.config.seed), seed))(seeds)
+        fold_in = jax.vmap(jax.random.fold_in, (0, None))
+        self._keys_of = jax.jit(lambda iteration: fold_in(jax.random.clone(keys), iteration))
+        self._iterate = backend.iteration(self.estimator, self.model)
+        if self.already < backend.recipe.iterations and bool(jnp.any(going(self.state))):
+            first = self._keys_of(self.already)
+            with nullcontext() if self.model.analytic else timed(self.program):
+                jax.block_until_ready(self._iterate(self.state, first, self.already))  # compile; discard the result
 
-    def arrays(self, index: int) -> dict[str, np.ndarray]:
-        leaves = jax.tree.leaves(self.state)
-        found = {f"state_{index}_{leaf}": np.asarray(value) for leaf, value in enumerate(leaves)}
-        found |= {f"history_{index}_{name}": values for name, values in self.history.items()}
-        return found | {f"seconds_{index}": np.array(self.seconds)}
+    def descend(self) -> None:
+        """Run the remaining iterations, writing a checkpoint now and then and at the end."""
+        iterations, done, pending = self.backend.recipe.iterations, self.already, []
+        last = saved = time.perf_counter()
+        while done < iterations and (pending or bool(jnp.any(going(self.state)))):
+            self.state, record = self._iterate(self.state, self._keys_of(done), done)
+            pending.append(record)
+            done += 1
+            if len(pending) >= REPORT_EVERY:
+                last = self._collect(pending, last)
+                total = len(self.backend.config.estimators) * iterations
+                self.part.report(self.index * iterations + done, total, self.estimator.name)
+                if last - saved > SAVE_SECONDS:
+                    self._save()
+                    saved = last = time.perf_counter()
+        if pending:
+            self._collect(pending, last)
+        if done > self.already:
+            self._save()
 
-    @property
-    def history(self) -> dict[str, Float[np.ndarray, "iterations seeds"]]:
-        seeds = self.state.reason.shape[0]
+    def _collect(self, pending: list[Record], since: float) -> float:
+        """Fetch records from the device, and return when they arrived."""
+        self.records += jax.device_get(pending)
+        now, elapsed = time.perf_counter(), self.seconds[-1] if self.seconds else 0.0
+        self.seconds += [elapsed + (now - since) * (place + 1) / len(pending) for place in range(len(pending))]
+        pending.clear()
+        return now
+
+    def _save(self) -> None:
+        with self.backend.saving:
+            leaves = jax.tree.leaves(self.state)
+            self.kept.update({f"state_{self.index}_{leaf}": np.asarray(value) for leaf, value in enumerate(leaves)})
+            self.kept.update({f"history_{self.index}_{name}": values for name, values in self._history().items()})
+            self.kept[f"seconds_{self.index}"] = np.array(self.seconds)
+            self.part.save(dict(self.kept))
+
+    def _history(self) -> dict[str, Float[np.ndarray, "iterations seeds"]]:
+        shape = len(self.records), self.backend.seeds
         return {
-            name: np.array([getattr(record, name) for record in self.records], float).reshape(-1, seeds)
-            for name in HISTORY
+            name: np.array([getattr(record, name) for record in self.records], float).reshape(shape) for name in HISTORY
         }
 
-
-def _begin(
-    backend: Backend,
-    model: ContactPoint,
-    index: int,
-    estimator: Estimator,
-    program: Program,
-    kept: dict[str, np.ndarray],
-    part: Part,
-) -> Callable[[], tuple[_Progress, int, float]]:
-    """Compile an iteration of all seeds of one estimator.
-
-    Returns:
-         A function that runs the remaining iterations and adds them to `kept`; it returns the run, calls and seconds.
-    """
-    seeds, iterations = backend.seeds, backend.recipe.iterations
-    run = _Progress.of(kept, index, begin(backend.optimizer, backend.task.theta, seeds))
-    state, records, seconds = backend.place(run.state, index), run.records, run.seconds
-    keys = jax.vmap(lambda seed: jax.random.fold_in(jax.random.key(backend.config.seed), seed))(jnp.arange(seeds))
-    keys_of = jax.jit(lambda index: jax.vmap(lambda key: jax.random.fold_in(key, index))(jax.random.clone(keys)))
-    iterate = backend.iteration(estimator, model)
-    already = len(records)
-    if already < iterations and bool(jnp.any(going(state))):
-        first = keys_of(already)
-        with nullcontext() if model.analytic else timed(program):
-            jax.block_until_ready(iterate(state, first, already))  # compile; the result is discarded
-    before = seconds[-1] if seconds else 0.0
-
-    def descend() -> tuple[_Progress, int, float]:
-        nonlocal state
-        done, elapsed, pending = already, before, []
-        saved = last = time.perf_counter()
-
-        def collect(record: Record | None) -> None:
-            nonlocal last, elapsed
-            if record is not None:
-                pending.append(record)
-            if pending and (record is None or len(pending) >= REPORT_EVERY):
-                records.extend(jax.device_get(pending))
-                now = time.perf_counter()
-                seconds.extend(elapsed + (now - last) * (index + 1) / len(pending) for index in range(len(pending)))
-                elapsed, last = seconds[-1], now
-                pending.clear()
-
-        def save() -> None:
-            with backend.saving:
-                kept.update(_Progress(state, records, seconds).arrays(index))
-                part.save(dict(kept))
-
-        while done < iterations:
-            if not pending and not bool(jnp.any(going(state))):
-                break
-            state, record = iterate(state, keys_of(done), done)
-            done += 1
-            collect(record)
-            if not pending:
-                part.report(index * iterations + done, len(backend.config.estimators) * iterations, estimator.name)
-                if time.perf_counter() - saved > SAVE_SECONDS:
-                    save()
-                    saved = last = time.perf_counter()
-        collect(None)
-        if done > already:
-            save()
-        return _Progress(state, records, seconds), done - already, elapsed - before
-
-    return descend
-
-
-def _numbers(backend: Backend, model: ContactPoint, estimator: Estimator, run: _Progress) -> dict[str, np.ndarray]:
-    iterations, seeds = backend.recipe.iterations, backend.seeds
-    costs = [backend.cost(theta, model) for theta in run.state.theta]
-    metrics = [backend.metrics(theta, model) for theta in run.state.theta]
-    reason = np.asarray(run.state.reason)
-    done = np.sum(~np.isnan(run.history["nonfinite"]), axis=0)
-    found = {name: _padded(values, iterations) for name, values in run.history.items()}
-    return found | {
-        "theta": np.asarray(run.state.theta),
-        "seconds": _padded(np.array(run.seconds), iterations),
-        "stopped_at": np.where(reason > 0, done, np.nan),
-        "reason": np.where(reason > 0, reason, np.nan).reshape(seeds),
-        "final_cost": np.array([mean for mean, _ in costs]),
-        "final_cost_se": np.array([error for _, error in costs]),
-        "rollouts": np.array(_rollouts(estimator, backend)),
-        **{METRIC + name: np.array([each[name] for each in metrics]) for name in metrics[0]},
-    }
+    def numbers(self) -> dict[str, np.ndarray]:
+        """Numbers of the run, once it has ended."""
+        backend, history = self.backend, self._history()
+        costs = [backend.cost(theta, self.model) for theta in self.state.theta]
+        metrics = [backend.metrics(theta, self.model) for theta in self.state.theta]
+        reason = np.asarray(self.state.reason)
+        done = np.sum(~np.isnan(history["nonfinite"]), axis=0)
+        calls = [rollouts_of(each, backend.samples, backend.task.random_start) for each in self.estimator.needs]
+        found = {name: _padded(values, backend.recipe.iterations) for name, values in history.items()}
+        return found | {
+            "theta": np.asarray(self.state.theta),
+            "seconds": _padded(np.array(self.seconds), backend.recipe.iterations),
+            "stopped_at": np.where(reason > 0, done, np.nan),
+            "reason": np.where(reason > 0, reason, np.nan),
+            "final_cost": np.array([mean for mean, _ in costs]),
+            "final_cost_se": np.array([error for _, error in costs]),
+            "rollouts": np.array(sum(rollouts for rollouts, _ in calls)),
+            **{METRIC + name: np.array([each[name] for each in metrics]) for name in metrics[0]},
+        }
 
 
 def _padded(values: np.ndarray, length: int) -> np.ndarray:
     """Pad values with NaN to a length along the first axis."""
     missing = [(0, length - len(values))] + [(0, 0)] * (values.ndim - 1)
     return np.pad(np.asarray(values, float), missing, constant_values=np.nan)
-
-
-def _rollouts(estimator: Estimator, backend: Backend) -> int:
-    """Rollouts in one iteration of one seed."""
-    return sum(rollouts_of(oracle, backend.samples, backend.task.random_start)[0] for oracle in estimator.needs)

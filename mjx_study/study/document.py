@@ -1,13 +1,20 @@
-"""The schema of study.json; files from elsewhere are validated before use."""
+"""study.json: what a plan writes into it, and its schema; files from elsewhere are validated before use."""
 
+import dataclasses
 import json
 import math
+from collections import Counter, defaultdict
 from typing import Annotated, Any, Final, Literal
 
+import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from mjx_study.files import Finite, told
+from mjx_study.files import Finite, Schema, told
+from mjx_study.identity import git_revision, versions
 from mjx_study.option import OPTIONS
+from mjx_study.runtime import environment
+from mjx_study.study.plan import StudyCell, StudyPlan, estimators_of
+from mjx_study.table import digits_to_tell_apart
 
 MOST_NUMBERS: Final = 500_000_000
 """Maximum size of a variable of a study."""
@@ -103,25 +110,99 @@ class _Format(BaseModel):
 
 
 def read_format(content: bytes | str) -> int:
-    """Read the format number of a study.json.
-
-    Raises:
-        ValueError: there is none.
-    """
-    try:
-        return _Format.model_validate_json(content).format
-    except ValidationError as error:
-        raise ValueError(told(error)) from None
+    """Format number of a study.json; ValueError if there is none."""
+    return _validated(_Format, content).format
 
 
 def read_document(content: bytes | str) -> dict[str, Any]:
-    """Read a study.json as plain data.
+    """Read a study.json as plain data; ValueError names the key that violates the schema."""
+    _validated(StudyDocument, content)
+    return json.loads(content)
 
-    Raises:
-        ValueError: it violates the schema; the message names the key.
-    """
+
+def _validated(schema: type[Schema], content: bytes | str) -> Schema:
     try:
-        StudyDocument.model_validate_json(content)
+        return schema.model_validate_json(content)
     except ValidationError as error:
         raise ValueError(told(error)) from None
-    return json.loads(content)
+
+
+def document_of(plan: StudyPlan, command: str | None) -> dict[str, Any]:
+    """The document of a plan. Coordinates are compared exactly, not by their printed names."""
+    exact = [_coordinates(plan, cell) for cell in plan.cells]
+    axes = {name: list(dict.fromkeys(each[name] for each in exact)) for name in exact[0]}
+    for name in ("timestep", "sigma", "samples"):  # the others keep the order of the configuration
+        axes[name].sort()
+    index = {name: {value: place for place, value in enumerate(along)} for name, along in axes.items()}
+    places = [{name: index[name][value] for name, value in each.items()} for each in exact]
+    fields = {field.name: getattr(plan.config, field.name) for field in dataclasses.fields(plan.config)}
+    fields |= {"tasks": plan.config.task_names, "seeds": plan.config.batches, "iterations": plan.iterations or None}
+    return {
+        "config": fields,
+        "warnings": list(plan.warnings),
+        "contents": plan.contents,
+        "versions": versions(),
+        "environment": environment(),
+        "revision": git_revision(),
+        "command": command,
+        "models": [{"contact": family, "stiffness": stiffness} for family, stiffness in axes["model"]],
+        "axes": axes | {"task": _task_names(plan, axes["task"]), "model": _model_names(axes["model"])},
+        "resolved": _resolved(plan, places, len(axes["task"])),
+        "cells": [
+            {"label": plan.label(cell), "at": at} | _solver_parameters(cell)
+            for cell, at in zip(plan.cells, places, strict=True)
+        ],
+    }
+
+
+def _coordinates(plan: StudyPlan, cell: StudyCell) -> dict[str, Any]:
+    group = plan.groups[cell.group]
+    return {
+        "task": group.name,
+        "timestep": group.timestep,
+        "cone": group.cone,
+        "model": (cell.model.family, cell.model.stiffness),
+        "sigma": cell.sigma,
+        "samples": cell.samples,
+    }
+
+
+def _resolved(plan: StudyPlan, places: list[dict[str, int]], tasks: int) -> list[dict[str, Any]]:
+    """Settings that differ between tasks: noise, horizons and estimator options."""
+    found: list[dict[str, Any]] = [{} for _ in range(tasks)]
+    for cell, at in zip(plan.cells, places, strict=True):
+        group, entry = plan.groups[cell.group], found[at["task"]]
+        horizons = entry.setdefault("horizon", [])
+        if group.task.horizon not in horizons:
+            horizons.append(group.task.horizon)
+        if "noise" not in entry:
+            chosen = zip(plan.config.estimators, estimators_of(plan, cell), strict=True)
+            entry["noise"] = group.task.noise
+            entry["estimators"] = {name: dataclasses.asdict(estimator) for name, estimator in chosen}
+            entry["recipe"] = {} if group.recipe is None else dataclasses.asdict(group.recipe)
+            entry["parameters"] = group.task.policy.num_params
+    return found
+
+
+def _solver_parameters(cell: StudyCell) -> dict[str, list[float] | None]:
+    """solref and solimp of a cell's contact; None if the MJCF's apply."""
+    contact = cell.model.contact
+    return {
+        name: None if contact is None else np.asarray(getattr(contact, name)).tolist() for name in ("solref", "solimp")
+    }
+
+
+def _task_names(plan: StudyPlan, configured: list[str]) -> list[str]:
+    """The tasks' own names, or the configuration's where several tasks share one."""
+    own = {group.name: group.task.name for group in plan.groups}
+    shared = Counter(own[name] for name in configured)
+    return [name if shared[own[name]] > 1 else own[name] for name in configured]
+
+
+def _model_names(models: list[tuple[str, float]]) -> list[str]:
+    """Family and stiffness, with enough digits to distinguish a family's stiffnesses."""
+    by_family = defaultdict(list)
+    for family, stiffness in models:
+        by_family[family].append(stiffness)
+    digits = {family: digits_to_tell_apart(values) for family, values in by_family.items()}
+    return [f"{family} {stiffness:.{digits[family]}g}" if stiffness else family for family, stiffness in models]

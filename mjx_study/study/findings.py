@@ -1,10 +1,9 @@
 """Results of a study: a row for each gradient estimate, and findings supported by the intervals."""
 
-import itertools
 import json
 import math
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from types import SimpleNamespace
 from typing import Any, Final
 
@@ -87,7 +86,7 @@ class Row(SimpleNamespace):
 
 def rows_of(dataset: xr.Dataset) -> list[Row]:
     """Return a row for each computed estimate; contact model, seed and estimator vary fastest."""
-    outer = ("task", "timestep", "cone", "sigma", "samples", "model", "seed", "estimator")
+    outer = PLACE[:8]
     rows, grid = [], dataset["gradient_norm"].transpose(*outer)
     names = [name for name in GRADIENTS if name in dataset and name not in VECTORS]
 
@@ -115,27 +114,33 @@ def rows_of(dataset: xr.Dataset) -> list[Row]:
 def findings(dataset: xr.Dataset) -> list[str]:
     """Return the findings supported by a study's intervals, as sentences."""
     kind = json.loads(dataset.attrs["config"])["kind"]
-    return {"gradients": _of_gradients, "descents": lambda _: [], "landscapes": _of_landscapes}[kind](dataset)
+    return [] if kind == "descents" else {"gradients": _of_gradients, "landscapes": _of_landscapes}[kind](dataset)
 
 
 def _of_gradients(dataset: xr.Dataset) -> list[str]:
     """Report where FoBG's variance exceeds ZoBG's and which means are biased, by the coordinates in `SETTING`."""
     rows, gammas, sentences = rows_of(dataset), gammas_of(dataset), []
     confidence = json.loads(dataset.attrs["config"])["confidence"]
-    varied = [name for name in SETTING if len({getattr(row, name) for row in rows}) > 1]
-    for setting in dict.fromkeys(tuple(getattr(row, name) for name in SETTING) for row in rows):
-        alike = [row for row in rows if tuple(getattr(row, name) for name in SETTING) == setting]
+    varied = [name for name in SETTING if len(_by(rows, name)) > 1]
+    for setting, alike in _by(rows, *SETTING).items():
         told = [_setting(name, value) for name, value in zip(SETTING, setting, strict=True) if name in varied]
-        for family in dict.fromkeys(row.contact for row in alike):
-            part, prefix = [row for row in alike if row.contact == family], ", ".join([*told, family])
+        for (family,), part in _by(alike, "contact").items():
             found = [
                 *_variance_finding(part, confidence),
                 *_bias_findings(part, gammas),
                 *_onset_findings(part),
                 *_meaningless(part, gammas),
             ]
-            sentences += [f"{prefix}: {sentence}" for sentence in found]
+            sentences += [f"{', '.join([*told, family])}: {sentence}" for sentence in found]
     return sentences
+
+
+def _by(rows: Iterable[Row], *names: str) -> dict[tuple[Any, ...], list[Row]]:
+    """Rows by some of their variables, in the order of the first ones."""
+    groups: dict[tuple[Any, ...], list[Row]] = defaultdict(list)
+    for row in rows:
+        groups[tuple(getattr(row, name) for name in names)].append(row)
+    return groups
 
 
 def _setting(name: str, value: Any) -> str:
@@ -154,22 +159,18 @@ def gammas_of(dataset: xr.Dataset) -> dict[str, float]:
 def _meaningless(rows: Sequence[Row], gammas: Mapping[str, float]) -> list[str]:
     """Report why results mean nothing: contact never active, reference too uncertain, AoBG's bound below epsilon."""
     found = []
-    numbers = defaultdict(list)
-    for row in rows:
-        numbers[row.estimator, row.seed].append((row.gradient_norm, row.variance))
-    several = [each for each in numbers.values() if len(each) > 1]
-    if several and all(np.allclose(each, each[0], rtol=1e-12, atol=0, equal_nan=True) for each in several):
+    several = [group for group in _by(rows, "estimator", "seed").values() if len(group) > 1]
+    numbers = [[(row.gradient_norm, row.variance) for row in group] for group in several]
+    if numbers and all(np.allclose(each, each[0], rtol=1e-12, atol=0, equal_nan=True) for each in numbers):
         found.append("nothing depends on K: the contact whose stiffness is swept was never active")
-    unsure = _stiffnesses([row for row in rows if row.reference_uncertainty > UNSURE])
-    if unsure:
+    if unsure := [row for row in rows if row.reference_uncertainty > UNSURE]:
         found.append(
             f"the reference's own uncertainty exceeds {UNSURE:.0%}{_at(unsure)}: errors and verdicts mean "
             "little there; increase --reference-samples"
         )
-    bound = [row for row in rows if row.estimator in INTERPOLATED and (row.epsilon or 0.0) > gammas[row.task]]
-    if bound:
+    if bound := [row for row in rows if row.estimator in INTERPOLATED and (row.epsilon or 0.0) > gammas[row.task]]:
         found.append(
-            f"AoBG equals ZoBG{_at(_stiffnesses(bound))}: its bound gamma is below epsilon, the radius of ZoBG's mean; "
+            f"AoBG equals ZoBG{_at(bound)}: its bound gamma is below epsilon, the radius of ZoBG's mean; "
             "increase --gamma or --samples"
         )
     return found
@@ -177,17 +178,15 @@ def _meaningless(rows: Sequence[Row], gammas: Mapping[str, float]) -> list[str]:
 
 def _variance_finding(rows: Sequence[Row], confidence: float) -> list[str]:
     """Compare FoBG's variance with ZoBG's at each stiffness: the verdict shared by all seeds, if most have one."""
-    table: dict[float, dict[str, list[Row]]] = defaultdict(lambda: defaultdict(list))
-    for row in rows:
-        table[row.stiffness][row.estimator].append(row)
-    groups: dict[str, list[float]] = {verdict: [] for verdict in (BELOW, ABOVE, ALIKE, UNKNOWN)}
-    for stiffness, estimates in sorted(table.items()):
-        if not {"zobg", "fobg"} <= estimates.keys():
+    groups: dict[str, list[Row]] = {verdict: [] for verdict in (BELOW, ABOVE, ALIKE, UNKNOWN)}
+    for _, same in sorted(_by(rows, "stiffness").items()):
+        zeroth, first = ([row for row in same if row.estimator == name] for name in ("zobg", "fobg"))
+        if not zeroth or not first:
             return []
-        verdicts = [_order(*pair) for pair in zip(estimates["zobg"], estimates["fobg"], strict=True)]
+        verdicts = [_order(*pair) for pair in zip(zeroth, first, strict=True)]
         known = [verdict for verdict in verdicts if verdict != UNKNOWN]
         shared = known[0] if len(set(known)) == 1 else ALIKE
-        groups[shared if 2 * len(known) > len(verdicts) else UNKNOWN].append(stiffness)
+        groups[shared if 2 * len(known) > len(verdicts) else UNKNOWN] += first
     parts = [f"{verdict}{_at(group)}" for verdict, group in groups.items() if group]
     return [f"FoBG's variance is {'; '.join(parts)} ({confidence:.0%} intervals)"]
 
@@ -201,28 +200,25 @@ def _order(zeroth: Row, first: Row) -> str:
 
 
 def _bias_findings(rows: Sequence[Row], gammas: Mapping[str, float]) -> list[str]:
-    """Report means farther from the reference than any draw of the test, or off but undecided, in a sentence each.
-
-    With several seeds, counts and the median debiased error are given.
-    """
+    """Report means farther from the reference than any draw of the test, or off but undecided, in a sentence each; with
+    several seeds, with counts and the median debiased error."""
     sentences = []
-    for estimator in dict.fromkeys(row.estimator for row in rows if row.estimator in BIASED):
-        mine = [row for row in rows if row.estimator == estimator]
-        seeds = len({row.seed for row in mine})
+    for (estimator,), mine in _by((row for row in rows if row.estimator in BIASED), "estimator").items():
+        seeds = len(_by(mine, "seed"))
         biased = [row for row in mine if row.bias_verdict == "biased"]
         off = [row for row in mine if row.bias_verdict == "too few effective samples" and _off(row)]
         mean = f"{BIASED[estimator]}'s mean is"
         if biased:
-            shares = ", ".join(f"{_share(same)}{_at([stiffness])}{_of(same, seeds)}" for stiffness, same in _by(biased))
+            shares = ", ".join(f"{_share(same)}{_of(same, seeds)}" for same in _by(biased, "stiffness").values())
             least = max(row.bias_p_value for row in biased)
             free = estimator in INTERPOLATED and math.isinf(gammas[biased[0].task])
             advice = ": it has no accuracy bound; set one with --gamma" if free else ""
             sentences.append(f"{mean} biased by {shares} (p <= {least:.3f}){advice}")
-        for stiffness, same in _by(off):
+        for same in _by(off, "stiffness").values():
             fewest = [min(row.effective_samples, row.reference_effective_samples) for row in same]
             held = f"{min(fewest):.1f}" if all(row.effective_samples for row in same) else "all equal"
             sentences.append(
-                f"{mean} off by {_share(same)}{_at([stiffness])}{_of(same, seeds)}, from bias or lack of rare samples: "
+                f"{mean} off by {_share(same)}{_of(same, seeds)}, from bias or lack of rare samples: "
                 f"too few effective samples ({held})"
             )
     return sentences
@@ -238,32 +234,22 @@ def linear_error(strength: float) -> str:
 def _onset_findings(rows: Sequence[Row]) -> list[str]:
     """Report where the onset term may be off: either kind if noise is narrow, else the linear one at long timesteps."""
     found, corrected = [], [row for row in rows if row.onsets]
-    narrow = [row for row in corrected if row.onset_spread < NARROW]
-    if narrow:
+    if narrow := [row for row in corrected if row.onset_spread < NARROW]:
         least = min(row.onset_spread for row in narrow)
         found.append(
-            f"the onset term may be off{_at(_stiffnesses(narrow))}, since the noise is narrow: the step at which "
+            f"the onset term may be off{_at(narrow)}, since the noise is narrow: the step at which "
             f"contact begins has a standard deviation of {least:.2g}, and {NARROW} generally suffices; use a "
             "smaller timestep or a larger --sigma, or check the mean (gradcheck --mean)"
         )
     wide = [row for row in corrected if not row.onset_spread < NARROW]
-    strong = [row for row in wide if SHARE_OFF * row.onset_strength > NOTABLE]
-    if strong:
+    if strong := [row for row in wide if SHARE_OFF * row.onset_strength > NOTABLE]:
         most = max(row.onset_strength for row in strong)
         found.append(
             f"{linear_error(most)}, more at grazing contacts and corners"
-            f"{_at(_stiffnesses(strong))}: an onset takes {most:.0%} of the approach speed in one step; --onset jump "
+            f"{_at(strong)}: an onset takes {most:.0%} of the approach speed in one step; --onset jump "
             "or a smaller timestep is better"
         )
     return found
-
-
-def _stiffnesses(rows: Sequence[Row]) -> list[float]:
-    return list(dict.fromkeys(row.stiffness for row in rows))
-
-
-def _by(rows: Sequence[Row]) -> list[tuple[float, list[Row]]]:
-    return [(k, [row for row in rows if row.stiffness == k]) for k in _stiffnesses(rows)]
 
 
 def _off(row: Row) -> bool:
@@ -271,7 +257,8 @@ def _off(row: Row) -> bool:
 
 
 def _of(rows: Sequence[Row], seeds: int) -> str:
-    return f" in {len(rows)} of {seeds} seeds" if seeds > 1 else ""
+    """Where rows are, and how many of the seeds they are."""
+    return _at(rows) + (f" in {len(rows)} of {seeds} seeds" if seeds > 1 else "")
 
 
 def _share(rows: Sequence[Row]) -> str:
@@ -283,8 +270,9 @@ def _share(rows: Sequence[Row]) -> str:
     return f"{share:.1%}" if error < 0.005 else f"{float(f'{100 * share:.2g}'):g}%"
 
 
-def _at(stiffnesses: Sequence[float]) -> str:
-    """Format stiffnesses for a sentence; empty without contact."""
+def _at(rows: Sequence[Row]) -> str:
+    """Format the stiffnesses of rows for a sentence; empty without contact."""
+    stiffnesses = list(dict.fromkeys(row.stiffness for row in rows))
     digits = digits_to_tell_apart(stiffnesses, least=4)
     rounded = (float(f"{value:.{digits}g}") for value in stiffnesses)
     return f" at K = {', '.join(f'{value:.{digits + 2}g}' for value in rounded)} N/m" if any(stiffnesses) else ""
@@ -292,18 +280,15 @@ def _at(stiffnesses: Sequence[float]) -> str:
 
 def _of_landscapes(dataset: xr.Dataset) -> list[str]:
     """Report where the mean of FoBG differs from the slope of the mean cost."""
-    return [
-        f"{label}: {_gap(one)}" for label, one in curves_of(dataset) if {"zobg", "fobg"} <= set(one["estimator"].values)
-    ]
+    both = {"zobg", "fobg"} <= set(dataset["estimator"].values)
+    return [f"{label}: {_gap(one)}" for label, one in curves_of(dataset)] if both else []
 
 
 def curves_of(dataset: xr.Dataset) -> list[tuple[str, xr.Dataset]]:
     """Computed cells of a study of landscapes: contact model, and its numbers along the line."""
-    outer = ("task", "timestep", "cone", "sigma", "samples", "model")
-    cells = (
-        dataset.isel(dict(zip(outer, place, strict=True)))
-        for place in itertools.product(*(range(dataset.sizes[name]) for name in outer))
-    )
+    outer = (*SETTING, "model")
+    places = np.ndindex(*(dataset.sizes[name] for name in outer))
+    cells = [dataset.isel(dict(zip(outer, place, strict=True))) for place in places]
     return [(one["model"].item(), one) for one in cells if bool(one["position"].notnull().any())]
 
 

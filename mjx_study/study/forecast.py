@@ -20,32 +20,19 @@ from mjx_study.table import count, duration, size
 
 @dataclasses.dataclass(frozen=True)
 class Forecast:
-    """The forecast cost of a study; counts cover the missing cells.
-
-    Attributes:
-        computed: number of cells already in the folder.
-        programs: number of rollout programs to compile.
-        rollouts: approximate number of rollouts to simulate, including those to differentiate.
-        gradients: approximate number of rollouts to differentiate.
-        kept: size of all cells' arrays [bytes].
-        memory: approximate size of the largest cell's batches held at once [bytes].
-        devices: number of devices of this process, or of a cluster's workers, that share the work.
-        seconds: approximate time from the start of the first cell to the end of the last [s].
-        compilation: the part of it spent on tracing and compilation, or on reading compiled programs [s].
-        basis: time by basis of the estimate (`times.BASES`), summed over all devices [s].
-    """
+    """The forecast cost of a study; counts cover the missing cells, and rollouts and sizes are approximate."""
 
     cells: int
-    computed: int
-    programs: int
-    rollouts: int
-    gradients: int
-    kept: int
-    memory: int
-    devices: int
-    seconds: float
-    compilation: float
-    basis: dict[str, float]
+    computed: int  # cells already in the folder
+    programs: int  # rollout programs to compile
+    rollouts: int  # to simulate, including those to differentiate
+    gradients: int  # rollouts to differentiate
+    kept: int  # size of all cells' arrays [bytes]
+    memory: int  # size of the largest cell's batches held at once [bytes]
+    devices: int  # of this process, or workers of a cluster, that share the work
+    seconds: float  # from the start of the first cell to the end of the last [s]
+    compilation: float  # the part of it spent on tracing and compilation, or on reading compiled programs [s]
+    basis: dict[str, float]  # time by basis of the estimate (`times.BASES`), summed over all devices [s]
 
     @property
     def lines(self) -> list[str]:
@@ -73,21 +60,16 @@ def forecast(
 ) -> Forecast:
     """Forecast the cost of a plan, less the finished cells of a folder if one is given.
 
-    Args:
-        cluster: as for `cluster.connected`; an address is not contacted and counts as one worker.
-
-    Raises:
-        ValueError: the folder holds another study, or one computed with other versions.
+    The cluster is as for `cluster.connected`; an address is not contacted and counts as one worker. ValueError if the
+    folder holds another study, or one computed with other versions.
     """
     store = None if folder is None else begun_store(plan, folder, accept_versions=accept_versions)
     longer = store is not None and (store.document["config"].get("iterations") or 0) < plan.iterations
     if store is not None:
-        plan = plan.with_chunk(store.document["config"]["chunk_size"])
+        plan = plan.with_chunk(store.chunk_size)
     missing = range(len(plan.cells)) if store is None or longer else store.missing
     cells = [plan.cells[index] for index in missing]
     counts = [rollouts(plan, cell) for cell in cells]
-    programs = {program for cell in cells if (program := plan.program_of(cell)) is not None}
-    each = len(plan.config.estimators) if plan.config.kind == "descents" else 2
     time = _Time(Rates.read(times_folder()))
     devices = len(jax.local_devices()) if cluster is None else _workers(cluster)
     compilation = time.setup(plan, cells)
@@ -99,7 +81,7 @@ def forecast(
     return Forecast(
         cells=len(plan.cells),
         computed=len(plan.cells) - len(cells),
-        programs=each * len(programs),
+        programs=dataclasses.replace(plan, cells=tuple(cells)).compilations,
         rollouts=sum(count for count, _ in counts),
         gradients=sum(count for _, count in counts),
         kept=sum(_kept(plan, cell) for cell in plan.cells),
@@ -139,8 +121,7 @@ class _Time:
             assert recipe is not None
             programs = [iteration(plan, cell, each.needs) for each in estimators_of(plan, cell)]
             own = [self._calls(program, recipe.iterations) for program in programs]
-            for program in programs:
-                counts.pop(program, None)
+            counts = {program: count for program, count in counts.items() if program not in programs}
         batches = sum((self._calls(program, count) for program, count in counts.items()), 0.0)
         return batches + _side_by_side(own, devices) + self._calls(rest(plan, cell), 1)
 

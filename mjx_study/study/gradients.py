@@ -26,8 +26,17 @@ from mjx_study.reference import Reference
 from mjx_study.runtime import traces_folder
 from mjx_study.stopwatch import unheard
 from mjx_study.study.blocks import REFERENCE, Arrays, Blocks, pack
-from mjx_study.study.memory import BIAS_DRAWS, LARGEST_BLOCK
-from mjx_study.study.plan import StudyCell, StudyPlan, block_of, blocks_of, estimators_of, oracles_of, seeds_together
+from mjx_study.study.memory import BIAS_DRAWS, LARGEST_BLOCK, padded_size
+from mjx_study.study.plan import (
+    StudyCell,
+    StudyPlan,
+    block_of,
+    blocks_of,
+    estimators_of,
+    oracles_of,
+    padded_samples,
+    seeds_together,
+)
 from mjx_study.study.reference_gradient import reference_gradient
 from mjx_study.study.sampling import Objectives, cell_keys, draw_batches, sample_keys
 from mjx_study.study.store import Part
@@ -138,7 +147,9 @@ class Gradients:
         def statistics(drawn: Any, seconds: Any, residuals: Any, keys: Any, compiled: Future[None]) -> Any:
             compiled.result()
             with self._device:
-                numbers = jax.block_until_ready(_seed_numbers(chosen, config.confidence)(drawn, reference, keys))
+                batches = jax.tree.map(partial(_padded, size=padded_samples(self._plan, cell)), drawn)
+                arguments = batches, np.asarray(cell.samples), reference, keys
+                numbers = jax.block_until_ready(_seed_numbers(chosen, config.confidence)(*arguments))
             tallies = {name: Tally.of(drawn[name], seconds[name], residuals[name]) for name in oracles}
             return jax.device_get(numbers), tallies
 
@@ -183,17 +194,16 @@ class Gradients:
         config, task = self._config, self._plan.groups[cell.group].task
         blank = BlankObjective(**vars(objective))
         key, seeds = jax.random.split(jax.random.key(0), 1), seeds_together(self._plan, cell)
+        size = padded_samples(self._plan, cell)
         batches = {
             name: getattr(blank, ORACLES[name].method)(task.theta, jax.random.clone(key)) for name in oracles_of(config)
         }
-        drawn = jax.tree.map(
-            lambda leaf: jax.ShapeDtypeStruct((seeds, cell.samples, *leaf.shape[1:]), leaf.dtype), batches
-        )
+        drawn = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct((seeds, size, *leaf.shape[1:]), leaf.dtype), batches)
         soft = task.theta if takes_candidates(task) and task.contact_pair is not None else None
         pilot = blank.evaluate(task.theta, jax.random.split(jax.random.key(0), min(cell.samples, PILOT)))
         reference = reference_of(task, blank, *self._reference_keys, pilot, soft)
         keys = jax.random.split(self._keys["test"], config.batches)[:seeds]
-        types = drawn, jax.tree.map(type_of, reference), type_of(keys)
+        types = drawn, type_of(np.asarray(size)), jax.tree.map(type_of, reference), type_of(keys)
         statistics = _seed_numbers(estimators_of(self._plan, cell), config.confidence)
         self._compiling = self._pool.submit(unheard(statistics.ahead(*types)))
 
@@ -311,6 +321,8 @@ def reference_of(
         return _antithetic(plus, minus, "zero_noise")
     own = jnp.median(objective.differentiate(task.theta, candidate_keys).gradient, axis=0)
     candidates = jnp.stack([own, jnp.zeros_like(own) if soft is None else soft])
+    padding = padded_size(len(pilot.value)) - len(pilot.value)
+    pilot = jax.tree.map(lambda leaf: np.pad(leaf, [(0, padding)] + [(0, 0)] * (leaf.ndim - 1)), pilot)
     return _reference_gradient(objective.evaluate_odd(task.theta, odd_keys), pilot, candidates, objective.sigma)
 
 
@@ -331,12 +343,31 @@ def _reference_gradient(
 
 @cache
 def _seed_numbers(chosen: tuple[Estimator, ...], confidence: float) -> Compiled:
-    """Compiled statistics of all estimators, batched over seeds: a function of batches, reference and keys."""
+    """Compiled statistics of all estimators, batched over seeds: a function of batches, which may be padded, their
+    number of samples, reference and keys."""
 
-    def numbers(batches, reference, key):
-        return estimate_numbers([estimator(batches) for estimator in chosen], reference, key, confidence)
+    def numbers(batches, samples, reference, key):
+        estimates = [_estimate(estimator, batches, samples) for estimator in chosen]
+        found = estimate_numbers(estimates, reference, key, confidence)
+        padding = len(batches["evaluation"].value) - samples
+        return [row | {"nonfinite": row["nonfinite"] - padding} for row in found]
 
-    return Compiled(jax.vmap(numbers, (0, None, 0)), "numbers of seeds", chosen, confidence)
+    return Compiled(jax.vmap(numbers, (0, None, None, 0)), "numbers of seeds", chosen, confidence)
+
+
+def _estimate(estimator: Estimator, batches: Batches, samples: Array) -> GradientEstimate:
+    """The estimate from the first samples of batches, the others being padding if the estimator is mergeable."""
+    if not estimator.mergeable:
+        return estimator(batches)
+    parts = [part.per_sample for part in estimator.parts(*estimator.pick(batches))]
+    real = jnp.arange(len(parts[0]))[:, None] < samples
+    return estimator.join(*(estimators.summarise(jnp.where(real, part, jnp.nan)) for part in parts))
+
+
+def _padded(leaf: Array, size: int) -> Array | np.ndarray:
+    """Batches of several seeds with copies of their last sample, up to a size."""
+    samples = leaf.shape[1]
+    return leaf if samples == size else np.asarray(leaf)[:, np.minimum(np.arange(size), samples - 1)]
 
 
 @partial(jax.jit, static_argnames="chosen")

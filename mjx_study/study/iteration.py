@@ -4,6 +4,7 @@ import ast
 import dataclasses
 import inspect
 import math
+from contextlib import suppress
 from typing import Any, Final
 
 import jax
@@ -30,11 +31,10 @@ REASONS: Final = (
 @register_pytree
 @dataclasses.dataclass(frozen=True)
 class Descent:
-    """State of all seeds of a run.
+    """State of all seeds of a run; stopped seeds no longer change.
 
     Attributes:
-        theta: parameters of each seed.
-        reason: index into `REASONS`; 0 while a seed continues. Stopped seeds no longer change.
+        reason: index into `REASONS`; 0 while a seed continues.
         first_cost: absolute mean cost of each seed at its first iteration.
     """
 
@@ -47,14 +47,9 @@ class Descent:
 @register_pytree
 @dataclasses.dataclass(frozen=True)
 class Record:
-    """Record of one iteration for each seed; NaN once a seed has stopped.
+    """Variables of one iteration for each seed, see `variables.DESCENTS`; NaN once a seed has stopped.
 
-    Attributes:
-        cost: mean cost of the batch, before the update.
-        variance: variance of a single gradient sample.
-        alpha: weight of the first-order batch; NaN for estimators with a single batch.
-        nonfinite: number of excluded samples.
-        residual: largest solver residual in the batch; 0 for an analytic system.
+    alpha is NaN for estimators with a single batch, and the residual 0 for an analytic system.
     """
 
     cost: Float[Array, "*seeds"]
@@ -68,45 +63,32 @@ class Record:
 def make_optimizer(name: str, learning_rate: float, decay: float) -> optax.GradientTransformation:
     """Create an optax optimiser by name, with learning rate learning_rate / i^decay at iteration i.
 
-    Raises:
-        ValueError: optax has no such optimiser, it needs more than a learning rate, or a number is out of range.
+    ValueError if optax has no such optimiser, it needs more than a learning rate, or a number is out of range.
     """
     if not learning_rate > 0 or not learning_rate < float("inf"):
         raise ValueError(f"the learning rate must be positive and finite, got {learning_rate}")
     if not 0 <= decay <= 2:
         raise ValueError(f"the decay of the learning rate must be a power from 0 to 2, got {decay}")
-    optimizer = _optimizer(name, lambda count: learning_rate / (1.0 + count) ** decay)
-    if optimizer is None:
+    optimizer = None
+    with suppress(Exception):  # whatever optax has by this name may raise anything
+        factory = getattr(optax, name)
+        if "learning_rate" in inspect.signature(factory).parameters:
+            made = factory(learning_rate=lambda count: learning_rate / (1.0 + count) ** decay)
+            theta = jax.ShapeDtypeStruct((2,), float)
+            jax.eval_shape(lambda theta: made.update(theta, made.init(theta), theta), theta)
+            optimizer = made
+    if not isinstance(optimizer, optax.GradientTransformation):
         raise ValueError(
             f"optax has no optimiser {name!r} that takes a learning rate; use for example sgd, adam or rmsprop"
         )
     return optimizer
 
 
-def _optimizer(name: str, schedule: optax.Schedule) -> optax.GradientTransformation | None:
-    """Return optax's optimiser of a name; None if it has no learning rate or needs more than gradients."""
-    theta = jax.ShapeDtypeStruct((2,), float)
-    try:
-        factory = getattr(optax, name)
-        if "learning_rate" not in inspect.signature(factory).parameters:
-            return None
-        optimizer = factory(learning_rate=schedule)
-        jax.eval_shape(lambda theta: optimizer.update(theta, optimizer.init(theta), theta), theta)
-    except Exception:  # whatever optax has by this name may raise anything
-        return None
-    return optimizer if isinstance(optimizer, optax.GradientTransformation) else None
-
-
 def schedule_factors(text: str | None, iterations: int, most: float = math.inf) -> Float[np.ndarray, " iterations"]:
     """Evaluate an optax schedule given as text, such as "linear_schedule(0.01, 1, 100)", at each iteration.
 
-    Args:
-        text: call of an optax schedule with numbers, lists or nested schedules as arguments; None for a constant 1.
-        iterations: number of iterations.
-        most: largest allowed factor.
-
-    Raises:
-        ValueError: the text is not such a call, optax rejects it, or a factor is not positive or too large.
+    The text calls an optax schedule with numbers, lists or nested schedules; None is a constant 1. ValueError if it is
+    not such a call, optax rejects it, or a factor is not positive or larger than `most`.
     """
     if text is None:
         return np.ones(iterations)
@@ -138,22 +120,15 @@ def _evaluate(node: ast.expr) -> Any:
 def begin(optimizer: optax.GradientTransformation, theta: Float[Array, " params"], seeds: int) -> Descent:
     """Start all seeds at the same parameters."""
     thetas = jnp.broadcast_to(theta, (seeds, *theta.shape))
-    return Descent(
-        thetas, jax.vmap(optimizer.init)(thetas), jnp.zeros(seeds, int), jnp.full(seeds, jnp.nan, theta.dtype)
-    )
+    first_cost = jnp.full(seeds, jnp.nan, theta.dtype)
+    return Descent(thetas, jax.vmap(optimizer.init)(thetas), jnp.zeros(seeds, int), first_cost)
 
 
 def advance(
     state: Descent, batches: dict[str, Any], estimator: Estimator, optimizer: optax.GradientTransformation
 ) -> tuple[Descent, Record]:
-    """Advance every active seed by one iteration.
-
-    Args:
-        batches: batches of the estimator's oracles, each array with a leading axis of seeds.
-
-    Returns:
-        The new state, and the record of the iteration.
-    """
+    """Advance every active seed by one iteration, given the batches of the estimator's oracles with a leading axis of
+    seeds; return the new state, and the record of the iteration."""
     return jax.vmap(lambda state, batches: _advance_one(state, batches, estimator, optimizer))(state, batches)
 
 
@@ -165,9 +140,8 @@ def _advance_one(state: Descent, batches, estimator, optimizer):
     first_cost = jnp.where(jnp.isnan(state.first_cost), jnp.abs(cost), state.first_cost)
     updates, optimizer_state = optimizer.update(estimate.mean, state.optimizer, state.theta)
     theta: Array = optax.apply_updates(state.theta, updates)  # type: ignore[assignment]
-    # the most severe reason last
     reason = jnp.zeros((), int)
-    for code, holds in (
+    for code, holds in (  # the most severe one last
         (4, jnp.abs(cost) > DIVERGED * jnp.maximum(first_cost, 1e-12)),
         (3, ~jnp.all(jnp.isfinite(theta))),
         (2, ~jnp.all(jnp.isfinite(estimate.mean))),
@@ -184,15 +158,15 @@ def _advance_one(state: Descent, batches, estimator, optimizer):
         first_cost,
     )
     nan = jnp.full((), jnp.nan, theta.dtype)
-    figures = (
-        cost,
-        jnp.linalg.norm(estimate.mean),
-        estimate.variance,
-        nan if estimate.alpha is None else estimate.alpha.alpha,
-        estimate.num_nonfinite.astype(theta.dtype),
-        jnp.zeros((), theta.dtype) if residual is None else jnp.max(residual),
+    record = Record(
+        cost=cost,
+        gradient_norm=jnp.linalg.norm(estimate.mean),
+        variance=estimate.variance,
+        alpha=nan if estimate.alpha is None else estimate.alpha.alpha,
+        nonfinite=estimate.num_nonfinite.astype(theta.dtype),
+        residual=jnp.zeros((), theta.dtype) if residual is None else jnp.max(residual),
     )
-    return following, Record(*(jnp.where(stopped_before, nan, figure) for figure in figures))
+    return following, jax.tree.map(lambda figure: jnp.where(stopped_before, nan, figure), record)
 
 
 def _values(batch) -> tuple[Float[Array, " samples"], Float[Array, " samples"] | None]:

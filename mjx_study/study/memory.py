@@ -1,6 +1,5 @@
 """Limit the memory of a study's batches: compute few seeds at a time, and reject plans that need too much."""
 
-import math
 from collections.abc import Sequence
 from typing import Final
 
@@ -18,14 +17,22 @@ LARGEST_BATCH: Final = {"cpu": 20_000, "gpu": 2**17, "tpu": 2**17}
 AT_ONCE: Final = {"cpu": 512e6, "gpu": 8e9, "tpu": 8e9}
 """Memory limit for the batches of several seeds [bytes]; those of a single seed may take more. Accelerators idle unless
 many samples are drawn at once."""
+PADDED: Final = (100, 400, 1600)
+"""Sizes to which programs pad smaller batches, so that few numbers of samples compile anything."""
 LARGEST_BLOCK: Final = 20_000
 BLOCK_BYTES: Final = 512e6
-"""Limits on a block's samples and memory [bytes]; the same on all machines, so that any can compute a block."""
+"""Limits on a block's samples, which are even, and memory [bytes]; the same on all machines, so that any can compute a
+block."""
 
 
 def largest_batch() -> int:
     """Maximum number of samples drawn at once by JAX's default backend."""
     return LARGEST_BATCH[jax.default_backend()]
+
+
+def padded_size(samples: int) -> int:
+    """Smallest size in `PADDED` that holds a batch, or its own."""
+    return next((size for size in PADDED if size >= samples), samples)
 
 
 def batches_at_once(samples: int) -> int:
@@ -37,7 +44,7 @@ def numbers_per_sample(task: Task, oracle: str) -> int:
     """Count of numbers held per sample of a batch."""
     params, (steps, dimensions) = task.policy.num_params, task.policy.noise_shape
     noise = steps * dimensions * (1 if task.policy.additive else 1 + params)  # scores, and the policy's Jacobian
-    states = task.scene.host.nq + task.scene.host.nv + task.scene.host.na
+    states = _state_size(task)
     inputs = states + task.scene.host.nu
     each = {
         "evaluation": params + 3,
@@ -52,6 +59,10 @@ def numbers_per_sample(task: Task, oracle: str) -> int:
     return each[oracle]
 
 
+def _state_size(task: Task) -> int:
+    return task.scene.host.nq + task.scene.host.nv + task.scene.host.na
+
+
 def bytes_per_sample(task: Task, oracles: Sequence[str], estimators: int, draws: int = BIAS_DRAWS) -> int:
     """Memory per sample [bytes]: every batch, gradients of every estimator, and the draws of the bias test."""
     numbers = sum(numbers_per_sample(task, oracle) for oracle in oracles)
@@ -64,26 +75,9 @@ def bytes_of_moments(estimators: Sequence[Estimator], params: int) -> int:
     return 8 * sum(size * (size + 6 * EXTREMES) for each in sizes for size in each)
 
 
-def block_for(each: int) -> int:
-    """Number of samples per block, even and within `BLOCK_BYTES`, given the bytes per sample."""
-    return min(LARGEST_BLOCK, max(2, int(BLOCK_BYTES / each) // 2 * 2))
-
-
-def seeds_at_once(memory_of_seed: int, seeds: int) -> int:
-    """Number of seeds per group that fits into `AT_ONCE`, at least one, in as few and as equal groups as possible."""
-    fitting = max(1, int(AT_ONCE[jax.default_backend()] / memory_of_seed))
-    return math.ceil(seeds / math.ceil(seeds / fitting))
-
-
 def check_batches(needed: int, whole: Sequence[str] = ()) -> None:
-    """Reject batches that need more memory than `MOST_GIB`.
-
-    Args:
-        whole: names of estimators that need whole batches, where others could use blocks.
-
-    Raises:
-        ValueError: with the limit and what to change.
-    """
+    """Raise ValueError for batches that need more memory than `MOST_GIB`, with what to change; `whole` names estimators
+    that need whole batches, where others could use blocks."""
     gib = needed / 2**30
     if gib > MOST_GIB:
         change = "use fewer samples and more seeds"
@@ -101,20 +95,13 @@ def blocks_take(whole: Sequence[str]) -> str:
 
 
 def check_memory(task: Task, estimators: Sequence[Estimator], samples: int, *, other: int = 0) -> None:
-    """Reject a plan whose arrays do not fit into `MOST_GIB`.
+    """Raise ValueError for arrays that do not fit into `MOST_GIB`, with what to change.
 
-    Args:
-        task: determines the numbers of parameters P, steps H and controls m, and the state size n.
-        estimators: each keeps about 3 N P numbers; those that work step by step N H m more (times P with feedback), and
-            those that linearise N H n (n + m) more.
-        samples: N, the number of samples of all batches held at once.
-        other: number of further numbers kept.
-
-    Raises:
-        ValueError: with the limit and what to change.
+    A task has P parameters, H steps, m controls and a state of size n. Of N samples of all batches held at once, each
+    estimator keeps about 3 N P numbers; those that work step by step N H m more (times P with feedback), and those that
+    linearise N H n (n + m) more. `other` is the number of further numbers kept.
     """
-    host, params = task.scene.host, task.policy.num_params
-    controls, state = host.nu, host.nq + host.nv + host.na
+    controls, state, params = task.scene.host.nu, _state_size(task), task.policy.num_params
     needs = {oracle for estimator in estimators for oracle in estimator.needs}
     each = params * (1 + 3 * len(estimators)) + task.horizon * controls
     if any("step" in oracle or oracle == "linearisation" for oracle in needs):

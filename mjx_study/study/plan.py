@@ -10,32 +10,33 @@ import jax
 
 import estimators
 from estimators import Estimator, find_estimator
-from estimators.cross_fitting import check_weights
-from mjx_study.choices import REFERENCE
+from estimators.alpha import check_weights
+from mjx_study.choices import CONES, REFERENCE
 from mjx_study.identity import contents, estimator_contents
 from mjx_study.limits import MOST_CELLS, MOST_GIB, MOST_PROGRAMS, check_count
 from mjx_study.objective import chunk_for
 from mjx_study.option import OPTIONS, check
+from mjx_study.reference.noise import check_sigma
 from mjx_study.study.configuration import SAMPLES, StudyConfig
 from mjx_study.study.iteration import make_optimizer, schedule_factors
-from mjx_study.study.line import line_of
 from mjx_study.study.memory import (
-    block_for,
+    AT_ONCE,
+    BLOCK_BYTES,
+    LARGEST_BLOCK,
     blocks_take,
     bytes_of_moments,
     bytes_per_sample,
     check_batches,
     check_memory,
     largest_batch,
-    seeds_at_once,
+    padded_size,
 )
-from mjx_study.study.resolution import at_theta, configured_estimators, recipe_of
+from mjx_study.study.resolution import at_theta, configured_estimators, line_of, recipe_of
 from mjx_study.table import digits_to_tell_apart
 from mjx_study.tasks import make_task
 from mjx_study.tasks.contact_grid import ContactPoint, backward_grid, contact_grid, solver_grid
 from mjx_study.tasks.network import with_network
-from mjx_study.tasks.task import Recipe, Task, check_sigma
-from mjx_study.tasks.validation import check_shapes
+from mjx_study.tasks.task import Recipe, Task, check_shapes
 
 HISTORY_NUMBERS: Final = 20
 """Approximate count of numbers kept per iteration and seed, over all estimators."""
@@ -43,13 +44,7 @@ HISTORY_NUMBERS: Final = 20
 
 @dataclasses.dataclass(frozen=True)
 class Group:
-    """Cells that share compiled programs.
-
-    Attributes:
-        name: the task's name in the configuration, which is unique.
-        cone: friction cone, pyramidal or elliptic.
-        recipe: settings of descents; None in other kinds of study.
-    """
+    """Cells that share compiled programs; the task's name in the configuration is unique."""
 
     name: str
     task: Task
@@ -61,11 +56,7 @@ class Group:
 
 @dataclasses.dataclass(frozen=True)
 class StudyCell:
-    """One cell of a study, stored as one file.
-
-    Attributes:
-        sigma: standard deviation of the noise.
-    """
+    """One cell of a study, stored as one file; sigma is the standard deviation of the noise."""
 
     group: int
     model: ContactPoint
@@ -108,13 +99,7 @@ class StudyPlan:
     @property
     def memory(self) -> int:
         """Approximate memory of the batches and statistics held at once in the largest cell [bytes]."""
-        cells = {(cell.group, cell.samples): cell for cell in self.cells}.values()
-        return max(
-            memory_of_blocks(self, cell)
-            if blocks_of(self, cell)
-            else memory_of_seed(self, cell) * seeds_together(self, cell)
-            for cell in cells
-        )
+        return max(memory_of(self, cell) for cell in {(cell.group, cell.samples): cell for cell in self.cells}.values())
 
     @property
     def iterations(self) -> int:
@@ -147,12 +132,13 @@ def plan_study(config: StudyConfig, built: Mapping[str, Task] | None = None) -> 
     Raises:
         ValueError: the configuration cannot be run; the message says what is accepted.
     """
-    programs = len(config.tasks) * len(config.timestep or (None,)) * len(config.cone or (None,))
+    variants = config.tasks, config.timestep or (None,), config.cone or (None,)
+    programs = math.prod(map(len, variants))
     check_count(programs, "programs", MOST_PROGRAMS, "give fewer tasks, timesteps or cones")
     groups: list[Group] = []
     cells: list[StudyCell] = []
     messages: list[str] = []
-    for which, timestep, cone in itertools.product(config.tasks, config.timestep or (None,), config.cone or (None,)):
+    for which, timestep, cone in itertools.product(*variants):
         task = _build(config, which, timestep, cone, built or {})
         if config.network is not None:
             if REFERENCE in (config.contact or ()):
@@ -167,17 +153,15 @@ def plan_study(config: StudyConfig, built: Mapping[str, Task] | None = None) -> 
         if config.solref or config.solimp:
             more, also = solver_grid(task, config.solref, config.solimp)
             models, told = models + more, told + also
-        surrogate = config.backward, config.backward_stiffness, config.backward_margin
-        models, also = backward_grid(task, models, *surrogate)
+        models, also = backward_grid(task, models, config.backward, config.backward_stiffness, config.backward_margin)
         told += also
         if not models:
             raise ValueError("no contact model: give at least one contact family, solref or solimp")
         each = len(models) * len(config.sigma or (None,)) * len(counts)
         change = "give fewer contact models, timesteps, sigmas or sample counts"
         check_count(programs * each, "cells", MOST_CELLS, change)
-        host = task.scene.host
-        cone_name = {0: "pyramidal", 1: "elliptic"}[int(host.opt.cone)]
-        group = Group(name, task, float(host.opt.timestep), cone_name, models, recipe)
+        options = task.scene.host.opt
+        group = Group(name, task, float(options.timestep), CONES[int(options.cone)], models, recipe)
         at = f"h = {group.timestep!r} s: " if config.timestep is not None else ""
         messages += [f"{at}{message}" for message in told]
         for model, sigma, samples in itertools.product(models, config.sigma or (task.sigma,), counts):
@@ -191,28 +175,25 @@ def plan_study(config: StudyConfig, built: Mapping[str, Task] | None = None) -> 
     plan = StudyPlan(config, tuple(groups), tuple(cells), chunk, tuple(dict.fromkeys(messages)))
     check_batches(plan.memory, _whole(plan))
     for cell in {cell.group: cell for cell in cells}.values():
-        chosen, recipe = estimators_of(plan, cell), groups[cell.group].recipe
+        group, chosen = groups[cell.group], estimators_of(plan, cell)
         if config.surrogate and (corrected := [each.name for each in chosen if "corrected" in each.needs]):
             raise ValueError(f"{corrected[0]} corrects exact derivatives: omit it or backward")
-        if recipe is not None:
-            make_optimizer(config.optimizer or "", recipe.learning_rate, recipe.decay)
-            _check_schedules(config, groups[cell.group], chosen)
-            history = HISTORY_NUMBERS * config.batches * recipe.iterations
-            check_memory(groups[cell.group].task, chosen, config.batches * cell.samples, other=history)
-            check_memory(groups[cell.group].task, (), config.evaluation_samples or 0)
+        if group.recipe is not None:
+            make_optimizer(config.optimizer or "", group.recipe.learning_rate, group.recipe.decay)
+            _check_schedules(config, group, group.recipe.iterations, chosen)
+            history = HISTORY_NUMBERS * config.batches * group.recipe.iterations
+            check_memory(group.task, chosen, config.batches * cell.samples, other=history)
+            check_memory(group.task, (), config.evaluation_samples or 0)
         elif config.kind == "landscapes":
-            if config.theta is not None and groups[cell.group].task.policy.num_params == 1:
+            if config.theta is not None and group.task.policy.num_params == 1:
                 raise ValueError("theta has one entry, and the line is its range: give --span")
-            line_of(groups[cell.group].task, config.points or 0, config.span, config.direction, config.seed)
+            line_of(group.task, config.points or 0, config.span, config.direction, config.seed)
     return plan
 
 
 def _whole(plan: StudyPlan) -> list[str]:
-    """Names of estimators that need whole batches, in studies whose batches can be split into blocks.
-
-    Raises:
-        ValueError: such an estimator is combined with a block size.
-    """
+    """Names of estimators that need whole batches, in studies whose batches can be split into blocks; ValueError if
+    there are any along with a block size."""
     if plan.config.kind != "gradients":
         return []
     found = [each.name for each in estimators_of(plan, plan.cells[0]) if not each.mergeable]
@@ -222,11 +203,10 @@ def _whole(plan: StudyPlan) -> list[str]:
     return found
 
 
-def _check_schedules(config: StudyConfig, group: Group, chosen: Sequence[Estimator]) -> None:
+def _check_schedules(config: StudyConfig, group: Group, iterations: int, chosen: Sequence[Estimator]) -> None:
     """Raise ValueError for a schedule that cannot be read, or that a contact model or estimator does not support."""
-    assert group.recipe is not None
-    schedule_factors(config.sigma_schedule, group.recipe.iterations)
-    schedule_factors(config.stiffness_schedule, group.recipe.iterations, most=1.0)
+    schedule_factors(config.sigma_schedule, iterations)
+    schedule_factors(config.stiffness_schedule, iterations, most=1.0)
     if config.stiffness_schedule and any(
         not model.stiffness or (model.contact is None and not model.analytic) for model in group.models
     ):
@@ -244,14 +224,19 @@ def oracles_of(config: StudyConfig) -> tuple[str, ...]:
 def memory_of_seed(plan: StudyPlan, cell: StudyCell) -> int:
     """Memory of the batches and statistics of one seed of a cell [bytes]."""
     each = bytes_per_sample(plan.groups[cell.group].task, oracles_of(plan.config), len(plan.config.estimators))
-    return cell.samples * each
+    return padded_samples(plan, cell) * each
+
+
+def padded_samples(plan: StudyPlan, cell: StudyCell) -> int:
+    """Number of samples to which whole batches are padded for their statistics: their own unless all estimators are
+    mergeable, and so ignore padding."""
+    mergeable = all(each.mergeable for each in estimators_of(plan, cell))
+    return padded_size(cell.samples) if mergeable else cell.samples
 
 
 def block_of(plan: StudyPlan, cell: StudyCell) -> int:
-    """Number of a seed's samples held at once: all of them, or a block.
-
-    Batches are split into blocks if the configuration asks for it, or if they would otherwise be rejected.
-    """
+    """Number of a seed's samples held at once: all of them, or a block if the configuration asks for it, or if the
+    batches would otherwise be rejected."""
     config, whole = plan.config, cell.samples
     if config.kind != "gradients":
         return whole
@@ -260,7 +245,8 @@ def block_of(plan: StudyPlan, cell: StudyCell) -> int:
     fits = memory_of_seed(plan, cell) <= MOST_GIB * 2**30
     if fits or not all(each.mergeable for each in estimators_of(plan, cell)):
         return whole
-    return min(whole, block_for(bytes_in_block(plan, cell)))
+    even = int(BLOCK_BYTES / bytes_in_block(plan, cell)) // 2 * 2
+    return min(whole, LARGEST_BLOCK, max(2, even))
 
 
 def blocks_of(plan: StudyPlan, cell: StudyCell) -> int:
@@ -269,8 +255,10 @@ def blocks_of(plan: StudyPlan, cell: StudyCell) -> int:
     return 0 if size == cell.samples else math.ceil(cell.samples / size)
 
 
-def memory_of_blocks(plan: StudyPlan, cell: StudyCell) -> int:
-    """Memory of a block, and of the moments kept until a batch is complete [bytes]."""
+def memory_of(plan: StudyPlan, cell: StudyCell) -> int:
+    """Memory held at once [bytes]: batches and statistics, or a block, and moments until a batch is complete."""
+    if not blocks_of(plan, cell):
+        return memory_of_seed(plan, cell) * seeds_together(plan, cell)
     moments = bytes_of_moments(estimators_of(plan, cell), plan.groups[cell.group].task.policy.num_params)
     kept = plan.config.batches + math.ceil(math.log2(blocks_of(plan, cell)))
     return block_of(plan, cell) * bytes_in_block(plan, cell) + 2 * kept * moments
@@ -283,9 +271,12 @@ def bytes_in_block(plan: StudyPlan, cell: StudyCell) -> int:
 
 
 def seeds_together(plan: StudyPlan, cell: StudyCell) -> int:
-    """Number of seeds that a cell draws at once: as many as fit in studies of gradients, otherwise all."""
+    """Number of seeds that a cell draws at once: all, or in studies of gradients as many as fit, in equal groups."""
     batches = plan.config.batches
-    return seeds_at_once(memory_of_seed(plan, cell), batches) if plan.config.kind == "gradients" else batches
+    if plan.config.kind != "gradients":
+        return batches
+    fitting = max(1, int(AT_ONCE[jax.default_backend()] / memory_of_seed(plan, cell)))
+    return math.ceil(batches / math.ceil(batches / fitting))
 
 
 def _build(

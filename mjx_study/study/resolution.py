@@ -1,23 +1,24 @@
-"""Resolve a configuration for a task: estimators, recipe and parameters."""
+"""Resolve a configuration for a task: estimators, recipe, parameters, and the line of a landscape."""
 
 import dataclasses
 from collections.abc import Iterable, Sequence
-from typing import Any
+from typing import Any, Final
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from estimators import Estimator, make_estimator
-from mjx_study.study.configuration import StudyConfig
+from mjx_study.study.configuration import StudyConfig, check_span
 from mjx_study.tasks.task import Recipe, Task
+
+SPAN_SIGMAS: Final = 10.0
+"""Half the default length of a line through many parameters, in standard deviations of the noise."""
 
 
 def recipe_of(config: StudyConfig, task: Task) -> Recipe:
-    """Return the settings of a task's descents: the configuration's, else those of the task's recipe.
-
-    Raises:
-        ValueError: a setting is missing.
-    """
+    """The settings of a task's descents: the configuration's, else those of the task's recipe; ValueError if one is
+    missing."""
     given = {name: getattr(config, name) for name in ("iterations", "learning_rate", "decay")}
     given |= {"samples": None if config.samples is None else max(config.samples)}
     if (recipe := task.defaults.recipe) is not None:
@@ -29,11 +30,8 @@ def recipe_of(config: StudyConfig, task: Task) -> Recipe:
 
 
 def at_theta(task: Task, theta: Sequence[float] | None) -> Task:
-    """Return the task with other parameters; unchanged for None.
-
-    Raises:
-        ValueError: their number differs from the policy's, or one is nonfinite.
-    """
+    """The task with other parameters, unchanged for None; ValueError for another number than the policy's, or a
+    nonfinite one."""
     if theta is None:
         return task
     values = np.asarray(theta, float)
@@ -47,9 +45,8 @@ def at_theta(task: Task, theta: Sequence[float] | None) -> Task:
 def configured_estimators(config: StudyConfig, task: Task) -> tuple[Estimator, ...]:
     """Build a configuration's estimators with their options, and check them against the task.
 
-    Raises:
-        ValueError: there is no such estimator, an option is out of range or missing, an estimator does not support the
-            task, or published constants are requested where there are none or along with others.
+    ValueError if there is no such estimator, an option is out of range or missing, or an estimator does not support the
+    task.
     """
     options = {name: getattr(config, name) for name in ("baseline", "max_norm", "window", "tolerance", "weights")}
     options |= bound_constants(config, task) | {"sigma": task.sigma}
@@ -59,29 +56,22 @@ def configured_estimators(config: StudyConfig, task: Task) -> tuple[Estimator, .
 
 
 def bound_constants(config: StudyConfig, task: Task) -> dict[str, Any]:
-    """Return the constants of AoBG's bound, from the configuration or the published example.
-
-    Raises:
-        ValueError: published constants are requested where there are none, or along with others.
-    """
+    """The constants of AoBG's bound, from the configuration or the published example; ValueError if there is none, or
+    other constants are given along with it."""
     names = ("gamma", "failure_probability", "variance_proxy", "radius")
     given = {name: getattr(config, name) for name in names}
     if not config.published:
         return given | {"gamma": task.defaults.gamma if config.gamma is None else config.gamma}
     if task.defaults.published is None:
         raise ValueError(f"{task.name} has no published constants of the bound; omit published")
-    defaults = {field.name: field.default for field in dataclasses.fields(StudyConfig)}
-    if others := [name for name in names if given[name] != defaults[name]]:
+    if others := [name for name in names if given[name] != StudyConfig.default(name)]:
         raise ValueError(f"published sets {', '.join(names)}: omit {', '.join(others)}")
     return dataclasses.asdict(task.defaults.published)
 
 
 def check_estimators(estimators: Iterable[Estimator], task: Task) -> None:
-    """Reject estimators whose formula does not hold for a task.
-
-    Raises:
-        ValueError: the formula needs Gaussian noise, noise on theta or no onset term, and the task differs.
-    """
+    """Raise ValueError for an estimator that needs Gaussian noise, noise on theta or no onset term, where the task
+    differs."""
     for estimator in estimators:
         if estimator.gaussian and task.noise != "gaussian":
             raise ValueError(f"{estimator.name!r} holds for Gaussian noise only; the noise is {task.noise}")
@@ -93,3 +83,40 @@ def check_estimators(estimators: Iterable[Estimator], task: Task) -> None:
             raise ValueError(
                 f"{estimator.name!r} needs the derivatives of single steps, which have no onset term; omit onset"
             )
+
+
+@dataclasses.dataclass(frozen=True)
+class ThetaLine:
+    """Points theta_0 + t direction, with t in the unit of theta and a unit vector."""
+
+    position: Float[np.ndarray, " points"]
+    direction: Float[np.ndarray, " params"]
+    thetas: tuple[Float[Array, " params"], ...]
+
+
+def line_of(task: Task, points: int, span: Sequence[float] | None, direction: str | None, seed: int) -> ThetaLine:
+    """Return the line through a task's theta; for a scalar parameter, its range, whatever theta is.
+
+    Args:
+        span: first and last t; None for the task's, or `SPAN_SIGMAS` to either side.
+        direction: "random" (by the seed) or None, or the index of one parameter.
+    """
+    theta = np.asarray(task.theta, float)
+    along = direction_of(direction or "random", len(theta), seed)
+    low, high = span or task.defaults.span or (-SPAN_SIGMAS * task.sigma, SPAN_SIGMAS * task.sigma)
+    check_span((low, high))
+    position = np.linspace(low, high, points)
+    origin = np.zeros(1) if len(theta) == 1 else theta
+    return ThetaLine(position, along, tuple(jnp.asarray(origin + t * along, task.theta.dtype) for t in position))
+
+
+def direction_of(direction: str, params: int, seed: int) -> Float[np.ndarray, " params"]:
+    """Return a unit vector, random or along one parameter; arguments as for `line_of`."""
+    if params == 1:
+        return np.ones(1)
+    if direction == "random":
+        drawn = np.random.default_rng(seed).normal(size=params)
+        return drawn / np.linalg.norm(drawn)
+    if not direction.isdecimal() or int(direction) >= params:
+        raise ValueError(f"direction must be random or a parameter's index, 0 to {params - 1}; got {direction}")
+    return np.eye(params)[int(direction)]

@@ -9,27 +9,25 @@ import dataclasses
 import json
 import time
 from collections import deque
-from collections.abc import Generator, Iterable, Sequence
+from collections.abc import Callable, Generator, Iterable, Sequence
 from concurrent.futures import Future
 from contextlib import ExitStack, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
-import numpy as np
 import xarray as xr
 
 from estimators import ENOUGH_EFFECTIVE
 from mjx_study.disk import prepare_folder
 from mjx_study.identity import differences, versions
-from mjx_study.runtime import environment
-from mjx_study.study.axes import Axes, axes_of, solver_arrays, solver_parameters
+from mjx_study.study.blocks import Arrays
 from mjx_study.study.cells import Computation
 from mjx_study.study.cluster import cells_on, connected
 from mjx_study.study.configuration import Progress, StudyConfig
-from mjx_study.study.dataset import Cells, as_plain, dataset_of, write_dataset
-from mjx_study.study.plan import StudyCell, StudyPlan, estimators_of, plan_study
-from mjx_study.study.revision import git_revision
+from mjx_study.study.dataset import as_plain, dataset_of, write_dataset
+from mjx_study.study.document import document_of
+from mjx_study.study.plan import StudyPlan, plan_study
 from mjx_study.study.store import Part, Store
 from mjx_study.study.times import recording
 
@@ -37,80 +35,27 @@ WAIT_SECONDS: Final = 0.5
 """Interval between polls of cells that another process computes."""
 
 
-def _document(plan: StudyPlan, command: str | None) -> dict[str, Any]:
-    fields = {field.name: getattr(plan.config, field.name) for field in dataclasses.fields(plan.config)}
-    axes = axes_of(plan)
-    fields |= {"tasks": plan.config.task_names, "seeds": plan.config.batches}
-    fields["iterations"] = plan.iterations or None
-    return {
-        "config": fields,
-        "warnings": list(plan.warnings),
-        "contents": plan.contents,
-        "versions": versions(),
-        "environment": environment(),
-        "revision": git_revision(),
-        "command": command,
-        "models": list(axes.models),
-        "axes": axes.values,
-        "resolved": _resolved(plan, axes),
-        "cells": [
-            {"label": plan.label(cell), "at": at} | solver_parameters(cell)
-            for cell, at in zip(plan.cells, axes.places, strict=True)
-        ],
-    }
-
-
-def _resolved(plan: StudyPlan, axes: Axes) -> list[dict[str, Any]]:
-    """Settings that differ between tasks: noise, horizons and estimator options."""
-    found: list[dict[str, Any]] = [{} for _ in axes.values["task"]]
-    for cell, at in zip(plan.cells, axes.places, strict=True):
-        task, entry = plan.groups[cell.group].task, found[at["task"]]
-        entry.setdefault("horizon", [])
-        if task.horizon not in entry["horizon"]:
-            entry["horizon"].append(task.horizon)
-        if "noise" not in entry:
-            recipe = plan.groups[cell.group].recipe
-            settings = {} if recipe is None else dataclasses.asdict(recipe)
-            entry |= {"noise": task.noise, "estimators": _options(plan, cell), "recipe": settings}
-            entry["parameters"] = task.policy.num_params
-    return found
-
-
-def _options(plan: StudyPlan, cell: StudyCell) -> dict[str, dict[str, Any]]:
-    chosen = zip(plan.config.estimators, estimators_of(plan, cell), strict=True)
-    return {name: dataclasses.asdict(estimator) for name, estimator in chosen}
-
-
 def open_store(plan: StudyPlan, folder: Path, command: str | None = None, *, accept_versions: bool = False) -> Store:
     """Open a plan's folder, new or begun; a begun one keeps its chunk size unless the configuration sets another.
 
-    Args:
-        command: command line to record; None if no command asked for the study.
-        accept_versions: resume a study begun by other versions.
-
-    Raises:
-        ValueError: the folder is not writable or holds another study.
+    ValueError if the folder is not writable or holds another study. The command line is recorded, if one asked for the
+    study; `accept_versions` resumes a study begun by other versions.
     """
     document = _document_in(plan, folder, command)
     return Store.create(prepare_folder(folder), document, accept_versions=accept_versions)
 
 
 def begun_store(plan: StudyPlan, folder: Path, *, accept_versions: bool = False) -> Store | None:
-    """Open a plan's folder for reading, as `open_store` would resume it; None if nothing is begun.
-
-    Raises:
-        ValueError: the folder holds another study.
-    """
+    """Open a plan's folder for reading, as `open_store` would resume it; None if nothing is begun."""
     return Store.begun(folder, _document_in(plan, folder), accept_versions=accept_versions)
 
 
 def _document_in(plan: StudyPlan, folder: Path, command: str | None = None) -> dict[str, Any]:
     """Document of a plan, with the chunk size of a study begun in the folder."""
-    document = _document(plan, command)
+    document = document_of(plan, command)
     if plan.config.chunk_size is None:
         begun = (folder / "study.json").exists()
-        stored = Store.open(folder).document["config"]["chunk_size"] if begun else plan.chunk_size
-        document["config"]["chunk_size"] = stored
+        document["config"]["chunk_size"] = Store.open(folder).chunk_size if begun else plan.chunk_size
     return document
 
 
@@ -146,44 +91,37 @@ def run_study(
         OSError: a cell could not be written; earlier ones are kept.
     """
     plan = plan_study(study) if isinstance(study, StudyConfig) else study
-    run = _Run(plan, progress)
     if folder is None:
         if cluster is not None:
             raise ValueError("a cluster needs a folder for the study")
         with recording():
-            return run.in_memory(as_plain(_document(plan, command)))
+            return _Run(plan, progress).in_memory(as_plain(document_of(plan, command)))
     if not isinstance(folder, Store):
         folder = open_store(plan, Path(folder), command, accept_versions=accept_versions)
     with ExitStack() as stack:
         client = stack.enter_context(connected(cluster)) if isinstance(cluster, str) else cluster
         stack.enter_context(recording())
-        return run.in_folder(folder, keep_going, client)
+        return _Run(plan.with_chunk(folder.chunk_size), progress).in_folder(folder, keep_going, client)
 
 
 class _Run:
     def __init__(self, plan: StudyPlan, progress: Progress):
         self._plan, self._progress, self._total = plan, progress, len(plan.cells)
-        self._begun: set[Any] = {None}
+        self._compute, self._begun = Computation(plan), {None}
 
     def in_memory(self, document: dict[str, Any]) -> xr.Dataset:
         """Compute all cells and write none."""
         document["config"]["chunk_size"] = self._plan.chunk_size
-        compute, cells = Computation(self._plan), {}
-        for index, arrays in self._computed(compute, ((index, index, Part()) for index in range(self._total))):
-            cells[index] = arrays, document["versions"]
+        places = ((index, index) for index in range(self._total))
+        cells = {index: (found, document["versions"]) for index, found in self._computed(places, lambda index: Part())}
         self._progress(self._total, self._total, "done")
-        return _labelled(document, cells).assign_attrs(computed_cells=self._total)
+        return dataset_of(document, cells).assign_attrs(computed_cells=self._total)
 
     def in_folder(self, store: Store, keep_going: bool, client: Any) -> xr.Dataset:
         """Compute and write missing cells; one that cannot be written is kept in memory or ends the run."""
-        self._plan = self._plan.with_chunk(store.document["config"]["chunk_size"])
-        for index in range(self._total):
-            if store.has(index):
-                store.read(index)  # reject damaged files before computing anything
-            else:
-                store.read_part(index)
-        compute = Computation(self._plan)
-        cells = partial(self._cells_here, compute) if client is None else partial(self._cells_there, client)
+        for index in range(self._total):  # reject damaged files before computing anything
+            store.read(index) if store.has(index) else store.read_part(index)
+        cells = self._cells_here if client is None else partial(self._cells_there, client)
         computed, held, failed = 0, {}, set()
         unwritten: OSError | None = None
         while missing := [index for index in store.missing if index not in held and index not in failed]:
@@ -207,7 +145,7 @@ class _Run:
                 self._progress(self._total - len(missing), self._total, "another process computes the rest")
                 time.sleep(WAIT_SECONDS)
         self._progress(self._total, self._total, "done")
-        dataset = _labelled(store.document, store.read_all() | held)
+        dataset = dataset_of(store.document, store.read_all() | held)
         try:
             write_dataset(dataset, store.folder / "results.nc")
         except OSError as error:
@@ -223,67 +161,49 @@ class _Run:
             dataset.attrs["failed_cells"] = json.dumps(labels)
         return dataset.assign_attrs(computed_cells=computed)
 
-    def _cells_here(
-        self, compute: Computation, store: Store, missing: Sequence[int]
-    ) -> Generator[tuple[int, dict[str, np.ndarray]]]:
+    def _cells_here(self, store: Store, missing: Sequence[int]) -> Generator[tuple[int, Arrays]]:
         """Compute in this process the cells that no other process has claimed."""
         with store.claims() as claim:
-            yield from self._computed(
-                compute,
-                (
-                    (
-                        index,
-                        self._total - len(missing) + place,
-                        Part(store.read_part(index), partial(_keep, store, index)),
-                    )
-                    for place, index in enumerate(missing)
-                    if claim(index) and not store.has(index)
-                ),
-            )
+            places = enumerate(missing, self._total - len(missing))
+            mine = ((done, index) for done, index in places if claim(index) and not store.has(index))
+            yield from self._computed(mine, partial(_part, store))
 
-    def _cells_there(
-        self, client: Any, store: Store, missing: Sequence[int]
-    ) -> Generator[tuple[int, dict[str, np.ndarray] | str]]:
+    def _cells_there(self, client: Any, store: Store, missing: Sequence[int]) -> Generator[tuple[int, Arrays | str]]:
         """Compute on a cluster the cells that no other process has claimed; a failure yields its reason as text."""
         with store.claims() as claim:
-            waiting = [index for index in missing if claim(index) and not store.has(index)]
-            done = self._total - len(waiting)
+            parts = {index: _part(store, index) for index in missing if claim(index) and not store.has(index)}
+            done = self._total - len(parts)
 
             def told(workers: int) -> None:
                 self._progress(done, self._total, f"{workers} workers" if workers else "waiting for workers")
 
-            def part(index: int) -> Part:
-                def report(blocks: int, tasks: int, what: str) -> None:
-                    self._progress(*((blocks, tasks) if self._total == 1 else (done, self._total)), what)
+            def report(blocks: int, tasks: int, what: str) -> None:
+                self._progress(*((blocks, tasks) if self._total == 1 else (done, self._total)), what)
 
-                return Part(store.read_part(index), partial(_keep, store, index), report)
-
-            for index, arrays in cells_on(client, self._plan, {index: part(index) for index in waiting}, told):
+            parts = {index: dataclasses.replace(part, report=report) for index, part in parts.items()}
+            for index, arrays in cells_on(client, self._plan, parts, told):
                 done += 1
                 self._progress(done, self._total, self._plan.label(self._plan.cells[index]))
                 yield index, arrays
 
     def _computed(
-        self, compute: Computation, cells: Iterable[tuple[int, int, Part]]
-    ) -> Generator[tuple[int, dict[str, np.ndarray]]]:
+        self, places: Iterable[tuple[int, int]], part_of: Callable[[int], Part]
+    ) -> Generator[tuple[int, Arrays]]:
         """Yield indices and numbers of cells; each is begun before waiting for the statistics of the one before.
+        `places` are the number of cells done before each, and its index."""
 
-        Args:
-            cells: index, number of cells done before, and checkpoint of each.
-        """
+        def end(index: int, begun: Future[Arrays]) -> tuple[int, Arrays]:
+            return index, self._compute.end(self._plan.cells[index], begun)
 
-        def end(index: int, begun: Future[dict[str, np.ndarray]]) -> tuple[int, dict[str, np.ndarray]]:
-            return index, compute.end(self._plan.cells[index], begun)
-
-        running: deque[tuple[int, Future[dict[str, np.ndarray]]]] = deque()
-        for index, done, part in cells:
-            running.append((index, self._begin(compute, index, done, part)))
+        running: deque[tuple[int, Future[Arrays]]] = deque()
+        for done, index in places:
+            running.append((index, self._begin(index, done, part_of(index))))
             while len(running) > 1 or (running and running[0][1].done()):
                 yield end(*running.popleft())
         for each in running:
             yield end(*each)
 
-    def _begin(self, compute: Computation, index: int, done: int, part: Part) -> Future[dict[str, np.ndarray]]:
+    def _begin(self, index: int, done: int, part: Part) -> Future[Arrays]:
         """Begin a cell, reporting progress in whole cells, or within the cell if it is the only one."""
         cell = self._plan.cells[index]
         label = self._plan.label(cell)
@@ -292,19 +212,17 @@ class _Run:
             label += " (compiling first)"
         self._progress(done, self._total, label)
         within = self._progress if self._total == 1 else lambda *_: self._progress(done, self._total, label)
-        return compute.begin(cell, dataclasses.replace(part, report=within))
+        return self._compute.begin(cell, dataclasses.replace(part, report=within))
 
 
-def _keep(store: Store, index: int, arrays: dict[str, np.ndarray]) -> None:
-    """Write a checkpoint if possible; failing to must not cost the cell."""
-    with suppress(OSError):
-        store.write_part(index, arrays)
+def _part(store: Store, index: int) -> Part:
+    """A cell's checkpoint in its folder; failing to write one must not cost the cell."""
 
+    def keep(arrays: Arrays) -> None:
+        with suppress(OSError):
+            store.write_part(index, arrays)
 
-def _labelled(document: dict[str, Any], cells: Cells) -> xr.Dataset:
-    """Build the Dataset, with the parameters of each cell's contact model."""
-    solver = [solver_arrays(cell) for cell in document["cells"]]
-    return dataset_of(document, {at: ({**arrays, **solver[at]}, by) for at, (arrays, by) in cells.items()})
+    return Part(store.read_part(index), keep)
 
 
 def load_study(folder: str | Path) -> xr.Dataset:
@@ -317,7 +235,7 @@ def load_study(folder: str | Path) -> xr.Dataset:
         StudyError: there is no study, or a file of it is damaged.
     """
     store = Store.open(Path(folder))
-    return _labelled(store.document, store.read_all())
+    return dataset_of(store.document, store.read_all())
 
 
 def warnings_of(dataset: xr.Dataset) -> tuple[str, ...]:
@@ -331,25 +249,25 @@ def warnings_of(dataset: xr.Dataset) -> tuple[str, ...]:
         found.append(f"cells were computed with different versions: {dataset.attrs['mixed_versions']}")
     if told := dataset.attrs.get("other_versions"):
         found.append(f"these numbers were computed with other versions ({told}); use another folder to recompute them")
-    for name, says in (
-        ("nonfinite", "samples overflowed or became NaN and were left out"),
-        ("unconverged", "rollouts in which the contact solver did not converge"),
-        ("onsets_missed", "onsets of contact have no onset term: there are too many in a rollout"),
-        ("onsets_bounded", "onsets of contact are grazing, and their terms bounded"),
-    ):
-        if name in dataset and (count := _count(dataset[name])):
-            found.append(f"{count} {says}")
+    counted = {
+        "nonfinite": "samples overflowed or became NaN and were left out",
+        "unconverged": "rollouts in which the contact solver did not converge",
+        "onsets_missed": "onsets of contact have no onset term: there are too many in a rollout",
+        "onsets_bounded": "onsets of contact are grazing, and their terms bounded",
+    }
+    counts = {name: _count(dataset[name]) for name in counted if name in dataset}
+    found += [f"{count} {counted[name]}" for name, count in counts.items() if count]
     if "effective_samples" in dataset and (few := int((dataset["effective_samples"] < ENOUGH_EFFECTIVE).sum())):
         found.append(
             f"{few} batches rest on fewer than {ENOUGH_EFFECTIVE:g} effective samples: do not trust their errors, "
             "p-values and variances (marked ? in the table of compare, effective_samples in the data)"
         )
-    if "stopped_at" in dataset and bool(dataset["stopped_at"].notnull().any()):
-        found.append(f"{int(dataset['stopped_at'].notnull().sum())} descents stopped before their last iteration")
+    if "stopped_at" in dataset and (stopped := int(dataset["stopped_at"].notnull().sum())):
+        found.append(f"{stopped} descents stopped before their last iteration")
     return tuple(found)
 
 
 def _count(counts: xr.DataArray) -> int:
     """Total count; where estimators share rollouts, the largest over estimators."""
-    shared = counts.dims and "seed" not in counts.dims and "estimator" in counts.dims and "point" not in counts.dims
+    shared = "estimator" in counts.dims and not {"seed", "point"} & set(counts.dims)
     return int(counts.max("estimator").sum() if shared else counts.sum())

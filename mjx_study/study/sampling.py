@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Int, Key
 from estimators import ORACLES, Linearisation
 from mjx_study.objective import MjxObjective, Simulator
 from mjx_study.reference import Reference
-from mjx_study.study.memory import batches_at_once
+from mjx_study.study.memory import batches_at_once, padded_size
 from mjx_study.study.plan import StudyCell, StudyPlan
 
 UNCONVERGED: Final = {"float64": 1e-6, "float32": 1e-3}
@@ -69,9 +69,7 @@ def draw_batches(
     """Draw batches of every oracle, with a leading axis of seeds.
 
     Args:
-        samples: number of samples per batch.
-        seeds: slice of the seeds to draw.
-        first: index of the first sample, if the batch is part of a larger one.
+        samples, first: number of samples per batch, and index of the first one if the batch is part of a larger one.
         device: context held during each timed call.
 
     Returns:
@@ -84,7 +82,7 @@ def draw_batches(
         parts, seconds[name] = [], 0.0
         for start in range(0, len(streams), together):
             some = jax.random.clone(streams)[start : start + together]
-            flat = _keys_of_seeds(some, first, samples).reshape(-1)
+            flat = _keys_of_seeds(some, first, padded_size(samples))[:, :samples].reshape(-1)
             with device:
                 begun = time.perf_counter()
                 batch = jax.block_until_ready(getattr(objective, ORACLES[name].method)(theta, flat))

@@ -31,9 +31,6 @@ from mjx_study.study.document import read_document, read_format
 
 FORMAT: Final = 3
 """Format of the folder; increased when older programs cannot read newer folders."""
-
-IDENTITY: Final = ("contents", "config")
-"""Parts of study.json that must match when a study resumes."""
 VERSIONS: Final = "versions"
 """Entry of a cell that records the versions that computed it."""
 
@@ -57,16 +54,16 @@ class Part:
 
 
 class Store:
-    """The folder of one study, from `Store.create` or `Store.open`.
-
-    Attributes:
-        document: contents of study.json.
-    """
+    """The folder of one study, from `Store.create` or `Store.open`, with the contents of study.json."""
 
     def __init__(self, folder: Path, document: dict[str, Any]):
         self.folder, self.document = folder, document
         self._versions: dict[str, str] = document.get("versions", {})
         self._study = _digest_of_text(_identity(document))
+
+    @property
+    def chunk_size(self) -> int:
+        return self.document["config"]["chunk_size"]
 
     @classmethod
     def create(cls, folder: Path, document: dict[str, Any], *, accept_versions: bool = False) -> "Store":
@@ -84,31 +81,28 @@ class Store:
         kept = cls.begun(folder, document, accept_versions=accept_versions)
         prepare_folder(folder)
         prepare_folder(folder / "cells")
-        document, path = as_plain({"format": FORMAT} | document), folder / "study.json"
+        document = as_plain({"format": FORMAT} | document)
         if kept is not None:
-            if (document["config"].get("iterations") or 0) > (kept.document["config"].get("iterations") or 0):
+            if _iterations(document) > _iterations(kept.document):
                 kept._extend(document)
             kept._versions = document.get("versions", {})
             return kept
         if any((folder / "cells").glob("*.npz")):
             raise StudyError(f"{folder} holds cells of a study without its study.json; choose another folder")
-        _write_document(path, document)
-        return cls(folder, document)
+        created = cls(folder, document)
+        created._write_document()
+        return created
 
     @classmethod
     def begun(cls, folder: Path, document: dict[str, Any], *, accept_versions: bool = False) -> "Store | None":
-        """Open a folder's study for reading, as `create` would resume it; None if there is none.
-
-        Raises:
-            StudyError: as for `create`.
-        """
+        """Open a folder's study for reading, as `create` would resume it; None if there is none. Raises as `create`."""
         if not (folder / "study.json").exists():
             return None
         document, kept = as_plain({"format": FORMAT} | document), cls.open(folder)
-        theirs, ours = (_flat(_identity(each)) for each in (kept.document, document))
+        theirs, ours = ({**parts["contents"], **parts["config"]} for parts in map(_identity, (kept.document, document)))
         if told := differences(theirs, ours):
             raise StudyError(f"{folder} holds another study ({told}); choose another folder")
-        there, asked = (each["config"].get("iterations") or 0 for each in (kept.document, document))
+        there, asked = _iterations(kept.document), _iterations(document)
         if asked < there:
             raise StudyError(
                 f"{folder} holds {there} iterations, and {asked} are asked for: give --iterations {there} or more, "
@@ -124,18 +118,19 @@ class Store:
         for index in range(len(self.document["cells"])):
             if self.has(index):
                 arrays, written_by = self.read_with_versions(index)
-                self._write(self.part_path(index), arrays, written_by, self._place(index, part=True))
+                self._write(index, arrays, written_by, part=True)
                 self.path(index).unlink()
         self.document |= {"config": document["config"], "resolved": document["resolved"]}
-        _write_document(self.folder / "study.json", self.document)
+        self._write_document()
+
+    def _write_document(self) -> None:
+        content = json.dumps(self.document, indent=1) + "\n"
+        write_whole(self.folder / "study.json", lambda file: file.write(content.encode()))
 
     @classmethod
     def open(cls, folder: Path) -> "Store":
-        """Open a study's folder for reading.
-
-        Raises:
-            StudyError: there is no study, or its study.json is damaged or of another format.
-        """
+        """Open a folder for reading; StudyError if it holds no study, or its study.json is damaged or of another
+        format."""
         path = folder / "study.json"
         try:
             content = read_whole(path)
@@ -159,10 +154,10 @@ class Store:
         return self.path(index).exists()
 
     def part_path(self, index: int) -> Path:
-        return self.folder / "cells" / f"{index:05d}.part.npz"
+        return self.path(index).with_suffix(".part.npz")
 
     def write(self, index: int, arrays: Mapping[str, np.ndarray]) -> None:
-        self._write(self.path(index), arrays, self._authors(index), self._place(index))
+        self._write(index, arrays, self._authors(index))
         self.part_path(index).unlink(missing_ok=True)
         self._failed(index).unlink(missing_ok=True)
 
@@ -179,53 +174,55 @@ class Store:
         return self.path(index).with_suffix(".failed")
 
     def write_part(self, index: int, arrays: Mapping[str, np.ndarray]) -> None:
-        self._write(self.part_path(index), arrays, self._authors(index), self._place(index, part=True))
+        self._write(index, arrays, self._authors(index), part=True)
 
-    def _write(self, path: Path, arrays: Mapping[str, np.ndarray], versions: dict[str, str], place: str) -> None:
+    def _write(
+        self, index: int, arrays: Mapping[str, np.ndarray], versions: dict[str, str], *, part: bool = False
+    ) -> None:
         kept = dict(arrays) | {VERSIONS: np.array(json.dumps(versions))}
-        digest = np.array([_digest(kept), self._study, place])
+        digest = np.array([_digest(kept), self._study, self._place(index, part=part)])
+        path = self.part_path(index) if part else self.path(index)
         write_whole(path, lambda file: np.savez(file, digest=digest, **kept))  # type: ignore[arg-type]
 
     def _authors(self, index: int) -> dict[str, str]:
         """Versions that computed a cell, including those of its checkpoint."""
         if not self.part_path(index).exists():
             return self._versions
-        before = self._read(self.part_path(index), self._place(index, part=True))[1]
+        before = self.read_with_versions(index, part=True)[1]
         names = dict.fromkeys([*before, *self._versions])
         told = {name: [*before.get(name, "none").split(" and "), self._versions.get(name, "none")] for name in names}
         return {name: " and ".join(dict.fromkeys(each)) for name, each in told.items()}
 
     def read(self, index: int) -> dict[str, np.ndarray]:
-        """Read the numbers of a cell.
-
-        Raises:
-            StudyError: the file is damaged, or belongs to another study or cell.
-        """
+        """Read the numbers of a cell; see `read_with_versions`."""
         return self.read_with_versions(index)[0]
 
-    def read_with_versions(self, index: int) -> tuple[dict[str, np.ndarray], dict[str, str]]:
-        """Read the numbers of a cell and the versions that computed them; see `read`."""
-        return self._read(self.path(index), self._place(index))
-
     def read_part(self, index: int) -> dict[str, np.ndarray]:
-        """Read a cell's checkpoint; empty if there is none. Raises as `read`."""
-        path = self.part_path(index)
-        return self._read(path, self._place(index, part=True))[0] if path.exists() else {}
+        """Read a cell's checkpoint; empty if there is none."""
+        return self.read_with_versions(index, part=True)[0] if self.part_path(index).exists() else {}
 
-    def _read(self, path: Path, expected: str) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+    def read_all(self) -> dict[int, tuple[dict[str, np.ndarray], dict[str, str]]]:
+        """Read all computed cells with their versions."""
+        indices = range(len(self.document["cells"]))
+        return {index: self.read_with_versions(index) for index in indices if self.has(index)}
+
+    def read_with_versions(self, index: int, *, part: bool = False) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+        """Read the numbers of a cell, or its checkpoint, and the versions that computed them; StudyError if the file is
+        damaged, or belongs to another study or cell."""
+        path = self.part_path(index) if part else self.path(index)
         try:
             with np.load(io.BytesIO(read_whole(path)), allow_pickle=False) as stored:
                 arrays = {name: stored[name] for name in stored.files}
             content, study, place = arrays.pop("digest").tolist()
         except Exception as error:  # numpy, zipfile and zlib may raise anything
             raise StudyError(f"{path} is damaged ({_told(error)}); move it away to compute it again") from error
-        for wrong, is_that in (
-            (study != self._study, "a cell of another study"),
-            (place != expected, "another cell of this study"),
-            (content != _digest(arrays), "damaged (its digest does not match)"),
-        ):
-            if wrong:
-                raise StudyError(f"{path} is {is_that}; move it away to compute it again")
+        wrong = {
+            "a cell of another study": study != self._study,
+            "another cell of this study": place != self._place(index, part=part),
+            "damaged (its digest does not match)": content != _digest(arrays),
+        }
+        if is_that := next((what for what, holds in wrong.items() if holds), None):
+            raise StudyError(f"{path} is {is_that}; move it away to compute it again")
         return arrays, json.loads(str(arrays.pop(VERSIONS)))
 
     @contextmanager
@@ -257,11 +254,6 @@ class Store:
         iterations = None if part else self.document["config"].get("iterations")
         return _digest_of_text({"index": index, "cell": cell, "at": at, "iterations": iterations})
 
-    def read_all(self) -> dict[int, tuple[dict[str, np.ndarray], dict[str, str]]]:
-        """Read all computed cells with their versions; see `read`."""
-        there = [index for index in range(len(self.document["cells"])) if self.has(index)]
-        return {index: self.read_with_versions(index) for index in there}
-
     @property
     def missing(self) -> list[int]:
         return [index for index in range(len(self.document["cells"])) if not self.has(index)]
@@ -281,17 +273,12 @@ def _digest_of_text(document: Mapping[str, Any]) -> str:
 
 def _identity(document: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     """The parts that must match when a study resumes: all that its numbers depend on, except the length of descents."""
-    found = {name: dict(document.get(name, {})) for name in IDENTITY}
-    found["config"].pop("iterations", None)
-    return found
+    config = {name: value for name, value in document["config"].items() if name != "iterations"}
+    return {"contents": document.get("contents", {}), "config": config}
 
 
-def _flat(parts: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    return {name: value for part in parts.values() for name, value in part.items()}
-
-
-def _write_document(path: Path, document: Mapping[str, Any]) -> None:
-    write_whole(path, lambda file: file.write((json.dumps(document, indent=1) + "\n").encode()))
+def _iterations(document: Mapping[str, Any]) -> int:
+    return document["config"].get("iterations") or 0
 
 
 def _told(error: Exception) -> str:

@@ -14,19 +14,12 @@ from mjx_study.study.sampling import unconverged
 
 @dataclasses.dataclass(frozen=True)
 class Tally:
-    """Diagnostics of a batch's rollouts, or of a part of them.
+    """Diagnostics of a batch's rollouts, or of a part of them."""
 
-    Attributes:
-        seconds: computing time [s].
-        residual: largest relative residual of the solver.
-        unconverged: number of rollouts with too large a residual.
-        onsets: see `_met`.
-    """
-
-    seconds: np.ndarray
-    residual: np.ndarray
-    unconverged: np.ndarray
-    onsets: Float[np.ndarray, " eight"]
+    seconds: np.ndarray  # computing time
+    residual: np.ndarray  # the largest
+    unconverged: np.ndarray  # number of rollouts
+    onsets: Float[np.ndarray, " eight"]  # see `_met`
 
     @classmethod
     def of(cls, batch: Any, seconds: float, residuals: np.ndarray) -> "Tally":

@@ -57,23 +57,14 @@ MEASURED, SCALED, ROUGH = BASES
 
 @dataclasses.dataclass(frozen=True)
 class Program:
-    """Quantities that determine the time of a call of a program, or of a cell's statistics.
+    """Quantities that determine the time of a call of a program, or of a cell's statistics."""
 
-    Attributes:
-        kind: one of `objective.SamplePrograms`, or for an iteration of descents several joined by "+"; "analytic" or
-            "statistics".
-        content: digest of what else is compiled, and of the machine.
-        steps: number of steps of a rollout; 1 for statistics.
-        rows: number of rollouts in a call; for statistics, of numbers.
-        dof, constraints: degrees of freedom and constraint rows.
-    """
-
-    kind: str
-    content: str
-    steps: int
-    rows: int
+    kind: str  # one of `objective.SamplePrograms`, several joined by "+" in descents, or one of `OTHERS`
+    content: str  # digest of what else is compiled, and of the machine
+    steps: int  # of a rollout; 1 for statistics
+    rows: int  # rollouts in a call; for statistics, numbers
     dof: int = 0
-    constraints: int = 0
+    constraints: int = 0  # rows
 
     @property
     def work(self) -> float:
@@ -87,19 +78,18 @@ class Program:
         """Rough estimate of the time of a call [s]."""
         if self.kind in OTHERS:
             return self.work * OTHERS[self.kind][0]
-        return self.work * RATE[jax.default_backend()] * self.factor * self._size
+        return self.work * RATE[jax.default_backend()] * statistics.fmean(self._factors) * self._size
 
     @property
-    def factor(self) -> float:
-        """Time relative to a call of rollouts."""
-        return statistics.fmean(FACTORS.get(part, 1.0) for part in self.kind.split("+"))
+    def _factors(self) -> list[float]:
+        return [FACTORS.get(part, 1.0) for part in self.kind.split("+")]
 
     @property
     def rough_setup(self) -> tuple[float, float]:
         """Rough estimates of tracing and compilation times [s]."""
         if self.kind in OTHERS:
             return OTHERS_SETUP
-        grown = self._size * sum(FACTORS.get(part, 1.0) ** 0.5 for part in self.kind.split("+"))
+        grown = self._size * sum(factor**0.5 for factor in self._factors)
         return SETUP[0] * grown, SETUP[1] * grown
 
     @property
@@ -128,12 +118,8 @@ class Record(BaseModel):
 
 
 def program_of(kind: str, task: Task, contact: Any, rows: int, steps: int | None = None) -> Program:
-    """Return a program of a task.
-
-    Args:
-        contact: structure of the contact model's arrays.
-        steps: the task's horizon by default.
-    """
+    """Return a program of a task, given the structure of the contact model's arrays; its horizon is the default of
+    `steps`."""
     host = task.scene.host
     content = _content(task, str(contact))
     return Program(kind, content, steps or task.horizon, rows, int(host.nv), num_constraint_rows(task.scene.template))
@@ -169,10 +155,8 @@ def times_folder() -> Path | None:
 def recording(watch: Stopwatch | None = None) -> Generator[None]:
     """Record the times of programs run within, for later forecasts; failures to write are ignored.
 
-    The latest run of a program counts, so concurrent processes need not wait for each other.
-
-    Args:
-        watch: earlier measurements of the same process; written at most every `SAVE_SECONDS`.
+    The latest run of a program counts, so concurrent processes need not wait for each other. A watch with earlier
+    measurements of the same process is written at most every `SAVE_SECONDS`.
     """
     watch = Stopwatch() if watch is None else watch
     with watch.running():
@@ -212,7 +196,7 @@ class Rates:
     def read(cls, folder: Path | None) -> "Rates":
         """Read a folder's records, skipping damaged ones."""
         found = []
-        for path in [] if folder is None else sorted(folder.glob("*.json")):
+        for path in sorted(folder.glob("*.json")) if folder else ():
             with suppress(ValueError):
                 found.append(read_json(path, Record))
         return cls(found)

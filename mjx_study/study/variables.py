@@ -7,12 +7,7 @@ from typing import Final
 
 @dataclasses.dataclass(frozen=True)
 class Variable:
-    """A variable of a study.
-
-    Attributes:
-        dims: dimensions within a cell.
-        unit: "gradient" is cost per unit of theta.
-    """
+    """A variable of a study: dimensions within a cell, unit ("gradient" is cost per unit of theta) and description."""
 
     dims: tuple[str, ...]
     unit: str

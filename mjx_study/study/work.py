@@ -1,8 +1,8 @@
 """The work of a cell: calls of each program, and the rest."""
 
+import itertools
 import math
 from collections import Counter
-from collections.abc import Iterator
 from typing import Any
 
 import jax
@@ -10,7 +10,7 @@ import numpy as np
 
 from mjx_study.objective import contact_for, rounds
 from mjx_study.study.gradients import CANDIDATES, takes_candidates
-from mjx_study.study.landscapes import QUADRATURE
+from mjx_study.study.landscapes import CHUNK, QUADRATURE, applies
 from mjx_study.study.memory import batches_at_once
 from mjx_study.study.plan import (
     StudyCell,
@@ -22,7 +22,6 @@ from mjx_study.study.plan import (
     oracles_of,
     seeds_together,
 )
-from mjx_study.study.quadrature import CHUNK, applies
 from mjx_study.study.sampling import calls_of, rollouts_of
 from mjx_study.study.times import Program, other_program, program_of
 
@@ -67,11 +66,11 @@ def calls(plan: StudyPlan, cell: StudyCell, devices: int) -> Counter[Program]:
             found[iteration(plan, cell, estimator.needs)] += recipe.iterations
         batch("value", calls_of("evaluation", config.evaluation_samples or 0, task.random_start)[0][1], _costs(plan))
         return found
-    for seeds in _in_turn(config.batches, seeds_together(plan, cell)):
-        for some in _in_turn(seeds, batches_at_once(cell.samples)):
-            for oracle in oracles_of(config):
-                for program, rows in calls_of(oracle, some * cell.samples, task.random_start):
-                    batch(program, rows, config.points or 1)
+    groups = _in_turn(config.batches, seeds_together(plan, cell))
+    draws = [some for seeds in groups for some in _in_turn(seeds, batches_at_once(cell.samples))]
+    for some, oracle in itertools.product(draws, oracles_of(config)):
+        for program, rows in calls_of(oracle, some * cell.samples, task.random_start):
+            batch(program, rows, config.points or 1)
     if config.kind == "gradients":
         odd = takes_candidates(task)
         batch("value", (2 if odd else 3) * (config.reference_samples or 0))
@@ -98,11 +97,11 @@ def rest(plan: StudyPlan, cell: StudyCell) -> Program:
     if cell.model.analytic:
         return other_program("analytic", rollouts(plan, cell)[0], task.name, *content, steps=task.horizon)
     if config.kind == "descents":
-        return other_program("statistics", _evaluations(plan) * task.policy.num_params, *content)
-    if blocks_of(plan, cell):
-        numbers = cell.samples * bytes_in_block(plan, cell) // 8 * config.batches
-        return other_program("statistics", numbers, *content, "in blocks")
-    numbers = memory_of_seed(plan, cell) // 8 * config.batches * (config.points or 1)
+        numbers = _evaluations(plan) * task.policy.num_params
+    elif blocks_of(plan, cell):
+        numbers, content = cell.samples * bytes_in_block(plan, cell) // 8 * config.batches, (*content, "in blocks")
+    else:
+        numbers = memory_of_seed(plan, cell) // 8 * config.batches * (config.points or 1)
     return other_program("statistics", numbers, *content)
 
 
@@ -132,7 +131,6 @@ def _evaluations(plan: StudyPlan) -> int:
     return _costs(plan) * (plan.config.evaluation_samples or 0)
 
 
-def _in_turn(count: int, together: int) -> Iterator[int]:
-    """Yield the sizes of the groups of at most `together` that make up `count`."""
-    for start in range(0, count, together):
-        yield min(together, count - start)
+def _in_turn(count: int, together: int) -> list[int]:
+    """Sizes of the groups of at most `together` that make up `count`."""
+    return [min(together, count - start) for start in range(0, count, together)]

@@ -33,11 +33,6 @@ TASKS: Final[dict[str, Callable[..., Task]]] = {
 """Task builders by name; variants of a system have their own names, such as `ball_wall:dome`."""
 
 
-def task_names() -> list[str]:
-    """Names of the built-in tasks."""
-    return list(TASKS)
-
-
 def make_task(name: str, **options: Any) -> Task:
     """Build a task by name with `options` for its builder (`cone`, `horizon`, ...).
 
@@ -57,8 +52,7 @@ def make_task(name: str, **options: Any) -> Task:
         if "model" in options:
             raise ValueError(f"model replaces the MJCF of a task, but {name} is a file already")
         return mjcf_task(name, **options)
-    place = registered_place(name)
-    if place is not None:
+    if (place := registered_place(name)) is not None:
         return own_task(place, options)
     if ":" in name:
         try:
@@ -66,18 +60,3 @@ def make_task(name: str, **options: Any) -> Task:
         except MissingModuleError as error:
             raise ValueError(unknown_task(name, f" ({error})")) from None
     raise ValueError(unknown_task(name))
-
-
-__all__ = [
-    "TASKS",
-    "ball_wall",
-    "double_pendulum",
-    "gripper",
-    "landing",
-    "make_task",
-    "momentum_transfer",
-    "pusher",
-    "sliding_box",
-    "task_names",
-    "tennis",
-]

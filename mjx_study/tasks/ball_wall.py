@@ -7,6 +7,7 @@ with a round top, the `dome`, on which the bounce angle varies continuously; the
 friction holds a ball that grazes the top.
 """
 
+import dataclasses
 from pathlib import Path
 from typing import Final
 
@@ -64,7 +65,7 @@ def ball_wall(
 
     def start_at(start: State, parameters: Float[Array, " params"]) -> State:
         direction = jnp.stack([jnp.cos(parameters[0]), jnp.sin(parameters[0])])
-        return State(start.qpos, speed * direction, start.act, start.warmstart)
+        return dataclasses.replace(start, qvel=speed * direction)
 
     name = "ball_wall" if variant == "box" else f"ball_wall:{variant}"
     return Task(
@@ -76,7 +77,6 @@ def ball_wall(
         theta=jnp.full(1, ANGLE, dtype),
         sigma=SIGMA,
         start=initial_state(scene),
-        running_cost=lambda state, control: jnp.zeros((), dtype),
         final_cost=lambda state: -((state.qpos[0] / LENGTH_SCALE) ** 2),
         contact_pair=("ball", "wall"),
         reference=lambda stiffness: FunctionObjective(BallWall(), SIGMA),

@@ -48,13 +48,17 @@ class ContactPoint:
         return f"{self.family}, K = {self.stiffness:.{self.digits}g} N/m" if self.stiffness else self.family
 
 
+Grid = tuple[tuple[ContactPoint, ...], tuple[str, ...]]
+"""Contact models and their warnings."""
+
+
 def contact_grid(
     task: Task,
     families: Sequence[str] | None = None,
     stiffnesses: Sequence[float] | None = None,
     damping: float | None = None,
-) -> tuple[tuple[ContactPoint, ...], tuple[str, ...]]:
-    """Return the contact models of a sweep, family by family, and their warnings.
+) -> Grid:
+    """Return the contact models of a sweep, family by family.
 
     Args:
         task: source of the effective mass and of defaults for arguments that are None.
@@ -65,7 +69,7 @@ def contact_grid(
     Raises:
         ValueError: a family is unknown, or a stiffness or damping is out of range.
     """
-    cells, messages = [], []
+    points, messages = [], []
     stiffnesses = task.defaults.stiffnesses if stiffnesses is None else stiffnesses
     families = task.defaults.families if families is None else families
     check_count(len(families) * len(stiffnesses), "contact models", MOST_MODELS, "give fewer stiffnesses or families")
@@ -74,52 +78,52 @@ def contact_grid(
         if family == REFERENCE:
             check_reference(task)
             found = stiffnesses if task.contact_pair is not None else (0.0,)
-            cells += [ContactPoint(family, stiffness, None, digits) for stiffness in found]
+            points += [ContactPoint(family, stiffness, None, digits) for stiffness in found]
             continue
         swept = family not in FAMILIES or FAMILIES[family].swept
         for stiffness in stiffnesses if swept else (None,):
             with _warnings_of_contact() as caught:
                 contact = None if family == "mjcf" else _contact(task, family, stiffness, damping)
-                cell = ContactPoint(family, stiffness or _stiffness(task, contact), contact, digits)
-            cells.append(cell)
-            messages += [f"{cell.label}: {warning.message}" for warning in caught]
-    return tuple(cells), tuple(messages)
+                points.append(ContactPoint(family, stiffness or _stiffness(task, contact), contact, digits))
+            messages += [f"{points[-1].label}: {warning.message}" for warning in caught]
+    return tuple(points), tuple(messages)
 
 
 def backward_grid(
     task: Task,
-    cells: Sequence[ContactPoint],
+    points: Sequence[ContactPoint],
     families: Sequence[str],
     stiffness: float | None = None,
     margin: float | None = None,
-) -> tuple[tuple[ContactPoint, ...], tuple[str, ...]]:
+) -> Grid:
     """Return contact models with surrogate derivatives, and the warnings of the surrogate models.
 
     Args:
         task: source of the effective mass.
-        cells: contact models to roll out; analytic systems are kept unchanged.
-        families: families that supply derivatives, each for every cell at its stiffness; "none" for exact ones.
-        stiffness: stiffness of the families that take one, instead of the cell's [N/m].
+        points: contact models to roll out; analytic systems are kept unchanged.
+        families: families that supply derivatives, each for every model at its stiffness; "none" for exact ones.
+        stiffness: stiffness of the families that take one, instead of the model's [N/m].
         margin: distance at which contact begins in the surrogates [m]; None for the MJCF's.
 
     Raises:
         ValueError: a family lacks a stiffness, or a contact model is the MJCF's.
     """
-    found, messages = [cell for cell in cells if cell.analytic or "none" in families], []
-    simulated = [cell for cell in cells if not cell.analytic]
-    for family, cell in itertools.product((name for name in families if name != "none"), simulated):
-        if cell.contact is None:
-            raise ValueError(f"contact {cell.family} takes no backward model; give its solref and solimp instead")
-        own = (stiffness or cell.stiffness or None) if FAMILIES[family].swept else None
+    found, messages = [point for point in points if point.analytic or "none" in families], []
+    simulated = [point for point in points if not point.analytic]
+    for family, point in itertools.product((name for name in families if name != "none"), simulated):
+        if point.contact is None:
+            raise ValueError(f"contact {point.family} takes no backward model; give its solref and solimp instead")
+        own = (stiffness or point.stiffness or None) if FAMILIES[family].swept else None
         with _warnings_of_contact() as caught:
             other = _contact(task, family, own, None)
+        name = f"{point.family}, backward {family}"
+        if stiffness is not None and own:
+            name += f" {stiffness:g} N/m"
         if margin is not None:
             other = dataclasses.replace(other, margin=jnp.asarray(margin, other.solref.dtype))
-        name = f"{cell.family}, backward {family}"
-        name += f" {stiffness:g} N/m" if stiffness is not None and own else ""
-        name += "" if margin is None else f" from {margin:g} m"
-        contact = dataclasses.replace(cell.contact, backward=other)
-        found.append(dataclasses.replace(cell, family=name, contact=contact))
+            name += f" from {margin:g} m"
+        contact = dataclasses.replace(point.contact, backward=other)
+        found.append(dataclasses.replace(point, family=name, contact=contact))
         messages += [f"{found[-1].label}: {warning.message}" for warning in caught]
     return tuple(found), tuple(messages)
 
@@ -132,10 +136,8 @@ def check_reference(task: Task) -> None:
         raise ValueError("the analytic references have no onset term; omit onset")
 
 
-def solver_grid(
-    task: Task, solrefs: Sequence[Sequence[float]], solimps: Sequence[Sequence[float]]
-) -> tuple[tuple[ContactPoint, ...], tuple[str, ...]]:
-    """Return contact models in MuJoCo's terms, every solref with every solimp, and their warnings.
+def solver_grid(task: Task, solrefs: Sequence[Sequence[float]], solimps: Sequence[Sequence[float]]) -> Grid:
+    """Return contact models in MuJoCo's terms, every solref with every solimp.
 
     Args:
         task: source of the scene, and of the effective mass for the reported stiffness.
@@ -145,7 +147,7 @@ def solver_grid(
     Raises:
         ValueError: MuJoCo would silently alter a value.
     """
-    cells, messages = [], []
+    points, messages = [], []
     digits = digits_to_tell_apart(itertools.chain(*solrefs, *solimps))
     count = max(1, len(solrefs)) * max(1, len(solimps))
     check_count(count, "contact models", MOST_MODELS, "give fewer solrefs or solimps")
@@ -156,18 +158,14 @@ def solver_grid(
         name = " ".join(f"{key} {' '.join(f'{value:.{digits}g}' for value in part)}" for key, part in parts.items())
         with _warnings_of_contact() as caught:
             contact = contact_model(solref, solimp, scene=task.scene)
-            cells.append(ContactPoint(name, _stiffness(task, contact), contact, digits))
+            points.append(ContactPoint(name, _stiffness(task, contact), contact, digits))
         messages += [f"{name}: {warning.message}" for warning in caught]
-    return tuple(cells), tuple(messages)
+    return tuple(points), tuple(messages)
 
 
 @contextmanager
 def _warnings_of_contact() -> Generator[list[warnings.WarningMessage]]:
-    """Collect the warnings of contact models built in this context.
-
-    Raises:
-        ValueError: their numbers are so large or small that arithmetic overflows.
-    """
+    """Collect the warnings of contact models built in this context; numbers that overflow are a ValueError."""
     try:
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", ContactWarning)

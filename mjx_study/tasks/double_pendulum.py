@@ -8,6 +8,7 @@ Angles are relative, the second rod's to the first; those of the published examp
 these coordinates is the variant `published`; the default uses the same four numbers as relative angles.
 """
 
+import dataclasses
 import math
 from pathlib import Path
 from typing import Final
@@ -54,7 +55,7 @@ def double_pendulum(
     dtype = scene.template.qpos.dtype
 
     def start_at(rest: State, parameters: Float[Array, " params"]) -> State:
-        return State(parameters[:2], parameters[2:], rest.act, rest.warmstart)
+        return dataclasses.replace(rest, qpos=parameters[:2], qvel=parameters[2:])
 
     name = "double_pendulum" if start == "default" else f"double_pendulum:{start}"
     return Task(
@@ -66,7 +67,6 @@ def double_pendulum(
         theta=jnp.array(STARTS[start], dtype),
         sigma=SIGMA,
         start=initial_state(scene),
-        running_cost=lambda state, control: jnp.zeros((), dtype),
         final_cost=lambda state: jnp.sum(state.qpos**2),
         contact_pair=None,
         reference=lambda stiffness: ReferenceObjective(

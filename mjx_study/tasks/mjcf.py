@@ -1,5 +1,6 @@
 """A task made from an MJCF alone, with the displacement of its bodies as cost."""
 
+import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
@@ -52,7 +53,7 @@ def scene_task(scene: Scene, *, horizon: int = CHECKED_STEPS, pair: tuple[str, s
     origin = start.qpos[measured]
 
     def push(start: State, change: Float[Array, " params"]) -> State:
-        return State(start.qpos, start.qvel + change, start.act, start.warmstart)
+        return dataclasses.replace(start, qvel=start.qvel + change)
 
     if host.nu:
         policy, changed = OpenLoop(horizon, host.nu), "controls"

@@ -6,6 +6,7 @@ Suh et al. 2022. An undamped spring is elastic, which doubles the momentum, and 
 `MomentumTransfer` models both. The bar points up only, so below 0 the ball misses here but not in `MomentumTransfer`.
 """
 
+import dataclasses
 from pathlib import Path
 from typing import Final
 
@@ -48,7 +49,7 @@ def momentum_transfer(
 
     def start_at(start: State, parameters: Float[Array, " params"]) -> State:
         velocity = SPEED * jnp.stack([jnp.cos(parameters[0]), jnp.sin(parameters[0]), jnp.zeros_like(parameters[0])])
-        return State(start.qpos, velocity, start.act, start.warmstart)
+        return dataclasses.replace(start, qvel=velocity)
 
     elastic = MomentumTransfer(restitution=1.0, inertia_ratio=mass * DISTANCE**2 / inertia)
     edge = np.array([elastic.edge])
@@ -63,7 +64,6 @@ def momentum_transfer(
         theta=jnp.full(1, ANGLE, dtype),
         sigma=SIGMA,
         start=initial_state(scene),
-        running_cost=lambda state, control: jnp.zeros((), dtype),
         final_cost=lambda state: -((inertia * state.qvel[2] / unit) ** 2),
         contact_pair=("ball", "bar"),
         reference=lambda stiffness: FunctionObjective(elastic, SIGMA),

@@ -5,11 +5,11 @@ from itertools import pairwise
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Key
+from jaxtyping import Array, Key
 
 from mjx_study.limits import MOST_LAYERS, MOST_PARAMS, check_count
 from mjx_study.simulation.dynamics import State
-from mjx_study.tasks.policy import Feedback, LinearFeedback
+from mjx_study.tasks.policy import Control, Feedback, LinearFeedback, Noise, Theta
 from mjx_study.tasks.task import Task
 
 
@@ -18,8 +18,6 @@ class Network(Feedback):
     """u_h = net(phi(x_h)) + w_h with tanh layers and a linear output; theta is all weights and biases, flattened.
 
     Attributes:
-        num_features: length of phi.
-        features: feature map phi of the state.
         hidden: width of each hidden layer.
     """
 
@@ -38,30 +36,27 @@ class Network(Feedback):
     def num_params(self) -> int:
         return sum((inputs + 1) * outputs for inputs, outputs in self.shapes)
 
-    def initial(self, key: Key[Array, ""], dtype) -> Float[Array, " params"]:
+    def initial(self, key: Key[Array, ""], dtype) -> Theta:
         """Draw normal weights of variance 1 / inputs; biases and output layer are 0, so the initial control is zero."""
         parts = []
-        for index, (inputs, outputs) in enumerate(self.shapes):
+        for inputs, outputs in self.shapes:
             key, drawn = jax.random.split(key)
-            last = index == len(self.shapes) - 1
-            scale = 0.0 if last else inputs**-0.5
+            scale = 0.0 if len(parts) == 2 * len(self.hidden) else inputs**-0.5
             weights = scale * jax.random.normal(drawn, (inputs, outputs), dtype)
             parts += [weights.reshape(-1), jnp.zeros(outputs, dtype)]
         return jnp.concatenate(parts)
 
-    def feedback(self, theta: Float[Array, " params"], state: State) -> Float[Array, " nu"]:
+    def feedback(self, theta: Theta, state: State) -> Control:
         signal, used = self.features(state), 0
         for index, (inputs, outputs) in enumerate(self.shapes):
             weights = theta[used : used + inputs * outputs].reshape(inputs, outputs)
             used += inputs * outputs
             signal = signal @ weights + theta[used : used + outputs]
             used += outputs
-            signal = signal if index == len(self.shapes) - 1 else jnp.tanh(signal)
+            signal = jnp.tanh(signal) if index < len(self.hidden) else signal
         return signal
 
-    def score(
-        self, theta: Float[Array, " params"], states: State, noise_gradient: Float[Array, "steps dimensions"]
-    ) -> Float[Array, " params"]:
+    def score(self, theta: Theta, states: State, noise_gradient: Noise) -> Theta:
         """sum_h D_theta net(phi(x_h))^T noise_gradient_h, one backward pass through the network."""
         _, pull = jax.vjp(lambda at: jax.vmap(lambda state: self.feedback(at, state))(states), theta)
         return pull(noise_gradient)[0]

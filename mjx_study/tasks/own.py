@@ -7,8 +7,7 @@ from typing import Any
 
 from estimators.places import described, find_attribute, importable_here
 from mjx_study.choices import TASK_GROUP
-from mjx_study.tasks.task import Task
-from mjx_study.tasks.validation import check_shapes
+from mjx_study.tasks.task import Task, check_shapes
 
 
 def registered_place(name: str) -> str | None:

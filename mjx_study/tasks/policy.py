@@ -15,6 +15,11 @@ from jaxtyping import Array, Float
 
 from mjx_study.simulation.dynamics import State
 
+Theta = Float[Array, " params"]
+Noise = Float[Array, "steps dimensions"]
+Controls = Float[Array, "horizon nu"]
+Control = Float[Array, " nu"]
+
 
 @runtime_checkable
 class Policy(Protocol):
@@ -40,23 +45,19 @@ class Policy(Protocol):
         """Whether theta and the noise act only on the initial state."""
         ...
 
-    def place(self, theta: Float[Array, " params"], noise: Float[Array, "steps dimensions"], start: State) -> State:
+    def place(self, theta: Theta, noise: Noise, start: State) -> State:
         """Return the initial state after theta and the noise have acted on it."""
         ...
 
-    def feedforward(
-        self, theta: Float[Array, " params"], noise: Float[Array, "steps dimensions"]
-    ) -> Float[Array, "horizon nu"]:
+    def feedforward(self, theta: Theta, noise: Noise) -> Controls:
         """State-independent part of the controls, noise included."""
         ...
 
-    def feedback(self, theta: Float[Array, " params"], state: State) -> Float[Array, " nu"] | None:
+    def feedback(self, theta: Theta, state: State) -> Control | None:
         """State-dependent part of the control; None if there is none."""
         ...
 
-    def score(
-        self, theta: Float[Array, " params"], states: State, noise_gradient: Float[Array, "steps dimensions"]
-    ) -> Float[Array, " params"]:
+    def score(self, theta: Theta, states: State, noise_gradient: Noise) -> Theta:
         """sum_h D_theta u_h(x_h)^T noise_gradient_h, with the states held fixed; never touches the dynamics."""
         ...
 
@@ -78,20 +79,13 @@ class NoisyControls:
     def noise_shape(self) -> tuple[int, int]:
         return self.horizon, self.controls
 
-    def place(self, theta: Float[Array, " params"], noise: Float[Array, "steps dimensions"], start: State) -> State:
+    def place(self, theta: Theta, noise: Noise, start: State) -> State:
         return start
 
 
 @dataclasses.dataclass(frozen=True)
 class OpenLoop(NoisyControls):
-    """Open-loop control sequence: theta is (horizon, controls), flattened.
-
-    Attributes:
-        horizon: number of steps H.
-        controls: number of controls m; theta has H m entries.
-        additive: True, since the noise is added to theta entry by entry.
-        at_start: False, since theta and the noise act at every step.
-    """
+    """Open-loop control sequence: theta is (horizon, controls), flattened; the noise is added to it entry by entry."""
 
     additive: bool = dataclasses.field(default=True, init=False)
 
@@ -99,18 +93,13 @@ class OpenLoop(NoisyControls):
     def num_params(self) -> int:
         return self.horizon * self.controls
 
-    def feedforward(
-        self, theta: Float[Array, " params"], noise: Float[Array, "steps dimensions"]
-    ) -> Float[Array, "horizon nu"]:
+    def feedforward(self, theta: Theta, noise: Noise) -> Controls:
         return theta.reshape(self.horizon, self.controls) + noise
 
-    def feedback(self, theta: Float[Array, " params"], state: State) -> None:
+    def feedback(self, theta: Theta, state: State) -> None:
         return None
 
-    def score(
-        self, theta: Float[Array, " params"], states: State, noise_gradient: Float[Array, "steps dimensions"]
-    ) -> Float[Array, " params"]:
-        """The noise gradient itself: D_theta u is the identity."""
+    def score(self, theta: Theta, states: State, noise_gradient: Noise) -> Theta:
         return noise_gradient.reshape(-1)
 
 
@@ -119,8 +108,6 @@ class Feedback(NoisyControls):
     """Base of feedback policies u_h = pi(phi(x_h), theta) + w_h.
 
     Attributes:
-        horizon: number of steps H.
-        controls: number of controls m.
         num_features: length of phi.
         features: feature map phi of the state.
     """
@@ -129,9 +116,7 @@ class Feedback(NoisyControls):
     features: Callable[[State], Float[Array, " features"]]
     additive: bool = dataclasses.field(default=False, init=False)
 
-    def feedforward(
-        self, theta: Float[Array, " params"], noise: Float[Array, "steps dimensions"]
-    ) -> Float[Array, "horizon nu"]:
+    def feedforward(self, theta: Theta, noise: Noise) -> Controls:
         return noise
 
 
@@ -143,19 +128,17 @@ class LinearFeedback(Feedback):
     def num_params(self) -> int:
         return self.controls * self.num_features
 
-    def feedback(self, theta: Float[Array, " params"], state: State) -> Float[Array, " nu"]:
+    def feedback(self, theta: Theta, state: State) -> Control:
         return theta.reshape(self.controls, self.num_features) @ self.features(state)
 
-    def score(
-        self, theta: Float[Array, " params"], states: State, noise_gradient: Float[Array, "steps dimensions"]
-    ) -> Float[Array, " params"]:
+    def score(self, theta: Theta, states: State, noise_gradient: Noise) -> Theta:
         """sum_h noise_gradient_h phi(x_h)^T."""
         return jnp.sum(noise_gradient[:, :, None] * jax.vmap(self.features)(states)[:, None, :], axis=0).reshape(-1)
 
 
 @dataclasses.dataclass(frozen=True)
 class InitialStatePolicy:
-    """Policy that sets the initial state from theta + w and applies no controls.
+    """Policy that sets the initial state from theta + w, drawn once, and applies no controls.
 
     Attributes:
         num_params: length of theta and of the noise w.
@@ -163,35 +146,28 @@ class InitialStatePolicy:
         controls: number of controls m, all zero.
         start_at: maps (start, theta + w) to the initial state of the simulation.
         unit: unit of theta; empty if unknown.
-        additive: True, since the noise is added to theta entry by entry.
-        at_start: True, since theta and the noise act on the initial state only.
     """
 
     num_params: int
     horizon: int
     controls: int
-    start_at: Callable[[State, Float[Array, " params"]], State]
+    start_at: Callable[[State, Theta], State]
     unit: str = ""
     additive: bool = dataclasses.field(default=True, init=False)
     at_start: bool = dataclasses.field(default=True, init=False)
 
     @property
     def noise_shape(self) -> tuple[int, int]:
-        """(1, params): one draw, before the first step."""
         return 1, self.num_params
 
-    def place(self, theta: Float[Array, " params"], noise: Float[Array, "steps dimensions"], start: State) -> State:
+    def place(self, theta: Theta, noise: Noise, start: State) -> State:
         return self.start_at(start, theta + noise[0])
 
-    def feedforward(
-        self, theta: Float[Array, " params"], noise: Float[Array, "steps dimensions"]
-    ) -> Float[Array, "horizon nu"]:
+    def feedforward(self, theta: Theta, noise: Noise) -> Controls:
         return jnp.zeros((self.horizon, self.controls), theta.dtype)
 
-    def feedback(self, theta: Float[Array, " params"], state: State) -> None:
+    def feedback(self, theta: Theta, state: State) -> None:
         return None
 
-    def score(
-        self, theta: Float[Array, " params"], states: State, noise_gradient: Float[Array, "steps dimensions"]
-    ) -> Float[Array, " params"]:
+    def score(self, theta: Theta, states: State, noise_gradient: Noise) -> Theta:
         return noise_gradient[0]

@@ -3,12 +3,15 @@
 import dataclasses
 import math
 from collections.abc import Callable
+from typing import Any
 
 import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
+from estimators.places import described
 from mjx_study.reference import Reference
-from mjx_study.reference.noise import check_density
+from mjx_study.reference.noise import check_density, check_sigma
 from mjx_study.simulation.contact import effective_mass
 from mjx_study.simulation.dynamics import State
 from mjx_study.simulation.onset import check_onset
@@ -93,12 +96,8 @@ class StudyDefaults:
         return self.stiffnesses[len(self.stiffnesses) // 2]
 
 
-def no_running_cost(state: State, control: Float[Array, " nu"]) -> Float[Array, ""]:
-    return jax.numpy.zeros((), state.qpos.dtype)
-
-
-def no_final_cost(state: State) -> Float[Array, ""]:
-    return jax.numpy.zeros((), state.qpos.dtype)
+def no_cost(state: State, control: Float[Array, " nu"] | None = None) -> Float[Array, ""]:
+    return jnp.zeros((), state.qpos.dtype)
 
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
@@ -136,8 +135,8 @@ class Task:
     theta: Float[Array, " params"]
     sigma: float
     start: State | Callable[[Key[Array, ""]], State]
-    running_cost: Callable[[State, Float[Array, " nu"]], Float[Array, ""]] = no_running_cost
-    final_cost: Callable[[State], Float[Array, ""]] = no_final_cost
+    running_cost: Callable[[State, Float[Array, " nu"]], Float[Array, ""]] = no_cost
+    final_cost: Callable[[State], Float[Array, ""]] = no_cost
     contact_pair: tuple[str, str] | None
     reference: Callable[[float], Reference] | None = None
     noise: str = "gaussian"
@@ -146,14 +145,14 @@ class Task:
     defaults: StudyDefaults = StudyDefaults()
 
     def __post_init__(self) -> None:
-        theta = jax.numpy.asarray(self.theta)
-        object.__setattr__(self, "theta", jax.numpy.asarray(theta, theta.dtype))
+        theta = jnp.asarray(self.theta)
+        object.__setattr__(self, "theta", jnp.asarray(theta, theta.dtype))
         if self.horizon < 1:
             raise ValueError(f"horizon must be at least 1 step, got {self.horizon}")
         check_sigma(self.sigma)
         check_density(self.noise)
         check_onset(self.onset)
-        if self.running_cost is no_running_cost and self.final_cost is no_final_cost:
+        if self.running_cost is self.final_cost is no_cost:
             raise ValueError("a task needs a running_cost, a final_cost, or both")
         if self.theta.shape != (self.policy.num_params,):
             raise ValueError(f"theta has shape {self.theta.shape}, the policy needs ({self.policy.num_params},)")
@@ -193,7 +192,43 @@ class Task:
         return dataclasses.replace(self, **changes)
 
 
-def check_sigma(sigma: float) -> None:
-    """Raise ValueError unless sigma is positive and finite."""
-    if not 0 < sigma < math.inf:
-        raise ValueError(f"sigma must be positive and finite, in the unit of the quantity it is added to; got {sigma}")
+def check_shapes(task: Task, name: str = "") -> None:
+    """Reject mismatches that broadcasting and clamped indices would hide; traces only, computes nothing.
+
+    Args:
+        name: prefix of messages; by default the task's name.
+
+    Raises:
+        ValueError: a part raises, or its shape or dtype is not what the simulation needs.
+    """
+    name = name or task.name
+    policy, dtype = task.policy, task.scene.template.qpos.dtype
+    steps, controls = task.horizon, task.scene.host.nu
+    if jnp.asarray(task.theta).dtype != dtype:
+        raise ValueError(f"{name}: theta is {task.theta.dtype}, and the simulation {dtype}")
+    start = _traced(name, "start", lambda: task.draw_start(jax.random.key(0)))
+    noise = jax.ShapeDtypeStruct(policy.noise_shape, dtype)
+    control = jax.ShapeDtypeStruct((controls,), dtype)
+    placed = _traced(name, "policy's place", policy.place, task.theta, noise, start)
+    for leaf in ("qpos", "qvel", "act"):
+        found, needed = getattr(placed, leaf).shape, getattr(task.scene.template, leaf).shape
+        if found != needed:
+            raise ValueError(f"{name}: {leaf} of the start has shape {found}; the scene needs {needed}")
+    parts = {
+        "policy's feedforward": (policy.feedforward, (task.theta, noise), (steps, controls)),
+        "policy's feedback": (policy.feedback, (task.theta, start), (controls,)),
+        "running_cost": (task.running_cost, (start, control), ()),
+        "final_cost": (task.final_cost, (start,), ()),
+    }
+    for part, (function, arguments, needed) in parts.items():
+        found = _traced(name, part, function, *arguments)
+        if found is not None and found.shape != needed:
+            fitting = f"; {steps} steps and {controls} controls need {needed}" if needed else ", and a cost is a scalar"
+            raise ValueError(f"{name}: the {part} has shape {found.shape}{fitting}")
+
+
+def _traced(name: str, part: str, function: Callable[..., Any], *arguments: Any) -> Any:
+    try:
+        return jax.eval_shape(function, *arguments)
+    except (Exception, SystemExit) as error:
+        raise ValueError(f"{name}: the {part} raised {described(error)}") from error

@@ -10,7 +10,7 @@ from scipy.stats import t as student_t
 
 import estimators
 from estimators import GradientEstimate, effective_samples, norm_quantiles, variance_interval
-from estimators.intervals import student_quantile
+from estimators.confidence import student_quantile
 from tests.estimators.statistics_helpers import binomial_standard_error
 
 # Compiled whole: a fraction of the time of compiling operation by operation.

@@ -15,6 +15,7 @@ from mjx_study.gradcheck.diagnosis import (
     judge,
     modes_apart,
     resolved_by,
+    worst_error,
     worst_verdict,
 )
 from mjx_study.gradcheck.differences import Differences
@@ -53,7 +54,7 @@ def verdict(
         exact = TRUE.copy()
         exact[1, 0] = converged
     found = Differences(truth, uncertainty * there, gap * there, (kink * there) > 0, (jump * there) > 0, there < 0)
-    codes = judge(layout(), derivative, found, exact).codes
+    codes = judge(layout(), derivative, found, exact)
     assert (np.delete(codes, 3) == diagnosis.RIGHT).all()
     return VERDICTS[codes[1, 0]]
 
@@ -113,7 +114,7 @@ def test_a_degenerate_contact_excuses_what_it_enters_and_what_jumps() -> None:
     none, never = np.zeros_like(TRUE), np.zeros(TRUE.shape, bool)
     truth = Differences(TRUE, none, none, never, never, rough)
     entered = np.array([[True, False, True], [True, False, True]])
-    codes = judge(layout(), derivative, truth, degenerate=entered).codes
+    codes = judge(layout(), derivative, truth, degenerate=entered)
     assert [VERDICTS[code] for code in codes[1]] == ["jump", "wrong", "wrong"]
 
 
@@ -128,7 +129,7 @@ def test_the_engine_is_a_judge() -> None:
     rough = dataclasses.replace(right, kink=found)
     assert not disagreements(ours, right, engine, rough).any()
     vague = judge(layout(), TRUE, dataclasses.replace(right, uncertainty=np.ones_like(TRUE)))
-    assert (vague.codes == diagnosis.UNRESOLVED).all() and (resolved_by(vague, ours).codes == diagnosis.RIGHT).all()
+    assert (vague == diagnosis.UNRESOLVED).all() and (resolved_by(vague, ours) == diagnosis.RIGHT).all()
 
 
 def test_an_unconverged_solve_is_told_from_a_wrong_derivative() -> None:
@@ -139,9 +140,10 @@ def test_an_unconverged_solve_is_told_from_a_wrong_derivative() -> None:
 def test_the_error_leaves_out_what_differences_do_not_resolve() -> None:
     none, never = np.zeros_like(TRUE), np.zeros(TRUE.shape, bool)
     truth = Differences(TRUE * (1 + 1e-7), none, none, never, never, never)
-    assert judge(layout(), TRUE, truth).error == pytest.approx(1e-7, rel=1e-3)
-    vague = np.full_like(TRUE, 1e-3)
-    assert judge(layout(), TRUE, Differences(truth.value, vague, none, never, never, never)).error == 0.0
+    right, columns = np.full(TRUE.shape, diagnosis.RIGHT), range(TRUE.shape[1])
+    assert worst_error(layout(), TRUE, truth, right, columns) == pytest.approx(1e-7, rel=1e-3)
+    vague = dataclasses.replace(truth, uncertainty=np.full_like(TRUE, 1e-3))
+    assert worst_error(layout(), TRUE, vague, right, columns) == 0.0
 
 
 def test_modes_are_compared_by_rows_and_blocks() -> None:

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from mjx_study.gradcheck.coordinates import coordinates
-from mjx_study.gradcheck.differences import RATIO, SIZES, Differences, differences, moves
+from mjx_study.gradcheck.differences import RATIO, SIZES, Differences, differences, moves, solution_noise
 from mjx_study.gradcheck.programs import Programs, Setting
-from mjx_study.gradcheck.rounding import solution_noise
 from mjx_study.simulation.engine import HostState
 from mjx_study.simulation.scene import put_scene
 

@@ -5,14 +5,13 @@ import dataclasses
 import mujoco
 import pytest
 
-from mjx_study import cli
-from mjx_study.cli import gradcheck as command
+from mjx_study import cli, gradcheck
 from mjx_study.cli import options
 from mjx_study.gradcheck import Finding, GradcheckReport, StepCheck
 from mjx_study.gradcheck.check import unoffered
-from mjx_study.gradcheck.cost import CostCheck, judge_closed_forms
+from mjx_study.gradcheck.cost import judge_closed_forms
 from mjx_study.gradcheck.coverage import coverage
-from mjx_study.gradcheck.finding import Entry
+from mjx_study.gradcheck.report import CostCheck, Entry
 from tests.documents import stages_of
 
 PARTS = frozenset({"contact", "stick", "slide", "separate", "limit"})
@@ -52,7 +51,7 @@ def test_what_is_never_exercised_is_a_warning_and_another_exit_code(
     failing = dataclasses.replace(unexercised, verdict="value")
     monkeypatch.setattr(options, "configure", lambda **_: None)
     for steps, code in (((STEP,), 0), ((STEP, unexercised), 3), ((STEP, failing), 1)):
-        monkeypatch.setattr(command.check, "gradcheck", lambda plan, progress, steps=steps: report(*steps))
+        monkeypatch.setattr(gradcheck, "gradcheck", lambda plan, progress, steps=steps: report(*steps))
         assert cli.main(["gradcheck", "pusher", "--horizon", "2", "--stiffness", "100"]) == code
     capsys.readouterr()
     lines = report(unexercised).lines()
@@ -84,7 +83,7 @@ def test_each_stage_is_a_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Ca
         return report(STEP)
 
     monkeypatch.setattr(options, "configure", lambda **_: None)
-    monkeypatch.setattr(command.check, "gradcheck", stages)
+    monkeypatch.setattr(gradcheck, "gradcheck", stages)
     assert cli.main(["gradcheck", "pusher", "--horizon", "2", "--stiffness", "100"]) == 0
     assert stages_of(capsys.readouterr().err) == ["[0/2] compiling", "[1/2] penalty: start"]
 

@@ -4,8 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjx_study.gradcheck.coverage import Coverage
-from mjx_study.gradcheck.reach import Reach, contact_parts, pairs_of
+from mjx_study.gradcheck.coverage import Coverage, Reach, contact_parts, pairs_of
 from mjx_study.gradcheck.states import Sample, states_of
 from mjx_study.simulation.engine import host_state
 from mjx_study.simulation.scene import Scene, load_scene, put_scene

@@ -53,7 +53,7 @@ OBJECTIVE: Final = (
 ESTIMATORS: Final = (
     Defect(
         "mean-of-all-as-baseline",
-        "estimators/baselines.py",
+        "estimators/orders.py",
         "(jnp.sum(value) - value) / jnp.maximum(num_others, 1.0)",
         "jnp.sum(value) / (num_others + 1.0)",
         "the batch's mean depends on the sample: biased by 1/N",
@@ -93,7 +93,7 @@ ESTIMATORS: Final = (
     ),
     Defect(
         "control-variate-scale",
-        "estimators/zeroth.py",
+        "estimators/orders.py",
         "linear = scale**2 * jnp.sum",
         "linear = scale * jnp.sum",
         "sigma in place of its square: unbiased still, but no longer a control variate",
@@ -101,7 +101,7 @@ ESTIMATORS: Final = (
     ),
     Defect(
         "pairs-as-samples",
-        "estimators/zeroth.py",
+        "estimators/orders.py",
         "return summarise((above + below) / 2.0)",
         "return summarise(jnp.concatenate([above, below]))",
         "the halves of a pair are not independent: the same mean, another standard error",
@@ -109,7 +109,7 @@ ESTIMATORS: Final = (
     ),
     Defect(
         "cut-one-step-early",
-        "estimators/propagation.py",
+        "estimators/stepwise.py",
         "jnp.arange(1, horizon + 1) % window != 0",
         "jnp.arange(horizon) % window != 0",
         "windows counted from the wrong end",
@@ -120,7 +120,7 @@ ESTIMATORS: Final = (
 REFERENCES: Final = (
     Defect(
         "range-slope",
-        "mjx_study/reference/ball_wall.py",
+        "mjx_study/reference/launch.py",
         "slope = 2 * self.speed**2 / self.gravity * np.cos(2 * angle)",
         "slope = self.speed**2 / self.gravity * np.cos(2 * angle)",
         "the inner derivative of sin(2 angle) forgotten",
@@ -128,7 +128,7 @@ REFERENCES: Final = (
     ),
     Defect(
         "adjoint-not-transposed",
-        "mjx_study/reference/adjoint.py",
+        "mjx_study/reference/system.py",
         'cost_states[..., step, :] + np.einsum("...ij,...i->...j", over_state, adjoint)',
         'cost_states[..., step, :] + np.einsum("...ij,...j->...i", over_state, adjoint)',
         "the Jacobian in place of its transpose",
@@ -144,7 +144,7 @@ REFERENCES: Final = (
     ),
     Defect(
         "impact-of-a-fixed-paddle",
-        "mjx_study/reference/paddle.py",
+        "mjx_study/reference/tennis.py",
         "slope[:, :2] - slope[:, 4:6]) - along[:, None] * slope[:, 6]",
         "slope[:, :2] - slope[:, 4:6])",
         "the time of impact without the paddle's turning",

@@ -255,8 +255,8 @@ CONTACT: Final = (
     Defect(
         "margin-twice",
         "mjx_study/simulation/contact.py",
-        "fill(model.geom_margin, contact.margin / 2)",
-        "fill(model.geom_margin, contact.margin)",
+        '"geom_margin": contact.margin / 2',
+        '"geom_margin": contact.margin',
         "MuJoCo adds the margins of two geoms",
         ("tests/test_contact.py::test_contact_parameters_reach_every_contact",),
     ),

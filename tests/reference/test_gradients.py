@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mjx_study.reference import Rollout, System, Tennis, roll_out, value_and_gradient, value_and_gradients
+from mjx_study.reference import Rollout, System, Tennis, roll_out, value_and_gradients
 from tests.reference.systems import ROLLOUTS, STEPS, RolloutCase, StepCase, differentiate, relative
 
 TOLERANCE = 1e-8  # relative to a column's norm; truncation and rounding of the quotients are below 1e-10 of it
@@ -99,14 +99,6 @@ def test_the_rollouts_meet_events():
         rollout = roll_out(case.system, case.start, case.controls, case.feedback)
         kinds[name] = set(case.events(rollout).ravel().tolist())
     assert kinds["tennis"] == {0, 1} and kinds["pusher"] == {True, False} and kinds["sliding_box"] == {0, 2, 3}
-
-
-@rollouts
-def test_value_and_gradient_is_the_part_over_controls(case: RolloutCase):
-    value, gradient = value_and_gradient(case.system, case.start, case.controls)
-    expected, gradients = value_and_gradients(case.system, case.start, case.controls)
-    assert value == expected and gradients.feedback is None
-    np.testing.assert_array_equal(gradient, gradients.controls)
 
 
 @pytest.mark.parametrize("name", [name for name, case in ROLLOUTS.items() if case.feedback is not None])

@@ -1,0 +1,204 @@
+"""Rollouts as mjx-study rollout simulates, draws and describes them."""
+
+import argparse
+import dataclasses
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from mjx_study import objective
+from mjx_study.choices import is_file
+from mjx_study.cli.console import number
+from mjx_study.cli.options import UsageError, configure_process, scene_options, task_of, theta_of, usage_errors
+from mjx_study.cli.output import attempt, computing, print_report
+from mjx_study.disk import prepare_folder, write_whole
+from mjx_study.files import PolicyFile, read_json
+from mjx_study.limits import MOST_STEPS, check_count
+from mjx_study.plots.style import save_figure
+from mjx_study.render import Motion, RenderError, animate, check_format, resolve_renderer, strip, stroboscope
+from mjx_study.simulation.scene import load_model
+from mjx_study.study.resolution import at_theta
+from mjx_study.table import format_table
+from mjx_study.tasks.contact_grid import ContactPoint, contact_grid
+from mjx_study.tasks.network import with_network
+from mjx_study.tasks.task import Task
+
+PASSIVE_SECONDS = 2.0
+MOST_BODIES = 12
+LARGEST = 1e10  # MuJoCo itself considers larger coordinates bad
+
+
+@dataclasses.dataclass(frozen=True)
+class Rollout:
+    """A simulated rollout, with one control fewer than states.
+
+    Attributes:
+        time: of each state [s].
+        facts: what is known about the rollout, as JSON data.
+        focus: geoms to keep in view.
+        lasting: number of states before the first nonfinite one.
+    """
+
+    title: str
+    model: mujoco.MjModel
+    time: np.ndarray
+    qpos: np.ndarray
+    qvel: np.ndarray
+    controls: np.ndarray
+    facts: dict[str, Any]
+    focus: tuple[int, ...]
+    lasting: int
+
+
+def run_rollout(options: argparse.Namespace) -> int:
+    with usage_errors():
+        configure_process(options)
+        check_format(options.format)
+        if options.sigma is not None and not options.noise:
+            raise ValueError("--sigma has an effect only with --noise")
+        simulate, messages = _plan_file(options) if is_file(options.task) else _plan_task(options)
+        resolve_renderer(options.renderer)
+        stem = (Path(options.task).stem if is_file(options.task) else options.task).replace(":", "-")
+        folder = prepare_folder(options.output or Path("results") / f"{stem}-rollout")
+    with computing() as progress:
+        progress(0, 2, "simulating")
+        rollout = simulate()
+        progress(1, 2, "drawing")
+        written, unwritten = attempt(lambda: _write(rollout, folder, options))
+    if rollout.lasting < len(rollout.qpos):
+        messages += (f"the state is not finite from {rollout.time[rollout.lasting]:g} s on; pictures end before",)
+    document = rollout.facts | {"warnings": list(messages), "written": [str(path) for path in written]}
+    return print_report(options, document, _lines(rollout, messages, written), unwritten)
+
+
+def _plan_file(options: argparse.Namespace) -> tuple[Callable[[], Rollout], tuple[str, ...]]:
+    """Return a function that runs the requested simulation, and warnings."""
+    unfit = ("contact", "stiffness", "damping", "noise", "sigma", "theta", "policy", "model")
+    given = [f"--{name}" for name in unfit if getattr(options, name) not in (None, False)]
+    if given:
+        raise ValueError(f"{', '.join(given)}: only for a task; {options.task} moves as its MJCF says")
+    model = load_model(options.task, **scene_options(options, "cone"))
+    steps = options.horizon or max(1, round(min(PASSIVE_SECONDS / model.opt.timestep, 1e15)))
+    check_count(steps, "steps", MOST_STEPS, "give --horizon, or a longer timestep")
+    return partial(_simulate_passive, model, Path(options.task).stem, steps), ()
+
+
+def _plan_task(options: argparse.Namespace) -> tuple[Callable[[], Rollout], tuple[str, ...]]:
+    policy = None
+    if options.policy is not None:
+        if options.theta is not None:
+            raise ValueError("--policy and --theta both say what theta is; give one of them")
+        policy = read_json(options.policy, PolicyFile)
+        if policy.task != options.task:
+            raise ValueError(f"{options.policy} is a policy of {policy.task}, not of {options.task}")
+        for name in ("contact", "stiffness", "damping", "cone", "horizon", "model"):
+            if getattr(options, name) is None:
+                setattr(options, name, getattr(policy, name) or None)
+    task = task_of(options)
+    if policy is not None and policy.network is not None:
+        task = with_network(task, tuple(policy.network), jax.random.key(0))  # theta replaces its weights
+    stiffness = task.defaults.middle_stiffness if options.stiffness is None else options.stiffness
+    cells, messages = contact_grid(task, (options.contact or task.defaults.main_family,), (stiffness,), options.damping)
+    task = at_theta(task, theta_of(options) if policy is None else policy.theta)
+    return partial(_simulate_task, task, cells[0], options.seed, options.noise), messages
+
+
+def _simulate_task(task: Task, cell: ContactPoint, seed: int, noisy: bool) -> Rollout:
+    theta = task.theta
+    program = objective.compiled_rollout(task)
+    outputs = program(theta, cell.contact, jax.random.key(seed), jnp.asarray(float(noisy), theta.dtype))
+    states, controls, cost, residual = jax.device_get(outputs)
+    facts = {
+        "task": task.name,
+        "contact": cell.family,
+        "stiffness": cell.stiffness,
+        "theta": np.asarray(theta, float).tolist(),
+        "sigma": task.sigma if noisy else 0.0,
+        "seed": seed,
+        "cost": float(cost) if np.isfinite(cost) else None,
+        "residual": float(residual) if np.isfinite(residual) else None,
+    }
+    noise = f"noise {task.sigma:g}, seed {seed}" if noisy else "no noise"
+    at = f"theta {float(theta[0]):g}, " if theta.size == 1 else ""
+    title = f"{task.name}: {cell.label}, {at}{noise}"
+    focus = tuple(task.scene.geom(name) for name in task.contact_pair or ())
+    return _rollout(title, task.scene.host, states.qpos, states.qvel, controls, facts, focus)
+
+
+def _simulate_passive(model: mujoco.MjModel, name: str, steps: int) -> Rollout:
+    """Simulate with MuJoCo's C engine from the first keyframe or the reference pose, with constant controls."""
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET  # show bad states rather than reset them
+    data = mujoco.MjData(model)
+    if model.nkey:
+        mujoco.mj_resetDataKeyframe(model, data, 0)
+    qpos, qvel = np.empty((steps + 1, model.nq)), np.empty((steps + 1, model.nv))
+    qpos[0], qvel[0] = data.qpos, data.qvel
+    for index in range(steps):
+        mujoco.mj_step(model, data)
+        qpos[index + 1], qvel[index + 1] = data.qpos, data.qvel
+    controls = np.tile(data.ctrl, (steps, 1))
+    return _rollout(f"{name}: C engine", model, qpos, qvel, controls, {"task": name})
+
+
+def _rollout(
+    title: str,
+    model: mujoco.MjModel,
+    qpos: np.ndarray,
+    qvel: np.ndarray,
+    controls: np.ndarray,
+    facts: dict[str, Any],
+    focus: tuple[int, ...] = (),
+) -> Rollout:
+    """Build a rollout with the common facts: steps, duration, and final positions of the bodies' centres of mass."""
+    qpos, qvel, controls = np.asarray(qpos, float), np.asarray(qvel, float), np.asarray(controls)
+    good = np.all(np.abs(np.concatenate([qpos, qvel], axis=1)) < LARGEST, axis=1)
+    steps, lasting = len(qpos) - 1, len(good) if good.all() else int(np.argmin(good))
+    duration = steps * model.opt.timestep
+    facts |= {"steps": steps, "duration": duration, "finite": lasting == len(good), "bodies": {}}
+    if lasting > 0:
+        data = mujoco.MjData(model)
+        data.qpos[:] = qpos[lasting - 1]
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        for body in np.flatnonzero(model.body_weldid):
+            facts["bodies"][model.body(body).name or f"body {body}"] = data.xipos[body].tolist()
+    time = np.arange(len(qpos)) * model.opt.timestep
+    return Rollout(title, model, time, qpos, qvel, controls, facts, focus, lasting)
+
+
+def _write(rollout: Rollout, folder: Path, options: argparse.Namespace) -> list[Path]:
+    """Write all files of a rollout; what can fail comes first, so that a failure leaves nothing."""
+    if rollout.lasting == 0:
+        raise UsageError(f"{rollout.title}: the first state is not finite")
+    motion = Motion(rollout.model, rollout.time[: rollout.lasting], rollout.qpos[: rollout.lasting], rollout.focus)
+    view, renderer = options.view, options.renderer
+    try:
+        pictures = strip(motion, frames=options.frames, view=view, renderer=renderer)
+        ghosts = stroboscope(motion, view=view)
+        film = animate(motion, folder / f"rollout.{options.format}", slow=options.slow, view=view, renderer=renderer)
+    except RenderError as error:
+        raise UsageError(str(error)) from error
+    arrays = {"time": rollout.time, "qpos": rollout.qpos, "qvel": rollout.qvel, "controls": rollout.controls}
+    numbers = write_whole(folder / "trajectory.npz", lambda file: np.savez_compressed(file, **arrays))  # type: ignore[arg-type]
+    return [*save_figure(pictures, folder, "strip"), *save_figure(ghosts, folder, "stroboscope"), film, numbers]
+
+
+def _lines(rollout: Rollout, messages: tuple[str, ...], written: list[Path]) -> list[str]:
+    facts, model = rollout.facts, rollout.model
+    lines = [rollout.title]
+    if "cost" in facts:
+        lines.append(f"cost {number(facts['cost'], 6)}, largest solver residual {number(facts['residual'], 2)}")
+    lines.append(f"{facts['steps']} steps of {1e3 * model.opt.timestep:g} ms, {facts['duration']:g} s")
+    rows = [[name, *(f"{value:.4f}" for value in place)] for name, place in facts["bodies"].items()]
+    if rows:
+        lines += format_table(rows[:MOST_BODIES], ["ended at", "x [m]", "y [m]", "z [m]"])
+    if len(rows) > MOST_BODIES:
+        lines.append(f"and {len(rows) - MOST_BODIES} more bodies: --json lists them all")
+    lines += [f"warning: {message}" for message in messages]
+    return lines + [f"written to {path.parent}: {', '.join(each.name for each in written)}" for path in written[:1]]

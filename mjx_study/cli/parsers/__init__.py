@@ -1,1 +1,0 @@
-"""The options of each command: `EPILOG` for its help, and `add`."""

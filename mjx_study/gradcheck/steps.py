@@ -1,0 +1,212 @@
+"""Check the steps of one contact model: all comparisons at each state, their findings, and a row of the table."""
+
+import dataclasses
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+
+import jax.numpy as jnp
+import numpy as np
+
+from mjx_study.gradcheck import diagnosis
+from mjx_study.gradcheck.causes import SINGULAR, Place, cause_of_fault, cause_of_kink
+from mjx_study.gradcheck.coordinates import Coordinates
+from mjx_study.gradcheck.coverage import Coverage
+from mjx_study.gradcheck.diagnosis import ENGINE, NAN, RIGHT, UNRESOLVED, VERDICTS, Codes, judge, worst_error
+from mjx_study.gradcheck.differences import Differences, differences, moves, solution_noise
+from mjx_study.gradcheck.programs import Programs, Setting
+from mjx_study.gradcheck.report import Entry, Finding, StepCheck
+from mjx_study.gradcheck.states import Sample
+from mjx_study.gradcheck.values import EngineStep, Values, compare_values
+from mjx_study.simulation.contact import apply_contact
+from mjx_study.tasks.contact_grid import ContactPoint
+
+STOCK = "mjx.step"
+_Found = tuple[tuple[str, str, tuple[str, ...], str], str, float, float | None, float | None]
+"""Owner of the derivative, verdict, modes and cause; and name, derivative, difference and gap of an entry."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class StateCheck:
+    """All results at one state.
+
+    Attributes:
+        derivatives, judged: derivatives by mode (forward, reverse, tape or mjx.step), and verdicts on them.
+        truth, engine_truth: finite differences of this project's step, and of the C engine's.
+        modes: difference between reverse and forward mode where no jump excuses it.
+        engine: verdicts on the forward-mode derivative by `engine_truth`; None if the two steps differ.
+    """
+
+    sample: Sample
+    residual: float
+    derivatives: dict[str, np.ndarray]
+    truth: Differences
+    judged: dict[str, Codes]
+    modes: float
+    values: Values
+    engine_truth: Differences
+    engine: Codes | None
+    place: Place
+
+    def of(self, who: str) -> dict[str, Codes]:
+        """Verdicts on the derivatives of the project or of `mjx.step`."""
+        return {mode: codes for mode, codes in self.judged.items() if (mode == STOCK) == (who == STOCK)}
+
+
+def check_state(
+    programs: Programs, engine_step: EngineStep, setting: Setting, sample: Sample, *, stock: bool = False
+) -> StateCheck:
+    """Run all comparisons of a step and its derivatives; with `stock`, differentiate `mjx.step` too."""
+    layout = programs.layout
+    linear = programs.linear(setting, sample.state)
+    reference = jnp.asarray(linear.qpos)
+    ladder = moves(np.eye(len(layout.inputs)))
+    qacc = programs.exact(setting, sample.state, reference, ladder[:1]).after.warmstart
+    solved = dataclasses.replace(sample.state, warmstart=qacc)
+    exact = programs.exact(setting, solved, reference, ladder)
+    noise = solution_noise(layout, exact.stages, qacc)
+    truth = differences(exact.outputs, noise)
+    engine_truth = differences(engine_step.outputs(solved, linear.qpos, ladder), engine_step.noise(solved, linear.qpos))
+    stock_step = programs.stock_step(setting, solved)
+    values = compare_values(layout, engine_step, solved, exact.after, stock_step, exact.stages, noise)
+
+    model = apply_contact(layout.scene.model, setting.contact)
+    solref, solimp = np.asarray(model.geom_solref), np.asarray(model.geom_solimp)
+    place = Place(layout, sample.state, exact.stages, qacc, solref, solimp)
+    degenerate = np.array(
+        [
+            [any(contact.concerns(output, source) for contact in place.degenerate) for source in layout.inputs]
+            for output in layout.outputs
+        ]
+    )
+    derivatives = {"forward": linear.forward, "reverse": linear.reverse}
+    derivatives |= {} if linear.tape is None else {"tape": linear.tape}
+    excused = degenerate & truth.rough
+    others = list(derivatives.values())[1:]
+    apart = max(diagnosis.modes_apart(layout, linear.forward, other, excused) for other in others)
+    converged = None if linear.residual <= 1e-10 else programs.linear(setting, solved).forward
+    starved = not linear.residual <= diagnosis.RESIDUAL_TOLERANCE
+    judged = {
+        mode: judge(layout, jacobian, truth, converged, starved=starved, degenerate=degenerate)
+        for mode, jacobian in derivatives.items()
+    }
+    engine = judge(layout, linear.forward, engine_truth) if values.agrees_with_engine else None
+    if engine is not None:
+        judged = {mode: diagnosis.resolved_by(codes, engine) for mode, codes in judged.items()}
+    if stock:
+        derivatives[STOCK] = programs.stock(setting, sample.state)
+        judged[STOCK] = judge(layout, derivatives[STOCK], truth, degenerate=degenerate)
+    return StateCheck(sample, linear.residual, derivatives, truth, judged, apart, values, engine_truth, engine, place)
+
+
+def step_check(
+    cell: ContactPoint, layout: Coordinates, checks: Sequence[StateCheck], found: Sequence[Finding], coverage: Coverage
+) -> StepCheck:
+    """Summarise the checks of one contact model."""
+
+    def worst(who: str, *blocks: str) -> float:
+        return max(
+            worst_error(layout, check.derivatives[mode], check.truth, codes, layout.columns(*blocks))
+            for check in checks
+            for mode, codes in check.of(who).items()
+        )
+
+    blocks = layout.blocks()
+    engine = [
+        worst_error(layout, check.derivatives["forward"], check.engine_truth, check.engine, range(len(layout.inputs)))
+        for check in checks
+        if check.engine is not None
+    ]
+    stock = None
+    if STOCK in checks[0].judged:
+        nan = any((check.judged[STOCK] == NAN).any() for check in checks)
+        stock = float("inf") if nan else worst(STOCK, *blocks)
+    return StepCheck(
+        contact=cell.family,
+        stiffness=cell.stiffness,
+        states=len(checks),
+        entries=len(checks) * len(layout.inputs) * len(layout.outputs),
+        unresolved=sum(int(np.sum(_worst_codes(check.of("project")) == UNRESOLVED)) for check in checks),
+        modes=max(check.modes for check in checks),
+        differences=worst("project", *(block for block in blocks if block != "contact")),
+        parameters=worst("project", "contact") if len(layout.scales) else None,
+        stock_step=max(check.values.stock for check in checks),
+        engine_step=max(check.values.engine for check in checks),
+        engine=max(engine, default=None),
+        stock=stock,
+        residual=max(check.residual for check in checks),
+        coverage=coverage,
+        verdict=diagnosis.worst_verdict([f.verdict for f in found if f.who == "project" and f.verdict in VERDICTS]),
+    )
+
+
+def collect(cell: ContactPoint, layout: Coordinates, checks: Sequence[StateCheck]) -> list[Finding]:
+    """Group the findings for one contact model."""
+    groups: dict[tuple[str, str, tuple[str, ...], str], list[Entry]] = defaultdict(list)
+    for check in checks:
+        label, index = check.sample.label, check.sample.index
+        for key, *entry in (*_of_entries(check, layout), *_of_engine(check, layout), *_of_state(check, layout)):
+            groups[key].append(Entry(label, index, index * layout.scene.timestep, *entry))
+    return [Finding(cell.label, *key, tuple(entries)) for key, entries in groups.items()]
+
+
+def _worst_codes(judged: dict[str, Codes]) -> Codes:
+    return np.max(list(judged.values()), axis=0)
+
+
+def _of_entries(check: StateCheck, layout: Coordinates) -> Iterator[_Found]:
+    for who in ("project", STOCK) if STOCK in check.judged else ("project",):
+        judged = check.of(who)
+        worst = _worst_codes(judged)
+        for row, column in np.argwhere((worst != RIGHT) & (worst != UNRESOLVED)).tolist():
+            verdict = VERDICTS[worst[row, column]]
+            smooth = verdict not in ("kink", "jump")
+            if who == STOCK and not smooth:
+                continue  # inherited from the step, so already attributed to the project
+            output, source = layout.outputs[row], layout.inputs[column]
+            if not smooth:
+                cause = cause_of_kink(check.place, output, source)
+            elif verdict == "unconverged":
+                cause = _budget(layout)
+            else:
+                cause = cause_of_fault(check.place, output, source, stock=who == STOCK)
+            modes = tuple(mode for mode, codes in judged.items() if codes[row, column] == worst[row, column])
+            derivative, difference, gap = (
+                float(values[row, column])
+                for values in (check.derivatives[modes[0]], check.truth.value, check.truth.gap)
+            )
+            name = f"d {output} / d {source}"
+            yield (who, verdict, modes, cause), name, derivative, difference, None if smooth else gap
+
+
+def _of_engine(check: StateCheck, layout: Coordinates) -> Iterator[_Found]:
+    """Findings where the C engine's step has the same value but a different derivative."""
+    if check.engine is None:
+        return
+    apart = diagnosis.disagreements(check.judged["forward"], check.truth, check.engine, check.engine_truth)
+    key = ("project", VERDICTS[ENGINE], (), "the derivative is that of this step, and the C engine's has another")
+    for row, column in np.argwhere(apart).tolist():
+        numbers = (float(each[row, column]) for each in (check.derivatives["forward"], check.engine_truth.value))
+        yield key, f"d {layout.outputs[row]} / d {layout.inputs[column]}", *numbers, None
+
+
+def _of_state(check: StateCheck, layout: Coordinates) -> Iterator[_Found]:
+    values = check.values
+    if not check.residual <= diagnosis.RESIDUAL_TOLERANCE:
+        cause = f"residual {check.residual:.1e}; {_budget(layout)}"
+        yield ("project", "unconverged", (), cause), "", check.residual, None, None
+    if not check.modes <= diagnosis.MODES_TOLERANCE:
+        text = f"the two modes of differentiation disagree by {check.modes:.1e}"
+        cause = f"{text}: {SINGULAR}" if check.place.singular else text
+        yield ("project", "wrong", (), cause), "", check.modes, None, None
+    if values.verdict:
+        who = STOCK if values.verdict == "value" and values.agrees_with_engine else "project"
+        name = f"change of {layout.outputs[values.coordinate]}"
+        yield (who, values.verdict, (), values.cause), name, *values.numbers, None
+
+
+def _budget(layout: Coordinates) -> str:
+    option = layout.scene.host.opt
+    return (
+        f"the solver stopped early, with iterations={option.iterations} and ls_iterations={option.ls_iterations}; "
+        "give more with --iterations and --ls-iterations"
+    )
