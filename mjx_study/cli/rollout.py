@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 
 from mjx_study import objective
-from mjx_study.choices import is_file
+from mjx_study.choices import CONES, is_file
 from mjx_study.cli.console import number
 from mjx_study.cli.options import (
     UsageError,
@@ -111,10 +111,13 @@ def _plan(options: argparse.Namespace):
 def _plan_task(options: argparse.Namespace):
     policy = None if options.policy is None else _load_policy(options)
     if policy is not None:
-        for name in ("contact", "stiffness", "damping", "cone", "horizon", "model"):
+        for name in ("contact", "stiffness", "damping", "horizon", "model"):
             if getattr(options, name) is None:
                 setattr(options, name, getattr(policy, name) or None)
     task = task_of(options)
+    if policy is not None and options.cone is None and policy.cone not in (None, CONES[task.scene.host.opt.cone]):
+        options.cone = policy.cone  # only if it differs: a task of the user's own need not take the option
+        task = task_of(options)
     if policy is not None and policy.network is not None:
         task = with_network(task, tuple(policy.network), jax.random.key(0))  # theta replaces its weights
     stiffness = task.defaults.middle_stiffness if options.stiffness is None else options.stiffness
