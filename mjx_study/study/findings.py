@@ -24,7 +24,7 @@ BIASED: Final = {
     "aobg_onset": "AoBG (onset)",
     "ivw": "IVW",
 }
-"""Estimators whose bias is reported: first order, and the interpolations that follow it."""
+"""Estimators whose bias is reported, besides user-defined ones: first order, and interpolations that follow it."""
 APART: Final = 4.0
 """Standard errors beyond which a mean without a verdict is reported as off."""
 DETECTED: Final = 4.0
@@ -206,12 +206,12 @@ def _bias_findings(rows: Sequence[Row], gammas: Mapping[str, float]) -> list[str
     With several seeds, counts and the median debiased error are given.
     """
     sentences = []
-    for estimator in dict.fromkeys(row.estimator for row in rows if row.estimator in BIASED):
+    for estimator in dict.fromkeys(row.estimator for row in rows if row.estimator in BIASED or ":" in row.estimator):
         mine = [row for row in rows if row.estimator == estimator]
         seeds = len({row.seed for row in mine})
         biased = [row for row in mine if row.bias_verdict == "biased"]
         off = [row for row in mine if row.bias_verdict == "too few effective samples" and _off(row)]
-        mean = f"{BIASED[estimator]}'s mean is"
+        mean = f"{BIASED.get(estimator, estimator.rpartition(':')[2])}'s mean is"
         if biased:
             shares = ", ".join(f"{_share(same)}{_at([stiffness])}{_of(same, seeds)}" for stiffness, same in _by(biased))
             least = max(row.bias_p_value for row in biased)
