@@ -155,6 +155,11 @@ def name_of(estimator: str | Estimator) -> str:
     return own.name if ESTIMATORS.get(own.name) is own else f"{own.__module__}:{own.__qualname__}"
 
 
+def label_of(name: str) -> str:
+    """Label of an estimator in texts and figures; that of `module:name` is its name."""
+    return (ESTIMATORS[name].label if name in ESTIMATORS else "") or name.rpartition(":")[2]
+
+
 def find_estimator(name: str | Estimator) -> Estimator | type[Estimator]:
     """Look up an estimator by name; an unknown one is a ValueError.
 

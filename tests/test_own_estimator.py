@@ -1,11 +1,14 @@
 """An estimator of the user's own, one file outside the package, through the commands; and one line for each mistake."""
 
+import json
 import re
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import jax
+import numpy as np
 import pytest
 
 from estimators import ESTIMATORS, Estimator, FirstOrder, ZerothOrder, find_estimator, make_estimator, register
@@ -13,13 +16,48 @@ from estimators.catalogue import CATALOGUE
 from mjx_study import cli
 from mjx_study.cli import options
 from mjx_study.plots.style import STYLE, style_of
+from mjx_study.report import CAPTIONS
 from mjx_study.study.configuration import StudyConfig
 from mjx_study.study.findings import rows_of
 from mjx_study.study.run import load_study
 
 PAGE = (Path(__file__).parents[1] / "docs" / "estimators.md").read_text()
 (CODE,) = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
-OWN = "my_estimators:SignAgreement"
+HEIRS = """
+
+class Cautious(estimators.AlphaOrder):
+    name = "cautious"
+
+
+class Doubled(estimators.FirstOrder):
+    def combine(self, differentiation):
+        return estimators.summarise(2 * differentiation.gradient)
+"""
+"""An interpolation, and one whose mean is wrong, under the name of the class that it inherits from."""
+OWN, CAUTIOUS, DOUBLED = "my_estimators:SignAgreement", "my_estimators:Cautious", "my_estimators:Doubled"
+ANALYTIC = ["pusher", "--horizon", "4", "--contact", "reference", "--stiffness", "10,100"]
+STUDIES = {
+    "batch": ["--samples", "8", "--reference-samples", "8", "--seeds", "1"],
+    "gradients": ["--samples", "8,16", "--reference-samples", "8", "--seeds", "3"],
+    "descents": ["--iterations", "2", "--samples", "4", "--seeds", "2", "--learning-rate", "0.01"],
+    "landscapes": ["--points", "3", "--direction", "0", "--span=-1,1", "--samples", "4"],
+}
+"""Of each kind, the smallest that has all its figures."""
+BOTH = {"SignAgreement", "Cautious"}
+FIGURES = {
+    "batch": {"comparison": BOTH},
+    "gradients": {
+        "variance": BOTH,
+        "bias": BOTH,
+        "error_against_samples": BOTH,
+        "alpha": {"Cautious"},
+        "map_stiffness_samples": set(),
+    },
+    "descents": {"achieved": BOTH, "descent": BOTH},
+    "landscapes": {"landscape": BOTH},
+}
+"""What each figure shows of them; a map is of zobg and fobg."""
+NUMBER = {"batch": "variance", "gradients": "variance", "descents": "final_cost", "landscapes": "slope"}
 
 pytestmark = pytest.mark.usefixtures("shared_programs")
 
@@ -29,11 +67,16 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """The page's file, in the current directory; the tests' own settings stand."""
     monkeypatch.setattr(options, "configure", lambda **_: None)
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "my_estimators.py").write_text(CODE)
+    (tmp_path / "my_estimators.py").write_text(CODE + HEIRS)
     path = list(sys.path)
     yield tmp_path
     assert sys.path == path
     sys.modules.pop("my_estimators", None)
+
+
+def document(capsys: pytest.CaptureFixture[str], *arguments: str) -> dict[str, Any]:
+    assert cli.main([*arguments, "--json"]) == 0
+    return json.loads(capsys.readouterr().out)
 
 
 def test_compare_and_sweep_take_it(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -52,7 +95,7 @@ def test_compare_and_sweep_take_it(folder: Path, capsys: pytest.CaptureFixture[s
 
 def test_optimise_takes_it_and_goes_on(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = ["optimise", "pusher", "--reference", "--horizon", "4", "--samples", "8", "--seeds", "1"]
-    arguments += ["--estimator", OWN, "--learning-rate", "0.01", "--output", "out", "--json", "--iterations"]
+    arguments += ["--estimators", OWN, "--learning-rate", "0.01", "--output", "out", "--json", "--iterations"]
     assert cli.main([*arguments, "2"]) == 0 and cli.main([*arguments, "3"]) == 0
     capsys.readouterr()
     assert {path.name for path in (folder / "out").iterdir()} >= {
@@ -62,6 +105,72 @@ def test_optimise_takes_it_and_goes_on(folder: Path, capsys: pytest.CaptureFixtu
     (folder / "my_estimators.py").write_text(CODE.replace("sign(low.mean) ==", "sign(low.mean) !="))
     assert cli.main([*arguments, "4"]) == 2
     assert "holds another study (" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", STUDIES)
+def test_every_figure_and_report_shows_it(name: str, folder: Path) -> None:
+    """A report has a row for each contact model."""
+    arguments = ["--estimators", f"zobg,fobg,{OWN},{CAUTIOUS}", *STUDIES[name], "--chunk-size", "4"]
+    assert cli.main(["sweep", *ANALYTIC, *arguments, "--output", "out"]) == 0
+    assert cli.main(["plot", "out", "--style", "paper", "--format", "svg"]) == 0
+    drawn = {path.stem: path.read_text() for path in (folder / "out").glob("*.svg")}
+    assert {key: {own for own in BOTH if own in text} for key, text in drawn.items()} == FIGURES[name]
+    data = load_study(folder / "out")
+    assert bool(data[NUMBER[name]].sel(estimator=[OWN, CAUTIOUS]).notnull().all())
+    assert cli.main(["report", "out"]) == 0
+    page = (folder / "out" / "report.html").read_text()
+    assert page.count(f"<td>{OWN}</td>") == page.count(f"<td>{CAUTIOUS}</td>") == data.sizes["model"] == 2
+
+
+def test_these_are_all_figures() -> None:
+    assert {each.partition("_stiffness")[0] for figures in FIGURES.values() for each in figures} == set(CAPTIONS)
+
+
+def test_landscape_takes_it(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Its slope along one parameter is that of one order or the other, as the page says."""
+    line = ["--points", "3", "--direction", "0", "--span=-1,1", "--samples", "4", "--output", "out"]
+    found = document(capsys, "landscape", *ANALYTIC, *line, "--estimators", f"zobg,fobg,{OWN}")
+    assert found["estimators"] == ["zobg", "fobg", OWN] and (folder / "out" / "landscape.png").is_file()
+    for curve in found["curves"]:
+        zeroth, first, mine = np.array(curve["slope"], float)
+        assert np.all(np.isclose(mine, zeroth, rtol=1e-9) | np.isclose(mine, first, rtol=1e-9))
+
+
+def test_findings_tell_its_bias(capsys: pytest.CaptureFixture[str]) -> None:
+    """The mean of one is twice the gradient; that of the other is right."""
+    arguments = ["--samples", "400", "--reference-samples", "400", "--estimators", f"{DOUBLED},{CAUTIOUS}"]
+    found = document(capsys, "compare", *ANALYTIC, *arguments)["findings"]
+    (told,) = (sentence for sentence in found if "mean is" in sentence)
+    percent = r"[\d.]+%"
+    assert re.match(rf"reference: Doubled's mean is biased by {percent} at K = 10 N/m, {percent} at K = 100 N/m", told)
+
+
+def test_gradcheck_takes_it(capsys: pytest.CaptureFixture[str]) -> None:
+    """Its mean, along a path and along the means; the name is the one that was given."""
+    common = ["gradcheck", "tests.carts:cart", "--contact", "penalty", "--stiffness", "10", "--mean"]
+    assert cli.main([*common, "--estimators", f"fobg,{DOUBLED}", "--json"]) == 1
+    right, wrong = json.loads(capsys.readouterr().out)["checks"]
+    assert (right["estimator"], right["verdict"]) == ("fobg", "right")
+    assert (wrong["estimator"], wrong["verdict"]) == (DOUBLED, "biased")
+    assert abs(wrong["relative_gap"]) == pytest.approx(1.0, abs=0.1)
+    assert cli.main([*common, "--estimators", OWN, "--direction", "means"]) in (0, 3)
+    assert re.search(rf"penalty +10 +{OWN} ", capsys.readouterr().out)
+
+
+@pytest.mark.parametrize("command", ["compare", "landscape", "optimise", "sweep"])
+def test_a_dry_run_takes_it(command: str, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    one = [*ANALYTIC[:-1], "10", "--estimators", OWN, "--samples", "8", "--output", "out", "--dry-run"]
+    told = document(capsys, command, *one)
+    assert told["cells"] == 1 and told["rollouts"] >= 16 and told["gradients"] >= 8
+    assert not (folder / "out").exists()
+
+
+def test_rollout_takes_its_policy(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["--contact", "reference", "--horizon", "4", "--samples", "4", "--seeds", "1", "--iterations", "1"]
+    (found,) = document(capsys, "optimise", "pusher", *arguments, "--estimators", OWN, "--output", "out")["runs"]
+    policy = ["--policy", "out/policy-my_estimators.SignAgreement.json", "--renderer", "drawing", "--output", "seen"]
+    facts = document(capsys, "rollout", "pusher", *policy)
+    assert facts["theta"] == found["theta"][0] and facts["steps"] == 4 and facts["finite"]
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 """A task of the user's own: the page that explains it works as it stands there, and each mistake gets one line."""
 
 import json
+import math
 import os
 import re
 import subprocess
@@ -12,11 +13,14 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
 from mjx_study import cli
 from mjx_study.choices import TASK_GROUP
+from mjx_study.cli import options as settings
 from mjx_study.cli.gradcheck import UNEXERCISED
+from mjx_study.diagnose.measurement import ESTIMATORS
 from mjx_study.gradcheck import plan_gradcheck
 from mjx_study.study.configuration import StudyConfig
 from mjx_study.study.findings import rows_of
@@ -41,6 +45,22 @@ def hop(horizon=3, **options):
     return Task(name="hop", scene=scene, horizon=horizon, policy=policy, theta=jnp.zeros(horizon), sigma=1.0,
                 start=initial_state(scene), contact_pair=("pusher", "slider"), final_cost=lambda state: state.qpos[1])
 """
+CART = '''
+import mujoco
+from mjx_study import StudyDefaults, put_scene
+
+def cart(horizon=3):
+    scene, policy = put_scene(mujoco.MjModel.from_xml_string("""
+        <mujoco><worldbody><body name="cart">
+          <joint name="x" type="slide" axis="1 0 0"/><geom size="0.1" mass="1"/>
+        </body></worldbody><actuator><motor joint="x"/></actuator></mujoco>
+    """), "cart"), OpenLoop(horizon, 1)
+    return Task(name="cart", scene=scene, horizon=horizon, policy=policy, theta=jnp.ones(horizon), sigma=1.0,
+                start=initial_state(scene, qpos=jnp.ones(1)), final_cost=lambda state: state.qpos[0]**2,
+                running_cost=lambda state, control: control @ control, contact_pair=None,
+                defaults=StudyDefaults(families=("mjcf",)))
+'''
+"""A task without contact, which compiles faster, in a single file."""
 
 
 @pytest.fixture(scope="module")
@@ -121,7 +141,7 @@ def test_compare(folder: Path) -> None:
 
 @pytest.mark.slow
 def test_optimise(folder: Path) -> None:
-    arguments = ["--estimator", "fobg", "--iterations", "2", "--samples", "4", "--seeds", "2", "--learning-rate", "1"]
+    arguments = ["--estimators", "fobg", "--iterations", "2", "--samples", "4", "--seeds", "2", "--learning-rate", "1"]
     document = run(folder, "optimise", "my_tasks:hopper", *arguments, "--evaluation-samples", "4")
     (found,) = document["runs"]
     assert len(found["final_cost"]) == 2 and found["stopped"] == []
@@ -156,6 +176,119 @@ def test_gradcheck(folder: Path) -> None:
     (cost,), (step,) = document["costs"], document["steps"]
     assert cost["verdict"] == step["verdict"] == "right"
     assert cost["gradient_norm"] > 0.1 and cost["difference"] < 1e-6 and step["engine"] < 1e-6
+
+
+# Every command, with small tasks
+
+
+@pytest.fixture(scope="module", params=["cart", pytest.param("hop", marks=pytest.mark.slow)])
+def task(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """Its file is in the current directory; the tests' own settings stand."""
+    path = tmp_path_factory.mktemp("small")
+    (path / "mine.py").write_text(TINY + CART)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(settings, "configure", lambda **_: None)
+        patch.chdir(path)
+        yield f"mine:{request.param}"
+
+
+@pytest.fixture
+def document(capsys: pytest.CaptureFixture[str]):
+    def document(*arguments: str, codes: Sequence[int] = (0,)) -> dict[str, Any]:
+        """What a command prints as JSON."""
+        assert cli.main([*arguments, "--json"]) in codes
+        return json.loads(capsys.readouterr().out)
+
+    return document
+
+
+def finite(values: Any) -> bool:
+    return bool(np.all(np.isfinite(np.array(values, float))))
+
+
+LINE = ["--points", "3", "--direction", "0", "--span=-1,1", "--samples", "4"]
+
+
+def test_compare_and_report(task: str, document) -> None:
+    found = document("compare", task, "--samples", "4", "--reference-samples", "4", "--output", "batch")
+    assert found["config"]["tasks"] == [task]
+    assert {row["estimator"] for row in found["rows"]} == {"zobg", "fobg", "aobg"}
+    assert finite([[row["variance"], row["relative_error"]] for row in found["rows"]])
+    assert Path("batch/comparison.png").is_file()
+    assert document("report", "batch")["written"] == "batch/report.html"
+    page = Path("batch/report.html").read_text()
+    assert f"<h1>{task}: gradient estimates through" in page and 'alt="comparison"' in page
+    assert page.count("<td>fobg</td>") == len(found["rows"]) / 3
+
+
+def test_landscape_plot_and_report(task: str, document) -> None:
+    found = document("landscape", task, *LINE, "--output", "line")
+    assert found["config"]["tasks"] == [task] and found["estimators"] == ["zobg", "fobg"]
+    assert all(finite(curve[name]) for curve in found["curves"] for name in ("cost", "smoothed", "slope"))
+    assert document("plot", "line", "--output", "drawn")["written"] == ["drawn/landscape.png", "drawn/landscape.pdf"]
+    document("report", "line")
+    page = Path("line/report.html").read_text()
+    assert f"<h1>{task}: landscapes through" in page and 'alt="landscape"' in page
+
+
+def test_optimise_and_rollout(task: str, document) -> None:
+    """A rollout of the policy that was found, and one of the task's own."""
+    small = ["--iterations", "2", "--samples", "4", "--seeds", "1", "--learning-rate", "0.1", "--estimators", "fobg"]
+    drawn = ["--renderer", "drawing"]
+    (run,) = document("optimise", task, *small, "--output", "descent")["runs"]
+    assert finite(run["final_cost"]) and Path("descent/descent.png").is_file()
+    found = document("rollout", task, "--policy", "descent/policy-fobg.json", "--output", "found", *drawn)
+    start = document("rollout", task, *drawn)
+    assert found["theta"] == run["theta"][0] != start["theta"]
+    for facts in (found, start):
+        assert facts["task"] == task.partition(":")[2] and facts["steps"] == 3 and facts["finite"]
+        assert math.isfinite(facts["cost"])
+    assert {Path(name).name for name in start["written"]} == {
+        "rollout.gif", "strip.pdf", "strip.png", "stroboscope.pdf", "stroboscope.png", "trajectory.npz",
+    }  # fmt: skip
+    assert {Path(name).parent for name in start["written"]} == {Path("results") / f"{task.replace(':', '-')}-rollout"}
+
+
+def test_gradcheck_of_steps_and_means(task: str, document) -> None:
+    found = document("gradcheck", task, "--states", "1", codes=(0, UNEXERCISED))
+    assert found["subject"] == task.partition(":")[2] and found["passed"]
+    assert len(found["steps"]) > 0 and all(finite(step["differences"]) for step in found["steps"])
+    means = document("gradcheck", task, "--mean", "--contact", "mjcf", codes=(0, 1, UNEXERCISED))["checks"]
+    assert [mean["estimator"] for mean in means] == ["zobg", "fobg"]
+    assert all(finite([mean["difference"], mean["gap"]]) for mean in means)
+    assert task == "mine:hop" or means[1]["verdict"] == "right"
+
+
+def test_bench(task: str, document) -> None:
+    found = document("bench", task, "--samples", "4")
+    assert found["task"] == task.partition(":")[2] and (found["samples"], found["horizon"]) == (4, 3)
+    assert finite(list(found["ratios"].values())) and all(ratio > 0 for ratio in found["ratios"].values())
+    assert ("onset_per_gradient" in found["ratios"]) == (task == "mine:hop")
+
+
+def test_diagnose(task: str, document) -> None:
+    found = document("diagnose", task, "--samples", "23")
+    assert found["subject"] == task and found["derivatives"] == "right"
+    assert {each["estimator"] for each in found["estimators"]} == set(ESTIMATORS)
+    assert finite([each["variance"] for each in found["estimators"]]) and finite(found["gradient_norm"])
+    assert (found["best"] in ESTIMATORS) == found["resolved"]
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["compare", "--samples", "4"],
+        ["landscape", *LINE],
+        ["optimise", "--iterations", "2", "--samples", "4", "--learning-rate", "0.1"],
+        ["sweep", "--samples", "4,8"],
+    ],
+    ids=lambda command: command[0],
+)
+def test_a_dry_run(command: list[str], task: str, document) -> None:
+    name, *own = command
+    told = document(name, task, *own, "--output", "nowhere", "--dry-run")
+    assert told["cells"] >= 1 and told["programs"] >= 1 and told["rollouts"] > told["gradients"] > 0
+    assert not Path("nowhere").exists()
 
 
 @pytest.mark.parametrize("name", ["hopper", "feedback", "thrown"])

@@ -124,9 +124,9 @@ def _run_mean(options: argparse.Namespace) -> int:
         plan = plan_gradcheck(task, options.contact, options.stiffness, seed=options.seed, damping=options.damping)
         found = [make_estimator(name, gamma=task.defaults.gamma, sigma=task.sigma) for name in chosen["estimators"]]
         check_estimators(found, task)
-    path = {name: chosen[name] for name in ("samples", "span", "direction")}
+    given = {name: chosen[name] for name in ("samples", "span", "direction")} | {"names": chosen["estimators"]}
     with computing() as progress:
-        checks = check_mean(task, plan.cells, found, seed=options.seed, progress=progress, **path)
+        checks = check_mean(task, plan.cells, found, seed=options.seed, progress=progress, **given)
     document = {"checks": [each.as_dict() for each in checks], "warnings": list(plan.warnings)}
     print_report(options, document, [*lines_of(checks), *(f"warning: {text}" for text in plan.warnings)])
     verdicts = {each.verdict for each in checks}

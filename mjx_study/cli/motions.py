@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 
 from mjx_study import objective
-from mjx_study.choices import is_file
+from mjx_study.choices import CONES, is_file
 from mjx_study.cli.console import number
 from mjx_study.cli.options import UsageError, configure_process, scene_options, task_of, theta_of, usage_errors
 from mjx_study.cli.output import attempt, computing, print_report
@@ -97,10 +97,13 @@ def _plan_task(options: argparse.Namespace) -> tuple[Callable[[], Rollout], tupl
         policy = read_json(options.policy, PolicyFile)
         if policy.task != options.task:
             raise ValueError(f"{options.policy} is a policy of {policy.task}, not of {options.task}")
-        for name in ("contact", "stiffness", "damping", "cone", "horizon", "model"):
+        for name in ("contact", "stiffness", "damping", "horizon", "model"):
             if getattr(options, name) is None:
                 setattr(options, name, getattr(policy, name) or None)
     task = task_of(options)
+    if policy is not None and options.cone is None and policy.cone not in (None, CONES[int(task.scene.host.opt.cone)]):
+        options.cone = policy.cone  # only if it differs: a user's own task need not take the option
+        task = task_of(options)
     if policy is not None and policy.network is not None:
         task = with_network(task, tuple(policy.network), jax.random.key(0))  # theta replaces its weights
     stiffness = task.defaults.middle_stiffness if options.stiffness is None else options.stiffness

@@ -109,8 +109,9 @@ def _at_right_angles(estimates: Sequence[GradientEstimate]) -> list[np.ndarray]:
 
 
 def unmixed(estimators: Sequence[Estimator], batches: dict[str, Any]) -> list[GradientEstimate]:
-    """Compute the estimates that use a single batch, without interpolation."""
-    return [estimator(batches) for estimator in estimators if len(estimator.needs) == 1]
+    """Compute the estimates that use a single batch, without interpolation; all if there are none."""
+    single = [estimator for estimator in estimators if len(estimator.needs) == 1]
+    return [estimator(batches) for estimator in single or estimators]
 
 
 def check_mean(
@@ -120,6 +121,7 @@ def check_mean(
     *,
     samples: int,
     seed: int,
+    names: Sequence[str] = (),
     span: Sequence[float] | None = None,
     direction: str = "random",
     tolerance: float = TOLERANCE,
@@ -133,6 +135,7 @@ def check_mean(
         estimators: estimators with their options; they share the samples.
         samples: samples at each node of the path.
         seed: random seed of the samples and of a random direction.
+        names: names of the estimators in the checks; by default their own.
         span: ends of the path, from theta along the direction [unit of theta]; None for two standard deviations of the
             noise to either side, or 0.02 for noise on the controls.
         direction: "random", the index of a parameter, or "means" for the paths of `along_means`.
@@ -161,9 +164,9 @@ def check_mean(
         else:
             paths = [circulations(estimators, objective, *ends, key, samples)]
         found += [
-            MeanCheck(cell.family, cell.stiffness or 0.0, estimator.name, each, each.verdict(tolerance))
+            MeanCheck(cell.family, cell.stiffness or 0.0, name, each, each.verdict(tolerance))
             for numbers in paths
-            for estimator, each in zip(estimators, numbers, strict=True)
+            for name, each in zip(names or [estimator.name for estimator in estimators], numbers, strict=True)
         ]
     progress(len(cells), len(cells), "done")
     return found

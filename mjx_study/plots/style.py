@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from estimators import ESTIMATORS
+from estimators.estimator import label_of
 from mjx_study.choices import FAMILIES
 from mjx_study.disk import write_whole
 
@@ -50,10 +50,9 @@ assert set(TITLES) >= set(FAMILIES)
 
 def style_of(name: str) -> tuple[str, str, str]:
     """Label, colour and marker of an estimator; user-defined ones depend on the name alone."""
-    label = (ESTIMATORS[name].label if name in ESTIMATORS else "") or name.rpartition(":")[2]
     colours, markers = OTHERS
     drawn = zlib.crc32(name.encode())
-    return label, *STYLE.get(name, (colours[drawn % len(colours)], markers[drawn // 7 % len(markers)]))
+    return label_of(name), *STYLE.get(name, (colours[drawn % len(colours)], markers[drawn // 7 % len(markers)]))
 
 
 def mean_with_band(axes: Axes, x, mean, error, color: str, label: str) -> None:

@@ -10,20 +10,13 @@ from typing import Any, Final
 import numpy as np
 import xarray as xr
 
-from estimators import ENOUGH_EFFECTIVE
+from estimators import ENOUGH_EFFECTIVE, ESTIMATORS, ORACLES
+from estimators.estimator import label_of
 from mjx_study.study.variables import GRADIENTS, ONSETS
 from mjx_study.table import digits_to_tell_apart
 
 SURE: Final = 0.001
 """p-value at which a mean is called biased: the smallest that the test's 999 draws can yield."""
-BIASED: Final = {
-    "fobg": "FoBG",
-    "fobg_onset": "FoBG (onset)",
-    "aobg": "AoBG",
-    "aobg_onset": "AoBG (onset)",
-    "ivw": "IVW",
-}
-"""Estimators whose bias is reported: first order, and the interpolations that follow it."""
 APART: Final = 4.0
 """Standard errors beyond which a mean without a verdict is reported as off."""
 DETECTED: Final = 4.0
@@ -47,8 +40,6 @@ PLACE: Final = ("task", "timestep", "cone", "sigma", "samples", "model", "seed",
 """Coordinates of a row."""
 SETTING: Final = ("task", "timestep", "cone", "sigma", "samples")
 """Coordinates shared by all rows of a finding."""
-INTERPOLATED: Final = ("aobg", "aobg_onset")
-"""Estimators with the accuracy bound gamma."""
 VECTORS: Final = ("gradient", "reference")
 BELOW, ABOVE, ALIKE = "below ZoBG's", "above ZoBG's", "not told apart from ZoBG's"
 UNKNOWN: Final = "undecided (too few effective samples)"
@@ -148,15 +139,26 @@ def _setting(name: str, value: Any) -> str:
     return text if name in ("task", "cone") else f"{name} {text}"
 
 
-def gammas_of(dataset: xr.Dataset) -> dict[str, float]:
-    """AoBG's accuracy bound by task; infinite if there is none."""
-    estimators = [entry["estimators"] for entry in json.loads(dataset.attrs["resolved"])]
-    options = [given.get("aobg", given.get("aobg_onset", {})) for given in estimators]
-    names = dataset["task"].values.tolist()
-    return {name: float(given.get("gamma", math.inf)) for name, given in zip(names, options, strict=True)}
+Bounds = Mapping[tuple[str, str], float]
+"""Accuracy bound gamma by task and estimator, of the estimators that have one; may be infinite."""
 
 
-def _meaningless(rows: Sequence[Row], gammas: Mapping[str, float]) -> list[str]:
+def gammas_of(dataset: xr.Dataset) -> Bounds:
+    resolved = zip(dataset["task"].values.tolist(), json.loads(dataset.attrs["resolved"]), strict=True)
+    return {
+        (task, estimator): float(options["gamma"])
+        for task, entry in resolved
+        for estimator, options in entry["estimators"].items()
+        if "gamma" in options
+    }
+
+
+def differentiates(estimator: str) -> bool:
+    """Whether an estimator uses first-order samples, which may be biased; user-defined ones may."""
+    return estimator not in ESTIMATORS or any(ORACLES[oracle].order for oracle in ESTIMATORS[estimator].needs)
+
+
+def _meaningless(rows: Sequence[Row], gammas: Bounds) -> list[str]:
     """Report why results mean nothing: contact never active, reference too uncertain, AoBG's bound below epsilon."""
     found = []
     several = [group for group in _by(rows, "estimator", "seed").values() if len(group) > 1]
@@ -168,7 +170,7 @@ def _meaningless(rows: Sequence[Row], gammas: Mapping[str, float]) -> list[str]:
             f"the reference's own uncertainty exceeds {UNSURE:.0%}{_at(unsure)}: errors and verdicts mean "
             "little there; increase --reference-samples"
         )
-    if bound := [row for row in rows if row.estimator in INTERPOLATED and (row.epsilon or 0.0) > gammas[row.task]]:
+    if bound := [row for row in rows if (row.epsilon or 0.0) > gammas.get((row.task, row.estimator), math.inf)]:
         found.append(
             f"AoBG equals ZoBG{_at(bound)}: its bound gamma is below epsilon, the radius of ZoBG's mean; "
             "increase --gamma or --samples"
@@ -199,19 +201,19 @@ def _order(zeroth: Row, first: Row) -> str:
     return ABOVE if first.variance_lower > zeroth.variance_upper else ALIKE
 
 
-def _bias_findings(rows: Sequence[Row], gammas: Mapping[str, float]) -> list[str]:
+def _bias_findings(rows: Sequence[Row], gammas: Bounds) -> list[str]:
     """Report means farther from the reference than any draw of the test, or off but undecided, in a sentence each; with
     several seeds, with counts and the median debiased error."""
     sentences = []
-    for (estimator,), mine in _by((row for row in rows if row.estimator in BIASED), "estimator").items():
+    for (estimator,), mine in _by((row for row in rows if differentiates(row.estimator)), "estimator").items():
         seeds = len(_by(mine, "seed"))
         biased = [row for row in mine if row.bias_verdict == "biased"]
         off = [row for row in mine if row.bias_verdict == "too few effective samples" and _off(row)]
-        mean = f"{BIASED[estimator]}'s mean is"
+        mean = f"{label_of(estimator)}'s mean is"
         if biased:
             shares = ", ".join(f"{_share(same)}{_of(same, seeds)}" for same in _by(biased, "stiffness").values())
             least = max(row.bias_p_value for row in biased)
-            free = estimator in INTERPOLATED and math.isinf(gammas[biased[0].task])
+            free = math.isinf(gammas.get((biased[0].task, estimator), 0.0))
             advice = ": it has no accuracy bound; set one with --gamma" if free else ""
             sentences.append(f"{mean} biased by {shares} (p <= {least:.3f}){advice}")
         for same in _by(off, "stiffness").values():
