@@ -1,5 +1,7 @@
 """Names and one-line descriptions of estimators and their choices, free of imports that compute."""
 
+import difflib
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Final
 
@@ -111,3 +113,18 @@ CATALOGUE: dict[str, Entry] = {
     )
 }
 """Estimators by name; `register` adds user-defined ones."""
+
+
+def unknown(label: str, value: object, choices: Iterable[str], more: str = "") -> str:
+    """Return the error message for an invalid choice: the closest match, otherwise all choices and `more`."""
+    text = str(value)
+    shown = repr(value) if len(text) <= 60 else f"{text[:50]!r}..."
+    return f"unknown {label} {shown}" + (suggestion(text, choices) or f"; choose from {', '.join(choices)}{more}")
+
+
+def suggestion(value: str, choices: Iterable[str], cutoff: float = 0.6) -> str:
+    """Suggest the choice that a shortened or misspelt value probably means, as the end of a message; empty if none is
+    as similar as the cutoff."""
+    whole = [choice for choice in choices if value and choice.startswith(value)]
+    near = difflib.get_close_matches(value, whole or list(choices), n=1, cutoff=0 if whole else cutoff)
+    return "".join(f"; did you mean {each}?" for each in near)

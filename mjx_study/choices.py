@@ -1,10 +1,10 @@
 """Names that users choose from, with one-line descriptions; free of imports that compute."""
 
 import dataclasses
-import difflib
-from collections.abc import Iterable
 from importlib import metadata
 from typing import Final
+
+from estimators.catalogue import unknown
 
 PRECISIONS: Final = ("float64", "float32")
 CONES: Final = ("pyramidal", "elliptic")
@@ -110,15 +110,3 @@ def unknown_task(name: str, reason: str = "") -> str | None:
         return None
     choices = dict.fromkeys([*TASK_DESCRIPTIONS, *registered])
     return unknown("task", name, choices, ", module:name of your own, or an MJCF") + reason
-
-
-def unknown(label: str, value: object, choices: Iterable[str], more: str = "") -> str:
-    """Return the error message for an invalid choice: the closest match, otherwise all choices and `more`."""
-    text = str(value)
-    shown = repr(value) if len(text) <= 60 else f"{text[:50]!r}..."
-    return f"unknown {label} {shown}" + (suggestion(text, choices) or f"; choose from {', '.join(choices)}{more}")
-
-
-def suggestion(value: str, choices: Iterable[str]) -> str:
-    """Suggest the choice that a misspelt value probably means, as the end of a message; empty if none is close."""
-    return "".join(f"; did you mean {near}?" for near in difflib.get_close_matches(value, list(choices), n=1))

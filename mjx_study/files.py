@@ -1,13 +1,14 @@
 """Read user-supplied files and validate them against a schema; errors name the file and the key in one line."""
 
 import tomllib
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any, Final, TypeVar
 
 import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
-from mjx_study.choices import suggestion
+from estimators.catalogue import suggestion
 from mjx_study.disk import read_whole
 from mjx_study.option import OPTIONS
 
@@ -45,21 +46,21 @@ def read_toml(path: Path, schema: type[BaseModel]) -> dict[str, Any]:
     try:
         found = schema.model_validate(tomllib.loads(content.decode()))
     except ValidationError as error:
-        raise ValueError(f"{path}: {told(error)}") from None
+        raise ValueError(f"{path}: {told(error, schema.model_fields)}") from None
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{path} is not TOML: {error}") from error
     return {name: getattr(found, name) for name in found.model_fields_set}
 
 
-def told(error: ValidationError) -> str:
-    """Describe the first violation of a schema, with its key, and count the others."""
+def told(error: ValidationError, names: Iterable[str] = ()) -> str:
+    """Describe the first violation of a schema, which may have such names, with its key, and count the others."""
     found = error.errors(include_url=False, include_input=False)
     first = found[0]
     key = ".".join(map(str, first["loc"]))
     raised = first.get("ctx", {}).get("error")  # from a validator of ours; pydantic adds words to its message
     reason = str(raised) if isinstance(raised, ValueError) else first["msg"]
     if first["type"] == "extra_forbidden":
-        reason = f"there is no such option{suggestion(key, OPTIONS)}"
+        reason = f"there is no such option{suggestion(key, names)}"
     more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
     return f"{key}{': ' * bool(key)}{' '.join(reason.split())}{more}"
 

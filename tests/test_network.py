@@ -64,7 +64,7 @@ def test_a_network_is_optimised_and_replayed(
 ) -> None:
     monkeypatch.setattr(options, "configure", lambda **_: None)
     out = tmp_path / "out"
-    arguments = ["optimise", "pusher", "--network", "4", "--estimator", "fobg", "--horizon", "60", "--iterations", "8"]
+    arguments = ["optimise", "pusher", "--network", "4", "--estimators", "fobg", "--horizon", "60", "--iterations", "8"]
     arguments += ["--contact", "penalty", "--stiffness", "100", "--optimizer", "adam", "--learning-rate", "0.02"]
     arguments += ["--samples", "4", "--seeds", "2", "--evaluation-samples", "4", "--output", str(out), "--json"]
     assert cli.main(arguments) == 0

@@ -511,6 +511,7 @@ def test_a_file_and_flags_are_one_configuration(tmp_path: Path) -> None:
         ('samples = ["x"]', "samples: must be a whole number, got 'x'"),
         ("colour = 1", "colour: there is no such option"),
         ("stifness = 10", "stifness: there is no such option; did you mean stiffness?"),
+        ('task = "pusher"', "task: there is no such option; did you mean tasks?"),
     ],
 )
 def test_a_file_with_a_value_of_another_kind_gets_one_line(tmp_path: Path, line: str, says: str) -> None:

@@ -7,14 +7,19 @@ import re
 from collections.abc import Callable, Generator, Iterable, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any, Final, NoReturn
 
-from mjx_study.choices import FAMILIES, PRECISIONS, TASK_DESCRIPTIONS, suggestion, unknown, unknown_task
+from estimators.catalogue import suggestion, unknown
+from mjx_study.choices import FAMILIES, PRECISIONS, TASK_DESCRIPTIONS, unknown_task
 from mjx_study.option import CONTACTS, OPTIONS, Option
 from mjx_study.study.configuration import StudyConfig
 
 if TYPE_CHECKING:
     import mjx_study.tasks.task
+
+
+SIMILAR_FLAGS: Final = 0.75
+"""Least similarity of a flag that is suggested, which its dashes add to."""
 
 
 class UsageError(ValueError):
@@ -34,6 +39,9 @@ class Parser(argparse.ArgumentParser):
     """Argument parser that adds options from their descriptions, and raises UsageError, with suggestions for misspelt
     names."""
 
+    def __init__(self, *args: Any, **settings: Any) -> None:
+        super().__init__(*args, allow_abbrev=False, **settings)
+
     def error(self, message: str) -> NoReturn:
         message = re.sub(r"^argument (?!-)\S+: ", "", message)
         raise UsageError(f"{message}{'' if message.endswith('?') else '.'} See {self.prog} --help")
@@ -43,8 +51,8 @@ class Parser(argparse.ArgumentParser):
         given, flags = list(args or ()), self._option_string_actions
         own = itertools.takewhile(lambda text: text.startswith("-") if self._subparsers else text != "--", given)
         for flag in (text.partition("=")[0] for text in own if text.startswith("--")):
-            if not any(known.startswith(flag) for known in flags):
-                self.error(f"unknown option {flag}{suggestion(flag, flags)}")
+            if flag not in (*flags, "--"):
+                self.error(f"unknown option {flag}{suggestion(flag, flags, SIMILAR_FLAGS)}")
         parsed, extra = super().parse_known_args(given, namespace)
         if extra:
             self.error(f"unexpected argument {extra[0]}")
