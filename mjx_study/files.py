@@ -87,14 +87,14 @@ class PolicyFile(BaseModel):
     network: list[Annotated[int, Field(ge=1, le=OPTIONS["network"].interval.high)]] | None = None  # type: ignore[union-attr]
 
 
-def read_theta(path: Path) -> tuple[tuple[float, ...], str | None]:
-    """Read parameters from a policy file, a .json list or a .npy array, with the policy's task; else ValueError."""
+def read_theta(path: Path) -> tuple[tuple[float, ...], PolicyFile | None]:
+    """Read parameters from a policy file, which is returned as well, a .json list or a .npy array; else ValueError."""
     if path.suffix != ".json":
         return _read_array(path), None
     content = read_bytes(path)
     if content.lstrip().startswith(b"{"):
         policy = _validated(path, content, PolicyFile)
-        return tuple(policy.theta), policy.task
+        return tuple(policy.theta), policy
     return tuple(_validated(path, content, list[Finite])), None
 
 

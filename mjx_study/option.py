@@ -267,7 +267,8 @@ OPTIONS: Final[dict[str, Option]] = {
         _number("states", int, "[1, 1000]", "N", "states to check"),
         _choice("integrator", INTEGRATORS, "NAME", "integrator: {}", unset="the MJCF's"),
         _choice("solver", SOLVERS, "NAME", "constraint solver: {}", unset="the MJCF's"),
-        _number("ls_iterations", int, "[1, 100000]", "N", "iterations of the solver's line search", unset="the MJCF's"),
+        _number("solver_iterations", int, "[1, 100000]", "N", "iterations of the solver", unset="the MJCF's"),
+        _number("solver_ls_iterations", int, "[1, 100000]", "N", "and of its line search", unset="the MJCF's"),
         _number("frames", int, "[1, 100]", "N", "frames in the film strip"),
         _number("slow", float, "(0, 1000]", "FACTOR", "slow-motion factor"),
     )

@@ -261,6 +261,7 @@ OPTION = "unknown option --stifness; did you mean --stiffness? See mjx-study com
         ([], "COMMAND"),
         (["gradcheck", "puhser"], "unknown task 'puhser'; did you mean pusher? See mjx-study gradcheck --help"),
         (["gradcheck", "pusher", "--contact", ""], "no contact model to check"),
+        (["gradcheck", "pusher", "--verbose"], "unknown option --verbose"),
         (["bench", "pusher", "--samples", "0"], "--samples: must be at least 1"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
@@ -272,6 +273,14 @@ def test_bad_options_get_one_line(
     extra = ["--output", str(untouched)] if arguments[:1] == ["compare"] and len(arguments) > 1 else []
     assert says in refused(capsys, *arguments, *extra)
     assert not untouched.exists()
+
+
+def test_iterations_of_the_solver_and_of_a_descent_are_different_options() -> None:
+    parse = cli.parser().parse_args
+    for command in ("gradcheck", "rollout"):
+        parsed = parse([command, "pusher", "--solver-iterations", "7", "--solver-ls-iterations", "9"])
+        assert options.scene_options(parsed) == {"iterations": 7, "ls_iterations": 9}
+    assert options.scene_options(parse(["optimise", "pusher", "--iterations", "7"])) == {}
 
 
 @pytest.mark.parametrize(

@@ -59,7 +59,7 @@ def array(folder: Path, data: st.DataObject) -> list[str]:
 
 def policy(folder: Path, data: st.DataObject) -> list[str]:
     (folder / "policy.json").write_bytes(data.draw(fuzzing.texts(POLICY)))
-    return ["rollout", "pusher", "--policy", "policy.json", "--output", "out"]
+    return ["rollout", "pusher", "--theta", "policy.json", "--output", "out"]
 
 
 def mjcf(folder: Path, data: st.DataObject) -> list[str]:

@@ -72,7 +72,7 @@ def test_a_network_is_optimised_and_replayed(
     (run,) = document["runs"]
     assert max(run["final_cost"]) < document["start_cost"][0]
     policy = out / "policy-fobg.json"
-    replay = ["rollout", "pusher", "--policy", str(policy), "--frames", "1", "--json"]
+    replay = ["rollout", "pusher", "--theta", str(policy), "--frames", "1", "--json"]
     assert cli.main([*replay, "--output", str(tmp_path / "replay")]) == 0
     facts = json.loads(capsys.readouterr().out)
     assert facts["theta"] == json.loads(policy.read_text())["theta"] and len(facts["theta"]) == 25

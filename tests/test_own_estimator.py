@@ -168,7 +168,7 @@ def test_a_dry_run_takes_it(command: str, folder: Path, capsys: pytest.CaptureFi
 def test_rollout_takes_its_policy(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = ["--contact", "reference", "--horizon", "4", "--samples", "4", "--seeds", "1", "--iterations", "1"]
     (found,) = document(capsys, "optimise", "pusher", *arguments, "--estimators", OWN, "--output", "out")["runs"]
-    policy = ["--policy", "out/policy-my_estimators.SignAgreement.json", "--renderer", "drawing", "--output", "seen"]
+    policy = ["--theta", "out/policy-my_estimators.SignAgreement.json", "--renderer", "drawing", "--output", "seen"]
     facts = document(capsys, "rollout", "pusher", *policy)
     assert facts["theta"] == found["theta"][0] and facts["steps"] == 4 and facts["finite"]
 

@@ -237,7 +237,7 @@ def test_optimise_and_rollout(task: str, document) -> None:
     drawn = ["--renderer", "drawing"]
     (run,) = document("optimise", task, *small, "--output", "descent")["runs"]
     assert finite(run["final_cost"]) and Path("descent/descent.png").is_file()
-    found = document("rollout", task, "--policy", "descent/policy-fobg.json", "--output", "found", *drawn)
+    found = document("rollout", task, "--theta", "descent/policy-fobg.json", "--output", "found", *drawn)
     start = document("rollout", task, *drawn)
     assert found["theta"] == run["theta"][0] != start["theta"]
     for facts in (found, start):

@@ -56,7 +56,7 @@ def ten_steps() -> Simulator:
     return Simulator(make_task("pusher", horizon=10), chunk_size=1)
 
 
-@pytest.mark.parametrize("noise", [[], ["--noise", "--seed", "3"]], ids=["silent", "noisy"])
+@pytest.mark.parametrize("noise", [[], ["--noisy", "--seed", "3"]], ids=["silent", "noisy"])
 def test_the_cost_is_the_objectives(capsys: pytest.CaptureFixture[str], noise: list[str]) -> None:
     """The same sample as in a batch: the value with its key's noise, the baseline without."""
     facts = document(capsys, *SHORT, "--contact", "penalty", "--stiffness", "1000", *noise)
@@ -176,8 +176,8 @@ def test_a_theta_without_a_finite_cost(capsys: pytest.CaptureFixture[str], elsew
         (["pusher", "--frames", "0"], "--frames: must be at least 1 and at most 100, got 0"),
         (["pusher", "--seed", "-1"], "--seed: must be at least 0"),
         (["pusher", "--slow", "0"], "--slow: must be positive and at most 1000, got 0"),
-        (["pusher", "--sigma", "0.2"], "--sigma has an effect only with --noise"),
-        (["pusher", "--sigma", "-1", "--noise"], "--sigma: must be positive"),
+        (["pusher", "--sigma", "0.2"], "--sigma has an effect only with --noisy"),
+        (["pusher", "--sigma", "-1", "--noisy"], "--sigma: must be positive"),
         (["pusher", "--view", "zx"], "unknown view 'zx'; choose from auto, xz"),
         (["pusher", "--renderer", "povray"], "unknown renderer 'povray'; choose from auto"),
         (["pusher", "--format", "avi"], "unknown format 'avi'; choose from gif, mp4"),
@@ -200,7 +200,7 @@ def test_a_theta_without_a_finite_cost(capsys: pytest.CaptureFixture[str], elsew
         (["nowhere.xml"], "no MJCF file at nowhere.xml"),
         (["broken.xml"], "broken.xml is not a valid MJCF"),
         (["rod.xml", "--horizon", "0"], "--horizon: must be at least 1"),
-        (["rod.xml", "--contact", "penalty", "--noise"], "--contact, --noise: only for a task; rod.xml moves as"),
+        (["rod.xml", "--contact", "penalty", "--noisy"], "--contact, --noisy: only for a task; rod.xml moves as"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )

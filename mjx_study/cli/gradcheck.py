@@ -56,8 +56,6 @@ def add(command: Parser) -> None:
     command.add_option(PAIR)
     command.add_option("cone")
     command.add_scene_options()
-    command.add_option("iterations", line="iterations of the solver", unset="the MJCF's")
-    command.add_option("ls_iterations")
     command.add_option("horizon", unset=f"the task's; {CHECKED_STEPS} for a file")
     command.add_option("model")
     command.add_option("states", CHECKED_STATES)
@@ -71,7 +69,7 @@ def add(command: Parser) -> None:
         more = "; or means: three paths that the means span" if name == "direction" else ""
         line = f"with --mean: {OPTIONS[name].line}{more}"
         command.add_option(name, default, given=False, line=line, **changes.get(name, {}))
-    command.add_flag("--verbose", "print every entry of every finding")
+    command.add_flag("--details", "print every entry of every finding")
     command.add_process_options()
 
 
@@ -88,7 +86,7 @@ def run(options: argparse.Namespace) -> int:
     common = {name: getattr(options, name) for name in ("seed", "damping", "states", "stock")}
     with usage_errors():
         configure_process(options)
-        chosen = scene_options(options, "cone", "iterations", "ls_iterations")
+        chosen = scene_options(options, "cone")
         if not is_file(options.task):
             if options.pair is not None:
                 raise UsageError("--pair is for files; a task has its own")
@@ -104,7 +102,7 @@ def run(options: argparse.Namespace) -> int:
             plan = plan_scene_gradcheck(scene, options.contact, options.stiffness, **common)
     with computing() as progress:
         report = gradcheck(plan, progress)
-    print_report(options, report.as_json(), report.lines(verbose=options.verbose))
+    print_report(options, report.as_json(), report.lines(verbose=options.details))
     return 1 if not report.passed else UNEXERCISED if report.unexercised else 0
 
 
@@ -118,7 +116,7 @@ def _run_mean(options: argparse.Namespace) -> int:
     chosen = MEAN | given_options(options, *MEAN)
     with usage_errors():
         configure_process(options)
-        scene = scene_options(options, "cone", "iterations", "ls_iterations", "horizon", "model")
+        scene = scene_options(options, "cone", "horizon", "model")
         task = make_task(options.task, **scene).replace(onset=chosen["onset"])
         task = task if chosen["sigma"] is None else task.replace(sigma=chosen["sigma"])
         plan = plan_gradcheck(task, options.contact, options.stiffness, seed=options.seed, damping=options.damping)

@@ -15,10 +15,9 @@ import numpy as np
 from mjx_study import objective
 from mjx_study.choices import CONES, is_file
 from mjx_study.cli.console import number
-from mjx_study.cli.options import UsageError, configure_process, scene_options, task_of, theta_of, usage_errors
+from mjx_study.cli.options import UsageError, configure_process, scene_options, task_of, theta_and_policy, usage_errors
 from mjx_study.cli.output import attempt, computing, print_report
 from mjx_study.disk import prepare_folder, write_whole
-from mjx_study.files import PolicyFile, read_json
 from mjx_study.limits import MOST_STEPS, check_count
 from mjx_study.plots.style import save_figure
 from mjx_study.render import Motion, RenderError, animate, check_format, resolve_renderer, strip, stroboscope
@@ -60,8 +59,8 @@ def run_rollout(options: argparse.Namespace) -> int:
     with usage_errors():
         configure_process(options)
         check_format(options.format)
-        if options.sigma is not None and not options.noise:
-            raise ValueError("--sigma has an effect only with --noise")
+        if options.sigma is not None and not options.noisy:
+            raise ValueError("--sigma has an effect only with --noisy")
         simulate, messages = _plan_file(options) if is_file(options.task) else _plan_task(options)
         resolve_renderer(options.renderer)
         stem = (Path(options.task).stem if is_file(options.task) else options.task).replace(":", "-")
@@ -79,7 +78,7 @@ def run_rollout(options: argparse.Namespace) -> int:
 
 def _plan_file(options: argparse.Namespace) -> tuple[Callable[[], Rollout], tuple[str, ...]]:
     """Return a function that runs the requested simulation, and warnings."""
-    unfit = ("contact", "stiffness", "damping", "noise", "sigma", "theta", "policy", "model")
+    unfit = ("contact", "stiffness", "damping", "noisy", "sigma", "theta", "model")
     given = [f"--{name}" for name in unfit if getattr(options, name) not in (None, False)]
     if given:
         raise ValueError(f"{', '.join(given)}: only for a task; {options.task} moves as its MJCF says")
@@ -90,13 +89,8 @@ def _plan_file(options: argparse.Namespace) -> tuple[Callable[[], Rollout], tupl
 
 
 def _plan_task(options: argparse.Namespace) -> tuple[Callable[[], Rollout], tuple[str, ...]]:
-    policy = None
-    if options.policy is not None:
-        if options.theta is not None:
-            raise ValueError("--policy and --theta both say what theta is; give one of them")
-        policy = read_json(options.policy, PolicyFile)
-        if policy.task != options.task:
-            raise ValueError(f"{options.policy} is a policy of {policy.task}, not of {options.task}")
+    theta, policy = theta_and_policy(options)
+    if policy is not None:
         for name in ("contact", "stiffness", "damping", "horizon", "model"):
             if getattr(options, name) is None:
                 setattr(options, name, getattr(policy, name) or None)
@@ -108,8 +102,7 @@ def _plan_task(options: argparse.Namespace) -> tuple[Callable[[], Rollout], tupl
         task = with_network(task, tuple(policy.network), jax.random.key(0))  # theta replaces its weights
     stiffness = task.defaults.middle_stiffness if options.stiffness is None else options.stiffness
     cells, messages = contact_grid(task, (options.contact or task.defaults.main_family,), (stiffness,), options.damping)
-    task = at_theta(task, theta_of(options) if policy is None else policy.theta)
-    return partial(_simulate_task, task, cells[0], options.seed, options.noise), messages
+    return partial(_simulate_task, at_theta(task, theta), cells[0], options.seed, options.noisy), messages
 
 
 def _simulate_task(task: Task, cell: ContactPoint, seed: int, noisy: bool) -> Rollout:

@@ -15,15 +15,15 @@ Every estimator starts from the task's theta, or from --theta, and draws the sam
 and --samples default to the task's own, which are the paper's: plain gradient descent.
 
 With --output DIR, a study is written: its numbers (for plot, report, load_study), descent.png and .pdf (cost against
-iterations, rollouts and seconds; alpha), and each estimator's policy of its best seed (policy-NAME.json, for rollout
---policy). The same command resumes a stopped run, repeating at most 20 s, or extends it with more --iterations.
+iterations, rollouts and seconds; alpha), and each estimator's policy of its best seed (policy-NAME.json, for
+--theta). The same command resumes a stopped run, repeating at most 20 s, or extends it with more --iterations.
 
 examples:
   mjx-study optimise pusher --contact penalty --stiffness 1000 --output out
   mjx-study optimise ball_wall --reference --estimators zobg,fobg,aobg --seeds 5
   mjx-study optimise pusher --estimators ivw_h --optimizer adam --learning-rate 0.01
   mjx-study optimise tennis --network 16,16 --optimizer adam --learning-rate 0.003 --contact penalty
-  mjx-study rollout pusher --policy out/policy-aobg.json
+  mjx-study rollout pusher --theta out/policy-aobg.json
 
 columns of the table:
   cost        mean cost with noise of the final policy over --evaluation-samples rollouts, the same for all, and its

@@ -15,11 +15,15 @@ from mjx_study.option import CONTACTS, OPTIONS, Option
 from mjx_study.study.configuration import StudyConfig
 
 if TYPE_CHECKING:
+    import mjx_study.files
     import mjx_study.tasks.task
 
 
 SIMILAR_FLAGS: Final = 0.75
 """Least similarity of a flag that is suggested, which its dashes add to."""
+
+SOLVER_BUDGET: Final = {"solver_iterations": "iterations", "solver_ls_iterations": "ls_iterations"}
+"""Names of the solver's options in an MJCF, by those of the command line."""
 
 
 class UsageError(ValueError):
@@ -135,6 +139,8 @@ class Parser(argparse.ArgumentParser):
 
         self.add_option("integrator")
         self.add_option("solver")
+        for name in SOLVER_BUDGET:
+            self.add_option(name)
         listed = f"flags to disable, as in the MJCF's <flag>: {', '.join(FLAGS)}"
         self.add_argument("--disable-flag", metavar="FLAG[,FLAG]", dest="disable_flags", help=listed)
 
@@ -199,7 +205,8 @@ def given_options(options: argparse.Namespace, *names: str) -> dict[str, Any]:
 
 def scene_options(options: argparse.Namespace, *names: str) -> dict[str, Any]:
     """The given scene options and the named ones, as arguments of `load_scene`."""
-    return given_options(options, "integrator", "solver", "disable_flags", *names)
+    given = given_options(options, "integrator", "solver", *SOLVER_BUDGET, "disable_flags", *names)
+    return {SOLVER_BUDGET.get(name, name): value for name, value in given.items()}
 
 
 def task_of(options: argparse.Namespace) -> "mjx_study.tasks.task.Task":
@@ -210,19 +217,26 @@ def task_of(options: argparse.Namespace) -> "mjx_study.tasks.task.Task":
 
 
 def theta_of(options: argparse.Namespace) -> tuple[float, ...] | None:
-    """Return the parameters given by `--theta`; None if it is not given. A policy must be for the task."""
+    """Return the parameters given by `--theta`; None if it is not given."""
+    return theta_and_policy(options)[0]
+
+
+def theta_and_policy(
+    options: argparse.Namespace,
+) -> "tuple[tuple[float, ...] | None, mjx_study.files.PolicyFile | None]":
+    """Return the parameters given by `--theta`, and the policy file that holds them, which must be for the task."""
     from mjx_study.files import read_theta
 
     if options.theta is None:
-        return None
+        return None, None
     try:
-        return tuple(float(part) for part in options.theta.split(","))
+        return tuple(float(part) for part in options.theta.split(",")), None
     except ValueError:
         path = Path(options.theta)
-    theta, task = read_theta(path)
-    if task not in (None, options.task):
-        raise ValueError(f"{path} is a policy of {task}, not of {options.task}")
-    return theta
+    theta, policy = read_theta(path)
+    if policy is not None and policy.task != options.task:
+        raise ValueError(f"{path} is a policy of {policy.task}, not of {options.task}")
+    return theta, policy
 
 
 def configure_process(options: argparse.Namespace) -> None:

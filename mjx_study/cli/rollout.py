@@ -17,7 +17,7 @@ one, for 2 s unless --horizon is given.
 examples:
   mjx-study rollout pusher
   mjx-study rollout ball_wall --theta 0.75 --stiffness 1e4 --slow 4
-  mjx-study rollout tennis --noise --seed 3 --theta learnt.npy
+  mjx-study rollout tennis --noisy --seed 3 --theta learnt.npy
   mjx-study rollout humanoid.xml --horizon 500 --view xz --format mp4
 """
 
@@ -26,9 +26,8 @@ def add(command: Parser) -> None:
     command.add_task_options()
     command.add_scene_options()
     command.add_contact_options("the middle one of the task's sweep", many=False, analytic=False)
-    command.add_flag("--noise", "add noise, drawn with --seed (default: none)")
-    command.add_theta_option("parameters")
-    command.add_argument("--policy", type=Path, metavar="FILE", help="a policy written by optimise, policy-NAME.json")
+    command.add_flag("--noisy", "add noise, drawn with --seed (default: none)")
+    command.add_theta_option("parameters, and of a policy also its contact, horizon, model and cone")
     command.add_option("frames", 6)
     command.add_argument("--view", choices=["auto", *PLANES], default="auto", help="default: auto, by the motion")
     command.add_argument("--renderer", choices=RENDERERS, default="auto", help="default: auto, opengl where it works")

@@ -260,7 +260,7 @@ class GradcheckReport:
                     for entry in finding.entries
                 ]
         if len(shown) < len(alike):
-            lines.append(f"and {len(alike) - len(shown)} more of the kind (--verbose shows all)")
+            lines.append(f"and {len(alike) - len(shown)} more of the kind (--details shows all)")
         verdicts = dict.fromkeys(finding.verdict for finding in self.findings)
         lines += [f"{verdict}: {MEANING[verdict]}" for verdict in verdicts if verdict in MEANING]
         return [*lines, ""] if lines else []

@@ -210,5 +210,5 @@ def _budget(layout: Coordinates) -> str:
     option = layout.scene.host.opt
     return (
         f"the solver stopped early, with iterations={option.iterations} and ls_iterations={option.ls_iterations}; "
-        "give more with --iterations and --ls-iterations"
+        "give more with --solver-iterations and --solver-ls-iterations"
     )
