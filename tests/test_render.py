@@ -495,7 +495,7 @@ def test_a_motion_of_one_state_is_a_film_of_one_frame(tmp_path: Path) -> None:
 def test_a_gif_that_would_be_too_large_is_made_smaller() -> None:
     noise = np.random.default_rng(0).integers(0, 255, (12, 480, 640, 3), dtype=np.uint8)
     content = figures._gif(noise, np.full(12, 40), 64)
-    assert len(content) <= figures.MOST_BYTES
+    assert len(content) <= figures.MOST_GIF_BYTES
 
 
 def test_mp4_without_ffmpeg_names_gif(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -5,7 +5,7 @@ import dataclasses
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import jax
 import jax.numpy as jnp
@@ -28,9 +28,12 @@ from mjx_study.tasks.contact_grid import ContactPoint, contact_grid
 from mjx_study.tasks.network import with_network
 from mjx_study.tasks.task import Task
 
-PASSIVE_SECONDS = 2.0
-MOST_BODIES = 12
-LARGEST = 1e10  # MuJoCo itself considers larger coordinates bad
+FILE_SECONDS: Final = 2.0
+"""Duration of a file's rollout without --horizon [s]."""
+MOST_BODIES_LISTED: Final = 12
+"""Maximum number of bodies whose final positions are printed."""
+LARGEST_COORDINATE: Final = 1e10
+"""Size of coordinates and velocities from which a state counts as nonfinite [m, rad, m/s or rad/s], as in MuJoCo."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,7 +86,7 @@ def _plan_file(options: argparse.Namespace) -> tuple[Callable[[], Rollout], tupl
     if given:
         raise ValueError(f"{', '.join(given)}: only for a task; {options.task} moves as its MJCF says")
     model = load_model(options.task, **scene_options(options, "cone"))
-    steps = options.horizon or max(1, round(min(PASSIVE_SECONDS / model.opt.timestep, 1e15)))
+    steps = options.horizon or max(1, round(min(FILE_SECONDS / model.opt.timestep, 1e15)))
     check_count(steps, "steps", MOST_STEPS, "give --horizon, or a longer timestep")
     return partial(_simulate_passive, model, Path(options.task).stem, steps), ()
 
@@ -153,7 +156,7 @@ def _rollout(
 ) -> Rollout:
     """Build a rollout with the common facts: steps, duration, and final positions of the bodies' centres of mass."""
     qpos, qvel, controls = np.asarray(qpos, float), np.asarray(qvel, float), np.asarray(controls)
-    good = np.all(np.abs(np.concatenate([qpos, qvel], axis=1)) < LARGEST, axis=1)
+    good = np.all(np.abs(np.concatenate([qpos, qvel], axis=1)) < LARGEST_COORDINATE, axis=1)
     steps, lasting = len(qpos) - 1, len(good) if good.all() else int(np.argmin(good))
     duration = steps * model.opt.timestep
     facts |= {"steps": steps, "duration": duration, "finite": lasting == len(good), "bodies": {}}
@@ -193,8 +196,8 @@ def _lines(rollout: Rollout, messages: tuple[str, ...], written: list[Path]) -> 
     lines.append(f"{facts['steps']} steps of {1e3 * model.opt.timestep:g} ms, {facts['duration']:g} s")
     rows = [[name, *(f"{value:.4f}" for value in place)] for name, place in facts["bodies"].items()]
     if rows:
-        lines += format_table(rows[:MOST_BODIES], ["ended at", "x [m]", "y [m]", "z [m]"])
-    if len(rows) > MOST_BODIES:
-        lines.append(f"and {len(rows) - MOST_BODIES} more bodies: --json lists them all")
+        lines += format_table(rows[:MOST_BODIES_LISTED], ["ended at", "x [m]", "y [m]", "z [m]"])
+    if len(rows) > MOST_BODIES_LISTED:
+        lines.append(f"and {len(rows) - MOST_BODIES_LISTED} more bodies: --json lists them all")
     lines += [f"warning: {message}" for message in messages]
     return lines + [f"written to {path.parent}: {', '.join(each.name for each in written)}" for path in written[:1]]
