@@ -16,7 +16,7 @@ from estimators.builtin import (
     TruncatedFirstOrder,
     ZerothOrder,
 )
-from estimators.catalogue import VARIANCE_PROXIES, WEIGHTS
+from estimators.catalogue import ORACLES, VARIANCE_PROXIES, WEIGHTS, Oracle
 from estimators.comparison import (
     BiasTest,
     Comparison,
@@ -37,10 +37,8 @@ from estimators.confidence import (
 )
 from estimators.estimator import (
     ESTIMATORS,
-    ORACLES,
     Batches,
     Estimator,
-    Oracle,
     draw,
     estimate,
     find_estimator,

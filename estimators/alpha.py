@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from estimators.catalogue import CROSS_FITTED, PLUG_IN, WEIGHTS
+from estimators.catalogue import CROSS_FITTED, PLUG_IN, WEIGHTS, unknown
 from estimators.rows import Rows, weigh
 from estimators.types import AlphaChoice, GradientEstimate
 
@@ -190,7 +190,7 @@ def weigh_batches(
 def check_weights(weights: str, samples: int | None = None) -> None:
     """Validate the name of weights and, if given, the number of samples for cross-fitting."""
     if weights not in WEIGHTS:
-        raise ValueError(f"weights must be one of {', '.join(WEIGHTS)}; got {weights!r}")
+        raise ValueError(unknown("weights", weights, WEIGHTS))
     if weights == CROSS_FITTED and samples is not None and samples < FEWEST_SAMPLES:
         raise ValueError(
             f"cross-fitted weights need at least {FEWEST_SAMPLES} samples, two in each half; got {samples}"

@@ -28,6 +28,43 @@ DENSITIES: Final = {
 
 
 @dataclass(frozen=True)
+class Oracle:
+    """A kind of batch that an objective can produce.
+
+    Attributes:
+        name: Name in `ORACLES` and in an estimator's `needs`.
+        order: 0 if only values are needed, 1 if derivatives are; batches of the same order share their samples.
+        method: Method of the objective, called with theta and keys.
+        contents: What the batch holds, for messages and tables.
+    """
+
+    name: str
+    order: int
+    method: str
+    contents: str
+
+    @property
+    def phrase(self) -> str:
+        """Name of the batch in messages."""
+        return f"a {'first' if self.order else 'zeroth'}-order batch of {self.contents}"
+
+
+ORACLES: Final[dict[str, Oracle]] = {
+    oracle.name: oracle
+    for oracle in (
+        Oracle("evaluation", 0, "evaluate", "values"),
+        Oracle("pair", 0, "evaluate_pair", "pairs"),
+        Oracle("steps", 0, "evaluate_steps", "steps"),
+        Oracle("step_pair", 0, "evaluate_step_pair", "pairs by step"),
+        Oracle("differentiation", 1, "differentiate", "gradients"),
+        Oracle("corrected", 1, "differentiate_corrected", "corrected gradients"),
+        Oracle("step_differentiation", 1, "differentiate_steps", "gradients by step"),
+        Oracle("linearisation", 1, "linearise", "derivatives of steps"),
+    )
+}
+
+
+@dataclass(frozen=True)
 class Entry:
     """An estimator's name on the command line, label in legends, oracles in the order of the arguments of `combine`,
     one-line description, and options without a default."""

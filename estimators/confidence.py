@@ -10,7 +10,7 @@ import numpy as np
 from jax.scipy.special import ndtri
 from jaxtyping import Array, Bool, Float
 
-from estimators.catalogue import MAX_DEVIATION, VARIANCE_PROXIES
+from estimators.catalogue import MAX_DEVIATION, VARIANCE_PROXIES, unknown
 from estimators.pytree import register_pytree
 from estimators.types import GradientEstimate
 
@@ -188,11 +188,11 @@ def check_confidence_arguments(failure_probability: float, variance_proxy: str, 
             f"got {failure_probability}; it is the probability that the bound fails, so choose it small"
         )
     if variance_proxy not in VARIANCE_PROXIES:
-        raise ValueError(f"variance_proxy must be one of {', '.join(VARIANCE_PROXIES)}; got {variance_proxy!r}")
+        raise ValueError(unknown("variance proxy", variance_proxy, VARIANCE_PROXIES))
     if isinstance(radius, str) and radius != MAX_DEVIATION:
         raise ValueError(f"radius must be {MAX_DEVIATION!r} or a number; got {radius!r}")
     if variance_proxy == "upper_bound" and isinstance(radius, str):
-        raise ValueError(f"variance_proxy 'upper_bound' requires radius to be a bound on ||g_i - E g||; got {radius!r}")
+        raise ValueError(f"variance_proxy 'upper_bound' requires a `radius`: a bound on ||g_i - E g||; got {radius!r}")
     if isinstance(radius, int | float) and not 0.0 <= radius < float("inf"):
         raise ValueError(
             f"radius must be finite and not negative; got {radius}; without a bound, pass {MAX_DEVIATION!r}"

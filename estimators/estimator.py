@@ -3,46 +3,14 @@
 import dataclasses
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, ClassVar, Final, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import jax
 from jaxtyping import Array, Float, Key
 
-from estimators.catalogue import CATALOGUE, LEAVE_ONE_OUT, PLUG_IN, Entry
+from estimators.catalogue import CATALOGUE, LEAVE_ONE_OUT, ORACLES, PLUG_IN, Entry, unknown
 from estimators.places import MissingModuleError, find_attribute, importable_here
 from estimators.types import GradientEstimate, Objective
-
-
-@dataclasses.dataclass(frozen=True)
-class Oracle:
-    """A kind of batch that an objective can produce.
-
-    Attributes:
-        name: Name in `ORACLES` and in an estimator's `needs`.
-        order: 0 if only values are needed, 1 if derivatives are; batches of the same order share their samples.
-        method: Method of the objective, called with theta and keys.
-        phrase: Name of the batch in messages.
-    """
-
-    name: str
-    order: int
-    method: str
-    phrase: str
-
-
-ORACLES: Final[dict[str, Oracle]] = {
-    oracle.name: oracle
-    for oracle in (
-        Oracle("evaluation", 0, "evaluate", "a zeroth-order batch"),
-        Oracle("pair", 0, "evaluate_pair", "a zeroth-order batch of pairs"),
-        Oracle("steps", 0, "evaluate_steps", "a zeroth-order batch step by step"),
-        Oracle("step_pair", 0, "evaluate_step_pair", "a zeroth-order batch of pairs step by step"),
-        Oracle("differentiation", 1, "differentiate", "a first-order batch"),
-        Oracle("corrected", 1, "differentiate_corrected", "a first-order batch with the onset term"),
-        Oracle("step_differentiation", 1, "differentiate_steps", "a first-order batch step by step"),
-        Oracle("linearisation", 1, "linearise", "a first-order batch with the derivatives of its steps"),
-    )
-}
 
 Batches = Mapping[str, Any]
 """Batches by oracle name."""
@@ -180,9 +148,7 @@ def find_estimator(name: str | Estimator) -> Estimator | type[Estimator]:
             reason = f" ({error})"
         else:
             return _check_class(found, name)
-    raise ValueError(
-        f"estimator must be one of {', '.join(ESTIMATORS)}, or module:name of your own{reason}; got {name!r}"
-    )
+    raise ValueError(unknown("estimator", name, ESTIMATORS, ", or module:name of your own") + reason)
 
 
 def _check_class(found: Any, place: str) -> Any:
@@ -192,8 +158,8 @@ def _check_class(found: Any, place: str) -> Any:
     missing += sorted(getattr(found, "__abstractmethods__", ()))
     if missing:
         raise ValueError(f"{place} has no {' and no '.join(missing)}: an Estimator needs them")
-    if unknown := set(found.needs) - set(ORACLES):
-        raise ValueError(f"{place} needs {', '.join(sorted(unknown))}; the oracles are {', '.join(ORACLES)}")
+    if others := set(found.needs) - set(ORACLES):
+        raise ValueError(f"{place} needs {', '.join(sorted(others))}; the oracles are {', '.join(ORACLES)}")
     return found
 
 
@@ -214,7 +180,7 @@ def make_estimator(which: str | Estimator, **options: Any) -> Estimator:
     given = {name: value for name, value in options.items() if name in own and value is not None}
     for name in found.required():
         if name not in given:
-            raise ValueError(f"{found.name!r} needs the option {name}; set it")
+            raise ValueError(f"{found.name!r} needs the option `{name}`; set it")
     return found(**given)
 
 

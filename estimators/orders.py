@@ -10,6 +10,7 @@ from collections.abc import Callable
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from estimators.catalogue import unknown
 from estimators.statistics import summarise
 from estimators.types import Differentiation, Evaluation, GradientEstimate
 
@@ -49,7 +50,7 @@ BASELINES: dict[str, Callable[[Evaluation], Float[Array, " samples"]]] = {
 def find_baseline(name: str) -> Callable[[Evaluation], Float[Array, " samples"]]:
     """Look up a baseline by name; an unknown one is a ValueError."""
     if name not in BASELINES:
-        raise ValueError(f"baseline must be one of {', '.join(BASELINES)}; got {name!r}")
+        raise ValueError(unknown("baseline", name, BASELINES))
     return BASELINES[name]
 
 

@@ -85,6 +85,10 @@ class Option:
     many: bool = False
     unset: str = ""
 
+    @property
+    def flag(self) -> str:
+        return f"--{self.name.replace('_', '-')}"
+
     def within(self, interval: str) -> "Option":
         """Return the option with another range."""
         return dataclasses.replace(self, interval=Interval(interval))
@@ -210,6 +214,7 @@ def _choice(name: str, choices: Collection[str], metavar: str, line: str, **more
 
 
 TASKS: Final = "the task's"
+MJCF: Final = "the MJCF's"
 KINDS: Final = ("gradients", "descents", "landscapes")
 """Kinds of study."""
 CONTACTS: Final = (*FAMILIES, REFERENCE)
@@ -233,15 +238,15 @@ OPTIONS: Final[dict[str, Option]] = {
         _choice("weights", WEIGHTS, "NAME", "weights of interpolations: plug_in, or cross_fitted (unbiased)"),
         _choice("onset", ONSETS, "NAME", "onset term of first-order gradients: none, linear, or jump (costly)"),
         _choice("backward", ("none", *FAMILIES), "FAMILY", "contact whose derivatives are taken", label="family"),
-        _number("backward_stiffness", float, "(0, inf)", "K", "its stiffness", unit="N/m", unset="that of the rollout"),
-        _number("backward_margin", float, "(0, inf)", "M", "distance at which it begins", unit="m", unset="the MJCF's"),
+        _number("backward_stiffness", float, "(0, inf)", "K", "stiffness of --backward", unit="N/m", unset="unchanged"),
+        _number("backward_margin", float, "(0, inf)", "M", "distance where --backward begins", unit="m", unset=MJCF),
         _choice("kind", KINDS, "KIND", "kind of study", unset="from --iterations and --points"),
         _choice("estimators", CATALOGUE, "NAME", "see `mjx-study estimators`", label="estimator", own=True),
         _choice("contact", CONTACTS, "FAMILY", "contact family: {}", label="contact family", unset=TASKS),
         _number("stiffness", float, "(0, inf)", "K", "contact stiffness", unit="N/m", unset=TASKS),
         _number("damping", float, "[0, inf)", "B", "contact damping", unit="N s/m", unset="the family's"),
-        _choice("cone", CONES, "CONE", "friction cone: {}", unset="the MJCF's"),
-        _number("timestep", float, "(0, 1)", "H", "timestep", unit="s", unset="the MJCF's"),
+        _choice("cone", CONES, "CONE", "friction cone: {}", unset=MJCF),
+        _number("timestep", float, "(0, 1)", "H", "timestep", unit="s", unset=MJCF),
         _number("horizon", int, "[1, 1000000]", "H", "number of steps", unset=TASKS),
         Option("model", str, "FILE.xml", "MJCF that replaces the task's own"),
         _number("theta", float, "(-inf, inf)", "X", "policy parameters", unset=TASKS),
@@ -265,10 +270,10 @@ OPTIONS: Final[dict[str, Option]] = {
         _number("solimp", float, "(-inf, inf)", "D0,D1,W,M,P", "solimp to combine with them; several separated by ;"),
         Option("direction", str, "DIR", "random, or a parameter's index", unset="random"),
         _number("states", int, "[1, 1000]", "N", "states to check"),
-        _choice("integrator", INTEGRATORS, "NAME", "integrator: {}", unset="the MJCF's"),
-        _choice("solver", SOLVERS, "NAME", "constraint solver: {}", unset="the MJCF's"),
-        _number("solver_iterations", int, "[1, 100000]", "N", "iterations of the solver", unset="the MJCF's"),
-        _number("solver_ls_iterations", int, "[1, 100000]", "N", "and of its line search", unset="the MJCF's"),
+        _choice("integrator", INTEGRATORS, "NAME", "integrator: {}", unset=MJCF),
+        _choice("solver", SOLVERS, "NAME", "constraint solver: {}", unset=MJCF),
+        _number("solver_iterations", int, "[1, 100000]", "N", "iterations of the solver", unset=MJCF),
+        _number("solver_ls_iterations", int, "[1, 100000]", "N", "and of its line search", unset=MJCF),
         _number("frames", int, "[1, 100]", "N", "frames in the film strip"),
         _number("slow", float, "(0, 1000]", "FACTOR", "slow-motion factor"),
     )

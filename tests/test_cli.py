@@ -178,6 +178,12 @@ def test_help_lists_the_families_that_a_command_takes(
     assert families and ("reference" in families[1]) == analytic and "penalty" in families[1]
 
 
+def test_the_contact_of_surrogate_derivatives_is_named(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        cli.main(["compare", "--help"])
+    assert re.search(r"--backward-stiffness K\s+stiffness of --backward \[N/m\]", capsys.readouterr().out)
+
+
 def test_version(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stop:
         cli.main(["--version"])
@@ -245,13 +251,19 @@ OPTION = "unknown option --stifness; did you mean --stiffness? See mjx-study com
         (["compare", "pusher", "--cone", "elliptic"], "MJX cannot run pusher: condim=1 with ConeType.ELLIPTIC"),
         (["compare", "pusher", "--precision", "float16"], "unknown precision 'float16'; did you mean float64?"),
         (["compare", "pusher", "--model", "nowhere.xml"], "no MJCF file at nowhere.xml"),
-        (["compare", "pusher", "--model", "tennis_racket"], "no model named 'tennis_racket'; there are ball_wall,"),
+        (["compare", "pusher", "--model", "tennis_racket"], "no model named 'tennis_racket'; did you mean tennis?"),
         (["compare", "pusher", "--stifness", "10"], OPTION),
         (["compare", "--stifness=10", "pusher"], OPTION),
         (["compare", "pusher", "--estimator", "zobg"], "unknown option --estimator; did you mean --estimators? See"),
         (["compare", "pusher", "--backward-s=1"], "unknown option --backward-s; did you mean --backward-stiffness?"),
         (["compare", "pusher", "--iterations", "3"], "unknown option --iterations. See mjx-study compare --help"),
         (["compare", "pusher", "--baseline", "zero"], "unknown baseline 'zero'; did you mean zero_noise?"),
+        (["compare", "pusher", "--backward-margin", "1"], "--backward-margin needs a contact family in --backward"),
+        (["compare", "pusher", "--estimators", "fobg_clipped"], "'fobg_clipped' needs the option --max-norm; set it"),
+        (["compare", "pusher", "--estimators", "ivw_h", "--block-size", "2"], "omit --block-size: batches of any size"),
+        (["compare", "pusher", "--contact", "mjcf", "--damping", "1"], "takes no damping; omit --damping"),
+        (["optimise", "pusher", "--optimizer", "adm"], "optax has no optimiser 'adm' that takes a learning rate; did"),
+        (["sweep", "pusher", "--decay", "1", "--output", "x"], "--decay is for descents: give --iterations as well"),
         (["compare", "pusher", "--no-such-option"], "unknown option --no-such-option. See mjx-study compare --help"),
         (["compare", "pusher", "more"], "unexpected argument more. See mjx-study compare --help"),
         (["--versoin"], "unknown option --versoin; did you mean --version? See mjx-study --help"),
@@ -287,7 +299,7 @@ def test_iterations_of_the_solver_and_of_a_descent_are_different_options() -> No
     ("content", "says"),
     [
         ("<mujoco><worldbody>", "is not a valid MJCF"),
-        (MJCF.format(joint="push", geom="sphere"), "no joint 'pusher'; it has push, slider"),
+        (MJCF.format(joint="push", geom="sphere"), "no joint 'pusher'; did you mean push?"),
         (MJCF.format(joint="pusher", geom="cylinder"), "MJX cannot run"),
     ],
     ids=["does not parse", "no such joint", "not for MJX"],

@@ -64,6 +64,13 @@ def test_one_line(
     assert list(tmp_path.iterdir()) == []
 
 
+def test_the_command_line_names_options_as_flags() -> None:
+    others = "'max_norm', out/max_norm.npy, my_window and max_norm: of a file"
+    with pytest.raises(options.UsageError) as told, options.usage_errors():
+        raise ValueError(f"omit `gamma` or max_norm; not gamma, `other`, {others}")
+    assert str(told.value) == f"omit --gamma or --max-norm; not gamma, `other`, {others}"
+
+
 def test_intervals_in_words() -> None:
     said = {
         text: str(Interval(text)) for text in ("(0, inf)", "(0, inf]", "[0, 1)", "[1, 1e6]", "(-inf, inf)", "(2, 3)")

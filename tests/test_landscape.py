@@ -234,7 +234,7 @@ def test_the_line_goes_through_theta() -> None:
     np.testing.assert_allclose(line.thetas, [[1, 1, 3], [1, 2, 3], [1, 3, 3]])
     (group,) = plan_study(config("pusher", horizon=3, theta=(1.0, 2.0, 3.0), points=3)).groups
     assert group.task.theta.tolist() == [1.0, 2.0, 3.0]
-    with pytest.raises(ValueError, match="theta has one entry, and the line is its range: give --span"):
+    with pytest.raises(ValueError, match="theta has one entry, and the line is its range: give `span`"):
         plan_study(config("ball_wall", theta=(1.0,), points=3))
 
 
@@ -298,8 +298,8 @@ def test_the_command_prints_and_writes(drawn: tuple[Path, str], flown: xr.Datase
     [
         (["--points", "1"], "--points: must be at least 2"),
         (["--samples", "2"], "--samples: must be at least 3"),
-        (["--span", "1,0"], "span must be two numbers, the lower one first"),
-        (["--span", "1"], "span must be two numbers"),
+        (["--span", "1,0"], "--span must be two numbers, the lower one first"),
+        (["--span", "1"], "--span must be two numbers"),
         (["--seed", "-1"], "--seed: must be at least 0"),
         (["--contact", ""], "no contact model"),
         (["--sigma", "0"], "--sigma: must be positive"),
@@ -332,4 +332,4 @@ def test_a_family_without_stiffness_is_taken_as_it_is(command: str, monkeypatch:
 
 def test_directions_are_checked(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["landscape", "pusher", "--direction", "200"]) == 2
-    assert "direction must be random or a parameter's index, 0 to 199" in capsys.readouterr().err
+    assert "--direction must be random or a parameter's index, 0 to 199" in capsys.readouterr().err

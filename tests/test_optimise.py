@@ -252,7 +252,7 @@ def test_any_optimiser_of_optax(name: str) -> None:
         ({"optimizer": "apply_updates"}, "optax has no optimiser 'apply_updates'"),
         ({"learning_rate": 0.0}, "learning_rate must be positive and finite, got 0"),
         ({"decay": 3.0}, "decay must be at least 0 and at most 2, got 3"),
-        ({"estimators": ("fobg_truncated",)}, "'fobg_truncated' needs the option window"),
+        ({"estimators": ("fobg_truncated",)}, "'fobg_truncated' needs the option `window`"),
         ({"noise": "laplace", "estimators": ("delta",)}, "'delta' holds for Gaussian noise only"),
     ],
 )
@@ -264,7 +264,7 @@ def test_what_cannot_be_run_is_refused(changes: dict[str, Any], message: str) ->
 def test_a_task_without_recipe_or_reference_says_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     bare = make_task("pusher", horizon=3).replace(defaults=StudyDefaults(), reference=None)
     monkeypatch.setattr(plan, "make_task", lambda *_, **__: bare)
-    with pytest.raises(ValueError, match="pusher has no recipe: give learning rate, samples$"):
+    with pytest.raises(ValueError, match="pusher has no recipe: give `learning_rate`, `samples`$"):
         plan_study(config(horizon=3, samples=None, learning_rate=None))
     (group,) = plan_study(config(horizon=3)).groups
     assert group.recipe is not None and group.recipe.decay == 0.0

@@ -176,13 +176,16 @@ def test_rollout_takes_its_policy(folder: Path, capsys: pytest.CaptureFixture[st
 @pytest.mark.parametrize(
     ("source", "message"),
     [
-        (None, "unknown|one of zobg, .*, or module:name of your own \\(there is no module 'my_estimators' here or"),
+        (None, "choose from zobg, .*, or module:name of your own \\(there is no module 'my_estimators' here or"),
         ("1 +", "importing my_estimators raised SyntaxError"),
         ("def other(): ...", "my_estimators has no 'SignAgreement'; it has other"),
         ("SignAgreement = 3", "SignAgreement is neither an Estimator nor an Estimator class, but of type int"),
         (CODE.replace("combine", "mix"), "SignAgreement has no combine: an Estimator needs them"),
         (CODE.replace('"differentiation"', '"gradients"'), "needs gradients; the oracles are evaluation, pair, "),
-        (CODE.replace(': str = "zero_noise"', ": str").replace("baseline", "level"), "needs the option level; set it"),
+        (
+            CODE.replace(': str = "zero_noise"', ": str").replace("baseline", "level"),
+            "needs the option `level`; set it",
+        ),
     ],
 )
 def test_mistakes_get_one_line(

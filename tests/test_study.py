@@ -531,7 +531,7 @@ def test_gradients_are_taken_where_theta_says() -> None:
         built(theta=(1.0,))
     with pytest.raises(ValueError, match="theta must be finite, got nan"):
         built(theta=(float("nan"),) * 4)
-    with pytest.raises(ValueError, match="theta is for a single task"):
+    with pytest.raises(ValueError, match="`theta` is for a single task"):
         built(theta=(1.0,), tasks=("pusher", "ball_wall"))
 
 

@@ -2,7 +2,7 @@
 
 import argparse
 
-from estimators.catalogue import CATALOGUE, DENSITIES
+from estimators.catalogue import CATALOGUE, DENSITIES, ORACLES
 from mjx_study.cli.options import Parser
 from mjx_study.cli.output import print_report
 
@@ -10,16 +10,6 @@ EPILOG = """\
 The second column says what each needs: values (rollouts), pairs (of opposite noise), steps (costs to go), gradients, or
 derivatives of every step. compare, optimise and sweep accept any of them in --estimators.
 """
-WORDS = {
-    "evaluation": "values",
-    "pair": "pairs",
-    "steps": "steps",
-    "step_pair": "pairs by step",
-    "differentiation": "gradients",
-    "corrected": "corrected gradients",
-    "step_differentiation": "gradients by step",
-    "linearisation": "derivatives of steps",
-}
 
 
 def add(command: Parser) -> None:
@@ -30,7 +20,7 @@ def run(options: argparse.Namespace) -> int:
     entries, rows = [], []
     for name, item in CATALOGUE.items():
         flags = [f"--{option.replace('_', '-')}" for option in item.required if option != "sigma"]
-        needs = " + ".join(WORDS[oracle] for oracle in item.needs)
+        needs = " + ".join(ORACLES[oracle].contents for oracle in item.needs)
         entries.append({"name": name, "description": item.description, "needs": list(item.needs), "requires": flags})
         rows.append((name, ", ".join([needs, *flags]), item.description))
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]

@@ -82,7 +82,7 @@ def run(options: argparse.Namespace) -> int:
     if options.mean:
         return _run_mean(options)
     if given := given_options(options, *MEAN):
-        raise UsageError(f"--{next(iter(given))} is for --mean")
+        raise UsageError(f"{OPTIONS[next(iter(given))].flag} is for --mean")
     common = {name: getattr(options, name) for name in ("seed", "damping", "states", "stock")}
     with usage_errors():
         configure_process(options)

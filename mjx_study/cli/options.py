@@ -21,7 +21,8 @@ if TYPE_CHECKING:
 
 SIMILAR_FLAGS: Final = 0.75
 """Least similarity of a flag that is suggested, which its dashes add to."""
-
+OPTION_NAME: Final = re.compile(r"""`\w+`|(?<![\w.'"/=-])[a-z]+(_[a-z]+)+(?![\w?'"]|: |[./=]\w)""")
+"""What may name an option in a message: a word in backticks, or one with an underscore, but not the key of a file."""
 SOLVER_BUDGET: Final = {"solver_iterations": "iterations", "solver_ls_iterations": "ls_iterations"}
 """Names of the solver's options in an MJCF, by those of the command line."""
 
@@ -32,11 +33,17 @@ class UsageError(ValueError):
 
 @contextmanager
 def usage_errors() -> Generator[None]:
-    """Turn errors that users can cause into UsageErrors; for checks only, never for computing."""
+    """Turn errors that users can cause into UsageErrors, with flags for names of options; for checks only, never for
+    computing."""
     try:
         yield
     except (ValueError, OSError) as error:
-        raise UsageError(str(error)) from error
+        raise UsageError(OPTION_NAME.sub(_flag_of, str(error))) from error
+
+
+def _flag_of(found: re.Match[str]) -> str:
+    name = found[0].strip("`")
+    return OPTIONS[name].flag if name in OPTIONS else found[0]
 
 
 class Parser(argparse.ArgumentParser):
@@ -91,7 +98,7 @@ class Parser(argparse.ArgumentParser):
             except ValueError as error:
                 raise argparse.ArgumentTypeError(str(error)) from None
 
-        flag, several = f"--{option.name.replace('_', '-')}", option.many and "," not in option.metavar
+        flag, several = option.flag, option.many and "," not in option.metavar
         if option.kind is bool:
             self.add_argument(flag, action="store_true", default=None, help=option.describe())
             return

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from mjx_study.choices import TASK_DESCRIPTIONS
-from mjx_study.cli.options import Parser, known_task
+from mjx_study.cli.options import Parser, UsageError, known_task
 from mjx_study.option import MOST_VALUES, Interval, Option
 
 EPILOG = """\
@@ -57,12 +57,14 @@ def add(command: Parser) -> None:
     command.add_backward_options()
     command.add_fields("horizon", "model", "chunk_size", "block_size")
     command.add_process_options(seed=None)
-    command.add_argument("--output", type=Path, required=True, metavar="DIR", help="folder for the study")
+    command.add_argument("--output", type=Path, metavar="DIR", help="folder for the study; only --dry-run does without")
     command.add_cluster_option()
     command.add_resume_options()
 
 
 def run(options: argparse.Namespace) -> int:
+    if options.output is None and not options.dry_run:
+        raise UsageError("no folder for the study: give --output, or --dry-run. See mjx-study sweep --help")
     from mjx_study.cli.studies import run_sweep
 
     return run_sweep(options)

@@ -12,6 +12,7 @@ import jax
 import mujoco
 import numpy as np
 
+from estimators.catalogue import suggestion
 from mjx_study.choices import CONES, INTEGRATORS, SOLVERS, unknown
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.limitations import FLAGS, ignored, lacking
@@ -106,8 +107,9 @@ class Scene:
     def _index(self, kind: mujoco.mjtObj, noun: str, name: str, count: int) -> int:
         index = mujoco.mj_name2id(self.host, kind, name)
         if index < 0:
-            names = [mujoco.mj_id2name(self.host, kind, i) for i in range(count)]
-            raise SceneError(f"{self.name} has no {noun} {name!r}; it has {', '.join(map(str, names)) or 'none'}")
+            names = [str(mujoco.mj_id2name(self.host, kind, i)) for i in range(count)]
+            more = suggestion(name, names) or f"; it has {', '.join(names) or 'none'}"
+            raise SceneError(f"{self.name} has no {noun} {name!r}{more}")
         return index
 
 
@@ -201,7 +203,8 @@ def _find(source: str | Path) -> Path:
         if not path.is_file():
             raise SceneError(f"no MJCF file at {path}")
         return path
-    raise SceneError(f"no model named {source!r}; there are {', '.join(model_names())}, or give a path to an .xml")
+    more = f"; there are {', '.join(model_names())}, or give a path to an .xml"
+    raise SceneError(f"no model named {source!r}{suggestion(str(source), model_names()) or more}")
 
 
 def require(scene: Scene, *, joints: tuple[str, ...], geoms: tuple[str, ...], driven: tuple[str, ...] = ()) -> None:

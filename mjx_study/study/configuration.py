@@ -31,7 +31,7 @@ OF_KIND: Final[dict[str, dict[str, Any]]] = {
     "landscapes": {"span": None, "direction": None},
 }
 """Options specific to one kind of study, with their defaults."""
-ASKED_BY: Final = {"descents": "give iterations as well", "landscapes": "give points as well"}
+ASKED_BY: Final = {"descents": "give `iterations` as well", "landscapes": "give `points` as well"}
 SAMPLES: Final = 100
 """Samples per batch unless the configuration or a recipe sets another number."""
 
@@ -148,7 +148,7 @@ class StudyConfig(Checked):
         if not self.tasks:
             raise ValueError("no task given")
         if self.theta is not None and len(self.tasks) > 1:
-            raise ValueError("theta is for a single task; give one task, or omit theta")
+            raise ValueError("`theta` is for a single task; give one task, or omit it")
         if not self.estimators:
             raise ValueError(f"no estimator given; choose from {', '.join(CATALOGUE)}")
         refuse_repeats("estimator", self.estimator_names)
@@ -156,20 +156,20 @@ class StudyConfig(Checked):
         if self.contact is not None and not takes_stiffness(self.contact):
             for name in ("stiffness", "damping"):
                 if getattr(self, name) is not None:
-                    chosen = f"contact {', '.join(self.contact)}" if self.contact else "solref or solimp alone"
-                    raise ValueError(f"{chosen} takes no {name}; omit {name}")
+                    chosen = f"contact {', '.join(self.contact)}" if self.contact else "`solref` or `solimp` alone"
+                    raise ValueError(f"{chosen} takes no {name}; omit `{name}`")
         for name in ("tasks", "stiffness", "solref", "solimp", "timestep", "cone", "sigma", "samples", "backward"):
             values = getattr(self, name)
             refuse_repeats(name, values or ())
             if values == () and name not in ("solref", "solimp"):
                 raise ValueError(f"no {name} given: give at least one, or omit it")
         if self.surrogate and self.onset != "none":
-            raise ValueError("the onset term corrects exact derivatives: omit onset or backward")
+            raise ValueError("the onset term corrects exact derivatives: omit `onset` or `backward`")
         for name in () if self.surrogate else ("backward_stiffness", "backward_margin"):
             if getattr(self, name) is not None:
-                raise ValueError(f"{name} needs a contact family in backward")
+                raise ValueError(f"`{name}` needs a contact family in `backward`")
         if self.iterations is not None and self.points is not None:
-            raise ValueError("iterations are for descents and points for landscapes: give one of them")
+            raise ValueError("`iterations` are for descents and `points` for landscapes: give one of them")
         if self.kind is None:
             of_points = "gradients" if self.points is None else "landscapes"
             object.__setattr__(self, "kind", of_points if self.iterations is None else "descents")
@@ -179,7 +179,7 @@ class StudyConfig(Checked):
     def _settle(self) -> None:
         """Reject options of other kinds of study, and fill in the defaults of this kind's own."""
         for kind, options in OF_KIND.items():
-            given = [name for name in options if getattr(self, name) is not None]
+            given = [f"`{name}`" for name in options if getattr(self, name) is not None]
             if kind != self.kind and given:
                 listed = f"{' and '.join(given)} {'is' if len(given) == 1 else 'are'}"
                 raise ValueError(f"{listed} for {kind}: {ASKED_BY.get(kind, 'omit it')}")
@@ -223,7 +223,7 @@ def refuse_repeats(label: str, values: Sequence[object]) -> None:
 def check_span(span: Sequence[float] | None) -> None:
     """Raise ValueError unless span is None or two numbers in ascending order."""
     if span is not None and not (len(span) == 2 and 0 < span[1] - span[0] < math.inf):
-        raise ValueError(f"span must be two numbers, the lower one first; got {span}")
+        raise ValueError(f"`span` must be two numbers, the lower one first; got {span}")
 
 
 def takes_stiffness(families: Sequence[str]) -> bool:

@@ -14,6 +14,7 @@ import optax
 from jaxtyping import Array, Bool, Float, Int
 
 from estimators import Estimator, Linearisation, StepEvaluation
+from estimators.catalogue import suggestion
 from estimators.pytree import register_pytree
 
 DIVERGED: Final = 1e6
@@ -78,9 +79,10 @@ def make_optimizer(name: str, learning_rate: float, decay: float) -> optax.Gradi
             jax.eval_shape(lambda theta: made.update(theta, made.init(theta), theta), theta)
             optimizer = made
     if not isinstance(optimizer, optax.GradientTransformation):
-        raise ValueError(
-            f"optax has no optimiser {name!r} that takes a learning rate; use for example sgd, adam or rmsprop"
-        )
+        functions = [] if hasattr(optax, name) else [each for each in vars(optax).values() if inspect.isfunction(each)]
+        known = [each.__name__ for each in functions if "learning_rate" in inspect.signature(each).parameters]
+        more = suggestion(name, known) or "; use for example sgd, adam or rmsprop"
+        raise ValueError(f"optax has no optimiser {name!r} that takes a learning rate{more}")
     return optimizer
 
 
@@ -109,7 +111,8 @@ def _evaluate(node: ast.expr) -> Any:
     if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
         factory = vars(optax.schedules).get(node.func.id)
         if not inspect.isfunction(factory):
-            raise ValueError(f"optax has no schedule {node.func.id!r}")
+            known = [name for name, each in vars(optax.schedules).items() if inspect.isfunction(each)]
+            raise ValueError(f"optax has no schedule {node.func.id!r}{suggestion(node.func.id, known)}")
         named = {str(keyword.arg): _evaluate(keyword.value) for keyword in node.keywords}
         return factory(*map(_evaluate, node.args), **named)
     if isinstance(node, ast.List | ast.Tuple):

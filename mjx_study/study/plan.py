@@ -156,7 +156,7 @@ def plan_study(config: StudyConfig, built: Mapping[str, Task] | None = None) -> 
         models, also = backward_grid(task, models, config.backward, config.backward_stiffness, config.backward_margin)
         told += also
         if not models:
-            raise ValueError("no contact model: give at least one contact family, solref or solimp")
+            raise ValueError("no contact model: give at least one contact family, `solref` or `solimp`")
         each = len(models) * len(config.sigma or (None,)) * len(counts)
         change = "give fewer contact models, timesteps, sigmas or sample counts"
         check_count(programs * each, "cells", MOST_CELLS, change)
@@ -177,7 +177,7 @@ def plan_study(config: StudyConfig, built: Mapping[str, Task] | None = None) -> 
     for cell in {cell.group: cell for cell in cells}.values():
         group, chosen = groups[cell.group], estimators_of(plan, cell)
         if config.surrogate and (corrected := [each.name for each in chosen if "corrected" in each.needs]):
-            raise ValueError(f"{corrected[0]} corrects exact derivatives: omit it or backward")
+            raise ValueError(f"{corrected[0]} corrects exact derivatives: omit it or `backward`")
         if group.recipe is not None:
             make_optimizer(config.optimizer or "", group.recipe.learning_rate, group.recipe.decay)
             _check_schedules(config, group, group.recipe.iterations, chosen)
@@ -186,7 +186,7 @@ def plan_study(config: StudyConfig, built: Mapping[str, Task] | None = None) -> 
             check_memory(group.task, (), config.evaluation_samples or 0)
         elif config.kind == "landscapes":
             if config.theta is not None and group.task.policy.num_params == 1:
-                raise ValueError("theta has one entry, and the line is its range: give --span")
+                raise ValueError("theta has one entry, and the line is its range: give `span`")
             line_of(group.task, config.points or 0, config.span, config.direction, config.seed)
     return plan
 
@@ -199,7 +199,7 @@ def _whole(plan: StudyPlan) -> list[str]:
     found = [each.name for each in estimators_of(plan, plan.cells[0]) if not each.mergeable]
     if found and plan.config.block_size is not None:
         verb = "needs" if len(found) == 1 else "need"
-        raise ValueError(f"{', '.join(found)} {verb} whole batches, omit block_size: {blocks_take(found)}")
+        raise ValueError(f"{', '.join(found)} {verb} whole batches, omit `block_size`: {blocks_take(found)}")
     return found
 
 
@@ -210,10 +210,10 @@ def _check_schedules(config: StudyConfig, group: Group, iterations: int, chosen:
     if config.stiffness_schedule and any(
         not model.stiffness or (model.contact is None and not model.analytic) for model in group.models
     ):
-        raise ValueError("stiffness_schedule needs contact models with a stiffness; mjcf has none to set")
+        raise ValueError("`stiffness_schedule` needs contact models with a stiffness; mjcf has none to set")
     fixed = [each.name for each in chosen if hasattr(each, "sigma")]
     if config.sigma_schedule and fixed:
-        raise ValueError(f"{fixed[0]} holds for one sigma; omit it or sigma_schedule")
+        raise ValueError(f"{fixed[0]} holds for one sigma; omit it or `sigma_schedule`")
 
 
 def oracles_of(config: StudyConfig) -> tuple[str, ...]:

@@ -24,7 +24,7 @@ def recipe_of(config: StudyConfig, task: Task) -> Recipe:
     if (recipe := task.defaults.recipe) is not None:
         return dataclasses.replace(recipe, **{name: value for name, value in given.items() if value is not None})
     given["decay"] = given["decay"] or 0.0
-    if missing := [name.replace("_", " ") for name, value in given.items() if value is None]:
+    if missing := [f"`{name}`" for name, value in given.items() if value is None]:
         raise ValueError(f"{task.name} has no recipe: give {', '.join(missing)}")
     return Recipe(**given)
 
@@ -66,9 +66,9 @@ def bound_constants(config: StudyConfig, task: Task) -> dict[str, Any]:
     if not config.published:
         return given | {"gamma": task.defaults.gamma if config.gamma is None else config.gamma}
     if task.defaults.published is None:
-        raise ValueError(f"{task.name} has no published constants of the bound; omit published")
-    if others := [name for name in names if given[name] != StudyConfig.default(name)]:
-        raise ValueError(f"published sets {', '.join(names)}: omit {', '.join(others)}")
+        raise ValueError(f"{task.name} has no published constants of the bound; omit `published`")
+    if others := [f"`{name}`" for name in names if given[name] != StudyConfig.default(name)]:
+        raise ValueError(f"`published` sets {', '.join(names)}: omit {', '.join(others)}")
     return dataclasses.asdict(task.defaults.published)
 
 
@@ -86,7 +86,7 @@ def check_estimators(estimators: Iterable[Estimator], task: Task) -> None:
             )
         if task.onset != "none" and "linearisation" in estimator.needs:
             raise ValueError(
-                f"{estimator.name!r} needs the derivatives of single steps, which have no onset term; omit onset"
+                f"{estimator.name!r} needs the derivatives of single steps, which have no onset term; omit `onset`"
             )
 
 
@@ -123,5 +123,5 @@ def direction_of(direction: str, params: int, seed: int) -> Float[np.ndarray, " 
         drawn = np.random.default_rng(seed).normal(size=params)
         return drawn / np.linalg.norm(drawn)
     if not direction.isdecimal() or int(direction) >= params:
-        raise ValueError(f"direction must be random or a parameter's index, 0 to {params - 1}; got {direction}")
+        raise ValueError(f"`direction` must be random or a parameter's index, 0 to {params - 1}; got {direction}")
     return np.eye(params)[int(direction)]

@@ -107,5 +107,5 @@ def test_too_few_samples_and_unknown_weights_are_refused() -> None:
     drawn = estimators.draw(("evaluation", "differentiation"), objective, jnp.asarray(theta), jax.random.key(3), 3)
     with pytest.raises(ValueError, match="cross-fitted weights need at least 4 samples, two in each half; got 3"):
         InverseVariance(weights="cross_fitted")(drawn)
-    with pytest.raises(ValueError, match="weights must be one of plug_in, cross_fitted; got 'split'"):
+    with pytest.raises(ValueError, match="unknown weights 'split'; choose from plug_in, cross_fitted"):
         InverseVariance(weights="split")

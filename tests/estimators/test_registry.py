@@ -202,9 +202,9 @@ def test_leave_one_out_is_the_mean_of_the_other_finite_values():
 
 def test_unknown_names_are_refused_with_the_choices():
     zeroth, _ = lossy_batches()
-    with pytest.raises(ValueError, match="one of zobg, .*, aobg, .*; got 'zo'"):
-        estimate("zo", OBJECTIVE, jnp.asarray(THETA), jax.random.key(0), 10)
-    with pytest.raises(ValueError, match="one of none, zero_noise, leave_one_out; got 'mean'"):
+    with pytest.raises(ValueError, match=r"unknown estimator 'fogb'; did you mean fobg\?"):
+        estimate("fogb", OBJECTIVE, jnp.asarray(THETA), jax.random.key(0), 10)
+    with pytest.raises(ValueError, match="unknown baseline 'mean'; choose from none, zero_noise, leave_one_out"):
         zeroth_order(zeroth, "mean")
 
 
@@ -218,15 +218,17 @@ class _Bare:
 def test_missing_batches_and_impossible_sizes_are_refused():
     zeroth, first = lossy_batches()
     for name in ("zobg", "aobg", "ivw"):
-        with pytest.raises(ValueError, match=f"'{name}' needs a zeroth-order batch; .*evaluate.*'evaluation'"):
+        with pytest.raises(
+            ValueError, match=f"'{name}' needs a zeroth-order batch of values; .*evaluate.*'evaluation'"
+        ):
             made(name)({"differentiation": first})
     for name in ("fobg", "aobg", "ivw"):
         with pytest.raises(ValueError, match=f"'{name}' needs a first-order batch"):
             made(name)({"evaluation": zeroth, "differentiation": None})
     for name, option in (("fobg_clipped", "max_norm"), ("fobg_truncated", "window"), ("ddcg", "sigma")):
-        with pytest.raises(ValueError, match=f"'{name}' needs the option {option}; set it"):
+        with pytest.raises(ValueError, match=f"'{name}' needs the option `{option}`; set it"):
             made(name, **{option: None})
-        with pytest.raises(ValueError, match=f"'{name}' needs the option {option}; set it"):
+        with pytest.raises(ValueError, match=f"'{name}' needs the option `{option}`; set it"):
             estimate(name, OBJECTIVE, jnp.asarray(THETA), jax.random.key(0), 9)
     with pytest.raises(ValueError, match="_Bare has no method evaluate_pair for a zeroth-order batch of pairs"):
         estimate("zobg_antithetic", _Bare(), jnp.asarray(THETA), jax.random.key(0), 9)
@@ -239,12 +241,20 @@ def test_missing_batches_and_impossible_sizes_are_refused():
 @pytest.mark.parametrize(
     ("name", "change", "message"),
     [
-        ("zobg", {"baseline": "mean"}, "one of none, zero_noise, leave_one_out; got 'mean'"),
+        ("zobg", {"baseline": "mean"}, "unknown baseline 'mean'; choose from none, zero_noise, leave_one_out"),
         ("aobg", {"gamma": 0.0}, "gamma must be positive; got 0.0"),
         ("aobg", {"gamma": float("nan")}, "gamma must be positive; got nan"),
         ("aobg", {"failure_probability": 1.5}, "strictly between 0 and 1; got 1.5"),
-        ("aobg", {"variance_proxy": "sum"}, "one of variance, second_moment, upper_bound; got 'sum'"),
-        ("aobg", {"variance_proxy": "upper_bound"}, "'upper_bound' requires radius .* got 'max_deviation'"),
+        (
+            "aobg",
+            {"variance_proxy": "sum"},
+            "unknown variance proxy 'sum'; choose from variance, second",
+        ),
+        (
+            "aobg",
+            {"variance_proxy": "upper_bound"},
+            "'upper_bound' requires a `radius`: .* got 'max_deviation'",
+        ),
         ("delta", {"sigma": 0.0}, "sigma must be positive and finite; got 0.0"),
         ("fobg_clipped", {"max_norm": float("inf")}, "max_norm must be positive and finite; got inf"),
         ("fobg_truncated", {"window": 0}, "window must be at least 1 step; got 0"),
