@@ -266,7 +266,7 @@ def measure_devices(tasks: list[str], samples: list[int]) -> None:
             simulator = Simulator(task, chunk_size=chunk)
             shared = task.theta, None, np.asarray(task.sigma, rows[1].dtype)
             for kind in KINDS:
-                program: Any = simulator._programs[kind]  # type: ignore[attr-defined]
+                program: Any = simulator._programs[kind]
                 taken: dict[int, list[float]] = {1: [], len(devices): []}
                 results: dict[int, Any] = {}
                 for repeat in range(REPEATS + 1):

@@ -89,6 +89,11 @@ class Estimator(ABC):
         return estimate
 
     @classmethod
+    def place(cls) -> str:
+        """Name by which `find_estimator` finds the class: that under which it is registered, or `module:class`."""
+        return cls.name if ESTIMATORS.get(cls.name) is cls else f"{cls.__module__}:{cls.__qualname__}"
+
+    @classmethod
     def required(cls) -> tuple[str, ...]:
         """Options without a default."""
         return tuple(field.name for field in dataclasses.fields(cls) if field.default is dataclasses.MISSING)
@@ -113,14 +118,6 @@ def register(estimator: EstimatorClass) -> EstimatorClass:
     entry = Entry(name, estimator.label, estimator.needs, estimator.description, estimator.required())
     CATALOGUE.setdefault(name, entry)
     return estimator
-
-
-def name_of(estimator: str | Estimator) -> str:
-    """Name by which `find_estimator` finds an estimator's class; a name is its own."""
-    if isinstance(estimator, str):
-        return estimator
-    own = type(estimator)
-    return own.name if ESTIMATORS.get(own.name) is own else f"{own.__module__}:{own.__qualname__}"
 
 
 def label_of(name: str) -> str:

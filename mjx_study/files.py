@@ -1,12 +1,13 @@
 """Read user-supplied files and validate them against a schema; errors name the file and the key in one line."""
 
+import dataclasses
 import tomllib
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any, Final, TypeVar
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, field_validator
 
 from estimators.catalogue import suggestion
 from mjx_study.disk import read_whole
@@ -65,12 +66,6 @@ def told(error: ValidationError, names: Iterable[str] = ()) -> str:
     return f"{key}{': ' * bool(key)}{' '.join(reason.split())}{more}"
 
 
-def _option(name: str, kind: Any, interval: str = "") -> Any:
-    """Type of a field that takes an option's values, or null."""
-    option = OPTIONS[name].within(interval) if interval else OPTIONS[name]
-    return Annotated[kind, AfterValidator(option.check)] | None  # type: ignore[operator]
-
-
 class PolicyFile(BaseModel):
     """A policy written by `optimise`: its parameters, and the setting in which they were found."""
 
@@ -78,13 +73,20 @@ class PolicyFile(BaseModel):
 
     task: str
     theta: list[Finite] = Field(min_length=1)
-    contact: _option("contact", str) = None  # type: ignore[valid-type]
-    stiffness: _option("stiffness", float, "[0, inf)") = None  # type: ignore[valid-type]
-    damping: _option("damping", float) = None  # type: ignore[valid-type]
-    cone: _option("cone", str) = None  # type: ignore[valid-type]
+    contact: str | None = None
+    stiffness: float | None = None
+    damping: float | None = None
+    cone: str | None = None
     model: str | None = None
-    horizon: _option("horizon", int) = None  # type: ignore[valid-type]
-    network: list[Annotated[int, Field(ge=1, le=OPTIONS["network"].interval.high)]] | None = None  # type: ignore[union-attr]
+    horizon: int | None = None
+    network: list[int] | None = None
+
+    @field_validator("contact", "stiffness", "damping", "cone", "horizon", "network")
+    @classmethod
+    def _check(cls, value: Any, info: Any) -> Any:
+        option = OPTIONS[str(info.field_name)]
+        option = option.within("[0, inf)") if option.name == "stiffness" else option  # 0: no contact has one
+        return value if value is None else dataclasses.replace(option, many=option.name == "network").check(value)
 
 
 def read_theta(path: Path) -> tuple[tuple[float, ...], PolicyFile | None]:

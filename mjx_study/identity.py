@@ -27,7 +27,6 @@ import mujoco
 import numpy as np
 
 from estimators import Estimator, find_estimator
-from estimators.estimator import name_of
 from mjx_study.runtime import precision
 from mjx_study.simulation.scene import Scene, models_folder
 from mjx_study.tasks.task import Task
@@ -101,7 +100,7 @@ def estimator_contents(*chosen: str | Estimator) -> dict[str, str]:
         digest = _Digest()
         digest.add(find_estimator(each))
         if digest.sources or isinstance(each, Estimator):
-            found[f"estimator {name_of(each)}"] = digest.hexdigest()
+            found[f"estimator {each if isinstance(each, str) else each.place()}"] = digest.hexdigest()
             found |= {f"source of {file}": content for file, content in sorted(digest.sources.items())}
     return found
 

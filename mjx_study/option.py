@@ -281,6 +281,7 @@ OPTIONS: Final[dict[str, Option]] = {
 """Every option by its name."""
 
 
+@dataclasses.dataclass(frozen=True)
 class Checked:
     """Base of configurations: frozen dataclasses whose fields are options, each checked on construction.
 
@@ -298,14 +299,14 @@ class Checked:
 
     @classmethod
     def default(cls, name: str) -> Any:
-        return next(field.default for field in dataclasses.fields(cls) if field.name == name)  # type: ignore[arg-type]
+        return next(field.default for field in dataclasses.fields(cls) if field.name == name)
 
     def _named(self, name: str) -> Any:
         """Value of a field as options describe it, with names in place of objects."""
         return getattr(self, name)
 
     def __post_init__(self) -> None:
-        for field in dataclasses.fields(self):  # type: ignore[arg-type]
+        for field in dataclasses.fields(self):
             value = self._named(field.name)
             if field.name in ("solref", "solimp"):
                 for row in value:

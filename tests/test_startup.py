@@ -1,5 +1,6 @@
 """What needs no simulation imports nothing that computes, and what is described is there."""
 
+import importlib
 import pkgutil
 import resource
 import subprocess
@@ -94,9 +95,7 @@ def test_descriptions_are_of_what_there_is() -> None:
 
 
 def test_the_estimators_are_also_a_part_of_the_package() -> None:
-    import mjx_study.estimators
-
-    assert mjx_study.estimators is estimators
+    assert importlib.import_module("mjx_study.estimators") is mjx_study.estimators is estimators
 
 
 def test_a_file_that_hides_the_estimators_is_told_in_one_line(tmp_path: Path) -> None:

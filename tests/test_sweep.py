@@ -154,7 +154,7 @@ def test_one_compilation_serves_all_contact_models(tmp_path: Path, monkeypatch: 
     run_study(plan, tmp_path / "out")
     assert len(made) == 2 == len(plan.groups) and plan.compilations == 4
     for simulator in made:
-        sizes = {name: each.num_compilations for name, each in simulator._programs.items()}  # type: ignore[attr-defined]
+        sizes = {name: each.num_compilations for name, each in simulator._programs.items()}
         assert sizes["value"] == sizes["gradient"] == 1, sizes
 
 

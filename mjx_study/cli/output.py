@@ -44,7 +44,7 @@ def written_out() -> Generator[None]:
             raise OutputError(f"cannot write {error.filename}: {error.strerror}") from error
         with suppress(OSError, AttributeError, ValueError):  # else Python would try to write the rest again at exit
             nowhere = os.open(os.devnull, os.O_WRONLY)
-            os.dup2(nowhere, sys.stdout.fileno())
+            os.dup2(nowhere, sys.stdout.fileno())  # type: ignore[union-attr]
             os.close(nowhere)
         if isinstance(error, BrokenPipeError):
             raise

@@ -168,9 +168,9 @@ class Programs:
 
     def _after(self, step_function, point, change, parameters, reference=None):
         """Outputs after a change, relative to a given position or that after the step; and the state there."""
-        layout, (setting, state, control) = self.layout, point
+        layout, ((contact, scales), state, control) = self.layout, point
         moved, moved_control = layout.state(state, control, change)
-        after, *rest = step_function(layout.scene, layout.model(*setting, parameters), moved, moved_control)
+        after, *rest = step_function(layout.scene, layout.model(contact, scales, parameters), moved, moved_control)
         reference = jax.lax.stop_gradient(after.qpos) if reference is None else reference
         tangent = difference_position(layout.scene.host, reference, after.qpos)
         return jnp.concatenate([tangent, after.qvel, after.act]), (after, *rest)
@@ -179,7 +179,8 @@ class Programs:
         def one(change):
             parameters = change[self.layout.num_state :]
             output, (after, _, data) = self._after(exact_step, point, change, parameters, reference)
-            return output, after, _stages(self.layout.model(*point[0], parameters), data)
+            contact, scales = point[0]
+            return output, after, _stages(self.layout.model(contact, scales, parameters), data)
 
         return jax.lax.map(one, changes)
 
@@ -204,8 +205,8 @@ class Programs:
         return jax.lax.map(push, push_rows)
 
     def _stock_step(self, point):
-        layout, (setting, state, control) = self.layout, point
-        model = constraint.with_generous_budget(layout.model(*setting, jnp.zeros(len(layout.scales))))
+        layout, ((contact, scales), state, control) = self.layout, point
+        model = constraint.with_generous_budget(layout.model(contact, scales, jnp.zeros(len(layout.scales))))
         return _mjx_step(layout.scene, model, state, control)[0]
 
 

@@ -192,11 +192,7 @@ class StudyConfig(Checked):
 
     @property
     def estimator_names(self) -> tuple[str, ...]:
-        if all(isinstance(each, str) for each in self.estimators):
-            return self.estimators  # type: ignore[return-value]
-        from estimators.estimator import name_of  # imports JAX, which the command line's help does without
-
-        return tuple(map(name_of, self.estimators))
+        return tuple(each if isinstance(each, str) else each.place() for each in self.estimators)
 
     @property
     def task_names(self) -> list[str]:

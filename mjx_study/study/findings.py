@@ -209,7 +209,7 @@ def _bias_findings(rows: Sequence[Row], gammas: Bounds) -> list[str]:
         seeds = len(_by(mine, "seed"))
         biased = [row for row in mine if row.bias_verdict == "biased"]
         off = [row for row in mine if row.bias_verdict == "too few effective samples" and _off(row)]
-        mean = f"{label_of(estimator)}'s mean is"
+        mean = f"{label_of(estimator).replace(', onset', ' (onset)')}'s mean is"
         if biased:
             shares = ", ".join(f"{_share(same)}{_of(same, seeds)}" for same in _by(biased, "stiffness").values())
             least = max(row.bias_p_value for row in biased)
