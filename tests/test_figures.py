@@ -220,6 +220,12 @@ def test_numbers_on_axes_are_of_one_kind() -> None:
     assert [each.get_text() for each in figure.axes[1].get_xticklabels()] == ["3,000", "10,000", "30,000"]
 
 
+def test_any_name_of_a_task_can_be_written() -> None:
+    found = study("gradients", [("penalty", 10.0)]).assign_coords(task=["a$\\b$\0c"])
+    (figure,) = plot_study(found).values()
+    assert "a$\\b$?c" in figure.get_suptitle()
+
+
 def test_constants_say_what_they_limit() -> None:
     """A docstring follows every number at the top of a module of figures."""
     for path in Path(plots.__file__).parent.glob("*.py"):

@@ -33,7 +33,7 @@ def panels(
     """Create a figure with a title over a grid of panels; sizes in inches."""
     figure = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
-    figure.suptitle(title, fontsize="medium")
+    figure.suptitle(title, fontsize="medium", parse_math=False)
     grid = figure.subplots(rows, columns, squeeze=False, **shared)
     for axes in grid.flat:
         axes.grid(alpha=0.25)

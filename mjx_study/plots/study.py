@@ -84,7 +84,7 @@ def _slices(dataset: xr.Dataset, keep: str = "") -> Iterator[tuple[str, str, xr.
         suffix = "".join("_" + re.sub(r"[^\w.+-]", "-", values[name])[:60] for name in varied)
         suffix += f"_{len(taken)}" if suffix in taken else ""
         taken.add(suffix)
-        told = [values["task"]] + [
+        told = ["".join(each if each.isprintable() else "?" for each in values["task"])] + [
             f"{label} = {values[name]}{unit}"
             for name, label, unit in (("timestep", "h", " s"), ("sigma", "sigma", ""), ("samples", "N", ""))
             if name in values
