@@ -403,7 +403,7 @@ def sliding_box_displacement(axes: Axes) -> None:
         simulated(axes, time[10::20], stiff.qpos[rank, 10::20, 2], colour, "+", size=5)
     simulated(axes, [], [], GREY, label="penalty")
     simulated(axes, [], [], GREY, "+", "mujoco", size=5)
-    axes.set(title="sliding_box: where the box is", xlabel="time [s]", ylabel="displacement [m]")
+    axes.set(title="sliding_box: displacement of the box", xlabel="time [s]", ylabel="displacement [m]")
     axes.legend(loc="upper left")
 
 
@@ -415,10 +415,8 @@ def landing(axes: Axes, name: str) -> None:
     closed_form(axes, fine, 10 * BallWall().landing(fine[:, None]))
     for stiffness, colour, marker in ((3000.0, SKY, "o"), (30000.0, ORANGE, "o")):
         qpos = run(task, coarse[:, None], contact_of(task, "mujoco", stiffness)).qpos
-        simulated(axes, coarse, qpos[:, -1, 0], colour, marker, label=f"K = {stiffness:g} N/m", size=2.4)
-    axes.set(
-        title=f"{name}: where the ball ends", xlabel="launch angle [rad]", ylabel="distance [m]", ylim=(-0.05, 1.4)
-    )
+        simulated(axes, coarse, qpos[:, -1, 0], colour, marker, label=f"K = {stiffness:,.0f} N/m", size=2.4)
+    axes.set(title=f"{name}: end of the flight", xlabel="launch angle [rad]", ylabel="distance [m]", ylim=(-0.05, 1.4))
     axes.legend(loc="upper right")
 
 
@@ -439,10 +437,10 @@ def transferred(axes: Axes) -> None:
         color=GREY,
         linewidth=1,
         linestyle=":",
-        label="inelastic, rigid bar: sin",
+        label="inelastic, rigid bar: sin(angle)",
     )
     axes.set(
-        title="momentum_transfer: what the bar gets",
+        title="momentum_transfer: the bar",
         xlabel="launch angle [rad]",
         ylabel="angular momentum / (m v d)",
         ylim=(-0.06, 1.85),
@@ -498,7 +496,7 @@ def separation(axes: Axes) -> None:
     for distance, colour, text in lines:
         axes.plot(time[1:], distance[1:], color=colour, linewidth=1.3)
         note(axes, 3.95, distance[-1] / 20, text, colour, ha="right", va="top")
-    axes.set(title="double_pendulum: between two rollouts", xlabel="time [s]", ylabel="distance [rad]")
+    axes.set(title="double_pendulum: two rollouts", xlabel="time [s]", ylabel="distance [rad]")
     axes.set(yscale="log", ylim=(1e-16, 1e3))
 
 
@@ -579,7 +577,7 @@ def played_errors():
             ]
             row.append(np.median(np.linalg.norm(found - exact, axis=1) / way))
         errors.append(row)
-    return "tennis: ball's end", GREEN, "^", stiffnesses, errors
+    return "tennis: end of the ball's flight", GREEN, "^", stiffnesses, errors
 
 
 def impedance(axes: Axes) -> None:
@@ -593,7 +591,7 @@ def impedance(axes: Axes) -> None:
         for d in impedances:
             contact = contact_model(solref, (d, d, 0.001, 0.5, 2.0), scene=task.scene)
             errors.append(np.abs(run(task, forces[None], contact).qpos[0] - exact).max())
-        axes.plot(impedances, errors, color=colour, marker=marker, markersize=4, label=f"K = {stiffness:g} N/m")
+        axes.plot(impedances, errors, color=colour, marker=marker, markersize=4, label=f"K = {stiffness:,.0f} N/m")
     guide = np.array([3e-3, 1e-1])
     axes.plot(guide, 1e-5 * guide, color=GREY, linewidth=1, linestyle="--")
     axes.text(0.1, 6e-8, "proportional to d", color=GREY, fontsize=8.5, ha="right", va="top")
@@ -654,18 +652,19 @@ def correction_figure() -> Figure:
     for axes in (wide, near):
         axes.plot(position, found["none"].slope, color=INK, linewidth=4, alpha=0.35, label="slope of the mean cost")
         for onset, colour, label in (
-            ("none", ORANGE, "E[FoBG]"),
-            ("linear", BLUE, "E[FoBG], linear onset term"),
-            ("jump", GREEN, "E[FoBG], jump"),
+            ("none", ORANGE, "mean of FoBG"),
+            ("linear", BLUE, "mean of FoBG with the linear onset term"),
+            ("jump", GREEN, "mean of FoBG with the jump"),
         ):
             axes.plot(position, found[onset].first, color=colour, linewidth=1.5, label=label)
         axes.axhline(0.0, color=GREY, linewidth=0.8)
         axes.set_xlabel("launch angle [rad]")
         axes.grid(alpha=0.25)
     near.set_ylim(-1.05, 0.15)
-    wide.set_ylabel("gradient [1/rad]")
+    wide.set_ylabel("derivative by the launch angle [1/rad]")
+    wide.set_title("momentum_transfer, MuJoCo's default contact", fontsize=10)
     wide.legend(frameon=False, fontsize=8.5)
-    near.set_title("the same, enlarged", fontsize=10)
+    near.set_title("enlarged around the slope of the mean cost", fontsize=10)
     return figure
 
 

@@ -396,12 +396,13 @@ def apart(logarithms: Any) -> list[float]:
 
 
 PANELS: Final = {
-    "samples": ("samples", "time of a step"),
-    "horizon": ("steps", "time of a step"),
-    "dof": ("degrees of freedom", "time of a step"),
-    "contacts": ("contacts", "time of a step"),
-    "devices": ("devices (CPU: cores)", "samples per second"),
+    "samples": "samples of a call",
+    "horizon": "steps of a rollout",
+    "dof": "degrees of freedom",
+    "contacts": "contacts",
+    "devices": "devices (CPU: cores)",
 }
+"""Axes of the figure's panels, with their labels."""
 
 
 def draw(documents: list[dict[str, Any]], output: Path) -> None:
@@ -423,7 +424,7 @@ def draw(documents: list[dict[str, Any]], output: Path) -> None:
         device = "one core" if on_cpu else environment["device_kind"].removeprefix("NVIDIA ").split(" ")[0]
         base = document["base"]
         units.append(f"{base['samples']:,} at once on {device}")
-        for axis, (label, title) in PANELS.items():
+        for axis, label in PANELS.items():
             for kind, (name, colour, marker) in names.items():
                 rows = [row for row in document["measured"] if row["axis"] == axis and row["kind"] == kind]
                 if not rows:
@@ -434,13 +435,13 @@ def draw(documents: list[dict[str, Any]], output: Path) -> None:
                 places, told = [row["at"] for row in rows], f"{name}, {device}"
                 style = {"ms": 4} if kind == "value" else wide
                 axes.plot(places, each, line, color=colour, marker=marker, label=told, **style)
-                axes.set(xlabel=label, title=title)
+                axes.set(xlabel=label)
     for axis, axes in panels.items():
         places = sorted({row["at"] for each in documents for row in each["measured"] if row["axis"] == axis})
         axes.set(xscale="log", yscale="log")
         if axis == "devices":
             axes.plot(places, places, color="0.7", linewidth=0.8, zorder=0)
-            axes.set(ylabel="over one device")
+            axes.set(ylabel="speedup over one device")
             axes.set_yticks(places, [str(at) for at in places])
         else:
             low, high = axes.get_ylim()
@@ -450,7 +451,7 @@ def draw(documents: list[dict[str, Any]], output: Path) -> None:
         if axis != "samples":
             axes.set_xticks(places, [str(at) for at in places])
         axes.minorticks_off()
-    next(iter(panels.values())).set_ylabel("in steps of the unit")
+    next(iter(panels.values())).set_ylabel("time of a step, over the unit")
     unit = f"unit: a step of a rollout of {BASE} of {documents[0]['base']['steps']} steps"
     figure.supxlabel(f"{unit}, {', '.join(units)}", fontsize="small")
     next(iter(panels.values())).legend(fontsize=7)

@@ -1,6 +1,6 @@
 """Shared parts of study figures: panels by contact family, and estimator lines."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Final
 
 import numpy as np
@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from mjx_study.plots.style import HOLLOW, NO_CONTACT, TITLES, line_with_band, style_of
+from mjx_study.plots.style import NO_CONTACT, TITLES, combines, line_with_band, style_of
 from mjx_study.simulation.contact import stable
 
 SWEPT: Final = {
@@ -20,7 +20,11 @@ SWEPT: Final = {
     "samples": "samples N in a batch",
 }
 """Dimensions that can be a figure's axis, with their labels."""
+UNSTABLE: Final = "unstable step"
 MOST_PANELS: Final = 6
+"""Maximum number of contact models in a figure that has a panel, a row or a column for each."""
+APART: Final = 1.05
+"""Ratio of the stiffnesses at which neighbouring estimators are drawn where they would hide each other."""
 
 
 def panels(
@@ -29,7 +33,7 @@ def panels(
     """Create a figure with a title over a grid of panels; sizes in inches."""
     figure = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
-    figure.suptitle(title, fontsize="medium")
+    figure.suptitle(title, fontsize="medium", parse_math=False)
     grid = figure.subplots(rows, columns, squeeze=False, **shared)
     for axes in grid.flat:
         axes.grid(alpha=0.25)
@@ -59,22 +63,23 @@ def make_logarithmic(axes: Axes, x: np.ndarray | None) -> None:
             axes.set_xlim(min(x) / 1.1, max(x) * 1.1)
         ticks = np.unique(x)
         if len(ticks) <= 5 and ticks[-1] <= 30 * ticks[0]:  # few powers of ten: label the values themselves
-            axes.set_xticks(ticks, [f"{each:.4g}" for each in ticks])
+            axes.set_xticks(ticks, [number(each) for each in ticks])
             axes.minorticks_off()
 
 
-def legend_below(figure: Figure, columns: int) -> None:
-    """Add one legend for all panels below them, where it hides nothing."""
-    shown = {
-        label: handle for axes in figure.axes for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)
-    }
-    columns = max(2, min(len(shown), columns))
-    figure.legend(shown.values(), shown, loc="outside lower center", ncols=columns, frameon=False, fontsize="small")
+def number(value: Any, digits: int = 4) -> str:
+    """Format a tick or a stiffness; whole numbers in groups of three."""
+    return f"{value:,.0f}" if digits <= 4 and 1000 <= value < 1e6 else f"{value:.{digits}g}"
 
 
-def note(axes: Axes, x: float, text: str, **style: Any) -> None:
-    """Write a label along the upper end of a vertical line."""
-    axes.annotate(text, (x, 0.98), xycoords=("data", "axes fraction"), rotation=90, va="top", **style)
+def counted(number: int, noun: str) -> str:
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
+
+
+def model_title(one: xr.Dataset, between: str = ", ") -> str:
+    """Name of a contact model, with its stiffness if it has one."""
+    family, stiffness = str(one["contact"].item()), float(one["stiffness"])
+    return TITLES.get(family, family) + (f"{between}{number(stiffness)}\N{NO-BREAK SPACE}N/m" if stiffness > 0 else "")
 
 
 def positions(rows: xr.Dataset) -> np.ndarray:
@@ -97,44 +102,45 @@ def against_stiffness(
 ) -> Figure:
     """Plot one panel per contact family."""
     found = families(part)
-    figure, grid = panels(1, len(found), 1.4 + 3.2 * len(found), 3.7, title, sharey=True)
+    figure, grid = panels(1, len(found), 1.4 + 3.2 * len(found), 3.9, title, sharey=True)
     for axes, (family, rows) in zip(grid[0], found, strict=True):
-        if family:
-            x = positions(rows)
-            axes.set(xscale="log", xlabel=SWEPT["stiffness"])
-            axes.set_title(TITLES.get(family, family), fontsize="medium")
-        else:
-            x = np.arange(rows.sizes["model"], dtype=float)
-            labels = [TITLES.get(name, name) for name in rows["contact"].values.tolist()]
-            axes.set_xticks(x, labels, rotation=20, ha="right", fontsize="small")
-            axes.set_xlim(-0.6, len(x) - 0.4)
+        x = stiffness_axis(axes, family, rows)
         draw(axes, rows, x)
-        if family:
-            shade_unstable((axes,), rows, x)
+        shade_unstable(axes, family, rows, x)
         if log:
             make_logarithmic(axes, x if family else None)
     grid[0, 0].set_ylabel(ylabel)
-    grid[0, 0].legend(frameon=False, fontsize="small")
     return figure
+
+
+def stiffness_axis(axes: Axes, family: str, rows: xr.Dataset) -> np.ndarray:
+    """Make x the stiffness of a family, or its models if it is one of `families` without a name; return positions."""
+    if family:
+        axes.set(xscale="log", xlabel=SWEPT["stiffness"])
+        axes.set_title(TITLES.get(family, family), fontsize="medium")
+        return positions(rows)
+    x = np.arange(rows.sizes["model"], dtype=float)
+    labels = [model_title(rows.isel(model=index), ",\n") for index in range(len(x))]
+    axes.set_xticks(x, labels, rotation=20, ha="right", fontsize="small")
+    axes.set_xlim(-0.6, len(x) - 0.4)
+    return x
+
+
+def beside(axes: Axes, x: np.ndarray, rank: float) -> np.ndarray:
+    """Move positions to the right, by so many estimators, or to the left."""
+    return x * APART**rank if axes.get_xscale() == "log" else x + (APART - 1) * rank
 
 
 def estimators(rows: xr.Dataset) -> Iterator[tuple[xr.Dataset, dict[str, Any]]]:
     for name in rows["estimator"].values.tolist():
         label, colour, marker = style_of(name)
-        style = {"label": label, "color": colour, "marker": marker, "hollow": name in HOLLOW}
+        style = {"label": label, "color": colour, "marker": marker, "hollow": combines(name)}
         yield rows.sel(estimator=name), style
 
 
 def line(axes: Axes, rows: xr.Dataset, x: np.ndarray, y, lower, upper, style: Mapping[str, Any]) -> None:
     """Draw a line with a band over stiffnesses, or points with bars over models of one stiffness."""
-    if len(np.unique(rows["contact"].values)) == 1 and len(x) > 1:
-        line_with_band(axes, x, y, lower, upper, **style)
-        return
-    bars = np.nan_to_num([y - lower, upper - y])
-    axes.errorbar(
-        x, y, yerr=bars, color=style["color"], marker=style["marker"], markersize=5, linestyle="none", capsize=3,
-        label=style["label"],
-    )  # fmt: skip
+    line_with_band(axes, x, y, lower, upper, **style, joined=len(np.unique(rows["contact"].values)) == 1)
 
 
 def positive(values: Any) -> np.ndarray:
@@ -163,16 +169,20 @@ def limit(x: np.ndarray, solref: np.ndarray, first: int, timestep: float) -> flo
     return next(unstable, float(x[first]))
 
 
-def shade_unstable(along: Sequence[Axes], rows: xr.Dataset, x: np.ndarray) -> None:
-    """Shade stiffnesses at which the step gains energy while in contact."""
+def unstable(rows: xr.Dataset) -> np.ndarray:
+    """Mask of contact models with which the step gains energy while in contact."""
     if "solref" not in rows:
-        return
-    known = rows["solref"].transpose("model", "solref_entry").values
-    timestep = float(rows["timestep"])
-    steady = np.array([np.isnan(each).any() or stable(each.tolist(), timestep) for each in known])
-    if steady.all() or not np.any(rows["stiffness"].values):
-        return
-    left = limit(x, known, int(np.argmin(steady)), timestep)
-    for axes in along:
-        axes.axvspan(left, x[-1] * 1.15, color="0.5", alpha=0.13, linewidth=0, zorder=0)
-    note(along[0], left, "unstable step", fontsize="x-small", color="0.35")
+        return np.zeros(rows.sizes["model"], bool)
+    known, timestep = rows["solref"].transpose("model", "solref_entry").values.tolist(), float(rows["timestep"])
+    return np.array([not np.isnan(each).any() and not stable(each, timestep) for each in known])
+
+
+def shade_unstable(axes: Axes, family: str, rows: xr.Dataset, x: np.ndarray) -> None:
+    """Shade where the step is unstable: stiffnesses of a family from the limit on, or single models."""
+    mask = unstable(rows)
+    spans = [(each - 0.5, each + 0.5) for each in x[mask]]
+    if family and mask.any():
+        solref = rows["solref"].transpose("model", "solref_entry").values
+        spans = [(limit(x, solref, int(np.argmax(mask)), float(rows["timestep"])), x[-1] * 1.15)]
+    for left, right in spans:
+        axes.axvspan(left, right, color="0.5", alpha=0.13, linewidth=0, zorder=0, label=UNSTABLE)

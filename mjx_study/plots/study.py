@@ -10,15 +10,18 @@ import numpy as np
 import xarray as xr
 from matplotlib.colors import TwoSlopeNorm
 from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
 
 from mjx_study.plots.descents import achieved, descent, landscape
 from mjx_study.plots.gradients import alpha, bias, comparison, error_against_samples, variance
-from mjx_study.plots.panels import SWEPT, families, panels, positive
-from mjx_study.plots.style import TITLES
+from mjx_study.plots.panels import SWEPT, UNSTABLE, families, number, panels, positive, unstable
+from mjx_study.plots.style import TITLES, fit_texts, legend_below, mark_clipped
 from mjx_study.table import digits_to_tell_apart
 
 MOST_FIGURES: Final = 12
 """Maximum number of figures of one kind; further tasks, timesteps and noises are dropped."""
+MOST_DECADES: Final = 6
+"""Maximum ratio of FoBG to ZoBG, or of ZoBG to FoBG, that a map tells apart, as a power of ten."""
 
 
 def plot_study(dataset: xr.Dataset) -> dict[str, Figure]:
@@ -30,6 +33,10 @@ def plot_study(dataset: xr.Dataset) -> dict[str, Figure]:
     def add(kind: str, draw: Callable[[xr.Dataset, str], Figure | None], keep: str = "") -> None:
         for suffix, title, part in itertools.islice(_slices(dataset, keep), MOST_FIGURES):
             if (figure := draw(part, title)) is not None:
+                for axes in figure.axes:
+                    mark_clipped(axes)
+                legend_below(figure)
+                fit_texts(figure)
                 figures[kind + suffix] = figure
 
     quantity = _quantity(dataset)
@@ -77,7 +84,7 @@ def _slices(dataset: xr.Dataset, keep: str = "") -> Iterator[tuple[str, str, xr.
         suffix = "".join("_" + re.sub(r"[^\w.+-]", "-", values[name])[:60] for name in varied)
         suffix += f"_{len(taken)}" if suffix in taken else ""
         taken.add(suffix)
-        told = [values["task"]] + [
+        told = ["".join(each if each.isprintable() else "?" for each in values["task"])] + [
             f"{label} = {values[name]}{unit}"
             for name, label, unit in (("timestep", "h", " s"), ("sigma", "sigma", ""), ("samples", "N", ""))
             if name in values
@@ -97,8 +104,7 @@ def _texts(values: np.ndarray) -> list[str]:
 def _ticks(values: np.ndarray) -> list[str]:
     """Values with three digits, or more to distinguish them."""
     digits = digits_to_tell_apart(values.tolist(), least=3)
-    whole = digits == 3
-    return [f"{value:.0f}" if whole and 100 <= value < 1e6 else f"{value:.{digits}g}" for value in values.tolist()]
+    return [number(value, digits) for value in values.tolist()]
 
 
 def _present(part: xr.Dataset) -> np.ndarray:
@@ -111,20 +117,24 @@ def _ratio_map(part: xr.Dataset, title: str, quantity: str, other: str) -> Figur
     """Plot log10 of FoBG over ZoBG against two swept parameters, one panel per family; blue where FoBG is smaller."""
     found = [(family, rows) for family, rows in families(part) if family] or families(part)
     title = f"{title}\nwhere first order is ahead (blue) and behind (red)"
-    figure, grid = panels(1, len(found), 1.8 + 3.2 * len(found), 3.6, title, sharey=True)
+    figure, grid = panels(1, len(found), 1.8 + 3.2 * len(found), 3.9, title, sharey=True)
     ratios = []
     for _, rows in found:
         values = rows[quantity].median("seed")
         ratio = np.log10(positive(values.sel(estimator="fobg")) / positive(values.sel(estimator="zobg")))
         ratios.append(ratio if values.sel(estimator="fobg").dims[0] == other else ratio.T)
-    extent = max(1e-3, float(np.nanmax(np.abs(np.concatenate([ratio.ravel() for ratio in ratios])))))
+    known = np.concatenate(ratios, axis=None)
+    extent = min(MOST_DECADES, max(1e-3, float(np.nanmax(np.abs(known)))))
     mesh = None
     for axes, (family, rows), ratio in zip(grid[0], found, ratios, strict=True):
         axes.grid(visible=False)
         mesh = axes.pcolormesh(
             np.arange(ratio.shape[1] + 1), np.arange(ratio.shape[0] + 1), ratio,
-            cmap="RdBu_r", norm=TwoSlopeNorm(0, -min(extent, 6), min(extent, 6)),
+            cmap="RdBu_r", norm=TwoSlopeNorm(0, -extent, extent),
         )  # fmt: skip
+        shaky = [unstable(rows.isel({other: index})) for index in range(rows.sizes[other])]
+        for row, column in np.argwhere(shaky):
+            axes.add_patch(Rectangle((column, row), 1, 1, fill=False, hatch="///", linewidth=0, label=UNSTABLE))
         stiffness = _ticks(rows["stiffness"].values)
         axes.set_xticks(np.arange(len(stiffness)) + 0.5, stiffness, rotation=60, ha="right", fontsize="small")
         labels = _ticks(rows[other].values)
@@ -133,5 +143,8 @@ def _ratio_map(part: xr.Dataset, title: str, quantity: str, other: str) -> Figur
         axes.set_title(TITLES.get(family, family), fontsize="medium")
     grid[0, 0].set_ylabel(SWEPT[other])
     assert mesh is not None
-    figure.colorbar(mesh, ax=list(grid[0]), label=f"log10 of {quantity.replace('_', ' ')}, FoBG over ZoBG")
+    below, above = bool(np.nanmin(known) < -extent), bool(np.nanmax(known) > extent)
+    beyond = (("neither", "max"), ("min", "both"))[below][above]
+    told = f"log$_{{10}}$ of {quantity.replace('_', ' ')},\nFoBG over ZoBG"
+    figure.colorbar(mesh, ax=list(grid[0]), label=told, extend=beyond)
     return figure

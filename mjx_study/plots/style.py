@@ -1,19 +1,26 @@
 """Colours, names, lines with bands, and file formats shared by all figures."""
 
+import itertools
+import math
+import textwrap
 import zlib
 from collections.abc import Mapping, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.colors import to_hex
+from matplotlib.container import ErrorbarContainer
 from matplotlib.figure import Figure
 
+from estimators import find_estimator
 from estimators.estimator import label_of
 from mjx_study.choices import FAMILIES
 from mjx_study.disk import write_whole
 
-# Okabe-Ito colours, distinguishable in print and by colour-blind readers; markers repeat the distinction.
 STYLE: Final = {
     "zobg": ("#0072B2", "o"),
     "zobg_antithetic": ("#56B4E9", "v"),
@@ -31,10 +38,11 @@ STYLE: Final = {
     "ddcg": ("#009E73", "h"),
     "delta": ("#777777", "d"),
 }
+"""Okabe-Ito colours, distinguishable in print and by colour-blind readers; markers repeat the distinction."""
 OTHERS: Final = (("#E69F00", "#56B4E9", "#009E73", "#F0E442", "#0072B2", "#D55E00", "#CC79A7"), "1234+x|_")
 """Colours and markers for user-defined estimators."""
 NO_CONTACT: Final = 1.0
-"""Position of tasks without contact on a stiffness axis."""
+"""Position of models without a stiffness on a stiffness axis [N/m]."""
 TITLES: Final = {
     "penalty": "penalty (impedance 1e-4)",
     "impedance": "impedance 0.5",
@@ -45,6 +53,7 @@ TITLES: Final = {
     "mjcf": "as in the MJCF",
     "reference": "analytic reference",
 }
+"""Names of contact families."""
 assert set(TITLES) >= set(FAMILIES)
 
 
@@ -55,9 +64,13 @@ def style_of(name: str) -> tuple[str, str, str]:
     return label_of(name), *STYLE.get(name, (colours[drawn % len(colours)], markers[drawn // 7 % len(markers)]))
 
 
-def mean_with_band(axes: Axes, x, mean, error, color: str, label: str) -> None:
-    axes.plot(x, mean, color=color, linewidth=1.6, label=label)
-    axes.fill_between(x, mean - 1.96 * error, mean + 1.96 * error, color=color, alpha=0.2, linewidth=0)
+@cache
+def combines(name: str) -> bool:
+    """Whether an estimator combines batches, so that its curve may coincide with another's; not if it is not found."""
+    try:
+        return len(find_estimator(name).needs) > 1
+    except Exception:  # whatever the module of somebody else's estimator raises
+        return False
 
 
 def robust_limits(curves: Sequence[np.ndarray]) -> tuple[float, float]:
@@ -76,7 +89,8 @@ STYLES: Final = {
         "axes.linewidth": 0.6,
         "lines.linewidth": 1.0,
         "pdf.fonttype": 42,  # embedded, keeping text as text
-        "svg.fonttype": "none",
+        "ps.fonttype": 42,
+        "svg.fonttype": "path",  # SVG embeds no fonts
     },
 }
 """matplotlib settings by style."""
@@ -87,9 +101,41 @@ COLUMN, PAGE = 3.4, 7.0
 def fit_to_paper(figure: Figure) -> None:
     """Fit a figure to a column or page and drop its title, which goes into the caption."""
     width, height = figure.get_size_inches()
-    wanted = COLUMN if width < 5 else PAGE
-    figure.set_size_inches(wanted, height * wanted / width)
+    wanted, rows = COLUMN if width <= 5 else PAGE, len({round(axes.bbox.y0) for axes in figure.axes})
+    figure.set_size_inches(wanted, max(height * wanted / width, 1.2 * rows + 1.4))
     figure.suptitle("")
+    legend_below(figure)
+    fit_texts(figure)
+
+
+def legend_below(figure: Figure) -> None:
+    """Make one legend for all panels below them, where it hides nothing, in as few rows as fit the width."""
+    while figure.legends:
+        figure.legends[0].remove()
+    pairs = [zip(*axes.get_legend_handles_labels(), strict=True) for axes in figure.axes]
+    shown = {label: handle for each in pairs for handle, label in each}
+    for rows in range(1, len(shown) + 1):
+        columns, place = -(-len(shown) // rows), "outside lower center"
+        legend = figure.legend(shown.values(), shown, loc=place, ncols=columns, frameon=False, fontsize="small")
+        if columns == 1 or legend.get_window_extent().width <= figure.bbox.width:
+            break
+        legend.remove()
+
+
+def fit_texts(figure: Figure) -> None:
+    """Break titles and labels that are longer than their axes; make smaller those that still are."""
+    for broken in (False, True):
+        figure.draw_without_rendering()
+        for axes in figure.axes:
+            for text in (axes.title, axes.xaxis.label, axes.yaxis.label):
+                side = "height" if text is axes.yaxis.label else "width"
+                excess = getattr(text.get_window_extent(), side) / getattr(axes.bbox, side)
+                if excess > 1 and broken:
+                    text.set_fontsize(text.get_fontsize() / excess)
+                elif excess > 1:
+                    lines = text.get_text().split("\n")
+                    most = max(map(len, lines)) // math.ceil(excess) + 6
+                    text.set_text("\n".join(textwrap.fill(line, most, break_long_words=False) for line in lines))
 
 
 def save_figure(figure: Figure, folder: Path, name: str, formats: Sequence[str] = ("png", "pdf")) -> list[Path]:
@@ -109,18 +155,24 @@ def save_figures(figures: Mapping[str, Figure], folder: Path, formats: Sequence[
     return [path for name, figure in figures.items() for path in save_figure(figure, folder, name, formats)]
 
 
+MOST_POINTS: Final = 15
+"""Maximum number of points of a curve each of which has a marker; of longer curves a few have."""
+
+
 def line_with_band(
-    axes: Axes, x, y, lower, upper, *, color: str, marker: str, label: str | None = None, hollow: bool = False
-) -> None:
-    """Draw a line with its interval. A curve that may coincide with another is dashed with hollow markers.
+    axes: Axes, x, y, lower, upper, *, color: str, marker: str, label: str | None = None, hollow: bool = False,
+    joined: bool = True,
+) -> None:  # fmt: skip
+    """Draw a line with its interval, or points with bars. A curve that may coincide with another is hollow and dashed.
 
     Two points are not joined, since nothing was measured in between.
     """
-    joined = len(x) > 2
+    joined = joined and len(x) > 2
     line = ("--" if hollow else "-") if joined else "none"
     face, size = ("none", 7.5) if hollow else (color, 4.5)
     axes.plot(
-        x, y, color=color, marker=marker, markersize=size, markerfacecolor=face, linestyle=line, label=label
+        x, y, color=color, marker=marker, markersize=size, markerfacecolor=face, linestyle=line, label=label,
+        markevery=1 if len(x) <= MOST_POINTS else len(x) // 5,
     )  # fmt: skip
     if joined:
         axes.fill_between(x, lower, upper, color=color, alpha=0.2, linewidth=0)
@@ -129,5 +181,29 @@ def line_with_band(
         axes.errorbar(x, y, yerr=bars, color=color, capsize=3, linestyle="none")
 
 
-HOLLOW: Final = ("aobg", "ivw", "ivw_h", "ddcg", "total_propagation")
-"""Interpolating estimators, whose curves may coincide with others."""
+def mark_clipped(axes: Axes) -> None:
+    """Put arrowheads at the edges of the finished axes beyond which curves (filled) and intervals (hollow) continue."""
+    caps = {cap for each in axes.containers if isinstance(each, ErrorbarContainer) for cap in each[1]}
+    lines = [each for each in axes.lines if each not in caps and each.get_transform() is axes.transData]
+    curves: list[tuple[np.ndarray, str, bool]]
+    curves = [(np.asarray(each.get_xydata()), to_hex(each.get_color()), True) for each in lines]
+    for drawn in axes.collections:
+        color = drawn.get_edgecolor() if isinstance(drawn, LineCollection) else drawn.get_facecolor()
+        curves += [
+            (np.asarray(path.vertices), to_hex(np.ravel(color)[:3].tolist()), False) for path in drawn.get_paths()
+        ]
+    marked: dict[tuple[float, int], list[str]] = {}
+    for (points, color, filled), sign in itertools.product(curves, (-1, 1)):
+        beyond = np.flatnonzero(sign * points[:, 1] > sign * axes.get_ylim()[sign > 0])
+        if len(points) > 2 * MOST_POINTS + 3:  # with both sides of a band: then one for each stretch
+            stretches = np.split(beyond, np.flatnonzero(np.diff(beyond) > 1) + 1)
+            beyond = [each[len(each) // 2] for each in stretches if len(each)]
+        for x in points[beyond, 0].tolist():
+            others = marked.setdefault((x, sign), [])
+            if color not in others:
+                y, shape = 0.5 + sign * (0.47 - 0.06 * len(others)), "^" if sign > 0 else "v"
+                looks = {"color": color, "markerfacecolor": color if filled else "none", "markersize": 5}
+                axes.plot(x, y, shape, transform=axes.get_xaxis_transform(), zorder=4, **looks)
+                others.append(color)
+    if marked:
+        axes.plot([], [], "^", color="0.4", markersize=5, label="beyond the axis (hollow: its interval)")

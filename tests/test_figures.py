@@ -1,0 +1,239 @@
+"""Figures of made-up studies: what they show, mark and name, and that their texts fit."""
+
+import ast
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_hex
+from matplotlib.figure import Figure
+
+from estimators import Estimator
+from mjx_study import plots
+from mjx_study._matplotlib import matplotlib
+from mjx_study.plots.panels import UNSTABLE, counted, number
+from mjx_study.plots.study import MOST_DECADES, plot_study
+from mjx_study.plots.style import STYLE, STYLES, combines, fit_to_paper, mark_clipped
+from mjx_study.study.variables import CELL, VARIABLES
+
+OUTER = ("task", "timestep", "cone", "model", "sigma", "samples")
+MASS, TIMESTEP = 0.05, 0.01  # kg, s: an undamped spring is unstable from 2000 N/m on
+FAMILIES = ("penalty", "mujoco", "mujoco_stiff", "smooth_onset")
+BOTH = ("zobg", "fobg", "aobg")
+
+
+def study(kind: str, models: list[tuple[str, float]], seeds: int = 1, sigma=(0.1,), **changes: Any) -> xr.Dataset:
+    """A study whose numbers are all 0.5 unless changed, to what broadcasts over a variable's dimensions."""
+    coords: dict[str, Any] = {
+        "task": ["pusher"], "timestep": [TIMESTEP], "cone": ["pyramidal"], "sigma": list(sigma), "samples": [50],
+        "model": [f"{family} {stiffness:g}" for family, stiffness in models],
+        "estimator": list(BOTH), "seed": range(seeds), "iteration": range(1, 41), "point": range(41),
+    }  # fmt: skip
+    sizes = {name: len(values) for name, values in coords.items()} | {"solref_entry": 2}
+    data = {}
+    changes.setdefault("position", along("point", *range(41)))
+    for name, variable in (VARIABLES[kind] | {"solref": CELL["solref"]}).items():
+        dims = (*OUTER, *variable.dims)
+        if "param" not in dims:
+            full = xr.DataArray(np.full([sizes[dim] for dim in dims], 0.5), dims=dims)
+            data[name] = (full * 0 + changes.get(name, full)).transpose(*dims)
+    springs = [[-stiffness / MASS, 0.0] for _, stiffness in models]
+    data["solref"] = data["solref"] * 0 + xr.DataArray(springs, dims=("model", "solref_entry"))
+    used = {dim for array in data.values() for dim in array.dims}
+    found = xr.Dataset(data, {name: values for name, values in coords.items() if name in used})
+    found = found.assign_coords({n: ("model", [m[k] for m in models]) for k, n in enumerate(("contact", "stiffness"))})
+    config = json.dumps({"confidence": 0.95, "direction": None})
+    return found.assign_attrs(config=config, many_parameters=0)
+
+
+def along(dim: str, *values: Any) -> xr.DataArray:
+    return xr.DataArray(list(values), dims=(dim,))
+
+
+def marks(axes: Axes, shape: str) -> list[tuple[float, str]]:
+    """Arrowheads at an edge: where along x, and whose colour."""
+    drawn = [each for each in axes.lines if each.get_transform() is not axes.transData and each.get_marker() == shape]
+    return sorted((float(each.get_xdata()[0]), to_hex(each.get_color())) for each in drawn)  # type: ignore[index]
+
+
+def bare() -> Axes:
+    figure = Figure()
+    FigureCanvasAgg(figure)
+    return figure.subplots()
+
+
+def legend_of(figure: Figure) -> list[str]:
+    return [text.get_text() for legend in figure.legends for text in legend.get_texts()]
+
+
+def test_titles_and_labels_fit_their_axes_on_paper() -> None:
+    models = [(family, stiffness) for family in FAMILIES for stiffness in (10.0, 100.0, 1000.0)]
+    several = {"seeds": 3, "squared_bias": 0.5, "squared_bias_se": 0.1}
+    studies = [study("gradients", models), study("gradients", models, **several), study("descents", models),
+               study("landscapes", models)]  # fmt: skip
+    with matplotlib.rc_context(STYLES["paper"]):
+        for found in studies:
+            for name, figure in plot_study(found).items():
+                fit_to_paper(figure)
+                figure.draw_without_rendering()
+                assert all(each.get_window_extent().width <= figure.bbox.width for each in figure.legends), name
+                for axes in figure.axes:
+                    room = axes.get_window_extent()
+                    for text, height in ((axes.title, 0), (axes.xaxis.label, 0), (axes.yaxis.label, 1)):
+                        box = text.get_window_extent()
+                        taken, free = (box.height, room.height) if height else (box.width, room.width)
+                        assert taken <= 1.05 * free, (name, text.get_text())
+    assert STYLES["paper"]["svg.fonttype"] == "path"  # SVG embeds no fonts
+    assert STYLES["paper"]["pdf.fonttype"] == STYLES["paper"]["ps.fonttype"] == 42
+
+
+def test_curves_and_intervals_beyond_the_limits_are_marked() -> None:
+    axes = bare()
+    axes.plot([1, 2, 3], [5.0, 50.0, np.inf], color="#112233")
+    axes.fill_between([1, 2, 3], [-9.0, 1.0, 1.0], [6.0, 6.0, 6.0], color="#445566", alpha=0.2)
+    axes.errorbar([2.0], [4.0], yerr=[[9.0], [1.0]], color="#778899", linestyle="none", capsize=3)
+    axes.axhline(99)
+    axes.set_ylim(0, 10)
+    mark_clipped(axes)
+    assert marks(axes, "^") == [(2.0, "#112233"), (3.0, "#112233")]
+    assert marks(axes, "v") == [(1.0, "#445566"), (2.0, "#778899")]
+    faces = {each.get_marker(): each.get_markerfacecolor() for each in axes.lines if np.size(each.get_xdata()) == 1}
+    assert faces["v"] == "none" != faces["^"]
+
+
+def test_a_long_stretch_beyond_the_limits_is_marked_once() -> None:
+    axes = bare()
+    axes.plot(range(100), np.where(np.arange(100) < 50, 1, 20), color="#112233")
+    axes.set_ylim(0, 10)
+    mark_clipped(axes)
+    assert marks(axes, "^") == [(75.0, "#112233")]
+
+
+def test_every_kind_of_figure_marks_what_its_limits_clip() -> None:
+    models = [("penalty", stiffness) for stiffness in (10.0, 100.0, 1000.0)]
+    wide = along("model", 1.0, 1e30, 1.0)
+    (comparison,) = plot_study(study("gradients", models, variance=1.0, variance_upper=wide)).values()
+    assert {x for x, _ in marks(comparison.axes[0], "^")} == {100.0}
+    unsure = plot_study(study("gradients", models, relative_error_se=along("model", 0.01, 9.0, 0.01)))["comparison"]
+    assert {x for x, _ in marks(unsure.axes[1], "v")} == {100.0}
+    far = xr.where(along("iteration", *range(40)) > 20, along("estimator", 1.0, 1e6, 1.0), 1.0)
+    descent = plot_study(study("descents", models, cost=far, start_cost=2.0, cost_se=0.0))["descent"]
+    assert {colour for _, colour in marks(descent.axes[0], "^")} == {to_hex(STYLE["fobg"][0])}
+    steep = xr.where(along("point", *range(41)) == 20, along("estimator", 0.0, 1e6, 0.0), 0.0)
+    rising = along("point", *range(41)) * 1.0
+    (landscape,) = plot_study(study("landscapes", models[:1], slope=steep, slope_se=0.0, smoothed=rising)).values()
+    assert marks(landscape.axes[1], "^") == [(20.0, to_hex(STYLE["fobg"][0]))]
+    assert "beyond the axis (hollow: its interval)" in legend_of(landscape)
+
+
+def test_achieved_costs_are_above_one_baseline_and_none_is_drawn_at_it() -> None:
+    cost = along("model", 3.0, 5.0, 9.0) + along("estimator", 0.0, 1.0, 4.0)
+    models = [("penalty", stiffness) for stiffness in (10.0, 100.0, 1000.0)]
+    figure = plot_study(study("descents", models, final_cost=cost))["achieved"]
+    (axes,) = [each for each in figure.axes if each.get_xlabel()]
+    curves = {line.get_label(): np.asarray(line.get_ydata(), float) for line in axes.lines}
+    np.testing.assert_allclose(curves["ZoBG"], [np.nan, 2, 6])  # the baseline itself: not on a logarithmic axis
+    np.testing.assert_allclose(curves["FoBG"], [1, 3, 7])
+    assert marks(axes, "v") == [(10.0, to_hex(STYLE["zobg"][0]))]
+    assert "3" in axes.get_ylabel().split()[-1] and "lowest" in axes.get_ylabel()
+    assert "(1 seed as dots" in figure.get_suptitle()
+    assert counted(10, "seed") == "10 seeds"
+
+
+def test_unstable_steps_are_shown_wherever_the_axis_is_stiffness() -> None:
+    mixed = [("penalty", 10.0), ("penalty", 100.0), ("penalty", 1e4), ("mujoco", 1e4), ("smooth_onset", 10.0)]
+    (figure,) = plot_study(study("gradients", mixed)).values()
+    shaded = [[patch for patch in axes.patches if patch.get_label() == UNSTABLE] for axes in figure.axes]
+    assert [len(each) for each in shaded] == [1, 1, 1, 1]  # two rows: from the limit on; the first of two families
+    assert shaded[1][0].get_extents().width > 0 and UNSTABLE in legend_of(figure)
+    assert not any(text.get_text() == UNSTABLE for axes in figure.axes for text in axes.texts)  # not on the data
+    swept = [("penalty", stiffness) for stiffness in (10.0, 100.0, 1e4)]
+    chart = plot_study(study("gradients", swept, 3, (0.1, 1.0)))["map_stiffness_sigma"]
+    hatched = [patch.get_xy() for patch in chart.axes[0].patches if patch.get_hatch()]  # type: ignore[attr-defined]
+    assert hatched == [(2, 0), (2, 1)] and UNSTABLE in legend_of(chart)
+
+
+@pytest.mark.parametrize(
+    ("least", "greatest", "extend"), [(0, 0, "neither"), (-1, 0, "min"), (0, 1, "max"), (-1, 1, "both")]
+)
+def test_a_map_says_where_its_colours_end(least: int, greatest: int, extend: str) -> None:
+    powers = [10.0 ** (each * (MOST_DECADES + 2)) for each in (least, 0, greatest)]
+    values = xr.where(along("estimator", 0, 1, 0) == 1, along("model", *powers), 1.0)
+    swept = [("penalty", stiffness) for stiffness in (10.0, 100.0, 1000.0)]
+    figure = plot_study(study("gradients", swept, 3, (0.1, 1.0), variance=values))["map_stiffness_sigma"]
+    assert figure.axes[-1]._colorbar.extend == extend  # type: ignore[attr-defined]
+
+
+def test_one_stiffness_gives_an_axis_of_families_and_two_are_not_joined() -> None:
+    """Warnings are errors here: an axis of one stiffness had identical limits."""
+    (figure,) = plot_study(study("gradients", [(family, 1000.0) for family in FAMILIES])).values()
+    assert len(figure.axes) == 2
+    labels = [label.get_text() for label in figure.axes[1].get_xticklabels()]
+    assert len(labels) == len(FAMILIES) and labels[-1].replace("\N{NO-BREAK SPACE}", " ") == "smooth onset,\n1,000 N/m"
+    (figure,) = plot_study(study("gradients", [("penalty", 300.0), ("penalty", 3000.0)])).values()
+    for axes in figure.axes:
+        lines = [line for line in axes.lines if np.size(line.get_xdata()) == 2 and line.get_marker() != "None"]
+        assert lines and all(line.get_linestyle() == "None" for line in lines)
+        assert all(np.shape(path.vertices) == (2, 2) for each in axes.collections for path in each.get_paths())  # bars
+
+
+class Both(Estimator):
+    """Somebody's own, of two batches."""
+
+    name = "both"
+    needs = ("evaluation", "differentiation")
+
+    def combine(self, *args: Any, **kwargs: Any) -> Any:
+        raise NotImplementedError
+
+
+def test_an_estimator_of_two_batches_is_hollow_and_dashed_whoever_wrote_it() -> None:
+    both = f"{__name__}:Both"
+    assert [combines(name) for name in ("aobg", "ivw_h", both)] == [True] * 3
+    assert not any(combines(name) for name in ("zobg", "fobg", "nowhere_to_be_found:It"))
+    models = [("penalty", stiffness) for stiffness in (10.0, 100.0, 1000.0)]
+    for kind, labels in (("descents", ("AoBG", "FoBG")), ("landscapes", ("mean of AoBG", "mean of FoBG"))):
+        figure = list(plot_study(study(kind, models)).values())[-1]
+        styles = {line.get_label(): line for axes in figure.axes for line in axes.lines}
+        assert [styles[each].get_linestyle() for each in labels] == ["--", "-"]
+        assert styles[labels[0]].get_markerfacecolor() == "none"
+
+
+@pytest.mark.parametrize("models", [[("penalty", 10.0), ("penalty", 100.0)], [("penalty", 10.0), ("mujoco", 10.0)]])
+def test_bounds_of_a_bias_are_side_by_side(models: list[tuple[str, float]]) -> None:
+    figure = plot_study(study("gradients", models, 3, squared_bias=0.0, squared_bias_se=0.1))["bias"]
+    bounds = [
+        line.get_xdata() for line in figure.axes[0].lines if line.get_marker() == "v" and np.size(line.get_xdata())
+    ]
+    assert len(bounds) == len({float(x[0]) for x in bounds}) == len(BOTH)  # type: ignore[index]
+
+
+def test_numbers_on_axes_are_of_one_kind() -> None:
+    assert [number(each) for each in (300, 3000.0, 10_000.0, 0.5, 1e7)] == ["300", "3,000", "10,000", "0.5", "1e+07"]
+    models = [("penalty", stiffness) for stiffness in (3000.0, 10_000.0, 30_000.0)]
+    (figure,) = plot_study(study("gradients", models)).values()
+    assert [each.get_text() for each in figure.axes[1].get_xticklabels()] == ["3,000", "10,000", "30,000"]
+
+
+def test_any_name_of_a_task_can_be_written() -> None:
+    found = study("gradients", [("penalty", 10.0)]).assign_coords(task=["a$\\b$\0c"])
+    (figure,) = plot_study(found).values()
+    assert "a$\\b$?c" in figure.get_suptitle()
+
+
+def test_constants_say_what_they_limit() -> None:
+    """A docstring follows every number at the top of a module of figures."""
+    for path in Path(plots.__file__).parent.glob("*.py"):
+        body = ast.parse(path.read_text()).body
+        for here, after in zip(body, [*body[1:], None], strict=True):
+            value = getattr(here, "value", None)
+            if isinstance(here, ast.Assign | ast.AnnAssign) and value is not None:
+                numbers = [each for each in ast.walk(value) if isinstance(each, ast.Constant)]
+                if numbers and all(isinstance(each.value, int | float) for each in numbers):
+                    told = isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant)
+                    assert told, f"{path.name}:{here.lineno}"
