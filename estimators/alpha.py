@@ -133,6 +133,7 @@ def alpha_order(
 
     Args:
         zeroth: Zeroth-order estimate, assumed unbiased.
+        first: First-order estimate from the same number of independent samples.
         gamma: Largest acceptable error, [cost/param]; infinity for inverse-variance weighting.
         epsilon: Confidence radius of the zeroth-order mean, [cost/param]; see `bernstein_epsilon`.
 

@@ -66,6 +66,7 @@ def variance_interval(estimate: GradientEstimate, confidence: float) -> tuple[Fl
     variance by the batches' chance covariance; the interval is widened to contain that variance if necessary.
 
     Args:
+        estimate: An estimate with n finite rows.
         confidence: Nominal coverage, approached as n grows; a ValueError outside (0, 1).
 
     Returns:
@@ -212,6 +213,7 @@ def variance_upper_bound(
     Pairs with a nonfinite row are left out; without any pair, the bound is 2 R^2.
 
     Args:
+        estimate: The estimate; pairs with a nonfinite row are left out.
         radius: R >= ||g_i - E g|| always, [cost/param].
         failure_probability: In (0, 1).
 

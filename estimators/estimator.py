@@ -193,6 +193,8 @@ def draw(
     """Draw batches by name in `ORACLES`; those of order 0 and those of order 1 use separate sets of keys.
 
     Args:
+        oracles: Names in `ORACLES`; those of the same order share their samples.
+        objective: Objective to sample.
         theta: Parameters, [param].
         key: Random key; consumed.
         num_samples: Samples per batch, >= 1.

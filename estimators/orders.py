@@ -63,6 +63,7 @@ def zeroth_order(evaluation: Evaluation, baseline: str) -> GradientEstimate:
     (N sigma^2) for |f - b| <= B_V, ||D pi|| <= B_pi and m noise dimensions at each of H steps.
 
     Args:
+        evaluation: Batch of evaluations: values, scores and zero-noise costs.
         baseline: A name in `BASELINES`; another is a ValueError.
 
     Reference: Suh et al. 2022, def. of the ZoBG and lemma on its variance (which prints H n for the noise
@@ -82,6 +83,7 @@ def antithetic(plus: Evaluation, minus: Evaluation, baseline: str) -> GradientEs
     ((f^+ - f^-) / 2) s^+: all of the signal without the variance of the even part.
 
     Args:
+        plus: Batch of evaluations, one of each pair.
         minus: Batch with the starts of `plus` and the opposite noise.
         baseline: A name in `BASELINES`, applied within each half; another is a ValueError.
     """
@@ -102,6 +104,7 @@ def delta_control_variate(
     own gradient. A wrong g only costs variance, so references use this even where first-order gradients are biased.
 
     Args:
+        evaluation: Open-loop batch.
         gradient: g, such as a first-order mean from other samples, [cost/param].
         sigma: Standard deviation of the noise, [param].
     """

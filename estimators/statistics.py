@@ -42,6 +42,7 @@ def norm_quantiles(estimate: GradientEstimate, probabilities: Sequence[float]) -
     They are interpolated linearly, and NaN without finite rows.
 
     Args:
+        estimate: The estimate; without finite rows the quantiles are NaN.
         probabilities: Each in [0, 1]; else a ValueError.
     """
     if not all(0.0 <= probability <= 1.0 for probability in probabilities):

@@ -37,6 +37,7 @@ def cost_to_go(steps: StepEvaluation, baseline: str) -> GradientEstimate:
     Same mean as with total costs, since earlier costs do not depend on a step's noise, and less variance.
 
     Args:
+        steps: Batch of stepwise evaluations, (samples, steps).
         baseline: A name in `BASELINES`, applied step by step; another is a ValueError.
 
     Reference: Suh et al. 2022, appendix on the policy gradient.
@@ -83,6 +84,8 @@ def stepwise_inverse_variance(
     standard errors treat the weights as fixed.
 
     Args:
+        zeroth: Batch of stepwise evaluations, (samples, steps).
+        first: Batch of differentiations from the same number of independent samples.
         baseline: A name in `BASELINES`, applied step by step.
         weights: A name in `WEIGHTS`, the source of alpha_h.
 
@@ -226,6 +229,7 @@ def total_propagation(linearisation: Linearisation, baseline: str, weights: str 
     same rollouts, as published, and so are not independent.
 
     Args:
+        linearisation: Batch of linearised rollouts, with the derivatives of every step.
         baseline: A name in `BASELINES`, applied step by step; another is a ValueError.
         weights: A name in `WEIGHTS`, the source of alpha_h.
 

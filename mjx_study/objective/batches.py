@@ -79,6 +79,10 @@ class Simulator:
         """Run one of `SamplePrograms` on all samples; outputs as returned by `spread`.
 
         Args:
+            name: name in `SamplePrograms`.
+            theta: parameters, (params,).
+            contact: the contact model; None for the MJCF's own.
+            sigma: standard deviation of the noise, in the unit of the quantity it is added to.
             keys: data of each sample's key.
             noise_scale: noise factor of each sample.
 

@@ -54,6 +54,9 @@ def configured_estimators(config: StudyConfig, task: Task) -> tuple[Estimator, .
     found = tuple(
         each if isinstance(each, Estimator) else make_estimator(each, **options) for each in config.estimators
     )
+    for estimator in found:
+        if getattr(estimator, "sigma", task.sigma) != task.sigma:
+            raise ValueError(f"{estimator.name!r} holds for another sigma than {task.sigma:g}")
     check_estimators(found, task)
     return found
 
@@ -76,8 +79,6 @@ def check_estimators(estimators: Iterable[Estimator], task: Task) -> None:
     """Raise ValueError for an estimator that needs Gaussian noise, noise on theta or no onset term, where the task
     differs."""
     for estimator in estimators:
-        if getattr(estimator, "sigma", task.sigma) != task.sigma:
-            raise ValueError(f"{estimator.name!r} holds for another sigma than {task.sigma:g}")
         if estimator.gaussian and task.noise != "gaussian":
             raise ValueError(f"{estimator.name!r} holds for Gaussian noise only; the noise is {task.noise}")
         if estimator.additive and not task.policy.additive:

@@ -146,6 +146,8 @@ class InitialStatePolicy:
         controls: number of controls m, all zero.
         start_at: maps (start, theta + w) to the initial state of the simulation.
         unit: unit of theta; empty if unknown.
+        additive: True, since the noise is added to theta entry by entry.
+        at_start: True, since theta and the noise act on the initial state only.
     """
 
     num_params: int
