@@ -102,7 +102,7 @@ def test_every_command_runs(source: Path | None, here: Path, capsys: pytest.Capt
     assert commands
     for command in commands:
         folder = command[command.index("--output") + 1] if "--output" in command else None
-        if folder is not None and command[0] in ("optimise", "sweep"):
+        if folder is not None and command[0] in ("compare", "landscape", "optimise", "sweep"):
             shutil.rmtree(here / folder, ignore_errors=True)  # another study may be there, and would be kept
         code = cli.main(small(command))
         printed = capsys.readouterr()
