@@ -206,7 +206,7 @@ def test_ids_and_families_are_known(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["claims", "--list", "--only", "lemma-closed-form"]) == 0
     assert "below 0.0001" in capsys.readouterr().out
     assert cli.main(["claims", "--only", "lemma"]) == 2
-    assert "unknown claim 'lemma'; choose from zobg-unbiased" in capsys.readouterr().err
+    assert "unknown claim 'lemma'; did you mean lemma-accuracy?" in capsys.readouterr().err
 
 
 @pytest.mark.slow

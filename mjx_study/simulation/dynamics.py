@@ -299,7 +299,10 @@ def step_jacobian(
     Args:
         scene: static part of the model; its own contact parameters are not used.
         model: the model to step, with any contact model applied.
-        qpos, qvel, act, control: the point of linearisation.
+        qpos: positions at the point of linearisation, (nq,).
+        qvel: velocities there, (nv,).
+        act: activations there, (na,).
+        control: controls there, (nu,).
         qacc: the converged constrained acceleration there.
     """
     return entry_by_entry(_jacobian, model, scene.template, qpos, qvel, act, control, qacc)

@@ -78,7 +78,7 @@ def test_coverage_with_a_valid_variance_and_radius(dimension: int):
     [
         ({"failure_probability": 0.0}, "strictly between 0 and 1; got 0.0"),
         ({"failure_probability": 1.0}, "strictly between 0 and 1; got 1.0"),
-        ({"variance_proxy": "variances"}, "one of variance, second_moment, upper_bound; got 'variances'"),
+        ({"variance_proxy": "variances"}, "unknown variance proxy 'variances'; did you mean variance"),
         ({"radius": "max"}, "'max_deviation' or a number; got 'max'"),
         ({"radius": -1.0}, "not negative; got -1.0"),
         ({"radius": float("nan")}, "finite and not negative; got nan"),

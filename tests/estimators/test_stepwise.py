@@ -285,7 +285,7 @@ def test_windows_and_shapes_out_of_range_are_refused(few) -> None:
     with pytest.raises(ValueError, match=r"same shape .* got \(20, 3, 2\) zeroth-order and \(40, 3, 2\) first-order"):
         stepwise_inverse_variance(half, few[1], "none")
     for act in (lambda: estimators.cost_to_go(few[3], "mean"), lambda: total_propagation(few[2], "mean")):
-        with pytest.raises(ValueError, match="one of none, zero_noise, leave_one_out; got 'mean'"):
+        with pytest.raises(ValueError, match="unknown baseline 'mean'; choose from none, zero_noise, leave_one_out"):
             act()
 
 
