@@ -135,6 +135,7 @@ class Pair:
 
 def pairs_of(host: mujoco.MjModel) -> Iterator[Pair]:
     for *both, index in _driver.geom_pairs(host):
+        first, second = map(int, both)
         if index >= 0:
             condim, friction, margin = host.pair_dim[index], host.pair_friction[index, 0], host.pair_margin[index]
         else:
@@ -142,7 +143,7 @@ def pairs_of(host: mujoco.MjModel) -> Iterator[Pair]:
             ruling = np.array(both)[priority == max(priority)]
             condim, friction = max(host.geom_condim[ruling]), max(host.geom_friction[ruling, 0])
             margin = sum(host.geom_margin[both])
-        yield Pair(*map(int, both), bool(condim > 1 and friction > NO_FRICTION), float(margin))
+        yield Pair(first, second, bool(condim > 1 and friction > NO_FRICTION), float(margin))
 
 
 class Reach:
