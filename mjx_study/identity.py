@@ -93,14 +93,14 @@ def trace_contents(made_of: Any) -> str | None:
     return None if digest.foreign else digest.hexdigest()
 
 
-def estimator_contents(*chosen: str | Estimator) -> dict[str, str]:
-    """Digests of those estimators that are given as objects or user-defined, and of their source files."""
+def estimator_contents(chosen: Mapping[str, str | Estimator]) -> dict[str, str]:
+    """Digests of those estimators, by name, that are given as objects or user-defined, and of their source files."""
     found: dict[str, str] = {}
-    for each in chosen:
+    for name, each in chosen.items():
         digest = _Digest()
         digest.add(find_estimator(each))
         if digest.sources or isinstance(each, Estimator):
-            found[f"estimator {each if isinstance(each, str) else each.place()}"] = digest.hexdigest()
+            found[f"estimator {name}"] = digest.hexdigest()
             found |= {f"source of {file}": content for file, content in sorted(digest.sources.items())}
     return found
 

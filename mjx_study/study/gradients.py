@@ -140,15 +140,14 @@ class Gradients:
         config, oracles, keys = self._config, oracles_of(self._config), self._keys
         objective, theta = self._objective(cell), self._plan.groups[cell.group].task.theta
         tests, chosen = jax.random.split(keys["test"], config.batches), estimators_of(self._plan, cell)
-        together = seeds_together(self._plan, cell)
+        together, padded = seeds_together(self._plan, cell), partial(_padded, size=padded_samples(self._plan, cell))
         reference: GradientEstimate | None = None
         parts: list[Future[Any]] = []
 
         def statistics(drawn: Any, seconds: Any, residuals: Any, keys: Any, compiled: Future[None]) -> Any:
             compiled.result()
+            arguments = jax.tree.map(padded, drawn), np.asarray(cell.samples), reference, keys
             with self._device:
-                batches = jax.tree.map(partial(_padded, size=padded_samples(self._plan, cell)), drawn)
-                arguments = batches, np.asarray(cell.samples), reference, keys
                 numbers = jax.block_until_ready(_seed_numbers(chosen, config.confidence)(*arguments))
             tallies = {name: Tally.of(drawn[name], seconds[name], residuals[name]) for name in oracles}
             return jax.device_get(numbers), tallies

@@ -112,7 +112,9 @@ class StudyPlan:
         forms: dict[str, list[Task]] = {}
         for group in self.groups:
             forms.setdefault(group.name, []).append(group.task)
-        return contents(forms) | estimator_contents(*self.config.estimators)
+        return contents(forms) | estimator_contents(
+            dict(zip(self.config.estimator_names, self.config.estimators, strict=True))
+        )
 
     def label(self, cell: StudyCell) -> str:
         """A cell's name in messages."""
