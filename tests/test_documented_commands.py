@@ -96,6 +96,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("shared_programs")
 @pytest.mark.parametrize("source", [*filter(from_page, PAGES), None], ids=lambda page: page.name if page else "help")
 def test_every_command_runs(source: Path | None, here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     commands = from_help() if source is None else from_page(source)
