@@ -19,7 +19,7 @@ from mjx_study.objective import Simulator
 from mjx_study.render import RenderError
 from mjx_study.simulation.engine import quiet_engine
 from mjx_study.tasks import make_task
-from mjx_study.tasks.contact_grid import contact_grid
+from mjx_study.tasks.contact_grid import family_grid
 from tests.documents import stages_of
 
 SHORT = ["pusher", "--horizon", "10", "--renderer", "drawing"]
@@ -61,7 +61,7 @@ def test_the_cost_is_the_objectives(capsys: pytest.CaptureFixture[str], noise: l
     """The same sample as in a batch: the value with its key's noise, the baseline without."""
     facts = document(capsys, *SHORT, "--contact", "penalty", "--stiffness", "1000", *noise)
     task = ten_steps().task
-    (cell,), _ = contact_grid(task, ("penalty",), (1000.0,))
+    (cell,), _ = family_grid(task, ("penalty",), (1000.0,))
     batch = ten_steps().objective(cell.contact).evaluate(task.theta, jax.random.key(3)[None])
     assert facts["cost"] == pytest.approx(float((batch.value if noise else batch.baseline)[0]), rel=1e-9)
     assert facts["contact"] == "penalty" and facts["stiffness"] == 1000 and facts["finite"]

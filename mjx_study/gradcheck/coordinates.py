@@ -112,7 +112,7 @@ class Coordinates:
         return apply_contact(model.replace(**geoms), contact)
 
 
-def coordinates(scene: Scene, contact: ContactModel | None) -> Coordinates:
+def make_coordinates(scene: Scene, contact: ContactModel | None) -> Coordinates:
     host = scene.host
     dofs = [(name, joint) for joint in range(host.njnt) for name in _dof_names(host, joint)]
     actuators = [host.actuator(index).name or f"actuator {index}" for index in range(host.nu)]

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_study.gradcheck.diagnosis import worst_verdict
-from mjx_study.gradcheck.differences import differences, moves
+from mjx_study.gradcheck.differences import moves, take_differences
 from mjx_study.gradcheck.programs import Compiler
 from mjx_study.gradcheck.report import CostCheck, Entry, Finding
 from mjx_study.objective import rollout_cost
@@ -75,7 +75,7 @@ def check_cost(programs: CostPrograms, cell: ContactPoint, seed: int) -> tuple[C
     norm = float(np.linalg.norm(gradient))
     scale = norm if norm > 0 else 1.0
     modes = float(np.max(np.abs(slopes - directions @ gradient))) / scale
-    truth = differences(programs.costs(cell.contact, moves(directions))[:, None])
+    truth = take_differences(programs.costs(cell.contact, moves(directions))[:, None])
     error = np.abs(directions @ gradient - truth.value[0])
     apart = error > DIFFERENCE_TOLERANCE * scale + 3 * truth.uncertainty[0]
     verdict = cost_verdict(

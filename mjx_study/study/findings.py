@@ -102,7 +102,7 @@ def rows_of(dataset: xr.Dataset) -> list[Row]:
     return rows
 
 
-def findings(dataset: xr.Dataset) -> list[str]:
+def findings_of(dataset: xr.Dataset) -> list[str]:
     """Return the findings supported by a study's intervals, as sentences."""
     kind = json.loads(dataset.attrs["config"])["kind"]
     return [] if kind == "descents" else {"gradients": _of_gradients, "landscapes": _of_landscapes}[kind](dataset)

@@ -74,7 +74,7 @@ class Forecast:
         return f"time: about {duration(self.seconds)}, of which compilation {duration(self.compilation)}; {told}"
 
 
-def forecast(
+def forecast_study(
     plan: StudyPlan, folder: Path | None = None, *, accept_versions: bool = False, cluster: str | None = None
 ) -> Forecast:
     """Forecast the cost of a plan, less the finished cells of a folder if one is given.

@@ -37,12 +37,12 @@ from mjx_study.study.plan import (
     padded_samples,
     seeds_together,
 )
-from mjx_study.study.reference_gradient import reference_gradient
+from mjx_study.study.reference_gradient import estimate_reference
 from mjx_study.study.sampling import Objectives, cell_keys, draw_batches, sample_keys
 from mjx_study.study.store import Part
 from mjx_study.study.tally import Tally, numbers_of, together
 from mjx_study.study.variables import BATCH, GRADIENTS, ONSETS
-from mjx_study.tasks.contact_grid import contact_grid
+from mjx_study.tasks.contact_grid import family_grid
 from mjx_study.tasks.task import Task
 
 Result = TypeVar("Result")
@@ -293,7 +293,7 @@ def soft_gradient(simulator: Simulator, sigma: float, keys: Key[Array, " samples
     task = simulator.task
     if task.contact_pair is None or not takes_candidates(task):
         return None
-    (cell,), _ = contact_grid(task, ("penalty",), (min(task.defaults.stiffnesses),))
+    (cell,), _ = family_grid(task, ("penalty",), (min(task.defaults.stiffnesses),))
     objective = simulator.objective(cell.contact, sigma)
     return jnp.median(objective.differentiate(task.theta, jax.random.clone(keys)).gradient, axis=0)
 
@@ -337,7 +337,7 @@ _antithetic = jax.jit(estimators.antithetic, static_argnames="baseline")
 def _reference_gradient(
     odd: Evaluation, pilot: Evaluation, candidates: Float[Array, "candidates params"], sigma: float
 ):
-    return reference_gradient(odd, pilot, list(candidates), sigma)
+    return estimate_reference(odd, pilot, list(candidates), sigma)
 
 
 @cache

@@ -34,7 +34,7 @@ from mjx_study.study.memory import (
 from mjx_study.study.resolution import at_theta, configured_estimators, line_of, recipe_of
 from mjx_study.table import digits_to_tell_apart
 from mjx_study.tasks import make_task
-from mjx_study.tasks.contact_grid import ContactPoint, backward_grid, contact_grid, solver_grid
+from mjx_study.tasks.contact_grid import ContactPoint, backward_grid, family_grid, solver_grid
 from mjx_study.tasks.network import with_network
 from mjx_study.tasks.task import Recipe, Task, check_shapes
 
@@ -151,7 +151,7 @@ def plan_study(config: StudyConfig, built: Mapping[str, Task] | None = None) -> 
         counts = config.samples or (SAMPLES if recipe is None else recipe.samples,)
         check_weights(config.weights, min(counts))
         name = which if isinstance(which, str) else which.name
-        models, told = contact_grid(task, config.contact, config.stiffness, config.damping)
+        models, told = family_grid(task, config.contact, config.stiffness, config.damping)
         if config.solref or config.solimp:
             more, also = solver_grid(task, config.solref, config.solimp)
             models, told = models + more, told + also

@@ -52,7 +52,7 @@ Grid = tuple[tuple[ContactPoint, ...], tuple[str, ...]]
 """Contact models and their warnings."""
 
 
-def contact_grid(
+def family_grid(
     task: Task,
     families: Sequence[str] | None = None,
     stiffnesses: Sequence[float] | None = None,

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from mjx_study.gradcheck import coordinates as layouts
-from mjx_study.gradcheck.coordinates import Coordinates, coordinates
+from mjx_study.gradcheck.coordinates import Coordinates, make_coordinates
 from mjx_study.gradcheck.programs import Programs, Setting, _stages
 from mjx_study.gradcheck.values import EngineStep, Values, compare_values, difference_of_engines
 from mjx_study.simulation import integration, patches
@@ -30,7 +30,7 @@ PLAIN = SERVO.replace('forcerange="-1 1"', "")
 
 @cache
 def layout(xml: str = PLAIN) -> Coordinates:
-    return coordinates(put_scene(mujoco.MjModel.from_xml_string(xml), "scene"), None)
+    return make_coordinates(put_scene(mujoco.MjModel.from_xml_string(xml), "scene"), None)
 
 
 def start(xml: str = PLAIN) -> HostState:
@@ -112,7 +112,7 @@ def test_at_rest_rounding_is_all_that_moves() -> None:
 def test_the_engines_step_changes_as_the_layout_says(index: int) -> None:
     """Each entry of the flat vector is the same change in both engines: state, length, velocity, control."""
     scene = scene_of("pusher")
-    both = coordinates(scene, contact_model((-100.0, -1.0), scene=scene))
+    both = make_coordinates(scene, contact_model((-100.0, -1.0), scene=scene))
     contact = contact_model((-100.0, -1.0), scene=scene)
     change = np.zeros(len(both.inputs))
     change[both.num_state + index % 7] = 0.25
@@ -127,7 +127,7 @@ def test_parameters_change_in_the_contact_model(monkeypatch: pytest.MonkeyPatch)
     """So that their derivatives pass through `apply_contact`, where a planted fault shows."""
     scene = scene_of("pusher")
     contact = contact_model((-100.0, -1.0), scene=scene)
-    both, seen = coordinates(scene, contact), []
+    both, seen = make_coordinates(scene, contact), []
     monkeypatch.setattr(layouts, "apply_contact", lambda model, contact: seen.append(contact) or model)
     both.model(contact, jnp.asarray(both.scales), jnp.arange(len(both.scales), dtype=float))
     (changed,) = seen
