@@ -154,6 +154,18 @@ def test_a_rollout_that_is_lost_is_shown_as_far_as_it_goes(capsys: pytest.Captur
     assert not good.all() and facts["bodies"]["ball"][0] == pytest.approx(data["qpos"][np.argmin(good) - 1, 0])
 
 
+def test_a_policy_keeps_what_is_zero_and_not_what_is_none(capsys: pytest.CaptureFixture[str], elsewhere: Path) -> None:
+    """A damping of 0 is one; a stiffness of 0 stands for none in files written earlier."""
+    policy = {"task": "pusher", "theta": [0.1, 0.1], "contact": "mujoco", "stiffness": 100.0, "horizon": 2}
+    costs = []
+    for given in ({}, {"damping": 0.0}, {"stiffness": 0}):
+        (elsewhere / "policy.json").write_text(json.dumps(policy | given))
+        facts = document(capsys, "pusher", "--theta", "policy.json", "--frames", "1")
+        costs.append((facts["stiffness"], facts["cost"]))
+    middle = make_task("pusher").defaults.middle_stiffness
+    assert [stiffness for stiffness, _ in costs] == [100.0, 100.0, middle] and costs[0][1] != costs[1][1]
+
+
 def test_theta_as_numbers(capsys: pytest.CaptureFixture[str], elsewhere: Path) -> None:
     facts = document(capsys, "pusher", "--horizon", "3", "--frames", "1", "--theta=-0.5,1,2e-1")
     assert facts["theta"] == [-0.5, 1.0, 0.2]

@@ -195,7 +195,7 @@ class Laboratory:
         (cell,), _ = family_grid(task, (family,), (stiffness,))
         if relaxed is not None:
             other, factor, margin = RELAXATIONS[relaxed]
-            (cell,), _ = backward_grid(task, (cell,), (other,), factor * cell.stiffness, margin)
+            (cell,), _ = backward_grid(task, (cell,), (other,), factor * cell.stiffness_or_zero, margin)
         return cell.contact
 
     def _landscape(

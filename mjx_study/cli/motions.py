@@ -96,7 +96,7 @@ def _plan_task(options: argparse.Namespace) -> tuple[Callable[[], Rollout], tupl
     if policy is not None:
         for name in ("contact", "stiffness", "damping", "horizon", "model"):
             if getattr(options, name) is None:
-                setattr(options, name, getattr(policy, name) or None)
+                setattr(options, name, getattr(policy, name))
     task = task_of(options)
     if policy is not None and options.cone is None and policy.cone not in (None, CONES[int(task.scene.host.opt.cone)]):
         options.cone = policy.cone  # only if it differs: a user's own task need not take the option
@@ -116,7 +116,7 @@ def _simulate_task(task: Task, cell: ContactPoint, seed: int, noisy: bool) -> Ro
     facts = {
         "task": task.name,
         "contact": cell.family,
-        "stiffness": cell.stiffness,
+        "stiffness": cell.stiffness_or_zero,
         "theta": np.asarray(theta, float).tolist(),
         "sigma": task.sigma if noisy else 0.0,
         "seed": seed,

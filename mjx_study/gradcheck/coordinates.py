@@ -36,12 +36,12 @@ class Coordinate:
 
     Attributes:
         block: qpos, quaternion length, qvel, act, ctrl or contact.
-        joint: index of the joint, or -1.
+        joint: index of the joint, if it has one.
     """
 
     block: str
     name: str
-    joint: int = -1
+    joint: int | None = None
 
     def __str__(self) -> str:
         return self.name if self.block == "contact" else f"{self.block}[{self.name}]"

@@ -89,7 +89,7 @@ def check_cost(programs: CostPrograms, cell: ContactPoint, seed: int) -> tuple[C
     )
     closed_form = _against_closed_form(task, cell, gradient, jax.random.clone(programs.key))
     errors = (modes, float(error.max() / scale), float(truth.gap.max() / scale), closed_form, float(residual))
-    check = CostCheck(cell.family, cell.stiffness, norm, *errors, verdict)
+    check = CostCheck(cell.family, cell.stiffness_or_zero, norm, *errors, verdict)
     fields = (states.qpos, states.qvel, states.act, controls, states.warmstart)
     return check, [HostState(*row) for row in zip(*map(np.asarray, fields), strict=False)]  # one state more
 
@@ -124,6 +124,6 @@ def cost_verdict(*, finite: bool, modes: float, residual: float, excused: list[s
 def _against_closed_form(task: Task, cell: ContactPoint, gradient: np.ndarray, key: Any) -> float | None:
     if task.reference is None or cell.family != "penalty":
         return None
-    exact = np.asarray(task.reference(cell.stiffness).value_and_gradient(task.theta, key)[1])
+    exact = np.asarray(task.reference(cell.stiffness_or_zero).value_and_gradient(task.theta, key)[1])
     size = float(np.linalg.norm(exact))
     return float(np.linalg.norm(gradient - exact)) / (size if size > 0 else 1.0)

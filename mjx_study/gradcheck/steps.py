@@ -124,7 +124,7 @@ def step_check(
         stock = float("inf") if nan else worst(STOCK, *blocks)
     return StepCheck(
         contact=cell.family,
-        stiffness=cell.stiffness,
+        stiffness=cell.stiffness_or_zero,
         states=len(checks),
         entries=len(checks) * len(layout.inputs) * len(layout.outputs),
         unresolved=sum(int(np.sum(_worst_codes(check.of("project")) == UNRESOLVED)) for check in checks),

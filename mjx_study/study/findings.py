@@ -170,7 +170,8 @@ def _meaningless(rows: Sequence[Row], gammas: Bounds) -> list[str]:
             f"the reference's own uncertainty exceeds {UNSURE:.0%}{_at(unsure)}: errors and verdicts mean "
             "little there; increase --reference-samples"
         )
-    if bound := [row for row in rows if (row.epsilon or 0.0) > gammas.get((row.task, row.estimator), math.inf)]:
+    limited = [row for row in rows if row.epsilon is not None]
+    if bound := [row for row in limited if row.epsilon > gammas.get((row.task, row.estimator), math.inf)]:
         found.append(
             f"AoBG equals ZoBG{_at(bound)}: its bound gamma is below epsilon, the radius of ZoBG's mean; "
             "increase --gamma or --samples"

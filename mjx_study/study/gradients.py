@@ -26,6 +26,7 @@ from mjx_study.reference import Reference
 from mjx_study.runtime import traces_folder
 from mjx_study.stopwatch import unheard
 from mjx_study.study.blocks import REFERENCE, Arrays, Blocks, pack
+from mjx_study.study.configuration import settled
 from mjx_study.study.memory import BIAS_DRAWS, LARGEST_BLOCK, padded_size
 from mjx_study.study.plan import (
     StudyCell,
@@ -76,7 +77,7 @@ class Gradients:
     @property
     def _reference_keys(self) -> tuple[Key[Array, " pairs"], Key[Array, " samples"]]:
         odd, candidate = self._keys["reference"]
-        return jax.random.split(odd, self._config.reference_samples or 0), jax.random.split(candidate, CANDIDATES)
+        return jax.random.split(odd, settled(self._config.reference_samples)), jax.random.split(candidate, CANDIDATES)
 
     def __call__(self, cell: StudyCell, part: Part = Part()) -> Arrays:  # noqa: B008, it is empty
         """Compute a cell's numbers, see `begin`."""
@@ -88,7 +89,7 @@ class Gradients:
         Returns:
             The cell's numbers: complete on CPUs; on accelerators the statistics may still be running.
         """
-        if not blocks_of(self._plan, cell):
+        if blocks_of(self._plan, cell) == 1:
             return self._whole(cell)
         blocks = self.begun(cell, part.kept)
         for task in blocks.missing:
@@ -188,7 +189,8 @@ class Gradients:
 
     def _compile_statistics(self, cell: StudyCell, objective: MjxObjective | Reference) -> None:
         """Compile the statistics in another thread, in parallel with the rollouts."""
-        if not isinstance(objective, MjxObjective) or traces_folder() is None or blocks_of(self._plan, cell):
+        in_blocks = blocks_of(self._plan, cell) > 1
+        if not isinstance(objective, MjxObjective) or traces_folder() is None or in_blocks:
             return
         config, task = self._config, self._plan.groups[cell.group].task
         blank = BlankObjective(**vars(objective))
