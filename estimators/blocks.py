@@ -77,7 +77,7 @@ class Moments:
         )
 
     def merged(self, other: "Moments") -> "Moments":
-        """Return the moments of both blocks together."""
+        """Return the moments of both blocks together; the order affects rounding."""
         count = int(self.count + other.count)
         share = int(other.count) / max(count, 1)
         mean = self.mean + share * (other.mean - self.mean)
@@ -142,11 +142,6 @@ def moments_of(parts: Sequence[Float[Any, "samples params"]], first: int, every:
     rows = [np.asarray(part, float)[:, None] for part in parts]
     rows += [np.concatenate(rows, axis=1)] if len(rows) > 1 else []
     return tuple(Moments.of(each, first, every) for each in rows)
-
-
-def merge(one: Parts, other: Parts) -> Parts:
-    """Merge the moments of two blocks; the order affects rounding."""
-    return tuple(mine.merged(theirs) for mine, theirs in zip(one, other, strict=True))
 
 
 @dataclass(frozen=True)

@@ -36,10 +36,12 @@ other 61."""
 NARROW: Final = 0.75
 """Standard deviation of the first onset's step from which an onset term is accurate to 1.5 % of what it adds; at 0.5
 it can be off by 60 %."""
-PLACE: Final = ("task", "timestep", "cone", "sigma", "samples", "model", "seed", "estimator", "contact", "stiffness")
-"""Coordinates of a row."""
 SETTING: Final = ("task", "timestep", "cone", "sigma", "samples")
 """Coordinates shared by all rows of a finding."""
+AXES: Final = (*SETTING, "model", "seed", "estimator")
+"""Dimensions along which there is a row for each place."""
+PLACE: Final = (*AXES, "contact", "stiffness")
+"""Coordinates of a row."""
 VECTORS: Final = ("gradient", "reference")
 BELOW, ABOVE, ALIKE = "below ZoBG's", "above ZoBG's", "not told apart from ZoBG's"
 UNKNOWN: Final = "undecided (too few effective samples)"
@@ -77,13 +79,12 @@ class Row(SimpleNamespace):
 
 def rows_of(dataset: xr.Dataset) -> list[Row]:
     """Return a row for each computed estimate; contact model, seed and estimator vary fastest."""
-    outer = PLACE[:8]
-    rows, grid = [], dataset["gradient_norm"].transpose(*outer)
+    rows, grid = [], dataset["gradient_norm"].transpose(*AXES)
     names = [name for name in GRADIENTS if name in dataset and name not in VECTORS]
 
     def along(name: str, *last: str) -> np.ndarray:
         variable = dataset[name].variable
-        return variable.set_dims({**grid.sizes, **variable.sizes}).transpose(*outer, *last).values
+        return variable.set_dims({**grid.sizes, **variable.sizes}).transpose(*AXES, *last).values
 
     scalars, coordinates = ({name: along(name) for name in each} for each in (names, PLACE))
     vectors = {name: along(name, f"{name}_entry") for name in ("solref", "solimp") if name in dataset}
@@ -210,7 +211,7 @@ def _bias_findings(rows: Sequence[Row], gammas: Bounds) -> list[str]:
         seeds = len(_by(mine, "seed"))
         biased = [row for row in mine if row.bias_verdict == "biased"]
         off = [row for row in mine if row.bias_verdict == "too few effective samples" and _off(row)]
-        mean = f"{label_of(estimator).replace(', onset', ' (onset)')}'s mean is"
+        mean = f"{label_of(estimator)}'s mean is"
         if biased:
             shares = ", ".join(f"{_share(same)}{_of(same, seeds)}" for same in _by(biased, "stiffness").values())
             least = max(row.bias_p_value for row in biased)
