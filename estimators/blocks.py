@@ -18,7 +18,7 @@ from estimators.rows import Deviations
 
 EXTREMES: Final = 32
 """Samples kept for each kind of extreme."""
-THINNED: Final = 2**14
+MOST_THINNED: Final = 2**14
 """Maximum number of samples of a batch whose norms are kept; larger batches are subsampled at a regular stride."""
 
 Block = Float[np.ndarray, "samples parts params"]
@@ -157,8 +157,8 @@ class Merged:
       sample is among the largest of a part or of the sum of both at equal spread.
     - `log_spread`: exact for the extremes, second order for the rest, each of which has less than 1/`EXTREMES` of the
       spread; the relative error is below that share, and about the largest share of any sample if there are no tails.
-    - `norm_quantiles`: from at most `THINNED` thinned samples, so ranks have a standard error of 0.4 % (at the median);
-      exact for fewer samples. The maximum is that of `top`.
+    - `norm_quantiles`: from at most `MOST_THINNED` thinned samples, so ranks have a standard error of 0.4 % (at the
+      median); exact for fewer samples. The maximum is that of `top`.
     - `perturbed_means`: different draws from the same distribution.
 
     `size` is the number of samples per batch, nonfinite ones included.
