@@ -13,7 +13,7 @@ import xarray as xr
 from estimators import ENOUGH_EFFECTIVE
 from mjx_study.choices import FAMILIES, REFERENCE
 from mjx_study.plots.style import style_of
-from mjx_study.study.findings import Row, curves_of, findings, rows_of
+from mjx_study.study.findings import Row, curves_of, findings_of, rows_of
 from mjx_study.study.iteration import REASONS
 from mjx_study.study.variables import HISTORY, METRIC, START
 from mjx_study.table import format_table
@@ -165,7 +165,7 @@ def gradient_lines(dataset: xr.Dataset, document: dict[str, Any], details: bool 
 
 def rows_as_json(dataset: xr.Dataset) -> dict[str, Any]:
     """Findings, and a row per estimate."""
-    return {"findings": findings(dataset), "rows": [row.as_dict() for row in rows_of(dataset)]}
+    return {"findings": findings_of(dataset), "rows": [row.as_dict() for row in rows_of(dataset)]}
 
 
 def curves(dataset: xr.Dataset) -> dict[str, Any]:
@@ -175,7 +175,7 @@ def curves(dataset: xr.Dataset) -> dict[str, Any]:
         | {str(name): one[name].values for name in one if "entry" not in str(one[name].dims)}
         for label, one in curves_of(dataset)
     ]
-    return {"findings": findings(dataset), "estimators": dataset["estimator"].values, "curves": found}
+    return {"findings": findings_of(dataset), "estimators": dataset["estimator"].values, "curves": found}
 
 
 def curve_lines(dataset: xr.Dataset, document: dict[str, Any]) -> list[str]:

@@ -9,7 +9,7 @@ from typing import Final
 import mujoco
 import numpy as np
 
-from mjx_study.gradcheck.coverage import OPTIONAL, Coverage, coverage, exercised, possible
+from mjx_study.gradcheck.coverage import OPTIONAL, Coverage, count_coverage, exercised, possible
 from mjx_study.simulation.contact import ContactModel
 from mjx_study.simulation.engine import HostState, converged_host, host_data, host_state
 from mjx_study.simulation.scene import Scene
@@ -26,7 +26,7 @@ POSES: Final = 30
 """Number of random poses tried for parts that no rollout reached."""
 FALL: Final = 50
 """Number of steps of the rollout from each pose."""
-BEYOND: Final = 0.01
+MOST_EXCESS: Final = 0.01
 """Largest excess of a pose beyond a limit, relative to the range."""
 LOOK: Final = 200
 """Number of states searched at once for one that exercises a missing part."""
@@ -90,7 +90,7 @@ def states_of(
         chosen += _even(pool, count - len(chosen))
     chosen += itertools.islice(_elsewhere(host, start, horizon, random), count - len(chosen))
     chosen[1:] = sorted(chosen[1:], key=lambda sample: (len(sample.label.split(",")), sample.index))
-    return chosen, coverage(parts, [sample.parts for sample in chosen], unreachable)
+    return chosen, count_coverage(parts, [sample.parts for sample in chosen], unreachable)
 
 
 def _cover(chosen: list[Sample], pool: Iterable[Sample], wanted: frozenset[str], count: int) -> list[Sample]:
@@ -172,6 +172,6 @@ def _posed(host: mujoco.MjModel, state: HostState, random: np.random.Generator) 
     qpos = state.qpos.copy()
     for joint in np.flatnonzero(host.jnt_limited & np.isin(host.jnt_type, _SCALAR)):
         low, high = host.jnt_range[joint]
-        share = random.choice([-BEYOND, 1 + BEYOND, random.uniform()])
+        share = random.choice([-MOST_EXCESS, 1 + MOST_EXCESS, random.uniform()])
         qpos[host.jnt_qposadr[joint]] = low + share * (high - low)
     return dataclasses.replace(state, qpos=qpos)

@@ -23,11 +23,11 @@ SWEPT: Final = {
 UNSTABLE: Final = "unstable step"
 MOST_PANELS: Final = 6
 """Maximum number of contact models in a figure that has a panel, a row or a column for each."""
-APART: Final = 1.05
+SHIFT_RATIO: Final = 1.05
 """Ratio of the stiffnesses at which neighbouring estimators are drawn where they would hide each other."""
 
 
-def panels(
+def make_panels(
     rows: int, columns: int, width: float, height: float, title: str, **shared: Any
 ) -> tuple[Figure, np.ndarray]:
     """Create a figure with a title over a grid of panels; sizes in inches."""
@@ -102,7 +102,7 @@ def against_stiffness(
 ) -> Figure:
     """Plot one panel per contact family."""
     found = families(part)
-    figure, grid = panels(1, len(found), 1.4 + 3.2 * len(found), 3.9, title, sharey=True)
+    figure, grid = make_panels(1, len(found), 1.4 + 3.2 * len(found), 3.9, title, sharey=True)
     for axes, (family, rows) in zip(grid[0], found, strict=True):
         x = stiffness_axis(axes, family, rows)
         draw(axes, rows, x)
@@ -128,7 +128,7 @@ def stiffness_axis(axes: Axes, family: str, rows: xr.Dataset) -> np.ndarray:
 
 def beside(axes: Axes, x: np.ndarray, rank: float) -> np.ndarray:
     """Move positions to the right, by so many estimators, or to the left."""
-    return x * APART**rank if axes.get_xscale() == "log" else x + (APART - 1) * rank
+    return x * SHIFT_RATIO**rank if axes.get_xscale() == "log" else x + (SHIFT_RATIO - 1) * rank
 
 
 def estimators(rows: xr.Dataset) -> Iterator[tuple[xr.Dataset, dict[str, Any]]]:

@@ -39,6 +39,7 @@ from mjx_study.reference.noise import split_sample_key
 from mjx_study.runtime import precision
 from mjx_study.simulation.contact import ContactModel
 from mjx_study.stopwatch import timed
+from mjx_study.study.configuration import settled
 from mjx_study.study.plan import StudyCell, StudyPlan, estimators_of, oracles_of
 from mjx_study.study.resolution import line_of
 from mjx_study.study.sampling import Objectives, cell_keys, draw_batches, unconverged
@@ -46,7 +47,7 @@ from mjx_study.tasks.task import Task
 
 QUADRATURE: Final = 1500
 """Number of quadrature points under Gaussian noise; heavier tails get more."""
-TAIL: Final = 1e-6
+TAIL_PROBABILITY: Final = 1e-6
 """Probability of noise outside the grid, from each end of the line."""
 CHUNK: Final = 256
 """Quadrature points per device and call."""
@@ -71,7 +72,7 @@ def compute_landscapes(plan: StudyPlan) -> Callable[..., dict[str, np.ndarray]]:
 
     def compute(cell: StudyCell, part: object = None) -> dict[str, np.ndarray]:
         task, objective = plan.groups[cell.group].task, objectives(cell)
-        line = line_of(task, config.points or 0, config.span, config.direction, config.seed)
+        line = line_of(task, settled(config.points), config.span, config.direction, config.seed)
         chosen = estimators_of(plan, cell)
         keys, columns, solved = cell_keys(config.seed, config.batches), [], []
         for theta in line.thetas:
@@ -185,7 +186,7 @@ class Line:
 def grid(low: float, high: float, sigma: float, size: int, noise: str) -> Float[np.ndarray, " size"]:
     """Midpoints of the cells of a uniform grid that covers the line and the noise around it: `size` cells for Gaussian
     noise; heavier tails get more cells of the same width."""
-    needed, gaussian = (high - low + 2 * sigma * NOISES[name].reach(TAIL) for name in (noise, "gaussian"))
+    needed, gaussian = (high - low + 2 * sigma * NOISES[name].reach(TAIL_PROBABILITY) for name in (noise, "gaussian"))
     cells = math.ceil(size * needed / gaussian)
     return (low + high - needed) / 2 + needed * (np.arange(cells) + 0.5) / cells
 
@@ -202,7 +203,7 @@ def means(
 
     ValueError if the grid is too coarse or does not cover the noise.
     """
-    spacing, reach = points[1] - points[0], NOISES[noise].reach(TAIL)
+    spacing, reach = points[1] - points[0], NOISES[noise].reach(TAIL_PROBABILITY)
     gap = 0.51 * spacing - reach * sigma
     if spacing > sigma / 8 or points[0] > position.min() + gap or points[-1] < position.max() - gap:
         raise ValueError(
