@@ -15,6 +15,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import to_hex
 from matplotlib.container import ErrorbarContainer
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 
 from estimators import find_estimator
 from estimators.estimator import label_of
@@ -124,18 +125,29 @@ def legend_below(figure: Figure) -> None:
 
 def fit_texts(figure: Figure) -> None:
     """Break titles and labels that are longer than their axes; make smaller those that still are."""
-    for broken in (False, True):
-        figure.draw_without_rendering()
-        for axes in figure.axes:
-            for text in (axes.title, axes.xaxis.label, axes.yaxis.label):
-                side = "height" if text is axes.yaxis.label else "width"
-                excess = getattr(text.get_window_extent(), side) / getattr(axes.bbox, side)
-                if excess > 1 and broken:
-                    text.set_fontsize(text.get_fontsize() / excess)
-                elif excess > 1:
-                    lines = text.get_text().split("\n")
-                    most = max(map(len, lines)) // math.ceil(excess) + 6
-                    text.set_text("\n".join(textwrap.fill(line, most, break_long_words=False) for line in lines))
+    for mend in (_break, _shrink):
+        if engine := figure.get_layout_engine():
+            engine.execute(figure)
+        longer = [
+            (text, ratio)
+            for axes in figure.axes
+            for text, side in ((axes.title, "width"), (axes.xaxis.label, "width"), (axes.yaxis.label, "height"))
+            if (ratio := getattr(text.get_window_extent(), side) / getattr(axes.bbox, side)) > 1
+        ]
+        for text, ratio in longer:
+            mend(text, ratio)
+        if not longer:
+            break
+
+
+def _break(text: Text, ratio: float) -> None:
+    lines = text.get_text().split("\n")
+    most = max(map(len, lines)) // math.ceil(ratio) + 6
+    text.set_text("\n".join(textwrap.fill(line, most, break_long_words=False) for line in lines))
+
+
+def _shrink(text: Text, ratio: float) -> None:
+    text.set_fontsize(text.get_fontsize() / ratio)
 
 
 def save_figure(figure: Figure, folder: Path, name: str, formats: Sequence[str] = ("png", "pdf")) -> list[Path]:
