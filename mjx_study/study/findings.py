@@ -40,11 +40,9 @@ PLACE: Final = ("task", "timestep", "cone", "sigma", "samples", "model", "seed",
 """Coordinates of a row."""
 SETTING: Final = ("task", "timestep", "cone", "sigma", "samples")
 """Coordinates shared by all rows of a finding."""
-VECTORS: Final = ("gradient", "reference")
 BELOW, ABOVE, ALIKE = "below ZoBG's", "above ZoBG's", "not told apart from ZoBG's"
 UNKNOWN: Final = "undecided (too few effective samples)"
 """Verdicts on FoBG's variance."""
-COUNTS: Final = ("unconverged", "nonfinite", "onsets", "onsets_bounded", "onsets_missed")
 
 
 class Row(SimpleNamespace):
@@ -79,7 +77,7 @@ def rows_of(dataset: xr.Dataset) -> list[Row]:
     """Return a row for each computed estimate; contact model, seed and estimator vary fastest."""
     outer = PLACE[:8]
     rows, grid = [], dataset["gradient_norm"].transpose(*outer)
-    names = [name for name in GRADIENTS if name in dataset and name not in VECTORS]
+    names = [name for name, variable in GRADIENTS.items() if name in dataset and "param" not in variable.dims]
 
     def along(name: str, *last: str) -> np.ndarray:
         variable = dataset[name].variable
@@ -94,7 +92,8 @@ def rows_of(dataset: xr.Dataset) -> list[Row]:
         for name in ("alpha", "epsilon", "discrepancy", *ONSETS):
             if name not in numbers or math.isnan(numbers[name]):
                 numbers[name] = None
-        numbers |= {name: int(numbers[name]) for name in COUNTS if numbers[name] is not None}
+        counts = [name for name in numbers if GRADIENTS[name].digits == 0 and numbers[name] is not None]
+        numbers |= {name: int(numbers[name]) for name in counts}
         at = {name: values[place] for name, values in coordinates.items()}
         at = {name: value.item() if isinstance(value, np.generic) else value for name, value in at.items()}
         solver = {name: tuple(values[place].tolist()) for name, values in vectors.items()}

@@ -260,9 +260,8 @@ def _of_seeds(numbers: Sequence[dict[str, Any]], seeds: int) -> dict[str, np.nda
         if variable.dims == BATCH
     }
     first = numbers[0]  # the reference's numbers are the same for every estimator and seed
-    shared = ("reference_norm", "reference_uncertainty", "reference_effective_samples")
     arrays["gradient"] = np.stack([row["gradient"] for row in numbers], axis=1)
-    return arrays | {name: np.asarray(first[name][0]) for name in shared}
+    return arrays | {name: np.asarray(first[name][0]) for name, variable in GRADIENTS.items() if not variable.dims}
 
 
 def _bias(numbers: Sequence[dict[str, Any]], reference: GradientEstimate) -> dict[str, np.ndarray]:
