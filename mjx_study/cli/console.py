@@ -188,6 +188,7 @@ def descents(dataset: xr.Dataset) -> dict[str, Any]:
         "start_cost": [one["start_cost"].item(), one["start_cost_se"].item()],
         "start_metrics": {str(name)[len(START) :]: one[name].item() for name in one if str(name).startswith(START)},
         "runs": [_run(one.sel(estimator=name)) for name in config["estimators"]],
+        "findings": findings(dataset),
     }
 
 
@@ -235,7 +236,7 @@ def descent_lines(dataset: xr.Dataset, document: dict[str, Any]) -> list[str]:
         for stop in run["stopped"]:
             label, _, _ = style_of(run["estimator"])
             lines.append(f"{label}, seed {stop['seed']}: stopped at iteration {stop['iteration']}, {stop['reason']}")
-    return lines
+    return lines + [f"{sentence}." for sentence in document["findings"]]
 
 
 def _row(run: dict[str, Any]) -> list[str]:

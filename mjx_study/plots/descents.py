@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from mjx_study.plots.panels import a_few, against_stiffness, counted, estimators, line, model_title, panels
 from mjx_study.plots.style import STYLE, line_with_band, robust_limits
-from mjx_study.study.variables import DERIVED, DESCENTS, LANDSCAPES
+from mjx_study.study.variables import DERIVED, DESCENTS, LANDSCAPES, THETA
 
 MOST_COST_RATIO: Final = 1e7
 """Maximum ratio of the ends of an axis of costs; beyond it a descent counts as diverged."""
@@ -98,6 +98,8 @@ def landscape(part: xr.Dataset, title: str) -> Figure:
     slopes, steepest = [], 0.0
     direction = json.loads(part.attrs["config"])["direction"] or "random"
     along, per = (f"t in theta + t d (d: {direction})", "t") if part.attrs["many_parameters"] else ("theta", "theta")
+    unit = part["position"].attrs.get("units", THETA)
+    along += "" if unit == THETA else f" [{unit}]"
     for (above, below), model in zip(grid.T, models, strict=True):
         one = part.isel(model=model)
         t = one["position"].values

@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 
 from mjx_study.disk import write_whole
-from mjx_study.study.variables import COORDINATES, variables_of
+from mjx_study.study.variables import COORDINATES, THETA, variables_of
 
 Cells = Mapping[int, tuple[Mapping[str, np.ndarray], Mapping[str, str]]]
 """Arrays by variable of each cell, by index, with the versions of the software that computed them."""
@@ -45,6 +45,8 @@ def dataset_of(document: Mapping[str, Any], cells: Cells) -> xr.Dataset:
     }
     shape = tuple(len(dimensions[name]) for name in outer)
     data: dict[str, Any] = {}
+    units = {entry.get("unit", "") for entry in document["resolved"]}
+    unit = units.pop() if len(units) == 1 else ""
     names = sorted({name for arrays, _ in cells.values() for name in arrays})
     for name, variable in variables_of(config["kind"], names).items():
         held = {index: arrays[name] for index, (arrays, _) in cells.items() if name in arrays}
@@ -56,7 +58,8 @@ def dataset_of(document: Mapping[str, Any], cells: Cells) -> xr.Dataset:
         for index, array in held.items():
             place = tuple(places[index]["at"][dimension] for dimension in outer)
             values[(*place, *(slice(size) for size in array.shape))] = array
-        data[name] = ((*outer, *variable.dims), values, variable.attributes)
+        attributes = variable.attributes | ({"units": unit} if unit and variable.unit == THETA else {})
+        data[name] = ((*outer, *variable.dims), values, attributes)
     used = {dimension for dims, *_ in data.values() for dimension in dims} | set(outer)
     coordinates: dict[str, Any] = {name: (name, list(values)) for name, values in dimensions.items() if name in used}
     for name in ("contact", "stiffness"):

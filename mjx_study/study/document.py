@@ -62,6 +62,7 @@ class _Resolved(_Part):
     noise: Name
     estimators: dict[str, dict[str, Any]]
     parameters: Count = 1
+    unit: str = ""
 
 
 class _Environment(_Part):
@@ -181,7 +182,7 @@ def _resolved(plan: StudyPlan, places: list[dict[str, int]], tasks: int) -> list
             entry["noise"] = group.task.noise
             entry["estimators"] = {name: dataclasses.asdict(estimator) for name, estimator in chosen}
             entry["recipe"] = {} if group.recipe is None else dataclasses.asdict(group.recipe)
-            entry["parameters"] = group.task.policy.num_params
+            entry |= {"parameters": group.task.policy.num_params, "unit": getattr(group.task.policy, "unit", "")}
     return found
 
 

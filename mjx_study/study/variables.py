@@ -42,6 +42,7 @@ class Variable:
 BATCH: Final = ("seed", "estimator")
 EACH: Final = ("estimator",)
 LINE: Final = ("point",)
+THETA: Final = "unit of theta"
 COORDINATES: Final = {
     "stiffness": Variable(("model",), "N/m", "contact stiffness K", "K"),
     "timestep": Variable(("timestep",), "s", "timestep h", "h"),
@@ -110,10 +111,10 @@ DESCENTS: Final = {
     **{name: replace(GRADIENTS[name], dims=STEP) for name in HISTORY[1:]},
     "rollouts": Variable(EACH, "1", "rollouts simulated in one iteration of one seed", digits=0),
     "seconds": Variable(STEP[::2], "s", "time of all seeds, measured; compilation excluded", "seconds"),
-    "theta": Variable((*BATCH, "param"), "unit of theta", "parameters of the final policy"),
+    "theta": Variable((*BATCH, "param"), THETA, "parameters of the final policy"),
 }
 LANDSCAPES: Final = {
-    "position": Variable(LINE, "unit of theta", "t in theta_0 + t direction"),
+    "position": Variable(LINE, THETA, "t in theta_0 + t direction"),
     "cost": Variable(LINE, "cost", "cost without noise; the mean over initial states if these are random"),
     "smoothed": Variable(LINE, "cost", "mean cost with noise", digits=4),
     "smoothed_se": Variable(LINE, "cost", "standard error of smoothed"),
@@ -137,7 +138,7 @@ DERIVED: Final = {
     "seed_rollouts": Variable(EACH, "1", "rollouts of one seed, derivatives and baselines included", "rollouts", 0),
     "stopped_seeds": Variable(EACH, "1", "seeds that stopped before the end", "stopped seeds", 0),
     "least_cost": Variable((), "cost", "lowest mean cost on the line", "least mean cost", 4),
-    "least_at": Variable((), "unit of theta", "position of the lowest mean cost", "at t"),
+    "least_at": Variable((), THETA, "position of the lowest mean cost", "at t"),
     "steepest": Variable(EACH, "gradient", "steepest slope on the line", "steepest slope"),
 }
 """Quantities of tables that a Dataset does not hold."""
