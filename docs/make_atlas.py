@@ -40,13 +40,13 @@ from mjx_study.simulation.contact import ContactModel, stable
 from mjx_study.simulation.dynamics import State, initial_state
 from mjx_study.simulation.engine import engine_model
 from mjx_study.simulation.onset import as_row
-from mjx_study.study.reference_gradient import reference_gradient
+from mjx_study.study.reference_gradient import estimate_reference
 from mjx_study.study.resolution import direction_of
 from mjx_study.study.sampling import unconverged
 from mjx_study.study.tally import onset_numbers
 from mjx_study.study.variables import ONSETS
 from mjx_study.tasks import make_task
-from mjx_study.tasks.contact_grid import contact_grid
+from mjx_study.tasks.contact_grid import family_grid
 from mjx_study.tasks.task import Task
 
 HERE: Final = Path(__file__).parent
@@ -177,7 +177,7 @@ def contact_of(task: Task, cell: Cell) -> ContactModel:
     damping = None
     if not math.isnan(cell.dampratio):
         damping = 2 * cell.dampratio * math.sqrt(cell.stiffness * task.effective_mass)
-    (point,), _ = contact_grid(task, [FAMILIES[cell.family]], [cell.stiffness], damping)
+    (point,), _ = family_grid(task, [FAMILIES[cell.family]], [cell.stiffness], damping)
     assert point.contact is not None
     return dataclasses.replace(point.contact, solimp=point.contact.solimp.at[2].set(cell.width))
 
@@ -295,7 +295,7 @@ def _statistics(plus: Evaluation, minus: Evaluation, pilot: Evaluation | None, g
         reference = antithetic(plus, minus, "zero_noise")
     else:
         odd = dataclasses.replace(plus, value=(plus.value - minus.value) / 2, baseline=jnp.zeros_like(plus.value))
-        reference = reference_gradient(odd, pilot, [jnp.nanmedian(kept, axis=0)], sigma)
+        reference = estimate_reference(odd, pilot, [jnp.nanmedian(kept, axis=0)], sigma)
     half = len(kept) // 2
     parts = slice(half), slice(half, None)
     medians = [jnp.nanmedian(kept[part], axis=0) for part in parts]

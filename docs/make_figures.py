@@ -44,7 +44,7 @@ from mjx_study.simulation.contact import ContactModel, contact_model, solref_fro
 from mjx_study.simulation.dynamics import State, initial_state
 from mjx_study.study.landscapes import Line, grid, means
 from mjx_study.tasks import make_task
-from mjx_study.tasks.contact_grid import contact_grid
+from mjx_study.tasks.contact_grid import family_grid
 from mjx_study.tasks.task import Task
 
 HERE = Path(__file__).parent
@@ -94,7 +94,7 @@ def run(task: Task, thetas: np.ndarray, contact: ContactModel | None, starts: St
 
 def contact_of(task: Task, family: str, stiffness: float) -> ContactModel:
     """A contact model as `mjx-study compare` makes it."""
-    ((cell,), _) = contact_grid(task, [family], [stiffness])
+    ((cell,), _) = family_grid(task, [family], [stiffness])
     assert cell.contact is not None
     return cell.contact
 

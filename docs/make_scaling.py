@@ -487,7 +487,7 @@ def measure_engine(workers: int, cells: int, seconds: float, programs: int, numb
 
     index = {"cells": [{"label": str(cell), "at": {}} for cell in range(cells)], "config": {}}
     replaced = {"_compute": sleep, "_packed": lambda plan: b"", "Computation": lambda plan: None}
-    replaced["blocks_of"] = lambda plan, cell: 0
+    replaced["blocks_of"] = lambda plan, cell: 1
     with tempfile.TemporaryDirectory() as name, mock.patch.multiple(cluster, **replaced):
         store, writing = Store(Path(name), index), 0.0
         (Path(name) / "cells").mkdir()

@@ -33,7 +33,7 @@ from mjx_study.simulation.dynamics import State
 from mjx_study.simulation.engine import engine_model
 from mjx_study.study.configuration import Progress
 from mjx_study.study.memory import check_memory
-from mjx_study.tasks.contact_grid import ContactPoint, contact_grid
+from mjx_study.tasks.contact_grid import ContactPoint, family_grid
 from mjx_study.tasks.task import Task
 
 REPEATS: Final = 5
@@ -129,12 +129,12 @@ def plan_bench(task: Task, samples: int) -> BenchPlan:
     if samples < 1:
         raise ValueError(f"samples must be at least 1, got {samples}")
     check_memory(task, (ZerothOrder(), FirstOrder()), samples)
-    (cell,), _ = contact_grid(task, [task.defaults.main_family], [task.defaults.middle_stiffness])
-    (onset,), _ = contact_grid(task, ["mujoco_default"]) if task.contact_pair else ((None,), ())
+    (cell,), _ = family_grid(task, [task.defaults.main_family], [task.defaults.middle_stiffness])
+    (onset,), _ = family_grid(task, ["mujoco_default"]) if task.contact_pair else ((None,), ())
     return BenchPlan(task, samples, cell, onset)
 
 
-def bench(plan: BenchPlan, progress: Progress = lambda done, total, what: None) -> BenchReport:
+def run_bench(plan: BenchPlan, progress: Progress = lambda done, total, what: None) -> BenchReport:
     """Measure everything, interleaved with the baselines; report medians of repeats."""
     task, samples, cell = plan.task, plan.samples, plan.cell
     devices = jax.local_devices()

@@ -85,8 +85,9 @@ class PolicyFile(BaseModel):
     @classmethod
     def _check(cls, value: Any, info: Any) -> Any:
         option = OPTIONS[str(info.field_name)]
-        option = option.within("[0, inf)") if option.name == "stiffness" else option  # 0: no contact has one
-        return value if value is None else dataclasses.replace(option, many=option.name == "network").check(value)
+        if value is None or (option.name == "stiffness" and value == 0):  # no contact has one
+            return None
+        return dataclasses.replace(option, many=option.name == "network").check(value)
 
 
 def read_theta(path: Path) -> tuple[tuple[float, ...], PolicyFile | None]:

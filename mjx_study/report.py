@@ -14,7 +14,7 @@ import xarray as xr
 from matplotlib.figure import Figure
 
 from mjx_study.plots.study import plot_study
-from mjx_study.study.findings import findings, rows_of
+from mjx_study.study.findings import findings_of, rows_of
 from mjx_study.study.run import warnings_of
 from mjx_study.study.variables import COORDINATES, QUANTITIES, Variable
 
@@ -58,7 +58,7 @@ class StudyAccessor:
         return self._dataset[short].to_dataframe().reset_index()
 
     def findings(self) -> list[str]:
-        return findings(self._dataset)
+        return findings_of(self._dataset)
 
     def warnings(self) -> tuple[str, ...]:
         return warnings_of(self._dataset)
@@ -67,10 +67,10 @@ class StudyAccessor:
         return plot_study(self._dataset)
 
     def report(self) -> str:
-        return report(self._dataset)
+        return render_report(self._dataset)
 
 
-def report(dataset: xr.Dataset) -> str:
+def render_report(dataset: xr.Dataset) -> str:
     config = json.loads(dataset.attrs["config"])
     title, summary, names = KINDS[config["kind"]]
     quantities = {name: QUANTITIES[config["kind"]][name] for name in names}

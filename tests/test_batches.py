@@ -15,7 +15,7 @@ from estimators import ESTIMATORS, DiscontinuityGated, ZerothOrder, make_estimat
 from mjx_study.objective import Simulator, simulate
 from mjx_study.study.resolution import check_estimators
 from mjx_study.tasks import make_task
-from mjx_study.tasks.contact_grid import contact_grid
+from mjx_study.tasks.contact_grid import family_grid
 from mjx_study.tasks.task import Task
 from tests.carts import cart, launched_cart, steered_cart
 
@@ -34,7 +34,7 @@ def drawn(request: pytest.FixtureRequest) -> tuple[Task, Any, dict[str, Any]]:
     task = task.replace(theta=theta)
     contact = None
     if name in TASKS and task.contact_pair:
-        (cell,), _ = contact_grid(task, ["penalty"], [task.defaults.stiffnesses[0]])
+        (cell,), _ = family_grid(task, ["penalty"], [task.defaults.stiffnesses[0]])
         contact = cell.contact
     objective = Simulator(task, chunk_size=2).objective(contact)
     keys = jax.random.split(jax.random.key(0), SAMPLES)
@@ -118,7 +118,7 @@ def test_a_formula_that_needs_gaussian_noise_refuses_another() -> None:
 def test_a_reference_draws_the_noise_that_mjx_draws(noise: str) -> None:
     """Same keys, same density: the pusher's two simulations differ by the contact's impedance and nothing else."""
     task = make_task("pusher", horizon=20).replace(noise=noise)
-    (cell,), _ = contact_grid(task, ["penalty"], [100.0])
+    (cell,), _ = family_grid(task, ["penalty"], [100.0])
     assert task.reference is not None
     reference = dataclasses.replace(task.reference(100.0), noise=noise)  # type: ignore[type-var]
     keys = jax.random.split(jax.random.key(2), 4)

@@ -13,7 +13,7 @@ from mjx_study.cli import options
 from mjx_study.objective import Simulator, simulate
 from mjx_study.simulation.engine import engine_model
 from mjx_study.tasks import make_task
-from mjx_study.tasks.contact_grid import contact_grid
+from mjx_study.tasks.contact_grid import family_grid
 from mjx_study.tasks.task import StudyDefaults
 
 
@@ -50,7 +50,7 @@ def test_bench_prints_its_ratios_and_the_machine(
 def test_stock_mjx_runs_the_same_samples() -> None:
     """The rival's costs are ours: same starts, noise of the task's own density, policy and contact."""
     task = make_task("tennis", horizon=5).replace(noise="laplace")
-    (cell,), _ = contact_grid(task, ["mujoco"], [4000.0])
+    (cell,), _ = family_grid(task, ["mujoco"], [4000.0])
     keys = jax.random.split(jax.random.key(0), 4)
     values, _ = bench._stock_programs(task, cell.contact, keys, jax.local_devices())
     ours = Simulator(task, chunk_size=2).objective(cell.contact).evaluate(task.theta, jax.random.clone(keys))
@@ -71,7 +71,7 @@ def test_the_engines_rollouts_are_ours() -> None:
 def test_the_engines_rival_computes_a_gradient() -> None:
     """Of the sum of the last state, by differences: the same as perturbing one control, or the start, by hand."""
     task = make_task("pusher", horizon=20)
-    (cell,), _ = contact_grid(task, ["mujoco"], [100.0])
+    (cell,), _ = family_grid(task, ["mujoco"], [100.0])
     start, controls = (np.array([0.0, 1.0]), np.zeros(2)), np.full((20, 1), 0.1)
     over_start, over_controls = bench.engine_gradient(task, cell.contact, start, controls)
 
@@ -114,7 +114,7 @@ def test_plans_take_the_task_s_own_contact() -> None:
 def test_gradients_are_as_fast_as_promised() -> None:
     """Ratios of one run; the machine should be quiet."""
     with jax.debug_key_reuse(False):  # all contenders run with the same keys
-        report = bench.bench(bench.plan_bench(make_task("pusher"), 1000))
+        report = bench.run_bench(bench.plan_bench(make_task("pusher"), 1000))
     assert report.ratios["gradient_per_value"] <= 3.5
     assert report.ratios["speedup_over_stock"] >= 2
     assert report.ratios["speedup_over_engine"] >= 1

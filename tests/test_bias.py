@@ -5,13 +5,13 @@ import pytest
 
 from mjx_study.study.landscapes import Line, Means, grid, means
 from mjx_study.tasks import make_task
-from mjx_study.tasks.contact_grid import contact_grid
+from mjx_study.tasks.contact_grid import family_grid
 
 
 def measured(name: str, families: tuple[str, ...], position: np.ndarray, size: int) -> dict[str, Means]:
     task = make_task(name)
     line, points = Line(task), grid(position.min(), position.max(), task.sigma, size, task.noise)
-    cells, _ = contact_grid(task, families, [10000.0])
+    cells, _ = family_grid(task, families, [10000.0])
     return {cell.family: means(points, *line(points, cell.contact), position, task.sigma, task.noise) for cell in cells}
 
 

@@ -15,7 +15,7 @@ import pytest
 from estimators import Differentiation, Evaluation, FirstOrder, ZerothOrder, estimate
 from mjx_study import cli
 from mjx_study.cli import options
-from mjx_study.diagnose import ESTIMATORS, Diagnosis, Measured, Touch, diagnose
+from mjx_study.diagnose import ESTIMATORS, Diagnosis, Measured, Touch, diagnose_task
 from mjx_study.diagnose.measurement import affordable, chunk_of
 from mjx_study.diagnose.setting import setting_of
 from mjx_study.gradcheck import Finding
@@ -45,7 +45,7 @@ def ball(folder: Path, solimp: str = "0.9 0.95 0.001 0.5 2") -> str:
 def found(tmp_path_factory: pytest.TempPathFactory) -> Diagnosis:
     """Of the ball, on its way up again."""
     name = ball(tmp_path_factory.mktemp("ball"))
-    return diagnose(name, make_task(name, horizon=65).replace(sigma=0.05), samples=500)
+    return diagnose_task(name, make_task(name, horizon=65).replace(sigma=0.05), samples=500)
 
 
 def test_the_contact_is_what_it_is_by_hand(found: Diagnosis) -> None:
@@ -102,7 +102,7 @@ def test_the_advised_impedance_avoids_the_bias(found: Diagnosis, tmp_path: Path)
     (advice,) = (text for text, _ in found._advice() if "solimp" in text)
     solimp = advice.partition('solimp="')[2].partition('"')[0]
     name = ball(tmp_path, solimp)
-    smooth = diagnose(name, make_task(name, horizon=65).replace(sigma=0.05), samples=500)
+    smooth = diagnose_task(name, make_task(name, horizon=65).replace(sigma=0.05), samples=500)
     assert {each.estimator: each.verdict for each in smooth.estimators}["fobg"] == "right"
     assert not [text for text, _ in smooth._advice() if "biased" in text]
 
@@ -122,7 +122,7 @@ def test_the_commands_on_the_page_repeat_it(
 ) -> None:
     monkeypatch.setattr(options, "configure", lambda **_: None)  # JAX takes its devices once per process
     name, horizon = str(HELD_OUT / f"{model}.xml"), 60
-    told = diagnose(name, make_task(name, horizon=horizon), samples=60, options=f" --horizon {horizon}")
+    told = diagnose_task(name, make_task(name, horizon=horizon), samples=60, options=f" --horizon {horizon}")
     commands = [line.removeprefix("  > mjx-study ").split() for line in told.lines() if line.startswith("  > ")]
     steps, means = (command for command in commands if command[0] == "gradcheck")
     batches = next(

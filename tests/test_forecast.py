@@ -15,10 +15,9 @@ from mjx_study import cli
 from mjx_study.cli import options
 from mjx_study.runtime import available_cores
 from mjx_study.stopwatch import Stopwatch
-from mjx_study.study import forecast as forecasts
-from mjx_study.study import times
+from mjx_study.study import forecast, times
 from mjx_study.study.configuration import StudyConfig
-from mjx_study.study.forecast import forecast
+from mjx_study.study.forecast import forecast_study
 from mjx_study.study.plan import plan_study
 from mjx_study.study.run import run_study
 from mjx_study.table import count, duration, size
@@ -35,7 +34,7 @@ def configured(monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPat
     monkeypatch.setattr(options, "configure", lambda **_: None)
     folder = tmp_path_factory.mktemp("cache") / "times"
     monkeypatch.setattr(times, "times_folder", lambda: folder)
-    monkeypatch.setattr(forecasts, "times_folder", lambda: folder)
+    monkeypatch.setattr(forecast, "times_folder", lambda: folder)
 
 
 def test_batches_of_gradients_are_counted() -> None:
@@ -44,7 +43,7 @@ def test_batches_of_gradients_are_counted() -> None:
         tasks=("pusher",), contact=("penalty",), stiffness=(10.0, 100.0), samples=(8,), seeds=3, horizon=4,
         reference_samples=10,
     )  # fmt: skip
-    found = forecast(plan_study(config))
+    found = forecast_study(plan_study(config))
     assert (found.cells, found.computed, found.programs) == (2, 0, 2)
     assert found.rollouts == 2 * (3 * (8 + 1 + 8) + 2 * 10 + 100)
     assert found.gradients == 2 * (3 * 8 + 100)
@@ -61,7 +60,7 @@ def test_points_of_landscapes_are_counted() -> None:
         tasks=("ball_wall",), contact=("reference", "mujoco_default"), points=5, samples=(8,),
         stiffness=(1000.0,), estimators=("zobg", "fobg"),
     )  # fmt: skip
-    found = forecast(plan_study(config))
+    found = forecast_study(plan_study(config))
     assert found.rollouts == 2 * 5 * (8 + 1 + 8) + 1500 and found.gradients == 2 * 5 * 8 + 1500
 
 
@@ -98,12 +97,12 @@ def test_the_time_is_what_the_last_run_of_each_program_took(tmp_path: Path) -> N
         tasks=("pusher",), contact=("penalty",), stiffness=(50.0, 100.0, 200.0), horizon=2, samples=(8,), seeds=3,
         reference_samples=10, chunk_size=7,
     )  # fmt: skip
-    before = forecast(plan_study(config), tmp_path)
+    before = forecast_study(plan_study(config), tmp_path)
     assert before.basis[times.ROUGH] == pytest.approx(before.seconds) and before.seconds > before.compilation > 0
     run_study(config, tmp_path)
-    assert forecast(plan_study(config), tmp_path).seconds == 0
+    assert forecast_study(plan_study(config), tmp_path).seconds == 0
     (tmp_path / "cells" / "00001.npz").unlink()
-    found = forecast(plan_study(config), tmp_path)
+    found = forecast_study(plan_study(config), tmp_path)
     assert found.computed == 2 and found.basis[times.MEASURED] == pytest.approx(found.seconds)
     records = {each.kind: each for each in times.Rates.read(times.times_folder())._records}
     assert set(records) == {"value", "gradient", "statistics"} and {each.rows for each in records.values()} > {7}
@@ -161,12 +160,12 @@ def test_a_cache_that_cannot_be_written_fails_nothing(tmp_path: Path, monkeypatc
 
 def test_workers_share_the_cells() -> None:
     """Cells go to the next free worker, and workers here to the cores that there are."""
-    assert forecasts._side_by_side([3.0, 1.0, 1.0, 2.0], 2) == 4.0 and forecasts._side_by_side([], 2) == 0.0
+    assert forecast._side_by_side([3.0, 1.0, 1.0, 2.0], 2) == 4.0 and forecast._side_by_side([], 2) == 0.0
     config = StudyConfig(tasks=("pusher",), contact=("penalty",), stiffness=(1.0, 2.0, 3.0), horizon=4)
-    alone, many = (forecast(plan_study(config), cluster=f"slurm:{workers}") for workers in (1, 3))
+    alone, many = (forecast_study(plan_study(config), cluster=f"slurm:{workers}") for workers in (1, 3))
     assert (alone.devices, many.devices) == (1, 3) and alone.compilation == many.compilation
     assert alone.seconds - alone.compilation == pytest.approx(3 * (many.seconds - many.compilation))
-    assert forecast(plan_study(config), cluster="local:1000").devices <= available_cores()
+    assert forecast_study(plan_study(config), cluster="local:1000").devices <= available_cores()
 
 
 GRADIENTS: dict[str, Any] = {
@@ -197,10 +196,10 @@ def test_the_forecast_is_within_a_factor_of_two(tmp_path: Path, monkeypatch: pyt
     for index, other in enumerate(OTHERS):
         folder = tmp_path / str(index)
         shutil.copytree(kept, folder)
-        for module in (times, forecasts):
+        for module in (times, forecast):
             monkeypatch.setattr(module, "times_folder", lambda folder=folder: folder)
         plan = plan_study(StudyConfig(**GRADIENTS | other))
-        found = forecast(plan)
+        found = forecast_study(plan)
         assert found.basis[times.ROUGH] == 0, other
         run_study(plan)
         spent = [each for name, each in watches[-1].spent.items() if name != "descents"]

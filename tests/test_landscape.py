@@ -28,7 +28,7 @@ from mjx_study.simulation.dynamics import State
 from mjx_study.study import landscapes, sampling
 from mjx_study.study import plan as plan_module
 from mjx_study.study.configuration import StudyConfig
-from mjx_study.study.findings import curves_of, findings
+from mjx_study.study.findings import curves_of, findings_of
 from mjx_study.study.landscapes import Line, applies, closed_form, compute_landscapes, grid, means
 from mjx_study.study.plan import StudyPlan, plan_study
 from mjx_study.study.resolution import line_of
@@ -203,12 +203,12 @@ def test_curves_agree_with_quadrature_and_with_each_other(flown: xr.Dataset) -> 
     exact = curve["exact_slope"].values
     np.testing.assert_allclose(curve["exact_first"], exact, atol=1e-4 * np.abs(exact).max())
     assert float(curve["nonfinite"].sum()) == 0 and float(curve["residual"]) < 1e-8
-    assert label == "mujoco 10000" and "nowhere differs" in findings(flown)[1]
+    assert label == "mujoco 10000" and "nowhere differs" in findings_of(flown)[1]
 
 
 def test_a_reference_that_jumps_is_found_out(flown: xr.Dataset) -> None:
     assert curves_of(flown)[0][0] == "reference 10000"
-    assert "E[FoBG] differs from the mean cost's slope" in findings(flown)[0]
+    assert "E[FoBG] differs from the mean cost's slope" in findings_of(flown)[0]
     document = json.loads(json.dumps(as_document(flown, curves), allow_nan=False))
     assert len(document["curves"][0]["exact_slope"]) == 5
 
@@ -238,6 +238,8 @@ def test_the_line_goes_through_theta() -> None:
     assert group.task.theta.tolist() == [1.0, 2.0, 3.0]
     with pytest.raises(ValueError, match="theta has one entry, and the line is its range: give `span`"):
         plan_study(config("ball_wall", theta=(1.0,), points=3))
+    with pytest.raises(ValueError, match="landscapes need `points`"):
+        config("ball_wall")
 
 
 def test_random_directions_are_unit_vectors_of_the_seed() -> None:

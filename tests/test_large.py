@@ -63,7 +63,7 @@ def test_blocks_give_the_numbers_of_the_batch() -> None:
     estimators = ("zobg", "zobg_antithetic", "fobg", "fobg_clipped", "fobg_truncated", "aobg", "ivw")
     changes: dict[str, Any] = {"samples": (4096,), "estimators": estimators, "max_norm": 50.0, "window": 2}
     whole, blocks = planned(**changes, block_size=None), planned(**changes, block_size=512)
-    assert blocks_of(whole, whole.cells[0]) == 0 and blocks_of(blocks, blocks.cells[0]) == 8
+    assert blocks_of(whole, whole.cells[0]) == 1 and blocks_of(blocks, blocks.cells[0]) == 8
     expected, found = (compute_gradients(plan)(plan.cells[0]) for plan in (whole, blocks))
     assert set(found) == set(expected) > SUBSTITUTES
     for name in set(expected) - SUBSTITUTES - set(MEASURED):
@@ -162,7 +162,7 @@ def test_what_needs_whole_batches_is_refused() -> None:
 def test_ten_million_samples_are_planned_in_blocks() -> None:
     """Whatever fits comes whole, as before; the memory of what does not fit is that of a block."""
     plans = [planned(samples=(samples,), block_size=None) for samples in (400, 1_000_000, 5_000_000, 10_000_000)]
-    assert [blocks_of(plan, plan.cells[0]) for plan in plans] == [0, 0, 250, 500]
+    assert [blocks_of(plan, plan.cells[0]) for plan in plans] == [1, 1, 250, 500]
     assert plans[2].memory <= plans[3].memory < 1.01 * plans[2].memory < 5e8 < plans[1].memory
     wide = planned(samples=(10_000_000,), block_size=None, horizon=2000)
     assert 2 <= block_of(wide, wide.cells[0]) < 20_000 and block_of(wide, wide.cells[0]) % 2 == 0

@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from mjx_study.choices import TASK_DESCRIPTIONS
+
 ROOT = Path(__file__).resolve().parents[1]
 # From the bottom up; a package or module may import from its own layer and from those above it in this list.
 LAYERS = [
@@ -123,6 +125,34 @@ def test_every_layer_is_used_once_and_files_are_found() -> None:
 )
 def test_the_walk_sees(module: str, source: str, wrong: set[str]) -> None:
     assert refused(module, imports_of(source, module, is_package=False)) == wrong
+
+
+STABLE = "mjx_study.gradcheck.check.gradcheck"
+BUILDERS = {f"mjx_study.tasks.{name}.{name}" for name in TASK_DESCRIPTIONS}
+"""Their names are in the digests by which the folder of a study is recognised."""
+
+
+def namesakes(module: str, source: str) -> set[str]:
+    """Public functions of a module that have its name, or that of a package around it."""
+    functions = {node.name for node in ast.parse(source).body if isinstance(node, ast.FunctionDef)}
+    return {f"{module}.{name}" for name in functions.intersection(module.split("."))}
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_no_function_hides_its_module(path: Path) -> None:
+    assert namesakes(module_of(path), path.read_text()) <= {STABLE, *BUILDERS}
+
+
+@pytest.mark.parametrize(
+    ("module", "found"),
+    [
+        ("mjx_study.report", {"mjx_study.report.report"}),
+        ("mjx_study.report.page", {"mjx_study.report.page.report"}),
+        ("mjx_study.page", set()),
+    ],
+)
+def test_namesakes_are_found(module: str, found: set[str]) -> None:
+    assert namesakes(module, "class Report: ...\ndef report(): ...\ndef _page(): ...") == found
 
 
 def test_a_module_in_no_layer_fails() -> None:

@@ -20,7 +20,7 @@ from mjx_study.simulation.onset import check_onset, corrected_rollout
 from mjx_study.study.findings import SHARE_OFF
 from mjx_study.study.landscapes import Line, grid, means
 from mjx_study.tasks import make_task
-from mjx_study.tasks.contact_grid import contact_grid
+from mjx_study.tasks.contact_grid import family_grid
 from tests.scenes import floor_scene, option, scene_of
 
 TIMECONST, LOW, HIGH, WIDTH = 0.02, 0.9, 0.95, 0.001
@@ -283,7 +283,7 @@ def test_the_mean_has_the_slope_where_plain_first_order_has_the_wrong_sign(onset
     """MuJoCo's default contact, h b = 0.2: the mean of plain first-order gradients is +0.78 at 0.5 rad, not -0.945."""
     task = make_task("momentum_transfer").replace(onset=onset)
     position, points = np.array([0.5]), grid(0.5, 0.5, task.sigma, 400, task.noise)
-    (cell,), _ = contact_grid(task, ("mujoco_default",))
+    (cell,), _ = family_grid(task, ("mujoco_default",))
     found = means(points, *Line(task)(points, cell.contact), position, task.sigma, task.noise)
     assert found.slope_error + found.first_error < 0.02
     assert found.slope < -0.9
@@ -329,7 +329,7 @@ def test_contact_that_turns_or_ends_has_its_share(between: tuple[float, float], 
     With onsets alone, found by straight lines, the linear term was 27 % off in either range.
     """
     task = make_task("ball_wall")
-    (cell,), _ = contact_grid(task, ("mujoco_default",))
+    (cell,), _ = family_grid(task, ("mujoco_default",))
     points = np.linspace(*between, 3000)
     (values, plain), (_, gradients) = (Line(task.replace(onset=each))(points, cell.contact) for each in ("none", onset))
     added = np.trapezoid(gradients - plain, points)
@@ -341,7 +341,7 @@ def test_grazing_onsets_do_not_spoil_the_mean() -> None:
     """ball_wall at 0.2 rad: where it is thrown flat the ball leaves the floor, and meets it again, at no speed."""
     task = make_task("ball_wall").replace(onset="linear")
     position, points = np.array([0.2]), grid(0.2, 0.2, task.sigma, 2000, task.noise)
-    (cell,), _ = contact_grid(task, ("mujoco_default",))
+    (cell,), _ = family_grid(task, ("mujoco_default",))
     values, gradients = Line(task)(points, cell.contact)
     found = means(points, values, gradients, position, task.sigma, task.noise)
     weights = np.exp(-(((points - 0.2) / task.sigma) ** 2) / 2)
@@ -373,7 +373,7 @@ def test_onsets_beyond_the_slots_are_counted_and_left_out() -> None:
 @pytest.mark.slow
 def test_a_batch_says_what_the_term_met() -> None:
     task = make_task("momentum_transfer").replace(onset="linear")
-    (cell,), _ = contact_grid(task, ("mujoco_default",))
+    (cell,), _ = family_grid(task, ("mujoco_default",))
     keys = jax.random.split(jax.random.key(0), 4)
     batch = Simulator(task, chunk_size=2).objective(cell.contact).differentiate(task.theta, keys)
     assert batch.events is not None and batch.events[:, :3].tolist() == [[1.0, 0.0, 0.0]] * 4

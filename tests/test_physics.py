@@ -20,7 +20,7 @@ from mjx_study.reference import BallWall, MomentumTransfer, SlidingBox, Tennis, 
 from mjx_study.reference.noise import split_sample_key
 from mjx_study.simulation.contact import ContactModel, ContactWarning
 from mjx_study.tasks import make_task
-from mjx_study.tasks.contact_grid import contact_grid
+from mjx_study.tasks.contact_grid import family_grid
 from mjx_study.tasks.task import Task
 
 BATCH = 7
@@ -47,7 +47,7 @@ def rollouts(task: Task) -> Callable[..., Any]:
 def contact(task: Task, family: str, stiffness: float) -> ContactModel:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ContactWarning)
-        ((cell,), _) = contact_grid(task, [family], [stiffness])
+        ((cell,), _) = family_grid(task, [family], [stiffness])
     assert cell.contact is not None
     return cell.contact
 
@@ -181,7 +181,7 @@ def test_a_stiff_damper_creeps_less() -> None:
     task, run = dragged()
     slips = []
     for damping in (1.8, 3.6):
-        ((cell,), _) = contact_grid(task, ["penalty"], [1000.0], damping)
+        ((cell,), _) = family_grid(task, ["penalty"], [1000.0], damping)
         states, *_ = run(jnp.asarray(FORCES["creeps"])[None], cell.contact)
         velocity = np.asarray(states.qvel)[0, -1]
         slips.append(velocity[0] - velocity[2])

@@ -6,7 +6,7 @@ import pytest
 from scipy import stats
 
 from estimators import Evaluation, delta_control_variate, first_order
-from mjx_study.study.reference_gradient import reference_gradient
+from mjx_study.study.reference_gradient import estimate_reference
 from tests.estimators.statistics_helpers import assert_mean_is
 from tests.pusher_fixtures import SIGMA, penalty, pusher_simulator, pusher_task, sample_keys
 
@@ -32,7 +32,7 @@ def odd_batch(samples: int, seed: int) -> Evaluation:
 
 
 def estimate(*candidates: np.ndarray, samples: int = 40_000):
-    return reference_gradient(odd_batch(samples, 1), odd_batch(200, 2), [*map(jnp.asarray, candidates)], NOISE)
+    return estimate_reference(odd_batch(samples, 1), odd_batch(200, 2), [*map(jnp.asarray, candidates)], NOISE)
 
 
 @pytest.mark.parametrize(
@@ -71,9 +71,9 @@ def test_without_a_usable_candidate_it_is_the_plain_estimate():
 def test_non_finite_samples_of_the_pilot_do_not_poison_it():
     pilot = odd_batch(200, 2)
     broken = Evaluation(pilot.value.at[3].set(jnp.nan), pilot.score, pilot.baseline)
-    result = reference_gradient(odd_batch(1000, 1), broken, [jnp.asarray(EXACT)], NOISE)
+    result = estimate_reference(odd_batch(1000, 1), broken, [jnp.asarray(EXACT)], NOISE)
     assert result.num_nonfinite == 0 and np.all(np.isfinite(result.per_sample))
-    assert result.variance < 0.5 * reference_gradient(odd_batch(1000, 1), pilot, [], NOISE).variance
+    assert result.variance < 0.5 * estimate_reference(odd_batch(1000, 1), pilot, [], NOISE).variance
 
 
 @pytest.mark.slow
@@ -82,7 +82,7 @@ def test_is_precise_on_the_pusher():
     mjx, theta = pusher_simulator().objective(penalty(10.0)), pusher_task().theta
     candidate = jnp.median(mjx.differentiate(theta, sample_keys(64, 3)).gradient, axis=0)
     odd, pilot = mjx.evaluate_odd(theta, sample_keys(500, 1)), mjx.evaluate_odd(theta, sample_keys(100, 2))
-    reference = reference_gradient(odd, pilot, [candidate], SIGMA)
+    reference = estimate_reference(odd, pilot, [candidate], SIGMA)
     size = np.linalg.norm(reference.mean)
     uncertainty = np.linalg.norm(reference.standard_error)
     assert uncertainty < 1e-2 * size

@@ -19,7 +19,7 @@ from mjx_study.objective import Simulator
 from mjx_study.render import RenderError
 from mjx_study.simulation.engine import quiet_engine
 from mjx_study.tasks import make_task
-from mjx_study.tasks.contact_grid import contact_grid
+from mjx_study.tasks.contact_grid import family_grid
 from tests.documents import stages_of
 
 SHORT = ["pusher", "--horizon", "10", "--renderer", "drawing"]
@@ -61,7 +61,7 @@ def test_the_cost_is_the_objectives(capsys: pytest.CaptureFixture[str], noise: l
     """The same sample as in a batch: the value with its key's noise, the baseline without."""
     facts = document(capsys, *SHORT, "--contact", "penalty", "--stiffness", "1000", *noise)
     task = ten_steps().task
-    (cell,), _ = contact_grid(task, ("penalty",), (1000.0,))
+    (cell,), _ = family_grid(task, ("penalty",), (1000.0,))
     batch = ten_steps().objective(cell.contact).evaluate(task.theta, jax.random.key(3)[None])
     assert facts["cost"] == pytest.approx(float((batch.value if noise else batch.baseline)[0]), rel=1e-9)
     assert facts["contact"] == "penalty" and facts["stiffness"] == 1000 and facts["finite"]
@@ -152,6 +152,18 @@ def test_a_rollout_that_is_lost_is_shown_as_far_as_it_goes(capsys: pytest.Captur
     assert len(data["qpos"]) == 101
     good = np.all(np.abs(data["qpos"]) < 1e10, axis=1) & np.all(np.abs(data["qvel"]) < 1e10, axis=1)
     assert not good.all() and facts["bodies"]["ball"][0] == pytest.approx(data["qpos"][np.argmin(good) - 1, 0])
+
+
+def test_a_policy_keeps_what_is_zero_and_not_what_is_none(capsys: pytest.CaptureFixture[str], elsewhere: Path) -> None:
+    """A damping of 0 is one; a stiffness of 0 stands for none in files written earlier."""
+    policy = {"task": "pusher", "theta": [0.1, 0.1], "contact": "mujoco", "stiffness": 100.0, "horizon": 2}
+    costs = []
+    for given in ({}, {"damping": 0.0}, {"stiffness": 0}):
+        (elsewhere / "policy.json").write_text(json.dumps(policy | given))
+        facts = document(capsys, "pusher", "--theta", "policy.json", "--frames", "1")
+        costs.append((facts["stiffness"], facts["cost"]))
+    middle = make_task("pusher").defaults.middle_stiffness
+    assert [stiffness for stiffness, _ in costs] == [100.0, 100.0, middle] and costs[0][1] != costs[1][1]
 
 
 def test_theta_as_numbers(capsys: pytest.CaptureFixture[str], elsewhere: Path) -> None:

@@ -33,7 +33,7 @@ from mjx_study.plots.style import save_figure
 from mjx_study.study import sampling
 from mjx_study.study.configuration import StudyConfig
 from mjx_study.study.dataset import dataset_of
-from mjx_study.study.findings import Row, findings, rows_of
+from mjx_study.study.findings import Row, findings_of, rows_of
 from mjx_study.study.plan import estimators_of, plan_study
 from mjx_study.study.run import run_study, warnings_of
 from mjx_study.study.store import StudyError
@@ -235,13 +235,13 @@ def test_a_dataset_says_what_a_study_is_good_for(spied) -> None:
     table = found.mjx_study.table()
     assert len(table) == 78 and set(table["estimator"]) == {"zobg", "fobg", "aobg"}
     assert table["variance_seconds"].notnull().all() and set(found.mjx_study.plot()) == {"comparison"}
-    assert found.mjx_study.findings() == findings(found) and found.mjx_study.report().startswith("<!doctype html>")
+    assert found.mjx_study.findings() == findings_of(found) and found.mjx_study.report().startswith("<!doctype html>")
 
 
 def test_findings_follow_the_intervals() -> None:
     rows = (row("zobg", 10, 100), row("fobg", 10, 1), row("zobg", 100, 100), row("fobg", 100, 150))
     rows += (row("zobg", 1000, 100), row("fobg", 1000, 1e6))
-    (sentence,) = findings(result(*rows))
+    (sentence,) = findings_of(result(*rows))
     assert sentence == (
         "penalty: FoBG's variance is below ZoBG's at K = 10 N/m; above ZoBG's at K = 1000 N/m; not told apart from "
         "ZoBG's at K = 100 N/m (95% intervals)"
@@ -252,7 +252,7 @@ def test_no_variance_is_called_less_on_too_few_effective_samples() -> None:
     """A batch without one of the rare samples that carry the gradient varies little, or not at all."""
     for variance, effective in ((0, 0.0), (1, 2.0)):
         doubtful = row("fobg", 10, variance, effective_samples=effective, debiased_error_se=0.01)
-        (sentence,) = findings(result(row("zobg", 10, 100), doubtful))
+        (sentence,) = findings_of(result(row("zobg", 10, 100), doubtful))
         assert sentence == (
             "penalty: FoBG's variance is undecided (too few effective samples) at K = 10 N/m (95% intervals)"
         )
@@ -261,13 +261,13 @@ def test_no_variance_is_called_less_on_too_few_effective_samples() -> None:
 def test_bias_is_reported_only_beyond_what_noise_explains() -> None:
     quiet = row("fobg", 10, 1, relative_error=0.044, bias_p_value=0.002)
     loud = row("fobg", 10, 1, relative_error=0.044, bias_p_value=0.001)
-    assert findings(result(quiet)) == []
-    (sentence,) = findings(result(loud))
+    assert findings_of(result(quiet)) == []
+    (sentence,) = findings_of(result(loud))
     assert sentence == "penalty: FoBG's mean is biased by 4.4% at K = 10 N/m (p <= 0.001)"
     mixed = row("aobg", 10, 1, relative_error=16.95, bias_p_value=0.001)
-    (sentence,) = findings(result(mixed))
+    (sentence,) = findings_of(result(mixed))
     assert sentence == "penalty: AoBG's mean is biased by 1700% at K = 10 N/m (p <= 0.001)"
-    (sentence,) = findings(result(mixed, gamma="inf"))
+    (sentence,) = findings_of(result(mixed, gamma="inf"))
     assert sentence.endswith("(p <= 0.001): it has no accuracy bound; set one with --gamma")
 
 
@@ -281,82 +281,82 @@ def test_seeds_are_counted_and_not_repeated() -> None:
     shares, p_values = (0.02, 0.03, 0.044), (0.001, 0.001, 0.4)
     rows = [row("fobg", 10, 1, relative_error=share, bias_p_value=p) for share, p in zip(shares, p_values, strict=True)]
     parts = [result(row("zobg", 10, variance), each) for each, variance in zip(rows, (100, 100, 1), strict=True)]
-    assert findings(joined("seed", [0, 1, 2], parts)) == [
+    assert findings_of(joined("seed", [0, 1, 2], parts)) == [
         "penalty: FoBG's variance is not told apart from ZoBG's at K = 10 N/m (95% intervals)",
         "penalty: FoBG's mean is biased by 2.5% at K = 10 N/m in 2 of 3 seeds (p <= 0.001)",
     ]
     below = joined("seed", [0, 1], parts[:2])
-    assert findings(below)[0] == "penalty: FoBG's variance is below ZoBG's at K = 10 N/m (95% intervals)"
+    assert findings_of(below)[0] == "penalty: FoBG's variance is below ZoBG's at K = 10 N/m (95% intervals)"
 
 
 def test_the_onset_term_is_judged_like_the_rest() -> None:
-    (sentence,) = findings(result(row("fobg_onset", 10, 1, relative_error=0.044, bias_p_value=0.001)))
+    (sentence,) = findings_of(result(row("fobg_onset", 10, 1, relative_error=0.044, bias_p_value=0.001)))
     assert sentence == "penalty: FoBG (onset)'s mean is biased by 4.4% at K = 10 N/m (p <= 0.001)"
 
 
 def test_an_onset_term_that_is_not_to_be_trusted_is_told() -> None:
     """Noise that does not reach the next step, and onsets that take much of the speed in one; not so for the jump."""
     events = {"onsets": 100.0, "onset_spread": 2.0, "onset_strength": 0.1}
-    assert findings(result(row("fobg_onset", 10, 1, **events))) == []
-    (narrow,) = findings(result(row("fobg_onset", 10, 1, **events | {"onset_spread": 0.4})))
+    assert findings_of(result(row("fobg_onset", 10, 1, **events))) == []
+    (narrow,) = findings_of(result(row("fobg_onset", 10, 1, **events | {"onset_spread": 0.4})))
     assert narrow.startswith(
         "penalty: the onset term may be off at K = 10 N/m, since the noise is narrow: the step at which contact "
     )
     both = events | {"onset_spread": 0.4, "onset_strength": 0.25}
-    assert findings(result(row("fobg_onset", 10, 1, **both))) == [narrow]  # narrow noise spoils the jump as much
-    (strong,) = findings(result(row("fobg_onset", 10, 1, **events | {"onset_strength": 0.25})))
+    assert findings_of(result(row("fobg_onset", 10, 1, **both))) == [narrow]  # narrow noise spoils the jump as much
+    (strong,) = findings_of(result(row("fobg_onset", 10, 1, **events | {"onset_strength": 0.25})))
     assert strong.startswith("penalty: the linear onset term can be off by 12% of what it adds, more at ")
-    (beyond,) = findings(result(row("fobg_onset", 10, 1, **events | {"onset_strength": 1.2})))
+    (beyond,) = findings_of(result(row("fobg_onset", 10, 1, **events | {"onset_strength": 1.2})))
     assert beyond.startswith("penalty: the linear onset term can leave more than it adds, more at ")
-    assert findings(result(row("fobg_onset", 10, 1, **events | {"onset_strength": 0.0}))) == []
+    assert findings_of(result(row("fobg_onset", 10, 1, **events | {"onset_strength": 0.0}))) == []
 
 
 def test_noises_are_told_apart() -> None:
     """Not the last one's verdict for all."""
     parts = [result(row("zobg", 10, 100), row("fobg", 10, variance)) for variance in (1, 1e6)]
-    quiet, loud = findings(joined("sigma", [0.01, 1.0], parts))
+    quiet, loud = findings_of(joined("sigma", [0.01, 1.0], parts))
     assert quiet == "sigma 0.01, penalty: FoBG's variance is below ZoBG's at K = 10 N/m (95% intervals)"
     assert loud == "sigma 1, penalty: FoBG's variance is above ZoBG's at K = 10 N/m (95% intervals)"
 
 
 def test_a_bias_beyond_computing_is_no_number() -> None:
     wild = row("fobg", 10, 1, relative_error=math.nan, bias_p_value=0.001)
-    (sentence,) = findings(result(wild))
+    (sentence,) = findings_of(result(wild))
     assert sentence == "penalty: FoBG's mean is biased by more than can be computed at K = 10 N/m (p <= 0.001)"
 
 
 def test_a_result_that_means_nothing_says_so() -> None:
     """Contact that is never met, a reference as uncertain as the errors, a bound below ZoBG's own radius."""
     same = (row("zobg", 10, 5.0), row("fobg", 10, 1.0), row("zobg", 100, 5.0), row("fobg", 100, 1.0))
-    assert findings(result(*same))[-1] == (
+    assert findings_of(result(*same))[-1] == (
         "penalty: nothing depends on K: the contact whose stiffness is swept was never active"
     )
-    assert not any("never active" in each for each in findings(result(*same[:3], row("fobg", 100, 1.001))))
-    (sentence,) = findings(result(row("fobg", 10, 1.0, reference_uncertainty=0.25)))
+    assert not any("never active" in each for each in findings_of(result(*same[:3], row("fobg", 100, 1.001))))
+    (sentence,) = findings_of(result(row("fobg", 10, 1.0, reference_uncertainty=0.25)))
     assert sentence.startswith("penalty: the reference's own uncertainty exceeds 20% at K = 10 N/m: errors and")
-    (sentence,) = findings(result(row("aobg", 10, 1.0, alpha=0.0, epsilon=7.0, discrepancy=1.0), gamma=5.0))
+    (sentence,) = findings_of(result(row("aobg", 10, 1.0, alpha=0.0, epsilon=7.0, discrepancy=1.0), gamma=5.0))
     assert sentence.startswith("penalty: AoBG equals ZoBG at K = 10 N/m: its bound gamma is below epsilon")
-    assert findings(result(row("aobg", 10, 1.0, alpha=0.3, epsilon=7.0, discrepancy=1.0), gamma=9.0)) == []
+    assert findings_of(result(row("aobg", 10, 1.0, alpha=0.3, epsilon=7.0, discrepancy=1.0), gamma=9.0)) == []
 
 
 def test_nothing_is_called_biased_on_too_few_effective_samples() -> None:
     loud: dict[str, Any] = {"relative_error": 0.44, "debiased_error_se": 0.03, "bias_p_value": 0.001}
     assert one(row("fobg", 10, 1, **loud)).bias_verdict == "biased"
     few = row("fobg", 10, 1, **loud, effective_samples=1.9)
-    (sentence,) = findings(result(few))
+    (sentence,) = findings_of(result(few))
     assert sentence == (
         "penalty: FoBG's mean is off by 44% at K = 10 N/m, from bias or lack of rare samples: too few effective "
         "samples (1.9)"
     )
     equal = row("fobg", 10, 1, **loud | {"bias_p_value": math.nan}, effective_samples=0.0, top_share=math.nan)
-    (sentence,) = findings(result(equal))
+    (sentence,) = findings_of(result(equal))
     assert sentence.endswith("too few effective samples (all equal)")
     unsure = row("fobg", 10, 1, **loud, reference_effective_samples=2.0)
     for doubtful in (few, equal, unsure):
         assert one(doubtful).bias_verdict == "too few effective samples"
         assert as_json(result(doubtful))["rows"][0]["bias_verdict"] == "too few effective samples"
     agrees = row("fobg", 10, 1, debiased_error=0.01, debiased_error_se=0.01, effective_samples=0.0)
-    assert findings(result(agrees)) == []
+    assert findings_of(result(agrees)) == []
     assert one(row("fobg", 10, 1)).bias_verdict == "none seen"
 
 

@@ -29,7 +29,7 @@ from mjx_study.cli.studies import sweep_fields
 from mjx_study.cli.sweep import solimp, solref
 from mjx_study.objective import Simulator, simulate
 from mjx_study.plots import study as study_plots
-from mjx_study.report import report
+from mjx_study.report import render_report
 from mjx_study.simulation.contact import stiffness_from_solref
 from mjx_study.study import sampling, store
 from mjx_study.study.configuration import StudyConfig
@@ -592,8 +592,8 @@ def test_every_axis_gets_its_figures(undisturbed: Path, descents: Path, landscap
     }  # fmt: skip
     assert set(study_plots.plot_study(load_study(descents))) == {"achieved", "descent"}
     assert set(study_plots.plot_study(load_study(landscapes))) == {"landscape"}
-    assert "steepest slope" in report(load_study(landscapes))
-    page = report(load_study(descents))  # both estimators of both models, though only one has an alpha
+    assert "steepest slope" in render_report(load_study(landscapes))
+    page = render_report(load_study(descents))  # both estimators of both models, though only one has an alpha
     assert page.count("<td>fobg</td>") == page.count("<td>aobg</td>") == 2
     few = load_study(undisturbed).assign(squared_bias=load_study(undisturbed)["squared_bias"] * np.nan)
     assert "bias" not in study_plots.plot_study(few)
@@ -613,7 +613,7 @@ def test_an_unfinished_study_can_be_drawn(undisturbed: Path, tmp_path: Path) -> 
     for path in (folder / "cells").iterdir():
         path.unlink()
     assert study_plots.plot_study(load_study(folder)) == {}
-    assert "no cell is computed" in report(load_study(folder))
+    assert "no cell is computed" in render_report(load_study(folder))
 
 
 def test_the_commands_write_figures_and_a_page(

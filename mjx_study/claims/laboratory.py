@@ -27,7 +27,7 @@ from mjx_study.study.configuration import StudyConfig
 from mjx_study.study.landscapes import Line, means
 from mjx_study.study.run import run_study
 from mjx_study.tasks import make_task
-from mjx_study.tasks.contact_grid import backward_grid, contact_grid
+from mjx_study.tasks.contact_grid import backward_grid, family_grid
 from mjx_study.tasks.task import Task
 
 TIMED: Final = 64
@@ -192,10 +192,10 @@ class Laboratory:
 
     def _contact(self, task: Task, family: str, stiffness: float, relaxed: str | None = None) -> ContactModel | None:
         """Contact model of a family, with its own derivatives or those of one of `RELAXATIONS`."""
-        (cell,), _ = contact_grid(task, (family,), (stiffness,))
+        (cell,), _ = family_grid(task, (family,), (stiffness,))
         if relaxed is not None:
             other, factor, margin = RELAXATIONS[relaxed]
-            (cell,), _ = backward_grid(task, (cell,), (other,), factor * cell.stiffness, margin)
+            (cell,), _ = backward_grid(task, (cell,), (other,), factor * cell.stiffness_or_zero, margin)
         return cell.contact
 
     def _landscape(

@@ -18,11 +18,11 @@ def add(command: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    from mjx_study.bench import bench, plan_bench
+    from mjx_study.bench import plan_bench, run_bench
 
     with usage_errors():
         configure_process(options)
         plan = plan_bench(task_of(options), options.samples)
     with computing() as progress:
-        report = bench(plan, progress)
+        report = run_bench(plan, progress)
     return print_report(options, report.as_json(), report.lines())

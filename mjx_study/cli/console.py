@@ -14,7 +14,7 @@ import xarray as xr
 from estimators import ENOUGH_EFFECTIVE
 from mjx_study.choices import FAMILIES, REFERENCE
 from mjx_study.plots.style import style_of
-from mjx_study.study.findings import Row, curves_of, findings, rows_of
+from mjx_study.study.findings import Row, curves_of, findings_of, rows_of
 from mjx_study.study.iteration import REASONS
 from mjx_study.study.variables import COLUMNS, DEBIASED, DETAILS, HISTORY, MARKS, METRIC, QUANTITIES, START
 from mjx_study.table import format_table, number
@@ -143,7 +143,7 @@ def gradient_lines(dataset: xr.Dataset, document: dict[str, Any], details: bool 
 
 def rows_as_json(dataset: xr.Dataset) -> dict[str, Any]:
     """Findings, and a row per estimate."""
-    return {"findings": findings(dataset), "rows": [row.as_dict() for row in rows_of(dataset)]}
+    return {"findings": findings_of(dataset), "rows": [row.as_dict() for row in rows_of(dataset)]}
 
 
 def curves(dataset: xr.Dataset) -> dict[str, Any]:
@@ -153,7 +153,7 @@ def curves(dataset: xr.Dataset) -> dict[str, Any]:
         | {str(name): one[name].values for name in one if "entry" not in str(one[name].dims)}
         for label, one in curves_of(dataset)
     ]
-    return {"findings": findings(dataset), "estimators": dataset["estimator"].values, "curves": found}
+    return {"findings": findings_of(dataset), "estimators": dataset["estimator"].values, "curves": found}
 
 
 def curve_lines(dataset: xr.Dataset, document: dict[str, Any]) -> list[str]:
@@ -188,7 +188,7 @@ def descents(dataset: xr.Dataset) -> dict[str, Any]:
         "start_cost": [one["start_cost"].item(), one["start_cost_se"].item()],
         "start_metrics": {str(name)[len(START) :]: one[name].item() for name in one if str(name).startswith(START)},
         "runs": [_run(one.sel(estimator=name)) for name in config["estimators"]],
-        "findings": findings(dataset),
+        "findings": findings_of(dataset),
     }
 
 

@@ -31,7 +31,7 @@ def add(command: Parser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Measure and print; return 1 if a derivative is wrong."""
-    from mjx_study.diagnose import diagnose
+    from mjx_study.diagnose import diagnose_task
 
     with usage_errors():
         configure_process(options)
@@ -44,7 +44,7 @@ def run(options: argparse.Namespace) -> int:
     given |= {"seed": options.seed} if options.seed else {}
     flags = "".join(f" --{name} {value:{'g' if isinstance(value, float) else ''}}" for name, value in given.items())
     with computing() as progress, usage_errors():
-        found = diagnose(
+        found = diagnose_task(
             options.task,
             task,
             options.contact,

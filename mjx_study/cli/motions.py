@@ -23,7 +23,7 @@ from mjx_study.render import Motion, RenderError, animate, check_format, resolve
 from mjx_study.simulation.scene import load_model
 from mjx_study.study.resolution import at_theta
 from mjx_study.table import format_table, number
-from mjx_study.tasks.contact_grid import ContactPoint, contact_grid
+from mjx_study.tasks.contact_grid import ContactPoint, family_grid
 from mjx_study.tasks.network import with_network
 from mjx_study.tasks.task import Task
 
@@ -95,7 +95,7 @@ def _plan_task(options: argparse.Namespace) -> tuple[Callable[[], Rollout], tupl
     if policy is not None:
         for name in ("contact", "stiffness", "damping", "horizon", "model"):
             if getattr(options, name) is None:
-                setattr(options, name, getattr(policy, name) or None)
+                setattr(options, name, getattr(policy, name))
     task = task_of(options)
     if policy is not None and options.cone is None and policy.cone not in (None, CONES[int(task.scene.host.opt.cone)]):
         options.cone = policy.cone  # only if it differs: a user's own task need not take the option
@@ -103,7 +103,7 @@ def _plan_task(options: argparse.Namespace) -> tuple[Callable[[], Rollout], tupl
     if policy is not None and policy.network is not None:
         task = with_network(task, tuple(policy.network), jax.random.key(0))  # theta replaces its weights
     stiffness = task.defaults.middle_stiffness if options.stiffness is None else options.stiffness
-    cells, messages = contact_grid(task, (options.contact or task.defaults.main_family,), (stiffness,), options.damping)
+    cells, messages = family_grid(task, (options.contact or task.defaults.main_family,), (stiffness,), options.damping)
     return partial(_simulate_task, at_theta(task, theta), cells[0], options.seed, options.noisy), messages
 
 
@@ -115,7 +115,7 @@ def _simulate_task(task: Task, cell: ContactPoint, seed: int, noisy: bool) -> Ro
     facts = {
         "task": task.name,
         "contact": cell.family,
-        "stiffness": cell.stiffness,
+        "stiffness": cell.stiffness_or_zero,
         "theta": np.asarray(theta, float).tolist(),
         "sigma": task.sigma if noisy else 0.0,
         "seed": seed,

@@ -22,14 +22,14 @@ def add(command: Parser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     from mjx_study.disk import prepare_folder, write_whole
-    from mjx_study.report import report
+    from mjx_study.report import render_report
     from mjx_study.study.run import load_study, warnings_of
 
     with usage_errors():
         dataset = load_study(options.folder)
         path = options.output or options.folder / "report.html"
         prepare_folder(path.parent)
-    page = report(dataset).encode()
+    page = render_report(dataset).encode()
     written, unwritten = attempt(lambda: [write_whole(path, page)])
     warnings = list(warnings_of(dataset))
     lines = [f"warning: {message}" for message in warnings]

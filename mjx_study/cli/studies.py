@@ -21,7 +21,7 @@ from mjx_study.plots.style import save_figures
 from mjx_study.study.cluster import connected
 from mjx_study.study.configuration import StudyConfig
 from mjx_study.study.dataset import as_plain
-from mjx_study.study.forecast import forecast
+from mjx_study.study.forecast import forecast_study
 from mjx_study.study.plan import StudyPlan, plan_study
 from mjx_study.study.run import load_study, open_store, run_study, warnings_of
 from mjx_study.study.store import Store, StudyError
@@ -115,7 +115,7 @@ def _announce(plan: StudyPlan, options: argparse.Namespace) -> int:
     """Print the forecast cost of a study."""
     cluster = getattr(options, "cluster", None)
     with usage_errors():
-        found = forecast(plan, options.output, accept_versions=options.accept_versions, cluster=cluster)
+        found = forecast_study(plan, options.output, accept_versions=options.accept_versions, cluster=cluster)
     lines = [*found.lines, *(f"warning: {message}" for message in plan.warnings)]
     return print_report(options, dataclasses.asdict(found) | {"warnings": list(plan.warnings)}, lines)
 

@@ -5,7 +5,7 @@ Every statement is measured and comes with the command that reproduces it.
 
 from mjx_study.diagnose.measurement import ESTIMATORS, Measured, Measurement, measure
 from mjx_study.diagnose.page import SMOOTH, WIDTHS, Diagnosis
-from mjx_study.diagnose.run import diagnose
+from mjx_study.diagnose.run import diagnose_task
 from mjx_study.diagnose.setting import Touch, touch_of
 
 __all__ = [
@@ -16,7 +16,7 @@ __all__ = [
     "Measured",
     "Measurement",
     "Touch",
-    "diagnose",
+    "diagnose_task",
     "measure",
     "touch_of",
 ]

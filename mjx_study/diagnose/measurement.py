@@ -161,7 +161,7 @@ def measure(
     Args:
         simulator: its compiled programs serve every contact model.
         contact: the contact model; None for the MJCF's own.
-        samples: see `diagnose`.
+        samples: see `diagnose_task`.
         seed: random seed.
     """
     task = simulator.task

@@ -10,14 +10,14 @@ from mjx_study.gradcheck import gradcheck, plan_gradcheck, plan_scene_gradcheck
 from mjx_study.objective import Simulator
 from mjx_study.study.configuration import Progress
 from mjx_study.study.memory import check_memory
-from mjx_study.tasks.contact_grid import contact_grid
+from mjx_study.tasks.contact_grid import family_grid
 from mjx_study.tasks.task import Task
 
 STATES: Final = 2
 """Number of states in the gradient check."""
 
 
-def diagnose(
+def diagnose_task(
     subject: str,
     task: Task,
     family: str | None = None,
@@ -45,7 +45,7 @@ def diagnose(
         ValueError: there is no such contact model, or the batches do not fit in memory.
     """
     family, stiffness = family or task.defaults.main_family, stiffness or task.defaults.middle_stiffness
-    (cell,), warnings = contact_grid(task, [family], [stiffness], damping)
+    (cell,), warnings = family_grid(task, [family], [stiffness], damping)
     check_memory(task, estimators_of(task), samples or SAMPLES)
     progress(0, 4, "rollout without noise")
     touches = tuple(touches_of(task, cell))

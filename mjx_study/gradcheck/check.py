@@ -10,7 +10,7 @@ import mujoco
 
 from mjx_study.choices import CHECKED_STATES, CHECKED_STEPS, FAMILIES
 from mjx_study.choices import CHECKED_STIFFNESS as STIFFNESS
-from mjx_study.gradcheck.coordinates import coordinates
+from mjx_study.gradcheck.coordinates import make_coordinates
 from mjx_study.gradcheck.cost import CostPrograms, check_cost, judge_closed_forms
 from mjx_study.gradcheck.programs import Compiler, Programs, Setting
 from mjx_study.gradcheck.report import CostCheck, Finding, GradcheckReport, StepCheck, gravity
@@ -21,7 +21,7 @@ from mjx_study.runtime import environment
 from mjx_study.simulation.engine import quiet_engine
 from mjx_study.simulation.scene import Scene
 from mjx_study.study.configuration import Progress
-from mjx_study.tasks.contact_grid import ContactPoint, contact_grid
+from mjx_study.tasks.contact_grid import ContactPoint, family_grid
 from mjx_study.tasks.mjcf import scene_task
 from mjx_study.tasks.task import Task
 
@@ -82,7 +82,7 @@ def plan_gradcheck(
     if stiffnesses is None:
         own = task.defaults.stiffnesses
         stiffnesses = STIFFNESS if min(STIFFNESS) <= max(own) else own
-    cells, messages = contact_grid(task, families, stiffnesses, damping)
+    cells, messages = family_grid(task, families, stiffnesses, damping)
     if not cells:
         raise ValueError("no contact model to check: give at least one stiffness and one contact family")
     return GradcheckPlan(task, True, cells, messages, states, seed, stock)
@@ -125,7 +125,7 @@ def plan_scene_gradcheck(
         raise ValueError("a stiffness in N/m requires the effective mass of a contact: give --pair GEOM,GEOM")
     subject = scene_task(scene, horizon=horizon, pair=pair)
     _check(subject, states)
-    cells, messages = contact_grid(subject, families, stiffnesses or (), damping)
+    cells, messages = family_grid(subject, families, stiffnesses or (), damping)
     return GradcheckPlan(subject, False, cells, messages, states, seed, stock)
 
 
@@ -148,7 +148,7 @@ def gradcheck(plan: GradcheckPlan, progress: Progress = lambda done, total, what
         progress(min(next(done), total), total, what)
 
     begin("compiling")
-    layouts = [coordinates(task.scene, cell.contact) for cell in plan.cells]
+    layouts = [make_coordinates(task.scene, cell.contact) for cell in plan.cells]
     programs = Programs(layouts[0], compiler)
     settings = [Setting(cell.contact, layout.scales) for cell, layout in zip(plan.cells, layouts, strict=True)]
     programs.start(settings[0], start_of(task.scene), stock=plan.stock)

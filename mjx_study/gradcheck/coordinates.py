@@ -36,12 +36,12 @@ class Coordinate:
 
     Attributes:
         block: qpos, quaternion length, qvel, act, ctrl or contact.
-        joint: index of the joint, or -1.
+        joint: index of the joint, if it has one.
     """
 
     block: str
     name: str
-    joint: int = -1
+    joint: int | None = None
 
     def __str__(self) -> str:
         return self.name if self.block == "contact" else f"{self.block}[{self.name}]"
@@ -112,7 +112,7 @@ class Coordinates:
         return apply_contact(model.replace(**geoms), contact)
 
 
-def coordinates(scene: Scene, contact: ContactModel | None) -> Coordinates:
+def make_coordinates(scene: Scene, contact: ContactModel | None) -> Coordinates:
     host = scene.host
     dofs = [(name, joint) for joint in range(host.njnt) for name in _dof_names(host, joint)]
     actuators = [host.actuator(index).name or f"actuator {index}" for index in range(host.nu)]

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_study.gradcheck.diagnosis import worst_verdict
-from mjx_study.gradcheck.differences import differences, moves
+from mjx_study.gradcheck.differences import moves, take_differences
 from mjx_study.gradcheck.programs import Compiler
 from mjx_study.gradcheck.report import CostCheck, Entry, Finding
 from mjx_study.objective import rollout_cost
@@ -75,7 +75,7 @@ def check_cost(programs: CostPrograms, cell: ContactPoint, seed: int) -> tuple[C
     norm = float(np.linalg.norm(gradient))
     scale = norm if norm > 0 else 1.0
     modes = float(np.max(np.abs(slopes - directions @ gradient))) / scale
-    truth = differences(programs.costs(cell.contact, moves(directions))[:, None])
+    truth = take_differences(programs.costs(cell.contact, moves(directions))[:, None])
     error = np.abs(directions @ gradient - truth.value[0])
     apart = error > DIFFERENCE_TOLERANCE * scale + 3 * truth.uncertainty[0]
     verdict = cost_verdict(
@@ -89,7 +89,7 @@ def check_cost(programs: CostPrograms, cell: ContactPoint, seed: int) -> tuple[C
     )
     closed_form = _against_closed_form(task, cell, gradient, jax.random.clone(programs.key))
     errors = (modes, float(error.max() / scale), float(truth.gap.max() / scale), closed_form, float(residual))
-    check = CostCheck(cell.family, cell.stiffness, norm, *errors, verdict)
+    check = CostCheck(cell.family, cell.stiffness_or_zero, norm, *errors, verdict)
     fields = (states.qpos, states.qvel, states.act, controls, states.warmstart)
     return check, [HostState(*row) for row in zip(*map(np.asarray, fields), strict=False)]  # one state more
 
@@ -124,6 +124,6 @@ def cost_verdict(*, finite: bool, modes: float, residual: float, excused: list[s
 def _against_closed_form(task: Task, cell: ContactPoint, gradient: np.ndarray, key: Any) -> float | None:
     if task.reference is None or cell.family != "penalty":
         return None
-    exact = np.asarray(task.reference(cell.stiffness).value_and_gradient(task.theta, key)[1])
+    exact = np.asarray(task.reference(cell.stiffness_or_zero).value_and_gradient(task.theta, key)[1])
     size = float(np.linalg.norm(exact))
     return float(np.linalg.norm(gradient - exact)) / (size if size > 0 else 1.0)

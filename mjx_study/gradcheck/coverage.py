@@ -67,7 +67,7 @@ class Coverage:
         return f"of {self.states} states, {'; '.join(parts)}" if parts else ""
 
 
-def coverage(
+def count_coverage(
     parts: frozenset[str], states: Sequence[Collection[str]], unreachable: Mapping[str, int] = MappingProxyType({})
 ) -> Coverage:
     counts = {part: sum(part in state for state in states) for part in PARTS if part in parts}

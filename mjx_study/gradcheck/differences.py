@@ -52,12 +52,12 @@ class Differences:
 
 
 def moves(columns: Float[np.ndarray, "columns inputs"]) -> Float[np.ndarray, "moves inputs"]:
-    """All changes at which `differences` needs outputs: zero, then every step size forwards and backwards."""
+    """All changes at which `take_differences` needs outputs: zero, then every step size forwards and backwards."""
     steps = (np.array(SIZES)[:, None, None] * columns).reshape(-1, columns.shape[1])
     return np.concatenate([np.zeros((1, columns.shape[1])), steps, -steps])
 
 
-def differences(
+def take_differences(
     outputs: Float[np.ndarray, "moves outputs"], noise_floor: Float[np.ndarray, " outputs"] | float = 0.0
 ) -> Differences:
     """Differences of the outputs at `moves`, one row per change; the noise floor is in addition to `ROUNDING`."""

@@ -164,7 +164,7 @@ def check_mean(
         else:
             paths = [circulations(estimators, objective, *ends, key, samples)]
         found += [
-            MeanCheck(cell.family, cell.stiffness or 0.0, name, each, each.verdict(tolerance))
+            MeanCheck(cell.family, cell.stiffness_or_zero, name, each, each.verdict(tolerance))
             for numbers in paths
             for name, each in zip(names or [estimator.name for estimator in estimators], numbers, strict=True)
         ]

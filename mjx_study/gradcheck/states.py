@@ -9,7 +9,7 @@ from typing import Final
 import mujoco
 import numpy as np
 
-from mjx_study.gradcheck.coverage import OPTIONAL, Coverage, coverage, exercised, possible
+from mjx_study.gradcheck.coverage import OPTIONAL, Coverage, count_coverage, exercised, possible
 from mjx_study.simulation.contact import ContactModel
 from mjx_study.simulation.engine import HostState, converged_host, host_data, host_state
 from mjx_study.simulation.scene import Scene
@@ -90,7 +90,7 @@ def states_of(
         chosen += _even(pool, count - len(chosen))
     chosen += itertools.islice(_elsewhere(host, start, horizon, random), count - len(chosen))
     chosen[1:] = sorted(chosen[1:], key=lambda sample: (len(sample.label.split(",")), sample.index))
-    return chosen, coverage(parts, [sample.parts for sample in chosen], unreachable)
+    return chosen, count_coverage(parts, [sample.parts for sample in chosen], unreachable)
 
 
 def _cover(chosen: list[Sample], pool: Iterable[Sample], wanted: frozenset[str], count: int) -> list[Sample]:

@@ -12,7 +12,7 @@ from mjx_study.gradcheck.causes import SINGULAR, Place, cause_of_fault, cause_of
 from mjx_study.gradcheck.coordinates import Coordinates
 from mjx_study.gradcheck.coverage import Coverage
 from mjx_study.gradcheck.diagnosis import ENGINE, NAN, RIGHT, UNRESOLVED, VERDICTS, Codes, judge, worst_error
-from mjx_study.gradcheck.differences import Differences, differences, moves, solution_noise
+from mjx_study.gradcheck.differences import Differences, moves, solution_noise, take_differences
 from mjx_study.gradcheck.programs import Programs, Setting
 from mjx_study.gradcheck.report import Entry, Finding, StepCheck
 from mjx_study.gradcheck.states import Sample
@@ -64,8 +64,10 @@ def check_state(
     solved = dataclasses.replace(sample.state, warmstart=qacc)
     exact = programs.exact(setting, solved, reference, ladder)
     noise = solution_noise(layout, exact.stages, qacc)
-    truth = differences(exact.outputs, noise)
-    engine_truth = differences(engine_step.outputs(solved, linear.qpos, ladder), engine_step.noise(solved, linear.qpos))
+    truth = take_differences(exact.outputs, noise)
+    engine_truth = take_differences(
+        engine_step.outputs(solved, linear.qpos, ladder), engine_step.noise(solved, linear.qpos)
+    )
     stock_step = programs.stock_step(setting, solved)
     values = compare_values(layout, engine_step, solved, exact.after, stock_step, exact.stages, noise)
 
@@ -122,7 +124,7 @@ def step_check(
         stock = float("inf") if nan else worst(STOCK, *blocks)
     return StepCheck(
         contact=cell.family,
-        stiffness=cell.stiffness,
+        stiffness=cell.stiffness_or_zero,
         states=len(checks),
         entries=len(checks) * len(layout.inputs) * len(layout.outputs),
         unresolved=sum(int(np.sum(_worst_codes(check.of("project")) == UNRESOLVED)) for check in checks),

@@ -109,14 +109,14 @@ class Values:
     Attributes:
         stock, engine: difference of this project's state from that of `mjx.step`, and from the C engine's.
         verdict: value (this project and `mjx.step` differ), engine (they agree, and the C engine differs for no
-            documented reason), engine_mismatch (for a documented reason), or empty.
+            documented reason), engine_mismatch (for a documented reason), or None.
         coordinate: output that differs most, an index into the layout's outputs.
         numbers: change of this coordinate in this project and in the differing implementation.
     """
 
     stock: float
     engine: float
-    verdict: str = ""
+    verdict: str | None = None
     cause: str = ""
     coordinate: int = 0
     numbers: tuple[float, float] = (0.0, 0.0)
@@ -145,7 +145,7 @@ def compare_values(
     theirs = engine_step.after(state)
     gaps = [_apart(layout, state, ours, other, noise) for other in (stock, theirs)]
     from_stock, from_engine = (float(gap.max()) for gap in gaps)
-    verdict = cause = ""
+    verdict, cause = None, ""
     if not np.all(np.isfinite(ours.warmstart)):
         return Values(from_stock, from_engine)
     if not from_stock <= TOLERANCE:
@@ -249,8 +249,8 @@ def _forward(host: mujoco.MjModel, state: HostState) -> mujoco.MjData:
     return data
 
 
-def _stage(host: mujoco.MjModel, data: mujoco.MjData, stages: dict[str, Any]) -> str:
-    """Return the first quantity that differs, which explains later ones; empty if none differs."""
+def _stage(host: mujoco.MjModel, data: mujoco.MjData, stages: dict[str, Any]) -> str | None:
+    """Return the first quantity that differs, which explains later ones; None if none differs."""
     inertia = np.zeros((host.nv, host.nv))
     mujoco.mj_fullM(host, data, inertia)
     for name, words in STAGES.items():
@@ -258,7 +258,7 @@ def _stage(host: mujoco.MjModel, data: mujoco.MjData, stages: dict[str, Any]) ->
         gap = _relative(np.asarray(stages[name]).reshape(theirs.shape), theirs)
         if gap > TOLERANCE:
             return f"{words} differ{'' if words.endswith('s') else 's'} by {gap:.1e}"
-    return ""
+    return None
 
 
 def _integration(host: mujoco.MjModel) -> Found:

@@ -8,7 +8,7 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from mjx_study.plots.panels import a_few, against_stiffness, counted, estimators, line, model_title, panels
+from mjx_study.plots.panels import a_few, against_stiffness, counted, estimators, line, make_panels, model_title
 from mjx_study.plots.style import STYLE, line_with_band, robust_limits
 from mjx_study.study.variables import DERIVED, DESCENTS, LANDSCAPES, THETA
 
@@ -53,7 +53,7 @@ def descent(part: xr.Dataset, title: str) -> Figure:
     models, columns = a_few(part), 4 if bool(part["alpha"].notnull().any()) else 3
     seeds = counted(part.sizes["seed"], "seed")
     title = f"{title} ({f'median and range of {seeds}' if part.sizes['seed'] > 1 else seeds})"
-    figure, grid = panels(len(models), columns, 0.6 + 3.4 * columns, 1.3 + 2.5 * len(models), title)
+    figure, grid = make_panels(len(models), columns, 0.6 + 3.4 * columns, 1.3 + 2.5 * len(models), title)
     for row, model in zip(grid, models, strict=True):
         one = part.isel(model=model)
         curves, least = [], np.inf
@@ -94,7 +94,7 @@ def descent(part: xr.Dataset, title: str) -> Figure:
 def landscape(part: xr.Dataset, title: str) -> Figure:
     """Plot cost and mean cost along the line above, estimators' slopes below; one column for each of a few models."""
     models, title = a_few(part), f"{title} at each point (bands: 95 %)"
-    figure, grid = panels(2, len(models), 1.6 + 2.9 * len(models), 6.2, title, sharex=True, sharey="row")
+    figure, grid = make_panels(2, len(models), 1.6 + 2.9 * len(models), 6.2, title, sharex=True, sharey="row")
     slopes, steepest = [], 0.0
     direction = json.loads(part.attrs["config"])["direction"] or "random"
     along, per = (f"t in theta + t d (d: {direction})", "t") if part.attrs["many_parameters"] else ("theta", "theta")

@@ -18,8 +18,8 @@ from mjx_study.plots.panels import (
     geometric,
     line,
     make_logarithmic,
+    make_panels,
     model_title,
-    panels,
     positive,
     shade_unstable,
     stiffness_axis,
@@ -32,7 +32,7 @@ def comparison(part: xr.Dataset, title: str) -> Figure:
     """Plot variance above and relative error below, with intervals of one batch; one column per contact family."""
     found, confidence = families(part), json.loads(part.attrs["config"])["confidence"]
     title = f"{title}\ngradient estimates (bands: {100 * confidence:.0f} % intervals)"
-    figure, axes = panels(2, len(found), 1.2 + 3.4 * len(found), 6.2, title, sharex="col", sharey="row")
+    figure, axes = make_panels(2, len(found), 1.2 + 3.4 * len(found), 6.2, title, sharex="col", sharey="row")
     one = part.isel(seed=0)
     for panel, shown, room in (
         (axes[0, 0], [one["variance"]], 100),
@@ -139,7 +139,7 @@ def error_against_samples(part: xr.Dataset, title: str) -> Figure:
                for index in range(rows.sizes["model"])]  # fmt: skip
     chosen = chosen[:MOST_PANELS]
     title = f"{title}\nerror (95 % intervals over the seeds)"
-    figure, grid = panels(1, len(chosen), 1.4 + 3.2 * len(chosen), 3.7, title, sharey=True)
+    figure, grid = make_panels(1, len(chosen), 1.4 + 3.2 * len(chosen), 3.7, title, sharey=True)
     for axes, rows in zip(grid[0], chosen, strict=True):
         x = rows["samples"].values
         for mine, style in estimators(rows):

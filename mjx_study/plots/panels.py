@@ -21,7 +21,7 @@ APART: Final = 1.05
 """Ratio of the stiffnesses at which neighbouring estimators are drawn where they would hide each other."""
 
 
-def panels(
+def make_panels(
     rows: int, columns: int, width: float, height: float, title: str, **shared: Any
 ) -> tuple[Figure, np.ndarray]:
     """Create a figure with a title over a grid of panels; sizes in inches."""
@@ -96,7 +96,7 @@ def against_stiffness(
 ) -> Figure:
     """Plot one panel per contact family."""
     found = families(part)
-    figure, grid = panels(1, len(found), 1.4 + 3.2 * len(found), 3.9, title, sharey=True)
+    figure, grid = make_panels(1, len(found), 1.4 + 3.2 * len(found), 3.9, title, sharey=True)
     for axes, (family, rows) in zip(grid[0], found, strict=True):
         x = stiffness_axis(axes, family, rows)
         draw(axes, rows, x)

@@ -14,7 +14,7 @@ from matplotlib.patches import Rectangle
 
 from mjx_study.plots.descents import achieved, descent, landscape
 from mjx_study.plots.gradients import alpha, bias, comparison, error_against_samples, variance
-from mjx_study.plots.panels import UNSTABLE, families, number, panels, positive, unstable
+from mjx_study.plots.panels import UNSTABLE, families, make_panels, number, positive, unstable
 from mjx_study.plots.style import TITLES, fit_texts, legend_below, mark_clipped
 from mjx_study.study.variables import COORDINATES, DESCENTS, GRADIENTS
 from mjx_study.table import digits_to_tell_apart
@@ -118,7 +118,7 @@ def _ratio_map(part: xr.Dataset, title: str, quantity: str, other: str) -> Figur
     """Plot log10 of FoBG over ZoBG against two swept parameters, one panel per family; blue where FoBG is smaller."""
     found = [(family, rows) for family, rows in families(part) if family] or families(part)
     title = f"{title}\nwhere first order is ahead (blue) and behind (red)"
-    figure, grid = panels(1, len(found), 1.8 + 3.2 * len(found), 3.9, title, sharey=True)
+    figure, grid = make_panels(1, len(found), 1.8 + 3.2 * len(found), 3.9, title, sharey=True)
     ratios = []
     for _, rows in found:
         values = rows[quantity].median("seed")

@@ -114,7 +114,7 @@ def cells_on(
     begun = {
         index: computation.compute.begun(plan.cells[index], part.kept)
         for index, part in parts.items()
-        if blocks_of(plan, plan.cells[index])
+        if blocks_of(plan, plan.cells[index]) > 1
     }
     waiting: dict[Any, deque[Task]] = defaultdict(deque)
     has: dict[Any, set[str]] = defaultdict(set)  # workers that have compiled a program

@@ -4,7 +4,7 @@ import dataclasses
 import math
 from collections import Counter
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Final, Union
+from typing import TYPE_CHECKING, Any, ClassVar, Final, TypeVar, Union
 
 from estimators.catalogue import CATALOGUE, PLUG_IN, PUBLISHED_TOLERANCE
 from mjx_study.choices import FAMILIES
@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     import estimators.estimator
     import mjx_study.tasks.task
 
+Setting = TypeVar("Setting")
 Progress = Callable[[int, int, str], None]
 """Called with (work done, total work, what is being computed)."""
 OF_KIND: Final[dict[str, dict[str, Any]]] = {
@@ -173,6 +174,8 @@ class StudyConfig(Checked):
         if self.kind is None:
             of_points = "gradients" if self.points is None else "landscapes"
             object.__setattr__(self, "kind", of_points if self.iterations is None else "descents")
+        if self.kind == "landscapes" and self.points is None:
+            raise ValueError("landscapes need `points`: give their number")
         self._settle()
         check_span(self.span)
 
@@ -207,6 +210,12 @@ class StudyConfig(Checked):
     def batches(self) -> int:
         """Number of seeds, given or by default."""
         return self.seeds or (1 if self.kind == "landscapes" else 10)
+
+
+def settled(value: Setting | None) -> Setting:
+    """A setting that the study's kind has: it is given, or has a default."""
+    assert value is not None
+    return value
 
 
 def refuse_repeats(label: str, values: Sequence[object]) -> None:

@@ -40,9 +40,11 @@ def dataset_of(document: Mapping[str, Any], cells: Cells) -> xr.Dataset:
     dimensions: dict[str, Sequence[Any]] = dict(document["axes"]) | {
         "estimator": config["estimators"],
         "seed": range(config["seeds"]),
-        "iteration": range(1, (config["iterations"] or 0) + 1),
-        "point": range(config.get("points") or 0),
     }
+    if (iterations := config["iterations"]) is not None:
+        dimensions["iteration"] = range(1, iterations + 1)
+    if (points := config.get("points")) is not None:
+        dimensions["point"] = range(points)
     shape = tuple(len(dimensions[name]) for name in outer)
     data: dict[str, Any] = {}
     units = {entry.get("unit", "") for entry in document["resolved"]}

@@ -28,6 +28,7 @@ from mjx_study.objective import Simulator, TracedObjective, simulate
 from mjx_study.reference import Reference
 from mjx_study.simulation.contact import ContactModel, soften
 from mjx_study.stopwatch import tell, timed
+from mjx_study.study.configuration import settled
 from mjx_study.study.forecast import iteration
 from mjx_study.study.iteration import Descent, Record, advance, begin, going, make_optimizer, schedule_factors
 from mjx_study.study.plan import StudyCell, StudyPlan, estimators_of
@@ -50,7 +51,7 @@ def compute_descents(plan: StudyPlan) -> Callable[..., dict[str, np.ndarray]]:
     backends: dict[tuple[Any, ...], Backend] = {}
 
     def compute(cell: StudyCell, part: Part = Part()) -> dict[str, np.ndarray]:  # noqa: B008, it is empty
-        key = (cell.group, cell.sigma, cell.samples, cell.model.stiffness if cell.model.analytic else None)
+        key = (cell.group, cell.sigma, cell.samples, cell.model.stiffness_or_zero if cell.model.analytic else None)
         if key not in backends:
             backends[key] = Backend(plan, cell)
         backend, kept = backends[key], dict(part.kept)
@@ -82,10 +83,10 @@ class Backend:
 
     def __init__(self, plan: StudyPlan, cell: StudyCell):
         group, config = plan.groups[cell.group], plan.config
-        assert group.recipe is not None and config.optimizer is not None, "a plan of descents has recipes"
-        self.task, self.recipe, self.samples = group.task.replace(sigma=cell.sigma), group.recipe, cell.samples
+        self.task, self.recipe = group.task.replace(sigma=cell.sigma), settled(group.recipe)
+        self.samples = cell.samples
         self.config, self.seeds = config, config.batches
-        self.optimizer = make_optimizer(config.optimizer, self.recipe.learning_rate, self.recipe.decay)
+        self.optimizer = make_optimizer(settled(config.optimizer), self.recipe.learning_rate, self.recipe.decay)
         self.simulator = None if cell.model.analytic else Simulator(self.task, chunk_size=plan.chunk_size)
         self.saving = threading.Lock()
         iterations = self.recipe.iterations
@@ -136,7 +137,7 @@ class Backend:
 
         def on_host(state: Descent, keys: Key[Array, " seeds"], index: int) -> tuple[Descent, Record]:
             task = self.task.replace(sigma=float(self._sigma[index]))
-            reference = task.analytic(model.stiffness * float(self._stiffness[index]))
+            reference = task.analytic(model.stiffness_or_zero * float(self._stiffness[index]))
             groups = [slice(first, first + count) for first in range(0, self.seeds, count)]
             parts = [self._together(estimator.needs, reference, state.theta[some], keys[some]) for some in groups]
             return compiled(state, jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts))
@@ -162,9 +163,8 @@ class Backend:
 
     def cost(self, theta: Float[Array, " params"], model: ContactPoint) -> tuple[float, float]:
         """Mean cost with noise at theta, over samples with the same noise for every theta, and its standard error."""
-        objective = (
-            self.task.analytic(model.stiffness) if self.simulator is None else self.simulator.objective(model.contact)
-        )
+        analytic, simulator = self.task.analytic, self.simulator
+        objective = analytic(model.stiffness_or_zero) if simulator is None else simulator.objective(model.contact)
         value = np.asarray(objective.evaluate(theta, self._evaluation_keys()).value)
         value = value[np.isfinite(value)]
         if len(value) < 2:
@@ -174,7 +174,7 @@ class Backend:
     def metrics(self, theta: Float[Array, " params"], model: ContactPoint) -> dict[str, float]:
         """Means of the task's metrics over the rollouts of `cost`, nonfinite values excluded."""
         if self.simulator is None:
-            found = self.task.analytic(model.stiffness).observe(theta, self._evaluation_keys())
+            found = self.task.analytic(model.stiffness_or_zero).observe(theta, self._evaluation_keys())
         elif self.task.metrics is None:
             return {}
         else:
@@ -183,7 +183,7 @@ class Backend:
 
     def _evaluation_keys(self) -> Key[Array, " samples"]:
         key = jax.random.fold_in(jax.random.key(self.config.seed), 2**31 - 1)
-        return jax.random.split(key, self.config.evaluation_samples or 0)
+        return jax.random.split(key, settled(self.config.evaluation_samples))
 
     @cached_property
     def _observe(self) -> Compiled:

@@ -138,7 +138,7 @@ def document_of(plan: StudyPlan, command: str | None) -> dict[str, Any]:
     places = [{name: index[name][value] for name, value in each.items()} for each in exact]
     fields = {field.name: getattr(plan.config, field.name) for field in dataclasses.fields(plan.config)}
     fields |= {"tasks": plan.config.task_names, "estimators": plan.config.estimator_names}
-    fields |= {"seeds": plan.config.batches, "iterations": plan.iterations or None}
+    fields |= {"seeds": plan.config.batches, "iterations": plan.iterations}
     return {
         "config": fields,
         "warnings": list(plan.warnings),
@@ -163,7 +163,7 @@ def _coordinates(plan: StudyPlan, cell: StudyCell) -> dict[str, Any]:
         "task": group.name,
         "timestep": group.timestep,
         "cone": group.cone,
-        "model": (cell.model.family, cell.model.stiffness),
+        "model": (cell.model.family, cell.model.stiffness_or_zero),
         "sigma": cell.sigma,
         "samples": cell.samples,
     }

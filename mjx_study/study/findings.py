@@ -102,7 +102,7 @@ def rows_of(dataset: xr.Dataset) -> list[Row]:
     return rows
 
 
-def findings(dataset: xr.Dataset) -> list[str]:
+def findings_of(dataset: xr.Dataset) -> list[str]:
     """Return the findings supported by a study's intervals, as sentences."""
     kind = json.loads(dataset.attrs["config"])["kind"]
     return {"gradients": _of_gradients, "descents": _of_descents, "landscapes": _of_landscapes}[kind](dataset)
@@ -190,7 +190,8 @@ def _meaningless(rows: Sequence[Row], gammas: Bounds) -> list[str]:
             f"the reference's own uncertainty exceeds {UNSURE:.0%}{_at(unsure)}: errors and verdicts mean "
             "little there; increase --reference-samples"
         )
-    if bound := [row for row in rows if (row.epsilon or 0.0) > gammas.get((row.task, row.estimator), math.inf)]:
+    limited = [row for row in rows if row.epsilon is not None]
+    if bound := [row for row in limited if row.epsilon > gammas.get((row.task, row.estimator), math.inf)]:
         found.append(f"AoBG equals ZoBG{_at(bound)}: {BOUND}")
     return found
 

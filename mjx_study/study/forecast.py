@@ -17,6 +17,7 @@ import numpy as np
 
 from mjx_study.objective import contact_for, rounds
 from mjx_study.runtime import available_cores
+from mjx_study.study.configuration import settled
 from mjx_study.study.gradients import CANDIDATES, MOST_KEPT, takes_candidates
 from mjx_study.study.landscapes import CHUNK, QUADRATURE, applies
 from mjx_study.study.memory import batches_at_once
@@ -74,7 +75,7 @@ class Forecast:
         return f"time: about {duration(self.seconds)}, of which compilation {duration(self.compilation)}; {told}"
 
 
-def forecast(
+def forecast_study(
     plan: StudyPlan, folder: Path | None = None, *, accept_versions: bool = False, cluster: str | None = None
 ) -> Forecast:
     """Forecast the cost of a plan, less the finished cells of a folder if one is given.
@@ -83,7 +84,7 @@ def forecast(
     folder holds another study, or one computed with other versions.
     """
     store = None if folder is None else begun_store(plan, folder, accept_versions=accept_versions)
-    longer = store is not None and (store.document["config"].get("iterations") or 0) < plan.iterations
+    longer = store is not None and store.document["config"].get("iterations") != plan.iterations
     if store is not None:
         plan = plan.with_chunk(store.chunk_size)
     missing = range(len(plan.cells)) if store is None or longer else store.missing
@@ -95,7 +96,7 @@ def forecast(
     if cluster is None:
         spent = sum((time.cell(plan, cell, devices) for cell in cells), 0.0)
     else:
-        tasks = ((time.cell(plan, cell, 1), 1 + blocks_of(plan, cell) * plan.config.batches) for cell in cells)
+        tasks = ((time.cell(plan, cell, 1), _tasks(plan, cell)) for cell in cells)
         spent = _side_by_side((seconds / count for seconds, count in tasks for _ in range(count)), devices)
     return Forecast(
         cells=len(plan.cells),
@@ -136,8 +137,7 @@ class _Time:
         counts = calls(plan, cell, devices)
         own: list[float] = []
         if plan.config.kind == "descents" and not cell.model.analytic:
-            recipe = plan.groups[cell.group].recipe
-            assert recipe is not None
+            recipe = settled(plan.groups[cell.group].recipe)
             programs = [iteration(plan, cell, each.needs) for each in estimators_of(plan, cell)]
             own = [self._calls(program, recipe.iterations) for program in programs]
             counts = {program: count for program, count in counts.items() if program not in programs}
@@ -166,14 +166,20 @@ def _workers(cluster: str) -> int:
     return int(count or 1) if kind == "slurm" else 1
 
 
+def _tasks(plan: StudyPlan, cell: StudyCell) -> int:
+    """Number of tasks into which a cell is divided among workers: the reference and all blocks, or the whole cell."""
+    blocks = blocks_of(plan, cell)
+    return 1 if blocks == 1 else 1 + blocks * plan.config.batches
+
+
 def _kept(plan: StudyPlan, cell: StudyCell) -> int:
     """Size of a cell's arrays [bytes]."""
     config, group = plan.config, plan.groups[cell.group]
-    sizes = {
+    sizes: dict[str, Any] = {
         "seed": config.batches,
         "estimator": len(config.estimators),
-        "iteration": group.recipe.iterations if group.recipe else 0,
-        "point": config.points or 0,
+        "iteration": group.recipe and group.recipe.iterations,
+        "point": config.points,
         "param": group.task.policy.num_params,
     }
     counts = [math.prod(sizes[dim] for dim in each.dims) for each in VARIABLES[str(config.kind)].values()]
@@ -188,16 +194,15 @@ def rollouts(plan: StudyPlan, cell: StudyCell) -> tuple[int, int]:
         return np.sum([rollouts_of(oracle, cell.samples, group.task.random_start) for oracle in oracles], axis=0)
 
     if config.kind == "descents":
-        assert group.recipe is not None
         each = np.sum([batches(estimator.needs) for estimator in estimators_of(plan, cell)], axis=0)
-        total = config.batches * group.recipe.iterations * each + [_evaluations(plan), 0]
+        total = config.batches * settled(group.recipe).iterations * each + [_evaluations(plan), 0]
     elif config.kind == "landscapes":
         exact = QUADRATURE if not cell.model.analytic and applies(group.task) else 0
-        total = (config.points or 0) * config.batches * batches(oracles_of(config)) + [exact, exact]
+        total = settled(config.points) * config.batches * batches(oracles_of(config)) + [exact, exact]
     else:
         candidates = 0 if cell.model.analytic else CANDIDATES
         total = config.batches * batches(oracles_of(config))
-        total = total + [2 * (config.reference_samples or 0) + candidates, candidates]
+        total = total + [2 * settled(config.reference_samples) + candidates, candidates]
     return int(total[0]), int(total[1])
 
 
@@ -215,10 +220,10 @@ def calls(plan: StudyPlan, cell: StudyCell, devices: int) -> Counter[Program]:
         found[_program(plan, cell, program, plan.chunk_size)] += times * rounds(rows, plan.chunk_size, devices)
 
     if config.kind == "descents":
-        assert recipe is not None
         for estimator in estimators_of(plan, cell):
-            found[iteration(plan, cell, estimator.needs)] += recipe.iterations
-        batch("value", calls_of("evaluation", config.evaluation_samples or 0, task.random_start)[0][1], _costs(plan))
+            found[iteration(plan, cell, estimator.needs)] += settled(recipe).iterations
+        evaluations = calls_of("evaluation", settled(config.evaluation_samples), task.random_start)
+        batch("value", evaluations[0][1], _costs(plan))
         return found
     groups = _in_turn(config.batches, seeds_together(plan, cell))
     draws = [some for seeds in groups for some in _in_turn(seeds, batches_at_once(cell.samples))]
@@ -227,7 +232,7 @@ def calls(plan: StudyPlan, cell: StudyCell, devices: int) -> Counter[Program]:
             batch(program, rows, config.points or 1)
     if config.kind == "gradients":
         odd = takes_candidates(task)
-        batch("value", (2 if odd else 3) * (config.reference_samples or 0))
+        batch("value", (2 if odd else 3) * settled(config.reference_samples))
         if odd:
             batch("gradient", CANDIDATES)
     elif applies(task):
@@ -252,7 +257,7 @@ def rest(plan: StudyPlan, cell: StudyCell) -> Program:
         return other_program("analytic", rollouts(plan, cell)[0], task.name, *content, steps=task.horizon)
     if config.kind == "descents":
         numbers = _evaluations(plan) * task.policy.num_params
-    elif blocks_of(plan, cell):
+    elif blocks_of(plan, cell) > 1:
         numbers, content = cell.samples * bytes_in_block(plan, cell) // 8 * config.batches, (*content, "in blocks")
     else:
         numbers = memory_of_seed(plan, cell) // 8 * config.batches * (config.points or 1)
@@ -282,7 +287,7 @@ def _costs(plan: StudyPlan) -> int:
 
 
 def _evaluations(plan: StudyPlan) -> int:
-    return _costs(plan) * (plan.config.evaluation_samples or 0)
+    return _costs(plan) * settled(plan.config.evaluation_samples)
 
 
 def _in_turn(count: int, together: int) -> list[int]:

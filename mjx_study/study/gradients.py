@@ -26,6 +26,7 @@ from mjx_study.reference import Reference
 from mjx_study.runtime import traces_folder
 from mjx_study.stopwatch import unheard
 from mjx_study.study.blocks import REFERENCE, Arrays, Blocks, pack
+from mjx_study.study.configuration import settled
 from mjx_study.study.memory import BIAS_DRAWS, LARGEST_BLOCK, padded_size
 from mjx_study.study.plan import (
     StudyCell,
@@ -37,12 +38,12 @@ from mjx_study.study.plan import (
     padded_samples,
     seeds_together,
 )
-from mjx_study.study.reference_gradient import reference_gradient
+from mjx_study.study.reference_gradient import estimate_reference
 from mjx_study.study.sampling import Objectives, cell_keys, draw_batches, sample_keys
 from mjx_study.study.store import Part
 from mjx_study.study.tally import Tally, numbers_of, together
 from mjx_study.study.variables import BATCH, GRADIENTS, ONSETS
-from mjx_study.tasks.contact_grid import contact_grid
+from mjx_study.tasks.contact_grid import family_grid
 from mjx_study.tasks.task import Task
 
 Result = TypeVar("Result")
@@ -76,7 +77,7 @@ class Gradients:
     @property
     def _reference_keys(self) -> tuple[Key[Array, " pairs"], Key[Array, " samples"]]:
         odd, candidate = self._keys["reference"]
-        return jax.random.split(odd, self._config.reference_samples or 0), jax.random.split(candidate, CANDIDATES)
+        return jax.random.split(odd, settled(self._config.reference_samples)), jax.random.split(candidate, CANDIDATES)
 
     def __call__(self, cell: StudyCell, part: Part = Part()) -> Arrays:  # noqa: B008, it is empty
         """Compute a cell's numbers, see `begin`."""
@@ -88,7 +89,7 @@ class Gradients:
         Returns:
             The cell's numbers: complete on CPUs; on accelerators the statistics may still be running.
         """
-        if not blocks_of(self._plan, cell):
+        if blocks_of(self._plan, cell) == 1:
             return self._whole(cell)
         blocks = self.begun(cell, part.kept)
         for task in blocks.missing:
@@ -188,7 +189,8 @@ class Gradients:
 
     def _compile_statistics(self, cell: StudyCell, objective: MjxObjective | Reference) -> None:
         """Compile the statistics in another thread, in parallel with the rollouts."""
-        if not isinstance(objective, MjxObjective) or traces_folder() is None or blocks_of(self._plan, cell):
+        in_blocks = blocks_of(self._plan, cell) > 1
+        if not isinstance(objective, MjxObjective) or traces_folder() is None or in_blocks:
             return
         config, task = self._config, self._plan.groups[cell.group].task
         blank = BlankObjective(**vars(objective))
@@ -292,7 +294,7 @@ def soft_gradient(simulator: Simulator, sigma: float, keys: Key[Array, " samples
     task = simulator.task
     if task.contact_pair is None or not takes_candidates(task):
         return None
-    (cell,), _ = contact_grid(task, ("penalty",), (min(task.defaults.stiffnesses),))
+    (cell,), _ = family_grid(task, ("penalty",), (min(task.defaults.stiffnesses),))
     objective = simulator.objective(cell.contact, sigma)
     return jnp.median(objective.differentiate(task.theta, jax.random.clone(keys)).gradient, axis=0)
 
@@ -336,7 +338,7 @@ _antithetic = jax.jit(estimators.antithetic, static_argnames="baseline")
 def _reference_gradient(
     odd: Evaluation, pilot: Evaluation, candidates: Float[Array, "candidates params"], sigma: float
 ):
-    return reference_gradient(odd, pilot, list(candidates), sigma)
+    return estimate_reference(odd, pilot, list(candidates), sigma)
 
 
 @cache

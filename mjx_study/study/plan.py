@@ -17,7 +17,7 @@ from mjx_study.limits import MOST_CELLS, MOST_GIB, MOST_PROGRAMS, check_count
 from mjx_study.objective import chunk_for
 from mjx_study.option import OPTIONS, check
 from mjx_study.reference.noise import check_sigma
-from mjx_study.study.configuration import SAMPLES, StudyConfig
+from mjx_study.study.configuration import SAMPLES, StudyConfig, settled
 from mjx_study.study.iteration import make_optimizer, schedule_factors
 from mjx_study.study.memory import (
     AT_ONCE,
@@ -34,7 +34,7 @@ from mjx_study.study.memory import (
 from mjx_study.study.resolution import at_theta, configured_estimators, line_of, recipe_of
 from mjx_study.table import digits_to_tell_apart
 from mjx_study.tasks import make_task
-from mjx_study.tasks.contact_grid import ContactPoint, backward_grid, contact_grid, solver_grid
+from mjx_study.tasks.contact_grid import ContactPoint, backward_grid, family_grid, solver_grid
 from mjx_study.tasks.network import with_network
 from mjx_study.tasks.task import Recipe, Task, check_shapes
 
@@ -102,9 +102,9 @@ class StudyPlan:
         return max(memory_of(self, cell) for cell in {(cell.group, cell.samples): cell for cell in self.cells}.values())
 
     @property
-    def iterations(self) -> int:
-        """Iterations of the longest descent; 0 in other kinds of study."""
-        return max((group.recipe.iterations for group in self.groups if group.recipe), default=0)
+    def iterations(self) -> int | None:
+        """Iterations of the longest descent; None in other kinds of study."""
+        return max((group.recipe.iterations for group in self.groups if group.recipe), default=None)
 
     @property
     def contents(self) -> dict[str, str]:
@@ -151,7 +151,7 @@ def plan_study(config: StudyConfig, built: Mapping[str, Task] | None = None) -> 
         counts = config.samples or (SAMPLES if recipe is None else recipe.samples,)
         check_weights(config.weights, min(counts))
         name = which if isinstance(which, str) else which.name
-        models, told = contact_grid(task, config.contact, config.stiffness, config.damping)
+        models, told = family_grid(task, config.contact, config.stiffness, config.damping)
         if config.solref or config.solimp:
             more, also = solver_grid(task, config.solref, config.solimp)
             models, told = models + more, told + also
@@ -181,15 +181,15 @@ def plan_study(config: StudyConfig, built: Mapping[str, Task] | None = None) -> 
         if config.surrogate and (corrected := [each.name for each in chosen if "corrected" in each.needs]):
             raise ValueError(f"{corrected[0]} corrects exact derivatives: omit it or `backward`")
         if group.recipe is not None:
-            make_optimizer(config.optimizer or "", group.recipe.learning_rate, group.recipe.decay)
+            make_optimizer(settled(config.optimizer), group.recipe.learning_rate, group.recipe.decay)
             _check_schedules(config, group, group.recipe.iterations, chosen)
             history = HISTORY_NUMBERS * config.batches * group.recipe.iterations
             check_memory(group.task, chosen, config.batches * cell.samples, other=history)
-            check_memory(group.task, (), config.evaluation_samples or 0)
+            check_memory(group.task, (), settled(config.evaluation_samples))
         elif config.kind == "landscapes":
             if config.theta is not None and group.task.policy.num_params == 1:
                 raise ValueError("theta has one entry, and the line is its range: give `span`")
-            line_of(group.task, config.points or 0, config.span, config.direction, config.seed)
+            line_of(group.task, settled(config.points), config.span, config.direction, config.seed)
     return plan
 
 
@@ -210,7 +210,7 @@ def _check_schedules(config: StudyConfig, group: Group, iterations: int, chosen:
     schedule_factors(config.sigma_schedule, iterations)
     schedule_factors(config.stiffness_schedule, iterations, most=1.0)
     if config.stiffness_schedule and any(
-        not model.stiffness or (model.contact is None and not model.analytic) for model in group.models
+        model.stiffness is None or (model.contact is None and not model.analytic) for model in group.models
     ):
         raise ValueError("`stiffness_schedule` needs contact models with a stiffness; mjcf has none to set")
     fixed = [each.name for each in chosen if hasattr(each, "sigma")]
@@ -252,14 +252,13 @@ def block_of(plan: StudyPlan, cell: StudyCell) -> int:
 
 
 def blocks_of(plan: StudyPlan, cell: StudyCell) -> int:
-    """Number of blocks per seed; 0 for whole batches."""
-    size = block_of(plan, cell)
-    return 0 if size == cell.samples else math.ceil(cell.samples / size)
+    """Number of blocks per seed; whole batches are one."""
+    return math.ceil(cell.samples / block_of(plan, cell))
 
 
 def memory_of(plan: StudyPlan, cell: StudyCell) -> int:
     """Memory held at once [bytes]: batches and statistics, or a block, and moments until a batch is complete."""
-    if not blocks_of(plan, cell):
+    if blocks_of(plan, cell) == 1:
         return memory_of_seed(plan, cell) * seeds_together(plan, cell)
     moments = bytes_of_moments(estimators_of(plan, cell), plan.groups[cell.group].task.policy.num_params)
     kept = plan.config.batches + math.ceil(math.log2(blocks_of(plan, cell)))

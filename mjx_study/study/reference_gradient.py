@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 from estimators import Evaluation, GradientEstimate, delta_control_variate
 
 
-def reference_gradient(
+def estimate_reference(
     odd: Evaluation, pilot: Evaluation, candidates: Sequence[Float[Array, " params"]], sigma: float
 ) -> GradientEstimate:
     """Return an unbiased estimate of grad F from odd parts and the best of several control variates.

@@ -34,7 +34,7 @@ class Objectives:
 
     def __call__(self, cell: StudyCell) -> MjxObjective | Reference:
         if cell.model.analytic:
-            return self._plan.groups[cell.group].task.replace(sigma=cell.sigma).analytic(cell.model.stiffness)
+            return self._plan.groups[cell.group].task.replace(sigma=cell.sigma).analytic(cell.model.stiffness_or_zero)
         return self.simulator(cell.group).objective(cell.model.contact, cell.sigma)
 
 

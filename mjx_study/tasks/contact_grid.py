@@ -28,13 +28,13 @@ class ContactPoint:
 
     Attributes:
         family: name of the contact family, "reference", or solref and solimp.
-        stiffness: spring stiffness K [N/m]; 0 without contact.
+        stiffness: spring stiffness K [N/m]; None without contact or spring.
         contact: the contact model; None for the MJCF's own and for the reference.
         digits: significant digits of the stiffness in messages, enough to distinguish the models of a sweep.
     """
 
     family: str
-    stiffness: float
+    stiffness: float | None
     contact: ContactModel | None
     digits: int = 6
 
@@ -44,15 +44,20 @@ class ContactPoint:
         return self.family == REFERENCE
 
     @property
+    def stiffness_or_zero(self) -> float:
+        """Stiffness in numbers that are kept and in analytic systems, 0 where there is none [N/m]."""
+        return 0.0 if self.stiffness is None else self.stiffness
+
+    @property
     def label(self) -> str:
-        return f"{self.family}, K = {self.stiffness:.{self.digits}g} N/m" if self.stiffness else self.family
+        return self.family if self.stiffness is None else f"{self.family}, K = {self.stiffness:.{self.digits}g} N/m"
 
 
 Grid = tuple[tuple[ContactPoint, ...], tuple[str, ...]]
 """Contact models and their warnings."""
 
 
-def contact_grid(
+def family_grid(
     task: Task,
     families: Sequence[str] | None = None,
     stiffnesses: Sequence[float] | None = None,
@@ -74,7 +79,7 @@ def contact_grid(
     for family in families:
         if family == REFERENCE:
             check_reference(task)
-            found = stiffnesses if task.contact_pair is not None else (0.0,)
+            found = stiffnesses if task.contact_pair is not None else (None,)
             points += [ContactPoint(family, stiffness, None, digits) for stiffness in found]
             continue
         swept = family not in FAMILIES or FAMILIES[family].swept
@@ -109,7 +114,7 @@ def backward_grid(
     for family, point in itertools.product((name for name in families if name != "none"), simulated):
         if point.contact is None:
             raise ValueError(f"contact {point.family} takes no backward model; give its solref and solimp instead")
-        own = (stiffness or point.stiffness or None) if FAMILIES[family].swept else None
+        own = (stiffness or point.stiffness) if FAMILIES[family].swept else None
         with _warnings_of_contact() as caught:
             other = _contact(task, family, own, None)
         name = f"{point.family}, backward {family}"
@@ -173,12 +178,12 @@ def _contact(task: Task, family: str, stiffness: float | None, damping: float | 
     return family_model(family, task.scene, stiffness=stiffness, damping=damping, effective_mass=mass)
 
 
-def _stiffness(task: Task, contact: ContactModel | None) -> float:
-    """Spring stiffness K [N/m] of a contact model not defined by one; 0 without contact."""
+def _stiffness(task: Task, contact: ContactModel | None) -> float | None:
+    """Spring stiffness K [N/m] of a contact model not defined by one; None without contact or spring."""
     if task.contact_pair is None:
-        return 0.0
+        return None
     if contact is None:
         solref = task.scene.host.geom_solref[task.scene.geom(task.contact_pair[0])]
     else:
         solref = np.asarray(contact.solref)
-    return stiffness_from_solref(solref.tolist(), effective_mass=task.effective_mass)[0]
+    return stiffness_from_solref(solref.tolist(), effective_mass=task.effective_mass)[0] or None

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mjx_study.gradcheck import diagnosis
-from mjx_study.gradcheck.coordinates import Coordinates, coordinates
+from mjx_study.gradcheck.coordinates import Coordinates, make_coordinates
 from mjx_study.gradcheck.diagnosis import (
     VERDICTS,
     disagreements,
@@ -28,7 +28,7 @@ CART = """<mujoco><worldbody><body name="cart"><joint name="x" type="slide" axis
 @cache
 def layout() -> Coordinates:
     """One slide joint and one motor: outputs (qpos, qvel), inputs (qpos, qvel, ctrl)."""
-    return coordinates(put_scene(mujoco.MjModel.from_xml_string(CART), "cart"), None)
+    return make_coordinates(put_scene(mujoco.MjModel.from_xml_string(CART), "cart"), None)
 
 
 TRUE = np.array([[1.0, 0.01, 1e-4], [0.5, 1.0, 0.01]])

@@ -8,8 +8,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjx_study.gradcheck.coordinates import coordinates
-from mjx_study.gradcheck.differences import RATIO, SIZES, Differences, differences, moves, solution_noise
+from mjx_study.gradcheck.coordinates import make_coordinates
+from mjx_study.gradcheck.differences import RATIO, SIZES, Differences, moves, solution_noise, take_differences
 from mjx_study.gradcheck.programs import Programs, Setting
 from mjx_study.simulation.engine import HostState
 from mjx_study.simulation.scene import put_scene
@@ -19,7 +19,7 @@ def read(function: Callable[[np.ndarray], np.ndarray], noise: float = 0.0) -> Di
     """Differences of a function of one variable at zero, with rounding of a given size."""
     points = moves(np.ones((1, 1)))[:, 0]
     random = np.random.default_rng(0)
-    return differences((function(points) + noise * random.normal(size=points.shape))[:, None])
+    return take_differences((function(points) + noise * random.normal(size=points.shape))[:, None])
 
 
 def test_moves_are_the_ladder_both_ways() -> None:
@@ -40,7 +40,7 @@ def test_a_smooth_function(length: float) -> None:
 
 def test_many_outputs_and_columns_keep_their_places() -> None:
     matrix = np.random.default_rng(1).normal(size=(3, 2))
-    found = differences(moves(np.eye(2)) @ matrix.T)
+    found = take_differences(moves(np.eye(2)) @ matrix.T)
     assert found.value.shape == (3, 2)
     np.testing.assert_allclose(found.value, matrix, rtol=1e-9)
 
@@ -104,7 +104,7 @@ def test_forces_that_cancel_are_rounded() -> None:
     pull = '<joint joint1="x" polycoef="{} 0 0 0 0"/>'
     xml = f"""<mujoco><worldbody><body><joint name="x" type="slide"/><geom size=".1" mass="1"/></body></worldbody>
     <equality>{pull.format(1e5)}{pull.format(1 - 1e5)}</equality><actuator><motor joint="x"/></actuator></mujoco>"""
-    layout = coordinates(put_scene(mujoco.MjModel.from_xml_string(xml), "scene"), None)
+    layout = make_coordinates(put_scene(mujoco.MjModel.from_xml_string(xml), "scene"), None)
     programs, setting, ladder = Programs(layout), Setting(None, layout.scales), moves(np.eye(3)[2:])
     nothing, zero = np.zeros(0), np.zeros(1)
     state = HostState(zero, zero, nothing, zero, zero)
@@ -112,9 +112,9 @@ def test_forces_that_cancel_are_rounded() -> None:
         exact = programs.exact(setting, state, jnp.zeros(1), ladder)
         state = dataclasses.replace(state, warmstart=exact.after.warmstart)
     noise = solution_noise(layout, exact.stages, state.warmstart)
-    assert not differences(exact.outputs, noise).rough.any()
+    assert not take_differences(exact.outputs, noise).rough.any()
     rng = np.random.default_rng(0)
     for _ in range(10):
         rounded = exact.outputs + 0.5 * noise * rng.uniform(-1, 1, np.shape(exact.outputs))
-        assert differences(rounded).rough.any()
-        assert not differences(rounded, noise).rough.any()
+        assert take_differences(rounded).rough.any()
+        assert not take_differences(rounded, noise).rough.any()

@@ -8,13 +8,13 @@ from mjx_study.cli import main
 from mjx_study.gradcheck import check_mean
 from mjx_study.gradcheck.mean import lines_of
 from mjx_study.tasks import make_task
-from mjx_study.tasks.contact_grid import contact_grid
+from mjx_study.tasks.contact_grid import family_grid
 
 
 @pytest.mark.slow
 def test_the_bias_of_first_order_is_found_and_is_gone_with_the_onset_term() -> None:
     task = make_task("momentum_transfer").replace(theta=jnp.full(1, 0.3))
-    cells, _ = contact_grid(task, ("mujoco_default",))
+    cells, _ = family_grid(task, ("mujoco_default",))
     chosen = [make_estimator(name) for name in ("fobg", "fobg_onset")]
     plain, corrected = check_mean(task, cells, chosen, samples=400, seed=0)
     assert plain.verdict == "biased" and plain.circulation.gap > 0.4 * abs(plain.circulation.difference)

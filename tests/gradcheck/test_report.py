@@ -10,13 +10,13 @@ from mjx_study.cli import options
 from mjx_study.gradcheck import Finding, GradcheckReport, StepCheck
 from mjx_study.gradcheck.check import unoffered
 from mjx_study.gradcheck.cost import judge_closed_forms
-from mjx_study.gradcheck.coverage import coverage
+from mjx_study.gradcheck.coverage import count_coverage
 from mjx_study.gradcheck.report import CostCheck, Entry
 from tests.documents import stages_of
 
 PARTS = frozenset({"contact", "stick", "slide", "separate", "limit"})
-STICKING = coverage(PARTS, [{"contact", "stick"}, {"contact", "stick", "limit"}, {"separate"}])
-WHOLE = coverage(PARTS, [{"contact", "stick"}, {"contact", "slide", "limit"}])
+STICKING = count_coverage(PARTS, [{"contact", "stick"}, {"contact", "stick", "limit"}, {"separate"}])
+WHOLE = count_coverage(PARTS, [{"contact", "stick"}, {"contact", "slide", "limit"}])
 STEP = StepCheck(
     contact="penalty",
     stiffness=100.0,
@@ -63,7 +63,7 @@ def test_what_is_never_exercised_is_a_warning_and_another_exit_code(
 
 def test_what_the_model_cannot_reach_is_told_and_no_gap() -> None:
     step = dataclasses.replace(
-        STEP, coverage=coverage(PARTS - {"slide"}, [{"contact", "stick", "limit"}], {"slide": 2})
+        STEP, coverage=count_coverage(PARTS - {"slide"}, [{"contact", "stick", "limit"}], {"slide": 2})
     )
     lines = report(step).lines()
     assert (

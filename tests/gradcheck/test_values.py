@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from mjx_study.gradcheck import coordinates as layouts
-from mjx_study.gradcheck.coordinates import Coordinates, coordinates
+from mjx_study.gradcheck.coordinates import Coordinates, make_coordinates
 from mjx_study.gradcheck.programs import Programs, Setting, _stages
 from mjx_study.gradcheck.values import EngineStep, Values, compare_values, difference_of_engines
 from mjx_study.simulation import integration, patches
@@ -30,7 +30,7 @@ PLAIN = SERVO.replace('forcerange="-1 1"', "")
 
 @cache
 def layout(xml: str = PLAIN) -> Coordinates:
-    return coordinates(put_scene(mujoco.MjModel.from_xml_string(xml), "scene"), None)
+    return make_coordinates(put_scene(mujoco.MjModel.from_xml_string(xml), "scene"), None)
 
 
 def start(xml: str = PLAIN) -> HostState:
@@ -62,7 +62,7 @@ def compare(ours: float, stock: float, xml: str = PLAIN, **stages: Any) -> Value
 
 def test_three_equal_steps() -> None:
     found = compare(0.0, 0.0)
-    assert found.verdict == "" and found.engine == found.stock == 0
+    assert found.verdict is None and found.engine == found.stock == 0
 
 
 def test_a_defect_here() -> None:
@@ -95,7 +95,7 @@ def test_a_documented_difference() -> None:
 
 
 def test_rounding_is_no_difference() -> None:
-    assert compare(1e-16, -1e-16).verdict == ""
+    assert compare(1e-16, -1e-16).verdict is None
 
 
 def test_at_rest_rounding_is_all_that_moves() -> None:
@@ -112,7 +112,7 @@ def test_at_rest_rounding_is_all_that_moves() -> None:
 def test_the_engines_step_changes_as_the_layout_says(index: int) -> None:
     """Each entry of the flat vector is the same change in both engines: state, length, velocity, control."""
     scene = scene_of("pusher")
-    both = coordinates(scene, contact_model((-100.0, -1.0), scene=scene))
+    both = make_coordinates(scene, contact_model((-100.0, -1.0), scene=scene))
     contact = contact_model((-100.0, -1.0), scene=scene)
     change = np.zeros(len(both.inputs))
     change[both.num_state + index % 7] = 0.25
@@ -127,7 +127,7 @@ def test_parameters_change_in_the_contact_model(monkeypatch: pytest.MonkeyPatch)
     """So that their derivatives pass through `apply_contact`, where a planted fault shows."""
     scene = scene_of("pusher")
     contact = contact_model((-100.0, -1.0), scene=scene)
-    both, seen = coordinates(scene, contact), []
+    both, seen = make_coordinates(scene, contact), []
     monkeypatch.setattr(layouts, "apply_contact", lambda model, contact: seen.append(contact) or model)
     both.model(contact, jnp.asarray(both.scales), jnp.arange(len(both.scales), dtype=float))
     (changed,) = seen
@@ -269,8 +269,8 @@ def test_frames_that_c_takes_for_the_same() -> None:
     assert more.verdict == "engine" and more.cause.startswith("passive forces differ")
 
 
-@pytest.mark.parametrize(("speed", "verdict"), [(9e-9, ""), (2e-8, "value")])
-def test_mjx_stops_what_turns_slower_than_it_sees(speed: float, verdict: str) -> None:
+@pytest.mark.parametrize(("speed", "verdict"), [(9e-9, None), (2e-8, "value")])
+def test_mjx_stops_what_turns_slower_than_it_sees(speed: float, verdict: str | None) -> None:
     """Below 1e-8 rad/s MJX leaves an orientation as it is."""
     xml = '<mujoco><worldbody><body><joint type="ball"/><geom size=".1"/></body></worldbody></mujoco>'
     own = layout(xml)
