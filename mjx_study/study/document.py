@@ -136,8 +136,7 @@ def document_of(plan: StudyPlan, command: str | None) -> dict[str, Any]:
         axes[name].sort()
     index = {name: {value: place for place, value in enumerate(along)} for name, along in axes.items()}
     places = [{name: index[name][value] for name, value in each.items()} for each in exact]
-    fields = {field.name: getattr(plan.config, field.name) for field in dataclasses.fields(plan.config)}
-    fields |= {"tasks": plan.config.task_names, "estimators": plan.config.estimator_names}
+    fields = plan.config.resolved() | {"tasks": plan.config.task_names, "estimators": plan.config.estimator_names}
     fields |= {"seeds": plan.config.batches, "iterations": plan.iterations}
     return {
         "config": fields,
