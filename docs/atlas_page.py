@@ -18,8 +18,8 @@ from matplotlib.lines import Line2D
 
 from estimators import ENOUGH_EFFECTIVE
 from estimators.confidence import coverage_interval
-from mjx_study.diagnose import SMOOTH, WIDTHS
-from mjx_study.study.findings import NARROW, SHARE_OFF, STRONG
+from mjx_study.diagnose import SMOOTH_SHARE, WIDTH_RATIO
+from mjx_study.study.findings import ERROR_PER_STRENGTH, LEAST_SPREAD, MOST_STRENGTH
 
 Table = Any
 """A pandas.DataFrame with a row for each cell; pandas comes without types."""
@@ -95,7 +95,7 @@ def read(path: Path) -> Table:
     added = (table.fobg_bias - table.fobg_onset_bias).abs()
     table["left"] = table.fobg_onset_bias.abs() / added
     table["left_error"] = np.hypot(table.fobg_onset_bias_se, table.slope_se) / added
-    excess = table.left - SHARE_OFF * table.strength
+    excess = table.left - ERROR_PER_STRENGTH * table.strength
     told = np.isfinite(excess) & (excess.abs() > QUANTILE * table.left_error)
     table["beyond"] = np.where(told, (excess > 0).astype(float), np.nan)
     last = table.environment == table.groupby("task").environment.transform("max")
@@ -173,7 +173,7 @@ def _plain(table: Table) -> Any:
 
 def _curable(table: Table) -> Any:
     """Of these, the cells where force jumps, so that the onset term adds something."""
-    return _plain(table) & (table.strength > SMOOTH)
+    return _plain(table) & (table.strength > SMOOTH_SHARE)
 
 
 def _on(where: Callable[[Table], Any], *tasks: str) -> Callable[[Table], Any]:
@@ -183,7 +183,7 @@ def _on(where: Callable[[Table], Any], *tasks: str) -> Callable[[Table], Any]:
 
 def _wide(table: Table) -> Any:
     """Cells with something to cure where noise is as wide as the term needs."""
-    return _curable(table) & (table.onset_spread >= NARROW)
+    return _curable(table) & (table.onset_spread >= LEAST_SPREAD)
 
 
 LAUNCHED: Final = ("momentum_transfer", "ball_wall")
@@ -191,23 +191,25 @@ FORCES: Final = ("pusher", "pusher_apart", "sliding_box")
 RULES: Final = (
     Rule("unstable step: variance above; launch angle", "limit", 1.0, "above", _on(_any, *LAUNCHED)),
     Rule("unstable step: variance above; many forces", "limit", 1.0, "above", _on(_any, *FORCES)),
-    Rule("force jumps at first touch: mean off", "strength", SMOOTH, "fobg_off", _met),
+    Rule("force jumps at first touch: mean off", "strength", SMOOTH_SHARE, "fobg_off", _met),
     Rule(
         "smooth onset, travel over width: variance above",
         "travel",
-        1 / WIDTHS,
+        1 / WIDTH_RATIO,
         "above",
         lambda table: _met(table) & (table.contact == "smooth_onset"),
     ),
-    Rule("noise narrower than steps: mean off with the term", "crossing", 1 / NARROW, "fobg_onset_off", _curable),
+    Rule("noise narrower than steps: mean off with the term", "crossing", 1 / LEAST_SPREAD, "fobg_onset_off", _curable),
     Rule(
         "strong onset: term beyond its bound, `momentum_transfer`",
         "strength",
-        STRONG,
+        MOST_STRENGTH,
         "beyond",
         _on(_wide, "momentum_transfer"),
     ),
-    Rule("strong onset: term beyond its bound, `ball_wall`", "strength", STRONG, "beyond", _on(_wide, "ball_wall")),
+    Rule(
+        "strong onset: term beyond its bound, `ball_wall`", "strength", MOST_STRENGTH, "beyond", _on(_wide, "ball_wall")
+    ),
 )
 
 
@@ -272,7 +274,7 @@ def jump_table(table: Table) -> str:
     rows = []
     for name in TASKS:
         part = table[_met(table) & (table.task == name)]
-        jumps = part.strength > SMOOTH
+        jumps = part.strength > SMOOTH_SHARE
         rows.append([f"`{name}`"])
         for some in (part[~jumps], part[jumps]):
             rows[-1] += [share(some.fobg_off.dropna().to_numpy() == 1), int(some.fobg_off.isna().sum())]
@@ -330,7 +332,7 @@ def steps_table(table: Table) -> str:
         quarter = cells.stiffness.quantile([0.25, 0.75])
         parts = cells[cells.stiffness <= quarter[0.25]], cells[cells.stiffness >= quarter[0.75]]
         largest = cells.timestep.max()
-        jumping = cells[_met(cells) & (cells.strength > SMOOTH)]
+        jumping = cells[_met(cells) & (cells.strength > SMOOTH_SHARE)]
         known = jumping[jumping.slope.abs() > SURE * jumping.slope_se]
         alike = known[largest**2 * known.k + 2 * largest * known.b < 4]
         for timestep in sorted(cells.timestep.unique()):
@@ -502,9 +504,9 @@ def onset_figure(table: Table) -> Figure:
         for name, part in some.groupby("task", sort=False):
             each.scatter(part[group], part.left.clip(1e-3, 10), s=5, color=TASKS[name], alpha=0.6, linewidths=0)
         each.set(xscale="log", yscale="log", xlabel=symbol_of(group), ylim=(1e-3, 10))
-    strength = np.array([SMOOTH, STRONG])
-    axes[0].plot(strength, SHARE_OFF * strength, color="black", linewidth=0.8)
-    axes[1].axvline(1 / NARROW, color="black", linewidth=0.6, linestyle=":")
+    strength = np.array([SMOOTH_SHARE, MOST_STRENGTH])
+    axes[0].plot(strength, ERROR_PER_STRENGTH * strength, color="black", linewidth=0.8)
+    axes[1].axvline(1 / LEAST_SPREAD, color="black", linewidth=0.6, linestyle=":")
     axes[0].set_ylabel("bias left / what the term adds")
     key(
         figure,

@@ -19,7 +19,7 @@ import estimators
 from estimators import ENOUGH_EFFECTIVE, ESTIMATORS, make_estimator, summarise
 from mjx_study.reference import LinearQuadratic, ReferenceObjective
 from mjx_study.runtime import configure
-from mjx_study.study.findings import DETECTED
+from mjx_study.study.findings import DETECTED_SE
 
 PAGE: Final = Path(__file__).parent / "coverage.md"
 SAMPLES: Final = (10, 50, 400)
@@ -65,7 +65,7 @@ KINDS: Final = {
 }
 COLUMNS: Final = {
     "mean": "mean ± 1.96 se",
-    "apart": f"mean off by {DETECTED:g} se",
+    "apart": f"mean off by {DETECTED_SE:g} se",
     "variance": "variance",
     "variances": "two variances told apart",
     "relative_error": "relative error",
@@ -104,7 +104,7 @@ def trials(kind: Kind, samples: int, count: int) -> dict[str, np.ndarray]:
         found = estimators.compare(biased, reference)
         said = {
             "mean": off <= 1.96,
-            "apart": off > DETECTED,
+            "apart": off > DETECTED_SE,
             "variance": (lower <= kind.variance) & (kind.variance <= upper),
             "epsilon": jnp.linalg.norm(batch.mean - gradient) <= epsilon,
             "rejects": test.p_value <= 0.05,

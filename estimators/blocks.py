@@ -18,7 +18,7 @@ from estimators.rows import Deviations
 
 EXTREMES: Final = 32
 """Samples kept for each kind of extreme."""
-THINNED: Final = 2**14
+MOST_THINNED: Final = 2**14
 """Maximum number of samples of a batch whose norms are kept; larger batches are subsampled at a regular stride."""
 
 Block = Float[np.ndarray, "samples parts params"]
@@ -77,7 +77,7 @@ class Moments:
         )
 
     def merged(self, other: "Moments") -> "Moments":
-        """Return the moments of both blocks together."""
+        """Return the moments of both blocks together; the order affects rounding."""
         count = int(self.count + other.count)
         share = int(other.count) / max(count, 1)
         mean = self.mean + share * (other.mean - self.mean)
@@ -144,11 +144,6 @@ def moments_of(parts: Sequence[Float[Any, "samples params"]], first: int, every:
     return tuple(Moments.of(each, first, every) for each in rows)
 
 
-def merge(one: Parts, other: Parts) -> Parts:
-    """Merge the moments of two blocks; the order affects rounding."""
-    return tuple(mine.merged(theirs) for mine, theirs in zip(one, other, strict=True))
-
-
 @dataclass(frozen=True)
 class Merged:
     """Samples reduced to their moments, with the interface of `estimators.rows.Rows`.
@@ -162,8 +157,8 @@ class Merged:
       sample is among the largest of a part or of the sum of both at equal spread.
     - `log_spread`: exact for the extremes, second order for the rest, each of which has less than 1/`EXTREMES` of the
       spread; the relative error is below that share, and about the largest share of any sample if there are no tails.
-    - `norm_quantiles`: from at most `THINNED` thinned samples, so ranks have a standard error of 0.4 % (at the median);
-      exact for fewer samples. The maximum is that of `top`.
+    - `norm_quantiles`: from at most `MOST_THINNED` thinned samples, so ranks have a standard error of 0.4 % (at the
+      median); exact for fewer samples. The maximum is that of `top`.
     - `perturbed_means`: different draws from the same distribution.
 
     `size` is the number of samples per batch, nonfinite ones included.

@@ -80,28 +80,28 @@ CATALOGUE: dict[str, Entry] = {
     entry.name: entry
     for entry in (
         Entry("zobg", "ZoBG", ("evaluation",), "zeroth order: values times scores"),
-        Entry("zobg_antithetic", "ZoBG, antithetic", ("pair",), "zeroth order over pairs of opposite noise"),
+        Entry("zobg_antithetic", "ZoBG (antithetic)", ("pair",), "zeroth order over pairs of opposite noise"),
         Entry(
-            "zobg_to_go", "ZoBG, costs to go", ("steps",), "zeroth order: costs to go times the scores of single steps"
+            "zobg_to_go", "ZoBG (costs to go)", ("steps",), "zeroth order: costs to go times the scores of single steps"
         ),
         Entry(
             "zobg_to_go_antithetic",
-            "ZoBG, to go, antithetic",
+            "ZoBG (to go, antithetic)",
             ("step_pair",),
             "costs to go over pairs of opposite noise",
         ),
         Entry("fobg", "FoBG", ("differentiation",), "first order: gradients of the samples"),
-        Entry("fobg_onset", "FoBG, onset", ("corrected",), "first order, corrected where contact begins and ends"),
+        Entry("fobg_onset", "FoBG (onset)", ("corrected",), "first order, corrected where contact begins and ends"),
         Entry(
             "fobg_clipped",
-            "FoBG, clipped",
+            "FoBG (clipped)",
             ("differentiation",),
             "first order, the norm of every sample bounded",
             ("max_norm",),
         ),
         Entry(
             "fobg_truncated",
-            "FoBG, truncated",
+            "FoBG (truncated)",
             ("linearisation",),
             "first order, the adjoint cut every few steps",
             ("window",),
@@ -114,7 +114,7 @@ CATALOGUE: dict[str, Entry] = {
         ),
         Entry(
             "aobg_onset",
-            "AoBG, onset",
+            "AoBG (onset)",
             ("evaluation", "corrected"),
             "alpha order, its first-order batch corrected where contact begins and ends",
         ),

@@ -18,7 +18,7 @@ from estimators.types import Objective
 
 NODES: Final = 9
 """Quadrature nodes along a path."""
-SURE: Final = 3.29
+HALF_WIDTH_SE: Final = 3.29
 """Half-width of a 99.9 % interval in standard errors."""
 TOLERANCE: Final = 0.05
 """Relative error, as a share of F's difference, within which a mean counts as right."""
@@ -49,7 +49,7 @@ class Circulation:
     @property
     def half_width(self) -> Float[Array, ""]:
         """Half-width of the 99.9 % interval for the gap, quadrature error included, [cost]."""
-        return SURE * self.standard_error + self.quadrature
+        return HALF_WIDTH_SE * self.standard_error + self.quadrature
 
     def verdict(self, tolerance: float = TOLERANCE) -> str:
         """Return "right" (within a share of F's difference), "biased" or "undecided"."""

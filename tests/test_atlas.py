@@ -37,7 +37,7 @@ def _statements() -> list[str]:
         (lambda t: t[(t.limit > 0.03) & (t.limit < 1 / 3)]),
     )
     damped = forces[forces.b > 0]
-    low = met[(met.task == "momentum_transfer") & (met.strength <= page.SMOOTH)]
+    low = met[(met.task == "momentum_transfer") & (met.strength <= page.SMOOTH_SHARE)]
     smooth = met[(met.task == "ball_wall") & (met.contact == "smooth_onset")]
     soft, stiff = smooth[smooth.stiffness < 5e3], smooth[smooth.stiffness >= 5e3]
     bar = wide[wide.task == "momentum_transfer"]

@@ -10,7 +10,7 @@ import pytest
 from mujoco.mjx._src import solver
 
 from mjx_study.simulation import constraint, dynamics
-from mjx_study.simulation.linear_algebra import SMALL, solve_positive_definite
+from mjx_study.simulation.linear_algebra import MOST_UNROLLED, solve_positive_definite
 from mjx_study.simulation.scene import put_scene
 from tests.scenes import (
     CASES,
@@ -182,14 +182,14 @@ def test_small_systems_are_solved_to_rounding_from_anywhere() -> None:
     """Also where MJX's conjugate gradients stop because their cost no longer falls, and whatever MJX's budget."""
     case = CASES["mechanism"]
     scene = scene_of(case.source.replace('iterations="100" ls', 'solver="CG" iterations="1" ls'))
-    assert scene.host.nv <= SMALL
+    assert scene.host.nv <= MOST_UNROLLED
     point, warmstart = start_point(case, scene), jnp.zeros(scene.host.nv)
     step = compiled(lambda *args: step_flat(scene, scene.model, *args), point, warmstart)
     for start in (warmstart, warmstart + 1e3, warmstart - 1e5):
         assert float(step(point, start)[2]) < 1e-13
 
 
-@pytest.mark.parametrize("size", [1, 2, SMALL, SMALL + 1])
+@pytest.mark.parametrize("size", [1, 2, MOST_UNROLLED, MOST_UNROLLED + 1])
 def test_solve_positive_definite(size: int) -> None:
     """Unrolled and by a library."""
     rng = np.random.default_rng(size)

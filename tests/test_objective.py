@@ -411,7 +411,7 @@ def test_a_starved_solver_shows_in_the_residual(monkeypatch):
 
 def test_large_batches_for_lapack_run_on_one_device(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two at a time never end in jaxlib; a batch has a factorisation for every onset that is corrected."""
-    monkeypatch.setattr("mjx_study.objective.batches.SMALL", 0)
+    monkeypatch.setattr("mjx_study.objective.batches.MOST_UNROLLED", 0)
     devices = tuple(jax.local_devices())
     assert len(devices) == 2
     for onset, chunk, expected in (("none", 256, 2), ("linear", 255, 2), ("linear", 256, 1), ("none", 2048, 1)):

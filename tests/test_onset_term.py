@@ -17,7 +17,7 @@ from mjx_study.simulation.branches import jump_term
 from mjx_study.simulation.contact import ContactModel, apply_contact, contact_model
 from mjx_study.simulation.dynamics import initial_state, rollout
 from mjx_study.simulation.onset import check_onset, corrected_rollout
-from mjx_study.study.findings import SHARE_OFF
+from mjx_study.study.findings import ERROR_PER_STRENGTH
 from mjx_study.study.landscapes import Line, grid, means
 from mjx_study.tasks import make_task
 from mjx_study.tasks.contact_grid import family_grid
@@ -309,9 +309,9 @@ def test_the_error_that_findings_tell_is_not_exceeded() -> None:
         strength = task.scene.timestep * solimp[0] * 2 / (solimp[1] * solref[0])
         share = np.abs(found.first - found.slope) / np.abs(found.first - without.first)
         unsure = (found.slope_error + found.first_error + without.first_error) / np.abs(found.first - without.first)
-        assert np.all(share < SHARE_OFF * strength + unsure)
+        assert np.all(share < ERROR_PER_STRENGTH * strength + unsure)
         shares.append(np.max(share / strength))
-    assert max(shares) > SHARE_OFF / 10
+    assert max(shares) > ERROR_PER_STRENGTH / 10
 
 
 @pytest.mark.slow

@@ -397,7 +397,7 @@ def test_warnings_name_what_must_not_be_overlooked() -> None:
 
 
 def test_an_unconverged_solve_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sampling.UNCONVERGED, "float64", 1e-30)
+    monkeypatch.setitem(sampling.MOST_RESIDUAL, "float64", 1e-30)
     found = compare(stiffness=(10.0,), contact=("penalty",), chunk_size=4)
     assert all(row.unconverged > 0 for row in rows_of(found))
     assert any("the contact solver did not converge" in warning for warning in warnings_of(found))

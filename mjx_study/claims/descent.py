@@ -27,7 +27,7 @@ CELL: Final = ("task", "timestep", "cone", "model", "sigma", "samples")
 """Singleton dimensions of a study with one cell."""
 GAMES: Final = 12
 """Number of descents per estimator on tennis, at any effort, with half the usual samples: they take the longest."""
-LARGEST: Final = 10.0
+DIVERGED: Final = 10.0
 """Cost of a diverged descent, as a multiple of the best one's gain."""
 
 
@@ -77,7 +77,7 @@ def scaled(dataset: xr.Dataset, variable: str, estimator: str, like: xr.Dataset 
     ends, start = other["final_cost"], float(other["start_cost"])
     best = float(ends.where(np.isfinite(ends)).mean("seed").min())
     costs = cell[variable].sel(estimator=estimator).transpose(..., "seed").values
-    found = np.clip(np.nan_to_num((costs - start) / (start - best), nan=LARGEST, posinf=LARGEST), -LARGEST, LARGEST)
+    found = np.clip(np.nan_to_num((costs - start) / (start - best), nan=DIVERGED, posinf=DIVERGED), -DIVERGED, DIVERGED)
     return found if found.ndim == 1 else np.mean(found, axis=0)
 
 

@@ -37,7 +37,7 @@ HIT, EDGE, SHORT, WALL = (
 )  # fmt: skip
 # Not closer to the edge: at 0.77 rad the bias of the default contact crosses zero (31 % at 0.76, -13 % at 0.78).
 STEP, RAMP = "step", "ramp of 0.01 sigma"
-NEGLIGIBLE: Final = 0.1
+NEGLIGIBLE_BIAS: Final = 0.1
 """Share of the gradient below which a bias is negligible."""
 FACTOR: Final = math.log10(1.25)
 """Ratios of variances or errors closer to 1 than this count as equal."""
@@ -190,7 +190,7 @@ CLAIMS: Final = (
         "zobg-unbiased",
         "section 3.1, lemma on ZoBG",
         "The zeroth-order estimate is unbiased where the cost jumps.",
-        within("(E[ZoBG] - grad F) / grad F", -NEGLIGIBLE, NEGLIGIBLE),
+        within("(E[ZoBG] - grad F) / grad F", -NEGLIGIBLE_BIAS, NEGLIGIBLE_BIAS),
         JUMPS,
         zeroth_bias,
         SLOPES.format("ball_wall"),
@@ -199,7 +199,7 @@ CLAIMS: Final = (
         "fobg-biased-at-jumps",
         "section 3.1, Heaviside; figure of ball with wall and momentum transfer",
         "The first-order estimate is biased where the cost jumps.",
-        above("|E[FoBG] - grad F| / |grad F|", NEGLIGIBLE),
+        above("|E[FoBG] - grad F| / |grad F|", NEGLIGIBLE_BIAS),
         JUMPS,
         bias,
         SLOPES.format("momentum_transfer"),
@@ -226,7 +226,7 @@ CLAIMS: Final = (
         "fobg-unbiased-away",
         "section 3.1, lemma on FoBG",
         "Away from jumps of the cost the first-order estimate is unbiased.",
-        within("(E[FoBG] - grad F) / grad F", -NEGLIGIBLE, NEGLIGIBLE),
+        within("(E[FoBG] - grad F) / grad F", -NEGLIGIBLE_BIAS, NEGLIGIBLE_BIAS),
         {RAMP: (REFERENCE,), **SMOOTH},
         relative_bias,
         SLOPES.format("momentum_transfer"),

@@ -45,6 +45,8 @@ MEAN = {
     "sigma": None,
     "span": None,
     "direction": "random",
+    "max_norm": None,
+    "window": None,
 }
 """Options of --mean, with their defaults."""
 
@@ -120,7 +122,9 @@ def _run_mean(options: argparse.Namespace) -> int:
         task = make_task(options.task, **scene).replace(onset=chosen["onset"])
         task = task if chosen["sigma"] is None else task.replace(sigma=chosen["sigma"])
         plan = plan_gradcheck(task, options.contact, options.stiffness, seed=options.seed, damping=options.damping)
-        found = [make_estimator(name, gamma=task.defaults.gamma, sigma=task.sigma) for name in chosen["estimators"]]
+        settings = {name: chosen[name] for name in ("max_norm", "window")}
+        settings |= {"gamma": task.defaults.gamma, "sigma": task.sigma}
+        found = [make_estimator(name, **settings) for name in chosen["estimators"]]
         check_estimators(found, task)
     given = {name: chosen[name] for name in ("samples", "span", "direction")} | {"names": chosen["estimators"]}
     with computing() as progress:

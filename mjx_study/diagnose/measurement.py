@@ -28,16 +28,16 @@ from mjx_study.tasks.task import Task
 ESTIMATORS: Final = ("zobg", "fobg", "aobg", "fobg_onset", "aobg_onset")
 SAMPLES: Final = 500
 """Samples per batch, if time allows."""
-BUDGET: Final = 60.0
+BUDGET_SECONDS: Final = 60.0
 """Time for all batches, compilation excluded [s]."""
 CHUNKS: Final = (32, 8)
 """Samples per program call on a CPU, for small and large models: a call takes the time of all of them, however few are
 requested."""
-SMALL: Final = (8, 32)
+SMALL_MODEL: Final = (8, 32)
 """Maximum numbers of degrees of freedom and constraint rows of a small model."""
-RESOLVED: Final = 2.0
+RESOLVED_SE: Final = 2.0
 """Standard errors beyond which a gradient is distinguishable from 0."""
-ACCURATE: Final = 0.1
+TARGET_ERROR: Final = 0.1
 """Relative error for which the page states a number of samples."""
 
 
@@ -116,7 +116,7 @@ class Measurement:
     @property
     def resolved(self) -> bool:
         """Whether the gradient is distinguishable from 0."""
-        return self.surest.norm > RESOLVED * self.norm_error
+        return self.surest.norm > RESOLVED_SE * self.norm_error
 
     @property
     def best(self) -> Measured:
@@ -125,8 +125,8 @@ class Measurement:
 
     @property
     def samples_needed(self) -> float:
-        """Samples the best estimator needs for a relative error of `ACCURATE`; infinite if its bias alone is larger."""
-        left = (ACCURATE * self.norm) ** 2 - self.best.bias**2
+        """Samples that the best estimator needs for `TARGET_ERROR`; infinite if its bias alone is larger."""
+        left = (TARGET_ERROR * self.norm) ** 2 - self.best.bias**2
         return self.best.variance / left if left > 0 else math.inf
 
 
@@ -137,19 +137,19 @@ def estimators_of(task: Task) -> list[Estimator]:
 def chunk_of(task: Task, samples: int) -> int:
     """Number of samples per program call."""
     devices, size = jax.local_devices(), (task.scene.host.nv, num_constraint_rows(task.scene.template))
-    large = any(number > most for number, most in zip(size, SMALL, strict=True))
+    large = any(number > most for number, most in zip(size, SMALL_MODEL, strict=True))
     most = CHUNKS[large] if devices[0].platform == "cpu" else samples + 1
     return min(chunk_for(samples, devices, [task]), most)
 
 
 def affordable(seconds: float, chunk: int) -> int:
-    """Number of samples that fit into `BUDGET`, at theta and along all paths, but at least one call per path.
+    """Number of samples that fit into `BUDGET_SECONDS`, at theta and along all paths, but at least one call per path.
 
     Args:
         seconds: time of one call of all programs [s].
         chunk: number of samples in it, including a baseline.
     """
-    calls = max(1, round(BUDGET / (seconds * MOST_PATHS * (NODES + 1))))
+    calls = max(1, round(BUDGET_SECONDS / (seconds * MOST_PATHS * (NODES + 1))))
     return min(SAMPLES, MOST_PATHS * chunk * calls - 1)
 
 

@@ -8,31 +8,31 @@ import textwrap
 from collections.abc import Iterator
 from typing import Any, Final
 
-from mjx_study.diagnose.measurement import ACCURATE, RESOLVED, SAMPLES, Measured, Measurement
+from mjx_study.diagnose.measurement import RESOLVED_SE, SAMPLES, TARGET_ERROR, Measured, Measurement
 from mjx_study.diagnose.setting import Setting, Touch
 from mjx_study.gradcheck import GradcheckReport
 from mjx_study.gradcheck.diagnosis import MEANING
 from mjx_study.gradcheck.mean import MEANS
 from mjx_study.runtime import environment
 from mjx_study.study.dataset import as_plain
-from mjx_study.study.findings import NARROW, NOTABLE, SHARE_OFF, STRONG, linear_error
+from mjx_study.study.findings import ERROR_PER_STRENGTH, LEAST_SPREAD, MOST_STRENGTH, NOTABLE_SHARE, linear_error
 from mjx_study.table import format_table
 from mjx_study.tasks.task import Task
 
-FEW: Final = 100
+FEWEST_SAMPLES: Final = 100
 """Number of samples below which the page warns."""
-SMOOTH: Final = 0.01
+SMOOTH_SHARE: Final = 0.01
 """Share of the approach speed lost in the first step below which force counts as setting in without a jump."""
-WIDTHS: Final = 3.0
+WIDTH_RATIO: Final = 3.0
 """Recommended width of the impedance's rise, as a multiple of a step's travel."""
 LEGEND: Final = (
     "  zobg: zeroth order; fobg: first order; aobg: both, weighted; _onset: with a term for contact that begins or ends"
 )
-UNSURE: Final = 0.5
+ONE_DIGIT_UNCERTAINTY: Final = 0.5
 """Relative standard error beyond which an error is shown with one digit."""
-BEYOND: Final = 100.0
+MOST_ERROR: Final = 100.0
 """Upper end beyond which the interval of a relative error is uninformative."""
-SHOWN: Final = 6
+MOST_SHOWN: Final = 6
 """Number of contacts listed in the text, least resolved first."""
 
 
@@ -140,7 +140,7 @@ class Diagnosis(Measurement):
                 f"{each.impedance:g}",
                 "stable" if each.stable else "UNSTABLE",
             ]
-            for each in worst[:SHOWN]
+            for each in worst[:MOST_SHOWN]
         ]
         more = len(worst) - len(rows)
         return [*lines, *format_table(rows, header), *([f"  and {more} more"] if more else [])]
@@ -157,7 +157,7 @@ class Diagnosis(Measurement):
                 [
                     f"  {each.estimator}",
                     shown,
-                    f"{least} to {most}" if high * self._scale <= BEYOND * self.norm else f"at least {least}",
+                    f"{least} to {most}" if high * self._scale <= MOST_ERROR * self.norm else f"at least {least}",
                     mean if judged else "not judged",
                     f"{1e3 * each.seconds:.3g}",
                 ]
@@ -176,8 +176,8 @@ class Diagnosis(Measurement):
 
     def _shown(self, error: float, unsure: float) -> str:
         """Format an error to two significant digits, or to one if its relative standard error is large."""
-        size = float(f"{error * (100 if self.resolved else 1):.{1 if unsure > UNSURE else 2}g}")
-        decimals = 1 - math.floor(math.log10(size)) - (unsure > UNSURE) if size > 0 else 0
+        size = float(f"{error * (100 if self.resolved else 1):.{1 if unsure > ONE_DIGIT_UNCERTAINTY else 2}g}")
+        decimals = 1 - math.floor(math.log10(size)) - (unsure > ONE_DIGIT_UNCERTAINTY) if size > 0 else 0
         text = f"{size:.{max(decimals, 0)}f}" if -6 < decimals < 6 else f"{size:g}"
         return f"{text}{'%' if self.resolved else ''}"
 
@@ -188,7 +188,7 @@ class Diagnosis(Measurement):
         """Lines that say that the gradient is not distinguishable from 0, and what would resolve it."""
         if not self.norm:
             return "the gradient is 0: nothing that the parameters change reaches the cost"
-        needed = _round(self.surest.variance * (RESOLVED / self.norm) ** 2).replace(",", "")
+        needed = _round(self.surest.variance * (RESOLVED_SE / self.norm) ** 2).replace(",", "")
         other = "larger" if self.surest.estimator == "zobg" else "smaller"
         return (
             f"the gradient cannot be told from 0: its norm is {self.surest.norm:.1g} ± {self.norm_error:.1g}; "
@@ -211,7 +211,7 @@ class Diagnosis(Measurement):
             )
         if unstable := [each for each in self.touches if not each.stable]:
             yield f"the step in contact is unstable: {unstable[0].pair}, h^2 k = {unstable[0].stiffness:.2g}"
-        if self.samples < FEW:
+        if self.samples < FEWEST_SAMPLES:
             yield f"{self.samples} samples are few: --samples {SAMPLES} takes longer and says more"
         if self.best.verdict == "undecided" and self.resolved:
             yield f"the mean of {self.best.estimator} could not be judged with {self.samples} samples"
@@ -230,7 +230,7 @@ class Diagnosis(Measurement):
             return
         if math.isfinite(self.samples_needed):
             many = _round(self.samples_needed)
-            needed = f"a relative error of {ACCURATE:.0%} needs {many} {'sample' if many == '1' else 'samples'}"
+            needed = f"a relative error of {TARGET_ERROR:.0%} needs {many} {'sample' if many == '1' else 'samples'}"
             needed += f"; its bias of {self._bias(self.best)} stays" if self.best.verdict == "biased" else ""
         else:
             needed = f"its bias of {self._bias(self.best)} stays, however many samples"
@@ -242,39 +242,39 @@ class Diagnosis(Measurement):
         spread, strength = self.onsets["onset_spread"], self.onsets["onset_strength"]
         if plain.verdict == "biased":
             text = f"plain first order is biased by {self._bias(plain)}, "
-            if max([each.jump for each in self.touches] or [strength]) <= SMOOTH:
+            if max([each.jump for each in self.touches] or [strength]) <= SMOOTH_SHARE:
                 text += "though force sets in without a jump: something else jumps, as where corners and edges touch"
             elif corrected.verdict == "right":
                 text += "because contact sets in with a jump: the onset term corrects that"
             else:
                 text += "and contact sets in with a jump, the usual cause"
-            if travel := max((each.speed * timestep for each in self.touches if each.jump > SMOOTH), default=0.0):
-                text += f'; an impedance that rises from 0, solimp="0 0.95 {WIDTHS * travel:.1g}", has no jump'
+            if travel := max((each.speed * timestep for each in self.touches if each.jump > SMOOTH_SHARE), default=0.0):
+                text += f'; an impedance that rises from 0, solimp="0 0.95 {WIDTH_RATIO * travel:.1g}", has no jump'
             yield text, "--onset linear" if corrected.verdict == "right" else ""
         elif not self.best.estimator.endswith("_onset"):
             return  # the onset term is not recommended
         if corrected.verdict == "right":
-            if spread < NARROW:
+            if spread < LEAST_SPREAD:
                 yield (
-                    f"for onset terms the noise is narrow (the first contact varies by {spread:.2g} steps, {NARROW:g} "
-                    "are enough in general): fobg_onset is right here, by the check of the mean",
+                    f"for onset terms the noise is narrow (the first contact varies by {spread:.2g} steps, "
+                    f"{LEAST_SPREAD:g} are enough in general): fobg_onset is right here, by the check of the mean",
                     "",
                 )
             return
-        explained = SHARE_OFF * strength * (plain.bias + corrected.bias)
-        if spread < NARROW:
-            finer = f"a timestep of {timestep * spread / NARROW:.1g} s, or " if spread > 0 else ""
+        explained = ERROR_PER_STRENGTH * strength * (plain.bias + corrected.bias)
+        if spread < LEAST_SPREAD:
+            finer = f"a timestep of {timestep * spread / LEAST_SPREAD:.1g} s, or " if spread > 0 else ""
             yield f"for fobg_onset and aobg_onset the noise is too narrow: take {finer}a larger --sigma", ""
-        elif corrected.verdict == "biased" and corrected.bias > explained and strength <= STRONG:
+        elif corrected.verdict == "biased" and corrected.bias > explained and strength <= MOST_STRENGTH:
             yield (
                 f"the onset term leaves a bias of {self._bias(corrected)}, which its own error does not "
                 "explain; the usual causes are corners, edges, grazing and rolling contact",
                 "",
             )
-        elif SHARE_OFF * strength > NOTABLE:
-            step = timestep * NOTABLE / (SHARE_OFF * strength)
+        elif ERROR_PER_STRENGTH * strength > NOTABLE_SHARE:
+            step = timestep * NOTABLE_SHARE / (ERROR_PER_STRENGTH * strength)
             yield (
-                f"{linear_error(strength)}: a timestep of {step:.1g} s brings that down to {NOTABLE:.0%}; the "
+                f"{linear_error(strength)}: a timestep of {step:.1g} s brings that down to {NOTABLE_SHARE:.0%}; the "
                 "error of --onset jump is only of second order in the step",
                 "--onset jump",
             )

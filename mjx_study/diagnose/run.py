@@ -37,7 +37,7 @@ def diagnose_task(
         stiffness: contact stiffness [N/m]; None for the task's middle one.
         damping: contact damping [N s/m]; None for the family's.
         samples: samples per batch, and per node of the paths along which means are checked; None for `SAMPLES`, or as
-            many as fit into `BUDGET`.
+            many as fit into `BUDGET_SECONDS`.
         options: contact options as command-line flags.
         progress: called before each part.
 

@@ -21,7 +21,7 @@ from mjx_study.gradcheck.coordinates import (
 from mjx_study.simulation.engine import HostState, host_data
 from mjx_study.simulation.scene import num_constraint_rows
 
-NEAR: Final = 2e-6
+NEAR_DISTANCE: Final = 2e-6
 """Distance below which a switch counts as the cause; about the smallest difference step [m, rad, relative]."""
 PARALLEL: Final = 1e-5
 """Angle [rad] or distance [m] below which directions or points coincide; contact points turn within less."""
@@ -173,7 +173,7 @@ def _kinks(place: Place, output: Coordinate, source: Coordinate) -> Iterator[str
     host = place.host
     if source.block == "ctrl":
         column = place.layout.columns("ctrl").index(place.layout.inputs.index(source))
-        reached = np.abs(host.actuator_ctrlrange[column] - place.state.control[column]).min() < NEAR
+        reached = np.abs(host.actuator_ctrlrange[column] - place.state.control[column]).min() < NEAR_DISTANCE
         if host.actuator_ctrllimited[column] and reached:
             yield "a control is at the end of its range, where MuJoCo clips it"
     if output.block != "act":  # unaffected by contacts
@@ -190,16 +190,16 @@ def _parameter_kinks(place: Place, source: Coordinate) -> Iterator[str]:
     entry = {"solimp[d_0]": 0, "solimp[d_width]": 1, "solimp[midpoint]": 3}.get(source.name)
     if entry is not None:
         bounds = np.array([[mujoco.mjMINIMP, mujoco.mjMAXIMP]])
-        if np.any(np.abs(solimp[:, [entry]] - bounds) < NEAR):
+        if np.any(np.abs(solimp[:, [entry]] - bounds) < NEAR_DISTANCE):
             yield f"{source.name} is at the bound where MuJoCo clips it"
-        if entry < 2 and np.any(np.abs(solimp[:, 0] - solimp[:, 1]) < NEAR):
+        if entry < 2 and np.any(np.abs(solimp[:, 0] - solimp[:, 1]) < NEAR_DISTANCE):
             yield "d_0 equals d_width, and MuJoCo clips the impedance between the two"
     if source.name == "solimp[power]" and np.any(solimp[:, 4] == 1):
         yield "solimp's power is 1, the smallest that MuJoCo accepts"
-    if source.name == "solref[1]" and np.any((solref[:, 0] <= 0) & (np.abs(solref[:, 1]) < NEAR)):
+    if source.name == "solref[1]" and np.any((solref[:, 0] <= 0) & (np.abs(solref[:, 1]) < NEAR_DISTANCE)):
         yield "solref's damping is 0, and MuJoCo interprets a positive number there differently"
     clips = source.name == "solref[0]" and not option.disableflags & mujoco.mjtDisableBit.mjDSBL_REFSAFE
-    if clips and np.any(np.abs(solref[:, 0] - 2 * option.timestep) < NEAR):
+    if clips and np.any(np.abs(solref[:, 0] - 2 * option.timestep) < NEAR_DISTANCE):
         yield "solref's time constant is two timesteps, where MuJoCo clips it"
     if source.block == "contact" and len(np.unique(np.round(solimp, 12), axis=0)) > 1:
         yield "MuJoCo selects or mixes the parameters of two geoms, which tie here"
@@ -208,16 +208,16 @@ def _parameter_kinks(place: Place, source: Coordinate) -> Iterator[str]:
 def _constraint_kinks(place: Place) -> Iterator[str]:
     host, stages = place.host, place.stages
     gap = stages["dist"] - stages["margin"]
-    for contact in np.flatnonzero(np.abs(gap) < NEAR):
+    for contact in np.flatnonzero(np.abs(gap) < NEAR_DISTANCE):
         pair = " and ".join(geom_label(host, int(geom)) for geom in stages["geom"][contact])
         yield f"contact of {pair} is at its onset ({abs(gap[contact]):.1e} m away)"
     for joint in np.flatnonzero(host.jnt_limited & np.isin(host.jnt_type, (_SLIDE, _HINGE))):
         (low, high), margin = host.jnt_range[joint], host.jnt_margin[joint]
         position = place.state.qpos[host.jnt_qposadr[joint]]
-        if min(abs(position - low - margin), abs(high - position - margin)) < NEAR:
+        if min(abs(position - low - margin), abs(high - position - margin)) < NEAR_DISTANCE:
             yield f"{joint_name(host, int(joint))} is at its limit"
     from_limits = np.abs(stages["ten_length"][:, None] - host.tendon_range).min(axis=1, initial=np.inf)
-    if np.any(host.tendon_limited.astype(bool) & (from_limits < NEAR)):
+    if np.any(host.tendon_limited.astype(bool) & (from_limits < NEAR_DISTANCE)):
         yield "a tendon is at its limit"
     rows, reference, loss = np.abs(stages["efc_J"]), np.abs(stages["efc_aref"]), stages["efc_frictionloss"]
     size = reference + rows @ np.abs(place.qacc)

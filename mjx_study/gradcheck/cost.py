@@ -23,9 +23,9 @@ BATCH: Final = 8
 """Rollouts per call of the cost program."""
 DIFFERENCE_TOLERANCE: Final = 1e-6
 MODES_TOLERANCE: Final = 1e-9
-CLOSED_FORM: Final = 1e-3
+CLOSED_FORM_TOLERANCE: Final = 1e-3
 """Relative distance from the closed form's gradient that counts as agreement."""
-GROWTH: Final = 2.0
+MOST_GROWTH: Final = 2.0
 """Allowed growth of the distance with stiffness, which should bring the two models together."""
 
 
@@ -100,8 +100,8 @@ def judge_closed_forms(checks: Sequence[CostCheck]) -> list[Finding]:
     findings = []
     for stiffness, distance, contact in known:
         softest, nearest, _ = known[0]
-        grows = distance > max(CLOSED_FORM, GROWTH * nearest)
-        if not distance <= CLOSED_FORM:
+        grows = distance > max(CLOSED_FORM_TOLERANCE, MOST_GROWTH * nearest)
+        if not distance <= CLOSED_FORM_TOLERANCE:
             text = f"the gradient is {distance:.1e} of its norm from the closed form's"
             text += f", farther than at {softest:g} N/m ({nearest:.1e})" if grows else ""
             entry = Entry("the whole rollout", 0, 0.0, "", distance, None)

@@ -27,7 +27,7 @@ OPTIONAL: Final = frozenset({"separate", "contact", "friction loss"})
 """Parts counted but not required: undamped contact never separates within its margin; the others have subparts."""
 NO_FRICTION: Final = mujoco.mjMINMU
 """Sliding friction that MuJoCo assigns to a contact whose geoms have none."""
-ALIGNED: Final = 1e-9
+ALIGNED_SINE: Final = 1e-9
 """Sine of the angle below which directions coincide."""
 _STATE, _KIND = mujoco.mjtConstraintState, mujoco.mjtConstraint
 _LIMITS = (int(_KIND.mjCNSTR_LIMIT_JOINT), int(_KIND.mjCNSTR_LIMIT_TENDON))
@@ -182,7 +182,7 @@ class Reach:
         else:
             return True
         return any(
-            np.linalg.norm(zero.xaxis[joint] - (zero.xaxis[joint] @ normal) * normal) > ALIGNED for joint in joints
+            np.linalg.norm(zero.xaxis[joint] - (zero.xaxis[joint] @ normal) * normal) > ALIGNED_SINE for joint in joints
         )
 
     def _normal(self, plane: int) -> np.ndarray:
@@ -206,7 +206,7 @@ class Reach:
             for joint in range(host.body_jntadr[body], host.body_jntadr[body] + host.body_jntnum[body]):
                 kind = host.jnt_type[joint]
                 if kind == _SLIDE:
-                    along = normal is not None and not turning[body] and abs(zero.xaxis[joint] @ normal) <= ALIGNED
+                    along = normal is not None and not turning[body] and abs(zero.xaxis[joint] @ normal) <= ALIGNED_SINE
                     radius[body] += 0.0 if along else np.inf
                 else:
                     radius[body] += np.inf if kind == _FREE else 2 * float(np.linalg.norm(host.jnt_pos[joint]))

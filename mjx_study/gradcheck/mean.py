@@ -32,7 +32,7 @@ FEEDBACK: Final = 0.02
 MEANS: Final = "means"
 """Value of `direction` for paths along the estimators' own means, see `along_means`."""
 MOST_PATHS: Final = 3
-NEGLIGIBLE: Final = 1e-3
+LEAST_SHARE: Final = 1e-3
 """Smallest share of a mean orthogonal to the others that warrants a path along it."""
 HEADER: Final = ("contact", "K [N/m]", "estimator", "difference", "gap", "±", "quadrature", "share", "finds", "verdict")
 
@@ -103,7 +103,7 @@ def _at_right_angles(estimates: Sequence[GradientEstimate]) -> list[np.ndarray]:
         for unit in units:
             left = left - (left @ unit) * unit
         size = float(np.linalg.norm(left))
-        if len(units) < MOST_PATHS and size > NEGLIGIBLE * float(np.linalg.norm(mean)):
+        if len(units) < MOST_PATHS and size > LEAST_SHARE * float(np.linalg.norm(mean)):
             units.append(left / size)
     return units or [np.eye(len(np.asarray(estimates[0].mean)))[0]]
 

@@ -10,7 +10,7 @@ from mjx_study.gradcheck.diagnosis import FAILURES, MEANING, VERDICTS
 from mjx_study.study.dataset import as_plain
 from mjx_study.table import format_table
 
-SHOWN: Final = 12
+MOST_SHOWN: Final = 12
 """Maximum number of findings in the text, unless all are requested."""
 OTHERS: Final = {"value": "mjx.step", "engine": "the C engine", "engine_mismatch": "the C engine"}
 """Source of the compared number, if not finite differences."""
@@ -247,7 +247,7 @@ class GradcheckReport:
         alike: dict[tuple[str, str, str], list[Finding]] = {}
         for finding in self.findings:
             alike.setdefault((finding.who, finding.verdict, finding.cause), []).append(finding)
-        shown = list(alike.values()) if verbose else list(alike.values())[:SHOWN]
+        shown = list(alike.values()) if verbose else list(alike.values())[:MOST_SHOWN]
         lines: list[str] = []
         for group in shown:
             contacts = list(dict.fromkeys(finding.contact for finding in group))

@@ -17,10 +17,10 @@ from mjx_study.simulation.engine import HostState, converged_host, host_data
 
 TOLERANCE: Final = 1e-8
 """Relative difference above which two implementations differ in a quantity."""
-TINY: Final = 1e-12
+LEAST_ROW: Final = 1e-12
 """Size below which a constraint row counts as zero."""
 ROUNDING: Final = 1e-14
-STILL: Final = 1e-8
+LEAST_TURNING: Final = 1e-8
 """Angular velocity [rad/s] below which, in every component, MJX treats the step of an orientation as zero."""
 WARMSTARTS: Final = (0.0, 0.5, 1.001)
 """Alternative warm starts, relative to the solution, whose results differ only by rounding."""
@@ -194,7 +194,7 @@ def _apart(
     still = np.zeros(host.nv)  # angular velocities that MJX treats as zero
     for _, _, first in quaternions(host):
         turning = np.abs(ours.qvel[first : first + 3])
-        still[first : first + 3] = np.where(turning.max() <= STILL, turning, 0.0)
+        still[first : first + 3] = np.where(turning.max() <= LEAST_TURNING, turning, 0.0)
     unseen = (ROUNDING * max(1.0, _largest(before.qpos)) + timestep * still, ROUNDING * speed, ROUNDING)
     scales = (timestep * speed, timestep * force, activation)
     parts = np.split(_change(host, theirs, ours), [host.nv, 2 * host.nv])
@@ -305,7 +305,7 @@ def _rows(host: mujoco.MjModel, data: mujoco.MjData, stages: dict[str, Any], *, 
     """
     here = {name: stages[name] for name in ROWS}
     there = {"efc_J": _jacobian(host, data), "efc_aref": data.efc_aref, "efc_D": data.efc_D}
-    live, alive = (np.abs(rows["efc_J"]).max(axis=1, initial=0.0) > TINY for rows in (here, there))
+    live, alive = (np.abs(rows["efc_J"]).max(axis=1, initial=0.0) > LEAST_ROW for rows in (here, there))
     kinds, labels = stages["efc_type"], _labels(host, data)
     found: list[Found] = []
     for kind in np.union1d(kinds[live], data.efc_type[alive]):
@@ -332,7 +332,7 @@ def _rows(host: mujoco.MjModel, data: mujoco.MjData, stages: dict[str, Any], *, 
 def _distances(ours: np.ndarray, theirs: np.ndarray) -> Float[np.ndarray, "ours theirs"]:
     """Pairwise distances, relative to the largest magnitude."""
     mine, its = (rows.reshape(len(rows), -1) for rows in (ours, theirs))
-    return cdist(mine, its, "chebyshev") / max(_largest(mine), _largest(its), TINY)
+    return cdist(mine, its, "chebyshev") / max(_largest(mine), _largest(its), LEAST_ROW)
 
 
 def _jacobian(host: mujoco.MjModel, data: mujoco.MjData) -> Float[np.ndarray, "rows nv"]:

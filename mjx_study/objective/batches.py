@@ -17,7 +17,7 @@ from mjx_study.objective.cost import simulate
 from mjx_study.objective.programs import SamplePrograms
 from mjx_study.reference.noise import check_sigma
 from mjx_study.simulation.contact import ContactModel
-from mjx_study.simulation.linear_algebra import SMALL
+from mjx_study.simulation.linear_algebra import MOST_UNROLLED
 from mjx_study.simulation.onset import SLOTS
 from mjx_study.stopwatch import timed
 from mjx_study.tasks.task import Task
@@ -26,7 +26,7 @@ Theta = Float[Array, " params"]
 Keys = Key[Array, " samples"]
 LAPACK_BATCH: Final = 2048
 """Batch size from which jaxlib 0.10.2 splits matrix factorisations among its CPU threads, which deadlocks if two
-programs do so at a time. Matrices with up to `SMALL` rows do not use LAPACK."""
+programs do so at a time. Matrices with up to `MOST_UNROLLED` rows do not use LAPACK."""
 
 
 def compiled_rollout(task: Task) -> Compiled:
@@ -120,7 +120,7 @@ class Simulator:
         """All devices, or only one where two would deadlock; see `LAPACK_BATCH`."""
         corrected = name == "corrected" or self.task.onset != "none"
         batch = self.chunk_size * (SLOTS if corrected else 1)
-        hangs = self.devices[0].platform == "cpu" and self.task.scene.host.nv > SMALL and batch >= LAPACK_BATCH
+        hangs = self.devices[0].platform == "cpu" and self.task.scene.host.nv > MOST_UNROLLED and batch >= LAPACK_BATCH
         return self.devices[:1] if hangs else self.devices
 
 

@@ -17,7 +17,7 @@ from mjx_study.study.variables import COORDINATES
 UNSTABLE: Final = "unstable step"
 MOST_PANELS: Final = 6
 """Maximum number of contact models in a figure that has a panel, a row or a column for each."""
-APART: Final = 1.05
+SHIFT_RATIO: Final = 1.05
 """Ratio of the stiffnesses at which neighbouring estimators are drawn where they would hide each other."""
 
 
@@ -122,7 +122,7 @@ def stiffness_axis(axes: Axes, family: str, rows: xr.Dataset) -> np.ndarray:
 
 def beside(axes: Axes, x: np.ndarray, rank: float) -> np.ndarray:
     """Move positions to the right, by so many estimators, or to the left."""
-    return x * APART**rank if axes.get_xscale() == "log" else x + (APART - 1) * rank
+    return x * SHIFT_RATIO**rank if axes.get_xscale() == "log" else x + (SHIFT_RATIO - 1) * rank
 
 
 def estimators(rows: xr.Dataset) -> Iterator[tuple[xr.Dataset, dict[str, Any]]]:

@@ -24,7 +24,7 @@ Values = Float[np.ndarray, "*batch"]
 Points = Float[np.ndarray, "*batch params"]
 Theta = Float[np.ndarray, " params"]
 
-TAIL: Final = 1e-15
+TAIL_PROBABILITY: Final = 1e-15
 """Probability of noise outside the range of the quadrature."""
 NODES: Final = np.polynomial.legendre.leggauss(64)
 """Nodes on (-1, 1) and weights of the Gauss-Legendre rule between adjacent cuts."""
@@ -112,7 +112,7 @@ def smoothed(function: Function, theta: Theta, sigma: float, noise: str = "gauss
             f"{type(function).__name__} cannot be smoothed: it needs a method `smoothed`, or `period`, `jumps` and "
             "`breakpoints`"
         )
-    centre, reach = float(theta[0]), density.reach(TAIL)
+    centre, reach = float(theta[0]), density.reach(TAIL_PROBABILITY)
 
     def copies(point: float) -> Float[np.ndarray, " copies"]:
         return (_copies(point, function.period, centre, reach * sigma) - centre) / sigma

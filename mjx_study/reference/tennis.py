@@ -32,7 +32,7 @@ from jaxtyping import Array, Float, Int, Key
 
 from mjx_study.reference.system import ControlJacobians, Controls, Costs, QuadraticCost, StateJacobians, States
 
-TURNED: Final = 1e-3
+MOST_TURNED: Final = 1e-3
 """Bound on the deviation of a velocity that was not reflected [rad]."""
 MAX_IMPACTS: Final = 4
 """Maximum number of impacts per step; a ball still approaching the paddle afterwards passes through."""
@@ -42,7 +42,7 @@ SUBDIVISIONS: Final = 8
 """Number of parts of a flight searched for a crossing; entry and exit within one part (a graze) are missed."""
 BISECTIONS: Final = 60
 """Bisections of such a part, down to adjacent floating-point numbers."""
-TOUCHING: Final = 1e-9
+TOUCHING_DEPTH: Final = 1e-9
 """Depth inside a face that still counts as outside [m], for rounding after an impact at the end of a step."""
 
 Rows = Float[np.ndarray, "samples 7"]
@@ -144,7 +144,7 @@ def tennis_metrics(
     first = velocity[..., :1, :]
     across = first[..., 0] * velocity[..., 1] - first[..., 1] * velocity[..., 0]
     along = first[..., 0] * velocity[..., 0] + first[..., 1] * velocity[..., 1]
-    turned = (abs(across) > TURNED * abs(along)) | (along < 0)
+    turned = (abs(across) > MOST_TURNED * abs(along)) | (along < 0)
     away = position[..., -1, :] - np.array(Tennis.goal[:2])
     return {"hit": turned.any(-1) * 1.0, "distance [m]": (away**2).sum(-1) ** 0.5}
 
@@ -193,7 +193,7 @@ def _first_impact(
     """Row indices of the balls that cross a face from outside and within its width, and the first time they do [s]."""
     offset, velocity = state[:, :2] - state[:, 4:6], state[:, 2:4] - control[:, :2]
     nearest = np.hypot(*offset.T) - duration * np.hypot(*velocity.T)
-    near = np.flatnonzero(nearest <= np.hypot(half_width, reach) + TOUCHING)  # others cannot reach the paddle
+    near = np.flatnonzero(nearest <= np.hypot(half_width, reach) + TOUCHING_DEPTH)  # others cannot reach the paddle
     if len(near) < len(state):
         hits, time = _first_impact(state[near], control[near], duration[near], reach, half_width)
         return near[hits], time
@@ -208,7 +208,7 @@ def _first_impact(
     every = np.arange(len(state))
     fractions = np.linspace(0, 1, SUBDIVISIONS + 1)[1:]
     inside = clearance(every, duration[:, None] * fractions) < 0
-    rows = np.flatnonzero((clearance(every, np.zeros(len(state))) >= -TOUCHING) & inside.any(axis=1))
+    rows = np.flatnonzero((clearance(every, np.zeros(len(state))) >= -TOUCHING_DEPTH) & inside.any(axis=1))
     if len(rows) == 0:
         return rows, duration[rows]
     late = duration[rows] * fractions[np.argmax(inside[rows], axis=1)]

@@ -25,7 +25,7 @@ from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Bool, Float
 
 from mjx_study.simulation._mjx import mjx
-from mjx_study.simulation.linear_algebra import SMALL, product, solve_positive_definite
+from mjx_study.simulation.linear_algebra import MOST_UNROLLED, product, solve_positive_definite
 from mjx_study.simulation.patches import AT_FIRST_TOUCH, RELAXING, patched
 from mjx_study.simulation.scene import num_constraint_rows
 
@@ -39,7 +39,7 @@ OWN_SOLVER: Final = True
 """Whether small systems use the solver below instead of MJX's; tests compare both."""
 NEWTON_STEPS: Final = 30
 LINE_SEARCH_STEPS: Final = 4
-ROUNDINGS: Final = 8
+MOST_ROUNDINGS: Final = 8
 """Tolerance of the solver's equation in rounding errors of its terms."""
 GENEROUS: Final = (100, 50)
 """Iterations of the solver and its line search in `solve_to_rounding`."""
@@ -129,7 +129,7 @@ def run_solver(model: mjx.Model, data: mjx.Data) -> Qvel:
     """
     if num_constraint_rows(data) == 0:
         return data.qacc_smooth
-    if OWN_SOLVER and model.nv <= SMALL:
+    if OWN_SOLVER and model.nv <= MOST_UNROLLED:
         return _newton(model, data)
     return mjx.solve(model, data).qacc
 
@@ -142,7 +142,7 @@ def _newton(model: mjx.Model, data: mjx.Data) -> Qvel:
     """
     rows: Any = data._impl
     inertia, jacobian = mjx.full_m(model, data), rows.efc_J
-    rounding = ROUNDINGS * jnp.finfo(inertia.dtype).eps
+    rounding = MOST_ROUNDINGS * jnp.finfo(inertia.dtype).eps
 
     def force(slack):
         return row_force(model, data, slack)

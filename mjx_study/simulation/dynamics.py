@@ -30,7 +30,7 @@ from mjx_study.simulation import constraint
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.constraint import Qvel, Scalar
 from mjx_study.simulation.integration import integrate_position
-from mjx_study.simulation.linear_algebra import SMALL, product, solve_positive_definite
+from mjx_study.simulation.linear_algebra import MOST_UNROLLED, product, solve_positive_definite
 from mjx_study.simulation.patches import patched
 from mjx_study.simulation.scalars import traced_part, unrolled
 from mjx_study.simulation.scene import Scene
@@ -135,7 +135,7 @@ def _solved(solver: constraint.Solver, scene: Scene, model: mjx.Model, state: St
 
 def entry_by_entry(function: Callable[..., Any], model: mjx.Model, *arguments: Any) -> Any:
     """Evaluate `function(model, *arguments)`, unrolled if that pays: few degrees of freedom and a constant model."""
-    if model.nv <= SMALL and not isinstance(model.body_mass, Tracer):
+    if model.nv <= MOST_UNROLLED and not isinstance(model.body_mass, Tracer):
         return unrolled(function, model, *arguments)
     return function(model, *arguments)
 

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-SMALL: Final = 8
+MOST_UNROLLED: Final = 8
 """Largest number of degrees of freedom for which linear systems are unrolled."""
 
 
@@ -22,7 +22,7 @@ def product(matrix: Float[Array, "rows columns"], vector: Float[Array, " columns
 def cholesky(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
     """Return the upper factor U of a symmetric positive definite matrix U^T U."""
     size = matrix.shape[0]
-    if size > SMALL:
+    if size > MOST_UNROLLED:
         return jax.scipy.linalg.cholesky(matrix)
     upper = [[jnp.zeros_like(matrix, shape=()) for _ in range(size)] for _ in range(size)]
     for j in range(size):
@@ -35,7 +35,7 @@ def cholesky(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
 def solve_factored(upper: Float[Array, "n n"], right_side: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
     """Solve U^T U x = b for one or more right-hand sides."""
     size = upper.shape[0]
-    if size > SMALL:
+    if size > MOST_UNROLLED:
         return jax.scipy.linalg.cho_solve((upper, False), right_side)
     solution = list(right_side)
     for i in range(size):

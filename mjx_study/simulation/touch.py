@@ -14,9 +14,9 @@ from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.dynamics import Qpos, Qvel, Scalar, fwd_position
 from mjx_study.simulation.integration import integrate_position
 
-TOUCHING: Final = 1e-6
+TOUCHING_SHARE: Final = 1e-6
 """Share of a cell: a body closer than this before the step was already touching, so there is no onset."""
-WITHIN: Final = 0.1
+NEAR_TOUCH: Final = 0.1
 """Share of the way from the touch to the state in contact at which the contact's geometry is evaluated."""
 
 
@@ -108,7 +108,7 @@ def find_events(
 
 def onset_begins(distance: Float[Array, "*steps guards"], travel: Float[Array, "*steps guards"]) -> Bool[Array, "..."]:
     """Whether contact begins at a step, from each guard's distance before it and travel in the preceding step."""
-    return (distance < 0) & (travel < 0) & (distance - travel > -TOUCHING * travel)
+    return (distance < 0) & (travel < 0) & (distance - travel > -TOUCHING_SHARE * travel)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -155,7 +155,7 @@ def at_touch(model: mjx.Model, template: mjx.Data, qpos: Qpos, qvel: Qvel, event
     zero, tiny = jnp.zeros_like(qpos, shape=()), jnp.finfo(qpos.dtype).tiny
     (distance, travel), (_, curvature), deep = jax.jvp(stage, (zero,), (-jnp.ones_like(zero),), has_aux=True)
     begun, _ = since(distance, travel, curvature)
-    back = jnp.where(ends, 1.0, (1 - WITHIN) * jnp.minimum(begun, 1.0))
+    back = jnp.where(ends, 1.0, (1 - NEAR_TOUCH) * jnp.minimum(begun, 1.0))
     at_back, near = stage(back)
     # MJX may report no contact close to the touch, or another one in its place.
     chosen = ends | (at_back[0] < 0)
@@ -168,6 +168,6 @@ def at_touch(model: mjx.Model, template: mjx.Data, qpos: Qpos, qvel: Qvel, event
     passes = ~ends & (length < 1)
     length = jnp.where(passes, length, 1.0)
     last = jnp.where(passes, 2 * jnp.maximum(1 - share / length, 0.0) / length, 1 - share)
-    moves = (distance < 0) & (share > 0) & (share < 1 - TOUCHING) & (~ends | (travel > 0))
+    moves = (distance < 0) & (share > 0) & (share < 1 - TOUCHING_SHARE) & (~ends | (travel > 0))
     before = jnp.where(passes | event.brief, 0.0, share)
     return Touch(share, (last, before), travel, positioned, event.used & moves)

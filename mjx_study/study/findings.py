@@ -15,31 +15,33 @@ from estimators.estimator import label_of
 from mjx_study.study.variables import GRADIENTS, ONSETS
 from mjx_study.table import digits_to_tell_apart
 
-SURE: Final = 0.001
+BIASED_P_VALUE: Final = 0.001
 """p-value at which a mean is called biased: the smallest that the test's 999 draws can yield."""
-APART: Final = 4.0
+OFF_SE: Final = 4.0
 """Standard errors beyond which a mean without a verdict is reported as off."""
-DETECTED: Final = 4.0
+DETECTED_SE: Final = 4.0
 """Standard errors beyond which two means are considered different."""
-NOTABLE: Final = 0.05
+NOTABLE_SHARE: Final = 0.05
 """Share of the largest slope beyond which a difference free of sampling error is reported."""
-UNSURE: Final = 0.2
+MOST_UNCERTAINTY: Final = 0.2
 """Relative uncertainty beyond which a reference is too imprecise to judge errors."""
-SHARE_OFF: Final = 0.5
+ERROR_PER_STRENGTH: Final = 0.5
 """Error of the linear onset term's mean, as a share of what the term adds, over the onset strength. Among 11 contact
 models on momentum_transfer and ball_wall the largest was 0.44; at random thetas the atlas has larger ones, at grazing
-contacts, at corners, or where an onset is `STRONG`."""
-STRONG: Final = 0.9
-"""Onset strength up to which `SHARE_OFF` holds; where an onset removes more of the approach speed in one step, the
-linear term's error can exceed the term. Fitted to half of the atlas's cells on momentum_transfer; right for 59 of the
-other 61."""
-NARROW: Final = 0.75
+contacts, at corners, or where an onset is stronger than `MOST_STRENGTH`."""
+MOST_STRENGTH: Final = 0.9
+"""Onset strength up to which `ERROR_PER_STRENGTH` holds; where an onset removes more of the approach speed in one step,
+the linear term's error can exceed the term. Fitted to half of the atlas's cells on momentum_transfer; right for 59 of
+the other 61."""
+LEAST_SPREAD: Final = 0.75
 """Standard deviation of the first onset's step from which an onset term is accurate to 1.5 % of what it adds; at 0.5
 it can be off by 60 %."""
-PLACE: Final = ("task", "timestep", "cone", "sigma", "samples", "model", "seed", "estimator", "contact", "stiffness")
-"""Coordinates of a row."""
 SETTING: Final = ("task", "timestep", "cone", "sigma", "samples")
 """Coordinates shared by all rows of a finding."""
+AXES: Final = (*SETTING, "model", "seed", "estimator")
+"""Dimensions along which there is a row for each place."""
+PLACE: Final = (*AXES, "contact", "stiffness")
+"""Coordinates of a row."""
 BELOW, ABOVE, ALIKE = "below ZoBG's", "above ZoBG's", "not told apart from ZoBG's"
 UNKNOWN: Final = "undecided (too few effective samples)"
 """Verdicts on FoBG's variance."""
@@ -62,7 +64,7 @@ class Row(SimpleNamespace):
         """Result of the test for bias: "biased", "none seen", or "too few effective samples"."""
         if not min(self.effective_samples, self.reference_effective_samples) >= ENOUGH_EFFECTIVE:
             return "too few effective samples"
-        return "biased" if self.bias_p_value <= SURE else "none seen"
+        return "biased" if self.bias_p_value <= BIASED_P_VALUE else "none seen"
 
     def as_dict(self) -> dict[str, Any]:
         """All variables by name, derived ones included."""
@@ -76,13 +78,12 @@ class Row(SimpleNamespace):
 
 def rows_of(dataset: xr.Dataset) -> list[Row]:
     """Return a row for each computed estimate; contact model, seed and estimator vary fastest."""
-    outer = PLACE[:8]
-    rows, grid = [], dataset["gradient_norm"].transpose(*outer)
+    rows, grid = [], dataset["gradient_norm"].transpose(*AXES)
     names = [name for name, variable in GRADIENTS.items() if name in dataset and "param" not in variable.dims]
 
     def along(name: str, *last: str) -> np.ndarray:
         variable = dataset[name].variable
-        return variable.set_dims({**grid.sizes, **variable.sizes}).transpose(*outer, *last).values
+        return variable.set_dims({**grid.sizes, **variable.sizes}).transpose(*AXES, *last).values
 
     scalars, coordinates = ({name: along(name) for name in each} for each in (names, PLACE))
     vectors = {name: along(name, f"{name}_entry") for name in ("solref", "solimp") if name in dataset}
@@ -185,9 +186,9 @@ def _meaningless(rows: Sequence[Row], gammas: Bounds) -> list[str]:
     numbers = [[(row.gradient_norm, row.variance) for row in group] for group in several]
     if numbers and all(np.allclose(each, each[0], rtol=1e-12, atol=0, equal_nan=True) for each in numbers):
         found.append("nothing depends on K: the contact whose stiffness is swept was never active")
-    if unsure := [row for row in rows if row.reference_uncertainty > UNSURE]:
+    if unsure := [row for row in rows if row.reference_uncertainty > MOST_UNCERTAINTY]:
         found.append(
-            f"the reference's own uncertainty exceeds {UNSURE:.0%}{_at(unsure)}: errors and verdicts mean "
+            f"the reference's own uncertainty exceeds {MOST_UNCERTAINTY:.0%}{_at(unsure)}: errors and verdicts mean "
             "little there; increase --reference-samples"
         )
     limited = [row for row in rows if row.epsilon is not None]
@@ -227,7 +228,7 @@ def _bias_findings(rows: Sequence[Row], gammas: Bounds) -> list[str]:
         seeds = len(_by(mine, "seed"))
         biased = [row for row in mine if row.bias_verdict == "biased"]
         off = [row for row in mine if row.bias_verdict == "too few effective samples" and _off(row)]
-        mean = f"{label_of(estimator).replace(', onset', ' (onset)')}'s mean is"
+        mean = f"{label_of(estimator)}'s mean is"
         if biased:
             shares = ", ".join(f"{_share(same)}{_of(same, seeds)}" for same in _by(biased, "stiffness").values())
             least = max(row.bias_p_value for row in biased)
@@ -246,23 +247,23 @@ def _bias_findings(rows: Sequence[Row], gammas: Bounds) -> list[str]:
 
 def linear_error(strength: float) -> str:
     """Describe how large the linear onset term's error can be."""
-    if strength > STRONG:
+    if strength > MOST_STRENGTH:
         return "the linear onset term can leave more than it adds"
-    return f"the linear onset term can be off by {SHARE_OFF * strength:.0%} of what it adds"
+    return f"the linear onset term can be off by {ERROR_PER_STRENGTH * strength:.0%} of what it adds"
 
 
 def _onset_findings(rows: Sequence[Row]) -> list[str]:
     """Report where the onset term may be off: either kind if noise is narrow, else the linear one at long timesteps."""
     found, corrected = [], [row for row in rows if row.onsets]
-    if narrow := [row for row in corrected if row.onset_spread < NARROW]:
+    if narrow := [row for row in corrected if row.onset_spread < LEAST_SPREAD]:
         least = min(row.onset_spread for row in narrow)
         found.append(
             f"the onset term may be off{_at(narrow)}, since the noise is narrow: the step at which "
-            f"contact begins has a standard deviation of {least:.2g}, and {NARROW} generally suffices; use a "
+            f"contact begins has a standard deviation of {least:.2g}, and {LEAST_SPREAD} generally suffices; use a "
             "smaller timestep or a larger --sigma, or check the mean (gradcheck --mean)"
         )
-    wide = [row for row in corrected if not row.onset_spread < NARROW]
-    if strong := [row for row in wide if SHARE_OFF * row.onset_strength > NOTABLE]:
+    wide = [row for row in corrected if not row.onset_spread < LEAST_SPREAD]
+    if strong := [row for row in wide if ERROR_PER_STRENGTH * row.onset_strength > NOTABLE_SHARE]:
         most = max(row.onset_strength for row in strong)
         found.append(
             f"{linear_error(most)}, more at grazing contacts and corners"
@@ -273,7 +274,7 @@ def _onset_findings(rows: Sequence[Row]) -> list[str]:
 
 
 def _off(row: Row) -> bool:
-    return row.bias_p_value <= SURE or row.debiased_error > APART * row.debiased_error_se
+    return row.bias_p_value <= BIASED_P_VALUE or row.debiased_error > OFF_SE * row.debiased_error_se
 
 
 def _of(rows: Sequence[Row], seeds: int) -> str:
@@ -317,12 +318,12 @@ def _gap(one: xr.Dataset) -> str:
     if "exact_slope" in one and bool(one["exact_slope"].notnull().all()):
         first, slope = one["exact_first"].values, one["exact_slope"].values
         largest = float(np.max(np.abs(slope)))
-        error = 3 * (one["exact_slope_error"].values + one["exact_first_error"].values) + NOTABLE * largest
-        source, uncertainty = "the mean cost's slope", f"more than {NOTABLE:.0%} of its largest value"
+        error = 3 * (one["exact_slope_error"].values + one["exact_first_error"].values) + NOTABLE_SHARE * largest
+        source, uncertainty = "the mean cost's slope", f"more than {NOTABLE_SHARE:.0%} of its largest value"
     else:
         first, slope = (one["slope"].sel(estimator=name).values for name in ("fobg", "zobg"))
-        error = DETECTED * np.hypot(*(one["slope_se"].sel(estimator=name).values for name in ("fobg", "zobg")))
-        source, uncertainty = "E[ZoBG]", f"more than {DETECTED:g} standard errors"
+        error = DETECTED_SE * np.hypot(*(one["slope_se"].sel(estimator=name).values for name in ("fobg", "zobg")))
+        source, uncertainty = "E[ZoBG]", f"more than {DETECTED_SE:g} standard errors"
     seen = np.abs(first - slope) > error
     if not np.any(seen):
         return f"E[FoBG] nowhere differs from {source} by {uncertainty}"

@@ -17,14 +17,14 @@ from estimators import Estimator, Linearisation, StepEvaluation
 from estimators.catalogue import suggestion
 from estimators.pytree import register_pytree
 
-DIVERGED: Final = 1e6
+MOST_COST_RATIO: Final = 1e6
 """Ratio of the mean cost to the size of the first one beyond which a run counts as diverged."""
 REASONS: Final = (
     "",
     "no sample of the batch is finite",
     "the gradient estimate is not finite",
     "the parameters are not finite after the update",
-    f"the mean cost exceeds {DIVERGED:g} times the size of the first one",
+    f"the mean cost exceeds {MOST_COST_RATIO:g} times the size of the first one",
 )
 """Reasons why a seed stopped, by code; 0 while it continues."""
 
@@ -145,7 +145,7 @@ def _advance_one(state: Descent, batches, estimator, optimizer):
     theta: Array = optax.apply_updates(state.theta, updates)  # type: ignore[assignment]
     reason = jnp.zeros((), int)
     for code, holds in (  # the most severe one last
-        (4, jnp.abs(cost) > DIVERGED * jnp.maximum(first_cost, 1e-12)),
+        (4, jnp.abs(cost) > MOST_COST_RATIO * jnp.maximum(first_cost, 1e-12)),
         (3, ~jnp.all(jnp.isfinite(theta))),
         (2, ~jnp.all(jnp.isfinite(estimate.mean))),
         (1, estimate.num_finite == 0),

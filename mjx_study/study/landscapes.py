@@ -46,7 +46,7 @@ from mjx_study.tasks.task import Task
 
 QUADRATURE: Final = 1500
 """Number of quadrature points under Gaussian noise; heavier tails get more."""
-TAIL: Final = 1e-6
+TAIL_PROBABILITY: Final = 1e-6
 """Probability of noise outside the grid, from each end of the line."""
 CHUNK: Final = 256
 """Quadrature points per device and call."""
@@ -185,7 +185,7 @@ class Line:
 def grid(low: float, high: float, sigma: float, size: int, noise: str) -> Float[np.ndarray, " size"]:
     """Midpoints of the cells of a uniform grid that covers the line and the noise around it: `size` cells for Gaussian
     noise; heavier tails get more cells of the same width."""
-    needed, gaussian = (high - low + 2 * sigma * NOISES[name].reach(TAIL) for name in (noise, "gaussian"))
+    needed, gaussian = (high - low + 2 * sigma * NOISES[name].reach(TAIL_PROBABILITY) for name in (noise, "gaussian"))
     cells = math.ceil(size * needed / gaussian)
     return (low + high - needed) / 2 + needed * (np.arange(cells) + 0.5) / cells
 
@@ -202,7 +202,7 @@ def means(
 
     ValueError if the grid is too coarse or does not cover the noise.
     """
-    spacing, reach = points[1] - points[0], NOISES[noise].reach(TAIL)
+    spacing, reach = points[1] - points[0], NOISES[noise].reach(TAIL_PROBABILITY)
     gap = 0.51 * spacing - reach * sigma
     if spacing > sigma / 8 or points[0] > position.min() + gap or points[-1] < position.max() - gap:
         raise ValueError(

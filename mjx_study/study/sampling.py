@@ -17,7 +17,7 @@ from mjx_study.reference import Reference
 from mjx_study.study.memory import batches_at_once, padded_size
 from mjx_study.study.plan import StudyCell, StudyPlan
 
-UNCONVERGED: Final = {"float64": 1e-6, "float32": 1e-3}
+MOST_RESIDUAL: Final = {"float64": 1e-6, "float32": 1e-3}
 """Relative solver residual above which a sample is reported as unconverged."""
 
 
@@ -122,4 +122,4 @@ def residuals_of(batch: Any) -> Float[np.ndarray, " rollouts"]:
 
 def unconverged(residuals: np.ndarray, precision: str) -> int:
     """Number of residuals that are too large or nonfinite."""
-    return int(np.sum(~(residuals <= UNCONVERGED[precision])))
+    return int(np.sum(~(residuals <= MOST_RESIDUAL[precision])))

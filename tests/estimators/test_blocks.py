@@ -10,7 +10,7 @@ import pytest
 
 import estimators
 from estimators import GradientEstimate, blocks, make_estimator, summarise
-from estimators.blocks import Parts, merge, moments_of
+from estimators.blocks import Parts, moments_of
 from estimators.statistics import merged_estimates
 
 SAMPLES, BLOCK, PARAMS = 4096, 512, 5
@@ -28,6 +28,10 @@ def drawn(kind: str) -> Rows:
     if kind == "far":
         zeroth += 1e6
     return zeroth, first
+
+
+def merge(one: Parts, other: Parts) -> Parts:
+    return tuple(mine.merged(theirs) for mine, theirs in zip(one, other, strict=True))
 
 
 def in_blocks(rows: Rows, every: int = 1) -> Parts:

@@ -1,10 +1,12 @@
 """gradcheck --mean: through MuJoCo's default contact first order is biased, with the onset term it is not."""
 
+import json
+
 import jax.numpy as jnp
 import pytest
 
 from estimators import make_estimator
-from mjx_study.cli import main
+from mjx_study.cli import main, options
 from mjx_study.gradcheck import check_mean
 from mjx_study.gradcheck.mean import lines_of
 from mjx_study.tasks import make_task
@@ -23,10 +25,21 @@ def test_the_bias_of_first_order_is_found_and_is_gone_with_the_onset_term() -> N
     assert len(lines_of([plain, corrected])) >= 3
 
 
+def test_estimators_take_their_options(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """A norm that no sample reaches clips none."""
+    monkeypatch.setattr(options, "configure", lambda **_: None)
+    chosen = ["--estimators", "fobg,fobg_clipped", "--max-norm", "1e9", "--samples", "5", "--json"]
+    main(["gradcheck", "tests.carts:cart", "--contact", "penalty", "--stiffness", "10", "--mean", *chosen])
+    plain, clipped = json.loads(capsys.readouterr().out)["checks"]
+    assert clipped == plain | {"estimator": "fobg_clipped"}
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (["pusher", "--samples", "9"], "--samples is for --mean"),
+        (["pusher", "--window", "9"], "--window is for --mean"),
+        (["pusher", "--mean", "--estimators", "fobg_clipped"], "'fobg_clipped' needs the option --max-norm; set it"),
         (["model.xml", "--mean"], "no MJCF file at model.xml"),
         (["tennis", "--mean", "--estimators", "delta"], "'delta' needs noise that is added to theta itself"),
         (["tennis", "--mean", "--onset", "jump", "--estimators", "total_propagation"], "have no onset term"),
