@@ -48,7 +48,7 @@ def dataset_of(document: Mapping[str, Any], cells: Cells) -> xr.Dataset:
     shape = tuple(len(dimensions[name]) for name in outer)
     data: dict[str, Any] = {}
     units = {entry.get("unit", "") for entry in document["resolved"]}
-    unit = units.pop() if len(units) == 1 else ""
+    unit = (units.pop() if len(units) == 1 else "") or THETA
     names = sorted({name for arrays, _ in cells.values() for name in arrays})
     for name, variable in variables_of(config["kind"], names).items():
         held = {index: arrays[name] for index, (arrays, _) in cells.items() if name in arrays}
@@ -60,7 +60,7 @@ def dataset_of(document: Mapping[str, Any], cells: Cells) -> xr.Dataset:
         for index, array in held.items():
             place = tuple(places[index]["at"][dimension] for dimension in outer)
             values[(*place, *(slice(size) for size in array.shape))] = array
-        attributes = variable.attributes | ({"units": unit} if unit and variable.unit == THETA else {})
+        attributes = {"units": unit if variable.unit == THETA else variable.unit, "long_name": variable.description}
         data[name] = ((*outer, *variable.dims), values, attributes)
     used = {dimension for dims, *_ in data.values() for dimension in dims} | set(outer)
     coordinates: dict[str, Any] = {name: (name, list(values)) for name, values in dimensions.items() if name in used}
@@ -68,7 +68,7 @@ def dataset_of(document: Mapping[str, Any], cells: Cells) -> xr.Dataset:
         coordinates[name] = ("model", [model[name] for model in document["models"]])
     dataset = xr.Dataset(data, coordinates)
     for name, coordinate in COORDINATES.items():
-        dataset[name].attrs = coordinate.attributes
+        dataset[name].attrs = {"units": coordinate.unit, "long_name": coordinate.description}
     dataset.attrs = {
         key: json.dumps(value) if isinstance(value, dict | list) else value
         for key, value in document.items()

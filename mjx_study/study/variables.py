@@ -20,11 +20,6 @@ class Variable:
     digits: int = 3
 
     @property
-    def attributes(self) -> dict[str, str]:
-        """Attributes in a Dataset."""
-        return {"units": self.unit, "long_name": self.description}
-
-    @property
     def shown_unit(self) -> str:
         """Unit in figures; empty if it says nothing."""
         return "" if self.unit in ("1", "cost") or "unit of" in self.unit else self.unit.replace("^2", "$^2$")
