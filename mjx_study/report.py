@@ -4,6 +4,7 @@ the methods of its Dataset."""
 import base64
 import io
 import json
+from collections.abc import Mapping
 from typing import Any, Final
 
 import jinja2
@@ -12,9 +13,10 @@ import pandas as pd
 import xarray as xr
 from matplotlib.figure import Figure
 
-from mjx_study.plots.study import SWEPT, plot_study
+from mjx_study.plots.study import plot_study
 from mjx_study.study.findings import findings_of, rows_of
 from mjx_study.study.run import warnings_of
+from mjx_study.study.variables import COORDINATES, QUANTITIES, Variable
 
 CAPTIONS: Final = {
     "comparison": "Variance of one gradient sample, and relative error of the mean against the reference.",
@@ -29,30 +31,15 @@ CAPTIONS: Final = {
     "descent": "Cost against iterations, rollouts and seconds.",
 }
 MEDIANS: Final = "Medians over the seeds, at the largest sample count."
-KINDS: Final = {
-    "gradients": ("gradient estimates", MEDIANS),
-    "descents": ("gradient descent", MEDIANS),
-    "landscapes": ("landscapes", "At the largest sample count."),
+ESTIMATED: Final = ("variance", "effective_samples", "top_share", "relative_error", "debiased_error", "squared_bias")
+KINDS: Final[dict[str, tuple[str, str, tuple[str, ...]]]] = {
+    "gradients": ("gradient estimates", MEDIANS, (*ESTIMATED, "squared_bias_se", "alpha", "nonfinite")),
+    "descents": ("gradient descent", MEDIANS, ("final_cost", "stopped_seeds", "variance", "alpha", "nonfinite")),
+    "landscapes": ("landscapes", "At the largest sample count.", ("least_cost", "least_at", "steepest", "nonfinite")),
 }
-"""Title, and what the numbers in the table are, by kind of study."""
+"""Title, what the numbers in the table are, and the quantities in it, by kind of study."""
 PRESENT: Final = ("residual", "rollouts", "unconverged")
 """For every kind of study, a variable that is finite in every computed cell."""
-COLUMNS: Final = {
-    "variance": "variance",
-    "effective_samples": "effective samples",
-    "top_share": "top share",
-    "relative_error": "relative error",
-    "debiased_error": "debiased",
-    "squared_bias": "squared bias",
-    "squared_bias_se": "± (standard error)",
-    "alpha": "alpha",
-    "nonfinite": "nan",
-    "least_cost": "least mean cost",
-    "least_at": "at t",
-    "steepest": "steepest slope",
-    "final_cost": "final cost, median",
-    "stopped_at": "stopped seeds",
-}
 
 
 @xr.register_dataset_accessor("mjx_study")
@@ -85,7 +72,8 @@ class StudyAccessor:
 
 def render_report(dataset: xr.Dataset) -> str:
     config = json.loads(dataset.attrs["config"])
-    title, summary = KINDS[config["kind"]]
+    title, summary, names = KINDS[config["kind"]]
+    quantities = {name: QUANTITIES[config["kind"]][name] for name in names}
     pages = jinja2.Environment(loader=jinja2.PackageLoader("mjx_study"), autoescape=True, keep_trailing_newline=True)
     return pages.get_template("report.html").render(
         tasks=", ".join(config["tasks"]),
@@ -94,7 +82,8 @@ def render_report(dataset: xr.Dataset) -> str:
         warnings=warnings_of(dataset),
         figures=[_figure(name, figure) for name, figure in plot_study(dataset).items()],
         summary=summary,
-        numbers=_numbers(dataset),
+        numbers=_numbers(dataset, quantities),
+        meanings={each.heading: each.description for each in quantities.values()},
         config=[[key, _shown(value)] for key, value in sorted(config.items()) if value is not None],
         provenance=_provenance(dataset),
         command=dataset.attrs.get("command"),
@@ -109,49 +98,47 @@ def _figure(name: str, figure: Figure) -> tuple[str, str, str]:
     return name, caption, base64.b64encode(file.getvalue()).decode()
 
 
-def _numbers(dataset: xr.Dataset) -> tuple[list[str], list[list[str]]] | None:
+def _numbers(dataset: xr.Dataset, quantities: Mapping[str, Variable]) -> tuple[list[str], list[list[str]]] | None:
     """Titles of the table of numbers, and a row for each cell and estimator."""
     if not dataset.data_vars:
         return None
     if "smoothed" in dataset:
         dataset = _with_extremes(dataset)
+    if "stopped_at" in dataset:
+        dataset = dataset.assign(stopped_seeds=dataset["stopped_at"].notnull())
     axes = ("task", "timestep", "cone", "sigma", "model", "estimator")
     outer = [name for name in axes[:4] if dataset.sizes[name] > 1]
-    variables = [name for name in COLUMNS if name in dataset]
+    shown = {name: variable for name, variable in quantities.items() if name in dataset}
     last = dataset.isel(samples=-1)
     rows = []
     for picked in np.ndindex(*(dataset.sizes[name] for name in axes)):
         one = last.isel(dict(zip(axes, picked, strict=True)))
         if any(np.isfinite(one[name]).all() for name in PRESENT if name in one):
             place = [_shown(one[name].item()) for name in ("model", *outer, "estimator")]
-            rows.append([*place, *(_shown(_reduced(name, one[name])) for name in variables)])
-    titles = ["contact model", *(SWEPT.get(name, name) for name in outer), "estimator"]
-    return [*titles, *(COLUMNS[name] for name in variables)], rows
+            rows.append([*place, *(_reduced(variable, one[name]) for name, variable in shown.items())])
+    labels = [COORDINATES[name].label if name in COORDINATES else name for name in outer]
+    return ["contact model", *labels, "estimator", *(variable.heading for variable in shown.values())], rows
 
 
 def _with_extremes(dataset: xr.Dataset) -> xr.Dataset:
     """Summarise a landscape by its extremes."""
     least = dataset["smoothed"].fillna(np.inf).argmin("point")
-    found = {
-        "least_cost": dataset["smoothed"].min("point"),
-        "least_at": dataset["position"].isel(point=least),
-        "steepest": abs(dataset["slope"]).max("point"),
-        "nonfinite": dataset["nonfinite"].sum("point"),
-    }
-    return dataset.drop_vars(["nonfinite"]).assign(found)
+    return dataset.assign(
+        least_cost=dataset["smoothed"].min("point"),
+        least_at=dataset["position"].isel(point=least),
+        steepest=abs(dataset["slope"]).max("point"),
+    )
 
 
-def _reduced(name: str, values: xr.DataArray) -> float:
-    """Reduce to one number over all seeds, and over the last tenth of the iterations."""
+def _reduced(variable: Variable, values: xr.DataArray) -> str:
+    """Reduce to a number: counts to their sum, others to the median over the seeds and the last tenth of iterations."""
     array = np.asarray(values.values, float)
-    if name == "stopped_at":
-        return float(np.sum(np.isfinite(array)))
-    if name == "nonfinite":
-        return float(np.nansum(array))
+    if variable.digits == 0:
+        return variable.text(float(np.nansum(array)))
     if "iteration" in values.dims:
         array = np.moveaxis(array, values.dims.index("iteration"), 0)[-max(1, values.sizes["iteration"] // 10) :]
     array = array[np.isfinite(array)]
-    return float(np.median(array)) if len(array) else float("nan")
+    return variable.text(float(np.median(array)) if len(array) else None)
 
 
 def _provenance(dataset: xr.Dataset) -> list[list[str]]:

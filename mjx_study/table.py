@@ -1,12 +1,32 @@
 """Plain-text tables, and numbers as text."""
 
-from collections.abc import Iterable, Sequence
+import math
+from collections.abc import Iterable, Mapping, Sequence
 
 
 def format_table(rows: Sequence[Sequence[str]], header: Sequence[str]) -> list[str]:
     """Format right-aligned columns two spaces apart."""
     widths = [max(map(len, cells)) for cells in zip(header, *rows, strict=True)]
     return ["  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in (header, *rows)]
+
+
+def number(value: float | None, digits: int = 3) -> str:
+    """Format a number in few characters; `-` for None, `nan` and `inf` unchanged."""
+    if value is None:
+        return "-"
+    if value == 0 or not math.isfinite(value):
+        return f"{value:g}"
+    if 1e-3 <= abs(value) < 1e4:
+        rounded = float(f"{value:.{digits}g}")
+        return f"{rounded:.0f}" if abs(rounded) >= 10 ** (digits - 1) else f"{rounded:.{digits}g}"
+    mantissa, exponent = f"{value:.1e}".split("e")
+    return f"{mantissa}e{int(exponent)}"
+
+
+def described(meanings: Mapping[str, str]) -> str:
+    """Format names with what they mean, a line each."""
+    width = max(map(len, meanings))
+    return "\n".join(f"  {name:<{width}}  {meaning}" for name, meaning in meanings.items())
 
 
 def digits_to_tell_apart(values: Iterable[float | int], least: int = 6) -> int:

@@ -88,6 +88,24 @@ def test_every_option_of_a_sweep_is_described() -> None:
     assert set(vars(StudyConfig(tasks=("pusher",)))) - set(OPTIONS) == {"tasks"}
 
 
+@pytest.mark.parametrize(
+    ("given", "own"),
+    [
+        ({}, {"kind": "gradients", "reference_samples": 600}),
+        ({"reference_samples": 50}, {"kind": "gradients", "reference_samples": 50}),
+        ({"iterations": 3}, {"kind": "descents", "optimizer": "sgd", "evaluation_samples": 200}),
+        ({"points": 5}, {"kind": "landscapes"}),
+    ],
+)
+def test_a_configuration_holds_what_was_given(given: dict[str, Any], own: dict[str, Any]) -> None:
+    """A study is identified by its defaults as well, those of its kind."""
+    config = StudyConfig(tasks=("pusher",), **given)
+    fields = {name: value for name, value in vars(config).items() if name in ("kind", *(given | own))}
+    assert fields == dict.fromkeys(own) | given
+    assert config.resolved() == vars(config) | given | own
+    assert all(getattr(config.settings, name) == value for name, value in own.items())
+
+
 @pytest.mark.parametrize("name", ["clip", "freeze", "lbfgs", "polyak_sgd", "chain", "zero_nans", "__name__", "no such"])
 def test_no_optimiser(name: str) -> None:
     with pytest.raises(ValueError, match="optax has no optimiser"):

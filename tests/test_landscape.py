@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 import io
 import json
+import shutil
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ from mjx_study import cli
 from mjx_study.cli import options, studies
 from mjx_study.cli.console import curves
 from mjx_study.cli.studies import as_document
+from mjx_study.plots.study import plot_study
 from mjx_study.reference import BallWall, FunctionObjective, Heaviside, Quadratic, smoothed
 from mjx_study.simulation.dynamics import State
 from mjx_study.study import landscapes, sampling
@@ -160,7 +162,7 @@ def shot(horizon: int = 40) -> Task:
         return dataclasses.replace(start, qpos=jnp.zeros(1), qvel=2 * jnp.cos(theta))
 
     return task.replace(
-        policy=InitialStatePolicy(1, horizon, 1, start_at),
+        policy=InitialStatePolicy(1, horizon, 1, start_at, "rad"),
         theta=jnp.array([0.5]),
         final_cost=lambda state: state.qpos[0] ** 2,
         reference=ball.reference,
@@ -293,6 +295,23 @@ def test_the_command_prints_and_writes(drawn: tuple[Path, str], flown: xr.Datase
     assert {"landscape.pdf", "landscape.png", "study.json"} < {path.name for path in folder.iterdir()}
     assert flown["contact"].values.tolist() == ["reference", "mujoco"] and flown.sizes["point"] == 5
     assert json.loads(flown.attrs["environment"])["precision"] == "float64"
+
+
+def test_theta_has_its_unit(drawn: tuple[Path, str], tmp_path: Path) -> None:
+    """As the task says, also on the axis; folders begun before are read without it."""
+    shutil.copytree(drawn[0], tmp_path / "before")
+    written = tmp_path / "before" / "study.json"
+    written.write_text(written.read_text().replace('"unit": "rad"', '"others": 1'))
+    for folder, unit, label in (
+        (drawn[0], "rad", "theta [rad]"),
+        (tmp_path / "before", "unit of theta", "theta"),
+    ):
+        data = load_study(folder)
+        assert data["position"].attrs["units"] == unit
+        (figure,) = plot_study(data).values()
+        assert {axes.get_xlabel() for axes in figure.axes} == {"", label}
+    pusher = run_study(config("pusher", horizon=3, points=2, samples=(4,), contact=("reference",)))
+    assert pusher["position"].attrs["units"] == "unit of theta"
 
 
 @pytest.mark.parametrize(

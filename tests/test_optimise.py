@@ -23,6 +23,7 @@ from mjx_study.study import descents, plan, sampling, store
 from mjx_study.study import iteration as descent
 from mjx_study.study.configuration import StudyConfig
 from mjx_study.study.descents import Backend
+from mjx_study.study.findings import findings_of
 from mjx_study.study.iteration import REASONS, begin, make_optimizer
 from mjx_study.study.plan import StudyPlan, estimators_of, plan_study
 from mjx_study.study.run import load_study, run_study
@@ -82,6 +83,21 @@ def test_a_run_has_its_whole_history(short: xr.Dataset) -> None:
     assert bool(alpha.sel(estimator="zobg").isnull().all()) and bool((alpha.sel(estimator="aobg") > 0.5).all())
     assert short["rollouts"].values.tolist() == [6, 11]
     assert short["sigma"].item() == 0.1
+
+
+def test_a_bound_below_epsilon_is_told() -> None:
+    """At the stiffnesses where it holds in all iterations of all seeds, and not of inverse variances, unbounded."""
+    few = {"iterations": 2, "seeds": 2, "samples": (4,), "evaluation_samples": 2, "stiffness": (10.0, 30.0)}
+    study = on_reference("pusher", **SHORT | few | {"estimators": ("aobg", "ivw")})
+    stuck = run_study(dataclasses.replace(study, gamma=1e-9))
+    (sentence,) = findings_of(stuck)
+    assert sentence == (
+        "reference: AoBG equals ZoBG throughout at K = 10, 30 N/m: its bound gamma is below epsilon, the radius of "
+        "ZoBG's mean; increase --gamma or --samples"
+    )
+    once = stuck["alpha"].where((stuck["stiffness"] != 10) | (stuck["seed"] != 1) | (stuck["iteration"] != 2), 0.1)
+    assert "throughout at K = 30 N/m: " in findings_of(stuck.assign(alpha=once))[0]
+    assert findings_of(run_study(study)) == [] == findings_of(stuck.drop_vars("alpha"))
 
 
 def test_a_descent_starts_where_theta_says() -> None:

@@ -177,10 +177,9 @@ class Laboratory:
     def _study(self, config: StudyConfig) -> xr.Dataset:
         folder = None
         if self._folder is not None:
-            fields = {field.name: getattr(config, field.name) for field in dataclasses.fields(config)}
-            told = repr(fields | {"tasks": config.task_names, "effort": self.effort})
+            told = repr(config.resolved() | {"tasks": config.task_names, "effort": self.effort})
             digest = hashlib.sha256(told.encode()).hexdigest()[:12]
-            folder = self._folder / f"{re.sub(r'[^a-z_]+', '-', config.task_names[0])}-{config.kind}-{digest}"
+            folder = self._folder / f"{re.sub(r'[^a-z_]+', '-', config.task_names[0])}-{config.settings.kind}-{digest}"
         return run_study(config, folder, accept_versions=self._accept)
 
     def _task(self, name: str, timestep: float | None = None, onset: str = "none") -> Task:

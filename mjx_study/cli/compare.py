@@ -7,9 +7,10 @@ from estimators.catalogue import CATALOGUE
 from mjx_study.choices import FAMILIES
 from mjx_study.cli.options import Parser
 from mjx_study.study.configuration import StudyConfig
+from mjx_study.study.variables import COLUMNS, DETAILS, MARKS, explained
+from mjx_study.table import described
 
-EPILOG = (
-    """\
+EPILOG = f"""\
 examples:
   mjx-study compare pusher --stiffness 10,1000 --contact penalty,mujoco_default
   mjx-study compare momentum_transfer --contact mujoco_default --theta 0.5 --estimators zobg,fobg,aobg,ivw --gamma 0.5
@@ -17,34 +18,20 @@ examples:
   mjx-study compare pusher --json > pusher.json
 
 estimators:
-"""
-    + "\n".join(f"  {item.name:<21} {item.description}" for item in CATALOGUE.values())
-    + """
+{described({item.name: item.description for item in CATALOGUE.values()})}
 
 contact families (K: from --stiffness):
-"""
-    + "\n".join(f"  {item.name:<15} {item.description}" for item in FAMILIES.values())
-    + """
+{described({item.name: item.description for item in FAMILIES.values()})}
 
 columns of the table:
-  variance        trace of the sample covariance of one gradient sample, with a jackknife interval
-  relative error  distance of the mean to a reference gradient, over the norm of the reference
-  -> debiased     the same without the sampling noise of batch and reference, ± one standard error; < and >: no error
-                  is detected, these are bounds of two standard errors; -: noise explains all of it
-  ?               fewer than three effective samples: do not trust the number
-  alpha           weight of the first-order batch in AoBG
-  ms              computing time of one sample in milliseconds, compilation excluded
-  variance x s    variance times that time: the variance left after one second of computing
+{explained("gradients", *(name for group in COLUMNS for name in group if name not in DETAILS))}
 
 and with --details:
-  |gradient|      norm of the mean gradient
-  effective (top) effective number of samples behind the variance, and the share of the largest
-  cosine          between mean and reference gradient, and the same debiased; for several parameters
-  epsilon, B      confidence radius of the zeroth-order mean; distance between the two means
-  residual        largest relative residual of MuJoCo's constraint solver
-  nan             samples that overflowed or became NaN; they are left out, with a warning
+{explained("gradients", *DETAILS, "top_share")}
+
+{MARKS}
+?: too few effective samples; do not trust the number.
 """
-)
 
 
 def add(command: Parser) -> None:

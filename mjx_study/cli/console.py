@@ -5,6 +5,7 @@ import json
 import math
 import shutil
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,23 +16,10 @@ from mjx_study.choices import FAMILIES, REFERENCE
 from mjx_study.plots.style import style_of
 from mjx_study.study.findings import Row, curves_of, findings_of, rows_of
 from mjx_study.study.iteration import REASONS
-from mjx_study.study.variables import HISTORY, METRIC, START
-from mjx_study.table import format_table
+from mjx_study.study.variables import COLUMNS, DEBIASED, DETAILS, HISTORY, MARKS, METRIC, QUANTITIES, START
+from mjx_study.table import format_table, number
 
 Column = tuple[str, Callable[[Row], str]]
-
-
-def number(value: float | None, digits: int = 3) -> str:
-    """Format a number in few characters; `-` for None, `nan` and `inf` unchanged."""
-    if value is None:
-        return "-"
-    if value == 0 or not math.isfinite(value):
-        return f"{value:g}"
-    if 1e-3 <= abs(value) < 1e4:
-        rounded = float(f"{value:.{digits}g}")
-        return f"{rounded:.0f}" if abs(rounded) >= 10 ** (digits - 1) else f"{rounded:.{digits}g}"
-    mantissa, exponent = f"{value:.1e}".split("e")
-    return f"{mantissa}e{int(exponent)}"
 
 
 def _with_error(value: float, error: float) -> str:
@@ -44,9 +32,11 @@ def _with_error(value: float, error: float) -> str:
     return f"{value:.{decimals}f} ± {error:.{decimals}f}"
 
 
-def _debiased(row: Row, value: float, debiased: float, error: float, best: float) -> str:
+def _debiased(row: Row, name: str) -> str:
     """Format a value and what remains of it without noise: a bound if no error is detected, "-" if noise explains all
     of it."""
+    value, debiased, error = (getattr(row, each) for each in (name, DEBIASED[name], f"{DEBIASED[name]}_se"))
+    best = 1.0 if name == "cosine" else 0.0
     plain = f"{value:.3f}" if 0.01 <= abs(value) < 1000 else number(value, 2)
     if math.isnan(debiased):
         left = "-"
@@ -67,45 +57,34 @@ def _doubt(row: Row) -> str:
 
 
 def columns(confidence: float, details: bool = False, *, scalar: bool = False) -> list[list[Column]]:
-    """Columns of the comparison: those that identify a row, then groups that a table keeps together.
-
-    A scalar parameter has no cosine.
-    """
+    """Columns of the comparison: those that identify a row, then groups that a table keeps together; a scalar parameter
+    has no cosine."""
+    quantities = QUANTITIES["gradients"]
 
     def interval(row: Row) -> str:
-        bounds = f"{number(row.variance_lower, 2)} to {number(row.variance_upper, 2)}"
-        return f"{number(row.variance)} ({bounds}){_doubt(row)}"
+        return (
+            f"{number(row.variance)} ({number(row.variance_lower, 2)} to {number(row.variance_upper, 2)}){_doubt(row)}"
+        )
 
     def effective(row: Row) -> str:
         return number(row.effective_samples, 2) + (f" ({row.top_share:.0%})" if row.effective_samples else "")
 
-    variance = f"variance ({confidence:.0%} interval)", interval
-    error = (
-        "relative error -> debiased",
-        lambda row: _debiased(row, row.relative_error, row.debiased_error, row.debiased_error_se, 0.0),
-    )
-    cosine = (
-        "cosine -> debiased",
-        lambda row: _debiased(row, row.cosine, row.debiased_cosine, row.debiased_cosine_se, 1.0),
-    )
-    alpha = "alpha", lambda row: "-" if row.alpha is None else f"{row.alpha:.3f}"
-    times: list[Column] = [
-        ("ms", lambda row: number(1e3 * row.seconds_per_sample, 2)),
-        ("variance x s", lambda row: number(row.variance_seconds, 2)),
-    ]
-    identity: list[Column] = [
-        ("K [N/m]", lambda row: number(row.stiffness or None)),
-        ("estimator", lambda row: style_of(row.estimator)[0]),
-    ]
-    if not details:
-        return [identity, [variance, error], [alpha, *times]]
-    return [
-        identity,
-        [("|gradient|", lambda row: number(row.gradient_norm)), variance, ("effective (top)", effective)],
-        [error] if scalar else [error, cosine],
-        [alpha, ("epsilon", lambda row: number(row.epsilon)), ("B", lambda row: number(row.discrepancy))],
-        [*times, ("residual", lambda row: number(row.residual, 2)), ("nan", lambda row: str(row.nonfinite))],
-    ]
+    own: dict[str, Column] = {
+        "stiffness": (f" [{quantities['stiffness'].unit}]", lambda row: number(row.stiffness or None)),
+        "variance": (f" ({confidence:.0%} interval)", interval),
+        "effective_samples": (f" ({quantities['top_share'].heading})", effective),
+        "seconds_per_sample": ("", lambda row: number(1e3 * row.seconds_per_sample, 2)),
+    }
+    own |= {name: (f" -> {quantities[DEBIASED[name]].heading}", partial(_debiased, name=name)) for name in DEBIASED}
+
+    def column(name: str) -> Column:
+        variable = quantities[name]
+        more, show = own.get(name, ("", lambda row: variable.text(getattr(row, name))))
+        return variable.heading + more, show
+
+    identity = [column("stiffness"), ("estimator", lambda row: style_of(row.estimator)[0])]
+    hidden = () if details and not scalar else ("cosine",) if details else DETAILS
+    return [identity, *([column(name) for name in group if name not in hidden] for group in COLUMNS)]
 
 
 def _blocks(rows: Sequence[Row], shown: list[list[Column]], width: int) -> Iterator[list[str]]:
@@ -152,8 +131,7 @@ def gradient_lines(dataset: xr.Dataset, document: dict[str, Any], details: bool 
             "of rollouts with a control variate;",
             f"its own relative uncertainty is {low if low == high else f'{low} to {high}'}, and smaller errors cannot "
             "be told from zero.",
-            "After the arrows: the same without the sampling noise of batch and reference, ± one standard error;",
-            "< and >: no error is detected, these are bounds of two standard errors; -: noise explains all of it.",
+            MARKS,
         ]
     if not all(row.believable for row in rows):
         lines.append(
@@ -190,13 +168,13 @@ def curve_lines(dataset: xr.Dataset, document: dict[str, Any]) -> list[str]:
         "",
         "where the mean cost is least on the line:",
     ]
-    rows = []
+    rows, place, lowest = [], *(QUANTITIES["landscapes"][name] for name in ("least_at", "least_cost"))
     for label, one in found:
         smoothed, error = one["smoothed"].values, one["smoothed_se"].values
         best = int(np.nanargmin(smoothed)) if np.any(np.isfinite(smoothed)) else 0
-        least = f"{number(smoothed[best], 4)} ± {number(error[best], 1)}"
-        rows.append([label, f"{one['position'].values[best]:.3g}", least])
-    return [*lines, *format_table(rows, ["contact", "at", "mean cost"]), "", *document["findings"]]
+        least = f"{lowest.text(smoothed[best])} ± {number(error[best], 1)}"
+        rows.append([label, place.text(one["position"].values[best]), least])
+    return [*lines, *format_table(rows, ["contact", place.heading, lowest.heading]), "", *document["findings"]]
 
 
 def descents(dataset: xr.Dataset) -> dict[str, Any]:
@@ -210,6 +188,7 @@ def descents(dataset: xr.Dataset) -> dict[str, Any]:
         "start_cost": [one["start_cost"].item(), one["start_cost_se"].item()],
         "start_metrics": {str(name)[len(START) :]: one[name].item() for name in one if str(name).startswith(START)},
         "runs": [_run(one.sel(estimator=name)) for name in config["estimators"]],
+        "findings": findings_of(dataset),
     }
 
 
@@ -242,35 +221,34 @@ def descent_lines(dataset: xr.Dataset, document: dict[str, Any]) -> list[str]:
         where = f"{where}, K = {config['stiffness']:g} N/m"
     metrics = "".join(f", {name} {number(value, 3)}" for name, value in document["start_metrics"].items())
     decay = f" / i^{config['decay']:g}" if config["decay"] else ""
-    mean, error = document["start_cost"]
+    start, (mean, error) = QUANTITIES["descents"]["start_cost"], document["start_cost"]
+    shown = [QUANTITIES["descents"][name].heading for name in ("final_cost", "alpha", "seed_rollouts", "seconds")]
+    headings = ["estimator", shown[0], "best", *document["start_metrics"], *shown[1:]]
     lines = [
         f"{config['task']}: {where}; {config['optimizer']}, learning rate {config['learning_rate']:g}{decay}, "
         f"{config['iterations']} iterations",
         f"{config['samples']} samples in each batch, {config['seeds']} seeds from {config['seed']}, "
-        f"sigma {config['sigma']:g}; cost at the start {number(mean, 4)} ± {number(error, 2)}{metrics}",
+        f"sigma {config['sigma']:g}; {start.heading} {start.text(mean)} ± {number(error, 2)}{metrics}",
         "",
-        *format_table(
-            [_row(run) for run in document["runs"]],
-            ["estimator", "cost", "best", *document["start_metrics"], "alpha", "rollouts", "seconds"],
-        ),
+        *format_table([_row(run) for run in document["runs"]], headings),
     ]
     for run in document["runs"]:
         for stop in run["stopped"]:
             label, _, _ = style_of(run["estimator"])
             lines.append(f"{label}, seed {stop['seed']}: stopped at iteration {stop['iteration']}, {stop['reason']}")
-    return lines
+    return lines + [f"{sentence}." for sentence in document["findings"]]
 
 
 def _row(run: dict[str, Any]) -> list[str]:
-    costs = _finite(run["final_cost"])
+    cost, costs = QUANTITIES["descents"]["final_cost"], _finite(run["final_cost"])
     length = len(run["seconds"])
     weights = _finite([weight for row in run["history"]["alpha"][-max(1, length // 10) :] for weight in row])
     return [
         style_of(run["estimator"])[0],
-        _mean_and_spread(costs, 4),
-        number(float(np.min(costs)), 4) if len(costs) else "nan",
+        _mean_and_spread(costs, cost.digits),
+        cost.text(float(np.min(costs))) if len(costs) else "nan",
         *(_mean_and_spread(_finite(values), 3) for values in run["metrics"].values()),
-        f"{np.mean(weights):.3f}" if len(weights) else "-",
+        QUANTITIES["descents"]["alpha"].text(float(np.mean(weights))) if len(weights) else "-",
         str(run["rollouts_per_iteration"] * length),
         f"{run['seconds'][-1]:.1f}" if length else "-",
     ]

@@ -12,9 +12,8 @@ examples:
   mjx-study landscape momentum_transfer --contact penalty,mujoco_default --stiffness 3000,100000
   mjx-study landscape pusher --direction 0 --span=-2,2   the first of 200 forces
 
-Top row of the figure: the cost without noise, and the mean cost with noise (the smoothed objective) with a 95 % band.
-Bottom row: the means of ZoBG and FoBG along the line, with 95 % bands. Where the smoothed objective has a slope that
-the mean of FoBG lacks, the cost jumps: first-order gradients do not see jumps.
+The figure shows costs above, and slopes below, with 95 % bands. Where the mean cost with noise has a slope that the
+mean of FoBG lacks, the cost jumps: first-order gradients do not see jumps.
 
 For a scalar initial-state parameter with a fixed start, both slopes are also computed without sampling error, by
 quadrature over 1500 rollouts and gradients per contact model (more if --noise has heavy tails), whatever --points and

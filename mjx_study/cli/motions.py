@@ -14,7 +14,6 @@ import numpy as np
 
 from mjx_study import objective
 from mjx_study.choices import CONES, is_file
-from mjx_study.cli.console import number
 from mjx_study.cli.options import UsageError, configure_process, scene_options, task_of, theta_and_policy, usage_errors
 from mjx_study.cli.output import attempt, computing, print_report
 from mjx_study.disk import prepare_folder, write_whole
@@ -23,7 +22,7 @@ from mjx_study.plots.style import save_figure
 from mjx_study.render import Motion, RenderError, animate, check_format, resolve_renderer, strip, stroboscope
 from mjx_study.simulation.scene import load_model
 from mjx_study.study.resolution import at_theta
-from mjx_study.table import format_table
+from mjx_study.table import format_table, number
 from mjx_study.tasks.contact_grid import ContactPoint, family_grid
 from mjx_study.tasks.network import with_network
 from mjx_study.tasks.task import Task

@@ -9,8 +9,9 @@ from mjx_study.choices import REFERENCE
 from mjx_study.cli.options import Parser, scene_options
 from mjx_study.disk import write_whole
 from mjx_study.study.configuration import StudyConfig, takes_stiffness
+from mjx_study.study.variables import explained
 
-EPILOG = """\
+EPILOG = f"""\
 Every estimator starts from the task's theta, or from --theta, and draws the same noise. --learning-rate, --iterations
 and --samples default to the task's own, which are the paper's: plain gradient descent.
 
@@ -26,11 +27,11 @@ examples:
   mjx-study rollout pusher --theta out/policy-aobg.json
 
 columns of the table:
-  cost        mean cost with noise of the final policy over --evaluation-samples rollouts, the same for all, and its
-              standard deviation over seeds
-  hit, ...    what a task counts besides its cost, averaged over the same rollouts
-  alpha       mean weight of first-order gradients in the last tenth of the iterations
-  rollouts    number simulated per seed, including differentiated ones and baselines
+{explained("descents", "final_cost", "alpha", "seed_rollouts", "seconds")}
+  hit, ...        what a task counts besides its cost
+
+Costs and counts are means over --evaluation-samples rollouts, the same for all, ± their standard deviation over seeds;
+alpha is the mean over the last tenth of the iterations.
 """
 WRAPPED = ("contact", "stiffness", "sigma", "cone", "samples", "backward")
 """Options with a single value here and a list in a study."""

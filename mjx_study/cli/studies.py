@@ -187,7 +187,7 @@ def _sweep_head(plan: StudyPlan, missing: int) -> list[str]:
         f"about {size(plan.memory)} for the batches of a cell"
     )
     return [
-        f"{', '.join(config.task_names)}: {kind.get(str(config.kind), config.kind)}, "
+        f"{', '.join(config.task_names)}: {kind.get(config.settings.kind, config.settings.kind)}, "
         f"{', '.join(config.estimator_names)}, seeds {config.batches}",
         f"contact models: {len(models)}, timestep {_listed(group.timestep for group in plan.groups)} s, "
         f"{', '.join(dict.fromkeys(group.cone for group in plan.groups))} cone, "

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 
 from mjx_study.plots.panels import a_few, against_stiffness, counted, estimators, line, make_panels, model_title
 from mjx_study.plots.style import STYLE, line_with_band, robust_limits
+from mjx_study.study.variables import DERIVED, DESCENTS, LANDSCAPES, THETA
 
 MOST_COST_RATIO: Final = 1e7
 """Maximum ratio of the ends of an axis of costs; beyond it a descent counts as diverged."""
@@ -81,10 +82,10 @@ def descent(part: xr.Dataset, title: str) -> Figure:
                 axes.set_ylim(low, high)
         for axes in row[3:]:
             axes.set_ylim(-0.03, 1.03)
-            axes.set_ylabel("weight alpha", fontsize="small")
-        row[0].set_ylabel("mean cost", fontsize="small")
+            axes.set_ylabel(DESCENTS["alpha"].heading, fontsize="small")
+        row[0].set_ylabel(DESCENTS["cost"].label, fontsize="small")
         row[0].set_title(model_title(one), loc="left", fontsize="medium")  # along the row
-    labels = ("iteration", "rollouts of one seed", "time of all seeds [s]", "iteration")
+    labels = ("iteration", DERIVED["seed_rollouts"].label, DESCENTS["seconds"].label, "iteration")
     for axes, label in zip(grid[-1], labels, strict=False):
         axes.set_xlabel(label)
     return figure
@@ -97,13 +98,15 @@ def landscape(part: xr.Dataset, title: str) -> Figure:
     slopes, steepest = [], 0.0
     direction = json.loads(part.attrs["config"])["direction"] or "random"
     along, per = (f"t in theta + t d (d: {direction})", "t") if part.attrs["many_parameters"] else ("theta", "theta")
+    unit = part["position"].attrs.get("units", THETA)
+    along += "" if unit == THETA else f" [{unit}]"
     for (above, below), model in zip(grid.T, models, strict=True):
         one = part.isel(model=model)
         t = one["position"].values
         steepest = max(steepest, float(np.nanmax(np.abs(np.gradient(one["smoothed"].values, t)), initial=0.0)))
-        above.plot(t, one["cost"], color="0.55", linewidth=1.2, label="cost without noise")
+        above.plot(t, one["cost"], color="0.55", linewidth=1.2, label=LANDSCAPES["cost"].label)
         mean = _interval(one["smoothed"], one["smoothed_se"])
-        line_with_band(above, t, *mean, color="black", marker="", label="mean cost with noise")
+        line_with_band(above, t, *mean, color="black", marker="", label=LANDSCAPES["smoothed"].label)
         if "exact_slope" in one and bool(one["exact_slope"].notnull().any()):
             above_all = {"linestyle": "none", "markerfacecolor": "none", "markersize": 4, "zorder": 3}
             below.plot(t, one["exact_slope"], "ok", **above_all, label="slope of the mean cost, quadrature")

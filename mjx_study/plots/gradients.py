@@ -1,7 +1,6 @@
 """Figures of gradient estimates: variance, error, bias and weights."""
 
 import json
-from typing import Final
 
 import numpy as np
 import xarray as xr
@@ -11,7 +10,6 @@ from matplotlib.figure import Figure
 from mjx_study.choices import DEFAULT_SOLREF
 from mjx_study.plots.panels import (
     MOST_PANELS,
-    SWEPT,
     against_stiffness,
     beside,
     counted,
@@ -27,9 +25,7 @@ from mjx_study.plots.panels import (
     stiffness_axis,
 )
 from mjx_study.plots.style import line_with_band
-
-ALPHA: Final = "alpha, weight of first order"
-VARIANCE: Final = "variance of one sample [gradient$^2$]"
+from mjx_study.study.variables import COORDINATES, GRADIENTS
 
 
 def comparison(part: xr.Dataset, title: str) -> Figure:
@@ -63,8 +59,9 @@ def comparison(part: xr.Dataset, title: str) -> Figure:
             make_logarithmic(panel, x if family else None)
             shade_unstable(panel, family, rows, x)
         _mark_default(above, family, rows)
-    axes[0, 0].set_ylabel(VARIANCE)
-    axes[1, 0].set_ylabel(f"relative error of the mean\nof {counted(int(part['samples']), 'sample')}")
+    axes[0, 0].set_ylabel(GRADIENTS["variance"].label)
+    error, samples = GRADIENTS["relative_error"].heading, counted(int(part["samples"]), "sample")
+    axes[1, 0].set_ylabel(f"{error} of the mean\nof {samples}")
     return figure
 
 
@@ -83,7 +80,7 @@ def variance(part: xr.Dataset, title: str) -> Figure:
             line(axes, mine, x, *geometric(mine["variance"]), style)
 
     seeds = counted(part.sizes["seed"], "seed")
-    return against_stiffness(part, f"{title}\nvariance ({seeds}, 95 % intervals)", VARIANCE, draw)
+    return against_stiffness(part, f"{title}\nvariance ({seeds}, 95 % intervals)", GRADIENTS["variance"].label, draw)
 
 
 def bias(part: xr.Dataset, title: str) -> Figure | None:
@@ -131,9 +128,8 @@ def alpha(part: xr.Dataset, title: str) -> Figure | None:
         axes.set_ylim(-0.03, 1.03)
 
     seeds = counted(part.sizes["seed"], "seed")
-    return against_stiffness(
-        weighed, f"{title}\nweight of first-order gradients (mean and range of {seeds})", ALPHA, draw, log=False
-    )
+    title = f"{title}\nweight of first-order gradients (mean and range of {seeds})"
+    return against_stiffness(weighed, title, GRADIENTS["alpha"].label, draw, log=False)
 
 
 def error_against_samples(part: xr.Dataset, title: str) -> Figure:
@@ -151,7 +147,7 @@ def error_against_samples(part: xr.Dataset, title: str) -> Figure:
         floor = float(rows["reference_uncertainty"].mean())
         axes.plot(x, np.full(len(x), floor), ":", color="0.4", label="uncertainty of the reference")
         make_logarithmic(axes, x)
-        axes.set_xlabel(SWEPT["samples"])
+        axes.set_xlabel(COORDINATES["samples"].label)
         axes.set_title(model_title(rows.isel(model=0)), fontsize="medium")
-    grid[0, 0].set_ylabel("relative error of the mean")
+    grid[0, 0].set_ylabel(f"{GRADIENTS['relative_error'].heading} of the mean")
     return figure

@@ -12,14 +12,8 @@ from matplotlib.figure import Figure
 
 from mjx_study.plots.style import NO_CONTACT, TITLES, combines, line_with_band, style_of
 from mjx_study.simulation.contact import stable
+from mjx_study.study.variables import COORDINATES
 
-SWEPT: Final = {
-    "stiffness": "contact stiffness K [N/m]",
-    "timestep": "timestep h [s]",
-    "sigma": "noise sigma",
-    "samples": "samples N in a batch",
-}
-"""Dimensions that can be a figure's axis, with their labels."""
 UNSTABLE: Final = "unstable step"
 MOST_PANELS: Final = 6
 """Maximum number of contact models in a figure that has a panel, a row or a column for each."""
@@ -116,7 +110,7 @@ def against_stiffness(
 def stiffness_axis(axes: Axes, family: str, rows: xr.Dataset) -> np.ndarray:
     """Make x the stiffness of a family, or its models if it is one of `families` without a name; return positions."""
     if family:
-        axes.set(xscale="log", xlabel=SWEPT["stiffness"])
+        axes.set(xscale="log", xlabel=COORDINATES["stiffness"].label)
         axes.set_title(TITLES.get(family, family), fontsize="medium")
         return positions(rows)
     x = np.arange(rows.sizes["model"], dtype=float)

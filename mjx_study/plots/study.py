@@ -14,8 +14,9 @@ from matplotlib.patches import Rectangle
 
 from mjx_study.plots.descents import achieved, descent, landscape
 from mjx_study.plots.gradients import alpha, bias, comparison, error_against_samples, variance
-from mjx_study.plots.panels import SWEPT, UNSTABLE, families, make_panels, number, positive, unstable
+from mjx_study.plots.panels import UNSTABLE, families, make_panels, number, positive, unstable
 from mjx_study.plots.style import TITLES, fit_texts, legend_below, mark_clipped
+from mjx_study.study.variables import COORDINATES, DESCENTS, GRADIENTS
 from mjx_study.table import digits_to_tell_apart
 
 MOST_FIGURES: Final = 12
@@ -53,7 +54,7 @@ def plot_study(dataset: xr.Dataset) -> dict[str, Figure]:
         add("error_against_samples", error_against_samples, keep="samples")
     if quantity == "smoothed":
         return figures
-    pair = [name for name in SWEPT if len(np.unique(dataset[name].values)) > 1][:2]
+    pair = [name for name in COORDINATES if len(np.unique(dataset[name].values)) > 1][:2]
     if len(pair) == 2 and {"zobg", "fobg"} <= set(dataset["estimator"].values.tolist()):
         add(f"map_{pair[0]}_{pair[1]}", partial(_ratio_map, quantity=quantity, other=pair[1]), keep=pair[1])
     return figures
@@ -85,8 +86,8 @@ def _slices(dataset: xr.Dataset, keep: str = "") -> Iterator[tuple[str, str, xr.
         suffix += f"_{len(taken)}" if suffix in taken else ""
         taken.add(suffix)
         told = ["".join(each if each.isprintable() else "?" for each in values["task"])] + [
-            f"{label} = {values[name]}{unit}"
-            for name, label, unit in (("timestep", "h", " s"), ("sigma", "sigma", ""), ("samples", "N", ""))
+            f"{variable.heading} = {values[name]} {variable.shown_unit}".rstrip()
+            for name, variable in COORDINATES.items()
             if name in values
         ]
         told += [f"{values['cone']} cone"] if "cone" in varied else []
@@ -139,12 +140,12 @@ def _ratio_map(part: xr.Dataset, title: str, quantity: str, other: str) -> Figur
         axes.set_xticks(np.arange(len(stiffness)) + 0.5, stiffness, rotation=60, ha="right", fontsize="small")
         labels = _ticks(rows[other].values)
         axes.set_yticks(np.arange(len(labels)) + 0.5, labels, fontsize="small")
-        axes.set_xlabel(SWEPT["stiffness"])
+        axes.set_xlabel(COORDINATES["stiffness"].label)
         axes.set_title(TITLES.get(family, family), fontsize="medium")
-    grid[0, 0].set_ylabel(SWEPT[other])
+    grid[0, 0].set_ylabel(COORDINATES[other].label)
     assert mesh is not None
     below, above = bool(np.nanmin(known) < -extent), bool(np.nanmax(known) > extent)
     beyond = (("neither", "max"), ("min", "both"))[below][above]
-    told = f"log$_{{10}}$ of {quantity.replace('_', ' ')},\nFoBG over ZoBG"
+    told = f"log$_{{10}}$ of {(GRADIENTS | DESCENTS)[quantity].heading},\nFoBG over ZoBG"
     figure.colorbar(mesh, ax=list(grid[0]), label=told, extend=beyond)
     return figure

@@ -13,7 +13,7 @@ from mjx_study.study.landscapes import compute_landscapes
 from mjx_study.study.plan import StudyCell, StudyPlan
 from mjx_study.study.store import Part
 
-COMPUTE: Final[dict[str | None, Callable[[StudyPlan], Any]]] = {
+COMPUTE: Final[dict[str, Callable[[StudyPlan], Any]]] = {
     "gradients": compute_gradients,
     "descents": compute_descents,
     "landscapes": compute_landscapes,
@@ -25,7 +25,7 @@ class Computation:
     `Gradients`."""
 
     def __init__(self, plan: StudyPlan):
-        self._plan, self.compute = plan, COMPUTE[plan.config.kind](plan)
+        self._plan, self.compute = plan, COMPUTE[plan.settings.kind](plan)
 
     def __call__(self, cell: StudyCell, part: Part) -> Arrays:
         """Compute a cell, resuming from its checkpoint (landscapes have none)."""

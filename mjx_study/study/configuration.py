@@ -4,7 +4,7 @@ import dataclasses
 import math
 from collections import Counter
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Final, TypeVar, Union
+from typing import TYPE_CHECKING, Any, ClassVar, Final, Union
 
 from estimators.catalogue import CATALOGUE, PLUG_IN, PUBLISHED_TOLERANCE
 from mjx_study.choices import FAMILIES
@@ -14,27 +14,33 @@ if TYPE_CHECKING:
     import estimators.estimator
     import mjx_study.tasks.task
 
-Setting = TypeVar("Setting")
 Progress = Callable[[int, int, str], None]
 """Called with (work done, total work, what is being computed)."""
-OF_KIND: Final[dict[str, dict[str, Any]]] = {
-    "gradients": {"reference_samples": 600, "block_size": None},
-    "descents": {
-        "iterations": None,
-        "optimizer": "sgd",
-        "learning_rate": None,
-        "decay": None,
-        "stiffness_schedule": None,
-        "sigma_schedule": None,
-        "evaluation_samples": 200,
-        "network": None,
-    },
-    "landscapes": {"span": None, "direction": None},
-}
-"""Options specific to one kind of study, with their defaults."""
+OF_KIND: Final[dict[str, tuple[str, ...]]] = {
+    "gradients": ("reference_samples", "block_size"),
+    "descents": ("iterations", "optimizer", "learning_rate", "decay", "stiffness_schedule", "sigma_schedule",
+                 "evaluation_samples", "network"),
+    "landscapes": ("span", "direction"),
+}  # fmt: skip
+"""Options specific to one kind of study."""
 ASKED_BY: Final = {"descents": "give `iterations` as well", "landscapes": "give `points` as well"}
 SAMPLES: Final = 100
 """Samples per batch unless the configuration or a recipe sets another number."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """Options of a configuration with their defaults in place of None; those of other kinds of study have no effect.
+
+    Attributes:
+        points: number of thetas at which batches are drawn: one, unless along a line.
+    """
+
+    kind: str
+    points: int = 1
+    reference_samples: int = 600
+    optimizer: str = "sgd"
+    evaluation_samples: int = 200
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -171,27 +177,31 @@ class StudyConfig(Checked):
                 raise ValueError(f"`{name}` needs a contact family in `backward`")
         if self.iterations is not None and self.points is not None:
             raise ValueError("`iterations` are for descents and `points` for landscapes: give one of them")
-        if self.kind is None:
-            of_points = "gradients" if self.points is None else "landscapes"
-            object.__setattr__(self, "kind", of_points if self.iterations is None else "descents")
-        if self.kind == "landscapes" and self.points is None:
+        kind = self.settings.kind
+        if kind == "landscapes" and self.points is None:
             raise ValueError("landscapes need `points`: give their number")
-        self._settle()
-        check_span(self.span)
-
-    def _settle(self) -> None:
-        """Reject options of other kinds of study, and fill in the defaults of this kind's own."""
-        for kind, options in OF_KIND.items():
+        for other, options in OF_KIND.items():
             given = [f"`{name}`" for name in options if getattr(self, name) is not None]
-            if kind != self.kind and given:
+            if other != kind and given:
                 listed = f"{' and '.join(given)} {'is' if len(given) == 1 else 'are'}"
-                raise ValueError(f"{listed} for {kind}: {ASKED_BY.get(kind, 'omit it')}")
-            for name, default in options.items():
-                if kind == self.kind and getattr(self, name) is None:
-                    object.__setattr__(self, name, default)
+                raise ValueError(f"{listed} for {other}: {ASKED_BY.get(other, 'omit it')}")
+        check_span(self.span)
 
     def _named(self, name: str) -> Any:
         return self.estimator_names if name == "estimators" else super()._named(name)
+
+    @property
+    def settings(self) -> Settings:
+        of_points = "gradients" if self.points is None else "landscapes"
+        given = {field.name: getattr(self, field.name) for field in dataclasses.fields(Settings)}
+        given["kind"] = self.kind or (of_points if self.iterations is None else "descents")
+        return Settings(**{name: value for name, value in given.items() if value is not None})
+
+    def resolved(self) -> dict[str, Any]:
+        """Return all fields, with the defaults of the study's kind in place of None."""
+        fields = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        settings = vars(self.settings)
+        return fields | {name: settings[name] for name in ("kind", *OF_KIND[settings["kind"]]) if name in settings}
 
     @property
     def estimator_names(self) -> tuple[str, ...]:
@@ -209,13 +219,7 @@ class StudyConfig(Checked):
     @property
     def batches(self) -> int:
         """Number of seeds, given or by default."""
-        return self.seeds or (1 if self.kind == "landscapes" else 10)
-
-
-def settled(value: Setting | None) -> Setting:
-    """A setting that the study's kind has: it is given, or has a default."""
-    assert value is not None
-    return value
+        return self.seeds or (1 if self.settings.kind == "landscapes" else 10)
 
 
 def refuse_repeats(label: str, values: Sequence[object]) -> None:

@@ -4,15 +4,14 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 import xarray as xr
 
 from mjx_study.disk import write_whole
-from mjx_study.study.variables import variables_of
+from mjx_study.study.variables import COORDINATES, THETA, variables_of
 
-UNITS: Final = {"timestep": "s", "sigma": "unit of what the noise is added to", "samples": "1", "stiffness": "N/m"}
 Cells = Mapping[int, tuple[Mapping[str, np.ndarray], Mapping[str, str]]]
 """Arrays by variable of each cell, by index, with the versions of the software that computed them."""
 
@@ -48,6 +47,8 @@ def dataset_of(document: Mapping[str, Any], cells: Cells) -> xr.Dataset:
         dimensions["point"] = range(points)
     shape = tuple(len(dimensions[name]) for name in outer)
     data: dict[str, Any] = {}
+    units = {entry.get("unit", "") for entry in document["resolved"]}
+    unit = (units.pop() if len(units) == 1 else "") or THETA
     names = sorted({name for arrays, _ in cells.values() for name in arrays})
     for name, variable in variables_of(config["kind"], names).items():
         held = {index: arrays[name] for index, (arrays, _) in cells.items() if name in arrays}
@@ -59,18 +60,15 @@ def dataset_of(document: Mapping[str, Any], cells: Cells) -> xr.Dataset:
         for index, array in held.items():
             place = tuple(places[index]["at"][dimension] for dimension in outer)
             values[(*place, *(slice(size) for size in array.shape))] = array
-        attributes = {"units": variable.unit, "long_name": variable.description}
+        attributes = {"units": unit if variable.unit == THETA else variable.unit, "long_name": variable.description}
         data[name] = ((*outer, *variable.dims), values, attributes)
     used = {dimension for dims, *_ in data.values() for dimension in dims} | set(outer)
-    coordinates: dict[str, Any] = {
-        name: (name, list(values), {"units": UNITS[name]} if name in UNITS else {})
-        for name, values in dimensions.items()
-        if name in used
-    }
+    coordinates: dict[str, Any] = {name: (name, list(values)) for name, values in dimensions.items() if name in used}
     for name in ("contact", "stiffness"):
-        along = [model[name] for model in document["models"]]
-        coordinates[name] = ("model", along, {"units": UNITS[name]} if name in UNITS else {})
+        coordinates[name] = ("model", [model[name] for model in document["models"]])
     dataset = xr.Dataset(data, coordinates)
+    for name, coordinate in COORDINATES.items():
+        dataset[name].attrs = {"units": coordinate.unit, "long_name": coordinate.description}
     dataset.attrs = {
         key: json.dumps(value) if isinstance(value, dict | list) else value
         for key, value in document.items()

@@ -28,7 +28,6 @@ from mjx_study.objective import Simulator, TracedObjective, simulate
 from mjx_study.reference import Reference
 from mjx_study.simulation.contact import ContactModel, soften
 from mjx_study.stopwatch import tell, timed
-from mjx_study.study.configuration import settled
 from mjx_study.study.forecast import iteration
 from mjx_study.study.iteration import Descent, Record, advance, begin, going, make_optimizer, schedule_factors
 from mjx_study.study.plan import StudyCell, StudyPlan, estimators_of
@@ -83,10 +82,9 @@ class Backend:
 
     def __init__(self, plan: StudyPlan, cell: StudyCell):
         group, config = plan.groups[cell.group], plan.config
-        self.task, self.recipe = group.task.replace(sigma=cell.sigma), settled(group.recipe)
-        self.samples = cell.samples
+        self.task, self.recipe, self.samples = group.task.replace(sigma=cell.sigma), group.descent, cell.samples
         self.config, self.seeds = config, config.batches
-        self.optimizer = make_optimizer(settled(config.optimizer), self.recipe.learning_rate, self.recipe.decay)
+        self.optimizer = make_optimizer(config.settings.optimizer, self.recipe.learning_rate, self.recipe.decay)
         self.simulator = None if cell.model.analytic else Simulator(self.task, chunk_size=plan.chunk_size)
         self.saving = threading.Lock()
         iterations = self.recipe.iterations
@@ -183,7 +181,7 @@ class Backend:
 
     def _evaluation_keys(self) -> Key[Array, " samples"]:
         key = jax.random.fold_in(jax.random.key(self.config.seed), 2**31 - 1)
-        return jax.random.split(key, settled(self.config.evaluation_samples))
+        return jax.random.split(key, self.config.settings.evaluation_samples)
 
     @cached_property
     def _observe(self) -> Compiled:

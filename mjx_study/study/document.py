@@ -62,6 +62,7 @@ class _Resolved(_Part):
     noise: Name
     estimators: dict[str, dict[str, Any]]
     parameters: Count = 1
+    unit: str = ""
 
 
 class _Environment(_Part):
@@ -135,8 +136,7 @@ def document_of(plan: StudyPlan, command: str | None) -> dict[str, Any]:
         axes[name].sort()
     index = {name: {value: place for place, value in enumerate(along)} for name, along in axes.items()}
     places = [{name: index[name][value] for name, value in each.items()} for each in exact]
-    fields = {field.name: getattr(plan.config, field.name) for field in dataclasses.fields(plan.config)}
-    fields |= {"tasks": plan.config.task_names, "estimators": plan.config.estimator_names}
+    fields = plan.config.resolved() | {"tasks": plan.config.task_names, "estimators": plan.config.estimator_names}
     fields |= {"seeds": plan.config.batches, "iterations": plan.iterations}
     return {
         "config": fields,
@@ -181,7 +181,7 @@ def _resolved(plan: StudyPlan, places: list[dict[str, int]], tasks: int) -> list
             entry["noise"] = group.task.noise
             entry["estimators"] = {name: dataclasses.asdict(estimator) for name, estimator in chosen}
             entry["recipe"] = {} if group.recipe is None else dataclasses.asdict(group.recipe)
-            entry["parameters"] = group.task.policy.num_params
+            entry |= {"parameters": group.task.policy.num_params, "unit": getattr(group.task.policy, "unit", "")}
     return found
 
 

@@ -3,7 +3,7 @@
 import json
 import math
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from types import SimpleNamespace
 from typing import Any, Final
 
@@ -42,11 +42,10 @@ AXES: Final = (*SETTING, "model", "seed", "estimator")
 """Dimensions along which there is a row for each place."""
 PLACE: Final = (*AXES, "contact", "stiffness")
 """Coordinates of a row."""
-VECTORS: Final = ("gradient", "reference")
 BELOW, ABOVE, ALIKE = "below ZoBG's", "above ZoBG's", "not told apart from ZoBG's"
 UNKNOWN: Final = "undecided (too few effective samples)"
 """Verdicts on FoBG's variance."""
-COUNTS: Final = ("unconverged", "nonfinite", "onsets", "onsets_bounded", "onsets_missed")
+BOUND: Final = "its bound gamma is below epsilon, the radius of ZoBG's mean; increase --gamma or --samples"
 
 
 class Row(SimpleNamespace):
@@ -80,7 +79,7 @@ class Row(SimpleNamespace):
 def rows_of(dataset: xr.Dataset) -> list[Row]:
     """Return a row for each computed estimate; contact model, seed and estimator vary fastest."""
     rows, grid = [], dataset["gradient_norm"].transpose(*AXES)
-    names = [name for name in GRADIENTS if name in dataset and name not in VECTORS]
+    names = [name for name, variable in GRADIENTS.items() if name in dataset and "param" not in variable.dims]
 
     def along(name: str, *last: str) -> np.ndarray:
         variable = dataset[name].variable
@@ -95,7 +94,8 @@ def rows_of(dataset: xr.Dataset) -> list[Row]:
         for name in ("alpha", "epsilon", "discrepancy", *ONSETS):
             if name not in numbers or math.isnan(numbers[name]):
                 numbers[name] = None
-        numbers |= {name: int(numbers[name]) for name in COUNTS if numbers[name] is not None}
+        counts = [name for name in numbers if GRADIENTS[name].digits == 0 and numbers[name] is not None]
+        numbers |= {name: int(numbers[name]) for name in counts}
         at = {name: values[place] for name, values in coordinates.items()}
         at = {name: value.item() if isinstance(value, np.generic) else value for name, value in at.items()}
         solver = {name: tuple(values[place].tolist()) for name, values in vectors.items()}
@@ -106,24 +106,44 @@ def rows_of(dataset: xr.Dataset) -> list[Row]:
 def findings_of(dataset: xr.Dataset) -> list[str]:
     """Return the findings supported by a study's intervals, as sentences."""
     kind = json.loads(dataset.attrs["config"])["kind"]
-    return [] if kind == "descents" else {"gradients": _of_gradients, "landscapes": _of_landscapes}[kind](dataset)
+    return {"gradients": _of_gradients, "descents": _of_descents, "landscapes": _of_landscapes}[kind](dataset)
 
 
 def _of_gradients(dataset: xr.Dataset) -> list[str]:
-    """Report where FoBG's variance exceeds ZoBG's and which means are biased, by the coordinates in `SETTING`."""
-    rows, gammas, sentences = rows_of(dataset), gammas_of(dataset), []
-    confidence = json.loads(dataset.attrs["config"])["confidence"]
-    varied = [name for name in SETTING if len(_by(rows, name)) > 1]
+    """Report where FoBG's variance exceeds ZoBG's and which means are biased."""
+    gammas, confidence = gammas_of(dataset), json.loads(dataset.attrs["config"])["confidence"]
+
+    def of(rows: Sequence[Row]) -> list[str]:
+        found = [*_variance_finding(rows, confidence), *_bias_findings(rows, gammas)]
+        return [*found, *_onset_findings(rows), *_meaningless(rows, gammas)]
+
+    return _by_family(dataset, rows_of(dataset), of)
+
+
+def _of_descents(dataset: xr.Dataset) -> list[str]:
+    """Report where AoBG's bound keeps the weight of the first-order batch at 0 in all iterations of all seeds."""
+    if "alpha" not in dataset:
+        return []
+    gammas, along = gammas_of(dataset), ("iteration", "seed")
+    stuck = (dataset["alpha"].max(along) == 0).stack(place=(*SETTING, "model", "estimator"))
+    names = (*SETTING, "contact", "stiffness", "estimator")
+    rows = [Row(**{name: one[name].item() for name in names}) for one in stuck[stuck.values]]
+    bound = [row for row in rows if gammas.get((row.task, row.estimator), math.inf) < math.inf]
+
+    def of(rows: Sequence[Row]) -> list[str]:
+        groups = _by(rows, "estimator").items()
+        return [f"{label_of(name)} equals ZoBG throughout{_at(same)}: {BOUND}" for (name,), same in groups]
+
+    return _by_family(dataset, bound, of)
+
+
+def _by_family(dataset: xr.Dataset, rows: Iterable[Row], of: Callable[[list[Row]], list[str]]) -> list[str]:
+    """Sentences about the rows of each contact family, led by the coordinates in `SETTING` that vary."""
+    sentences, varied = [], [name for name in SETTING if dataset.sizes[name] > 1]
     for setting, alike in _by(rows, *SETTING).items():
         told = [_setting(name, value) for name, value in zip(SETTING, setting, strict=True) if name in varied]
         for (family,), part in _by(alike, "contact").items():
-            found = [
-                *_variance_finding(part, confidence),
-                *_bias_findings(part, gammas),
-                *_onset_findings(part),
-                *_meaningless(part, gammas),
-            ]
-            sentences += [f"{', '.join([*told, family])}: {sentence}" for sentence in found]
+            sentences += [f"{', '.join([*told, family])}: {sentence}" for sentence in of(part)]
     return sentences
 
 
@@ -173,10 +193,7 @@ def _meaningless(rows: Sequence[Row], gammas: Bounds) -> list[str]:
         )
     limited = [row for row in rows if row.epsilon is not None]
     if bound := [row for row in limited if row.epsilon > gammas.get((row.task, row.estimator), math.inf)]:
-        found.append(
-            f"AoBG equals ZoBG{_at(bound)}: its bound gamma is below epsilon, the radius of ZoBG's mean; "
-            "increase --gamma or --samples"
-        )
+        found.append(f"AoBG equals ZoBG{_at(bound)}: {BOUND}")
     return found
 
 

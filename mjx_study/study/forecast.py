@@ -17,7 +17,6 @@ import numpy as np
 
 from mjx_study.objective import contact_for, rounds
 from mjx_study.runtime import available_cores
-from mjx_study.study.configuration import settled
 from mjx_study.study.gradients import CANDIDATES, MOST_KEPT, takes_candidates
 from mjx_study.study.landscapes import CHUNK, QUADRATURE, applies
 from mjx_study.study.memory import batches_at_once
@@ -136,10 +135,10 @@ class _Time:
         """Seconds of a cell, excluding compilation."""
         counts = calls(plan, cell, devices)
         own: list[float] = []
-        if plan.config.kind == "descents" and not cell.model.analytic:
-            recipe = settled(plan.groups[cell.group].recipe)
+        if plan.settings.kind == "descents" and not cell.model.analytic:
+            iterations = plan.groups[cell.group].descent.iterations
             programs = [iteration(plan, cell, each.needs) for each in estimators_of(plan, cell)]
-            own = [self._calls(program, recipe.iterations) for program in programs]
+            own = [self._calls(program, iterations) for program in programs]
             counts = {program: count for program, count in counts.items() if program not in programs}
         batches = sum((self._calls(program, count) for program, count in counts.items()), 0.0)
         return batches + _side_by_side(own, devices) + self._calls(rest(plan, cell), 1)
@@ -179,11 +178,11 @@ def _kept(plan: StudyPlan, cell: StudyCell) -> int:
         "seed": config.batches,
         "estimator": len(config.estimators),
         "iteration": group.recipe and group.recipe.iterations,
-        "point": config.points,
+        "point": plan.settings.points,
         "param": group.task.policy.num_params,
     }
-    counts = [math.prod(sizes[dim] for dim in each.dims) for each in VARIABLES[str(config.kind)].values()]
-    return int(8 * sum(count for count in counts if config.kind != "gradients" or count <= MOST_KEPT))
+    counts = [math.prod(sizes[dim] for dim in each.dims) for each in VARIABLES[plan.settings.kind].values()]
+    return int(8 * sum(count for count in counts if plan.settings.kind != "gradients" or count <= MOST_KEPT))
 
 
 def rollouts(plan: StudyPlan, cell: StudyCell) -> tuple[int, int]:
@@ -193,16 +192,16 @@ def rollouts(plan: StudyPlan, cell: StudyCell) -> tuple[int, int]:
     def batches(oracles: Any) -> np.ndarray:
         return np.sum([rollouts_of(oracle, cell.samples, group.task.random_start) for oracle in oracles], axis=0)
 
-    if config.kind == "descents":
+    if plan.settings.kind == "descents":
         each = np.sum([batches(estimator.needs) for estimator in estimators_of(plan, cell)], axis=0)
-        total = config.batches * settled(group.recipe).iterations * each + [_evaluations(plan), 0]
-    elif config.kind == "landscapes":
+        total = config.batches * group.descent.iterations * each + [_evaluations(plan), 0]
+    elif plan.settings.kind == "landscapes":
         exact = QUADRATURE if not cell.model.analytic and applies(group.task) else 0
-        total = settled(config.points) * config.batches * batches(oracles_of(config)) + [exact, exact]
+        total = plan.settings.points * config.batches * batches(oracles_of(config)) + [exact, exact]
     else:
         candidates = 0 if cell.model.analytic else CANDIDATES
         total = config.batches * batches(oracles_of(config))
-        total = total + [2 * settled(config.reference_samples) + candidates, candidates]
+        total = total + [2 * plan.settings.reference_samples + candidates, candidates]
     return int(total[0]), int(total[1])
 
 
@@ -214,25 +213,25 @@ def calls(plan: StudyPlan, cell: StudyCell, devices: int) -> Counter[Program]:
     found: Counter[Program] = Counter()
     if cell.model.analytic:
         return found
-    task, config, recipe = plan.groups[cell.group].task, plan.config, plan.groups[cell.group].recipe
+    task, config, settings = plan.groups[cell.group].task, plan.config, plan.settings
 
     def batch(program: str, rows: int, times: int = 1) -> None:
         found[_program(plan, cell, program, plan.chunk_size)] += times * rounds(rows, plan.chunk_size, devices)
 
-    if config.kind == "descents":
+    if settings.kind == "descents":
         for estimator in estimators_of(plan, cell):
-            found[iteration(plan, cell, estimator.needs)] += settled(recipe).iterations
-        evaluations = calls_of("evaluation", settled(config.evaluation_samples), task.random_start)
+            found[iteration(plan, cell, estimator.needs)] += plan.groups[cell.group].descent.iterations
+        evaluations = calls_of("evaluation", settings.evaluation_samples, task.random_start)
         batch("value", evaluations[0][1], _costs(plan))
         return found
     groups = _in_turn(config.batches, seeds_together(plan, cell))
     draws = [some for seeds in groups for some in _in_turn(seeds, batches_at_once(cell.samples))]
     for some, oracle in itertools.product(draws, oracles_of(config)):
         for program, rows in calls_of(oracle, some * cell.samples, task.random_start):
-            batch(program, rows, config.points or 1)
-    if config.kind == "gradients":
+            batch(program, rows, settings.points)
+    if settings.kind == "gradients":
         odd = takes_candidates(task)
-        batch("value", (2 if odd else 3) * settled(config.reference_samples))
+        batch("value", (2 if odd else 3) * settings.reference_samples)
         if odd:
             batch("gradient", CANDIDATES)
     elif applies(task):
@@ -252,15 +251,15 @@ def iteration(plan: StudyPlan, cell: StudyCell, needs: tuple[str, ...]) -> Progr
 def rest(plan: StudyPlan, cell: StudyCell) -> Program:
     """The work of a cell besides its rollout programs, as one call: statistics, or all of an analytic system."""
     config, task = plan.config, plan.groups[cell.group].task
-    content = str(config.kind), *config.estimator_names
+    content = plan.settings.kind, *config.estimator_names
     if cell.model.analytic:
         return other_program("analytic", rollouts(plan, cell)[0], task.name, *content, steps=task.horizon)
-    if config.kind == "descents":
+    if plan.settings.kind == "descents":
         numbers = _evaluations(plan) * task.policy.num_params
     elif blocks_of(plan, cell) > 1:
         numbers, content = cell.samples * bytes_in_block(plan, cell) // 8 * config.batches, (*content, "in blocks")
     else:
-        numbers = memory_of_seed(plan, cell) // 8 * config.batches * (config.points or 1)
+        numbers = memory_of_seed(plan, cell) // 8 * config.batches * plan.settings.points
     return other_program("statistics", numbers, *content)
 
 
@@ -270,7 +269,7 @@ def setups(plan: StudyPlan, cell: StudyCell) -> dict[Any, Program]:
     found: dict[Any, Program] = {other: other}
     for program in calls(plan, cell, 1):
         found[own, program] = program
-    if plan.config.kind == "descents" and own is not None:
+    if plan.settings.kind == "descents" and own is not None:
         for estimator in estimators_of(plan, cell):
             found[own, estimator] = found.pop((own, program := iteration(plan, cell, estimator.needs)), program)
     return found
@@ -287,7 +286,7 @@ def _costs(plan: StudyPlan) -> int:
 
 
 def _evaluations(plan: StudyPlan) -> int:
-    return _costs(plan) * settled(plan.config.evaluation_samples)
+    return _costs(plan) * plan.settings.evaluation_samples
 
 
 def _in_turn(count: int, together: int) -> list[int]:

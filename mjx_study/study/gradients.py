@@ -26,7 +26,6 @@ from mjx_study.reference import Reference
 from mjx_study.runtime import traces_folder
 from mjx_study.stopwatch import unheard
 from mjx_study.study.blocks import REFERENCE, Arrays, Blocks, pack
-from mjx_study.study.configuration import settled
 from mjx_study.study.memory import BIAS_DRAWS, LARGEST_BLOCK, padded_size
 from mjx_study.study.plan import (
     StudyCell,
@@ -77,7 +76,8 @@ class Gradients:
     @property
     def _reference_keys(self) -> tuple[Key[Array, " pairs"], Key[Array, " samples"]]:
         odd, candidate = self._keys["reference"]
-        return jax.random.split(odd, settled(self._config.reference_samples)), jax.random.split(candidate, CANDIDATES)
+        pairs = self._config.settings.reference_samples
+        return jax.random.split(odd, pairs), jax.random.split(candidate, CANDIDATES)
 
     def __call__(self, cell: StudyCell, part: Part = Part()) -> Arrays:  # noqa: B008, it is empty
         """Compute a cell's numbers, see `begin`."""
@@ -262,9 +262,8 @@ def _of_seeds(numbers: Sequence[dict[str, Any]], seeds: int) -> dict[str, np.nda
         if variable.dims == BATCH
     }
     first = numbers[0]  # the reference's numbers are the same for every estimator and seed
-    shared = ("reference_norm", "reference_uncertainty", "reference_effective_samples")
     arrays["gradient"] = np.stack([row["gradient"] for row in numbers], axis=1)
-    return arrays | {name: np.asarray(first[name][0]) for name in shared}
+    return arrays | {name: np.asarray(first[name][0]) for name, variable in GRADIENTS.items() if not variable.dims}
 
 
 def _bias(numbers: Sequence[dict[str, Any]], reference: GradientEstimate) -> dict[str, np.ndarray]:

@@ -39,7 +39,6 @@ from mjx_study.reference.noise import split_sample_key
 from mjx_study.runtime import precision
 from mjx_study.simulation.contact import ContactModel
 from mjx_study.stopwatch import timed
-from mjx_study.study.configuration import settled
 from mjx_study.study.plan import StudyCell, StudyPlan, estimators_of, oracles_of
 from mjx_study.study.resolution import line_of
 from mjx_study.study.sampling import Objectives, cell_keys, draw_batches, unconverged
@@ -72,7 +71,7 @@ def compute_landscapes(plan: StudyPlan) -> Callable[..., dict[str, np.ndarray]]:
 
     def compute(cell: StudyCell, part: object = None) -> dict[str, np.ndarray]:
         task, objective = plan.groups[cell.group].task, objectives(cell)
-        line = line_of(task, settled(config.points), config.span, config.direction, config.seed)
+        line = line_of(task, config.settings.points, config.span, config.direction, config.seed)
         chosen = estimators_of(plan, cell)
         keys, columns, solved = cell_keys(config.seed, config.batches), [], []
         for theta in line.thetas:

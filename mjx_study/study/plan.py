@@ -17,7 +17,7 @@ from mjx_study.limits import MOST_CELLS, MOST_GIB, MOST_PROGRAMS, check_count
 from mjx_study.objective import chunk_for
 from mjx_study.option import OPTIONS, check
 from mjx_study.reference.noise import check_sigma
-from mjx_study.study.configuration import SAMPLES, StudyConfig, settled
+from mjx_study.study.configuration import SAMPLES, Settings, StudyConfig
 from mjx_study.study.iteration import make_optimizer, schedule_factors
 from mjx_study.study.memory import (
     AT_ONCE,
@@ -53,6 +53,12 @@ class Group:
     models: tuple[ContactPoint, ...]
     recipe: Recipe | None = None
 
+    @property
+    def descent(self) -> Recipe:
+        """The recipe, which groups of descents have."""
+        assert self.recipe is not None
+        return self.recipe
+
 
 @dataclasses.dataclass(frozen=True)
 class StudyCell:
@@ -79,6 +85,10 @@ class StudyPlan:
     chunk_size: int
     warnings: tuple[str, ...]
 
+    @property
+    def settings(self) -> Settings:
+        return self.config.settings
+
     def with_chunk(self, size: int) -> "StudyPlan":
         """The plan with another chunk size, such as that of a study begun earlier."""
         return dataclasses.replace(self, chunk_size=size)
@@ -86,14 +96,14 @@ class StudyPlan:
     @property
     def compilations(self) -> int:
         """Number of programs to compile for each kind of contact of a group: two, or in descents one per estimator."""
-        each = 2 if self.config.kind != "descents" else len(self.config.estimators)
+        each = 2 if self.settings.kind != "descents" else len(self.config.estimators)
         return each * len({self.program_of(cell) for cell in self.cells if not cell.model.analytic})
 
     def program_of(self, cell: StudyCell) -> tuple[Any, ...] | None:
         """Key of a cell's compiled programs; None for an analytic system."""
         if cell.model.analytic:
             return None
-        own = (cell.sigma, cell.samples) if self.config.kind == "descents" else ()
+        own = (cell.sigma, cell.samples) if self.settings.kind == "descents" else ()
         return cell.group, *own, jax.tree.structure(cell.model.contact)
 
     @property
@@ -134,6 +144,7 @@ def plan_study(config: StudyConfig, built: Mapping[str, Task] | None = None) -> 
     Raises:
         ValueError: the configuration cannot be run; the message says what is accepted.
     """
+    settings = config.settings
     variants = config.tasks, config.timestep or (None,), config.cone or (None,)
     programs = math.prod(map(len, variants))
     check_count(programs, "programs", MOST_PROGRAMS, "give fewer tasks, timesteps or cones")
@@ -147,7 +158,7 @@ def plan_study(config: StudyConfig, built: Mapping[str, Task] | None = None) -> 
                 raise ValueError("a network needs MJX: the analytic references use the task's own policy")
             task = with_network(task, config.network, jax.random.key(config.seed))
         task = at_theta(task, config.theta)
-        recipe = recipe_of(config, task) if config.kind == "descents" else None
+        recipe = recipe_of(config, task) if settings.kind == "descents" else None
         counts = config.samples or (SAMPLES if recipe is None else recipe.samples,)
         check_weights(config.weights, min(counts))
         name = which if isinstance(which, str) else which.name
@@ -170,7 +181,7 @@ def plan_study(config: StudyConfig, built: Mapping[str, Task] | None = None) -> 
             check_sigma(sigma)
             cells.append(StudyCell(len(groups), model, sigma, samples))
         groups.append(group)
-    together = 1 if config.kind == "descents" else config.batches
+    together = 1 if settings.kind == "descents" else config.batches
     most = min(largest_batch(), max(min(cell.samples, config.block_size or cell.samples) for cell in cells) * together)
     tasks = [group.task for group in groups]
     chunk = chunk_for(most, jax.local_devices(), tasks) if config.chunk_size is None else config.chunk_size
@@ -181,22 +192,22 @@ def plan_study(config: StudyConfig, built: Mapping[str, Task] | None = None) -> 
         if config.surrogate and (corrected := [each.name for each in chosen if "corrected" in each.needs]):
             raise ValueError(f"{corrected[0]} corrects exact derivatives: omit it or `backward`")
         if group.recipe is not None:
-            make_optimizer(settled(config.optimizer), group.recipe.learning_rate, group.recipe.decay)
+            make_optimizer(settings.optimizer, group.recipe.learning_rate, group.recipe.decay)
             _check_schedules(config, group, group.recipe.iterations, chosen)
             history = HISTORY_NUMBERS * config.batches * group.recipe.iterations
             check_memory(group.task, chosen, config.batches * cell.samples, other=history)
-            check_memory(group.task, (), settled(config.evaluation_samples))
-        elif config.kind == "landscapes":
+            check_memory(group.task, (), settings.evaluation_samples)
+        elif settings.kind == "landscapes":
             if config.theta is not None and group.task.policy.num_params == 1:
                 raise ValueError("theta has one entry, and the line is its range: give `span`")
-            line_of(group.task, settled(config.points), config.span, config.direction, config.seed)
+            line_of(group.task, settings.points, config.span, config.direction, config.seed)
     return plan
 
 
 def _whole(plan: StudyPlan) -> list[str]:
     """Names of estimators that need whole batches, in studies whose batches can be split into blocks; ValueError if
     there are any along with a block size."""
-    if plan.config.kind != "gradients":
+    if plan.settings.kind != "gradients":
         return []
     found = [each.name for each in estimators_of(plan, plan.cells[0]) if not each.mergeable]
     if found and plan.config.block_size is not None:
@@ -240,7 +251,7 @@ def block_of(plan: StudyPlan, cell: StudyCell) -> int:
     """Number of a seed's samples held at once: all of them, or a block if the configuration asks for it, or if the
     batches would otherwise be rejected."""
     config, whole = plan.config, cell.samples
-    if config.kind != "gradients":
+    if plan.settings.kind != "gradients":
         return whole
     if config.block_size is not None:
         return min(config.block_size, whole)
@@ -274,7 +285,7 @@ def bytes_in_block(plan: StudyPlan, cell: StudyCell) -> int:
 def seeds_together(plan: StudyPlan, cell: StudyCell) -> int:
     """Number of seeds that a cell draws at once: all, or in studies of gradients as many as fit, in equal groups."""
     batches = plan.config.batches
-    if plan.config.kind != "gradients":
+    if plan.settings.kind != "gradients":
         return batches
     fitting = max(1, int(AT_ONCE[jax.default_backend()] / memory_of_seed(plan, cell)))
     return math.ceil(batches / math.ceil(batches / fitting))
