@@ -30,7 +30,6 @@ RATIOS = {"gradient_per_value", "rollouts_over_stock", "rollouts_over_engine", "
     ("task", "further"),
     [
         ("tests.carts:cart", {"speedup_over_engine", "onset_per_gradient"}),
-        pytest.param("pusher", {"speedup_over_engine", "onset_per_gradient"}, marks=pytest.mark.slow),
         pytest.param("tennis", {"speedup_over_engine", "onset_per_gradient"}, marks=pytest.mark.slow),
         pytest.param("double_pendulum", set(), marks=pytest.mark.slow),
     ],

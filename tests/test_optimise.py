@@ -121,7 +121,7 @@ def test_seeds_on_a_reference_do_not_depend_on_those_drawn_with_them(
 ) -> None:
     """All at once, two at a time, one at a time, and the first alone."""
     few = {"iterations": 2, "seeds": 3, "evaluation_samples": 2, "learning_rate": 1e-5, "estimators": ("aobg",)}
-    study = on_reference(task, **SHORT | few)
+    study = on_reference(task, **SHORT | few | {"horizon": 20})
     together = descend(study)["theta"]
     for most in (10, 1):
         monkeypatch.setattr(descents, "TOGETHER", most)

@@ -535,6 +535,7 @@ def test_a_file_with_a_value_of_another_kind_gets_one_line(tmp_path: Path, line:
         ({"stiffness": (10.0, 10.0)}, "stiffness given twice: 10.0"),
         ({"samples": (2,)}, "samples must be at least 3"),
         ({"iterations": 3, "points": 3}, "give one of them"),
+        ({"kind": "gradients", "points": 3}, "`points` are for landscapes, and `kind` is gradients"),
         ({"span": (0.0, 1.0)}, "`span` is for landscapes: give `points` as well"),
         ({"learning_rate": math.nan}, "learning_rate must be positive and finite, got nan"),
         ({"learning_rate": 0.1}, "`learning_rate` is for descents: give `iterations` as well"),

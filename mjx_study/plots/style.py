@@ -147,7 +147,7 @@ def _break(text: Text, ratio: float) -> None:
 
 
 def _shrink(text: Text, ratio: float) -> None:
-    text.set_fontsize(text.get_fontsize() / ratio)
+    text.set_fontsize(float(text.get_fontsize()) / ratio)
 
 
 def save_figure(figure: Figure, folder: Path, name: str, formats: Sequence[str] = ("png", "pdf")) -> list[Path]:

@@ -180,6 +180,8 @@ class StudyConfig(Checked):
         kind = self.settings.kind
         if kind == "landscapes" and self.points is None:
             raise ValueError("landscapes need `points`: give their number")
+        if kind != "landscapes" and self.points is not None:
+            raise ValueError(f"`points` are for landscapes, and `kind` is {kind}: omit one of them")
         for other, options in OF_KIND.items():
             given = [f"`{name}`" for name in options if getattr(self, name) is not None]
             if other != kind and given:
