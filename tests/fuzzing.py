@@ -55,7 +55,7 @@ def stub(monkeypatch: pytest.MonkeyPatch) -> None:
     mujoco.set_mju_user_warning(lambda message: print(f"MuJoCo: {message}", file=sys.stderr))  # as `configure` does
     for module, names in (
         (studies, ("_compute", "open_store", "run_study")),
-        (gradcheck, ("gradcheck",)), (bench, ("bench",)),
+        (gradcheck, ("gradcheck",)), (bench, ("run_bench",)),
         (motions, ("_simulate_task", "_simulate_passive")),
     ):  # fmt: skip
         for name in names:
