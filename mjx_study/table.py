@@ -19,7 +19,7 @@ def number(value: float | None, digits: int = 3) -> str:
     if 1e-3 <= abs(value) < 1e4:
         rounded = float(f"{value:.{digits}g}")
         return f"{rounded:.0f}" if abs(rounded) >= 10 ** (digits - 1) else f"{rounded:.{digits}g}"
-    mantissa, exponent = f"{value:.1e}".split("e")
+    mantissa, exponent = f"{value:.{digits - 1 if digits > 3 else 1}e}".split("e")
     return f"{mantissa}e{int(exponent)}"
 
 

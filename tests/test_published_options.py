@@ -59,7 +59,7 @@ def test_every_study_takes_them(kind: str) -> None:
 
 def test_published_constants_stand_alone() -> None:
     task = make_task("pusher", horizon=3)
-    with pytest.raises(ValueError, match="`published` sets gamma, .*: omit `gamma`, `radius`"):
+    with pytest.raises(ValueError, match="`published` sets `gamma`, .*: omit `gamma`, `radius`"):
         configured_estimators(StudyConfig(tasks=("pusher",), published=True, gamma=1.0, radius=2.0), task)
     with pytest.raises(ValueError, match="double_pendulum has no published constants of the bound"):
         configured_estimators(StudyConfig(tasks=("double_pendulum",), published=True), make_task("double_pendulum"))

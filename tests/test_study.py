@@ -23,7 +23,7 @@ from estimators import (
     InverseVariance,
     summarise,
 )
-from mjx_study import disk
+from mjx_study import cli, disk
 from mjx_study.cli import console
 from mjx_study.cli.studies import as_document
 from mjx_study.objective import MjxObjective, Simulator
@@ -305,9 +305,9 @@ def test_an_onset_term_that_is_not_to_be_trusted_is_told() -> None:
     both = events | {"onset_spread": 0.4, "onset_strength": 0.25}
     assert findings_of(result(row("fobg_onset", 10, 1, **both))) == [narrow]  # narrow noise spoils the jump as much
     (strong,) = findings_of(result(row("fobg_onset", 10, 1, **events | {"onset_strength": 0.25})))
-    assert strong.startswith("penalty: the linear onset term can be off by 12% of what it adds, more at ")
+    assert strong.startswith("penalty: the linear onset term can be off by 12% of what it adds at K = 10 N/m (more at ")
     (beyond,) = findings_of(result(row("fobg_onset", 10, 1, **events | {"onset_strength": 1.2})))
-    assert beyond.startswith("penalty: the linear onset term can leave more than it adds, more at ")
+    assert beyond.startswith("penalty: the linear onset term can leave more than it adds at K = 10 N/m (more at ")
     assert findings_of(result(row("fobg_onset", 10, 1, **events | {"onset_strength": 0.0}))) == []
 
 
@@ -488,6 +488,20 @@ def test_a_bound_of_a_cosine_is_rounded_down(cosine: float, error: float, shown:
 def test_times_are_no_more_exact_than_the_clock() -> None:
     lines = table(result(row("fobg", 10, 1.234, seconds_per_sample=3.456e-3)))
     assert any(re.search(r"  3\.5 +0\.0043($|  )", line) for line in lines)
+
+
+def test_stepwise_estimators_take_a_task_without_controls() -> None:
+    """Whose single-step derivatives have an axis of length 0."""
+    stepwise = {"estimators": ("fobg_truncated", "fobg", "total_propagation"), "window": 1000}
+    found = compare(tasks=("ball_wall",), contact=("reference",), **stepwise).gradient
+    np.testing.assert_allclose(found.isel(estimator=0), found.isel(estimator=1), rtol=1e-9)  # longer than the rollout
+    assert np.isfinite(found).all()
+
+
+def test_a_table_says_what_was_chosen(capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["--contact", "reference", "--samples", "8", "--reference-samples", "8", "--theta", "0.5"]
+    assert cli.main(["compare", "ball_wall", *arguments, "--gamma", "0.5"]) == 0
+    assert "float64, theta 0.5, gamma 0.5\n" in capsys.readouterr().out
 
 
 def test_a_single_parameter_has_no_cosine() -> None:

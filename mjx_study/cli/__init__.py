@@ -21,7 +21,7 @@ from mjx_study.cli.output import OutputError, complain, ending, written_out
 ENDED = "existing files are complete"
 EXAMPLES = """\
 start here:
-  mjx-study compare pusher                       which estimator, at which contact stiffness? 20 s once compiled
+  mjx-study compare pusher                       which estimator, at which contact stiffness? 10 s once compiled
   mjx-study compare pusher --output out          the same, with a figure and the numbers on disk
   mjx-study optimise pusher --output out         what does each estimator achieve in gradient descent?
   mjx-study sweep pusher --output out            many contact models, resumable; then plot out, report out

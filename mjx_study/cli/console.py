@@ -6,7 +6,7 @@ import math
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import xarray as xr
@@ -14,12 +14,19 @@ import xarray as xr
 from estimators import ENOUGH_EFFECTIVE
 from mjx_study.choices import FAMILIES, REFERENCE
 from mjx_study.plots.style import style_of
+from mjx_study.study.configuration import StudyConfig
 from mjx_study.study.findings import Row, curves_of, findings_of, rows_of
 from mjx_study.study.iteration import REASONS
 from mjx_study.study.variables import COLUMNS, DEBIASED, DETAILS, HISTORY, MARKS, METRIC, QUANTITIES, START
 from mjx_study.table import format_table, number
 
 Column = tuple[str, Callable[[Row], str]]
+CHOSEN: Final = ("theta", "gamma", "onset", "noise", "baseline", "weights")
+"""Options that the header of a table states where they are given."""
+MOST_SHOWN: Final = 3
+"""Maximum number of parameters printed."""
+ROUNDING: Final = 1e-12
+"""Spread over the mean below which equal numbers differ by rounding alone."""
 
 
 def _with_error(value: float, error: float) -> str:
@@ -107,6 +114,14 @@ def _table(rows: Sequence[Row], table: Sequence[Column]) -> list[str]:
     return format_table(cells, [heading for heading, _ in table])
 
 
+def _chosen(config: dict[str, Any]) -> str:
+    """Options that change what the estimators are, where given."""
+    given = {name: config[name] for name in CHOSEN if config.get(name) not in (None, StudyConfig.default(name))}
+    if (theta := given.get("theta")) is not None:
+        given["theta"] = ", ".join(f"{each:g}" for each in theta[:MOST_SHOWN]) + (" ..." if theta[MOST_SHOWN:] else "")
+    return "".join(f", {name} {value}" for name, value in given.items())
+
+
 def gradient_lines(dataset: xr.Dataset, document: dict[str, Any], details: bool = False) -> list[str]:
     """Format a study of gradients and its document: configuration, a table per contact family, findings."""
     config, rows, lines = document["config"], rows_of(dataset), []
@@ -116,7 +131,7 @@ def gradient_lines(dataset: xr.Dataset, document: dict[str, Any], details: bool 
             f"{task}: {', '.join(map(str, config['samples']))} samples in each batch, "
             f"sigma {', '.join(f'{sigma:g}' for sigma in dataset['sigma'].values)}, "
             f"{', '.join(map(str, resolved['horizon']))} steps, {', '.join(dataset['cone'].values)} cone, "
-            f"seed {config['seed']}, {document['environment']['precision']}"
+            f"seed {config['seed']}, {document['environment']['precision']}{_chosen(config)}"
         )
     width = shutil.get_terminal_size((140, 24)).columns
     for family in dict.fromkeys(row.contact for row in rows):
@@ -261,5 +276,7 @@ def _finite(values: list[float | None]) -> np.ndarray:
 def _mean_and_spread(values: np.ndarray, digits: int) -> str:
     if len(values) == 0:
         return "nan"
-    spread = f" ± {number(float(np.std(values, ddof=1)), 2)}" if len(values) > 1 else ""
-    return number(float(np.mean(values)), digits) + spread
+    mean, spread = float(np.mean(values)), float(np.std(values, ddof=1)) if len(values) > 1 else None
+    if spread is None:
+        return number(mean, digits)
+    return f"{number(mean, digits)} ± {number(spread if spread > ROUNDING * abs(mean) else 0.0, 2)}"

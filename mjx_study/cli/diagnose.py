@@ -19,13 +19,13 @@ columns of the contacts:
 The error after a second of computing is that of a gradient from as many samples as this machine computes in a second:
 bias and standard deviation combined, relative to the gradient. "mean" says whether an estimator's mean integrates to
 the difference of the mean cost along a path, as in gradcheck --mean: right within 5 %, off by the stated amount, or
-undecided. There are at least 23 samples. Exit code 1 if a derivative is wrong.
+undecided. At least 23 samples are drawn, whatever --samples. Exit code 1 if a derivative is wrong.
 """
 
 
 def add(command: Parser) -> None:
     command.add_task_options()
-    command.add_contact_options("the middle one of the task's", many=False, analytic=False)
+    command.add_contact_options("the middle one of the task's sweep", many=False, analytic=False)
     command.add_option("samples", unset="500, or as many as fit into a minute")
 
 

@@ -30,7 +30,7 @@ def add(command: Parser) -> None:
     command.add_option(StudyConfig.option("estimators"), ("zobg", "fobg"))
     command.add_option(StudyConfig.option("samples"), (100,))
     command.add_option("points", 41)
-    command.add_fields("span", "direction", "onset", "chunk_size")
+    command.add_fields("span", "direction", "gamma", "max_norm", "window", "onset", "chunk_size")
     command.add_backward_options()
     command.add_flag("--no-reference", "omit the analytic reference")
     command.add_folder_options()

@@ -28,6 +28,7 @@ examples:
 
 columns of the table:
 {explained("descents", "final_cost", "alpha", "seed_rollouts", "seconds")}
+  best            final cost of the best seed
   hit, ...        what a task counts besides its cost
 
 Costs and counts are means over --evaluation-samples rollouts, the same for all, ± their standard deviation over seeds;

@@ -124,7 +124,7 @@ def landscape(part: xr.Dataset, title: str) -> Figure:
         low, high = max(low, -MOST_SLOPE_RATIO * steepest), min(high, MOST_SLOPE_RATIO * steepest)
     grid[1, 0].set_ylim(low, high)
     grid[0, 0].set_ylabel("cost")
-    grid[1, 0].set_ylabel(f"derivative of the\nmean cost by {per}")
+    grid[1, 0].set_ylabel(f"derivative of the\nmean cost w.r.t. {per}")
     return figure
 
 

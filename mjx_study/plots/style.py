@@ -124,16 +124,19 @@ def legend_below(figure: Figure) -> None:
 
 
 def fit_texts(figure: Figure) -> None:
-    """Break titles and labels that are longer than their axes; make smaller those that still are."""
-    for mend in (_break, _shrink):
+    """Break titles and labels that are longer than their axes or figure; make smaller those that still are."""
+    for mend in (_break, _shrink, _shrink):
         if engine := figure.get_layout_engine():
             engine.execute(figure)
-        longer = [
-            (text, ratio)
-            for axes in figure.axes
-            for text, side in ((axes.title, "width"), (axes.xaxis.label, "width"), (axes.yaxis.label, "height"))
-            if (ratio := getattr(text.get_window_extent(), side) / getattr(axes.bbox, side)) > 1
-        ]
+        sides = [(text, figure, "width") for text in figure.texts]
+        for axes in figure.axes:
+            sides += [
+                (axes.title, axes, "width"),
+                (axes.xaxis.label, axes, "width"),
+                (axes.yaxis.label, axes, "height"),
+            ]
+        ratios = [(text, getattr(text.get_window_extent(), side) / getattr(of.bbox, side)) for text, of, side in sides]
+        longer = [(text, ratio) for text, ratio in ratios if ratio > 1]
         for text, ratio in longer:
             mend(text, ratio)
         if not longer:

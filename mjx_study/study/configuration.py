@@ -152,6 +152,9 @@ class StudyConfig(Checked):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        for name in ("tasks", "estimators"):
+            if isinstance(getattr(self, name), str):
+                raise ValueError(f"{name} must be a list, got {getattr(self, name)!r}")
         if not self.tasks:
             raise ValueError("no task given")
         if self.theta is not None and len(self.tasks) > 1:
@@ -234,7 +237,7 @@ def refuse_repeats(label: str, values: Sequence[object]) -> None:
 def check_span(span: Sequence[float] | None) -> None:
     """Raise ValueError unless span is None or two numbers in ascending order."""
     if span is not None and not (len(span) == 2 and 0 < span[1] - span[0] < math.inf):
-        raise ValueError(f"`span` must be two numbers, the lower one first; got {span}")
+        raise ValueError("`span` must be two numbers, the lower one first; got " + ", ".join(map(str, span)))
 
 
 def takes_stiffness(families: Sequence[str]) -> bool:

@@ -266,9 +266,8 @@ def _onset_findings(rows: Sequence[Row]) -> list[str]:
     if strong := [row for row in wide if ERROR_PER_STRENGTH * row.onset_strength > NOTABLE_SHARE]:
         most = max(row.onset_strength for row in strong)
         found.append(
-            f"{linear_error(most)}, more at grazing contacts and corners"
-            f"{_at(strong)}: an onset takes {most:.0%} of the approach speed in one step; --onset jump "
-            "or a smaller timestep is better"
+            f"{linear_error(most)}{_at(strong)} (more at grazing contacts and corners): an onset takes {most:.0%} of "
+            "the approach speed in one step; --onset jump or a smaller timestep is better"
         )
     return found
 

@@ -71,7 +71,7 @@ def bound_constants(config: StudyConfig, task: Task) -> dict[str, Any]:
     if task.defaults.published is None:
         raise ValueError(f"{task.name} has no published constants of the bound; omit `published`")
     if others := [f"`{name}`" for name in names if given[name] != StudyConfig.default(name)]:
-        raise ValueError(f"`published` sets {', '.join(names)}: omit {', '.join(others)}")
+        raise ValueError(f"`published` sets {', '.join(f'`{name}`' for name in names)}: omit {', '.join(others)}")
     return dataclasses.asdict(task.defaults.published)
 
 

@@ -228,8 +228,8 @@ def warnings_of(dataset: xr.Dataset) -> tuple[str, ...]:
     counted = {
         "nonfinite": "samples overflowed or became NaN and were left out",
         "unconverged": "rollouts in which the contact solver did not converge",
-        "onsets_missed": "onsets of contact have no onset term: there are too many in a rollout",
-        "onsets_bounded": "onsets of contact are grazing, and their terms bounded",
+        "onsets_missed": "onsets of contact have no term, since their rollouts have too many",
+        "onsets_bounded": "onsets of contact are grazing, and their terms are bounded",
     }
     counts = {name: _count(dataset[name]) for name in counted if name in dataset}
     found += [f"{count} {counted[name]}" for name, count in counts.items() if count]

@@ -88,7 +88,7 @@ def draw_batches(
                 batch = jax.block_until_ready(getattr(objective, ORACLES[name].method)(theta, flat))
                 seconds[name] += time.perf_counter() - begun
             residuals[name] = np.concatenate([residuals.get(name, np.zeros(0)), residuals_of(batch)])
-            parts.append(jax.tree.map(lambda leaf: leaf.reshape(-1, samples, *leaf.shape[1:]), batch))
+            parts.append(jax.tree.map(lambda leaf: leaf.reshape(len(leaf) // samples, samples, *leaf.shape[1:]), batch))
         drawn[name] = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
     return drawn, seconds, residuals
 

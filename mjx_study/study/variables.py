@@ -153,8 +153,8 @@ COLUMNS: Final = (
 DETAILS: Final = ("gradient_norm", "effective_samples", "cosine", "epsilon", "discrepancy", "residual", "nonfinite")
 """Columns that only --details shows."""
 MARKS: Final = """\
-After the arrows: the same without the sampling noise of batch and reference, ± one standard error;
-< and >: no error is detected, these are bounds of two standard errors; -: noise explains all of it."""
+After the arrows: the same without the sampling noise of batch and reference, ± one standard error; errors below two
+of them are not detected. < and >: bounds of two standard errors where nothing is left; -: noise explains all of it."""
 MEASURED: Final = ("seconds", "seconds_per_sample")
 """Measured times, the only variables that differ from run to run."""
 

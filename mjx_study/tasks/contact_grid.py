@@ -134,7 +134,7 @@ def check_reference(task: Task) -> None:
     if task.reference is None:
         raise ValueError(f"{task.name} has no analytic reference")
     if task.onset != "none":
-        raise ValueError("the analytic references have no onset term; omit onset")
+        raise ValueError("the analytic references have no onset term; omit `onset`")
 
 
 def solver_grid(task: Task, solrefs: Sequence[Sequence[float]], solimps: Sequence[Sequence[float]]) -> Grid:
