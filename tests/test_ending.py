@@ -18,6 +18,7 @@ from mjx_study.study import cells as sweep_cells
 from mjx_study.study.plan import StudyCell, StudyPlan
 from mjx_study.study.run import run_study
 from mjx_study.study.store import Part
+from mjx_study.study.variables import GRADIENTS
 from tests.documents import stages_of
 
 SIGNALS = """
@@ -123,13 +124,16 @@ def test_a_full_disk_costs_a_study_nothing_that_was_there(
     tmp_path: Path, full: Callable[[], None], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def compute_of(plan: StudyPlan) -> Callable[[StudyCell, Part], dict[str, np.ndarray]]:
-        seeds = plan.config.batches, len(plan.config.estimators)
+        sizes = {"seed": plan.config.batches, "estimator": len(plan.config.estimators)}
 
         def compute(cell: StudyCell, part: Part) -> dict[str, np.ndarray]:
             if cell.samples == 8:
                 full()
-            numbers = {name: np.ones(seeds) for name in ("variance", "alpha", "relative_error")}
-            return numbers | {"squared_bias": np.full(seeds[1], np.nan), "reference_uncertainty": np.ones(())}
+            held = {name: each for name, each in GRADIENTS.items() if "param" not in each.dims}
+            return {
+                name: np.full([sizes[dim] for dim in each.dims], 9.0 if each.digits else 0.0)
+                for name, each in held.items()
+            }
 
         return compute
 
