@@ -141,4 +141,5 @@ def test_linearising_on_the_tape(make: Callable[..., Task]) -> None:
         for each in (task, make(adjoint="tape"))
     )
     for one, other in zip(jax.tree.leaves(small), jax.tree.leaves(large), strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9 * float(jnp.abs(other).max()))
+        rounding = 1e-14  # all there is of a solver's residual
+        np.testing.assert_allclose(one, other, rtol=1e-9, atol=rounding + 1e-9 * float(jnp.abs(other).max()))
