@@ -80,7 +80,7 @@ def render_report(dataset: xr.Dataset) -> str:
         kind=title,
         models=dataset.sizes["model"],
         warnings=warnings_of(dataset),
-        findings=findings_of(dataset) if dataset.data_vars else [],
+        findings=findings_of(dataset),
         figures=[_figure(name, figure) for name, figure in plot_study(dataset).items()],
         summary=summary,
         numbers=_numbers(dataset, quantities),

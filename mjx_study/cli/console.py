@@ -21,6 +21,8 @@ from mjx_study.study.variables import COLUMNS, DEBIASED, DETAILS, HISTORY, MARKS
 from mjx_study.table import format_table, number
 
 Column = tuple[str, Callable[[Row], str]]
+DESCENT_COLUMNS: Final = ("final_cost", "best_cost", "alpha", "seed_rollouts", "seconds")
+"""Columns of the table of `optimise`, a task's metrics after the second."""
 CHOSEN: Final = ("theta", "gamma", "onset", "noise", "baseline", "weights")
 """Options that the header of a table states where they are given."""
 MOST_SHOWN: Final = 3
@@ -237,8 +239,8 @@ def descent_lines(dataset: xr.Dataset, document: dict[str, Any]) -> list[str]:
     metrics = "".join(f", {name} {number(value, 3)}" for name, value in document["start_metrics"].items())
     decay = f" / i^{config['decay']:g}" if config["decay"] else ""
     start, (mean, error) = QUANTITIES["descents"]["start_cost"], document["start_cost"]
-    shown = [QUANTITIES["descents"][name].heading for name in ("final_cost", "alpha", "seed_rollouts", "seconds")]
-    headings = ["estimator", shown[0], "best", *document["start_metrics"], *shown[1:]]
+    shown = [QUANTITIES["descents"][name].heading for name in DESCENT_COLUMNS]
+    headings = ["estimator", *shown[:2], *document["start_metrics"], *shown[2:]]
     lines = [
         f"{config['task']}: {where}; {config['optimizer']}, learning rate {config['learning_rate']:g}{decay}, "
         f"{config['iterations']} iterations",

@@ -27,12 +27,10 @@ examples:
   mjx-study rollout pusher --theta out/policy-aobg.json
 
 columns of the table:
-{explained("descents", "final_cost", "alpha", "seed_rollouts", "seconds")}
-  best            final cost of the best seed
-  hit, ...        what a task counts besides its cost
+{explained("descents", "final_cost", "best_cost", "alpha", "seed_rollouts", "seconds")}
 
-Costs and counts are means over --evaluation-samples rollouts, the same for all, ± their standard deviation over seeds;
-alpha is the mean over the last tenth of the iterations.
+A task's own counts, such as hit, have a column each. Costs and counts are means over --evaluation-samples rollouts,
+the same for all, ± their standard deviation over seeds; alpha is the mean over the last tenth of the iterations.
 """
 WRAPPED = ("contact", "stiffness", "sigma", "cone", "samples", "backward")
 """Options with a single value here and a list in a study."""

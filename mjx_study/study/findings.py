@@ -104,7 +104,9 @@ def rows_of(dataset: xr.Dataset) -> list[Row]:
 
 
 def findings_of(dataset: xr.Dataset) -> list[str]:
-    """Return the findings supported by a study's intervals, as sentences."""
+    """Return the findings supported by a study's intervals, as sentences; none if no cell is computed."""
+    if not dataset.data_vars:
+        return []
     kind = json.loads(dataset.attrs["config"])["kind"]
     return {"gradients": _of_gradients, "descents": _of_descents, "landscapes": _of_landscapes}[kind](dataset)
 

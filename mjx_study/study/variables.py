@@ -131,6 +131,7 @@ CELL: Final = {
 DERIVED: Final = {
     "variance_seconds": Variable(BATCH, "gradient^2 s", "variance left after a second of computing", "variance x s", 2),
     "seed_rollouts": Variable(EACH, "1", "rollouts of one seed, derivatives and baselines included", "rollouts", 0),
+    "best_cost": Variable(EACH, "cost", "final cost of the best seed", "best", 4),
     "stopped_seeds": Variable(EACH, "1", "seeds that stopped before the end", "stopped seeds", 0),
     "least_cost": Variable((), "cost", "lowest mean cost on the line", "least mean cost", 4),
     "least_at": Variable((), THETA, "position of the lowest mean cost", "at t"),
