@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError,
 
 from estimators.catalogue import suggestion
 from mjx_study.disk import read_whole
-from mjx_study.option import OPTIONS
+from mjx_study.option import BUILDER_OPTIONS, OPTIONS
 
 MOST_BYTES: Final = 100_000_000
 """Maximum size of a file that is read [bytes]."""
@@ -77,17 +77,23 @@ class PolicyFile(BaseModel):
     stiffness: float | None = None
     damping: float | None = None
     cone: str | None = None
-    model: str | None = None
+    timestep: float | None = None
     horizon: int | None = None
+    model: str | None = None
+    integrator: str | None = None
+    solver: str | None = None
+    solver_iterations: int | None = None
+    solver_ls_iterations: int | None = None
+    disable_flag: list[str] | None = None
     network: list[int] | None = None
 
-    @field_validator("contact", "stiffness", "damping", "cone", "horizon", "network")
+    @field_validator("contact", "stiffness", "damping", "timestep", "cone", "network", *BUILDER_OPTIONS)
     @classmethod
     def _check(cls, value: Any, info: Any) -> Any:
         option = OPTIONS[str(info.field_name)]
         if value is None or (option.name == "stiffness" and value == 0):  # no contact has one
             return None
-        return dataclasses.replace(option, many=option.name == "network").check(value)
+        return dataclasses.replace(option, many=isinstance(value, list)).check(value)
 
 
 def read_theta(path: Path) -> tuple[tuple[float, ...], PolicyFile | None]:

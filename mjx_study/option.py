@@ -7,7 +7,7 @@ defaults and may narrow ranges.
 import dataclasses
 import math
 import sys
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from numbers import Integral, Real
 from typing import Any, ClassVar, Final
 
@@ -274,11 +274,28 @@ OPTIONS: Final[dict[str, Option]] = {
         _choice("solver", SOLVERS, "NAME", "constraint solver: {}", unset=MJCF),
         _number("solver_iterations", int, "[1, 100000]", "N", "iterations of the solver", unset=MJCF),
         _number("solver_ls_iterations", int, "[1, 100000]", "N", "and of its line search", unset=MJCF),
+        Option("disable_flag", str, "FLAG", "flags to disable, named as in the MJCF's <flag>"),
         _number("frames", int, "[1, 100]", "N", "frames in the film strip"),
         _number("slow", float, "(0, 1000]", "FACTOR", "slow-motion factor"),
     )
 }  # fmt: skip
 """Every option by its name."""
+SCENE_OPTIONS: Final = {
+    "integrator": "integrator",
+    "solver": "solver",
+    "solver_iterations": "iterations",
+    "solver_ls_iterations": "ls_iterations",
+    "disable_flag": "disable_flags",
+}
+"""Options that override an MJCF's <option>, so that a model can be adapted to MJX without editing its file, and the
+arguments of `load_scene` that they set."""
+BUILDER_OPTIONS: Final = ("horizon", "model", *SCENE_OPTIONS)
+"""Options passed to the builder of a task."""
+
+
+def as_arguments(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Options that are not None, as arguments of `make_task` and `load_scene`."""
+    return {SCENE_OPTIONS.get(name, name): value for name, value in options.items() if value is not None}
 
 
 @dataclasses.dataclass(frozen=True)

@@ -67,6 +67,7 @@ def programs() -> tuple[dict[Any, Any], dict[Any, Any]]:
 @pytest.fixture(scope="module")
 def shared_programs(programs: tuple[dict[Any, Any], dict[Any, Any]]) -> Iterator[None]:
     """Studies that need the same task and chunk size share them with all that is compiled."""
+    from mjx_study.option import BUILDER_OPTIONS
     from mjx_study.runtime import precision  # not above: type checking is switched on after this file is imported
     from mjx_study.study import descents, plan, sampling
     from mjx_study.tasks import TASKS
@@ -77,8 +78,9 @@ def shared_programs(programs: tuple[dict[Any, Any], dict[Any, Any]]) -> Iterator
     def built(config: Any, which: Any, timestep: float | None, cone: str | None, given: Any) -> Any:
         if not isinstance(which, str) or which not in TASKS:
             return build(config, which, timestep, cone, given)
-        key = (which, timestep, cone, config.horizon, config.model, config.onset, config.noise, precision())
-        key = (*key, plan.make_task)  # which a test may replace
+        own = [getattr(config, name) for name in BUILDER_OPTIONS]
+        key = (which, timestep, cone, *own, config.onset, config.noise, precision())
+        key = (*key, plan.task_with_options)  # which a test may replace
         if key not in tasks:
             tasks[key] = build(config, which, timestep, cone, given)
         return tasks[key]

@@ -64,8 +64,7 @@ def stub(monkeypatch: pytest.MonkeyPatch) -> None:
     for command in COMMANDS:
         flags_of(command)  # outside of strategies: building a parser uses the random module
     built = functools.lru_cache(maxsize=256)(make_task)
-    for module in (tasks, sweep_plan):
-        monkeypatch.setattr(module, "make_task", built)
+    monkeypatch.setattr(tasks, "make_task", built)
 
 
 def answer(arguments: list[str], folder: Path) -> int:

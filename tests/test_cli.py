@@ -11,12 +11,14 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any, NoReturn
 
 import jax.numpy as jnp
 import pytest
 
 from mjx_study import cli
 from mjx_study.cli import options
+from mjx_study.option import OPTIONS, SCENE_OPTIONS, as_arguments
 from mjx_study.plots.style import PAGE
 from mjx_study.study import plan as plan_module
 from mjx_study.study.configuration import StudyConfig
@@ -256,7 +258,10 @@ OPTION = "unknown option --stifness; did you mean --stiffness? See mjx-study com
         (["compare", "--stifness=10", "pusher"], OPTION),
         (["compare", "pusher", "--estimator", "zobg"], "unknown option --estimator; did you mean --estimators? See"),
         (["compare", "pusher", "--backward-s=1"], "unknown option --backward-s; did you mean --backward-stiffness?"),
-        (["compare", "pusher", "--iterations", "3"], "unknown option --iterations. See mjx-study compare --help"),
+        (
+            ["compare", "pusher", "--iterations", "3"],
+            "unknown option --iterations; did you mean --solver-iterations?",
+        ),
         (["compare", "pusher", "--baseline", "zero"], "unknown baseline 'zero'; did you mean zero_noise?"),
         (["compare", "pusher", "--backward-margin", "1"], "--backward-margin needs a contact family in --backward"),
         (["compare", "pusher", "--estimators", "fobg_clipped"], "'fobg_clipped' needs the option --max-norm; set it"),
@@ -289,10 +294,37 @@ def test_bad_options_get_one_line(
 
 def test_iterations_of_the_solver_and_of_a_descent_are_different_options() -> None:
     parse = cli.parser().parse_args
-    for command in ("gradcheck", "rollout"):
-        parsed = parse([command, "pusher", "--solver-iterations", "7", "--solver-ls-iterations", "9"])
-        assert options.scene_options(parsed) == {"iterations": 7, "ls_iterations": 9}
-    assert options.scene_options(parse(["optimise", "pusher", "--iterations", "7"])) == {}
+    parsed = parse(["optimise", "pusher", "--solver-iterations", "7", "--iterations", "5"])
+    assert as_arguments(options.given_options(parsed, *SCENE_OPTIONS)) == {"iterations": 7}
+    assert parsed.iterations == 5
+
+
+@pytest.mark.parametrize(
+    "command", ["compare", "optimise", "sweep", "landscape", "rollout", "gradcheck", "diagnose", "bench"]
+)
+def test_every_command_about_a_task_overrides_the_options_of_its_mjcf(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], command: str
+) -> None:
+    seen: dict[str, Any] = {}
+
+    def builder(**arguments: Any) -> NoReturn:
+        seen.update(arguments)
+        raise ValueError("seen")
+
+    monkeypatch.setitem(TASKS, "pusher", builder)
+    given = {
+        "integrator": "euler",
+        "solver": "cg",
+        "solver_iterations": 7,
+        "solver_ls_iterations": 9,
+        "horizon": 4,
+        "timestep": 0.001,
+    }
+    flags = [text for name, value in given.items() for text in (OPTIONS[name].flag, str(value))]
+    flags += ["--disable-flag", "warmstart,gravity", *(["--dry-run"] if command == "sweep" else [])]
+    assert "seen" in refused(capsys, command, "pusher", *flags)
+    seen.pop("timestep", None)  # studies ask for the task's defaults first
+    assert seen == as_arguments(given | {"timestep": None, "disable_flag": ("warmstart", "gravity")})
 
 
 @pytest.mark.parametrize(

@@ -346,7 +346,7 @@ def test_a_family_without_stiffness_is_taken_as_it_is(command: str, monkeypatch:
 
     monkeypatch.setattr(studies, "_compute", compute)
     if command != "compare":
-        monkeypatch.setattr(plan_module, "make_task", None)  # the task is built once, by the command
+        monkeypatch.setattr(plan_module, "task_with_options", None)  # the task is built once, by the command
     with pytest.raises(Planned):
         cli.main([command, "momentum_transfer", "--contact", "mujoco_default", "--horizon", "4"])
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 import xarray as xr
@@ -16,7 +17,8 @@ from PIL import Image
 import estimators
 from estimators import ESTIMATORS, Differentiation, FirstOrder
 from mjx_study import cli, disk
-from mjx_study.cli import options
+from mjx_study.cli import motions, options
+from mjx_study.files import PolicyFile
 from mjx_study.objective import Simulator
 from mjx_study.reference import ReferenceObjective, Tennis, roll_out
 from mjx_study.study import descents, plan, sampling, store
@@ -279,7 +281,7 @@ def test_what_cannot_be_run_is_refused(changes: dict[str, Any], message: str) ->
 
 def test_a_task_without_recipe_or_reference_says_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     bare = make_task("pusher", horizon=3).replace(defaults=StudyDefaults(), reference=None)
-    monkeypatch.setattr(plan, "make_task", lambda *_, **__: bare)
+    monkeypatch.setattr(plan, "task_with_options", lambda *_, **__: bare)
     with pytest.raises(ValueError, match="pusher has no recipe: give `learning_rate`, `samples`$"):
         plan_study(config(horizon=3, samples=None, learning_rate=None))
     (group,) = plan_study(config(horizon=3)).groups
@@ -431,6 +433,12 @@ def test_a_policy_is_replayed(
     assert cli.main([*arguments, "--output", str(tmp_path / "replay")]) == 0
     facts = json.loads(capsys.readouterr().out)
     assert facts["theta"] == theta and facts["steps"] == 8
+    kept = json.loads(policy.read_text())
+    assert PolicyFile.model_fields.keys() <= kept.keys()
+    (changed := tmp_path / "changed.json").write_text(json.dumps(kept | {"timestep": 0.0025, "solver": "cg"}))
+    simulate, _ = motions._plan_task(cli.parser().parse_args(["rollout", "pusher", "--theta", str(changed)]))
+    option = simulate.args[0].scene.host.opt
+    assert (option.timestep, option.solver) == (0.0025, mujoco.mjtSolver.mjSOL_CG)
     for wrong, says in (
         (["rollout", "sliding_box", "--theta", str(policy)], "is a policy of pusher, not of sliding_box"),
         (

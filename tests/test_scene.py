@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 from mjx_study.choices import CONES, INTEGRATORS, SOLVERS
-from mjx_study.cli.options import Parser, scene_options
+from mjx_study.cli.options import TASK_OPTIONS, Parser, given_options
+from mjx_study.option import as_arguments
 from mjx_study.simulation.dynamics import State
 from mjx_study.simulation.limitations import FLAGS
 from mjx_study.simulation.scene import (
@@ -150,22 +151,22 @@ def test_malformed_files_are_refused(text: str, message: str, tmp_path: Path) ->
     [
         (
             '<option solver="PGS"/>',
-            r"MJX lacks the solver that here asks for; set one of newton, cg in its <option> .* --solver\)",
+            r"MJX lacks the solver that here asks for; set one of newton, cg in its <option>, or give --solver$",
             {"solver": "newton"},
         ),
         (
             '<option integrator="implicit"/>',
-            r"the integrator that here asks for; set one of euler, implicitfast, rk4 in .* --integrator\)",
+            r"the integrator that here asks for; set one of euler, implicitfast, rk4 in .* --integrator$",
             {"integrator": "euler"},
         ),
         (
             '<option integrator="RK4"/>',
-            r"here combines RK4 with contacts.*; set integrator to euler or implicitfast in .* --integrator\)",
+            r"here combines RK4 with contacts.*; set integrator to euler or implicitfast in .* --integrator$",
             {"integrator": "implicitfast"},
         ),
         (
             '<option><flag fwdinv="enable" sleep="enable"/></option>',
-            r"MJX lacks fwdinv, sleep, which here enables; disable them in .* --disable-flag fwdinv,sleep\)",
+            r"MJX lacks fwdinv, sleep, which here enables; disable them in .* --disable-flag fwdinv,sleep$",
             {"disable_flags": "fwdinv,sleep"},
         ),
     ],
@@ -192,12 +193,13 @@ def test_the_command_line_changes_what_is_refused(tmp_path: Path) -> None:
     option = '<option integrator="RK4" solver="PGS"><flag fwdinv="enable" sleep="enable"/></option>'
     path.write_text(floor_scene(FREE_BOX, option))
     parser = Parser()
-    parser.add_scene_options()
+    parser.add_builder_options()
     given = "--solver newton --disable-flag fwdinv,sleep --integrator euler".split()
     for count, message in ((0, "--solver"), (2, "--disable-flag fwdinv,sleep"), (4, "--integrator")):
         with pytest.raises(SceneError, match=message):
-            load_scene(path, **scene_options(parser.parse_args(given[:count])))
-    assert load_scene(path, **scene_options(parser.parse_args(given))).host.opt.enableflags == 0
+            load_scene(path, **as_arguments(given_options(parser.parse_args(given[:count]), *TASK_OPTIONS)))
+    chosen = as_arguments(given_options(parser.parse_args(given), *TASK_OPTIONS))
+    assert load_scene(path, **chosen).host.opt.enableflags == 0
 
 
 @pytest.mark.parametrize("flag", FLAGS)

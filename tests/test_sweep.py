@@ -17,6 +17,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 import xarray as xr
@@ -221,6 +222,7 @@ def process(folder: Path, *more: str, **kwargs: Any) -> subprocess.Popen[str]:
 ZYGOTE = """
 import json, os, random, signal, sys, time
 from pathlib import Path
+import mujoco
 import numpy as np
 from mjx_study.study.store import Store
 from tests.documents import study_document
@@ -574,6 +576,17 @@ def test_a_timestep_keeps_the_duration() -> None:
     assert [group.task.horizon for group in plan.groups] == [small.horizon, 2 * small.horizon]
     plan = plan_study(config(timestep=(0.0025,), horizon=7))
     assert [group.task.horizon for group in plan.groups] == [7]
+
+
+def test_options_of_the_mjcf_are_part_of_a_study(tmp_path: Path) -> None:
+    """They reach the model, and another solver is another study."""
+    chosen = {"solver": "cg", "solver_iterations": 50, "disable_flag": ("warmstart",)}
+    plan = plan_study(config(**chosen))
+    option = plan.groups[0].task.scene.host.opt
+    assert (option.solver, option.iterations) == (mujoco.mjtSolver.mjSOL_CG, 50)
+    open_store(plan, tmp_path)
+    with pytest.raises(StudyError, match="solver cg there and none here, 2 more"):
+        open_store(plan_study(config()), tmp_path)
 
 
 def test_contact_models_in_mujocos_terms() -> None:

@@ -6,6 +6,7 @@ from functools import partial
 from estimators.catalogue import CATALOGUE
 from mjx_study.choices import FAMILIES
 from mjx_study.cli.options import Parser
+from mjx_study.option import BUILDER_OPTIONS
 from mjx_study.study.configuration import StudyConfig
 from mjx_study.study.variables import COLUMNS, DETAILS, MARKS, explained
 from mjx_study.table import described
@@ -36,7 +37,7 @@ and with --details:
 
 def add(command: Parser) -> None:
     command.add_task_argument()
-    command.add_fields("sigma", "cone", "horizon", "model", "timestep")
+    command.add_fields("sigma", "timestep", "cone", *BUILDER_OPTIONS)
     command.add_process_options()
     command.add_contact_options()
     command.add_theta_option("parameters at which gradients are taken")

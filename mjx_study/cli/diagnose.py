@@ -1,10 +1,12 @@
 """mjx-study diagnose."""
 
 import argparse
+import shlex
 
 from mjx_study.choices import FAMILIES, is_file
-from mjx_study.cli.options import Parser, configure_process, given_options, task_of, usage_errors
+from mjx_study.cli.options import TASK_OPTIONS, Parser, configure_process, given_options, task_of, usage_errors
 from mjx_study.cli.output import computing, print_report
+from mjx_study.option import OPTIONS
 
 EPILOG = """\
 examples:
@@ -40,9 +42,9 @@ def run(options: argparse.Namespace) -> int:
             options.contact = options.contact or task.defaults.main_family
             if FAMILIES[options.contact].swept:
                 options.stiffness = options.stiffness or task.defaults.middle_stiffness
-    given = given_options(options, "contact", "stiffness", "damping", "sigma", "horizon", "cone", "model")
+    given = given_options(options, "contact", "stiffness", "damping", "sigma", *TASK_OPTIONS)
     given |= {"seed": options.seed} if options.seed else {}
-    flags = "".join(f" --{name} {value:{'g' if isinstance(value, float) else ''}}" for name, value in given.items())
+    flags = "".join(f" {OPTIONS[name].flag} {shlex.quote(_text(value))}" for name, value in given.items())
     with computing() as progress, usage_errors():
         found = diagnose_task(
             options.task,
@@ -57,3 +59,8 @@ def run(options: argparse.Namespace) -> int:
         )
     print_report(options, found.as_json(), found.lines())
     return 0 if found.derivatives.passed else 1
+
+
+def _text(value: str | float | tuple[str, ...]) -> str:
+    """A value as on the command line."""
+    return ",".join(value) if isinstance(value, tuple) else f"{value:.12g}" if isinstance(value, float) else str(value)

@@ -4,7 +4,7 @@ import argparse
 from typing import Any
 
 from mjx_study.choices import CHECKED_STATES, CHECKED_STEPS, CHECKED_STIFFNESS, is_file
-from mjx_study.cli.options import Parser, UsageError, configure_process, given_options, scene_options, usage_errors
+from mjx_study.cli.options import Parser, UsageError, configure_process, given_options, task_of, usage_errors
 from mjx_study.cli.output import computing, print_report
 from mjx_study.option import OPTIONS, Option
 
@@ -56,10 +56,7 @@ def add(command: Parser) -> None:
     usual = ",".join(f"{each:g}" for each in CHECKED_STIFFNESS)
     command.add_contact_options(f"{usual}, or the task's if stiffer", analytic=False)
     command.add_option(PAIR)
-    command.add_option("cone")
-    command.add_scene_options()
-    command.add_option("horizon", unset=f"the task's; {CHECKED_STEPS} for a file")
-    command.add_option("model")
+    command.add_builder_options(horizon={"unset": f"the task's; {CHECKED_STEPS} for a file"})
     command.add_option("states", CHECKED_STATES)
     command.add_flag("--stock", "also check the derivative of mjx.step itself")
     command.add_flag("--mean", "check the means of estimators instead of derivatives")
@@ -78,8 +75,6 @@ def add(command: Parser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Check and print; return 1 if something is wrong, 3 if something was not exercised."""
     from mjx_study.gradcheck import gradcheck, plan_gradcheck, plan_scene_gradcheck
-    from mjx_study.simulation.scene import load_scene
-    from mjx_study.tasks import make_task
 
     if options.mean:
         return _run_mean(options)
@@ -88,20 +83,16 @@ def run(options: argparse.Namespace) -> int:
     common = {name: getattr(options, name) for name in ("seed", "damping", "states", "stock")}
     with usage_errors():
         configure_process(options)
-        chosen = scene_options(options, "cone")
+        task = task_of(options)
         if not is_file(options.task):
             if options.pair is not None:
                 raise UsageError("--pair is for files; a task has its own")
-            task = make_task(options.task, **chosen, **given_options(options, "horizon", "model"))
             plan = plan_gradcheck(task, options.contact, options.stiffness, **common)
         else:
-            if options.model is not None:
-                raise UsageError("--model replaces the MJCF of a task, but this is a file already")
             if options.pair is not None and len(options.pair) != 2:
                 raise UsageError(f"--pair takes the names of two geoms, got {len(options.pair)}")
-            scene = load_scene(options.task, **chosen)
-            common |= {"pair": options.pair, "horizon": CHECKED_STEPS if options.horizon is None else options.horizon}
-            plan = plan_scene_gradcheck(scene, options.contact, options.stiffness, **common)
+            common |= {"pair": options.pair, "horizon": task.horizon}
+            plan = plan_scene_gradcheck(task.scene, options.contact, options.stiffness, **common)
     with computing() as progress:
         report = gradcheck(plan, progress)
     print_report(options, report.as_json(), report.lines(verbose=options.details))
@@ -113,14 +104,11 @@ def _run_mean(options: argparse.Namespace) -> int:
     from mjx_study.gradcheck import check_mean, plan_gradcheck
     from mjx_study.gradcheck.mean import lines_of
     from mjx_study.study.resolution import check_estimators
-    from mjx_study.tasks import make_task
 
     chosen = MEAN | given_options(options, *MEAN)
     with usage_errors():
         configure_process(options)
-        scene = scene_options(options, "cone", "horizon", "model")
-        task = make_task(options.task, **scene).replace(onset=chosen["onset"])
-        task = task if chosen["sigma"] is None else task.replace(sigma=chosen["sigma"])
+        task = task_of(options).replace(onset=chosen["onset"])
         plan = plan_gradcheck(task, options.contact, options.stiffness, seed=options.seed, damping=options.damping)
         settings = {name: chosen[name] for name in ("max_norm", "window")}
         settings |= {"gamma": task.defaults.gamma, "sigma": task.sigma}

@@ -3,7 +3,8 @@
 import argparse
 
 from mjx_study.choices import REFERENCE
-from mjx_study.cli.options import Parser, scene_options
+from mjx_study.cli.options import Parser, given_options
+from mjx_study.option import BUILDER_OPTIONS
 from mjx_study.study.configuration import StudyConfig, takes_stiffness
 
 EPILOG = """\
@@ -23,7 +24,7 @@ quadrature over 1500 rollouts and gradients per contact model (more if --noise h
 
 def add(command: Parser) -> None:
     command.add_task_argument()
-    command.add_fields("sigma", "cone", "horizon", "model", "noise")
+    command.add_fields("sigma", "timestep", "cone", *BUILDER_OPTIONS, "noise")
     command.add_process_options()
     command.add_contact_options("the middle one of the task's sweep")
     command.add_theta_option("parameters that the line goes through")
@@ -40,11 +41,12 @@ def run(options: argparse.Namespace) -> int:
     from mjx_study.cli.console import curve_lines, curves
     from mjx_study.cli.studies import run_one, study_fields
     from mjx_study.study.plan import StudyPlan, plan_study
-    from mjx_study.tasks import make_task
+    from mjx_study.tasks import task_with_options
 
     def planned() -> StudyPlan:
         """The task's contact models at the middle stiffness of its sweep, and its analytic reference if it has one."""
-        fields, task = study_fields(options), make_task(options.task, **scene_options(options, "horizon", "model"))
+        fields = study_fields(options)
+        task = task_with_options(options.task, given_options(options, *BUILDER_OPTIONS))
         fields.setdefault("contact", task.defaults.families)
         if not options.no_reference and task.reference is not None and fields.get("onset", "none") == "none":
             fields["contact"] = tuple(dict.fromkeys((REFERENCE, *fields["contact"]))) if fields["contact"] else ()

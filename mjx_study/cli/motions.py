@@ -14,10 +14,18 @@ import numpy as np
 
 from mjx_study import objective
 from mjx_study.choices import CONES, is_file
-from mjx_study.cli.options import UsageError, configure_process, scene_options, task_of, theta_and_policy, usage_errors
+from mjx_study.cli.options import (
+    UsageError,
+    configure_process,
+    given_options,
+    task_of,
+    theta_and_policy,
+    usage_errors,
+)
 from mjx_study.cli.output import attempt, computing, print_report
 from mjx_study.disk import prepare_folder, write_whole
 from mjx_study.limits import MOST_STEPS, check_count
+from mjx_study.option import BUILDER_OPTIONS, SCENE_OPTIONS, as_arguments
 from mjx_study.plots.style import save_figure
 from mjx_study.render import Motion, RenderError, animate, check_format, resolve_renderer, strip, stroboscope
 from mjx_study.simulation.scene import load_model
@@ -84,7 +92,7 @@ def _plan_file(options: argparse.Namespace) -> tuple[Callable[[], Rollout], tupl
     given = [f"--{name}" for name in unfit if getattr(options, name) not in (None, False)]
     if given:
         raise ValueError(f"{', '.join(given)}: only for a task; {options.task} moves as its MJCF says")
-    model = load_model(options.task, **scene_options(options, "cone"))
+    model = load_model(options.task, **as_arguments(given_options(options, "timestep", "cone", *SCENE_OPTIONS)))
     steps = options.horizon or max(1, round(min(FILE_SECONDS / model.opt.timestep, 1e15)))
     check_count(steps, "steps", MOST_STEPS, "give --horizon, or a longer timestep")
     return partial(_simulate_passive, model, Path(options.task).stem, steps), ()
@@ -93,7 +101,7 @@ def _plan_file(options: argparse.Namespace) -> tuple[Callable[[], Rollout], tupl
 def _plan_task(options: argparse.Namespace) -> tuple[Callable[[], Rollout], tuple[str, ...]]:
     theta, policy = theta_and_policy(options)
     if policy is not None:
-        for name in ("contact", "stiffness", "damping", "horizon", "model"):
+        for name in ("contact", "stiffness", "damping", "timestep", *BUILDER_OPTIONS):
             if getattr(options, name) is None:
                 setattr(options, name, getattr(policy, name))
     task = task_of(options)

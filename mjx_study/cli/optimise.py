@@ -6,8 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from mjx_study.choices import REFERENCE
-from mjx_study.cli.options import Parser, scene_options
+from mjx_study.cli.options import Parser, given_options
 from mjx_study.disk import write_whole
+from mjx_study.option import BUILDER_OPTIONS
 from mjx_study.study.configuration import StudyConfig, takes_stiffness
 from mjx_study.study.variables import explained
 
@@ -32,7 +33,7 @@ columns of the table:
 A task's own counts, such as hit, have a column each. Costs and counts are means over --evaluation-samples rollouts,
 the same for all, ± their standard deviation over seeds; alpha is the mean over the last tenth of the iterations.
 """
-WRAPPED = ("contact", "stiffness", "sigma", "cone", "samples", "backward")
+WRAPPED = ("contact", "stiffness", "sigma", "timestep", "cone", "samples", "backward")
 """Options with a single value here and a list in a study."""
 
 
@@ -54,11 +55,12 @@ def run(options: argparse.Namespace) -> int:
     from mjx_study.cli.console import descent_lines, descents
     from mjx_study.cli.studies import run_one, study_fields
     from mjx_study.study.plan import StudyPlan, plan_study
-    from mjx_study.tasks import make_task
+    from mjx_study.tasks import task_with_options
 
     def planned() -> StudyPlan:
         """A single contact model, the given one or the task's own."""
-        fields, task = study_fields(options), make_task(options.task, **scene_options(options, "horizon", "model"))
+        fields = study_fields(options)
+        task = task_with_options(options.task, given_options(options, *BUILDER_OPTIONS))
         if options.reference:
             if options.contact not in (None, REFERENCE):
                 raise ValueError(f"--reference replaces --contact {options.contact}; omit one of them")
@@ -75,8 +77,9 @@ def run(options: argparse.Namespace) -> int:
 
 def _save_policies(document: dict[str, Any], folder: Path) -> list[Path]:
     config, written = document["config"], []
-    kept = {name: config[name] for name in ("task", "stiffness", "damping", "cone", "model", "network")}
-    kept |= {"contact": None if config["contact"] == REFERENCE else config["contact"], "horizon": config["horizon"]}
+    kept = {name: config[name] for name in ("task", "stiffness", "damping", "cone", *BUILDER_OPTIONS, "network")}
+    kept |= {"contact": None if config["contact"] == REFERENCE else config["contact"]}
+    kept |= {"timestep": config["timestep"][0] if config["timestep"] else None}
     for run in document["runs"]:
         best = run["best_seed"]
         policy = kept | {"estimator": run["estimator"], "seed": best, "cost": run["final_cost"][best]}

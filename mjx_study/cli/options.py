@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final, NoReturn
 
 from estimators.catalogue import suggestion, unknown
 from mjx_study.choices import FAMILIES, PRECISIONS, TASK_DESCRIPTIONS, unknown_task
-from mjx_study.option import CONTACTS, OPTIONS, Option
+from mjx_study.option import BUILDER_OPTIONS, CONTACTS, OPTIONS, Option
 from mjx_study.study.configuration import StudyConfig
 
 if TYPE_CHECKING:
@@ -23,8 +23,8 @@ SIMILAR_FLAGS: Final = 0.75
 """Least similarity of a flag that is suggested, which its dashes add to."""
 OPTION_NAME: Final = re.compile(r"""`\w+`|(?<![\w.'"/=-])[a-z]+(_[a-z]+)+(?![\w?'"]|: |[./=]\w)""")
 """What may name an option in a message: a word in backticks, or one with an underscore, but not the key of a file."""
-SOLVER_BUDGET: Final = {"solver_iterations": "iterations", "solver_ls_iterations": "ls_iterations"}
-"""Names of the solver's options in an MJCF, by those of the command line."""
+TASK_OPTIONS: Final = ("timestep", "cone", *BUILDER_OPTIONS)
+"""Options for the builder of a task."""
 
 
 class UsageError(ValueError):
@@ -119,9 +119,14 @@ class Parser(argparse.ArgumentParser):
     def add_task_options(self) -> None:
         """Add the task, options that override its settings, and process options."""
         self.add_task_argument()
-        for name in ("sigma", "cone", "horizon", "model"):
-            self.add_option(name)
+        self.add_option("sigma")
+        self.add_builder_options()
         self.add_process_options()
+
+    def add_builder_options(self, *names: str, **changes: dict[str, Any]) -> None:
+        """Add options for the builder of a task, or the named ones of them, with changes to their descriptions."""
+        for name in names or TASK_OPTIONS:
+            self.add_option(name, many=name == "disable_flag", **changes.get(name, {}))
 
     def add_task_argument(self) -> None:
         named = f"one of: {', '.join(TASK_DESCRIPTIONS)}; module:name of your own; or any MJCF that MJX runs"
@@ -139,17 +144,6 @@ class Parser(argparse.ArgumentParser):
         self.add_option("stiffness", many=many, unset=stiffness)
         self.add_option("contact", many=many, choices=CONTACTS if analytic else tuple(FAMILIES))
         self.add_option("damping")
-
-    def add_scene_options(self) -> None:
-        """Add overrides of an MJCF's <option>, so that a model can be adapted to MJX without editing its file."""
-        from mjx_study.simulation.limitations import FLAGS
-
-        self.add_option("integrator")
-        self.add_option("solver")
-        for name in SOLVER_BUDGET:
-            self.add_option(name)
-        listed = f"flags to disable, as in the MJCF's <flag>: {', '.join(FLAGS)}"
-        self.add_argument("--disable-flag", metavar="FLAG[,FLAG]", dest="disable_flags", help=listed)
 
     def add_estimator_options(self) -> None:
         """Add the noise and the estimators' options; see `estimators.ESTIMATORS`."""
@@ -210,16 +204,10 @@ def given_options(options: argparse.Namespace, *names: str) -> dict[str, Any]:
     return {name: value for name, value in found.items() if value is not None}
 
 
-def scene_options(options: argparse.Namespace, *names: str) -> dict[str, Any]:
-    """The given scene options and the named ones, as arguments of `load_scene`."""
-    given = given_options(options, "integrator", "solver", *SOLVER_BUDGET, "disable_flags", *names)
-    return {SOLVER_BUDGET.get(name, name): value for name, value in given.items()}
-
-
 def task_of(options: argparse.Namespace) -> "mjx_study.tasks.task.Task":
-    from mjx_study.tasks import make_task
+    from mjx_study.tasks import task_with_options
 
-    task = make_task(options.task, **scene_options(options, "cone", "horizon", "model"))
+    task = task_with_options(options.task, given_options(options, *TASK_OPTIONS))
     return task if options.sigma is None else task.replace(sigma=options.sigma)
 
 

@@ -24,7 +24,6 @@ examples:
 
 def add(command: Parser) -> None:
     command.add_task_options()
-    command.add_scene_options()
     command.add_contact_options("the middle one of the task's sweep", many=False, analytic=False)
     command.add_flag("--noisy", "add noise, drawn with --seed (default: none)")
     command.add_theta_option("parameters, and of a policy also its contact, horizon, model and cone")

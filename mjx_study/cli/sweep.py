@@ -7,7 +7,7 @@ from typing import Any
 
 from mjx_study.choices import TASK_DESCRIPTIONS
 from mjx_study.cli.options import Parser, UsageError, known_task
-from mjx_study.option import MOST_VALUES, Interval, Option
+from mjx_study.option import BUILDER_OPTIONS, MOST_VALUES, Interval, Option
 
 EPILOG = """\
 Every combination of task, contact model, timestep, cone, sigma and number of samples is a cell: all its seeds and
@@ -55,7 +55,7 @@ def add(command: Parser) -> None:
     command.add_fields("stiffness_schedule", "sigma_schedule", "reference_samples", "evaluation_samples")
     command.add_estimator_options()
     command.add_backward_options()
-    command.add_fields("horizon", "model", "chunk_size", "block_size")
+    command.add_fields(*BUILDER_OPTIONS, "chunk_size", "block_size")
     command.add_process_options(seed=None)
     command.add_argument("--output", type=Path, metavar="DIR", help="folder for the study; only --dry-run does without")
     command.add_cluster_option()

@@ -207,7 +207,7 @@ class Diagnosis(Measurement):
         if self.unconverged:
             yield (
                 f"in {self.unconverged} rollouts the contact solver did not converge: their derivatives are not those "
-                "of what is simulated; raise iterations and ls_iterations in the MJCF's <option>"
+                "of what is simulated; raise --solver-iterations and --solver-ls-iterations"
             )
         if unstable := [each for each in self.touches if not each.stable]:
             yield f"the step in contact is unstable: {unstable[0].pair}, h^2 k = {unstable[0].stiffness:.2g}"
@@ -263,7 +263,7 @@ class Diagnosis(Measurement):
             return
         explained = ERROR_PER_STRENGTH * strength * (plain.bias + corrected.bias)
         if spread < LEAST_SPREAD:
-            finer = f"a timestep of {timestep * spread / LEAST_SPREAD:.1g} s, or " if spread > 0 else ""
+            finer = f"--timestep {timestep * spread / LEAST_SPREAD:.1g}, or " if spread > 0 else ""
             yield f"for fobg_onset and aobg_onset the noise is too narrow: take {finer}a larger --sigma", ""
         elif corrected.verdict == "biased" and corrected.bias > explained and strength <= MOST_STRENGTH:
             yield (
@@ -274,7 +274,7 @@ class Diagnosis(Measurement):
         elif ERROR_PER_STRENGTH * strength > NOTABLE_SHARE:
             step = timestep * NOTABLE_SHARE / (ERROR_PER_STRENGTH * strength)
             yield (
-                f"{linear_error(strength)}: a timestep of {step:.1g} s brings that down to {NOTABLE_SHARE:.0%}; the "
+                f"{linear_error(strength)}: --timestep {step:.1g} brings that down to {NOTABLE_SHARE:.0%}; the "
                 "error of --onset jump is only of second order in the step",
                 "--onset jump",
             )

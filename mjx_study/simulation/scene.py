@@ -188,7 +188,7 @@ def put_scene(host: mujoco.MjModel, name: str, *, adjoint: SceneOption = "auto",
         raise SceneError(
             f"{name} combines RK4 with contacts, limits, equalities or friction loss: RK4's stages would solve the "
             "constraints four times per step without an order to gain; set integrator to euler or implicitfast "
-            "in its <option> (rollout and gradcheck: --integrator)"
+            "in its <option>, or give --integrator"
         )
     return scene
 
@@ -271,13 +271,13 @@ def check_model(host: mujoco.MjModel, name: str = "the model") -> None:
         value = int(getattr(host.opt, option))
         if value not in {int(choice) for choice in choices.values()}:
             raise SceneError(
-                f"MJX lacks the {option} that {name} asks for; set one of {', '.join(choices)} in its <option> "
-                f"(rollout and gradcheck: --{option})"
+                f"MJX lacks the {option} that {name} asks for; set one of {', '.join(choices)} in its <option>, "
+                f"or give --{option}"
             )
     if flags := lacking(host):
         raise SceneError(
-            f"MJX lacks {', '.join(flags)}, which {name} enables; disable them in its <option><flag> (rollout and "
-            f"gradcheck: --disable-flag {','.join(flags)})"
+            f"MJX lacks {', '.join(flags)}, which {name} enables; disable them in its <option><flag>, or give "
+            f"--disable-flag {','.join(flags)}"
         )
     if features := ignored(host):
         raise SceneError(f"MJX would leave out part of {name}: {'; '.join(features)}")

@@ -95,6 +95,8 @@ class StudyConfig(Checked):
         backward_margin: distance at which contact begins in their derivatives [m]; None for the MJCF's.
         horizon: number of steps; None for each task's.
         model: an MJCF that replaces the task's own; None for the task's.
+        integrator, solver, solver_iterations, solver_ls_iterations, disable_flag: overrides of the MJCF's <option>,
+            as in `mjx_study.load_scene`; None for the MJCF's.
         chunk_size: samples per device and call; None to choose it by the number of samples.
         block_size: samples held at once in studies of gradients; larger batches are split into blocks whose statistics
             are merged. None for whole batches if they fit in the memory limit.
@@ -147,6 +149,11 @@ class StudyConfig(Checked):
     backward_margin: float | None = None
     horizon: int | None = None
     model: str | None = None
+    integrator: str | None = None
+    solver: str | None = None
+    solver_iterations: int | None = None
+    solver_ls_iterations: int | None = None
+    disable_flag: tuple[str, ...] | None = None
     chunk_size: int | None = None
     block_size: int | None = None
 

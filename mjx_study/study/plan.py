@@ -15,7 +15,7 @@ from mjx_study.choices import CONES, REFERENCE
 from mjx_study.identity import contents, estimator_contents
 from mjx_study.limits import MOST_CELLS, MOST_GIB, MOST_PROGRAMS, check_count
 from mjx_study.objective import chunk_for
-from mjx_study.option import OPTIONS, check
+from mjx_study.option import BUILDER_OPTIONS
 from mjx_study.reference.noise import check_sigma
 from mjx_study.study.configuration import SAMPLES, Settings, StudyConfig
 from mjx_study.study.iteration import make_optimizer, schedule_factors
@@ -33,7 +33,7 @@ from mjx_study.study.memory import (
 )
 from mjx_study.study.resolution import at_theta, configured_estimators, line_of, recipe_of
 from mjx_study.table import digits_to_tell_apart
-from mjx_study.tasks import make_task
+from mjx_study.tasks import task_with_options
 from mjx_study.tasks.contact_grid import ContactPoint, backward_grid, family_grid, solver_grid
 from mjx_study.tasks.network import with_network
 from mjx_study.tasks.task import Recipe, Task, check_shapes
@@ -138,7 +138,7 @@ def plan_study(config: StudyConfig, built: Mapping[str, Task] | None = None) -> 
 
     Args:
         config: what to study; fields that are None take their defaults.
-        built: tasks already built by the caller, by name, with the configuration's horizon and model and the MJCF's
+        built: tasks already built by the caller, by name, with the configuration's `BUILDER_OPTIONS` and the MJCF's
             timestep and cone.
 
     Raises:
@@ -294,8 +294,8 @@ def seeds_together(plan: StudyPlan, cell: StudyCell) -> int:
 def _build(
     config: StudyConfig, which: str | Task, timestep: float | None, cone: str | None, built: Mapping[str, Task]
 ) -> Task:
-    chosen = {"timestep": timestep, "cone": cone, "horizon": config.horizon, "model": config.model}
-    chosen = {key: value for key, value in chosen.items() if value is not None}
+    chosen = {"timestep": timestep, "cone": cone} | {name: getattr(config, name) for name in BUILDER_OPTIONS}
+    chosen = {name: value for name, value in chosen.items() if value is not None}
     changes = {"onset": config.onset} | ({} if config.noise is None else {"noise": config.noise})
     if isinstance(which, Task):
         if chosen:
@@ -304,12 +304,7 @@ def _build(
         return which.replace(**changes)
     if which in built and timestep is None and cone is None:
         return built[which].replace(**changes)
-    if timestep is not None and config.horizon is None:
-        own = make_task(which, **{key: value for key, value in chosen.items() if key != "timestep"})
-        steps = own.horizon * float(own.scene.host.opt.timestep) / timestep
-        chosen["horizon"] = max(1, round(min(steps, 1e15)))
-        check(OPTIONS["horizon"], chosen["horizon"])
-    return make_task(which, **chosen).replace(**changes)
+    return task_with_options(which, chosen).replace(**changes)
 
 
 def estimators_of(plan: StudyPlan, cell: StudyCell) -> tuple[Estimator, ...]:

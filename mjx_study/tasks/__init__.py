@@ -1,11 +1,12 @@
 """The systems of the study, one module each, all structured alike."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, Final
 
 from estimators.places import MissingModuleError
 from mjx_study.choices import is_file, unknown_task
+from mjx_study.option import OPTIONS, as_arguments, check
 from mjx_study.tasks.ball_wall import ball_wall
 from mjx_study.tasks.double_pendulum import double_pendulum
 from mjx_study.tasks.gripper import gripper
@@ -60,3 +61,13 @@ def make_task(name: str, **options: Any) -> Task:
         except MissingModuleError as error:
             raise ValueError(unknown_task(name, f" ({error})")) from None
     raise ValueError(unknown_task(name))
+
+
+def task_with_options(name: str, options: Mapping[str, Any]) -> Task:
+    """Build a task with options that are not None; with a timestep but no horizon, rollouts keep their duration."""
+    given = as_arguments(options)
+    if "timestep" in given and "horizon" not in given:
+        own = make_task(name, **{key: value for key, value in given.items() if key != "timestep"})
+        steps = own.horizon * own.scene.timestep / given["timestep"]
+        given["horizon"] = check(OPTIONS["horizon"], max(1, round(min(steps, 1e15))))
+    return make_task(name, **given)

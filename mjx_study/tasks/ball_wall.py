@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 from mjx_study.choices import TASK_DESCRIPTIONS, unknown
 from mjx_study.reference import BallWall, FunctionObjective
 from mjx_study.simulation.dynamics import State, initial_state
-from mjx_study.simulation.scene import SceneError, load_model, put_scene, require
+from mjx_study.simulation.scene import SceneError, SceneOption, load_model, put_scene, require
 from mjx_study.tasks.policy import InitialStatePolicy
 from mjx_study.tasks.task import Published, Recipe, StudyDefaults, Task
 
@@ -40,7 +40,7 @@ def ball_wall(
     horizon: int = HORIZON,
     model: str | Path = "ball_wall",
     adjoint: str = "auto",
-    **scene_options: str | float,
+    **scene_options: SceneOption,
 ) -> Task:
     """Cost -(x / 10)^2, with x [m] the ball's final position.
 

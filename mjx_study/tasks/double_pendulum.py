@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 from mjx_study.choices import TASK_DESCRIPTIONS, unknown
 from mjx_study.reference import DoublePendulum, ReferenceObjective
 from mjx_study.simulation.dynamics import State, initial_state
-from mjx_study.simulation.scene import load_scene, require
+from mjx_study.simulation.scene import SceneOption, load_scene, require
 from mjx_study.tasks.policy import InitialStatePolicy
 from mjx_study.tasks.task import Recipe, StudyDefaults, Task
 
@@ -37,7 +37,7 @@ def double_pendulum(
     *,
     horizon: int = HORIZON,
     model: str | Path = "double_pendulum",
-    **scene_options: str | float,
+    **scene_options: SceneOption,
 ) -> Task:
     """Cost |q|^2, with q [rad] the final angles, not wrapped, since wrapping would add jumps.
 

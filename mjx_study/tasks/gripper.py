@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, Key
 
 from mjx_study.choices import TASK_DESCRIPTIONS
 from mjx_study.simulation.dynamics import State, initial_state
-from mjx_study.simulation.scene import load_scene, require
+from mjx_study.simulation.scene import SceneOption, load_scene, require
 from mjx_study.tasks.network import Network
 from mjx_study.tasks.task import Recipe, StudyDefaults, Task
 
@@ -31,7 +31,7 @@ SIGMA: Final = 0.05  # [0.1 m and rad]
 RECIPE: Final = Recipe(0.01, 200, 50)
 
 
-def gripper(*, horizon: int = HORIZON, model: str | Path = "gripper", **scene_options: str | float) -> Task:
+def gripper(*, horizon: int = HORIZON, model: str | Path = "gripper", **scene_options: SceneOption) -> Task:
     """Cost |box - goal|^2 + |its velocity|^2 at the end, in the units above, plus 0.001 sum_h |u_h|^2.
 
     Args:

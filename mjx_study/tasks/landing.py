@@ -16,7 +16,7 @@ from jaxtyping import Array, Float, Key
 
 from mjx_study.choices import TASK_DESCRIPTIONS
 from mjx_study.simulation.dynamics import State, initial_state
-from mjx_study.simulation.scene import load_scene, require
+from mjx_study.simulation.scene import SceneOption, load_scene, require
 from mjx_study.tasks.network import Network
 from mjx_study.tasks.task import Recipe, StudyDefaults, Task
 
@@ -30,7 +30,7 @@ SIGMA: Final = 0.05  # [rad]
 RECIPE: Final = Recipe(0.003, 200, 50)
 
 
-def landing(*, horizon: int = HORIZON, model: str | Path = "landing", **scene_options: str | float) -> Task:
+def landing(*, horizon: int = HORIZON, model: str | Path = "landing", **scene_options: SceneOption) -> Task:
     """Cost |trunk's height, pitch and velocities|^2 at the end, plus the mean over steps of the joints' |torque|^2.
 
     Joint torques measure the impact, since they carry the feet's forces.

@@ -1,7 +1,6 @@
 """A task made from an MJCF alone, with the displacement of its bodies as cost."""
 
 import dataclasses
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
@@ -13,7 +12,7 @@ from jaxtyping import Array, Float
 from mjx_study.choices import CHECKED_STEPS
 from mjx_study.simulation.dynamics import State, initial_state
 from mjx_study.simulation.engine import HostState, host_data, quiet_engine
-from mjx_study.simulation.scene import Scene, load_scene
+from mjx_study.simulation.scene import Scene, SceneOption, load_scene
 from mjx_study.tasks.policy import InitialStatePolicy, OpenLoop
 from mjx_study.tasks.task import StudyDefaults, Task
 
@@ -24,7 +23,7 @@ LEAST_MOTION: Final = 1e-9
 _FREE, _BALL = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL)
 
 
-def mjcf_task(path: str | Path, *, horizon: int = CHECKED_STEPS, **scene_options: str | float | Sequence[str]) -> Task:
+def mjcf_task(path: str | Path, *, horizon: int = CHECKED_STEPS, **scene_options: SceneOption) -> Task:
     """Make a task from a file; see `scene_task`."""
     return scene_task(load_scene(path, **scene_options), horizon=horizon)
 

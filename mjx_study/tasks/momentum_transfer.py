@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 from mjx_study.choices import TASK_DESCRIPTIONS
 from mjx_study.reference import FunctionObjective, MomentumTransfer
 from mjx_study.simulation.dynamics import State, initial_state
-from mjx_study.simulation.scene import load_scene, require
+from mjx_study.simulation.scene import SceneOption, load_scene, require
 from mjx_study.tasks.policy import InitialStatePolicy
 from mjx_study.tasks.task import Published, Recipe, StudyDefaults, Task
 
@@ -32,7 +32,7 @@ RECIPE: Final = Recipe(0.01, 500, 50)
 
 
 def momentum_transfer(
-    *, horizon: int = HORIZON, model: str | Path = "momentum_transfer", **scene_options: str | float
+    *, horizon: int = HORIZON, model: str | Path = "momentum_transfer", **scene_options: SceneOption
 ) -> Task:
     """Cost -(I omega / (m v d))^2, with I omega the bar's final angular momentum.
 

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 from mjx_study.choices import TASK_DESCRIPTIONS
 from mjx_study.reference import Pusher, ReferenceObjective
 from mjx_study.simulation.dynamics import State, initial_state
-from mjx_study.simulation.scene import load_scene, require
+from mjx_study.simulation.scene import SceneOption, load_scene, require
 from mjx_study.tasks.policy import OpenLoop
 from mjx_study.tasks.task import Published, Recipe, StudyDefaults, Task
 
@@ -31,7 +31,7 @@ RADIUS: Final = 100.0
 RECIPE: Final = Recipe(1e-3, 500, 10)
 
 
-def pusher(*, horizon: int = HORIZON, model: str | Path = "pusher", **scene_options: str | float) -> Task:
+def pusher(*, horizon: int = HORIZON, model: str | Path = "pusher", **scene_options: SceneOption) -> Task:
     """Cost sum_h e_h^T Q e_h + R u_h^2 + e_{H+1}^T Q e_{H+1}, with e the state minus the goal.
 
     Args:

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 from mjx_study.choices import TASK_DESCRIPTIONS
 from mjx_study.reference import ReferenceObjective, SlidingBox
 from mjx_study.simulation.dynamics import State, initial_state
-from mjx_study.simulation.scene import load_scene, require
+from mjx_study.simulation.scene import SceneOption, load_scene, require
 from mjx_study.tasks.policy import OpenLoop
 from mjx_study.tasks.task import Published, Recipe, StudyDefaults, Task
 
@@ -32,7 +32,7 @@ RECIPE: Final = Recipe(1e-4, 100, 10)
 BLOCK, BOX = 0, 2  # indices among the coordinates block, height, box
 
 
-def sliding_box(*, horizon: int = HORIZON, model: str | Path = "sliding_box", **scene_options: str | float) -> Task:
+def sliding_box(*, horizon: int = HORIZON, model: str | Path = "sliding_box", **scene_options: SceneOption) -> Task:
     """Cost sum_h e_h^T Q e_h + R u_h^2 + e_{H+1}^T Q e_{H+1}, with e the horizontal state minus the goal.
 
     Args:

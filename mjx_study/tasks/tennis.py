@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, Key
 from mjx_study.choices import TASK_DESCRIPTIONS
 from mjx_study.reference import ReferenceObjective, Tennis, draw_start, tennis_metrics
 from mjx_study.simulation.dynamics import State, initial_state
-from mjx_study.simulation.scene import load_model, put_scene, require
+from mjx_study.simulation.scene import SceneOption, load_model, put_scene, require
 from mjx_study.tasks.policy import LinearFeedback
 from mjx_study.tasks.task import Published, Recipe, StudyDefaults, Task
 
@@ -32,7 +32,7 @@ FEATURES: Final = 7
 
 
 def tennis(
-    *, horizon: int = HORIZON, model: str | Path = "tennis", adjoint: str = "auto", **scene_options: str | float
+    *, horizon: int = HORIZON, model: str | Path = "tennis", adjoint: str = "auto", **scene_options: SceneOption
 ) -> Task:
     """Cost 0.001 sum_h |u_h|^2 + 100 (|position - target|^2 + |velocity|^2 / 10), the latter of the ball at the end.
 
