@@ -117,7 +117,7 @@ def test_what_compare_wrote_can_be_drawn_and_reported(
     assert "relative error" in (tmp_path / "page.html").read_text()
     assert cli.main(["plot", str(folder), "--output", str(tmp_path), "--style", "paper", "--format", "svg"]) == 0
     picture = (tmp_path / "comparison.svg").read_text()
-    assert "<!-- AoBG -->" in picture and "<text" not in picture and "bands:" not in picture  # no fonts, no title
+    assert "<!-- AoBG -->" in picture and "<text" not in picture and "95 %" not in picture  # no fonts, no title
     assert float(re.search(r'width="([\d.]+)pt"', picture).group(1)) == pytest.approx(72 * PAGE)  # type: ignore[union-attr]
 
 

@@ -10,7 +10,7 @@ import pytest
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.colors import to_hex
+from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
 
 from estimators import Estimator
@@ -104,6 +104,15 @@ def test_curves_and_intervals_beyond_the_limits_are_marked() -> None:
     assert marks(axes, "v") == [(1.0, "#445566"), (2.0, "#778899")]
     faces = {each.get_marker(): each.get_markerfacecolor() for each in axes.lines if np.size(each.get_xdata()) == 1}
     assert faces["v"] == "none" != faces["^"]
+    heads = [each for each in axes.lines if each.get_marker() in ("^", "v") and np.size(each.get_xdata()) == 1]
+    assert len(heads) == 4
+    boxes = [(each.get_window_extent(), each.get_marker()) for each in heads]
+    assert all(box.y0 > axes.bbox.y1 if shape == "^" else box.y1 < axes.bbox.y0 for box, shape in boxes)
+
+
+def test_no_estimator_is_black_or_grey() -> None:
+    """Which mean costs and references are."""
+    assert min(np.ptp(to_rgb(colour)) for colour, _ in STYLE.values()) > 0.3
 
 
 def test_a_long_stretch_beyond_the_limits_is_marked_once() -> None:
@@ -140,6 +149,7 @@ def test_achieved_costs_are_above_one_baseline_and_none_is_drawn_at_it() -> None
     np.testing.assert_allclose(curves["ZoBG"], [np.nan, 2, 6])  # the baseline itself: not on a logarithmic axis
     np.testing.assert_allclose(curves["FoBG"], [1, 3, 7])
     assert marks(axes, "v") == [(10.0, to_hex(STYLE["zobg"][0]))]
+    assert axes.get_ylim()[1] == pytest.approx(3 * (9 + 4 - 3))
     assert "3" in axes.get_ylabel().split()[-1] and "lowest" in axes.get_ylabel()
     assert "(1 seed as dots" in figure.get_suptitle()
     assert counted(10, "seed") == "10 seeds"
@@ -151,6 +161,8 @@ def test_unstable_steps_are_shown_wherever_the_axis_is_stiffness() -> None:
     shaded = [[patch for patch in axes.patches if patch.get_label() == UNSTABLE] for axes in figure.axes]
     assert [len(each) for each in shaded] == [1, 1, 1, 1]  # two rows: from the limit on; the first of two families
     assert shaded[1][0].get_extents().width > 0 and UNSTABLE in legend_of(figure)
+    handles = dict(zip(legend_of(figure), figure.legends[0].legend_handles, strict=True))
+    assert handles["ZoBG"].get_linestyle() == "-"  # as in the panel of a family, not as single models are drawn
     assert not any(text.get_text() == UNSTABLE for axes in figure.axes for text in axes.texts)  # not on the data
     swept = [("penalty", stiffness) for stiffness in (10.0, 100.0, 1e4)]
     chart = plot_study(study("gradients", swept, 3, (0.1, 1.0)))["map_stiffness_sigma"]
@@ -167,6 +179,12 @@ def test_a_map_says_where_its_colours_end(least: int, greatest: int, extend: str
     swept = [("penalty", stiffness) for stiffness in (10.0, 100.0, 1000.0)]
     figure = plot_study(study("gradients", swept, 3, (0.1, 1.0), variance=values))["map_stiffness_sigma"]
     assert figure.axes[-1]._colorbar.extend == extend  # type: ignore[attr-defined]
+
+
+def test_negative_costs_have_no_ratio_and_no_map() -> None:
+    for cost, drawn in ((0.5, True), (-0.5, False)):
+        figures = plot_study(study("descents", [("penalty", 10.0), ("penalty", 100.0)], 1, (0.1, 1.0), final_cost=cost))
+        assert ("map_stiffness_sigma" in figures) == drawn
 
 
 def test_one_stiffness_gives_an_axis_of_families_and_two_are_not_joined() -> None:
@@ -202,6 +220,7 @@ def test_an_estimator_of_two_batches_is_hollow_and_dashed_whoever_wrote_it() -> 
         styles = {line.get_label(): line for axes in figure.axes for line in axes.lines}
         assert [styles[each].get_linestyle() for each in labels] == ["--", "-"]
         assert styles[labels[0]].get_markerfacecolor() == "none"
+        assert len({styles[each].get_markevery() for each in labels}) == 2  # at different points
 
 
 @pytest.mark.parametrize("models", [[("penalty", 10.0), ("penalty", 100.0)], [("penalty", 10.0), ("mujoco", 10.0)]])

@@ -28,7 +28,8 @@ def achieved(part: xr.Dataset, title: str) -> Figure | None:
     middle = (part["final_cost"].median("seed") - best).values
     positive = middle[np.isfinite(middle) & (middle > 0)]
     floor = float(np.min(positive)) / 3 if len(positive) else 1e-3
-    ceiling = MOST_COST_RATIO * floor
+    costs = (part["final_cost"] - best).values
+    ceiling = min(MOST_COST_RATIO * floor, 3 * float(np.max(costs, where=np.isfinite(costs), initial=floor)))
 
     def draw(axes: Axes, rows: xr.Dataset, x: np.ndarray) -> None:
         for mine, style in estimators(rows):
@@ -82,7 +83,7 @@ def descent(part: xr.Dataset, title: str) -> Figure:
                 axes.set_ylim(low, high)
         for axes in row[3:]:
             axes.set_ylim(-0.03, 1.03)
-            axes.set_ylabel(DESCENTS["alpha"].heading, fontsize="small")
+            axes.set_ylabel(DESCENTS["alpha"].label, fontsize="small")
         row[0].set_ylabel(DESCENTS["cost"].label, fontsize="small")
         row[0].set_title(model_title(one), loc="left", fontsize="medium")  # along the row
     labels = ("iteration", DERIVED["seed_rollouts"].label, DESCENTS["seconds"].label, "iteration")
@@ -93,7 +94,7 @@ def descent(part: xr.Dataset, title: str) -> Figure:
 
 def landscape(part: xr.Dataset, title: str) -> Figure:
     """Plot cost and mean cost along the line above, estimators' slopes below; one column for each of a few models."""
-    models, title = a_few(part), f"{title} at each point (bands: 95 %)"
+    models, title = a_few(part), f"{title} at each point (95 % intervals)"
     figure, grid = make_panels(2, len(models), 1.6 + 2.9 * len(models), 6.2, title, sharex=True, sharey="row")
     slopes, steepest = [], 0.0
     direction = json.loads(part.attrs["config"])["direction"] or "random"
@@ -114,7 +115,7 @@ def landscape(part: xr.Dataset, title: str) -> Figure:
             below.plot(t, one["exact_first"], **first, **above_all, label="mean of FoBG, quadrature")
         for mine, style in estimators(one):
             slopes.append(mine["slope"].values)
-            style |= {"label": f"mean of {style['label']}", "marker": ""}
+            style["label"] = f"mean of {style['label']}"
             line_with_band(below, t, *_interval(mine["slope"], mine["slope_se"]), **style)
         above.set_title(model_title(one, ",\n"), fontsize="medium")
         below.axhline(0, color="0.7", linewidth=0.8)

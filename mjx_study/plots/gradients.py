@@ -1,6 +1,7 @@
 """Figures of gradient estimates: variance, error, bias and weights."""
 
 import json
+from typing import Final
 
 import numpy as np
 import xarray as xr
@@ -27,11 +28,13 @@ from mjx_study.plots.panels import (
 from mjx_study.plots.style import line_with_band
 from mjx_study.study.variables import COORDINATES, GRADIENTS
 
+WHOLE: Final = "as large as the gradient"
+
 
 def comparison(part: xr.Dataset, title: str) -> Figure:
     """Plot variance above and relative error below, with intervals of one batch; one column per contact family."""
     found, confidence = families(part), json.loads(part.attrs["config"])["confidence"]
-    title = f"{title}\ngradient estimates (bands: {100 * confidence:.0f} % intervals)"
+    title = f"{title}\ngradient estimates ({100 * confidence:.0f} % intervals)"
     figure, axes = make_panels(2, len(found), 1.2 + 3.4 * len(found), 6.2, title, sharex="col", sharey="row")
     one = part.isel(seed=0)
     for panel, shown, room in (
@@ -54,7 +57,7 @@ def comparison(part: xr.Dataset, title: str) -> Figure:
             line(below, mine, x, y, lower, positive(y + 1.96 * error), style)
         floor, dotted = positive(rows["reference_uncertainty"]), ":" if family and len(x) > 2 else "none"
         below.plot(x, floor, color="0.4", linestyle=dotted, marker="_", label="uncertainty of the reference")
-        below.axhline(1, color="0.7", linewidth=0.8, label="as large as the gradient")
+        below.axhline(1, color="0.7", linewidth=0.8, label=WHOLE)
         for panel in (above, below):
             make_logarithmic(panel, x if family else None)
             shade_unstable(panel, family, rows, x)
@@ -105,7 +108,7 @@ def bias(part: xr.Dataset, title: str) -> Figure | None:
             axes.errorbar(at, y, yerr=bars, **shown, capsize=2.5, linestyle=joined)
             axes.plot(at[~seen], high[~seen], color=style["color"], marker="v", linestyle="none", alpha=0.45)
         axes.plot([], [], color="0.5", marker="v", linestyle="none", alpha=0.6, label="no bias seen: upper bound")
-        axes.axhline(1, color="0.7", linewidth=0.8)
+        axes.axhline(1, color="0.7", linewidth=0.8, label=WHOLE)
 
     pooled = part.sizes["seed"] * int(part["samples"])
     return against_stiffness(

@@ -115,7 +115,8 @@ def stiffness_axis(axes: Axes, family: str, rows: xr.Dataset) -> np.ndarray:
         return positions(rows)
     x = np.arange(rows.sizes["model"], dtype=float)
     labels = [model_title(rows.isel(model=index), ",\n") for index in range(len(x))]
-    axes.set_xticks(x, labels, rotation=20, ha="right", fontsize="small")
+    turned = {"rotation": 20, "ha": "right"} if len(x) > 1 else {}
+    axes.set_xticks(x, labels, **turned, fontsize="small")
     axes.set_xlim(-0.6, len(x) - 0.4)
     return x
 
@@ -126,9 +127,9 @@ def beside(axes: Axes, x: np.ndarray, rank: float) -> np.ndarray:
 
 
 def estimators(rows: xr.Dataset) -> Iterator[tuple[xr.Dataset, dict[str, Any]]]:
-    for name in rows["estimator"].values.tolist():
+    for rank, name in enumerate(rows["estimator"].values.tolist()):
         label, colour, marker = style_of(name)
-        style = {"label": label, "color": colour, "marker": marker, "hollow": combines(name)}
+        style = {"label": label, "color": colour, "marker": marker, "hollow": combines(name), "rank": rank}
         yield rows.sel(estimator=name), style
 
 

@@ -114,17 +114,19 @@ def _present(part: xr.Dataset) -> np.ndarray:
     return np.asarray(quantity.notnull().any([name for name in quantity.dims if name != "model"]))
 
 
-def _ratio_map(part: xr.Dataset, title: str, quantity: str, other: str) -> Figure:
+def _ratio_map(part: xr.Dataset, title: str, quantity: str, other: str) -> Figure | None:
     """Plot log10 of FoBG over ZoBG against two swept parameters, one panel per family; blue where FoBG is smaller."""
     found = [(family, rows) for family, rows in families(part) if family] or families(part)
-    title = f"{title}\nwhere first order is ahead (blue) and behind (red)"
-    figure, grid = make_panels(1, len(found), 1.8 + 3.2 * len(found), 3.9, title, sharey=True)
     ratios = []
     for _, rows in found:
         values = rows[quantity].median("seed")
         ratio = np.log10(positive(values.sel(estimator="fobg")) / positive(values.sel(estimator="zobg")))
         ratios.append(ratio if values.sel(estimator="fobg").dims[0] == other else ratio.T)
     known = np.concatenate(ratios, axis=None)
+    if not np.isfinite(known).any():
+        return None  # costs may be negative
+    title = f"{title}\nwhere first order is ahead (blue) and behind (red)"
+    figure, grid = make_panels(1, len(found), 1.8 + 3.2 * len(found), 3.9, title, sharey=True)
     extent = min(MOST_DECADES, max(1e-3, float(np.nanmax(np.abs(known)))))
     mesh = None
     for axes, (family, rows), ratio in zip(grid[0], found, ratios, strict=True):

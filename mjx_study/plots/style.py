@@ -10,12 +10,14 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.colors import to_hex
 from matplotlib.container import ErrorbarContainer
 from matplotlib.figure import Figure
 from matplotlib.text import Text
+from matplotlib.transforms import ScaledTranslation
 
 from estimators import find_estimator
 from estimators.estimator import label_of
@@ -28,18 +30,19 @@ STYLE: Final = {
     "zobg_to_go": ("#56B4E9", "P"),
     "zobg_to_go_antithetic": ("#0072B2", "X"),
     "fobg": ("#D55E00", "s"),
-    "fobg_onset": ("#000000", "s"),
+    "fobg_onset": ("#7A2E00", "s"),
     "fobg_clipped": ("#E69F00", "<"),
     "fobg_truncated": ("#E69F00", ">"),
     "aobg": ("#009E73", "D"),
-    "aobg_onset": ("#777777", "D"),
+    "aobg_onset": ("#8FBF5A", "D"),
     "ivw": ("#CC79A7", "^"),
     "ivw_h": ("#CC79A7", "p"),
-    "total_propagation": ("#000000", "*"),
+    "total_propagation": ("#332288", "*"),
     "ddcg": ("#009E73", "h"),
-    "delta": ("#777777", "d"),
+    "delta": ("#999933", "d"),
 }
-"""Okabe-Ito colours, distinguishable in print and by colour-blind readers; markers repeat the distinction."""
+"""Okabe-Ito colours and four more, distinguishable in print and by colour-blind readers;
+markers repeat the distinction. Black and grey are for what is no estimator's."""
 OTHERS: Final = (("#E69F00", "#56B4E9", "#009E73", "#F0E442", "#0072B2", "#D55E00", "#CC79A7"), "1234+x|_")
 """Colours and markers for user-defined estimators."""
 NO_CONTACT: Final = 1.0
@@ -114,7 +117,9 @@ def legend_below(figure: Figure) -> None:
     while figure.legends:
         figure.legends[0].remove()
     pairs = [zip(*axes.get_legend_handles_labels(), strict=True) for axes in figure.axes]
-    shown = {label: handle for each in pairs for handle, label in each}
+    shown: dict[str, Artist] = {}
+    for handle, label in itertools.chain(*pairs):
+        shown.setdefault(label, handle)  # panels of curves come before those of single models
     for rows in range(1, len(shown) + 1):
         columns, place = -(-len(shown) // rows), "outside lower center"
         legend = figure.legend(shown.values(), shown, loc=place, ncols=columns, frameon=False, fontsize="small")
@@ -176,18 +181,20 @@ MOST_POINTS: Final = 15
 
 def line_with_band(
     axes: Axes, x, y, lower, upper, *, color: str, marker: str, label: str | None = None, hollow: bool = False,
-    joined: bool = True,
+    joined: bool = True, rank: int = 0,
 ) -> None:  # fmt: skip
     """Draw a line with its interval, or points with bars. A curve that may coincide with another is hollow and dashed.
 
-    Two points are not joined, since nothing was measured in between.
+    Two points are not joined, since nothing was measured in between. Long curves of different rank have their markers
+    at different points.
     """
+    apart = max(1, len(x) // 5)
     joined = joined and len(x) > 2
     line = ("--" if hollow else "-") if joined else "none"
     face, size = ("none", 7.5) if hollow else (color, 4.5)
     axes.plot(
         x, y, color=color, marker=marker, markersize=size, markerfacecolor=face, linestyle=line, label=label,
-        markevery=1 if len(x) <= MOST_POINTS else len(x) // 5,
+        markevery=1 if len(x) <= MOST_POINTS else (rank * max(1, apart // 3) % apart, apart),
     )  # fmt: skip
     if joined:
         axes.fill_between(x, lower, upper, color=color, alpha=0.2, linewidth=0)
@@ -196,8 +203,12 @@ def line_with_band(
         axes.errorbar(x, y, yerr=bars, color=color, capsize=3, linestyle="none")
 
 
+ARROWHEAD: Final = 5.5
+"""Height of an arrowhead with the room around it [points]."""
+
+
 def mark_clipped(axes: Axes) -> None:
-    """Put arrowheads at the edges of the finished axes beyond which curves (filled) and intervals (hollow) continue."""
+    """Put arrowheads outside the finished axes where curves (filled) and intervals (hollow) continue beyond an edge."""
     caps = {cap for each in axes.containers if isinstance(each, ErrorbarContainer) for cap in each[1]}
     lines = [each for each in axes.lines if each not in caps and each.get_transform() is axes.transData]
     curves: list[tuple[np.ndarray, str, bool]]
@@ -208,17 +219,29 @@ def mark_clipped(axes: Axes) -> None:
             (np.asarray(path.vertices), to_hex(np.ravel(color)[:3].tolist()), False) for path in drawn.get_paths()
         ]
     marked: dict[tuple[float, int], list[str]] = {}
+    left, right = axes.get_xlim()
+    figure = axes.get_figure(root=True)
+    assert figure is not None
     for (points, color, filled), sign in itertools.product(curves, (-1, 1)):
         beyond = np.flatnonzero(sign * points[:, 1] > sign * axes.get_ylim()[sign > 0])
         if len(points) > 2 * MOST_POINTS + 3:  # with both sides of a band: then one for each stretch
             stretches = np.split(beyond, np.flatnonzero(np.diff(beyond) > 1) + 1)
             beyond = [each[len(each) // 2] for each in stretches if len(each)]
-        for x in points[beyond, 0].tolist():
+        for x in (x for x in points[beyond, 0].tolist() if left <= x <= right):
             others = marked.setdefault((x, sign), [])
             if color not in others:
-                y, shape = 0.5 + sign * (0.47 - 0.06 * len(others)), "^" if sign > 0 else "v"
-                looks = {"color": color, "markerfacecolor": color if filled else "none", "markersize": 5}
-                axes.plot(x, y, shape, transform=axes.get_xaxis_transform(), zorder=4, **looks)
+                away = ScaledTranslation(0, sign * ARROWHEAD * (0.75 + len(others)) / 72, figure.dpi_scale_trans)
+                looks = {"color": color, "markerfacecolor": color if filled else "none", "markersize": 0.8 * ARROWHEAD}
+                axes.plot(
+                    x, sign > 0, "^" if sign > 0 else "v", transform=axes.get_xaxis_transform() + away, clip_on=False,
+                    markeredgewidth=0.8, **looks,
+                )  # fmt: skip
                 others.append(color)
     if marked:
-        axes.plot([], [], "^", color="0.4", markersize=5, label="beyond the axis (hollow: its interval)")
+        axes.plot([], [], "^", color="0.4", markersize=0.8 * ARROWHEAD, label="beyond the axis (hollow: its interval)")
+    above, below = (max((len(each) for (_, at), each in marked.items() if at == sign), default=0) for sign in (1, -1))
+    for place in ("left", "center"):
+        if above and (title := axes.get_title(place)):
+            axes.set_title(title, loc=place, pad=ARROWHEAD * (above + 0.5), fontsize="medium")
+    if below:
+        axes.tick_params("x", pad=ARROWHEAD * (below + 0.5))
