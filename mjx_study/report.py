@@ -4,6 +4,7 @@ the methods of its Dataset."""
 import base64
 import io
 import json
+import math
 from collections.abc import Mapping
 from typing import Any, Final
 
@@ -13,10 +14,13 @@ import pandas as pd
 import xarray as xr
 from matplotlib.figure import Figure
 
+from estimators.estimator import label_of
+from mjx_study.plots.panels import counted
 from mjx_study.plots.study import plot_study
-from mjx_study.study.findings import findings_of, rows_of
+from mjx_study.study.findings import findings_of, model_name, remains, rows_of
 from mjx_study.study.run import warnings_of
-from mjx_study.study.variables import COORDINATES, QUANTITIES, Variable
+from mjx_study.study.variables import COORDINATES, DEBIASED, QUANTITIES, Variable
+from mjx_study.table import with_error
 
 CAPTIONS: Final = {
     "comparison": "Variance of one gradient sample, and relative error of the mean against the reference.",
@@ -30,14 +34,13 @@ CAPTIONS: Final = {
     "landscape": "Cost along a line through theta, and the slope that the mean of each estimator has there.",
     "descent": "Cost against iterations, rollouts and seconds.",
 }
-MEDIANS: Final = "Medians over the seeds, at the largest sample count."
 ESTIMATED: Final = ("variance", "effective_samples", "top_share", "relative_error", "debiased_error", "squared_bias")
-KINDS: Final[dict[str, tuple[str, str, tuple[str, ...]]]] = {
-    "gradients": ("gradient estimates", MEDIANS, (*ESTIMATED, "squared_bias_se", "alpha", "nonfinite")),
-    "descents": ("gradient descent", MEDIANS, ("final_cost", "stopped_seeds", "variance", "alpha", "nonfinite")),
-    "landscapes": ("landscapes", "At the largest sample count.", ("least_cost", "least_at", "steepest", "nonfinite")),
+KINDS: Final = {
+    "gradients": ("gradient estimates", (*ESTIMATED, "alpha", "nonfinite")),
+    "descents": ("gradient descent", ("final_cost", "stopped_seeds", "variance", "alpha", "nonfinite")),
+    "landscapes": ("landscapes", ("least_cost", "least_at", "steepest", "nonfinite")),
 }
-"""Title, what the numbers in the table are, and the quantities in it, by kind of study."""
+"""Title, and the quantities in the table, by kind of study."""
 PRESENT: Final = ("residual", "rollouts", "unconverged")
 """For every kind of study, a variable that is finite in every computed cell."""
 
@@ -72,7 +75,7 @@ class StudyAccessor:
 
 def render_report(dataset: xr.Dataset) -> str:
     config = json.loads(dataset.attrs["config"])
-    title, summary, names = KINDS[config["kind"]]
+    title, names = KINDS[config["kind"]]
     quantities = {name: QUANTITIES[config["kind"]][name] for name in names}
     pages = jinja2.Environment(loader=jinja2.PackageLoader("mjx_study"), autoescape=True, keep_trailing_newline=True)
     return pages.get_template("report.html").render(
@@ -82,10 +85,10 @@ def render_report(dataset: xr.Dataset) -> str:
         warnings=warnings_of(dataset),
         findings=findings_of(dataset),
         figures=[_figure(name, figure) for name, figure in plot_study(dataset).items()],
-        summary=summary,
+        summary=_summary(dataset),
         numbers=_numbers(dataset, quantities),
         meanings={each.heading: each.description for each in quantities.values()},
-        config=[[key, _shown(value)] for key, value in sorted(config.items()) if value is not None],
+        config=[[key, _shown(value)] for key, value in sorted(config.items()) if value not in (None, [], "")],
         provenance=_provenance(dataset),
         command=dataset.attrs.get("command"),
     )
@@ -99,8 +102,17 @@ def _figure(name: str, figure: Figure) -> tuple[str, str, str]:
     return name, caption, base64.b64encode(file.getvalue()).decode()
 
 
+def _summary(dataset: xr.Dataset) -> str:
+    """What the numbers in the table are."""
+    seeds, samples = dataset.sizes.get("seed", 1), int(dataset["samples"][-1])
+    told = f"Medians over {seeds} seeds, counts summed" if seeds > 1 else "One seed"
+    return (
+        f"{told}; {counted(samples, 'sample')} in a batch; ± one standard error; -: not defined, or explained by noise."
+    )
+
+
 def _numbers(dataset: xr.Dataset, quantities: Mapping[str, Variable]) -> tuple[list[str], list[list[str]]] | None:
-    """Titles of the table of numbers, and a row for each cell and estimator."""
+    """Titles of the table of numbers, and a row for each cell and estimator; what all rows of a cell share, once."""
     if not dataset.data_vars:
         return None
     if "smoothed" in dataset:
@@ -111,14 +123,19 @@ def _numbers(dataset: xr.Dataset, quantities: Mapping[str, Variable]) -> tuple[l
     outer = [name for name in axes[:4] if dataset.sizes[name] > 1]
     shown = {name: variable for name, variable in quantities.items() if name in dataset}
     last = dataset.isel(samples=-1)
-    rows = []
+    labels = [COORDINATES[name].label if name in COORDINATES else name for name in outer]
+    titles = ["contact model", *labels, "estimator", *(variable.heading for variable in shown.values())]
+    shared = [True] * (1 + len(outer)) + [False] + ["estimator" not in each.dims for each in shown.values()]
+    rows, above = [], None
     for picked in np.ndindex(*(dataset.sizes[name] for name in axes)):
         one = last.isel(dict(zip(axes, picked, strict=True)))
         if any(np.isfinite(one[name]).all() for name in PRESENT if name in one):
-            place = [_shown(one[name].item()) for name in ("model", *outer, "estimator")]
-            rows.append([*place, *(_reduced(variable, one[name]) for name, variable in shown.items())])
-    labels = [COORDINATES[name].label if name in COORDINATES else name for name in outer]
-    return ["contact model", *labels, "estimator", *(variable.heading for variable in shown.values())], rows
+            place = [model_name(one), *(_shown(one[name].item()) for name in outer), label_of(one["estimator"].item())]
+            row = [*place, *(_text(name, variable, one) for name, variable in shown.items())]
+            rows.append(["" if picked[:-1] == above and once else cell for cell, once in zip(row, shared, strict=True)])
+            above = picked[:-1]
+    filled = [index for index in range(len(titles)) if any(row[index] not in ("", "-") for row in rows)]
+    return [titles[index] for index in filled], [[row[index] for index in filled] for row in rows]
 
 
 def _with_extremes(dataset: xr.Dataset) -> xr.Dataset:
@@ -126,20 +143,27 @@ def _with_extremes(dataset: xr.Dataset) -> xr.Dataset:
     least = dataset["smoothed"].fillna(np.inf).argmin("point")
     return dataset.assign(
         least_cost=dataset["smoothed"].min("point"),
+        least_cost_se=dataset["smoothed_se"].isel(point=least),
         least_at=dataset["position"].isel(point=least),
         steepest=abs(dataset["slope"]).max("point"),
     )
 
 
-def _reduced(variable: Variable, values: xr.DataArray) -> str:
-    """Reduce to a number: counts to their sum, others to the median over the seeds and the last tenth of iterations."""
-    array = np.asarray(values.values, float)
+def _text(name: str, variable: Variable, one: xr.Dataset) -> str:
+    """Format the sum of counts, the median of other numbers over the seeds and the last tenth of iterations, with its
+    standard error where that of a single number is known."""
+    values, error = one[name], one.get(f"{name}_se")
+    error = math.nan if error is None or error.size > 1 else error.item()
+    if "iteration" in values.dims and variable.digits:
+        values = values.isel(iteration=slice(-max(1, values.sizes["iteration"] // 10), None))
+    array = values.values[np.isfinite(values.values)].astype(float)
+    if len(array) == 0:
+        return "-"
     if variable.digits == 0:
-        return variable.text(float(np.nansum(array)))
-    if "iteration" in values.dims:
-        array = np.moveaxis(array, values.dims.index("iteration"), 0)[-max(1, values.sizes["iteration"] // 10) :]
-    array = array[np.isfinite(array)]
-    return variable.text(float(np.median(array)) if len(array) else None)
+        return variable.text(float(np.sum(array)))
+    if name == DEBIASED["relative_error"]:
+        return remains("relative_error", float(one["relative_error"].median()), float(np.median(array)), error)
+    return with_error(float(np.median(array)), error, variable.digits)
 
 
 def _provenance(dataset: xr.Dataset) -> list[list[str]]:
@@ -153,7 +177,7 @@ def _provenance(dataset: xr.Dataset) -> list[list[str]]:
 
 def _shown(value: Any) -> str:
     if isinstance(value, float):
-        return "-" if np.isnan(value) else f"{value:.4g}"
+        return f"{value:g}"
     if isinstance(value, list):
         return ", ".join(_shown(each) for each in value)
     return str(value)

@@ -2,6 +2,10 @@
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from typing import Final
+
+ROUNDING: Final = 1e-12
+"""Error over the value below which it is one of rounding."""
 
 
 def format_table(rows: Sequence[Sequence[str]], header: Sequence[str]) -> list[str]:
@@ -20,6 +24,25 @@ def number(value: float | None, digits: int = 3) -> str:
         rounded = float(f"{value:.{digits}g}")
         return f"{rounded:.0f}" if abs(rounded) >= 10 ** (digits - 1) else f"{rounded:.{digits}g}"
     mantissa, exponent = f"{value:.{digits - 1 if digits > 3 else 1}e}".split("e")
+    return f"{mantissa}e{int(exponent)}"
+
+
+def with_error(value: float, error: float | None, digits: int = 3) -> str:
+    """Format a number and its error to the error's second digit; the number alone if its error is unknown."""
+    if error is None or not (math.isfinite(value) and math.isfinite(error)):
+        return number(value, digits)
+    if error <= ROUNDING * abs(value):
+        return f"{number(value, digits)} ± 0"
+    decimals = 1 - math.floor(math.log10(error))
+    return f"{_to_decimals(value, decimals)} ± {_to_decimals(error, decimals)}"
+
+
+def _to_decimals(value: float, decimals: int) -> str:
+    """Format to decimals, of which there are fewer than none for large errors."""
+    rounded = round(value, decimals)
+    if rounded == 0 or 1e-4 <= abs(rounded) < 1e6:
+        return f"{rounded:.{max(0, decimals)}f}" if rounded else "0"
+    mantissa, exponent = f"{rounded:.{max(0, decimals + math.floor(math.log10(abs(rounded))))}e}".split("e")
     return f"{mantissa}e{int(exponent)}"
 
 

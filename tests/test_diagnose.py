@@ -248,8 +248,8 @@ def test_nothing_is_advised_or_judged_where_no_gradient_shows(found: Diagnosis) 
     assert text.startswith("no estimator can be advised") and not flags
     page, norm_error = unseen.lines(), 2 / math.sqrt(500)
     assert page[3] == (
-        f"the gradient cannot be told from 0: its norm is 0.1 ± {norm_error:.1g}; --samples 1600 would tell one of 0.1,"
-        " and a larger --sigma may need fewer"
+        f"the gradient cannot be told from 0: its norm is 0.100 ± {norm_error:.3f}; --samples 1600 would tell one of "
+        "0.1, and a larger --sigma may need fewer"
     )
     table = page[page.index("estimators, by their error, in the gradient's unit, after a second of computing") :]
     assert table[2].split()[:4] == ["zobg", "0.20", "0.17", "to"]

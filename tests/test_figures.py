@@ -2,6 +2,7 @@
 
 import ast
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from mjx_study._matplotlib import matplotlib
 from mjx_study.plots.panels import UNSTABLE, counted, number
 from mjx_study.plots.study import MOST_DECADES, plot_study
 from mjx_study.plots.style import STYLE, STYLES, combines, fit_to_paper, mark_clipped
+from mjx_study.report import render_report
 from mjx_study.study.variables import CELL, VARIABLES
 
 OUTER = ("task", "timestep", "cone", "model", "sigma", "samples")
@@ -161,8 +163,9 @@ def test_unstable_steps_are_shown_wherever_the_axis_is_stiffness() -> None:
     shaded = [[patch for patch in axes.patches if patch.get_label() == UNSTABLE] for axes in figure.axes]
     assert [len(each) for each in shaded] == [1, 1, 1, 1]  # two rows: from the limit on; the first of two families
     assert shaded[1][0].get_extents().width > 0 and UNSTABLE in legend_of(figure)
-    handles = dict(zip(legend_of(figure), figure.legends[0].legend_handles, strict=True))
-    assert handles["ZoBG"].get_linestyle() == "-"  # as in the panel of a family, not as single models are drawn
+    assert (
+        figure.legends[0].get_lines()[0].get_linestyle() == "-"
+    )  # as in the panel of a family, not as single models are drawn
     assert not any(text.get_text() == UNSTABLE for axes in figure.axes for text in axes.texts)  # not on the data
     swept = [("penalty", stiffness) for stiffness in (10.0, 100.0, 1e4)]
     chart = plot_study(study("gradients", swept, 3, (0.1, 1.0)))["map_stiffness_sigma"]
@@ -200,6 +203,32 @@ def test_one_stiffness_gives_an_axis_of_families_and_two_are_not_joined() -> Non
         assert all(np.shape(path.vertices) == (2, 2) for each in axes.collections for path in each.get_paths())  # bars
 
 
+def numbers_of(found: xr.Dataset) -> dict[tuple[str, ...], list[list[str]]]:
+    """Headings of the table in a report, and its rows."""
+    page = render_report(found)
+    table = page[page.index("<h2>Numbers") : page.index("<h2>Configuration")]
+    headings = tuple(re.findall(r"<th>(.*?)</th>", table))
+    return {headings: [re.findall(r"<td>(.*?)</td>", row) for row in table.split("\n") if "<td>" in row]}
+
+
+def test_a_report_shows_what_there_is_and_once() -> None:
+    """One number of a cell stands in its first row, and what no estimator has, in none."""
+    config = {"confidence": 0.95, "direction": None, "tasks": ["pusher"], "theta": [], "gamma": 0.0}
+    attrs = {"environment": json.dumps({"versions": {}}), "missing_cells": 0, "mixed_versions": ""}
+    lines = study(
+        "landscapes", [("penalty", 10.0)], smoothed=along("point", *range(41)), smoothed_se=0.0312, slope=-2.0
+    )
+    lines = lines.assign_attrs(attrs | {"config": json.dumps(config | {"kind": "landscapes"})})
+    assert numbers_of(lines) == {
+        ("contact model", "estimator", "least mean cost", "at t", "steepest slope", "nan"): [
+            ["penalty, K = 10 N/m", "ZoBG", "0 ± 0.031", "0", "2", "20"],
+            *(["", name, "", "", "2", "20"] for name in ("FoBG", "AoBG")),
+        ]
+    }
+    page = render_report(lines)
+    assert "<td>gamma</td>" in page and "<td>theta</td>" not in page and "<td>direction</td>" not in page
+
+
 class Both(Estimator):
     """Somebody's own, of two batches."""
 
@@ -220,7 +249,7 @@ def test_an_estimator_of_two_batches_is_hollow_and_dashed_whoever_wrote_it() -> 
         styles = {line.get_label(): line for axes in figure.axes for line in axes.lines}
         assert [styles[each].get_linestyle() for each in labels] == ["--", "-"]
         assert styles[labels[0]].get_markerfacecolor() == "none"
-        assert len({styles[each].get_markevery() for each in labels}) == 2  # at different points
+        assert len({str(styles[each].get_markevery()) for each in labels}) == 2  # at different points
 
 
 @pytest.mark.parametrize("models", [[("penalty", 10.0), ("penalty", 100.0)], [("penalty", 10.0), ("mujoco", 10.0)]])

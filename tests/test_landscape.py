@@ -203,11 +203,11 @@ def test_curves_agree_with_quadrature_and_with_each_other(flown: xr.Dataset) -> 
     exact = curve["exact_slope"].values
     np.testing.assert_allclose(curve["exact_first"], exact, atol=1e-4 * np.abs(exact).max())
     assert float(curve["nonfinite"].sum()) == 0 and float(curve["residual"]) < 1e-8
-    assert label == "mujoco 10000" and "nowhere differs" in findings_of(flown)[1]
+    assert label == "mujoco, K = 10000 N/m" and "nowhere differs" in findings_of(flown)[1]
 
 
 def test_a_reference_that_jumps_is_found_out(flown: xr.Dataset) -> None:
-    assert curves_of(flown)[0][0] == "reference 10000"
+    assert curves_of(flown)[0][0] == "reference, K = 10000 N/m"
     assert "E[FoBG] differs from the mean cost's slope" in findings_of(flown)[0]
     document = json.loads(json.dumps(as_document(flown, curves), allow_nan=False))
     assert len(document["curves"][0]["exact_slope"]) == 5

@@ -87,15 +87,16 @@ def test_a_run_has_its_whole_history(short: xr.Dataset) -> None:
     assert short["sigma"].item() == 0.1
 
 
-def test_a_bound_below_epsilon_is_told() -> None:
+def test_a_weight_of_zero_throughout_is_told() -> None:
     """At the stiffnesses where it holds in all iterations of all seeds, and not of inverse variances, unbounded."""
     few = {"iterations": 2, "seeds": 2, "samples": (4,), "evaluation_samples": 2, "stiffness": (10.0, 30.0)}
     study = on_reference("pusher", **SHORT | few | {"estimators": ("aobg", "ivw")})
     stuck = run_study(dataclasses.replace(study, gamma=1e-9))
     (sentence,) = findings_of(stuck)
     assert sentence == (
-        "reference: AoBG equals ZoBG throughout at K = 10, 30 N/m: its bound gamma is below epsilon, the radius of "
-        "ZoBG's mean; increase --gamma or --samples"
+        "reference: AoBG equals ZoBG throughout at K = 10, 30 N/m: alpha is 0 in every iteration, generally since its "
+        "bound gamma is below epsilon, the radius of ZoBG's mean (then increase --gamma or --samples), else since no "
+        "first-order variance is finite"
     )
     once = stuck["alpha"].where((stuck["stiffness"] != 10) | (stuck["seed"] != 1) | (stuck["iteration"] != 2), 0.1)
     assert "throughout at K = 30 N/m: " in findings_of(stuck.assign(alpha=once))[0]

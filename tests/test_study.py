@@ -388,6 +388,8 @@ def test_doubtful_numbers_are_marked_in_the_table() -> None:
     assert "(0.5 to 2)?" in below
     assert any(line.startswith("?: fewer than 3 effective samples") for line in lines)
     assert not any("?" in line for line in table(result(sure)))
+    nothing = row("fobg", 20, 1, effective_samples=1.2, relative_error=0.3, debiased_error=0.0, debiased_error_se=0.5)
+    assert any("0.3 -> ?  " in line for line in table(result(nothing)))
 
 
 def test_warnings_name_what_must_not_be_overlooked() -> None:
@@ -460,15 +462,35 @@ def test_numbers_are_short(value: float | None, digits: int, shown: str) -> None
 
 
 @pytest.mark.parametrize(
+    ("value", "error", "shown"),
+    [
+        (832.0912, 0.0123, "832.091 ± 0.012"),
+        (-1.42, 0.13, "-1.42 ± 0.13"),
+        (0.00012, 0.0101, "0 ± 0.010"),
+        (-0.009331, 2.14e-5, "-0.009331 ± 2.1e-5"),
+        (39123.4, 37456.0, "39000 ± 37000"),
+        (6.8321e20, 1.2e18, "6.832e20 ± 1.2e18"),
+        (0.5, 0.0, "0.5 ± 0"),
+        (0.5, 1e-17, "0.5 ± 0"),
+        (0.12345, None, "0.123"),
+        (0.12345, math.nan, "0.123"),
+        (math.inf, 1.0, "inf"),
+    ],
+)
+def test_a_number_and_its_error_have_the_same_digits(value: float, error: float | None, shown: str) -> None:
+    assert console.with_error(value, error) == shown
+
+
+@pytest.mark.parametrize(
     ("value", "debiased", "error", "shown"),
     [
         (0.325, 0.298, 0.0098, "0.325 -> 0.2980 ± 0.0098"),
         (7.825, 1.684, 10.088, "7.825 -> 2 ± 10"),
         (0.00047, 0.00031, 0.00012, "4.7e-4 -> 0.00031 ± 0.00012"),
         (0.0043, 0.0, 0.0002, "0.0043 -> < 4.0e-4"),
-        (0.25, 0.0, 0.01, "0.250 -> < 0.02"),
-        (0.25, 0.0, 0.2, "0.250 -> -"),
-        (3.3e4, 240.0, 4.6e4, "3.3e4 -> 240 ± 4.6e4"),
+        (0.25, 0.0, 0.01, "0.25 -> < 0.02"),
+        (0.25, 0.0, 0.2, "0.25 -> -"),
+        (3.3e4, 240.0, 4.6e4, "3.3e4 -> 0 ± 46000"),
     ],
 )
 def test_no_error_is_rounded_to_nothing(value: float, debiased: float, error: float, shown: str) -> None:
@@ -478,7 +500,7 @@ def test_no_error_is_rounded_to_nothing(value: float, debiased: float, error: fl
 
 @pytest.mark.parametrize(
     ("cosine", "error", "shown"),
-    [(0.9, 0.013, "> 0.97"), (0.9, 0.0004, "> 0.9992"), (0.9, 1e-9, "> 0.9999"), (1.0, 0.0, "1.000 -> 1")],
+    [(0.9, 0.013, "> 0.97"), (0.9, 0.0004, "> 0.9992"), (0.9, 1e-9, "> 0.9999"), (1.0, 0.0, "1 -> 1 ± 0")],
 )
 def test_a_bound_of_a_cosine_is_rounded_down(cosine: float, error: float, shown: str) -> None:
     each = row("fobg", 10, 1, cosine=cosine, debiased_cosine=1.0, debiased_cosine_se=error)

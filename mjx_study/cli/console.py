@@ -15,10 +15,10 @@ from estimators import ENOUGH_EFFECTIVE
 from mjx_study.choices import FAMILIES, REFERENCE
 from mjx_study.plots.style import style_of
 from mjx_study.study.configuration import StudyConfig
-from mjx_study.study.findings import Row, curves_of, findings_of, rows_of
+from mjx_study.study.findings import Row, curves_of, findings_of, remains, rows_of
 from mjx_study.study.iteration import REASONS
 from mjx_study.study.variables import COLUMNS, DEBIASED, DETAILS, HISTORY, MARKS, METRIC, QUANTITIES, START
-from mjx_study.table import format_table, number
+from mjx_study.table import format_table, number, with_error
 
 Column = tuple[str, Callable[[Row], str]]
 DESCENT_COLUMNS: Final = ("final_cost", "best_cost", "alpha", "seed_rollouts", "seconds")
@@ -27,37 +27,13 @@ CHOSEN: Final = ("theta", "gamma", "onset", "noise", "baseline", "weights")
 """Options that the header of a table states where they are given."""
 MOST_SHOWN: Final = 3
 """Maximum number of parameters printed."""
-ROUNDING: Final = 1e-12
-"""Spread over the mean below which equal numbers differ by rounding alone."""
-
-
-def _with_error(value: float, error: float) -> str:
-    """Format value and error to the error's second digit, or separately where that takes many characters."""
-    if not (math.isfinite(value) and 0 < error < math.inf):
-        return number(value)
-    if not 1e-4 <= error < 1000:
-        return f"{number(value, 2)} ± {number(error, 2)}"
-    decimals = max(0, 1 - math.floor(math.log10(error)))
-    return f"{value:.{decimals}f} ± {error:.{decimals}f}"
 
 
 def _debiased(row: Row, name: str) -> str:
-    """Format a value and what remains of it without noise: a bound if no error is detected, "-" if noise explains all
-    of it."""
+    """Format a value and what remains of it without noise."""
     value, debiased, error = (getattr(row, each) for each in (name, DEBIASED[name], f"{DEBIASED[name]}_se"))
-    best = 1.0 if name == "cosine" else 0.0
-    plain = f"{value:.3f}" if 0.01 <= abs(value) < 1000 else number(value, 2)
-    if math.isnan(debiased):
-        left = "-"
-    elif debiased == best and 0 < error < math.inf:
-        says_nothing = abs(debiased - value) <= 2 * error
-        decimals = 2 if error >= 0.005 else 4
-        above = best - math.ceil(10**decimals * 2 * error) / 10**decimals
-        bound = f"< {number(2 * error, 2)}" if best == 0 else f"> {above:.{decimals}f}"
-        left = "-" if says_nothing else bound
-    else:
-        left = _with_error(debiased, error)
-    return f"{plain} -> {left}{_doubt(row)}"
+    left, doubt = remains(name, value, debiased, error), _doubt(row)
+    return f"{QUANTITIES['gradients'][name].text(value)} -> {left.removesuffix('-') if doubt else left}{doubt}"
 
 
 def _doubt(row: Row) -> str:
@@ -189,7 +165,7 @@ def curve_lines(dataset: xr.Dataset, document: dict[str, Any]) -> list[str]:
     for label, one in found:
         smoothed, error = one["smoothed"].values, one["smoothed_se"].values
         best = int(np.nanargmin(smoothed)) if np.any(np.isfinite(smoothed)) else 0
-        least = f"{lowest.text(smoothed[best])} ± {number(error[best], 1)}"
+        least = with_error(smoothed[best], error[best], lowest.digits)
         rows.append([label, place.text(one["position"].values[best]), least])
     return [*lines, *format_table(rows, ["contact", place.heading, lowest.heading]), "", *document["findings"]]
 
@@ -245,7 +221,7 @@ def descent_lines(dataset: xr.Dataset, document: dict[str, Any]) -> list[str]:
         f"{config['task']}: {where}; {config['optimizer']}, learning rate {config['learning_rate']:g}{decay}, "
         f"{config['iterations']} iterations",
         f"{config['samples']} samples in each batch, {config['seeds']} seeds from {config['seed']}, "
-        f"sigma {config['sigma']:g}; {start.heading} {start.text(mean)} ± {number(error, 2)}{metrics}",
+        f"sigma {config['sigma']:g}; {start.heading} {with_error(mean, error, start.digits)}{metrics}",
         "",
         *format_table([_row(run) for run in document["runs"]], headings),
     ]
@@ -257,14 +233,14 @@ def descent_lines(dataset: xr.Dataset, document: dict[str, Any]) -> list[str]:
 
 
 def _row(run: dict[str, Any]) -> list[str]:
-    cost, costs = QUANTITIES["descents"]["final_cost"], _finite(run["final_cost"])
+    digits, costs = QUANTITIES["descents"]["final_cost"].digits, _finite(run["final_cost"])
     length = len(run["seconds"])
     weights = _finite([weight for row in run["history"]["alpha"][-max(1, length // 10) :] for weight in row])
     return [
         style_of(run["estimator"])[0],
-        _mean_and_spread(costs, cost.digits),
-        cost.text(float(np.min(costs))) if len(costs) else "nan",
-        *(_mean_and_spread(_finite(values), 3) for values in run["metrics"].values()),
+        _with_spread(np.mean, costs, digits),
+        _with_spread(np.min, costs, digits).partition(" ")[0],
+        *(_with_spread(np.mean, _finite(values), 3) for values in run["metrics"].values()),
         QUANTITIES["descents"]["alpha"].text(float(np.mean(weights))) if len(weights) else "-",
         str(run["rollouts_per_iteration"] * length),
         f"{run['seconds'][-1]:.1f}" if length else "-",
@@ -275,10 +251,8 @@ def _finite(values: list[float | None]) -> np.ndarray:
     return np.array([value for value in values if value is not None and math.isfinite(value)])
 
 
-def _mean_and_spread(values: np.ndarray, digits: int) -> str:
+def _with_spread(of: Callable[[np.ndarray], float], values: np.ndarray, digits: int) -> str:
+    """Format a statistic of values with their standard deviation."""
     if len(values) == 0:
         return "nan"
-    mean, spread = float(np.mean(values)), float(np.std(values, ddof=1)) if len(values) > 1 else None
-    if spread is None:
-        return number(mean, digits)
-    return f"{number(mean, digits)} ± {number(spread if spread > ROUNDING * abs(mean) else 0.0, 2)}"
+    return with_error(float(of(values)), float(np.std(values, ddof=1)) if len(values) > 1 else None, digits)

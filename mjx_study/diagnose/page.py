@@ -16,7 +16,7 @@ from mjx_study.gradcheck.mean import MEANS
 from mjx_study.runtime import environment
 from mjx_study.study.dataset import as_plain
 from mjx_study.study.findings import ERROR_PER_STRENGTH, LEAST_SPREAD, MOST_STRENGTH, NOTABLE_SHARE, linear_error
-from mjx_study.table import format_table
+from mjx_study.table import format_table, with_error
 from mjx_study.tasks.task import Task
 
 FEWEST_SAMPLES: Final = 100
@@ -191,7 +191,7 @@ class Diagnosis(Measurement):
         needed = _round(self.surest.variance * (RESOLVED_SE / self.norm) ** 2).replace(",", "")
         other = "larger" if self.surest.estimator == "zobg" else "smaller"
         return (
-            f"the gradient cannot be told from 0: its norm is {self.surest.norm:.1g} ± {self.norm_error:.1g}; "
+            f"the gradient cannot be told from 0: its norm is {with_error(self.surest.norm, self.norm_error)}; "
             f"--samples {needed} would tell one of {self.norm:.1g}, and a {other} --sigma may need fewer"
         )
 

@@ -87,6 +87,8 @@ def descent(part: xr.Dataset, title: str) -> Figure:
         row[0].set_ylabel(DESCENTS["cost"].label, fontsize="small")
         row[0].set_title(model_title(one), loc="left", fontsize="medium")  # along the row
     labels = ("iteration", DERIVED["seed_rollouts"].label, DESCENTS["seconds"].label, "iteration")
+    for axes in grid.flat:
+        axes.locator_params(axis="x", nbins=5)  # numbers of rollouts are long
     for axes, label in zip(grid[-1], labels, strict=False):
         axes.set_xlabel(label)
     return figure

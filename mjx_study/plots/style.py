@@ -43,8 +43,8 @@ STYLE: Final = {
 }
 """Okabe-Ito colours and four more, distinguishable in print and by colour-blind readers;
 markers repeat the distinction. Black and grey are for what is no estimator's."""
-OTHERS: Final = (("#E69F00", "#56B4E9", "#009E73", "#F0E442", "#0072B2", "#D55E00", "#CC79A7"), "1234+x|_")
-"""Colours and markers for user-defined estimators."""
+OTHERS: Final = (("#882255", "#AA4499", "#332288", "#88CCEE", "#DDCC77", "#661100", "#999933"), "1234+x|_")
+"""Colours, of Tol's muted scheme, and markers for user-defined estimators."""
 NO_CONTACT: Final = 1.0
 """Position of models without a stiffness on a stiffness axis [N/m]."""
 TITLES: Final = {
@@ -112,6 +112,10 @@ def fit_to_paper(figure: Figure) -> None:
     fit_texts(figure)
 
 
+LEGEND: Final = 0.4
+"""Height of a legend for which figures have room [in]; they grow for a higher one."""
+
+
 def legend_below(figure: Figure) -> None:
     """Make one legend for all panels below them, where it hides nothing, in as few rows as fit the width."""
     while figure.legends:
@@ -124,8 +128,14 @@ def legend_below(figure: Figure) -> None:
         columns, place = -(-len(shown) // rows), "outside lower center"
         legend = figure.legend(shown.values(), shown, loc=place, ncols=columns, frameon=False, fontsize="small")
         if columns == 1 or legend.get_window_extent().width <= figure.bbox.width:
+            higher = legend.get_window_extent().height / figure.dpi - LEGEND
+            figure.set_figheight(figure.get_figheight() + max(0.0, higher))
             break
         legend.remove()
+
+
+ROOM: Final = 0.95
+"""Share of its axes or figure that a text may take; its length differs a little between resolutions."""
 
 
 def fit_texts(figure: Figure) -> None:
@@ -140,7 +150,10 @@ def fit_texts(figure: Figure) -> None:
                 (axes.xaxis.label, axes, "width"),
                 (axes.yaxis.label, axes, "height"),
             ]
-        ratios = [(text, getattr(text.get_window_extent(), side) / getattr(of.bbox, side)) for text, of, side in sides]
+        ratios = [
+            (text, getattr(text.get_window_extent(), side) / (ROOM * getattr(of.bbox, side)))
+            for text, of, side in sides
+        ]
         longer = [(text, ratio) for text, ratio in ratios if ratio > 1]
         for text, ratio in longer:
             mend(text, ratio)

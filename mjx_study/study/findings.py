@@ -13,7 +13,7 @@ import xarray as xr
 from estimators import ENOUGH_EFFECTIVE, ESTIMATORS, ORACLES
 from estimators.estimator import label_of
 from mjx_study.study.variables import GRADIENTS, ONSETS
-from mjx_study.table import digits_to_tell_apart
+from mjx_study.table import digits_to_tell_apart, number, with_error
 
 BIASED_P_VALUE: Final = 0.001
 """p-value at which a mean is called biased: the smallest that the test's 999 draws can yield."""
@@ -46,6 +46,11 @@ BELOW, ABOVE, ALIKE = "below ZoBG's", "above ZoBG's", "not told apart from ZoBG'
 UNKNOWN: Final = "undecided (too few effective samples)"
 """Verdicts on FoBG's variance."""
 BOUND: Final = "its bound gamma is below epsilon, the radius of ZoBG's mean; increase --gamma or --samples"
+WEIGHTLESS: Final = (
+    "alpha is 0 in every iteration, generally since its bound gamma is below epsilon, the radius of ZoBG's mean (then "
+    "increase --gamma or --samples), else since no first-order variance is finite"
+)
+"""Why AoBG equals ZoBG: known of a batch, whose epsilon is kept, and supposed of a descent."""
 
 
 class Row(SimpleNamespace):
@@ -103,6 +108,21 @@ def rows_of(dataset: xr.Dataset) -> list[Row]:
     return rows
 
 
+def remains(name: str, value: float, debiased: float, error: float) -> str:
+    """Format what remains of one of `DEBIASED` without noise: a bound if no error is detected, "-" if noise explains
+    all of it, or if nothing is left and the standard error is unknown."""
+    best = 1.0 if name == "cosine" else 0.0
+    if math.isnan(debiased) or (debiased == best and math.isnan(error)):
+        return "-"
+    if not (debiased == best and 0 < error < math.inf):
+        return with_error(debiased, error)
+    if abs(debiased - value) <= 2 * error:
+        return "-"
+    decimals = 2 if error >= 0.005 else 4
+    above = best - math.ceil(10**decimals * 2 * error) / 10**decimals
+    return f"< {number(2 * error, 2)}" if best == 0 else f"> {above:.{decimals}f}"
+
+
 def findings_of(dataset: xr.Dataset) -> list[str]:
     """Return the findings supported by a study's intervals, as sentences; none if no cell is computed."""
     if not dataset.data_vars:
@@ -123,7 +143,7 @@ def _of_gradients(dataset: xr.Dataset) -> list[str]:
 
 
 def _of_descents(dataset: xr.Dataset) -> list[str]:
-    """Report where AoBG's bound keeps the weight of the first-order batch at 0 in all iterations of all seeds."""
+    """Report where the first-order batch of an AoBG with a bound has no weight in any iteration of any seed."""
     if "alpha" not in dataset:
         return []
     gammas, along = gammas_of(dataset), ("iteration", "seed")
@@ -134,7 +154,7 @@ def _of_descents(dataset: xr.Dataset) -> list[str]:
 
     def of(rows: Sequence[Row]) -> list[str]:
         groups = _by(rows, "estimator").items()
-        return [f"{label_of(name)} equals ZoBG throughout{_at(same)}: {BOUND}" for (name,), same in groups]
+        return [f"{label_of(name)} equals ZoBG throughout{_at(same)}: {WEIGHTLESS}" for (name,), same in groups]
 
     return _by_family(dataset, bound, of)
 
@@ -311,7 +331,14 @@ def curves_of(dataset: xr.Dataset) -> list[tuple[str, xr.Dataset]]:
     outer = (*SETTING, "model")
     places = np.ndindex(*(dataset.sizes[name] for name in outer))
     cells = [dataset.isel(dict(zip(outer, place, strict=True))) for place in places]
-    return [(one["model"].item(), one) for one in cells if bool(one["position"].notnull().any())]
+    return [(model_name(one), one) for one in cells if bool(one["position"].notnull().any())]
+
+
+def model_name(one: xr.Dataset) -> str:
+    """Contact family of a part of a study with one contact model, and its stiffness if it has one."""
+    family = one["contact"].item()
+    stiffness = one["model"].item().removeprefix(family)
+    return f"{family}, K ={stiffness} N/m" if stiffness else family
 
 
 def _gap(one: xr.Dataset) -> str:

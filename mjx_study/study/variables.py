@@ -70,7 +70,7 @@ GRADIENTS: Final = {
     "nonfinite": Variable(BATCH, "1", "nonfinite samples, left out", "nan", 0),
     "pooled_error": Variable(EACH, "1", "relative error of the mean over all seeds"),
     "squared_bias": Variable(EACH, "1", "squared bias over the reference's squared norm, unbiased", "squared bias"),
-    "squared_bias_se": Variable(EACH, "1", "standard error of squared_bias", "± (standard error)", 2),
+    "squared_bias_se": Variable(EACH, "1", "standard error of squared_bias"),
     "residual": Variable(EACH, "1", "largest relative residual of the constraint solver", "residual", 2),
     "unconverged": Variable(EACH, "1", "rollouts whose solver residual is too large", digits=0),
     "seconds_per_sample": Variable(EACH, "s", "computing time of one sample, measured; compilation excluded", "ms", 2),
