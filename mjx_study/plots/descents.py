@@ -1,5 +1,6 @@
 """Figures of descents, the costs they reach and their progress, and of landscapes."""
 
+import itertools
 import json
 from typing import Final
 
@@ -41,9 +42,10 @@ def achieved(part: xr.Dataset, title: str) -> Figure | None:
         axes.set_ylim(floor, ceiling)
 
     iterations, seeds = part.sizes["iteration"], counted(part.sizes["seed"], "seed")
+    seeds += " as dots, and the median" if part.sizes["seed"] > 1 else ""
     return against_stiffness(
         part,
-        f"{title}\ncost after {iterations} iterations ({seeds} as dots, and the median)",
+        f"{title}\ncost after {iterations} iterations ({seeds})",
         f"cost above the lowest\nmean, {best:.6g}",
         draw,
     )
@@ -87,8 +89,8 @@ def descent(part: xr.Dataset, title: str) -> Figure:
         row[0].set_ylabel(DESCENTS["cost"].label, fontsize="small")
         row[0].set_title(model_title(one), loc="left", fontsize="medium")  # along the row
     labels = ("iteration", DERIVED["seed_rollouts"].label, DESCENTS["seconds"].label, "iteration")
-    for axes in grid.flat:
-        axes.locator_params(axis="x", nbins=5)  # numbers of rollouts are long
+    for axes, label in zip(grid.flat, itertools.cycle(labels[:columns])):
+        axes.locator_params(axis="x", nbins=5, integer=label != labels[2])  # numbers of rollouts are long
     for axes, label in zip(grid[-1], labels, strict=False):
         axes.set_xlabel(label)
     return figure

@@ -34,8 +34,7 @@ def plot_study(dataset: xr.Dataset) -> dict[str, Figure]:
     def add(kind: str, draw: Callable[[xr.Dataset, str], Figure | None], keep: str = "") -> None:
         for suffix, title, part in itertools.islice(_slices(dataset, keep), MOST_FIGURES):
             if (figure := draw(part, title)) is not None:
-                for axes in figure.axes:
-                    mark_clipped(axes)
+                mark_clipped(figure)
                 legend_below(figure)
                 fit_texts(figure)
                 figures[kind + suffix] = figure

@@ -220,8 +220,21 @@ ARROWHEAD: Final = 5.5
 """Height of an arrowhead with the room around it [points]."""
 
 
-def mark_clipped(axes: Axes) -> None:
-    """Put arrowheads outside the finished axes where curves (filled) and intervals (hollow) continue beyond an edge."""
+def mark_clipped(figure: Figure) -> None:
+    """Put arrowheads outside finished axes where curves (filled) and intervals (hollow) continue beyond an edge, and
+    make room for them."""
+    counts = [_mark(axes, figure) for axes in figure.axes]
+    above, below = (max(each) for each in zip(*counts, strict=True))
+    for axes in figure.axes:
+        for place in ("left", "center"):
+            if above and (title := axes.get_title(place)):
+                axes.set_title(title, loc=place, pad=ARROWHEAD * (above + 0.5), fontsize="medium")
+        if below:
+            axes.tick_params("x", pad=ARROWHEAD * (below + 0.5))
+
+
+def _mark(axes: Axes, figure: Figure) -> tuple[int, int]:
+    """Put arrowheads outside an axes; return how many there are at most above each other, at the top and below."""
     caps = {cap for each in axes.containers if isinstance(each, ErrorbarContainer) for cap in each[1]}
     lines = [each for each in axes.lines if each not in caps and each.get_transform() is axes.transData]
     curves: list[tuple[np.ndarray, str, bool]]
@@ -233,8 +246,6 @@ def mark_clipped(axes: Axes) -> None:
         ]
     marked: dict[tuple[float, int], list[str]] = {}
     left, right = axes.get_xlim()
-    figure = axes.get_figure(root=True)
-    assert figure is not None
     for (points, color, filled), sign in itertools.product(curves, (-1, 1)):
         beyond = np.flatnonzero(sign * points[:, 1] > sign * axes.get_ylim()[sign > 0])
         if len(points) > 2 * MOST_POINTS + 3:  # with both sides of a band: then one for each stretch
@@ -253,8 +264,4 @@ def mark_clipped(axes: Axes) -> None:
     if marked:
         axes.plot([], [], "^", color="0.4", markersize=0.8 * ARROWHEAD, label="beyond the axis (hollow: its interval)")
     above, below = (max((len(each) for (_, at), each in marked.items() if at == sign), default=0) for sign in (1, -1))
-    for place in ("left", "center"):
-        if above and (title := axes.get_title(place)):
-            axes.set_title(title, loc=place, pad=ARROWHEAD * (above + 0.5), fontsize="medium")
-    if below:
-        axes.tick_params("x", pad=ARROWHEAD * (below + 0.5))
+    return above, below
