@@ -224,7 +224,9 @@ def mark_clipped(figure: Figure) -> None:
     """Put arrowheads outside finished axes where curves (filled) and intervals (hollow) continue beyond an edge, and
     make room for them."""
     counts = [_mark(axes, figure) for axes in figure.axes]
-    above, below = (max(each) for each in zip(*counts, strict=True))
+    titled = [axes.get_title() != "" or axes.get_title("left") != "" for axes in figure.axes]
+    above = max((count for (count, _), has in zip(counts, titled, strict=True) if has), default=0)
+    below = max(count for _, count in counts)
     for axes in figure.axes:
         for place in ("left", "center"):
             if above and (title := axes.get_title(place)):
