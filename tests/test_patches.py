@@ -121,7 +121,8 @@ def test_levels_of_a_chain_are_not_fused() -> None:
 
     apart = [each for each in jax.make_jaxpr(places)(data).eqns if each.primitive.name == "optimization_barrier"]
     assert len(apart) == 4
-    np.testing.assert_array_equal(places(data).xpos, mjx.kinematics(mjx.put_model(model), data).xpos)
+    stock = jax.jit(lambda data: mjx.kinematics(mjx.put_model(model), data).xpos)(data)
+    np.testing.assert_allclose(jax.jit(places)(data).xpos, stock, atol=1e-15)
 
 
 def test_other_threads_are_left_alone() -> None:
