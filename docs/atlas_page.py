@@ -20,6 +20,7 @@ from estimators import ENOUGH_EFFECTIVE
 from estimators.confidence import coverage_interval
 from mjx_study.diagnose import SMOOTH_SHARE, WIDTH_RATIO
 from mjx_study.study.findings import ERROR_PER_STRENGTH, LEAST_SPREAD, MOST_STRENGTH
+from mjx_study.table import percent
 
 Table = Any
 """A pandas.DataFrame with a row for each cell; pandas comes without types."""
@@ -218,7 +219,7 @@ def share(right: np.ndarray) -> str:
     if not len(right):
         return "- (0)"
     middle, low, high = coverage_interval(right, 0.95)
-    return f"{middle:.0%} ({low:.0%} to {high:.0%}; {len(right)})"
+    return f"{percent(middle)} ({percent(low)} to {percent(high)}; {len(right)})"
 
 
 def verdicts(part: Table) -> list[Any]:
@@ -491,7 +492,7 @@ def bias_figure(table: Table) -> Figure:
             binned(axes[place + 4], part[group], part.fobg_off, COLOURS[name])
         axes[place + 4].set(xscale="log", xlabel=symbol_of(group), ylim=(-0.03, 1.03))
     axes[0].set_ylabel("relative bias of first order")
-    axes[4].set_ylabel(f"share off by more than {TOLERANCE:.0%}")
+    axes[4].set_ylabel(f"share off by more than {percent(TOLERANCE)}")
     key(figure, COLOURS)
     return figure
 

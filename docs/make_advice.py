@@ -32,6 +32,7 @@ from mjx_study.simulation.contact import contact_model
 from mjx_study.simulation.scene import load_scene
 from mjx_study.study.gradients import reference_of
 from mjx_study.study.sampling import cell_keys, draw_batches
+from mjx_study.table import percent
 from mjx_study.tasks import make_task
 from mjx_study.tasks.mjcf import scene_task
 from mjx_study.tasks.task import Task
@@ -210,7 +211,7 @@ def table(results: list[dict[str, Any]]) -> str:
         share, low, high = coverage_interval(jnp.array(good), 0.95)
         names = ", ".join(f"`{name}`" for name in dict.fromkeys(each["model"] for each in some))
         row = [f"{what}: {names}", len(some), len(some) - len(decided), f"{sum(good)} of {len(good)}"]
-        row += [f"{share:.0%} ({low:.0%} to {high:.0%})", max(each["factor"] for each in decided)]
+        row += [f"{percent(share)} ({percent(low)} to {percent(high)})", max(each["factor"] for each in decided)]
         lines.append(f"| {' | '.join(map(str, row))} |")
     factors = [each["factor"] for each in results]
     within, worst = sum(each <= FACTOR for each in factors), max(factors)

@@ -20,6 +20,7 @@ from estimators import ENOUGH_EFFECTIVE, ESTIMATORS, make_estimator, summarise
 from mjx_study.reference import LinearQuadratic, ReferenceObjective
 from mjx_study.runtime import configure
 from mjx_study.study.findings import DETECTED_SE
+from mjx_study.table import percent
 
 PAGE: Final = Path(__file__).parent / "coverage.md"
 SAMPLES: Final = (10, 50, 400)
@@ -61,7 +62,7 @@ KINDS: Final = {
     "lognormal": Kind(
         lambda key, n: jnp.exp(jax.random.normal(key, (n, PARAMS))) - np.exp(0.5), (np.e - 1) * np.e * PARAMS
     ),
-    f"an event of {RARE:.0%}": Kind(_rare, 1 / RARE - 1),
+    f"an event of {percent(RARE)}": Kind(_rare, 1 / RARE - 1),
 }
 COLUMNS: Final = {
     "mean": "mean ± 1.96 se",
@@ -228,7 +229,7 @@ def weights_rows(samples: int, count: int = 20_000) -> list[list[str]]:
                 means = np.asarray(program(mine))
                 bias = np.linalg.norm(np.mean(means, axis=0) - exact) / np.linalg.norm(exact)
                 errors.append(np.sum(np.var(means, axis=0)))
-                row.append(f"{bias:.1%}")
+                row.append(percent(bias, 1))
             rows.append([*row, f"{errors[1] / errors[0]:.2f}"])
     return rows
 

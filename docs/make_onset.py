@@ -20,6 +20,7 @@ from mjx_study.study.landscapes import Line, Means, grid, means
 from mjx_study.study.resolution import direction_of
 from mjx_study.study.tally import onset_numbers
 from mjx_study.study.variables import ONSETS
+from mjx_study.table import percent
 from mjx_study.tasks import make_task
 from mjx_study.tasks.task import Task
 
@@ -139,7 +140,7 @@ def main() -> None:
         task = task_of("momentum_transfer", timestep)
         for onset in ("linear", "jump"):
             each, _ = measure(task.replace(onset=onset), ANGLES["momentum_transfer"])
-            _print(f"{onset}, {1e3 * timestep:g} ms", [f"{error:.2%}" for error in abs(each.first / each.slope - 1)])
+            _print(f"{onset}, {1e3 * timestep:g} ms", [percent(error, 2) for error in abs(each.first / each.slope - 1)])
 
 
 def _row(name: str, samples: list[np.ndarray]) -> None:

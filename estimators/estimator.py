@@ -120,9 +120,17 @@ def register(estimator: EstimatorClass) -> EstimatorClass:
     return estimator
 
 
-def label_of(name: str) -> str:
-    """Label of an estimator in texts and figures; that of `module:name` is its name."""
-    return (ESTIMATORS[name].label if name in ESTIMATORS else "") or name.rpartition(":")[2]
+def label_of(name: str, onset: str = "none") -> str:
+    """Label of an estimator in texts and figures, with the onset term that its first-order batch has; that of
+    `module:name` is its name."""
+    found = ESTIMATORS.get(name)
+    label = (found.label if found else "") or name.rpartition(":")[2]
+    if onset == "none" or found is None or not any(ORACLES[oracle].order for oracle in found.needs):
+        return label
+    term = "onset" if onset == "linear" else onset
+    if "corrected" in found.needs:
+        return label.replace("onset", term)
+    return f"{label[:-1]}, {term})" if label.endswith(")") else f"{label} ({term})"
 
 
 def find_estimator(name: str | Estimator) -> Estimator | type[Estimator]:

@@ -11,7 +11,7 @@ from collections.abc import Collection, Mapping
 from numbers import Integral, Real
 from typing import Any, ClassVar, Final
 
-from estimators.catalogue import BASELINES, CATALOGUE, DENSITIES, VARIANCE_PROXIES, WEIGHTS, unknown
+from estimators.catalogue import BASELINES, CATALOGUE, DENSITIES, VARIANCE_PROXIES, WEIGHTS, suggestion, unknown
 from mjx_study.choices import CONES, FAMILIES, INTEGRATORS, ONSETS, REFERENCE, SOLVERS
 
 MOST_VALUES: Final = 10_000
@@ -307,6 +307,14 @@ class Checked:
     """
 
     ranges: ClassVar[dict[str, str]] = {}
+
+    def __new__(cls, **given: Any) -> "Checked":
+        """Suggest a name for a misspelt one."""
+        names = [field.name for field in dataclasses.fields(cls)]
+        for name in given:
+            if name not in names:
+                raise TypeError(f"{cls.__name__} has no option {name!r}{suggestion(name, names)}")
+        return super().__new__(cls)
 
     @classmethod
     def option(cls, name: str) -> Option:

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from estimators.estimator import label_of
 from mjx_study.plots.panels import counted
 from mjx_study.plots.study import plot_study
-from mjx_study.study.findings import findings_of, model_name, remains, rows_of
+from mjx_study.study.findings import findings_of, model_name, onset_of, remains, rows_of
 from mjx_study.study.run import warnings_of
 from mjx_study.study.variables import COORDINATES, DEBIASED, QUANTITIES, Variable
 from mjx_study.table import with_error
@@ -61,15 +61,19 @@ class StudyAccessor:
         return self._dataset[short].to_dataframe().reset_index()
 
     def findings(self) -> list[str]:
+        """Return what the study's intervals support, as sentences."""
         return findings_of(self._dataset)
 
     def warnings(self) -> tuple[str, ...]:
+        """Return warnings about contact models, lost samples and missing cells."""
         return warnings_of(self._dataset)
 
     def plot(self) -> dict[str, Figure]:
+        """Draw the figures that the study has data for, by name."""
         return plot_study(self._dataset)
 
     def report(self) -> str:
+        """Return the study as one HTML page."""
         return render_report(self._dataset)
 
 
@@ -130,7 +134,8 @@ def _numbers(dataset: xr.Dataset, quantities: Mapping[str, Variable]) -> tuple[l
     for picked in np.ndindex(*(dataset.sizes[name] for name in axes)):
         one = last.isel(dict(zip(axes, picked, strict=True)))
         if any(np.isfinite(one[name]).all() for name in PRESENT if name in one):
-            place = [model_name(one), *(_shown(one[name].item()) for name in outer), label_of(one["estimator"].item())]
+            label = label_of(one["estimator"].item(), onset_of(dataset))
+            place = [model_name(one), *(_shown(one[name].item()) for name in outer), label]
             row = [*place, *(_text(name, variable, one) for name, variable in shown.items())]
             rows.append(["" if picked[:-1] == above and once else cell for cell, once in zip(row, shared, strict=True)])
             above = picked[:-1]

@@ -46,6 +46,11 @@ def _to_decimals(value: float, decimals: int) -> str:
     return f"{mantissa}e{int(exponent)}"
 
 
+def percent(share: float, digits: int = 0) -> str:
+    """Format a share as a percentage with so many decimals."""
+    return f"{100 * share:.{digits}f} %"
+
+
 def described(meanings: Mapping[str, str]) -> str:
     """Format names with what they mean, a line each."""
     width = max(map(len, meanings))

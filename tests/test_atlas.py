@@ -8,6 +8,7 @@ import pytest
 
 from docs import atlas_page as page
 from docs import make_atlas as atlas
+from mjx_study.table import percent
 
 TABLE = page.read(atlas.RESULTS)
 
@@ -25,7 +26,7 @@ def _off(part: page.Table, verdict: str = "fobg_off") -> tuple[int, int]:
 
 def _share(part: page.Table, verdict: str = "above") -> str:
     yes, decided = _off(part, verdict)
-    return f"{yes / decided:.0%}".replace("%", " %")
+    return percent(yes / decided)
 
 
 def _statements() -> list[str]:

@@ -66,6 +66,6 @@ def test_what_the_page_says_of_its_tables() -> None:
         assert float(row[3]) < 0.06  # rejects at 5 %, whether believable or not
     for row in rows("dimensions"):
         assert float(row[6]) > 0.9 and float(row[10]) > 0.9  # the debiased numbers
-    weights = [[float(cell.strip("%")) for cell in row[3:5]] for row in rows("weights") if row[2] == "10"]
+    weights = [[float(cell.strip(" %")) for cell in row[3:5]] for row in rows("weights") if row[2] == "10"]
     assert max(plugged for plugged, _ in weights) > 4 and max(fitted for _, fitted in weights) < 2
     assert np.mean([float(row[5]) for row in rows("weights")]) > 1

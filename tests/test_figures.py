@@ -220,7 +220,7 @@ def test_a_report_shows_what_there_is_and_once() -> None:
     )
     lines = lines.assign_attrs(attrs | {"config": json.dumps(config | {"kind": "landscapes"})})
     assert numbers_of(lines) == {
-        ("contact model", "estimator", "least mean cost", "at t", "steepest slope", "nan"): [
+        ("contact model", "estimator", "least mean cost", "least at", "steepest slope", "nan"): [
             ["penalty, K = 10 N/m", "ZoBG", "0 ± 0.031", "0", "2", "20"],
             *(["", name, "", "", "2", "20"] for name in ("FoBG", "AoBG")),
         ]

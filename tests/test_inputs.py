@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from estimators import AlphaOrder
 from mjx_study import cli
 from mjx_study.cli import options
 from mjx_study.files import PolicyFile, read_json, read_theta
@@ -51,6 +52,48 @@ BODY = "<worldbody><body><freejoint/><geom size='0.1'/></body></worldbody>"
         ("sweep pusher --sigma 1:10:3000 --output x", "54000 cells are planned, and the limit is 50000: give fewer"),
         ("sweep pusher --timestep 1e-9 --output x", "horizon must be at least 1 and at most 1000000"),
         ("sweep pusher --timestep 1e-3:1e-2:600 --output x", "600 programs are planned, and the limit is 500"),
+        ("compare pusher --max-norm 3", "--max-norm has no effect on zobg, fobg, aobg: omit it, or name one that it "),
+        ("optimise pusher --reference --window 3", "that it acts on: fobg_truncated"),
+        (
+            "landscape pusher --gamma 3",
+            "--gamma has no effect on zobg, fobg: omit it, or name one that it acts on: aobg",
+        ),
+        ("compare pusher --estimators zobg --published", "--published has no effect on zobg: omit it"),
+        ("compare pusher --estimators fobg --baseline none", "--baseline has no effect on fobg: omit it"),
+        ("compare pusher --estimators zobg --onset linear", "--onset has no effect: it changes first-order gradients"),
+        ("compare pusher --estimators fobg_onset --onset linear", "--onset has no effect: it changes first-order "),
+        ("compare double_pendulum --onset jump", "--onset has no effect: it changes first-order gradients through sim"),
+        ("compare pusher --contact reference --backward smooth_onset", "--backward has no effect: it changes first-"),
+        ("compare pusher --backward mujoco_default --backward-stiffness 3", "--backward-stiffness has no effect: no "),
+        (
+            "compare pusher --contact reference --estimators fobg_onset",
+            "fobg_onset corrects gradients through sim",
+        ),
+        ("compare pusher --contact reference --solver cg", "--solver has no effect: nothing is simulated"),
+        ("compare pusher --contact reference --cone pyramidal", "--cone has no effect: nothing that is simulated has"),
+        (
+            "compare pusher --contact reference --damping 3",
+            "takes no damping; omit --damping, or add a family",
+        ),
+        (
+            "compare double_pendulum --stiffness 3",
+            "--stiffness has no effect: no contact model takes one; ",
+        ),
+        ("optimise double_pendulum --reference --stiffness 3", "--stiffness has no effect: no contact model takes one"),
+        ("landscape pusher --contact reference --no-reference", "--no-reference omits --contact reference: omit one"),
+        ("landscape ball_wall --direction 3", "--direction must be random or a parameter's index, 0 to 0; got 3"),
+        ("landscape ball_wall --theta 0.3 --span 0,1", "--theta has one entry, and the line is its range: give --span"),
+        ("sweep pusher --iterations 3 --confidence 0.9 --output x", "--confidence is for gradients: omit it"),
+        ("gradcheck pusher --mean --states 3", "--states is for derivatives of steps: omit it, or --mean"),
+        ("gradcheck pusher --mean --max-norm 3", "--max-norm has no effect on zobg, fobg: omit it, or name one that "),
+        ("gradcheck pusher --mean --estimators zobg --onset linear", "--onset has no effect on these estimators"),
+        ("gradcheck pusher --mean --direction means --span 1,2", "--span is for one path, and --direction means choo"),
+        ("gradcheck pusher --contact mujoco_default --stiffness 3", "contact mujoco_default takes no stiffness; omit"),
+        ("rollout pusher --contact mjcf --stiffness 3", "contact mjcf takes no stiffness; omit --stiffness, or add a "),
+        ("rollout pusher --seed 3", "--seed has an effect only with --noisy, as the initial state is fixed"),
+        ("diagnose pusher --contact mujoco_default --damping 3", "contact mujoco_default takes no damping; omit --dam"),
+        ("compare pusher --accept-versions", "--accept-versions needs a folder for the study: give --output"),
+        ("claims --accept-versions", "--accept-versions needs the folder to resume: give --output"),
     ],
 )
 def test_one_line(
@@ -62,6 +105,31 @@ def test_one_line(
     printed = capsys.readouterr()
     assert says in printed.err and printed.err.count("\n") == 1 and printed.out == ""
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "chosen",
+    [
+        {"tasks": ("pusher", "double_pendulum"), "stiffness": (3.0,), "damping": 1.0},
+        {"tasks": ("double_pendulum", "pusher"), "onset": "linear"},
+        {"contact": ("reference", "penalty"), "backward": ("none", "mujoco"), "backward_stiffness": 3.0},
+        {"contact": ("reference", "penalty"), "estimators": ("fobg_onset",), "damping": 1.0},
+        {"estimators": ("zobg",), "points": 3, "onset": "linear"},  # landscapes have the mean of FoBG all the same
+        {"estimators": (AlphaOrder(gamma=3.0), "ivw"), "weights": "cross_fitted"},
+    ],
+)
+def test_an_option_that_some_cells_read(chosen: dict[str, Any]) -> None:
+    assert plan_study(StudyConfig(**{"tasks": ("pusher",), "horizon": 3} | chosen)).cells
+
+
+def test_a_misspelt_option_of_a_configuration() -> None:
+    with pytest.raises(TypeError, match="^StudyConfig has no option 'estimator'; did you mean estimators?"):
+        StudyConfig(tasks=("pusher",), estimator=("zobg",))  # type: ignore[call-arg]
+
+
+def test_estimators_that_are_objects_have_options_of_their_own() -> None:
+    with pytest.raises(ValueError, match="`gamma` has no effect on aobg: omit it, or name one that it acts on: aobg, "):
+        plan_study(StudyConfig(tasks=("pusher",), horizon=3, estimators=(AlphaOrder(gamma=3.0),), gamma=2.0))
 
 
 def test_the_command_line_names_options_as_flags() -> None:

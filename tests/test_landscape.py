@@ -236,7 +236,7 @@ def test_the_line_goes_through_theta() -> None:
     np.testing.assert_allclose(line.thetas, [[1, 1, 3], [1, 2, 3], [1, 3, 3]])
     (group,) = plan_study(config("pusher", horizon=3, theta=(1.0, 2.0, 3.0), points=3)).groups
     assert group.task.theta.tolist() == [1.0, 2.0, 3.0]
-    with pytest.raises(ValueError, match="theta has one entry, and the line is its range: give `span`"):
+    with pytest.raises(ValueError, match="`theta` has one entry, and the line is its range: give `span` instead"):
         plan_study(config("ball_wall", theta=(1.0,), points=3))
     with pytest.raises(ValueError, match="landscapes need `points`"):
         config("ball_wall")
@@ -291,7 +291,11 @@ def test_the_command_draws_a_task_that_meets_contact(capsys: pytest.CaptureFixtu
 
 def test_the_command_prints_and_writes(drawn: tuple[Path, str], flown: xr.Dataset) -> None:
     folder, printed = drawn
-    assert "where the mean cost is least" in printed and "theta from 0.3 to 1.2 in 5 points" in printed
+    assert (
+        "where the mean cost is least" in printed
+        and "theta from 0.3 to 1.2 rad in 5 points" in printed
+        and "least at theta [rad]" in printed
+    )
     assert {"landscape.pdf", "landscape.png", "study.json"} < {path.name for path in folder.iterdir()}
     assert flown["contact"].values.tolist() == ["reference", "mujoco"] and flown.sizes["point"] == 5
     assert json.loads(flown.attrs["environment"])["precision"] == "float64"

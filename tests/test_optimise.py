@@ -236,9 +236,9 @@ def test_a_diverging_run_keeps_its_history_and_says_why() -> None:
     assert bool(run["cost"].isel(iteration=-1).isnull().all()) and bool(run["cost"].isel(iteration=0).notnull().all())
 
 
-@pytest.mark.parametrize("name", ESTIMATORS)
+@pytest.mark.parametrize("name", [name for name, each in ESTIMATORS.items() if "corrected" not in each.needs])
 def test_every_estimator_optimises(name: str) -> None:
-    changes: dict[str, Any] = {"max_norm": 1e3, "window": 40}
+    changes: dict[str, Any] = {"fobg_clipped": {"max_norm": 1e3}, "fobg_truncated": {"window": 40}}.get(name, {})
     cost = descend(config(estimators=(name,), contact=("reference",), **changes))["cost"]
     assert bool((cost.isel(iteration=-1) < cost.isel(iteration=0)).all())
 

@@ -23,6 +23,7 @@ from estimators import (
     InverseVariance,
     summarise,
 )
+from estimators.estimator import label_of
 from mjx_study import cli, disk
 from mjx_study.cli import console
 from mjx_study.cli.studies import as_document
@@ -244,7 +245,7 @@ def test_findings_follow_the_intervals() -> None:
     (sentence,) = findings_of(result(*rows))
     assert sentence == (
         "penalty: FoBG's variance is below ZoBG's at K = 10 N/m; above ZoBG's at K = 1000 N/m; not told apart from "
-        "ZoBG's at K = 100 N/m (95% intervals)"
+        "ZoBG's at K = 100 N/m (95 % intervals)"
     )
 
 
@@ -254,7 +255,7 @@ def test_no_variance_is_called_less_on_too_few_effective_samples() -> None:
         doubtful = row("fobg", 10, variance, effective_samples=effective, debiased_error_se=0.01)
         (sentence,) = findings_of(result(row("zobg", 10, 100), doubtful))
         assert sentence == (
-            "penalty: FoBG's variance is undecided (too few effective samples) at K = 10 N/m (95% intervals)"
+            "penalty: FoBG's variance is undecided (too few effective samples) at K = 10 N/m (95 % intervals)"
         )
 
 
@@ -263,10 +264,10 @@ def test_bias_is_reported_only_beyond_what_noise_explains() -> None:
     loud = row("fobg", 10, 1, relative_error=0.044, bias_p_value=0.001)
     assert findings_of(result(quiet)) == []
     (sentence,) = findings_of(result(loud))
-    assert sentence == "penalty: FoBG's mean is biased by 4.4% at K = 10 N/m (p <= 0.001)"
+    assert sentence == "penalty: FoBG's mean is biased by 4.4 % at K = 10 N/m (p <= 0.001)"
     mixed = row("aobg", 10, 1, relative_error=16.95, bias_p_value=0.001)
     (sentence,) = findings_of(result(mixed))
-    assert sentence == "penalty: AoBG's mean is biased by 1700% at K = 10 N/m (p <= 0.001)"
+    assert sentence == "penalty: AoBG's mean is biased by 1700 % at K = 10 N/m (p <= 0.001)"
     (sentence,) = findings_of(result(mixed, gamma="inf"))
     assert sentence.endswith("(p <= 0.001): it has no accuracy bound; set one with --gamma")
 
@@ -282,16 +283,40 @@ def test_seeds_are_counted_and_not_repeated() -> None:
     rows = [row("fobg", 10, 1, relative_error=share, bias_p_value=p) for share, p in zip(shares, p_values, strict=True)]
     parts = [result(row("zobg", 10, variance), each) for each, variance in zip(rows, (100, 100, 1), strict=True)]
     assert findings_of(joined("seed", [0, 1, 2], parts)) == [
-        "penalty: FoBG's variance is not told apart from ZoBG's at K = 10 N/m (95% intervals)",
-        "penalty: FoBG's mean is biased by 2.5% at K = 10 N/m in 2 of 3 seeds (p <= 0.001)",
+        "penalty: FoBG's variance is not told apart from ZoBG's at K = 10 N/m (95 % intervals)",
+        "penalty: FoBG's mean is biased by 2.5 % at K = 10 N/m in 2 of 3 seeds (p <= 0.001)",
     ]
     below = joined("seed", [0, 1], parts[:2])
-    assert findings_of(below)[0] == "penalty: FoBG's variance is below ZoBG's at K = 10 N/m (95% intervals)"
+    assert findings_of(below)[0] == "penalty: FoBG's variance is below ZoBG's at K = 10 N/m (95 % intervals)"
 
 
 def test_the_onset_term_is_judged_like_the_rest() -> None:
     (sentence,) = findings_of(result(row("fobg_onset", 10, 1, relative_error=0.044, bias_p_value=0.001)))
-    assert sentence == "penalty: FoBG (onset)'s mean is biased by 4.4% at K = 10 N/m (p <= 0.001)"
+    assert sentence == "penalty: FoBG (onset)'s mean is biased by 4.4 % at K = 10 N/m (p <= 0.001)"
+
+
+@pytest.mark.parametrize(
+    ("name", "onset", "label"),
+    [
+        ("fobg", "none", "FoBG"),
+        ("fobg", "linear", "FoBG (onset)"),
+        ("fobg_onset", "linear", "FoBG (onset)"),
+        ("fobg_clipped", "linear", "FoBG (clipped, onset)"),
+        ("aobg_onset", "jump", "AoBG (jump)"),
+        ("zobg_antithetic", "jump", "ZoBG (antithetic)"),
+        ("mine:Own", "jump", "Own"),
+    ],
+)
+def test_a_label_has_the_onset_term(name: str, onset: str, label: str) -> None:
+    assert label_of(name, onset) == label
+
+
+def test_a_table_and_its_findings_say_that_there_is_an_onset_term() -> None:
+    dataset = result(row("zobg", 10, 100.0), row("fobg", 10, 1.0))
+    dataset.attrs["config"] = json.dumps(json.loads(dataset.attrs["config"]) | {"onset": "linear"})
+    printed = table(dataset)
+    assert any(" FoBG (onset) " in line for line in printed) and any(" ZoBG " in line for line in printed)
+    assert findings_of(dataset)[0].startswith("penalty: FoBG (onset)'s variance is below ZoBG's")
 
 
 def test_an_onset_term_that_is_not_to_be_trusted_is_told() -> None:
@@ -305,7 +330,7 @@ def test_an_onset_term_that_is_not_to_be_trusted_is_told() -> None:
     both = events | {"onset_spread": 0.4, "onset_strength": 0.25}
     assert findings_of(result(row("fobg_onset", 10, 1, **both))) == [narrow]  # narrow noise spoils the jump as much
     (strong,) = findings_of(result(row("fobg_onset", 10, 1, **events | {"onset_strength": 0.25})))
-    assert strong.startswith("penalty: the linear onset term can be off by 12% of what it adds at K = 10 N/m (more at ")
+    assert strong.startswith("penalty: the linear onset term can be off by 12 % of what it adds at K = 10 N/m (")
     (beyond,) = findings_of(result(row("fobg_onset", 10, 1, **events | {"onset_strength": 1.2})))
     assert beyond.startswith("penalty: the linear onset term can leave more than it adds at K = 10 N/m (more at ")
     assert findings_of(result(row("fobg_onset", 10, 1, **events | {"onset_strength": 0.0}))) == []
@@ -315,8 +340,8 @@ def test_noises_are_told_apart() -> None:
     """Not the last one's verdict for all."""
     parts = [result(row("zobg", 10, 100), row("fobg", 10, variance)) for variance in (1, 1e6)]
     quiet, loud = findings_of(joined("sigma", [0.01, 1.0], parts))
-    assert quiet == "sigma 0.01, penalty: FoBG's variance is below ZoBG's at K = 10 N/m (95% intervals)"
-    assert loud == "sigma 1, penalty: FoBG's variance is above ZoBG's at K = 10 N/m (95% intervals)"
+    assert quiet == "sigma 0.01, penalty: FoBG's variance is below ZoBG's at K = 10 N/m (95 % intervals)"
+    assert loud == "sigma 1, penalty: FoBG's variance is above ZoBG's at K = 10 N/m (95 % intervals)"
 
 
 def test_a_bias_beyond_computing_is_no_number() -> None:
@@ -333,7 +358,7 @@ def test_a_result_that_means_nothing_says_so() -> None:
     )
     assert not any("never active" in each for each in findings_of(result(*same[:3], row("fobg", 100, 1.001))))
     (sentence,) = findings_of(result(row("fobg", 10, 1.0, reference_uncertainty=0.25)))
-    assert sentence.startswith("penalty: the reference's own uncertainty exceeds 20% at K = 10 N/m: errors and")
+    assert sentence.startswith("penalty: the reference's own uncertainty exceeds 20 % at K = 10 N/m: errors and")
     (sentence,) = findings_of(result(row("aobg", 10, 1.0, alpha=0.0, epsilon=7.0, discrepancy=1.0), gamma=5.0))
     assert sentence.startswith("penalty: AoBG equals ZoBG at K = 10 N/m: its bound gamma is below epsilon")
     assert findings_of(result(row("aobg", 10, 1.0, alpha=0.3, epsilon=7.0, discrepancy=1.0), gamma=9.0)) == []
@@ -345,7 +370,7 @@ def test_nothing_is_called_biased_on_too_few_effective_samples() -> None:
     few = row("fobg", 10, 1, **loud, effective_samples=1.9)
     (sentence,) = findings_of(result(few))
     assert sentence == (
-        "penalty: FoBG's mean is off by 44% at K = 10 N/m, from bias or lack of rare samples: too few effective "
+        "penalty: FoBG's mean is off by 44 % at K = 10 N/m, from bias or lack of rare samples: too few effective "
         "samples (1.9)"
     )
     equal = row("fobg", 10, 1, **loud | {"bias_p_value": math.nan}, effective_samples=0.0, top_share=math.nan)
@@ -369,11 +394,11 @@ def table(dataset: xr.Dataset, details: bool = True) -> list[str]:
 
 
 def test_the_short_table_says_which_estimator_to_take(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("COLUMNS", "100")
+    monkeypatch.setenv("COLUMNS", "104")
     data = result(row("zobg", 10, 1), row("fobg", 10, 1))
     short, full = table(data, details=False), table(data)
     (heading,) = [line for line in short if "estimator" in line]
-    for name in ("variance (95% interval)", "relative error -> debiased", "alpha", "ms", "variance x s"):
+    for name in ("variance (95 % interval)", "relative error -> debiased", "alpha", "ms/sample", "variance x s"):
         assert name in heading and any(name in line for line in full)
     for name in ("|gradient|", "effective (top)", "cosine -> debiased", "epsilon", "B", "residual", "nan"):
         assert name not in re.split(r"\s{2,}", heading) and any(name in line for line in full)
@@ -383,8 +408,8 @@ def test_doubtful_numbers_are_marked_in_the_table() -> None:
     sure = row("zobg", 10, 1, relative_error=0.325, debiased_error=0.298, debiased_error_se=0.0098)
     lines = table(result(sure, row("fobg", 20, 1, effective_samples=1.2, top_share=0.9)))
     (above,) = [line for line in lines if "0.325 -> 0.2980 ± 0.0098" in line]
-    assert "30 (10%)" in above and "?" not in above
-    (below,) = [line for line in lines if "1.2 (90%)" in line]
+    assert "30 (10 %)" in above and "?" not in above
+    (below,) = [line for line in lines if "1.2 (90 %)" in line]
     assert "(0.5 to 2)?" in below
     assert any(line.startswith("?: fewer than 3 effective samples") for line in lines)
     assert not any("?" in line for line in table(result(sure)))
@@ -531,7 +556,7 @@ def test_a_single_parameter_has_no_cosine() -> None:
     assert headings and not any("cosine" in heading for heading in headings)
 
 
-@pytest.mark.parametrize(("columns", "tables"), [(200, 1), (80, 3)])
+@pytest.mark.parametrize(("columns", "tables"), [(200, 1), (80, 4)])
 def test_the_table_fits_the_terminal(monkeypatch: pytest.MonkeyPatch, columns: int, tables: int) -> None:
     monkeypatch.setenv("COLUMNS", str(columns))
     full = row("aobg", 1000, 6.4e20, alpha=0.5, epsilon=641.0, discrepancy=1.2e11, relative_error=4.1e9)

@@ -14,7 +14,7 @@ threads.
 
 def add(command: Parser) -> None:
     command.add_task_options()
-    command.add_option("samples", 1000)
+    command.add_option("samples", 1000, line="samples in the batch that is timed")
 
 
 def run(options: argparse.Namespace) -> int:

@@ -56,6 +56,8 @@ def run(options: argparse.Namespace) -> int:
         ]
         lines = [f"{each['id']}\n  {each['statement']}\n  {each['quantity']}: {each['criterion']}" for each in listed]
         return print_report(options, {"claims": listed}, lines)
+    if options.accept_versions and options.output is None:
+        raise UsageError("--accept-versions needs the folder to resume: give --output")
     with usage_errors():
         configure_process(options)
         if options.output is not None:

@@ -12,13 +12,13 @@ import numpy as np
 import xarray as xr
 
 from estimators import ENOUGH_EFFECTIVE
+from estimators.estimator import label_of
 from mjx_study.choices import FAMILIES, REFERENCE
-from mjx_study.plots.style import style_of
 from mjx_study.study.configuration import StudyConfig
-from mjx_study.study.findings import Row, curves_of, findings_of, remains, rows_of
+from mjx_study.study.findings import Row, curves_of, findings_of, line_of, onset_of, remains, rows_of
 from mjx_study.study.iteration import REASONS
-from mjx_study.study.variables import COLUMNS, DEBIASED, DETAILS, HISTORY, MARKS, METRIC, QUANTITIES, START
-from mjx_study.table import format_table, number, with_error
+from mjx_study.study.variables import COLUMNS, DEBIASED, DERIVED, DETAILS, HISTORY, MARKS, METRIC, QUANTITIES, START
+from mjx_study.table import format_table, number, percent, with_error
 
 Column = tuple[str, Callable[[Row], str]]
 DESCENT_COLUMNS: Final = ("final_cost", "best_cost", "alpha", "seed_rollouts", "seconds")
@@ -41,7 +41,7 @@ def _doubt(row: Row) -> str:
     return "" if row.believable else "?"
 
 
-def columns(confidence: float, details: bool = False, *, scalar: bool = False) -> list[list[Column]]:
+def columns(confidence: float, onset: str, *, details: bool, scalar: bool) -> list[list[Column]]:
     """Columns of the comparison: those that identify a row, then groups that a table keeps together; a scalar parameter
     has no cosine."""
     quantities = QUANTITIES["gradients"]
@@ -52,11 +52,11 @@ def columns(confidence: float, details: bool = False, *, scalar: bool = False) -
         )
 
     def effective(row: Row) -> str:
-        return number(row.effective_samples, 2) + (f" ({row.top_share:.0%})" if row.effective_samples else "")
+        return number(row.effective_samples, 2) + (f" ({percent(row.top_share)})" if row.effective_samples else "")
 
     own: dict[str, Column] = {
         "stiffness": (f" [{quantities['stiffness'].unit}]", lambda row: number(row.stiffness or None)),
-        "variance": (f" ({confidence:.0%} interval)", interval),
+        "variance": (f" ({percent(confidence)} interval)", interval),
         "effective_samples": (f" ({quantities['top_share'].heading})", effective),
         "seconds_per_sample": ("", lambda row: number(1e3 * row.seconds_per_sample, 2)),
     }
@@ -67,7 +67,7 @@ def columns(confidence: float, details: bool = False, *, scalar: bool = False) -
         more, show = own.get(name, ("", lambda row: variable.text(getattr(row, name))))
         return variable.heading + more, show
 
-    identity = [column("stiffness"), ("estimator", lambda row: style_of(row.estimator)[0])]
+    identity = [column("stiffness"), ("estimator", lambda row: label_of(row.estimator, onset))]
     hidden = () if details and not scalar else ("cosine",) if details else DETAILS
     return [identity, *([column(name) for name in group if name not in hidden] for group in COLUMNS)]
 
@@ -103,7 +103,7 @@ def _chosen(config: dict[str, Any]) -> str:
 def gradient_lines(dataset: xr.Dataset, document: dict[str, Any], details: bool = False) -> list[str]:
     """Format a study of gradients and its document: configuration, a table per contact family, findings."""
     config, rows, lines = document["config"], rows_of(dataset), []
-    shown = columns(config["confidence"], details, scalar=dataset.sizes.get("param") == 1)
+    shown = columns(config["confidence"], onset_of(dataset), details=details, scalar=dataset.sizes.get("param") == 1)
     for resolved, task in zip(document["resolved"], dataset["task"].values.tolist(), strict=True):
         lines.append(
             f"{task}: {', '.join(map(str, config['samples']))} samples in each batch, "
@@ -152,22 +152,25 @@ def curves(dataset: xr.Dataset) -> dict[str, Any]:
 def curve_lines(dataset: xr.Dataset, document: dict[str, Any]) -> list[str]:
     config, found = document["config"], curves_of(dataset)
     low, high = found[0][1]["position"].values[[0, -1]]
-    where = f"t, along direction {config['direction'] or 'random'}," if dataset.attrs["many_parameters"] else "theta"
+    name, unit = line_of(dataset)
+    where = f"t in theta + t d (d: {config['direction'] or 'random'})" if name == "t" else name
     samples, sigmas = ([f"{value:g}" for value in dataset[name].values] for name in ("samples", "sigma"))
     lines = [
-        f"{', '.join(config['tasks'])}: {where} from {low:.3g} to {high:.3g} in {config['points']} points, "
-        f"sigma {', '.join(sigmas)},",
-        f"{', '.join(samples)} samples at each, seed {config['seed']}, {document['environment']['precision']}",
+        f"{', '.join(config['tasks'])}: {where} from {low:.3g} to {high:.3g}{f' {unit}' if unit else ''} in "
+        f"{config['points']} points, sigma {', '.join(sigmas)},",
+        f"{', '.join(samples)} samples at each, seed {config['seed']}, {document['environment']['precision']}"
+        f"{_chosen(config)}",
         "",
         "where the mean cost is least on the line:",
     ]
-    rows, place, lowest = [], *(QUANTITIES["landscapes"][name] for name in ("least_at", "least_cost"))
+    rows, place, lowest = [], *(DERIVED[each] for each in ("least_at", "least_cost"))
     for label, one in found:
         smoothed, error = one["smoothed"].values, one["smoothed_se"].values
         best = int(np.nanargmin(smoothed)) if np.any(np.isfinite(smoothed)) else 0
         least = with_error(smoothed[best], error[best], lowest.digits)
         rows.append([label, place.text(one["position"].values[best]), least])
-    return [*lines, *format_table(rows, ["contact", place.heading, lowest.heading]), "", *document["findings"]]
+    headings = ["contact", f"{place.heading} {name}" + (f" [{unit}]" if unit else ""), lowest.heading]
+    return [*lines, *format_table(rows, headings), "", *document["findings"]]
 
 
 def descents(dataset: xr.Dataset) -> dict[str, Any]:
@@ -208,7 +211,7 @@ def _run(one: xr.Dataset) -> dict[str, Any]:
 
 
 def descent_lines(dataset: xr.Dataset, document: dict[str, Any]) -> list[str]:
-    config = document["config"]
+    config, onset = document["config"], onset_of(dataset)
     where = "analytic reference" if config["contact"] == REFERENCE else config["contact"]
     if config["contact"] != REFERENCE and config["stiffness"]:
         where = f"{where}, K = {config['stiffness']:g} N/m"
@@ -223,27 +226,27 @@ def descent_lines(dataset: xr.Dataset, document: dict[str, Any]) -> list[str]:
         f"{config['samples']} samples in each batch, {config['seeds']} seeds from {config['seed']}, "
         f"sigma {config['sigma']:g}; {start.heading} {with_error(mean, error, start.digits)}{metrics}",
         "",
-        *format_table([_row(run) for run in document["runs"]], headings),
+        *format_table([_row(run, onset) for run in document["runs"]], headings),
     ]
     for run in document["runs"]:
         for stop in run["stopped"]:
-            label, _, _ = style_of(run["estimator"])
+            label = label_of(run["estimator"], onset)
             lines.append(f"{label}, seed {stop['seed']}: stopped at iteration {stop['iteration']}, {stop['reason']}")
     return lines + [f"{sentence}." for sentence in document["findings"]]
 
 
-def _row(run: dict[str, Any]) -> list[str]:
+def _row(run: dict[str, Any], onset: str) -> list[str]:
     digits, costs = QUANTITIES["descents"]["final_cost"].digits, _finite(run["final_cost"])
     length = len(run["seconds"])
     weights = _finite([weight for row in run["history"]["alpha"][-max(1, length // 10) :] for weight in row])
     return [
-        style_of(run["estimator"])[0],
+        label_of(run["estimator"], onset),
         _with_spread(np.mean, costs, digits),
         _with_spread(np.min, costs, digits).partition(" ")[0],
         *(_with_spread(np.mean, _finite(values), 3) for values in run["metrics"].values()),
         QUANTITIES["descents"]["alpha"].text(float(np.mean(weights))) if len(weights) else "-",
         str(run["rollouts_per_iteration"] * length),
-        f"{run['seconds'][-1]:.1f}" if length else "-",
+        number(run["seconds"][-1], 2) if length else "-",
     ]
 
 

@@ -7,21 +7,19 @@ from mjx_study.choices import FAMILIES, is_file
 from mjx_study.cli.options import TASK_OPTIONS, Parser, configure_process, given_options, task_of, usage_errors
 from mjx_study.cli.output import computing, print_report
 from mjx_study.option import OPTIONS
+from mjx_study.study.variables import explained
 
-EPILOG = """\
+EPILOG = f"""\
 examples:
   mjx-study diagnose momentum_transfer --contact mujoco_default
   mjx-study diagnose robot.xml                 no cost is needed: one is made from the bodies' positions
 
-columns of the contacts:
-  h b, h^2 k     damping and stiffness of the contact over one step h; the step is unstable if h^2 k >= 4 - 2 h b
-  h v / width    travel per step over the depth over which the impedance rises
-  impedance      at first touch: 0 is a smooth onset; MuJoCo's default, 0.9, is a jump, which biases first order
+columns of the contacts and of the estimators:
+{explained("diagnosis")}
 
-The error after a second of computing is that of a gradient from as many samples as this machine computes in a second:
-bias and standard deviation combined, relative to the gradient. "mean" says whether an estimator's mean integrates to
-the difference of the mean cost along a path, as in gradcheck --mean: right within 5 %, off by the stated amount, or
-undecided. At least 23 samples are drawn, whatever --samples. Exit code 1 if a derivative is wrong.
+The error is that of a gradient from as many samples as this machine computes in a second. Means are checked along
+paths, as in gradcheck --mean, and so is the bias. At least 23 samples are drawn, whatever --samples. Exit code 1 if a
+derivative is wrong.
 """
 
 

@@ -7,11 +7,12 @@ from mjx_study.choices import CHECKED_STATES, CHECKED_STEPS, CHECKED_STIFFNESS, 
 from mjx_study.cli.options import Parser, UsageError, configure_process, given_options, task_of, usage_errors
 from mjx_study.cli.output import computing, print_report
 from mjx_study.option import OPTIONS, Option
+from mjx_study.study.variables import explained
 
 UNEXERCISED = 3
 """Exit code if nothing is wrong but something was never exercised."""
 PAIR = Option("pair", str, "GEOM,GEOM", "for files: pair of geoms that the stiffness is for", many=True)
-EPILOG = """\
+EPILOG = f"""\
 Columns, all relative errors, each the worst over the states:
   modes        reverse mode against forward mode
   differences  derivatives with respect to state and control, against central differences
@@ -34,9 +35,8 @@ can reach was never exercised. Kinks and jumps are properties of the step, and d
 derivative errors: both are reported but do not fail.
 
 With --mean: does an estimator's mean integrate to the difference of the mean cost along a path through theta? No
-reference gradient is needed. Columns: that difference; the integral minus it (the gap), the half-width of its 99.9 %
-interval, and the quadrature's part of that; the gap as a share of the difference, and the smallest share certain to be
-detected. "Right" is within 5 %. Exit code 0: all are right. 1: one is biased. 3: undecided, too few samples.
+reference gradient is needed. Exit code 0: all are right. 1: one is biased. 3: undecided. Columns:
+{explained("means")}
 """
 MEAN = {
     "estimators": ("zobg", "fobg"),
@@ -49,12 +49,15 @@ MEAN = {
     "window": None,
 }
 """Options of --mean, with their defaults."""
+OF_DERIVATIVES = {"states": CHECKED_STATES, "stock": False, "pair": None, "details": False}
+"""Options that --mean does not read, with their defaults."""
 
 
 def add(command: Parser) -> None:
     command.add_task_argument()
     usual = ",".join(f"{each:g}" for each in CHECKED_STIFFNESS)
-    command.add_contact_options(f"{usual}, or the task's if stiffer", analytic=False)
+    families = "penalty,mujoco,mujoco_default; mjcf without contact_pair, as for a file"
+    command.add_contact_options(f"{usual}, or the task's if stiffer", families, analytic=False)
     command.add_option(PAIR)
     command.add_builder_options(horizon={"unset": f"the task's; {CHECKED_STEPS} for a file"})
     command.add_option("states", CHECKED_STATES)
@@ -62,12 +65,14 @@ def add(command: Parser) -> None:
     command.add_flag("--mean", "check the means of estimators instead of derivatives")
     changes: dict[str, dict[str, Any]] = {
         "estimators": {"many": True},
-        "span": {"many": True, "unset": "two sigma about theta"},
+        "span": {"many": True, "line": "range of the path", "unset": "two sigma about theta"},
+        "samples": {"line": "samples at each node of the path"},
     }
     for name, default in MEAN.items():
         more = "; or means: three paths that the means span" if name == "direction" else ""
-        line = f"with --mean: {OPTIONS[name].line}{more}"
-        command.add_option(name, default, given=False, line=line, **changes.get(name, {}))
+        own = changes.get(name, {})
+        own["line"] = f"with --mean: {own.get('line', OPTIONS[name].line)}{more}"
+        command.add_option(name, default, given=False, **own)
     command.add_flag("--details", "print every entry of every finding")
     command.add_process_options()
 
@@ -77,6 +82,8 @@ def run(options: argparse.Namespace) -> int:
     from mjx_study.gradcheck import gradcheck, plan_gradcheck, plan_scene_gradcheck
 
     if options.mean:
+        if given := [name for name, default in OF_DERIVATIVES.items() if getattr(options, name) != default]:
+            raise UsageError(f"--{given[0]} is for derivatives of steps: omit it, or --mean")
         return _run_mean(options)
     if given := given_options(options, *MEAN):
         raise UsageError(f"{OPTIONS[next(iter(given))].flag} is for --mean")
@@ -101,8 +108,10 @@ def run(options: argparse.Namespace) -> int:
 
 def _run_mean(options: argparse.Namespace) -> int:
     from estimators import make_estimator
+    from mjx_study.diagnose.setting import setting_of
     from mjx_study.gradcheck import check_mean, plan_gradcheck
-    from mjx_study.gradcheck.mean import lines_of
+    from mjx_study.gradcheck.mean import ALONG_MEANS, lines_of, path_of
+    from mjx_study.study.effect import reads_onset, refuse_unread
     from mjx_study.study.resolution import check_estimators
 
     chosen = MEAN | given_options(options, *MEAN)
@@ -114,10 +123,25 @@ def _run_mean(options: argparse.Namespace) -> int:
         settings |= {"gamma": task.defaults.gamma, "sigma": task.sigma}
         found = [make_estimator(name, **settings) for name in chosen["estimators"]]
         check_estimators(found, task)
+        refuse_unread(chosen["estimators"], given_options(options, "max_norm", "window"))
+        if options.onset not in (None, "none") and not reads_onset(chosen["estimators"], options.onset):
+            raise UsageError("--onset has no effect on these estimators: add fobg")
+        if options.span is not None and options.direction == ALONG_MEANS:
+            raise UsageError("--span is for one path, and --direction means chooses its own: omit one of them")
     given = {name: chosen[name] for name in ("samples", "span", "direction")} | {"names": chosen["estimators"]}
     with computing() as progress:
         checks = check_mean(task, plan.cells, found, seed=options.seed, progress=progress, **given)
     document = {"checks": [each.as_dict() for each in checks], "warnings": list(plan.warnings)}
-    print_report(options, document, [*lines_of(checks), *(f"warning: {text}" for text in plan.warnings)])
+    onset, table = chosen["onset"], lines_of(checks, chosen["onset"])
+    lines = [
+        f"{options.task}: {chosen['samples']} samples at each node of the path, seed {options.seed}, float64"
+        f"{'' if onset == 'none' else f', onset {onset}'}",
+        setting_of(options.task, task).line(),
+        path_of(task, chosen["span"], chosen["direction"]),
+        "",
+        *table,
+        *(f"warning: {text}" for text in plan.warnings),
+    ]
+    print_report(options, document, lines)
     verdicts = {each.verdict for each in checks}
     return 1 if "biased" in verdicts else UNEXERCISED if "undecided" in verdicts else 0

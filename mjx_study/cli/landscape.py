@@ -6,12 +6,16 @@ from mjx_study.choices import REFERENCE
 from mjx_study.cli.options import Parser, given_options
 from mjx_study.option import BUILDER_OPTIONS
 from mjx_study.study.configuration import StudyConfig, takes_stiffness
+from mjx_study.study.variables import explained
 
-EPILOG = """\
+EPILOG = f"""\
 examples:
   mjx-study landscape ball_wall --output out             the whole range of launch angles, reference and MJX
   mjx-study landscape momentum_transfer --contact penalty,mujoco_default --stiffness 3000,100000
   mjx-study landscape pusher --direction 0 --span=-2,2   the first of 200 forces
+
+columns of the table, which shows where the mean cost is least on the line:
+{explained("landscapes", "least_at", "least_cost")}
 
 The figure shows costs above, and slopes below, with 95 % bands. Where the mean cost with noise has a slope that the
 mean of FoBG lacks, the cost jumps: first-order gradients do not see jumps.
@@ -48,6 +52,8 @@ def run(options: argparse.Namespace) -> int:
         fields = study_fields(options)
         task = task_with_options(options.task, given_options(options, *BUILDER_OPTIONS))
         fields.setdefault("contact", task.defaults.families)
+        if options.no_reference and REFERENCE in fields["contact"]:
+            raise ValueError(f"--no-reference omits --contact {REFERENCE}: omit one of them")
         if not options.no_reference and task.reference is not None and fields.get("onset", "none") == "none":
             fields["contact"] = tuple(dict.fromkeys((REFERENCE, *fields["contact"]))) if fields["contact"] else ()
         if takes_stiffness(fields["contact"]):

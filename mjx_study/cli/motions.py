@@ -29,6 +29,7 @@ from mjx_study.option import BUILDER_OPTIONS, SCENE_OPTIONS, as_arguments
 from mjx_study.plots.style import save_figure
 from mjx_study.render import Motion, RenderError, animate, check_format, resolve_renderer, strip, stroboscope
 from mjx_study.simulation.scene import load_model
+from mjx_study.study.configuration import refuse_untaken
 from mjx_study.study.resolution import at_theta
 from mjx_study.table import format_table, number
 from mjx_study.tasks.contact_grid import ContactPoint, family_grid
@@ -88,7 +89,7 @@ def run_rollout(options: argparse.Namespace) -> int:
 
 def _plan_file(options: argparse.Namespace) -> tuple[Callable[[], Rollout], tuple[str, ...]]:
     """Return a function that runs the requested simulation, and warnings."""
-    unfit = ("contact", "stiffness", "damping", "noisy", "sigma", "theta", "model")
+    unfit = ("contact", "stiffness", "damping", "noisy", "sigma", "theta", "model", "seed")
     given = [f"--{name}" for name in unfit if getattr(options, name) not in (None, False)]
     if given:
         raise ValueError(f"{', '.join(given)}: only for a task; {options.task} moves as its MJCF says")
@@ -99,6 +100,7 @@ def _plan_file(options: argparse.Namespace) -> tuple[Callable[[], Rollout], tupl
 
 
 def _plan_task(options: argparse.Namespace) -> tuple[Callable[[], Rollout], tuple[str, ...]]:
+    given = {name: getattr(options, name) for name in ("stiffness", "damping")}
     theta, policy = theta_and_policy(options)
     if policy is not None:
         for name in ("contact", "stiffness", "damping", "timestep", *BUILDER_OPTIONS):
@@ -110,8 +112,12 @@ def _plan_task(options: argparse.Namespace) -> tuple[Callable[[], Rollout], tupl
         task = task_of(options)
     if policy is not None and policy.network is not None:
         task = with_network(task, tuple(policy.network), jax.random.key(0))  # theta replaces its weights
+    if options.seed and not (options.noisy or task.random_start):
+        raise ValueError("--seed has an effect only with --noisy, as the initial state is fixed")
     stiffness = task.defaults.middle_stiffness if options.stiffness is None else options.stiffness
-    cells, messages = family_grid(task, (options.contact or task.defaults.main_family,), (stiffness,), options.damping)
+    families = (options.contact or task.defaults.main_family,)
+    refuse_untaken(families, **given)
+    cells, messages = family_grid(task, families, (stiffness,), options.damping)
     return partial(_simulate_task, at_theta(task, theta), cells[0], options.seed, options.noisy), messages
 
 

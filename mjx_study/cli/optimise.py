@@ -43,7 +43,7 @@ def add(command: Parser) -> None:
     command.add_contact_options("the middle one of the task's sweep", many=False)
     command.add_flag("--reference", "use the analytic reference instead of MJX")
     command.add_fields("network", "estimators", "iterations", "samples", samples={"many": False})
-    command.add_option("seeds", 3)
+    command.add_option("seeds", 3, line="number of descents, each with noise of its own")
     command.add_fields("optimizer", "learning_rate", "decay", "stiffness_schedule", "sigma_schedule")
     command.add_estimator_options()
     command.add_backward_options(many=False)

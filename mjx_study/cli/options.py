@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final, NoReturn
 
 from estimators.catalogue import suggestion, unknown
 from mjx_study.choices import FAMILIES, PRECISIONS, TASK_DESCRIPTIONS, unknown_task
-from mjx_study.option import BUILDER_OPTIONS, CONTACTS, OPTIONS, Option
+from mjx_study.option import BUILDER_OPTIONS, CONTACTS, OPTIONS, TASKS, Option
 from mjx_study.study.configuration import StudyConfig
 
 if TYPE_CHECKING:
@@ -138,11 +138,11 @@ class Parser(argparse.ArgumentParser):
         self.add_argument("--theta", metavar="FILE|X[,X]", help=f"{purpose}: {numbers}")
 
     def add_contact_options(
-        self, stiffness: str = "the task's sweep", *, many: bool = True, analytic: bool = True
+        self, stiffness: str = "the task's sweep", contact: str = TASKS, *, many: bool = True, analytic: bool = True
     ) -> None:
         """Add the contact models: one or many, with or without the analytic reference."""
         self.add_option("stiffness", many=many, unset=stiffness)
-        self.add_option("contact", many=many, choices=CONTACTS if analytic else tuple(FAMILIES))
+        self.add_option("contact", many=many, unset=contact, choices=CONTACTS if analytic else tuple(FAMILIES))
         self.add_option("damping")
 
     def add_estimator_options(self) -> None:

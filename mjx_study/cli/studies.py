@@ -85,8 +85,9 @@ def run_one(
 def _compute(plan: StudyPlan, options: argparse.Namespace) -> tuple[xr.Dataset, str | None]:
     """Run a study, in its folder if one is given; a full disk costs no number, and its reason is returned as well."""
     if options.output is None:
-        if getattr(options, "cluster", None) is not None:
-            raise UsageError("--cluster needs a folder for the study: give --output")
+        for name in ("cluster", "accept_versions"):
+            if getattr(options, name, None):
+                raise UsageError(f"--{name.replace('_', '-')} needs a folder for the study: give --output")
         with computing() as progress:
             return run_study(plan, progress=progress), None
     dataset = _compute_in(_store(plan, options), plan, options, keep_going=True)

@@ -48,7 +48,14 @@ def add(command: Parser) -> None:
     command.add_option("solref", read=solref)
     command.add_option("solimp", read=solimp)
     command.add_fields("timestep", "cone", "sigma", "samples")
-    command.add_fields("seeds", "estimators", "kind", "network", "confidence", seeds={"unset": "10; 1 for landscapes"})
+    command.add_fields(
+        "seeds",
+        "estimators",
+        "kind",
+        "network",
+        "confidence",
+        seeds={"line": "batches for each cell, or descents", "unset": "10; 1 for landscapes"},
+    )
     command.add_fields("iterations", iterations={"line": "optimise policies, N iterations", "unset": ""})
     command.add_fields("points", points={"line": "landscapes, at N points of a line through theta"})
     command.add_fields("span", "direction", "optimizer", "learning_rate", "decay")

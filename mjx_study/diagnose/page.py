@@ -12,13 +12,17 @@ from mjx_study.diagnose.measurement import RESOLVED_SE, SAMPLES, TARGET_ERROR, M
 from mjx_study.diagnose.setting import Setting, Touch
 from mjx_study.gradcheck import GradcheckReport
 from mjx_study.gradcheck.diagnosis import MEANING
-from mjx_study.gradcheck.mean import MEANS
+from mjx_study.gradcheck.mean import ALONG_MEANS
 from mjx_study.runtime import environment
 from mjx_study.study.dataset import as_plain
 from mjx_study.study.findings import ERROR_PER_STRENGTH, LEAST_SPREAD, MOST_STRENGTH, NOTABLE_SHARE, linear_error
-from mjx_study.table import format_table, with_error
+from mjx_study.study.variables import DIAGNOSIS
+from mjx_study.table import format_table, percent, with_error
 from mjx_study.tasks.task import Task
 
+OF_CONTACT: Final = ("time", "speed", "damping", "stiffness", "travel", "impedance", "stable")
+OF_ESTIMATOR: Final = ("error", "interval", "mean", "seconds")
+"""Columns of the two tables, in `DIAGNOSIS`."""
 FEWEST_SAMPLES: Final = 100
 """Number of samples below which the page warns."""
 SMOOTH_SHARE: Final = 0.01
@@ -112,7 +116,7 @@ class Diagnosis(Measurement):
         batch = f"--estimators {','.join(each.estimator for each in self.estimators)} --samples {self.samples}"
         error = "relative error" if self.resolved else "error, in the gradient's unit,"
         lines += ["", f"estimators, by their {error} after a second of computing", *self._estimator_lines()]
-        lines += [f"  > {command.format('gradcheck')} --mean --direction {MEANS} {batch}"]
+        lines += [f"  > {command.format('gradcheck')} --mean --direction {ALONG_MEANS} {batch}"]
         lines += [f"  > {command.format('compare')} {batch}"]
         lines += ["", "advice"]
         for text, flags in self._advice():
@@ -126,12 +130,12 @@ class Diagnosis(Measurement):
         if found:
             lines += [
                 f"  step at which the first begins: standard deviation {self.onsets['onset_spread']:.2g}",
-                f"  approach speed that a contact takes in its first step: {self.onsets['onset_strength']:.0%}",
+                f"  approach speed that a contact takes in its first step: {percent(self.onsets['onset_strength'])}",
             ]
         if not self.touches:
             return [*lines, "  contacts that begin in the rollout without noise: 0"]
         worst = sorted(self.touches, key=lambda each: (each.stable, -each.jump, -each.travel))
-        header = ["  without noise", "t [s]", "v [m/s]", "h b", "h^2 k", "h v / width", "impedance", "step"]
+        header = ["  without noise", *(DIAGNOSIS[name].heading for name in OF_CONTACT)]
         rows = [
             [
                 f"  {each.pair}",
@@ -162,7 +166,7 @@ class Diagnosis(Measurement):
                     f"{1e3 * each.seconds:.3g}",
                 ]
             )
-        return [*format_table(rows, ["  estimator", "error", "95 % interval", "mean", "ms a sample"]), LEGEND]
+        return [*format_table(rows, ["  estimator", *(DIAGNOSIS[name].heading for name in OF_ESTIMATOR)]), LEGEND]
 
     @property
     def _scale(self) -> float:
@@ -179,7 +183,7 @@ class Diagnosis(Measurement):
         size = float(f"{error * (100 if self.resolved else 1):.{1 if unsure > ONE_DIGIT_UNCERTAINTY else 2}g}")
         decimals = 1 - math.floor(math.log10(size)) - (unsure > ONE_DIGIT_UNCERTAINTY) if size > 0 else 0
         text = f"{size:.{max(decimals, 0)}f}" if -6 < decimals < 6 else f"{size:g}"
-        return f"{text}{'%' if self.resolved else ''}"
+        return f"{text}{' %' if self.resolved else ''}"
 
     def _bias(self, estimator: Measured) -> str:
         return self._shown(estimator.bias / self._scale, math.hypot(estimator.bias_error, self._unsure))
@@ -203,18 +207,21 @@ class Diagnosis(Measurement):
     def _cautions(self) -> Iterator[str]:
         """Caveats about the numbers on the page."""
         if self.lost:
-            yield f"{self.lost} samples are not finite and were left out"
+            yield f"{self.lost} samples are not finite and were left out: a smaller --timestep or --sigma may help"
         if self.unconverged:
             yield (
                 f"in {self.unconverged} rollouts the contact solver did not converge: their derivatives are not those "
                 "of what is simulated; raise --solver-iterations and --solver-ls-iterations"
             )
         if unstable := [each for each in self.touches if not each.stable]:
-            yield f"the step in contact is unstable: {unstable[0].pair}, h^2 k = {unstable[0].stiffness:.2g}"
+            yield (
+                f"the step in contact is unstable: {unstable[0].pair}, h^2 k = {unstable[0].stiffness:.2g}; take a "
+                "smaller --timestep or a softer contact"
+            )
         if self.samples < FEWEST_SAMPLES:
             yield f"{self.samples} samples are few: --samples {SAMPLES} takes longer and says more"
         if self.best.verdict == "undecided" and self.resolved:
-            yield f"the mean of {self.best.estimator} could not be judged with {self.samples} samples"
+            yield f"the mean of {self.best.estimator} could not be judged with {self.samples} samples: take more"
         if not self.derivatives.passed:
             yield "derivatives of a step are not right (see below): do not trust a first-order estimate"
 
@@ -222,34 +229,42 @@ class Diagnosis(Measurement):
         """Recommendations, each with options of `compare` that demonstrate it."""
         by_name, timestep = {each.estimator: each for each in self.estimators}, self.task.scene.timestep
         if not self.resolved:
+            more = "more --samples may (see above); or take" if self.norm else "take"
             yield (
-                f"no estimator can be advised: {self.samples} samples do not tell the gradient from 0; another start "
-                "may have one",
+                f"no estimator can be advised: {self.samples} samples do not tell the gradient from 0; {more} another "
+                "start or cost, in a task of your own (docs/extending.md)",
                 "",
             )
             return
         if math.isfinite(self.samples_needed):
             many = _round(self.samples_needed)
-            needed = f"a relative error of {TARGET_ERROR:.0%} needs {many} {'sample' if many == '1' else 'samples'}"
+            samples = "sample" if many == "1" else "samples"
+            needed = f"a relative error of {percent(TARGET_ERROR)} needs {many} {samples}"
             needed += f"; its bias of {self._bias(self.best)} stays" if self.best.verdict == "biased" else ""
         else:
             needed = f"its bias of {self._bias(self.best)} stays, however many samples"
         yield f"at {self.setting.level}, take {self.best.estimator}; {needed}", ""
         if not self.onsets.get("onsets"):
-            yield "no contact begins: longer rollouts, more noise or another start would say more", ""
+            yield (
+                "no contact begins, so nothing here is about contact: take a longer --horizon, a larger --sigma or "
+                "another start (for a file, its first keyframe)",
+                "",
+            )
             return
         plain, corrected = by_name["fobg"], by_name["fobg_onset"]
         spread, strength = self.onsets["onset_spread"], self.onsets["onset_strength"]
         if plain.verdict == "biased":
             text = f"plain first order is biased by {self._bias(plain)}, "
             if max([each.jump for each in self.touches] or [strength]) <= SMOOTH_SHARE:
-                text += "though force sets in without a jump: something else jumps, as where corners and edges touch"
+                text += "though force sets in without a jump: something else jumps, as where corners and edges touch, "
+                text += "and zobg alone is sure to be unbiased"
             elif corrected.verdict == "right":
                 text += "because contact sets in with a jump: the onset term corrects that"
             else:
                 text += "and contact sets in with a jump, the usual cause"
             if travel := max((each.speed * timestep for each in self.touches if each.jump > SMOOTH_SHARE), default=0.0):
-                text += f'; an impedance that rises from 0, solimp="0 0.95 {WIDTH_RATIO * travel:.1g}", has no jump'
+                rising = f'solimp="0 0.95 {WIDTH_RATIO * travel:.1g}"'
+                text += f"; an impedance that rises from 0 has no jump: {rising} in the MJCF"
             yield text, "--onset linear" if corrected.verdict == "right" else ""
         elif not self.best.estimator.endswith("_onset"):
             return  # the onset term is not recommended
@@ -268,13 +283,13 @@ class Diagnosis(Measurement):
         elif corrected.verdict == "biased" and corrected.bias > explained and strength <= MOST_STRENGTH:
             yield (
                 f"the onset term leaves a bias of {self._bias(corrected)}, which its own error does not "
-                "explain; the usual causes are corners, edges, grazing and rolling contact",
+                "explain; the usual causes are corners, edges, grazing and rolling contact: take zobg there",
                 "",
             )
         elif ERROR_PER_STRENGTH * strength > NOTABLE_SHARE:
             step = timestep * NOTABLE_SHARE / (ERROR_PER_STRENGTH * strength)
             yield (
-                f"{linear_error(strength)}: --timestep {step:.1g} brings that down to {NOTABLE_SHARE:.0%}; the "
+                f"{linear_error(strength)}: --timestep {step:.1g} brings that down to {percent(NOTABLE_SHARE)}; the "
                 "error of --onset jump is only of second order in the step",
                 "--onset jump",
             )

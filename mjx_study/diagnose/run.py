@@ -8,7 +8,7 @@ from mjx_study.diagnose.page import Diagnosis
 from mjx_study.diagnose.setting import setting_of, touches_of
 from mjx_study.gradcheck import gradcheck, plan_gradcheck, plan_scene_gradcheck
 from mjx_study.objective import Simulator
-from mjx_study.study.configuration import Progress
+from mjx_study.study.configuration import Progress, refuse_untaken, takes_stiffness
 from mjx_study.study.memory import check_memory
 from mjx_study.tasks.contact_grid import family_grid
 from mjx_study.tasks.task import Task
@@ -44,8 +44,10 @@ def diagnose_task(
     Raises:
         ValueError: there is no such contact model, or the batches do not fit in memory.
     """
-    family, stiffness = family or task.defaults.main_family, stiffness or task.defaults.middle_stiffness
-    (cell,), warnings = family_grid(task, [family], [stiffness], damping)
+    family = family or task.defaults.main_family
+    refuse_untaken([family], stiffness=stiffness, damping=damping)
+    stiffnesses = [stiffness or task.defaults.middle_stiffness] if takes_stiffness([family]) else None
+    (cell,), warnings = family_grid(task, [family], stiffnesses, damping)
     check_memory(task, estimators_of(task), samples or SAMPLES)
     progress(0, 4, "rollout without noise")
     touches = tuple(touches_of(task, cell))
@@ -54,7 +56,7 @@ def diagnose_task(
     if is_file(subject):
         plan = plan_scene_gradcheck(task.scene, [family], None, horizon=task.horizon, **common)
     else:
-        plan = plan_gradcheck(task, [family], [stiffness], **common)
+        plan = plan_gradcheck(task, [family], stiffnesses, **common)
     derivatives = gradcheck(plan)
     progress(2, 4, "estimators")
     found = measure(Simulator(task, chunk_size=chunk_of(task, samples or SAMPLES)), cell.contact, samples, seed)

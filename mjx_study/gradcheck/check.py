@@ -8,7 +8,7 @@ from typing import Final
 import jax.numpy as jnp
 import mujoco
 
-from mjx_study.choices import CHECKED_STATES, CHECKED_STEPS, FAMILIES
+from mjx_study.choices import CHECKED_STATES, CHECKED_STEPS
 from mjx_study.choices import CHECKED_STIFFNESS as STIFFNESS
 from mjx_study.gradcheck.coordinates import make_coordinates
 from mjx_study.gradcheck.cost import CostPrograms, check_cost, judge_closed_forms
@@ -20,7 +20,7 @@ from mjx_study.gradcheck.values import EngineStep
 from mjx_study.runtime import environment
 from mjx_study.simulation.engine import quiet_engine
 from mjx_study.simulation.scene import Scene
-from mjx_study.study.configuration import Progress
+from mjx_study.study.configuration import Progress, refuse_untaken, takes_stiffness
 from mjx_study.tasks.contact_grid import ContactPoint, family_grid
 from mjx_study.tasks.mjcf import scene_task
 from mjx_study.tasks.task import Task
@@ -79,12 +79,12 @@ def plan_gradcheck(
     _check(task, states)
     if families is None:
         families = ("mjcf",) if task.contact_pair is None else CONTACT
-    if stiffnesses is None:
-        own = task.defaults.stiffnesses
-        stiffnesses = STIFFNESS if min(STIFFNESS) <= max(own) else own
-    cells, messages = family_grid(task, families, stiffnesses, damping)
+    own = task.defaults.stiffnesses
+    usual = STIFFNESS if min(STIFFNESS) <= max(own) else own
+    cells, messages = family_grid(task, families, usual if stiffnesses is None else stiffnesses, damping)
     if not cells:
         raise ValueError("no contact model to check: give at least one stiffness and one contact family")
+    refuse_untaken(families, stiffness=stiffnesses, damping=damping)
     return GradcheckPlan(task, True, cells, messages, states, seed, stock)
 
 
@@ -118,11 +118,14 @@ def plan_scene_gradcheck(
     """
     if families is None:
         families = ("mjcf",) if stiffnesses is None else ("mujoco",)
-    swept = any(name in FAMILIES and FAMILIES[name].swept for name in families)
+    refuse_untaken(families, stiffness=stiffnesses, damping=damping)
+    swept = takes_stiffness(families)
     if swept and stiffnesses is None:
         raise ValueError("a contact family with a stiffness needs one: give --stiffness in N/m, and --pair")
-    if (swept or stiffnesses is not None) and pair is None:
+    if swept and pair is None:
         raise ValueError("a stiffness in N/m requires the effective mass of a contact: give --pair GEOM,GEOM")
+    if pair is not None and not swept:
+        raise ValueError("--pair is for a stiffness: give --stiffness, or omit it")
     subject = scene_task(scene, horizon=horizon, pair=pair)
     _check(subject, states)
     cells, messages = family_grid(subject, families, stiffnesses or (), damping)

@@ -15,13 +15,15 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from estimators import Estimator, GradientEstimate, Objective, oracles_of
+from estimators.estimator import label_of
 from estimators.mean_check import TOLERANCE, Circulation, circulations
 from mjx_study.objective import Simulator, chunk_for
 from mjx_study.study.configuration import Progress, check_span
 from mjx_study.study.dataset import as_plain
 from mjx_study.study.resolution import check_estimators, direction_of
 from mjx_study.study.sampling import cell_keys, draw_batches
-from mjx_study.table import format_table
+from mjx_study.study.variables import MEANS
+from mjx_study.table import format_table, percent
 from mjx_study.tasks.contact_grid import ContactPoint
 from mjx_study.tasks.task import Task
 
@@ -29,12 +31,13 @@ HALF_LENGTH: Final = 2.0
 """Length of the path to either side of theta, in standard deviations of noise on theta."""
 FEEDBACK: Final = 0.02
 """The same for noise on the controls, in the unit of theta."""
-MEANS: Final = "means"
+ALONG_MEANS: Final = "means"
 """Value of `direction` for paths along the estimators' own means, see `along_means`."""
 MOST_PATHS: Final = 3
+SHARES: Final = ("relative_gap", "detectable")
+"""Columns shown in per cent."""
 LEAST_SHARE: Final = 1e-3
 """Smallest share of a mean orthogonal to the others that warrants a path along it."""
-HEADER: Final = ("contact", "K [N/m]", "estimator", "difference", "gap", "±", "quadrature", "share", "finds", "verdict")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,6 +70,14 @@ class MeanCheck:
 def reach_of(task: Task) -> float:
     """Default half length of a path through a task's theta [unit of theta]."""
     return HALF_LENGTH * task.sigma if task.policy.additive else FEEDBACK
+
+
+def path_of(task: Task, span: Sequence[float] | None, direction: str) -> str:
+    """Describe the path, or paths, along which means are checked."""
+    low, high = span or (-reach_of(task), reach_of(task))
+    unit = getattr(task.policy, "unit", "")
+    through = f"theta = {float(task.theta[0]):g}" if task.policy.num_params == 1 else f"theta, direction {direction}"
+    return f"path: {low:.3g} to {high:.3g}{f' {unit}' if unit else ''} about {through}"
 
 
 def along_means(
@@ -147,15 +158,15 @@ def check_mean(
     """
     check_estimators(estimators, task)
     check_span(span)
-    low, high = (-reach_of(task), reach_of(task)) if span is None else span
-    axis = "random" if direction == MEANS else direction
+    low, high = span or (-reach_of(task), reach_of(task))
+    axis = "random" if direction == ALONG_MEANS else direction
     along = jnp.asarray(direction_of(axis, task.policy.num_params, seed), task.theta.dtype)
     simulator = Simulator(task, chunk_size=chunk_for(samples, jax.local_devices(), [task]))
     found, ends = [], (task.theta + low * along, task.theta + high * along)
     for index, cell in enumerate(cells):
         progress(index, len(cells), cell.label)
         objective, key = simulator.objective(cell.contact), jax.random.key(seed)
-        if direction == MEANS:
+        if direction == ALONG_MEANS:
             batches, _, _ = draw_batches(
                 objective, task.theta, cell_keys(seed, 1), oracles_of(estimators), samples, slice(1)
             )
@@ -172,12 +183,15 @@ def check_mean(
     return found
 
 
-def lines_of(checks: Sequence[MeanCheck]) -> list[str]:
-    formats = {"difference": ".3g", "gap": ".3g", "half_width": ".3g", "quadrature": ".3g"}
-    formats |= {"relative_gap": ".1%", "detectable": ".1%"}
+def lines_of(checks: Sequence[MeanCheck], onset: str = "none") -> list[str]:
+    """Format the checks as a table; its columns are described in `MEANS`."""
+
+    def shown(name: str, value: Any) -> str:
+        return percent(value, 1) if name in SHARES and value is not None else MEANS[name].text(value)
+
     rows = []
     for check in checks:
         told, stiffness = check.as_dict(), f"{check.stiffness:g}" if check.stiffness else "-"
-        shown = ["-" if told[name] is None else f"{told[name]:{style}}" for name, style in formats.items()]
-        rows.append([check.contact, stiffness, check.estimator, *shown, check.verdict])
-    return format_table(rows, list(HEADER))
+        numbers = [shown(name, told[name]) for name in MEANS if name != "verdict"]
+        rows.append([check.contact, stiffness, label_of(check.estimator, onset), *numbers, check.verdict])
+    return format_table(rows, ["contact", "K [N/m]", "estimator", *(variable.heading for variable in MEANS.values())])

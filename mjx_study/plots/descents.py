@@ -10,8 +10,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from mjx_study.plots.panels import a_few, against_stiffness, counted, estimators, line, make_panels, model_title
-from mjx_study.plots.style import STYLE, line_with_band, robust_limits
-from mjx_study.study.variables import DERIVED, DESCENTS, LANDSCAPES, THETA
+from mjx_study.plots.style import line_with_band, robust_limits, style_of
+from mjx_study.study.findings import line_of, onset_of
+from mjx_study.study.variables import DERIVED, DESCENTS, LANDSCAPES
 
 MOST_COST_RATIO: Final = 1e7
 """Maximum ratio of the ends of an axis of costs; beyond it a descent counts as diverged."""
@@ -102,9 +103,8 @@ def landscape(part: xr.Dataset, title: str) -> Figure:
     figure, grid = make_panels(2, len(models), 1.6 + 2.9 * len(models), 6.2, title, sharex=True, sharey="row")
     slopes, steepest = [], 0.0
     direction = json.loads(part.attrs["config"])["direction"] or "random"
-    along, per = (f"t in theta + t d (d: {direction})", "t") if part.attrs["many_parameters"] else ("theta", "theta")
-    unit = part["position"].attrs.get("units", THETA)
-    along += "" if unit == THETA else f" [{unit}]"
+    per, unit = line_of(part)
+    along = (f"t in theta + t d (d: {direction})" if per == "t" else per) + (f" [{unit}]" if unit else "")
     for (above, below), model in zip(grid.T, models, strict=True):
         one = part.isel(model=model)
         t = one["position"].values
@@ -115,8 +115,9 @@ def landscape(part: xr.Dataset, title: str) -> Figure:
         if "exact_slope" in one and bool(one["exact_slope"].notnull().any()):
             above_all = {"linestyle": "none", "markerfacecolor": "none", "markersize": 4, "zorder": 3}
             below.plot(t, one["exact_slope"], "ok", **above_all, label="slope of the mean cost, quadrature")
-            first = {"color": STYLE["fobg"][0], "marker": STYLE["fobg"][1]}
-            below.plot(t, one["exact_first"], **first, **above_all, label="mean of FoBG, quadrature")
+            name, colour, marker = style_of("fobg", onset_of(part))
+            first = {"color": colour, "marker": marker}
+            below.plot(t, one["exact_first"], **first, **above_all, label=f"mean of {name}, quadrature")
         for mine, style in estimators(one):
             slopes.append(mine["slope"].values)
             style["label"] = f"mean of {style['label']}"

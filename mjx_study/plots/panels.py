@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 
 from mjx_study.plots.style import NO_CONTACT, TITLES, combines, line_with_band, style_of
 from mjx_study.simulation.contact import stable
+from mjx_study.study.findings import onset_of
 from mjx_study.study.variables import COORDINATES
 
 UNSTABLE: Final = "unstable step"
@@ -128,7 +129,7 @@ def beside(axes: Axes, x: np.ndarray, rank: float) -> np.ndarray:
 
 def estimators(rows: xr.Dataset) -> Iterator[tuple[xr.Dataset, dict[str, Any]]]:
     for rank, name in enumerate(rows["estimator"].values.tolist()):
-        label, colour, marker = style_of(name)
+        label, colour, marker = style_of(name, onset_of(rows))
         style = {"label": label, "color": colour, "marker": marker, "hollow": combines(name), "rank": rank}
         yield rows.sel(estimator=name), style
 

@@ -12,10 +12,12 @@ from matplotlib.colors import TwoSlopeNorm
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
+from estimators.estimator import label_of
 from mjx_study.plots.descents import achieved, descent, landscape
 from mjx_study.plots.gradients import alpha, bias, comparison, error_against_samples, variance
 from mjx_study.plots.panels import UNSTABLE, families, make_panels, number, positive, unstable
 from mjx_study.plots.style import TITLES, fit_texts, legend_below, mark_clipped
+from mjx_study.study.findings import onset_of
 from mjx_study.study.variables import COORDINATES, DESCENTS, GRADIENTS
 from mjx_study.table import digits_to_tell_apart
 
@@ -147,6 +149,6 @@ def _ratio_map(part: xr.Dataset, title: str, quantity: str, other: str) -> Figur
     assert mesh is not None
     below, above = bool(np.nanmin(known) < -extent), bool(np.nanmax(known) > extent)
     beyond = (("neither", "max"), ("min", "both"))[below][above]
-    told = f"log$_{{10}}$ of {(GRADIENTS | DESCENTS)[quantity].heading},\nFoBG over ZoBG"
+    told = f"log$_{{10}}$ of {(GRADIENTS | DESCENTS)[quantity].heading},\n{label_of('fobg', onset_of(part))} over ZoBG"
     figure.colorbar(mesh, ax=list(grid[0]), label=told, extend=beyond)
     return figure

@@ -61,11 +61,11 @@ TITLES: Final = {
 assert set(TITLES) >= set(FAMILIES)
 
 
-def style_of(name: str) -> tuple[str, str, str]:
-    """Label, colour and marker of an estimator; user-defined ones depend on the name alone."""
+def style_of(name: str, onset: str = "none") -> tuple[str, str, str]:
+    """Label, colour and marker of an estimator under an onset term; those of user-defined ones depend on the name."""
     colours, markers = OTHERS
     drawn = zlib.crc32(name.encode())
-    return label_of(name), *STYLE.get(name, (colours[drawn % len(colours)], markers[drawn // 7 % len(markers)]))
+    return label_of(name, onset), *STYLE.get(name, (colours[drawn % len(colours)], markers[drawn // 7 % len(markers)]))
 
 
 @cache

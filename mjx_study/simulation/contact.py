@@ -35,6 +35,7 @@ from estimators.pytree import register_pytree
 from mjx_study.choices import DEFAULT_SOLIMP, FAMILIES, MAX_IMPEDANCE, MIN_IMPEDANCE, unknown
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.scene import Scene
+from mjx_study.table import percent
 
 
 class ContactWarning(UserWarning):
@@ -300,7 +301,7 @@ def _warn_if_unstable(solref: Sequence[float], timestep: float) -> None:
     share = (2 * (math.sqrt(dampratio**2 + 1) - dampratio)) ** 2 / (timestep**2 * k) if k > 0 else 0.0
     warnings.warn(
         f"h^2 k = {timestep**2 * k:.3g} is not below 4 - 2 h b = {4 - 2 * timestep * b:.3g}: the step gains energy "
-        f"while in contact; it is stable up to {share:.0%} of this stiffness at h = {timestep:g} s",
+        f"while in contact; it is stable up to {percent(share)} of this stiffness at h = {timestep:g} s",
         ContactWarning,
         stacklevel=3,
     )

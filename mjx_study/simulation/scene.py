@@ -89,6 +89,7 @@ class Scene:
 
     @property
     def timestep(self) -> float:
+        """Timestep h [s]."""
         return float(self.host.opt.timestep)
 
     @property

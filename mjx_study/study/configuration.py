@@ -3,11 +3,11 @@
 import dataclasses
 import math
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Union
 
 from estimators.catalogue import CATALOGUE, PLUG_IN, PUBLISHED_TOLERANCE
-from mjx_study.choices import FAMILIES
+from mjx_study.choices import FAMILIES, REFERENCE
 from mjx_study.option import Checked
 
 if TYPE_CHECKING:
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 Progress = Callable[[int, int, str], None]
 """Called with (work done, total work, what is being computed)."""
 OF_KIND: Final[dict[str, tuple[str, ...]]] = {
-    "gradients": ("reference_samples", "block_size"),
+    "gradients": ("reference_samples", "block_size", "confidence"),
     "descents": ("iterations", "optimizer", "learning_rate", "decay", "stiffness_schedule", "sigma_schedule",
                  "evaluation_samples", "network"),
     "landscapes": ("span", "direction"),
@@ -170,11 +170,8 @@ class StudyConfig(Checked):
             raise ValueError(f"no estimator given; choose from {', '.join(CATALOGUE)}")
         refuse_repeats("estimator", self.estimator_names)
         refuse_repeats("contact family", self.contact or ())
-        if self.contact is not None and not takes_stiffness(self.contact):
-            for name in ("stiffness", "damping"):
-                if getattr(self, name) is not None:
-                    chosen = f"contact {', '.join(self.contact)}" if self.contact else "`solref` or `solimp` alone"
-                    raise ValueError(f"{chosen} takes no {name}; omit `{name}`")
+        if self.contact is not None:
+            refuse_untaken(self.contact, stiffness=self.stiffness, damping=self.damping)
         for name in ("tasks", "stiffness", "solref", "solimp", "timestep", "cone", "sigma", "samples", "backward"):
             values = getattr(self, name)
             refuse_repeats(name, values or ())
@@ -193,7 +190,7 @@ class StudyConfig(Checked):
         if kind != "landscapes" and self.points is not None:
             raise ValueError(f"`points` are for landscapes, and `kind` is {kind}: omit one of them")
         for other, options in OF_KIND.items():
-            given = [f"`{name}`" for name in options if getattr(self, name) is not None]
+            given = [f"`{name}`" for name in options if self.given(name)]
             if other != kind and given:
                 listed = f"{' and '.join(given)} {'is' if len(given) == 1 else 'are'}"
                 raise ValueError(f"{listed} for {other}: {ASKED_BY.get(other, 'omit it')}")
@@ -204,10 +201,15 @@ class StudyConfig(Checked):
 
     @property
     def settings(self) -> Settings:
+        """The options whose defaults depend on the kind of study, with these in place of None."""
         of_points = "gradients" if self.points is None else "landscapes"
         given = {field.name: getattr(self, field.name) for field in dataclasses.fields(Settings)}
         given["kind"] = self.kind or (of_points if self.iterations is None else "descents")
         return Settings(**{name: value for name, value in given.items() if value is not None})
+
+    def given(self, name: str) -> bool:
+        """Whether a field differs from its default."""
+        return getattr(self, name) != self.default(name)
 
     def resolved(self) -> dict[str, Any]:
         """Return all fields, with the defaults of the study's kind in place of None."""
@@ -217,10 +219,12 @@ class StudyConfig(Checked):
 
     @property
     def estimator_names(self) -> tuple[str, ...]:
+        """Names of the estimators; `module:class` of objects of your own."""
         return tuple(each if isinstance(each, str) else each.place() for each in self.estimators)
 
     @property
     def task_names(self) -> list[str]:
+        """Names of the tasks."""
         return [which if isinstance(which, str) else which.name for which in self.tasks]
 
     @property
@@ -247,6 +251,15 @@ def check_span(span: Sequence[float] | None) -> None:
         raise ValueError("`span` must be two numbers, the lower one first; got " + ", ".join(map(str, span)))
 
 
-def takes_stiffness(families: Sequence[str]) -> bool:
+def takes_stiffness(families: Iterable[str]) -> bool:
     """Whether any of the contact families, "reference" included, has a stiffness."""
     return any(family not in FAMILIES or FAMILIES[family].swept for family in families)
+
+
+def refuse_untaken(families: Sequence[str], *, stiffness: object, damping: object) -> None:
+    """Raise ValueError for a stiffness or damping, not None, that none of the contact families takes."""
+    undamped = [family for family in families if family != REFERENCE]
+    for name, value, able in (("stiffness", stiffness, families), ("damping", damping, undamped)):
+        if value is not None and not takes_stiffness(able):
+            chosen = f"contact {', '.join(families)}" if families else "`solref` or `solimp` alone"
+            raise ValueError(f"{chosen} takes no {name}; omit `{name}`, or add a family that does, such as mujoco")

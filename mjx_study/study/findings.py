@@ -4,6 +4,7 @@ import json
 import math
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from types import SimpleNamespace
 from typing import Any, Final
 
@@ -12,8 +13,8 @@ import xarray as xr
 
 from estimators import ENOUGH_EFFECTIVE, ESTIMATORS, ORACLES
 from estimators.estimator import label_of
-from mjx_study.study.variables import GRADIENTS, ONSETS
-from mjx_study.table import digits_to_tell_apart, number, with_error
+from mjx_study.study.variables import GRADIENTS, ONSETS, THETA
+from mjx_study.table import digits_to_tell_apart, number, percent, with_error
 
 BIASED_P_VALUE: Final = 0.001
 """p-value at which a mean is called biased: the smallest that the test's 999 draws can yield."""
@@ -134,10 +135,11 @@ def findings_of(dataset: xr.Dataset) -> list[str]:
 def _of_gradients(dataset: xr.Dataset) -> list[str]:
     """Report where FoBG's variance exceeds ZoBG's and which means are biased."""
     gammas, confidence = gammas_of(dataset), json.loads(dataset.attrs["config"])["confidence"]
+    label = partial(label_of, onset=onset_of(dataset))
 
     def of(rows: Sequence[Row]) -> list[str]:
-        found = [*_variance_finding(rows, confidence), *_bias_findings(rows, gammas)]
-        return [*found, *_onset_findings(rows), *_meaningless(rows, gammas)]
+        found = [*_variance_finding(rows, confidence, label), *_bias_findings(rows, gammas, label)]
+        return [*found, *_onset_findings(rows), *_meaningless(rows, gammas, label)]
 
     return _by_family(dataset, rows_of(dataset), of)
 
@@ -146,7 +148,7 @@ def _of_descents(dataset: xr.Dataset) -> list[str]:
     """Report where the first-order batch of an AoBG with a bound has no weight in any iteration of any seed."""
     if "alpha" not in dataset:
         return []
-    gammas, along = gammas_of(dataset), ("iteration", "seed")
+    gammas, along, onset = gammas_of(dataset), ("iteration", "seed"), onset_of(dataset)
     stuck = (dataset["alpha"].max(along) == 0).stack(place=(*SETTING, "model", "estimator"))
     names = (*SETTING, "contact", "stiffness", "estimator")
     rows = [Row(**{name: one[name].item() for name in names}) for one in stuck[stuck.values]]
@@ -154,7 +156,7 @@ def _of_descents(dataset: xr.Dataset) -> list[str]:
 
     def of(rows: Sequence[Row]) -> list[str]:
         groups = _by(rows, "estimator").items()
-        return [f"{label_of(name)} equals ZoBG throughout{_at(same)}: {WEIGHTLESS}" for (name,), same in groups]
+        return [f"{label_of(name, onset)} equals ZoBG throughout{_at(same)}: {WEIGHTLESS}" for (name,), same in groups]
 
     return _by_family(dataset, bound, of)
 
@@ -196,12 +198,17 @@ def gammas_of(dataset: xr.Dataset) -> Bounds:
     }
 
 
+def onset_of(dataset: xr.Dataset) -> str:
+    """Onset term of a study's first-order batches."""
+    return json.loads(dataset.attrs["config"]).get("onset", "none")
+
+
 def differentiates(estimator: str) -> bool:
     """Whether an estimator uses first-order samples, which may be biased; user-defined ones may."""
     return estimator not in ESTIMATORS or any(ORACLES[oracle].order for oracle in ESTIMATORS[estimator].needs)
 
 
-def _meaningless(rows: Sequence[Row], gammas: Bounds) -> list[str]:
+def _meaningless(rows: Sequence[Row], gammas: Bounds, label: Callable[[str], str]) -> list[str]:
     """Report why results mean nothing: contact never active, reference too uncertain, AoBG's bound below epsilon."""
     found = []
     several = [group for group in _by(rows, "estimator", "seed").values() if len(group) > 1]
@@ -210,16 +217,16 @@ def _meaningless(rows: Sequence[Row], gammas: Bounds) -> list[str]:
         found.append("nothing depends on K: the contact whose stiffness is swept was never active")
     if unsure := [row for row in rows if row.reference_uncertainty > MOST_UNCERTAINTY]:
         found.append(
-            f"the reference's own uncertainty exceeds {MOST_UNCERTAINTY:.0%}{_at(unsure)}: errors and verdicts mean "
-            "little there; increase --reference-samples"
+            f"the reference's own uncertainty exceeds {percent(MOST_UNCERTAINTY)}{_at(unsure)}: errors and verdicts "
+            "mean little there; increase --reference-samples"
         )
     limited = [row for row in rows if row.epsilon is not None]
     if bound := [row for row in limited if row.epsilon > gammas.get((row.task, row.estimator), math.inf)]:
-        found.append(f"AoBG equals ZoBG{_at(bound)}: {BOUND}")
+        found += [f"{label(name)} equals ZoBG{_at(same)}: {BOUND}" for (name,), same in _by(bound, "estimator").items()]
     return found
 
 
-def _variance_finding(rows: Sequence[Row], confidence: float) -> list[str]:
+def _variance_finding(rows: Sequence[Row], confidence: float, label: Callable[[str], str]) -> list[str]:
     """Compare FoBG's variance with ZoBG's at each stiffness: the verdict shared by all seeds, if most have one."""
     groups: dict[str, list[Row]] = {verdict: [] for verdict in (BELOW, ABOVE, ALIKE, UNKNOWN)}
     for _, same in sorted(_by(rows, "stiffness").items()):
@@ -231,7 +238,7 @@ def _variance_finding(rows: Sequence[Row], confidence: float) -> list[str]:
         shared = known[0] if len(set(known)) == 1 else ALIKE
         groups[shared if 2 * len(known) > len(verdicts) else UNKNOWN] += first
     parts = [f"{verdict}{_at(group)}" for verdict, group in groups.items() if group]
-    return [f"FoBG's variance is {'; '.join(parts)} ({confidence:.0%} intervals)"]
+    return [f"{label('fobg')}'s variance is {'; '.join(parts)} ({percent(confidence)} intervals)"]
 
 
 def _order(zeroth: Row, first: Row) -> str:
@@ -242,7 +249,7 @@ def _order(zeroth: Row, first: Row) -> str:
     return ABOVE if first.variance_lower > zeroth.variance_upper else ALIKE
 
 
-def _bias_findings(rows: Sequence[Row], gammas: Bounds) -> list[str]:
+def _bias_findings(rows: Sequence[Row], gammas: Bounds, label: Callable[[str], str]) -> list[str]:
     """Report means farther from the reference than any draw of the test, or off but undecided, in a sentence each; with
     several seeds, with counts and the median debiased error."""
     sentences = []
@@ -250,7 +257,7 @@ def _bias_findings(rows: Sequence[Row], gammas: Bounds) -> list[str]:
         seeds = len(_by(mine, "seed"))
         biased = [row for row in mine if row.bias_verdict == "biased"]
         off = [row for row in mine if row.bias_verdict == "too few effective samples" and _off(row)]
-        mean = f"{label_of(estimator)}'s mean is"
+        mean = f"{label(estimator)}'s mean is"
         if biased:
             shares = ", ".join(f"{_share(same)}{_of(same, seeds)}" for same in _by(biased, "stiffness").values())
             least = max(row.bias_p_value for row in biased)
@@ -271,7 +278,7 @@ def linear_error(strength: float) -> str:
     """Describe how large the linear onset term's error can be."""
     if strength > MOST_STRENGTH:
         return "the linear onset term can leave more than it adds"
-    return f"the linear onset term can be off by {ERROR_PER_STRENGTH * strength:.0%} of what it adds"
+    return f"the linear onset term can be off by {percent(ERROR_PER_STRENGTH * strength)} of what it adds"
 
 
 def _onset_findings(rows: Sequence[Row]) -> list[str]:
@@ -288,8 +295,8 @@ def _onset_findings(rows: Sequence[Row]) -> list[str]:
     if strong := [row for row in wide if ERROR_PER_STRENGTH * row.onset_strength > NOTABLE_SHARE]:
         most = max(row.onset_strength for row in strong)
         found.append(
-            f"{linear_error(most)}{_at(strong)} (more at grazing contacts and corners): an onset takes {most:.0%} of "
-            "the approach speed in one step; --onset jump or a smaller timestep is better"
+            f"{linear_error(most)}{_at(strong)} (more at grazing contacts and corners): an onset takes {percent(most)} "
+            "of the approach speed in one step; --onset jump or a smaller timestep is better"
         )
     return found
 
@@ -309,7 +316,7 @@ def _share(rows: Sequence[Row]) -> str:
     error = max(max(row.debiased_error_se, row.reference_uncertainty) for row in rows)
     if not math.isfinite(share):
         return "more than can be computed"
-    return f"{share:.1%}" if error < 0.005 else f"{float(f'{100 * share:.2g}'):g}%"
+    return percent(share, 1) if error < 0.005 else f"{float(f'{100 * share:.2g}'):g} %"
 
 
 def _at(rows: Sequence[Row]) -> str:
@@ -323,7 +330,8 @@ def _at(rows: Sequence[Row]) -> str:
 def _of_landscapes(dataset: xr.Dataset) -> list[str]:
     """Report where the mean of FoBG differs from the slope of the mean cost."""
     both = {"zobg", "fobg"} <= set(dataset["estimator"].values)
-    return [f"{label}: {_gap(one)}" for label, one in curves_of(dataset)] if both else []
+    name = label_of("fobg", onset_of(dataset))
+    return [f"{label}: {_gap(one, f'E[{name}]')}" for label, one in curves_of(dataset)] if both else []
 
 
 def curves_of(dataset: xr.Dataset) -> list[tuple[str, xr.Dataset]]:
@@ -341,22 +349,31 @@ def model_name(one: xr.Dataset) -> str:
     return f"{family}, K ={stiffness} N/m" if stiffness else family
 
 
-def _gap(one: xr.Dataset) -> str:
-    """Report where E[FoBG] differs from the slope of the mean cost, by quadrature if available."""
+def line_of(dataset: xr.Dataset) -> tuple[str, str]:
+    """Symbol of the position along a landscape's line, and its unit, empty if it is not known."""
+    unit = dataset["position"].attrs.get("units", THETA)
+    return "t" if dataset.attrs["many_parameters"] else "theta", "" if unit == THETA else unit
+
+
+def _gap(one: xr.Dataset, mean: str) -> str:
+    """Report where the mean of FoBG differs from the slope of the mean cost, by quadrature if available."""
     if "exact_slope" in one and bool(one["exact_slope"].notnull().all()):
         first, slope = one["exact_first"].values, one["exact_slope"].values
         largest = float(np.max(np.abs(slope)))
         error = 3 * (one["exact_slope_error"].values + one["exact_first_error"].values) + NOTABLE_SHARE * largest
-        source, uncertainty = "the mean cost's slope", f"more than {NOTABLE_SHARE:.0%} of its largest value"
+        source, uncertainty = "the mean cost's slope", f"more than {percent(NOTABLE_SHARE)} of its largest value"
     else:
         first, slope = (one["slope"].sel(estimator=name).values for name in ("fobg", "zobg"))
         error = DETECTED_SE * np.hypot(*(one["slope_se"].sel(estimator=name).values for name in ("fobg", "zobg")))
         source, uncertainty = "E[ZoBG]", f"more than {DETECTED_SE:g} standard errors"
     seen = np.abs(first - slope) > error
     if not np.any(seen):
-        return f"E[FoBG] nowhere differs from {source} by {uncertainty}"
+        return f"{mean} nowhere differs from {source} by {uncertainty}"
+    name, unit = line_of(one)
+    unit = f" {unit}" if unit else ""
     worst = int(np.argmax(np.where(seen, np.abs(first - slope), -np.inf)))
     return (
-        f"E[FoBG] differs from {source} by {uncertainty} at {np.mean(seen):.0%} of the points, most at "
-        f"{one['position'].values[worst]:.3g}, where it is {first[worst]:.3g} in place of {slope[worst]:.3g}"
+        f"{mean} differs from {source} by {uncertainty} at {percent(float(np.mean(seen)))} of the points, most at "
+        f"{name} = {one['position'].values[worst]:.3g}{unit}, where it is {first[worst]:.3g} in place of "
+        f"{slope[worst]:.3g}"
     )

@@ -34,7 +34,7 @@ from mjx_study.study.sampling import calls_of, rollouts_of
 from mjx_study.study.store import begun_store
 from mjx_study.study.times import BASES, READING, Program, Rates, other_program, program_of, times_folder
 from mjx_study.study.variables import VARIABLES
-from mjx_study.table import count, duration, size
+from mjx_study.table import count, duration, percent, size
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,7 +70,7 @@ class Forecast:
         if total == 0:
             return "time: none"
         shares = {basis: seconds / total for basis, seconds in self.basis.items() if seconds > 0.005 * total}
-        told = ", ".join(f"{basis} ({share:.0%})" if len(shares) > 1 else basis for basis, share in shares.items())
+        told = ", ".join(f"{basis} ({percent(share)})" if len(shares) > 1 else basis for basis, share in shares.items())
         return f"time: about {duration(self.seconds)}, of which compilation {duration(self.compilation)}; {told}"
 
 

@@ -18,6 +18,7 @@ from mjx_study.objective import chunk_for
 from mjx_study.option import BUILDER_OPTIONS
 from mjx_study.reference.noise import check_sigma
 from mjx_study.study.configuration import SAMPLES, Settings, StudyConfig
+from mjx_study.study.effect import refuse_idle
 from mjx_study.study.iteration import make_optimizer, schedule_factors
 from mjx_study.study.memory import (
     AT_ONCE,
@@ -87,6 +88,7 @@ class StudyPlan:
 
     @property
     def settings(self) -> Settings:
+        """The configuration's."""
         return self.config.settings
 
     def with_chunk(self, size: int) -> "StudyPlan":
@@ -199,8 +201,9 @@ def plan_study(config: StudyConfig, built: Mapping[str, Task] | None = None) -> 
             check_memory(group.task, (), settings.evaluation_samples)
         elif settings.kind == "landscapes":
             if config.theta is not None and group.task.policy.num_params == 1:
-                raise ValueError("theta has one entry, and the line is its range: give `span`")
+                raise ValueError("`theta` has one entry, and the line is its range: give `span` instead")
             line_of(group.task, settings.points, config.span, config.direction, config.seed)
+    refuse_idle(config, [(group.task, group.models) for group in groups])
     return plan
 
 

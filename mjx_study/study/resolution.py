@@ -12,6 +12,10 @@ from estimators import Estimator, make_estimator
 from mjx_study.study.configuration import StudyConfig, check_span
 from mjx_study.tasks.task import Recipe, Task
 
+BOUND: Final = ("gamma", "failure_probability", "variance_proxy", "radius")
+"""Constants of AoBG's bound."""
+OF_ESTIMATORS: Final = ("baseline", "max_norm", "window", "tolerance", "weights", *BOUND)
+"""Options of a configuration that estimators own."""
 SPAN_SIGMAS: Final = 10.0
 """Half the default length of a line through many parameters, in standard deviations of the noise."""
 
@@ -49,7 +53,7 @@ def configured_estimators(config: StudyConfig, task: Task) -> tuple[Estimator, .
     ValueError if there is no such estimator, an option is out of range or missing, or an estimator does not support the
     task.
     """
-    options = {name: getattr(config, name) for name in ("baseline", "max_norm", "window", "tolerance", "weights")}
+    options = {name: getattr(config, name) for name in OF_ESTIMATORS}
     options |= bound_constants(config, task) | {"sigma": task.sigma}
     found = tuple(
         each if isinstance(each, Estimator) else make_estimator(each, **options) for each in config.estimators
@@ -64,14 +68,13 @@ def configured_estimators(config: StudyConfig, task: Task) -> tuple[Estimator, .
 def bound_constants(config: StudyConfig, task: Task) -> dict[str, Any]:
     """The constants of AoBG's bound, from the configuration or the published example; ValueError if there is none, or
     other constants are given along with it."""
-    names = ("gamma", "failure_probability", "variance_proxy", "radius")
-    given = {name: getattr(config, name) for name in names}
+    given = {name: getattr(config, name) for name in BOUND}
     if not config.published:
         return given | {"gamma": task.defaults.gamma if config.gamma is None else config.gamma}
     if task.defaults.published is None:
         raise ValueError(f"{task.name} has no published constants of the bound; omit `published`")
-    if others := [f"`{name}`" for name in names if given[name] != StudyConfig.default(name)]:
-        raise ValueError(f"`published` sets {', '.join(f'`{name}`' for name in names)}: omit {', '.join(others)}")
+    if others := [f"`{name}`" for name in BOUND if config.given(name)]:
+        raise ValueError(f"`published` sets {', '.join(f'`{name}`' for name in BOUND)}: omit {', '.join(others)}")
     return dataclasses.asdict(task.defaults.published)
 
 
@@ -118,11 +121,9 @@ def line_of(task: Task, points: int, span: Sequence[float] | None, direction: st
 
 def direction_of(direction: str, params: int, seed: int) -> Float[np.ndarray, " params"]:
     """Return a unit vector, random or along one parameter; arguments as for `line_of`."""
-    if params == 1:
-        return np.ones(1)
     if direction == "random":
         drawn = np.random.default_rng(seed).normal(size=params)
-        return drawn / np.linalg.norm(drawn)
+        return drawn / np.linalg.norm(drawn) if params > 1 else np.ones(1)
     if not direction.isdecimal() or int(direction) >= params:
         raise ValueError(f"`direction` must be random or a parameter's index, 0 to {params - 1}; got {direction}")
     return np.eye(params)[int(direction)]

@@ -73,7 +73,9 @@ GRADIENTS: Final = {
     "squared_bias_se": Variable(EACH, "1", "standard error of squared_bias"),
     "residual": Variable(EACH, "1", "largest relative residual of the constraint solver", "residual", 2),
     "unconverged": Variable(EACH, "1", "rollouts whose solver residual is too large", digits=0),
-    "seconds_per_sample": Variable(EACH, "s", "computing time of one sample, measured; compilation excluded", "ms", 2),
+    "seconds_per_sample": Variable(
+        EACH, "s", "computing time of one sample, measured; compilation excluded", "ms/sample", 2
+    ),
     "onsets": Variable(EACH, "1", "onsets of contact in the first-order batches", digits=0),
     "onsets_bounded": Variable(EACH, "1", "onsets at grazing speed, with a bounded term", digits=0),
     "onsets_missed": Variable(EACH, "1", "onsets without a term", digits=0),
@@ -133,15 +135,40 @@ DERIVED: Final = {
     "seed_rollouts": Variable(EACH, "1", "rollouts of one seed, derivatives and baselines included", "rollouts", 0),
     "best_cost": Variable(EACH, "cost", "final cost of the best seed", "best", 4),
     "stopped_seeds": Variable(EACH, "1", "seeds that stopped before the end", "stopped seeds", 0),
-    "least_cost": Variable((), "cost", "lowest mean cost on the line", "least mean cost", 4),
-    "least_at": Variable((), THETA, "position of the lowest mean cost", "at t"),
+    "least_cost": Variable((), "cost", "lowest mean cost on the line, ± its standard error", "least mean cost", 4),
+    "least_at": Variable((), THETA, "position on the line of the lowest mean cost", "least at"),
     "steepest": Variable(EACH, "gradient", "steepest slope on the line", "steepest slope"),
 }
 """Quantities of tables that a Dataset does not hold."""
 VARIABLES: Final = {"gradients": GRADIENTS, "descents": DESCENTS, "landscapes": LANDSCAPES}
 """Variables by kind of study."""
-QUANTITIES: Final = {kind: variables | COORDINATES | DERIVED for kind, variables in VARIABLES.items()}
-"""All quantities by kind of study."""
+MEANS: Final = {
+    "difference": Variable((), "cost", "difference of the mean cost between the ends of the path", "difference"),
+    "gap": Variable((), "cost", "integral of the estimator's mean along the path, less the difference", "gap"),
+    "half_width": Variable((), "cost", "half-width of the gap's 99.9 % interval", "±"),
+    "quadrature": Variable((), "cost", "part of the half-width that comes from the quadrature", "quadrature"),
+    "relative_gap": Variable((), "1", "gap as a share of the difference", "share"),
+    "detectable": Variable((), "1", "smallest share certain to be detected", "finds"),
+    "verdict": Variable((), "1", "right (within 5 %), biased, or undecided: too few samples", "verdict"),
+}
+"""Columns of `gradcheck --mean`."""
+DIAGNOSIS: Final = {
+    "time": Variable((), "s", "time at which the contact begins", "t [s]"),
+    "speed": Variable((), "m/s", "approach speed", "v [m/s]", 2),
+    "damping": Variable((), "1", "damping of the contact over one step h", "h b", 2),
+    "stiffness": Variable((), "1", "its stiffness over one step", "h^2 k", 2),
+    "travel": Variable((), "1", "travel per step over the depth over which the impedance rises", "h v / width", 2),
+    "impedance": Variable((), "1", "d_0, at first touch: 0 is a smooth onset, MuJoCo's 0.9 a jump", "impedance"),
+    "stable": Variable((), "1", "whether the step in contact is stable: not if h^2 k >= 4 - 2 h b", "step"),
+    "error": Variable((), "1", "bias and standard deviation after a second of computing, relative", "error"),
+    "interval": Variable((), "1", "interval of the error, as the variance has one", "95 % interval"),
+    "mean": Variable((), "1", "right (within 5 %), off by so much, unbiased in theory, or undecided", "mean"),
+    "seconds": replace(GRADIENTS["seconds_per_sample"], digits=3),
+}
+"""Columns of `diagnose`: of its contacts, and of its estimators from `error` on."""
+TABLES: Final = {"means": MEANS, "diagnosis": DIAGNOSIS}
+QUANTITIES: Final = {kind: variables | COORDINATES | DERIVED for kind, variables in VARIABLES.items()} | TABLES
+"""All quantities by kind of study, and those of tables of other commands."""
 DEBIASED: Final = {"relative_error": "debiased_error", "cosine": "debiased_cosine"}
 """Quantities that noise biases, and the corrected ones, which tables show beside them."""
 COLUMNS: Final = (
@@ -169,8 +196,9 @@ def variables_of(kind: str, names: Iterable[str]) -> dict[str, Variable]:
 
 
 def explained(kind: str, *names: str) -> str:
-    """Explain columns of a table for the help."""
-    return described({QUANTITIES[kind][name].heading: QUANTITIES[kind][name].description for name in names})
+    """Explain columns of a table for the help; all of them if none is named."""
+    shown = [QUANTITIES[kind][name] for name in names or QUANTITIES[kind]]
+    return described({variable.heading: variable.description for variable in shown})
 
 
 def markdown_table(kind: str) -> str:

@@ -50,6 +50,7 @@ class ContactPoint:
 
     @property
     def label(self) -> str:
+        """Family, and stiffness if there is one."""
         return self.family if self.stiffness is None else f"{self.family}, K = {self.stiffness:.{self.digits}g} N/m"
 
 

@@ -178,9 +178,11 @@ class Task:
         return effective_mass(self.scene, *self.contact_pair)
 
     def draw_start(self, key: Key[Array, ""]) -> State:
+        """Initial state, drawn with the key if it is random."""
         return self.start if isinstance(self.start, State) else self.start(key)
 
     def replace(self, **changes) -> "Task":
+        """The task with other attributes."""
         return dataclasses.replace(self, **changes)
 
 
