@@ -229,7 +229,7 @@ def weights_rows(samples: int, count: int = 20_000) -> list[list[str]]:
                 means = np.asarray(program(mine))
                 bias = np.linalg.norm(np.mean(means, axis=0) - exact) / np.linalg.norm(exact)
                 errors.append(np.sum(np.var(means, axis=0)))
-                row.append(percent(bias, 1))
+                row.append(percent(float(bias), 1))
             rows.append([*row, f"{errors[1] / errors[0]:.2f}"])
     return rows
 

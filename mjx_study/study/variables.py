@@ -73,9 +73,7 @@ GRADIENTS: Final = {
     "squared_bias_se": Variable(EACH, "1", "standard error of squared_bias"),
     "residual": Variable(EACH, "1", "largest relative residual of the constraint solver", "residual", 2),
     "unconverged": Variable(EACH, "1", "rollouts whose solver residual is too large", digits=0),
-    "seconds_per_sample": Variable(
-        EACH, "s", "computing time of one sample, measured; compilation excluded", "ms/sample", 2
-    ),
+    "seconds_per_sample": Variable(EACH, "s", "computing time of one sample, without compilation", "ms", 2),
     "onsets": Variable(EACH, "1", "onsets of contact in the first-order batches", digits=0),
     "onsets_bounded": Variable(EACH, "1", "onsets at grazing speed, with a bounded term", digits=0),
     "onsets_missed": Variable(EACH, "1", "onsets without a term", digits=0),
