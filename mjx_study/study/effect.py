@@ -69,8 +69,10 @@ def refuse_idle(config: StudyConfig, grids: Sequence[tuple[Task, Sequence[Contac
         if config.given(name) and not effective:
             raise ValueError(f"`{name}` has no effect: {reason}")
     for each in map(find_estimator, config.estimators):
-        if CORRECTED in each.needs and not touching:
-            raise ValueError(f"{each.name} corrects gradients through simulated contact, and there is none: omit it")
+        if CORRECTED in each.needs and not simulated:
+            raise ValueError(
+                f"{each.name} corrects gradients through simulated contact, and nothing is simulated: omit it"
+            )
 
 
 def _fields(estimator: type[Estimator]) -> set[str]:
