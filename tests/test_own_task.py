@@ -218,7 +218,7 @@ def test_compare_and_report(task: str, document) -> None:
     assert document("report", "batch")["written"] == "batch/report.html"
     page = Path("batch/report.html").read_text()
     assert f"<h1>{task}: gradient estimates through" in page and 'alt="comparison"' in page
-    assert page.count("<td>fobg</td>") == len(found["rows"]) / 3
+    assert page.count("<td>FoBG</td>") == len(found["rows"]) / 3
 
 
 def test_landscape_plot_and_report(task: str, document) -> None:

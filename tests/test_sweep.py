@@ -608,7 +608,7 @@ def test_every_axis_gets_its_figures(undisturbed: Path, descents: Path, landscap
     assert set(study_plots.plot_study(load_study(landscapes))) == {"landscape"}
     assert "steepest slope" in render_report(load_study(landscapes))
     page = render_report(load_study(descents))  # both estimators of both models, though only one has an alpha
-    assert page.count("<td>fobg</td>") == page.count("<td>aobg</td>") == 2
+    assert page.count("<td>FoBG</td>") == page.count("<td>AoBG</td>") == 2
     few = load_study(undisturbed).assign(squared_bias=load_study(undisturbed)["squared_bias"] * np.nan)
     assert "bias" not in study_plots.plot_study(few)
     for folder in (undisturbed, descents, landscapes):

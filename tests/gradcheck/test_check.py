@@ -217,9 +217,13 @@ def test_stock_derivatives_are_checked_apart() -> None:
 
 def test_a_stiffness_needs_the_pair_that_it_acts_on() -> None:
     scene = load_scene("pusher")
-    for arguments in ((["penalty"], None), (["mujoco_default"], [10.0]), (["penalty"], [10.0])):
-        with pytest.raises(ValueError, match="--pair"):
-            plan_scene_gradcheck(scene, *arguments, seed=0)
+    for families, stiffnesses, message in (
+        (["penalty"], None, "--pair"),
+        (["penalty"], [10.0], "--pair"),
+        (["mujoco_default"], [10.0], "contact mujoco_default takes no stiffness"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            plan_scene_gradcheck(scene, families, stiffnesses, seed=0)
     plan = plan_scene_gradcheck(scene, ["penalty"], [10.0, 100.0], seed=0, pair=("pusher", "slider"))
     assert [cell.stiffness for cell in plan.cells] == [10.0, 100.0]
     with pytest.raises(ValueError, match="no geom 'nothing'"):
