@@ -56,7 +56,8 @@ def from_help() -> list[list[str]]:
     """Examples of every command, those that others read from first; what an example does is said after two spaces."""
     text = "\n".join(str(part) for part in epilogs())
     lines = [re.split(r" {2,}| > ", line.strip())[0] for line in text.splitlines() if line.startswith("  mjx-study ")]
-    return sorted((shlex.split(line)[1:] for line in lines), key=lambda command: ORDER.index(command[0]))
+    commands = (shlex.split(line)[1:] for line in lines)  # those that write a folder, where others read, come last
+    return sorted(commands, key=lambda command: (ORDER.index(command[0]), "--output" in command))
 
 
 def epilogs() -> list[str | None]:
@@ -68,7 +69,7 @@ def epilogs() -> list[str | None]:
 def small(command: list[str]) -> list[str]:
     """The command on as little as shows that it works; later flags win."""
     name, *rest = ["pusher" if part == "TASK" else part for part in command]
-    more = SMALL.get(name, "").split()
+    more = "--horizon 4".split() if "--mean" in rest else SMALL.get(name, "").split()
     if name == "sweep":
         more += next((own for flag, own in OF_KIND.items() if flag in rest), "--reference-samples 4").split()
     return [name, *rest, *more]

@@ -59,6 +59,6 @@ def run(options: argparse.Namespace) -> int:
     return 0 if found.derivatives.passed else 1
 
 
-def _text(value: str | float | tuple[str, ...]) -> str:
+def _text(value: str | int | float | tuple[str, ...]) -> str:
     """A value as on the command line."""
     return ",".join(value) if isinstance(value, tuple) else f"{value:.12g}" if isinstance(value, float) else str(value)
