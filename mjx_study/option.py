@@ -142,7 +142,7 @@ class Option:
 
     def _parse_one(self, text: str) -> Any:
         if self.kind is str or text in self.choices:
-            return text
+            return text.lower() if text.lower() in self.choices else text  # MuJoCo writes RK4, Newton
         try:
             return int(text) if self.kind is int else float(text)
         except ValueError:

@@ -77,9 +77,12 @@ BODY = "<worldbody><body><freejoint/><geom size='0.1'/></body></worldbody>"
         ),
         (
             "compare double_pendulum --stiffness 3",
-            "--stiffness has no effect: no contact model takes one; ",
+            "--stiffness has no effect: double_pendulum names no contact",
         ),
-        ("optimise double_pendulum --reference --stiffness 3", "--stiffness has no effect: no contact model takes one"),
+        (
+            "optimise double_pendulum --reference --stiffness 3",
+            "--stiffness has no effect: double_pendulum names no contact",
+        ),
         ("landscape pusher --contact reference --no-reference", "--no-reference omits --contact reference: omit one"),
         ("landscape ball_wall --direction 3", "--direction must be random or a parameter's index, 0 to 0; got 3"),
         ("landscape ball_wall --theta 0.3 --span 0,1", "--theta has one entry, and the line is its range: give --span"),

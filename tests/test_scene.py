@@ -161,7 +161,7 @@ def test_malformed_files_are_refused(text: str, message: str, tmp_path: Path) ->
         ),
         (
             '<option integrator="RK4"/>',
-            r"here combines RK4 with contacts.*; set integrator to euler or implicitfast in .* --integrator$",
+            r"here combines RK4 with contacts.*; set integrator to euler or implicitfast in .* --integrator euler$",
             {"integrator": "implicitfast"},
         ),
         (

@@ -14,6 +14,7 @@ import xarray as xr
 from estimators import ENOUGH_EFFECTIVE
 from estimators.estimator import label_of
 from mjx_study.choices import FAMILIES, REFERENCE
+from mjx_study.option import SCENE_OPTIONS
 from mjx_study.study.configuration import StudyConfig
 from mjx_study.study.findings import Row, curves_of, findings_of, line_of, onset_of, remains, rows_of
 from mjx_study.study.iteration import REASONS
@@ -23,7 +24,7 @@ from mjx_study.table import format_table, number, percent, with_error
 Column = tuple[str, Callable[[Row], str]]
 DESCENT_COLUMNS: Final = ("final_cost", "best_cost", "alpha", "seed_rollouts", "seconds")
 """Columns of the table of `optimise`, a task's metrics after the second."""
-CHOSEN: Final = ("theta", "gamma", "onset", "noise", "baseline", "weights")
+CHOSEN: Final = ("theta", "gamma", "onset", "noise", "baseline", "weights", *SCENE_OPTIONS)
 """Options that the header of a table states where they are given."""
 MOST_SHOWN: Final = 3
 """Maximum number of parameters printed."""
@@ -97,7 +98,8 @@ def _chosen(config: dict[str, Any]) -> str:
     given = {name: config[name] for name in CHOSEN if config.get(name) not in (None, StudyConfig.default(name))}
     if (theta := given.get("theta")) is not None:
         given["theta"] = ", ".join(f"{each:g}" for each in theta[:MOST_SHOWN]) + (" ..." if theta[MOST_SHOWN:] else "")
-    return "".join(f", {name} {value}" for name, value in given.items())
+    told = {name: ",".join(value) if isinstance(value, list) else value for name, value in given.items()}
+    return "".join(f", {name.replace('_', ' ')} {value}" for name, value in told.items())
 
 
 def gradient_lines(dataset: xr.Dataset, document: dict[str, Any], details: bool = False) -> list[str]:
@@ -108,7 +110,9 @@ def gradient_lines(dataset: xr.Dataset, document: dict[str, Any], details: bool 
         lines.append(
             f"{task}: {', '.join(map(str, config['samples']))} samples in each batch, "
             f"sigma {', '.join(f'{sigma:g}' for sigma in dataset['sigma'].values)}, "
-            f"{', '.join(map(str, resolved['horizon']))} steps, {', '.join(dataset['cone'].values)} cone, "
+            f"{', '.join(map(str, resolved['horizon']))} steps of "
+            f"{', '.join(f'{step:g}' for step in dataset['timestep'].values)} s, "
+            f"{', '.join(dataset['cone'].values)} cone, "
             f"seed {config['seed']}, {document['environment']['precision']}{_chosen(config)}"
         )
     width = shutil.get_terminal_size((140, 24)).columns

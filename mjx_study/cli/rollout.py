@@ -26,7 +26,7 @@ def add(command: Parser) -> None:
     command.add_task_options()
     command.add_contact_options("the middle one of the task's sweep", many=False, analytic=False)
     command.add_flag("--noisy", "add noise, drawn with --seed (default: none)")
-    command.add_theta_option("parameters, and of a policy also its contact, horizon, model and cone")
+    command.add_theta_option("parameters, and of a policy also its contact, horizon and MJCF options")
     command.add_option("frames", 6)
     command.add_argument("--view", choices=["auto", *PLANES], default="auto", help="default: auto, by the motion")
     command.add_argument("--renderer", choices=RENDERERS, default="auto", help="default: auto, opengl where it works")

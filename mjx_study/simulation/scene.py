@@ -65,9 +65,9 @@ class Scene:
     """
 
     name: str
-    host: mujoco.MjModel
-    model: mjx.Model
-    template: mjx.Data
+    host: mujoco.MjModel = dataclasses.field(repr=False)
+    model: mjx.Model = dataclasses.field(repr=False)
+    template: mjx.Data = dataclasses.field(repr=False)
     adjoint: str = "auto"
 
     def __post_init__(self) -> None:
@@ -189,7 +189,7 @@ def put_scene(host: mujoco.MjModel, name: str, *, adjoint: SceneOption = "auto",
         raise SceneError(
             f"{name} combines RK4 with contacts, limits, equalities or friction loss: RK4's stages would solve the "
             "constraints four times per step without an order to gain; set integrator to euler or implicitfast "
-            "in its <option>, or give --integrator"
+            "in its <option>, or give --integrator euler"
         )
     return scene
 

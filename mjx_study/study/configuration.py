@@ -193,7 +193,8 @@ class StudyConfig(Checked):
             given = [f"`{name}`" for name in options if self.given(name)]
             if other != kind and given:
                 listed = f"{' and '.join(given)} {'is' if len(given) == 1 else 'are'}"
-                raise ValueError(f"{listed} for {other}: {ASKED_BY.get(other, 'omit it')}")
+                advice = ASKED_BY.get(other) if self.kind is None else f"`kind` is {kind}"
+                raise ValueError(f"{listed} for {other}: {advice or 'omit it'}")
         check_span(self.span)
 
     def _named(self, name: str) -> Any:

@@ -55,7 +55,9 @@ def refuse_idle(config: StudyConfig, grids: Sequence[tuple[Task, Sequence[Contac
     ]
     chosen = any(config.stiffness == (task.defaults.middle_stiffness,) for task, _ in grids)  # by the command
     such = "no contact model takes one; add a family that does, such as mujoco"
-    needed = "it changes first-order gradients through simulated contact; add fobg, or a contact family"
+    if not any(task.contact_pair for task, _ in grids):
+        such = f"{grids[0][0].name} names no contact whose stiffness could be set (docs/extending.md: contact_pair)"
+    needed = "it changes first-order gradients through simulated contact, and there are none here"
     corrected = f"{needed} (estimators named _onset have the linear term anyway)"
     for name, effective, reason in (
         ("stiffness", chosen or takes_stiffness(families), such),

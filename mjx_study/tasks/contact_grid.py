@@ -114,7 +114,7 @@ def backward_grid(
     simulated = [point for point in points if not point.analytic]
     for family, point in itertools.product((name for name in families if name != "none"), simulated):
         if point.contact is None:
-            raise ValueError(f"contact {point.family} takes no backward model; give its solref and solimp instead")
+            raise ValueError(f"contact {point.family} takes no backward model: choose another family")
         own = (stiffness or point.stiffness) if FAMILIES[family].swept else None
         with _warnings_of_contact() as caught:
             other = _contact(task, family, own, None)
