@@ -130,9 +130,7 @@ def gradient_lines(dataset: xr.Dataset, document: dict[str, Any], details: bool 
             "be told from zero.",
             MARKS,
         ]
-    lines.append(
-        "ms: computing time of one sample; variance x s: the variance times it, comparable between estimators."
-    )
+    lines.append("ms: computing time of one sample; variance x s: the variance times it, in seconds.")
     if not all(row.believable for row in rows):
         lines.append(
             f"?: fewer than {ENOUGH_EFFECTIVE:g} effective samples carry the batch's variance; trust neither the "
