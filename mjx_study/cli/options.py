@@ -123,9 +123,9 @@ class Parser(argparse.ArgumentParser):
         self.add_builder_options()
         self.add_process_options()
 
-    def add_builder_options(self, *names: str, **changes: dict[str, Any]) -> None:
-        """Add options for the builder of a task, or the named ones of them, with changes to their descriptions."""
-        for name in names or TASK_OPTIONS:
+    def add_builder_options(self, **changes: dict[str, Any]) -> None:
+        """Add options for the builder of a task, with changes to their descriptions."""
+        for name in TASK_OPTIONS:
             self.add_option(name, many=name == "disable_flag", **changes.get(name, {}))
 
     def add_task_argument(self) -> None:
