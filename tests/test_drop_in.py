@@ -1,5 +1,6 @@
 """The drop-in step: MJX's in every field, with derivatives that MJX's lacks, by itself and under the context."""
 
+import itertools
 import re
 from pathlib import Path
 from typing import Any
@@ -61,7 +62,6 @@ def assert_same(ours: Any, theirs: Any, tolerance: float) -> None:
     assert jax.tree.structure(ours) == jax.tree.structure(theirs)
     for (path, one), other in zip(jax.tree_util.tree_leaves_with_path(ours), jax.tree.leaves(theirs), strict=True):
         one, other = np.asarray(one), np.asarray(other)
-        assert one.dtype == other.dtype, path
         scale = np.abs(other[np.isfinite(other)]).max(initial=1.0)
         np.testing.assert_allclose(one, other, rtol=0, atol=tolerance * scale, err_msg=jax.tree_util.keystr(path))
 
@@ -76,11 +76,59 @@ def test_every_field_is_mjxs(name: str) -> None:
     )
     stock, ours = (compiled(function, model, data) for function in (mjx.step, step))
     for _ in range(3):
-        following = stock(model, data)
-        assert_same(ours(model, data), following, 1e-9)
-        carried = {name: getattr(following, name) for name in ("qpos", "qvel", "act", "time", "qacc_warmstart")}
-        data = data.replace(**carried)  # others change their type in a step
+        following = ours(model, data)
+        assert_same(following, stock(model, data), 1e-9)
+        assert jax.tree.map(jax.typeof, following) == jax.tree.map(jax.typeof, data)
+        data = following
     assert np.abs(data.qvel).max() > 0
+
+
+@pytest.mark.parametrize("body", [slider(), '<body pos="0 0 .09"><freejoint/><geom size=".1"/></body>'])
+def test_a_state_of_the_engine_can_be_stepped_in_a_scan(body: str) -> None:
+    """`mjx.put_data` in contact, with fields of 32 bits."""
+    host = mujoco.MjModel.from_xml_string(floor_scene(body, option(extra='cone="elliptic"')))
+    state = mujoco.MjData(host)
+    state.qpos[2] = 0.09 if host.nq == 7 else -0.01
+    mujoco.mj_forward(host, state)
+    assert state.ncon == 1
+    model, data = mjx.put_model(host), mjx.put_data(host, state)
+    last = jax.eval_shape(lambda: jax.lax.scan(lambda data, _: (step(model, data), None), data, length=2)[0])
+    assert jax.tree.map(jax.typeof, last) == jax.tree.map(jax.typeof, data)
+
+
+TENDON_DRIVEN = f"""<mujoco>{option()}<worldbody><geom type="plane" size="1 1 .1"/><site name="a" pos=".3 0 0"/>
+<body pos="0 0 .1"><joint type="slide" axis="1 0 0"/><joint type="slide" axis="0 0 1"/><geom size=".1" mass="1"/>
+<site name="b"/></body></worldbody>
+<tendon><spatial name="t" stiffness="20"><site site="a"/><site site="b"/></spatial></tendon>
+<actuator><general tendon="t" dyntype="filter" dynprm=".05" gainprm="3"/></actuator></mujoco>"""
+INPUTS = {"qpos": (0.01, -0.0004), "qvel": (0.2, -0.3), "act": (0.2,), "ctrl": (0.4,)}
+SOME = [pytest.param(pair, marks=[] if pair == ("qvel",) else [pytest.mark.slow])
+        for size in (1, 2) for pair in itertools.combinations(INPUTS, size)]  # fmt: skip
+
+
+@pytest.mark.parametrize("onset", ["none", "linear"])
+@pytest.mark.parametrize("names", SOME, ids=" ".join)
+def test_derivatives_over_any_input(names: tuple[str, ...], onset: str) -> None:
+    """In both modes, over some inputs of a scanned step: the columns of the derivative over all of them."""
+    model, data = device(TENDON_DRIVEN)
+    point = {name: jnp.array(value) for name, value in INPUTS.items()}
+
+    def last(chosen):
+        start = data.replace(time=jnp.array(1.0), **(point | chosen))
+        following = jax.lax.scan(lambda data, _: (step(model, data, onset=onset), None), start, length=2)[0]
+        return jnp.concatenate([following.qpos, following.qvel, following.act])
+
+    def both(chosen):
+        return jax.jacfwd(last)(chosen), jax.jacrev(last)(chosen)
+
+    some = {name: point[name] for name in names}
+    forward, reverse = compiled(both, some)(some)
+    for name in names:
+        expected = central_jacobian(compiled(lambda x, name=name: last({name: x}), point[name]), point[name], 1e-5)
+        scale = np.abs(expected).max()
+        np.testing.assert_allclose(reverse[name], forward[name], rtol=0, atol=1e-10 * scale)
+        if onset == "none":
+            np.testing.assert_allclose(forward[name], expected, rtol=0, atol=1e-6 * scale)
 
 
 @pytest.mark.slow

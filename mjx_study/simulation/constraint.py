@@ -15,6 +15,7 @@ MJX's constraint rows are private (`Data._impl.efc_*`) and are read only here.
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, Final
 
 import jax
@@ -25,8 +26,10 @@ from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Bool, Float
 
 from mjx_study.simulation._mjx import mjx
+from mjx_study.simulation.derivative_rule import with_rule
 from mjx_study.simulation.linear_algebra import MOST_UNROLLED, product, solve_positive_definite
 from mjx_study.simulation.patches import AT_FIRST_TOUCH, RELAXING, patched
+from mjx_study.simulation.scalars import traced_part
 from mjx_study.simulation.scene import num_constraint_rows
 
 Scalar = Float[Array, ""]
@@ -245,20 +248,34 @@ def solve_to_rounding(model: mjx.Model, data: mjx.Data) -> Qvel:
 
 
 def solve(model: mjx.Model, data: mjx.Data, solver: Solver = run_solver) -> Qvel:
-    """Constrained acceleration [m/s^2 or rad/s^2] with its implicit derivative, exact in forward and reverse mode.
+    """Constrained acceleration [m/s^2 or rad/s^2] with its implicit derivative, da = -G_a^{-1} G_x dx.
 
-    Model and data, after `mjx.fwd_acceleration`, may be traced and differentiated, except for the warm start.
+    Model and data, after `mjx.fwd_acceleration`, may be traced and differentiated, except for the warm start, to any
+    order in any composition of forward and reverse mode.
     """
     if num_constraint_rows(data) == 0:
         return data.qacc_smooth
-    # Named outside of the root finding: JAX saves named values but would recompute those inside.
-    found = checkpoint_name(solver(*jax.lax.stop_gradient((model, data))), "qacc")
-    return jax.lax.custom_root(
-        f=lambda qacc: imbalance(model, data, qacc),
-        initial_guess=found,
-        solve=lambda _, solution: solution,
-        tangent_solve=_solve_linear,
-    )
+    traced, whole = traced_part((model, data))
+
+    def found(traced: Any) -> Qvel:
+        return solver(*jax.lax.stop_gradient(whole(traced)))
+
+    def rule(primals: Any, changes: Any) -> tuple[Qvel, Qvel]:
+        # Named, so that reverse mode saves it instead of running the solver again.
+        qacc = checkpoint_name(root(*primals), "qacc")
+        fixed, structure = jax.tree.flatten(primals)
+        changes = structure.flatten_up_to(changes)
+
+        def gap(moving: Any, qacc: Qvel) -> Qvel:
+            leaves = [leaf if each is None else each for leaf, each in zip(fixed, moving, strict=True)]
+            return imbalance(*whole(*structure.unflatten(leaves)), qacc)
+
+        moving = [None if change is None else leaf for leaf, change in zip(fixed, changes, strict=True)]
+        _, left = jax.jvp(lambda moving: gap(moving, qacc), (moving,), (changes,))
+        return qacc, -_solve_linear(lambda change: jax.jvp(partial(gap, moving), (qacc,), (change,))[1], left)
+
+    root = with_rule(found, rule)
+    return root(traced)
 
 
 def guard_rows(model: mjx.Model, data: mjx.Data) -> tuple[np.ndarray, np.ndarray]:

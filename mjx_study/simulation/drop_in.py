@@ -11,15 +11,15 @@ from typing import Any, Final
 
 import jax
 import jax.numpy as jnp
-from jax.custom_derivatives import SymbolicZero, zero_from_primal
 from jaxtyping import Array, Bool, Float
 
 from mjx_study.choices import unknown
 from mjx_study.simulation import constraint
 from mjx_study.simulation._mjx import mjx
+from mjx_study.simulation.derivative_rule import instantiated, with_rule
 from mjx_study.simulation.dynamics import SAVE_SOLUTION, Qvel, State, fwd_position
 from mjx_study.simulation.integration import difference_position, integrate_position
-from mjx_study.simulation.onset import onset_term, tangent_of, without_derivative
+from mjx_study.simulation.onset import differentiated_once, onset_term, tangent_of, without_derivative
 from mjx_study.simulation.patches import Place, patched
 from mjx_study.simulation.touch import Events, onset_begins
 
@@ -45,7 +45,8 @@ def step(model: mjx.Model, data: mjx.Data, *, onset: str = "none") -> mjx.Data:
             or ends under force, and restricts them to qpos, qvel, act and ctrl (see `_corrected_step`).
 
     Returns:
-        The state after the step, with every field that `mjx.step` fills in.
+        The state after the step, with every field that `mjx.step` fills in, of the type that it had before, so that a
+        step can be scanned. (`mjx.step` turns 32-bit indices of contacts and tendons into 64-bit ones.)
 
     Raises:
         ValueError: unknown onset, or the model is not for MJX's JAX implementation.
@@ -56,8 +57,11 @@ def step(model: mjx.Model, data: mjx.Data, *, onset: str = "none") -> mjx.Data:
         raise ValueError(f"only MJX's implementation in JAX has derivatives, this model is for {model.impl.value}")
     with patched(_SOLVE):
         if onset == "none":
-            return jax.checkpoint(mjx.step, policy=SAVE_SOLUTION)(model, data)
-        return jax.checkpoint(_corrected_step, policy=SAVE_SOLUTION)(model, data, _preceding_contact(model, data))
+            following = jax.checkpoint(mjx.step, policy=SAVE_SOLUTION)(model, data)
+        else:
+            preceding = _preceding_contact(model, data)
+            following = jax.checkpoint(_corrected_step, policy=SAVE_SOLUTION)(model, data, preceding)
+    return jax.tree.map(lambda new, old: new.astype(jax.typeof(old).dtype), following, data)
 
 
 @contextlib.contextmanager
@@ -154,21 +158,21 @@ def _corrected_step(model: mjx.Model, data: mjx.Data, preceding: Preceding) -> m
     return after.replace(qpos=after.qpos + tangent_of(spread), qvel=after.qvel + tangent_of(later))
 
 
-@jax.custom_jvp
-def _onset_change(
+def _no_change(
     model: mjx.Model, data: mjx.Data, preceding: Preceding, moved: Qvel, moved_before: Qvel
 ) -> tuple[Qvel, Qvel]:
-    """Zero velocities, before and after the step, that change with the step at which contact begins or ends."""
     return jnp.zeros_like(moved), jnp.zeros_like(moved)
 
 
-@partial(_onset_change.defjvp, symbolic_zeros=True)
-def _(primals, tangents):
-    model, data, preceding, moved, _ = primals
-    change, change_before = (zero_from_primal(t) if isinstance(t, SymbolicZero) else t for t in tangents[3:])
-    spread, shift = _step_terms(model, data, preceding)
-    zero = jnp.zeros_like(moved)
-    return (zero, zero), (shift @ change_before, spread @ change)
+def _onset_rule(primals: Any, changes: Any) -> tuple[tuple[Qvel, Qvel], tuple[Qvel, Qvel]]:
+    spread, shift = _step_terms(*primals[:3])
+    change, change_before = instantiated(primals[3:], changes[3:])
+    value = _onset_change(*primals[:3], *differentiated_once(primals[3:]))
+    return value, (shift @ change_before, spread @ change)
+
+
+_onset_change = with_rule(_no_change, _onset_rule)
+"""Zero velocities, before and after the step, that change with the step at which contact begins or ends."""
 
 
 def _step_terms(

@@ -22,13 +22,13 @@ import jax
 import jax.numpy as jnp
 import mujoco
 from jax.core import Tracer
-from jax.custom_derivatives import SymbolicZero, zero_from_primal
 from jaxtyping import Array, Bool, Float, Int
 
 from estimators.pytree import register_pytree
 from mjx_study.simulation import constraint
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.constraint import Qvel, Scalar
+from mjx_study.simulation.derivative_rule import instantiated, with_rule
 from mjx_study.simulation.integration import integrate_position
 from mjx_study.simulation.linear_algebra import MOST_UNROLLED, product, solve_positive_definite
 from mjx_study.simulation.patches import patched
@@ -151,17 +151,17 @@ def surrogate_step(
     Derivatives with respect to either model are zero.
     """
 
-    @jax.custom_jvp
-    def advance(model, backward, state, control):
-        return step(scene, model, state, control)
+    traced, whole = traced_part(jax.lax.stop_gradient((model, backward)))
 
-    @advance.defjvp
-    def _(primals, tangents):
-        _, other, state, control = primals
-        _, change = jax.jvp(partial(step, scene, other), (state, control), tangents[2:])
-        return advance(*primals), change
+    def forward(traced, state, control):
+        return step(scene, whole(traced)[0], state, control)
 
-    return advance(jax.lax.stop_gradient(model), jax.lax.stop_gradient(backward), state, control)
+    def rule(primals, changes):
+        point, changes = primals[1:], instantiated(primals[1:], changes[1:])
+        return advance(*primals), jax.jvp(partial(step, scene, whole(primals[0])[1]), point, changes)[1]
+
+    advance = with_rule(forward, rule)
+    return advance(traced, state, control)
 
 
 def rollout(
@@ -259,32 +259,25 @@ def _jacobian_update(scene: Scene, model: mjx.Model, *inputs: Array):
     """`_tape_update` with derivatives by the Jacobian program, except with respect to the model."""
     traced_model, whole = traced_part(model)
 
-    @jax.custom_jvp
-    def update(traced, qpos, *inputs):
-        solved = partial(_constrained_update, solve=constraint.run_solver)
-        return entry_by_entry(solved, whole(traced), scene.template.replace(qpos=qpos), *inputs)
+    def solved(traced, qpos, *inputs):
+        update = partial(_constrained_update, solve=constraint.run_solver)
+        return entry_by_entry(update, whole(traced), scene.template.replace(qpos=qpos), *inputs)
 
-    @partial(update.defjvp, symbolic_zeros=True)
-    def _(primals, tangents):
+    def rule(primals, changes):
         traced, qpos, qvel, act, control, _ = primals
-        model_tangents, *inputs, _ = tangents
-        if any(not isinstance(leaf, SymbolicZero) for leaf in jax.tree.leaves(model_tangents)):
+        if jax.tree.leaves(changes[0]):
             through = lambda traced, *inputs: _tape_update(scene, whole(traced), *inputs)  # noqa: E731
-            return jax.jvp(through, primals, jax.tree.map(_instantiate, primals, tangents))
+            return jax.jvp(through, primals, instantiated(primals, changes))
         value = update(*primals)
-        inputs = [_instantiate(*pair) for pair in zip(primals[1:5], inputs, strict=True)]
         over_step, over_qacc = step_jacobian(scene, whole(traced), qpos, qvel, act, control, value[2])
-        direction = jnp.concatenate(inputs)
+        direction = jnp.concatenate(instantiated(primals[1:5], changes[1:5]))
         out, qacc_out = product(over_step, direction), product(over_qacc, direction)
         nv = qvel.shape[0]
         # The tangent of qacc is for second derivatives: the Jacobian is a function of qacc.
         return value, (out[:nv], out[nv:], qacc_out, jnp.zeros_like(value[3]))
 
+    update = with_rule(solved, rule)
     return update(traced_model, *inputs)
-
-
-def _instantiate(primal, tangent):
-    return zero_from_primal(primal) if isinstance(tangent, SymbolicZero) else tangent
 
 
 def step_jacobian(

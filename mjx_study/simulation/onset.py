@@ -30,7 +30,6 @@ Reference: Kong, Payne, Zhu, Johnson, "Saltation Matrices: The Essential Tool fo
 (arXiv 2306.06862), for the continuous-time limit.
 """
 
-from functools import partial
 from typing import Any, Final
 
 import jax
@@ -41,6 +40,7 @@ from mjx_study.choices import ONSETS, unknown
 from mjx_study.simulation import constraint
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.constraint import Rows, Scalar
+from mjx_study.simulation.derivative_rule import refusing, with_rule
 from mjx_study.simulation.dynamics import (
     SAVE_SOLUTION,
     ControlLaw,
@@ -236,41 +236,26 @@ def on_and_off(
     return jax.vmap(advanced)(jnp.array([True, False]))
 
 
-@jax.custom_jvp
 def tangent_of(value: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Zero, with the derivative of `value`."""
-    return jnp.zeros_like(value)
+    """Zero, with the derivative of `value`; differentiating it again raises TypeError."""
+    return _tangent_of(value)
 
 
-@tangent_of.defjvp
-def _(primals, tangents):
-    return tangent_of(*primals), tangents[0]
+_tangent_of = with_rule(
+    jnp.zeros_like, lambda primals, changes: (_tangent_of(differentiated_once(*primals)), changes[0])
+)
+differentiated_once = refusing("derivatives with the onset term are of first order: it has no second derivative")
 
 
-@jax.custom_jvp
 def tangent_along(matrix: Float[Array, "outputs inputs"], inputs: Float[Array, " inputs"]) -> Float[Array, " outputs"]:
     """Zero, whose derivative is the matrix times that of the inputs."""
-    return jnp.zeros_like(inputs, shape=matrix.shape[:1])
-
-
-@tangent_along.defjvp
-def _(primals, tangents):
-    return tangent_along(*primals), product(primals[0], tangents[1])
+    return tangent_of(product(jax.lax.stop_gradient(matrix), inputs))
 
 
 def without_derivative(model: mjx.Model) -> mjx.Model:
     """Return the model; differentiating with respect to it raises TypeError."""
     traced, whole = traced_part(model)
-    return whole(_without_derivative(traced))
+    return whole(_of_states_only(traced))
 
 
-@jax.custom_jvp
-def _without_derivative(traced: list[Any]) -> list[Any]:
-    return traced
-
-
-@partial(_without_derivative.defjvp, symbolic_zeros=True)
-def _(primals, tangents):
-    if any(not isinstance(leaf, jax.custom_derivatives.SymbolicZero) for leaf in jax.tree.leaves(tangents)):
-        raise TypeError("the onset term has derivatives over states and controls, but not over the model")
-    return primals[0], tangents[0]
+_of_states_only = refusing("the onset term has derivatives over states and controls, but not over the model")

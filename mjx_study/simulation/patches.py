@@ -18,6 +18,7 @@ import mujoco
 from jaxtyping import Array, Float
 
 from mjx_study.simulation._mjx import mjx
+from mjx_study.simulation.derivative_rule import instantiated, with_rule
 from mjx_study.simulation.integration import rotate_quaternion, rotation_between
 from mjx_study.simulation.linear_algebra import cholesky, solve_factored
 
@@ -118,29 +119,27 @@ def wrap_inside(*arguments: Any) -> tuple[Float[Array, " 1"], Float[Array, " 4"]
     return jnp.where(length < 0, length, _UNSEEN), points
 
 
-@jax.custom_jvp
 def cylinder_distance(position: Float[Array, " 3"], size: Float[Array, " 3"]) -> Float[Array, ""]:
     """MJX's signed distance [m] of a point from a cylinder along z, with size (radius, half length, 0) [m].
 
     MJX places contacts by its gradient. For an inside point, the square root in the branch for outside points is at 0,
     so the gradient has no derivative in reverse mode.
     """
-    return _ORIGINAL["collision_sdf", "_cylinder"](position, size)
+    return _cylinder(position, size)
 
 
-@cylinder_distance.defjvp
-def _(primals: Any, tangents: Any) -> Any:
-    position, size = primals
-    square = position[0] ** 2 + position[1] ** 2
-    radius, height = _root(square), jnp.abs(position[2])
+def _cylinder_rule(primals: Any, changes: Any) -> Any:
+    (position, size), (moved, grown) = primals, instantiated(primals, changes)
+    radius, height = _root(position[0] ** 2 + position[1] ** 2), jnp.abs(position[2])
     gaps = jnp.stack([radius - size[0], height - size[1]])
     outside = jnp.maximum(gaps, 0)
-    length = _root(jnp.sum(outside**2))
     across, along = position[:2] / _positive(radius), position[2] / _positive(height)
-    inward = jnp.where(jnp.argmax(gaps) == 0, jnp.append(across, 0), jnp.zeros(3).at[2].set(along))
-    outward = jnp.append(across * outside[0], along * outside[1]) / _positive(length)
-    gradient = jnp.where(gaps.max() < 0, inward, outward)
-    return cylinder_distance(position, size), jnp.dot(gradient, tangents[0])
+    change = jnp.stack([jnp.dot(across, moved[:2]), along * moved[2]]) - grown[:2]
+    inward, outward = jnp.arange(2) == jnp.argmax(gaps), outside / _positive(_root(jnp.sum(outside**2)))
+    return _cylinder(*primals), jnp.dot(jnp.where(gaps.max() < 0, inward, outward), change)
+
+
+_cylinder = with_rule(lambda *arguments: _ORIGINAL["collision_sdf", "_cylinder"](*arguments), _cylinder_rule)
 
 
 def _root(square: Float[Array, ""]) -> Float[Array, ""]:
