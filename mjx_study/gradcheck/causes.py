@@ -13,11 +13,11 @@ from mjx_study.gradcheck.coordinates import (
     LENGTH,
     Coordinate,
     Coordinates,
-    geom_label,
     joint_name,
     joints_above,
     quaternions,
 )
+from mjx_study.simulation.contact_pair import geom_label
 from mjx_study.simulation.engine import HostState, host_data
 from mjx_study.simulation.scene import num_constraint_rows
 

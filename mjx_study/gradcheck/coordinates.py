@@ -157,13 +157,6 @@ def joint_name(host: mujoco.MjModel, joint: int) -> str:
     return host.joint(joint).name or (f"joint {joint} of {body}" if body else f"joint {joint}")
 
 
-def geom_label(host: mujoco.MjModel, geom: int) -> str:
-    """A geom's name, or its body's and its type if it is unnamed."""
-    body = host.body(host.geom_bodyid[geom]).name or "body"
-    kind = mujoco.mjtGeom(int(host.geom_type[geom])).name.removeprefix("mjGEOM_").lower()
-    return host.geom(geom).name or f"the {kind} of {body}"
-
-
 def _parameter_scales(scene: Scene, contact: ContactModel | None) -> Float[np.ndarray, " parameters"]:
     """Largest size of each parameter over all geoms, 1 if all are 0; empty without contacts."""
     rows: Any = scene.template._impl

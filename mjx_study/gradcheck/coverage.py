@@ -6,9 +6,8 @@ undecided cases count as within reach.
 
 import dataclasses
 import functools
-import sys
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, Final
 
@@ -16,7 +15,7 @@ import mujoco
 import numpy as np
 
 from mjx_study.gradcheck.coordinates import joints_above
-from mjx_study.simulation._mjx import mjx
+from mjx_study.simulation.contact_pair import NO_FRICTION, ContactPair, contact_pairs
 from mjx_study.simulation.scene import Scene
 
 ZONES: Final = ("push", "stick", "slide", "separate")
@@ -25,8 +24,6 @@ PARTS: Final = ("contact", *ZONES, "limit", "friction loss", "held", "slipping",
 """Parts that a state can exercise; friction loss is held, or slipping at its bound."""
 OPTIONAL: Final = frozenset({"separate", "contact", "friction loss"})
 """Parts counted but not required: undamped contact never separates within its margin; the others have subparts."""
-NO_FRICTION: Final = mujoco.mjMINMU
-"""Sliding friction that MuJoCo assigns to a contact whose geoms have none."""
 ALIGNED_SINE: Final = 1e-9
 """Sine of the angle below which directions coincide."""
 _STATE, _KIND = mujoco.mjtConstraintState, mujoco.mjtConstraint
@@ -35,7 +32,6 @@ _LOSSES = (int(_KIND.mjCNSTR_FRICTION_DOF), int(_KIND.mjCNSTR_FRICTION_TENDON))
 _SATISFIED, _QUADRATIC = int(_STATE.mjCNSTRSTATE_SATISFIED), int(_STATE.mjCNSTRSTATE_QUADRATIC)
 _FREE, _SLIDE = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_SLIDE)
 _PLANE, _SPHERE = int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_SPHERE)
-_driver: Any = sys.modules[mjx.collision.__module__]  # its collision candidates are not public
 
 
 @dataclasses.dataclass(frozen=True)
@@ -117,35 +113,6 @@ def possible(scene: Scene, host: mujoco.MjModel) -> tuple[frozenset[str], dict[s
     return frozenset(parts), unreachable
 
 
-@dataclasses.dataclass(frozen=True)
-class Pair:
-    """Two geoms tested by MJX for collision.
-
-    Attributes:
-        first: the geom whose type has the smaller number.
-        friction: whether their contact has friction.
-        margin: upper bound on the distance at which contact begins [m].
-    """
-
-    first: int
-    second: int
-    friction: bool
-    margin: float
-
-
-def pairs_of(host: mujoco.MjModel) -> Iterator[Pair]:
-    for *both, index in _driver.geom_pairs(host):
-        first, second = map(int, both)
-        if index >= 0:
-            condim, friction, margin = host.pair_dim[index], host.pair_friction[index, 0], host.pair_margin[index]
-        else:
-            priority = host.geom_priority[both]
-            ruling = np.array(both)[priority == max(priority)]
-            condim, friction = max(host.geom_condim[ruling]), max(host.geom_friction[ruling, 0])
-            margin = sum(host.geom_margin[both])
-        yield Pair(first, second, bool(condim > 1 and friction > NO_FRICTION), float(margin))
-
-
 class Reach:
     """Regions that a model's joints can bring its geoms to; joint limits are ignored, since they are soft."""
 
@@ -154,7 +121,7 @@ class Reach:
         mujoco.mj_kinematics(host, self._zero)
         self._balls = functools.cache(self._bounding_balls)
 
-    def touch(self, pair: Pair) -> bool:
+    def touch(self, pair: ContactPair) -> bool:
         """Whether two geoms may come into contact."""
         if self._host.nmocap:  # may move anything fixed
             return True
@@ -167,7 +134,7 @@ class Reach:
             distance = np.linalg.norm(centre[second] - centre[first]) - radius[first] - radius[second]
         return bool(distance <= pair.margin)
 
-    def slide(self, pair: Pair) -> bool:
+    def slide(self, pair: ContactPair) -> bool:
         """Whether two geoms may move tangentially to their contact, rather than along its normal alone."""
         host, zero = self._host, self._zero
         one, other = (joints_above(host, int(host.geom_bodyid[geom])) for geom in (pair.first, pair.second))
@@ -219,10 +186,10 @@ class Reach:
 def contact_parts(host: mujoco.MjModel) -> tuple[set[str], dict[str, int]]:
     """Contact zones that may be reached, and those that cannot, with the number of pairs of geoms."""
     reach, had, within = Reach(host), Counter(), set()
-    for pair in pairs_of(host):
-        had.update({"contact", *(("stick", "slide") if pair.friction else ("push",))})
+    for pair in contact_pairs(host):
+        had.update({"contact", *(("stick", "slide") if pair.slides else ("push",))})
         if reach.touch(pair):
-            within |= {"contact", "separate", "stick" if pair.friction else "push"}
-            within |= {"slide"} if pair.friction and reach.slide(pair) else set()
+            within |= {"contact", "separate", "stick" if pair.slides else "push"}
+            within |= {"slide"} if pair.slides and reach.slide(pair) else set()
     out = {part: count for part, count in had.items() if part not in within}
     return within, {"contact": out["contact"]} if "contact" in out else out

@@ -11,8 +11,9 @@ from jaxtyping import Float
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.distance import cdist
 
-from mjx_study.gradcheck.coordinates import PAIR_FRICTION, Coordinates, geom_label, quaternions
+from mjx_study.gradcheck.coordinates import PAIR_FRICTION, Coordinates, quaternions
 from mjx_study.simulation.contact import ContactModel
+from mjx_study.simulation.contact_pair import geom_label
 from mjx_study.simulation.engine import HostState, converged_host, host_data
 
 TOLERANCE: Final = 1e-8

@@ -268,7 +268,8 @@ def solve(model: mjx.Model, data: mjx.Data, solver: Solver = run_solver) -> Qvel
 
         def gap(moving: Any, qacc: Qvel) -> Qvel:
             leaves = [leaf if each is None else each for leaf, each in zip(fixed, moving, strict=True)]
-            return imbalance(*whole(*structure.unflatten(leaves)), qacc)
+            model, data = whole(*structure.unflatten(leaves))
+            return imbalance(model, data, qacc)
 
         moving = [None if change is None else leaf for leaf, change in zip(fixed, changes, strict=True)]
         _, left = jax.jvp(lambda moving: gap(moving, qacc), (moving,), (changes,))

@@ -34,6 +34,7 @@ from jaxtyping import Array, Float
 from estimators.pytree import register_pytree
 from mjx_study.choices import DEFAULT_SOLIMP, FAMILIES, MAX_IMPEDANCE, MIN_IMPEDANCE, unknown
 from mjx_study.simulation._mjx import mjx
+from mjx_study.simulation.contact_pair import ContactPair, contact_pairs
 from mjx_study.simulation.scene import Scene
 from mjx_study.table import percent
 
@@ -178,6 +179,23 @@ def stiffness_from_solref(solref: Sequence[float], *, effective_mass: float) -> 
     return effective_mass / (first * second) ** 2, 2 * effective_mass / first
 
 
+def contact_pair(scene: Scene, geom1: str, geom2: str) -> ContactPair:
+    """The contact of two geoms given by name, in either order.
+
+    Raises:
+        SceneError: unknown geom name.
+        ValueError: the geoms are never tested for collision.
+    """
+    geoms = {scene.geom(geom1), scene.geom(geom2)}
+    for pair in contact_pairs(scene.host):
+        if {pair.first, pair.second} == geoms:
+            return pair
+    raise ValueError(
+        f"geoms {geom1!r} and {geom2!r} never collide: they are excluded, fixed to each other, parent and child, or "
+        "their contype and conaffinity have no bit in common"
+    )
+
+
 def effective_mass(scene: Scene, geom1: str, geom2: str) -> float:
     """Return the effective mass [kg] of the contact of two geoms along its normal, in the reference pose.
 
@@ -186,23 +204,21 @@ def effective_mass(scene: Scene, geom1: str, geom2: str) -> float:
 
         m_eff = 2 (condim - 1) impratio / (2 mu^2 (1 + mu^2) (w_1 + w_2))
 
-    in the penalty limit, where mu is the larger friction of the two geoms in the MJCF; explicit pairs and priorities
-    are ignored.
+    in the penalty limit, where mu is the sliding friction of the contact.
 
     Raises:
         SceneError: unknown geom name.
-        ValueError: neither body can move.
+        ValueError: neither body can move, or the geoms never collide.
     """
     host = scene.host
-    geoms = [scene.geom(geom1), scene.geom(geom2)]
-    weight = float(sum(host.body_invweight0[host.geom_bodyid[geom], 0] for geom in geoms))
+    weight = float(sum(host.body_invweight0[host.geom_bodyid[scene.geom(name)], 0] for name in (geom1, geom2)))
     if not weight > 0:
         raise ValueError(f"geoms {geom1!r} and {geom2!r} are both fixed: their contact has no effective mass")
-    condim = int(max(host.geom_condim[geom] for geom in geoms))
-    if condim == 1 or host.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC:
+    pair = contact_pair(scene, geom1, geom2)
+    if pair.condim == 1 or host.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC:
         return 1 / weight
-    mu = float(np.max(host.geom_friction[geoms, 0]))
-    return 2 * (condim - 1) * float(host.opt.impratio) / (2 * mu**2 * (1 + mu**2) * weight)
+    mu = float(pair.friction[0])
+    return 2 * (pair.condim - 1) * float(host.opt.impratio) / (2 * mu**2 * (1 + mu**2) * weight)
 
 
 def soften(contact: ContactModel, factor: float | Array) -> ContactModel:

@@ -109,6 +109,17 @@ def springs_and_dampers(model: mjx.Model, data: mjx.Data) -> Float[Array, " nv"]
     return force + rows.ten_J.T @ (stiffness * (shortest - data.ten_length))
 
 
+def contacts_with_friction(model: mjx.Model, data: mjx.Data) -> dict[Any, Any]:
+    """MJX's contact parameters, with friction of at least MuJoCo's minimum, as in the C engine.
+
+    Without it MJX drops elliptic contacts of zero friction, and the solver does not converge for pyramidal ones.
+    """
+    return {
+        key: contact.replace(friction=jnp.maximum(contact.friction, mujoco.mjMINMU))
+        for key, contact in _ORIGINAL["collision_driver", "_contact_groups"](model, data).items()
+    }
+
+
 def wrap_inside(*arguments: Any) -> tuple[Float[Array, " 1"], Float[Array, " 4"]]:
     """MJX's path of a tendon inside a sphere or cylinder: (length along it or -1, contact points).
 
@@ -188,6 +199,7 @@ Place = tuple[str, str]
 """Module and name of an MJX function; the empty module is the package, whose names only callers of MJX use."""
 
 _REPLACED: Final[dict[Place, Callable[..., Any]]] = {
+    ("collision_driver", "_contact_groups"): contacts_with_friction,
     ("constraint", "_kbi"): stiffness_damping_impedance,
     ("math", "quat_integrate"): turned_quaternion,
     ("math", "quat_sub"): rotation_difference,

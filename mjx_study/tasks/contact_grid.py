@@ -15,6 +15,7 @@ from mjx_study.simulation.contact import (
     ContactModel,
     ContactWarning,
     contact_model,
+    contact_pair,
     family_model,
     stiffness_from_solref,
 )
@@ -184,7 +185,7 @@ def _stiffness(task: Task, contact: ContactModel | None) -> float | None:
     if task.contact_pair is None:
         return None
     if contact is None:
-        solref = task.scene.host.geom_solref[task.scene.geom(task.contact_pair[0])]
+        solref = contact_pair(task.scene, *task.contact_pair).solref
     else:
         solref = np.asarray(contact.solref)
     return stiffness_from_solref(solref.tolist(), effective_mass=task.effective_mass)[0] or None

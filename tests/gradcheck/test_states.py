@@ -4,8 +4,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjx_study.gradcheck.coverage import Coverage, Reach, contact_parts, pairs_of
+from mjx_study.gradcheck.coverage import Coverage, Reach, contact_parts
 from mjx_study.gradcheck.states import Sample, states_of
+from mjx_study.simulation.contact_pair import contact_pairs
 from mjx_study.simulation.engine import host_state
 from mjx_study.simulation.scene import Scene, load_scene, put_scene
 
@@ -101,9 +102,10 @@ def test_balls_on_a_line_cannot_slide() -> None:
     assert on_a_line(0.0) == {"slide": 1} and on_a_line(0.01) == {}
 
 
-@pytest.mark.parametrize("geom", ['condim="1"', 'friction="0 0 0"'])
-def test_contact_without_friction_pushes(geom: str) -> None:
-    _, found = sampled(FLOOR.replace("/>", f" {geom}/>") + puck("<freejoint/>", geom), 4)
+@pytest.mark.parametrize(("geom", "cone"), [('condim="1"', "pyramidal"), ('friction="0 0 0"', "elliptic")])
+def test_contact_without_friction_pushes(geom: str, cone: str) -> None:
+    option = f'<option cone="{cone}"/>'
+    _, found = sampled(FLOOR.replace("/>", f" {geom}/>") + puck("<freejoint/>", geom), 4, option)
     assert found.missing == () and not found.unreachable and found.counts["push"]
 
 
@@ -153,7 +155,7 @@ def test_what_is_called_out_of_reach_is_never_touched() -> None:
     for _ in range(100):
         host = chain(random)
         reach, data = Reach(host), mujoco.MjData(host)
-        within = {frozenset((pair.first, pair.second)): reach.touch(pair) for pair in pairs_of(host)}
+        within = {frozenset((pair.first, pair.second)): reach.touch(pair) for pair in contact_pairs(host)}
         for _ in range(200):
             mujoco.mj_integratePos(host, data.qpos, 3 * random.normal(size=host.nv), 1.0)
             mujoco.mj_fwdPosition(host, data)
