@@ -18,6 +18,7 @@ from mjx_study.simulation.engine import HostState, converged_host, host_data
 
 TOLERANCE: Final = 1e-8
 """Relative difference above which two implementations differ in a quantity."""
+FAR: Final = 1e100
 LEAST_ROW: Final = 1e-12
 """Size below which a constraint row counts as zero."""
 ROUNDING: Final = 1e-14
@@ -257,7 +258,7 @@ def _stage(host: mujoco.MjModel, data: mujoco.MjData, stages: dict[str, Any]) ->
     for name, words in STAGES.items():
         theirs = inertia if name == "qM" else np.asarray(getattr(data, name))
         gap = _relative(np.asarray(stages[name]).reshape(theirs.shape), theirs)
-        if gap > TOLERANCE:
+        if not gap <= TOLERANCE:
             return f"{words} differ{'' if words.endswith('s') else 's'} by {gap:.1e}"
     return None
 
@@ -288,9 +289,9 @@ def _contacts(host: mujoco.MjModel, data: mujoco.MjData, stages: dict[str, Any])
         if len(mine) != len(its):
             texts.append(f"{label} touch at {len(mine)} points in MJX, {len(its)} in C")
             continue
-        order, match = linear_sum_assignment(cdist(mine[:, 1:4], its[:, 1:4]))
+        order, match = _matched(cdist(mine[:, 1:4], its[:, 1:4]))
         gaps = np.abs(mine[order] - its[match]).max(axis=0)
-        if gaps.max() > TOLERANCE:
+        if not gaps.max() <= TOLERANCE:
             texts.append(
                 f"contacts of {label} lie {gaps[1:4].max():.1e} m apart, their depths differ by {gaps[0]:.1e} m, their "
                 f"normals by {gaps[4:7].max():.1e} and their tangents by {gaps[7:].max():.1e}"
@@ -317,7 +318,7 @@ def _rows(host: mujoco.MjModel, data: mujoco.MjData, stages: dict[str, Any], *, 
             found.append((f"there are {len(ours)} active {_kind(kind)} rows in MJX, {len(theirs)} in C", False))
             continue
         far, *rest = (_distances(here[name][ours], there[name][theirs]) for name in ROWS)
-        order, match = linear_sum_assignment(far + 1e-3 * sum(rest))
+        order, match = _matched(far + 1e-3 * sum(rest))
         ours, theirs = ours[order], theirs[match]
         for label in dict.fromkeys(labels[theirs]):
             chosen = labels[theirs] == label
@@ -325,9 +326,14 @@ def _rows(host: mujoco.MjModel, data: mujoco.MjData, stages: dict[str, Any], *, 
                 gap = _relative(here[name][ours[chosen]], there[name][theirs[chosen]])
                 known = name == "efc_aref" and label in ("connect equality", "weld equality")
                 why = " (MJX leaves out -dJ/dt qvel, which the turning of the Jacobian adds)" if known else ""
-                if gap > TOLERANCE:
+                if not gap <= TOLERANCE:
                     found.append((f"{words} of {label} rows differ by {gap:.1e}{why}", known))
     return found
+
+
+def _matched(distances: Float[np.ndarray, "ours theirs"]) -> tuple[np.ndarray, np.ndarray]:
+    """Indices of pairs with the least total distance; what is not finite is matched last."""
+    return linear_sum_assignment(np.nan_to_num(distances, nan=FAR, posinf=FAR))
 
 
 def _distances(ours: np.ndarray, theirs: np.ndarray) -> Float[np.ndarray, "ours theirs"]:

@@ -280,3 +280,27 @@ def test_mjx_stops_what_turns_slower_than_it_sees(speed: float, verdict: str | N
     after = EngineStep(own, None).after(state)
     stopped = dataclasses.replace(after, qpos=state.qpos)
     assert compare_values(own, EngineStep(own, None), state, after, stopped, {}).verdict == verdict
+
+
+RESTING = """<mujoco><worldbody><geom type="plane" size="1 1 .1"/><body pos="0 0 .099"><freejoint/>
+<geom type="box" size=".1 .1 .1"/></body></worldbody></mujoco>"""
+
+
+@pytest.mark.parametrize("name", ["dist", "pos", "frame", "efc_J", "efc_aref", "efc_D", "xpos", "qM", "qacc_smooth"])
+def test_what_is_not_a_number_differs(name: str) -> None:
+    """And is compared nevertheless: no step ends in a traceback."""
+    host = mujoco.MjModel.from_xml_string(RESTING)
+    state = HostState(host.qpos0.copy(), np.zeros(6), np.zeros(0), np.zeros(0), np.zeros(6))
+    engine = EngineStep(make_coordinates(put_scene(host, "box"), None), None)
+    data = host_data(engine.host, state)
+    mujoco.mj_forward(engine.host, data)
+    contact = {part: np.array(getattr(data.contact, part)) for part in ("dist", "pos", "frame", "geom")}
+    rows = {"efc_J": data.efc_J.reshape(data.nefc, 6).copy()}
+    rows |= {part: np.array(getattr(data, part)) for part in ("efc_type", "efc_aref", "efc_D")}
+    stages = stages_of(engine, state) | contact | {"margin": np.array(data.contact.includemargin)} | rows
+    qacc = data.qacc.copy()
+    assert difference_of_engines(engine.host, state, stages, qacc, qacc)[0].startswith("the integration")
+    poisoned = np.full_like(stages[name], np.nan)
+    text, documented = difference_of_engines(engine.host, state, stages | {name: poisoned}, qacc, qacc + 1)
+    assert "differ" in text or "apart" in text or "points" in text or "rows" in text
+    assert not documented or name in ("dist", "pos", "frame")
