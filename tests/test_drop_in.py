@@ -281,6 +281,9 @@ def test_what_has_no_derivative_is_refused() -> None:
     host = mujoco.MjModel.from_xml_string("<mujoco><worldbody/></mujoco>")
     with pytest.raises(ValueError, match="only MJX's implementation in JAX has derivatives, this model is for cpp"):
         step(mjx.put_model(host, impl="cpp"), mjx.make_data(host))
+    host.opt.integrator = mujoco.mjtIntegrator.mjINT_RK4
+    with pytest.raises(ValueError, match="the onset term is that of steps by Euler or implicitfast"):
+        step(mjx.put_model(host), mjx.make_data(host), onset="linear")
     host.opt.noslip_iterations = 3
     with pytest.raises(study.SceneError, match="MJX would leave out part of sled: noslip_iterations"):
         study.check_model(host, "sled")

@@ -11,6 +11,7 @@ from typing import Any, Final
 
 import jax
 import jax.numpy as jnp
+import mujoco
 from jaxtyping import Array, Bool, Float
 
 from mjx_study.choices import unknown
@@ -49,12 +50,16 @@ def step(model: mjx.Model, data: mjx.Data, *, onset: str = "none") -> mjx.Data:
         step can be scanned. (`mjx.step` turns 32-bit indices of contacts and tendons into 64-bit ones.)
 
     Raises:
-        ValueError: unknown onset, or the model is not for MJX's JAX implementation.
-        TypeError: differentiation with respect to the model with the onset term.
+        ValueError: unknown onset, the onset term with RK4, or the model is not for MJX's JAX implementation.
+        TypeError: differentiation with respect to the model, or a second derivative, with the onset term.
     """
     _check_onset(onset)
     if model.impl != mjx.Impl.JAX:
         raise ValueError(f"only MJX's implementation in JAX has derivatives, this model is for {model.impl.value}")
+    if onset != "none" and model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
+        raise ValueError(
+            "the onset term is that of steps by Euler or implicitfast; with RK4, contact begins within a step"
+        )
     with patched(_SOLVE):
         if onset == "none":
             following = jax.checkpoint(mjx.step, policy=SAVE_SOLUTION)(model, data)
