@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from mjx_study.disk import TEMPORARY, prepare_folder, read_whole, write_whole
+from mjx_study.disk import TEMPORARY, prepare_folder, read_whole, temporary_name, write_whole
 from mjx_study.study.dataset import write_dataset
 from mjx_study.study.store import Store, StudyError
-from tests.documents import study_document
+from tests.documents import cell_arrays, study_document
 from tests.faults import deadline, every_fault, from_the_future, put_no_file
 
 CELLS = 3
@@ -23,7 +23,8 @@ DOCUMENT = study_document(CELLS)
 
 
 def numbers(index: int) -> dict[str, np.ndarray]:
-    return {"values": np.random.default_rng(index).normal(size=3000)}  # more than a buffer, so that a write is several
+    values = np.random.default_rng(index).normal(size=3000)  # more than a buffer, so that a write is several
+    return cell_arrays(DOCUMENT, index, values=values)
 
 
 def study(folder: Path) -> Store:
@@ -142,7 +143,7 @@ def test_killed_at_any_system_call_a_study_goes_on(tmp_path: Path) -> None:
 def test_what_a_living_process_writes_stays(tmp_path: Path) -> None:
     """Leftovers are known by their lock, not by their age; other programs' files are not touched."""
     (tmp_path / ".hidden").write_text("another program's")
-    (tmp_path / f".old.abcdefgh{TEMPORARY}").write_text("a dead process's")
+    (tmp_path / temporary_name("old")).write_text("a dead process's")
 
     def opening(file: Any) -> None:
         file.write(b"whole")
@@ -172,7 +173,7 @@ def test_what_is_no_file_is_refused_at_once(tmp_path: Path, kind: str) -> None:
             Store.open(folder)
         with pytest.raises(StudyError, match="cannot read .*study.json"):
             Store.create(folder, DOCUMENT)
-        put_no_file(tmp_path / f".x.abcdefgh{TEMPORARY}", kind)
+        put_no_file(tmp_path / temporary_name("x"), kind)
         prepare_folder(tmp_path)
 
 
@@ -180,7 +181,7 @@ def test_a_clock_in_the_future_changes_nothing(tmp_path: Path) -> None:
     folder = tmp_path / "study"
     study(folder)
     (folder / "cells" / "00001.npz").unlink()
-    (folder / "cells" / f".00001.npz.abcdefgh{TEMPORARY}").write_text("of a dead process")
+    (folder / "cells" / temporary_name("00001.npz")).write_text("of a dead process")
     from_the_future(tmp_path)
     assert Store.open(folder).missing == [1]
     study(folder)

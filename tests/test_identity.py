@@ -2,6 +2,7 @@
 
 import dataclasses
 import importlib
+import json
 import re
 import subprocess
 import sys
@@ -26,6 +27,7 @@ from mjx_study.study.run import load_study, run_study, warnings_of
 from mjx_study.study.store import Part, Store, StudyError
 from mjx_study.tasks import make_task
 from mjx_study.tasks.task import StudyDefaults, Task
+from tests.documents import altered, planned_arrays
 
 MODULE = """
 from functools import partial
@@ -148,7 +150,8 @@ SMALL: dict[str, Any] = {
 @pytest.fixture
 def stubbed(monkeypatch: pytest.MonkeyPatch) -> None:
     def compute_of(plan: StudyPlan) -> Callable[[StudyCell, Part], dict[str, np.ndarray]]:
-        return lambda cell, part: {"residual": np.full(len(plan.config.estimators), cell.model.stiffness)}
+        residual = lambda cell: np.full(len(plan.config.estimators), cell.model.stiffness)  # noqa: E731
+        return lambda cell, part: planned_arrays(plan, cell, residual=residual(cell))
 
     monkeypatch.setitem(sweep_cells.COMPUTE, "gradients", compute_of)
 
@@ -217,8 +220,12 @@ def test_a_cell_counts_in_its_place_alone(tmp_path: Path) -> None:
     (cells / "00000.npz").unlink()
     swept(folder)
     document = (folder / "study.json").read_text()
-    (folder / "study.json").write_text(document.replace('"penalty 10"', '"penalty 11"'))
+    axes = json.loads(document)["axes"]
+    altered(folder / "study.json", axes=axes | {"model": ["penalty 11", *axes["model"][1:]]})
     with pytest.raises(StudyError, match="is another cell"):
+        load_study(folder)
+    (folder / "study.json").write_text(document.replace('"penalty 10"', '"penalty 11"'))
+    with pytest.raises(StudyError, match="study.json is damaged .its digest does not match.; move the folder away"):
         load_study(folder)
     (folder / "study.json").write_text(document)
     kept = Store.open(folder)

@@ -1,20 +1,21 @@
 """A study's folder: its configuration, one file per cell, and one file of all results.
 
-    study.json       configuration, digests of what the numbers depend on, versions, machine, every cell's coordinates
+    study.json       configuration, digests of what the numbers depend on, versions, machine, every cell's coordinates,
+                     and a digest of all that
     cells/00042.npz  one cell's numbers, with digests of these, of the study and of the cell's coordinates
     cells/00042.part.npz  checkpoint of an unfinished cell (descents, or batches in blocks)
-    cells/00042.failed    why a cell could not be computed; the next run retries
-    results.nc       all cells as one NetCDF file, written after the last
+    cells/00042.failed    why a cell could not be computed, with a digest; the next run retries
+    results.nc       all cells as one NetCDF file, written after the last and never read
     study.lock       which cells are being computed, and by which process
 
 Files are moved into place once complete, so a process may be killed at any time. Locks are the operating system's and
-end with their process.
+end with their process. A folder may come from anywhere: every file that is read is limited in size, is no link, and
+matches its digest and its schema.
 """
 
 import dataclasses
 import fcntl
 import hashlib
-import io
 import json
 import os
 from collections.abc import Callable, Generator, Mapping
@@ -23,21 +24,34 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 
-from mjx_study.disk import open_regular, prepare_folder, read_whole, write_whole
+from mjx_study.disk import check_no_link, open_regular, prepare_folder, read_whole, write_whole
+from mjx_study.files import MOST_BYTES, told
 from mjx_study.identity import ACCEPT, differences
+from mjx_study.study.arrays import MOST_CELL_BYTES, check_cell, read_arrays, write_arrays
 from mjx_study.study.dataset import as_plain
-from mjx_study.study.document import document_of, read_document, read_format
+from mjx_study.study.document import document_of, read_document, read_format, sealed
 from mjx_study.study.plan import StudyPlan
 
-FORMAT: Final = 3
+FORMAT: Final = 4
 """Format of the folder; increased when older programs cannot read newer folders."""
 VERSIONS: Final = "versions"
 """Entry of a cell that records the versions that computed it."""
+VERSIONS_SCHEMA: Final = TypeAdapter(dict[str, str])
 
 
 class StudyError(ValueError):
     """A folder holds no study, another study, or a damaged file."""
+
+
+class _Failure(BaseModel):
+    """A file that states why a cell could not be computed; its digest is of the reason, the study and the cell."""
+
+    model_config = ConfigDict(strict=True)
+
+    reason: str
+    digest: str
 
 
 @dataclasses.dataclass(frozen=True)
@@ -81,7 +95,7 @@ class Store:
         """
         kept = cls.begun(folder, document, accept_versions=accept_versions)
         prepare_folder(folder)
-        prepare_folder(folder / "cells")
+        prepare_folder(folder / "cells", follow=False)
         document = as_plain({"format": FORMAT} | document)
         if kept is not None:
             if _iterations(document) > _iterations(kept.document):
@@ -97,7 +111,7 @@ class Store:
     @classmethod
     def begun(cls, folder: Path, document: dict[str, Any], *, accept_versions: bool = False) -> "Store | None":
         """Open a folder's study for reading, as `create` would resume it; None if there is none. Raises as `create`."""
-        if not (folder / "study.json").exists():
+        if not os.path.lexists(folder / "study.json"):
             return None
         document, kept = as_plain({"format": FORMAT} | document), cls.open(folder)
         theirs, ours = ({**parts["contents"], **parts["config"]} for parts in map(_identity, (kept.document, document)))
@@ -125,8 +139,7 @@ class Store:
         self._write_document()
 
     def _write_document(self) -> None:
-        content = json.dumps(self.document, indent=1) + "\n"
-        write_whole(self.folder / "study.json", lambda file: file.write(content.encode()))
+        write_whole(self.folder / "study.json", sealed(self.document))
 
     @classmethod
     def open(cls, folder: Path) -> "Store":
@@ -134,7 +147,7 @@ class Store:
         format."""
         path = folder / "study.json"
         try:
-            content = read_whole(path)
+            content = read_whole(path, follow=False, most=MOST_BYTES)
             version = read_format(content)
             document = read_document(content) if version == FORMAT else {}
         except FileNotFoundError as error:
@@ -145,6 +158,10 @@ class Store:
             raise StudyError(f"{path} is damaged ({error}); move the folder away to start again") from error
         if version != FORMAT:
             raise StudyError(f"{path} is of format {version}; this program reads {FORMAT}")
+        try:
+            check_no_link(folder / "cells")
+        except OSError as error:
+            raise StudyError(f"cannot read {folder / 'cells'}: {_told(error)}") from error
         return cls(folder, document)
 
     def path(self, index: int) -> Path:
@@ -152,7 +169,7 @@ class Store:
 
     def has(self, index: int) -> bool:
         """Whether a cell's file exists; `read` checks it."""
-        return self.path(index).exists()
+        return os.path.lexists(self.path(index))
 
     def part_path(self, index: int) -> Path:
         return self.path(index).with_suffix(".part.npz")
@@ -163,13 +180,27 @@ class Store:
         self._failed(index).unlink(missing_ok=True)
 
     def write_failure(self, index: int, reason: str) -> None:
-        write_whole(self._failed(index), lambda file: file.write(reason.encode()))
+        failure = _Failure(reason=reason, digest=self._digest_of_failure(index, reason))
+        write_whole(self._failed(index), failure.model_dump_json().encode())
 
     @property
     def failures(self) -> dict[int, str]:
-        """Reasons why missing cells could not be computed."""
-        paths = sorted((self.folder / "cells").glob("*.failed"))
-        return {int(path.stem): path.read_text() for path in paths if not self.has(int(path.stem))}
+        """Reasons why missing cells could not be computed; StudyError if one is damaged."""
+        found = {}
+        for index in self.missing:
+            if os.path.lexists(path := self._failed(index)):
+                try:
+                    content = read_whole(path, follow=False, most=MOST_BYTES)
+                    failure = _Failure.model_validate_json(content)
+                    if failure.digest != self._digest_of_failure(index, failure.reason):
+                        raise ValueError("its digest does not match")
+                except (OSError, ValueError) as error:
+                    raise StudyError(f"{path} is damaged ({_told(error)}); remove it") from error
+                found[index] = failure.reason
+        return found
+
+    def _digest_of_failure(self, index: int, reason: str) -> str:
+        return _digest_of_text({"reason": reason, "study": self._study, "place": self._place(index)})
 
     def _failed(self, index: int) -> Path:
         return self.path(index).with_suffix(".failed")
@@ -183,11 +214,11 @@ class Store:
         kept = dict(arrays) | {VERSIONS: np.array(json.dumps(versions))}
         digest = np.array([_digest(kept), self._study, self._place(index, part=part)])
         path = self.part_path(index) if part else self.path(index)
-        write_whole(path, lambda file: np.savez(file, digest=digest, **kept))  # type: ignore[arg-type]
+        write_whole(path, lambda file: write_arrays(file, {"digest": digest} | kept))
 
     def _authors(self, index: int) -> dict[str, str]:
         """Versions that computed a cell, including those of its checkpoint."""
-        if not self.part_path(index).exists():
+        if not os.path.lexists(self.part_path(index)):
             return self._versions
         before = self.read_with_versions(index, part=True)[1]
         names = dict.fromkeys([*before, *self._versions])
@@ -200,7 +231,7 @@ class Store:
 
     def read_part(self, index: int) -> dict[str, np.ndarray]:
         """Read a cell's checkpoint; empty if there is none."""
-        return self.read_with_versions(index, part=True)[0] if self.part_path(index).exists() else {}
+        return self.read_with_versions(index, part=True)[0] if os.path.lexists(self.part_path(index)) else {}
 
     def read_all(self) -> dict[int, tuple[dict[str, np.ndarray], dict[str, str]]]:
         """Read all computed cells with their versions."""
@@ -209,13 +240,12 @@ class Store:
 
     def read_with_versions(self, index: int, *, part: bool = False) -> tuple[dict[str, np.ndarray], dict[str, str]]:
         """Read the numbers of a cell, or its checkpoint, and the versions that computed them; StudyError if the file is
-        damaged, or belongs to another study or cell."""
+        damaged, or belongs to another study or cell, or a cell lacks a variable or has one of another shape."""
         path = self.part_path(index) if part else self.path(index)
         try:
-            with np.load(io.BytesIO(read_whole(path)), allow_pickle=False) as stored:
-                arrays = {name: stored[name] for name in stored.files}
+            arrays = read_arrays(read_whole(path, follow=False, most=MOST_CELL_BYTES))
             content, study, place = arrays.pop("digest").tolist()
-        except Exception as error:  # numpy, zipfile and zlib may raise anything
+        except Exception as error:  # numpy and zipfile may raise anything
             raise StudyError(f"{path} is damaged ({_told(error)}); move it away to compute it again") from error
         wrong = {
             "a cell of another study": study != self._study,
@@ -224,7 +254,14 @@ class Store:
         }
         if is_that := next((what for what, holds in wrong.items() if holds), None):
             raise StudyError(f"{path} is {is_that}; move it away to compute it again")
-        return arrays, json.loads(str(arrays.pop(VERSIONS)))
+        try:
+            versions = VERSIONS_SCHEMA.validate_json(str(arrays.pop(VERSIONS, "")))
+            if not part:
+                check_cell(arrays, self.document, index)
+        except ValueError as error:
+            reason = f"does not fit the study ({_told(error)})"
+            raise StudyError(f"{path} {reason}; move it away to compute it again") from error
+        return arrays, versions
 
     @contextmanager
     def claims(self) -> Generator[Callable[[int], bool]]:
@@ -235,7 +272,7 @@ class Store:
         """
         path = self.folder / "study.lock"
         try:
-            descriptor = open_regular(path, os.O_RDWR | os.O_CREAT)
+            descriptor = open_regular(path, os.O_RDWR | os.O_CREAT, follow=False)
         except OSError as error:
             raise StudyError(f"cannot lock {path}: {_told(error)}") from error
         with os.fdopen(descriptor, "r+b") as file:
@@ -279,7 +316,7 @@ def _document_in(plan: StudyPlan, folder: Path, command: str | None = None) -> d
     """Document of a plan, with the chunk size of a study begun in the folder."""
     document = document_of(plan, command)
     if plan.config.chunk_size is None:
-        begun = (folder / "study.json").exists()
+        begun = os.path.lexists(folder / "study.json")
         document["config"]["chunk_size"] = Store.open(folder).chunk_size if begun else plan.chunk_size
     return document
 
@@ -307,4 +344,6 @@ def _iterations(document: Mapping[str, Any]) -> int:
 
 
 def _told(error: Exception) -> str:
+    if isinstance(error, ValidationError):
+        return told(error)
     return (error.strerror if isinstance(error, OSError) else None) or str(error)
