@@ -86,6 +86,7 @@ class StudyDocument(_Part):
     digest: str
     config: _Config
     contents: dict[str, str]
+    seen: dict[str, str] = {}
     versions: dict[str, str]
     warnings: list[str]
     environment: _Environment
@@ -173,6 +174,7 @@ def document_of(plan: StudyPlan, command: str | None) -> dict[str, Any]:
         "config": fields,
         "warnings": list(plan.warnings),
         "contents": plan.contents,
+        "seen": plan.seen,
         "versions": versions(),
         "environment": environment(),
         "revision": git_revision(),

@@ -26,6 +26,7 @@ from typing import Any, Final
 import numpy as np
 from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 
+from estimators.seen import seen_now
 from mjx_study.disk import check_no_link, open_regular, prepare_folder, read_whole, write_whole
 from mjx_study.files import MOST_BYTES, told
 from mjx_study.identity import ACCEPT, differences
@@ -100,6 +101,7 @@ class Store:
         if kept is not None:
             if _iterations(document) > _iterations(kept.document):
                 kept._extend(document)
+            kept.record(document.get("seen", {}))
             kept._versions = document.get("versions", {})
             return kept
         if any((folder / "cells").glob("*.npz")):
@@ -115,7 +117,8 @@ class Store:
             return None
         document, kept = as_plain({"format": FORMAT} | document), cls.open(folder)
         theirs, ours = ({**parts["contents"], **parts["config"]} for parts in map(_identity, (kept.document, document)))
-        if told := differences(theirs, ours):
+        seen = kept.document.get("seen", {})
+        if told := differences(theirs, ours) or differences(seen, seen_now(seen)):
             raise StudyError(f"{folder} holds another study ({told}); choose another folder")
         there, asked = _iterations(kept.document), _iterations(document)
         if asked < there:
@@ -137,6 +140,13 @@ class Store:
                 self.path(index).unlink()
         self.document |= {"config": document["config"], "resolved": document["resolved"]}
         self._write_document()
+
+    def record(self, seen: Mapping[str, str]) -> None:
+        """Add to study.json what else the user's code has read; see `estimators.seen`."""
+        before = self.document.get("seen", {})
+        if new := {name: digest for name, digest in seen.items() if name not in before}:
+            self.document["seen"] = before | new
+            self._write_document()
 
     def _write_document(self) -> None:
         write_whole(self.folder / "study.json", sealed(self.document))
