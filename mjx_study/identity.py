@@ -442,10 +442,11 @@ def _state(value: Any) -> dict[str, Any]:
     if dataclasses.is_dataclass(value) and _by_version(kind.__module__):
         return {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
     held = {name: getattr(value, name) for name in _slots(kind) if hasattr(value, name)}
-    held |= {"__wrapped__": value.__wrapped__} if hasattr(value, "__wrapped__") else {}
     own = {name: each for name, each in getattr(value, "__dict__", {}).items() if name not in IMPLIED}
-    if "__wrapped__" in held and _by_version(kind.__module__):  # by jit and the like, which note where the function is
-        own = {name: each for name, each in own.items() if not name.startswith("_")}
+    if (wrapped := getattr(value, "__wrapped__", None)) is not None:
+        if _by_version(kind.__module__):  # jit and the like note where the function is
+            own = {name: each for name, each in own.items() if not name.startswith("_")}
+        held["__wrapped__"] = wrapped
     held |= own
     return {name: held[name] for name in held if not isinstance(getattr(kind, name, None), functools.cached_property)}
 

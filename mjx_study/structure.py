@@ -37,7 +37,7 @@ def _describe(tree: Any) -> Any:
     if type(tree) in (list, tuple):
         return {type(tree).__name__: [_describe(each) for each in tree]}
     kind = type(tree)
-    if names := _fields(kind):
+    if (names := _fields(kind)) is not None:
         return {"class": [kind.__module__, kind.__qualname__], "fields": [_describe(getattr(tree, n)) for n in names]}
     raise ValueError(f"a {kind.__qualname__} is no part of a structure")
 
@@ -59,7 +59,7 @@ def _restore(described: Any) -> Any:
 
 def _instance(kind: Any, values: list[Any]) -> Any:
     names = _fields(kind)
-    if not names or len(names) != len(values):
+    if names is None or len(names) != len(values):
         raise ValueError(f"{kind} is no class of so many fields")
     if issubclass(kind, tuple):
         return tuple.__new__(kind, values)
@@ -69,10 +69,10 @@ def _instance(kind: Any, values: list[Any]) -> Any:
     return made
 
 
-def _fields(kind: Any) -> tuple[str, ...]:
-    """Names of the fields of a named tuple or dataclass of `PACKAGES`; none of any other class."""
+def _fields(kind: Any) -> tuple[str, ...] | None:
+    """Names of the fields of a named tuple or dataclass of `PACKAGES`; None for any other class."""
     if not isinstance(kind, type) or kind.__module__.partition(".")[0] not in PACKAGES:
-        return ()
+        return None
     if issubclass(kind, tuple):
-        return getattr(kind, "_fields", ())
-    return tuple(field.name for field in dataclasses.fields(kind)) if dataclasses.is_dataclass(kind) else ()
+        return getattr(kind, "_fields", None)
+    return tuple(field.name for field in dataclasses.fields(kind)) if dataclasses.is_dataclass(kind) else None

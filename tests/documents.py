@@ -34,9 +34,13 @@ def study_document(cells: int, **changes: Any) -> dict[str, Any]:
 
 
 def cell_arrays(document: Mapping[str, Any], index: int = 0, **given: Any) -> dict[str, np.ndarray]:
-    """What the schema asks of a cell: NaN, but for the arrays that are given."""
+    """What the schema asks of a cell: NaN, and 0 for counts, but for the arrays that are given."""
     kind, sizes = document["config"]["kind"], sizes_of(document, index)
-    blank = {name: np.full([sizes[dim] for dim in VARIABLES[kind][name].dims], np.nan) for name in required(kind)}
+    variables = {name: VARIABLES[kind][name] for name in required(kind)}
+    blank = {
+        name: np.full([sizes[dim] for dim in each.dims], np.nan if each.digits else 0.0)
+        for name, each in variables.items()
+    }
     return blank | {name: np.asarray(value) for name, value in given.items()}
 
 

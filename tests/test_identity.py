@@ -114,7 +114,7 @@ def test_a_module_counts_by_its_source_and_by_what_its_functions_hold(own: Calla
     assert base == digest(own()) and {"source of hopping.py", "source of helping.py"} <= base.keys()
     for changes, what in (
         ({"bias": 1.5}, {"task it", "source of hopping.py"}),
-        ({"weight": 2.5}, {"task it", "source of helping.py"}),
+        ({"weight": 2.5}, {"task it", "source of helping.py", "global WEIGHT of helping"}),
         ({"text": "# a remark\n"}, {"source of hopping.py"}),
     ):
         other = digest(own(**changes))

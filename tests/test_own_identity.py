@@ -9,6 +9,7 @@ import json
 import os
 import subprocess
 import sys
+from collections import defaultdict
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -80,6 +81,18 @@ CASES: dict[str, tuple[str, str, str]] = {
     "an attribute of a class": (
         "import data\nclass It:\n    by = data.SCALE\n    def cost(self, state): return self.by * state.qpos[0]",
         "It().cost", "task hopping:hop differs",
+    ),
+    "a static method": (
+        "import data\nTABLE = [data.SCALE]\nclass It:\n    @staticmethod\n    def by(): return TABLE[0]",
+        PLAIN.format("It.by()"), "global TABLE of",
+    ),
+    "a class method": (
+        "import data\nTABLE = [data.SCALE]\nclass It:\n    @classmethod\n    def by(cls): return TABLE[0]",
+        PLAIN.format("It.by()"), "global TABLE of",
+    ),
+    "a base class": (
+        "import data\nTABLE = [data.SCALE]\nclass Base:\n    def by(self): return TABLE[0]\nclass It(Base): pass",
+        PLAIN.format("It().by()"), "global TABLE of",
     ),
     "a property": (
         "import data\nTABLE = [data.SCALE]\nclass It:\n    @property\n    def by(self): return TABLE[0]\nit = It()",
@@ -160,7 +173,7 @@ def world(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[
     """Writes the files that the cases read, with other content each time; nothing is imported before."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
-    monkeypatch.setattr(seen, "_SEEN", type(seen._SEEN)(dict))
+    monkeypatch.setattr(seen, "_SEEN", defaultdict(dict))
     (tmp_path / "below").mkdir()
 
     def write(scale: float) -> None:
@@ -265,7 +278,7 @@ def test_reads_of_users_count_and_no_others(tmp_path: Path, monkeypatch: pytest.
     """Not those of this package and of libraries, nor of files that are made meanwhile, nor outside `observing`."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr(seen, "_SEEN", type(seen._SEEN)(dict))
+    monkeypatch.setattr(seen, "_SEEN", defaultdict(dict))
     monkeypatch.delenv("MINE", raising=False)
     (tmp_path / "outside.py").write_text(OUTSIDE)
     (tmp_path / "mine.txt").write_text("mine")

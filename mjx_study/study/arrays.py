@@ -23,6 +23,8 @@ HEADERS: Final = {
 """Readers of .npy headers, by version of the format."""
 KINDS: Final = "fiub"
 """Kinds of the types that a variable may have."""
+MOST_COUNT: Final = 10**15
+"""Maximum of a variable that counts."""
 SIZES: Final = {"solref_entry": 2, "solimp_entry": 5}
 """Dimensions of the same size in every study."""
 
@@ -84,7 +86,8 @@ def sizes_of(document: Mapping[str, Any], index: int) -> dict[str, int]:
 def check_cell(arrays: Mapping[str, np.ndarray], document: Mapping[str, Any], index: int) -> None:
     """Raise ValueError unless a cell has all variables of its kind of study, in their shapes; others are ignored.
 
-    Descents of a task may have fewer iterations than the longest of the study.
+    Descents of a task may have fewer iterations than the longest of the study. Counts are neither negative nor huge,
+    and not NaN except after the end of a descent and without an onset term.
     """
     kind, sizes = document["config"]["kind"], sizes_of(document, index)
     if missing := [name for name in required(kind) if name not in arrays]:
@@ -102,3 +105,6 @@ def check_cell(arrays: Mapping[str, np.ndarray], document: Mapping[str, Any], in
         )
         if not within:
             raise ValueError(f"{name} has shape {array.shape}; the study needs {wanted}")
+        padded = np.isnan(array) if "iteration" in variable.dims or name in ONSETS else np.zeros(array.shape, bool)
+        if not variable.digits and not np.all(padded | ((array >= 0) & (array <= MOST_COUNT))):
+            raise ValueError(f"{name} is no count")

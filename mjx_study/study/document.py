@@ -1,7 +1,6 @@
 """study.json: what a plan writes into it, and its schema; files from elsewhere are validated before use."""
 
 import dataclasses
-import hashlib
 import json
 import math
 from collections import Counter, defaultdict
@@ -13,15 +12,13 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from estimators import Estimator, find_estimator
 from estimators.catalogue import CATALOGUE, ORACLES
 from estimators.estimator import label_of
-from mjx_study.files import Finite, Schema, told
+from mjx_study.files import Finite, Schema, digest_of_json, told
 from mjx_study.identity import git_revision, versions
 from mjx_study.option import OPTIONS
 from mjx_study.runtime import environment
 from mjx_study.study.plan import StudyCell, StudyPlan, estimators_of
 from mjx_study.table import digits_to_tell_apart
 
-DIGEST: Final = "digest"
-"""Key of the digest of all other keys."""
 MOST_NUMBERS: Final = 500_000_000
 """Maximum size of a variable of a study."""
 Name = Annotated[str, Field(min_length=1, max_length=1000)]
@@ -134,7 +131,7 @@ def read_format(content: bytes | str) -> int:
 
 def sealed(document: dict[str, Any]) -> bytes:
     """Write a study.json, with a digest of everything else in it."""
-    return (json.dumps(document | {DIGEST: _digest(document)}, indent=1) + "\n").encode()
+    return (json.dumps(document | {"digest": digest_of_json(document)}, indent=1) + "\n").encode()
 
 
 def read_document(content: bytes | str) -> dict[str, Any]:
@@ -142,14 +139,9 @@ def read_document(content: bytes | str) -> dict[str, Any]:
     that the digest does not match."""
     _validated(StudyDocument, content)
     document = json.loads(content)
-    if document.pop(DIGEST) != _digest(document):
+    if document.pop("digest") != digest_of_json(document):
         raise ValueError("its digest does not match")
     return document
-
-
-def _digest(document: dict[str, Any]) -> str:
-    rest = {name: value for name, value in document.items() if name != DIGEST}
-    return hashlib.sha256(json.dumps(rest, sort_keys=True).encode()).hexdigest()
 
 
 def _validated(schema: type[Schema], content: bytes | str) -> Schema:

@@ -201,7 +201,7 @@ def _part(store: Store, index: int) -> Part:
         with suppress(OSError):
             store.write_part(index, arrays)
 
-    return Part(store.read_part(index), keep)
+    return Part(store.read_part(index), keep, name=str(store.part_path(index)))
 
 
 def load_study(folder: str | Path) -> xr.Dataset:

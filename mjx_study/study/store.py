@@ -28,7 +28,7 @@ from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 
 from estimators.seen import seen_now
 from mjx_study.disk import check_no_link, open_regular, prepare_folder, read_whole, write_whole
-from mjx_study.files import MOST_BYTES, told
+from mjx_study.files import MOST_BYTES, digest_of_json, told
 from mjx_study.identity import ACCEPT, differences
 from mjx_study.study.arrays import MOST_CELL_BYTES, check_cell, read_arrays, write_arrays
 from mjx_study.study.dataset import as_plain
@@ -62,11 +62,23 @@ class Part:
     Attributes:
         kept: arrays of the last checkpoint.
         report: reports progress within the cell: done, total, and what is being computed.
+        name: name of the checkpoint in messages.
     """
 
     kept: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
     save: Callable[[dict[str, np.ndarray]], None] = lambda arrays: None
     report: Callable[[int, int, str], None] = lambda done, total, what: None
+    name: str = "the checkpoint"
+
+    @contextmanager
+    def restored(self) -> Generator[None]:
+        """Let arrays of the checkpoint that are missing or of another form be a StudyError."""
+        try:
+            yield
+        except (KeyError, IndexError, TypeError, ValueError) as error:
+            reason = f"no {error}" if isinstance(error, KeyError) else _told(error)
+            message = f"{self.name} does not fit the study ({reason}); move it away to compute its cell again"
+            raise StudyError(message) from error
 
 
 class Store:
@@ -75,7 +87,7 @@ class Store:
     def __init__(self, folder: Path, document: dict[str, Any]):
         self.folder, self.document = folder, document
         self._versions: dict[str, str] = document.get("versions", {})
-        self._study = _digest_of_text(_identity(document))
+        self._study = digest_of_json(_identity(document))
 
     @property
     def chunk_size(self) -> int:
@@ -210,7 +222,7 @@ class Store:
         return found
 
     def _digest_of_failure(self, index: int, reason: str) -> str:
-        return _digest_of_text({"reason": reason, "study": self._study, "place": self._place(index)})
+        return digest_of_json({"reason": reason, "study": self._study, "place": self._place(index)})
 
     def _failed(self, index: int) -> Path:
         return self.path(index).with_suffix(".failed")
@@ -300,7 +312,7 @@ class Store:
         cell, axes = self.document["cells"][index], self.document.get("axes", {})
         at = {name: axes[name][place] for name, place in cell.get("at", {}).items()}
         iterations = None if part else self.document["config"].get("iterations")
-        return _digest_of_text({"index": index, "cell": cell, "at": at, "iterations": iterations})
+        return digest_of_json({"index": index, "cell": cell, "at": at, "iterations": iterations})
 
     @property
     def missing(self) -> list[int]:
@@ -337,10 +349,6 @@ def _digest(arrays: Mapping[str, np.ndarray]) -> str:
         array = np.ascontiguousarray(arrays[name])
         sha.update(f"{name} {array.dtype} {array.shape}".encode() + array.tobytes())
     return sha.hexdigest()
-
-
-def _digest_of_text(document: Mapping[str, Any]) -> str:
-    return hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()
 
 
 def _identity(document: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
