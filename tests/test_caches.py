@@ -96,14 +96,14 @@ def test_a_cache_that_others_can_write_to_is_not_used(
     ):
         configure(**settings, cache=tmp_path / "mjx-study")
     configure(**settings)
-    assert traces_folder() is None and jax.config.jax_compilation_cache_dir is None
+    assert traces_folder() is None and jax.config.values["jax_compilation_cache_dir"] is None
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("mjx-study: compiled programs cannot be kept in") and "others can write to it" in line
     (tmp_path / "mjx-study").chmod(0o700)
     configure(**settings)
     assert traces_folder() == tmp_path / "mjx-study" / "traces"
     configure(**settings, cache="gs://bucket/cache")
-    assert traces_folder() is None and jax.config.jax_compilation_cache_dir == "gs://bucket/cache"
+    assert traces_folder() is None and jax.config.values["jax_compilation_cache_dir"] == "gs://bucket/cache"
 
 
 FLIPPED = """

@@ -270,6 +270,26 @@ def test_a_longer_run_is_neither_cut_nor_lost(tmp_path: Path) -> None:
     assert load_study(tmp_path).equals(longer)
 
 
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"state_0_0": np.zeros(3)}, "state_0_0 has shape .3,. and type float64"),
+        ({"history_1_cost": np.zeros((1, 2))}, "history_1_cost has shape .1, 2. and type float64"),
+        ({"seconds_0": np.zeros(9)}, "it has 9 iterations"),
+        ({"history_0_cost": None}, "no 'history_0_cost'"),
+    ],
+)
+def test_a_checkpoint_of_other_arrays_is_refused(tmp_path: Path, changes: dict[str, Any], says: str) -> None:
+    descended(tmp_path, 2)
+    store = Store.open(tmp_path)
+    arrays, versions = store.read_with_versions(0)
+    changed = {name: array for name, array in (arrays | changes).items() if array is not None}
+    store._write(0, changed, versions, part=True)
+    store.path(0).unlink()
+    with pytest.raises(StudyError, match=f"00000.part.npz does not fit the study .{says}.; move it away to compute"):
+        descended(tmp_path, 2)
+
+
 @pytest.mark.parametrize("moment", range(1, 4))
 def test_a_run_made_longer_survives_a_kill(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, moment: int) -> None:
     """Killed at each write of the step from six iterations to eight, it is done again, to the same numbers."""
