@@ -29,16 +29,12 @@ def test_a_few_forged_folders_get_an_answer(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_thousand_flips_are_noticed(tmp_path: Path) -> None:
-    check([fuzzing_studies.flip_studies(1000, tmp_path), fuzzing_studies.flip_cached(1000, tmp_path)])
-
-
-@pytest.mark.slow
-def test_hundreds_of_forged_folders_get_an_answer(tmp_path: Path) -> None:
-    rows = fuzzing_studies.forge_studies(100, tmp_path)
+def test_thousands_of_flips_and_hundreds_of_forged_folders_get_an_answer(tmp_path: Path) -> None:
+    """Figures with -rP."""
+    rows = fuzzing_studies.fuzz_studies(1000, 100, tmp_path)
     print(*rows, sep="\n")
     check(rows)
-    assert sum(row.inputs for row in rows) >= 400
+    assert sum(row.inputs for row in rows) >= 2400
 
 
 def test_the_fuzzer_finds_what_is_wrong(tmp_path: Path) -> None:
