@@ -76,6 +76,25 @@ class Moments:
             **_extremes(rows, places, mean, centre),
         )
 
+    @property
+    def parts(self) -> int:
+        """Number of batches that are paired."""
+        return self.mean.shape[0]
+
+    def check(self, params: int) -> None:
+        """Raise ValueError unless the arrays are moments of so many parameters, as those of a file may not be."""
+        parts = self.mean.shape[0] if self.mean.ndim == 2 else 1
+        products, kept = len(_pairs(parts)), self.places.size
+        shapes = {
+            "count": (), "mean": (parts, params), "products": (products,), "pairs": (2,), "places": (kept,),
+            "scatter": (products + parts * params,) * 2, "extremes": (kept, parts, params),
+            "thinned": (self.thinned.size // products, products),
+        }  # fmt: skip
+        for name, shape in shapes.items():
+            array, kinds = getattr(self, name), "iu" if name in ("count", "places") else "f"
+            if array.shape != shape or array.dtype.kind not in kinds:
+                raise ValueError(f"{name} has shape {array.shape} and type {array.dtype}")
+
     def merged(self, other: "Moments") -> "Moments":
         """Return the moments of both blocks together; the order affects rounding."""
         count = int(self.count + other.count)

@@ -9,6 +9,8 @@ from contextlib import contextmanager, suppress
 from operator import attrgetter
 from pathlib import Path
 
+from estimators.seen import observing
+
 
 class MissingModuleError(ValueError):
     """The module of a `module:name` cannot be found."""
@@ -30,7 +32,8 @@ def find_attribute(place: str, noun: str, kind: type) -> object:
         raise MissingModuleError(f"{module!r} is not a module name: write it as in an import, without a folder or .py")
     importlib.invalidate_caches()
     try:
-        loaded = importlib.import_module(module)
+        with observing(module):
+            loaded = importlib.import_module(module)
     except (Exception, SystemExit) as error:
         if isinstance(error, ModuleNotFoundError) and f"{module}.".startswith(f"{error.name}."):
             raise MissingModuleError(f"there is no module {error.name!r} here or installed") from error

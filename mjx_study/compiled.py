@@ -2,14 +2,16 @@
 
 JAX caches what XLA compiles; the trace before it is cached here as StableHLO, keyed by a digest of everything it
 depends on (`identity.trace_contents`). Traces that depend on code from outside this package are not cached.
+
+A file holds the structure of the outputs as JSON in a line, and the serialised StableHLO; see `caches` for who may read
+and write it.
 """
 
 import hashlib
+import json
 import os
-import pickle
 import re
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from functools import cache, cached_property
 from pathlib import Path
 from typing import Any, Final
@@ -17,9 +19,10 @@ from typing import Any, Final
 import jax
 import jax.export
 
-from mjx_study.disk import write_whole
+from mjx_study.caches import read_cached, write_cached
 from mjx_study.identity import trace_contents
 from mjx_study.runtime import precision, traces_folder
+from mjx_study.structure import describe, restore
 
 UNTRACED: Final = re.compile("cache|^jax_log|num_cpu_devices")
 """JAX settings that traces do not depend on."""
@@ -117,17 +120,16 @@ class Compiled:
 
         def of_leaves(*leaves: Any) -> list[Any]:
             found, structure = jax.tree.flatten(self._function(*form.unflatten(leaves)))
-            outputs[:] = [structure.unflatten(range(len(found)))]
+            outputs[:] = [structure]
             return found
 
         try:
             trace = jax.export.export(jax.jit(of_leaves))(*types).serialize()
-        except ValueError:  # an operation that cannot be exported
+            described = json.dumps(describe(outputs[0])).encode()
+        except ValueError:  # an operation that cannot be exported, or outputs of a class of others
             return self._whole
-        kept = pickle.dumps((bytes(trace), outputs[0]))
-        with suppress(OSError):
-            path.parent.mkdir(parents=True, exist_ok=True)
-            write_whole(path, lambda file: file.write(kept))
+        kept = described + b"\n" + bytes(trace)
+        write_cached(path, kept)
         return _load(kept)
 
 
@@ -155,14 +157,15 @@ def type_of(leaf: Any) -> jax.ShapeDtypeStruct:
 
 def _read(path: Path) -> Callable[..., Any] | None:
     """Load the function whose trace is in a file; None if the file is missing or unreadable."""
+    kept = read_cached(path)
     try:
-        return _load(path.read_bytes())
-    except Exception:  # a damaged file may raise anything; the trace is then made and written again
+        return None if kept is None else _load(kept)
+    except Exception:  # JAX may raise anything; the trace is then made and written again
         return None
 
 
 def _load(kept: bytes) -> Callable[..., Any]:
-    trace, outputs = pickle.loads(kept)
-    exported, structure = jax.export.deserialize(bytearray(trace)), jax.tree.structure(outputs)
+    described, _, trace = kept.partition(b"\n")
+    exported, structure = jax.export.deserialize(bytearray(trace)), restore(json.loads(described))
     call = lambda *arguments: structure.unflatten(exported.call(*jax.tree.leaves(arguments)))  # noqa: E731
     return jax.jit(call, compiler_options=compiler_options())

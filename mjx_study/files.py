@@ -1,8 +1,10 @@
 """Read user-supplied files and validate them against a schema; errors name the file and the key in one line."""
 
 import dataclasses
+import hashlib
+import json
 import tomllib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Final, TypeVar
 
@@ -29,11 +31,6 @@ def read_bytes(path: Path) -> bytes:
         raise ValueError(f"cannot read {path}: {error.strerror or error}") from error
 
 
-def read_json(path: Path, schema: type[Schema]) -> Schema:
-    """Read a JSON file; ValueError as for `read_bytes`, or if it violates the schema."""
-    return _validated(path, read_bytes(path), schema)
-
-
 def _validated(path: Path, content: bytes, schema: Any) -> Any:
     try:
         return TypeAdapter(schema).validate_json(content)
@@ -41,8 +38,15 @@ def _validated(path: Path, content: bytes, schema: Any) -> Any:
         raise ValueError(f"{path}: {told(error)}") from None
 
 
+def digest_of_json(document: Mapping[str, Any]) -> str:
+    """Digest of plain data, without that under the key "digest"."""
+    rest = {name: value for name, value in document.items() if name != "digest"}
+    return hashlib.sha256(json.dumps(rest, sort_keys=True).encode()).hexdigest()
+
+
 def read_toml(path: Path, schema: type[BaseModel]) -> dict[str, Any]:
-    """Read the options set by a TOML file; ValueError as for `read_json`, or if it is not TOML."""
+    """Read the options set by a TOML file; ValueError as for `read_bytes`, or if it is not TOML or violates the
+    schema."""
     content = read_bytes(path)
     try:
         found = schema.model_validate(tomllib.loads(content.decode()))
@@ -67,7 +71,7 @@ def told(error: ValidationError, names: Iterable[str] = ()) -> str:
 
 
 class PolicyFile(BaseModel):
-    """A policy written by `optimise`: its parameters, and the setting in which they were found."""
+    """A policy written by `optimise`: its parameters, the setting in which they were found, and a digest of it all."""
 
     model_config = ConfigDict(strict=True)
 
@@ -86,6 +90,7 @@ class PolicyFile(BaseModel):
     solver_ls_iterations: int | None = None
     disable_flag: list[str] | None = None
     network: list[int] | None = None
+    digest: str | None = None
 
     @field_validator("contact", "stiffness", "damping", "timestep", "cone", "network", *BUILDER_OPTIONS)
     @classmethod
@@ -103,6 +108,8 @@ def read_theta(path: Path) -> tuple[tuple[float, ...], PolicyFile | None]:
     content = read_bytes(path)
     if content.lstrip().startswith(b"{"):
         policy = _validated(path, content, PolicyFile)
+        if policy.digest not in (None, digest_of_json(json.loads(content))):
+            raise ValueError(f"{path} is damaged (its digest does not match); if you changed it, remove its digest")
         return tuple(policy.theta), policy
     return tuple(_validated(path, content, list[Finite])), None
 

@@ -1,8 +1,9 @@
 """Content-based identity of what results depend on: the compiled model, the task's parts, and the software.
 
 Numbers and arrays enter a digest by value, to twelve digits; models by MuJoCo's arrays, without names and colours.
-Functions enter by name, closure, defaults and the source file of their module, along with the neighbouring files that
-it imports. Code of this package and of the libraries below it enters by version.
+Functions enter by name, closure, defaults, what they read from their modules, and the source file of their module,
+along with the neighbouring files that it imports, at the top or within functions. Objects enter by class and state, and
+classes of the user by their methods. Code of this package and of the libraries below it enters by version.
 """
 
 import ast
@@ -15,7 +16,7 @@ import re
 import subprocess
 import sys
 import types
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from importlib import metadata
 from pathlib import Path
@@ -39,6 +40,22 @@ IRRELEVANT: Final = re.compile(r"_.*|.*name.*|.*path.*|.*rgba|(tex|mat|skin|ligh
 """Fields of MjModel that do not affect results."""
 ABOVE: Final = ("cli", "plots", "render", "gradcheck", "claims", "report.py", "bench.py", "diagnose")
 """Parts of mjx_study that use studies, and so do not affect their results."""
+STATE: Final = ("time", "qpos", "qvel", "act", "ctrl", "mocap_pos", "mocap_quat", "userdata")
+"""Fields of MjData that count; the others follow, or are measured."""
+STATELESS: Final = frozenset(
+    "logging threading _thread weakref _weakref io _io os posix socket contextvars queue asyncio concurrent "
+    "multiprocessing subprocess tempfile".split()
+)
+"""Modules of the standard library whose objects are no data: they differ from process to process."""
+IMPLIED: Final = frozenset(
+    "__abstractmethods__ __annotate__ __annotate_func__ __annotations__ __annotations_cache__ __classcell__ "
+    "__dataclass_fields__ __dataclass_params__ __dict__ __doc__ __firstlineno__ __match_args__ __module__ __name__ "
+    "__orig_bases__ __orig_class__ __parameters__ __qualname__ __slots__ __static_attributes__ __type_params__ "
+    "__weakref__ _abc_impl _is_protocol".split()
+)
+"""Attributes that say nothing beyond names and source."""
+CODE: Final = (type, types.FunctionType, types.BuiltinFunctionType, types.MethodType, functools.partial)
+"""Kinds of values that are code rather than data."""
 DIGEST: Final = re.compile("[0-9a-f]{12,64}")
 """Digests, which messages do not show."""
 ACCEPT: Final = "choose another folder, or accept the mixture by --accept-versions"
@@ -62,8 +79,9 @@ def git_revision(root: Path | None = None) -> str | None:
 
 def contents(tasks: Mapping[str, Iterable[Task]]) -> dict[str, str]:
     """Return the precision, and digests of everything that tasks consist of, all variants (timesteps, cones) of each
-    together: "model of NAME", "task NAME", and "source of FILE" for every source file of a user's task."""
-    found, sources = {"precision": precision()}, {}
+    together: "model of NAME", "task NAME", and of a user's task "source of FILE" for every source file and "global
+    NAME of MODULE" for the data that its functions read."""
+    found, parts = {"precision": precision()}, {}
     for name, forms in tasks.items():
         models, rest = _Digest(), _Digest()
         for task in forms:
@@ -72,8 +90,8 @@ def contents(tasks: Mapping[str, Iterable[Task]]) -> dict[str, str]:
                 if field.name not in ("scene", "description"):  # the latter does not affect results
                     rest.add((field.name, getattr(task, field.name)))
         found |= {f"model of {name}": models.hexdigest(), f"task {name}": rest.hexdigest()}
-        sources |= rest.sources
-    return found | {f"source of {name}": digest for name, digest in sorted(sources.items())}
+        parts |= rest.parts
+    return found | dict(sorted(parts.items()))
 
 
 def digest_of(value: Any) -> str:
@@ -101,7 +119,7 @@ def estimator_contents(chosen: Mapping[str, str | Estimator]) -> dict[str, str]:
         digest.add(find_estimator(each))
         if digest.sources or isinstance(each, Estimator):
             found[f"estimator {name}"] = digest.hexdigest()
-            found |= {f"source of {file}": content for file, content in sorted(digest.sources.items())}
+            found |= digest.parts
     return found
 
 
@@ -161,7 +179,8 @@ class _Digest:
 
     Attributes:
         sources: digests of the source files of functions and classes from outside this package.
-        foreign: whether there are any, including those of an interactive session.
+        globals: digests of the data that user-defined functions read from their modules, by "global NAME of MODULE".
+        foreign: whether there is any code from outside this package, including that of an interactive session.
     """
 
     def __init__(self, *, exact: bool = False) -> None:
@@ -169,6 +188,12 @@ class _Digest:
         self._sha = hashlib.sha256()
         self._seen: dict[int, tuple[int, Any]] = {}
         self.sources: dict[str, str] = {}
+        self.globals: dict[str, str] = {}
+
+    @property
+    def parts(self) -> dict[str, str]:
+        """Digests of sources and globals, by name."""
+        return self.globals | {f"source of {name}": digest for name, digest in sorted(self.sources.items())}
 
     def hexdigest(self) -> str:
         """Return the digest as sixteen hexadecimal digits."""
@@ -176,13 +201,12 @@ class _Digest:
 
     def add(self, value: Any) -> None:
         """Add a value and everything it contains."""
-        if value is None or isinstance(value, bool | int | str | bytes | enum.Enum):
+        if value is None or isinstance(value, bool | int | str | bytes | complex | enum.Enum):
             self._note(type(value).__name__, repr(value))
         elif isinstance(value, float | np.ndarray | np.generic | jax.Array):
             self._array(value)
-        elif isinstance(value, type):
-            self._note("class", value.__module__, value.__qualname__)
-            self._source(value.__module__)
+        elif type(value) in (tuple, frozenset):  # constants, which a process may share or not
+            self._object(value)
         elif id(value) in self._seen:
             self._note("again", str(self._seen[id(value)][0]))
         else:
@@ -194,28 +218,56 @@ class _Digest:
             self._scene(value)
         elif isinstance(value, mujoco.MjModel):
             self._model(value)
-        elif isinstance(value, Mapping):
-            self._all("mapping", sorted(value.items(), key=lambda item: repr(item[0])))
-        elif isinstance(value, set | frozenset):
-            self._all("set", sorted(value, key=repr))
-        elif isinstance(value, tuple | list):
-            self._all("sequence", value)
+        elif isinstance(value, mujoco.MjData):
+            self._all("data", (getattr(value, name) for name in STATE))
+        elif isinstance(value, type):
+            self._class(value)
+        elif isinstance(value, types.ModuleType):
+            self._note("module", value.__name__)
+            self._source(value.__name__)
+        elif isinstance(value, types.CodeType):
+            self._code(value)
         elif isinstance(value, functools.partial):
             self._all("partial", (value.func, value.args, value.keywords))
         elif isinstance(value, types.MethodType):
             self._all("method", (value.__self__, value.__func__))
         elif isinstance(value, types.FunctionType):
             self._function(value)
-        elif hasattr(value, "__wrapped__"):  # functions wrapped by jit and the like
-            self.add(value.__wrapped__)
-        elif dataclasses.is_dataclass(value):
-            fields = [(field.name, getattr(value, field.name)) for field in dataclasses.fields(value)]
-            self._all("dataclass", (type(value), fields))
+        elif isinstance(value, property):
+            self._all("property", (value.fget, value.fset, value.fdel))
+        elif type(value).__module__.partition(".")[0] in STATELESS:
+            self._note("stateless", type(value).__qualname__)
         else:
-            self._all("object", (type(value), getattr(value, "__name__", None), getattr(value, "__dict__", {})))
+            self._object(value)
+
+    def _object(self, value: Any) -> None:
+        """Add an object: its class, its items if it is a container, its attributes, and what else it is made of."""
+        kind = type(value)
+        if kind not in (dict, list, tuple, set, frozenset):
+            self.add(kind)
+        if isinstance(value, Mapping):
+            self._all("mapping", sorted(value.items(), key=lambda item: _order(item[0])))
+        elif isinstance(value, set | frozenset):
+            self._all("set", sorted(value, key=_order))
+        elif isinstance(value, tuple | list):
+            self._all("sequence", value)
+        elif kind.__reduce_ex__ is not object.__reduce_ex__ or kind.__reduce__ is not object.__reduce__:
+            self._all("reduced", _reduced(value))
+        elif not (hasattr(value, "__dict__") or _slots(kind)):
+            self._all("reduced", _reduced(value))
+        if state := _state(value):
+            self._all("attributes", sorted(state.items()))
+
+    def _class(self, kind: type) -> None:
+        """Add a class: by name and source, and of the user's its methods and attributes, inherited ones included."""
+        self._note("class", kind.__module__, kind.__qualname__)
+        for each in kind.__mro__:
+            self._source(each.__module__)
+            if _users(each.__module__):
+                self._all("members", sorted(_members(each).items()))
 
     def _note(self, *texts: str) -> None:
-        self._sha.update("\0".join((*texts, "\n")).encode())
+        self._sha.update("\0".join((*texts, "\n")).encode("utf-8", "surrogatepass"))
 
     def _all(self, kind: str, values: Iterable[Any]) -> None:
         values = list(values)
@@ -235,7 +287,10 @@ class _Digest:
             kind = np.where(finite, 0, np.where(np.isnan(array), 1, np.where(array > 0, 2, 3)))
             self._sha.update(np.rint(np.ldexp(mantissa, 40)).astype(np.int64).tobytes())
             array = np.stack([exponent.astype(np.int32), kind.astype(np.int32)])
-        self._sha.update(repr(array.tolist()).encode() if array.dtype.kind == "O" else array.tobytes())
+        if array.dtype.kind == "O":
+            self._all("objects", array.ravel().tolist())
+        else:
+            self._sha.update(array.tobytes())
 
     def _scene(self, scene: Scene) -> None:
         """Add MuJoCo's model, and the arrays that were changed in MJX's."""
@@ -261,24 +316,49 @@ class _Digest:
                     self._all(part + name, (np.asarray(value),))
 
     def _function(self, function: types.FunctionType) -> None:
-        versioned = _by_version(function.__module__)
-        function = inspect.unwrap(function) if versioned else function
+        if _by_version(function.__module__):
+            function = inspect.unwrap(function)
+        home = function.__globals__.get("__name__", function.__module__)  # decorators copy __module__
         self._note("function", function.__module__, function.__qualname__)
-        self._all("holds", (function.__defaults__, function.__kwdefaults__, _closure(function)))
-        if versioned:
+        self._all("holds", (function.__defaults__, function.__kwdefaults__, _closure(function), _state(function)))
+        if _by_version(home) or _by_version(function.__module__):
             return
-        self._source(function.__module__)
-        if _file(function.__module__) is None:  # from an interactive session
-            self._code(function.__code__)
-        for name in sorted(_names(function.__code__)):
-            value = function.__globals__.get(name)
-            if isinstance(value, bool | int | float | str | tuple | np.ndarray | jax.Array | types.FunctionType):
+        self._source(home)
+        code, path = function.__code__, _file(home)
+        if path is None or code.co_filename != str(path):  # from an interactive session, or made at run time
+            self._code(code)
+        names = _names(code)
+        for name in sorted(names & function.__globals__.keys()):
+            value = function.__globals__[name]
+            if _users(home):
+                self._global(home, name, value, names)
+            elif isinstance(value, bool | int | float | str | tuple | np.ndarray | jax.Array | types.FunctionType):
                 self._all(f"global {name}", (value,))
+
+    def _global(self, module: str, name: str, value: Any, names: set[str]) -> None:
+        """Add what a function reads from a module: data by a digest of its own, which has a name in messages; of
+        another module those of the names that the function uses."""
+        if isinstance(value, types.ModuleType):
+            if _users(value.__name__):
+                for each in sorted(names & vars(value).keys()):
+                    self._global(value.__name__, each, vars(value)[each], names - {each})
+            return
+        if isinstance(value, CODE) or hasattr(value, "__wrapped__"):
+            self._all(f"global {name}", (value,))
+            return
+        told = f"global {name} of {module}"
+        if told not in self.globals:
+            self.globals[told] = ""  # while it is made, since it may contain functions that read it
+            digest = _Digest(exact=self._exact)
+            digest.sources, digest.globals = self.sources, self.globals
+            digest.add(value)
+            self.globals[told] = digest.hexdigest()
+            self.foreign |= digest.foreign
+        self._note(told, self.globals[told])
 
     def _code(self, code: types.CodeType) -> None:
         self._note("code", code.co_code.hex())
-        for constant in code.co_consts:
-            self._code(constant) if isinstance(constant, types.CodeType) else self._note(repr(constant))
+        self._all("names", (*code.co_names, *code.co_consts))
 
     def _source(self, module: str) -> None:
         """Add the source file of a module, and of neighbouring modules that it imports."""
@@ -288,19 +368,43 @@ class _Digest:
             return
         levels = module.count(".") + (path.name == "__init__.py")
         root = path.parents[min(levels, len(path.parents) - 1)]
+        if self._read(path, root):
+            for value in list(vars(sys.modules[module]).values()):
+                other = value.__name__ if isinstance(value, types.ModuleType) else getattr(value, "__module__", None)
+                if isinstance(other, str) and _beside(other, module, root):
+                    self._source(other)
+            if _users(module):
+                self._imported(path, root, module if path.name == "__init__.py" else module.rpartition(".")[0])
+
+    def _read(self, path: Path, root: Path) -> bool:
+        """Add a source file; whether it is a new one."""
         name = str(path.relative_to(root))
-        if name in self.sources:
-            return
-        self.sources[name] = hashlib.sha256(path.read_bytes()).hexdigest()[:16]
-        for value in list(vars(sys.modules[module]).values()):
-            other = value.__name__ if isinstance(value, types.ModuleType) else getattr(value, "__module__", None)
-            if isinstance(other, str) and _beside(other, module, root):
-                self._source(other)
+        if new := name not in self.sources:
+            self.sources[name] = hashlib.sha256(path.read_bytes()).hexdigest()[:16]
+        return new
+
+    def _imported(self, path: Path, root: Path, package: str) -> None:
+        """Add the files that import statements of a file name, wherever they stand, whether or not they are loaded."""
+        for name in sorted(_imports(path.read_bytes(), package)):
+            place = root.joinpath(*name.split("."))
+            for found in (place.with_suffix(".py"), place / "__init__.py"):
+                if _by_version(name) or not found.is_file():
+                    continue
+                if _file(name) == found:
+                    self._source(name)
+                elif self._read(found, root):
+                    self._imported(found, root, name if found.name == "__init__.py" else name.rpartition(".")[0])
 
 
 def _by_version(module: str) -> bool:
     top = module.partition(".")[0]
     return top in BY_VERSION or top in sys.stdlib_module_names - {"__main__"}
+
+
+def _users(module: str) -> bool:
+    """Whether a module is the user's: neither identified by version nor installed."""
+    path = _file(module)
+    return not _by_version(module) and (path is None or not {"site-packages", "dist-packages"} & set(path.parts))
 
 
 def _file(module: str) -> Path | None:
@@ -314,7 +418,7 @@ def _beside(other: str, module: str, root: Path) -> bool:
     path = _file(other)
     if path is None or other.partition(".")[0] == module.partition(".")[0]:
         return path is not None
-    return path.is_relative_to(root) and "site-packages" not in path.parts and "dist-packages" not in path.parts
+    return path.is_relative_to(root) and _users(other)
 
 
 def _closure(function: types.FunctionType) -> dict[str, Any]:
@@ -324,6 +428,70 @@ def _closure(function: types.FunctionType) -> dict[str, Any]:
         with suppress(ValueError):  # a cell that is still empty
             held[name] = cell.cell_contents
     return held
+
+
+def _slots(kind: type) -> set[str]:
+    """Names of a class's slots, inherited ones included."""
+    slots = [vars(each).get("__slots__", ()) for each in kind.__mro__]
+    return {name for each in slots for name in ((each,) if isinstance(each, str) else each)} - IMPLIED
+
+
+def _state(value: Any) -> dict[str, Any]:
+    """Attributes of an object, in its dictionary or in slots, except cached ones; of our dataclasses, the fields."""
+    kind = type(value)
+    if dataclasses.is_dataclass(value) and _by_version(kind.__module__):
+        return {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
+    held = {name: getattr(value, name) for name in _slots(kind) if hasattr(value, name)}
+    own = {name: each for name, each in getattr(value, "__dict__", {}).items() if name not in IMPLIED}
+    if (wrapped := getattr(value, "__wrapped__", None)) is not None:
+        if _by_version(kind.__module__):  # jit and the like note where the function is
+            own = {name: each for name, each in own.items() if not name.startswith("_")}
+        held["__wrapped__"] = wrapped
+    held |= own
+    return {name: held[name] for name in held if not isinstance(getattr(kind, name, None), functools.cached_property)}
+
+
+def _reduced(value: Any) -> list[Any]:
+    """What pickle would keep of an object without attributes, such as a slice; its name, if it keeps nothing."""
+    try:
+        reduced = value.__reduce_ex__(2)
+    except Exception:  # the user's class may raise anything
+        return [getattr(value, "__name__", None)]
+    parts = reduced if isinstance(reduced, tuple) else (reduced,)
+    return [list(part) if isinstance(part, Iterator) else part for part in parts]
+
+
+def _members(kind: type) -> dict[str, Any]:
+    """Methods and attributes of a class, without those that Python or `dataclass` made."""
+    kept = {}
+    for name, value in vars(kind).items():
+        made = isinstance(value, types.FunctionType) and value.__code__.co_filename == "<string>"
+        slot = isinstance(value, types.MemberDescriptorType | types.GetSetDescriptorType)
+        if not (made or slot or name in IMPLIED):
+            kept[name] = value.func if isinstance(value, functools.cached_property) else value
+    return kept
+
+
+def _order(key: Any) -> str:
+    """Sort key of a key or an element, the same in every process."""
+    return repr(key) if isinstance(key, str | bytes | int | float | None) else digest_of(key)
+
+
+@functools.cache
+def _imports(source: bytes, package: str) -> set[str]:
+    """Names that the import statements of a source file may mean, in full."""
+    try:
+        nodes = list(ast.walk(ast.parse(source)))
+    except (SyntaxError, ValueError):
+        return set()
+    found = {alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names}
+    for node in nodes:
+        if isinstance(node, ast.ImportFrom):
+            above = package.split(".")[: len(package.split(".")) - node.level + 1] if node.level else []
+            stem = ".".join([*above, *([node.module] if node.module else [])])
+            found |= {stem} | {f"{stem}.{alias.name}".lstrip(".") for alias in node.names}
+    parents = {".".join(name.split(".")[:count]) for name in found for count in range(1, name.count(".") + 1)}
+    return (found | parents) - {""}
 
 
 def _names(code: types.CodeType) -> set[str]:

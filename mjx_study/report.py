@@ -14,10 +14,9 @@ import pandas as pd
 import xarray as xr
 from matplotlib.figure import Figure
 
-from estimators.estimator import label_of
 from mjx_study.plots.panels import counted
 from mjx_study.plots.study import plot_study
-from mjx_study.study.findings import findings_of, model_name, onset_of, remains, rows_of
+from mjx_study.study.findings import findings_of, label_in, model_name, remains, rows_of
 from mjx_study.study.run import warnings_of
 from mjx_study.study.variables import COORDINATES, DEBIASED, QUANTITIES, Variable
 from mjx_study.table import with_error
@@ -134,7 +133,7 @@ def _numbers(dataset: xr.Dataset, quantities: Mapping[str, Variable]) -> tuple[l
     for picked in np.ndindex(*(dataset.sizes[name] for name in axes)):
         one = last.isel(dict(zip(axes, picked, strict=True)))
         if any(np.isfinite(one[name]).all() for name in PRESENT if name in one):
-            label = label_of(one["estimator"].item(), onset_of(dataset))
+            label = label_in(dataset, one["estimator"].item())
             place = [model_name(one), *(_shown(one[name].item()) for name in outer), label]
             row = [*place, *(_text(name, variable, one) for name, variable in shown.items())]
             rows.append(["" if picked[:-1] == above and once else cell for cell, once in zip(row, shared, strict=True)])

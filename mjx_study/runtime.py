@@ -11,7 +11,9 @@ from typing import Any, Final
 import jax
 import mujoco
 
+from mjx_study.caches import check_programs
 from mjx_study.choices import PRECISIONS, unknown
+from mjx_study.disk import private_folder
 
 _TRACES: Final[list[Path]] = []
 
@@ -23,10 +25,11 @@ def configure(*, precision: str = "float64", cpu_devices: int | None = None, cac
         precision: float64 or float32. Stiff contact needs float64: equivalent float32 programs of one rollout differ in
             the second digit.
         cpu_devices: number of CPU devices, and so of cores that samples use; None for all.
-        cache: folder for compiled programs kept between runs; None for `default_cache()`.
+        cache: folder for compiled programs kept between runs, which this user owns and nobody else can write to; None
+            for `default_cache()`. A URL is left to JAX.
 
     Raises:
-        ValueError: unknown precision, or fewer than one device.
+        ValueError: unknown precision, fewer than one device, or a `cache` that others can write to.
     """
     if precision not in PRECISIONS:
         raise ValueError(unknown("precision", precision, PRECISIONS))
@@ -36,11 +39,30 @@ def configure(*, precision: str = "float64", cpu_devices: int | None = None, cac
     mujoco.set_mju_user_warning(lambda message: print(f"MuJoCo: {message}", file=sys.stderr))  # not a file in the cwd
     jax.config.update("jax_enable_x64", precision == "float64")
     jax.config.update("jax_num_cpu_devices", devices)
-    folder = default_cache() if cache is None else cache
-    jax.config.update("jax_compilation_cache_dir", None if folder is None else str(folder))
-    _TRACES[:] = [] if folder is None else [Path(folder) / "traces"]
+    _keep_programs(cache)
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
+
+
+def _keep_programs(cache: str | Path | None) -> None:
+    """Set the folders of compiled programs and traces; without a private one, none are kept."""
+    _TRACES.clear()
+    folder = default_cache() if cache is None else cache
+    if isinstance(folder, str) and "://" in folder:
+        jax.config.update("jax_compilation_cache_dir", folder)
+        return
+    kept = None
+    try:
+        kept = None if folder is None else private_folder(Path(folder))
+    except OSError as error:
+        told = f"compiled programs cannot be kept in {folder}: {error.strerror or error}"
+        if cache is not None:
+            raise ValueError(f"{told}; give a folder that you own and only you can write to") from error
+        print(f"mjx-study: {told}", file=sys.stderr)
+    jax.config.update("jax_compilation_cache_dir", None if kept is None else str(kept / "programs"))
+    if kept is not None:
+        check_programs(kept / "programs")
+        _TRACES.append(kept / "traces")
 
 
 def available_cores() -> int:
@@ -58,7 +80,7 @@ def default_cache() -> Path | None:
         root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     except RuntimeError:
         return None
-    return root / "mjx-study" / hashlib.sha256(_processor().encode()).hexdigest()[:12]
+    return root / "mjx-study" / hashlib.sha256(f"private\n{_processor()}".encode()).hexdigest()[:12]
 
 
 def traces_folder() -> Path | None:

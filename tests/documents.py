@@ -1,7 +1,17 @@
 """Documents of studies whose cells hold whatever a test writes into them."""
 
+import json
 import re
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
+
+import numpy as np
+
+from mjx_study.study.arrays import required, sizes_of
+from mjx_study.study.document import document_of, sealed
+from mjx_study.study.plan import StudyCell, StudyPlan
+from mjx_study.study.variables import VARIABLES
 
 
 def study_document(cells: int, **changes: Any) -> dict[str, Any]:
@@ -21,6 +31,27 @@ def study_document(cells: int, **changes: Any) -> dict[str, Any]:
         "resolved": [{"horizon": [1], "noise": "gaussian", "estimators": {}}],
         "cells": [{"label": str(index), "at": at} for index, at in enumerate(places)],
     }
+
+
+def cell_arrays(document: Mapping[str, Any], index: int = 0, **given: Any) -> dict[str, np.ndarray]:
+    """What the schema asks of a cell: NaN, and 0 for counts, but for the arrays that are given."""
+    kind, sizes = document["config"]["kind"], sizes_of(document, index)
+    variables = {name: VARIABLES[kind][name] for name in required(kind)}
+    blank = {
+        name: np.full([sizes[dim] for dim in each.dims], np.nan if each.digits else 0.0)
+        for name, each in variables.items()
+    }
+    return blank | {name: np.asarray(value) for name, value in given.items()}
+
+
+def planned_arrays(plan: StudyPlan, cell: StudyCell, **given: Any) -> dict[str, np.ndarray]:
+    """The same for a cell of a plan."""
+    return cell_arrays(document_of(plan, None), plan.cells.index(cell), **given)
+
+
+def altered(path: Path, **changes: Any) -> None:
+    """Change keys of a study.json, which gets a digest that matches."""
+    path.write_bytes(sealed(json.loads(path.read_text()) | changes))
 
 
 def stages_of(told: str) -> list[str]:

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from mjx_study.disk import TEMPORARY, prepare_folder, read_whole, write_whole
+from mjx_study.disk import TEMPORARY, prepare_folder, read_whole, temporary_name, write_whole
 from mjx_study.study.dataset import write_dataset
 from mjx_study.study.store import Store, StudyError
-from tests.documents import study_document
+from tests.documents import cell_arrays, study_document
 from tests.faults import deadline, every_fault, from_the_future, put_no_file
 
 CELLS = 3
@@ -23,7 +23,8 @@ DOCUMENT = study_document(CELLS)
 
 
 def numbers(index: int) -> dict[str, np.ndarray]:
-    return {"values": np.random.default_rng(index).normal(size=3000)}  # more than a buffer, so that a write is several
+    values = np.random.default_rng(index).normal(size=3000)  # more than a buffer, so that a write is several
+    return cell_arrays(DOCUMENT, index, values=values)
 
 
 def study(folder: Path) -> Store:
@@ -142,7 +143,7 @@ def test_killed_at_any_system_call_a_study_goes_on(tmp_path: Path) -> None:
 def test_what_a_living_process_writes_stays(tmp_path: Path) -> None:
     """Leftovers are known by their lock, not by their age; other programs' files are not touched."""
     (tmp_path / ".hidden").write_text("another program's")
-    (tmp_path / f".old.abcdefgh{TEMPORARY}").write_text("a dead process's")
+    (tmp_path / temporary_name("old")).write_text("a dead process's")
 
     def opening(file: Any) -> None:
         file.write(b"whole")
@@ -172,15 +173,96 @@ def test_what_is_no_file_is_refused_at_once(tmp_path: Path, kind: str) -> None:
             Store.open(folder)
         with pytest.raises(StudyError, match="cannot read .*study.json"):
             Store.create(folder, DOCUMENT)
-        put_no_file(tmp_path / f".x.abcdefgh{TEMPORARY}", kind)
+        put_no_file(tmp_path / temporary_name("x"), kind)
         prepare_folder(tmp_path)
+
+
+def test_a_link_in_a_study_is_refused_and_not_followed(tmp_path: Path) -> None:
+    folder, outside = tmp_path / "study", tmp_path / "outside"
+    study(folder)
+    outside.mkdir()
+
+    def linked(path: Path, target: Path) -> None:
+        path.unlink(missing_ok=True)
+        path.symlink_to(target)
+
+    whole = (folder / "cells" / "00001.npz").read_bytes()
+    (outside / "cell").write_bytes(whole)
+    linked(folder / "cells" / "00001.npz", outside / "cell")
+    with pytest.raises(StudyError, match="00001.npz is damaged .it is a symbolic link.; move it away"):
+        Store.open(folder).read(1)
+    (folder / "cells" / "00001.npz").unlink()
+    linked(folder / "cells" / "00001.failed", outside / "cell")
+    with pytest.raises(StudyError, match="00001.failed is damaged .it is a symbolic link.; remove it"):
+        _ = Store.open(folder).failures
+    linked(folder / "study.lock", outside / "new")
+    with (
+        pytest.raises(StudyError, match="cannot lock .*study.lock: it is a symbolic link"),
+        Store.open(folder).claims(),
+    ):
+        pass
+    os.rename(folder / "cells", tmp_path / "cells")
+    (folder / "cells").symlink_to(tmp_path / "cells")
+    with pytest.raises(StudyError, match="cannot read .*cells: it is a symbolic link"):
+        Store.open(folder)
+    (folder / "study.json").unlink()
+    with pytest.raises(ValueError, match="cannot write to the output folder .*cells: it is a symbolic link"):
+        Store.create(folder, DOCUMENT)
+    assert [path.name for path in outside.iterdir()] == ["cell"]
+
+
+def test_a_failure_is_as_it_was_written(tmp_path: Path) -> None:
+    store = Store.create(tmp_path, DOCUMENT)
+    store.write_failure(1, "no memory")
+    assert store.failures == {1: "no memory"}
+    path = tmp_path / "cells" / "00001.failed"
+    for content, says in (
+        (path.read_bytes().replace(b"no", b"so"), "its digest does not match"),
+        (b"no memory", "Invalid JSON"),
+        (b'{"reason": "no memory"}', "digest: Field required"),
+    ):
+        path.write_bytes(content)
+        with pytest.raises(StudyError, match=f"00001.failed is damaged .{says}.*; remove it"):
+            _ = store.failures
+
+
+def test_a_file_that_is_too_large_is_not_read(tmp_path: Path) -> None:
+    with (tmp_path / "file").open("wb") as file:
+        file.truncate(10**12)
+    with pytest.raises(OSError, match="it has 1000000000000 bytes; the limit is 100"):
+        read_whole(tmp_path / "file", most=100)
+    for folder, name in ((tmp_path / "one", "study.json"), (tmp_path / "two", "cells/00001.npz")):
+        study(folder)
+        with (folder / name).open("wb") as file:
+            file.truncate(10**12)
+        with pytest.raises(StudyError, match=f"{Path(name).name}.*it has 1000000000000 bytes"):
+            Store.open(folder).read(1)
+
+
+def test_only_files_made_here_are_removed(tmp_path: Path) -> None:
+    """A name that merely looks like a temporary one is somebody else's."""
+    mine = [
+        f".notes{TEMPORARY}",
+        f".old.abcdefgh{TEMPORARY}",
+        f".study.json.{'0' * 12}{'1' * 12}{TEMPORARY}",
+        f"a{TEMPORARY}",
+    ]
+    for name in mine:
+        (tmp_path / name).write_text("mine")
+    ours = [temporary_name(name) for name in ("study.json", "00001.npz", "with\nline", "\udcff")]
+    for name in ours:
+        (tmp_path / name).write_text("left")
+    copied = tmp_path / ours[0].replace("study.json", "study.toml")
+    copied.write_text("mine")
+    prepare_folder(tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == {*mine, copied.name}
 
 
 def test_a_clock_in_the_future_changes_nothing(tmp_path: Path) -> None:
     folder = tmp_path / "study"
     study(folder)
     (folder / "cells" / "00001.npz").unlink()
-    (folder / "cells" / f".00001.npz.abcdefgh{TEMPORARY}").write_text("of a dead process")
+    (folder / "cells" / temporary_name("00001.npz")).write_text("of a dead process")
     from_the_future(tmp_path)
     assert Store.open(folder).missing == [1]
     study(folder)

@@ -21,6 +21,7 @@ from mjx_study.plots.panels import UNSTABLE, counted, number
 from mjx_study.plots.study import MOST_DECADES, plot_study
 from mjx_study.plots.style import STYLE, STYLES, combines, fit_to_paper, mark_clipped
 from mjx_study.report import render_report
+from mjx_study.study.document import describe_estimator
 from mjx_study.study.variables import CELL, VARIABLES
 
 OUTER = ("task", "timestep", "cone", "model", "sigma", "samples")
@@ -241,8 +242,9 @@ class Both(Estimator):
 
 def test_an_estimator_of_two_batches_is_hollow_and_dashed_whoever_wrote_it() -> None:
     both = f"{__name__}:Both"
-    assert [combines(name) for name in ("aobg", "ivw_h", both)] == [True] * 3
-    assert not any(combines(name) for name in ("zobg", "fobg", "nowhere_to_be_found:It"))
+    described = {both: describe_estimator(Both())}
+    assert [combines(name, described) for name in ("aobg", "ivw_h", both)] == [True] * 3
+    assert not any(combines(name, described) for name in ("zobg", "fobg", "nowhere_to_be_found:It"))
     models = [("penalty", stiffness) for stiffness in (10.0, 100.0, 1000.0)]
     for kind, labels in (("descents", ("AoBG", "FoBG")), ("landscapes", ("mean of AoBG", "mean of FoBG"))):
         figure = list(plot_study(study(kind, models)).values())[-1]

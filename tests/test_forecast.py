@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from mjx_study import cli
+from mjx_study.caches import write_cached
 from mjx_study.cli import options
 from mjx_study.runtime import available_cores
 from mjx_study.stopwatch import Stopwatch
@@ -143,7 +144,10 @@ def test_figures_are_for_people(capsys: pytest.CaptureFixture[str]) -> None:
 
 @pytest.mark.parametrize("damage", [b"", b"{}", b"[1", b'{"each": -1}'])
 def test_a_damaged_record_is_no_record(damage: bytes, tmp_path: Path) -> None:
-    (tmp_path / "x.json").write_bytes(damage)
+    path = tmp_path / f"x{times.SUFFIX}"
+    path.write_bytes(damage)
+    assert times.Rates.read(tmp_path)._records == []
+    write_cached(path, damage)
     assert times.Rates.read(tmp_path)._records == []
 
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import importlib
+import json
 import re
 import subprocess
 import sys
@@ -26,6 +27,7 @@ from mjx_study.study.run import load_study, run_study, warnings_of
 from mjx_study.study.store import Part, Store, StudyError
 from mjx_study.tasks import make_task
 from mjx_study.tasks.task import StudyDefaults, Task
+from tests.documents import altered, planned_arrays
 
 MODULE = """
 from functools import partial
@@ -112,7 +114,7 @@ def test_a_module_counts_by_its_source_and_by_what_its_functions_hold(own: Calla
     assert base == digest(own()) and {"source of hopping.py", "source of helping.py"} <= base.keys()
     for changes, what in (
         ({"bias": 1.5}, {"task it", "source of hopping.py"}),
-        ({"weight": 2.5}, {"task it", "source of helping.py"}),
+        ({"weight": 2.5}, {"task it", "source of helping.py", "global WEIGHT of helping"}),
         ({"text": "# a remark\n"}, {"source of hopping.py"}),
     ):
         other = digest(own(**changes))
@@ -148,7 +150,8 @@ SMALL: dict[str, Any] = {
 @pytest.fixture
 def stubbed(monkeypatch: pytest.MonkeyPatch) -> None:
     def compute_of(plan: StudyPlan) -> Callable[[StudyCell, Part], dict[str, np.ndarray]]:
-        return lambda cell, part: {"residual": np.full(len(plan.config.estimators), cell.model.stiffness)}
+        residual = lambda cell: np.full(len(plan.config.estimators), cell.model.stiffness)  # noqa: E731
+        return lambda cell, part: planned_arrays(plan, cell, residual=residual(cell))
 
     monkeypatch.setitem(sweep_cells.COMPUTE, "gradients", compute_of)
 
@@ -217,8 +220,12 @@ def test_a_cell_counts_in_its_place_alone(tmp_path: Path) -> None:
     (cells / "00000.npz").unlink()
     swept(folder)
     document = (folder / "study.json").read_text()
-    (folder / "study.json").write_text(document.replace('"penalty 10"', '"penalty 11"'))
+    axes = json.loads(document)["axes"]
+    altered(folder / "study.json", axes=axes | {"model": ["penalty 11", *axes["model"][1:]]})
     with pytest.raises(StudyError, match="is another cell"):
+        load_study(folder)
+    (folder / "study.json").write_text(document.replace('"penalty 10"', '"penalty 11"'))
+    with pytest.raises(StudyError, match="study.json is damaged .its digest does not match.; move the folder away"):
         load_study(folder)
     (folder / "study.json").write_text(document)
     kept = Store.open(folder)
@@ -261,6 +268,26 @@ def test_a_longer_run_is_neither_cut_nor_lost(tmp_path: Path) -> None:
     assert longer.drop_vars("seconds").equals(undisturbed.drop_vars("seconds")) and longer.sizes["iteration"] == 8
     assert np.any(whole["theta"].values != longer["theta"].values)
     assert load_study(tmp_path).equals(longer)
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"state_0_0": np.zeros(3)}, "state_0_0 has shape .3,. and type float64"),
+        ({"history_1_cost": np.zeros((1, 2))}, "history_1_cost has shape .1, 2. and type float64"),
+        ({"seconds_0": np.zeros(9)}, "it has 9 iterations"),
+        ({"history_0_cost": None}, "no 'history_0_cost'"),
+    ],
+)
+def test_a_checkpoint_of_other_arrays_is_refused(tmp_path: Path, changes: dict[str, Any], says: str) -> None:
+    descended(tmp_path, 2)
+    store = Store.open(tmp_path)
+    arrays, versions = store.read_with_versions(0)
+    changed = {name: array for name, array in (arrays | changes).items() if array is not None}
+    store._write(0, changed, versions, part=True)
+    store.path(0).unlink()
+    with pytest.raises(StudyError, match=f"00000.part.npz does not fit the study .{says}.; move it away to compute"):
+        descended(tmp_path, 2)
 
 
 @pytest.mark.parametrize("moment", range(1, 4))

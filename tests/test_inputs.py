@@ -13,14 +13,14 @@ import pytest
 from estimators import AlphaOrder
 from mjx_study import cli
 from mjx_study.cli import options
-from mjx_study.files import PolicyFile, read_json, read_theta
+from mjx_study.files import digest_of_json, read_theta
 from mjx_study.limits import MOST_CELLS, MOST_MODELS, check_count
 from mjx_study.option import OPTIONS, Interval
 from mjx_study.runtime import default_cache
 from mjx_study.simulation.mjcf_sizes import too_large
 from mjx_study.simulation.scene import SceneError, load_model
 from mjx_study.study.configuration import StudyConfig
-from mjx_study.study.document import read_document
+from mjx_study.study.document import read_document, sealed
 from mjx_study.study.iteration import make_optimizer
 from mjx_study.study.plan import plan_study
 from mjx_study.study.run import open_store
@@ -223,8 +223,18 @@ def test_a_policy_that_is_none(content: str, says: str, tmp_path: Path) -> None:
     path = tmp_path / "policy.json"
     path.write_text(content)
     with pytest.raises(ValueError, match=says) as error:
-        read_json(path, PolicyFile)
+        read_theta(path)
     assert str(path) in str(error.value) and "\n" not in str(error.value)
+
+
+def test_a_policy_is_as_it_was_written_or_has_no_digest(tmp_path: Path) -> None:
+    path, policy = tmp_path / "policy.json", {"task": "pusher", "theta": [1.0, 2.0]}
+    for digest in ({}, {"digest": digest_of_json(policy)}):
+        path.write_text(json.dumps(policy | digest))
+        assert read_theta(path)[0] == (1.0, 2.0)
+    path.write_text(path.read_text().replace("2.0", "3.0"))
+    with pytest.raises(ValueError, match="policy.json is damaged .its digest does not match.; if you changed"):
+        read_theta(path)
 
 
 @pytest.mark.parametrize("shape", ["(1000000000000, 1000000)", "(-1,)", "(" * 90, "None"])
@@ -240,7 +250,7 @@ def test_an_array_of_an_impossible_shape(shape: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("place", "value", "says"),
     [
-        (("config", "estimators"), ["gobg"], "config.estimators.0: unknown estimator 'gobg'"),
+        (("config", "estimators"), ["gobg"], "config.estimators has 'gobg', which is neither built in nor described"),
         (("config", "seeds"), "ten", "config.seeds: Input should be a valid integer"),
         (("config", "kind"), "poems", "config.kind: Input should be"),
         (("config", "iterations"), 10**7, "a variable would have more than 500000000 numbers"),
@@ -255,13 +265,13 @@ def test_an_array_of_an_impossible_shape(shape: str, tmp_path: Path) -> None:
 def test_a_study_that_is_none(place: tuple[str, ...], value: Any, says: str, tmp_path: Path) -> None:
     plan = plan_study(StudyConfig(tasks=("pusher",), horizon=4, stiffness=(10.0, 100.0), contact=("penalty",)))
     document = json.loads(json.dumps(open_store(plan, tmp_path).document))
-    assert read_document(json.dumps(document)) == document
+    assert read_document(sealed(document)) == document
     part = document
     for key in place[:-1]:
         part = part[key]
     part[place[-1]] = value
     with pytest.raises(ValueError, match=says):
-        read_document(json.dumps(document))
+        read_document(sealed(document))
 
 
 def test_limits_are_named() -> None:

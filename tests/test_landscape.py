@@ -37,6 +37,7 @@ from mjx_study.tasks import make_task
 from mjx_study.tasks.policy import InitialStatePolicy, LinearFeedback
 from mjx_study.tasks.task import Task
 from tests.carts import cart
+from tests.documents import altered
 
 
 @pytest.fixture(autouse=True)
@@ -302,10 +303,11 @@ def test_the_command_prints_and_writes(drawn: tuple[Path, str], flown: xr.Datase
 
 
 def test_theta_has_its_unit(drawn: tuple[Path, str], tmp_path: Path) -> None:
-    """As the task says, also on the axis; folders begun before are read without it."""
+    """As the task says, also on the axis; a folder may say nothing of it."""
     shutil.copytree(drawn[0], tmp_path / "before")
     written = tmp_path / "before" / "study.json"
-    written.write_text(written.read_text().replace('"unit": "rad"', '"others": 1'))
+    resolved = json.loads(written.read_text())["resolved"]
+    altered(written, resolved=[{name: each[name] for name in each if name != "unit"} for each in resolved])
     for folder, unit, label in (
         (drawn[0], "rad", "theta [rad]"),
         (tmp_path / "before", "unit of theta", "theta"),

@@ -15,11 +15,12 @@ from estimators import ESTIMATORS, Estimator, FirstOrder, ZerothOrder, find_esti
 from estimators.catalogue import CATALOGUE
 from mjx_study import cli
 from mjx_study.cli import options
-from mjx_study.plots.style import STYLE, style_of
+from mjx_study.plots.style import STYLE, combines, style_of
 from mjx_study.report import CAPTIONS
 from mjx_study.study.configuration import StudyConfig
 from mjx_study.study.findings import rows_of
 from mjx_study.study.run import load_study
+from tests.documents import altered
 
 PAGE = (Path(__file__).parents[1] / "docs" / "estimators.md").read_text()
 (CODE,) = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
@@ -120,6 +121,37 @@ def test_every_figure_and_report_shows_it(name: str, folder: Path) -> None:
     assert cli.main(["report", "out"]) == 0
     page = (folder / "out" / "report.html").read_text()
     assert [page.count(f"<td>{own}</td>") for own in BOTH] == [data.sizes["model"]] * 2 == [2, 2]
+
+
+TRAP = """
+from pathlib import Path
+Path("trapped").touch()
+raise SystemExit(0)
+"""
+
+
+@pytest.mark.parametrize("place", [CAUTIOUS, "registered"])
+def test_reading_imports_nothing(
+    place: str, folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Not the estimators and tasks that a study names, which are drawn as they would be where they are known."""
+    with monkeypatch.context() as patch:
+        patch.setitem(ESTIMATORS, "registered", FirstOrder)
+        patch.setitem(CATALOGUE, "registered", CATALOGUE["fobg"])
+        options_ = ["--estimators", f"zobg,{place}", *STUDIES["gradients"], "--chunk-size", "4", "--output", "out"]
+        assert cli.main(["sweep", *ANALYTIC, *options_]) == 0
+    sys.modules.pop("my_estimators", None)
+    (folder / "my_estimators.py").write_text(TRAP)
+    document = json.loads((folder / "out" / "study.json").read_text())
+    config = document["config"] | {"tasks": ["my_estimators:task"]}
+    assert cli.main(["plot", "out"]) == 0 and cli.main(["report", "out"]) == 0
+    assert combines(place, document["described"]) == (place == CAUTIOUS)
+    altered(folder / "out" / "study.json", config=config)
+    for command in ("plot", "report"):
+        assert cli.main([command, "out"]) == 2  # its cells are of another study
+    assert not (folder / "trapped").exists() and "my_estimators" not in sys.modules
+    page = (folder / "out" / "report.html").read_text()
+    assert ("<td>Cautious</td>" if place == CAUTIOUS else "<td>FoBG</td>") in page
 
 
 def test_these_are_all_figures() -> None:

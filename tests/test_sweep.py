@@ -225,7 +225,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 from mjx_study.study.store import Store
-from tests.documents import study_document
+from tests.documents import cell_arrays, study_document
 
 folder, cells = Path(sys.argv[1]), 40
 document = study_document(cells)
@@ -236,7 +236,8 @@ def work():
         with store.claims() as claim:
             if claim(index) and not store.has(index):
                 time.sleep(0.002)
-                store.write(index, {"values": np.random.default_rng(index).normal(size=100_000)})
+                values = np.random.default_rng(index).normal(size=100_000)
+                store.write(index, cell_arrays(document, values=values))
 
 rng, kills = random.Random(0), 0
 while kills < 20:
@@ -359,7 +360,7 @@ def test_a_folder_of_another_study_is_refused(undisturbed: Path, tmp_path: Path)
     with pytest.raises(StudyError, match="holds no study"):
         load_study(tmp_path)
     (tmp_path / "study.json").write_text(json.dumps({"format": 99, "config": {}, "cells": []}))
-    with pytest.raises(StudyError, match="is of format 99; this program reads 3"):
+    with pytest.raises(StudyError, match="is of format 99; this program reads 4"):
         load_study(tmp_path)
 
 

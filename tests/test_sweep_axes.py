@@ -14,6 +14,7 @@ from mjx_study.study.plan import StudyCell, StudyPlan, plan_study
 from mjx_study.study.run import load_study, run_study
 from mjx_study.study.store import Part
 from mjx_study.table import digits_to_tell_apart
+from tests.documents import planned_arrays
 
 SMALL: dict[str, Any] = {"tasks": ("pusher",), "contact": ("penalty",), "samples": (4,), "seeds": 1, "horizon": 2}
 
@@ -25,7 +26,7 @@ def stubbed(monkeypatch: pytest.MonkeyPatch) -> None:
     def compute_of(plan: StudyPlan) -> Callable[[StudyCell, Part], dict[str, np.ndarray]]:
         def compute(cell: StudyCell, part: Part) -> dict[str, np.ndarray]:
             seeds = plan.config.batches, len(plan.config.estimators)
-            return {
+            own = {
                 "residual": np.full(seeds[1], cell.model.stiffness),
                 "unconverged": np.full(seeds[1], cell.sigma),
                 "reference_norm": np.asarray(plan.groups[cell.group].timestep),
@@ -37,6 +38,7 @@ def stubbed(monkeypatch: pytest.MonkeyPatch) -> None:
                 "variance_upper": np.full(seeds, 2.0 * cell.samples),
                 **{name: np.ones(seeds) for name in ("relative_error", "relative_error_se")},
             }
+            return planned_arrays(plan, cell, **own)
 
         return compute
 

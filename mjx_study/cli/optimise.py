@@ -8,6 +8,7 @@ from typing import Any
 from mjx_study.choices import REFERENCE
 from mjx_study.cli.options import Parser, given_options
 from mjx_study.disk import write_whole
+from mjx_study.files import digest_of_json
 from mjx_study.option import BUILDER_OPTIONS
 from mjx_study.study.configuration import StudyConfig, takes_stiffness
 from mjx_study.study.variables import explained
@@ -83,7 +84,8 @@ def _save_policies(document: dict[str, Any], folder: Path) -> list[Path]:
     for run in document["runs"]:
         best = run["best_seed"]
         policy = kept | {"estimator": run["estimator"], "seed": best, "cost": run["final_cost"][best]}
-        content = (json.dumps(policy | {"theta": run["theta"][best]}) + "\n").encode()
+        policy |= {"theta": run["theta"][best]}
+        content = (json.dumps(policy | {"digest": digest_of_json(policy)}) + "\n").encode()
         name = f"policy-{run['estimator'].replace(':', '.')}.json"
         written.append(write_whole(folder / name, content))
     return written

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from mjx_study.plots.style import NO_CONTACT, TITLES, combines, line_with_band, style_of
 from mjx_study.simulation.contact import stable
-from mjx_study.study.findings import onset_of
+from mjx_study.study.findings import estimators_of, label_in
 from mjx_study.study.variables import COORDINATES
 
 UNSTABLE: Final = "unstable step"
@@ -128,9 +128,11 @@ def beside(axes: Axes, x: np.ndarray, rank: float) -> np.ndarray:
 
 
 def estimators(rows: xr.Dataset) -> Iterator[tuple[xr.Dataset, dict[str, Any]]]:
+    described = estimators_of(rows)
     for rank, name in enumerate(rows["estimator"].values.tolist()):
-        label, colour, marker = style_of(name, onset_of(rows))
-        style = {"label": label, "color": colour, "marker": marker, "hollow": combines(name), "rank": rank}
+        _, colour, marker = style_of(name)
+        hollow = combines(name, described)
+        style = {"label": label_in(rows, name), "color": colour, "marker": marker, "hollow": hollow, "rank": rank}
         yield rows.sel(estimator=name), style
 
 

@@ -5,9 +5,8 @@ import math
 import textwrap
 import zlib
 from collections.abc import Mapping, Sequence
-from functools import cache
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from matplotlib.artist import Artist
@@ -19,7 +18,7 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 from matplotlib.transforms import ScaledTranslation
 
-from estimators import find_estimator
+from estimators import ESTIMATORS
 from estimators.estimator import label_of
 from mjx_study.choices import FAMILIES
 from mjx_study.disk import write_whole
@@ -68,13 +67,13 @@ def style_of(name: str, onset: str = "none") -> tuple[str, str, str]:
     return label_of(name, onset), *STYLE.get(name, (colours[drawn % len(colours)], markers[drawn // 7 % len(markers)]))
 
 
-@cache
-def combines(name: str) -> bool:
-    """Whether an estimator combines batches, so that its curve may coincide with another's; not if it is not found."""
-    try:
-        return len(find_estimator(name).needs) > 1
-    except Exception:  # whatever the module of somebody else's estimator raises
-        return False
+def combines(name: str, described: Mapping[str, Any]) -> bool:
+    """Whether an estimator combines batches, so that its curve may coincide with another's.
+
+    User-defined ones are not imported: `described` holds what their study recorded, by name.
+    """
+    needs = ESTIMATORS[name].needs if name in ESTIMATORS else described.get(name, {}).get("needs", ())
+    return len(needs) > 1
 
 
 def robust_limits(curves: Sequence[np.ndarray]) -> tuple[float, float]:

@@ -5,7 +5,7 @@ missing, so the result does not depend on the order in which blocks finish, and 
 logarithmically many summaries unmerged.
 """
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from functools import reduce
 from typing import Any, Final
 
@@ -40,6 +40,27 @@ class Blocks:
                 seed, level, place, rest = name.split(".", 3)
                 packed.setdefault((int(seed), int(level), int(place)), {})[rest] = array
         self._held = {node: unpack(arrays) for node, arrays in packed.items()}
+
+    def check(self, estimators: Collection[str], oracles: Collection[str], params: int) -> None:
+        """Raise ValueError unless the finished blocks are some of these, each a summary of all estimators and oracles,
+        and of so many parameters."""
+        done = np.zeros((self.seeds, self.blocks), int)
+        first = {name: each.parts for name, each in next(iter(self._held.values()), {}).items()}
+        for (seed, level, place), summary in self._held.items():
+            if not (0 <= seed < self.seeds and 0 <= level < 64 and 0 <= place << level < self.blocks):
+                raise ValueError(f"it has a block {seed}.{level}.{place}")
+            done[seed, place << level : (place + 1) << level] += 1
+            names = {name.partition(".")[0] for name in summary}
+            if names != {*estimators, *oracles}:
+                raise ValueError(f"block {seed}.{level}.{place} is of {', '.join(sorted(names))}")
+            for each in summary.values():
+                each.check(params) if isinstance(each, Moments) else each.check()
+            if {name: each.parts for name, each in summary.items()} != first:
+                raise ValueError("its blocks differ in their parts")
+        if np.any(done > 1):
+            raise ValueError("it has a block twice")
+        if self.reference is not None and (self.reference.ndim != 2 or self.reference.shape[1] != params):
+            raise ValueError(f"its reference has shape {self.reference.shape}")
 
     @property
     def tasks(self) -> int:

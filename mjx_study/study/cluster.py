@@ -112,7 +112,7 @@ def cells_on(
     """
     study, computation = _packed(plan), Computation(plan)
     begun = {
-        index: computation.compute.begun(plan.cells[index], part.kept)
+        index: computation.compute.restored(plan.cells[index], part)
         for index, part in parts.items()
         if blocks_of(plan, plan.cells[index]) > 1
     }

@@ -37,7 +37,9 @@ def dataset_of(document: Mapping[str, Any], cells: Cells) -> xr.Dataset:
     config, places = document["config"], document["cells"]
     outer = tuple(places[0]["at"])
     cells = {index: (_solver(places[index]) | dict(arrays), by) for index, (arrays, by) in cells.items()}
-    dimensions: dict[str, Sequence[Any]] = dict(document["axes"]) | {
+    axes = dict(document["axes"])
+    axes |= {name: [float(value) for value in axes[name]] for name in ("timestep", "sigma")}  # JSON may say 1
+    dimensions: dict[str, Sequence[Any]] = axes | {
         "estimator": config["estimators"],
         "seed": range(config["seeds"]),
     }
@@ -64,8 +66,8 @@ def dataset_of(document: Mapping[str, Any], cells: Cells) -> xr.Dataset:
         data[name] = ((*outer, *variable.dims), values, attributes)
     used = {dimension for dims, *_ in data.values() for dimension in dims} | set(outer)
     coordinates: dict[str, Any] = {name: (name, list(values)) for name, values in dimensions.items() if name in used}
-    for name in ("contact", "stiffness"):
-        coordinates[name] = ("model", [model[name] for model in document["models"]])
+    coordinates["contact"] = ("model", [model["contact"] for model in document["models"]])
+    coordinates["stiffness"] = ("model", [float(model["stiffness"]) for model in document["models"]])
     dataset = xr.Dataset(data, coordinates)
     for name, coordinate in COORDINATES.items():
         dataset[name].attrs = {"units": coordinate.unit, "long_name": coordinate.description}

@@ -214,12 +214,8 @@ class _Run:
         self.records: list[Record] = []
         self.seconds: list[float] = []
         if f"seconds_{index}" in self.kept:
-            leaves, structure = jax.tree.flatten(self.state)
-            kept = [jnp.asarray(self.kept[f"state_{index}_{leaf}"]) for leaf in range(len(leaves))]
-            self.state = structure.unflatten(kept)
-            columns = [self.kept[f"history_{index}_{name}"] for name in HISTORY]
-            self.records += [Record(*map(jnp.asarray, row)) for row in zip(*columns, strict=True)]
-            self.seconds += map(float, self.kept[f"seconds_{index}"])
+            with self.part.restored():
+                self._restore()
         self.already, self.before = len(self.records), self.seconds[-1] if self.seconds else 0.0
         self.state = backend.place(self.state, index)
         seeds = jnp.arange(backend.seeds)
@@ -231,6 +227,26 @@ class _Run:
             first = self._keys_of(self.already)
             with nullcontext() if self.model.analytic else timed(self.program):
                 jax.block_until_ready(self._iterate(self.state, first, self.already))  # compile; discard the result
+
+    def _restore(self) -> None:
+        """Take state, records and times from the checkpoint; KeyError or ValueError if it is not of this run."""
+        leaves, structure = jax.tree.flatten(self.state)
+        length = self.kept[f"seconds_{self.index}"].size
+        if length > self.backend.recipe.iterations:
+            raise ValueError(f"it has {length} iterations")
+
+        def kept(name: str, shape: tuple[int, ...], kind: str) -> np.ndarray:
+            array = self.kept[name]
+            if array.shape != shape or array.dtype.kind != kind:
+                raise ValueError(f"{name} has shape {array.shape} and type {array.dtype}")
+            return array
+
+        state = [kept(f"state_{self.index}_{i}", leaf.shape, leaf.dtype.kind) for i, leaf in enumerate(leaves)]
+        each = length, self.backend.seeds
+        columns = [kept(f"history_{self.index}_{name}", each, "f") for name in HISTORY]
+        self.state = structure.unflatten(map(jnp.asarray, state))
+        self.records += [Record(*map(jnp.asarray, row)) for row in zip(*columns, strict=True)]
+        self.seconds += map(float, kept(f"seconds_{self.index}", (length,), "f"))
 
     def descend(self) -> None:
         """Run the remaining iterations, writing a checkpoint now and then and at the end."""

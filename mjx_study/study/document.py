@@ -7,9 +7,12 @@ from collections import Counter, defaultdict
 from typing import Annotated, Any, Final, Literal
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from mjx_study.files import Finite, Schema, told
+from estimators import Estimator, find_estimator
+from estimators.catalogue import CATALOGUE, ORACLES
+from estimators.estimator import label_of
+from mjx_study.files import Finite, Schema, digest_of_json, told
 from mjx_study.identity import git_revision, versions
 from mjx_study.option import OPTIONS
 from mjx_study.runtime import environment
@@ -29,11 +32,16 @@ class _Part(BaseModel):
 class _Config(_Part):
     kind: Literal["gradients", "descents", "landscapes"]
     tasks: list[Name] = Field(min_length=1)
-    estimators: list[Annotated[Name, AfterValidator(OPTIONS["estimators"].check)]] = Field(min_length=1)
+    estimators: list[Name] = Field(min_length=1)
     seeds: int = Field(ge=1, le=int(OPTIONS["seeds"].interval.high))  # type: ignore[union-attr]
     iterations: Count | None
     points: Count | None = None
     confidence: Annotated[float, Field(gt=0, lt=1)] = 0.95
+
+
+class _Described(_Part):
+    label: Name
+    needs: list[Literal[tuple(ORACLES)]] = Field(min_length=1)  # type: ignore[valid-type]
 
 
 class _Axes(_Part):
@@ -72,13 +80,16 @@ class _Environment(_Part):
 class StudyDocument(_Part):
     """The parts of a study.json that are read; other keys may hold anything."""
 
+    digest: str
     config: _Config
     contents: dict[str, str]
+    seen: dict[str, str] = {}
     versions: dict[str, str]
     warnings: list[str]
     environment: _Environment
     revision: str | None = None
     command: str | None = None
+    described: dict[str, _Described] = {}
     models: list[_Model]
     axes: _Axes
     resolved: list[_Resolved]
@@ -98,6 +109,9 @@ class StudyDocument(_Part):
             if list(cell.at) != list(axes) or any(place >= axes[name] for name, place in cell.at.items()):
                 raise ValueError(f"cells.{index}.at is no place on the axes")
         config = self.config
+        for name in config.estimators:
+            if name not in CATALOGUE and name not in self.described:
+                raise ValueError(f"config.estimators has {name!r}, which is neither built in nor described")
         inner = config.seeds * len(config.estimators) * max(config.iterations or 1, config.points or 1)
         if math.prod(axes.values()) * inner > MOST_NUMBERS:
             raise ValueError(f"a variable would have more than {MOST_NUMBERS} numbers, which is the limit")
@@ -115,10 +129,19 @@ def read_format(content: bytes | str) -> int:
     return _validated(_Format, content).format
 
 
+def sealed(document: dict[str, Any]) -> bytes:
+    """Write a study.json, with a digest of everything else in it."""
+    return (json.dumps(document | {"digest": digest_of_json(document)}, indent=1) + "\n").encode()
+
+
 def read_document(content: bytes | str) -> dict[str, Any]:
-    """Read a study.json as plain data; ValueError names the key that violates the schema."""
+    """Read a study.json as plain data, without its digest; ValueError names the key that violates the schema, or says
+    that the digest does not match."""
     _validated(StudyDocument, content)
-    return json.loads(content)
+    document = json.loads(content)
+    if document.pop("digest") != digest_of_json(document):
+        raise ValueError("its digest does not match")
+    return document
 
 
 def _validated(schema: type[Schema], content: bytes | str) -> Schema:
@@ -137,15 +160,18 @@ def document_of(plan: StudyPlan, command: str | None) -> dict[str, Any]:
     index = {name: {value: place for place, value in enumerate(along)} for name, along in axes.items()}
     places = [{name: index[name][value] for name, value in each.items()} for each in exact]
     fields = plan.config.resolved() | {"tasks": plan.config.task_names, "estimators": plan.config.estimator_names}
+    named = zip(plan.config.estimator_names, plan.config.estimators, strict=True)
     fields |= {"seeds": plan.config.batches, "iterations": plan.iterations}
     return {
         "config": fields,
         "warnings": list(plan.warnings),
         "contents": plan.contents,
+        "seen": plan.seen,
         "versions": versions(),
         "environment": environment(),
         "revision": git_revision(),
         "command": command,
+        "described": {name: describe_estimator(each) for name, each in named},
         "models": [{"contact": family, "stiffness": stiffness} for family, stiffness in axes["model"]],
         "axes": axes | {"task": _task_names(plan, axes["task"]), "model": _model_names(axes["model"])},
         "resolved": _resolved(plan, places, len(axes["task"])),
@@ -154,6 +180,13 @@ def document_of(plan: StudyPlan, command: str | None) -> dict[str, Any]:
             for cell, at in zip(plan.cells, places, strict=True)
         ],
     }
+
+
+def describe_estimator(which: str | Estimator) -> dict[str, Any]:
+    """What figures and reports need of an estimator, so that reading a study imports none."""
+    found = find_estimator(which)
+    name = which if isinstance(which, str) else found.place()
+    return {"label": label_of(name), "needs": list(found.needs)}
 
 
 def _coordinates(plan: StudyPlan, cell: StudyCell) -> dict[str, Any]:

@@ -135,7 +135,7 @@ def findings_of(dataset: xr.Dataset) -> list[str]:
 def _of_gradients(dataset: xr.Dataset) -> list[str]:
     """Report where FoBG's variance exceeds ZoBG's and which means are biased."""
     gammas, confidence = gammas_of(dataset), json.loads(dataset.attrs["config"])["confidence"]
-    label = partial(label_of, onset=onset_of(dataset))
+    label = partial(label_in, dataset)
 
     def of(rows: Sequence[Row]) -> list[str]:
         found = [*_variance_finding(rows, confidence, label), *_bias_findings(rows, gammas, label)]
@@ -148,15 +148,15 @@ def _of_descents(dataset: xr.Dataset) -> list[str]:
     """Report where the first-order batch of an AoBG with a bound has no weight in any iteration of any seed."""
     if "alpha" not in dataset:
         return []
-    gammas, along, onset = gammas_of(dataset), ("iteration", "seed"), onset_of(dataset)
+    gammas, along = gammas_of(dataset), ("iteration", "seed")
     stuck = (dataset["alpha"].max(along) == 0).stack(place=(*SETTING, "model", "estimator"))
     names = (*SETTING, "contact", "stiffness", "estimator")
     rows = [Row(**{name: one[name].item() for name in names}) for one in stuck[stuck.values]]
     bound = [row for row in rows if gammas.get((row.task, row.estimator), math.inf) < math.inf]
 
     def of(rows: Sequence[Row]) -> list[str]:
-        groups = _by(rows, "estimator").items()
-        return [f"{label_of(name, onset)} equals ZoBG throughout{_at(same)}: {WEIGHTLESS}" for (name,), same in groups]
+        groups = [(label_in(dataset, name), same) for (name,), same in _by(rows, "estimator").items()]
+        return [f"{label} equals ZoBG throughout{_at(same)}: {WEIGHTLESS}" for label, same in groups]
 
     return _by_family(dataset, bound, of)
 
@@ -201,6 +201,17 @@ def gammas_of(dataset: xr.Dataset) -> Bounds:
 def onset_of(dataset: xr.Dataset) -> str:
     """Onset term of a study's first-order batches."""
     return json.loads(dataset.attrs["config"]).get("onset", "none")
+
+
+def estimators_of(dataset: xr.Dataset) -> dict[str, dict[str, Any]]:
+    """Label and needs of each estimator of a study, by name, as its plan recorded them."""
+    return json.loads(dataset.attrs.get("described", "{}"))
+
+
+def label_in(dataset: xr.Dataset, name: str) -> str:
+    """Label of an estimator in texts and figures of a study; a user-defined one has that which its plan recorded."""
+    known = {} if name in ESTIMATORS else estimators_of(dataset).get(name, {})
+    return known.get("label") or label_of(name, onset_of(dataset))
 
 
 def differentiates(estimator: str) -> bool:

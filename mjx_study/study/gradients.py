@@ -91,12 +91,21 @@ class Gradients:
         """
         if blocks_of(self._plan, cell) == 1:
             return self._whole(cell)
-        blocks = self.begun(cell, part.kept)
+        blocks = self.restored(cell, part)
         for task in blocks.missing:
             part.report(task, blocks.tasks, f"{self._plan.label(cell)}, in blocks")
             blocks.add(task, self.block(cell, task))
             part.save(blocks.arrays())
         return done(self.merged(cell, blocks))
+
+    def restored(self, cell: StudyCell, part: Part) -> Blocks:
+        """Blocks of a cell, with the finished ones of its checkpoint; StudyError if that does not fit."""
+        with part.restored():
+            blocks = self.begun(cell, part.kept)
+            chosen = estimators_of(self._plan, cell)
+            size = self._plan.groups[cell.group].task.policy.num_params
+            blocks.check([str(index) for index in range(len(chosen))], estimators.oracles_of(chosen), size)
+        return blocks
 
     def begun(self, cell: StudyCell, kept: Mapping[str, np.ndarray]) -> Blocks:
         """Blocks of a cell, with the finished ones of a checkpoint."""

@@ -11,6 +11,7 @@ import jax
 import estimators
 from estimators import Estimator, find_estimator
 from estimators.alpha import check_weights
+from estimators.seen import seen_by
 from mjx_study.choices import CONES, REFERENCE
 from mjx_study.identity import contents, estimator_contents
 from mjx_study.limits import MOST_CELLS, MOST_GIB, MOST_PROGRAMS, check_count
@@ -34,9 +35,10 @@ from mjx_study.study.memory import (
 )
 from mjx_study.study.resolution import at_theta, configured_estimators, line_of, recipe_of
 from mjx_study.table import digits_to_tell_apart
-from mjx_study.tasks import task_with_options
+from mjx_study.tasks import TASKS, task_with_options
 from mjx_study.tasks.contact_grid import ContactPoint, backward_grid, family_grid, solver_grid
 from mjx_study.tasks.network import with_network
+from mjx_study.tasks.own import registered_place
 from mjx_study.tasks.task import Recipe, Task, check_shapes
 
 HISTORY_NUMBERS: Final = 20
@@ -127,6 +129,19 @@ class StudyPlan:
         return contents(forms) | estimator_contents(
             dict(zip(self.config.estimator_names, self.config.estimators, strict=True))
         )
+
+    @property
+    def places(self) -> tuple[str, ...]:
+        """Names of the modules of user-defined tasks and estimators, and of tasks given as objects."""
+        tasks = [each if isinstance(each, str) else f"task {each.name}" for each in self.config.tasks]
+        places = [registered_place(each) or each for each in tasks if each not in TASKS]
+        own = [each for each in self.config.estimator_names if ":" in each]
+        return tuple(dict.fromkeys(each.partition(":")[0] for each in (*places, *own)))
+
+    @property
+    def seen(self) -> dict[str, str]:
+        """Digests of files and environment variables that user-defined code has read so far."""
+        return seen_by(self.places)
 
     def label(self, cell: StudyCell) -> str:
         """A cell's name in messages."""

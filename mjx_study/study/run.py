@@ -19,6 +19,7 @@ from typing import Any, Final
 import xarray as xr
 
 from estimators import ENOUGH_EFFECTIVE
+from estimators.seen import observing
 from mjx_study.identity import differences, versions
 from mjx_study.study.blocks import Arrays
 from mjx_study.study.cells import Computation
@@ -76,6 +77,7 @@ def run_study(
     with ExitStack() as stack:
         client = stack.enter_context(connected(cluster)) if isinstance(cluster, str) else cluster
         stack.enter_context(recording())
+        stack.enter_context(observing(*plan.places))
         return _Run(plan.with_chunk(folder.chunk_size), progress).in_folder(folder, keep_going, client)
 
 
@@ -110,6 +112,7 @@ class _Run:
                         store.write_failure(index, arrays)
                         continue
                     computed += 1
+                    store.record(self._plan.seen)
                     store.write(index, arrays)
                 except OSError as error:
                     if not keep_going:
@@ -198,7 +201,7 @@ def _part(store: Store, index: int) -> Part:
         with suppress(OSError):
             store.write_part(index, arrays)
 
-    return Part(store.read_part(index), keep)
+    return Part(store.read_part(index), keep, name=str(store.part_path(index)))
 
 
 def load_study(folder: str | Path) -> xr.Dataset:

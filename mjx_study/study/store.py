@@ -1,20 +1,21 @@
 """A study's folder: its configuration, one file per cell, and one file of all results.
 
-    study.json       configuration, digests of what the numbers depend on, versions, machine, every cell's coordinates
+    study.json       configuration, digests of what the numbers depend on, versions, machine, every cell's coordinates,
+                     and a digest of all that
     cells/00042.npz  one cell's numbers, with digests of these, of the study and of the cell's coordinates
     cells/00042.part.npz  checkpoint of an unfinished cell (descents, or batches in blocks)
-    cells/00042.failed    why a cell could not be computed; the next run retries
-    results.nc       all cells as one NetCDF file, written after the last
+    cells/00042.failed    why a cell could not be computed, with a digest; the next run retries
+    results.nc       all cells as one NetCDF file, written after the last and never read
     study.lock       which cells are being computed, and by which process
 
 Files are moved into place once complete, so a process may be killed at any time. Locks are the operating system's and
-end with their process.
+end with their process. A folder may come from anywhere: every file that is read is limited in size, is no link, and
+matches its digest and its schema.
 """
 
 import dataclasses
 import fcntl
 import hashlib
-import io
 import json
 import os
 from collections.abc import Callable, Generator, Mapping
@@ -23,21 +24,35 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 
-from mjx_study.disk import open_regular, prepare_folder, read_whole, write_whole
+from estimators.seen import seen_now
+from mjx_study.disk import check_no_link, open_regular, prepare_folder, read_whole, write_whole
+from mjx_study.files import MOST_BYTES, digest_of_json, told
 from mjx_study.identity import ACCEPT, differences
+from mjx_study.study.arrays import MOST_CELL_BYTES, check_cell, read_arrays, write_arrays
 from mjx_study.study.dataset import as_plain
-from mjx_study.study.document import document_of, read_document, read_format
+from mjx_study.study.document import document_of, read_document, read_format, sealed
 from mjx_study.study.plan import StudyPlan
 
-FORMAT: Final = 3
+FORMAT: Final = 4
 """Format of the folder; increased when older programs cannot read newer folders."""
 VERSIONS: Final = "versions"
 """Entry of a cell that records the versions that computed it."""
+VERSIONS_SCHEMA: Final = TypeAdapter(dict[str, str])
 
 
 class StudyError(ValueError):
     """A folder holds no study, another study, or a damaged file."""
+
+
+class _Failure(BaseModel):
+    """A file that states why a cell could not be computed; its digest is of the reason, the study and the cell."""
+
+    model_config = ConfigDict(strict=True)
+
+    reason: str
+    digest: str
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,11 +62,23 @@ class Part:
     Attributes:
         kept: arrays of the last checkpoint.
         report: reports progress within the cell: done, total, and what is being computed.
+        name: name of the checkpoint in messages.
     """
 
     kept: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
     save: Callable[[dict[str, np.ndarray]], None] = lambda arrays: None
     report: Callable[[int, int, str], None] = lambda done, total, what: None
+    name: str = "the checkpoint"
+
+    @contextmanager
+    def restored(self) -> Generator[None]:
+        """Let arrays of the checkpoint that are missing or of another form be a StudyError."""
+        try:
+            yield
+        except (KeyError, IndexError, TypeError, ValueError) as error:
+            reason = f"no {error}" if isinstance(error, KeyError) else _told(error)
+            message = f"{self.name} does not fit the study ({reason}); move it away to compute its cell again"
+            raise StudyError(message) from error
 
 
 class Store:
@@ -60,7 +87,7 @@ class Store:
     def __init__(self, folder: Path, document: dict[str, Any]):
         self.folder, self.document = folder, document
         self._versions: dict[str, str] = document.get("versions", {})
-        self._study = _digest_of_text(_identity(document))
+        self._study = digest_of_json(_identity(document))
 
     @property
     def chunk_size(self) -> int:
@@ -81,11 +108,12 @@ class Store:
         """
         kept = cls.begun(folder, document, accept_versions=accept_versions)
         prepare_folder(folder)
-        prepare_folder(folder / "cells")
+        prepare_folder(folder / "cells", follow=False)
         document = as_plain({"format": FORMAT} | document)
         if kept is not None:
             if _iterations(document) > _iterations(kept.document):
                 kept._extend(document)
+            kept.record(document.get("seen", {}))
             kept._versions = document.get("versions", {})
             return kept
         if any((folder / "cells").glob("*.npz")):
@@ -97,11 +125,12 @@ class Store:
     @classmethod
     def begun(cls, folder: Path, document: dict[str, Any], *, accept_versions: bool = False) -> "Store | None":
         """Open a folder's study for reading, as `create` would resume it; None if there is none. Raises as `create`."""
-        if not (folder / "study.json").exists():
+        if not os.path.lexists(folder / "study.json"):
             return None
         document, kept = as_plain({"format": FORMAT} | document), cls.open(folder)
         theirs, ours = ({**parts["contents"], **parts["config"]} for parts in map(_identity, (kept.document, document)))
-        if told := differences(theirs, ours):
+        seen = kept.document.get("seen", {})
+        if told := differences(theirs, ours) or differences(seen, seen_now(seen)):
             raise StudyError(f"{folder} holds another study ({told}); choose another folder")
         there, asked = _iterations(kept.document), _iterations(document)
         if asked < there:
@@ -124,9 +153,15 @@ class Store:
         self.document |= {"config": document["config"], "resolved": document["resolved"]}
         self._write_document()
 
+    def record(self, seen: Mapping[str, str]) -> None:
+        """Add to study.json what else the user's code has read; see `estimators.seen`."""
+        before = self.document.get("seen", {})
+        if new := {name: digest for name, digest in seen.items() if name not in before}:
+            self.document["seen"] = before | new
+            self._write_document()
+
     def _write_document(self) -> None:
-        content = json.dumps(self.document, indent=1) + "\n"
-        write_whole(self.folder / "study.json", lambda file: file.write(content.encode()))
+        write_whole(self.folder / "study.json", sealed(self.document))
 
     @classmethod
     def open(cls, folder: Path) -> "Store":
@@ -134,7 +169,7 @@ class Store:
         format."""
         path = folder / "study.json"
         try:
-            content = read_whole(path)
+            content = read_whole(path, follow=False, most=MOST_BYTES)
             version = read_format(content)
             document = read_document(content) if version == FORMAT else {}
         except FileNotFoundError as error:
@@ -145,6 +180,10 @@ class Store:
             raise StudyError(f"{path} is damaged ({error}); move the folder away to start again") from error
         if version != FORMAT:
             raise StudyError(f"{path} is of format {version}; this program reads {FORMAT}")
+        try:
+            check_no_link(folder / "cells")
+        except OSError as error:
+            raise StudyError(f"cannot read {folder / 'cells'}: {_told(error)}") from error
         return cls(folder, document)
 
     def path(self, index: int) -> Path:
@@ -152,7 +191,7 @@ class Store:
 
     def has(self, index: int) -> bool:
         """Whether a cell's file exists; `read` checks it."""
-        return self.path(index).exists()
+        return os.path.lexists(self.path(index))
 
     def part_path(self, index: int) -> Path:
         return self.path(index).with_suffix(".part.npz")
@@ -163,13 +202,27 @@ class Store:
         self._failed(index).unlink(missing_ok=True)
 
     def write_failure(self, index: int, reason: str) -> None:
-        write_whole(self._failed(index), lambda file: file.write(reason.encode()))
+        failure = _Failure(reason=reason, digest=self._digest_of_failure(index, reason))
+        write_whole(self._failed(index), failure.model_dump_json().encode())
 
     @property
     def failures(self) -> dict[int, str]:
-        """Reasons why missing cells could not be computed."""
-        paths = sorted((self.folder / "cells").glob("*.failed"))
-        return {int(path.stem): path.read_text() for path in paths if not self.has(int(path.stem))}
+        """Reasons why missing cells could not be computed; StudyError if one is damaged."""
+        found = {}
+        for index in self.missing:
+            if os.path.lexists(path := self._failed(index)):
+                try:
+                    content = read_whole(path, follow=False, most=MOST_BYTES)
+                    failure = _Failure.model_validate_json(content)
+                    if failure.digest != self._digest_of_failure(index, failure.reason):
+                        raise ValueError("its digest does not match")
+                except (OSError, ValueError) as error:
+                    raise StudyError(f"{path} is damaged ({_told(error)}); remove it") from error
+                found[index] = failure.reason
+        return found
+
+    def _digest_of_failure(self, index: int, reason: str) -> str:
+        return digest_of_json({"reason": reason, "study": self._study, "place": self._place(index)})
 
     def _failed(self, index: int) -> Path:
         return self.path(index).with_suffix(".failed")
@@ -183,11 +236,11 @@ class Store:
         kept = dict(arrays) | {VERSIONS: np.array(json.dumps(versions))}
         digest = np.array([_digest(kept), self._study, self._place(index, part=part)])
         path = self.part_path(index) if part else self.path(index)
-        write_whole(path, lambda file: np.savez(file, digest=digest, **kept))  # type: ignore[arg-type]
+        write_whole(path, lambda file: write_arrays(file, {"digest": digest} | kept))
 
     def _authors(self, index: int) -> dict[str, str]:
         """Versions that computed a cell, including those of its checkpoint."""
-        if not self.part_path(index).exists():
+        if not os.path.lexists(self.part_path(index)):
             return self._versions
         before = self.read_with_versions(index, part=True)[1]
         names = dict.fromkeys([*before, *self._versions])
@@ -200,7 +253,7 @@ class Store:
 
     def read_part(self, index: int) -> dict[str, np.ndarray]:
         """Read a cell's checkpoint; empty if there is none."""
-        return self.read_with_versions(index, part=True)[0] if self.part_path(index).exists() else {}
+        return self.read_with_versions(index, part=True)[0] if os.path.lexists(self.part_path(index)) else {}
 
     def read_all(self) -> dict[int, tuple[dict[str, np.ndarray], dict[str, str]]]:
         """Read all computed cells with their versions."""
@@ -209,13 +262,12 @@ class Store:
 
     def read_with_versions(self, index: int, *, part: bool = False) -> tuple[dict[str, np.ndarray], dict[str, str]]:
         """Read the numbers of a cell, or its checkpoint, and the versions that computed them; StudyError if the file is
-        damaged, or belongs to another study or cell."""
+        damaged, or belongs to another study or cell, or a cell lacks a variable or has one of another shape."""
         path = self.part_path(index) if part else self.path(index)
         try:
-            with np.load(io.BytesIO(read_whole(path)), allow_pickle=False) as stored:
-                arrays = {name: stored[name] for name in stored.files}
+            arrays = read_arrays(read_whole(path, follow=False, most=MOST_CELL_BYTES))
             content, study, place = arrays.pop("digest").tolist()
-        except Exception as error:  # numpy, zipfile and zlib may raise anything
+        except Exception as error:  # numpy and zipfile may raise anything
             raise StudyError(f"{path} is damaged ({_told(error)}); move it away to compute it again") from error
         wrong = {
             "a cell of another study": study != self._study,
@@ -224,7 +276,14 @@ class Store:
         }
         if is_that := next((what for what, holds in wrong.items() if holds), None):
             raise StudyError(f"{path} is {is_that}; move it away to compute it again")
-        return arrays, json.loads(str(arrays.pop(VERSIONS)))
+        try:
+            versions = VERSIONS_SCHEMA.validate_json(str(arrays.pop(VERSIONS, "")))
+            if not part:
+                check_cell(arrays, self.document, index)
+        except ValueError as error:
+            reason = f"does not fit the study ({_told(error)})"
+            raise StudyError(f"{path} {reason}; move it away to compute it again") from error
+        return arrays, versions
 
     @contextmanager
     def claims(self) -> Generator[Callable[[int], bool]]:
@@ -235,7 +294,7 @@ class Store:
         """
         path = self.folder / "study.lock"
         try:
-            descriptor = open_regular(path, os.O_RDWR | os.O_CREAT)
+            descriptor = open_regular(path, os.O_RDWR | os.O_CREAT, follow=False)
         except OSError as error:
             raise StudyError(f"cannot lock {path}: {_told(error)}") from error
         with os.fdopen(descriptor, "r+b") as file:
@@ -253,7 +312,7 @@ class Store:
         cell, axes = self.document["cells"][index], self.document.get("axes", {})
         at = {name: axes[name][place] for name, place in cell.get("at", {}).items()}
         iterations = None if part else self.document["config"].get("iterations")
-        return _digest_of_text({"index": index, "cell": cell, "at": at, "iterations": iterations})
+        return digest_of_json({"index": index, "cell": cell, "at": at, "iterations": iterations})
 
     @property
     def missing(self) -> list[int]:
@@ -279,7 +338,7 @@ def _document_in(plan: StudyPlan, folder: Path, command: str | None = None) -> d
     """Document of a plan, with the chunk size of a study begun in the folder."""
     document = document_of(plan, command)
     if plan.config.chunk_size is None:
-        begun = (folder / "study.json").exists()
+        begun = os.path.lexists(folder / "study.json")
         document["config"]["chunk_size"] = Store.open(folder).chunk_size if begun else plan.chunk_size
     return document
 
@@ -290,10 +349,6 @@ def _digest(arrays: Mapping[str, np.ndarray]) -> str:
         array = np.ascontiguousarray(arrays[name])
         sha.update(f"{name} {array.dtype} {array.shape}".encode() + array.tobytes())
     return sha.hexdigest()
-
-
-def _digest_of_text(document: Mapping[str, Any]) -> str:
-    return hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()
 
 
 def _identity(document: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
@@ -307,4 +362,6 @@ def _iterations(document: Mapping[str, Any]) -> int:
 
 
 def _told(error: Exception) -> str:
+    if isinstance(error, ValidationError):
+        return told(error)
     return (error.strerror if isinstance(error, OSError) else None) or str(error)

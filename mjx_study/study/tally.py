@@ -29,6 +29,18 @@ class Tally:
         onsets = _met(np.zeros((0, 5)) if events is None else np.asarray(events, float).reshape(-1, 5))
         return cls(np.array(seconds), np.asarray(largest), np.array(unconverged(residuals, precision())), onsets)
 
+    @property
+    def parts(self) -> int:
+        """Number of parts of a sample; 1, as of the moments of one batch."""
+        return 1
+
+    def check(self) -> None:
+        """Raise ValueError unless the arrays have their shapes, as those of a file may not."""
+        shapes = {"seconds": (), "residual": (), "unconverged": (), "onsets": (8,)}
+        for name, shape in shapes.items():
+            if getattr(self, name).shape != shape or getattr(self, name).dtype.kind not in "fiu":
+                raise ValueError(f"{name} has shape {getattr(self, name).shape}")
+
     def merged(self, other: "Tally") -> "Tally":
         """Combine with the tally of other rollouts."""
         return Tally(

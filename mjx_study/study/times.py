@@ -14,15 +14,14 @@ import math
 import statistics
 import time
 from collections.abc import Generator, Iterable
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
 import jax
 from pydantic import BaseModel, Field
 
-from mjx_study.disk import write_whole
-from mjx_study.files import read_json
+from mjx_study.caches import read_cached, write_cached
 from mjx_study.identity import digest_of, versions
 from mjx_study.runtime import precision, processor_name
 from mjx_study.simulation.scene import num_constraint_rows
@@ -48,6 +47,8 @@ OTHERS: Final = {"statistics": (2.5e-8, 5e6), "analytic": (1e-7, 1.5e6)}
 how many of these take as long as the overhead of a cell."""
 OTHERS_SETUP: Final = (2.0, 3.0)
 """Times of tracing and compilation of these [s]."""
+SUFFIX: Final = ".times"
+"""Suffix of a record's file."""
 SAVE_SECONDS: Final = 5.0
 READING: Final = 0.1
 """Time of reading a compiled program relative to compiling it."""
@@ -163,24 +164,30 @@ def recording(watch: Stopwatch | None = None) -> Generator[None]:
         finally:
             if time.monotonic() - watch.saved > SAVE_SECONDS and (folder := times_folder()) is not None:
                 watch.saved = time.monotonic()
-                with suppress(OSError):
-                    folder.mkdir(parents=True, exist_ok=True)
-                    for program, spent in watch.spent.items():
-                        _write(folder, program, spent)
+                for program, spent in watch.spent.items():
+                    _write(folder, program, spent)
 
 
 def _write(folder: Path, key: Any, spent: Spent) -> None:
     if isinstance(key, str):
         return
     program = key if isinstance(key, Program) else program_of(*key)
-    path = folder / f"{program.kind}-{program.content}-{program.steps}-{program.rows}.json"
+    path = folder / f"{program.kind}-{program.content}-{program.steps}-{program.rows}{SUFFIX}"
     setup = {"tracing": spent.tracing, "compiling": spent.compiling, "versions": versions()}
-    if not spent.setups:  # compiled earlier
-        with suppress(ValueError):
-            setup = read_json(path, Record).model_dump(include=set(setup))
+    if not spent.setups and (earlier := _read(path)):
+        setup = earlier.model_dump(include=set(setup))
     times = {"each": spent.each, "calls": spent.calls or spent.first_calls}
     record = dataclasses.asdict(program) | times | setup
-    write_whole(path, lambda file: file.write(json.dumps(record).encode()))
+    write_cached(path, json.dumps(record).encode())
+
+
+def _read(path: Path) -> Record | None:
+    """Read a record; None if there is none, or a damaged one."""
+    content = read_cached(path)
+    try:
+        return None if content is None else Record.model_validate_json(content)
+    except ValueError:
+        return None
 
 
 class Rates:
@@ -193,11 +200,7 @@ class Rates:
     @classmethod
     def read(cls, folder: Path | None) -> "Rates":
         """Read a folder's records, skipping damaged ones."""
-        found = []
-        for path in sorted(folder.glob("*.json")) if folder else ():
-            with suppress(ValueError):
-                found.append(read_json(path, Record))
-        return cls(found)
+        return cls(filter(None, map(_read, sorted(folder.glob(f"*{SUFFIX}")) if folder else ())))
 
     def call(self, program: Program) -> tuple[float, str]:
         """Seconds of a call, and the basis of the figure (see `BASES`)."""

@@ -6,6 +6,7 @@ from importlib import metadata
 from typing import Any
 
 from estimators.places import described, find_attribute, importable_here
+from estimators.seen import observing
 from mjx_study.choices import TASK_GROUP
 from mjx_study.tasks.task import Task, check_shapes
 
@@ -35,8 +36,9 @@ def own_task(place: str, options: dict[str, Any]) -> Task:
                 f"{place} is a ready-made Task, which {_listed(options)} cannot change: "
                 "give a function that takes this and returns the Task"
             )
-        task = found if isinstance(found, Task) else _build(place, found, options)
-        check_shapes(task, place)
+        with observing(place.partition(":")[0]):
+            task = found if isinstance(found, Task) else _build(place, found, options)
+            check_shapes(task, place)
     return task
 
 

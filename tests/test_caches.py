@@ -1,0 +1,193 @@
+"""Caches on disk: private, checked before use, and made again when they are not what was written."""
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+from estimators import Differentiation
+from mjx_study import disk, runtime
+from mjx_study.caches import digested, read_cached, undigested, write_cached
+from mjx_study.disk import private_folder
+from mjx_study.runtime import configure, traces_folder
+from mjx_study.structure import describe, restore
+from tests.faults import deadline, put_no_file
+
+
+def test_a_digest_is_checked() -> None:
+    for content in (b"", b"\n", b"content"):
+        assert undigested(digested(content)) == content
+        for damaged in (digested(content)[:-1], digested(content) + b"x", b"x" + content, b""):
+            with pytest.raises(ValueError, match="its digest does not match"):
+                undigested(damaged)
+
+
+@pytest.mark.parametrize("kind", ["fifo", "socket", "folder", "device"])
+def test_what_is_no_cached_file_is_none(kind: str, tmp_path: Path) -> None:
+    path = tmp_path / "entry"
+    assert read_cached(path) is None
+    put_no_file(path, kind)
+    with deadline(5):
+        assert read_cached(path) is None
+
+
+def test_a_cached_file_is_private_and_no_link(tmp_path: Path) -> None:
+    path, elsewhere = tmp_path / "cache" / "entry", tmp_path / "elsewhere"
+    write_cached(path, b"content")
+    assert path.stat().st_mode & 0o777 == 0o600 and path.parent.stat().st_mode & 0o777 == 0o700
+    assert read_cached(path) == b"content"
+    path.chmod(0o660)
+    assert read_cached(path) is None and not path.exists()
+    elsewhere.write_bytes(digested(b"theirs"))
+    path.symlink_to(elsewhere)
+    assert read_cached(path) is None and elsewhere.exists()
+    write_cached(path, b"content")
+    assert read_cached(path) == b"content" and elsewhere.read_bytes() == digested(b"theirs")
+
+
+def test_a_private_folder_is_this_users_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = tmp_path / "above" / "cache"
+    for mode in (None, 0o755):
+        if mode:
+            folder.chmod(mode)
+        assert private_folder(folder).stat().st_mode & 0o777 == 0o700
+    folder.chmod(0o770)
+    with pytest.raises(OSError, match="others can write to it"):
+        private_folder(folder)
+    folder.chmod(0o700)
+    (tmp_path / "link").symlink_to(folder)
+    with pytest.raises(OSError, match="it is a symbolic link"):
+        private_folder(tmp_path / "link")
+    monkeypatch.setattr(disk.os, "geteuid", lambda: os.getuid() + 1)
+    with pytest.raises(OSError, match="it belongs to another user"):
+        private_folder(folder)
+
+
+@pytest.fixture
+def settings_kept() -> Iterator[None]:
+    """JAX's settings are afterwards what they were before."""
+    names = ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs", "jax_enable_x64")
+    before = {name: jax.config.values[name] for name in names}
+    yield
+    for name, value in before.items():
+        jax.config.update(name, value)
+    runtime._TRACES.clear()
+
+
+@pytest.mark.usefixtures("settings_kept")
+def test_a_cache_that_others_can_write_to_is_not_used(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "mjx-study").mkdir()
+    monkeypatch.setattr("mjx_study.runtime.default_cache", lambda: tmp_path / "mjx-study")
+    (tmp_path / "mjx-study").chmod(0o777)
+    settings = {"precision": "float64", "cpu_devices": jax.local_device_count()}
+    with pytest.raises(
+        ValueError, match="compiled programs cannot be kept in .*: others can write to it; give a folder"
+    ):
+        configure(**settings, cache=tmp_path / "mjx-study")
+    configure(**settings)
+    assert traces_folder() is None and jax.config.values["jax_compilation_cache_dir"] is None
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("mjx-study: compiled programs cannot be kept in") and "others can write to it" in line
+    (tmp_path / "mjx-study").chmod(0o700)
+    configure(**settings)
+    assert traces_folder() == tmp_path / "mjx-study" / "traces"
+    configure(**settings, cache="gs://bucket/cache")
+    assert traces_folder() is None and jax.config.values["jax_compilation_cache_dir"] == "gs://bucket/cache"
+
+
+FLIPPED = """
+import random, sys
+from pathlib import Path
+import jax
+import mjx_study
+from jax._src import compilation_cache
+from mjx_study.caches import read_cached
+from mjx_study.objective import Simulator
+from mjx_study.study.times import recording
+from mjx_study.tasks import make_task
+from tests.fuzzing_studies import flipped
+
+folder, draw = Path(sys.argv[1]), random.Random(0)
+mjx_study.configure(cpu_devices=1, cache=folder)
+
+def evaluated():
+    jax.clear_caches()
+    compilation_cache.reset_cache()
+    task = make_task("pusher", horizon=2)
+    with recording():
+        objective = Simulator(task, chunk_size=2).objective(None)
+        return objective.evaluate(task.theta, jax.random.split(jax.random.key(0), 2)).value.tolist()
+
+right = evaluated()
+kept = {path: path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+assert {path.parent.name for path in kept} == {"programs", "traces", "times"}, kept.keys()
+assert all(path.stat().st_mode & 0o077 == 0 for path in folder.rglob("*"))
+assert evaluated() == right and all(path.read_bytes() == kept[path] for path in kept if path.parent.name != "times")
+for _ in range(int(sys.argv[2])):
+    for path, content in kept.items():
+        path.write_bytes(flipped(content, draw))
+    assert evaluated() == right
+    for path in kept:
+        assert path.parent.name != "traces" or read_cached(path) is not None  # made again
+print(len(kept))
+"""
+
+
+def test_with_bits_flipped_in_every_file_of_the_cache_the_numbers_are_the_same(tmp_path: Path) -> None:
+    """Programs, traces and times, none of which anybody else can read."""
+    command = [sys.executable, "-c", FLIPPED, str(tmp_path / "cache"), "2"]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=Path(__file__).parents[1])
+    assert done.returncode == 0, done.stderr
+    assert int(done.stdout) > 3 and "Error reading persistent" not in done.stderr
+
+
+# Structures.
+
+
+def test_a_structure_is_plain_data_and_comes_back() -> None:
+    state = optax.adam(0.1).init(jnp.zeros(3))
+    batch = Differentiation(jnp.zeros(2), jnp.zeros((2, 3)))
+    for tree in (0, None, (), [], {"b": 1, "a": (2, [None, 3])}, state, {"batch": batch, "state": [state]}):
+        structure = jax.tree.structure(tree)
+        assert restore(json.loads(json.dumps(describe(structure)))) == structure
+
+
+class Own(NamedTuple):
+    """A class of another package."""
+
+    value: Any
+
+
+@pytest.mark.parametrize("tree", [Own(1), {1: 2}, jax.tree_util.Partial(np.sin, 1)])
+def test_other_structures_are_refused(tree: Any) -> None:
+    with pytest.raises(ValueError, match="no part of a structure|parts beside its leaves"):
+        describe(jax.tree.structure(tree))
+
+
+@pytest.mark.parametrize(
+    ("described", "says"),
+    [
+        ("text", "not the description of a structure"),
+        ({"dict": {}, "more": 1}, "not the description of a structure"),
+        ({"set": []}, "not the description of a structure"),
+        ({"class": ["os", "system"], "fields": []}, "is no class of so many fields"),
+        ({"class": ["mjx_study.nowhere", "It"], "fields": []}, "is no class of so many fields"),
+        ({"class": ["tests.test_caches", "Own"], "fields": [0]}, "is no class of so many fields"),
+        ({"class": ["estimators.types", "Differentiation"], "fields": [0]}, "is no class of so many fields"),
+        ({"class": ["mjx_study.disk", "os"], "fields": []}, "is no class of so many fields"),
+    ],
+)
+def test_other_descriptions_are_refused(described: Any, says: str) -> None:
+    with pytest.raises(ValueError, match=says):
+        restore(described)

@@ -1,0 +1,343 @@
+"""What a user's code depends on, beyond its own file: a study goes on only where all of it is as it was.
+
+Each case is a module that a task comes from, and a change outside its file, or in its file where the function that
+counts is hidden behind something. The numbers of the cells are made up.
+"""
+
+import importlib
+import json
+import os
+import subprocess
+import sys
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from estimators import seen
+from mjx_study.files import read_theta
+from mjx_study.study import cells as study_cells
+from mjx_study.study.configuration import StudyConfig
+from mjx_study.study.plan import StudyCell, StudyPlan, plan_study
+from mjx_study.study.run import run_study
+from mjx_study.study.store import Part, Store, StudyError
+from tests.documents import planned_arrays
+
+TASK = """
+import importlib, os
+from collections import deque
+from functools import cached_property, lru_cache, partial
+from pathlib import Path
+import jax, jax.numpy as jnp, numpy as np
+from mjx_study.tasks import pusher
+
+{text}
+
+def hop(horizon=2, **options):
+    return pusher(horizon=horizon, **options).replace(final_cost={cost})
+"""
+PLAIN = "lambda state: {} * state.qpos[0]"
+SLOTTED = """
+class Weights:
+    __slots__ = ("one",)
+    def __init__(self): self.one = data.SCALE
+weights = Weights()
+"""
+CALLED = """
+class Cost:
+    def __init__(self): self.by = 1.0
+    def __call__(self, state): return self.by * TABLE["a"] * state.qpos[0]
+TABLE = {"a": data.SCALE}
+"""
+HELD = """
+def cost_with(held):
+    def cost(state): return state.qpos[0] * jnp.arange(9.0)[held].sum()
+    return cost
+"""
+CASES: dict[str, tuple[str, str, str]] = {
+    "a global dict": ('import data\nTABLE = {"a": data.SCALE}', PLAIN.format('TABLE["a"]'), "global TABLE of"),
+    "a dict in a dict": (
+        'import data\nTABLE = {"a": {"b": [data.SCALE]}}', PLAIN.format('TABLE["a"]["b"][0]'), "global TABLE of",
+    ),
+    "a global list": ("import data\nLIST = [1.0, data.SCALE]", PLAIN.format("LIST[1]"), "global LIST of"),
+    "a global set": ("import data\nSET = {1.0, data.SCALE}", PLAIN.format("max(SET)"), "global SET of"),
+    "a deque": ("import data\nLAST = deque([data.SCALE])", PLAIN.format("LAST[0]"), "global LAST of"),
+    "a subclass of dict": (
+        "import data\nclass Own(dict): pass\nOWN = Own()\nOWN.by = data.SCALE", PLAIN.format("OWN.by"), "global OWN of",
+    ),
+    "a global object": (
+        "import data\nclass It: pass\nit = It()\nit.by = data.SCALE", PLAIN.format("it.by"), "global it of",
+    ),
+    "slots": (f"import data\n{SLOTTED}", PLAIN.format("weights.one"), "global weights of"),
+    "__call__ of a class": (f"import data\n{CALLED}", "Cost()", "global TABLE of"),
+    "a method": (
+        "import data\nTABLE = [data.SCALE]\nclass It:\n    def cost(self, state): return TABLE[0] * state.qpos[0]",
+        "It().cost", "global TABLE of",
+    ),
+    "an attribute of a class": (
+        "import data\nclass It:\n    by = data.SCALE\n    def cost(self, state): return self.by * state.qpos[0]",
+        "It().cost", "task hopping:hop differs",
+    ),
+    "a static method": (
+        "import data\nTABLE = [data.SCALE]\nclass It:\n    @staticmethod\n    def by(): return TABLE[0]",
+        PLAIN.format("It.by()"), "global TABLE of",
+    ),
+    "a class method": (
+        "import data\nTABLE = [data.SCALE]\nclass It:\n    @classmethod\n    def by(cls): return TABLE[0]",
+        PLAIN.format("It.by()"), "global TABLE of",
+    ),
+    "a base class": (
+        "import data\nTABLE = [data.SCALE]\nclass Base:\n    def by(self): return TABLE[0]\nclass It(Base): pass",
+        PLAIN.format("It().by()"), "global TABLE of",
+    ),
+    "a property": (
+        "import data\nTABLE = [data.SCALE]\nclass It:\n    @property\n    def by(self): return TABLE[0]\nit = It()",
+        PLAIN.format("it.by"), "global TABLE of",
+    ),
+    "a helper under jit": (
+        "import data\nTABLE = [data.SCALE]\nhelp = jax.jit(lambda x: TABLE[0] * x)",
+        "lambda state: help(state.qpos[0])", "global TABLE of",
+    ),
+    "a helper under vmap": (
+        "import data\nhelp = jax.vmap(lambda x, y: x + y[0], in_axes=(0, data.AXIS))",
+        "lambda state: help(state.qpos, jnp.eye(2))[0] * 1.0", "task hopping:hop differs",
+    ),
+    "a rule of a custom derivative": (
+        "import data\nTABLE = [data.SCALE]\nhelp = jax.custom_jvp(lambda x: x)\n"
+        "@help.defjvp\ndef _(primals, tangents): return primals[0], TABLE[0] * tangents[0]",
+        "lambda state: help(state.qpos[0])", "global TABLE of",
+    ),
+    "a cached helper": (
+        "import data\nTABLE = [data.SCALE]\n@lru_cache\ndef help(): return TABLE[0]",
+        PLAIN.format("help()"), "global TABLE of",
+    ),
+    "a partial": (
+        "import data\nclass It: pass\nit = It()\nit.by = data.SCALE\ndef cost(it, state): return it.by * state.qpos[0]",
+        "partial(cost, it)", "task hopping:hop differs",
+    ),
+    "a slice in a closure": (f"import data\n{HELD}", "cost_with(slice(0, data.COUNT))", "task hopping:hop differs"),
+    "a range in a closure": (
+        f"import data\n{HELD}", "cost_with(np.array(range(data.COUNT)))", "task hopping:hop differs",
+    ),
+    "a range itself": (
+        "import data\ndef cost_with(r): return lambda state: state.qpos[0] * sum(r)",
+        "cost_with(range(data.COUNT))", "task hopping:hop differs",
+    ),
+    "an attribute of a module": ("import data", PLAIN.format("data.SCALE"), "global SCALE of data"),
+    "an attribute of a function": (
+        "import data\ndef cost(state): return cost.by * state.qpos[0]\ncost.by = data.SCALE",
+        "cost", "task hopping:hop differs",
+    ),
+    "a default argument": (
+        "import data\ndef cost(state, by=[data.SCALE]): return by[0] * state.qpos[0]", "cost", "task hopping:hop",
+    ),
+    "a function made at run time": (
+        "import data\nexec(f'def cost(state): return {data.SCALE} * state.qpos[0]')", "cost", "task hopping:hop",
+    ),
+    "an object array": (
+        "import data\nARRAY = np.array([{'a': data.SCALE}], dtype=object)",
+        PLAIN.format("ARRAY[0]['a']"), "global ARRAY of",
+    ),
+    "a random generator": (
+        "import data\nDRAWN = np.random.default_rng(int(data.SCALE))",
+        PLAIN.format("DRAWN.bit_generator.state['uinteger']"), "global DRAWN of",
+    ),
+    "a lazy import": (
+        "def cost(state):\n    import lazy\n    return lazy.BY * state.qpos[0]", "cost", "source of lazy.py",
+    ),
+    "an import of a lazy import": (
+        "def cost(state):\n    import between\n    return between.help() * state.qpos[0]", "cost", "source of lazy.py",
+    ),
+    "an import by name": (
+        "def cost(state): return importlib.import_module('la' + 'zy').BY * state.qpos[0]",
+        "cost", "file lazy.py differs",
+    ),
+    "a variable": ("", PLAIN.format('float(os.environ["HOP_BY"])'), "variable HOP_BY differs"),
+    "a variable by getenv": ("", PLAIN.format('float(os.getenv("HOP_BY", "1"))'), "variable HOP_BY differs"),
+    "whether a variable is set": (
+        "", PLAIN.format('(2.0 if "HOP_SET" in os.environ else 1.0)'), "variable HOP_SET differs",
+    ),
+    "a file": ("", PLAIN.format('float(Path("by.txt").read_text())'), "file by.txt differs"),
+    "a file opened in C": ("", PLAIN.format('float(np.loadtxt("by.txt"))'), "file by.txt differs"),
+    "a file below": ("", PLAIN.format('float(np.load("below/by.npy"))'), "file below/by.npy differs"),
+}  # fmt: skip
+"""By kind: text of the module, its cost, and what the refusal names."""
+
+
+@pytest.fixture
+def world(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., None]]:
+    """Writes the files that the cases read, with other content each time; nothing is imported before."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    monkeypatch.setattr(seen, "_SEEN", defaultdict(dict))
+    (tmp_path / "below").mkdir()
+
+    def write(scale: float) -> None:
+        (tmp_path / "lazy.py").write_text(f"BY = {scale}\n")
+        (tmp_path / "between.py").write_text("def help():\n    import lazy\n    return lazy.BY\n")
+        (tmp_path / "by.txt").write_text(str(scale))
+        np.save(tmp_path / "below" / "by.npy", scale)
+        monkeypatch.setenv("HOP_BY", str(scale))
+        monkeypatch.setenv("HOP_SET", "1") if scale > 1.5 else monkeypatch.delenv("HOP_SET", raising=False)
+        for name in ("hopping", "data", "lazy", "between"):
+            sys.modules.pop(name, None)
+        data = type(sys)("data")  # numbers that come from no file, as from a database
+        data.SCALE, data.COUNT, data.AXIS = scale, int(scale), int(scale) - 1
+        data.__file__ = str(tmp_path / "data.py")
+        sys.modules["data"] = data
+        importlib.invalidate_caches()
+
+    (tmp_path / "data.py").write_text("# what is here says nothing of the numbers\n")
+    yield write
+    for name in ("hopping", "data", "lazy", "between"):
+        sys.modules.pop(name, None)
+
+
+@pytest.fixture
+def stubbed(monkeypatch: pytest.MonkeyPatch) -> None:
+    def compute_of(plan: StudyPlan) -> Callable[[StudyCell, Part], dict[str, np.ndarray]]:
+        return lambda cell, part: planned_arrays(plan, cell)
+
+    monkeypatch.setitem(study_cells.COMPUTE, "gradients", compute_of)
+
+
+def swept(folder: Path, task: str = "hopping:hop") -> Any:
+    config = StudyConfig(tasks=(task,), contact=("penalty",), stiffness=(10.0,), samples=(4,), seeds=1)
+    return run_study(plan_study(config), folder)
+
+
+@pytest.mark.usefixtures("stubbed")
+@pytest.mark.parametrize("kind", CASES)
+def test_a_change_is_refused_and_nothing_else(kind: str, tmp_path: Path, world: Callable[[float], None]) -> None:
+    text, cost, named = CASES[kind]
+    (tmp_path / "hopping.py").write_text(TASK.format(text=text, cost=cost))
+    world(1.0)
+    assert swept(tmp_path / "out").attrs["computed_cells"] == 1
+    world(1.0)
+    assert swept(tmp_path / "out").attrs["computed_cells"] == 0
+    world(2.0)
+    with pytest.raises(StudyError, match=f"holds another study .*{named}") as refused:
+        swept(tmp_path / "out")
+    assert "\n" not in str(refused.value)
+    world(1.0)
+    assert swept(tmp_path / "out").attrs["computed_cells"] == 0
+
+
+LATE = """
+def metrics(states): return {"by": float(Path("by.txt").read_text()) + states.qpos[0, 0]}
+
+def late(**options): return hop(**options).replace(metrics=metrics)
+"""
+
+
+def test_what_is_read_while_computing_counts_too(
+    tmp_path: Path, world: Callable[[float], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Metrics are traced when the first cell is computed; until then nothing has been read."""
+    (tmp_path / "hopping.py").write_text(TASK.format(text="", cost=PLAIN.format(1.0)) + LATE)
+
+    def compute_of(plan: StudyPlan) -> Callable[[StudyCell, Part], dict[str, np.ndarray]]:
+        def compute(cell: StudyCell, part: Part) -> dict[str, np.ndarray]:
+            assert plan.seen.keys() == {"file hopping.py"}
+            plan.groups[cell.group].task.metrics(SimpleNamespace(qpos=np.zeros((2, 1))))  # type: ignore[misc]
+            return planned_arrays(plan, cell)
+
+        return compute
+
+    monkeypatch.setitem(study_cells.COMPUTE, "gradients", compute_of)
+    world(1.0)
+    swept(tmp_path / "out", "hopping:late")
+    assert Store.open(tmp_path / "out").document["seen"].keys() == {"file by.txt", "file hopping.py"}
+    world(2.0)
+    with pytest.raises(StudyError, match="holds another study .file by.txt differs."):
+        swept(tmp_path / "out", "hopping:late")
+    (tmp_path / "by.txt").unlink()
+    with pytest.raises(StudyError, match="holds another study .file by.txt differs."):
+        swept(tmp_path / "out", "hopping:late")
+
+
+OUTSIDE = """
+import os
+from pathlib import Path
+
+def read():
+    Path("mine.txt").read_text()
+    Path("made.txt").write_text("made")
+    Path("made.txt").read_text()
+    Path("made.txt").unlink()
+    open(os.devnull).close()
+    return os.environ.get("MINE"), os.environ.get("PATH")
+"""
+
+
+def test_reads_of_users_count_and_no_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not those of this package and of libraries, nor of files that are made meanwhile, nor outside `observing`."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(seen, "_SEEN", defaultdict(dict))
+    monkeypatch.delenv("MINE", raising=False)
+    (tmp_path / "outside.py").write_text(OUTSIDE)
+    (tmp_path / "mine.txt").write_text("mine")
+    (tmp_path / "theta.json").write_text("[1.0]")
+    outside = importlib.import_module("outside")
+    outside.read()
+    assert seen.seen_by(["outside"]) == {}
+    with seen.observing("outside"):
+        outside.read()
+        read_theta(tmp_path / "theta.json")
+    found = seen.seen_by(["outside"])
+    assert found.keys() == {"file mine.txt", "variable MINE", "variable PATH"} and found["variable MINE"] == "absent"
+    assert seen.seen_now(found) == found and seen.seen_by(["another"]) == {}
+    monkeypatch.setenv("MINE", "1")
+    assert [name for name, digest in seen.seen_now(found).items() if digest != found[name]] == ["variable MINE"]
+    del sys.modules["outside"]
+
+
+PRINTED = """
+import json, sys
+sys.path.insert(0, ".")
+from mjx_study.identity import contents
+from mjx_study.tasks import make_task
+print(json.dumps(contents({name: [make_task(f"{name}:hop")] for name in sys.argv[1:]})))
+"""
+STATELESS = """
+import logging, threading
+from mjx_study.tasks import pusher
+
+LOG, LOCK, NAMES = logging.getLogger(__name__), threading.Lock(), {"b", "a", "c"}
+
+class Cost:
+    def __init__(self): self.log, self.held = LOG, frozenset({"x", "y", "z"})
+
+    def __call__(self, state):
+        LOG.debug("%s %s", LOCK, "a" in {"a", "b", "c"})
+        return state.qpos[0] + len(NAMES)
+
+def hop(**options): return pusher(**options).replace(final_cost=Cost())
+"""
+
+
+def test_digests_are_the_same_in_every_process(tmp_path: Path) -> None:
+    """Whatever the seed of Python's hashes, the addresses, and whether modules come from bytecode."""
+    names = [f"part_{index}" for index in range(len(CASES))]
+    for name, (text, cost, _) in zip(names, CASES.values(), strict=True):
+        (tmp_path / f"{name}.py").write_text(TASK.format(text=text, cost=cost))
+    (tmp_path / "stateless.py").write_text(STATELESS)
+    (tmp_path / "data.py").write_text("SCALE, COUNT, AXIS = 1.0, 1, 0\n")
+    (tmp_path / "lazy.py").write_text("BY = 1.0\n")
+    (tmp_path / "between.py").write_text("def help():\n    import lazy\n    return lazy.BY\n")
+    (tmp_path / "by.txt").write_text("1.0")
+    (tmp_path / "below").mkdir()
+    np.save(tmp_path / "below" / "by.npy", 1.0)
+    found = []
+    for seed in ("0", "1", "2"):
+        env = os.environ | {"PYTHONHASHSEED": seed, "HOP_BY": "1", "PYTHONPATH": str(Path(__file__).parents[1])}
+        command = [sys.executable, "-c", PRINTED, *names, "stateless"]
+        done = subprocess.run(command, cwd=tmp_path, env=env, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+        found.append(json.loads(done.stdout))
+    assert found[0] == found[1] == found[2] and len(found[0]) > 3 * len(CASES)
