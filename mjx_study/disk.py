@@ -16,6 +16,8 @@ from typing import IO, Any, Final
 
 TEMPORARY: Final = ".mjx-study"
 """Suffix by which temporary files are recognised."""
+MOST_BYTES: Final = 100_000_000
+"""Maximum size of a file that users supply [bytes]."""
 
 
 def prepare_folder(folder: str | Path) -> Path:
@@ -89,4 +91,14 @@ def open_regular(path: Path, flags: int) -> int:
 def read_whole(path: Path) -> bytes:
     """Read a regular file; OSError as for `open_regular`."""
     with os.fdopen(open_regular(path, os.O_RDONLY), "rb") as file:
-        return file.read()
+        return file.read() or b""  # None where a read would have to wait
+
+
+def read_bytes(path: Path) -> bytes:
+    """Read a regular file of at most `MOST_BYTES`; anything else is a ValueError."""
+    try:
+        if (size := path.stat().st_size) > MOST_BYTES:
+            raise ValueError(f"{path} has {size} bytes; the limit is {MOST_BYTES}")
+        return read_whole(path)
+    except OSError as error:
+        raise ValueError(f"cannot read {path}: {error.strerror or error}") from error

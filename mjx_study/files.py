@@ -4,29 +4,17 @@ import dataclasses
 import tomllib
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated, Any, Final, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, field_validator
 
 from estimators.catalogue import suggestion
-from mjx_study.disk import read_whole
+from mjx_study.disk import read_bytes
 from mjx_study.option import BUILDER_OPTIONS, OPTIONS
 
-MOST_BYTES: Final = 100_000_000
-"""Maximum size of a file that is read [bytes]."""
 Schema = TypeVar("Schema", bound=BaseModel)
 Finite = Annotated[float, Field(allow_inf_nan=False)]
-
-
-def read_bytes(path: Path) -> bytes:
-    """Read a regular file of at most `MOST_BYTES`; anything else is a ValueError."""
-    try:
-        if (size := path.stat().st_size) > MOST_BYTES:
-            raise ValueError(f"{path} has {size} bytes; the limit is {MOST_BYTES}")
-        return read_whole(path)
-    except OSError as error:
-        raise ValueError(f"cannot read {path}: {error.strerror or error}") from error
 
 
 def read_json(path: Path, schema: type[Schema]) -> Schema:
