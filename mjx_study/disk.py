@@ -7,17 +7,36 @@ disk. A temporary file with a free lock was left by a process that died; the nex
 import errno
 import fcntl
 import os
+import shutil
 import stat
 import tempfile
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Generator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any, Final
 
 TEMPORARY: Final = ".mjx-study"
 """Suffix by which temporary files are recognised."""
+_FOLDERS: Final[set[str]] = set()
 MOST_BYTES: Final = 100_000_000
 """Maximum size of a file that users supply [bytes]."""
+
+
+@contextmanager
+def temporary_folder() -> Generator[str]:
+    """Make a private folder that is removed at the end, by `remove_temporary_folders` too."""
+    with tempfile.TemporaryDirectory(prefix="mjx-study-", ignore_cleanup_errors=True) as folder:
+        _FOLDERS.add(folder)
+        try:
+            yield folder
+        finally:
+            _FOLDERS.discard(folder)
+
+
+def remove_temporary_folders() -> None:
+    """Remove those of `temporary_folder` that are in use, before the process ends without leaving its contexts."""
+    for folder in tuple(_FOLDERS):
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def prepare_folder(folder: str | Path) -> Path:

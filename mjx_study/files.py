@@ -101,8 +101,12 @@ def _read_array(path: Path) -> tuple[float, ...]:
         if magic != np.lib.format.MAGIC_PREFIX:
             raise ValueError("not a .npy file")
         array = np.load(path, mmap_mode="r", allow_pickle=False)  # does not allocate an impossible shape
-        if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu" or not np.all(np.isfinite(array)):
-            raise ValueError("not an array of finite numbers")
-        return tuple(np.asarray(array, float).reshape(-1).tolist())
+        if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu":
+            raise ValueError("not an array of numbers")
+        with np.errstate(over="ignore"):
+            values = np.asarray(array, float)  # in which a long double may be infinite
+        if not np.all(np.isfinite(values)):
+            raise ValueError("not finite")
+        return tuple(values.reshape(-1).tolist())
     except Exception as error:  # numpy may raise anything
         raise ValueError(f"{path} is not a .npy array of finite numbers") from error

@@ -1,10 +1,11 @@
 """Process-wide settings: precision, devices, compilation cache. Applied by an explicit call, never on import."""
 
+import functools
 import hashlib
 import os
 import platform
 import sys
-from importlib import metadata
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
 
@@ -12,6 +13,7 @@ import jax
 import mujoco
 
 from mjx_study.choices import PRECISIONS, unknown
+from mjx_study.version import version_of
 
 _TRACES: Final[list[Path]] = []
 
@@ -33,7 +35,7 @@ def configure(*, precision: str = "float64", cpu_devices: int | None = None, cac
     devices = available_cores() if cpu_devices is None else cpu_devices
     if devices < 1:
         raise ValueError(f"cpu_devices must be at least 1, got {devices}")
-    mujoco.set_mju_user_warning(lambda message: print(f"MuJoCo: {message}", file=sys.stderr))  # not a file in the cwd
+    mujoco.set_mju_user_warning(print_warning)  # not a file in the current folder
     jax.config.update("jax_enable_x64", precision == "float64")
     jax.config.update("jax_num_cpu_devices", devices)
     folder = default_cache() if cache is None else cache
@@ -41,6 +43,12 @@ def configure(*, precision: str = "float64", cpu_devices: int | None = None, cac
     _TRACES[:] = [] if folder is None else [Path(folder) / "traces"]
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
+
+
+def print_warning(message: str) -> None:
+    """Print a warning of MuJoCo's on standard error, if anybody reads it."""
+    with suppress(OSError, AttributeError):
+        print(f"MuJoCo: {message}", file=sys.stderr)
 
 
 def available_cores() -> int:
@@ -66,6 +74,7 @@ def traces_folder() -> Path | None:
     return _TRACES[0] if _TRACES else None
 
 
+@functools.cache
 def _processor() -> str:
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
@@ -89,7 +98,7 @@ def environment() -> dict[str, Any]:
     """Versions, machine, devices and precision: what results depend on besides their configuration."""
     names = ("mjx-study", "mujoco", "mujoco-mjx", "jax", "jaxlib", "numpy")
     return {
-        "versions": {name: metadata.version(name) for name in names},
+        "versions": {name: version_of(name) for name in names},
         "python": platform.python_version(),
         "processor": processor_name(),
         "cores": available_cores(),

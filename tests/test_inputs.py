@@ -95,6 +95,11 @@ BODY = "<worldbody><body><freejoint/><geom size='0.1'/></body></worldbody>"
         ("rollout pusher --seed 3", "--seed has an effect only with --noisy, as the initial state is fixed"),
         ("diagnose pusher --contact mujoco_default --damping 3", "contact mujoco_default takes no damping; omit --dam"),
         ("compare pusher --accept-versions", "--accept-versions needs a folder for the study: give --output"),
+        ("compare pusher --theta=1e400", "--theta: must be at most 1.8e+308 in size, got '1e400'"),
+        ("rollout pusher --theta 0,-1e999", "--theta: must be at most 1.8e+308 in size, got '-1e999'"),
+        ("compare pusher --theta=inf", "theta must be finite, got inf"),
+        ("compare pusher --stiffness 1,1e400", "--stiffness: must be at most 1.8e+308 in size, got '1e400'"),
+        ("compare pusher --samples 1e400", "--samples: must be at most 1.8e+308 in size, got '1e400'"),
         ("claims --accept-versions", "--accept-versions needs the folder to resume: give --output"),
     ],
 )

@@ -17,6 +17,7 @@ LAYERS = [
     "estimators",
     "mjx_study.choices",
     "mjx_study._matplotlib",
+    "mjx_study.version",
     "mjx_study.runtime",
     "mjx_study.stopwatch",
     "mjx_study.table",

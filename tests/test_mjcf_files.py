@@ -201,6 +201,13 @@ def test_warnings_of_the_compiler_are_printed(folder: Path, capsys: pytest.Captu
     assert not (folder / "MUJOCO_LOG.TXT").exists()
 
 
+def test_a_name_that_is_not_utf_8(folder: Path) -> None:
+    path = Path(os.fsdecode(b"mine\xff.xml"))
+    path.write_text(f"<mujoco>{BODY}</mujoco>")
+    with pytest.raises(SceneError, match=r"the path of an MJCF must be UTF-8, got 'mine\\udcff.xml': rename it"):
+        load_model(path)
+
+
 def test_a_model_that_mjx_has_no_memory_for(folder: Path) -> None:
     bodies = "<replicate count='1000' offset='1 0 0'><body><freejoint/><geom size='.1'/></body></replicate>"
     (folder / "mine.xml").write_text(f"<mujoco><worldbody>{bodies}</worldbody></mujoco>")

@@ -11,6 +11,7 @@ from typing import Any, Final
 import mujoco
 
 from mjx_study.limits import MOST_GIB
+from mjx_study.runtime import print_warning
 from mjx_study.simulation.mjcf_files import check_files
 
 SECONDS: Final = 60
@@ -44,7 +45,7 @@ def compile_file(path: Path) -> mujoco.MjModel:
         raise ValueError(f"MuJoCo crashes on it ({name}), or needs more than {MOST_GIB:g} GiB or {SECONDS} s")
     report = _report(done.stderr)
     for warning in report["warnings"]:
-        print(f"MuJoCo: {warning}", file=sys.stderr)
+        print_warning(warning)
     if report["error"] is not None:
         raise ValueError(report["error"])
     name = "model.mjb"

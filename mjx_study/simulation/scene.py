@@ -240,6 +240,8 @@ def _find(source: str | Path) -> Path:
     if path.suffix.lower() == ".xml":
         if not path.is_file():
             raise SceneError(f"no MJCF file at {path}")
+        if not str(path).encode(errors="ignore").decode() == str(path):  # it names tasks in studies and figures
+            raise SceneError(f"the path of an MJCF must be UTF-8, got {str(path)!r}: rename it")
         return path
     more = f"; there are {', '.join(model_names())}, or give a path to an .xml"
     raise SceneError(f"no model named {source!r}{suggestion(str(source), model_names()) or more}")
