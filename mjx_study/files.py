@@ -14,7 +14,7 @@ from mjx_study.disk import read_bytes
 from mjx_study.option import BUILDER_OPTIONS, OPTIONS
 
 Schema = TypeVar("Schema", bound=BaseModel)
-Finite = Annotated[float, Field(allow_inf_nan=False)]
+Finite = Annotated[float, Field(allow_inf_nan=False, strict=True)]
 
 
 def read_json(path: Path, schema: type[Schema]) -> Schema:

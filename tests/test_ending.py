@@ -97,7 +97,7 @@ def test_names_of_folders_need_not_be_utf_8(tmp_path: Path) -> None:
         done = subprocess.run([sys.executable, "-m", "mjx_study", *command], capture_output=True)
         assert done.returncode == 0, done.stderr
     page = (Path(os.fsdecode(folder)) / "report.html").read_text()
-    assert r"--output &#39;" in page and r"out\xff" in page
+    assert r"--output &#39;" in page and r"out\udcff" in page
 
 
 @pytest.fixture

@@ -231,6 +231,20 @@ def test_a_policy_that_is_none(content: str, says: str, tmp_path: Path) -> None:
     assert str(path) in str(error.value) and "\n" not in str(error.value)
 
 
+@pytest.mark.parametrize("content", ["[0.0, false]", '["0.0", 1]', "[1e400]", "[NaN]", "[null]", "{}", "1"])
+def test_a_list_of_what_are_no_numbers(content: str, tmp_path: Path) -> None:
+    path = tmp_path / "theta.json"
+    path.write_text(content)
+    with pytest.raises(ValueError, match="theta.json: .*Input should be|theta.json: .*Field required"):
+        read_theta(path)
+
+
+def test_a_long_double_may_be_too_large(tmp_path: Path) -> None:
+    np.save(tmp_path / "theta.npy", np.array([np.finfo(np.longdouble).max]))
+    with pytest.raises(ValueError, match="theta.npy is not a .npy array of finite numbers"):
+        read_theta(tmp_path / "theta.npy")
+
+
 @pytest.mark.parametrize("shape", ["(1000000000000, 1000000)", "(-1,)", "(" * 90, "None"])
 def test_an_array_of_an_impossible_shape(shape: str, tmp_path: Path) -> None:
     path = tmp_path / "theta.npy"

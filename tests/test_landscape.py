@@ -5,6 +5,7 @@ import dataclasses
 import io
 import json
 import shutil
+import time
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -228,6 +229,13 @@ def test_a_direction_through_many_parameters() -> None:
     assert "exact_slope" not in found and np.all(np.abs(first - zeroth) < 4.5 * error)
     # the cost is nearly 2 theta of control cost along this line
     np.testing.assert_allclose(np.diff(first) / np.diff([-1.0, 0.0, 1.0]), 2, rtol=0.05)
+
+
+def test_a_plan_makes_no_array_for_each_point() -> None:
+    """Each takes a quarter of a millisecond, and all of them may not fit into memory."""
+    begun = time.process_time()
+    plan_study(config("pusher", points=100_000))
+    assert time.process_time() - begun < 8
 
 
 def test_the_line_goes_through_theta() -> None:

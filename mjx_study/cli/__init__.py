@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from importlib import import_module
 from typing import Final
 
-from mjx_study.cli.options import Parser, UsageError, refuse_lone_dashes
+from mjx_study.cli.options import Parser, UsageError, refuse_unusable
 from mjx_study.cli.output import OutputError, complain, encodable, ending, written_out
 from mjx_study.version import summary, version_of
 
@@ -57,7 +57,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         with written_out(), ending(ENDED, signal.SIGTERM, signal.SIGHUP):
             given = sys.argv[1:] if arguments is None else list(arguments)
-            refuse_lone_dashes(given)
+            refuse_unusable(given)
             chosen = next((text for text in given if not text.startswith("-")), "")
             options = parser(ALIASES.get(chosen, chosen)).parse_args(given)
             options.command_line = encodable(shlex.join(["mjx-study", *given]))

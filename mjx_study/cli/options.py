@@ -176,9 +176,11 @@ class Parser(argparse.ArgumentParser):
         self.add_argument("--cluster", type=_cluster, metavar="WHERE", help=line)
 
 
-def refuse_lone_dashes(given: Sequence[str]) -> None:
-    """Raise UsageError for an option whose value is --, which argparse drops."""
+def refuse_unusable(given: Sequence[str]) -> None:
+    """Raise UsageError for an option whose value is --, which argparse drops, and for what no file can be called."""
     for text in given:
+        if "\0" in text or re.search("[\ud800-\udc7f\udd00-\udfff]", text):
+            raise UsageError(f"no argument may hold null or surrogate characters, got {text!r}")
         if text.startswith("-") and text.endswith("=--"):
             raise UsageError(f"{text.removesuffix('=--')} needs a value, got --")
 

@@ -54,8 +54,8 @@ def written_out() -> Generator[None]:
 
 
 def encodable(text: str) -> str:
-    """Text of a command line with bytes that are not UTF-8, which no document holds, written as \\xff."""
-    return os.fsencode(text).decode(errors="backslashreplace")
+    """Text of a command line with bytes that are not UTF-8, which no document holds, written as \\udcff."""
+    return text.encode(errors="backslashreplace").decode()
 
 
 def complain(line: str) -> None:

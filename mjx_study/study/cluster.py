@@ -77,7 +77,8 @@ def connected(cluster: str) -> Generator[Any]:
 
             logging.getLogger("distributed").setLevel(logging.CRITICAL)  # this module reports on workers
             if kind == "local":
-                stack.enter_context(dask.config.set(SELDOM | PRIVATE))
+                scratch = {"temporary-directory": stack.enter_context(temporary_folder())}
+                stack.enter_context(dask.config.set(SELDOM | PRIVATE | scratch))
                 local = distributed.LocalCluster(
                     n_workers=int(count or available_cores()),
                     threads_per_worker=1,
@@ -86,7 +87,6 @@ def connected(cluster: str) -> Generator[Any]:
                     scheduler_kwargs={"dashboard": False},
                     silence_logs=logging.CRITICAL,
                     security=distributed.Security.temporary(),  # anybody on this machine may connect to a port
-                    local_directory=stack.enter_context(temporary_folder()),
                 )
                 address = stack.enter_context(local)
             elif kind == "slurm":
