@@ -63,7 +63,7 @@ test-newer-jax: ## Run the tests of devices on the newest JAX, if there is a Pyt
 defects: $(STAMP) ## Plant defects one at a time; say what catches each, here and in docs/testing.md (a quarter of an hour)
 	$(BIN)/python -m tests.planted --everything --page docs/testing.md
 
-fuzz: $(STAMP) ## Answer thousands of hostile inputs; say here and in docs/testing.md what came of them (half an hour)
+fuzz: $(STAMP) ## Answer thousands of hostile inputs; say here and in docs/testing.md what came of them (ten minutes)
 	$(BIN)/python -m tests.fuzz --page docs/testing.md
 
 lint: $(STAMP) ## Check style, formatting and types

@@ -99,6 +99,7 @@ def test_a_worker_of_other_versions_is_refused(workers: Any, tmp_path: Path, mon
 
 def test_nobody_else_can_connect_to_local_workers(workers: Any) -> None:
     """The scheduler's and the workers' ports answer only to this client's key; there is no dashboard."""
+    workers.wait_for_workers(2)  # those that tests before this one killed are started again
     addresses = [workers.scheduler.address, *workers.nthreads()]
     assert len(addresses) == 3 and all(address.startswith("tls://127.0.0.1:") for address in addresses)
     stranger = distributed.Security.temporary()
