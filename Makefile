@@ -13,7 +13,7 @@ UV_VERSION := 0.13.8
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo figures study coverage test test-all test-newer-jax defects lint docs dist format lock clean
+.PHONY: help demo figures study coverage test test-all test-newer-jax defects fuzz lint docs dist format lock clean
 
 help: ## List the targets
 	@awk 'BEGIN { FS = ":.*## " } /^[a-z-]+:.*## / { printf "  %-10s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
@@ -62,6 +62,9 @@ test-newer-jax: ## Run the tests of devices on the newest JAX, if there is a Pyt
 
 defects: $(STAMP) ## Plant defects one at a time; say what catches each, here and in docs/testing.md (a quarter of an hour)
 	$(BIN)/python -m tests.planted --everything --page docs/testing.md
+
+fuzz: $(STAMP) ## Answer thousands of hostile inputs; say here and in docs/testing.md what came of them (ten minutes)
+	$(BIN)/python -m tests.fuzz --page docs/testing.md
 
 lint: $(STAMP) ## Check style, formatting and types
 	$(BIN)/ruff check .

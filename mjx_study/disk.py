@@ -11,10 +11,11 @@ import hashlib
 import os
 import re
 import secrets
+import shutil
 import stat
 import tempfile
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Generator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any, Final
 
@@ -22,6 +23,26 @@ TEMPORARY: Final = ".mjx-study"
 """Suffix of temporary files."""
 SEALED: Final = re.compile(rf"(\..+\.[0-9a-f]{{12}})([0-9a-f]{{12}}){re.escape(TEMPORARY)}", re.DOTALL)
 """Temporary names: a dot, the file's name, random digits, and a checksum of all that."""
+_FOLDERS: Final[set[str]] = set()
+MOST_BYTES: Final = 100_000_000
+"""Maximum size of a file that users supply [bytes]."""
+
+
+@contextmanager
+def temporary_folder() -> Generator[str]:
+    """Make a private folder that is removed at the end, by `remove_temporary_folders` too."""
+    with tempfile.TemporaryDirectory(prefix="mjx-study-", ignore_cleanup_errors=True) as folder:
+        _FOLDERS.add(folder)
+        try:
+            yield folder
+        finally:
+            _FOLDERS.discard(folder)
+
+
+def remove_temporary_folders() -> None:
+    """Remove those of `temporary_folder` that are in use, before the process ends without leaving its contexts."""
+    for folder in tuple(_FOLDERS):
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def prepare_folder(folder: str | Path, *, follow: bool = True) -> Path:
@@ -166,4 +187,12 @@ def read_whole(path: Path, *, follow: bool = True, most: int | None = None) -> b
         size = os.fstat(file.fileno()).st_size
         if most is not None and size > most:
             raise OSError(errno.EFBIG, f"it has {size} bytes; the limit is {most}", str(path))
-        return file.read()
+        return file.read() or b""  # None where a read would have to wait
+
+
+def read_bytes(path: Path) -> bytes:
+    """Read a regular file of at most `MOST_BYTES`; anything else is a ValueError."""
+    try:
+        return read_whole(path, most=MOST_BYTES)
+    except OSError as error:
+        raise ValueError(f"cannot read {path}: {error.strerror or error}") from error

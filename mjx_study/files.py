@@ -6,29 +6,17 @@ import json
 import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Annotated, Any, Final, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, field_validator
 
 from estimators.catalogue import suggestion
-from mjx_study.disk import read_whole
+from mjx_study.disk import read_bytes
 from mjx_study.option import BUILDER_OPTIONS, OPTIONS
 
-MOST_BYTES: Final = 100_000_000
-"""Maximum size of a file that is read [bytes]."""
 Schema = TypeVar("Schema", bound=BaseModel)
-Finite = Annotated[float, Field(allow_inf_nan=False)]
-
-
-def read_bytes(path: Path) -> bytes:
-    """Read a regular file of at most `MOST_BYTES`; anything else is a ValueError."""
-    try:
-        if (size := path.stat().st_size) > MOST_BYTES:
-            raise ValueError(f"{path} has {size} bytes; the limit is {MOST_BYTES}")
-        return read_whole(path)
-    except OSError as error:
-        raise ValueError(f"cannot read {path}: {error.strerror or error}") from error
+Finite = Annotated[float, Field(allow_inf_nan=False, strict=True)]
 
 
 def _validated(path: Path, content: bytes, schema: Any) -> Any:
@@ -120,8 +108,12 @@ def _read_array(path: Path) -> tuple[float, ...]:
         if magic != np.lib.format.MAGIC_PREFIX:
             raise ValueError("not a .npy file")
         array = np.load(path, mmap_mode="r", allow_pickle=False)  # does not allocate an impossible shape
-        if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu" or not np.all(np.isfinite(array)):
-            raise ValueError("not an array of finite numbers")
-        return tuple(np.asarray(array, float).reshape(-1).tolist())
+        if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu":
+            raise ValueError("not an array of numbers")
+        with np.errstate(over="ignore"):
+            values = np.asarray(array, float)  # in which a long double may be infinite
+        if not np.all(np.isfinite(values)):
+            raise ValueError("not finite")
+        return tuple(values.reshape(-1).tolist())
     except Exception as error:  # numpy may raise anything
         raise ValueError(f"{path} is not a .npy array of finite numbers") from error

@@ -18,7 +18,6 @@ import sys
 import types
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
-from importlib import metadata
 from pathlib import Path
 from typing import Any, Final
 
@@ -31,6 +30,7 @@ from estimators import Estimator, find_estimator
 from mjx_study.runtime import precision
 from mjx_study.simulation.scene import Scene, models_folder
 from mjx_study.tasks.task import Task
+from mjx_study.version import version_of
 
 VERSIONED: Final = ("mjx-study", "mujoco", "mujoco-mjx", "jax", "jaxlib", "numpy", "optax")
 """Packages whose version may affect results."""
@@ -64,7 +64,7 @@ ACCEPT: Final = "choose another folder, or accept the mixture by --accept-versio
 
 def versions() -> dict[str, str]:
     """Versions of the packages that compute, and a digest of this package's code."""
-    return {name: metadata.version(name) for name in VERSIONED} | {"code of mjx-study": _own_code()}
+    return {name: version_of(name) for name in VERSIONED} | {"code of mjx-study": _own_code()}
 
 
 def git_revision(root: Path | None = None) -> str | None:
@@ -107,7 +107,7 @@ def trace_contents(made_of: Any) -> str | None:
     None if code from outside this package is involved, whose imports are not all followed.
     """
     digest = _Digest(exact=True)
-    digest.add((made_of, [metadata.version(name) for name in VERSIONED], _own_code(ABOVE)))
+    digest.add((made_of, [version_of(name) for name in VERSIONED], _own_code(ABOVE)))
     return None if digest.foreign else digest.hexdigest()
 
 

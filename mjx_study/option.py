@@ -144,9 +144,11 @@ class Option:
         if self.kind is str or text in self.choices:
             return text.lower() if text.lower() in self.choices else text  # MuJoCo writes RK4, Newton
         try:
-            return int(text) if self.kind is int else float(text)
+            value = int(text) if self.kind is int else float(text)
         except ValueError:
             return _whole(text) if self.kind is int else text
+        refuse_overflow(text, value)
+        return value
 
     def _parse_part(self, text: str) -> list[Any]:
         if self.kind is str or ":" not in text:
@@ -155,12 +157,20 @@ class Option:
         return [_whole(value) for value in values] if self.kind is int else values
 
 
+def refuse_overflow(text: str, value: float | int) -> None:
+    """Raise ValueError for a number such as 1e400, which Python reads as infinity."""
+    if value in (math.inf, -math.inf) and "inf" not in text.lower():
+        raise ValueError(f"must be at most {sys.float_info.max:.2g} in size, got {_short(text)}")
+
+
 def _whole(value: str | float) -> Any:
     """Convert a whole number such as 1e5 to int; return anything else unchanged."""
     try:
-        return int(float(value)) if float(value).is_integer() else value
+        number = float(value)
     except ValueError:
         return value
+    refuse_overflow(str(value), number)
+    return int(number) if number.is_integer() else value
 
 
 def _plain(value: Any) -> str:

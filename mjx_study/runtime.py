@@ -1,10 +1,11 @@
 """Process-wide settings: precision, devices, compilation cache. Applied by an explicit call, never on import."""
 
+import functools
 import hashlib
 import os
 import platform
 import sys
-from importlib import metadata
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
 
@@ -14,6 +15,7 @@ import mujoco
 from mjx_study.caches import check_programs
 from mjx_study.choices import PRECISIONS, unknown
 from mjx_study.disk import private_folder
+from mjx_study.version import version_of
 
 _TRACES: Final[list[Path]] = []
 
@@ -36,7 +38,7 @@ def configure(*, precision: str = "float64", cpu_devices: int | None = None, cac
     devices = available_cores() if cpu_devices is None else cpu_devices
     if devices < 1:
         raise ValueError(f"cpu_devices must be at least 1, got {devices}")
-    mujoco.set_mju_user_warning(lambda message: print(f"MuJoCo: {message}", file=sys.stderr))  # not a file in the cwd
+    mujoco.set_mju_user_warning(print_warning)  # not a file in the current folder
     jax.config.update("jax_enable_x64", precision == "float64")
     jax.config.update("jax_num_cpu_devices", devices)
     _keep_programs(cache)
@@ -65,6 +67,12 @@ def _keep_programs(cache: str | Path | None) -> None:
         _TRACES.append(kept / "traces")
 
 
+def print_warning(message: str) -> None:
+    """Print a warning of MuJoCo's on standard error, if anybody reads it."""
+    with suppress(OSError, AttributeError):
+        print(f"MuJoCo: {message}", file=sys.stderr)
+
+
 def available_cores() -> int:
     """Number of cores this process may run on."""
     affinity = getattr(os, "sched_getaffinity", None)
@@ -88,6 +96,7 @@ def traces_folder() -> Path | None:
     return _TRACES[0] if _TRACES else None
 
 
+@functools.cache
 def _processor() -> str:
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
@@ -111,7 +120,7 @@ def environment() -> dict[str, Any]:
     """Versions, machine, devices and precision: what results depend on besides their configuration."""
     names = ("mjx-study", "mujoco", "mujoco-mjx", "jax", "jaxlib", "numpy")
     return {
-        "versions": {name: metadata.version(name) for name in names},
+        "versions": {name: version_of(name) for name in names},
         "python": platform.python_version(),
         "processor": processor_name(),
         "cores": available_cores(),

@@ -1,5 +1,6 @@
 """Cells on Dask's workers: real schedulers and processes, which are killed, poisoned and refused."""
 
+import itertools
 import json
 import os
 import pickle
@@ -12,10 +13,13 @@ import time
 from collections import deque
 from collections.abc import Generator
 from contextlib import ExitStack, contextmanager, suppress
+from http.client import HTTPException
 from pathlib import Path
 from typing import Any
+from urllib.request import urlopen
 
 import dask.config
+import distributed
 import psutil
 import pytest
 import xarray as xr
@@ -80,17 +84,51 @@ def test_a_poisonous_cell_fails_and_the_rest_goes_on(workers: Any, tmp_path: Pat
 def test_a_worker_of_other_versions_is_refused(workers: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ours = cluster.versions()
     monkeypatch.setattr(cluster, "versions", lambda: ours | {"jax": "0.0"})
-    with pytest.raises(StudyError, match=r"^the worker tcp://\S+ is refused: jax 0\.0 there and \S+ here"):
+    with pytest.raises(StudyError, match=r"^the worker tls://\S+ is refused: jax 0\.0 there and \S+ here"):
         run_study(config(1.0), tmp_path, cluster=workers)
     monkeypatch.setattr(cluster, "versions", lambda: ours)
     packed = cluster._packed
     other = {"precision": "float32"}
     monkeypatch.setattr(cluster, "_packed", lambda plan: pickle.dumps((*pickle.loads(packed(plan))[:-1], other)))
     with pytest.raises(StudyError, match="is refused: precision float32 there and float64 here"):
-        run_study(config(1.0), tmp_path, cluster=workers.scheduler.address)
+        run_study(config(1.0), tmp_path, cluster=workers)
     monkeypatch.setattr(cluster, "CONNECT_SECONDS", 1)
     with pytest.raises(ValueError, match="cannot reach the cluster tcp://127.0.0.1:1: "):
         run_study(config(1.0), tmp_path, cluster="tcp://127.0.0.1:1")
+
+
+def test_nobody_else_can_connect_to_local_workers(workers: Any) -> None:
+    """The scheduler's and the workers' ports answer only to this client's key; there is no dashboard."""
+    workers.wait_for_workers(2)  # those that tests before this one killed are started again
+    addresses = [workers.scheduler.address, *workers.nthreads()]
+    assert len(addresses) == 3 and all(address.startswith("tls://127.0.0.1:") for address in addresses)
+    stranger = distributed.Security.temporary()
+    for address in addresses:
+        for url, security in ((address.replace("tls", "tcp"), None), (address, stranger)):
+            with pytest.raises(OSError), distributed.Client(url, timeout=3, security=security):
+                pass
+    family = [psutil.Process(), *psutil.Process().children(recursive=True)]
+    ports = {each.laddr.port for one in family for each in one.net_connections() if each.status == "LISTEN"}
+    assert {int(address.rpartition(":")[2]) for address in addresses} <= ports
+    for port, page in itertools.product(ports, ("", "status", "info/main/workers.html", "health", "metrics")):
+        with pytest.raises((OSError, HTTPException)):
+            urlopen(f"http://127.0.0.1:{port}/{page}", timeout=3)
+
+
+@pytest.mark.parametrize("ended_by", [None, signal.SIGTERM, signal.SIGINT])
+def test_a_local_cluster_leaves_nothing_behind(tmp_path: Path, ended_by: signal.Signals | None) -> None:
+    scratch, folder = tmp_path / "scratch", tmp_path / "out"
+    scratch.mkdir()
+    with sweep(folder, "local:1", TMPDIR=str(scratch)) as running:
+        seen: set[int] = set()
+        while running.poll() is None and not list(folder.glob("cells/*.npz")):
+            seen |= {path.stat().st_mode & 0o777 for path in scratch.glob("mjx-study-*")}
+            time.sleep(0.02)
+        if ended_by is not None:
+            running.send_signal(ended_by)
+        running.communicate()
+    assert running.returncode == (0 if ended_by is None else 128 + ended_by) and seen == {0o700}
+    assert list(scratch.iterdir()) == []
 
 
 def test_a_cell_goes_where_its_program_is() -> None:
@@ -164,9 +202,9 @@ def parts(path: Path) -> list[dict[str, Any]]:
     return list(yaml.safe_load_all(path.read_text()))
 
 
-def sweep(folder: Path, address: str = "local:2") -> subprocess.Popen[str]:
+def sweep(folder: Path, address: str = "local:2", **variables: str) -> subprocess.Popen[str]:
     command = [sys.executable, "-m", "mjx_study", "sweep", *ARGUMENTS, "--cluster", address, "--output", str(folder)]
-    environment = os.environ | {ACCOUNT: str(folder)}
+    environment = os.environ | {ACCOUNT: str(folder)} | variables
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
 
 

@@ -111,9 +111,9 @@ def test_code_versions_settings_and_the_form_of_arguments_count(monkeypatch: pyt
     with monkeypatch.context() as patch:
         patch.setattr(identity, "_own_code", lambda without: "other")
         assert path() != ours
-    version = identity.metadata.version
+    version = identity.version_of
     with monkeypatch.context() as patch:
-        patch.setattr(identity.metadata, "version", lambda name: "9" if name == "jaxlib" else version(name))
+        patch.setattr(identity, "version_of", lambda name: "9" if name == "jaxlib" else version(name))
         assert path() != ours
     with jax.numpy_dtype_promotion("strict"):
         assert path() != ours

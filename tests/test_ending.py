@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Callable
@@ -49,6 +50,54 @@ def test_a_signal_ends_a_command_with_one_line_and_its_code() -> None:
     words = ("interrupted", "terminated", "hung up")
     said = [line for line in done.stderr.splitlines() if line.startswith("mjx-study: ")]
     assert said == [f"mjx-study: {word}; the same command resumes" for word in words]
+
+
+UNREAD = """
+import os, signal, sys, time
+from mjx_study.cli import output
+
+signal.signal(signal.SIGHUP, signal.SIG_DFL)
+if sys.argv[2] == "full":
+    os.set_blocking(2, False)
+    try:
+        while True:
+            os.write(2, bytes(4096))
+    except BlockingIOError:
+        os.set_blocking(2, True)
+with output.computing():
+    print("begun", flush=True)
+    for _ in range(50):
+        time.sleep(0.1)
+"""
+
+
+@pytest.mark.parametrize("state", ["gone", "full", "closed"])
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGHUP, 129)])
+def test_a_signal_ends_a_command_that_cannot_say_so(state: str, number: signal.Signals, code: int) -> None:
+    """The reader of standard error has gone, does not read, or there never was one."""
+    read, write = os.pipe()
+    command = [sys.executable, "-c", UNREAD, "-", state]
+    command = ["sh", "-c", 'exec "$@" 2>&-', "-", *command] if state == "closed" else command
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=write) as running:
+        os.close(write)
+        assert running.stdout is not None and running.stdout.readline() == b"begun\n"
+        if state == "gone":
+            os.close(read)
+        running.send_signal(number)
+        assert running.wait(timeout=4) == code
+    if state != "gone":
+        os.close(read)
+
+
+def test_names_of_folders_need_not_be_utf_8(tmp_path: Path) -> None:
+    """Every file of a study can be read again, and holds the command that wrote it."""
+    folder = os.fsencode(tmp_path) + b"/out\xff"
+    arguments = "compare pusher --contact reference --stiffness 10 --horizon 2 --samples 4 --reference-samples 8"
+    for command in ([*arguments.split(), "--output", folder], ["plot", folder], ["report", folder]):
+        done = subprocess.run([sys.executable, "-m", "mjx_study", *command], capture_output=True)
+        assert done.returncode == 0, done.stderr
+    page = (Path(os.fsdecode(folder)) / "report.html").read_text()
+    assert r"--output &#39;" in page and r"out\udcff" in page
 
 
 @pytest.fixture

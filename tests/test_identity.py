@@ -188,8 +188,8 @@ def test_a_study_whose_model_or_task_changed_is_refused(
 
 
 def other_jax(monkeypatch: pytest.MonkeyPatch) -> None:
-    version = identity.metadata.version
-    monkeypatch.setattr(identity.metadata, "version", lambda name: "99.0" if name == "jax" else version(name))
+    version = identity.version_of
+    monkeypatch.setattr(identity, "version_of", lambda name: "99.0" if name == "jax" else version(name))
 
 
 @pytest.mark.usefixtures("stubbed")

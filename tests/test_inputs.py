@@ -17,7 +17,6 @@ from mjx_study.files import digest_of_json, read_theta
 from mjx_study.limits import MOST_CELLS, MOST_MODELS, check_count
 from mjx_study.option import OPTIONS, Interval
 from mjx_study.runtime import default_cache
-from mjx_study.simulation.mjcf_sizes import too_large
 from mjx_study.simulation.scene import SceneError, load_model
 from mjx_study.study.configuration import StudyConfig
 from mjx_study.study.document import read_document, sealed
@@ -96,6 +95,11 @@ BODY = "<worldbody><body><freejoint/><geom size='0.1'/></body></worldbody>"
         ("rollout pusher --seed 3", "--seed has an effect only with --noisy, as the initial state is fixed"),
         ("diagnose pusher --contact mujoco_default --damping 3", "contact mujoco_default takes no damping; omit --dam"),
         ("compare pusher --accept-versions", "--accept-versions needs a folder for the study: give --output"),
+        ("compare pusher --theta=1e400", "--theta: must be at most 1.8e+308 in size, got '1e400'"),
+        ("rollout pusher --theta 0,-1e999", "--theta: must be at most 1.8e+308 in size, got '-1e999'"),
+        ("compare pusher --theta=inf", "theta must be finite, got inf"),
+        ("compare pusher --stiffness 1,1e400", "--stiffness: must be at most 1.8e+308 in size, got '1e400'"),
+        ("compare pusher --samples 1e400", "--samples: must be at most 1.8e+308 in size, got '1e400'"),
         ("claims --accept-versions", "--accept-versions needs the folder to resume: give --output"),
     ],
 )
@@ -192,10 +196,10 @@ def test_no_optimiser(name: str) -> None:
         ("<size nuserdata='1000000000'/>", "<size> with nuserdata of 1e+09"),
         ("<size nuser_body='1000000000'/>", "<size> with nuser_body of 1e+09"),
         ("<worldbody><replicate count='500'><replicate count='500'><site/></replicate></replicate></worldbody>",
-         "<replicate> with count of 2.5e+05"),
-        ("<include file='other.xml'/>", "<size> with nkey of 1e+09 in other.xml"),
+         "mine.xml asks for 2.5e+05 elements, with those of <replicate>"),
+        ("<include file='other.xml'/>", "other.xml asks for <size> with nkey of 1e+09; the limit is 10000"),
         ("<option timestep='0'/>", "the timestep must be positive and finite, got 0"),
-        ("<option timestep='nan'/>", "the timestep must be positive and finite, got nan"),
+        ("<option timestep='nan'/>", "timestep of <option> must be finite, got 'nan'"),
     ],
 )  # fmt: skip
 def test_sizes_of_an_mjcf(body: str, says: str, tmp_path: Path) -> None:
@@ -205,7 +209,7 @@ def test_sizes_of_an_mjcf(body: str, says: str, tmp_path: Path) -> None:
     with pytest.raises(SceneError, match=says.replace("+", r"\+")):
         load_model(path)
     path.write_text(f"<mujoco>{BODY}</mujoco>")
-    assert too_large(path) is None and load_model(path).nbody == 2
+    assert load_model(path).nbody == 2
 
 
 @pytest.mark.parametrize(
@@ -235,6 +239,20 @@ def test_a_policy_is_as_it_was_written_or_has_no_digest(tmp_path: Path) -> None:
     path.write_text(path.read_text().replace("2.0", "3.0"))
     with pytest.raises(ValueError, match="policy.json is damaged .its digest does not match.; if you changed"):
         read_theta(path)
+
+
+@pytest.mark.parametrize("content", ["[0.0, false]", '["0.0", 1]', "[1e400]", "[NaN]", "[null]", "{}", "1"])
+def test_a_list_of_what_are_no_numbers(content: str, tmp_path: Path) -> None:
+    path = tmp_path / "theta.json"
+    path.write_text(content)
+    with pytest.raises(ValueError, match="theta.json: .*Input should be|theta.json: .*Field required"):
+        read_theta(path)
+
+
+def test_a_long_double_may_be_too_large(tmp_path: Path) -> None:
+    np.save(tmp_path / "theta.npy", np.array([np.finfo(np.longdouble).max]))
+    with pytest.raises(ValueError, match="theta.npy is not a .npy array of finite numbers"):
+        read_theta(tmp_path / "theta.npy")
 
 
 @pytest.mark.parametrize("shape", ["(1000000000000, 1000000)", "(-1,)", "(" * 90, "None"])

@@ -11,7 +11,6 @@ import hashlib
 import json
 import math
 from collections.abc import Callable, Sequence
-from importlib import metadata
 from pathlib import Path
 from typing import Any, Final
 
@@ -25,6 +24,7 @@ from mjx_study.disk import prepare_folder, write_whole
 from mjx_study.identity import VERSIONED, code_of, git_revision
 from mjx_study.runtime import environment, precision
 from mjx_study.study.configuration import Progress
+from mjx_study.version import version_of
 
 ALPHA: Final = 0.05
 """Probability that any interval of a ledger misses its value."""
@@ -108,7 +108,7 @@ class Claim:
 
     def made_by(self) -> str:
         """Digest of the code that measures the claim, and of library versions."""
-        versions = [metadata.version(name) for name in VERSIONED if name != "mjx-study"]
+        versions = [version_of(name) for name in VERSIONED if name != "mjx-study"]
         return _digest(code_of(self.measure.__module__), versions)
 
 

@@ -12,11 +12,12 @@ import shlex
 import signal
 import sys
 from collections.abc import Sequence
-from importlib import import_module, metadata
+from importlib import import_module
 from typing import Final
 
-from mjx_study.cli.options import Parser, UsageError, refuse_lone_dashes
-from mjx_study.cli.output import OutputError, complain, ending, written_out
+from mjx_study.cli.options import Parser, UsageError, refuse_unusable
+from mjx_study.cli.output import OutputError, complain, encodable, ending, written_out
+from mjx_study.version import summary, version_of
 
 ENDED = "existing files are complete"
 EXAMPLES = """\
@@ -56,10 +57,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         with written_out(), ending(ENDED, signal.SIGTERM, signal.SIGHUP):
             given = sys.argv[1:] if arguments is None else list(arguments)
-            refuse_lone_dashes(given)
+            refuse_unusable(given)
             chosen = next((text for text in given if not text.startswith("-")), "")
             options = parser(ALIASES.get(chosen, chosen)).parse_args(given)
-            options.command_line = shlex.join(["mjx-study", *given])
+            options.command_line = encodable(shlex.join(["mjx-study", *given]))
             return import_module(f"mjx_study.cli.{options.command}").run(options)
     except UsageError as error:
         complain(f"mjx-study: {' '.join(str(error).split())}")
@@ -78,18 +79,18 @@ def parser(chosen: str | None = None) -> argparse.ArgumentParser:
     """Build the command line's parser, with the options of all commands or of one only."""
     root = Parser(
         prog="mjx-study",
-        description=f"{metadata.metadata('mjx-study')['Summary']}.",
+        description=f"{summary()}.",
         epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    root.add_argument("--version", action="version", version=f"mjx-study {metadata.version('mjx-study')}")
+    root.add_argument("--version", action="version", version=f"mjx-study {version_of('mjx-study')}")
     commands = root.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    for name, summary in COMMANDS.items():
+    for name, line in COMMANDS.items():
         command = commands.add_parser(
             name,
             aliases=[alias for alias, of in ALIASES.items() if of == name],
-            help=summary,
-            description=summary[0].upper() + summary[1:] + ".",
+            help=line,
+            description=line[0].upper() + line[1:] + ".",
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
         if chosen in (None, name):

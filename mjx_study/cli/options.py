@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final, NoReturn
 
 from estimators.catalogue import suggestion, unknown
 from mjx_study.choices import FAMILIES, PRECISIONS, TASK_DESCRIPTIONS, unknown_task
-from mjx_study.option import BUILDER_OPTIONS, CONTACTS, OPTIONS, TASKS, Option
+from mjx_study.option import BUILDER_OPTIONS, CONTACTS, OPTIONS, TASKS, Option, refuse_overflow
 from mjx_study.study.configuration import StudyConfig
 
 if TYPE_CHECKING:
@@ -176,9 +176,11 @@ class Parser(argparse.ArgumentParser):
         self.add_argument("--cluster", type=_cluster, metavar="WHERE", help=line)
 
 
-def refuse_lone_dashes(given: Sequence[str]) -> None:
-    """Raise UsageError for an option whose value is --, which argparse drops."""
+def refuse_unusable(given: Sequence[str]) -> None:
+    """Raise UsageError for an option whose value is --, which argparse drops, and for what no file can be called."""
     for text in given:
+        if "\0" in text or re.search("[\ud800-\udc7f\udd00-\udfff]", text):
+            raise UsageError(f"no argument may hold null or surrogate characters, got {text!r}")
         if text.startswith("-") and text.endswith("=--"):
             raise UsageError(f"{text.removesuffix('=--')} needs a value, got --")
 
@@ -224,10 +226,18 @@ def theta_and_policy(
 
     if options.theta is None:
         return None, None
+    parts = options.theta.split(",")
     try:
-        return tuple(float(part) for part in options.theta.split(",")), None
+        numbers = tuple(map(float, parts))
     except ValueError:
         path = Path(options.theta)
+    else:
+        for text, number in zip(parts, numbers, strict=True):
+            try:
+                refuse_overflow(text, number)
+            except ValueError as error:
+                raise ValueError(f"--theta: {error}") from None
+        return numbers, None
     theta, policy = read_theta(path)
     if policy is not None and policy.task != options.task:
         raise ValueError(f"{path} is a policy of {policy.task}, not of {options.task}")

@@ -3,6 +3,7 @@
 import argparse
 import json
 import os
+import select
 import signal
 import sys
 import threading
@@ -12,6 +13,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Final, NoReturn
 
+from mjx_study.disk import remove_temporary_folders
 from mjx_study.study.configuration import Progress
 
 RESUMABLE: Final = "the same command resumes where it stopped"
@@ -51,6 +53,11 @@ def written_out() -> Generator[None]:
         raise OutputError(f"cannot write to standard output: {error.strerror or error}") from error
 
 
+def encodable(text: str) -> str:
+    """Text of a command line with bytes that are not UTF-8, which no document holds, written as \\udcff."""
+    return text.encode(errors="backslashreplace").decode()
+
+
 def complain(line: str) -> None:
     """Print a line on standard error, if there is one."""
     if sys.stderr is not None:
@@ -86,9 +93,15 @@ def ending(told: str, *signals: signal.Signals) -> Generator[None]:
 
 
 def _leave(message: str, code: int) -> NoReturn:
-    if sys.stderr is not None and sys.stderr.isatty():
-        sys.stderr.write("\n\x1b[?25h")  # the cursor that a progress bar hides
-    print(message, file=sys.stderr, flush=True)
+    """End the process, whether or not anybody reads the message: an exception here would be lost, or a write wait for
+    ever."""
+    with suppress(Exception):
+        descriptor = sys.stderr.fileno()  # not through sys.stderr, which may be amid a write
+        cursor = "\n\x1b[?25h" if os.isatty(descriptor) else ""  # a progress bar hides it
+        if select.select([], [descriptor], [], 0)[1]:
+            os.write(descriptor, f"{cursor}{message}\n".encode(errors="backslashreplace"))
+    with suppress(Exception):
+        remove_temporary_folders()
     os._exit(128 + code)
 
 
@@ -135,5 +148,5 @@ def print_report(
     print(json.dumps(document, allow_nan=False) if options.json else "\n".join(lines))
     failures = list(filter(None, unwritten))
     for failure in failures[:1]:
-        print(f"mjx-study: {failure}", file=sys.stderr)
+        complain(f"mjx-study: {failure}")
     return int(bool(failures))

@@ -14,10 +14,12 @@ import numpy as np
 
 from estimators.catalogue import suggestion
 from mjx_study.choices import CONES, INTEGRATORS, SOLVERS, unknown
+from mjx_study.limits import MOST_GIB
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.contact_pair import contact_pairs, geom_label
 from mjx_study.simulation.limitations import FLAGS, ignored, lacking
-from mjx_study.simulation.mjcf_sizes import too_large
+from mjx_study.simulation.mjcf_compile import compile_file
+from mjx_study.simulation.mjcf_files import RefusedFileError
 
 _ENUMERATED: Final = {
     "cone": {name: mujoco.mjtCone.__members__[f"mjCONE_{name.upper()}"] for name in CONES},
@@ -154,16 +156,31 @@ def load_model(source: str | Path, **options: SceneOption) -> mujoco.MjModel:
         SceneError: the file is missing or invalid, or an option is unknown or out of range.
     """
     path = _find(source)
-    if excess := too_large(path):
-        raise SceneError(f"{path} asks for {excess}")
     try:
-        host = mujoco.MjModel.from_xml_path(str(path))
-    except (ValueError, RuntimeError, mujoco.FatalError) as error:
+        own = path.parent == models_folder()
+        host = mujoco.MjModel.from_xml_path(str(path)) if own else compile_file(path)
+    except RefusedFileError as error:
+        raise SceneError(str(error)) from error
+    except (ValueError, RuntimeError, OSError, mujoco.FatalError) as error:
         raise SceneError(f"{path} is not a valid MJCF: {' '.join(str(error).split())}") from error
+    if field := not_finite_field(host):
+        raise SceneError(
+            f"{path}: {field} of the compiled model is not finite; a size, mass or position is too large, or a file "
+            "that it refers to holds numbers that are not finite"
+        )
     _set_options(host, options)
     if not 0 < host.opt.timestep < math.inf:
         raise SceneError(f"{path}: the timestep must be positive and finite, got {host.opt.timestep:g}")
     return host
+
+
+def not_finite_field(host: mujoco.MjModel) -> str | None:
+    """Name and row of the first entry of a compiled model that is not finite; None if there is none."""
+    for name in dir(host):
+        values = None if name.startswith("_") else getattr(host, name)
+        if isinstance(values, np.ndarray) and values.dtype.kind == "f" and not np.isfinite(values).all():
+            return f"{name}[{np.argwhere(~np.isfinite(values))[0][0]}]"
+    return None
 
 
 def put_scene(host: mujoco.MjModel, name: str, *, adjoint: SceneOption = "auto", **options: SceneOption) -> Scene:
@@ -177,10 +194,11 @@ def put_scene(host: mujoco.MjModel, name: str, *, adjoint: SceneOption = "auto",
         _set_options(host, options)
         FLAGS["energy"].disable(host.opt)  # MJX rejects it, and it does not affect the motion
     check_model(host, name)
+    check_rows(host, name)
     try:
         model = mjx.put_model(host)
         template = mjx.make_data(host)
-    except (NotImplementedError, ValueError, AssertionError) as error:
+    except (NotImplementedError, ValueError, AssertionError, MemoryError) as error:
         reason = str(error) or type(error).__name__
         raise SceneError(f"MJX cannot run {name}: {reason}") from error
     # `make_data` on a shared host gives weakly typed leaves; fix their types so that loops can carry them.
@@ -195,6 +213,25 @@ def put_scene(host: mujoco.MjModel, name: str, *, adjoint: SceneOption = "auto",
     return scene
 
 
+def check_rows(host: mujoco.MjModel, name: str) -> None:
+    """Reject a model for whose constraint rows MJX would need more than `MOST_GIB`: it reserves at least one contact
+    of four rows, each of nv numbers, for every pair of geoms that may touch.
+
+    Raises:
+        SceneError: there are too many; the message says how many.
+    """
+    masks = np.stack([host.geom_contype, host.geom_conaffinity], axis=1)
+    kinds, counts = np.unique(masks, axis=0, return_counts=True)
+    touching = (kinds[:, None, 0] & kinds[None, :, 1]) | (kinds[:, None, 1] & kinds[None, :, 0]) != 0
+    pairs = int((counts[:, None] * counts * touching).sum() - (counts * touching.diagonal()).sum()) // 2
+    needed = (4 * pairs + host.nv) * host.nv * np.dtype(float).itemsize / 2**30
+    if needed > MOST_GIB:
+        raise SceneError(
+            f"MJX would allocate {needed:.3g} GiB for {name}, with {pairs} pairs of geoms and {host.nv} degrees of "
+            f"freedom; the limit is {MOST_GIB:g} GiB: exclude pairs by contype and conaffinity, or use a smaller model"
+        )
+
+
 def _find(source: str | Path) -> Path:
     path, shipped = Path(source), models_folder() / f"{source}.xml"
     if shipped.is_file():
@@ -204,6 +241,8 @@ def _find(source: str | Path) -> Path:
     if path.suffix.lower() == ".xml":
         if not path.is_file():
             raise SceneError(f"no MJCF file at {path}")
+        if not str(path).encode(errors="ignore").decode() == str(path):  # it names tasks in studies and figures
+            raise SceneError(f"the path of an MJCF must be UTF-8, got {str(path)!r}: rename it")
         return path
     more = f"; there are {', '.join(model_names())}, or give a path to an .xml"
     raise SceneError(f"no model named {source!r}{suggestion(str(source), model_names()) or more}")

@@ -20,6 +20,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from glob import glob
 from typing import Any, Final
 
+from mjx_study.disk import temporary_folder
 from mjx_study.identity import differences, versions
 from mjx_study.runtime import available_cores, configure, precision
 from mjx_study.stopwatch import Stopwatch
@@ -43,6 +44,8 @@ SELDOM: Final = {
 }
 """Intervals of Dask's housekeeping, which this process does for every local worker: with 100 workers, the defaults keep
 a core busy."""
+PRIVATE: Final = {"distributed.scheduler.http.routes": [], "distributed.worker.http.routes": []}
+"""Pages of local workers, which anybody on the machine could read: none."""
 GPUS: Final = "/dev/nvidia[0-9]*"
 _ONE_AT_A_TIME, _SET_UP = threading.Lock(), threading.Event()
 Task = tuple[int, int | None]
@@ -58,8 +61,9 @@ def connected(cluster: str) -> Generator[Any]:
     """Connect a `distributed.Client` to a scheduler's address, or to workers that live as long as the context.
 
     Args:
-        cluster: "local:N", N local processes; "slurm:N", N workers as configured in Dask's jobqueue.yaml; or an address
-            such as "tcp://host:8786". Without N, one process per core, or one Slurm worker.
+        cluster: "local:N", N local processes, which only this process can connect to; "slurm:N", N workers as
+            configured in Dask's jobqueue.yaml; or an address such as "tcp://host:8786". Without N, one process per
+            core, or one Slurm worker.
 
     Raises:
         ValueError: Dask is not installed, or the cluster cannot be reached.
@@ -73,13 +77,16 @@ def connected(cluster: str) -> Generator[Any]:
 
             logging.getLogger("distributed").setLevel(logging.CRITICAL)  # this module reports on workers
             if kind == "local":
-                stack.enter_context(dask.config.set(SELDOM))
+                scratch = {"temporary-directory": stack.enter_context(temporary_folder())}
+                stack.enter_context(dask.config.set(SELDOM | PRIVATE | scratch))
                 local = distributed.LocalCluster(
                     n_workers=int(count or available_cores()),
                     threads_per_worker=1,
                     processes=True,
-                    dashboard_address="127.0.0.1:0",
+                    dashboard_address="127.0.0.1:0",  # of the server of HTTP, which has nothing to serve
+                    scheduler_kwargs={"dashboard": False},
                     silence_logs=logging.CRITICAL,
+                    security=distributed.Security.temporary(),  # anybody on this machine may connect to a port
                 )
                 address = stack.enter_context(local)
             elif kind == "slurm":

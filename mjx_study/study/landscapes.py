@@ -74,7 +74,7 @@ def compute_landscapes(plan: StudyPlan) -> Callable[..., dict[str, np.ndarray]]:
         line = line_of(task, config.settings.points, config.span, config.direction, config.seed)
         chosen = estimators_of(plan, cell)
         keys, columns, solved = cell_keys(config.seed, config.batches), [], []
-        for theta in line.thetas:
+        for theta in line.thetas(task.theta.dtype):
             drawn, _, residuals = draw_batches(objective, theta, keys, oracles, cell.samples, slice(None))
             solved += residuals.values()
             pooled = jax.tree.map(lambda leaf: jnp.asarray(leaf).reshape(-1, *leaf.shape[2:]), drawn)

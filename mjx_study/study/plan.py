@@ -4,6 +4,7 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Mapping, Sequence
+from functools import cached_property
 from typing import Any, Final
 
 import jax
@@ -88,10 +89,15 @@ class StudyPlan:
     chunk_size: int
     warnings: tuple[str, ...]
 
-    @property
+    @cached_property
     def settings(self) -> Settings:
         """The configuration's."""
         return self.config.settings
+
+    @cached_property
+    def chosen(self) -> dict[tuple[int, float], tuple[Estimator, ...]]:
+        """Estimators by group and sigma, filled by `estimators_of`."""
+        return {}
 
     def with_chunk(self, size: int) -> "StudyPlan":
         """The plan with another chunk size, such as that of a study begun earlier."""
@@ -327,5 +333,8 @@ def _build(
 
 def estimators_of(plan: StudyPlan, cell: StudyCell) -> tuple[Estimator, ...]:
     """Build a cell's estimators with their options, and check them against its task."""
-    task = plan.groups[cell.group].task.replace(sigma=cell.sigma)
-    return configured_estimators(plan.config, task)
+    key = cell.group, cell.sigma
+    if key not in plan.chosen:
+        task = plan.groups[cell.group].task.replace(sigma=cell.sigma)
+        plan.chosen[key] = configured_estimators(plan.config, task)
+    return plan.chosen[key]

@@ -1,7 +1,7 @@
 """Resolve a configuration for a task: estimators, recipe, parameters, and the line of a landscape."""
 
 import dataclasses
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, Final
 
 import jax.numpy as jnp
@@ -96,11 +96,15 @@ def check_estimators(estimators: Iterable[Estimator], task: Task) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class ThetaLine:
-    """Points theta_0 + t direction, with t in the unit of theta and a unit vector."""
+    """Points origin + t direction, with t in the unit of theta and a unit vector."""
 
     position: Float[np.ndarray, " points"]
     direction: Float[np.ndarray, " params"]
-    thetas: tuple[Float[Array, " params"], ...]
+    origin: Float[np.ndarray, " params"]
+
+    def thetas(self, dtype: Any) -> Iterator[Float[Array, " params"]]:
+        """Each point, made when it is needed: all of them may not fit into memory."""
+        return (jnp.asarray(self.origin + t * self.direction, dtype) for t in self.position)
 
 
 def line_of(task: Task, points: int, span: Sequence[float] | None, direction: str | None, seed: int) -> ThetaLine:
@@ -116,7 +120,7 @@ def line_of(task: Task, points: int, span: Sequence[float] | None, direction: st
     check_span((low, high))
     position = np.linspace(low, high, points)
     origin = np.zeros(1) if len(theta) == 1 else theta
-    return ThetaLine(position, along, tuple(jnp.asarray(origin + t * along, task.theta.dtype) for t in position))
+    return ThetaLine(position, along, origin)
 
 
 def direction_of(direction: str, params: int, seed: int) -> Float[np.ndarray, " params"]:

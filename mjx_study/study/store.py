@@ -27,8 +27,8 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 
 from estimators.seen import seen_now
-from mjx_study.disk import check_no_link, open_regular, prepare_folder, read_whole, write_whole
-from mjx_study.files import MOST_BYTES, digest_of_json, told
+from mjx_study.disk import MOST_BYTES, check_no_link, open_regular, prepare_folder, read_whole, write_whole
+from mjx_study.files import digest_of_json, told
 from mjx_study.identity import ACCEPT, differences
 from mjx_study.study.arrays import MOST_CELL_BYTES, check_cell, read_arrays, write_arrays
 from mjx_study.study.dataset import as_plain

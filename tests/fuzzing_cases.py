@@ -1,0 +1,334 @@
+"""Kinds of inputs at random: each writes a file and gives the command that reads it, and whether it must be refused."""
+
+import contextlib
+import dataclasses
+import functools
+import json
+import math
+import os
+import random
+import re
+import shutil
+import struct
+from collections import Counter
+from collections.abc import Callable, Generator
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from mjx_study.simulation.scene import models_folder
+from mjx_study.study import run as sweep
+from mjx_study.study.configuration import StudyConfig
+from mjx_study.study.plan import plan_study
+from tests import fuzzing
+from tests.faults import put_no_file
+
+POLICY: Final = {
+    "task": "pusher", "estimator": "fobg", "seed": 0, "cost": 1.0, "contact": "mujoco", "stiffness": 1000.0,
+    "damping": None, "cone": None, "model": None, "horizon": 4, "network": None, "theta": [0.0] * 4,
+}  # fmt: skip
+UNCHECKED: Final = (HealthCheck.too_slow, HealthCheck.data_too_large, HealthCheck.large_base_example)
+Case = tuple[list[str], bool | None]
+"""A command, and whether it must refuse; None if it may."""
+
+
+@dataclasses.dataclass
+class Row:
+    """A row of the table of what was tried: numbers of inputs, all of them and those that were answered wrongly.
+
+    Attributes:
+        silent: taken wrongly, or refused without a line.
+        outside: after which a file was another one that is none of the command's.
+        codes: how many ended with which exit code.
+        told: what was wrong.
+    """
+
+    kind: str
+    inputs: int = 0
+    silent: int = 0
+    tracebacks: int = 0
+    hangs: int = 0
+    outside: int = 0
+    codes: Counter[int] = dataclasses.field(default_factory=Counter)
+    told: list[str] = dataclasses.field(default_factory=list)
+
+    @property
+    def wrong(self) -> int:
+        """Number of inputs that were answered wrongly."""
+        return self.silent + self.tracebacks + self.hangs + self.outside
+
+    @contextlib.contextmanager
+    def counting(self, arguments: list[str]) -> Generator[None]:
+        """Count an input, and how its answer is wrong."""
+        self.inputs += 1
+        try:
+            yield
+        except fuzzing.TooSlow as error:
+            self.hangs, reason = self.hangs + 1, error
+        except fuzzing.SilentError as error:
+            self.silent, reason = self.silent + 1, error
+        except fuzzing.OutsideError as error:
+            self.outside, reason = self.outside + 1, error
+        except Exception as error:
+            self.tracebacks, reason = self.tracebacks + 1, error
+        else:
+            return
+        self.told.append(f"{self.kind}: {arguments}: {type(reason).__name__} {reason}")
+
+
+@contextlib.contextmanager
+def fuzzed_folder(path: Path) -> Generator[Path]:
+    """The current folder of every case, with a study that is begun."""
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        sweep.open_store(plan_study(StudyConfig(tasks=("pusher",), horizon=4, stiffness=(10.0, 100.0))), path / "study")
+        shutil.copy(path / "study" / "study.json", path / "kept.json")
+        monkeypatch.chdir(path)
+        fuzzing.stub(monkeypatch)
+        yield path
+
+
+def fuzz(kind: str, folder: Path, examples: int) -> Row:
+    """Answer inputs of a kind, the same ones each time."""
+    row, kept = Row(kind), (folder / "kept.json").read_bytes()
+
+    @settings(max_examples=examples, deadline=None, database=None, derandomize=True, suppress_health_check=UNCHECKED)
+    @given(st.data())
+    def cases(data: st.DataObject) -> None:
+        (folder / "study" / "study.json").write_bytes(kept)
+        arguments, refuse = CASES[kind](folder, data)
+        with row.counting(arguments):
+            row.codes[fuzzing.answer(arguments, folder, refuse=refuse)] += 1
+
+    cases()
+    return row
+
+
+def options(folder: Path, data: st.DataObject) -> Case:
+    return data.draw(fuzzing.command_lines()), None
+
+
+def toml(folder: Path, data: st.DataObject) -> Case:
+    (folder / "study.toml").write_bytes(data.draw(fuzzing.toml_files()))
+    return ["sweep", "--config", "study.toml", "--output", "out"], None
+
+
+def theta(folder: Path, data: st.DataObject) -> Case:
+    content = data.draw(fuzzing.texts([0.0] * 4))
+    (folder / "theta.json").write_bytes(content)
+    return ["compare", "pusher", "--horizon", "4", "--theta", "theta.json"], not _are_numbers(content, 4)
+
+
+def _are_numbers(content: bytes, count: int) -> bool:
+    """Whether a JSON file is a list of so many finite numbers."""
+    try:
+        found = json.loads(content)
+        numbers = isinstance(found, list) and all(type(each) in (int, float) for each in found)
+        return numbers and len(found) == count and all(math.isfinite(float(each)) for each in found)
+    except (ValueError, OverflowError, RecursionError):
+        return False
+
+
+def array(folder: Path, data: st.DataObject) -> Case:
+    (folder / "theta.npy").write_bytes(data.draw(fuzzing.arrays()))
+    return ["compare", "pusher", "--theta", "theta.npy"], None
+
+
+def policy(folder: Path, data: st.DataObject) -> Case:
+    (folder / "policy.json").write_bytes(data.draw(fuzzing.texts(POLICY)))
+    return ["rollout", "pusher", "--theta", "policy.json", "--output", "out"], None
+
+
+def _of_file(data: st.DataObject) -> list[str]:
+    """A command that reads mine.xml, mostly the fastest."""
+    command = data.draw(st.sampled_from(["rollout"] * 12 + ["gradcheck", "diagnose", "compare", "bench"]))
+    return [command, "mine.xml"] + ["--output", "out"] * (command == "rollout")
+
+
+def mjcf(folder: Path, data: st.DataObject) -> Case:
+    (folder / "mine.xml").write_bytes(data.draw(fuzzing.mjcf_files()))
+    return _of_file(data), None
+
+
+HOSTILE: Final = (
+    b"nan", b"-inf", b"1e400", b"1e308", b"0", b"-1", b"99999999999", b"", b"x", b"\xff", b"&", b"<", b"'\"", b"&#0;",
+    b"<!--", b"]]>", b"<![CDATA[", b"<replicate count='300'>", b"<include file='mine.xml'/>", b"\0",
+    b"<model name='m' file='mine.xml'/>", b"<!DOCTYPE a [<!ENTITY b '&b;&b;'>]>", b"<?xml encoding='klingon'?>",
+)  # fmt: skip
+"""What is put into an MJCF: text of any kind."""
+ENDLESS: Final = HOSTILE[:3]
+"""Numbers that are not finite."""
+
+
+@functools.cache
+def _texts() -> list[bytes]:
+    """Shipped models, without comments."""
+    return [re.sub(rb"<!--.*?-->", b"", path.read_bytes(), flags=re.DOTALL) for path in models_folder().glob("*.xml")]
+
+
+def mutated_mjcf(folder: Path, data: st.DataObject) -> Case:
+    """Cut, repeat, replace and insert in a shipped model; a number that is not finite must be refused."""
+    draw = random.Random(data.draw(st.integers(0, 2**32)))
+    content, refuse = draw.choice(_texts()), None
+    for _ in range(draw.randint(1, 3)):
+        first = draw.randrange(len(content))
+        last = min(len(content), first + draw.choice([1, 3, 30, 300]))
+        middle = draw.choice([b"", 2 * content[first:last], draw.choice(HOSTILE), draw.randbytes(1)])
+        content = content[:first] + middle + content[last:]
+    if draw.random() < 0.3:  # one number of a text that is whole
+        content = draw.choice(_texts())
+        places = [each.span(1) for each in re.finditer(rb'(?:size|pos|friction|damping|mass)="(\S+?)[ "]', content)]
+        if places:
+            first, last = draw.choice(places)
+            content, refuse = content[:first] + draw.choice(ENDLESS) + content[last:], True
+    (folder / "mine.xml").write_bytes(content)
+    return _of_file(data), refuse
+
+
+def assets(folder: Path, data: st.DataObject) -> Case:
+    """Meshes, textures, height fields and skins of which bytes are cut, changed or added."""
+    draw = random.Random(data.draw(st.integers(0, 2**32)))
+    name, content = draw.choice(_assets())
+    for _ in range(draw.randint(0, 4)):
+        first = draw.randrange(len(content)) if content else 0
+        last = first + draw.choice([0, 1, 4, 50])
+        content = content[:first] + draw.choice([b"", draw.randbytes(4), b"nan ", b"\xff" * 4]) + content[last:]
+    (folder / name).write_bytes(content)
+    tag = {"hf": "hfield size='1 1 1 1'", "png": "texture type='2d'"}.get(name[-3:].strip("."), "mesh")
+    kind = tag.partition(" ")[0]
+    used = {"mesh": "<geom type='mesh' mesh='m'/>", "hfield": "<geom type='hfield' hfield='m'/>"}.get(kind, "")
+    asset = f"<deformable><skin file='{name}'/></deformable>" if name.endswith("skn") else ""
+    asset = asset or f"<asset><{tag} name='m' file='{name}'/></asset>"
+    body = "<body><freejoint/><geom size='.1'/></body>"
+    (folder / "mine.xml").write_text(f"<mujoco>{asset}<worldbody>{used}{body}</worldbody></mujoco>")
+    return _of_file(data), None
+
+
+@functools.cache
+def _assets() -> list[tuple[str, bytes]]:
+    """A valid file of each format, less the image, which is empty."""
+    corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], "f4")
+    faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], "i4")
+    text = "".join("v {} {} {}\n".format(*each) for each in corners) + "".join(
+        "f {} {} {}\n".format(*each) for each in faces + 1
+    )
+    triangles = b"".join(struct.pack("<12fH", 0, 0, 0, *corners[face].ravel(), 0) for face in faces)
+    return [
+        ("m.obj", text.encode()),
+        ("m.stl", bytes(80) + struct.pack("<I", len(faces)) + triangles),
+        ("m.msh", struct.pack("<4i", 4, 0, 0, 4) + corners.tobytes() + faces.tobytes()),
+        ("m.hf", struct.pack("<2i4f", 2, 2, 0, 1, 2, 3)),
+        ("m.skn", struct.pack("<4i", 4, 0, 4, 0) + corners.tobytes() + faces.tobytes()),
+        ("m.png", b"\x89PNG\r\n\x1a\n" + struct.pack(">I4sIIBBBBB", 13, b"IHDR", 60000, 60000, 8, 2, 0, 0, 0)),
+    ]
+
+
+NO_FILES: Final = ("fifo", "socket", "folder", "device", "loop", "empty", "missing", "endless name")
+REFERENCES: Final = (
+    "<include file='{}'/>", "<asset><mesh name='m' file='{}'/></asset>", "<asset><model name='m' file='{}'/></asset>",
+    "<asset><texture name='t' type='2d' file='{}'/></asset>", "<deformable><skin file='{}'/></deformable>",
+    "<asset><texture name='t' type='cube' fileright='{}'/></asset>", "<compiler assetdir='{}'/><include file='{}'/>",
+    "<asset><hfield name='h' size='1 1 1 1' file='{}'/></asset>",
+    "<compiler meshdir='.'/><asset><mesh file='{}'/></asset>",
+    "<worldbody><flexcomp name='f' type='mesh' file='{}'/></worldbody>",
+)  # fmt: skip
+
+
+def no_files(folder: Path, data: st.DataObject) -> Case:
+    """Pipes, sockets, devices, folders, loops of links and nothing at all, wherever a file may be named."""
+    kind = data.draw(st.sampled_from(NO_FILES))
+    place = folder / "place"
+    shutil.rmtree(place, ignore_errors=True)
+    place.mkdir()
+    name = "x" * 300 if kind == "endless name" else "file"
+    suffix = data.draw(st.sampled_from(["", ".json", ".npy", ".toml", ".xml", ".stl", ".png"]))
+    path = place / f"{name}{suffix}"
+    if kind == "loop":
+        path.symlink_to(path)
+    elif kind == "empty":
+        path.touch()
+    elif kind not in ("missing", "endless name"):
+        put_no_file(path, kind)
+    reader = data.draw(st.integers(0, 9))
+    at = os.path.relpath(path, folder)
+    commands = {
+        0: ["compare", "pusher", "--theta", at],
+        1: ["rollout", "pusher", "--theta", at, "--output", "out"],
+        2: ["sweep", "--config", at, "--output", "out"],
+        3: ["plot", at, "--output", "out"],
+        4: ["report", at, "--output", "out/page.html"],
+        5: ["gradcheck", f"{at}.xml" if suffix != ".xml" else at],
+    }
+    if reader in commands:
+        return commands[reader], None if (kind, reader) == ("empty", 2) else True  # a TOML file may be empty
+    reference = data.draw(st.sampled_from(REFERENCES)).replace("{}", at)
+    body = "<worldbody><body><freejoint/><geom size='.1'/></body></worldbody>"
+    (folder / "mine.xml").write_text(f"<mujoco>{reference}{body}</mujoco>")
+    return _of_file(data), None if "model" in reference or "assetdir" in reference else True
+
+
+def outputs(folder: Path, data: st.DataObject) -> Case:
+    """Folders for the output that are none, or whose names are odd."""
+    kind = data.draw(st.sampled_from([*NO_FILES, "not UTF-8", "new line", "surrogate", "null", "dots"]))
+    place = folder / "out"
+    shutil.rmtree(place, ignore_errors=True)
+    place.mkdir()
+    names = {
+        "not UTF-8": os.fsdecode(b"\xff\xfe"),
+        "new line": "a\nb",
+        "surrogate": "\ud800",
+        "null": "a\0b",
+        "dots": "..",
+    }
+    names |= {"endless name": "x" * 300}
+    path = place / names.get(kind, "file")
+    if kind == "loop":
+        path.symlink_to(path)
+    elif kind == "empty":
+        path.touch()
+    elif kind in ("fifo", "socket", "folder", "device"):
+        put_no_file(path, kind)
+    at = "out" if kind == "dots" else f"out/{path.name}"
+    command = data.draw(
+        st.sampled_from(
+            [["compare", "pusher"], ["sweep", "pusher"], ["optimise", "pusher"], ["landscape", "ball_wall"]]
+            + [["rollout", "pusher"], ["claims"], ["plot", "study"], ["report", "study"]]
+        )
+    )
+    refuse = kind in ("fifo", "socket", "device", "loop", "empty", "endless name", "surrogate", "null")
+    return [*command, "--output", at], True if refuse and command[0] != "report" else None
+
+
+def study(folder: Path, data: st.DataObject) -> Case:
+    path = folder / "study" / "study.json"
+    path.write_bytes(data.draw(fuzzing.texts(json.loads(path.read_text()))))
+    command = data.draw(
+        st.sampled_from([["plot", "study", "--output", "out"], ["report", "study", "--output", "out/a"]])
+    )
+    return command, None
+
+
+CASES: Final[dict[str, Callable[[Path, st.DataObject], Case]]] = {
+    "options of every command": options,
+    "TOML files": toml,
+    "theta, JSON": theta,
+    "theta, .npy": array,
+    "policies": policy,
+    "MJCFs, generated": mjcf,
+    "MJCFs, mutated": mutated_mjcf,
+    "meshes, textures, height fields, skins": assets,
+    "pipes, devices, folders, links for files": no_files,
+    "folders for output": outputs,
+    "study.json, altered": study,
+}
+"""By kind."""
+FULL: Final[dict[str, int]] = dict.fromkeys(CASES, 400) | {"options of every command": 2600, "TOML files": 800}
+"""Number of inputs of each kind at full size."""
+
+
+def tally(codes: Any) -> str:
+    """How many cases ended how."""
+    return ", ".join(f"{count} x exit code {code}" for code, count in sorted(codes.items()))
