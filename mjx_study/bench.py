@@ -26,7 +26,7 @@ from estimators import FirstOrder, ZerothOrder
 from mjx_study.compiled import Compiled
 from mjx_study.objective import Simulator, chunk_for, simulate, spread
 from mjx_study.reference.noise import split_sample_key, standard_noise
-from mjx_study.runtime import environment
+from mjx_study.runtime import environment, local_devices
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.contact import ContactModel, apply_contact
 from mjx_study.simulation.dynamics import State
@@ -137,7 +137,7 @@ def plan_bench(task: Task, samples: int) -> BenchPlan:
 def run_bench(plan: BenchPlan, progress: Progress = lambda done, total, what: None) -> BenchReport:
     """Measure everything, interleaved with the baselines; report medians of repeats."""
     task, samples, cell = plan.task, plan.samples, plan.cell
-    devices = jax.local_devices()
+    devices = local_devices()
     keys = jax.random.split(jax.random.key(0), samples)
     simulator = Simulator(task, chunk_size=chunk_for(-(-samples // len(devices)), devices[:1], [task]))
     objective = simulator.objective(cell.contact)

@@ -18,6 +18,7 @@ LAYERS = [
     "mjx_study.choices",
     "mjx_study._matplotlib",
     "mjx_study.runtime",
+    "mjx_study.watchdog",
     "mjx_study.stopwatch",
     "mjx_study.table",
     "mjx_study.disk",

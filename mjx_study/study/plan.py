@@ -17,6 +17,7 @@ from mjx_study.limits import MOST_CELLS, MOST_GIB, MOST_PROGRAMS, check_count
 from mjx_study.objective import chunk_for
 from mjx_study.option import BUILDER_OPTIONS
 from mjx_study.reference.noise import check_sigma
+from mjx_study.runtime import local_devices
 from mjx_study.study.configuration import SAMPLES, Settings, StudyConfig
 from mjx_study.study.effect import refuse_idle
 from mjx_study.study.iteration import make_optimizer, schedule_factors
@@ -186,7 +187,7 @@ def plan_study(config: StudyConfig, built: Mapping[str, Task] | None = None) -> 
     together = 1 if settings.kind == "descents" else config.batches
     most = min(largest_batch(), max(min(cell.samples, config.block_size or cell.samples) for cell in cells) * together)
     tasks = [group.task for group in groups]
-    chunk = chunk_for(most, jax.local_devices(), tasks) if config.chunk_size is None else config.chunk_size
+    chunk = chunk_for(most, local_devices(), tasks) if config.chunk_size is None else config.chunk_size
     plan = StudyPlan(config, tuple(groups), tuple(cells), chunk, tuple(dict.fromkeys(messages)))
     check_batches(plan.memory, _whole(plan))
     for cell in {cell.group: cell for cell in cells}.values():
