@@ -34,6 +34,7 @@ from mjx_study.simulation.engine import engine_model
 from mjx_study.study.configuration import Progress
 from mjx_study.study.memory import check_memory
 from mjx_study.tasks.contact_grid import ContactPoint, family_grid
+from mjx_study.tasks.soundness import check_soundness
 from mjx_study.tasks.task import Task
 
 REPEATS: Final = 5
@@ -128,6 +129,7 @@ def plan_bench(task: Task, samples: int) -> BenchPlan:
     """Plan a benchmark; ValueError for fewer than one sample."""
     if samples < 1:
         raise ValueError(f"samples must be at least 1, got {samples}")
+    check_soundness(task)
     check_memory(task, (ZerothOrder(), FirstOrder()), samples)
     (cell,), _ = family_grid(task, [task.defaults.main_family], [task.defaults.middle_stiffness])
     (onset,), _ = family_grid(task, ["mujoco_default"]) if task.contact_pair else ((None,), ())

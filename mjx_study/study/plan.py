@@ -35,9 +35,10 @@ from mjx_study.study.memory import (
 )
 from mjx_study.study.resolution import at_theta, configured_estimators, line_of, recipe_of
 from mjx_study.table import digits_to_tell_apart
-from mjx_study.tasks import task_with_options
+from mjx_study.tasks import TASKS, task_with_options
 from mjx_study.tasks.contact_grid import ContactPoint, backward_grid, family_grid, solver_grid
 from mjx_study.tasks.network import with_network
+from mjx_study.tasks.soundness import check_soundness
 from mjx_study.tasks.task import Recipe, Task, check_shapes
 
 HISTORY_NUMBERS: Final = 20
@@ -154,6 +155,7 @@ def plan_study(config: StudyConfig, built: Mapping[str, Task] | None = None) -> 
     groups: list[Group] = []
     cells: list[StudyCell] = []
     messages: list[str] = []
+    sound: list[str | Task] = []
     for which, timestep, cone in itertools.product(*variants):
         task = _build(config, which, timestep, cone, built or {})
         if config.network is not None:
@@ -161,6 +163,9 @@ def plan_study(config: StudyConfig, built: Mapping[str, Task] | None = None) -> 
                 raise ValueError("a network needs MJX: the analytic references use the task's own policy")
             task = with_network(task, config.network, jax.random.key(config.seed))
         task = at_theta(task, config.theta)
+        if which not in sound and not (which in TASKS and config.theta is config.model is None):
+            check_soundness(task)
+        sound.append(which)
         recipe = recipe_of(config, task) if settings.kind == "descents" else None
         counts = config.samples or (SAMPLES if recipe is None else recipe.samples,)
         check_weights(config.weights, min(counts))
