@@ -152,7 +152,8 @@ def impedance_at(depth: float, solimp: np.ndarray) -> float:
 def test_geoms_that_never_collide_have_no_contact() -> None:
     host = mujoco.MjModel.from_xml_string(
         '<mujoco><worldbody><geom name="floor" type="plane" size="1 1 .1" contype="0" conaffinity="0"/>'
-        '<body><freejoint/><geom name="ball" size=".1"/></body></worldbody></mujoco>'
+        '<body><freejoint/><geom name="ball" size=".1"/></body><body><freejoint/><geom size=".1"/></body>'
+        "</worldbody></mujoco>"
     )
     with pytest.raises(ValueError, match="geoms 'ball' and 'floor' never collide"):
         effective_mass(scene_of(host), "ball", "floor")

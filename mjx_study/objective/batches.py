@@ -154,7 +154,8 @@ class MjxObjective:
         samples = len(keys)
         rows, scale = np.tile(np.arange(samples), 2), np.repeat([1.0, -1.0], samples)
         values, scores, residuals = self._run("value", theta, keys, rows, scale)
-        odd = (values[:samples] - values[samples:]) / 2
+        with np.errstate(all="ignore"):  # lost samples are counted with the estimates
+            odd = (values[:samples] - values[samples:]) / 2
         residual = jnp.maximum(residuals[:samples], residuals[samples:])
         return Evaluation(*map(jnp.asarray, (odd, scores[:samples], jnp.zeros_like(odd), residual)))
 

@@ -45,27 +45,36 @@ class ContactPair:
 
 
 def contact_pairs(host: mujoco.MjModel) -> Iterator[ContactPair]:
-    """Every pair of geoms that MJX tests for collision.
+    """Every pair of geoms that MJX tests for collision."""
+    for *both, index in _driver.geom_pairs(host):
+        yield explicit_pair(host, index) if index >= 0 else mixed_pair(host, *map(int, both))
 
-    An explicit pair has parameters of its own. Otherwise the geom of higher priority decides; at equal priority MuJoCo
-    takes the larger friction and condim, and mixes solref and solimp by solmix.
+
+def explicit_pair(host: mujoco.MjModel, index: int) -> ContactPair:
+    """A <pair> of the MJCF, which has parameters of its own."""
+    both = np.array([host.pair_geom1[index], host.pair_geom2[index]])
+    first, second = both[np.argsort(host.geom_type[both], stable=True)].tolist()
+    friction = np.maximum(host.pair_friction[index], NO_FRICTION)
+    solref, solimp = host.pair_solref[index].copy(), host.pair_solimp[index].copy()
+    return ContactPair(
+        first, second, int(host.pair_dim[index]), friction, solref, solimp, float(host.pair_margin[index])
+    )
+
+
+def mixed_pair(host: mujoco.MjModel, first: int, second: int) -> ContactPair:
+    """Two geoms, of which the one with the higher priority decides.
+
+    At equal priority MuJoCo takes the larger friction and condim, and mixes solref and solimp by solmix.
 
     Reference: MuJoCo documentation, Modeling, "Contact parameters".
     """
-    for *both, index in _driver.geom_pairs(host):
-        first, second = map(int, both)
-        if index >= 0:
-            condim, friction = host.pair_dim[index], host.pair_friction[index]
-            solref, solimp, margin = host.pair_solref[index], host.pair_solimp[index], host.pair_margin[index]
-        else:
-            priority, margin = host.geom_priority[both], sum(host.geom_margin[both])
-            ruling = np.array(both)[priority == max(priority)]
-            condim, friction = max(host.geom_condim[ruling]), host.geom_friction[ruling].max(axis=0)[[0, 0, 1, 2, 2]]
-            share = _shares(host.geom_solmix[ruling])
-            solref, solimp = host.geom_solref[ruling], share @ host.geom_solimp[ruling]
-            solref = share @ solref if (solref[:, 0] > 0).all() else solref.min(axis=0)
-        friction = np.maximum(friction, NO_FRICTION)
-        yield ContactPair(first, second, int(condim), friction, np.array(solref), np.array(solimp), float(margin))
+    both = np.array([first, second])
+    ruling = both[host.geom_priority[both] == host.geom_priority[both].max()]
+    condim, friction = host.geom_condim[ruling].max(), host.geom_friction[ruling].max(axis=0)[[0, 0, 1, 2, 2]]
+    share, solref = _shares(host.geom_solmix[ruling]), host.geom_solref[ruling]
+    solref = share @ solref if (solref[:, 0] > 0).all() else solref.min(axis=0)
+    solimp, margin = share @ host.geom_solimp[ruling], host.geom_margin[both].sum()
+    return ContactPair(first, second, int(condim), np.maximum(friction, NO_FRICTION), solref, solimp, float(margin))
 
 
 def _shares(solmix: Float[np.ndarray, " geoms"]) -> Float[np.ndarray, " geoms"]:
