@@ -8,6 +8,7 @@ import contextlib
 import io
 import json
 import os
+import random
 import shutil
 import zipfile
 from collections.abc import Callable, Iterator
@@ -17,29 +18,17 @@ from typing import Any, Final
 import numpy as np
 
 from mjx_study.disk import temporary_name
+from mjx_study.study import store as store_module
 from mjx_study.study.document import sealed
 from mjx_study.study.run import load_study
 from mjx_study.study.store import Store
 from tests.faults import put_no_file
+from tests.fuzz.answers import Row, SilentError
+from tests.fuzz.studies import STUDIES, draw, make, resume
 
 VALUES: Final = (
-    None,
-    True,
-    -1,
-    0,
-    10**9,
-    10**30,
-    1e308,
-    float("nan"),
-    "",
-    "$x^{",
-    "../../x",
-    "a\nb",
-    [],
-    [1],
-    {},
-    {"a": 1},
-)
+    None, True, -1, 0, 10**9, 10**30, 1e308, float("nan"), "", "$x^{", "../../x", "a\nb", [], [1], {}, {"a": 1}
+)  # fmt: skip
 """What stands in place of a value of study.json."""
 
 
@@ -187,24 +176,17 @@ def containers(folder: Path) -> Iterator[tuple[str, Forgery, bool]]:
     for name, versions in {"a list": "[]", "a number": '{"jax": 1}', "no JSON": "{", "none": None}.items():
 
         def written(at: Path, _: Path, versions: str | None = versions) -> None:
-            from mjx_study.study import store as module
-
             kept = dict(arrays) | ({} if versions is None else {"versions": np.array(versions)})
             place = Store(at, store.document)
-            signed = [module._digest(kept), place._study, place._place(0)]
+            signed = [store_module._digest(kept), place._study, place._place(0)]
             with open(at / "cells" / "00000.npz", "wb") as file:
                 np.savez(file, digest=np.array(signed), **kept)  # type: ignore[arg-type]
 
         yield f"versions of a cell: {name}", written, True
     failures = (
-        b"",
-        b"{",
-        b"[]",
-        b"\xff\xfe",
-        b'{"reason": 1, "digest": ""}',
-        b'{"reason": "a\\nb", "digest": "0"}',
-        b"[" * 10**5,
-    )
+        b"", b"{", b"[]", b"\xff\xfe", b"[" * 10**5,
+        b'{"reason": 1, "digest": ""}', b'{"reason": "a\\nb", "digest": "0"}',
+    )  # fmt: skip
     for content in failures:
 
         def failed(at: Path, _: Path, content: bytes = content) -> None:
@@ -279,22 +261,10 @@ def entries(folder: Path) -> Iterator[tuple[str, Forgery, bool]]:
 
     yield "leftovers: links and pipes", leftovers, False
     contents = (
-        b"",
-        b"{",
-        b"[]",
-        b"null",
-        b"1e999",
-        b"[" * 10**5,
-        b'{"a":' * 10**4,
-        b"\xff\xfe{}",
-        b'{"format": 4}',
-        b'{"format": 1e9}',
-        b'{"format": true}',
-        b'{"format": 3}',
-        b'{"format": "4"}',
-        b'{"format": 4' + b" " * 10**6 + b"}",
-        b'{"format": 1' + b"0" * 5000 + b"}",
-    )
+        b"", b"{", b"[]", b"null", b"1e999", b"[" * 10**5, b'{"a":' * 10**4, b"\xff\xfe{}", b'{"format": 4}',
+        b'{"format": 1e9}', b'{"format": true}', b'{"format": 3}', b'{"format": "4"}',
+        b'{"format": 4' + b" " * 10**6 + b"}", b'{"format": 1' + b"0" * 5000 + b"}",
+    )  # fmt: skip
     for content in contents:
 
         def replaced(at: Path, _: Path, content: bytes = content) -> None:
@@ -303,4 +273,35 @@ def entries(folder: Path) -> Iterator[tuple[str, Forgery, bool]]:
         yield f"study.json: {content[:16]!r}", replaced, True
 
 
-FORGERIES: Final = {"study.json": documents, "arrays": arrays_of, "containers": containers, "entries": entries}
+FORGERIES: Final = {
+    "forged folders: study.json": documents,
+    "forged folders: arrays": arrays_of,
+    "forged folders: files of cells": containers,
+    "forged folders: links, pipes, devices": entries,
+}
+FORGED: Final = dict.fromkeys(FORGERIES, 100)
+"""Kinds, and numbers of folders at full size."""
+
+
+def forge(kind: str, count: int, root: Path) -> Row:
+    """Forge folders of each kind of study, and draw and resume them."""
+    row, root, outside = Row(kind), root / "studies", root / "outside"
+    made = {each: make(each, root) for each in STUDIES}
+    every = [(study, *each) for study, folder in made.items() for each in FORGERIES[kind](folder)]
+    for study, name, change, refuse in random.Random(0).sample(every, min(count, len(every))):
+        at = root / "forged"
+        for folder in (at, outside):
+            shutil.rmtree(folder, ignore_errors=True)
+        outside.mkdir()
+        (outside / "file").write_text("somebody's")
+        shutil.copytree(made[study], at)
+        change(at, outside)
+        with row.counting(f"{study}, {name}"):
+            codes = [draw(at, outside)]
+            if codes == [0]:
+                codes.append(draw(at, outside, "report"))
+            row.codes[codes[-1]] += 1
+            codes.append(resume(study, at, outside))
+            if refuse and 0 in codes:
+                raise SilentError(f"accepted: exit codes {codes}")
+    return row
