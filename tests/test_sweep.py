@@ -26,8 +26,7 @@ import estimators
 from estimators import AlphaOrder, DiscontinuityGated
 from mjx_study import cli
 from mjx_study.cli import options
-from mjx_study.cli.studies import sweep_fields
-from mjx_study.cli.sweep import solimp, solref
+from mjx_study.cli.sweep import solimp, solref, sweep_fields
 from mjx_study.objective import Simulator, simulate
 from mjx_study.plots import study as study_plots
 from mjx_study.report import render_report
