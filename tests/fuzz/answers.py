@@ -22,6 +22,8 @@ SECONDS: Final = 20
 """Maximum time for an input [s]."""
 MOST_TEXT: Final = 3000
 """Maximum length of what a refusal prints."""
+OUTPUTS: Final = {"out", "results"}
+"""Folders that commands are asked to write to, or write to by default."""
 BESIDE: Final = re.compile(r"MuJoCo: | *\d+\.\d s  \[")
 """Beginnings of lines that may come beside a refusal: warnings and stages."""
 
@@ -92,7 +94,7 @@ def answer(arguments: list[str], folder: Path, *, refuse: bool | None = None) ->
 
     Args:
         arguments: of the command line.
-        folder: must be afterwards what it was before, except for what is under "out".
+        folder: must be afterwards what it was before, except for what is under `OUTPUTS`.
         refuse: whether the input must be refused, or must not; None for either.
 
     Raises:
@@ -127,10 +129,10 @@ def answer(arguments: list[str], folder: Path, *, refuse: bool | None = None) ->
 
 
 def contents_of(folder: Path) -> dict[str, str]:
-    """What each path of a folder is, except under "out": a file of some digest, or a folder, link, pipe or socket."""
+    """What each path of a folder is, except under `OUTPUTS`: a file of some digest, or a folder, link, pipe or socket."""
     found = {}
     for path in folder.rglob("*"):
-        if "out" not in path.parts:
+        if not OUTPUTS & set(path.relative_to(folder).parts):
             mode = path.lstat().st_mode
             is_file = stat.S_ISREG(mode) and mode & 0o400
             found[str(path)] = hashlib.sha256(path.read_bytes()).hexdigest() if is_file else oct(mode)
