@@ -129,7 +129,7 @@ def answer(arguments: list[str], folder: Path, *, refuse: bool | None = None) ->
 
 
 def contents_of(folder: Path) -> dict[str, str]:
-    """What each path of a folder is, except under `OUTPUTS`: a file of some digest, or a folder, link, pipe or socket."""
+    """What each path of a folder is, except under `OUTPUTS`: a file of some digest, a folder, a link, ..."""
     found = {}
     for path in folder.rglob("*"):
         if not OUTPUTS & set(path.relative_to(folder).parts):
