@@ -27,7 +27,7 @@ from estimators.confidence import coverage_interval
 from mjx_study.choices import DEFAULT_SOLIMP, DEFAULT_SOLREF, STIFF_SOLIMP
 from mjx_study.diagnose import ESTIMATORS, measure
 from mjx_study.objective import MjxObjective, Simulator, chunk_for
-from mjx_study.runtime import configure
+from mjx_study.runtime import configure, local_devices
 from mjx_study.simulation.contact import contact_model
 from mjx_study.simulation.scene import load_scene
 from mjx_study.study.gradients import reference_of
@@ -248,7 +248,7 @@ def main() -> None:
         ):
             continue
         if (key := (case.model, case.halved)) not in made:
-            made = {key: Simulator(task_of(case), chunk_size=chunk_for(SAMPLES, jax.local_devices()))}
+            made = {key: Simulator(task_of(case), chunk_size=chunk_for(SAMPLES, local_devices()))}
         line = result(case, made[key])
         with RESULTS.open("a") as file:
             file.write(json.dumps(line) + "\n")

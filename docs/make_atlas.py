@@ -35,7 +35,7 @@ from mjx_study.diagnose import touch_of
 from mjx_study.disk import write_whole
 from mjx_study.objective import SamplePrograms, rollout_cost, spread
 from mjx_study.reference.noise import batch_noise, noise_score
-from mjx_study.runtime import configure, environment
+from mjx_study.runtime import configure, environment, local_devices
 from mjx_study.simulation.contact import ContactModel, stable
 from mjx_study.simulation.dynamics import State, initial_state
 from mjx_study.simulation.engine import engine_model
@@ -222,7 +222,7 @@ class Programs:
         flat = [np.repeat(each, rows, axis=0) for each in settings]
         flat += [keys.reshape(cells * rows, -1), np.tile(scale, cells)]
         begun = time.perf_counter()
-        found = spread(self._programs[name], (), flat, CHUNK, jax.local_devices())
+        found = spread(self._programs[name], (), flat, CHUNK, local_devices())
         seconds = (time.perf_counter() - begun) / (cells * rows) if name in self._warm else math.nan
         self._warm.add(name)
         return jax.tree.map(lambda leaf: leaf.reshape(cells, rows, *leaf.shape[1:]), found), seconds

@@ -108,9 +108,9 @@ class Programs:
     """What is compiled, and rollouts of the base."""
 
     def __init__(self) -> None:
-        import jax
+        from mjx_study.runtime import local_devices
 
-        self.devices = jax.local_devices()
+        self.devices = local_devices()
         self.on_cpu = self.devices[0].platform == "cpu"
         self.chunk = 256 if self.on_cpu else 32_768
         self._simulators: dict[tuple[Any, ...], Any] = {}
@@ -249,11 +249,11 @@ def measure_devices(tasks: list[str], samples: list[int]) -> None:
     import numpy as np
 
     from mjx_study.objective import Simulator, spread
-    from mjx_study.runtime import configure, environment
+    from mjx_study.runtime import configure, environment, local_devices
     from mjx_study.tasks import make_task
 
     configure()
-    devices = jax.local_devices()
+    devices = local_devices()
     print(json.dumps(environment()))
     for name in tasks:
         task = make_task(name)

@@ -26,7 +26,7 @@ from estimators import FirstOrder, ZerothOrder
 from mjx_study.compiled import Compiled
 from mjx_study.objective import Simulator, chunk_for, simulate, spread
 from mjx_study.reference.noise import split_sample_key, standard_noise
-from mjx_study.runtime import environment
+from mjx_study.runtime import environment, local_devices
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.contact import ContactModel, apply_contact
 from mjx_study.simulation.dynamics import State
@@ -34,6 +34,7 @@ from mjx_study.simulation.engine import engine_model
 from mjx_study.study.configuration import Progress
 from mjx_study.study.memory import check_memory
 from mjx_study.tasks.contact_grid import ContactPoint, family_grid
+from mjx_study.tasks.soundness import check_soundness
 from mjx_study.tasks.task import Task
 
 REPEATS: Final = 5
@@ -128,6 +129,7 @@ def plan_bench(task: Task, samples: int) -> BenchPlan:
     """Plan a benchmark; ValueError for fewer than one sample."""
     if samples < 1:
         raise ValueError(f"samples must be at least 1, got {samples}")
+    check_soundness(task)
     check_memory(task, (ZerothOrder(), FirstOrder()), samples)
     (cell,), _ = family_grid(task, [task.defaults.main_family], [task.defaults.middle_stiffness])
     (onset,), _ = family_grid(task, ["mujoco_default"]) if task.contact_pair else ((None,), ())
@@ -137,7 +139,7 @@ def plan_bench(task: Task, samples: int) -> BenchPlan:
 def run_bench(plan: BenchPlan, progress: Progress = lambda done, total, what: None) -> BenchReport:
     """Measure everything, interleaved with the baselines; report medians of repeats."""
     task, samples, cell = plan.task, plan.samples, plan.cell
-    devices = jax.local_devices()
+    devices = local_devices()
     keys = jax.random.split(jax.random.key(0), samples)
     simulator = Simulator(task, chunk_size=chunk_for(-(-samples // len(devices)), devices[:1], [task]))
     objective = simulator.objective(cell.contact)

@@ -23,8 +23,9 @@ from mjx_study.caches import read_cached, write_cached
 from mjx_study.identity import trace_contents
 from mjx_study.runtime import precision, traces_folder
 from mjx_study.structure import describe, restore
+from mjx_study.watchdog import awaited
 
-UNTRACED: Final = re.compile("cache|^jax_log|num_cpu_devices")
+UNTRACED: Final = re.compile("cache|^jax_log|num_cpu_devices|async_dispatch")
 """JAX settings that traces do not depend on."""
 GRAPHS: Final = "FUSION,CUBLAS,CUBLASLT,CUDNN,CUSTOM_CALL,DYNAMIC_SLICE_FUSION,CONDITIONAL,WHILE"
 """Operations that XLA records in CUDA graphs: its default ones and whole loops, whose steps the host would launch."""
@@ -53,7 +54,8 @@ class Compiled:
         return jax.jit(self._function, compiler_options=compiler_options())
 
     def __call__(self, *arguments: Any) -> Any:
-        return self.prepare(*arguments)(*arguments)
+        with awaited():
+            return self.prepare(*arguments)(*arguments)
 
     @property
     def num_compilations(self) -> int:

@@ -76,6 +76,7 @@ class StudyAccessor:
         return render_report(self._dataset)
 
 
+@np.errstate(over="ignore", invalid="ignore")  # numbers of a motion that explodes
 def render_report(dataset: xr.Dataset) -> str:
     config = json.loads(dataset.attrs["config"])
     title, names = KINDS[config["kind"]]

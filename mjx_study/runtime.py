@@ -11,6 +11,7 @@ from typing import Any, Final
 
 import jax
 import mujoco
+from jax.extend.backend import clear_backends
 
 from mjx_study.caches import check_programs
 from mjx_study.choices import PRECISIONS, unknown
@@ -18,15 +19,22 @@ from mjx_study.disk import private_folder
 from mjx_study.version import version_of
 
 _TRACES: Final[list[Path]] = []
+_CORES: Final[list[int]] = []
+_POOL: Final = "PJRT_NPROC"
+"""Environment variable with the size of XLA's thread pools; read when JAX sets up its devices."""
 
 
 def configure(*, precision: str = "float64", cpu_devices: int | None = None, cache: str | Path | None = None) -> None:
     """Set up JAX for a study and send MuJoCo's warnings to standard error; call before creating any array.
 
+    On CPUs a program runs in the thread that calls it, and batches call it from several threads (`local_devices`).
+    XLA's own pool gets a single thread: jaxlib 0.10 splits LAPACK calls of 200,000 operations or more over it and waits
+    inside it for the parts, for ever if as many calls wait as it has threads.
+
     Args:
         precision: float64 or float32. Stiff contact needs float64: equivalent float32 programs of one rollout differ in
             the second digit.
-        cpu_devices: number of CPU devices, and so of cores that samples use; None for all.
+        cpu_devices: number of cores that samples use; None for all.
         cache: folder for compiled programs kept between runs, which this user owns and nobody else can write to; None
             for `default_cache()`. A URL is left to JAX.
 
@@ -35,12 +43,16 @@ def configure(*, precision: str = "float64", cpu_devices: int | None = None, cac
     """
     if precision not in PRECISIONS:
         raise ValueError(unknown("precision", precision, PRECISIONS))
-    devices = available_cores() if cpu_devices is None else cpu_devices
-    if devices < 1:
-        raise ValueError(f"cpu_devices must be at least 1, got {devices}")
+    cores = available_cores() if cpu_devices is None else cpu_devices
+    if cores < 1:
+        raise ValueError(f"cpu_devices must be at least 1, got {cores}")
     mujoco.set_mju_user_warning(print_warning)  # not a file in the current folder
     jax.config.update("jax_enable_x64", precision == "float64")
-    jax.config.update("jax_num_cpu_devices", devices)
+    jax.config.update("jax_num_cpu_devices", 1)  # XLA's pool has at least one thread per device
+    jax.config.update("jax_cpu_enable_async_dispatch", False)
+    if not _CORES and jax.default_backend() == "cpu":
+        _shrink_pool()
+    _CORES[:] = [cores]
     _keep_programs(cache)
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
@@ -71,6 +83,24 @@ def print_warning(message: str) -> None:
     """Print a warning of MuJoCo's on standard error, if anybody reads it."""
     with suppress(OSError, AttributeError):
         print(f"MuJoCo: {message}", file=sys.stderr)
+
+
+def _shrink_pool() -> None:
+    """Set up JAX's CPU again, with a pool of one thread. Accelerators keep theirs, which compile their programs."""
+    clear_backends()
+    before = os.environ.get(_POOL)
+    os.environ[_POOL] = "1"
+    try:
+        jax.local_devices()
+    finally:
+        del os.environ[_POOL]
+        os.environ.update({} if before is None else {_POOL: before})
+
+
+def local_devices() -> list[Any]:
+    """Devices that batches are spread over: all accelerators; or the CPU, once per core as set up by `configure`."""
+    found = jax.local_devices()
+    return found[:1] * (_CORES[0] if _CORES else 1) if found[0].platform == "cpu" else found
 
 
 def available_cores() -> int:
@@ -124,7 +154,7 @@ def environment() -> dict[str, Any]:
         "python": platform.python_version(),
         "processor": processor_name(),
         "cores": available_cores(),
-        "devices": [str(device) for device in jax.local_devices()],
+        "devices": [str(device) for device in local_devices()],
         "backend": jax.default_backend(),
         "device_kind": jax.local_devices()[0].device_kind,
         "precision": precision(),

@@ -1,4 +1,4 @@
-"""Settings that every test runs under: float64, two CPU devices, and reuse of random keys as an error."""
+"""Settings that every test runs under: float64, batches on two cores, and reuse of random keys as an error."""
 
 import gc
 import os
@@ -32,7 +32,9 @@ SETTINGS = {
 }
 MOST = 4 * 2**30
 """Bytes of a process that keeps what it compiled."""
-jax.config.update("jax_num_cpu_devices", 2)
+os.environ["PJRT_NPROC"] = "1"  # as `configure` sets it
+jax.config.update("jax_num_cpu_devices", 1)
+jax.config.update("jax_cpu_enable_async_dispatch", False)
 for name, value in SETTINGS.items():
     jax.config.update(name, value)
 
@@ -45,6 +47,7 @@ def settings() -> None:
     for name, value in SETTINGS.items():
         jax.config.update(name, value)
     runtime._TRACES.clear()
+    runtime._CORES[:] = [2]
 
 
 @pytest.fixture(scope="module", autouse=True)

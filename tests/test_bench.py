@@ -11,6 +11,7 @@ import pytest
 from mjx_study import bench, cli
 from mjx_study.cli import options
 from mjx_study.objective import Simulator, simulate
+from mjx_study.runtime import local_devices
 from mjx_study.simulation.engine import engine_model
 from mjx_study.tasks import make_task
 from mjx_study.tasks.contact_grid import family_grid
@@ -51,7 +52,7 @@ def test_stock_mjx_runs_the_same_samples() -> None:
     task = make_task("tennis", horizon=5).replace(noise="laplace")
     (cell,), _ = family_grid(task, ["mujoco"], [4000.0])
     keys = jax.random.split(jax.random.key(0), 4)
-    values, _ = bench._stock_programs(task, cell.contact, keys, jax.local_devices())
+    values, _ = bench._stock_programs(task, cell.contact, keys, local_devices())
     ours = Simulator(task, chunk_size=2).objective(cell.contact).evaluate(task.theta, jax.random.clone(keys))
     np.testing.assert_allclose(values(), ours.value, rtol=1e-10)
 

@@ -17,12 +17,13 @@ from matplotlib.figure import Figure
 from estimators import Estimator
 from mjx_study import plots
 from mjx_study._matplotlib import matplotlib
+from mjx_study.plots.edges import UNDRAWN
 from mjx_study.plots.panels import UNSTABLE, counted, number
 from mjx_study.plots.study import MOST_DECADES, plot_study
 from mjx_study.plots.style import STYLE, STYLES, combines, fit_to_paper, mark_clipped
 from mjx_study.report import render_report
 from mjx_study.study.document import describe_estimator
-from mjx_study.study.variables import CELL, VARIABLES
+from mjx_study.study.variables import CELL, ONSETS, VARIABLES
 
 OUTER = ("task", "timestep", "cone", "model", "sigma", "samples")
 MASS, TIMESTEP = 0.05, 0.01  # kg, s: an undamped spring is unstable from 2000 N/m on
@@ -141,6 +142,56 @@ def test_every_kind_of_figure_marks_what_its_limits_clip() -> None:
     (landscape,) = plot_study(study("landscapes", models[:1], slope=steep, slope_se=0.0, smoothed=rising)).values()
     assert marks(landscape.axes[1], "^") == [(20.0, to_hex(STYLE["fobg"][0]))]
     assert "beyond the axis (hollow: its interval)" in legend_of(landscape)
+
+
+def crosses(axes: Axes) -> list[tuple[float, bool]]:
+    """Crosses at the edges: where along x, and whether above."""
+    drawn = [each for each in axes.lines if each.get_label() == UNDRAWN]
+    return sorted((float(x), float(y) > 0.5) for each in drawn for x, y in np.asarray(each.get_xydata()))
+
+
+@pytest.mark.parametrize("seeds", [1, 3])
+def test_axes_follow_what_is_finite_and_stable_and_mark_the_rest(seeds: int) -> None:
+    """Of 10, 100 and 1000 N/m stable, 1e4 exploded, 1e5 without a number."""
+    models = [("penalty", stiffness) for stiffness in (10.0, 100.0, 1000.0, 1e4, 1e5)]
+    wild = along("model", 1.0, 10.0, 300.0, 1e76, np.nan)
+    numbers = {"variance": wild, "variance_lower": wild, "variance_upper": wild, "squared_bias": wild}
+    found = study("gradients", models, seeds, relative_error=wild, squared_bias_se=0.0, **numbers)
+    name = "comparison" if seeds == 1 else "variance"
+    figures = plot_study(found)
+    axes = figures[name].axes[0]
+    assert 1e-3 < axes.get_ylim()[0] < 1 and 300 < axes.get_ylim()[1] < 1e5
+    assert {x for x, _ in marks(axes, "^")} == {1e4} and crosses(axes) == [(1e5, True)] * 3
+    assert UNDRAWN in legend_of(figures[name])
+    if seeds > 1:
+        bias = figures["bias"].axes[0]
+        assert 17 < bias.get_ylim()[1] < 1e4 and len(crosses(bias)) == 3
+
+
+def test_a_zero_is_marked_below_and_a_ratio_of_nothing_in_its_place() -> None:
+    models = [("penalty", stiffness) for stiffness in (10.0, 100.0, 1000.0)]
+    (figure,) = plot_study(study("gradients", models, variance=along("model", 1.0, 0.0, 2.0))).values()
+    assert crosses(figure.axes[0]) == [(100.0, False)] * 3
+    lost = along("model", 1.0, np.nan, 2.0)
+    chart = plot_study(study("gradients", models, 3, (0.1, 1.0), variance=lost))["map_stiffness_sigma"]
+    assert [x for x, _ in crosses(chart.axes[0])] == [1.5, 1.5]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("value", [np.nan, np.inf, 0.0, 1e138, 1e308])
+@pytest.mark.parametrize("kind", ["gradients", "descents", "landscapes"])
+def test_figures_and_reports_of_extreme_numbers_warn_of_nothing(kind: str, value: float) -> None:
+    """Warnings are errors here."""
+    models = [("penalty", stiffness) for stiffness in (10.0, 100.0, 1000.0)]
+    counts = {"nonfinite", "unconverged", "position", "residual", *ONSETS}
+    config = json.dumps({"confidence": 0.95, "direction": None, "tasks": ["pusher"], "theta": [], "kind": kind})
+    for where in (along("model", True, False, False), along("model", True, True, True)):
+        extreme = {name: xr.where(where, value, 0.5) for name in VARIABLES[kind] if name not in counts}
+        found = study(kind, models, 3, (0.1, 1.0), **extreme)
+        assert plot_study(found)
+        attrs = {"config": config, "environment": json.dumps({"versions": {}}), "missing_cells": 0}
+        attrs |= {"mixed_versions": "", "resolved": json.dumps([{"estimators": {}}])}
+        assert "<table" in render_report(found.assign_attrs(attrs))
 
 
 def test_achieved_costs_are_above_one_baseline_and_none_is_drawn_at_it() -> None:

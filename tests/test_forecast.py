@@ -7,11 +7,10 @@ import time
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 import pytest
 
-from mjx_study import cli
+from mjx_study import cli, runtime
 from mjx_study.caches import write_cached
 from mjx_study.cli import options
 from mjx_study.runtime import available_cores
@@ -188,8 +187,7 @@ def test_the_forecast_is_within_a_factor_of_two(tmp_path: Path, monkeypatch: pyt
 
     Without compilation, whose time depends on what the cache has.
     """
-    one = jax.local_devices()[:1]
-    monkeypatch.setattr(jax, "local_devices", lambda: one)
+    monkeypatch.setattr(runtime, "_CORES", [1])
     monkeypatch.setattr(Stopwatch, "clock", staticmethod(time.process_time))
     watches: list[Stopwatch] = []
     monkeypatch.setattr(times, "Stopwatch", lambda: watches.append(Stopwatch()) or watches[-1])

@@ -14,6 +14,7 @@ import pytest
 
 from estimators import AlphaOrder, Differentiation, Evaluation, Objective, estimate, first_order, zeroth_order
 from mjx_study.objective import MAX_CHUNK, Simulator, chunk_for
+from mjx_study.runtime import local_devices
 from mjx_study.simulation import constraint, dynamics
 from mjx_study.simulation.contact import ContactModel, contact_model, family_model
 from mjx_study.simulation.dynamics import State, initial_state
@@ -79,14 +80,14 @@ def cart_evaluations() -> dict[tuple[int, int], Evaluation]:
     """The same 7 samples by (chunk size, devices); 7 fits none of the chunks."""
     task, results = cart(), {}
     for chunk, devices in ((2, 2), (3, 2), (100, 2), (3, 1)):
-        simulator = Simulator(task, chunk, tuple(jax.local_devices()[:devices]))
+        simulator = Simulator(task, chunk, tuple(local_devices()[:devices]))
         results[chunk, devices] = simulator.objective(ANY_CONTACT).evaluate(task.theta, sample_keys(7))
     return results
 
 
 def test_neither_chunks_nor_devices_matter(cart_evaluations):
     """Of devices not a bit depends; chunks of another size are another program, which may round differently."""
-    assert len(jax.local_devices()) == 2
+    assert len(local_devices()) == 2
     for one, other in zip(*(jax.tree.leaves(cart_evaluations[3, devices]) for devices in (1, 2)), strict=True):
         np.testing.assert_array_equal(one, other)
     first, *others = cart_evaluations.values()
@@ -158,7 +159,7 @@ def test_evaluating_never_differentiates_the_dynamics(monkeypatch):
     def forbidden(*arguments):
         raise RuntimeError("differentiated")
 
-    simulator = Simulator(pusher_task(), chunk_size=3, devices=tuple(jax.local_devices()[:1]))
+    simulator = Simulator(pusher_task(), chunk_size=3, devices=tuple(local_devices()[:1]))
     monkeypatch.setattr(dynamics, "step_jacobian", forbidden)
     objective, theta = simulator.objective(penalty(10.0)), pusher_task().theta
     alone = objective.evaluate(theta, sample_keys(7))
@@ -407,17 +408,6 @@ def test_a_starved_solver_shows_in_the_residual(monkeypatch):
         residuals[iterations] = float(np.max(residual))
     assert residuals[1] > 1e-3
     assert residuals[50] < 1e-8
-
-
-def test_large_batches_for_lapack_run_on_one_device(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two at a time never end in jaxlib; a batch has a factorisation for every onset that is corrected."""
-    monkeypatch.setattr("mjx_study.objective.batches.MOST_UNROLLED", 0)
-    devices = tuple(jax.local_devices())
-    assert len(devices) == 2
-    for onset, chunk, expected in (("none", 256, 2), ("linear", 255, 2), ("linear", 256, 1), ("none", 2048, 1)):
-        simulator = Simulator(cart().replace(onset=onset), chunk_size=chunk)
-        assert simulator._devices_for("gradient") == devices[:expected]
-    assert len(Simulator(cart(), chunk_size=256)._devices_for("corrected")) == 1
 
 
 # Memory

@@ -38,6 +38,7 @@ from mjx_study.claims.theory import (
     relative_bias,
     variances_of,
 )
+from mjx_study.runtime import local_devices
 from mjx_study.study.configuration import StudyConfig
 
 STIFFNESSES: Final = (10.0, 100.0, 1000.0, 1200.0)
@@ -106,7 +107,7 @@ def finer(lab: Laboratory, system: str, family: str) -> Statistic:
 
 def gradient_cost(lab: Laboratory, system: str, family: str) -> Statistic:
     objective, theta = lab.objective(system, family, STIFFNESS), lab.task(system).theta
-    keys = jax.random.split(jax.random.key(0), TIMED * len(jax.local_devices()) - 1)  # leaves room for a baseline
+    keys = jax.random.split(jax.random.key(0), TIMED * len(local_devices()) - 1)  # leaves room for a baseline
     methods = (objective.differentiate, objective.evaluate)
     one, other = (times_of(lambda method=method: method(theta, jax.random.clone(keys))) for method in methods)
     return mean_of(np.log10(one / other), "batches")

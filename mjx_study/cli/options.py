@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Final, NoReturn
 
 from estimators.catalogue import suggestion, unknown
 from mjx_study.choices import FAMILIES, PRECISIONS, TASK_DESCRIPTIONS, unknown_task
+from mjx_study.cli.output import complain
 from mjx_study.option import BUILDER_OPTIONS, CONTACTS, OPTIONS, TASKS, Option, refuse_overflow
 from mjx_study.study.configuration import StudyConfig
 
@@ -245,8 +246,11 @@ def theta_and_policy(
 
 
 def configure_process(options: argparse.Namespace) -> None:
-    """Set up JAX from the options; commands without them get float64 and one device."""
+    """Set up JAX from the options, and watch its computation; commands without them get float64 and one device."""
+    from mjx_study.watchdog import watch
+
     configure(precision=getattr(options, "precision", PRECISIONS[0]), cpu_devices=getattr(options, "devices", 1))
+    watch(lambda line: complain(f"mjx-study: {line}"))
 
 
 def configure(**settings: Any) -> None:
@@ -255,8 +259,8 @@ def configure(**settings: Any) -> None:
 
     from mjx_study.runtime import configure
 
-    configure(**settings)
     try:
+        configure(**settings)
         jax.local_devices()
     except RuntimeError as error:
         raise ValueError(f"JAX has no device to compute on: {error}") from error

@@ -18,6 +18,7 @@ from mjx_study.study.cluster import connected
 from mjx_study.study.configuration import StudyConfig
 from mjx_study.study.dataset import as_plain
 from mjx_study.study.forecast import forecast_study
+from mjx_study.study.lost import all_lost
 from mjx_study.study.plan import StudyPlan
 from mjx_study.study.run import load_study, open_store, run_study, warnings_of
 from mjx_study.study.store import Store, StudyError
@@ -75,7 +76,7 @@ def run_one(
         lines.append(f"nothing was computed: {folder} already holds all {len(plan.cells)} cells")
     if folder is not None and not unwritten:
         lines.append(f"written to {folder}: {', '.join([*(path.name for path in written), KEPT])}")
-    return print_report(options, document, lines, *failures)
+    return print_report(options, document, lines, *failures, all_lost(plan, dataset))
 
 
 def _compute(plan: StudyPlan, options: argparse.Namespace) -> tuple[xr.Dataset, str | None]:
@@ -149,7 +150,7 @@ def run_sweep(options: argparse.Namespace, planned: Callable[[], StudyPlan]) -> 
     }
     failed = len(json.loads(dataset.attrs.get("failed_cells", "{}")))
     failure = f"{failed} cells failed; the warnings say why" if failed else None
-    return print_report(options, document, lines, unwritten, failure)
+    return print_report(options, document, lines, unwritten, failure, all_lost(plan, dataset))
 
 
 def _sweep_head(plan: StudyPlan, missing: int) -> list[str]:

@@ -17,7 +17,7 @@ from estimators import ORACLES, Circulation, Estimator, make_estimator, oracles_
 from estimators.mean_check import NODES
 from mjx_study.gradcheck.mean import MOST_PATHS, along_means, reach_of, unmixed
 from mjx_study.objective import Simulator, chunk_for
-from mjx_study.runtime import precision
+from mjx_study.runtime import local_devices, precision
 from mjx_study.simulation.contact import ContactModel
 from mjx_study.simulation.scene import num_constraint_rows
 from mjx_study.study.sampling import cell_keys, draw_batches, unconverged
@@ -136,7 +136,7 @@ def estimators_of(task: Task) -> list[Estimator]:
 
 def chunk_of(task: Task, samples: int) -> int:
     """Number of samples per program call."""
-    devices, size = jax.local_devices(), (task.scene.host.nv, num_constraint_rows(task.scene.template))
+    devices, size = local_devices(), (task.scene.host.nv, num_constraint_rows(task.scene.template))
     large = any(number > most for number, most in zip(size, SMALL_MODEL, strict=True))
     most = CHUNKS[large] if devices[0].platform == "cpu" else samples + 1
     return min(chunk_for(samples, devices, [task]), most)

@@ -11,6 +11,7 @@ from mjx_study.objective import Simulator
 from mjx_study.study.configuration import Progress, refuse_untaken, takes_stiffness
 from mjx_study.study.memory import check_memory
 from mjx_study.tasks.contact_grid import family_grid
+from mjx_study.tasks.soundness import check_soundness
 from mjx_study.tasks.task import Task
 
 STATES: Final = 2
@@ -47,6 +48,7 @@ def diagnose_task(
     family = family or task.defaults.main_family
     refuse_untaken([family], stiffness=stiffness, damping=damping)
     stiffnesses = [stiffness or task.defaults.middle_stiffness] if takes_stiffness([family]) else None
+    check_soundness(task)
     (cell,), warnings = family_grid(task, [family], stiffnesses, damping)
     check_memory(task, estimators_of(task), samples or SAMPLES)
     progress(0, 4, "rollout without noise")

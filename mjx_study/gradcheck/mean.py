@@ -18,6 +18,7 @@ from estimators import Estimator, GradientEstimate, Objective, oracles_of
 from estimators.estimator import label_of
 from estimators.mean_check import TOLERANCE, Circulation, circulations
 from mjx_study.objective import Simulator, chunk_for
+from mjx_study.runtime import local_devices
 from mjx_study.study.configuration import Progress, check_span
 from mjx_study.study.dataset import as_plain
 from mjx_study.study.resolution import check_estimators, direction_of
@@ -161,7 +162,7 @@ def check_mean(
     low, high = span or (-reach_of(task), reach_of(task))
     axis = "random" if direction == ALONG_MEANS else direction
     along = jnp.asarray(direction_of(axis, task.policy.num_params, seed), task.theta.dtype)
-    simulator = Simulator(task, chunk_size=chunk_for(samples, jax.local_devices(), [task]))
+    simulator = Simulator(task, chunk_size=chunk_for(samples, local_devices(), [task]))
     found, ends = [], (task.theta + low * along, task.theta + high * along)
     for index, cell in enumerate(cells):
         progress(index, len(cells), cell.label)

@@ -1,8 +1,7 @@
 """Compiled programs of a check: values for finite differences, and derivatives in both modes.
 
 There are three or four small programs for any number of states, contact models and directions. Steps and directions run
-one by one (`lax.map`) rather than as a batch: jaxlib's batched Cholesky factorisations share a thread pool with the
-program that waits for them, and two at once deadlock (seen with jaxlib 0.10.2 on two cores).
+one by one (`lax.map`) rather than as a batch.
 """
 
 import dataclasses
@@ -24,6 +23,7 @@ from mjx_study.simulation.contact import ContactModel
 from mjx_study.simulation.dynamics import State, exact_step, step
 from mjx_study.simulation.engine import HostState
 from mjx_study.simulation.integration import difference_position
+from mjx_study.watchdog import awaited
 
 OPTIONS: Final = {"xla_backend_optimization_level": "0", "xla_cpu_use_fusion_emitters": False}
 """XLA options on CPUs: half the compile time of the default code generator, and fast enough for these checks."""
@@ -52,7 +52,8 @@ class Compiler:
         return self._programs[key]
 
     def run(self, function: Callable[..., Any], *arguments: Any) -> Any:
-        return self.start(function, *arguments).result()(*arguments)
+        with awaited():
+            return self.start(function, *arguments).result()(*arguments)
 
 
 def _compile(lowered: Any) -> Callable[..., Any]:

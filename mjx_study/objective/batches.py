@@ -3,7 +3,7 @@
 import dataclasses
 import math
 from functools import cached_property, partial
-from typing import Any, Final
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -16,17 +16,13 @@ from mjx_study.objective.chunks import rounds, spread
 from mjx_study.objective.cost import simulate
 from mjx_study.objective.programs import SamplePrograms
 from mjx_study.reference.noise import check_sigma
+from mjx_study.runtime import local_devices
 from mjx_study.simulation.contact import ContactModel
-from mjx_study.simulation.linear_algebra import MOST_UNROLLED
-from mjx_study.simulation.onset import SLOTS
 from mjx_study.stopwatch import timed
 from mjx_study.tasks.task import Task
 
 Theta = Float[Array, " params"]
 Keys = Key[Array, " samples"]
-LAPACK_BATCH: Final = 2048
-"""Batch size from which jaxlib 0.10.2 splits matrix factorisations among its CPU threads, which deadlocks if two
-programs do so at a time. Matrices with up to `MOST_UNROLLED` rows do not use LAPACK."""
 
 
 def compiled_rollout(task: Task) -> Compiled:
@@ -41,7 +37,7 @@ class Simulator:
     Attributes:
         task: the task to simulate; each call replaces its scene's contact parameters.
         chunk_size: samples per device and call; see `chunk_for`.
-        devices: devices to spread samples over; by default all local ones.
+        devices: devices to spread samples over; by default those of `mjx_study.runtime.local_devices`.
     """
 
     task: Task
@@ -51,7 +47,7 @@ class Simulator:
     def __post_init__(self) -> None:
         if self.chunk_size < 1:
             raise ValueError(f"chunk_size must be at least 1 sample, got {self.chunk_size}")
-        object.__setattr__(self, "devices", tuple(self.devices) or tuple(jax.local_devices()))
+        object.__setattr__(self, "devices", tuple(self.devices) or tuple(local_devices()))
 
     @cached_property
     def _programs(self) -> dict[str, Compiled]:
@@ -95,10 +91,9 @@ class Simulator:
         if len(noise_scale) == 0:
             raise ValueError("there are no samples to run: give at least one key")
         shared = theta, contact, np.asarray(sigma, self.task.scene.template.qpos.dtype)
-        devices = self._devices_for(name)
-        with timed(self.program(name, contact), rounds(len(noise_scale), self.chunk_size, len(devices))):
+        with timed(self.program(name, contact), rounds(len(noise_scale), self.chunk_size, len(self.devices))):
             return jax.block_until_ready(
-                spread(self._programs[name], shared, (keys, noise_scale), self.chunk_size, devices)
+                spread(self._programs[name], shared, (keys, noise_scale), self.chunk_size, self.devices)
             )
 
     def form(self, name: str, theta: Any, contact: ContactModel | None, sigma: Any) -> Any:
@@ -115,13 +110,6 @@ class Simulator:
     def program(self, name: str, contact: ContactModel | None) -> tuple[str, Task, Any, int]:
         """Key for the run time of one of `SamplePrograms`: name, task, kind of contact, samples per call."""
         return name, self.task, jax.tree.structure(contact), self.chunk_size
-
-    def _devices_for(self, name: str) -> tuple[Any, ...]:
-        """All devices, or only one where two would deadlock; see `LAPACK_BATCH`."""
-        corrected = name == "corrected" or self.task.onset != "none"
-        batch = self.chunk_size * (SLOTS if corrected else 1)
-        hangs = self.devices[0].platform == "cpu" and self.task.scene.host.nv > MOST_UNROLLED and batch >= LAPACK_BATCH
-        return self.devices[:1] if hangs else self.devices
 
 
 @dataclasses.dataclass(frozen=True)

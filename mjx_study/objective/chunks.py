@@ -12,6 +12,7 @@ import numpy as np
 
 from mjx_study.compiled import Compiled
 from mjx_study.tasks.task import Task
+from mjx_study.watchdog import awaited
 
 CPU_CHUNKS: Final = (5, 11, 21, 51, 101, 201)
 """Samples per call on a CPU, which gains little from more. Few choices, so that other sample sizes reuse compiled
@@ -55,7 +56,7 @@ def spread(program: Compiled, shared: Any, rows: Sequence[np.ndarray], chunk: in
         for index in left:
             outputs[index] = fetched(call(device, chunks[index]))
 
-    with ThreadPoolExecutor(len(devices)) as pool:
+    with awaited(), ThreadPoolExecutor(len(devices)) as pool:
         for worker in [pool.submit(work, device) for device in devices]:
             worker.result()
     return jax.tree.map(lambda *leaves: join.concatenate(leaves)[:count], *outputs)

@@ -9,6 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from mjx_study.choices import DEFAULT_SOLREF
+from mjx_study.plots.edges import limits, mark_undrawn, sane
 from mjx_study.plots.panels import (
     MOST_PANELS,
     against_stiffness,
@@ -36,15 +37,14 @@ def comparison(part: xr.Dataset, title: str) -> Figure:
     found, confidence = families(part), json.loads(part.attrs["config"])["confidence"]
     title = f"{title}\ngradient estimates ({100 * confidence:.0f} % intervals)"
     figure, axes = make_panels(2, len(found), 1.2 + 3.4 * len(found), 6.2, title, sharex="col", sharey="row")
-    one = part.isel(seed=0)
-    for panel, shown, room in (
-        (axes[0, 0], [one["variance"]], 100),
-        (axes[1, 0], [one["relative_error"], one["reference_uncertainty"], 1.0], 10),
+    one = part.isel(seed=0).assign(whole=xr.ones_like(part["reference_uncertainty"]))
+    for panel, names, room in (
+        (axes[0, 0], ["variance"], 100.0),
+        (axes[1, 0], ["relative_error", "reference_uncertainty", "whole"], 10.0),
     ):  # limits from the values, since intervals may span thirty decades
-        known = np.concatenate([positive(each).ravel() for each in shown])
         panel.set(yscale="log")
-        if np.any(np.isfinite(known)):
-            panel.set_ylim(np.nanmin(known) / room, np.nanmax(known) * room)
+        if ends := limits(one, names, room):
+            panel.set_ylim(ends)
     for (above, below), (family, rows) in zip(axes.T, found, strict=True):
         x = stiffness_axis(below, family, rows)
         above.set_title(below.get_title(), fontsize="medium")
@@ -52,6 +52,8 @@ def comparison(part: xr.Dataset, title: str) -> Figure:
         for mine, style in estimators(rows.isel(seed=0)):
             y, lower, upper = (positive(mine["variance" + end]) for end in ("", "_lower", "_upper"))
             line(above, mine, x, y, lower, upper, style)
+            mark_undrawn(above, x, mine["variance"].values, style)
+            mark_undrawn(below, x, mine["relative_error"].values, style)
             y, error = positive(mine["relative_error"]), np.asarray(mine["relative_error_se"], float)
             lower = np.maximum(y - 1.96 * error, below.get_ylim()[0] / 2)  # just beyond the axis
             line(below, mine, x, y, lower, positive(y + 1.96 * error), style)
@@ -80,7 +82,11 @@ def _mark_default(axes: Axes, family: str, rows: xr.Dataset) -> None:
 def variance(part: xr.Dataset, title: str) -> Figure:
     def draw(axes: Axes, rows: xr.Dataset, x: np.ndarray) -> None:
         for mine, style in estimators(rows):
-            line(axes, mine, x, *geometric(mine["variance"]), style)
+            y, lower, upper = geometric(mine["variance"])
+            line(axes, mine, x, y, lower, upper, style)
+            mark_undrawn(axes, x, np.where(np.isfinite(y), y, mine["variance"].max("seed").values), style)
+        if not sane(part, ["variance"]).all() and (ends := limits(part, ["variance"], 10.0)):
+            axes.set_ylim(ends)
 
     seeds = counted(part.sizes["seed"], "seed")
     return against_stiffness(part, f"{title}\nvariance ({seeds}, 95 % intervals)", GRADIENTS["variance"].label, draw)
@@ -107,8 +113,12 @@ def bias(part: xr.Dataset, title: str) -> Figure | None:
             shown |= {"markerfacecolor": "none", "markersize": 7.5} if style["hollow"] else {"markersize": 4.5}
             axes.errorbar(at, y, yerr=bars, **shown, capsize=2.5, linestyle=joined)
             axes.plot(at[~seen], high[~seen], color=style["color"], marker="v", linestyle="none", alpha=0.45)
+            mark_undrawn(axes, at, np.where(np.isfinite(high), 1.0, np.nan), style)
         axes.plot([], [], color="0.5", marker="v", linestyle="none", alpha=0.6, label="no bias seen: upper bound")
         axes.axhline(1, color="0.7", linewidth=0.8, label=WHOLE)
+        squares = part.assign(whole=xr.ones_like(part["squared_bias"]))
+        if not sane(part, ["squared_bias"]).all() and (ends := limits(squares, ["squared_bias", "whole"], 100.0)):
+            axes.set_ylim(ends[0] ** 0.5, ends[1] ** 0.5)
 
     pooled = part.sizes["seed"] * int(part["samples"])
     return against_stiffness(
@@ -126,8 +136,10 @@ def alpha(part: xr.Dataset, title: str) -> Figure | None:
 
     def draw(axes: Axes, rows: xr.Dataset, x: np.ndarray) -> None:
         for mine, style in estimators(rows):
-            values = mine["alpha"].transpose("model", "seed").values
-            line(axes, mine, x, np.nanmean(values, 1), np.nanmin(values, 1), np.nanmax(values, 1), style)
+            values = mine["alpha"].transpose("model", "seed")
+            mean, least, most = (getattr(values, how)("seed").values for how in ("mean", "min", "max"))
+            line(axes, mine, x, mean, least, most, style)
+            mark_undrawn(axes, x, np.where(values.notnull().any("seed"), 1.0, np.nan), style)
         axes.set_ylim(-0.03, 1.03)
 
     seeds = counted(part.sizes["seed"], "seed")
@@ -146,7 +158,9 @@ def error_against_samples(part: xr.Dataset, title: str) -> Figure:
     for axes, rows in zip(grid[0], chosen, strict=True):
         x = rows["samples"].values
         for mine, style in estimators(rows):
-            line_with_band(axes, x, *geometric(mine["relative_error"].isel(model=0)), **style)
+            y, *interval = geometric(mine["relative_error"].isel(model=0))
+            line_with_band(axes, x, y, *interval, **style)
+            mark_undrawn(axes, x, y, style)
         floor = float(rows["reference_uncertainty"].mean())
         axes.plot(x, np.full(len(x), floor), ":", color="0.4", label="uncertainty of the reference")
         make_logarithmic(axes, x)

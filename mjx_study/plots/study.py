@@ -14,6 +14,7 @@ from matplotlib.patches import Rectangle
 
 from estimators.estimator import label_of
 from mjx_study.plots.descents import achieved, descent, landscape
+from mjx_study.plots.edges import UNDRAWN, drawable
 from mjx_study.plots.gradients import alpha, bias, comparison, error_against_samples, variance
 from mjx_study.plots.panels import UNSTABLE, families, make_panels, number, positive, unstable
 from mjx_study.plots.style import TITLES, fit_texts, legend_below, mark_clipped
@@ -32,6 +33,7 @@ def plot_study(dataset: xr.Dataset) -> dict[str, Figure]:
     figures: dict[str, Figure] = {}
     if not dataset.data_vars:
         return figures
+    dataset = dataset.map(drawable, keep_attrs=True)
 
     def add(kind: str, draw: Callable[[xr.Dataset, str], Figure | None], keep: str = "") -> None:
         for suffix, title, part in itertools.islice(_slices(dataset, keep), MOST_FIGURES):
@@ -110,9 +112,9 @@ def _ticks(values: np.ndarray) -> list[str]:
 
 
 def _present(part: xr.Dataset) -> np.ndarray:
-    """Mask of contact models with data."""
-    quantity = part[_quantity(part)]
-    return np.asarray(quantity.notnull().any([name for name in quantity.dims if name != "model"]))
+    """Mask of contact models that are computed, be it without a finite number."""
+    known = [part[name].notnull() for name in (_quantity(part), "residual") if name in part]
+    return np.any([each.any([name for name in each.dims if name != "model"]) for each in known], axis=0)
 
 
 def _ratio_map(part: xr.Dataset, title: str, quantity: str, other: str) -> Figure | None:
@@ -136,6 +138,8 @@ def _ratio_map(part: xr.Dataset, title: str, quantity: str, other: str) -> Figur
             np.arange(ratio.shape[1] + 1), np.arange(ratio.shape[0] + 1), ratio,
             cmap="RdBu_r", norm=TwoSlopeNorm(0, -extent, extent),
         )  # fmt: skip
+        for row, column in np.argwhere(~np.isfinite(ratio)):
+            axes.plot(column + 0.5, row + 0.5, "x", color="0.4", markersize=5, label=UNDRAWN)
         shaky = [unstable(rows.isel({other: index})) for index in range(rows.sizes[other])]
         for row, column in np.argwhere(shaky):
             axes.add_patch(Rectangle((column, row), 1, 1, fill=False, hatch="///", linewidth=0, label=UNSTABLE))

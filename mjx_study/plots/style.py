@@ -81,7 +81,7 @@ def robust_limits(curves: Sequence[np.ndarray]) -> tuple[float, float]:
     values = np.concatenate(curves)
     values = values[np.isfinite(values)]
     low, high = np.quantile(values, [0.005, 0.995]) if len(values) else (-1.0, 1.0)
-    room = 0.08 * (high - low) or 1.0
+    room = 0.08 * (high - low) or 0.08 * abs(high) or 1.0
     return float(low - room), float(high + room)
 
 

@@ -1,6 +1,6 @@
 """Functions with a derivative rule of their own, at every order.
 
-`jax.custom_jvp` guarantees its rule for the first derivative only. When JAX prepares a `scan` for reverse mode, it
+`jax.custom_jvp` keeps its rule for the first derivative only. When JAX prepares a `scan` for reverse mode, it
 replaces calls inside by their bodies, whose own derivative any further differentiation then takes: silently zero behind
 a `stop_gradient`, wrong behind a solver's loop (fault 32 in `docs/gradient-faults.md`). A primitive keeps its rule.
 """

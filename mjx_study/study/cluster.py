@@ -12,6 +12,7 @@ import os
 import pickle
 import queue
 import re
+import sys
 import threading
 import time
 from collections import Counter, defaultdict, deque
@@ -29,6 +30,7 @@ from mjx_study.study.cells import Computation
 from mjx_study.study.plan import StudyPlan, blocks_of, plan_study
 from mjx_study.study.store import Part, StudyError
 from mjx_study.study.times import recording
+from mjx_study.watchdog import watch
 
 TRIES: Final = 3
 """Attempts at a task before its cell counts as failed."""
@@ -270,6 +272,7 @@ def _prepared(study: bytes) -> tuple[StudyPlan, Computation, Stopwatch]:
         if (gpu := _gpu(get_worker().name)) is not None:
             os.environ["CUDA_VISIBLE_DEVICES"] = gpu
         configure(precision=asked, cpu_devices=1)
+        watch(functools.partial(print, file=sys.stderr))  # a worker that hangs is lost, and its task tried again
         _SET_UP.set()
     plan = plan_study(config)
     ours = versions(), plan.contents

@@ -124,6 +124,7 @@ def remains(name: str, value: float, debiased: float, error: float) -> str:
     return f"< {number(2 * error, 2)}" if best == 0 else f"> {above:.{decimals}f}"
 
 
+@np.errstate(over="ignore", invalid="ignore")  # numbers of a motion that explodes
 def findings_of(dataset: xr.Dataset) -> list[str]:
     """Return the findings supported by a study's intervals, as sentences; none if no cell is computed."""
     if not dataset.data_vars:

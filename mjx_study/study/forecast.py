@@ -16,7 +16,7 @@ import jax
 import numpy as np
 
 from mjx_study.objective import contact_for, rounds
-from mjx_study.runtime import available_cores
+from mjx_study.runtime import available_cores, local_devices
 from mjx_study.study.gradients import CANDIDATES, MOST_KEPT, takes_candidates
 from mjx_study.study.landscapes import CHUNK, QUADRATURE, applies
 from mjx_study.study.memory import batches_at_once
@@ -90,7 +90,7 @@ def forecast_study(
     cells = [plan.cells[index] for index in missing]
     counts = [rollouts(plan, cell) for cell in cells]
     time = _Time(Rates.read(times_folder()))
-    devices = len(jax.local_devices()) if cluster is None else _workers(cluster)
+    devices = len(local_devices()) if cluster is None else _workers(cluster)
     compilation = time.setup(plan, cells)
     if cluster is None:
         spent = sum((time.cell(plan, cell, devices) for cell in cells), 0.0)

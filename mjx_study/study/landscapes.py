@@ -36,7 +36,7 @@ from mjx_study.compiled import Compiled
 from mjx_study.objective import rollout_cost, rounds, spread
 from mjx_study.reference import FunctionObjective, Reference, ScalarFunction, smoothed
 from mjx_study.reference.noise import split_sample_key
-from mjx_study.runtime import precision
+from mjx_study.runtime import local_devices, precision
 from mjx_study.simulation.contact import ContactModel
 from mjx_study.stopwatch import timed
 from mjx_study.study.plan import StudyCell, StudyPlan, estimators_of, oracles_of
@@ -176,7 +176,7 @@ class Line:
         self, points: Float[np.ndarray, " points"], contact: ContactModel | None
     ) -> tuple[Float[np.ndarray, " points"], Float[np.ndarray, " points"]]:
         """Zero-noise cost and its derivative at each point."""
-        devices = jax.local_devices()
+        devices = local_devices()
         program = "quadrature", self._task, jax.tree.structure(contact), CHUNK  # see `Simulator.program`
         with timed(program, rounds(len(points), CHUNK, len(devices))):
             return spread(self._program, (contact,), (points.astype(self._dtype),), CHUNK, devices)

@@ -19,6 +19,7 @@ from mjx_study.limits import MOST_CELLS, MOST_GIB, MOST_PROGRAMS, check_count
 from mjx_study.objective import chunk_for
 from mjx_study.option import BUILDER_OPTIONS
 from mjx_study.reference.noise import check_sigma
+from mjx_study.runtime import local_devices
 from mjx_study.study.configuration import SAMPLES, Settings, StudyConfig
 from mjx_study.study.effect import refuse_idle
 from mjx_study.study.iteration import make_optimizer, schedule_factors
@@ -40,6 +41,7 @@ from mjx_study.tasks import TASKS, task_with_options
 from mjx_study.tasks.contact_grid import ContactPoint, backward_grid, family_grid, solver_grid
 from mjx_study.tasks.network import with_network
 from mjx_study.tasks.own import registered_place
+from mjx_study.tasks.soundness import check_soundness
 from mjx_study.tasks.task import Recipe, Task, check_shapes
 
 HISTORY_NUMBERS: Final = 20
@@ -174,6 +176,7 @@ def plan_study(config: StudyConfig, built: Mapping[str, Task] | None = None) -> 
     groups: list[Group] = []
     cells: list[StudyCell] = []
     messages: list[str] = []
+    sound: list[str | Task] = []
     for which, timestep, cone in itertools.product(*variants):
         task = _build(config, which, timestep, cone, built or {})
         if config.network is not None:
@@ -181,6 +184,9 @@ def plan_study(config: StudyConfig, built: Mapping[str, Task] | None = None) -> 
                 raise ValueError("a network needs MJX: the analytic references use the task's own policy")
             task = with_network(task, config.network, jax.random.key(config.seed))
         task = at_theta(task, config.theta)
+        if which not in sound and not (which in TASKS and config.theta is config.model is None):
+            check_soundness(task)
+        sound.append(which)
         recipe = recipe_of(config, task) if settings.kind == "descents" else None
         counts = config.samples or (SAMPLES if recipe is None else recipe.samples,)
         check_weights(config.weights, min(counts))
@@ -207,7 +213,7 @@ def plan_study(config: StudyConfig, built: Mapping[str, Task] | None = None) -> 
     together = 1 if settings.kind == "descents" else config.batches
     most = min(largest_batch(), max(min(cell.samples, config.block_size or cell.samples) for cell in cells) * together)
     tasks = [group.task for group in groups]
-    chunk = chunk_for(most, jax.local_devices(), tasks) if config.chunk_size is None else config.chunk_size
+    chunk = chunk_for(most, local_devices(), tasks) if config.chunk_size is None else config.chunk_size
     plan = StudyPlan(config, tuple(groups), tuple(cells), chunk, tuple(dict.fromkeys(messages)))
     check_batches(plan.memory, _whole(plan))
     for cell in {cell.group: cell for cell in cells}.values():

@@ -27,6 +27,7 @@ from mjx_study.study.cluster import cells_on, connected
 from mjx_study.study.configuration import Progress, StudyConfig
 from mjx_study.study.dataset import as_plain, dataset_of, write_dataset
 from mjx_study.study.document import document_of
+from mjx_study.study.lost import lost_samples, total
 from mjx_study.study.plan import StudyPlan, plan_study
 from mjx_study.study.store import Part, Store, open_store
 from mjx_study.study.times import recording
@@ -229,12 +230,12 @@ def warnings_of(dataset: xr.Dataset) -> tuple[str, ...]:
     if told := dataset.attrs.get("other_versions"):
         found.append(f"these numbers were computed with other versions ({told}); use another folder to recompute them")
     counted = {
-        "nonfinite": "samples overflowed or became NaN and were left out",
         "unconverged": "rollouts in which the contact solver did not converge",
         "onsets_missed": "onsets of contact have no term, since their rollouts have too many",
         "onsets_bounded": "onsets of contact are grazing, and their terms are bounded",
     }
-    counts = {name: _count(dataset[name]) for name in counted if name in dataset}
+    counts = {name: total(dataset[name]) for name in counted if name in dataset}
+    found += lost_samples(dataset)
     found += [f"{count} {counted[name]}" for name, count in counts.items() if count]
     if "effective_samples" in dataset and (few := int((dataset["effective_samples"] < ENOUGH_EFFECTIVE).sum())):
         found.append(
@@ -244,9 +245,3 @@ def warnings_of(dataset: xr.Dataset) -> tuple[str, ...]:
     if "stopped_at" in dataset and (stopped := int(dataset["stopped_at"].notnull().sum())):
         found.append(f"{stopped} descents stopped before their last iteration")
     return tuple(found)
-
-
-def _count(counts: xr.DataArray) -> int:
-    """Total count; where estimators share rollouts, the largest over estimators."""
-    shared = "estimator" in counts.dims and not {"seed", "point"} & set(counts.dims)
-    return int(counts.max("estimator").sum() if shared else counts.sum())
