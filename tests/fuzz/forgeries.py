@@ -18,7 +18,7 @@ from typing import Any, Final
 import numpy as np
 
 from mjx_study.disk import temporary_name
-from mjx_study.study import store as store_module
+from mjx_study.study.cell_file import digest_of_arrays
 from mjx_study.study.document import sealed
 from mjx_study.study.run import load_study
 from mjx_study.study.store import Store
@@ -60,7 +60,7 @@ def rewritten(folder: Path, document: dict[str, Any], cells: dict[int, dict[str,
     with contextlib.suppress(Exception):  # a document without what identifies a cell
         store = Store(folder, document)
         for index, arrays in cells.items():
-            store._write(index, arrays, {"jax": "1"})
+            store.file(index).write(arrays, {"jax": "1"})
 
 
 Forgery = Callable[[Path, Path], None]
@@ -177,10 +177,9 @@ def containers(folder: Path) -> Iterator[tuple[str, Forgery, bool]]:
 
         def written(at: Path, _: Path, versions: str | None = versions) -> None:
             kept = dict(arrays) | ({} if versions is None else {"versions": np.array(versions)})
-            place = Store(at, store.document)
-            signed = [store_module._digest(kept), place._study, place._place(0)]
-            with open(at / "cells" / "00000.npz", "wb") as file:
-                np.savez(file, digest=np.array(signed), **kept)  # type: ignore[arg-type]
+            file = Store(at, store.document).file(0)
+            signed = np.array([digest_of_arrays(kept), file.study, file.place])
+            np.savez(file.path, digest=signed, **kept)  # type: ignore[arg-type]
 
         yield f"versions of a cell: {name}", written, True
     failures = (

@@ -33,7 +33,7 @@ def unfinished(whole: Path, folder: Path) -> Path:
         shutil.copytree(whole, folder)
         store = Store.open(folder)
         arrays, by = store.read_with_versions(1)
-        store._write(1, arrays, by, part=True)
+        store.file(1, part=True).write(arrays, by)
         store.path(1).unlink()
         store.write_failure(1, "no memory")
     return folder
