@@ -11,15 +11,14 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
+from pydantic import BaseModel, ConfigDict
 
 from mjx_study.disk import MOST_BYTES, read_whole, write_whole
-from mjx_study.files import digest_of_json, told
+from mjx_study.files import digest_of_json, validated
 from mjx_study.study.arrays import MOST_CELL_BYTES, read_arrays, write_arrays
 
 VERSIONS: Final = "versions"
 """Entry that records the versions that computed a cell."""
-VERSIONS_SCHEMA: Final = TypeAdapter(dict[str, str])
 
 
 class StudyError(ValueError):
@@ -28,14 +27,19 @@ class StudyError(ValueError):
 
 def reason_of(error: Exception) -> str:
     """What is wrong with a file, in one line."""
-    if isinstance(error, ValidationError):
-        return told(error)
     return (error.strerror if isinstance(error, OSError) else None) or str(error)
+
+
+class _Failure(BaseModel):
+    model_config = ConfigDict(strict=True)
+
+    reason: str
+    digest: str
 
 
 @dataclasses.dataclass(frozen=True)
 class CellFile:
-    """A file of a cell's numbers.
+    """A file of a cell's numbers, and beside it one that states why they could not be computed.
 
     Attributes:
         study: digest of the study.
@@ -71,13 +75,34 @@ class CellFile:
         if is_that := next((what for what, holds in wrong.items() if holds), None):
             raise StudyError(f"{path} is {is_that}; move it away to compute it again")
         try:
-            versions = VERSIONS_SCHEMA.validate_json(str(arrays.pop(VERSIONS, "")))
+            versions = validated(dict[str, str], str(arrays.pop(VERSIONS, "")))
             if check is not None:
                 check(arrays)
         except ValueError as error:
             reason = f"does not fit the study ({reason_of(error)})"
             raise StudyError(f"{path} {reason}; move it away to compute it again") from error
         return arrays, versions
+
+    @property
+    def failure(self) -> Path:
+        return self.path.with_suffix(".failed")
+
+    def write_failure(self, reason: str) -> None:
+        failure = _Failure(reason=reason, digest=self._digest(reason))
+        write_whole(self.failure, failure.model_dump_json().encode())
+
+    def read_failure(self) -> str:
+        """Read why the cell could not be computed; StudyError if the file is damaged."""
+        try:
+            found = validated(_Failure, read_whole(self.failure, follow=False, most=MOST_BYTES))
+            if found.digest != self._digest(found.reason):
+                raise ValueError("its digest does not match")
+        except (OSError, ValueError) as error:
+            raise StudyError(f"{self.failure} is damaged ({reason_of(error)}); remove it") from error
+        return found.reason
+
+    def _digest(self, reason: str) -> str:
+        return digest_of_json({"reason": reason, "study": self.study, "place": self.place})
 
 
 def digest_of_arrays(arrays: Mapping[str, np.ndarray]) -> str:
@@ -86,36 +111,3 @@ def digest_of_arrays(arrays: Mapping[str, np.ndarray]) -> str:
         array = np.ascontiguousarray(arrays[name])
         sha.update(f"{name} {array.dtype} {array.shape}".encode() + array.tobytes())
     return sha.hexdigest()
-
-
-class _Failure(BaseModel):
-    model_config = ConfigDict(strict=True)
-
-    reason: str
-    digest: str
-
-
-@dataclasses.dataclass(frozen=True)
-class FailureFile:
-    """A file that states why a cell could not be computed; attributes as in `CellFile`."""
-
-    path: Path
-    study: str
-    place: str
-
-    def write(self, reason: str) -> None:
-        failure = _Failure(reason=reason, digest=self._digest(reason))
-        write_whole(self.path, failure.model_dump_json().encode())
-
-    def read(self) -> str:
-        """Read the reason; StudyError if the file is damaged."""
-        try:
-            failure = _Failure.model_validate_json(read_whole(self.path, follow=False, most=MOST_BYTES))
-            if failure.digest != self._digest(failure.reason):
-                raise ValueError("its digest does not match")
-        except (OSError, ValueError) as error:
-            raise StudyError(f"{self.path} is damaged ({reason_of(error)}); remove it") from error
-        return failure.reason
-
-    def _digest(self, reason: str) -> str:
-        return digest_of_json({"reason": reason, "study": self.study, "place": self.place})

@@ -28,7 +28,7 @@ from mjx_study.disk import MOST_BYTES, check_no_link, open_regular, prepare_fold
 from mjx_study.files import digest_of_json
 from mjx_study.identity import ACCEPT, differences
 from mjx_study.study.arrays import check_cell
-from mjx_study.study.cell_file import CellFile, FailureFile, StudyError, reason_of
+from mjx_study.study.cell_file import CellFile, StudyError, reason_of
 from mjx_study.study.dataset import as_plain
 from mjx_study.study.document import document_of, read_document, read_format, sealed
 from mjx_study.study.plan import StudyPlan
@@ -179,32 +179,27 @@ class Store:
         path = self.part_path(index) if part else self.path(index)
         return CellFile(path, self._study, self._place(index, part=part))
 
-    def _failure(self, index: int) -> FailureFile:
-        return FailureFile(self._failed(index), self._study, self._place(index))
-
-    def _failed(self, index: int) -> Path:
-        return self.path(index).with_suffix(".failed")
-
     def has(self, index: int) -> bool:
         """Whether a cell's file exists; `read` checks it."""
         return os.path.lexists(self.path(index))
 
     def write(self, index: int, arrays: Mapping[str, np.ndarray]) -> None:
-        self.file(index).write(arrays, self._authors(index))
+        file = self.file(index)
+        file.write(arrays, self._authors(index))
         self.part_path(index).unlink(missing_ok=True)
-        self._failed(index).unlink(missing_ok=True)
+        file.failure.unlink(missing_ok=True)
 
     def write_part(self, index: int, arrays: Mapping[str, np.ndarray]) -> None:
         self.file(index, part=True).write(arrays, self._authors(index))
 
     def write_failure(self, index: int, reason: str) -> None:
-        self._failure(index).write(reason)
+        self.file(index).write_failure(reason)
 
     @property
     def failures(self) -> dict[int, str]:
         """Reasons why missing cells could not be computed; StudyError if one is damaged."""
-        failed = [index for index in self.missing if os.path.lexists(self._failed(index))]
-        return {index: self._failure(index).read() for index in failed}
+        failed = [index for index in self.missing if os.path.lexists(self.path(index).with_suffix(".failed"))]
+        return {index: self.file(index).read_failure() for index in failed}
 
     def _authors(self, index: int) -> dict[str, str]:
         """Versions that computed a cell, including those of its checkpoint."""

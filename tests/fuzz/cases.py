@@ -157,21 +157,30 @@ REFERENCES: Final = (
 )  # fmt: skip
 
 
-def no_files(folder: Path, data: st.DataObject) -> Case:
-    """Pipes, sockets, devices, folders, loops of links and nothing at all, wherever a file may be named."""
-    kind = data.draw(st.sampled_from(NO_FILES))
-    place = folder / "place"
-    shutil.rmtree(place, ignore_errors=True)
-    place.mkdir()
-    name = "x" * 300 if kind == "endless name" else "file"
-    suffix = data.draw(st.sampled_from(["", ".json", ".npy", ".toml", ".xml", ".stl", ".png"]))
-    path = place / f"{name}{suffix}"
+def _put(path: Path, kind: str) -> None:
+    """One of `NO_FILES` at a path."""
     if kind == "loop":
         path.symlink_to(path)
     elif kind == "empty":
         path.touch()
-    elif kind not in ("missing", "endless name"):
+    elif kind in ("fifo", "socket", "folder", "device"):
         put_no_file(path, kind)
+
+
+def _emptied(place: Path) -> Path:
+    shutil.rmtree(place, ignore_errors=True)
+    place.mkdir()
+    return place
+
+
+def no_files(folder: Path, data: st.DataObject) -> Case:
+    """Pipes, sockets, devices, folders, loops of links and nothing at all, wherever a file may be named."""
+    kind = data.draw(st.sampled_from(NO_FILES))
+    place = _emptied(folder / "place")
+    name = "x" * 300 if kind == "endless name" else "file"
+    suffix = data.draw(st.sampled_from(["", ".json", ".npy", ".toml", ".xml", ".stl", ".png"]))
+    path = place / f"{name}{suffix}"
+    _put(path, kind)
     reader = data.draw(st.integers(0, 9))
     at = os.path.relpath(path, folder)
     commands = {
@@ -193,31 +202,14 @@ def no_files(folder: Path, data: st.DataObject) -> Case:
 def outputs(folder: Path, data: st.DataObject) -> Case:
     """Folders for the output that are none, or whose names are odd."""
     kind = data.draw(st.sampled_from([*NO_FILES, "not UTF-8", "new line", "surrogate", "null", "dots"]))
-    place = folder / "out"
-    shutil.rmtree(place, ignore_errors=True)
-    place.mkdir()
-    names = {
-        "not UTF-8": os.fsdecode(b"\xff\xfe"),
-        "new line": "a\nb",
-        "surrogate": "\ud800",
-        "null": "a\0b",
-        "dots": "..",
-    }
-    names |= {"endless name": "x" * 300}
+    place = _emptied(folder / "out")
+    names = {"not UTF-8": os.fsdecode(b"\xff\xfe"), "new line": "a\nb", "surrogate": "\ud800", "null": "a\0b"}
+    names |= {"endless name": "x" * 300, "dots": ".."}
     path = place / names.get(kind, "file")
-    if kind == "loop":
-        path.symlink_to(path)
-    elif kind == "empty":
-        path.touch()
-    elif kind in ("fifo", "socket", "folder", "device"):
-        put_no_file(path, kind)
+    _put(path, kind)
     at = "out" if kind == "dots" else f"out/{path.name}"
-    command = data.draw(
-        st.sampled_from(
-            [["compare", "pusher"], ["sweep", "pusher"], ["optimise", "pusher"], ["landscape", "ball_wall"]]
-            + [["rollout", "pusher"], ["claims"], ["plot", "study"], ["report", "study"]]
-        )
-    )
+    commands = "compare pusher", "sweep pusher", "optimise pusher", "landscape ball_wall", "rollout pusher", "claims"
+    command = data.draw(st.sampled_from([*commands, "plot study", "report study"])).split()
     refuse = kind in ("fifo", "socket", "device", "loop", "empty", "endless name", "surrogate", "null")
     return [*command, "--output", at], True if refuse and command[0] != "report" else None
 
@@ -225,10 +217,8 @@ def outputs(folder: Path, data: st.DataObject) -> Case:
 def study(folder: Path, data: st.DataObject) -> Case:
     path = folder / "study" / "study.json"
     path.write_bytes(data.draw(strategies.texts(json.loads(path.read_text()))))
-    command = data.draw(
-        st.sampled_from([["plot", "study", "--output", "out"], ["report", "study", "--output", "out/a"]])
-    )
-    return command, None
+    command = data.draw(st.sampled_from(["plot study --output out", "report study --output out/a"]))
+    return command.split(), None
 
 
 CASES: Final[dict[str, Callable[[Path, st.DataObject], Case]]] = {
