@@ -8,15 +8,16 @@ import pytest
 
 from mjx_study import caches
 from mjx_study.cli import options
+from mjx_study.study import document
 from mjx_study.study import plan as plan_module
-from tests.fuzz import FUZZERS, flips, fuzz, strategies
+from tests.fuzz import FUZZERS, flips, fuzz, strategies, studies
 from tests.fuzz.__main__ import BEGIN, END, cells, markdown, put_into
 from tests.fuzz.answers import OutsideError, Row, SilentError, TooSlow, answer
 from tests.fuzz.cases import CASES
 from tests.fuzz.forgeries import FORGERIES
 from tests.fuzz.planning import fuzzed_folder
 
-SAMPLE = {"bit flips in files of studies": 45, "bit flips in files of caches": 60} | dict.fromkeys(FORGERIES, 3)
+SAMPLE = {"bit flips in files of studies": 36, "bit flips in files of caches": 60} | dict.fromkeys(FORGERIES, 2)
 """Numbers of inputs in the fast tests; of other kinds 8."""
 
 
@@ -34,7 +35,7 @@ def configured(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("kind", FUZZERS)
 def test_a_few_inputs_get_an_answer(kind: str, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(flips, "DRAWN", 45)
+    monkeypatch.setattr(flips, "DRAWN", 36)
     wanted = SAMPLE.get(kind, 8)
     row = fuzz(kind, root, wanted / FUZZERS[kind][1])
     assert row.inputs == wanted and row.wrong == 0, row.told
@@ -117,3 +118,10 @@ def test_a_flip_that_is_believed_is_counted(root: Path, monkeypatch: pytest.Monk
     """Without digests, flips change content."""
     monkeypatch.setattr(caches, "undigested", lambda content: content[caches.LENGTH :])
     assert flips.flip("bit flips in files of caches", 1, root).silent == 1
+
+
+def test_a_flip_that_changes_a_study_is_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without the digest of study.json, other texts and numbers are read."""
+    monkeypatch.setattr(document, "digest_of_json", lambda _: "0")
+    monkeypatch.setattr(studies, "STUDIES", {"landscapes": studies.STUDIES["landscapes"]})
+    assert flips.flip("bit flips in files of studies", 30, tmp_path).silent > 1

@@ -5,10 +5,10 @@ whether reading it must be refused; others may be accepted as the studies that t
 """
 
 import contextlib
+import functools
 import io
 import json
 import os
-import random
 import shutil
 import zipfile
 from collections.abc import Callable, Iterator
@@ -23,8 +23,6 @@ from mjx_study.study.document import sealed
 from mjx_study.study.run import load_study
 from mjx_study.study.store import Store
 from tests.faults import put_no_file
-from tests.fuzz.answers import Row, SilentError
-from tests.fuzz.studies import STUDIES, draw, make, resume
 
 VALUES: Final = (
     None, True, -1, 0, 10**9, 10**30, 1e308, float("nan"), "", "$x^{", "../../x", "a\nb", [], [1], {}, {"a": 1}
@@ -131,11 +129,10 @@ def npy(shape: Any, descr: str = "<f8", content: bytes = b"", *, version: bytes 
     return b"\x93NUMPY" + version + length + header + content
 
 
-def containers(folder: Path) -> Iterator[tuple[str, Forgery, bool]]:
-    """Forgeries of the file of a cell, a checkpoint or a failure."""
-    whole = (folder / "cells" / "00000.npz").read_bytes()
-    directory = whole.rindex(b"PK\x05\x06")
-    members = {
+@functools.cache
+def archives() -> dict[str, bytes]:
+    """Archives that are none of a cell."""
+    return {
         "a bomb": packed({"variance.npy": npy((5 * 10**8,), content=bytes(4 * 10**8))}, zipfile.ZIP_DEFLATED),
         "a compressed member": packed({"digest.npy": npy((1,), content=bytes(8))}, zipfile.ZIP_DEFLATED),
         "bzip2": packed({"a.npy": bytes(10**6)}, zipfile.ZIP_BZIP2),
@@ -149,6 +146,14 @@ def containers(folder: Path) -> Iterator[tuple[str, Forgery, bool]]:
         "members outside": packed({"../../outside.npy": npy((1,), content=bytes(8)), "/tmp/outside.npy": npy((0,))}),
         "many members": packed({f"{index}.npy": npy((0,)) for index in range(30_000)}),
         "no members": packed({}),
+    }
+
+
+def containers(folder: Path) -> Iterator[tuple[str, Forgery, bool]]:
+    """Forgeries of the file of a cell, a checkpoint or a failure."""
+    whole = (folder / "cells" / "00000.npz").read_bytes()
+    directory = whole.rindex(b"PK\x05\x06")
+    members = archives() | {
         "nonsense": b"nonsense",
         "nothing": b"",
         "half": whole[: len(whole) // 2],
@@ -278,29 +283,3 @@ FORGERIES: Final = {
     "forged folders: files of cells": containers,
     "forged folders: links, pipes, devices": entries,
 }
-FORGED: Final = dict.fromkeys(FORGERIES, 100)
-"""Kinds, and numbers of folders at full size."""
-
-
-def forge(kind: str, count: int, root: Path) -> Row:
-    """Forge folders of each kind of study, and draw and resume them."""
-    row, root, outside = Row(kind), root / "studies", root / "outside"
-    made = {each: make(each, root) for each in STUDIES}
-    every = [(study, *each) for study, folder in made.items() for each in FORGERIES[kind](folder)]
-    for study, name, change, refuse in random.Random(0).sample(every, min(count, len(every))):
-        at = root / "forged"
-        for folder in (at, outside):
-            shutil.rmtree(folder, ignore_errors=True)
-        outside.mkdir()
-        (outside / "file").write_text("somebody's")
-        shutil.copytree(made[study], at)
-        change(at, outside)
-        with row.counting(f"{study}, {name}"):
-            codes = [draw(at, outside)]
-            if codes == [0]:
-                codes.append(draw(at, outside, "report"))
-            row.codes[codes[-1]] += 1
-            codes.append(resume(study, at, outside))
-            if refuse and 0 in codes:
-                raise SilentError(f"accepted: exit codes {codes}")
-    return row
