@@ -77,13 +77,9 @@ def seen_by(names: Iterable[str]) -> dict[str, str]:
 
 def seen_now(names: Iterable[str]) -> Mapping[str, str]:
     """Digests of what the same names hold now."""
-    found = {}
-    for name in names:
-        if name.startswith(FILE):
-            found[name] = _digest_of_file(name.removeprefix(FILE))
-        elif name.startswith(VARIABLE):
-            found[name] = _digest_of_text(os.environ.get(name.removeprefix(VARIABLE)))
-    return found
+    readers = {FILE: _digest_of_file, VARIABLE: lambda name: _digest_of_text(os.environ.get(name))}
+    kinds = {name: kind for name in names for kind in readers if name.startswith(kind)}
+    return {name: readers[kind](name.removeprefix(kind)) for name, kind in kinds.items()}
 
 
 def _digest_of_text(text: str | None) -> str:

@@ -1,12 +1,13 @@
 """Read user-supplied files and validate them against a schema; errors name the file and the key in one line."""
 
 import dataclasses
+import functools
 import hashlib
 import json
 import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, Final
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, field_validator
@@ -15,15 +16,23 @@ from estimators.catalogue import suggestion
 from mjx_study.disk import read_bytes
 from mjx_study.option import BUILDER_OPTIONS, OPTIONS
 
-Schema = TypeVar("Schema", bound=BaseModel)
 Finite = Annotated[float, Field(allow_inf_nan=False, strict=True)]
+_ADAPTER: Final = functools.cache(TypeAdapter)
+
+
+def validated(schema: Any, content: bytes | str) -> Any:
+    """Read JSON of a type; a ValueError names the first key that violates it."""
+    try:
+        return _ADAPTER(schema).validate_json(content)
+    except ValidationError as error:
+        raise ValueError(told(error)) from None
 
 
 def _validated(path: Path, content: bytes, schema: Any) -> Any:
     try:
-        return TypeAdapter(schema).validate_json(content)
-    except ValidationError as error:
-        raise ValueError(f"{path}: {told(error)}") from None
+        return validated(schema, content)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
 
 
 def digest_of_json(document: Mapping[str, Any]) -> str:

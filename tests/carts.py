@@ -18,18 +18,21 @@ CART = """<mujoco model="cart">
   <option timestep="0.01" integrator="Euler"><flag eulerdamp="disable"/></option>
   <worldbody><body>
     <joint name="x" type="slide" axis="1 0 0" damping="0.1"/><geom name="cart" size="0.1" mass="1"/>
-  </body></worldbody>
+  </body>{wall}</worldbody>
   <actuator><motor joint="x"/></actuator>
 </mujoco>"""
+WALL = '<geom name="wall" size="0.1" pos="9 0 0" condim="1"/>'
+"""Out of reach."""
 
 
 def cart(
     running_cost=lambda state, control: jnp.sum(state.qpos**2) + jnp.sum(control**2),
     horizon: int = 5,
     adjoint: str = "auto",
+    wall: str = "",
 ) -> Task:
     """An open loop."""
-    scene = put_scene(mujoco.MjModel.from_xml_string(CART), "cart", adjoint=adjoint)
+    scene = put_scene(mujoco.MjModel.from_xml_string(CART.format(wall=wall)), "cart", adjoint=adjoint)
     return Task(
         name="cart",
         description="a mass on a slide",
@@ -41,9 +44,14 @@ def cart(
         start=initial_state(scene, qpos=jnp.array([1.0])),
         running_cost=running_cost,
         final_cost=lambda state: jnp.sum(state.qvel**2),
-        contact_pair=("cart", "cart"),
-        defaults=StudyDefaults(gamma=1.0),
+        contact_pair=("cart", "wall") if wall else None,
+        defaults=StudyDefaults(gamma=1.0) if wall else StudyDefaults(gamma=1.0, families=("mjcf",)),
     )
+
+
+def walled_cart(horizon: int = 5) -> Task:
+    """A cart for what needs a contact whose stiffness can be set."""
+    return cart(horizon=horizon, wall=WALL)
 
 
 def steered_cart() -> Task:

@@ -14,7 +14,7 @@ from mjx_study.study.blocks import Blocks, pack
 from mjx_study.study.store import Part, Store, StudyError
 from mjx_study.study.tally import Tally
 from tests.documents import cell_arrays, study_document
-from tests.forgeries import npy, packed
+from tests.fuzz.forgeries import npy, packed
 
 
 def test_arrays_come_back(tmp_path: Path) -> None:

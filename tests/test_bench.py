@@ -30,7 +30,7 @@ RATIOS = {"gradient_per_value", "rollouts_over_stock", "rollouts_over_engine", "
 @pytest.mark.parametrize(
     ("task", "further"),
     [
-        ("tests.carts:cart", {"speedup_over_engine", "onset_per_gradient"}),
+        ("tests.carts:walled_cart", {"speedup_over_engine", "onset_per_gradient"}),
         pytest.param("tennis", {"speedup_over_engine", "onset_per_gradient"}, marks=pytest.mark.slow),
         pytest.param("double_pendulum", set(), marks=pytest.mark.slow),
     ],

@@ -116,7 +116,7 @@ from mjx_study.caches import read_cached
 from mjx_study.objective import Simulator
 from mjx_study.study.times import recording
 from mjx_study.tasks import make_task
-from tests.fuzzing_studies import flipped
+from tests.fuzz.flips import flipped
 
 folder, draw = Path(sys.argv[1]), random.Random(0)
 mjx_study.configure(cpu_devices=1, cache=folder)

@@ -154,7 +154,7 @@ def test_a_worker_simulates_the_same_bits(workers: Any, tmp_path: Path) -> None:
     """MJX on one device of a worker and on two here; descents as well as gradients."""
     descents = {"reference_samples": None, "iterations": 3, "learning_rate": 0.01, "evaluation_samples": 6}
     for name, changes in {"gradients": {}, "descents": descents}.items():
-        asked = config(1.0, 2.0, 3.0, tasks=("tests.carts:cart",), contact=("penalty",), chunk_size=4, **changes)
+        asked = config(1.0, 2.0, 3.0, tasks=("tests.carts:walled_cart",), contact=("penalty",), chunk_size=4, **changes)
         here = run_study(asked, tmp_path / f"{name} here")
         assert same(run_study(asked, tmp_path / f"{name} there", cluster=workers), here)
 

@@ -6,48 +6,67 @@ from typing import Any
 
 import pytest
 
+from mjx_study import caches
+from mjx_study.cli import options
+from mjx_study.study import document
 from mjx_study.study import plan as plan_module
-from tests import fuzz, fuzzing
-from tests.fuzzing_cases import CASES, FULL, Row, fuzzed_folder
-from tests.fuzzing_cases import fuzz as answers
+from tests.fuzz import FUZZERS, flips, fuzz, strategies, studies
+from tests.fuzz.__main__ import BEGIN, END, cells, markdown, put_into
+from tests.fuzz.answers import OutsideError, Row, SilentError, TooSlow, answer
+from tests.fuzz.cases import CASES
+from tests.fuzz.forgeries import FORGERIES
+from tests.fuzz.planning import fuzzed_folder
+
+SAMPLE = {"bit flips in files of studies": 36, "bit flips in files of caches": 60} | dict.fromkeys(FORGERIES, 2)
+"""Numbers of inputs in the fast tests; of other kinds 8."""
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    with fuzzed_folder(tmp_path_factory.mktemp("fuzz")) as path:
-        yield path
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder that fuzzers share."""
+    return tmp_path_factory.mktemp("fuzz").resolve()
 
 
-@pytest.mark.parametrize("kind", CASES)
-def test_a_few_inputs_get_an_answer(kind: str, folder: Path) -> None:
-    row = answers(kind, folder, 8)
-    assert row.inputs == 8 and row.wrong == 0, row.told
+@pytest.fixture(autouse=True)
+def configured(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Commands run under the settings of the tests."""
+    monkeypatch.setattr(options, "configure", lambda **_: None)
+
+
+@pytest.mark.parametrize("kind", FUZZERS)
+def test_a_few_inputs_get_an_answer(kind: str, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(flips, "DRAWN", 36)
+    wanted = SAMPLE.get(kind, 8)
+    row = fuzz(kind, root, wanted / FUZZERS[kind][1])
+    assert row.inputs == wanted and row.wrong == 0, row.told
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", CASES)
-def test_thousands_of_inputs_get_an_answer(kind: str, folder: Path) -> None:
-    """Some are refused and, but for files that are seldom right, some are planned."""
-    row = answers(kind, folder, FULL[kind])
+@pytest.mark.parametrize("kind", FUZZERS)
+def test_thousands_of_inputs_get_an_answer(kind: str, root: Path) -> None:
+    """Some are refused."""
+    row = fuzz(kind, root)
     assert row.wrong == 0, row.told
-    assert row.codes[2] > FULL[kind] / 20
+    assert row.codes[2] > row.inputs / 20
 
 
 def test_enough_is_tried() -> None:
     """Of every command too, about as often as of any other."""
-    assert sum(FULL.values()) >= 4000 and FULL.keys() == CASES.keys()
-    assert FULL["options of every command"] >= 100 * len(fuzzing.COMMANDS)
+    counts = {kind: count for kind, (_, count) in FUZZERS.items()}
+    assert sum(counts[kind] for kind in CASES) >= 4000 and sum(counts[kind] for kind in flips.FLIPS) >= 1000
+    assert sum(counts[kind] for kind in FORGERIES) >= 100
+    assert counts["options of every command"] >= 100 * len(strategies.COMMANDS)
 
 
 def test_every_wrong_answer_has_its_column() -> None:
     row = Row("options")
-    errors = fuzzing.SilentError("a"), KeyError("b"), fuzzing.TooSlow(), fuzzing.OutsideError("c")
+    errors = SilentError("a"), KeyError("b"), TooSlow(), OutsideError("c")
     for error in errors:
         with row.counting(["compare"]):
             raise error
     with row.counting(["compare"]):
         pass
-    assert fuzz.cells(row) == ["options", "5", "1", "1", "1", "1"] and row.wrong == 4
+    assert cells(row) == ["options", "5", "1", "1", "1", "1"] and row.wrong == 4
     assert row.told[0] == "options: ['compare']: SilentError a"
     with pytest.raises(KeyboardInterrupt), row.counting(["compare"]):
         raise KeyboardInterrupt
@@ -55,13 +74,19 @@ def test_every_wrong_answer_has_its_column() -> None:
 
 def test_the_table_goes_between_its_marks(tmp_path: Path) -> None:
     page = tmp_path / "page.md"
-    page.write_text(f"before\n{fuzz.BEGIN}old\n{fuzz.END}after\n")
-    table = fuzz.markdown([Row("options", 1200, silent=3), Row("files", 7)])
-    fuzz.put_into(page, table)
-    fuzz.put_into(page, table)
-    assert page.read_text() == f"before\n{fuzz.BEGIN}\n{table}\n{fuzz.END}after\n"
+    page.write_text(f"before\n{BEGIN}old\n{END}after\n")
+    table = markdown([Row("options", 1200, silent=3), Row("files", 7)])
+    put_into(page, table)
+    put_into(page, table)
+    assert page.read_text() == f"before\n{BEGIN}\n{table}\n{END}after\n"
     assert table.splitlines()[0] == "1,207 inputs, 3 answered wrongly."
     assert table.splitlines()[-2:] == ["| options | 1200 | 3 | 0 | 0 | 0 |", "| files | 7 | 0 | 0 | 0 | 0 |"]
+
+
+@pytest.fixture
+def folder(root: Path) -> Iterator[Path]:
+    with fuzzed_folder(root / "inputs") as path:
+        yield path
 
 
 def test_the_fuzzer_finds_a_traceback_and_an_exit(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -73,17 +98,30 @@ def test_the_fuzzer_finds_a_traceback_and_an_exit(folder: Path, monkeypatch: pyt
 
         return plan
 
-    for error in (KeyError("theta"), SystemExit(0), fuzzing.TooSlow()):
+    for error in (KeyError("theta"), SystemExit(0), TooSlow()):
         monkeypatch.setattr(plan_module, "plan_study", broken(error))
-        with pytest.raises((KeyError, fuzzing.SilentError, fuzzing.TooSlow)):
-            fuzzing.answer(["compare", "pusher"], folder)
+        with pytest.raises((KeyError, SilentError, TooSlow)):
+            answer(["compare", "pusher"], folder)
 
     def touching(*_: Any, **__: Any) -> None:
         (folder / "policy.json").write_text("mine")
         raise ValueError("and refuses")
 
     monkeypatch.setattr(plan_module, "plan_study", touching)
-    with pytest.raises(fuzzing.OutsideError, match="a file was touched"):
-        fuzzing.answer(["compare", "pusher"], folder)
-    with pytest.raises(fuzzing.SilentError, match="exit code 2 of"):
-        fuzzing.answer(["compare", "nobody"], folder, refuse=False)
+    with pytest.raises(OutsideError, match="a file was touched"):
+        answer(["compare", "pusher"], folder)
+    with pytest.raises(SilentError, match="exit code 2 of"):
+        answer(["compare", "nobody"], folder, refuse=False)
+
+
+def test_a_flip_that_is_believed_is_counted(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without digests, flips change content."""
+    monkeypatch.setattr(caches, "undigested", lambda content: content[caches.LENGTH :])
+    assert flips.flip("bit flips in files of caches", 1, root).silent == 1
+
+
+def test_a_flip_that_changes_a_study_is_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without the digest of study.json, other texts and numbers are read."""
+    monkeypatch.setattr(document, "digest_of_json", lambda _: "0")
+    monkeypatch.setattr(studies, "STUDIES", {"landscapes": studies.STUDIES["landscapes"]})
+    assert flips.flip("bit flips in files of studies", 30, tmp_path).silent > 1

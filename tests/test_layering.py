@@ -1,10 +1,11 @@
-"""Imports only point down the layers, and importing has no effect on the process."""
+"""Imports only point down the layers and never in a circle, and importing has no effect on the process."""
 
 import ast
 import pkgutil
 import re
 import subprocess
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
@@ -30,6 +31,8 @@ LAYERS = [
     "mjx_study.option",
     "mjx_study.files",
     "mjx_study.tasks",
+    "mjx_study.sources",
+    "mjx_study.digest",
     "mjx_study.identity",
     "mjx_study.structure",
     "mjx_study.compiled",
@@ -106,6 +109,39 @@ def refused(module: str, imported: set[str]) -> set[str]:
 def test_imports_point_down(path: Path) -> None:
     wrong = refused(module_of(path), read(path))
     assert not wrong, f"{module_of(path)} imports {sorted(wrong)}, of a later layer"
+
+
+def cycle(imports: Mapping[str, set[str]]) -> list[str]:
+    """Modules each of which imports the next, and the last the first; empty if there are none."""
+    done: set[str] = set()
+
+    def follow(module: str, path: list[str]) -> list[str]:
+        if module in path:
+            return path[path.index(module) :]
+        if module in done:
+            return []
+        found = next(filter(None, (follow(each, [*path, module]) for each in sorted(imports.get(module, ())))), [])
+        done.add(module)
+        return found
+
+    return next(filter(None, (follow(module, []) for module in sorted(imports))), [])
+
+
+def test_no_files_import_each_other() -> None:
+    """Not within functions either."""
+    assert cycle({module_of(path): read(path) for path in FILES}) == []
+
+
+def test_a_cycle_is_found() -> None:
+    sources = {
+        "mjx_study.cli.plot": "import mjx_study.cli.sweep",
+        "mjx_study.cli.sweep": "def run():\n    from mjx_study.cli.studies import run_sweep",
+        "mjx_study.cli.studies": "from mjx_study.cli import sweep",
+    }
+    imports = {module: imports_of(source, module, is_package=False) for module, source in sources.items()}
+    assert cycle(imports) == ["mjx_study.cli.sweep", "mjx_study.cli.studies"]
+    assert cycle(imports | {"mjx_study.cli.studies": set()}) == []
+    assert cycle({"a": {"a"}}) == ["a"]
 
 
 def test_every_layer_is_used_once_and_files_are_found() -> None:
@@ -190,8 +226,8 @@ def test_import_has_no_global_effect() -> None:
 ARCHITECTURE = (ROOT / "docs" / "architecture.md").read_text()
 BESIDE = {"mjx_study.choices", "mjx_study._matplotlib", "mjx_study.runtime", "mjx_study.table", "mjx_study.disk"} | {
     "mjx_study.stopwatch", "mjx_study.watchdog", "mjx_study.limits", "mjx_study.option", "mjx_study.files",
-    "mjx_study._public", "mjx_study.identity", "mjx_study.compiled", "mjx_study.version",
-    "mjx_study.caches", "mjx_study.structure",
+    "mjx_study._public", "mjx_study.sources", "mjx_study.digest", "mjx_study.identity", "mjx_study.compiled",
+    "mjx_study.version", "mjx_study.caches", "mjx_study.structure",
 }  # fmt: skip
 """Small modules that the picture of the packages leaves out."""
 

@@ -21,7 +21,7 @@ from mjx_study.cli import motions, options
 from mjx_study.files import PolicyFile
 from mjx_study.objective import Simulator
 from mjx_study.reference import ReferenceObjective, Tennis, roll_out
-from mjx_study.study import descents, plan, sampling, store
+from mjx_study.study import cell_file, descents, plan, sampling, store
 from mjx_study.study import iteration as descent
 from mjx_study.study.configuration import StudyConfig
 from mjx_study.study.descents import Backend
@@ -179,7 +179,7 @@ def test_a_run_killed_in_its_middle_goes_on(tmp_path: Path, monkeypatch: pytest.
         return written
 
     with monkeypatch.context() as patch:
-        patch.setattr(store, "write_whole", killed)
+        patch.setattr(cell_file, "write_whole", killed)
         patch.setattr(descents, "SAVE_SECONDS", 0.0)
         with pytest.raises(Killed):
             run_study(study, tmp_path)

@@ -179,7 +179,7 @@ def test_findings_tell_its_bias(capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_gradcheck_takes_it(capsys: pytest.CaptureFixture[str]) -> None:
     """Its mean, along a path and along the means; the name is the one that was given."""
-    common = ["gradcheck", "tests.carts:cart", "--contact", "penalty", "--stiffness", "10", "--mean"]
+    common = ["gradcheck", "tests.carts:walled_cart", "--contact", "penalty", "--stiffness", "10", "--mean"]
     assert cli.main([*common, "--estimators", f"fobg,{DOUBLED}", "--json"]) == 1
     right, wrong = json.loads(capsys.readouterr().out)["checks"]
     assert (right["estimator"], right["verdict"]) == ("fobg", "right")
@@ -187,7 +187,7 @@ def test_gradcheck_takes_it(capsys: pytest.CaptureFixture[str]) -> None:
     assert abs(wrong["relative_gap"]) == pytest.approx(1.0, abs=0.1)
     assert cli.main([*common, "--estimators", OWN, "--direction", "means"]) in (0, 3)
     setting, noise, path, _, *table = capsys.readouterr().out.splitlines()
-    assert setting == "tests.carts:cart: 1000 samples at each node of the path, seed 0, float64"
+    assert setting == "tests.carts:walled_cart: 1000 samples at each node of the path, seed 0, float64"
     assert noise.startswith("gaussian noise of sigma = ") and "about theta, direction means" in path
     assert any(re.match(r" *penalty +10 +SignAgreement ", line) for line in table)
 

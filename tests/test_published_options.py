@@ -9,7 +9,7 @@ import pytest
 
 from mjx_study import cli
 from mjx_study.cli import options
-from mjx_study.cli.studies import sweep_fields
+from mjx_study.cli.sweep import sweep_fields
 from mjx_study.reference import DoublePendulum, roll_out
 from mjx_study.reference.system import gradients_along
 from mjx_study.study.configuration import StudyConfig

@@ -26,13 +26,12 @@ import estimators
 from estimators import AlphaOrder, DiscontinuityGated
 from mjx_study import cli
 from mjx_study.cli import options
-from mjx_study.cli.studies import sweep_fields
-from mjx_study.cli.sweep import solimp, solref
+from mjx_study.cli.sweep import solimp, solref, sweep_fields
 from mjx_study.objective import Simulator, simulate
 from mjx_study.plots import study as study_plots
 from mjx_study.report import render_report
 from mjx_study.simulation.contact import stiffness_from_solref
-from mjx_study.study import sampling, store
+from mjx_study.study import cell_file, sampling, store
 from mjx_study.study.configuration import StudyConfig
 from mjx_study.study.gradients import Gradients, compute_gradients
 from mjx_study.study.plan import estimators_of, plan_study
@@ -401,7 +400,8 @@ def test_a_write_that_fails_keeps_the_cells_before_it(
             raise OSError(28, "No space left on device")
         return whole(path, write)
 
-    monkeypatch.setattr(store, "write_whole", failing)
+    for module in (store, cell_file):
+        monkeypatch.setattr(module, "write_whole", failing)
     with pytest.raises(OSError, match="No space left"):
         run_study(plan_study(config()), tmp_path / "out")
     monkeypatch.undo()

@@ -6,16 +6,12 @@ import json
 from collections.abc import Callable, Iterable
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import xarray as xr
-from pydantic import BaseModel, BeforeValidator, ConfigDict, create_model
 
 from mjx_study.cli.options import UsageError, configure_process, given_options, theta_of, usage_errors
 from mjx_study.cli.output import RESUMABLE, attempt, computing, print_report
-from mjx_study.cli.sweep import TASKS, solimp, solref
-from mjx_study.files import read_toml
-from mjx_study.option import OPTIONS
 from mjx_study.plots.study import plot_study
 from mjx_study.plots.style import save_figures
 from mjx_study.study.cluster import connected
@@ -23,7 +19,7 @@ from mjx_study.study.configuration import StudyConfig
 from mjx_study.study.dataset import as_plain
 from mjx_study.study.forecast import forecast_study
 from mjx_study.study.lost import all_lost
-from mjx_study.study.plan import StudyPlan, plan_study
+from mjx_study.study.plan import StudyPlan
 from mjx_study.study.run import load_study, open_store, run_study, warnings_of
 from mjx_study.study.store import Store, StudyError
 from mjx_study.table import digits_to_tell_apart, size
@@ -122,10 +118,11 @@ def _announce(plan: StudyPlan, options: argparse.Namespace) -> int:
     return print_report(options, dataclasses.asdict(found) | {"warnings": list(plan.warnings)}, lines)
 
 
-def run_sweep(options: argparse.Namespace) -> int:
+def run_sweep(options: argparse.Namespace, planned: Callable[[], StudyPlan]) -> int:
+    """Run a study of any size in its folder: plan, say what is to compute, compute, say where it is."""
     with usage_errors():
         configure_process(options)
-        plan = plan_study(StudyConfig(**sweep_fields(options)))
+        plan = planned()
     if options.dry_run:
         return _announce(plan, options)
     store, folder, unwritten = _store(plan, options), options.output, None
@@ -154,29 +151,6 @@ def run_sweep(options: argparse.Namespace) -> int:
     failed = len(json.loads(dataset.attrs.get("failed_cells", "{}")))
     failure = f"{failed} cells failed; the warnings say why" if failed else None
     return print_report(options, document, lines, unwritten, failure, all_lost(plan, dataset))
-
-
-def sweep_fields(options: argparse.Namespace) -> dict[str, Any]:
-    """Fields of a sweep's configuration; flags take precedence over the file."""
-    fields = ({} if options.config is None else read_toml(options.config, _schema())) | study_fields(options)
-    if "tasks" not in fields:
-        raise ValueError("no task: name one, or give --config")
-    if fields.get("solref") or fields.get("solimp"):
-        fields.setdefault("contact", ())
-    return fields
-
-
-def _schema() -> type[BaseModel]:
-    """Schema of a TOML file: the configuration's fields, parsed like their options."""
-    own = {"tasks": TASKS.read, "direction": _direction, "solref": solref, "solimp": solimp}
-    names = [field.name for field in dataclasses.fields(StudyConfig)]
-    readers = {name: own[name] if name in own else StudyConfig.option(name).read for name in names}
-    fields = {name: (Annotated[Any, BeforeValidator(read)], None) for name, read in readers.items()}
-    return create_model("Sweep", __config__=ConfigDict(extra="forbid"), **fields)  # type: ignore[call-overload]
-
-
-def _direction(value: Any) -> str:
-    return OPTIONS["direction"].read(str(value) if isinstance(value, int) and not isinstance(value, bool) else value)
 
 
 def _sweep_head(plan: StudyPlan, missing: int) -> list[str]:

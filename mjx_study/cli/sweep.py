@@ -1,13 +1,18 @@
 """mjx-study sweep."""
 
 import argparse
+import dataclasses
 import itertools
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from mjx_study.choices import TASK_DESCRIPTIONS
 from mjx_study.cli.options import Parser, UsageError, known_task
-from mjx_study.option import BUILDER_OPTIONS, MOST_VALUES, Interval, Option
+from mjx_study.option import BUILDER_OPTIONS, MOST_VALUES, OPTIONS, Interval, Option
+from mjx_study.study.configuration import StudyConfig
+
+if TYPE_CHECKING:
+    from pydantic import BaseModel
 
 EPILOG = """\
 Every combination of task, contact model, timestep, cone, sigma and number of samples is a cell: all its seeds and
@@ -73,8 +78,37 @@ def run(options: argparse.Namespace) -> int:
     if options.output is None and not options.dry_run:
         raise UsageError("no folder for the study: give --output, or --dry-run. See mjx-study sweep --help")
     from mjx_study.cli.studies import run_sweep
+    from mjx_study.study.plan import plan_study
 
-    return run_sweep(options)
+    return run_sweep(options, lambda: plan_study(StudyConfig(**sweep_fields(options))))
+
+
+def sweep_fields(options: argparse.Namespace) -> dict[str, Any]:
+    """Fields of a sweep's configuration; flags take precedence over the file."""
+    from mjx_study.cli.studies import study_fields
+    from mjx_study.files import read_toml
+
+    fields = ({} if options.config is None else read_toml(options.config, _schema())) | study_fields(options)
+    if "tasks" not in fields:
+        raise ValueError("no task: name one, or give --config")
+    if fields.get("solref") or fields.get("solimp"):
+        fields.setdefault("contact", ())
+    return fields
+
+
+def _schema() -> type["BaseModel"]:
+    """Schema of a TOML file: the configuration's fields, parsed like their options."""
+    from pydantic import BeforeValidator, ConfigDict, create_model
+
+    own = {"tasks": TASKS.read, "direction": _direction, "solref": solref, "solimp": solimp}
+    names = [field.name for field in dataclasses.fields(StudyConfig)]
+    readers = {name: own[name] if name in own else StudyConfig.option(name).read for name in names}
+    fields = {name: (Annotated[Any, BeforeValidator(read)], None) for name, read in readers.items()}
+    return create_model("Sweep", __config__=ConfigDict(extra="forbid"), **fields)  # type: ignore[call-overload]
+
+
+def _direction(value: Any) -> str:
+    return OPTIONS["direction"].read(str(value) if isinstance(value, int) and not isinstance(value, bool) else value)
 
 
 def _tasks(text: str) -> tuple[str, ...]:

@@ -25,10 +25,10 @@ def main(library: str, plugins: str, seconds: str, size: str, file: str) -> None
                 ctypes.CDLL(os.path.join(folder, name))
     warnings: list[str] = []
 
-    def end(error: bytes) -> None:
-        report = {"error": error.decode(errors="replace"), "warnings": warnings}
+    def end(error: bytes | None = None) -> None:
+        report = {"error": None if error is None else error.decode(errors="replace"), "warnings": warnings}
         os.write(2, f"\n{json.dumps(report)}\n".encode())
-        os._exit(1)
+        os._exit(0 if error is None else 1)
 
     fatal, warned = REPORTED(end), REPORTED(lambda text: warnings.append(text.decode(errors="replace")))
     ctypes.c_void_p.in_dll(lib, "mju_user_error").value = ctypes.cast(fatal, ctypes.c_void_p).value
@@ -42,17 +42,12 @@ def main(library: str, plugins: str, seconds: str, size: str, file: str) -> None
     lib.mj_saveModel(model, None, content, ctypes.c_int64(len(content)))
     sys.stdout.buffer.write(content)
     sys.stdout.buffer.flush()
-    os.write(2, f"\n{json.dumps({'error': None, 'warnings': warnings})}\n".encode())
-    os._exit(0)
+    end()
 
 
 def limit_process(seconds: int, size: int) -> None:
     """Limit time and memory, write no core, end with the parent, and be the first to go when memory is short."""
-    for which, limit in (
-        (resource.RLIMIT_CPU, seconds),
-        (resource.RLIMIT_AS, size),
-        (resource.RLIMIT_CORE, 0),
-    ):
+    for which, limit in {resource.RLIMIT_CPU: seconds, resource.RLIMIT_AS: size, resource.RLIMIT_CORE: 0}.items():
         with suppress(ValueError, OSError):  # macOS has no limit on memory
             hard = resource.getrlimit(which)[1]
             limit = limit if hard == resource.RLIM_INFINITY else min(limit, hard)

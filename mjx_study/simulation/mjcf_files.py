@@ -23,17 +23,7 @@ DEEPEST: Final = 50
 """Limit on the nesting of files."""
 MOST_ASSET_BYTES: Final = 1_000_000_000
 """Maximum size of a mesh, texture, ... [bytes]."""
-_UNCOUNTED: Final = (
-    "mujoco",
-    "mujocoinclude",
-    "include",
-    "compiler",
-    "option",
-    "size",
-    "default",
-    "frame",
-    "replicate",
-)
+_UNCOUNTED: Final = "mujoco mujocoinclude include compiler option size default frame replicate".split()
 
 
 class RefusedFileError(ValueError):

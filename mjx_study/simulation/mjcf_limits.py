@@ -34,8 +34,9 @@ _TEXTS: Final = re.compile("name|.*class|model|file.*|.*dir|prefix|instance|plug
 """Attributes whose value is text, whatever it looks like."""
 _OF_TEXT: Final = ("text", "config")
 """Elements whose attributes are text."""
-_NOT_FINITE: Final = re.compile(r"[+-]?(nan(\(\w*\))?|inf(inity)?)", re.IGNORECASE)
-_NUMBER: Final = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
+_NUMBER: Final = re.compile(
+    r"([+-]?(?:(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?|nan|inf(?:inity)?))(?:(?<=nan)\(\w*\))?", re.IGNORECASE
+)
 
 
 def sizes(element: Element) -> Iterator[tuple[str, float, float]]:
@@ -51,9 +52,7 @@ def sizes(element: Element) -> Iterator[tuple[str, float, float]]:
 
 def copies(element: Element) -> float:
     """Number of bodies that an element makes by itself, or of copies of what is inside a `replicate`."""
-    if element.tag == "flexcomp":
-        return _product(element.attributes.get("count", _GRID)) or 1.0
-    return _product(element.attributes.get("count", "")) or 1.0
+    return _product(element.attributes.get("count", _GRID if element.tag == "flexcomp" else "")) or 1.0
 
 
 def not_finite(element: Element, names: Collection[str]) -> tuple[str, str] | None:
@@ -65,11 +64,8 @@ def not_finite(element: Element, names: Collection[str]) -> tuple[str, str] | No
             continue  # as nearly all: neither nan, inf nor an exponent
         if _TEXTS.fullmatch(name) or text in names:
             continue
-        parts = text.split()
-        special = [bool(_NOT_FINITE.fullmatch(part)) for part in parts]
-        numbers = [bool(_NUMBER.fullmatch(part)) for part in parts]
-        infinite = [is_number and math.isinf(float(part)) for part, is_number in zip(parts, numbers, strict=True)]
-        if all(map(max, special, numbers)) and (any(special) or any(infinite)):
+        numbers = list(map(_NUMBER.fullmatch, text.split()))
+        if all(numbers) and not all(math.isfinite(float(number[1])) for number in numbers if number):
             return name, text
     return None
 

@@ -7,12 +7,12 @@ from collections import Counter, defaultdict
 from typing import Annotated, Any, Final, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from estimators import Estimator, find_estimator
 from estimators.catalogue import CATALOGUE, ORACLES
 from estimators.estimator import label_of
-from mjx_study.files import Finite, Schema, digest_of_json, told
+from mjx_study.files import Finite, digest_of_json, validated
 from mjx_study.identity import git_revision, versions
 from mjx_study.option import OPTIONS
 from mjx_study.runtime import environment
@@ -126,7 +126,7 @@ class _Format(BaseModel):
 
 def read_format(content: bytes | str) -> int:
     """Format number of a study.json; ValueError if there is none."""
-    return _validated(_Format, content).format
+    return validated(_Format, content).format
 
 
 def sealed(document: dict[str, Any]) -> bytes:
@@ -137,18 +137,11 @@ def sealed(document: dict[str, Any]) -> bytes:
 def read_document(content: bytes | str) -> dict[str, Any]:
     """Read a study.json as plain data, without its digest; ValueError names the key that violates the schema, or says
     that the digest does not match."""
-    _validated(StudyDocument, content)
+    validated(StudyDocument, content)
     document = json.loads(content)
     if document.pop("digest") != digest_of_json(document):
         raise ValueError("its digest does not match")
     return document
-
-
-def _validated(schema: type[Schema], content: bytes | str) -> Schema:
-    try:
-        return schema.model_validate_json(content)
-    except ValidationError as error:
-        raise ValueError(told(error)) from None
 
 
 def document_of(plan: StudyPlan, command: str | None) -> dict[str, Any]:

@@ -15,8 +15,6 @@ matches its digest and its schema.
 
 import dataclasses
 import fcntl
-import hashlib
-import json
 import os
 from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager, suppress
@@ -24,35 +22,19 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 
 from estimators.seen import seen_now
 from mjx_study.disk import MOST_BYTES, check_no_link, open_regular, prepare_folder, read_whole, write_whole
-from mjx_study.files import digest_of_json, told
+from mjx_study.files import digest_of_json
 from mjx_study.identity import ACCEPT, differences
-from mjx_study.study.arrays import MOST_CELL_BYTES, check_cell, read_arrays, write_arrays
+from mjx_study.study.arrays import check_cell
+from mjx_study.study.cell_file import CellFile, StudyError, reason_of
 from mjx_study.study.dataset import as_plain
 from mjx_study.study.document import document_of, read_document, read_format, sealed
 from mjx_study.study.plan import StudyPlan
 
 FORMAT: Final = 4
 """Format of the folder; increased when older programs cannot read newer folders."""
-VERSIONS: Final = "versions"
-"""Entry of a cell that records the versions that computed it."""
-VERSIONS_SCHEMA: Final = TypeAdapter(dict[str, str])
-
-
-class StudyError(ValueError):
-    """A folder holds no study, another study, or a damaged file."""
-
-
-class _Failure(BaseModel):
-    """A file that states why a cell could not be computed; its digest is of the reason, the study and the cell."""
-
-    model_config = ConfigDict(strict=True)
-
-    reason: str
-    digest: str
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,7 +58,7 @@ class Part:
         try:
             yield
         except (KeyError, IndexError, TypeError, ValueError) as error:
-            reason = f"no {error}" if isinstance(error, KeyError) else _told(error)
+            reason = f"no {error}" if isinstance(error, KeyError) else reason_of(error)
             message = f"{self.name} does not fit the study ({reason}); move it away to compute its cell again"
             raise StudyError(message) from error
 
@@ -148,7 +130,7 @@ class Store:
         for index in range(len(self.document["cells"])):
             if self.has(index):
                 arrays, written_by = self.read_with_versions(index)
-                self._write(index, arrays, written_by, part=True)
+                self.file(index, part=True).write(arrays, written_by)
                 self.path(index).unlink()
         self.document |= {"config": document["config"], "resolved": document["resolved"]}
         self._write_document()
@@ -175,7 +157,7 @@ class Store:
         except FileNotFoundError as error:
             raise StudyError(f"{folder} holds no study: there is no study.json") from error
         except OSError as error:
-            raise StudyError(f"cannot read {path}: {_told(error)}") from error
+            raise StudyError(f"cannot read {path}: {reason_of(error)}") from error
         except ValueError as error:
             raise StudyError(f"{path} is damaged ({error}); move the folder away to start again") from error
         if version != FORMAT:
@@ -183,60 +165,41 @@ class Store:
         try:
             check_no_link(folder / "cells")
         except OSError as error:
-            raise StudyError(f"cannot read {folder / 'cells'}: {_told(error)}") from error
+            raise StudyError(f"cannot read {folder / 'cells'}: {reason_of(error)}") from error
         return cls(folder, document)
 
     def path(self, index: int) -> Path:
         return self.folder / "cells" / f"{index:05d}.npz"
 
+    def part_path(self, index: int) -> Path:
+        return self.path(index).with_suffix(".part.npz")
+
+    def file(self, index: int, *, part: bool = False) -> CellFile:
+        """File of a cell, or of its checkpoint."""
+        path = self.part_path(index) if part else self.path(index)
+        return CellFile(path, self._study, self._place(index, part=part))
+
     def has(self, index: int) -> bool:
         """Whether a cell's file exists; `read` checks it."""
         return os.path.lexists(self.path(index))
 
-    def part_path(self, index: int) -> Path:
-        return self.path(index).with_suffix(".part.npz")
-
     def write(self, index: int, arrays: Mapping[str, np.ndarray]) -> None:
-        self._write(index, arrays, self._authors(index))
+        file = self.file(index)
+        file.write(arrays, self._authors(index))
         self.part_path(index).unlink(missing_ok=True)
-        self._failed(index).unlink(missing_ok=True)
+        file.failure.unlink(missing_ok=True)
+
+    def write_part(self, index: int, arrays: Mapping[str, np.ndarray]) -> None:
+        self.file(index, part=True).write(arrays, self._authors(index))
 
     def write_failure(self, index: int, reason: str) -> None:
-        failure = _Failure(reason=reason, digest=self._digest_of_failure(index, reason))
-        write_whole(self._failed(index), failure.model_dump_json().encode())
+        self.file(index).write_failure(reason)
 
     @property
     def failures(self) -> dict[int, str]:
         """Reasons why missing cells could not be computed; StudyError if one is damaged."""
-        found = {}
-        for index in self.missing:
-            if os.path.lexists(path := self._failed(index)):
-                try:
-                    content = read_whole(path, follow=False, most=MOST_BYTES)
-                    failure = _Failure.model_validate_json(content)
-                    if failure.digest != self._digest_of_failure(index, failure.reason):
-                        raise ValueError("its digest does not match")
-                except (OSError, ValueError) as error:
-                    raise StudyError(f"{path} is damaged ({_told(error)}); remove it") from error
-                found[index] = failure.reason
-        return found
-
-    def _digest_of_failure(self, index: int, reason: str) -> str:
-        return digest_of_json({"reason": reason, "study": self._study, "place": self._place(index)})
-
-    def _failed(self, index: int) -> Path:
-        return self.path(index).with_suffix(".failed")
-
-    def write_part(self, index: int, arrays: Mapping[str, np.ndarray]) -> None:
-        self._write(index, arrays, self._authors(index), part=True)
-
-    def _write(
-        self, index: int, arrays: Mapping[str, np.ndarray], versions: dict[str, str], *, part: bool = False
-    ) -> None:
-        kept = dict(arrays) | {VERSIONS: np.array(json.dumps(versions))}
-        digest = np.array([_digest(kept), self._study, self._place(index, part=part)])
-        path = self.part_path(index) if part else self.path(index)
-        write_whole(path, lambda file: write_arrays(file, {"digest": digest} | kept))
+        failed = [index for index in self.missing if os.path.lexists(self.path(index).with_suffix(".failed"))]
+        return {index: self.file(index).read_failure() for index in failed}
 
     def _authors(self, index: int) -> dict[str, str]:
         """Versions that computed a cell, including those of its checkpoint."""
@@ -263,27 +226,8 @@ class Store:
     def read_with_versions(self, index: int, *, part: bool = False) -> tuple[dict[str, np.ndarray], dict[str, str]]:
         """Read the numbers of a cell, or its checkpoint, and the versions that computed them; StudyError if the file is
         damaged, or belongs to another study or cell, or a cell lacks a variable or has one of another shape."""
-        path = self.part_path(index) if part else self.path(index)
-        try:
-            arrays = read_arrays(read_whole(path, follow=False, most=MOST_CELL_BYTES))
-            content, study, place = arrays.pop("digest").tolist()
-        except Exception as error:  # numpy and zipfile may raise anything
-            raise StudyError(f"{path} is damaged ({_told(error)}); move it away to compute it again") from error
-        wrong = {
-            "a cell of another study": study != self._study,
-            "another cell of this study": place != self._place(index, part=part),
-            "damaged (its digest does not match)": content != _digest(arrays),
-        }
-        if is_that := next((what for what, holds in wrong.items() if holds), None):
-            raise StudyError(f"{path} is {is_that}; move it away to compute it again")
-        try:
-            versions = VERSIONS_SCHEMA.validate_json(str(arrays.pop(VERSIONS, "")))
-            if not part:
-                check_cell(arrays, self.document, index)
-        except ValueError as error:
-            reason = f"does not fit the study ({_told(error)})"
-            raise StudyError(f"{path} {reason}; move it away to compute it again") from error
-        return arrays, versions
+        file = self.file(index, part=part)
+        return file.read() if part else file.read(lambda arrays: check_cell(arrays, self.document, index))
 
     @contextmanager
     def claims(self) -> Generator[Callable[[int], bool]]:
@@ -296,7 +240,7 @@ class Store:
         try:
             descriptor = open_regular(path, os.O_RDWR | os.O_CREAT, follow=False)
         except OSError as error:
-            raise StudyError(f"cannot lock {path}: {_told(error)}") from error
+            raise StudyError(f"cannot lock {path}: {reason_of(error)}") from error
         with os.fdopen(descriptor, "r+b") as file:
 
             def claim(index: int) -> bool:
@@ -343,14 +287,6 @@ def _document_in(plan: StudyPlan, folder: Path, command: str | None = None) -> d
     return document
 
 
-def _digest(arrays: Mapping[str, np.ndarray]) -> str:
-    sha = hashlib.sha256()
-    for name in sorted(arrays):
-        array = np.ascontiguousarray(arrays[name])
-        sha.update(f"{name} {array.dtype} {array.shape}".encode() + array.tobytes())
-    return sha.hexdigest()
-
-
 def _identity(document: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     """The parts that must match when a study resumes: all that its numbers depend on, except the length of descents."""
     config = {name: value for name, value in document["config"].items() if name != "iterations"}
@@ -359,9 +295,3 @@ def _identity(document: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
 
 def _iterations(document: Mapping[str, Any]) -> int:
     return document["config"].get("iterations") or 0
-
-
-def _told(error: Exception) -> str:
-    if isinstance(error, ValidationError):
-        return told(error)
-    return (error.strerror if isinstance(error, OSError) else None) or str(error)

@@ -22,7 +22,8 @@ import jax
 from pydantic import BaseModel, Field
 
 from mjx_study.caches import read_cached, write_cached
-from mjx_study.identity import digest_of, versions
+from mjx_study.digest import digest_of
+from mjx_study.identity import versions
 from mjx_study.runtime import precision, processor_name
 from mjx_study.simulation.scene import num_constraint_rows
 from mjx_study.stopwatch import Spent, Stopwatch

@@ -29,7 +29,7 @@ def test_estimators_take_their_options(monkeypatch: pytest.MonkeyPatch, capsys: 
     """A norm that no sample reaches clips none."""
     monkeypatch.setattr(options, "configure", lambda **_: None)
     chosen = ["--estimators", "fobg,fobg_clipped", "--max-norm", "1e9", "--samples", "5", "--json"]
-    main(["gradcheck", "tests.carts:cart", "--contact", "penalty", "--stiffness", "10", "--mean", *chosen])
+    main(["gradcheck", "tests.carts:walled_cart", "--contact", "penalty", "--stiffness", "10", "--mean", *chosen])
     plain, clipped = json.loads(capsys.readouterr().out)["checks"]
     assert clipped == plain | {"estimator": "fobg_clipped"}
 

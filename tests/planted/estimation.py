@@ -10,7 +10,7 @@ STEPWISE, CHOICE = "tests/estimators/test_stepwise.py", "tests/estimators/test_a
 OBJECTIVE: Final = (
     Defect(
         "trace-of-another-model",
-        "mjx_study/identity.py",
+        "mjx_study/digest.py",
         "(scene.adjoint, saved, scene.model, scene.template)",
         "(scene.adjoint, scene.template)",
         "a trace that an earlier run kept for one mass serves another",

@@ -1,7 +1,5 @@
 """Kinds of inputs at random: each writes a file and gives the command that reads it, and whether it must be refused."""
 
-import contextlib
-import dataclasses
 import functools
 import json
 import math
@@ -10,114 +8,36 @@ import random
 import re
 import shutil
 import struct
-from collections import Counter
-from collections.abc import Callable, Generator
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
-import pytest
-from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from mjx_study.simulation.scene import models_folder
-from mjx_study.study import run as sweep
-from mjx_study.study.configuration import StudyConfig
-from mjx_study.study.plan import plan_study
-from tests import fuzzing
 from tests.faults import put_no_file
+from tests.fuzz import strategies
 
 POLICY: Final = {
     "task": "pusher", "estimator": "fobg", "seed": 0, "cost": 1.0, "contact": "mujoco", "stiffness": 1000.0,
     "damping": None, "cone": None, "model": None, "horizon": 4, "network": None, "theta": [0.0] * 4,
 }  # fmt: skip
-UNCHECKED: Final = (HealthCheck.too_slow, HealthCheck.data_too_large, HealthCheck.large_base_example)
 Case = tuple[list[str], bool | None]
 """A command, and whether it must refuse; None if it may."""
 
 
-@dataclasses.dataclass
-class Row:
-    """A row of the table of what was tried: numbers of inputs, all of them and those that were answered wrongly.
-
-    Attributes:
-        silent: taken wrongly, or refused without a line.
-        outside: after which a file was another one that is none of the command's.
-        codes: how many ended with which exit code.
-        told: what was wrong.
-    """
-
-    kind: str
-    inputs: int = 0
-    silent: int = 0
-    tracebacks: int = 0
-    hangs: int = 0
-    outside: int = 0
-    codes: Counter[int] = dataclasses.field(default_factory=Counter)
-    told: list[str] = dataclasses.field(default_factory=list)
-
-    @property
-    def wrong(self) -> int:
-        """Number of inputs that were answered wrongly."""
-        return self.silent + self.tracebacks + self.hangs + self.outside
-
-    @contextlib.contextmanager
-    def counting(self, arguments: list[str]) -> Generator[None]:
-        """Count an input, and how its answer is wrong."""
-        self.inputs += 1
-        try:
-            yield
-        except fuzzing.TooSlow as error:
-            self.hangs, reason = self.hangs + 1, error
-        except fuzzing.SilentError as error:
-            self.silent, reason = self.silent + 1, error
-        except fuzzing.OutsideError as error:
-            self.outside, reason = self.outside + 1, error
-        except Exception as error:
-            self.tracebacks, reason = self.tracebacks + 1, error
-        else:
-            return
-        self.told.append(f"{self.kind}: {arguments}: {type(reason).__name__} {reason}")
-
-
-@contextlib.contextmanager
-def fuzzed_folder(path: Path) -> Generator[Path]:
-    """The current folder of every case, with a study that is begun."""
-    with pytest.MonkeyPatch.context() as monkeypatch:
-        sweep.open_store(plan_study(StudyConfig(tasks=("pusher",), horizon=4, stiffness=(10.0, 100.0))), path / "study")
-        shutil.copy(path / "study" / "study.json", path / "kept.json")
-        monkeypatch.chdir(path)
-        fuzzing.stub(monkeypatch)
-        yield path
-
-
-def fuzz(kind: str, folder: Path, examples: int) -> Row:
-    """Answer inputs of a kind, the same ones each time."""
-    row, kept = Row(kind), (folder / "kept.json").read_bytes()
-
-    @settings(max_examples=examples, deadline=None, database=None, derandomize=True, suppress_health_check=UNCHECKED)
-    @given(st.data())
-    def cases(data: st.DataObject) -> None:
-        (folder / "study" / "study.json").write_bytes(kept)
-        arguments, refuse = CASES[kind](folder, data)
-        with row.counting(arguments):
-            row.codes[fuzzing.answer(arguments, folder, refuse=refuse)] += 1
-
-    cases()
-    return row
-
-
-def options(folder: Path, data: st.DataObject) -> Case:
-    return data.draw(fuzzing.command_lines()), None
+def command_line(folder: Path, data: st.DataObject) -> Case:
+    return data.draw(strategies.command_lines()), None
 
 
 def toml(folder: Path, data: st.DataObject) -> Case:
-    (folder / "study.toml").write_bytes(data.draw(fuzzing.toml_files()))
+    (folder / "study.toml").write_bytes(data.draw(strategies.toml_files()))
     return ["sweep", "--config", "study.toml", "--output", "out"], None
 
 
 def theta(folder: Path, data: st.DataObject) -> Case:
-    content = data.draw(fuzzing.texts([0.0] * 4))
+    content = data.draw(strategies.texts([0.0] * 4))
     (folder / "theta.json").write_bytes(content)
     return ["compare", "pusher", "--horizon", "4", "--theta", "theta.json"], not _are_numbers(content, 4)
 
@@ -133,12 +53,12 @@ def _are_numbers(content: bytes, count: int) -> bool:
 
 
 def array(folder: Path, data: st.DataObject) -> Case:
-    (folder / "theta.npy").write_bytes(data.draw(fuzzing.arrays()))
+    (folder / "theta.npy").write_bytes(data.draw(strategies.arrays()))
     return ["compare", "pusher", "--theta", "theta.npy"], None
 
 
 def policy(folder: Path, data: st.DataObject) -> Case:
-    (folder / "policy.json").write_bytes(data.draw(fuzzing.texts(POLICY)))
+    (folder / "policy.json").write_bytes(data.draw(strategies.texts(POLICY)))
     return ["rollout", "pusher", "--theta", "policy.json", "--output", "out"], None
 
 
@@ -149,7 +69,7 @@ def _of_file(data: st.DataObject) -> list[str]:
 
 
 def mjcf(folder: Path, data: st.DataObject) -> Case:
-    (folder / "mine.xml").write_bytes(data.draw(fuzzing.mjcf_files()))
+    (folder / "mine.xml").write_bytes(data.draw(strategies.mjcf_files()))
     return _of_file(data), None
 
 
@@ -237,21 +157,30 @@ REFERENCES: Final = (
 )  # fmt: skip
 
 
-def no_files(folder: Path, data: st.DataObject) -> Case:
-    """Pipes, sockets, devices, folders, loops of links and nothing at all, wherever a file may be named."""
-    kind = data.draw(st.sampled_from(NO_FILES))
-    place = folder / "place"
-    shutil.rmtree(place, ignore_errors=True)
-    place.mkdir()
-    name = "x" * 300 if kind == "endless name" else "file"
-    suffix = data.draw(st.sampled_from(["", ".json", ".npy", ".toml", ".xml", ".stl", ".png"]))
-    path = place / f"{name}{suffix}"
+def _put(path: Path, kind: str) -> None:
+    """One of `NO_FILES` at a path."""
     if kind == "loop":
         path.symlink_to(path)
     elif kind == "empty":
         path.touch()
-    elif kind not in ("missing", "endless name"):
+    elif kind in ("fifo", "socket", "folder", "device"):
         put_no_file(path, kind)
+
+
+def _emptied(place: Path) -> Path:
+    shutil.rmtree(place, ignore_errors=True)
+    place.mkdir()
+    return place
+
+
+def no_files(folder: Path, data: st.DataObject) -> Case:
+    """Pipes, sockets, devices, folders, loops of links and nothing at all, wherever a file may be named."""
+    kind = data.draw(st.sampled_from(NO_FILES))
+    place = _emptied(folder / "place")
+    name = "x" * 300 if kind == "endless name" else "file"
+    suffix = data.draw(st.sampled_from(["", ".json", ".npy", ".toml", ".xml", ".stl", ".png"]))
+    path = place / f"{name}{suffix}"
+    _put(path, kind)
     reader = data.draw(st.integers(0, 9))
     at = os.path.relpath(path, folder)
     commands = {
@@ -273,46 +202,27 @@ def no_files(folder: Path, data: st.DataObject) -> Case:
 def outputs(folder: Path, data: st.DataObject) -> Case:
     """Folders for the output that are none, or whose names are odd."""
     kind = data.draw(st.sampled_from([*NO_FILES, "not UTF-8", "new line", "surrogate", "null", "dots"]))
-    place = folder / "out"
-    shutil.rmtree(place, ignore_errors=True)
-    place.mkdir()
-    names = {
-        "not UTF-8": os.fsdecode(b"\xff\xfe"),
-        "new line": "a\nb",
-        "surrogate": "\ud800",
-        "null": "a\0b",
-        "dots": "..",
-    }
-    names |= {"endless name": "x" * 300}
+    place = _emptied(folder / "out")
+    names = {"not UTF-8": os.fsdecode(b"\xff\xfe"), "new line": "a\nb", "surrogate": "\ud800", "null": "a\0b"}
+    names |= {"endless name": "x" * 300, "dots": ".."}
     path = place / names.get(kind, "file")
-    if kind == "loop":
-        path.symlink_to(path)
-    elif kind == "empty":
-        path.touch()
-    elif kind in ("fifo", "socket", "folder", "device"):
-        put_no_file(path, kind)
+    _put(path, kind)
     at = "out" if kind == "dots" else f"out/{path.name}"
-    command = data.draw(
-        st.sampled_from(
-            [["compare", "pusher"], ["sweep", "pusher"], ["optimise", "pusher"], ["landscape", "ball_wall"]]
-            + [["rollout", "pusher"], ["claims"], ["plot", "study"], ["report", "study"]]
-        )
-    )
+    commands = "compare pusher", "sweep pusher", "optimise pusher", "landscape ball_wall", "rollout pusher", "claims"
+    command = data.draw(st.sampled_from([*commands, "plot study", "report study"])).split()
     refuse = kind in ("fifo", "socket", "device", "loop", "empty", "endless name", "surrogate", "null")
     return [*command, "--output", at], True if refuse and command[0] != "report" else None
 
 
 def study(folder: Path, data: st.DataObject) -> Case:
     path = folder / "study" / "study.json"
-    path.write_bytes(data.draw(fuzzing.texts(json.loads(path.read_text()))))
-    command = data.draw(
-        st.sampled_from([["plot", "study", "--output", "out"], ["report", "study", "--output", "out/a"]])
-    )
-    return command, None
+    path.write_bytes(data.draw(strategies.texts(json.loads(path.read_text()))))
+    command = data.draw(st.sampled_from(["plot study --output out", "report study --output out/a"]))
+    return command.split(), None
 
 
 CASES: Final[dict[str, Callable[[Path, st.DataObject], Case]]] = {
-    "options of every command": options,
+    "options of every command": command_line,
     "TOML files": toml,
     "theta, JSON": theta,
     "theta, .npy": array,
@@ -325,10 +235,3 @@ CASES: Final[dict[str, Callable[[Path, st.DataObject], Case]]] = {
     "study.json, altered": study,
 }
 """By kind."""
-FULL: Final[dict[str, int]] = dict.fromkeys(CASES, 400) | {"options of every command": 2600, "TOML files": 800}
-"""Number of inputs of each kind at full size."""
-
-
-def tally(codes: Any) -> str:
-    """How many cases ended how."""
-    return ", ".join(f"{count} x exit code {code}" for code, count in sorted(codes.items()))

@@ -1,150 +1,27 @@
-"""Inputs at random, and what every one of them must get: an exit code of 0, 1 or 2, a line, and files left alone.
+"""Inputs at random: command lines, and the contents of files that they may name."""
 
-Computing is stubbed: each command plans what it is asked for, and where it would compute it ends with exit code 0.
-JAX's devices are those of the tests, the parser of the command line is built once, and a task that was built once for
-some options is taken again.
-"""
-
-import contextlib
 import dataclasses
 import functools
-import hashlib
 import io
 import json
-import signal
 import string
-import sys
-from collections.abc import Generator, Sequence
-from pathlib import Path
+from collections.abc import Sequence
 from typing import Any
 
-import mujoco
 import numpy as np
-import pytest
 from hypothesis import strategies as st
 
 from estimators import ESTIMATORS
-from mjx_study import bench, cli, diagnose, gradcheck, tasks
-from mjx_study.choices import is_file
-from mjx_study.claims import ledger
-from mjx_study.cli import motions, options, studies
+from mjx_study import cli
 from mjx_study.option import OPTIONS
 from mjx_study.simulation.contact import FAMILIES
-from mjx_study.study import plan as sweep_plan
-from mjx_study.tasks import TASKS, make_task
+from mjx_study.study.configuration import StudyConfig
+from mjx_study.tasks import TASKS
 
-SECONDS = 10
 COMMANDS = tuple(cli.COMMANDS)
 OF_FOLDERS = ("plot", "report")
 WITHOUT_TASK = ("claims", "tasks", "estimators")
 FILES = ("theta.json", "policy.json", "theta.npy", "study.toml", "mine.xml")
-
-
-class Planned(BaseException):
-    """Raised where a command would begin to compute."""
-
-
-class TooSlow(BaseException):
-    """Raised when an answer takes too long."""
-
-
-class SilentError(AssertionError):
-    """Raised where something wrong is accepted, or refused without a line that says so."""
-
-
-class OutsideError(AssertionError):
-    """Raised where a file changes that is none of the command's."""
-
-
-def stub(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Plans are made and never run."""
-
-    def planned(*_: Any, **__: Any) -> None:
-        raise Planned
-
-    begin = studies.open_store
-
-    def opened(plan: Any, folder: Path, *more: Any, **named: Any) -> None:
-        if str(folder) != "out":  # which has no study of others' options
-            begin(plan, folder, *more, **named)
-        raise Planned
-
-    monkeypatch.setattr(options, "configure", lambda **_: None)
-    mujoco.set_mju_user_warning(lambda message: print(f"MuJoCo: {message}", file=sys.stderr))  # as `configure` does
-    for module, names in (
-        (studies, ("_compute_in", "run_study")),
-        (gradcheck, ("gradcheck", "check_mean")), (bench, ("run_bench",)), (diagnose, ("diagnose_task",)),
-        (motions, ("_simulate_task", "_simulate_passive")), (ledger, ("measure_ledger",)),
-    ):  # fmt: skip
-        for name in names:
-            monkeypatch.setattr(module, name, planned)
-    monkeypatch.setattr(studies, "open_store", opened)
-    monkeypatch.setattr(cli, "parser", functools.cache(cli.parser))  # to build it takes longer than most answers
-    for command in COMMANDS:
-        flags_of(command)  # outside of strategies: building a parser uses the random module
-    built = functools.lru_cache(maxsize=256)(make_task)
-    monkeypatch.setattr(
-        tasks, "make_task", lambda name, **given: (make_task if is_file(name) else built)(name, **given)
-    )
-
-
-def answer(arguments: list[str], folder: Path, *, refuse: bool | None = None) -> int:
-    """The exit code of a command, after it is checked that the answer is one.
-
-    Args:
-        arguments: of the command line.
-        folder: whose files must be afterwards what they were before, less what is under "out".
-        refuse: whether the input must be refused, or must not; None for either.
-
-    Raises:
-        SilentError: the input is taken wrongly, or the answer is not one line.
-        OutsideError: a file of the folder was touched.
-    """
-    before = digest(folder)
-    out, err = io.StringIO(), io.StringIO()
-    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err), limited(SECONDS):
-        try:
-            code = cli.main(arguments)
-        except Planned:
-            code = 0
-        except SystemExit as stop:
-            code = stop.code
-            if not {"--help", "-h", "--version"} & set(arguments) and not any(a.startswith("--h") for a in arguments):
-                raise SilentError(f"left with {code}") from stop
-    told = err.getvalue()
-    if "Traceback" in told:
-        raise RuntimeError(told)
-    if code not in (0, 1, 2) or (refuse is not None and refuse != (code == 2)):
-        raise SilentError(f"exit code {code} of {arguments}: {told}")
-    if code == 2:
-        lines = [line for line in told.splitlines() if not line.startswith("MuJoCo: ")]
-        if len(lines) != 1 or not lines[0].startswith("mjx-study: ") or out.getvalue() or len(told) > 3000:
-            raise SilentError(f"no single line: {told}{out.getvalue()}")
-    if digest(folder) != before:
-        raise OutsideError("a file was touched")
-    return code
-
-
-def digest(folder: Path) -> dict[str, str]:
-    """Of every file of a folder, but for those that a command was asked to write."""
-    files = [path for path in folder.rglob("*") if path.is_file() and "out" not in path.parts]
-    return {str(path): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
-
-
-@contextlib.contextmanager
-def limited(seconds: int) -> Generator[None]:
-    """Raises TooSlow inside where it takes longer."""
-
-    def late(*_: Any) -> None:
-        raise TooSlow
-
-    previous = signal.signal(signal.SIGALRM, late)
-    signal.alarm(seconds)
-    try:
-        yield
-    finally:
-        signal.alarm(0)
-        signal.signal(signal.SIGALRM, previous)
 
 
 @functools.cache
@@ -265,7 +142,7 @@ def arrays(draw: st.DrawFn) -> bytes:
 @st.composite
 def toml_files(draw: st.DrawFn) -> bytes:
     """A TOML file of sweep's options."""
-    names = [*(field.name for field in dataclasses.fields(sweep_plan.StudyConfig)), "colour"]
+    names = [*(field.name for field in dataclasses.fields(StudyConfig)), "colour"]
     lines = ['tasks = ["pusher"]'] * draw(st.integers(0, 1))
     for name in draw(st.lists(st.sampled_from(names), max_size=5, unique=draw(st.integers(0, 9)) > 0)):
         lines.append(f"{name} = {toml_of(draw(st.one_of(fitting(name), values(5))))}")
@@ -286,8 +163,6 @@ def toml_of(value: Any) -> str:
 
 
 SIZES = st.sampled_from([*"0 1 -1 nan inf 0.1 1e6 1000000 1000000000000 2147483648 1e308 x".split(), "1 2 3", ""])
-
-
 OPTION = "timestep gravity iterations tolerance integrator cone solver impratio noslip_iterations".split()
 SIZE = "memory nuserdata nkey njmax nconmax nstack nuser_body".split()
 ASSETS = (

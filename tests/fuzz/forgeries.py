@@ -5,6 +5,7 @@ whether reading it must be refused; others may be accepted as the studies that t
 """
 
 import contextlib
+import functools
 import io
 import json
 import os
@@ -17,29 +18,15 @@ from typing import Any, Final
 import numpy as np
 
 from mjx_study.disk import temporary_name
+from mjx_study.study.cell_file import digest_of_arrays
 from mjx_study.study.document import sealed
 from mjx_study.study.run import load_study
 from mjx_study.study.store import Store
 from tests.faults import put_no_file
 
 VALUES: Final = (
-    None,
-    True,
-    -1,
-    0,
-    10**9,
-    10**30,
-    1e308,
-    float("nan"),
-    "",
-    "$x^{",
-    "../../x",
-    "a\nb",
-    [],
-    [1],
-    {},
-    {"a": 1},
-)
+    None, True, -1, 0, 10**9, 10**30, 1e308, float("nan"), "", "$x^{", "../../x", "a\nb", [], [1], {}, {"a": 1}
+)  # fmt: skip
 """What stands in place of a value of study.json."""
 
 
@@ -71,7 +58,7 @@ def rewritten(folder: Path, document: dict[str, Any], cells: dict[int, dict[str,
     with contextlib.suppress(Exception):  # a document without what identifies a cell
         store = Store(folder, document)
         for index, arrays in cells.items():
-            store._write(index, arrays, {"jax": "1"})
+            store.file(index).write(arrays, {"jax": "1"})
 
 
 Forgery = Callable[[Path, Path], None]
@@ -142,11 +129,10 @@ def npy(shape: Any, descr: str = "<f8", content: bytes = b"", *, version: bytes 
     return b"\x93NUMPY" + version + length + header + content
 
 
-def containers(folder: Path) -> Iterator[tuple[str, Forgery, bool]]:
-    """Forgeries of the file of a cell, a checkpoint or a failure."""
-    whole = (folder / "cells" / "00000.npz").read_bytes()
-    directory = whole.rindex(b"PK\x05\x06")
-    members = {
+@functools.cache
+def archives() -> dict[str, bytes]:
+    """Archives that are none of a cell."""
+    return {
         "a bomb": packed({"variance.npy": npy((5 * 10**8,), content=bytes(4 * 10**8))}, zipfile.ZIP_DEFLATED),
         "a compressed member": packed({"digest.npy": npy((1,), content=bytes(8))}, zipfile.ZIP_DEFLATED),
         "bzip2": packed({"a.npy": bytes(10**6)}, zipfile.ZIP_BZIP2),
@@ -160,6 +146,14 @@ def containers(folder: Path) -> Iterator[tuple[str, Forgery, bool]]:
         "members outside": packed({"../../outside.npy": npy((1,), content=bytes(8)), "/tmp/outside.npy": npy((0,))}),
         "many members": packed({f"{index}.npy": npy((0,)) for index in range(30_000)}),
         "no members": packed({}),
+    }
+
+
+def containers(folder: Path) -> Iterator[tuple[str, Forgery, bool]]:
+    """Forgeries of the file of a cell, a checkpoint or a failure."""
+    whole = (folder / "cells" / "00000.npz").read_bytes()
+    directory = whole.rindex(b"PK\x05\x06")
+    members = archives() | {
         "nonsense": b"nonsense",
         "nothing": b"",
         "half": whole[: len(whole) // 2],
@@ -187,24 +181,16 @@ def containers(folder: Path) -> Iterator[tuple[str, Forgery, bool]]:
     for name, versions in {"a list": "[]", "a number": '{"jax": 1}', "no JSON": "{", "none": None}.items():
 
         def written(at: Path, _: Path, versions: str | None = versions) -> None:
-            from mjx_study.study import store as module
-
             kept = dict(arrays) | ({} if versions is None else {"versions": np.array(versions)})
-            place = Store(at, store.document)
-            signed = [module._digest(kept), place._study, place._place(0)]
-            with open(at / "cells" / "00000.npz", "wb") as file:
-                np.savez(file, digest=np.array(signed), **kept)  # type: ignore[arg-type]
+            file = Store(at, store.document).file(0)
+            signed = np.array([digest_of_arrays(kept), file.study, file.place])
+            np.savez(file.path, digest=signed, **kept)  # type: ignore[arg-type]
 
         yield f"versions of a cell: {name}", written, True
     failures = (
-        b"",
-        b"{",
-        b"[]",
-        b"\xff\xfe",
-        b'{"reason": 1, "digest": ""}',
-        b'{"reason": "a\\nb", "digest": "0"}',
-        b"[" * 10**5,
-    )
+        b"", b"{", b"[]", b"\xff\xfe", b"[" * 10**5,
+        b'{"reason": 1, "digest": ""}', b'{"reason": "a\\nb", "digest": "0"}',
+    )  # fmt: skip
     for content in failures:
 
         def failed(at: Path, _: Path, content: bytes = content) -> None:
@@ -279,22 +265,10 @@ def entries(folder: Path) -> Iterator[tuple[str, Forgery, bool]]:
 
     yield "leftovers: links and pipes", leftovers, False
     contents = (
-        b"",
-        b"{",
-        b"[]",
-        b"null",
-        b"1e999",
-        b"[" * 10**5,
-        b'{"a":' * 10**4,
-        b"\xff\xfe{}",
-        b'{"format": 4}',
-        b'{"format": 1e9}',
-        b'{"format": true}',
-        b'{"format": 3}',
-        b'{"format": "4"}',
-        b'{"format": 4' + b" " * 10**6 + b"}",
-        b'{"format": 1' + b"0" * 5000 + b"}",
-    )
+        b"", b"{", b"[]", b"null", b"1e999", b"[" * 10**5, b'{"a":' * 10**4, b"\xff\xfe{}", b'{"format": 4}',
+        b'{"format": 1e9}', b'{"format": true}', b'{"format": 3}', b'{"format": "4"}',
+        b'{"format": 4' + b" " * 10**6 + b"}", b'{"format": 1' + b"0" * 5000 + b"}",
+    )  # fmt: skip
     for content in contents:
 
         def replaced(at: Path, _: Path, content: bytes = content) -> None:
@@ -303,4 +277,9 @@ def entries(folder: Path) -> Iterator[tuple[str, Forgery, bool]]:
         yield f"study.json: {content[:16]!r}", replaced, True
 
 
-FORGERIES: Final = {"study.json": documents, "arrays": arrays_of, "containers": containers, "entries": entries}
+FORGERIES: Final = {
+    "forged folders: study.json": documents,
+    "forged folders: arrays": arrays_of,
+    "forged folders: files of cells": containers,
+    "forged folders: links, pipes, devices": entries,
+}

@@ -1,0 +1,72 @@
+"""Answer thousands of hostile inputs, and put the table of the answers into a page: `python -m tests.fuzz`."""
+
+import argparse
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+import pytest
+
+from mjx_study import configure
+from mjx_study.cli import options as of_commands
+from mjx_study.table import format_table
+from tests.fuzz import FUZZERS, fuzz
+from tests.fuzz.answers import Row
+from tests.planted.__main__ import MARK as END
+
+BEGIN: Final = "<!-- from here on: make fuzz -->\n"
+HEADER: Final = ("input", "tried", "silent errors", "tracebacks", "hangs", "writes outside")
+
+
+def timed(kind: str, folder: Path, share: float) -> Row:
+    """Answer inputs of a kind, and print how many ended how."""
+    begun = time.monotonic()
+    row = fuzz(kind, folder, share)
+    codes = ", ".join(f"{count} x exit code {code}" for code, count in sorted(row.codes.items()))
+    told = f"{kind}: {row.inputs} inputs, {row.wrong} wrong, {codes}"
+    print(f"{time.monotonic() - begun:7.1f} s  {told}", file=sys.stderr, flush=True)
+    return row
+
+
+def cells(row: Row) -> list[str]:
+    """A row's entries."""
+    return [row.kind, *map(str, (row.inputs, row.silent, row.tracebacks, row.hangs, row.outside))]
+
+
+def markdown(rows: Sequence[Row]) -> str:
+    """The table of the page."""
+    tried, wrong = sum(row.inputs for row in rows), sum(row.wrong for row in rows)
+    lines = [f"{tried:,} inputs, {wrong} answered wrongly.", "", f"| {' | '.join(HEADER)} |"]
+    lines += ["| --- |" + " ---: |" * (len(HEADER) - 1), *(f"| {' | '.join(cells(row))} |" for row in rows)]
+    return "\n".join(lines) + "\n"
+
+
+def put_into(page: Path, table: str) -> None:
+    """Replace the table of a page, which stands between its marks."""
+    head, _, rest = page.read_text().partition(BEGIN)
+    page.write_text(f"{head}{BEGIN}\n{table}\n{END}{rest.partition(END)[2]}")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Answer all inputs and print the table; 1 if an answer was wrong."""
+    parser = argparse.ArgumentParser(prog="python -m tests.fuzz", description=__doc__)
+    parser.add_argument("--only", action="append", metavar="KIND", choices=list(FUZZERS))
+    parser.add_argument("--share", type=float, default=1.0, metavar="X", help="of the full number of inputs")
+    parser.add_argument("--page", type=Path, metavar="FILE.md", help="put the table where the page has its marks")
+    options = parser.parse_args(arguments)
+    with tempfile.TemporaryDirectory(prefix="mjx-study-fuzz-") as name, pytest.MonkeyPatch.context() as monkeypatch:
+        folder = Path(name).resolve()
+        configure(cache=folder / "cache", cpu_devices=1)
+        monkeypatch.setattr(of_commands, "configure", lambda **_: None)
+        rows = [timed(kind, folder, options.share) for kind in options.only or FUZZERS]
+    print("\n".join([line for row in rows for line in row.told] + format_table(list(map(cells, rows)), HEADER)))
+    if options.page is not None:
+        put_into(options.page, markdown(rows))
+    return int(any(row.wrong for row in rows))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,155 @@
+"""Answers of commands to hostile inputs, and counts of those that are wrong.
+
+Whatever the input, a command ends in time with an exit code of 0, 1 or 2, says why in one line if it is not 0, and
+changes no file but those that it was asked to write.
+"""
+
+import contextlib
+import dataclasses
+import hashlib
+import io
+import re
+import signal
+import stat
+from collections import Counter
+from collections.abc import Generator
+from pathlib import Path
+from typing import Any, Final
+
+from mjx_study import cli
+
+SECONDS: Final = 20
+"""Maximum time for an input [s]."""
+MOST_TEXT: Final = 3000
+"""Maximum length of what a refusal prints."""
+OUTPUTS: Final = {"out", "results"}
+"""Folders that commands are asked to write to, or write to by default."""
+BESIDE: Final = re.compile(r"MuJoCo: | *\d+\.\d s  \[")
+"""Beginnings of lines that may come beside a refusal: warnings and stages."""
+
+
+class Planned(BaseException):
+    """Raised in place of a computation."""
+
+
+class TooSlow(BaseException):
+    """Raised when an answer takes too long."""
+
+
+class SilentError(AssertionError):
+    """Raised where something wrong is accepted, or refused without a line that says so."""
+
+
+class OutsideError(AssertionError):
+    """Raised where a file changes that is none of the command's."""
+
+
+@dataclasses.dataclass
+class Row:
+    """Numbers of inputs of one kind, in all and of those that were answered wrongly.
+
+    Attributes:
+        silent: taken wrongly, or refused without a line.
+        outside: after which another file differed than the command's.
+        codes: how many ended with which exit code.
+        told: what was wrong.
+    """
+
+    kind: str
+    inputs: int = 0
+    silent: int = 0
+    tracebacks: int = 0
+    hangs: int = 0
+    outside: int = 0
+    codes: Counter[int] = dataclasses.field(default_factory=Counter)
+    told: list[str] = dataclasses.field(default_factory=list)
+
+    @property
+    def wrong(self) -> int:
+        return self.silent + self.tracebacks + self.hangs + self.outside
+
+    @contextlib.contextmanager
+    def counting(self, what: Any) -> Generator[None]:
+        """Count an input, and in which way its answer is wrong."""
+        self.inputs += 1
+        try:
+            with limited(SECONDS):
+                yield
+            return
+        except KeyboardInterrupt:
+            raise
+        except TooSlow as error:
+            self.hangs, reason = self.hangs + 1, error
+        except SilentError as error:
+            self.silent, reason = self.silent + 1, error
+        except OutsideError as error:
+            self.outside, reason = self.outside + 1, error
+        except BaseException as error:
+            self.tracebacks, reason = self.tracebacks + 1, error
+        self.told.append(f"{self.kind}: {what}: {type(reason).__name__} {reason}")
+
+
+def answer(arguments: list[str], folder: Path, *, refuse: bool | None = None) -> int:
+    """Exit code of a command, whose answer is checked.
+
+    Args:
+        arguments: of the command line.
+        folder: must be afterwards what it was before, except for what is under `OUTPUTS`.
+        refuse: whether the input must be refused, or must not; None for either.
+
+    Raises:
+        SilentError: the input is taken wrongly, or refused without a line.
+        OutsideError: the folder has changed.
+        RuntimeError: a traceback was printed.
+    """
+    before = contents_of(folder)
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        try:
+            code = cli.main(arguments)
+        except Planned:
+            code = 0
+        except SystemExit as stop:
+            code = stop.code
+            if not {"-h", "--version"} & set(arguments) and not any(each.startswith("--h") for each in arguments):
+                raise SilentError(f"left with {code}") from stop
+    told = err.getvalue()
+    if "Traceback" in told:
+        raise RuntimeError(told)
+    if code not in (0, 1, 2) or (refuse is not None and refuse != (code == 2)):
+        raise SilentError(f"exit code {code} of {arguments}: {told}")
+    lines = [line for line in told.splitlines() if not BESIDE.match(line)]
+    if code and (len(lines) != 1 or not lines[0].startswith("mjx-study: ") or len(told) > MOST_TEXT):
+        raise SilentError(f"no single line: {told}")
+    if code == 2 and out.getvalue() and arguments[0] != "sweep":  # which first states what it would compute
+        raise SilentError(f"prints before it refuses: {out.getvalue()}")
+    if contents_of(folder) != before:
+        raise OutsideError("a file was touched")
+    return code
+
+
+def contents_of(folder: Path) -> dict[str, str]:
+    """What each path of a folder is, except under `OUTPUTS`: a file of some digest, a folder, a link, ..."""
+    found = {}
+    for path in folder.rglob("*"):
+        if not OUTPUTS & set(path.relative_to(folder).parts):
+            mode = path.lstat().st_mode
+            is_file = stat.S_ISREG(mode) and mode & 0o400
+            found[str(path)] = hashlib.sha256(path.read_bytes()).hexdigest() if is_file else oct(mode)
+    return found
+
+
+@contextlib.contextmanager
+def limited(seconds: int) -> Generator[None]:
+    """Raise TooSlow within the context once it has taken so long."""
+
+    def late(*_: Any) -> None:
+        raise TooSlow(f"no answer in {seconds} s")
+
+    previous = signal.signal(signal.SIGALRM, late)
+    signal.alarm(seconds)
+    try:
+        yield
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, previous)
