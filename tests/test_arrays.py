@@ -42,6 +42,7 @@ def test_arrays_come_back(tmp_path: Path) -> None:
         (packed({"a.npy": npy((1,), version=b"\x03\x00", content=bytes(8))}), "an array is in version 3.0 of NumPy's"),
         (packed({"a.npy": npy((0,)), "a": npy((0,))}), "it holds a twice"),
     ],
+    ids=["compressed", "larger", "size", "objects", "version", "twice"],
 )
 def test_other_files_are_refused(content: bytes, says: str) -> None:
     with pytest.raises(ValueError, match=says):
