@@ -34,7 +34,7 @@ from jaxtyping import Array, Float
 from estimators.pytree import register_pytree
 from mjx_study.choices import DEFAULT_SOLIMP, FAMILIES, MAX_IMPEDANCE, MIN_IMPEDANCE, unknown
 from mjx_study.simulation._mjx import mjx
-from mjx_study.simulation.contact_pair import ContactPair, contact_pairs, mixed_pair
+from mjx_study.simulation.contact_pair import ContactPair, contact_pairs
 from mjx_study.simulation.scene import Scene
 from mjx_study.table import percent
 
@@ -180,18 +180,16 @@ def stiffness_from_solref(solref: Sequence[float], *, effective_mass: float) -> 
 
 
 def contact_pair(scene: Scene, geom1: str, geom2: str) -> ContactPair:
-    """The contact of two geoms given by name, in either order; in a scene without contact, as it would be.
+    """The contact of two geoms given by name, in either order.
 
     Raises:
         SceneError: unknown geom name.
-        ValueError: the geoms are never tested for collision, although others are.
+        ValueError: the geoms are never tested for collision.
     """
-    geoms, pairs = [scene.geom(geom1), scene.geom(geom2)], list(contact_pairs(scene.host))
-    for pair in pairs:
-        if {pair.first, pair.second} == set(geoms):
+    geoms = {scene.geom(geom1), scene.geom(geom2)}
+    for pair in contact_pairs(scene.host):
+        if {pair.first, pair.second} == geoms:
             return pair
-    if not pairs:
-        return mixed_pair(scene.host, *geoms)
     raise ValueError(
         f"geoms {geom1!r} and {geom2!r} never collide: they are excluded, fixed to each other, parent and child, or "
         "their contype and conaffinity have no bit in common"

@@ -247,8 +247,8 @@ CONTACT: Final = (
     Defect(
         "edges-of-the-pyramid",
         "mjx_study/simulation/contact.py",
-        "return 2 * (condim - 1) * float(host.opt.impratio)",
-        "return (condim - 1) * float(host.opt.impratio)",
+        "return 2 * (pair.condim - 1) * float(host.opt.impratio)",
+        "return (pair.condim - 1) * float(host.opt.impratio)",
         "a pyramid has two edges for each direction of friction",
         ("tests/test_contact.py::test_effective_masses",),
     ),
