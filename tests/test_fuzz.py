@@ -124,4 +124,4 @@ def test_a_flip_that_changes_a_study_is_counted(tmp_path: Path, monkeypatch: pyt
     """Without the digest of study.json, other texts and numbers are read."""
     monkeypatch.setattr(document, "digest_of_json", lambda _: "0")
     monkeypatch.setattr(studies, "STUDIES", {"landscapes": studies.STUDIES["landscapes"]})
-    assert flips.flip("bit flips in files of studies", 30, tmp_path).silent > 1
+    assert flips.flip("bit flips in files of studies", 40, tmp_path).silent >= 1

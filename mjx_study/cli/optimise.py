@@ -8,7 +8,6 @@ from typing import Any
 from mjx_study.choices import REFERENCE
 from mjx_study.cli.options import Parser, given_options
 from mjx_study.disk import write_whole
-from mjx_study.files import digest_of_json
 from mjx_study.option import BUILDER_OPTIONS
 from mjx_study.study.configuration import StudyConfig, takes_stiffness
 from mjx_study.study.variables import explained
@@ -77,6 +76,8 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _save_policies(document: dict[str, Any], folder: Path) -> list[Path]:
+    from mjx_study.files import digest_of_json
+
     config, written = document["config"], []
     kept = {name: config[name] for name in ("task", "stiffness", "damping", "cone", *BUILDER_OPTIONS, "network")}
     kept |= {"contact": None if config["contact"] == REFERENCE else config["contact"]}
