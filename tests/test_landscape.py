@@ -158,10 +158,8 @@ def test_noise_reaches_quadrature_and_the_reference() -> None:
 
 def shot(horizon: int = 40) -> Task:
     """A cart that starts at 2 cos(theta) [m/s] and meets nothing, beside the reference of a ball that meets a bar."""
-    task, ball = (
-        cart(lambda state, control: jnp.zeros(()), horizon, wall=WALL),
-        make_task("momentum_transfer", horizon=2),
-    )
+    task = cart(lambda state, control: jnp.zeros(()), horizon, wall=WALL)
+    ball = make_task("momentum_transfer", horizon=2)
 
     def start_at(start: State, theta: jax.Array) -> State:
         return dataclasses.replace(start, qpos=jnp.zeros(1), qvel=2 * jnp.cos(theta))
