@@ -45,23 +45,25 @@ class ContactPair:
 
 
 def contact_pairs(host: mujoco.MjModel) -> Iterator[ContactPair]:
-    """Every pair of geoms that MJX tests for collision."""
+    """Every pair of geoms that MJX tests for collision, with the parameters of an explicit <pair> or mixed ones."""
     for *both, index in _driver.geom_pairs(host):
-        yield explicit_pair(host, index) if index >= 0 else mixed_pair(host, *map(int, both))
+        first, second = map(int, both)
+        if index < 0:
+            yield _mixed(host, first, second)
+            continue
+        friction, margin = np.maximum(host.pair_friction[index], NO_FRICTION), float(host.pair_margin[index])
+        solref, solimp = host.pair_solref[index].copy(), host.pair_solimp[index].copy()
+        yield ContactPair(first, second, int(host.pair_dim[index]), friction, solref, solimp, margin)
 
 
-def explicit_pair(host: mujoco.MjModel, index: int) -> ContactPair:
-    """A <pair> of the MJCF, which has parameters of its own."""
-    both = np.array([host.pair_geom1[index], host.pair_geom2[index]])
-    first, second = both[np.argsort(host.geom_type[both], stable=True)].tolist()
-    friction = np.maximum(host.pair_friction[index], NO_FRICTION)
-    solref, solimp = host.pair_solref[index].copy(), host.pair_solimp[index].copy()
-    return ContactPair(
-        first, second, int(host.pair_dim[index]), friction, solref, solimp, float(host.pair_margin[index])
-    )
+def frictionless_pair(host: mujoco.MjModel) -> ContactPair | None:
+    """The first pair whose contact has tangential dimensions, but no friction; None without one."""
+    if not any((friction[:, 0] <= NO_FRICTION).any() for friction in (host.geom_friction, host.pair_friction)):
+        return None  # without a look at every pair
+    return next((pair for pair in contact_pairs(host) if pair.condim > 1 and not pair.slides), None)
 
 
-def mixed_pair(host: mujoco.MjModel, first: int, second: int) -> ContactPair:
+def _mixed(host: mujoco.MjModel, first: int, second: int) -> ContactPair:
     """Two geoms, of which the one with the higher priority decides.
 
     At equal priority MuJoCo takes the larger friction and condim, and mixes solref and solimp by solmix.

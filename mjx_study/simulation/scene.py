@@ -16,7 +16,7 @@ from estimators.catalogue import suggestion
 from mjx_study.choices import CONES, INTEGRATORS, SOLVERS, unknown
 from mjx_study.limits import MOST_GIB
 from mjx_study.simulation._mjx import mjx
-from mjx_study.simulation.contact_pair import contact_pairs, geom_label
+from mjx_study.simulation.contact_pair import frictionless_pair, geom_label
 from mjx_study.simulation.limitations import FLAGS, ignored, lacking
 from mjx_study.simulation.mjcf_compile import compile_file
 from mjx_study.simulation.mjcf_files import RefusedFileError
@@ -321,12 +321,11 @@ def check_model(host: mujoco.MjModel, name: str = "the model") -> None:
             f"--disable-flag {','.join(flags)}"
         )
     pyramidal = host.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
-    for pair in contact_pairs(host) if pyramidal else ():
-        if pair.condim > 1 and not pair.slides:
-            both = " and ".join(geom_label(host, geom) for geom in (pair.first, pair.second))
-            raise SceneError(
-                f"{name}: the contact of {both} has no friction, which makes a pyramidal cone 1 / mu^2 = 1e10 times "
-                'stiffer and costs derivatives ten digits; give both geoms condim="1", or --cone elliptic'
-            )
+    if pyramidal and (pair := frictionless_pair(host)):
+        both = " and ".join(geom_label(host, geom) for geom in (pair.first, pair.second))
+        raise SceneError(
+            f"{name}: the contact of {both} has no friction, which makes a pyramidal cone 1 / mu^2 = 1e10 times "
+            'stiffer and costs derivatives ten digits; give both geoms condim="1", or --cone elliptic'
+        )
     if features := ignored(host):
         raise SceneError(f"MJX would leave out part of {name}: {'; '.join(features)}")
