@@ -27,6 +27,7 @@ LAYERS = [
     "mjx_study.table",
     "mjx_study.limits",
     "mjx_study.reference",
+    "mjx_study.graph",
     "mjx_study.simulation",
     "mjx_study.option",
     "mjx_study.files",

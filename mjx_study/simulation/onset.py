@@ -37,6 +37,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from mjx_study.choices import ONSETS, unknown
+from mjx_study.graph.scalars import traced_part
 from mjx_study.simulation import constraint
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.constraint import Rows, Scalar
@@ -56,7 +57,6 @@ from mjx_study.simulation.dynamics import (
 )
 from mjx_study.simulation.integration import difference_position, integrate_position
 from mjx_study.simulation.linear_algebra import product
-from mjx_study.simulation.scalars import traced_part
 from mjx_study.simulation.scene import Scene
 from mjx_study.simulation.touch import Events, OnsetCounts, at_touch, find_events
 

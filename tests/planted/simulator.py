@@ -13,11 +13,11 @@ CONE = "tests/test_constraint.py::test_the_elliptic_law_is_the_gradient_of_a_con
 DYNAMICS: Final = (
     Defect(
         "constants-by-shape",
-        "mjx_study/simulation/scalars.py",
+        "mjx_study/graph/scalars.py",
         "return array.shape, array.dtype.str, array.tobytes()",
         "return array.shape, array.dtype.str",
         "a graph with the constants of one model serves another of the same shapes",
-        ("tests/test_scalars.py::test_a_function_is_written_out_once_for_arguments_of_equal_content",),
+        ("tests/test_graph.py::test_a_function_is_written_out_once_for_arguments_of_equal_content",),
     ),
     Defect(
         "frame-without-derivative",

@@ -20,7 +20,7 @@ from jax import lax
 from jax.core import ShapedArray, Tracer
 from jax.extend.core import Literal, jaxpr_as_fun
 
-from mjx_study.simulation.scalar_graph import (
+from mjx_study.graph.nodes import (
     ELEMENTWISE,
     Node,
     ScalarGraph,
@@ -31,7 +31,7 @@ from mjx_study.simulation.scalar_graph import (
     needed_for,
     no_type_check,
 )
-from mjx_study.simulation.scalar_rules import RULES
+from mjx_study.graph.rules import RULES
 
 MOST_SCALARS: Final = {"cpu": 12_000, "gpu": 6_000, "tpu": 6_000}
 """Maximum number of scalar operations, by backend; XLA's compile time grows faster than linearly in it."""

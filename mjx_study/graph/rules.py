@@ -13,7 +13,7 @@ import numpy as np
 from jax import lax
 from jax.core import ShapedArray
 
-from mjx_study.simulation.scalar_graph import Node, ScalarGraph, constants, filled, no_type_check
+from mjx_study.graph.nodes import Node, ScalarGraph, constants, filled, no_type_check
 
 Arrays = list[np.ndarray]
 Parameters = dict[str, Any]

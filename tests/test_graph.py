@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_study.simulation import scalars
-from mjx_study.simulation.scalars import traced_part, unrolled
+from mjx_study.graph import scalars
+from mjx_study.graph.scalars import traced_part, unrolled
 
 TABLE = np.arange(12.0).reshape(4, 3) - 5
 ROW = np.array([0.3, -1.2, 2.5])

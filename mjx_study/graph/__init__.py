@@ -1,0 +1,1 @@
+"""Graphs of scalar operations: functions of small arrays, entry by entry."""
