@@ -2,10 +2,10 @@
 
 import argparse
 
-from mjx_study.choices import REFERENCE
+from mjx_study.choices import REFERENCE, takes_stiffness
 from mjx_study.cli.options import Parser, given_options
 from mjx_study.option import BUILDER_OPTIONS
-from mjx_study.study.configuration import StudyConfig, takes_stiffness
+from mjx_study.study.configuration import StudyConfig
 from mjx_study.study.variables import explained
 
 EPILOG = f"""\

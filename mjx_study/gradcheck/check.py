@@ -8,7 +8,7 @@ from typing import Final
 import jax.numpy as jnp
 import mujoco
 
-from mjx_study.choices import CHECKED_STATES, CHECKED_STEPS
+from mjx_study.choices import CHECKED_STATES, CHECKED_STEPS, refuse_untaken, takes_stiffness
 from mjx_study.choices import CHECKED_STIFFNESS as STIFFNESS
 from mjx_study.gradcheck.coordinates import make_coordinates
 from mjx_study.gradcheck.cost import CostPrograms, check_cost, judge_closed_forms
@@ -17,10 +17,10 @@ from mjx_study.gradcheck.report import CostCheck, Finding, GradcheckReport, Step
 from mjx_study.gradcheck.states import start_of, states_of
 from mjx_study.gradcheck.steps import check_state, collect, step_check
 from mjx_study.gradcheck.values import EngineStep
+from mjx_study.progress import Progress, silent
 from mjx_study.runtime import environment
 from mjx_study.simulation.engine import quiet_engine
 from mjx_study.simulation.scene import Scene
-from mjx_study.study.configuration import Progress, refuse_untaken, takes_stiffness
 from mjx_study.tasks.contact_grid import ContactPoint, family_grid
 from mjx_study.tasks.mjcf import scene_task
 from mjx_study.tasks.task import Task
@@ -142,7 +142,7 @@ def _check(task: Task, states: int) -> None:
 
 
 @quiet_engine()  # intermediate states may cause warnings
-def gradcheck(plan: GradcheckPlan, progress: Progress = lambda done, total, what: None) -> GradcheckReport:
+def gradcheck(plan: GradcheckPlan, progress: Progress = silent) -> GradcheckReport:
     """Run all checks of a plan; `progress` is called with (parts done, their total number, the next)."""
     task, compiler = plan.subject, Compiler()
     done, total = itertools.count(), 1 + len(plan.cells) * (plan.states + plan.is_task)

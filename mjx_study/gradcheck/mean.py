@@ -18,13 +18,13 @@ from estimators import Estimator, GradientEstimate, Objective, oracles_of
 from estimators.estimator import label_of
 from estimators.mean_check import TOLERANCE, Circulation, circulations
 from mjx_study.objective import Simulator, chunk_for
+from mjx_study.progress import Progress, silent
 from mjx_study.runtime import local_devices
-from mjx_study.study.configuration import Progress, check_span
-from mjx_study.study.dataset import as_plain
+from mjx_study.study.configuration import check_span
 from mjx_study.study.resolution import check_estimators, direction_of
 from mjx_study.study.sampling import cell_keys, draw_batches
 from mjx_study.study.variables import MEANS
-from mjx_study.table import format_table, percent
+from mjx_study.table import as_plain, format_table, percent
 from mjx_study.tasks.contact_grid import ContactPoint
 from mjx_study.tasks.task import Task
 
@@ -137,7 +137,7 @@ def check_mean(
     span: Sequence[float] | None = None,
     direction: str = "random",
     tolerance: float = TOLERANCE,
-    progress: Progress = lambda done, total, what: None,
+    progress: Progress = silent,
 ) -> list[MeanCheck]:
     """Check every estimator for every contact model.
 

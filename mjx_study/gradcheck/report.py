@@ -7,8 +7,7 @@ from typing import Any, Final
 
 from mjx_study.gradcheck.coverage import Coverage
 from mjx_study.gradcheck.diagnosis import FAILURES, MEANING, VERDICTS
-from mjx_study.study.dataset import as_plain
-from mjx_study.table import format_table
+from mjx_study.table import as_plain, format_table
 
 MOST_SHOWN: Final = 12
 """Maximum number of findings in the text, unless all are requested."""

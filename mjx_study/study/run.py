@@ -21,16 +21,18 @@ import xarray as xr
 from estimators import ENOUGH_EFFECTIVE
 from estimators.seen import observing
 from mjx_study.identity import differences, versions
+from mjx_study.progress import Progress, silent
 from mjx_study.study.blocks import Arrays
 from mjx_study.study.cells import Computation
 from mjx_study.study.cluster import cells_on, connected
-from mjx_study.study.configuration import Progress, StudyConfig
-from mjx_study.study.dataset import as_plain, dataset_of, write_dataset
+from mjx_study.study.configuration import StudyConfig
+from mjx_study.study.dataset import dataset_of, write_dataset
 from mjx_study.study.document import document_of
 from mjx_study.study.lost import lost_samples, total
 from mjx_study.study.plan import StudyPlan, plan_study
 from mjx_study.study.store import Part, Store, open_store
 from mjx_study.study.times import recording
+from mjx_study.table import as_plain
 
 WAIT_SECONDS: Final = 0.5
 """Interval between polls of cells that another process computes."""
@@ -39,7 +41,7 @@ WAIT_SECONDS: Final = 0.5
 def run_study(
     study: StudyConfig | StudyPlan,
     folder: str | Path | Store | None = None,
-    progress: Progress = lambda done, total, what: None,
+    progress: Progress = silent,
     *,
     command: str | None = None,
     accept_versions: bool = False,

@@ -29,9 +29,9 @@ from mjx_study.files import digest_of_json
 from mjx_study.identity import ACCEPT, differences
 from mjx_study.study.arrays import check_cell
 from mjx_study.study.cell_file import CellFile, StudyError, reason_of
-from mjx_study.study.dataset import as_plain
 from mjx_study.study.document import document_of, read_document, read_format, sealed
 from mjx_study.study.plan import StudyPlan
+from mjx_study.table import as_plain
 
 FORMAT: Final = 4
 """Format of the folder; increased when older programs cannot read newer folders."""
