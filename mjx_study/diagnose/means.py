@@ -34,10 +34,10 @@ FEEDBACK: Final = 0.02
 """The same for noise on the controls, in the unit of theta."""
 ALONG_MEANS: Final = "means"
 """Value of `direction` for paths along the estimators' own means, see `along_means`."""
-MOST_PATHS: Final = 3
+MAX_PATHS: Final = 3
 SHARES: Final = ("relative_gap", "detectable")
 """Columns shown in per cent."""
-LEAST_SHARE: Final = 1e-3
+MIN_SHARE: Final = 1e-3
 """Smallest share of a mean orthogonal to the others that warrants a path along it."""
 
 
@@ -115,7 +115,7 @@ def _at_right_angles(estimates: Sequence[GradientEstimate]) -> list[np.ndarray]:
         for unit in units:
             left = left - (left @ unit) * unit
         size = float(np.linalg.norm(left))
-        if len(units) < MOST_PATHS and size > LEAST_SHARE * float(np.linalg.norm(mean)):
+        if len(units) < MAX_PATHS and size > MIN_SHARE * float(np.linalg.norm(mean)):
             units.append(left / size)
     return units or [np.eye(len(np.asarray(estimates[0].mean)))[0]]
 
