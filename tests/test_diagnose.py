@@ -18,10 +18,10 @@ from mjx_study.cli import options
 from mjx_study.diagnose import ESTIMATORS, Diagnosis, Measured, Touch, diagnose_task
 from mjx_study.diagnose.measurement import affordable, chunk_of
 from mjx_study.diagnose.setting import setting_of
+from mjx_study.experiment.landscapes import Line, grid, means
 from mjx_study.gradcheck import Finding
 from mjx_study.gradcheck.mean import along_means
 from mjx_study.objective import Simulator
-from mjx_study.study.landscapes import Line, grid, means
 from mjx_study.tasks import make_task
 from mjx_study.tasks.mjcf import mjcf_task
 

@@ -13,10 +13,10 @@ from mjx_study.diagnose.setting import Setting, Touch
 from mjx_study.gradcheck import GradcheckReport
 from mjx_study.gradcheck.diagnosis import MEANING
 from mjx_study.gradcheck.mean import ALONG_MEANS
+from mjx_study.results.findings import ERROR_PER_STRENGTH, LEAST_SPREAD, MOST_STRENGTH, NOTABLE_SHARE, linear_error
+from mjx_study.results.variables import DIAGNOSIS
 from mjx_study.runtime import environment
-from mjx_study.study.dataset import as_plain
-from mjx_study.study.findings import ERROR_PER_STRENGTH, LEAST_SPREAD, MOST_STRENGTH, NOTABLE_SHARE, linear_error
-from mjx_study.study.variables import DIAGNOSIS
+from mjx_study.storage.dataset import as_plain
 from mjx_study.table import format_table, percent, with_error
 from mjx_study.tasks.task import Task
 

@@ -10,6 +10,7 @@ import mujoco
 
 from mjx_study.choices import CHECKED_STATES, CHECKED_STEPS
 from mjx_study.choices import CHECKED_STIFFNESS as STIFFNESS
+from mjx_study.experiment.configuration import Progress, refuse_untaken, takes_stiffness
 from mjx_study.gradcheck.coordinates import make_coordinates
 from mjx_study.gradcheck.cost import CostPrograms, check_cost, judge_closed_forms
 from mjx_study.gradcheck.programs import Compiler, Programs, Setting
@@ -20,7 +21,6 @@ from mjx_study.gradcheck.values import EngineStep
 from mjx_study.runtime import environment
 from mjx_study.simulation.engine import quiet_engine
 from mjx_study.simulation.scene import Scene
-from mjx_study.study.configuration import Progress, refuse_untaken, takes_stiffness
 from mjx_study.tasks.contact_grid import ContactPoint, family_grid
 from mjx_study.tasks.mjcf import scene_task
 from mjx_study.tasks.task import Task

@@ -7,7 +7,7 @@ from typing import Any, Final
 
 from mjx_study.gradcheck.coverage import Coverage
 from mjx_study.gradcheck.diagnosis import FAILURES, MEANING, VERDICTS
-from mjx_study.study.dataset import as_plain
+from mjx_study.storage.dataset import as_plain
 from mjx_study.table import format_table
 
 MOST_SHOWN: Final = 12
