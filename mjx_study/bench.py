@@ -24,6 +24,7 @@ from mujoco import rollout
 
 from estimators import FirstOrder, ZerothOrder
 from mjx_study.compiled import Compiled
+from mjx_study.experiment.memory import check_memory
 from mjx_study.objective import Simulator, chunk_for, simulate, spread
 from mjx_study.progress import Progress, silent
 from mjx_study.reference.noise import split_sample_key, standard_noise
@@ -32,7 +33,6 @@ from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.contact import ContactModel, apply_contact
 from mjx_study.simulation.dynamics import State
 from mjx_study.simulation.engine import engine_model
-from mjx_study.study.memory import check_memory
 from mjx_study.tasks.contact_grid import ContactPoint, family_grid
 from mjx_study.tasks.soundness import check_soundness
 from mjx_study.tasks.task import Task

@@ -17,13 +17,13 @@ from jaxtyping import Array, Float
 from estimators import Estimator, GradientEstimate, Objective, oracles_of
 from estimators.estimator import label_of
 from estimators.mean_check import TOLERANCE, Circulation, circulations
+from mjx_study.experiment.configuration import check_span
+from mjx_study.experiment.resolution import check_estimators, direction_of
+from mjx_study.experiment.sampling import cell_keys, draw_batches
 from mjx_study.objective import Simulator, chunk_for
 from mjx_study.progress import Progress, silent
+from mjx_study.results.variables import MEANS
 from mjx_study.runtime import local_devices
-from mjx_study.study.configuration import check_span
-from mjx_study.study.resolution import check_estimators, direction_of
-from mjx_study.study.sampling import cell_keys, draw_batches
-from mjx_study.study.variables import MEANS
 from mjx_study.table import as_plain, format_table, percent
 from mjx_study.tasks.contact_grid import ContactPoint
 from mjx_study.tasks.task import Task

@@ -13,9 +13,9 @@ from mjx_study.diagnose.measurement import RESOLVED_SE, SAMPLES, TARGET_ERROR, M
 from mjx_study.diagnose.setting import ContactSummary, RolloutSetting
 from mjx_study.gradcheck import GradcheckReport
 from mjx_study.gradcheck.diagnosis import MEANING
+from mjx_study.results.findings import ERROR_PER_STRENGTH, LEAST_SPREAD, MOST_STRENGTH, NOTABLE_SHARE, linear_error
+from mjx_study.results.variables import DIAGNOSIS
 from mjx_study.runtime import environment
-from mjx_study.study.findings import ERROR_PER_STRENGTH, LEAST_SPREAD, MOST_STRENGTH, NOTABLE_SHARE, linear_error
-from mjx_study.study.variables import DIAGNOSIS
 from mjx_study.table import as_plain, format_table, percent, with_error
 from mjx_study.tasks.task import Task
 

@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 
 from mjx_study.disk import write_whole
-from mjx_study.study.variables import COORDINATES, THETA, variables_of
+from mjx_study.results.variables import COORDINATES, THETA, variables_of
 
 Cells = Mapping[int, tuple[Mapping[str, np.ndarray], Mapping[str, str]]]
 """Arrays by variable of each cell, by index, with the versions of the software that computed them."""
