@@ -39,7 +39,8 @@ def format_table(rows: Sequence[Sequence[str]], header: Sequence[str]) -> list[s
 
 def markdown_table(rows: Iterable[Sequence[str]], header: Sequence[str]) -> str:
     """Format a table in Markdown, without a line feed at its end."""
-    return "\n".join(f"| {' | '.join(row)} |" for row in (header, ["---"] * len(header), *rows))
+    first, *others = (f"| {' | '.join(row)} |" for row in (header, *rows))
+    return "\n".join([first, f"|{'---|' * len(header)}", *others])
 
 
 def number(value: float | None, digits: int = 3) -> str:

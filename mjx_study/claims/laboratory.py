@@ -30,6 +30,12 @@ from mjx_study.tasks import make_task
 from mjx_study.tasks.contact_grid import backward_grid, family_grid
 from mjx_study.tasks.task import Task
 
+FAMILIES: Final = (
+    REFERENCE, "penalty", "impedance", "mujoco", "mujoco_default", "mujoco_stiff", "smooth_onset", "mjcf",
+)  # fmt: skip
+"""Columns of the verdict matrix."""
+REAL: Final = FAMILIES[1:-1]
+"""MJX contact families to compare; "mjcf" is for systems without contact."""
 TIMED: Final = 64
 """Samples per device in a timed batch."""
 REPEATS: Final = 12
