@@ -108,11 +108,11 @@ def run(options: argparse.Namespace) -> int:
 
 def _run_mean(options: argparse.Namespace) -> int:
     from estimators import make_estimator
+    from mjx_study.diagnose.means import ALONG_MEANS, check_mean, lines_of, path_of
     from mjx_study.diagnose.setting import setting_of
     from mjx_study.experiment.effect import reads_onset, refuse_unread
     from mjx_study.experiment.resolution import check_estimators
-    from mjx_study.gradcheck import check_mean, plan_gradcheck
-    from mjx_study.gradcheck.mean import ALONG_MEANS, lines_of, path_of
+    from mjx_study.gradcheck import plan_gradcheck
 
     chosen = MEAN | given_options(options, *MEAN)
     with usage_errors():

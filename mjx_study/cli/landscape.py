@@ -2,9 +2,9 @@
 
 import argparse
 
-from mjx_study.choices import REFERENCE
+from mjx_study.choices import REFERENCE, takes_stiffness
 from mjx_study.cli.options import Parser, given_options
-from mjx_study.experiment.configuration import StudyConfig, takes_stiffness
+from mjx_study.experiment.configuration import StudyConfig
 from mjx_study.option import BUILDER_OPTIONS
 from mjx_study.results.variables import explained
 

@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 
 from mjx_study import objective
-from mjx_study.choices import CONES, is_file
+from mjx_study.choices import CONES, is_file, refuse_untaken
 from mjx_study.cli.options import (
     UsageError,
     configure_process,
@@ -24,7 +24,6 @@ from mjx_study.cli.options import (
 )
 from mjx_study.cli.output import attempt, computing, print_report
 from mjx_study.disk import prepare_folder, write_whole
-from mjx_study.experiment.configuration import refuse_untaken
 from mjx_study.experiment.resolution import at_theta
 from mjx_study.limits import MOST_STEPS, check_count
 from mjx_study.option import BUILDER_OPTIONS, SCENE_OPTIONS, as_arguments

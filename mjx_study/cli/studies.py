@@ -21,9 +21,8 @@ from mjx_study.experiment.configuration import StudyConfig
 from mjx_study.experiment.plan import StudyPlan
 from mjx_study.plots.study import plot_study
 from mjx_study.plots.style import save_figures
-from mjx_study.storage.dataset import as_plain
 from mjx_study.storage.folder import Store
-from mjx_study.table import digits_to_tell_apart, size
+from mjx_study.table import as_plain, digits_to_tell_apart, size
 
 KEPT = "results.nc (every number), study.json (the configuration), cells/ (checkpoints)"
 INTACT = "existing files are complete, and the same command resumes"

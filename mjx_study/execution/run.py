@@ -26,12 +26,14 @@ from mjx_study.execution.lost import lost_samples, total
 from mjx_study.execution.times import recording
 from mjx_study.experiment.blocks import Arrays
 from mjx_study.experiment.checkpoint import Checkpoint
-from mjx_study.experiment.configuration import Progress, StudyConfig
+from mjx_study.experiment.configuration import StudyConfig
 from mjx_study.experiment.plan import StudyPlan, plan_study
 from mjx_study.identity import differences, versions
-from mjx_study.storage.dataset import as_plain, dataset_of, write_dataset
+from mjx_study.progress import Progress, silent
+from mjx_study.storage.dataset import dataset_of, write_dataset
 from mjx_study.storage.folder import Store, open_store
 from mjx_study.storage.manifest import document_of
+from mjx_study.table import as_plain
 
 WAIT_SECONDS: Final = 0.5
 """Interval between polls of cells that another process computes."""
@@ -40,7 +42,7 @@ WAIT_SECONDS: Final = 0.5
 def run_study(
     study: StudyConfig | StudyPlan,
     folder: str | Path | Store | None = None,
-    progress: Progress = lambda done, total, what: None,
+    progress: Progress = silent,
     *,
     command: str | None = None,
     accept_versions: bool = False,

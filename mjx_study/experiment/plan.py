@@ -40,9 +40,9 @@ from mjx_study.table import digits_to_tell_apart
 from mjx_study.tasks import TASKS, task_with_options
 from mjx_study.tasks.contact_grid import ContactPoint, backward_grid, family_grid, solver_grid
 from mjx_study.tasks.network import with_network
-from mjx_study.tasks.own import registered_place
 from mjx_study.tasks.soundness import check_soundness
 from mjx_study.tasks.task import Recipe, Task, check_shapes
+from mjx_study.tasks.user_task import registered_name
 
 HISTORY_NUMBERS: Final = 20
 """Approximate count of numbers kept per iteration and seed, over all estimators."""
@@ -142,7 +142,7 @@ class StudyPlan:
     def places(self) -> tuple[str, ...]:
         """Names of the modules of user-defined tasks and estimators, and of tasks given as objects."""
         tasks = [each if isinstance(each, str) else f"task {each.name}" for each in self.config.tasks]
-        places = [registered_place(each) or each for each in tasks if each not in TASKS]
+        places = [registered_name(each) or each for each in tasks if each not in TASKS]
         own = [each for each in self.config.estimator_names if ":" in each]
         return tuple(dict.fromkeys(each.partition(":")[0] for each in (*places, *own)))
 

@@ -30,8 +30,8 @@ from mjx_study.files import digest_of_json
 from mjx_study.identity import ACCEPT, differences
 from mjx_study.storage.arrays import check_cell
 from mjx_study.storage.cell_files import CellFile
-from mjx_study.storage.dataset import as_plain
 from mjx_study.storage.manifest import document_of, read_document, read_format, sealed
+from mjx_study.table import as_plain
 
 FORMAT: Final = 4
 """Format of the folder; increased when older programs cannot read newer folders."""
