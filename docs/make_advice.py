@@ -26,12 +26,12 @@ from estimators import GradientEstimate, make_estimator, oracles_of, squared_bia
 from estimators.confidence import coverage_interval
 from mjx_study.choices import DEFAULT_SOLIMP, DEFAULT_SOLREF, STIFF_SOLIMP
 from mjx_study.diagnose import ESTIMATORS, measure
+from mjx_study.experiment.gradients import reference_of
+from mjx_study.experiment.sampling import cell_keys, draw_batches
 from mjx_study.objective import MjxObjective, Simulator, chunk_for
 from mjx_study.runtime import configure, local_devices
 from mjx_study.simulation.contact import contact_model
 from mjx_study.simulation.scene import load_scene
-from mjx_study.study.gradients import reference_of
-from mjx_study.study.sampling import cell_keys, draw_batches
 from mjx_study.table import percent
 from mjx_study.tasks import make_task
 from mjx_study.tasks.mjcf import scene_task

@@ -18,8 +18,8 @@ from jax import Array
 import estimators
 from estimators import ENOUGH_EFFECTIVE, ESTIMATORS, make_estimator, summarise
 from mjx_study.reference import LinearQuadratic, ReferenceObjective
+from mjx_study.results.findings import DETECTED_SE
 from mjx_study.runtime import configure
-from mjx_study.study.findings import DETECTED_SE
 from mjx_study.table import percent
 
 PAGE: Final = Path(__file__).parent / "coverage.md"

@@ -26,6 +26,7 @@ from matplotlib.figure import Figure
 from matplotlib.transforms import Affine2D
 from PIL import Image
 
+from mjx_study.experiment.landscapes import Line, grid, means
 from mjx_study.objective import rollout_cost
 from mjx_study.reference import (
     BallWall,
@@ -42,7 +43,6 @@ from mjx_study.render.drawing import PALETTE, Drawing
 from mjx_study.runtime import configure
 from mjx_study.simulation.contact import ContactModel, contact_model, solref_from_stiffness
 from mjx_study.simulation.dynamics import State, initial_state
-from mjx_study.study.landscapes import Line, grid, means
 from mjx_study.tasks import make_task
 from mjx_study.tasks.contact_grid import family_grid
 from mjx_study.tasks.task import Task

@@ -24,7 +24,7 @@ fit into `--seconds`, and goes on where the file ends.
 `busy` sweeps contact models on an accelerator and prints the share of a cell's time in which a kernel runs, by JAX's
 profiler.
 
-`fit` prints the constants of the rough model of times (mjx_study/study/times.py) that these measurements give.
+`fit` prints the constants of the rough model of times (mjx_study/execution/times.py) that these measurements give.
 """
 
 import argparse
@@ -291,10 +291,10 @@ def measure_busy(cells: int, samples: int, seeds: int) -> None:
     import jax
     import numpy as np
 
+    from mjx_study.execution.run import run_study
+    from mjx_study.experiment.configuration import StudyConfig
+    from mjx_study.experiment.plan import plan_study
     from mjx_study.runtime import configure, environment
-    from mjx_study.study.configuration import StudyConfig
-    from mjx_study.study.plan import plan_study
-    from mjx_study.study.run import run_study
 
     configure()
     stiffness = tuple(float(each) for each in np.geomspace(10.0, 1e4, cells))
@@ -334,7 +334,7 @@ def measure_busy(cells: int, samples: int, seeds: int) -> None:
 
 
 def fit(document: dict[str, Any]) -> dict[str, Any]:
-    """The constants of the rough model, see `mjx_study.study.times`: of times and of compilation, and their errors.
+    """The constants of the rough model, see `mjx_study.execution.times`: of times and of compilation, and their errors.
 
     Returns:
         Constants to two digits, and as `spread` the factor by which measured times and those of the model differ, as
@@ -465,8 +465,9 @@ def measure_engine(workers: int, cells: int, seconds: float, programs: int, numb
     """Run the cells and write them; rates of all of it, and of its parts."""
     import numpy as np
 
-    from mjx_study.study import cluster
-    from mjx_study.study.store import Part, Store
+    from mjx_study.execution import cluster
+    from mjx_study.experiment.checkpoint import Checkpoint
+    from mjx_study.storage.folder import Store
 
     def sleep(study: bytes, index: int, kept: Any, block: Any) -> Any:
         import time
@@ -494,7 +495,7 @@ def measure_engine(workers: int, cells: int, seconds: float, programs: int, numb
         with cluster.connected(f"local:{workers}") as client:
             client.wait_for_workers(workers)
             begun, processor = time.perf_counter(), time.process_time()
-            parts = {cell: Part() for cell in range(cells)}
+            parts = {cell: Checkpoint() for cell in range(cells)}
             for done, arrays in cluster.cells_on(client, Plan(), parts, lambda _: None):  # type: ignore[arg-type]
                 assert isinstance(arrays, dict) and np.all(arrays["values"] == done)
                 before = time.perf_counter()
@@ -525,11 +526,11 @@ def measure_workers(workers: list[int], cells: int, samples: int) -> None:
     import numpy as np
     from distributed import get_task_stream
 
+    from mjx_study.execution import cluster
+    from mjx_study.execution.run import run_study
+    from mjx_study.experiment.configuration import StudyConfig
+    from mjx_study.experiment.plan import plan_study
     from mjx_study.runtime import configure
-    from mjx_study.study import cluster
-    from mjx_study.study.configuration import StudyConfig
-    from mjx_study.study.plan import plan_study
-    from mjx_study.study.run import run_study
 
     configure(cpu_devices=1)
     stiffness = tuple(float(each) for each in np.geomspace(10.0, 1e4, cells))

@@ -16,9 +16,9 @@ import mujoco
 import numpy as np
 
 import mjx_study as study
+from mjx_study.experiment.landscapes import Line, grid, means
 from mjx_study.simulation.contact import ContactModel
 from mjx_study.simulation.scene import put_scene
-from mjx_study.study.landscapes import Line, grid, means
 
 STIFFNESS, DAMPING, START, SPREAD, SECONDS = 50.0, 1.0, 1.0, 0.1, 2.0  # of the point: [1/s^2], [1/s], [m], [m], [s]
 TOSSED: Final = """<mujoco>
