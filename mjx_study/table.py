@@ -3,8 +3,10 @@
 import dataclasses
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
+Item = TypeVar("Item")
+Key = TypeVar("Key")
 ROUNDING: Final = 1e-12
 """Error over the value below which it is one of rounding."""
 
@@ -75,6 +77,19 @@ def _to_decimals(value: float, decimals: int) -> str:
     return f"{mantissa}e{int(exponent)}"
 
 
+def plural(count: int, noun: str) -> str:
+    """Format a count with its noun."""
+    return f"{count} {noun}{'' if count == 1 else 's'}"
+
+
+def grouped(items: Iterable[Item], key: Callable[[Item], Key]) -> dict[Key, list[Item]]:
+    """Group items by a key, in the order in which the keys occur."""
+    groups: dict[Key, list[Item]] = {}
+    for item in items:
+        groups.setdefault(key(item), []).append(item)
+    return groups
+
+
 def percent(share: float, digits: int = 0) -> str:
     """Format a share as a percentage with so many decimals."""
     return f"{100 * share:.{digits}f} %"
@@ -96,6 +111,11 @@ def as_plain(document: Any) -> Any:
     if isinstance(document, list | tuple):
         return [as_plain(item) for item in document]
     return None if isinstance(document, float) and not math.isfinite(document) else document
+
+
+def explain(*columns: Column) -> str:
+    """Format the headings of columns with their meanings, a line each."""
+    return described({column.heading: column.meaning for column in columns})
 
 
 def digits_to_tell_apart(values: Iterable[float | int], least: int = 6) -> int:

@@ -19,7 +19,7 @@ from matplotlib.lines import Line2D
 from estimators import ENOUGH_EFFECTIVE
 from estimators.confidence import coverage_interval
 from experiments.pages import DOCS, save_figure, with_table
-from mjx_study.diagnose import SMOOTH_SHARE, WIDTH_RATIO
+from mjx_study.diagnose.advice import SMOOTH_SHARE, WIDTH_RATIO
 from mjx_study.results.findings import ERROR_PER_STRENGTH, LEAST_SPREAD, MOST_STRENGTH
 from mjx_study.table import percent
 
