@@ -93,12 +93,12 @@ def differences(theirs: Mapping[str, Any], ours: Mapping[str, Any]) -> str | Non
     different = [name for name in dict(theirs) | dict(ours) if theirs.get(name) != ours.get(name)]
     digests = {name for name in different for each in (theirs, ours) if DIGEST.fullmatch(str(each.get(name)))}
     different.sort(key=lambda name: name in digests and (name not in theirs or name not in ours))
-    told = []
+    described = []
     for name in different[:3]:
         there, here = ("none" if each.get(name) is None else each[name] for each in (theirs, ours))
-        told.append(f"{name} differs" if name in digests else f"{name} {there} there and {here} here")
-    told += [f"{len(different) - 3} more"] if len(different) > 3 else []
-    return ", ".join(told) or None
+        described.append(f"{name} differs" if name in digests else f"{name} {there} there and {here} here")
+    described += [f"{len(different) - 3} more"] if len(different) > 3 else []
+    return ", ".join(described) or None
 
 
 @functools.cache

@@ -69,7 +69,7 @@ def with_error(value: float, error: float | None, digits: int = 3) -> str:
 
 
 def _to_decimals(value: float, decimals: int) -> str:
-    """Format to decimals, of which there are fewer than none for large errors."""
+    """Format to a number of decimals, which is negative for large errors."""
     rounded = round(value, decimals)
     if rounded == 0 or 1e-4 <= abs(rounded) < 1e6:
         return f"{rounded:.{max(0, decimals)}f}" if rounded else "0"

@@ -120,7 +120,7 @@ def _at_right_angles(estimates: Sequence[GradientEstimate]) -> list[np.ndarray]:
 
 
 def unmixed(estimators: Sequence[Estimator], batches: dict[str, Any]) -> list[GradientEstimate]:
-    """Compute the estimates that use a single batch, without interpolation; all if there are none."""
+    """Compute the estimates that use a single batch, without interpolation; by default all."""
     single = [estimator for estimator in estimators if len(estimator.needs) == 1]
     return [estimator(batches) for estimator in single or estimators]
 
