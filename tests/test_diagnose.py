@@ -15,7 +15,7 @@ import pytest
 from estimators import Differentiation, Evaluation, FirstOrder, ZerothOrder, estimate
 from mjx_study import cli
 from mjx_study.cli import options
-from mjx_study.diagnose.advice import advice
+from mjx_study.diagnose.advice import advise
 from mjx_study.diagnose.means import along_means
 from mjx_study.diagnose.measurement import ESTIMATORS, Measured, affordable, chunk_of
 from mjx_study.diagnose.page import document_of, page_lines
@@ -80,7 +80,7 @@ def test_the_bias_its_correction_and_the_best_estimator(found: Diagnosis) -> Non
 
 def advised(found: Diagnosis, **changes: Any) -> list[str]:
     """The texts of the advice where other numbers had been measured."""
-    return [text for text, _ in advice(dataclasses.replace(found, **changes))]
+    return [text for text, _ in advise(dataclasses.replace(found, **changes))]
 
 
 def with_estimator(found: Diagnosis, name: str, **changes: Any) -> tuple[Measured, ...]:
@@ -254,7 +254,7 @@ def test_biases_without_the_usual_explanation(found: Diagnosis) -> None:
 def test_nothing_is_advised_or_judged_without_a_significant_gradient(found: Diagnosis) -> None:
     """Errors are then absolute; twice the standard error takes four times the samples."""
     unseen = dataclasses.replace(found, estimators=tuple(planted(estimator=name, norm=0.1) for name in ESTIMATORS))
-    ((text, flags),) = advice(unseen)
+    ((text, flags),) = advise(unseen)
     assert text.startswith("no estimator can be recommended") and not flags
     page, norm_error = page_lines(unseen), 2 / math.sqrt(500)
     assert f"its norm is 0.100 ± {norm_error:.3f}; --samples 1600 would resolve one of 0.1, and a larger" in page[3]

@@ -42,7 +42,7 @@ def cautions(found: Diagnosis) -> Iterator[str]:
         yield "derivatives of a step are not right (see below): do not trust a first-order estimate"
 
 
-def advice(found: Diagnosis) -> Iterator[Advice]:
+def advise(found: Diagnosis) -> Iterator[Advice]:
     """Recommendations: the best estimator, the bias of first order, and whether its correction can be trusted."""
     if not found.resolved:
         more = "more --samples may resolve it (see above); or take" if found.norm else "take"

@@ -7,7 +7,7 @@ import shlex
 import textwrap
 from typing import Any, Final
 
-from mjx_study.diagnose.advice import advice, cautions
+from mjx_study.diagnose.advice import advise, cautions
 from mjx_study.diagnose.columns import CONTACTS, ESTIMATES
 from mjx_study.diagnose.means import ALONG_MEANS
 from mjx_study.diagnose.measurement import RESOLVED_SE, Measured
@@ -57,7 +57,7 @@ def document_of(found: Diagnosis) -> dict[str, Any]:
         "resolved": found.resolved,
         "samples_needed": found.samples_needed if found.resolved else None,
         "warnings": [*found.warnings, *cautions(found)],
-        "advice": [text for text, _ in advice(found)],
+        "advice": [text for text, _ in advise(found)],
         "environment": environment(),
     }
     return as_plain(document)
@@ -85,7 +85,7 @@ def page_lines(found: Diagnosis) -> list[str]:
     batch = f"--estimators {','.join(each.estimator for each in found.estimators)} --samples {found.samples}"
     lines += ["", f"estimators, by their {error} after a second of computing", *_estimator_lines(found)]
     lines += [f"{check} --mean --direction {ALONG_MEANS} {batch}", f"{compare} {batch}", "", "advice"]
-    for text, flags in advice(found):
+    for text, flags in advise(found):
         lines += textwrap.wrap(text, 100, initial_indent="  ", subsequent_indent="    ")
         lines += [f"{compare} {flags}"] if flags else []
     return lines
