@@ -23,8 +23,7 @@ from mjx_study.version import version_of
 VERSIONED: Final = ("mjx-study", "mujoco", "mujoco-mjx", "jax", "jaxlib", "numpy", "optax")
 """Packages whose version may affect results."""
 NOT_COMPUTING: Final = frozenset(
-    ["cli", "plots", "render", "gradcheck", "diagnose", "claims"]
-    + ["bench.py", "report.py", "_public.py", "__main__.py", "__init__.py"]
+    ["cli", "plots", "render", "gradcheck", "diagnose", "claims", "bench.py", "report.py", "_public.py", "__main__.py"]
 )
 """Parts of mjx_study that no study imports while it computes, and so do not affect results; all others count."""
 DIGEST: Final = re.compile("[0-9a-f]{12,64}")

@@ -32,7 +32,7 @@ def test_a_digest_is_checked() -> None:
 
 
 @pytest.mark.parametrize("kind", ["fifo", "socket", "folder", "device"])
-def test_what_is_no_cached_file_is_none(kind: str, tmp_path: Path) -> None:
+def test_non_regular_files_are_not_read(kind: str, tmp_path: Path) -> None:
     path = tmp_path / "entry"
     assert read_cached(path) is None
     put_no_file(path, kind)

@@ -59,7 +59,7 @@ def leftovers(folder: Path) -> list[Path]:
     [(errno.ENOSPC, False), (errno.ENOSPC, True), (errno.EIO, False), (errno.EROFS, True)],
     ids=["full once", "full", "broken once", "read-only"],
 )
-def test_a_fault_at_any_write_leaves_what_is_complete(tmp_path: Path, code: int, lasting: bool) -> None:
+def test_a_fault_at_any_write_keeps_complete_files(tmp_path: Path, code: int, lasting: bool) -> None:
     """A disk that is full, broken or read-only at the first write of a study, the second, and so on."""
     folders = [tmp_path / "0"]
     for at in every_fault(code, lambda: study(folders[-1]), lasting=lasting):
@@ -156,7 +156,7 @@ def test_what_a_living_process_writes_stays(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["fifo", "socket", "folder", "device"])
-def test_what_is_no_file_is_refused_at_once(tmp_path: Path, kind: str) -> None:
+def test_non_regular_files_are_refused_at_once(tmp_path: Path, kind: str) -> None:
     folder = tmp_path / "study"
     study(folder)
     with deadline(5):

@@ -70,7 +70,7 @@ def test_a_wrong_derivative_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
     assert report.lines()[-1] == "SOMETHING IS WRONG: see above"
 
 
-def test_a_kink_is_told_from_a_wrong_derivative() -> None:
+def test_a_kink_is_not_a_wrong_derivative() -> None:
     """Without a first push the bodies rest exactly at the onset of contact, where a difference straddles it."""
     task = make_task("pusher", horizon=6)
     task = task.replace(theta=task.theta.at[0].set(0.0))
@@ -81,7 +81,7 @@ def test_a_kink_is_told_from_a_wrong_derivative() -> None:
 
 
 @pytest.mark.slow
-def test_a_jump_is_told_from_a_wrong_derivative() -> None:
+def test_a_jump_is_not_a_wrong_derivative() -> None:
     """MuJoCo's default contact begins with its damping force: a ball that arrives with speed meets a jump."""
     falling = BALL.format(name="z", axis="0 0 1").replace("<body", '<body pos="0 0 .1"')
     key = '<keyframe><key qpos="0" qvel="-1"/></keyframe>'
@@ -174,7 +174,7 @@ def test_a_nan_fails_in_the_mode_that_has_it() -> None:
 
 
 @pytest.mark.slow
-def test_an_unconverged_solve_is_told_from_a_wrong_derivative() -> None:
+def test_an_unconverged_solve_is_not_a_wrong_derivative() -> None:
     """One iteration on two contacts that compete; given its budget, the same scene is right."""
     sliding = (
         '<geom type="plane" size="1 1 1"/><body pos="0 0 .0996"><joint name="z" type="slide" axis="0 0 1"/>'
@@ -230,7 +230,7 @@ def test_a_stiffness_needs_the_pair_that_it_acts_on() -> None:
         plan_scene_gradcheck(scene, ["penalty"], [10.0], seed=0, pair=("pusher", "nothing"))
 
 
-def test_plans_refuse_what_cannot_be_checked() -> None:
+def test_plans_are_refused() -> None:
     task = make_task("pusher", horizon=3)
     with jax.enable_x64(False):
         single = make_task("pusher", horizon=3)
@@ -260,7 +260,7 @@ def test_plans_refuse_what_cannot_be_checked() -> None:
         (["broken.xml"], "broken.xml"),
     ],
 )
-def test_bad_requests_are_said_in_a_line(
+def test_invalid_requests_are_refused_in_one_line(
     arguments: list[str],
     message: str,
     tmp_path: Path,

@@ -219,7 +219,7 @@ def test_rows_are_compared_whatever_their_order() -> None:
         ("efc_aref", "EQUALITY", "reference accelerations of joint equality rows"),
     ],
 )
-def test_rows_that_differ_are_no_documented_difference(name: str, kind: str, cause: str) -> None:
+def test_different_rows_are_not_a_documented_difference(name: str, kind: str, cause: str) -> None:
     """Beside one that is."""
     stages = dict(mixed_stages())
     chosen = stages["efc_type"] == int(getattr(mujoco.mjtConstraint, f"mjCNSTR_{kind}"))
@@ -237,7 +237,7 @@ def test_contacts_with_other_tangents_are_placed_differently() -> None:
     assert documented and "their normals by 0.0e+00 and their tangents by 1.0e+00" in found, found
 
 
-def test_a_row_that_one_engine_lacks_is_no_documented_difference() -> None:
+def test_a_missing_row_is_not_a_documented_difference() -> None:
     stages = dict(mixed_stages())
     active = np.flatnonzero(np.abs(stages["efc_J"]).max(axis=1) > 0)
     stages["efc_J"] = stages["efc_J"] * (np.arange(len(stages["efc_J"])) != active[-1])[:, None]
@@ -273,7 +273,7 @@ RESTING = """<mujoco><worldbody><geom type="plane" size="1 1 .1"/><body pos="0 0
 
 
 @pytest.mark.parametrize("name", ["dist", "pos", "frame", "efc_J", "efc_aref", "efc_D", "xpos", "qM", "qacc_smooth"])
-def test_what_is_not_a_number_differs(name: str) -> None:
+def test_nonfinite_quantities_differ(name: str) -> None:
     """And is compared nevertheless: no step ends in a traceback."""
     host = mujoco.MjModel.from_xml_string(RESTING)
     state = HostState(host.qpos0.copy(), np.zeros(6), np.zeros(0), np.zeros(0), np.zeros(6))
