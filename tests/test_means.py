@@ -44,6 +44,8 @@ def test_estimators_take_their_options(monkeypatch: pytest.MonkeyPatch, capsys: 
         (["tennis", "--mean", "--onset", "jump", "--estimators", "total_propagation"], "have no onset term"),
     ],
 )
-def test_meaningless_options_are_refused(arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_meaningless_options_are_refused(
+    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(["gradcheck", *arguments]) == 2
     assert message in capsys.readouterr().err

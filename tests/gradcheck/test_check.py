@@ -1,4 +1,4 @@
-"""The check passes what is right, and finds, names and explains what is not."""
+"""The check passes right derivatives, and finds, names and explains the others."""
 
 import json
 from pathlib import Path
@@ -36,7 +36,7 @@ def only(report: GradcheckReport, verdict: str) -> Finding:
 
 @pytest.fixture
 def configured(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The tests' own cases stand: JAX takes its devices once per process."""
+    """Keep the tests' settings: JAX takes its devices once per process."""
     monkeypatch.setattr(options, "configure", lambda **_: None)
 
 
@@ -112,7 +112,7 @@ def test_a_joint_at_its_limit_is_named() -> None:
 
 @pytest.mark.slow
 def test_an_upright_cylinder_excuses_its_own_entries_and_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its three contact points turn with the direction in which it tilts, however little; what stands beside does not.
+    """Its three contact points turn with the direction in which it tilts, however little; bodies beside it do not jump.
 
     The tilt is 1e-9 rad, which differences reach across. The planted fault is in a slider that touches nothing.
     """

@@ -1,4 +1,4 @@
-"""Differences over a ladder of steps find the derivative, or what is there in its place."""
+"""Differences over a ladder of steps find the derivative, or the kind of nonsmoothness."""
 
 import dataclasses
 from collections.abc import Callable
@@ -97,9 +97,9 @@ def test_the_ladder_ends_below_what_a_contact_can_show() -> None:
 
 
 def test_forces_that_cancel_are_rounded() -> None:
-    """Two constraints pull a slider apart: its velocity follows from their difference, which is no jump.
+    """Two constraints pull a slider apart: its velocity follows from their difference, which does not jump.
 
-    Rounding of half the size that is expected looks like one wherever that size is not told.
+    Rounding of half the expected size looks like one unless that size is given.
     """
     pull = '<joint joint1="x" polycoef="{} 0 0 0 0"/>'
     xml = f"""<mujoco><worldbody><body><joint name="x" type="slide"/><geom size=".1" mass="1"/></body></worldbody>

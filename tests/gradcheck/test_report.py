@@ -1,4 +1,4 @@
-"""What a report says and how the command exits, without a computation."""
+"""Lines of a report and exit codes of the command, without a computation."""
 
 import dataclasses
 

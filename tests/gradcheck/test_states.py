@@ -1,4 +1,4 @@
-"""States that exercise what a model has, and what is said where they do not; with the C engine alone."""
+"""States exercise all parts of a model, or the missing parts are reported; with the C engine alone."""
 
 import mujoco
 import numpy as np
