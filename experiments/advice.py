@@ -22,7 +22,8 @@ import numpy as np
 
 from estimators import GradientEstimate, make_estimator, oracles_of, squared_bias_of_means
 from estimators.confidence import coverage_interval
-from experiments.pages import DATA, DOCS, with_table
+from experiments import DATA, DOCS
+from experiments.pages import markdown_table, write_tables
 from mjx_study.choices import DEFAULT_SOLIMP, DEFAULT_SOLREF, STIFF_SOLIMP
 from mjx_study.diagnose import ESTIMATORS, measure
 from mjx_study.objective import MjxObjective, Simulator, chunk_for
@@ -174,14 +175,14 @@ def result(case: Case, simulator: Simulator) -> dict[str, Any]:
     objective = simulator.objective(contact)
     means, seconds = measured(objective, size)
     truth = reference(objective, jax.random.key(SEEDS[1] + 1))
-    told = {
+    line = {
         "case": case.name,
         "model": case.model,
         "held_out": case.model not in KNOWN,
         "advised": advice.best.estimator,
     }
-    said = {each.estimator: each.verdict for each in advice.estimators if each.paths}
-    return told | {"size": size, **factors(means, seconds, size, truth, advice.best.estimator), "means": said}
+    verdicts = {each.estimator: each.verdict for each in advice.estimators if each.paths}
+    return line | {"size": size, **factors(means, seconds, size, truth, advice.best.estimator), "means": verdicts}
 
 
 def read() -> list[dict[str, Any]]:
@@ -199,8 +200,7 @@ def verdict(each: dict[str, Any]) -> str:
 
 def table(results: list[dict[str, Any]]) -> str:
     """For the page, in Markdown."""
-    lines = ["| models | cases | undecided | within a factor of two | share, 95 % interval | largest factor |"]
-    lines += ["| --- " * 6 + "|"]
+    rows = []
     for what, held_out in (("held out", True), ("known", False)):
         some = [each for each in results if each["held_out"] is held_out]
         if not some:
@@ -211,19 +211,20 @@ def table(results: list[dict[str, Any]]) -> str:
         names = ", ".join(f"`{name}`" for name in dict.fromkeys(each["model"] for each in some))
         row = [f"{what}: {names}", len(some), len(some) - len(decided), f"{sum(good)} of {len(good)}"]
         row += [f"{percent(share)} ({percent(low)} to {percent(high)})", max(each["factor"] for each in decided)]
-        lines.append(f"| {' | '.join(map(str, row))} |")
+        rows.append(row)
     factors = [each["factor"] for each in results]
     within, worst = sum(each <= FACTOR for each in factors), max(factors)
     note = (
         f"{len(results)} of the {len(list(cases()))} cases of the script were run. By the factor without its interval, "
     )
     note += f"{within} of {len(results)} are within two, undecided ones included; the largest is {worst}."
-    return "\n".join([*lines, "", f"*{note}*"])
+    header = ("models", "cases", "undecided", "within a factor of two", "share, 95 % interval", "largest factor")
+    return f"{markdown_table(header, rows)}\n\n*{note}*"
 
 
 def write_page() -> None:
     """Put the table into the page."""
-    PAGE.write_text(with_table(PAGE.read_text(), "advice", table(read())))
+    write_tables(PAGE, {"advice": table(read())})
 
 
 def main() -> None:

@@ -5,7 +5,7 @@
 A minute on one core. Everything between the markers of the page is replaced; the text around it is written by hand.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable
 from typing import Any, Final, NamedTuple
 
 import jax
@@ -15,7 +15,8 @@ from jax import Array
 
 import estimators
 from estimators import ENOUGH_EFFECTIVE, ESTIMATORS, make_estimator, summarise
-from experiments.pages import DOCS, with_table
+from experiments import DOCS
+from experiments.pages import markdown_table, write_tables
 from mjx_study.reference import LinearQuadratic, ReferenceObjective
 from mjx_study.runtime import configure
 from mjx_study.study.findings import DETECTED_SE
@@ -237,29 +238,23 @@ def _share(value: float) -> str:
     return f"{value:.3f}" if 0 < value < 0.1 else f"{value:.2f}"
 
 
-def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """In Markdown."""
-    lines = [header, ["---"] * len(header), *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
-
-
 def tables() -> dict[str, str]:
     """Every table of the page, by its name."""
     both = [coverage_rows(name, samples) for name in KINDS for samples in SAMPLES]
     test = ["rejects at 5 %", "believable", "rejects of those"]
     wide = ["relative error", "covers", "debiased", "covers", "cosine", "covers", "debiased", "covers"]
     return {
-        "intervals": table(["samples of", "n", *COLUMNS.values()], [row for row, _ in both]),
-        "test": table(["samples of", "n", *test], [row for _, row in both]),
-        "rare": table(
+        "intervals": markdown_table(["samples of", "n", *COLUMNS.values()], [row for row, _ in both]),
+        "test": markdown_table(["samples of", "n", *test], [row for _, row in both]),
+        "rare": markdown_table(
             ["rare samples expected", "n", "z test", *test],
             [rare_row(expected, n) for expected, n in ((0.1, 50), (0.4, 50), (1, 50), (3.2, 400), (8, 400), (20, 400))],
         ),
-        "dimensions": table(
+        "dimensions": markdown_table(
             ["parameters", "reference ±", "true error", *wide],
             [dimension_row(*case) for case in ((5, 0.3, 0.02), (200, 0.3, 0.02), (200, 0.3, 0.1), (200, 0.0, 0.02))],
         ),
-        "weights": table(
+        "weights": markdown_table(
             ["problem", "estimator", "N", "bias, plug-in", "bias, cross-fitted", "variance, cross-fitted / plug-in"],
             [*weights_rows(10), *weights_rows(40, 5000)],
         ),
@@ -268,11 +263,7 @@ def tables() -> dict[str, str]:
 
 def main() -> None:
     configure()
-    page = PAGE.read_text()
-    for name, text in tables().items():
-        page = with_table(page, name, text)
-    PAGE.write_text(page)
-    print(f"written: {PAGE}")
+    write_tables(PAGE, tables())
 
 
 if __name__ == "__main__":

@@ -12,7 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from estimators import NOISES, first_order, zeroth_order
-from experiments.atlas.measure import task_of
+from experiments.atlas.design import task_of
+from experiments.pages import markdown_row
 from mjx_study.objective import Simulator
 from mjx_study.runtime import configure
 from mjx_study.simulation.contact import contact_model, family_model
@@ -153,7 +154,7 @@ def _with_errors(values: np.ndarray, errors: np.ndarray) -> list[str]:
 
 
 def _print(name: str, cells: list[str]) -> None:
-    print(f"| {name} | {' | '.join(cells)} |", flush=True)
+    print(markdown_row(name, *cells), flush=True)
 
 
 if __name__ == "__main__":

@@ -8,6 +8,7 @@ import math
 
 import numpy as np
 
+from experiments.pages import markdown_row, markdown_table
 from mjx_study.claims.laboratory import EFFORTS, RELAXATIONS, Laboratory, Landscape, Slopes
 from mjx_study.runtime import configure
 
@@ -34,7 +35,7 @@ def main() -> None:
     lab = Laboratory(dataclasses.replace(EFFORTS["quick"], density=120))
     for task, angles in ANGLES.items():
         header = [task, "contact", *(f"{angle}: E[FoBG] / slope, deviation" for angle in angles)]
-        print(f"\n| {' | '.join(header)} |\n|{' --- |' * len(header)}")
+        print("\n" + markdown_table(header, []))
         for family in FAMILIES:
             for name, treatment in TREATMENTS.items():
                 row = [name, f"`{family}`"]
@@ -42,7 +43,7 @@ def main() -> None:
                     at = lab.slopes(task, family, angle, stiffness=STIFFNESS, **treatment)  # type: ignore[arg-type]
                     share, error = at.first / at.gradient, sum(at.errors)
                     row.append(f"{share:.3g} ± {error:.1g}, {standard_deviation(at) / abs(at.gradient):.2g}")
-                print(f"| {' | '.join(row)} |", flush=True)
+                print(markdown_row(*row), flush=True)
 
 
 if __name__ == "__main__":

@@ -7,7 +7,8 @@ Six sweeps, in results/study/; half an hour on two cores, and it goes on where i
 
 from typing import Final
 
-from experiments.pages import DOCS, ROOT, save_figure
+from experiments import ROOT
+from experiments.pages import save_figure
 from mjx_study.cli.output import shown_progress
 from mjx_study.plots.study import plot_study
 from mjx_study.runtime import configure
@@ -71,9 +72,7 @@ def main() -> None:
         folder = ROOT / "results" / "study" / name
         with shown_progress() as progress:
             run_study(plan_study(config), folder, progress)
-        path = DOCS / f"{name}.png"
-        save_figure(plot_study(load_study(folder))[FIGURES.get(name, name)], path)
-        print(f"written: {path}")
+        save_figure(plot_study(load_study(folder))[FIGURES.get(name, name)], name)
 
 
 if __name__ == "__main__":

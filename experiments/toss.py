@@ -16,6 +16,7 @@ import mujoco
 import numpy as np
 
 import mjx_study as study
+from experiments.pages import markdown_row, markdown_table
 from mjx_study.simulation.contact import ContactModel
 from mjx_study.simulation.scene import put_scene
 from mjx_study.study.landscapes import Line, grid, means
@@ -74,22 +75,19 @@ def tossed(geom: str, onset: str) -> study.Task:
     )
 
 
-def row(*cells: str) -> None:
-    """Print a row of the table."""
-    print(f"| {' | '.join(cells)} |", flush=True)
-
-
 def main() -> None:
     """Print the table."""
     jax.config.update("jax_enable_x64", True)
-    row("scene", "slope", "E[FoBG]", "with the linear term")
-    row(*["---"] * 4)
+    print(markdown_table(("scene", "slope", "E[FoBG]", "with the linear term"), []))
     points = grid(START, START, SPREAD, 4000, "gaussian")
     for pulls, timestep in itertools.product((True, False), (0.1, 0.001)):
         found = means(points, *point(points, timestep, pulls=pulls), np.array([START]), SPREAD, "gaussian")
         what = "as published" if pulls else "without its pull"
-        numbers = told(found.slope, found.slope_error), told(found.first, found.first_error)
-        row(f"point, {what}, h = {1e3 * timestep:g} ms", *numbers, "")
+        numbers = (
+            _with_error(found.slope, found.slope_error),
+            _with_error(found.first, found.first_error),
+        )
+        print(markdown_row(f"point, {what}, h = {1e3 * timestep:g} ms", *numbers, ""))
     points = grid(SPEED, SPEED, SIGMA, POINTS, "gaussian")
     for geom in GEOMS:
         lines = [Line(tossed(geom, onset)) for onset in ("none", "linear")]
@@ -98,12 +96,15 @@ def main() -> None:
             plain, corrected = (
                 means(points, *line(points, contact), np.array([SPEED]), SIGMA, "gaussian") for line in lines
             )
-            numbers = [told(plain.slope, plain.slope_error), told(plain.first, plain.first_error)]
-            row(f"{geom}, solimp[0] = {name}", *numbers, told(corrected.first, corrected.first_error))
+            numbers = [
+                _with_error(plain.slope, plain.slope_error),
+                _with_error(plain.first, plain.first_error),
+            ]
+            numbers.append(_with_error(corrected.first, corrected.first_error))
+            print(markdown_row(f"{geom}, solimp[0] = {name}", *numbers), flush=True)
 
 
-def told(value: np.ndarray, error: np.ndarray) -> str:
-    """A mean with the error of its quadrature."""
+def _with_error(value: np.ndarray, error: np.ndarray) -> str:
     return f"{value[0]:.3g} ± {error[0]:.1g}"
 
 

@@ -25,6 +25,7 @@ from scipy import stats
 
 import mjx_study
 from estimators import Differentiation, Evaluation, FirstOrder, circulation
+from experiments.pages import markdown_table
 from mjx_study import differentiable_mjx
 
 STEPS: Final = 100
@@ -164,21 +165,19 @@ def means(environment: Any, onset: str, samples: int) -> Iterator[dict[str, floa
 
 
 def tables(lines: Iterable[dict[str, Any]]) -> str:
-    """What was found, in Markdown."""
+    """Format the results of both kinds of runs as two Markdown tables."""
     lines = list(lines)
     singles, batches = ([line for line in lines if bool(line["onset"]) == mean] for mean in (False, True))
-    rows = [
-        "| environment | DoF, steps | budget | stock | at one iteration | here | differences | converged: here |"
-        " off differences of 1e-6, 1e-7, 1e-8 by |",
-        "| --- | --- | --- | --- | --- | --- | --- | --- | --- |",
-    ]
+    rows = []
     for line in singles:
         stock = line["stock_own"] if isinstance(line["stock_own"], str) else f"{line['stock_own']:.4g}"
         off = ", ".join(f"{abs(found / line['ours'] - 1):.0e}" for found in line["differences"][2:])
         slopes = (line["stock_one"], line["ours_own"], line["differences_own"][-1], line["ours"])
         cells = [f"`{line['name']}`", f"{line['nv']}, {line['steps']}", str(line["budget"]), stock]
-        rows.append("| " + " | ".join([*cells, *(f"{slope:.4g}" for slope in slopes), off]) + " |")
-    rows += ["", "| environment | onset | N | difference [m] | gap [m] | smallest effective N |", "| --- " * 6 + "|"]
+        rows.append([*cells, *(f"{slope:.4g}" for slope in slopes), off])
+    header = ("environment", "DoF, steps", "budget", "stock", "at one iteration", "here", "differences")
+    first = markdown_table((*header, "converged: here", "off differences of 1e-6, 1e-7, 1e-8 by"), rows)
+    rows = []
     for name, onset in dict.fromkeys((line["name"], line["onset"]) for line in batches):
         mine = [line for line in batches if (line["name"], line["onset"]) == (name, onset)]
         intervals = []
@@ -187,8 +186,9 @@ def tables(lines: Iterable[dict[str, Any]]) -> str:
             wide = stats.t.ppf((1 + CONFIDENCE) / 2, len(mine) - 1) * stats.sem(values)
             intervals.append(f"{np.mean(values):.3g} ± {wide:.2g}")
         least = min(line["effective"] for line in mine)
-        rows.append(f"| `{name}` | {onset} | {BATCH * len(mine)} | {' | '.join(intervals)} | {least:.1f} |")
-    return "\n".join(rows)
+        rows.append([f"`{name}`", onset, BATCH * len(mine), *intervals, f"{least:.1f}"])
+    header = ("environment", "onset", "N", "difference [m]", "gap [m]", "smallest effective N")
+    return f"{first}\n\n{markdown_table(header, rows)}"
 
 
 def main() -> None:
