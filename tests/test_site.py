@@ -24,7 +24,7 @@ def pages_of(nav: Any) -> list[str]:
 def test_every_page_is_in_the_navigation_once() -> None:
     nav = pages_of(yaml.safe_load((ROOT / "mkdocs.yml").read_text())["nav"])
     staged = [str(place) for place in OWN.values() if place.suffix == ".md"]
-    made = [f"reference/{name}.md" for name in ("commands", *site.PACKAGES)]
+    made = [f"reference/{name}.md" for name in ("commands", "variables", *site.PACKAGES)]
     assert sorted(nav) == sorted(staged + made)
     assert {f"docs/{path.name}" for path in (ROOT / "docs").glob("*.md")} <= {str(source) for source in OWN}
 

@@ -23,7 +23,9 @@ from typing import Final
 import nbformat
 from latex2mathml.converter import convert
 
+from experiments.pages import markdown_table
 from mjx_study import cli
+from mjx_study.study.variables import VARIABLES
 
 ROOT = Path(__file__).parents[1]
 PAGES = ROOT / "build" / "pages"
@@ -143,6 +145,15 @@ def page_of_names(package: str) -> str:
     return "\n\n".join(parts)
 
 
+def page_of_variables() -> str:
+    """Every variable of a study's dataset, a table for each kind of study."""
+    parts = ["# Variables of a study", "Dimensions are those within a cell; see [studies](../studies.md#in-python)."]
+    for kind, variables in VARIABLES.items():
+        rows = [(f"`{name}`", ", ".join(each.dims), each.unit, each.description) for name, each in variables.items()]
+        parts += [f"## {kind.capitalize()}", markdown_table(("name", "dimensions", "unit", "meaning"), rows)]
+    return "\n\n".join(parts)
+
+
 def page_of_commands() -> str:
     """The help of every command."""
     return "\n\n".join(
@@ -173,7 +184,8 @@ def main() -> None:
             shutil.copy(ROOT / source, target)
     os.environ["COLUMNS"] = "100"  # of the help
     (PAGES / "reference").mkdir()
-    for name, text in [("commands", page_of_commands()), *((name, page_of_names(name)) for name in PACKAGES)]:
+    pages = {"commands": page_of_commands(), "variables": page_of_variables()}
+    for name, text in (pages | {name: page_of_names(name) for name in PACKAGES}).items():
         (PAGES / "reference" / f"{name}.md").write_text(text)
     build = subprocess.run([sys.executable, "-m", "zensical", "build", "--strict", "--clean"], cwd=ROOT, **PIPED)
     print(build.stdout, end="")
