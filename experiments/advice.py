@@ -23,16 +23,16 @@ import numpy as np
 from estimators import GradientEstimate, make_estimator, oracles_of, squared_bias_of_means
 from estimators.confidence import coverage_interval
 from experiments import DATA, DOCS
-from experiments.pages import markdown_table, write_tables
+from experiments.pages import write_tables
 from mjx_study.choices import DEFAULT_SOLIMP, DEFAULT_SOLREF, STIFF_SOLIMP
 from mjx_study.diagnose import ESTIMATORS, measure
+from mjx_study.experiment.gradients import reference_of
+from mjx_study.experiment.sampling import cell_keys, draw_batches
 from mjx_study.objective import MjxObjective, Simulator, chunk_for
 from mjx_study.runtime import configure, local_devices
 from mjx_study.simulation.contact import contact_model
 from mjx_study.simulation.scene import load_scene
-from mjx_study.study.gradients import reference_of
-from mjx_study.study.sampling import cell_keys, draw_batches
-from mjx_study.table import percent
+from mjx_study.table import markdown_table, percent
 from mjx_study.tasks import make_task
 from mjx_study.tasks.mjcf import scene_task
 from mjx_study.tasks.task import Task
@@ -219,7 +219,7 @@ def table(results: list[dict[str, Any]]) -> str:
     )
     note += f"{within} of {len(results)} are within two, undecided ones included; the largest is {worst}."
     header = ("models", "cases", "undecided", "within a factor of two", "share, 95 % interval", "largest factor")
-    return f"{markdown_table(header, rows)}\n\n*{note}*"
+    return f"{markdown_table(rows, header)}\n\n*{note}*"
 
 
 def write_page() -> None:

@@ -16,11 +16,11 @@ from jax import Array
 import estimators
 from estimators import ENOUGH_EFFECTIVE, ESTIMATORS, make_estimator, summarise
 from experiments import DOCS
-from experiments.pages import markdown_table, write_tables
+from experiments.pages import write_tables
 from mjx_study.reference import LinearQuadratic, ReferenceObjective
+from mjx_study.results.findings import DETECTED_SE
 from mjx_study.runtime import configure
-from mjx_study.study.findings import DETECTED_SE
-from mjx_study.table import percent
+from mjx_study.table import markdown_table, percent
 
 PAGE: Final = DOCS / "coverage.md"
 SAMPLES: Final = (10, 50, 400)
@@ -244,19 +244,19 @@ def tables() -> dict[str, str]:
     test = ["rejects at 5 %", "believable", "rejects of those"]
     wide = ["relative error", "covers", "debiased", "covers", "cosine", "covers", "debiased", "covers"]
     return {
-        "intervals": markdown_table(["samples of", "n", *COLUMNS.values()], [row for row, _ in both]),
-        "test": markdown_table(["samples of", "n", *test], [row for _, row in both]),
+        "intervals": markdown_table([row for row, _ in both], ["samples of", "n", *COLUMNS.values()]),
+        "test": markdown_table([row for _, row in both], ["samples of", "n", *test]),
         "rare": markdown_table(
-            ["rare samples expected", "n", "z test", *test],
             [rare_row(expected, n) for expected, n in ((0.1, 50), (0.4, 50), (1, 50), (3.2, 400), (8, 400), (20, 400))],
+            ["rare samples expected", "n", "z test", *test],
         ),
         "dimensions": markdown_table(
-            ["parameters", "reference ±", "true error", *wide],
             [dimension_row(*case) for case in ((5, 0.3, 0.02), (200, 0.3, 0.02), (200, 0.3, 0.1), (200, 0.0, 0.02))],
+            ["parameters", "reference ±", "true error", *wide],
         ),
         "weights": markdown_table(
-            ["problem", "estimator", "N", "bias, plug-in", "bias, cross-fitted", "variance, cross-fitted / plug-in"],
             [*weights_rows(10), *weights_rows(40, 5000)],
+            ["problem", "estimator", "N", "bias, plug-in", "bias, cross-fitted", "variance, cross-fitted / plug-in"],
         ),
     }
 

@@ -20,8 +20,9 @@ from mujoco import mjx
 
 import mjx_study
 from experiments import ROOT
-from experiments.pages import markdown_row, markdown_table
+from experiments.pages import markdown_row
 from experiments.timing import interleaved
+from mjx_study.table import markdown_table
 
 TESTED: Final = Path(mjx.__file__).parent / "test_data"
 MODELS: Final = {
@@ -85,7 +86,7 @@ def main() -> None:
     batch = parser.parse_args().batch
     mjx_study.configure(cpu_devices=1)
     header = "model", "DoF", "rollouts / stock", "gradients / stock, one iteration", "gradients / stock, model's budget"
-    print(markdown_table(header, []))
+    print(markdown_table([], header))
     for name, path in MODELS.items():
         found = measured(path, batch)
         ratios = [found["stock"] / found["ours"]]

@@ -14,13 +14,13 @@ import numpy as np
 from estimators import NOISES, first_order, zeroth_order
 from experiments.atlas.design import task_of
 from experiments.pages import markdown_row
+from mjx_study.experiment.landscapes import Line, Means, grid, means
+from mjx_study.experiment.resolution import direction_of
+from mjx_study.experiment.tally import onset_numbers
 from mjx_study.objective import Simulator
+from mjx_study.results.variables import ONSETS
 from mjx_study.runtime import configure
 from mjx_study.simulation.contact import contact_model, family_model
-from mjx_study.study.landscapes import Line, Means, grid, means
-from mjx_study.study.resolution import direction_of
-from mjx_study.study.tally import onset_numbers
-from mjx_study.study.variables import ONSETS
 from mjx_study.table import percent
 from mjx_study.tasks import make_task
 from mjx_study.tasks.task import Task

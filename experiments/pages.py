@@ -2,7 +2,7 @@
 
 import io
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -15,13 +15,8 @@ DPI: Final = 130
 
 
 def markdown_row(*cells: Any) -> str:
-    """Format one row of a Markdown table."""
+    """Format one row of a Markdown table, for scripts that print as they measure."""
     return f"| {' | '.join(map(str, cells))} |"
-
-
-def markdown_table(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
-    """Format a Markdown table."""
-    return "\n".join(markdown_row(*row) for row in (header, ["---"] * len(header), *rows))
 
 
 def replace_tables(text: str, tables: Mapping[str, str]) -> str:

@@ -8,9 +8,10 @@ import math
 
 import numpy as np
 
-from experiments.pages import markdown_row, markdown_table
+from experiments.pages import markdown_row
 from mjx_study.claims.laboratory import EFFORTS, RELAXATIONS, Laboratory, Landscape, Slopes
 from mjx_study.runtime import configure
+from mjx_study.table import markdown_table
 
 ANGLES = {"momentum_transfer": (0.3, 0.5, 0.7), "ball_wall": (0.2, 0.7, 0.9)}
 FAMILIES = ("mujoco_default", "mujoco_stiff")
@@ -35,7 +36,7 @@ def main() -> None:
     lab = Laboratory(dataclasses.replace(EFFORTS["quick"], density=120))
     for task, angles in ANGLES.items():
         header = [task, "contact", *(f"{angle}: E[FoBG] / slope, deviation" for angle in angles)]
-        print("\n" + markdown_table(header, []))
+        print("\n" + markdown_table([], header))
         for family in FAMILIES:
             for name, treatment in TREATMENTS.items():
                 row = [name, f"`{family}`"]

@@ -10,11 +10,11 @@ from typing import Final
 from experiments import ROOT
 from experiments.pages import save_figure
 from mjx_study.cli.output import shown_progress
+from mjx_study.execution.run import load_study, run_study
+from mjx_study.experiment.configuration import StudyConfig
+from mjx_study.experiment.plan import plan_study
 from mjx_study.plots.study import plot_study
 from mjx_study.runtime import configure
-from mjx_study.study.configuration import StudyConfig
-from mjx_study.study.plan import plan_study
-from mjx_study.study.run import load_study, run_study
 
 
 def decades(first: int, last: int, count: int) -> tuple[float, ...]:

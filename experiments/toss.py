@@ -16,10 +16,11 @@ import mujoco
 import numpy as np
 
 import mjx_study as study
-from experiments.pages import markdown_row, markdown_table
+from experiments.pages import markdown_row
+from mjx_study.experiment.landscapes import Line, grid, means
 from mjx_study.simulation.contact import ContactModel
 from mjx_study.simulation.scene import put_scene
-from mjx_study.study.landscapes import Line, grid, means
+from mjx_study.table import markdown_table
 
 STIFFNESS, DAMPING, START, SPREAD, SECONDS = 50.0, 1.0, 1.0, 0.1, 2.0  # of the point: [1/s^2], [1/s], [m], [m], [s]
 TOSSED: Final = """<mujoco>
@@ -78,7 +79,7 @@ def tossed(geom: str, onset: str) -> study.Task:
 def main() -> None:
     """Print the table."""
     jax.config.update("jax_enable_x64", True)
-    print(markdown_table(("scene", "slope", "E[FoBG]", "with the linear term"), []))
+    print(markdown_table([], ("scene", "slope", "E[FoBG]", "with the linear term")))
     points = grid(START, START, SPREAD, 4000, "gaussian")
     for pulls, timestep in itertools.product((True, False), (0.1, 0.001)):
         found = means(points, *point(points, timestep, pulls=pulls), np.array([START]), SPREAD, "gaussian")

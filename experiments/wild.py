@@ -25,8 +25,8 @@ from scipy import stats
 
 import mjx_study
 from estimators import Differentiation, Evaluation, FirstOrder, circulation
-from experiments.pages import markdown_table
 from mjx_study import differentiable_mjx
+from mjx_study.table import markdown_table
 
 STEPS: Final = 100
 """Of one rollout."""
@@ -176,7 +176,7 @@ def tables(lines: Iterable[dict[str, Any]]) -> str:
         cells = [f"`{line['name']}`", f"{line['nv']}, {line['steps']}", str(line["budget"]), stock]
         rows.append([*cells, *(f"{slope:.4g}" for slope in slopes), off])
     header = ("environment", "DoF, steps", "budget", "stock", "at one iteration", "here", "differences")
-    first = markdown_table((*header, "converged: here", "off differences of 1e-6, 1e-7, 1e-8 by"), rows)
+    first = markdown_table(rows, (*header, "converged: here", "off differences of 1e-6, 1e-7, 1e-8 by"))
     rows = []
     for name, onset in dict.fromkeys((line["name"], line["onset"]) for line in batches):
         mine = [line for line in batches if (line["name"], line["onset"]) == (name, onset)]
@@ -188,7 +188,7 @@ def tables(lines: Iterable[dict[str, Any]]) -> str:
         least = min(line["effective"] for line in mine)
         rows.append([f"`{name}`", onset, BATCH * len(mine), *intervals, f"{least:.1f}"])
     header = ("environment", "onset", "N", "difference [m]", "gap [m]", "smallest effective N")
-    return f"{first}\n\n{markdown_table(header, rows)}"
+    return f"{first}\n\n{markdown_table(rows, header)}"
 
 
 def main() -> None:

@@ -23,9 +23,9 @@ from typing import Final
 import nbformat
 from latex2mathml.converter import convert
 
-from experiments.pages import markdown_table
 from mjx_study import cli
-from mjx_study.study.variables import VARIABLES
+from mjx_study.results.variables import VARIABLES
+from mjx_study.table import markdown_table
 
 ROOT = Path(__file__).parents[1]
 PAGES = ROOT / "build" / "pages"
@@ -150,7 +150,7 @@ def page_of_variables() -> str:
     parts = ["# Variables of a study", "Dimensions are those within a cell; see [studies](../studies.md#in-python)."]
     for kind, variables in VARIABLES.items():
         rows = [(f"`{name}`", ", ".join(each.dims), each.unit, each.description) for name, each in variables.items()]
-        parts += [f"## {kind.capitalize()}", markdown_table(("name", "dimensions", "unit", "meaning"), rows)]
+        parts += [f"## {kind.capitalize()}", markdown_table(rows, ("name", "dimensions", "unit", "meaning"))]
     return "\n\n".join(parts)
 
 

@@ -21,8 +21,9 @@ from experiments.atlas.table import (
     read,
     verdicts,
 )
-from experiments.pages import markdown_table, save_figure, write_tables
+from experiments.pages import save_figure, write_tables
 from mjx_study.diagnose import SMOOTH_SHARE
+from mjx_study.table import markdown_table
 
 PAGE: Final = DOCS / "atlas.md"
 SURE: Final = 5.0
@@ -54,7 +55,7 @@ def rules_table(table: Table) -> str:
         fitted = rule.fitted(ours)
         shares = [[share(each) for each in rule.hits(theirs, value)] for value in (rule.threshold, fitted)]
         rows.append([rule.name, f"{rule.threshold:.3g}", *shares[0], f"{fitted:.2g}", *shares[1]])
-    return markdown_table(head, rows)
+    return markdown_table(rows, head)
 
 
 def jump_table(table: Table) -> str:
@@ -67,7 +68,7 @@ def jump_table(table: Table) -> str:
         for some in (part[~jumps], part[jumps]):
             rows[-1] += [share(some.fobg_off.dropna().to_numpy() == 1), int(some.fobg_off.isna().sum())]
     head = ("task", "off, no jump", "undecided", "off, force jumps", "undecided")
-    return markdown_table(head, rows)
+    return markdown_table(rows, head)
 
 
 def bound_table(table: Table) -> str:
@@ -83,7 +84,7 @@ def bound_table(table: Table) -> str:
             rows[-1].append(share(beyond.to_numpy() == 0))
     inner = [f"{low:g} to {high:g}" for low, high in itertools.pairwise(STRENGTHS)]
     within = [f"below {STRENGTHS[0]:g}", *inner, f"above {STRENGTHS[-1]:g}"]
-    return markdown_table(("task", "cells", "share left, median", *within), rows)
+    return markdown_table(rows, ("task", "cells", "share left, median", *within))
 
 
 def groups_table(table: Table) -> str:
@@ -102,7 +103,7 @@ def groups_table(table: Table) -> str:
             ", ".join(f"{100 * np.mean(each):.0f}" if len(each) else "-" for each in column) for column in columns
         ]
         rows.append([f"`{symbol}`, {meaning}", ", ".join(f"{edge:.2g}" for edge in edges), *shares])
-    return markdown_table(("group", "limits of the quarters", *VERDICTS), rows)
+    return markdown_table(rows, ("group", "limits of the quarters", *VERDICTS))
 
 
 def steps_table(table: Table) -> str:
@@ -137,7 +138,7 @@ def steps_table(table: Table) -> str:
         "variance x steps",
         "bias, median",
     )
-    return markdown_table(head, rows)
+    return markdown_table(rows, head)
 
 
 def cells_table(table: Table) -> str:
@@ -158,7 +159,7 @@ def cells_table(table: Table) -> str:
         "mean decided, where bodies meet",
         "gradients / rollout",
     )
-    return markdown_table(head, rows)
+    return markdown_table(rows, head)
 
 
 def samples_table(table: Table) -> str:
@@ -173,7 +174,7 @@ def samples_table(table: Table) -> str:
         rows[-1] += [f"{each:.2g}" if np.isfinite(each) else "-" for each in some]
     quartiles = ("lower quartile", "median", "upper quartile")
     head = ("task", "stable cells", *quartiles, "of these, mean off", *quartiles)
-    return markdown_table(head, rows)
+    return markdown_table(rows, head)
 
 
 TABLES: Final = {

@@ -17,18 +17,18 @@ from estimators.statistics import summarise
 from experiments.atlas.design import COLUMNS, Cell, contact_of
 from mjx_study.compiled import Compiled
 from mjx_study.diagnose import touch_of
+from mjx_study.experiment.reference_gradient import estimate_reference
+from mjx_study.experiment.resolution import direction_of
+from mjx_study.experiment.sampling import unconverged
+from mjx_study.experiment.tally import onset_numbers
 from mjx_study.objective import SamplePrograms, rollout_cost, spread
 from mjx_study.reference.noise import batch_noise, noise_score
+from mjx_study.results.variables import ONSETS
 from mjx_study.runtime import local_devices
 from mjx_study.simulation.contact import ContactModel, stable
 from mjx_study.simulation.dynamics import State
 from mjx_study.simulation.engine import engine_model
 from mjx_study.simulation.onset import as_row
-from mjx_study.study.reference_gradient import estimate_reference
-from mjx_study.study.resolution import direction_of
-from mjx_study.study.sampling import unconverged
-from mjx_study.study.tally import onset_numbers
-from mjx_study.study.variables import ONSETS
 from mjx_study.tasks.task import Task
 
 SAMPLES: Final = 64

@@ -11,7 +11,7 @@ import pandas as pd
 
 from estimators import ENOUGH_EFFECTIVE
 from mjx_study.diagnose import SMOOTH_SHARE, WIDTH_RATIO
-from mjx_study.study.findings import ERROR_PER_STRENGTH, LEAST_SPREAD, MOST_STRENGTH
+from mjx_study.results.findings import ERROR_PER_STRENGTH, LEAST_SPREAD, MOST_STRENGTH
 
 Table = Any
 """A pandas.DataFrame with a row for each cell; pandas comes without types."""

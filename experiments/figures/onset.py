@@ -5,7 +5,7 @@ from matplotlib.figure import Figure
 
 from experiments.figures.rollouts import BLUE, GREEN, GREY, INK, ORANGE, contact_of, task_of
 from experiments.pages import DPI
-from mjx_study.study.landscapes import Line, grid, means
+from mjx_study.experiment.landscapes import Line, grid, means
 
 
 def correction_figure() -> Figure:

@@ -8,8 +8,9 @@ from unittest import mock
 
 import numpy as np
 
-from mjx_study.study import cluster
-from mjx_study.study.store import Part, Store
+from mjx_study.execution import cluster
+from mjx_study.experiment.checkpoint import Checkpoint
+from mjx_study.storage.folder import Store
 
 
 def measure_engine(workers: int, cells: int, seconds: float, programs: int, numbers: int) -> dict[str, Any]:
@@ -41,7 +42,7 @@ def measure_engine(workers: int, cells: int, seconds: float, programs: int, numb
         with cluster.connected(f"local:{workers}") as client:
             client.wait_for_workers(workers)
             begun, processor = time.perf_counter(), time.process_time()
-            parts = {cell: Part() for cell in range(cells)}
+            parts = {cell: Checkpoint() for cell in range(cells)}
             for done, arrays in cluster.cells_on(client, Plan(), parts, lambda _: None):  # type: ignore[arg-type]
                 assert isinstance(arrays, dict) and np.all(arrays["values"] == done)
                 before = time.perf_counter()

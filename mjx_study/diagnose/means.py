@@ -17,14 +17,14 @@ from jaxtyping import Array, Float
 from estimators import Estimator, GradientEstimate, Objective, oracles_of
 from estimators.estimator import label_of
 from estimators.mean_check import TOLERANCE, Circulation, circulations
+from mjx_study.experiment.configuration import check_span
+from mjx_study.experiment.resolution import check_estimators, direction_of
+from mjx_study.experiment.sampling import cell_keys, draw_batches
 from mjx_study.objective import Simulator, chunk_for
+from mjx_study.progress import Progress, silent
+from mjx_study.results.variables import MEANS
 from mjx_study.runtime import local_devices
-from mjx_study.study.configuration import Progress, check_span
-from mjx_study.study.dataset import as_plain
-from mjx_study.study.resolution import check_estimators, direction_of
-from mjx_study.study.sampling import cell_keys, draw_batches
-from mjx_study.study.variables import MEANS
-from mjx_study.table import format_table, percent
+from mjx_study.table import as_plain, format_table, percent
 from mjx_study.tasks.contact_grid import ContactPoint
 from mjx_study.tasks.task import Task
 
@@ -34,10 +34,10 @@ FEEDBACK: Final = 0.02
 """The same for noise on the controls, in the unit of theta."""
 ALONG_MEANS: Final = "means"
 """Value of `direction` for paths along the estimators' own means, see `along_means`."""
-MOST_PATHS: Final = 3
+MAX_PATHS: Final = 3
 SHARES: Final = ("relative_gap", "detectable")
 """Columns shown in per cent."""
-LEAST_SHARE: Final = 1e-3
+MIN_SHARE: Final = 1e-3
 """Smallest share of a mean orthogonal to the others that warrants a path along it."""
 
 
@@ -115,7 +115,7 @@ def _at_right_angles(estimates: Sequence[GradientEstimate]) -> list[np.ndarray]:
         for unit in units:
             left = left - (left @ unit) * unit
         size = float(np.linalg.norm(left))
-        if len(units) < MOST_PATHS and size > LEAST_SHARE * float(np.linalg.norm(mean)):
+        if len(units) < MAX_PATHS and size > MIN_SHARE * float(np.linalg.norm(mean)):
             units.append(left / size)
     return units or [np.eye(len(np.asarray(estimates[0].mean)))[0]]
 
@@ -137,7 +137,7 @@ def check_mean(
     span: Sequence[float] | None = None,
     direction: str = "random",
     tolerance: float = TOLERANCE,
-    progress: Progress = lambda done, total, what: None,
+    progress: Progress = silent,
 ) -> list[MeanCheck]:
     """Check every estimator for every contact model.
 

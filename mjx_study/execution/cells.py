@@ -4,14 +4,14 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from typing import Any, Final
 
+from mjx_study.execution.forecast import rest
+from mjx_study.experiment.blocks import Arrays
+from mjx_study.experiment.checkpoint import Checkpoint
+from mjx_study.experiment.descents import compute_descents
+from mjx_study.experiment.gradients import Gradients, compute_gradients, done
+from mjx_study.experiment.landscapes import compute_landscapes
+from mjx_study.experiment.plan import StudyCell, StudyPlan
 from mjx_study.stopwatch import timed
-from mjx_study.study.blocks import Arrays
-from mjx_study.study.descents import compute_descents
-from mjx_study.study.forecast import rest
-from mjx_study.study.gradients import Gradients, compute_gradients, done
-from mjx_study.study.landscapes import compute_landscapes
-from mjx_study.study.plan import StudyCell, StudyPlan
-from mjx_study.study.store import Part
 
 COMPUTE: Final[dict[str, Callable[[StudyPlan], Any]]] = {
     "gradients": compute_gradients,
@@ -27,11 +27,11 @@ class Computation:
     def __init__(self, plan: StudyPlan):
         self._plan, self.compute = plan, COMPUTE[plan.settings.kind](plan)
 
-    def __call__(self, cell: StudyCell, part: Part) -> Arrays:
+    def __call__(self, cell: StudyCell, part: Checkpoint) -> Arrays:
         """Compute a cell, resuming from its checkpoint (landscapes have none)."""
         return self.end(cell, self.begin(cell, part))
 
-    def begin(self, cell: StudyCell, part: Part) -> Future[Arrays]:
+    def begin(self, cell: StudyCell, part: Checkpoint) -> Future[Arrays]:
         """Sample a cell; on accelerators its statistics may still be running on return."""
         with timed(rest(self._plan, cell)):
             if isinstance(self.compute, Gradients):

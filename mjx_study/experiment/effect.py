@@ -6,10 +6,10 @@ from typing import Final
 
 from estimators import ESTIMATORS, ORACLES, Estimator, find_estimator
 from estimators.catalogue import CATALOGUE
-from mjx_study.choices import REFERENCE
+from mjx_study.choices import REFERENCE, takes_stiffness
+from mjx_study.experiment.configuration import StudyConfig
+from mjx_study.experiment.resolution import OF_ESTIMATORS
 from mjx_study.option import SCENE_OPTIONS
-from mjx_study.study.configuration import StudyConfig, takes_stiffness
-from mjx_study.study.resolution import OF_ESTIMATORS
 from mjx_study.tasks.contact_grid import ContactPoint
 from mjx_study.tasks.task import Task
 

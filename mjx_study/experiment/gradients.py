@@ -21,13 +21,10 @@ from estimators import ORACLES, Batches, Estimator, Evaluation, GradientEstimate
 from estimators.blocks import MOST_THINNED, moments_of
 from estimators.statistics import merged_estimates
 from mjx_study.compiled import Compiled, type_of
-from mjx_study.objective import BlankObjective, MjxObjective, Simulator
-from mjx_study.reference import Reference
-from mjx_study.runtime import traces_folder
-from mjx_study.stopwatch import unheard
-from mjx_study.study.blocks import REFERENCE, Arrays, Blocks, pack
-from mjx_study.study.memory import BIAS_DRAWS, LARGEST_BLOCK, padded_size
-from mjx_study.study.plan import (
+from mjx_study.experiment.blocks import REFERENCE, Arrays, Blocks, pack
+from mjx_study.experiment.checkpoint import Checkpoint
+from mjx_study.experiment.memory import BIAS_DRAWS, LARGEST_BLOCK, padded_size
+from mjx_study.experiment.plan import (
     StudyCell,
     StudyPlan,
     block_of,
@@ -37,11 +34,14 @@ from mjx_study.study.plan import (
     padded_samples,
     seeds_together,
 )
-from mjx_study.study.reference_gradient import estimate_reference
-from mjx_study.study.sampling import Objectives, cell_keys, draw_batches, sample_keys
-from mjx_study.study.store import Part
-from mjx_study.study.tally import Tally, numbers_of, together
-from mjx_study.study.variables import BATCH, GRADIENTS, ONSETS
+from mjx_study.experiment.reference_gradient import estimate_reference
+from mjx_study.experiment.sampling import Objectives, cell_keys, draw_batches, sample_keys
+from mjx_study.experiment.tally import Tally, numbers_of, together
+from mjx_study.objective import BlankObjective, MjxObjective, Simulator
+from mjx_study.reference import Reference
+from mjx_study.results.variables import BATCH, GRADIENTS, ONSETS
+from mjx_study.runtime import traces_folder
+from mjx_study.stopwatch import unheard
 from mjx_study.tasks.contact_grid import family_grid
 from mjx_study.tasks.task import Task
 
@@ -79,11 +79,11 @@ class Gradients:
         pairs = self._config.settings.reference_samples
         return jax.random.split(odd, pairs), jax.random.split(candidate, CANDIDATES)
 
-    def __call__(self, cell: StudyCell, part: Part = Part()) -> Arrays:  # noqa: B008, it is empty
+    def __call__(self, cell: StudyCell, part: Checkpoint = Checkpoint()) -> Arrays:  # noqa: B008, it is empty
         """Compute a cell's numbers, see `begin`."""
         return self.begin(cell, part).result()
 
-    def begin(self, cell: StudyCell, part: Part) -> Future[Arrays]:
+    def begin(self, cell: StudyCell, part: Checkpoint) -> Future[Arrays]:
         """Sample a cell, in whole batches or in blocks, skipping blocks in the checkpoint.
 
         Returns:
@@ -98,7 +98,7 @@ class Gradients:
             part.save(blocks.arrays())
         return done(self.merged(cell, blocks))
 
-    def restored(self, cell: StudyCell, part: Part) -> Blocks:
+    def restored(self, cell: StudyCell, part: Checkpoint) -> Blocks:
         """Blocks of a cell, with the finished ones of its checkpoint; StudyError if that does not fit."""
         with part.restored():
             blocks = self.begun(cell, part.kept)

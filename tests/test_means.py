@@ -7,8 +7,7 @@ import pytest
 
 from estimators import make_estimator
 from mjx_study.cli import main, options
-from mjx_study.gradcheck import check_mean
-from mjx_study.gradcheck.mean import lines_of
+from mjx_study.diagnose.means import check_mean, lines_of
 from mjx_study.tasks import make_task
 from mjx_study.tasks.contact_grid import family_grid
 

@@ -12,7 +12,6 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import nullcontext
 from functools import cached_property, partial
 from typing import Any, Final
 
@@ -24,17 +23,14 @@ from jaxtyping import Array, Float, Key
 from estimators import Estimator, draw
 from estimators.estimator import draw_at, sample_keys
 from mjx_study.compiled import Compiled
+from mjx_study.experiment.checkpoint import Checkpoint
+from mjx_study.experiment.iteration import Descent, Record, advance, begin, going, make_optimizer, schedule_factors
+from mjx_study.experiment.plan import StudyCell, StudyPlan, estimators_of
+from mjx_study.experiment.sampling import rollouts_of
 from mjx_study.objective import Simulator, TracedObjective, simulate
 from mjx_study.reference import Reference
+from mjx_study.results.variables import HISTORY, METRIC, START
 from mjx_study.simulation.contact import ContactModel, soften
-from mjx_study.stopwatch import tell, timed
-from mjx_study.study.forecast import iteration
-from mjx_study.study.iteration import Descent, Record, advance, begin, going, make_optimizer, schedule_factors
-from mjx_study.study.plan import StudyCell, StudyPlan, estimators_of
-from mjx_study.study.sampling import rollouts_of
-from mjx_study.study.store import Part
-from mjx_study.study.times import Program
-from mjx_study.study.variables import HISTORY, METRIC, START
 from mjx_study.tasks.contact_grid import ContactPoint
 
 REPORT_EVERY: Final = 10
@@ -49,22 +45,17 @@ def compute_descents(plan: StudyPlan) -> Callable[..., dict[str, np.ndarray]]:
     """Return a function that computes cells and keeps compiled programs between them."""
     backends: dict[tuple[Any, ...], Backend] = {}
 
-    def compute(cell: StudyCell, part: Part = Part()) -> dict[str, np.ndarray]:  # noqa: B008, it is empty
+    def compute(cell: StudyCell, part: Checkpoint = Checkpoint()) -> dict[str, np.ndarray]:  # noqa: B008, it is empty
         key = (cell.group, cell.sigma, cell.samples, cell.model.stiffness_or_zero if cell.model.analytic else None)
         if key not in backends:
             backends[key] = Backend(plan, cell)
         backend, kept = backends[key], dict(part.kept)
         runs = [
-            _Run(backend, cell.model, each, index, iteration(plan, cell, each.needs), kept, part)
-            for index, each in enumerate(estimators_of(plan, cell))
+            _Run(backend, cell.model, each, index, kept, part) for index, each in enumerate(estimators_of(plan, cell))
         ]
-        waiting = nullcontext() if cell.model.analytic else timed("descents")
-        with waiting, ThreadPoolExecutor(backend.threads) as pool:
+        with ThreadPoolExecutor(backend.threads) as pool:
             each_in_turn = map if backend.threads == 1 else pool.map
             list(each_in_turn(_Run.descend, runs))
-        for run in runs:
-            if (calls := len(run.seconds) - run.already) and not cell.model.analytic:
-                tell(run.program, calls, run.seconds[-1] - run.before)
         numbers = [run.numbers() for run in runs]
         found = {name: np.stack([each[name] for each in numbers], axis=-1) for name in numbers[0] if name != "theta"}
         found["theta"] = np.stack([each["theta"] for each in numbers], axis=1)  # (seed, estimator, param)
@@ -203,9 +194,8 @@ class _Run:
     model: ContactPoint
     estimator: Estimator
     index: int
-    program: Program
     kept: dict[str, np.ndarray]
-    part: Part
+    part: Checkpoint
 
     def __post_init__(self) -> None:
         """Begin at the start, or restore a run from its checkpoint; and compile an iteration."""
@@ -216,7 +206,7 @@ class _Run:
         if f"seconds_{index}" in self.kept:
             with self.part.restored():
                 self._restore()
-        self.already, self.before = len(self.records), self.seconds[-1] if self.seconds else 0.0
+        self.already = len(self.records)
         self.state = backend.place(self.state, index)
         seeds = jnp.arange(backend.seeds)
         keys = jax.vmap(lambda seed: jax.random.fold_in(jax.random.key(backend.config.seed), seed))(seeds)
@@ -225,8 +215,7 @@ class _Run:
         self._iterate = backend.iteration(self.estimator, self.model)
         if self.already < backend.recipe.iterations and bool(jnp.any(going(self.state))):
             first = self._keys_of(self.already)
-            with nullcontext() if self.model.analytic else timed(self.program):
-                jax.block_until_ready(self._iterate(self.state, first, self.already))  # compile; discard the result
+            jax.block_until_ready(self._iterate(self.state, first, self.already))  # compile; discard the result
 
     def _restore(self) -> None:
         """Take state, records and times from the checkpoint; KeyError or ValueError if it is not of this run."""

@@ -14,16 +14,10 @@ from estimators import Estimator, find_estimator
 from estimators.alpha import check_weights
 from estimators.seen import seen_by
 from mjx_study.choices import CONES, REFERENCE
-from mjx_study.identity import contents, estimator_contents
-from mjx_study.limits import MOST_CELLS, MOST_GIB, MOST_PROGRAMS, check_count
-from mjx_study.objective import chunk_for
-from mjx_study.option import BUILDER_OPTIONS
-from mjx_study.reference.noise import check_sigma
-from mjx_study.runtime import local_devices
-from mjx_study.study.configuration import SAMPLES, Settings, StudyConfig
-from mjx_study.study.effect import refuse_idle
-from mjx_study.study.iteration import make_optimizer, schedule_factors
-from mjx_study.study.memory import (
+from mjx_study.experiment.configuration import SAMPLES, Settings, StudyConfig
+from mjx_study.experiment.effect import refuse_idle
+from mjx_study.experiment.iteration import make_optimizer, schedule_factors
+from mjx_study.experiment.memory import (
     AT_ONCE,
     BLOCK_BYTES,
     LARGEST_BLOCK,
@@ -35,14 +29,20 @@ from mjx_study.study.memory import (
     largest_batch,
     padded_size,
 )
-from mjx_study.study.resolution import at_theta, configured_estimators, line_of, recipe_of
+from mjx_study.experiment.resolution import at_theta, configured_estimators, line_of, recipe_of
+from mjx_study.identity import contents, estimator_contents
+from mjx_study.limits import MOST_CELLS, MOST_GIB, MOST_PROGRAMS, check_count
+from mjx_study.objective import chunk_for
+from mjx_study.option import BUILDER_OPTIONS
+from mjx_study.reference.noise import check_sigma
+from mjx_study.runtime import local_devices
 from mjx_study.table import digits_to_tell_apart
 from mjx_study.tasks import TASKS, task_with_options
 from mjx_study.tasks.contact_grid import ContactPoint, backward_grid, family_grid, solver_grid
 from mjx_study.tasks.network import with_network
-from mjx_study.tasks.own import registered_place
 from mjx_study.tasks.soundness import check_soundness
 from mjx_study.tasks.task import Recipe, Task, check_shapes
+from mjx_study.tasks.user_task import registered_name
 
 HISTORY_NUMBERS: Final = 20
 """Approximate count of numbers kept per iteration and seed, over all estimators."""
@@ -142,7 +142,7 @@ class StudyPlan:
     def places(self) -> tuple[str, ...]:
         """Names of the modules of user-defined tasks and estimators, and of tasks given as objects."""
         tasks = [each if isinstance(each, str) else f"task {each.name}" for each in self.config.tasks]
-        places = [registered_place(each) or each for each in tasks if each not in TASKS]
+        places = [registered_name(each) or each for each in tasks if each not in TASKS]
         own = [each for each in self.config.estimator_names if ":" in each]
         return tuple(dict.fromkeys(each.partition(":")[0] for each in (*places, *own)))
 

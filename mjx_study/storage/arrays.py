@@ -8,7 +8,7 @@ from typing import IO, Any, Final
 
 import numpy as np
 
-from mjx_study.study.variables import METRIC, ONSETS, START, VARIABLES, variables_of
+from mjx_study.results.variables import METRIC, ONSETS, START, VARIABLES, variables_of
 
 MOST_CELL_BYTES: Final = 2**31
 """Maximum size of a cell's file [bytes]."""

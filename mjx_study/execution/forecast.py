@@ -15,12 +15,11 @@ from typing import Any
 import jax
 import numpy as np
 
-from mjx_study.objective import contact_for, rounds
-from mjx_study.runtime import available_cores, local_devices
-from mjx_study.study.gradients import CANDIDATES, MOST_KEPT, takes_candidates
-from mjx_study.study.landscapes import CHUNK, QUADRATURE, applies
-from mjx_study.study.memory import batches_at_once
-from mjx_study.study.plan import (
+from mjx_study.execution.times import BASES, READING, Program, Rates, other_program, program_of, times_folder
+from mjx_study.experiment.gradients import CANDIDATES, MOST_KEPT, takes_candidates
+from mjx_study.experiment.landscapes import CHUNK, QUADRATURE, applies
+from mjx_study.experiment.memory import batches_at_once
+from mjx_study.experiment.plan import (
     StudyCell,
     StudyPlan,
     blocks_of,
@@ -30,10 +29,11 @@ from mjx_study.study.plan import (
     oracles_of,
     seeds_together,
 )
-from mjx_study.study.sampling import calls_of, rollouts_of
-from mjx_study.study.store import begun_store
-from mjx_study.study.times import BASES, READING, Program, Rates, other_program, program_of, times_folder
-from mjx_study.study.variables import VARIABLES
+from mjx_study.experiment.sampling import calls_of, rollouts_of
+from mjx_study.objective import contact_for, rounds
+from mjx_study.results.variables import VARIABLES
+from mjx_study.runtime import available_cores, local_devices
+from mjx_study.storage.folder import begun_store
 from mjx_study.table import count, duration, percent, size
 
 

@@ -1,7 +1,6 @@
 """Labelled arrays of a study's numbers, assembled from its document and cells."""
 
 import json
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -10,22 +9,10 @@ import numpy as np
 import xarray as xr
 
 from mjx_study.disk import write_whole
-from mjx_study.study.variables import COORDINATES, THETA, variables_of
+from mjx_study.results.variables import COORDINATES, THETA, variables_of
 
 Cells = Mapping[int, tuple[Mapping[str, np.ndarray], Mapping[str, str]]]
 """Arrays by variable of each cell, by index, with the versions of the software that computed them."""
-
-
-def as_plain(document: Any) -> Any:
-    """Convert to JSON types: arrays and tuples to lists, nonfinite numbers to null, an infinite gamma to "inf"."""
-    if isinstance(document, Mapping):
-        infinite = {"gamma": "inf"} if document.get("gamma") == math.inf else {}
-        return {str(key): as_plain(item) for key, item in {**document, **infinite}.items()}
-    if isinstance(document, np.ndarray):
-        return as_plain(document.tolist())
-    if isinstance(document, list | tuple):
-        return [as_plain(item) for item in document]
-    return None if isinstance(document, float) and not math.isfinite(document) else document
 
 
 def dataset_of(document: Mapping[str, Any], cells: Cells) -> xr.Dataset:

@@ -33,15 +33,14 @@ from jaxtyping import Array, Float
 
 from estimators import NOISES, Estimator
 from mjx_study.compiled import Compiled
-from mjx_study.objective import rollout_cost, rounds, spread
+from mjx_study.experiment.plan import StudyCell, StudyPlan, estimators_of, oracles_of
+from mjx_study.experiment.resolution import line_of
+from mjx_study.experiment.sampling import Objectives, cell_keys, draw_batches, unconverged
+from mjx_study.objective import rollout_cost, spread
 from mjx_study.reference import FunctionObjective, Reference, ScalarFunction, smoothed
 from mjx_study.reference.noise import split_sample_key
 from mjx_study.runtime import local_devices, precision
 from mjx_study.simulation.contact import ContactModel
-from mjx_study.stopwatch import timed
-from mjx_study.study.plan import StudyCell, StudyPlan, estimators_of, oracles_of
-from mjx_study.study.resolution import line_of
-from mjx_study.study.sampling import Objectives, cell_keys, draw_batches, unconverged
 from mjx_study.tasks.task import Task
 
 QUADRATURE: Final = 1500
@@ -177,9 +176,7 @@ class Line:
     ) -> tuple[Float[np.ndarray, " points"], Float[np.ndarray, " points"]]:
         """Zero-noise cost and its derivative at each point."""
         devices = local_devices()
-        program = "quadrature", self._task, jax.tree.structure(contact), CHUNK  # see `Simulator.program`
-        with timed(program, rounds(len(points), CHUNK, len(devices))):
-            return spread(self._program, (contact,), (points.astype(self._dtype),), CHUNK, devices)
+        return spread(self._program, (contact,), (points.astype(self._dtype),), CHUNK, devices)
 
 
 def grid(low: float, high: float, sigma: float, size: int, noise: str) -> Float[np.ndarray, " size"]:

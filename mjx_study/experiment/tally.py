@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from mjx_study.experiment.sampling import unconverged
 from mjx_study.runtime import precision
-from mjx_study.study.sampling import unconverged
 
 
 @dataclasses.dataclass(frozen=True)

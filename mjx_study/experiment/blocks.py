@@ -13,7 +13,7 @@ import numpy as np
 
 from estimators import ORACLES
 from estimators.blocks import Moments
-from mjx_study.study.tally import Tally
+from mjx_study.experiment.tally import Tally
 
 REFERENCE: Final = 0
 """Number of the task that computes the reference; the others are blocks, seed by seed."""

@@ -22,14 +22,14 @@ from glob import glob
 from typing import Any, Final
 
 from mjx_study.disk import temporary_folder
+from mjx_study.execution.cells import Computation
+from mjx_study.execution.times import recording
+from mjx_study.experiment.blocks import Arrays
+from mjx_study.experiment.checkpoint import Checkpoint, StudyError
+from mjx_study.experiment.plan import StudyPlan, blocks_of, plan_study
 from mjx_study.identity import differences, versions
 from mjx_study.runtime import available_cores, configure, precision
 from mjx_study.stopwatch import Stopwatch
-from mjx_study.study.blocks import Arrays
-from mjx_study.study.cells import Computation
-from mjx_study.study.plan import StudyPlan, blocks_of, plan_study
-from mjx_study.study.store import Part, StudyError
-from mjx_study.study.times import recording
 from mjx_study.watchdog import watch
 
 TRIES: Final = 3
@@ -105,7 +105,7 @@ def connected(cluster: str) -> Generator[Any]:
 
 
 def cells_on(
-    client: Any, plan: StudyPlan, parts: Mapping[int, Part], told: Callable[[int], None]
+    client: Any, plan: StudyPlan, parts: Mapping[int, Checkpoint], told: Callable[[int], None]
 ) -> Generator[tuple[int, Arrays | str]]:
     """Compute cells on a cluster whose workers may come and go.
 
@@ -259,7 +259,7 @@ def _compute(study: bytes, index: int, kept: Arrays, block: int | None) -> Array
         plan, computation, watch = _prepared(study)
         cell = plan.cells[index]
         with recording(watch):
-            return computation(cell, Part(kept)) if block is None else computation.compute.block(cell, block)
+            return computation(cell, Checkpoint(kept)) if block is None else computation.compute.block(cell, block)
 
 
 @functools.lru_cache(maxsize=4)

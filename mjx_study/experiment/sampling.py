@@ -12,10 +12,10 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
 from estimators import ORACLES, Linearisation
+from mjx_study.experiment.memory import batches_at_once, padded_size
+from mjx_study.experiment.plan import StudyCell, StudyPlan
 from mjx_study.objective import MjxObjective, Simulator
 from mjx_study.reference import Reference
-from mjx_study.study.memory import batches_at_once, padded_size
-from mjx_study.study.plan import StudyCell, StudyPlan
 
 MOST_RESIDUAL: Final = {"float64": 1e-6, "float32": 1e-3}
 """Relative solver residual above which a sample is reported as unconverged."""

@@ -90,7 +90,7 @@ GRADIENTS: Final = {
 ONSETS: Final = tuple(name for name in GRADIENTS if name.startswith("onset"))
 """Variables of studies with an onset term."""
 HISTORY: Final = ("cost", "gradient_norm", "variance", "alpha", "nonfinite", "residual")
-"""Variables recorded at each iteration of a descent; see `mjx_study.study.iteration.Record`."""
+"""Variables recorded at each iteration of a descent; see `mjx_study.experiment.iteration.Record`."""
 METRIC: Final = "metric_"
 START: Final = "start_metric_"
 """Prefixes of a task's metrics: of the final policies, and of the initial one."""
@@ -101,7 +101,7 @@ DESCENTS: Final = {
     "start_cost": Variable((), "cost", "mean cost of the initial policy", "cost at the start", 4),
     "start_cost_se": Variable((), "cost", "standard error of start_cost"),
     "stopped_at": Variable(BATCH, "1", "iteration at which a seed stopped before the end; NaN for none"),
-    "reason": Variable(BATCH, "1", "why it stopped, an index into `mjx_study.study.iteration.REASONS`; NaN for none"),
+    "reason": Variable(BATCH, "1", "why it stopped, an index into `experiment.iteration.REASONS`; NaN for none"),
     "cost": Variable(STEP, "cost", "mean cost of the batch, before the update"),
     **{name: replace(GRADIENTS[name], dims=STEP) for name in HISTORY[1:]},
     "rollouts": Variable(EACH, "1", "rollouts simulated in one iteration of one seed", digits=0),

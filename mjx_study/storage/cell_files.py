@@ -14,20 +14,12 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict
 
 from mjx_study.disk import MOST_BYTES, read_whole, write_whole
+from mjx_study.experiment.checkpoint import StudyError, reason_of
 from mjx_study.files import digest_of_json, validated
-from mjx_study.study.arrays import MOST_CELL_BYTES, read_arrays, write_arrays
+from mjx_study.storage.arrays import MOST_CELL_BYTES, read_arrays, write_arrays
 
 VERSIONS: Final = "versions"
 """Entry that records the versions that computed a cell."""
-
-
-class StudyError(ValueError):
-    """A folder holds no study, another study, or a damaged file."""
-
-
-def reason_of(error: Exception) -> str:
-    """What is wrong with a file, in one line."""
-    return (error.strerror if isinstance(error, OSError) else None) or str(error)
 
 
 class _Failure(BaseModel):

@@ -8,12 +8,12 @@ import numpy as np
 import xarray as xr
 
 from estimators.estimator import label_of
+from mjx_study.experiment.plan import StudyPlan
+from mjx_study.experiment.sampling import cell_keys, sample_keys
 from mjx_study.objective.batches import compiled_rollout
 from mjx_study.objective.cost import before_each_step, last_of
+from mjx_study.results.findings import onset_of
 from mjx_study.simulation.dynamics import State
-from mjx_study.study.findings import onset_of
-from mjx_study.study.plan import StudyPlan
-from mjx_study.study.sampling import cell_keys, sample_keys
 from mjx_study.tasks.task import Task
 
 MOST_NAMED: Final = 3

@@ -11,7 +11,7 @@ from mjx_study.choices import TASK_GROUP
 from mjx_study.tasks.task import Task, check_shapes
 
 
-def registered_place(name: str) -> str | None:
+def registered_name(name: str) -> str | None:
     """The `module:name` of a registered task, or None; a ValueError if packages register different ones so named."""
     places = {f"{point.module}:{point.attr}" for point in metadata.entry_points(group=TASK_GROUP, name=name)}
     if len(places) > 1:
@@ -19,7 +19,7 @@ def registered_place(name: str) -> str | None:
     return next(iter(places), None)
 
 
-def own_task(place: str, options: dict[str, Any]) -> Task:
+def user_task(place: str, options: dict[str, Any]) -> Task:
     """Return the task at a place: a Task, or the result of a function of the options.
 
     The current directory counts as importable, in the console script too.

@@ -13,7 +13,7 @@ import xarray as xr
 
 from estimators import ENOUGH_EFFECTIVE, ESTIMATORS, ORACLES
 from estimators.estimator import label_of
-from mjx_study.study.variables import GRADIENTS, ONSETS, THETA
+from mjx_study.results.variables import GRADIENTS, ONSETS, THETA
 from mjx_study.table import digits_to_tell_apart, number, percent, with_error
 
 BIASED_P_VALUE: Final = 0.001

@@ -3,19 +3,17 @@
 import dataclasses
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Union
 
 from estimators.catalogue import CATALOGUE, PLUG_IN, PUBLISHED_TOLERANCE
-from mjx_study.choices import FAMILIES, REFERENCE
+from mjx_study.choices import refuse_untaken
 from mjx_study.option import Checked
 
 if TYPE_CHECKING:
     import estimators.estimator
     import mjx_study.tasks.task
 
-Progress = Callable[[int, int, str], None]
-"""Called with (work done, total work, what is being computed)."""
 OF_KIND: Final[dict[str, tuple[str, ...]]] = {
     "gradients": ("reference_samples", "block_size", "confidence"),
     "descents": ("iterations", "optimizer", "learning_rate", "decay", "stiffness_schedule", "sigma_schedule",
@@ -250,17 +248,3 @@ def check_span(span: Sequence[float] | None) -> None:
     """Raise ValueError unless span is None or two numbers in ascending order."""
     if span is not None and not (len(span) == 2 and 0 < span[1] - span[0] < math.inf):
         raise ValueError("`span` must be two numbers, the lower one first; got " + ", ".join(map(str, span)))
-
-
-def takes_stiffness(families: Iterable[str]) -> bool:
-    """Whether any of the contact families, "reference" included, has a stiffness."""
-    return any(family not in FAMILIES or FAMILIES[family].swept for family in families)
-
-
-def refuse_untaken(families: Sequence[str], *, stiffness: object, damping: object) -> None:
-    """Raise ValueError for a stiffness or damping, not None, that none of the contact families takes."""
-    undamped = [family for family in families if family != REFERENCE]
-    for name, value, able in (("stiffness", stiffness, families), ("damping", damping, undamped)):
-        if value is not None and not takes_stiffness(able):
-            chosen = f"contact {', '.join(families)}" if families else "`solref` or `solimp` alone"
-            raise ValueError(f"{chosen} takes no {name}; omit `{name}`, or add a family that does, such as mujoco")

@@ -13,7 +13,6 @@ end with their process. A folder may come from anywhere: every file that is read
 matches its digest and its schema.
 """
 
-import dataclasses
 import fcntl
 import os
 from collections.abc import Callable, Generator, Mapping
@@ -25,42 +24,17 @@ import numpy as np
 
 from estimators.seen import seen_now
 from mjx_study.disk import MOST_BYTES, check_no_link, open_regular, prepare_folder, read_whole, write_whole
+from mjx_study.experiment.checkpoint import StudyError, reason_of
+from mjx_study.experiment.plan import StudyPlan
 from mjx_study.files import digest_of_json
 from mjx_study.identity import ACCEPT, differences
-from mjx_study.study.arrays import check_cell
-from mjx_study.study.cell_file import CellFile, StudyError, reason_of
-from mjx_study.study.dataset import as_plain
-from mjx_study.study.document import document_of, read_document, read_format, sealed
-from mjx_study.study.plan import StudyPlan
+from mjx_study.storage.arrays import check_cell
+from mjx_study.storage.cell_files import CellFile
+from mjx_study.storage.manifest import document_of, read_document, read_format, sealed
+from mjx_study.table import as_plain
 
 FORMAT: Final = 4
 """Format of the folder; increased when older programs cannot read newer folders."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Part:
-    """Checkpointing within a cell.
-
-    Attributes:
-        kept: arrays of the last checkpoint.
-        report: reports progress within the cell: done, total, and what is being computed.
-        name: name of the checkpoint in messages.
-    """
-
-    kept: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
-    save: Callable[[dict[str, np.ndarray]], None] = lambda arrays: None
-    report: Callable[[int, int, str], None] = lambda done, total, what: None
-    name: str = "the checkpoint"
-
-    @contextmanager
-    def restored(self) -> Generator[None]:
-        """Let arrays of the checkpoint that are missing or of another form be a StudyError."""
-        try:
-            yield
-        except (KeyError, IndexError, TypeError, ValueError) as error:
-            reason = f"no {error}" if isinstance(error, KeyError) else reason_of(error)
-            message = f"{self.name} does not fit the study ({reason}); move it away to compute its cell again"
-            raise StudyError(message) from error
 
 
 class Store:

@@ -20,17 +20,20 @@ import xarray as xr
 
 from estimators import ENOUGH_EFFECTIVE
 from estimators.seen import observing
+from mjx_study.execution.cells import Computation
+from mjx_study.execution.cluster import cells_on, connected
+from mjx_study.execution.lost import lost_samples, total
+from mjx_study.execution.times import recording
+from mjx_study.experiment.blocks import Arrays
+from mjx_study.experiment.checkpoint import Checkpoint
+from mjx_study.experiment.configuration import StudyConfig
+from mjx_study.experiment.plan import StudyPlan, plan_study
 from mjx_study.identity import differences, versions
-from mjx_study.study.blocks import Arrays
-from mjx_study.study.cells import Computation
-from mjx_study.study.cluster import cells_on, connected
-from mjx_study.study.configuration import Progress, StudyConfig
-from mjx_study.study.dataset import as_plain, dataset_of, write_dataset
-from mjx_study.study.document import document_of
-from mjx_study.study.lost import lost_samples, total
-from mjx_study.study.plan import StudyPlan, plan_study
-from mjx_study.study.store import Part, Store, open_store
-from mjx_study.study.times import recording
+from mjx_study.progress import Progress, silent
+from mjx_study.storage.dataset import dataset_of, write_dataset
+from mjx_study.storage.folder import Store, open_store
+from mjx_study.storage.manifest import document_of
+from mjx_study.table import as_plain
 
 WAIT_SECONDS: Final = 0.5
 """Interval between polls of cells that another process computes."""
@@ -39,7 +42,7 @@ WAIT_SECONDS: Final = 0.5
 def run_study(
     study: StudyConfig | StudyPlan,
     folder: str | Path | Store | None = None,
-    progress: Progress = lambda done, total, what: None,
+    progress: Progress = silent,
     *,
     command: str | None = None,
     accept_versions: bool = False,
@@ -92,7 +95,9 @@ class _Run:
         """Compute all cells and write none."""
         document["config"]["chunk_size"] = self._plan.chunk_size
         places = ((index, index) for index in range(self._total))
-        cells = {index: (found, document["versions"]) for index, found in self._computed(places, lambda index: Part())}
+        cells = {
+            index: (found, document["versions"]) for index, found in self._computed(places, lambda index: Checkpoint())
+        }
         self._progress(self._total, self._total, "done")
         return dataset_of(document, cells).assign_attrs(computed_cells=self._total)
 
@@ -167,7 +172,7 @@ class _Run:
                 yield index, arrays
 
     def _computed(
-        self, places: Iterable[tuple[int, int]], part_of: Callable[[int], Part]
+        self, places: Iterable[tuple[int, int]], part_of: Callable[[int], Checkpoint]
     ) -> Generator[tuple[int, Arrays]]:
         """Yield indices and numbers of cells; each is begun before waiting for the statistics of the one before.
         `places` are the number of cells done before each, and its index."""
@@ -183,7 +188,7 @@ class _Run:
         for each in running:
             yield end(*each)
 
-    def _begin(self, index: int, done: int, part: Part) -> Future[Arrays]:
+    def _begin(self, index: int, done: int, part: Checkpoint) -> Future[Arrays]:
         """Begin a cell, reporting progress in whole cells, or within the cell if it is the only one."""
         cell = self._plan.cells[index]
         label = self._plan.label(cell)
@@ -195,14 +200,14 @@ class _Run:
         return self._compute.begin(cell, dataclasses.replace(part, report=within))
 
 
-def _part(store: Store, index: int) -> Part:
+def _part(store: Store, index: int) -> Checkpoint:
     """A cell's checkpoint in its folder; failing to write one must not cost the cell."""
 
     def keep(arrays: Arrays) -> None:
         with suppress(OSError):
             store.write_part(index, arrays)
 
-    return Part(store.read_part(index), keep, name=str(store.part_path(index)))
+    return Checkpoint(store.read_part(index), keep, name=str(store.part_path(index)))
 
 
 def load_study(folder: str | Path) -> xr.Dataset:
