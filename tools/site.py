@@ -134,10 +134,12 @@ def page_of_names(package: str) -> str:
     """Every public name of a package by the module that it comes from."""
     folder = ROOT / package.replace(".", "/")
     source = next(path for path in (folder / "_public.py", folder / "__init__.py") if path.is_file())
-    names: dict[str, list[str]] = {}
+    public, names = import_module(package).__all__, dict[str, list[str]]()
     for node in ast.parse(source.read_text()).body:
         if isinstance(node, ast.ImportFrom) and node.module:
-            names.setdefault(node.module, []).extend(alias.asname or alias.name for alias in node.names)
+            imported = [alias.asname or alias.name for alias in node.names]
+            if exported := [name for name in imported if name in public]:
+                names.setdefault(node.module, []).extend(exported)
     parts = [f"# {package}", (import_module(package).__doc__ or "").strip()]
     for module, those in names.items():
         about = (import_module(module).__doc__ or "").strip().partition("\n")[0]
