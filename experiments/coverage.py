@@ -1,8 +1,8 @@
-"""Writes the tables of docs/coverage.md: how often each interval covers, how often each test rejects.
+"""Tables of docs/coverage.md: how often each interval covers, how often each test rejects.
 
     python -m experiments.coverage
 
-A minute on one core. Everything between the markers of the page is replaced; the text around it is written by hand.
+A minute on one core. Only the tables of the page are replaced.
 """
 
 from collections.abc import Callable, Mapping
@@ -26,20 +26,20 @@ PAGE: Final = DOCS / "coverage.md"
 SAMPLES: Final = (10, 400)
 TRIALS: Final = 2000
 TOGETHER: Final = 100
-"""Trials that are computed at once."""
+"""Trials computed together."""
 PARAMS: Final = 3
 DRAWS: Final = 199
 REFERENCE: Final = (100, 0.05)
-"""Samples of the reference, and its standard error over the gradient's norm."""
+"""Number of samples of the reference, and its standard error over the gradient's norm."""
 BIAS: Final = 0.3
-"""Bias over the gradient's norm where a relative error is estimated."""
+"""True relative error: bias over the gradient's norm."""
 SEEDS: Final = 10
-"""Batches behind an estimate of a squared bias."""
+"""Number of batches per estimate of a squared bias."""
 RARE: Final = 0.01
 
 
 class Kind(NamedTuple):
-    """Samples of noise of mean zero.
+    """A distribution of noise with mean zero.
 
     Attributes:
         draw: of a key and a number of samples; (samples, PARAMS).
@@ -51,7 +51,7 @@ class Kind(NamedTuple):
 
 
 def _rare(key: Array, samples: int) -> Array:
-    """1 / RARE with probability RARE, less its mean, in the first parameter."""
+    """Draw 1 / RARE with probability RARE, minus its mean, in the first parameter."""
     event = jax.random.bernoulli(key, RARE, (samples,)) / RARE - 1.0
     return event[:, None] * jnp.eye(1, PARAMS)
 
@@ -76,11 +76,11 @@ COLUMNS: Final = {
     "squared_bias": "squared bias",
     "epsilon": "epsilon",
 }
-"""What is printed of each kind of samples: shares of the trials."""
+"""Columns of the table of intervals; each holds a share of the trials."""
 
 
 def trials(kind: Kind, samples: int, count: int) -> dict[str, np.ndarray]:
-    """What `count` batches say, and whether that is true; by trial.
+    """Estimate from `count` batches, and compare each estimate with the truth.
 
     The gradient is as long as half a standard deviation of a sample; rare samples carry the whole of it.
     """
@@ -103,7 +103,7 @@ def trials(kind: Kind, samples: int, count: int) -> dict[str, np.ndarray]:
         test = estimators.bias_test(batch, reference, streams[2], num_draws=DRAWS)
         biased = summarise(batch.per_sample + offset)
         found = estimators.compare(biased, reference)
-        said = {
+        measured = {
             "mean": off <= 1.96,
             "apart": off > DETECTED_SE,
             "variance": (lower <= kind.variance) & (kind.variance <= upper),
@@ -114,21 +114,21 @@ def trials(kind: Kind, samples: int, count: int) -> dict[str, np.ndarray]:
         for name, exact in (("error", BIAS), ("cosine", (1 + BIAS**2) ** -0.5)):
             raw = "relative_error" if name == "error" else name
             for field in (raw, f"debiased_{name}"):
-                said[field] = jnp.abs(getattr(found, field) - exact) <= 1.96 * getattr(found, f"{field}_se")
-        return said | {"lower": lower, "upper": upper, "biased": biased.mean, "reference": reference}
+                measured[field] = jnp.abs(getattr(found, field) - exact) <= 1.96 * getattr(found, f"{field}_se")
+        return measured | {"lower": lower, "upper": upper, "biased": biased.mean, "reference": reference}
 
     return _map(one, jax.random.split(jax.random.key(samples), count)) | {"bias": BIAS * length}
 
 
 def _map(function: Callable[[Array], Any], keys: Array) -> Any:
-    """Over all keys, some at a time, as NumPy arrays."""
+    """Apply a function to all keys, `TOGETHER` at a time; return NumPy arrays."""
     program = jax.jit(lambda keys: jax.lax.map(function, keys, batch_size=TOGETHER))
     return jax.tree.map(np.asarray, program(keys))
 
 
 def shares(found: dict[str, Any]) -> dict[str, float]:
-    """Each column's share of the trials."""
-    said = {name: float(np.mean(found[name])) for name in COLUMNS if name in found}
+    """Return each column's share of the trials."""
+    measured = {name: float(np.mean(found[name])) for name in COLUMNS if name in found}
     apart = found["upper"][::2] < found["lower"][1::2]
     apart |= found["lower"][::2] > found["upper"][1::2]
     groups = len(found["biased"]) // SEEDS
@@ -136,15 +136,15 @@ def shares(found: dict[str, Any]) -> dict[str, float]:
     references = jax.tree.map(lambda leaf: jnp.asarray(leaf[: groups * SEEDS : SEEDS]), found["reference"])
     value, error = jax.jit(jax.vmap(estimators.squared_bias_of_means))(means, references)
     held = np.abs(np.asarray(value) - found["bias"] ** 2) <= 1.96 * np.asarray(error)
-    return said | {"variances": float(np.mean(apart)), "squared_bias": float(np.mean(held))}
+    return measured | {"variances": float(np.mean(apart)), "squared_bias": float(np.mean(held))}
 
 
 def coverage_rows(name: str, samples: int, count: int = TRIALS) -> tuple[list[str], list[str]]:
-    """One row of the table of intervals, and one of the table of the test for bias."""
+    """Return a row of the table of intervals, and one of the table of the test for bias."""
     found = trials(KINDS[name], samples, count)
-    said = shares(found)
+    share = shares(found)
     return (
-        [name, str(samples), *(_share(said[column]) for column in COLUMNS)],
+        [name, str(samples), *(_share(share[column]) for column in COLUMNS)],
         [name, str(samples), *_verdicts(found)],
     )
 
@@ -156,7 +156,7 @@ def _verdicts(found: dict[str, Any]) -> list[str]:
 
 
 def rare_row(expected: float, samples: int, count: int = TRIALS) -> list[str]:
-    """The test for bias where so many of a batch's samples, on average, carry the whole gradient."""
+    """Return a row on the test for bias where, on average, `expected` samples of a batch carry the whole gradient."""
     probability = expected / samples
 
     def one(key: Array) -> dict[str, Array]:
@@ -176,7 +176,7 @@ def rare_row(expected: float, samples: int, count: int = TRIALS) -> list[str]:
 
 
 def dimension_row(params: int, bias: float, uncertainty: float, samples: int = 400, count: int = 300) -> list[str]:
-    """Relative error and cosine where noise of an eighth of the gradient's norm is spread over many parameters."""
+    """Return a row on relative error and cosine with noise of an eighth of the gradient's norm."""
     gradient, others = jnp.eye(1, params)[0], 600
     offset = bias * jnp.roll(gradient, 1)
 
@@ -204,7 +204,7 @@ WEIGHED: Final = ("ivw", "ivw_h", "total_propagation", "ddcg")
 
 
 def weights_rows(sizes: Mapping[int, int]) -> list[list[str]]:
-    """Relative bias and variance of the mean with either kind of weights, on a linear-quadratic problem.
+    """Return rows on bias and variance with either kind of weights, on a linear-quadratic problem.
 
     Args:
         sizes: number of batches by the number of samples of each.
@@ -218,7 +218,7 @@ def weights_rows(sizes: Mapping[int, int]) -> list[list[str]]:
 
 
 def weights_columns(samples: int, count: int) -> list[list[str]]:
-    """Problem, estimator, bias with plug-in and with cross-fitted weights [%], ratio of variances, for one size."""
+    """Return problem, estimator, bias with plug-in and cross-fitted weights [%], and the ratio of variances."""
     weight = np.array([[1.0, 0.2], [0.2, 0.5]])
     system = LinearQuadratic(
         np.array([[0.9, 0.3], [-0.2, 0.8]]), np.array([[0.5, 0.1], [-0.3, 0.7]]), weight, np.diag([0.3, 0.2]), weight
@@ -253,7 +253,7 @@ def _share(value: float) -> str:
 
 
 def tables() -> dict[str, str]:
-    """Every table of the page, by its name."""
+    """Return every table of the page by its name."""
     both = [coverage_rows(name, samples) for name in KINDS for samples in SAMPLES]
     test = ["rejects at 5 %", "believable", "rejects of those"]
     wide = ["relative error", "covers", "debiased", "covers", "cosine", "covers", "debiased", "covers"]

@@ -1,9 +1,9 @@
-"""Prints the table of docs/differentiable-mjx.md: `mjx_study.step` against `mjx.step`, on this machine.
+"""Table of docs/differentiable-mjx.md: `mjx_study.step` against `mjx.step`, on this machine.
 
     python -m experiments.drop_in
     python -m experiments.drop_in --batch 1024    # on an accelerator
 
-A few minutes on one core, most of it compiling. Stock's gradient is the one it has, of a step of one solver iteration.
+A few minutes on one core, most of it compiling. Stock's gradient is of one solver iteration.
 """
 
 import argparse
@@ -34,11 +34,11 @@ MODELS: Final = {
 STEPS: Final = 20
 REPEATS: Final = 9
 SETTLING: Final = 0.3
-"""Time before the first state [s], in which bodies fall to the floor."""
+"""Time before the first state, in which bodies fall to the floor [s]."""
 
 
 def start_states(host: mujoco.MjModel, batch: int) -> tuple[np.ndarray, np.ndarray]:
-    """A batch of positions and velocities, in contact where the model has a floor."""
+    """Return a batch of positions and velocities, in contact if the model has a floor."""
     data, noise = mujoco.MjData(host), np.random.default_rng(0)
     if host.nkey:
         mujoco.mj_resetDataKeyframe(host, data, 0)
@@ -48,7 +48,7 @@ def start_states(host: mujoco.MjModel, batch: int) -> tuple[np.ndarray, np.ndarr
 
 
 def measured(path: Path, batch: int) -> dict[str, float]:
-    """Median seconds of a batch of rollouts and of their gradients, through both steps, interleaved."""
+    """Return median seconds of a batch of rollouts and of their gradients, through both steps."""
     host = mujoco.MjModel.from_xml_path(str(path))
     model, data = mjx.put_model(host), mjx.make_data(host)
     qpos, qvel = start_states(host, batch)

@@ -1,4 +1,4 @@
-"""A one-legged hopper that lands on its foot through MuJoCo's default contact and shall move forward.
+"""A one-legged hopper that must land on its foot, through MuJoCo's default contact, and move forward.
 
 A task in one file, as docs/extending.md describes; docs/in-the-wild.md trains it as `experiments.hopper:hopper`.
 """
@@ -45,11 +45,11 @@ MJCF = """
   </actuator>
 </mujoco>"""
 BENT = jnp.array([-0.4, 0.8, -0.4])
-"""Hip, knee and ankle in the air [rad]."""
+"""Angles of hip, knee and ankle in the air [rad]."""
 
 
 def hopper(horizon: int = 100) -> study.Task:
-    """Half a second from a random fall; the cost is minus the distance, and of leaning, crouching and torque."""
+    """Return half a second from a random fall; the cost is minus the distance, plus leaning, crouching and torque."""
     scene = study.put_scene(mujoco.MjModel.from_xml_string(MJCF), "hopper")
     step = scene.timestep
 

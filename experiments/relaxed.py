@@ -1,6 +1,8 @@
-"""The tables of surrogate derivatives in first-order-bias.md: means and spread of first-order gradients, by quadrature.
+"""Tables of docs/first-order-bias.md: means and spread of first-order gradients with surrogate derivatives.
 
-Run as python -m experiments.relaxed; half an hour on two cores, nothing is kept.
+    python -m experiments.relaxed
+
+Half an hour on two cores, by quadrature.
 """
 
 import dataclasses
@@ -22,7 +24,7 @@ TREATMENTS: dict[str, dict[str, str]] = {"exact": {}, "onset term": {"onset": "l
 
 
 def standard_deviation(at: Slopes) -> float:
-    """Of one first-order gradient, by the quadrature's landscape."""
+    """Return the standard deviation of one first-order gradient, by quadrature over the landscape."""
     table, sigma = at.objective.function, at.objective.sigma
     assert isinstance(table, Landscape)
     weight = np.exp(-0.5 * ((table.points - at.theta) / sigma) ** 2)
@@ -31,7 +33,7 @@ def standard_deviation(at: Slopes) -> float:
 
 
 def main() -> None:
-    """Print Markdown."""
+    """Print the tables."""
     configure()
     lab = Laboratory(dataclasses.replace(EFFORTS["quick"], density=120))
     for task, angles in ANGLES.items():

@@ -1,9 +1,9 @@
-"""Prints the table of docs/onset-correction.md on DiffMJX's scenes, described anew by their published numbers.
+"""Table of docs/onset-correction.md on DiffMJX's scenes, rebuilt from their published numbers.
 
     python -m experiments.toss
 
 Half an hour on two cores, most of it compiling. Paulus et al., arXiv 2506.14186: a point on a spring and a damper; a
-ball and a cube thrown to the floor, whose cost is where they come to be sideways.
+ball and a cube thrown to the floor, whose cost is their final sideways position.
 """
 
 import dataclasses
@@ -37,7 +37,7 @@ HEIGHT, DRIFT, SPEED, SIGMA, HORIZON, POINTS = 0.2, -0.1, -2.0, 0.05, 1000, 1600
 
 
 def point(start: np.ndarray, timestep: float, *, pulls: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Distance to 1 m after two seconds, and its derivative through the steps.
+    """Return the distance to 1 m after two seconds, and its derivative through the steps.
 
     Args:
         start: heights, all at -1 m/s.
@@ -55,7 +55,7 @@ def point(start: np.ndarray, timestep: float, *, pulls: bool) -> tuple[np.ndarra
 
 
 def tossed(geom: str, onset: str) -> study.Task:
-    """Where an object thrown to the floor comes to be sideways, by the speed of the throw."""
+    """Return the task of an object thrown to the floor: its final sideways position by the speed of the throw."""
     scene = put_scene(mujoco.MjModel.from_xml_string(TOSSED.format(GEOMS[geom])), geom)
 
     def start_at(start: study.State, parameters: jax.Array) -> study.State:

@@ -44,6 +44,14 @@ def _statements() -> list[str]:
     bar = wide[wide.task == "momentum_transfer"]
     inside = bar[(bar.strength >= 0.03) & (bar.strength < 0.8)]
     assert _off(inside, "beyond")[0] == 0 and len(set(_off(bar[bar.strength > 1], "beyond"))) == 1
+    jumping = met[(met.strength > table.SMOOTH_SHARE) & (met.slope.abs() > 5 * met.slope_se)]
+    largest = jumping.task.map(TABLE.groupby("task").timestep.max())
+    alike = jumping[largest**2 * jumping.k + 2 * largest * jumping.b < 4]
+    bias = alike.groupby(["task", "timestep"]).fobg_relative.median()
+    left = met[(met.fobg_off == 1) & (met.strength > table.SMOOTH_SHARE)].groupby(["task", "timestep"])
+    stiffest = TABLE[TABLE.stiffness >= TABLE.groupby("task").stiffness.transform(lambda each: each.quantile(0.75))]
+    above = {key: _share(part) for key, part in stiffest.groupby(["task", "timestep"])}
+    off = {key: percent(part.fobg_onset_off.dropna().mean()) for key, part in left}
     tennis = met[met.task == "tennis"]
     assert len(set(_off(tennis))) == 1
     return [
@@ -59,6 +67,13 @@ def _statements() -> list[str]:
         + "above 1.5 kN/m {} of {}.".format(*_off(low[low.stiffness >= 1500])),
         "{} of {} cells with a smooth onset below 5 kN/m are off, ".format(*_off(soft))
         + "and {} of {} above".format(*_off(stiff)),
+        "{:.2g}, {:.2g} and {:.2g} times the slope on `ball_wall` at 1, 2 and 4 ms, ".format(*bias["ball_wall"])
+        + "and {:.2g}, {:.2g} and {:.2g} times on".format(*bias["momentum_transfer"]),
+        f"{off['momentum_transfer', 0.004]} of the cells of `momentum_transfer` are off at 4 ms and "
+        f"{off['momentum_transfer', 0.001]} at 1 ms, of `ball_wall` {off['ball_wall', 0.004]} and "
+        f"{off['ball_wall', 0.001]}.",
+        f"in {above['pusher', 0.01]} at 10 ms and in {above['pusher', 0.0025]} at 2.5 ms; of `momentum_transfer` in "
+        f"{above['momentum_transfer', 0.004]} at 4 ms and {above['momentum_transfer', 0.001]} at 1 ms.",
         f"it holds in all {_off(inside, 'beyond')[1]} decided cells with a strength between 0.03 and 0.8 and in none "
         f"of the {_off(bar[bar.strength > 1], 'beyond')[1]} above 1",
     ]

@@ -20,9 +20,9 @@ from mjx_study.tasks.task import Task
 
 FAMILIES: Final = ("penalty", "impedance", "mujoco", "mujoco_stiff", "smooth_onset")
 UNDAMPED: Final = ("penalty", "impedance")
-"""Families that keep the task's own damping; the others' damping ratio varies."""
+"""Families that keep the task's damping; the others' damping ratio varies."""
 POINTS: Final = 128
-"""Cells of each family at each task and timestep."""
+"""Number of cells of each family at each task and timestep."""
 DAMPRATIO: Final = (0.1, 2.0)
 WIDTH: Final = (3e-4, 3e-2)
 """Depths over which the impedance of `smooth_onset` rises [m]."""
@@ -32,13 +32,13 @@ NOISE: Final = (0.1, 3.0)
 
 @dataclasses.dataclass(frozen=True)
 class Setting:
-    """What is varied on a task.
+    """Ranges of a task.
 
     Attributes:
-        timesteps: [s].
+        timesteps: timesteps [s].
         stiffness: least and largest stiffness [N/m].
         theta: least and largest t, of theta = t direction.
-        cost: computing time of a cell's step, all samples together [s], roughly; it orders and splits jobs.
+        cost: rough computing time of one step of a cell, all samples together [s]; it orders and splits jobs.
     """
 
     timesteps: tuple[float, ...]
@@ -57,7 +57,7 @@ TASKS: Final = {
 }
 """`pusher_apart` is the pusher whose bodies start 10 cm apart, so that they meet."""
 GAP: Final = 0.1
-"""Of `pusher_apart` [m]."""
+"""Gap of `pusher_apart` at the start [m]."""
 PROGRAMS: Final = tuple((name, timestep) for name, setting in TASKS.items() for timestep in setting.timesteps)
 CELLS: Final = len(PROGRAMS) * POINTS * len(FAMILIES)
 COLUMNS: Final = ("program", "family", "stiffness", "dampratio", "width", "sigma", "theta")
@@ -88,7 +88,7 @@ class Cell:
 
 
 def cells_of(program: int) -> Iterator[Cell]:
-    """The cells of a task and timestep, family by family in turn."""
+    """Yield the cells of a task and timestep, cycling through the families."""
     name, timestep = PROGRAMS[program]
     setting, sigma, own = TASKS[name], task_of(name, timestep).sigma, 0.001
     ranges = [setting.stiffness, DAMPRATIO, WIDTH, [factor * sigma for factor in NOISE]]
@@ -114,7 +114,7 @@ def cells_of(program: int) -> Iterator[Cell]:
 
 
 def task_of(name: str, timestep: float) -> Task:
-    """A task at a timestep, as long as at its own."""
+    """Return a task at another timestep, with its duration kept."""
     base = make_task(name.removesuffix("_apart"))
     steps = round(base.horizon * base.scene.timestep / timestep)
     task = make_task(name.removesuffix("_apart"), timestep=timestep, horizon=steps)
@@ -125,7 +125,7 @@ def task_of(name: str, timestep: float) -> Task:
 
 
 def contact_of(task: Task, cell: Cell) -> ContactModel:
-    """The contact model of a cell."""
+    """Return the contact model of a cell."""
     damping = None
     if not math.isnan(cell.dampratio):
         damping = 2 * cell.dampratio * math.sqrt(cell.stiffness * task.effective_mass)

@@ -29,12 +29,12 @@ TASKS: Final = {
     "sliding_box": "#999999",
     "tennis": "#000000",
 }
-"""Colours, in the order of panels."""
+"""Colours of the tasks, in the order of panels."""
 BINS: Final = 8
 
 
 def binned(axes: Axes, values: Any, verdict: Any, colour: str) -> None:
-    """The share of a verdict in bins of equal numbers of cells, with Wilson intervals."""
+    """Draw the share of a verdict in bins of equal numbers of cells, with Wilson intervals."""
     kept = np.isfinite(values) & (values > 0) & np.isfinite(verdict)
     values, verdict = values[kept], verdict[kept]
     if len(values) < 3 * BINS:
@@ -60,7 +60,7 @@ def panels(rows: int, columns: int, width: float = 3.4, height: float = 2.8) -> 
 
 
 def key(figure: Figure, colours: Mapping[str, str], *more: Line2D) -> None:
-    """A legend below the panels, outside them."""
+    """Draw a legend below the panels."""
     dots = [Line2D([], [], color=colour, marker="o", linewidth=0, label=name) for name, colour in colours.items()]
     columns = len(dots) if not more else 4
     figure.legend(handles=[*dots, *more], loc="outside lower center", ncols=columns, frameon=False)
@@ -71,14 +71,14 @@ def symbol_of(group: str) -> str:
 
 
 def scatter(axes: Axes, table: Table, x: str, y: str, limits: tuple[float, float]) -> None:
-    """A point for each cell, clipped to the limits, coloured by contact family."""
+    """Draw a point for each cell, clipped to the limits, coloured by contact family."""
     for name, part in table.groupby("contact", sort=False):
         axes.scatter(part[x], part[y].clip(*limits), s=3, color=COLOURS[name], alpha=0.5, linewidths=0)
     axes.set(xscale="log", yscale="log", xlabel=symbol_of(x), ylim=limits)
 
 
 def variance_figure(table: Table) -> Figure:
-    """Ratio of variances against the share of the stability limit, a panel for each task."""
+    """Draw the ratio of variances against the share of the stability limit, one panel per task."""
     figure, axes = panels(2, 3)
     for each, name in zip(axes, TASKS, strict=True):
         scatter(each, table[(table.task == name) & table.ratio.notna()], "limit", "ratio", (1e-7, 1e7))
@@ -92,7 +92,7 @@ def variance_figure(table: Table) -> Figure:
 
 
 def bias_figure(table: Table) -> Figure:
-    """Relative bias of plain first order, where decided, against four groups; shares of cells that are off below."""
+    """Draw the decided relative bias of plain first order against four groups, and shares of cells that are off."""
     met = table[bodies_meet(table) & np.isfinite(table.fobg_off)]
     figure, axes = panels(2, 4, 3.0)
     for place, group in enumerate(("h_b", "strength", "crossing", "travel")):
@@ -108,7 +108,7 @@ def bias_figure(table: Table) -> Figure:
 
 
 def onset_figure(table: Table) -> Figure:
-    """What the onset term leaves of what it adds, where force jumps and plain first order is off."""
+    """Draw the share that the onset term leaves of what it adds, where force jumps and plain first order is off."""
     some = table[term_acts(table)]
     figure, axes = panels(1, 3)
     for each, group in zip(axes, ("strength", "crossing", "limit"), strict=True):
@@ -129,7 +129,7 @@ def onset_figure(table: Table) -> Figure:
 
 
 def timestep_figure(table: Table) -> Figure:
-    """Shares of the three verdicts by timestep, a line for each task."""
+    """Draw the shares of the three verdicts by timestep, one line per task."""
     figure, axes = panels(1, 3)
     for name, cells in table.groupby("task", sort=False):
         steps = [(1e3 * timestep, verdicts(part)) for timestep, part in cells.groupby("timestep")]
@@ -151,7 +151,7 @@ def timestep_figure(table: Table) -> Figure:
 
 
 def samples_figure(table: Table) -> Figure:
-    """What first order gains in variance times seconds, and after how many rollouts its bias costs it the lead."""
+    """Draw first order's gain in variance times seconds, and the rollouts until its bias costs it the lead."""
     figure, axes = panels(1, 2, 4.4)
     for each, x, y, some, limits in (
         (axes[0], "limit", "worth", table[table.worth.notna()], (1e-7, 1e7)),

@@ -26,12 +26,10 @@ from mjx_study.diagnose import SMOOTH_SHARE
 from mjx_study.table import markdown_table
 
 PAGE: Final = DOCS / "atlas.md"
-SURE: Final = 5.0
-"""Standard errors from zero from which a slope serves as the unit of a bias."""
 OF_THE_DESIGN: Final = ("limit", "h_b", "h2_k", "impedance", "periods", "params")
-"""Groups that are known without a rollout; of the others, only cells where bodies meet count."""
+"""Groups that are known without a rollout; for the others, only cells where bodies meet count."""
 STRENGTHS: Final = (0.03, 0.8)
-"""Onset strengths between which the bound on the term's error is counted apart."""
+"""Onset strengths that separate the columns of the table of bounds."""
 
 
 def share(right: np.ndarray) -> str:
@@ -43,7 +41,7 @@ def share(right: np.ndarray) -> str:
 
 
 def rules_table(table: Table) -> str:
-    """How often the thresholds of diagnose are right, and those fitted to one half, on the other half."""
+    """Format how often the thresholds of diagnose, and those fitted to one half, are right on the other half."""
     fit, test = halves(table)
     head = ("rule", "threshold", "sensitivity", "specificity", "fitted", "sensitivity", "specificity")
     rows = []
@@ -59,7 +57,7 @@ def rules_table(table: Table) -> str:
 
 
 def jump_table(table: Table) -> str:
-    """How often plain first order is off where force jumps at first touch, and where it does not."""
+    """Format how often plain first order is off where force jumps at first touch, and where it does not."""
     rows = []
     for name in TASKS:
         part = table[bodies_meet(table) & (table.task == name)]
@@ -72,7 +70,7 @@ def jump_table(table: Table) -> str:
 
 
 def bound_table(table: Table) -> str:
-    """How often the error that the term leaves is within the bound that findings state, by onset strength."""
+    """Format how often the error that the term leaves is within the bound of findings, by onset strength."""
     rows = []
     for name in TASKS:
         part = table[noise_is_wide(table) & (table.task == name)]
@@ -106,43 +104,8 @@ def groups_table(table: Table) -> str:
     return markdown_table(rows, ("group", "limits of the quarters", *VERDICTS))
 
 
-def steps_table(table: Table) -> str:
-    """What a smaller step does to contacts that are stable at the largest one, and to the stiffest quarter of all.
-
-    Variances are over the squared gradient and times the number of steps, which is what a second of computing leaves.
-    """
-    rows = []
-    for name, cells in table.groupby("task"):
-        quarter = cells.stiffness.quantile([0.25, 0.75])
-        parts = cells[cells.stiffness <= quarter[0.25]], cells[cells.stiffness >= quarter[0.75]]
-        largest = cells.timestep.max()
-        jumping = cells[bodies_meet(cells) & (cells.strength > SMOOTH_SHARE)]
-        known = jumping[jumping.slope.abs() > SURE * jumping.slope_se]
-        alike = known[largest**2 * known.k + 2 * largest * known.b < 4]
-        for timestep in sorted(cells.timestep.unique()):
-            rows.append([f"`{name}`", f"{1e3 * timestep:g} ms"])
-            for part in parts:
-                left = part.fobg_variance / part.norm**2 / part.timestep
-                medians = left.groupby(part.timestep).median()
-                here = part[part.timestep == timestep]
-                rows[-1].append(share(here.above.dropna().to_numpy() == 1))
-                rows[-1].append(f"{medians[timestep] / medians[largest]:.2g}")
-            biases = alike.fobg_relative[alike.timestep == timestep]
-            rows[-1].append(f"{biases.median():.2g} ({len(biases)})" if len(biases) >= BINS else "-")
-    head = (
-        "task",
-        "timestep",
-        "softest quarter: variance above",
-        "variance x steps",
-        "stiffest quarter: variance above",
-        "variance x steps",
-        "bias, median",
-    )
-    return markdown_table(rows, head)
-
-
 def cells_table(table: Table) -> str:
-    """What is in the file, and how much of it is decided."""
+    """Format the contents of the file, and how many verdicts are decided."""
     rows = []
     for name, part in [*table.groupby("task"), ("all", table)]:
         met = part[bodies_meet(part)]
@@ -163,7 +126,7 @@ def cells_table(table: Table) -> str:
 
 
 def samples_table(table: Table) -> str:
-    """How much first order gains, and how many rollouts it takes until zeroth order is ahead of its bias."""
+    """Format first order's gain, and the rollouts until zeroth order overtakes its bias."""
     rows = []
     for name in TASKS:
         part = table[(table.task == name) & (table.stable == 1) & np.isfinite(table.ratio)]
@@ -183,7 +146,6 @@ TABLES: Final = {
     "groups": groups_table,
     "rules": rules_table,
     "bound": bound_table,
-    "steps": steps_table,
     "samples": samples_table,
 }
 

@@ -34,7 +34,7 @@ from mjx_study.tasks.task import Task
 SAMPLES: Final = 64
 """First-order samples of a cell, and pairs of rollouts for zeroth order and the reference."""
 BATCHES: Final = 8
-"""Into which first-order samples are split for the squared bias."""
+"""Number of batches for the squared bias."""
 CHUNK: Final = 256
 SEED: Final = 0
 ESTIMATORS: Final = ("zobg", "fobg", "fobg_onset")
@@ -69,7 +69,7 @@ class Programs:
         self._programs = {"value": of_rows(value), "gradients": of_rows(gradients)}
 
     def run(self, name: str, settings: Sequence[np.ndarray], keys: np.ndarray, scale: np.ndarray) -> tuple[Any, float]:
-        """Outputs `(cells, rows, ...)`, and seconds per row; NaN for a call that compiles.
+        """Return outputs `(cells, rows, ...)`, and seconds per row (NaN for a call that compiles).
 
         Args:
             settings: t, solref, solimp and sigma of every cell.
@@ -87,7 +87,7 @@ class Programs:
 
     @cached_property
     def control(self) -> Any:
-        """Control without noise at a step, from t and the state."""
+        """Control without noise as a function of t, the step and the state."""
         policy = self.task.policy
         noise = jnp.zeros(policy.noise_shape)
 
@@ -100,14 +100,14 @@ class Programs:
 
 
 def direction_along(task: Task) -> jax.Array:
-    """The direction of theta: the same force at every step, or random feedback gains."""
+    """Return the direction of theta: the same force at every step, or random feedback gains."""
     if task.policy.additive:
         return jnp.ones(task.policy.num_params)
     return jnp.asarray(direction_of("random", task.policy.num_params, SEED))
 
 
 def first_touch(programs: Programs, cell: Cell, contact: ContactModel, key: jax.Array) -> dict[str, float]:
-    """Whether bodies touch at the start, and the first contact that begins in the rollout without noise."""
+    """Return whether bodies touch at the start, and the speed at which the first contact begins, without noise."""
     task = programs.task
     policy, host = task.policy, engine_model(task.scene, contact)
     theta, still = cell.theta * programs.direction, jnp.zeros(policy.noise_shape)
@@ -135,7 +135,7 @@ def first_touch(programs: Programs, cell: Cell, contact: ContactModel, key: jax.
 
 @jax.jit
 def _statistics(plus: Evaluation, minus: Evaluation, pilot: Evaluation | None, gradients, sigma):
-    """Numbers of one cell.
+    """Return the statistics of one cell.
 
     The slope along a direction d is compared, since that is where a descent step goes. With one parameter d is 1.
     Otherwise it is the direction of the median first-order gradient of one half of the samples, along which the other
@@ -143,7 +143,7 @@ def _statistics(plus: Evaluation, minus: Evaluation, pilot: Evaluation | None, g
 
     Args:
         plus, minus: evaluations with opposite noise.
-        pilot: evaluation of the first-order samples; None for a feedback policy, whose reference is of pairs.
+        pilot: evaluation of the first-order samples; None for a feedback policy, whose reference averages pairs.
         gradients: (samples, 2, params), without and with the onset term.
     """
     zeroth = zeroth_order(plus, "zero_noise")
@@ -186,7 +186,7 @@ def _statistics(plus: Evaluation, minus: Evaluation, pilot: Evaluation | None, g
 
 
 def measure(programs: Programs, cells: Sequence[Cell]) -> dict[str, np.ndarray]:
-    """All columns of some cells of one task and timestep."""
+    """Return all columns of some cells of one task and timestep."""
     task, additive = programs.task, programs.task.policy.additive
     contacts = [contact_of(task, cell) for cell in cells]
     stacked = [np.stack([np.asarray(getattr(each, name)) for each in contacts]) for name in ("solref", "solimp")]

@@ -27,9 +27,9 @@ BLOCK: Final = 16
 DIGITS: Final = 10
 """Bits of the mantissa that are kept: a relative error of 5e-4, and a third of the size."""
 FEWEST: Final = 60.0
-"""Least time that is worth a job's compilation [s]."""
+"""Remaining time below which no job starts [s]."""
 LARGEST: Final = 200.0
-"""Of a job, compilation apart [s]; larger ones are split."""
+"""Maximum run time of a job, without compilation [s]; longer ones are split."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,14 +51,14 @@ class Job:
 
     @property
     def seconds(self) -> float:
-        """Computing time, roughly."""
+        """Rough computing time [s]."""
         name, timestep = PROGRAMS[self.program]
         steps = task_of(name, timestep).horizon
         return TASKS[name].cost * steps * POINTS * len(FAMILIES) / self.parts
 
 
 def jobs() -> list[Job]:
-    """All of them, longest first."""
+    """Return all jobs, longest first."""
     whole = [Job(program, 0, 1) for program in range(len(PROGRAMS))]
     counts = [math.ceil(job.seconds / LARGEST) for job in whole]
     split = [Job(job.program, part, parts) for job, parts in zip(whole, counts, strict=True) for part in range(parts)]
@@ -66,12 +66,12 @@ def jobs() -> list[Job]:
 
 
 def compute(job: Job, folder: Path, done: frozenset[int], end: float, most: int | None) -> int:
-    """Compute what is missing of a job until the end, in a process of its own; the number of cells.
+    """Compute the missing cells of a job until time is up; return their number.
 
     Args:
-        done: indices of cells that are there.
-        end: as `time.time`.
-        most: cells of each job; None for all.
+        done: indices of the cells that exist.
+        end: time limit, as `time.time`.
+        most: maximum number of cells of each job; None for all.
     """
     configure(cpu_devices=1)
     mujoco.set_mju_user_warning(lambda message: None)
@@ -92,7 +92,7 @@ def compute(job: Job, folder: Path, done: frozenset[int], end: float, most: int 
 
 
 def write(path: Path, parts: Sequence[dict[str, np.ndarray]], **more: Any) -> None:
-    """Columns one below another, as float32 with `DIGITS` bits, in the order of the cells, each once."""
+    """Write the columns of all parts as float32 with `DIGITS` bits, sorted by cell and without duplicates."""
     joined = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     _, kept = np.unique(joined["index"], return_index=True)
     whole = joined["index"][kept].astype(np.int32)
@@ -101,7 +101,7 @@ def write(path: Path, parts: Sequence[dict[str, np.ndarray]], **more: Any) -> No
 
 
 def rounded(values: np.ndarray) -> np.ndarray:
-    """As float32, the rest of the mantissa zero."""
+    """Round to float32 with `DIGITS` bits of the mantissa."""
     with np.errstate(over="ignore"):
         single = np.asarray(values, np.float32)
     finite = np.isfinite(single)
@@ -112,21 +112,21 @@ def rounded(values: np.ndarray) -> np.ndarray:
 
 
 def read(path: Path) -> dict[str, np.ndarray]:
-    """Columns of a file, without what it says about itself."""
+    """Read the columns of a file."""
     with np.load(path) as file:
         return {name: file[name] for name in file.files if name != "about"}
 
 
 def about(path: Path) -> dict[str, Any]:
-    """What a file says about itself."""
+    """Read the description of a file: machines, samples, seed, programs, families."""
     with np.load(path) as file:
         return json.loads(str(file["about"]))
 
 
 def condense(folder: Path) -> int:
-    """Join what the folder holds into atlas.npz, in place of its parts; the number of cells.
+    """Join the parts in a folder into its atlas.npz, and delete them; return the number of cells.
 
-    The column `environment` says on which of `environments` a cell was computed.
+    The column `environment` is an index into the description's `environments`.
     """
     joined = folder / RESULTS.name
     found, environments = [], []
@@ -174,4 +174,4 @@ def run(folder: Path, workers: int, seconds: float, most: int | None = None, onl
             left = max(0.0, end - time.time())
             outcome = future.exception() or f"{future.result()} cells"
             print(f"{waiting[future].label}: {outcome}; {left:.0f} s left", flush=True)
-    print(f"{condense(folder)} of {CELLS} cells in {folder / RESULTS.name}; {before} were there", flush=True)
+    print(f"{condense(folder)} of {CELLS} cells in {folder / RESULTS.name}; {before} existed before", flush=True)

@@ -36,7 +36,7 @@ GROUPS: Final = {
 
 
 def read(path: Path) -> Table:
-    """The atlas with its groups and verdicts, a row for each cell."""
+    """Return the atlas with its groups and verdicts, one row per cell."""
     with np.load(path) as file:
         about = json.loads(str(file["about"]))
         table = pd.DataFrame({name: file[name] for name in file.files if name != "about"}).astype({"index": int})
@@ -78,7 +78,7 @@ def read(path: Path) -> Table:
 
 
 def is_off(table: Table, name: str) -> np.ndarray:
-    """1 where a mean is off by more than `TOLERANCE`, 0 where it is right within, NaN where that is undecided."""
+    """Return 1 where a mean is off by more than `TOLERANCE`, 0 where it is within, NaN where undecided."""
     bias, slope = table[f"{name}_bias"].abs(), table.slope.abs()
     half = QUANTILE * np.hypot(table[f"{name}_bias_se"], table.slope_se)
     error = QUANTILE * table.slope_se
@@ -96,22 +96,22 @@ def bodies_meet(table: Table) -> Any:
 
 
 def plain_is_off(table: Table) -> Any:
-    """Cells where bodies meet, the step is stable, and plain first order is off."""
+    """Select cells where bodies meet, the step is stable, and plain first order is off."""
     return bodies_meet(table) & (table.fobg_off == 1)
 
 
 def term_acts(table: Table) -> Any:
-    """Of these, the cells where force jumps, so that the onset term adds something."""
+    """Select those of them where force jumps, so that the onset term adds something."""
     return plain_is_off(table) & (table.strength > SMOOTH_SHARE)
 
 
 def on_tasks(where: Callable[[Table], Any], *tasks: str) -> Callable[[Table], Any]:
-    """Cells of some tasks alone."""
+    """Restrict a selection to some tasks."""
     return lambda table: where(table) & table.task.isin(tasks)
 
 
 def noise_is_wide(table: Table) -> Any:
-    """Cells with something to cure where noise is as wide as the term needs."""
+    """Select those of them where noise is as wide as the term needs."""
     return term_acts(table) & (table.onset_spread >= LEAST_SPREAD)
 
 
@@ -119,7 +119,7 @@ VERDICTS: Final = ("variance above", "mean off", "off with the term")
 
 
 def verdicts(part: Table) -> list[Any]:
-    """Decided verdicts of some cells: variance above; mean off, where bodies meet; off with the term, where it acts."""
+    """Return decided verdicts: variance above; mean off, where bodies meet; off with the term, where it acts."""
     decided = [part.above, part[bodies_meet(part)].fobg_off, part[term_acts(part)].fobg_onset_off]
     return [each.dropna().to_numpy() == 1 for each in decided]
 
@@ -129,11 +129,11 @@ class Rule:
     """A threshold that predicts a verdict: above it 1 is expected, below it 0.
 
     Attributes:
-        group: column that is compared.
-        threshold: what diagnose takes.
+        group: column to compare.
+        threshold: threshold of `diagnose`.
         verdict: column with 1, 0 or NaN.
         rising: whether values above the threshold expect 1.
-        where: cells that the rule is about.
+        where: selects the cells to which the rule applies.
     """
 
     name: str
@@ -144,22 +144,22 @@ class Rule:
     rising: bool = True
 
     def judged(self, table: Table) -> Table:
-        """The decided cells that it is about."""
+        """Return the decided cells to which the rule applies."""
         kept = self.where(table) & np.isfinite(table[self.group]) & np.isfinite(table[self.verdict])
         return table[kept]
 
     def hits(self, table: Table, threshold: float) -> tuple[np.ndarray, np.ndarray]:
-        """Whether it is right in each cell where the verdict is 1, and in each where it is 0."""
+        """Return whether the rule is right in each cell with verdict 1, and in each with verdict 0."""
         expected = (table[self.group] > threshold) == self.rising
         truth = table[self.verdict] == 1
         return (expected[truth]).to_numpy(), (~expected[~truth]).to_numpy()
 
     def balanced(self, table: Table, threshold: float) -> float:
-        """Mean of both shares, so that the more frequent verdict does not decide."""
+        """Return the mean of sensitivity and specificity."""
         return sum(float(np.mean(each)) if len(each) else 1.0 for each in self.hits(table, threshold)) / 2
 
     def fitted(self, table: Table) -> float:
-        """The threshold with the best balanced share, of the quantiles."""
+        """Return the quantile with the best balanced share as threshold."""
         tried = np.unique(np.quantile(table[self.group], np.linspace(0.01, 0.99, 99)))
         return float(tried[int(np.argmax([self.balanced(table, each) for each in tried]))])
 
@@ -194,7 +194,7 @@ RULES: Final = (
 
 
 def halves(table: Table) -> tuple[Table, Table]:
-    """Two random halves; no contact model is in both.
+    """Return two random halves; no contact model is in both.
 
     Even and odd points would not do: in a Sobol sequence these are the two halves of a dimension, the damping ratio.
     """

@@ -9,7 +9,7 @@ from mjx_study.experiment.landscapes import Line, grid, means
 
 
 def correction_figure() -> Figure:
-    """momentum_transfer, MuJoCo's default contact: slope of the mean cost, and means of first-order gradients."""
+    """Draw the slope of the mean cost and means of first-order gradients, with MuJoCo's default contact."""
     task = task_of("momentum_transfer")
     contact, position = contact_of(task, "mujoco_default", 1.0), np.linspace(0.05, 0.74, 47)
     points = grid(position[0], position[-1], task.sigma, 2000, task.noise)

@@ -202,7 +202,7 @@ def convergence(axes: Axes) -> None:
 
 
 def thrown_errors():
-    """Of where a ball lands that meets no wall."""
+    """Return errors of the landing point of a ball that meets no wall."""
     angles = np.array([0.15, 0.2, 0.25, 0.85, 0.9, 0.95, 1.0])[:, None]
     exact = 10 * BallWall().landing(angles)
     stiffnesses = np.geomspace(1000, 100000, 7)
@@ -216,7 +216,7 @@ def thrown_errors():
 
 
 def shot_errors():
-    """Of the momentum that an elastic hit transfers."""
+    """Return errors of the momentum that an elastic hit transfers."""
     angles = np.array([0.1, 0.3, 0.5, 0.7])[:, None]
     exact = np.sqrt(-MomentumTransfer(restitution=1.0, inertia_ratio=0.1).value(angles))
     stiffnesses = np.geomspace(2000, 100000, 7)
@@ -228,7 +228,7 @@ def shot_errors():
 
 
 def played_errors():
-    """Of the way from start to end of a ball that a policy returns; the median of 64."""
+    """Return errors of the end of a returned ball's flight, over its length; medians of 64."""
     drawn = np.asarray(jax.vmap(draw_start)(jax.random.split(jax.random.key(3), 64)))
     gains = returning_gains()
     stiffnesses = np.geomspace(500, 40000, 7)

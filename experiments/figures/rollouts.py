@@ -36,13 +36,13 @@ class Runs(NamedTuple):
 
 @cache
 def task_of(name: str, **options: float) -> Task:
-    """A task; one object for each set of options, so that each is compiled once."""
+    """Return a task; one object per set of options, so that each compiles once."""
     return make_task(name, **options)
 
 
 @cache
 def program(task: Task) -> Callable[..., Runs]:
-    """Compiled rollouts of a batch of (theta, start); the contact model is an argument too."""
+    """Return compiled rollouts of a batch of (theta, start); the contact model is an argument too."""
 
     def one(theta, start, contact):
         cost, (states, *_) = rollout_cost(task, theta, contact, start, jnp.zeros(task.policy.noise_shape))
@@ -52,7 +52,7 @@ def program(task: Task) -> Callable[..., Runs]:
 
 
 def run(task: Task, thetas: np.ndarray, contact: ContactModel | None, starts: State | None = None) -> Runs:
-    """Roll out a batch of thetas; from the task's start unless starts are given."""
+    """Roll out a batch of thetas, from the task's start by default."""
     if starts is None:
         assert isinstance(task.start, State)
         starts = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (len(thetas), *leaf.shape)), task.start)
@@ -60,14 +60,14 @@ def run(task: Task, thetas: np.ndarray, contact: ContactModel | None, starts: St
 
 
 def contact_of(task: Task, family: str, stiffness: float) -> ContactModel:
-    """A contact model as `mjx-study compare` makes it."""
+    """Return a contact model as `mjx-study compare` makes it."""
     ((cell,), _) = family_grid(task, [family], [stiffness])
     assert cell.contact is not None
     return cell.contact
 
 
 def tennis_starts(task: Task, slow: np.ndarray) -> State:
-    """Start states of MJX from (ball x, y, vx, vy, paddle x, y, angle), velocities in slow time."""
+    """Return start states from (ball x, y, vx, vy, paddle x, y, angle), with velocities in slow time."""
 
     def one(drawn):
         qvel = jnp.concatenate([SLOW * drawn[2:4], jnp.zeros(3)])
@@ -77,13 +77,13 @@ def tennis_starts(task: Task, slow: np.ndarray) -> State:
 
 
 def returning_gains() -> np.ndarray:
-    """A policy by hand: the paddle runs after the ball and turns a little."""
+    """Return a policy written by hand: the paddle follows the ball and turns a little."""
     gains = np.zeros((3, 7))
     gains[0, 0], gains[0, 4], gains[2, 0] = 1.5, -1.5, 0.05
     return gains
 
 
 def note(axes: Axes, x: float, y: float, text: str, colour: str = INK, **options) -> None:
-    """Text; a colour is darkened until it can be read."""
+    """Write text, with its colour darkened until it is legible."""
     shade = tuple(0.8 * part for part in to_rgb(colour))
     axes.text(x, y, text, color=shade, fontsize=8.5, **{"ha": "center", "va": "center", "zorder": 6} | options)

@@ -35,10 +35,10 @@ from mjx_study.tasks.task import Task
 
 
 class Panel(NamedTuple):
-    """A picture of the gallery.
+    """A panel of the figure.
 
     Attributes:
-        title, subtitle: the task's name, and what is decided.
+        title, subtitle: the task's name, and its parameters.
         low, high: corners of what is shown [m].
         bar: length of the scale bar [m].
         draw: draws onto axes with these limits.
@@ -58,7 +58,7 @@ class Panel(NamedTuple):
 
 
 def drawing_of(task: Task, qpos: np.ndarray, view: str, colours: dict[str | int, str] | None = None) -> Drawing:
-    """A drawing of one rollout, some geoms in another colour than the MJCF's."""
+    """Return a drawing of one rollout, with some geoms recoloured."""
     model = copy.copy(task.scene.host)
     for geom, colour in (colours or {}).items():
         model.geom(geom).rgba[:3] = to_rgb(colour)
@@ -66,7 +66,7 @@ def drawing_of(task: Task, qpos: np.ndarray, view: str, colours: dict[str | int,
 
 
 def strobe(axes: Axes, drawing: Drawing, steps: Sequence[int], *, faintest: float = 0.25) -> None:
-    """The path, and poses at some steps, the earlier the fainter."""
+    """Draw the path, and poses at some steps, the earlier the fainter."""
     drawing.trace(axes, slice(steps[0], steps[-1] + 1))
     for rank, step in enumerate(steps):
         drawing.pose(axes, step, faintest + (1 - faintest) * ((rank + 1) / len(steps)) ** 1.5)
@@ -110,7 +110,7 @@ def sliding_box_panel() -> Panel:
 
 
 def thrown_panel(variant: str, throws: Sequence[tuple[float, str, float]], labels, **corners) -> Panel:
-    """Several throws: (angle, colour, seconds)."""
+    """Return a panel of several throws: (angle, colour, seconds)."""
     task = task_of("ball_wall" if variant == "box" else f"ball_wall:{variant}")
     runs = run(task, np.array([[angle] for angle, *_ in throws]), contact_of(task, "mujoco", 10000.0))
 
@@ -168,7 +168,7 @@ def tennis_panel() -> Panel:
 
 
 def robot_panel(name: str, seed: int, view: str, shown: Sequence[tuple[int, str]], apart: float, **corners) -> Panel:
-    """One sample's rollout without noise, by the policy that a descent starts from: (step, text), side by side."""
+    """Return a panel of one rollout without noise, with the initial policy: poses (step, text) side by side."""
     task = task_of(name)
     assert callable(task.start)
     start = jax.tree.map(lambda leaf: leaf[None], task.start(jax.random.key(seed)))
@@ -215,7 +215,7 @@ def pendulum_panel() -> Panel:
 
 
 def tasks_figure() -> Figure:
-    """One panel for each task, in rows that fill the page."""
+    """Draw one panel per task, in rows that fill the page."""
     throws = [(0.25, GREEN, 0.2), (0.5, ORANGE, 0.46), (0.72, PINK, 0.4), (0.9, BLUE, 0.52)]
     meets = [(0.57, GREEN, 0.42), (0.65, ORANGE, 0.4), (0.7, PINK, 0.4), (0.75, BLUE, 0.5)]
     ends = [
@@ -266,7 +266,7 @@ def tasks_figure() -> Figure:
 
 
 def _scale_bar(axes: Axes, panel: Panel) -> None:
-    """A length in metres, in the lower right corner."""
+    """Draw a length in metres in the lower right corner."""
     span = panel.high[1] - panel.low[1]
     x, y = panel.high[0] - 0.04 * span, panel.low[1] + 0.055 * span
     axes.plot([x - panel.bar, x], [y, y], color=INK, linewidth=1.5, solid_capstyle="butt", zorder=7)

@@ -25,7 +25,7 @@ def measure_engine(workers: int, cells: int, seconds: float, programs: int, numb
         return {"values": numpy.full(numbers, float(index))}
 
     class Plan:
-        """As much of a plan as hands out cells."""
+        """Just enough of a plan to hand out cells."""
 
         def __init__(self) -> None:
             self.cells = range(cells)
