@@ -105,7 +105,7 @@ lock: $(UV) ## Update requirements.lock from pyproject.toml (LOCK_ARGS=--upgrade
 		--custom-compile-command 'make lock' --quiet $(LOCK_ARGS) pyproject.toml -o requirements.lock
 
 clean: ## Remove environments, caches and builds, but not results/
-	rm -rf $(VENV) .venv-lock .venv-newest build dist *.egg-info .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) .venv-lock .venv-newest build dist .cache *.egg-info .pytest_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # Every file that pip installs here is pinned by its hash: the build backend comes from the lock as well.
