@@ -74,7 +74,7 @@ def bound_table(table: Table) -> str:
     rows = []
     for name in TASKS:
         part = table[noise_is_wide(table) & (table.task == name)]
-        if not len(part):
+        if len(part) < BINS:
             continue
         rows.append([f"`{name}`", len(part), f"{part.left[np.isfinite(part.left)].median():.2g}"])
         for low, high in itertools.pairwise((0, *STRENGTHS, np.inf)):
