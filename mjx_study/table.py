@@ -39,10 +39,9 @@ def format_table(rows: Sequence[Sequence[str]], header: Sequence[str]) -> list[s
     return ["  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in (header, *rows)]
 
 
-def markdown_table(rows: Iterable[Sequence[str]], header: Sequence[str]) -> str:
+def markdown_table(rows: Iterable[Sequence[Any]], header: Sequence[str]) -> str:
     """Format a table in Markdown, without a line feed at its end."""
-    first, *others = (f"| {' | '.join(row)} |" for row in (header, *rows))
-    return "\n".join([first, f"|{'---|' * len(header)}", *others])
+    return "\n".join(f"| {' | '.join(map(str, row))} |" for row in (header, ["---"] * len(header), *rows))
 
 
 def number(value: float | None, digits: int = 3) -> str:

@@ -172,12 +172,3 @@ def explained(kind: str, *names: str) -> str:
     """Explain columns of a table for the help; all of them if none is named."""
     shown = [QUANTITIES[kind][name] for name in names or QUANTITIES[kind]]
     return described({variable.heading: variable.description for variable in shown})
-
-
-def markdown_table(kind: str) -> str:
-    """Format the table of variables in docs/studies.md."""
-    rows = [
-        f"| `{name}` | {', '.join(variable.dims) or '-'} | {variable.unit} | {variable.description} |"
-        for name, variable in VARIABLES[kind].items()
-    ]
-    return "\n".join([f"| {kind} | within a cell | unit | meaning |", "| --- | --- | --- | --- |", *rows])
