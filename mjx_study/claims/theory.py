@@ -118,7 +118,7 @@ def silent(lab: Laboratory, system: str, family: str) -> Statistic:
 
 
 def missed(lab: Laboratory, system: str, family: str, *, truth: str, samples: int, quantile: float) -> Statistic:
-    """Share of batches whose own interval for the first-order mean, with a quantile of Student's t, misses a number of
+    """Share of batches whose interval for the first-order mean, with a quantile of Student's t, misses a number of
     the landscape."""
     point = at(lab, system, family)
     (found,) = batches([FirstOrder()], point, samples, 5 * lab.effort.batches)
