@@ -29,12 +29,12 @@ import numpy as np
 from scipy.stats import qmc
 
 from estimators import Evaluation, antithetic, effective_samples, squared_bias_of_means, variance_interval, zeroth_order
+from estimators.noise import batch_noise, noise_score
 from estimators.statistics import summarise
 from mjx_study.compiled import Compiled
 from mjx_study.diagnose import touch_of
 from mjx_study.disk import write_whole
 from mjx_study.objective import SamplePrograms, rollout_cost, spread
-from mjx_study.reference.noise import batch_noise, noise_score
 from mjx_study.runtime import configure, environment, local_devices
 from mjx_study.simulation.contact import ContactModel, stable
 from mjx_study.simulation.dynamics import State, initial_state

@@ -1,6 +1,18 @@
 """Public names of `estimators`, imported when one of them is first accessed."""
 
-from estimators.alpha import alpha_order, constrained_alpha, interpolate, inverse_variance_alpha, weigh_batches
+from estimators.batches import (
+    AlphaChoice,
+    Differentiation,
+    Evaluation,
+    GradientEstimate,
+    Linearisation,
+    Objective,
+    PairedObjective,
+    StepDifferentiation,
+    StepEvaluation,
+    StepwiseObjective,
+    pull_back,
+)
 from estimators.builtin import (
     AlphaOrder,
     Antithetic,
@@ -16,7 +28,7 @@ from estimators.builtin import (
     TruncatedFirstOrder,
     ZerothOrder,
 )
-from estimators.catalogue import ORACLES, VARIANCE_PROXIES, WEIGHTS, Oracle
+from estimators.choices import ORACLES, VARIANCE_PROXIES, WEIGHTS, Oracle
 from estimators.comparison import (
     BiasTest,
     Comparison,
@@ -35,7 +47,10 @@ from estimators.confidence import (
     variance_interval,
     variance_upper_bound,
 )
-from estimators.estimator import (
+from estimators.interpolation import alpha_order, constrained_alpha, interpolate, inverse_variance_alpha, weigh_batches
+from estimators.mean_check import Circulation, circulation
+from estimators.noise import NOISES, NoiseDensity
+from estimators.registry import (
     ESTIMATORS,
     Batches,
     Estimator,
@@ -46,20 +61,7 @@ from estimators.estimator import (
     oracles_of,
     register,
 )
-from estimators.mean_check import Circulation, circulation
-from estimators.noise import NOISES, NoiseDensity
-from estimators.orders import (
-    BASELINES,
-    antithetic,
-    clipped_first_order,
-    delta_control_variate,
-    first_order,
-    leave_one_out,
-    none,
-    zero_noise,
-    zeroth_order,
-)
-from estimators.rows import Rows
+from estimators.samples import Rows
 from estimators.statistics import norm_quantiles, summarise
 from estimators.stepwise import (
     antithetic_cost_to_go,
@@ -69,18 +71,16 @@ from estimators.stepwise import (
     total_propagation,
     truncated_first_order,
 )
-from estimators.types import (
-    AlphaChoice,
-    Differentiation,
-    Evaluation,
-    GradientEstimate,
-    Linearisation,
-    Objective,
-    PairedObjective,
-    StepDifferentiation,
-    StepEvaluation,
-    StepwiseObjective,
-    pull_back,
+from estimators.zeroth_first import (
+    BASELINES,
+    antithetic,
+    clipped_first_order,
+    delta_control_variate,
+    first_order,
+    leave_one_out,
+    none,
+    zero_noise,
+    zeroth_order,
 )
 
 __all__ = [

@@ -7,18 +7,11 @@ from typing import Any, ClassVar
 
 import jax.numpy as jnp
 
-from estimators.alpha import apply_choice, check_weights, choose_alpha, inverse_variance_alpha, weigh_batches
-from estimators.catalogue import CATALOGUE, MAX_DEVIATION, PLUG_IN, PUBLISHED_TOLERANCE
+from estimators.batches import AlphaChoice, Differentiation, Evaluation, GradientEstimate, StepEvaluation
+from estimators.choices import CATALOGUE, MAX_DEVIATION, PLUG_IN, PUBLISHED_TOLERANCE
 from estimators.confidence import bernstein_epsilon, check_confidence_arguments
-from estimators.estimator import Estimator, register
-from estimators.orders import (
-    antithetic,
-    clipped_first_order,
-    delta_control_variate,
-    find_baseline,
-    first_order,
-    zeroth_order,
-)
+from estimators.interpolation import apply_choice, check_weights, choose_alpha, inverse_variance_alpha, weigh_batches
+from estimators.registry import Estimator, register
 from estimators.stepwise import (
     antithetic_cost_to_go,
     check_tolerance,
@@ -29,7 +22,14 @@ from estimators.stepwise import (
     total_propagation,
     truncated_first_order,
 )
-from estimators.types import AlphaChoice, Differentiation, Evaluation, GradientEstimate, StepEvaluation
+from estimators.zeroth_first import (
+    antithetic,
+    clipped_first_order,
+    delta_control_variate,
+    find_baseline,
+    first_order,
+    zeroth_order,
+)
 
 
 def _check_positive(name: str, value: float) -> None:

@@ -7,12 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from estimators.alpha import apply_choice, inverse_variance_alpha, weigh_batches
-from estimators.catalogue import PLUG_IN, PUBLISHED_TOLERANCE
-from estimators.orders import find_baseline, zeroth_order
-from estimators.rows import Rows, finite_rows, weigh
-from estimators.statistics import summarise
-from estimators.types import (
+from estimators.batches import (
     AlphaChoice,
     Evaluation,
     GradientEstimate,
@@ -21,6 +16,11 @@ from estimators.types import (
     StepEvaluation,
     pull_back,
 )
+from estimators.choices import PLUG_IN, PUBLISHED_TOLERANCE
+from estimators.interpolation import apply_choice, inverse_variance_alpha, weigh_batches
+from estimators.samples import Rows, finite_rows, weigh
+from estimators.statistics import summarise
+from estimators.zeroth_first import find_baseline, zeroth_order
 
 Controls = Float[Array, "samples steps controls"]
 StepWeights = Float[Array, "steps controls"]

@@ -11,7 +11,7 @@ from collections.abc import Collection, Mapping
 from numbers import Integral, Real
 from typing import Any, ClassVar, Final
 
-from estimators.catalogue import BASELINES, CATALOGUE, DENSITIES, VARIANCE_PROXIES, WEIGHTS, suggestion, unknown
+from estimators.choices import BASELINES, CATALOGUE, DENSITIES, VARIANCE_PROXIES, WEIGHTS, suggestion, unknown
 from mjx_study.choices import CONES, FAMILIES, INTEGRATORS, ONSETS, REFERENCE, SOLVERS
 
 MOST_VALUES: Final = 10_000

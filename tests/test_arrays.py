@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from estimators.blocks import moments_of
+from estimators.merged_samples import moments_of
 from mjx_study.study import arrays as module
 from mjx_study.study.arrays import read_arrays, write_arrays
 from mjx_study.study.blocks import Blocks, pack

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from estimators import ESTIMATORS, Estimator, FirstOrder, ZerothOrder, find_estimator, make_estimator, register
-from estimators.catalogue import CATALOGUE
+from estimators.choices import CATALOGUE
 from mjx_study import cli
 from mjx_study.cli import options
 from mjx_study.plots.style import STYLE, combines, style_of

@@ -13,8 +13,9 @@ import pytest
 
 import estimators
 import mjx_study
-from estimators import BASELINES, ESTIMATORS, NOISES, catalogue
-from estimators.catalogue import CATALOGUE
+from estimators import BASELINES, ESTIMATORS, NOISES
+from estimators import choices as names
+from estimators.choices import CATALOGUE
 from mjx_study import choices
 from mjx_study.cli import COMMANDS
 from mjx_study.plots.style import STYLES
@@ -88,7 +89,7 @@ def test_descriptions_are_of_what_there_is() -> None:
             estimator.description,
         )
         assert entry.required == estimator.required()
-    assert tuple(catalogue.BASELINES) == tuple(BASELINES) and tuple(catalogue.DENSITIES) == tuple(NOISES)
+    assert tuple(names.BASELINES) == tuple(BASELINES) and tuple(names.DENSITIES) == tuple(NOISES)
     assert list(choices.TASK_DESCRIPTIONS) == list(TASKS)
     assert choices.FIGURE_STYLES == tuple(STYLES)
     assert (choices.MIN_IMPEDANCE, choices.MAX_IMPEDANCE) == (mujoco.mjMINIMP, mujoco.mjMAXIMP)

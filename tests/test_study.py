@@ -23,7 +23,7 @@ from estimators import (
     InverseVariance,
     summarise,
 )
-from estimators.estimator import label_of
+from estimators.registry import label_of
 from mjx_study import cli, disk
 from mjx_study.cli import console
 from mjx_study.cli.studies import as_document

@@ -3,7 +3,7 @@
 import argparse
 from functools import partial
 
-from estimators.catalogue import CATALOGUE
+from estimators.choices import CATALOGUE
 from mjx_study.choices import FAMILIES
 from mjx_study.cli.options import Parser
 from mjx_study.option import BUILDER_OPTIONS

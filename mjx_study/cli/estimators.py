@@ -2,7 +2,7 @@
 
 import argparse
 
-from estimators.catalogue import CATALOGUE, DENSITIES, ORACLES
+from estimators.choices import CATALOGUE, DENSITIES, ORACLES
 from mjx_study.cli.options import Parser
 from mjx_study.cli.output import print_report
 

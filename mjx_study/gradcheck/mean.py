@@ -15,8 +15,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from estimators import Estimator, GradientEstimate, Objective, oracles_of
-from estimators.estimator import label_of
 from estimators.mean_check import TOLERANCE, Circulation, circulations
+from estimators.registry import label_of
 from mjx_study.objective import Simulator, chunk_for
 from mjx_study.runtime import local_devices
 from mjx_study.study.configuration import Progress, check_span

@@ -19,7 +19,7 @@ from matplotlib.text import Text
 from matplotlib.transforms import ScaledTranslation
 
 from estimators import ESTIMATORS
-from estimators.estimator import label_of
+from estimators.registry import label_of
 from mjx_study.choices import FAMILIES
 from mjx_study.disk import write_whole
 

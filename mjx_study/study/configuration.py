@@ -6,12 +6,12 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Union
 
-from estimators.catalogue import CATALOGUE, PLUG_IN, PUBLISHED_TOLERANCE
+from estimators.choices import CATALOGUE, PLUG_IN, PUBLISHED_TOLERANCE
 from mjx_study.choices import FAMILIES, REFERENCE
 from mjx_study.option import Checked
 
 if TYPE_CHECKING:
-    import estimators.estimator
+    import estimators.registry
     import mjx_study.tasks.task
 
 Progress = Callable[[int, int, str], None]
@@ -106,7 +106,7 @@ class StudyConfig(Checked):
 
     tasks: tuple[Union[str, "mjx_study.tasks.task.Task"], ...]
     kind: str | None = None
-    estimators: tuple[Union[str, "estimators.estimator.Estimator"], ...] = ("zobg", "fobg", "aobg")
+    estimators: tuple[Union[str, "estimators.registry.Estimator"], ...] = ("zobg", "fobg", "aobg")
     theta: tuple[float, ...] | None = None
     network: tuple[int, ...] | None = None
     contact: tuple[str, ...] | None = None

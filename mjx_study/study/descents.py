@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Array, Float, Key
 
 from estimators import Estimator, draw
-from estimators.estimator import draw_at, sample_keys
+from estimators.registry import draw_at, sample_keys
 from mjx_study.compiled import Compiled
 from mjx_study.objective import Simulator, TracedObjective, simulate
 from mjx_study.reference import Reference

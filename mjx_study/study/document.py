@@ -10,8 +10,8 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from estimators import Estimator, find_estimator
-from estimators.catalogue import CATALOGUE, ORACLES
-from estimators.estimator import label_of
+from estimators.choices import CATALOGUE, ORACLES
+from estimators.registry import label_of
 from mjx_study.files import Finite, digest_of_json, validated
 from mjx_study.identity import git_revision, versions
 from mjx_study.option import OPTIONS

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Sequence
 from typing import Final
 
 from estimators import ESTIMATORS, ORACLES, Estimator, find_estimator
-from estimators.catalogue import CATALOGUE
+from estimators.choices import CATALOGUE
 from mjx_study.choices import REFERENCE
 from mjx_study.option import SCENE_OPTIONS
 from mjx_study.study.configuration import StudyConfig, takes_stiffness

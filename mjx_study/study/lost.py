@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 import xarray as xr
 
-from estimators.estimator import label_of
+from estimators.registry import label_of
 from mjx_study.objective.batches import compiled_rollout
 from mjx_study.objective.cost import before_each_step, last_of
 from mjx_study.simulation.dynamics import State

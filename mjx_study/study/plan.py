@@ -11,14 +11,14 @@ import jax
 
 import estimators
 from estimators import Estimator, find_estimator
-from estimators.alpha import check_weights
-from estimators.seen import seen_by
+from estimators.interpolation import check_weights
+from estimators.noise import check_sigma
+from estimators.user_inputs import inputs_read
 from mjx_study.choices import CONES, REFERENCE
 from mjx_study.identity import contents, estimator_contents
 from mjx_study.limits import MOST_CELLS, MOST_GIB, MOST_PROGRAMS, check_count
 from mjx_study.objective import chunk_for
 from mjx_study.option import BUILDER_OPTIONS
-from mjx_study.reference.noise import check_sigma
 from mjx_study.runtime import local_devices
 from mjx_study.study.configuration import SAMPLES, Settings, StudyConfig
 from mjx_study.study.effect import refuse_idle
@@ -149,7 +149,7 @@ class StudyPlan:
     @property
     def seen(self) -> dict[str, str]:
         """Digests of files and environment variables that user-defined code has read so far."""
-        return seen_by(self.places)
+        return inputs_read(self.places)
 
     def label(self, cell: StudyCell) -> str:
         """A cell's name in messages."""

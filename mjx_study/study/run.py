@@ -19,7 +19,7 @@ from typing import Any, Final
 import xarray as xr
 
 from estimators import ENOUGH_EFFECTIVE
-from estimators.seen import observing
+from estimators.user_inputs import observing
 from mjx_study.identity import differences, versions
 from mjx_study.study.blocks import Arrays
 from mjx_study.study.cells import Computation

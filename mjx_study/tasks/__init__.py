@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, Final
 
-from estimators.places import MissingModuleError
+from estimators.user_code import MissingModuleError
 from mjx_study.choices import is_file, unknown_task
 from mjx_study.option import OPTIONS, as_arguments, check
 from mjx_study.tasks.ball_wall import ball_wall

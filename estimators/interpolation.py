@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from estimators.catalogue import CROSS_FITTED, PLUG_IN, WEIGHTS, unknown
-from estimators.rows import Rows, weigh
-from estimators.types import AlphaChoice, GradientEstimate
+from estimators.batches import AlphaChoice, GradientEstimate
+from estimators.choices import CROSS_FITTED, PLUG_IN, WEIGHTS, unknown
+from estimators.samples import Rows, weigh
 
 FEWEST_SAMPLES: Final = 4
 """Two in each half, the fewest for a variance."""

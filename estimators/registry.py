@@ -8,9 +8,9 @@ from typing import Any, ClassVar, TypeVar
 import jax
 from jaxtyping import Array, Float, Key
 
-from estimators.catalogue import CATALOGUE, LEAVE_ONE_OUT, ORACLES, PLUG_IN, Entry, unknown
-from estimators.places import MissingModuleError, find_attribute, importable_here
-from estimators.types import GradientEstimate, Objective
+from estimators.batches import GradientEstimate, Objective
+from estimators.choices import CATALOGUE, LEAVE_ONE_OUT, ORACLES, PLUG_IN, Entry, unknown
+from estimators.user_code import MissingModuleError, find_attribute, importable_here
 
 Batches = Mapping[str, Any]
 """Batches by oracle name."""
@@ -100,7 +100,7 @@ class Estimator(ABC):
 
 
 ESTIMATORS: dict[str, type[Estimator]] = {}
-"""Estimators by name; `estimators.catalogue.CATALOGUE` describes them."""
+"""Estimators by name; `estimators.choices.CATALOGUE` describes them."""
 EstimatorClass = TypeVar("EstimatorClass", bound=type[Estimator])
 
 
