@@ -25,14 +25,14 @@ from mujoco import rollout
 from estimators import FirstOrder, ZerothOrder
 from estimators.noise import split_sample_key, standard_noise
 from mjx_study.compiled import Compiled
+from mjx_study.experiment.memory import check_memory
 from mjx_study.objective import Simulator, chunk_for, simulate, spread
+from mjx_study.progress import Progress, silent
 from mjx_study.runtime import environment, local_devices
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.contact import ContactModel, apply_contact
 from mjx_study.simulation.dynamics import State
 from mjx_study.simulation.engine import engine_model
-from mjx_study.study.configuration import Progress
-from mjx_study.study.memory import check_memory
 from mjx_study.tasks.contact_grid import ContactPoint, family_grid
 from mjx_study.tasks.soundness import check_soundness
 from mjx_study.tasks.task import Task
@@ -136,7 +136,7 @@ def plan_bench(task: Task, samples: int) -> BenchPlan:
     return BenchPlan(task, samples, cell, onset)
 
 
-def run_bench(plan: BenchPlan, progress: Progress = lambda done, total, what: None) -> BenchReport:
+def run_bench(plan: BenchPlan, progress: Progress = silent) -> BenchReport:
     """Measure everything, interleaved with the baselines; report medians of repeats."""
     task, samples, cell = plan.task, plan.samples, plan.cell
     devices = local_devices()

@@ -15,7 +15,7 @@ MOST_LAYERS: Final = 100
 MOST_STEPS: Final = 1_000_000
 """Maximum number of rollout steps."""
 MOST_GIB: Final = 16.0
-"""Maximum memory for arrays held at once [GiB], as counted by `mjx_study.study.memory.check_memory`."""
+"""Maximum memory for arrays held at once [GiB], as counted by `mjx_study.experiment.memory.check_memory`."""
 
 
 def check_count(count: int, what: str, limit: int, change: str) -> None:

@@ -14,11 +14,11 @@ import pandas as pd
 import xarray as xr
 from matplotlib.figure import Figure
 
+from mjx_study.execution.run import warnings_of
 from mjx_study.plots.panels import counted
 from mjx_study.plots.study import plot_study
-from mjx_study.study.findings import findings_of, label_in, model_name, remains, rows_of
-from mjx_study.study.run import warnings_of
-from mjx_study.study.variables import COORDINATES, DEBIASED, QUANTITIES, Variable
+from mjx_study.results.findings import findings_of, label_in, model_name, remains, rows_of
+from mjx_study.results.variables import COORDINATES, DEBIASED, QUANTITIES, Variable
 from mjx_study.table import with_error
 
 CAPTIONS: Final = {

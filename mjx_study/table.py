@@ -1,17 +1,45 @@
-"""Plain-text tables, and numbers as text."""
+"""Results as text tables, numbers as text, and both as plain data."""
 
+import dataclasses
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Final
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, Final
 
 ROUNDING: Final = 1e-12
 """Error over the value below which it is one of rounding."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Column:
+    """A column of a text table.
+
+    Attributes:
+        heading: its heading.
+        text: formats a row's cell.
+        meaning: its explanation in the help of a command.
+    """
+
+    heading: str
+    text: Callable[[Any], str]
+    meaning: str = ""
+
+
+def tabulate(rows: Iterable[Any], columns: Sequence[Column], *, omit: str | None = None) -> list[str]:
+    """Format a line per row below the headings; columns in which every cell is `omit` are left out."""
+    rows = list(rows)
+    shown = [column for column in columns if not rows or any(column.text(row) != omit for row in rows)]
+    return format_table([[column.text(row) for column in shown] for row in rows], [each.heading for each in shown])
 
 
 def format_table(rows: Sequence[Sequence[str]], header: Sequence[str]) -> list[str]:
     """Format right-aligned columns two spaces apart."""
     widths = [max(map(len, cells)) for cells in zip(header, *rows, strict=True)]
     return ["  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in (header, *rows)]
+
+
+def markdown_table(rows: Iterable[Sequence[str]], header: Sequence[str]) -> str:
+    """Format a table in Markdown, without a line feed at its end."""
+    return "\n".join(f"| {' | '.join(row)} |" for row in (header, ["---"] * len(header), *rows))
 
 
 def number(value: float | None, digits: int = 3) -> str:
@@ -55,6 +83,18 @@ def described(meanings: Mapping[str, str]) -> str:
     """Format names with what they mean, a line each."""
     width = max(map(len, meanings))
     return "\n".join(f"  {name:<{width}}  {meaning}" for name, meaning in meanings.items())
+
+
+def as_plain(document: Any) -> Any:
+    """Convert to JSON types: arrays and tuples to lists, nonfinite numbers to null, an infinite gamma to "inf"."""
+    if isinstance(document, Mapping):
+        infinite = {"gamma": "inf"} if document.get("gamma") == math.inf else {}
+        return {str(key): as_plain(item) for key, item in {**document, **infinite}.items()}
+    if hasattr(document, "tolist"):  # of NumPy or JAX
+        return as_plain(document.tolist())
+    if isinstance(document, list | tuple):
+        return [as_plain(item) for item in document]
+    return None if isinstance(document, float) and not math.isfinite(document) else document
 
 
 def digits_to_tell_apart(values: Iterable[float | int], least: int = 6) -> int:

@@ -70,9 +70,9 @@ def programs() -> tuple[dict[Any, Any], dict[Any, Any]]:
 @pytest.fixture(scope="module")
 def shared_programs(programs: tuple[dict[Any, Any], dict[Any, Any]]) -> Iterator[None]:
     """Studies that need the same task and chunk size share them with all that is compiled."""
+    from mjx_study.experiment import descents, plan, sampling
     from mjx_study.option import BUILDER_OPTIONS
     from mjx_study.runtime import precision  # not above: type checking is switched on after this file is imported
-    from mjx_study.study import descents, plan, sampling
     from mjx_study.tasks import TASKS
 
     build, make = plan._build, sampling.Simulator
@@ -105,7 +105,7 @@ def shared_programs(programs: tuple[dict[Any, Any], dict[Any, Any]]) -> Iterator
 @pytest.fixture(scope="module")
 def workers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
     """A client of two workers, which tell in a file what they compute of the task `poison`."""
-    from mjx_study.study.cluster import connected
+    from mjx_study.execution.cluster import connected
     from tests.poison import ACCOUNT
 
     with pytest.MonkeyPatch.context() as patch:

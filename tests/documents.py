@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from mjx_study.study.arrays import required, sizes_of
-from mjx_study.study.document import document_of, sealed
-from mjx_study.study.plan import StudyCell, StudyPlan
-from mjx_study.study.variables import VARIABLES
+from mjx_study.experiment.plan import StudyCell, StudyPlan
+from mjx_study.results.variables import VARIABLES
+from mjx_study.storage.arrays import required, sizes_of
+from mjx_study.storage.manifest import document_of, sealed
 
 
 def study_document(cells: int, **changes: Any) -> dict[str, Any]:

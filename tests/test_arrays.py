@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 from estimators.merged_samples import moments_of
-from mjx_study.study import arrays as module
-from mjx_study.study.arrays import read_arrays, write_arrays
-from mjx_study.study.blocks import Blocks, pack
-from mjx_study.study.store import Part, Store, StudyError
-from mjx_study.study.tally import Tally
+from mjx_study.experiment.blocks import Blocks, pack
+from mjx_study.experiment.checkpoint import Checkpoint, StudyError
+from mjx_study.experiment.tally import Tally
+from mjx_study.storage import arrays as module
+from mjx_study.storage.arrays import read_arrays, write_arrays
+from mjx_study.storage.folder import Store
 from tests.documents import cell_arrays, study_document
 from tests.fuzz.forgeries import npy, packed
 
@@ -96,7 +97,7 @@ def summary(rows: int = 6, params: int = 3) -> dict[str, Any]:
 
 
 def checked(kept: dict[str, np.ndarray]) -> None:
-    with Part(name="00000.part.npz").restored():
+    with Checkpoint(name="00000.part.npz").restored():
         Blocks(1, 4, kept).check(["0"], ["evaluation"], 3)
 
 

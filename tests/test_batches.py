@@ -12,8 +12,8 @@ import pytest
 
 import estimators
 from estimators import ESTIMATORS, DiscontinuityGated, ZerothOrder, make_estimator, pull_back, truncated_first_order
+from mjx_study.experiment.resolution import check_estimators
 from mjx_study.objective import Simulator, simulate
-from mjx_study.study.resolution import check_estimators
 from mjx_study.tasks import make_task
 from mjx_study.tasks.contact_grid import family_grid
 from mjx_study.tasks.task import Task

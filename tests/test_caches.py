@@ -114,7 +114,7 @@ import mjx_study
 from jax._src import compilation_cache
 from mjx_study.caches import read_cached
 from mjx_study.objective import Simulator
-from mjx_study.study.times import recording
+from mjx_study.execution.times import recording
 from mjx_study.tasks import make_task
 from tests.fuzz.flips import flipped
 

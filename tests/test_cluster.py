@@ -26,11 +26,12 @@ import xarray as xr
 import yaml
 
 from mjx_study import cli
-from mjx_study.study import cluster
-from mjx_study.study.cluster import TRIES
-from mjx_study.study.configuration import StudyConfig
-from mjx_study.study.run import load_study, run_study, warnings_of
-from mjx_study.study.store import Store, StudyError
+from mjx_study.execution import cluster
+from mjx_study.execution.cluster import TRIES
+from mjx_study.execution.run import load_study, run_study, warnings_of
+from mjx_study.experiment.checkpoint import StudyError
+from mjx_study.experiment.configuration import StudyConfig
+from mjx_study.storage.folder import Store
 from tests.poison import ACCOUNT, CRASH, RAISE, SLOW
 from tests.test_sweep import same
 

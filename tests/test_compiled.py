@@ -15,10 +15,10 @@ import pytest
 import estimators
 from mjx_study import compiled, identity
 from mjx_study.compiled import Compiled
+from mjx_study.execution.run import run_study
+from mjx_study.experiment import gradients
+from mjx_study.experiment.configuration import StudyConfig
 from mjx_study.objective import Simulator, programs
-from mjx_study.study import gradients
-from mjx_study.study.configuration import StudyConfig
-from mjx_study.study.run import run_study
 from mjx_study.tasks import Task, make_task
 from tests.carts import cart
 

@@ -15,17 +15,17 @@ import pytest
 from estimators import Differentiation, Evaluation, FirstOrder, ZerothOrder, estimate
 from mjx_study import cli
 from mjx_study.cli import options
-from mjx_study.diagnose import ESTIMATORS, Diagnosis, Measured, Touch, diagnose_task
+from mjx_study.diagnose import ESTIMATORS, ContactSummary, Diagnosis, Measured, diagnose_task
+from mjx_study.diagnose.means import along_means
 from mjx_study.diagnose.measurement import affordable, chunk_of
 from mjx_study.diagnose.setting import setting_of
+from mjx_study.experiment.landscapes import Line, grid, means
 from mjx_study.gradcheck import Finding
-from mjx_study.gradcheck.mean import along_means
 from mjx_study.objective import Simulator
-from mjx_study.study.landscapes import Line, grid, means
 from mjx_study.tasks import make_task
 from mjx_study.tasks.mjcf import mjcf_task
 
-HELD_OUT = Path(__file__).parents[1] / "docs" / "held_out"
+HELD_OUT = Path(__file__).parents[1] / "experiments" / "data" / "held_out"
 GRAVITY, HEIGHT, TIMESTEP = 9.81, 0.05, 0.002
 K, B = 3e4, 60.0  # [1/s^2], [1/s]: it bounces
 BALL = """<mujoco><option timestep="{h}"/>
@@ -365,7 +365,7 @@ def test_an_interval_without_an_upper_end_has_none(found: Diagnosis) -> None:
 
 
 def test_an_unstable_step_is_told_first(found: Diagnosis) -> None:
-    touch = Touch("a and b", 0.1, 1.0, 0.1, 9.0, 2.0, 0.9, 0.09, False)
+    touch = ContactSummary("a and b", 0.1, 1.0, 0.1, 9.0, 2.0, 0.9, 0.09, False)
     page = dataclasses.replace(found, touches=(touch, *found.touches)).lines()
     assert (
         page[3]

@@ -13,8 +13,9 @@ import pytest
 import xarray as xr
 
 from mjx_study.disk import TEMPORARY, prepare_folder, read_whole, temporary_name, write_whole
-from mjx_study.study.dataset import write_dataset
-from mjx_study.study.store import Store, StudyError
+from mjx_study.experiment.checkpoint import StudyError
+from mjx_study.storage.dataset import write_dataset
+from mjx_study.storage.folder import Store
 from tests.documents import cell_arrays, study_document
 from tests.faults import deadline, every_fault, from_the_future, put_no_file
 

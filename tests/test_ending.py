@@ -15,11 +15,11 @@ import pytest
 
 from mjx_study import cli, disk
 from mjx_study.cli import options, studies
-from mjx_study.study import cells as sweep_cells
-from mjx_study.study.plan import StudyCell, StudyPlan
-from mjx_study.study.run import run_study
-from mjx_study.study.store import Part
-from mjx_study.study.variables import GRADIENTS
+from mjx_study.execution import cells as sweep_cells
+from mjx_study.execution.run import run_study
+from mjx_study.experiment.checkpoint import Checkpoint
+from mjx_study.experiment.plan import StudyCell, StudyPlan
+from mjx_study.results.variables import GRADIENTS
 from tests.documents import stages_of
 
 SIGNALS = """
@@ -172,10 +172,10 @@ def test_a_full_disk_costs_a_landscape_no_number(tmp_path: Path, capsys: pytest.
 def test_a_full_disk_costs_a_study_nothing_that_was_there(
     tmp_path: Path, full: Callable[[], None], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def compute_of(plan: StudyPlan) -> Callable[[StudyCell, Part], dict[str, np.ndarray]]:
+    def compute_of(plan: StudyPlan) -> Callable[[StudyCell, Checkpoint], dict[str, np.ndarray]]:
         sizes = {"seed": plan.config.batches, "estimator": len(plan.config.estimators)}
 
-        def compute(cell: StudyCell, part: Part) -> dict[str, np.ndarray]:
+        def compute(cell: StudyCell, part: Checkpoint) -> dict[str, np.ndarray]:
             if cell.samples == 8:
                 full()
             held = {name: each for name, each in GRADIENTS.items() if "param" not in each.dims}

@@ -22,8 +22,8 @@ from mjx_study.plots.panels import UNSTABLE, counted, number
 from mjx_study.plots.study import MOST_DECADES, plot_study
 from mjx_study.plots.style import STYLE, STYLES, combines, fit_to_paper, mark_clipped
 from mjx_study.report import render_report
-from mjx_study.study.document import describe_estimator
-from mjx_study.study.variables import CELL, ONSETS, VARIABLES
+from mjx_study.results.variables import CELL, ONSETS, VARIABLES
+from mjx_study.storage.manifest import describe_estimator
 
 OUTER = ("task", "timestep", "cone", "model", "sigma", "samples")
 MASS, TIMESTEP = 0.05, 0.01  # kg, s: an undamped spring is unstable from 2000 N/m on

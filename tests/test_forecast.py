@@ -13,13 +13,13 @@ import pytest
 from mjx_study import cli, runtime
 from mjx_study.caches import write_cached
 from mjx_study.cli import options
+from mjx_study.execution import forecast, times
+from mjx_study.execution.forecast import forecast_study
+from mjx_study.execution.run import run_study
+from mjx_study.experiment.configuration import StudyConfig
+from mjx_study.experiment.plan import plan_study
 from mjx_study.runtime import available_cores
 from mjx_study.stopwatch import Stopwatch
-from mjx_study.study import forecast, times
-from mjx_study.study.configuration import StudyConfig
-from mjx_study.study.forecast import forecast_study
-from mjx_study.study.plan import plan_study
-from mjx_study.study.run import run_study
 from mjx_study.table import count, duration, size
 
 DESCENTS = (

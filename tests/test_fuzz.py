@@ -8,8 +8,8 @@ import pytest
 
 from mjx_study import caches
 from mjx_study.cli import options
-from mjx_study.study import document
-from mjx_study.study import plan as plan_module
+from mjx_study.experiment import plan as plan_module
+from mjx_study.storage import manifest as document
 from tests.fuzz import FUZZERS, flips, fuzz, strategies, studies
 from tests.fuzz.__main__ import BEGIN, END, cells, markdown, put_into
 from tests.fuzz.answers import OutsideError, Row, SilentError, TooSlow, answer

@@ -18,14 +18,16 @@ import xarray as xr
 from mjx_study import identity
 from mjx_study.digest import digest_of
 from mjx_study.disk import write_whole
+from mjx_study.execution import cells as sweep_cells
+from mjx_study.execution.run import load_study, run_study, warnings_of
+from mjx_study.experiment.checkpoint import Checkpoint, StudyError
+from mjx_study.experiment.configuration import StudyConfig
+from mjx_study.experiment.plan import StudyCell, StudyPlan, plan_study
 from mjx_study.identity import contents, differences, git_revision
 from mjx_study.simulation.scene import models_folder
-from mjx_study.study import cell_file, store
-from mjx_study.study import cells as sweep_cells
-from mjx_study.study.configuration import StudyConfig
-from mjx_study.study.plan import StudyCell, StudyPlan, plan_study
-from mjx_study.study.run import load_study, run_study, warnings_of
-from mjx_study.study.store import Part, Store, StudyError
+from mjx_study.storage import cell_files as cell_file
+from mjx_study.storage import folder as store
+from mjx_study.storage.folder import Store
 from mjx_study.tasks import make_task
 from mjx_study.tasks.task import StudyDefaults, Task
 from tests.documents import altered, planned_arrays
@@ -146,7 +148,7 @@ SMALL: dict[str, Any] = {
 
 @pytest.fixture
 def stubbed(monkeypatch: pytest.MonkeyPatch) -> None:
-    def compute_of(plan: StudyPlan) -> Callable[[StudyCell, Part], dict[str, np.ndarray]]:
+    def compute_of(plan: StudyPlan) -> Callable[[StudyCell, Checkpoint], dict[str, np.ndarray]]:
         residual = lambda cell: np.full(len(plan.config.estimators), cell.model.stiffness)  # noqa: E731
         return lambda cell, part: planned_arrays(plan, cell, residual=residual(cell))
 

@@ -14,16 +14,16 @@ import numpy as np
 import pytest
 
 from mjx_study import cli
-from mjx_study.study import gradients
-from mjx_study.study.blocks import REFERENCE, Arrays, Blocks
-from mjx_study.study.cluster import TRIES
-from mjx_study.study.configuration import StudyConfig
-from mjx_study.study.gradients import Gradients, compute_gradients
-from mjx_study.study.plan import StudyPlan, block_of, blocks_of, plan_study
-from mjx_study.study.run import load_study, run_study
-from mjx_study.study.sampling import sample_keys
-from mjx_study.study.store import Store
-from mjx_study.study.variables import MEASURED
+from mjx_study.execution.cluster import TRIES
+from mjx_study.execution.run import load_study, run_study
+from mjx_study.experiment import gradients
+from mjx_study.experiment.blocks import REFERENCE, Arrays, Blocks
+from mjx_study.experiment.configuration import StudyConfig
+from mjx_study.experiment.gradients import Gradients, compute_gradients
+from mjx_study.experiment.plan import StudyPlan, block_of, blocks_of, plan_study
+from mjx_study.experiment.sampling import sample_keys
+from mjx_study.results.variables import MEASURED
+from mjx_study.storage.folder import Store
 from tests.poison import ACCOUNT, RAISE, SLOW
 from tests.test_sweep import same
 
@@ -240,9 +240,9 @@ PEAK = """
 import resource, sys
 from mjx_study.runtime import configure
 configure(cpu_devices=1)
-from mjx_study.study import sampling
-from mjx_study.study.gradients import compute_gradients
-from mjx_study.study.plan import plan_study
+from mjx_study.experiment import sampling
+from mjx_study.experiment.gradients import compute_gradients
+from mjx_study.experiment.plan import plan_study
 from tests.test_sweep_memory import Stub, config
 
 sampling.Simulator = Stub

@@ -25,6 +25,7 @@ LAYERS = [
     "mjx_study.watchdog",
     "mjx_study.stopwatch",
     "mjx_study.table",
+    "mjx_study.progress",
     "mjx_study.limits",
     "mjx_study.reference",
     "mjx_study.graph",
@@ -38,7 +39,10 @@ LAYERS = [
     "mjx_study.structure",
     "mjx_study.compiled",
     "mjx_study.objective",
-    "mjx_study.study",
+    "mjx_study.results",
+    "mjx_study.experiment",
+    "mjx_study.storage",
+    "mjx_study.execution",
     "mjx_study.gradcheck",
     "mjx_study.diagnose",
     "mjx_study.bench",
@@ -228,7 +232,7 @@ ARCHITECTURE = (ROOT / "docs" / "architecture.md").read_text()
 BESIDE = {"mjx_study.choices", "mjx_study._matplotlib", "mjx_study.runtime", "mjx_study.table", "mjx_study.disk"} | {
     "mjx_study.stopwatch", "mjx_study.watchdog", "mjx_study.limits", "mjx_study.option", "mjx_study.files",
     "mjx_study._public", "mjx_study.sources", "mjx_study.digest", "mjx_study.identity", "mjx_study.compiled",
-    "mjx_study.version", "mjx_study.caches", "mjx_study.structure",
+    "mjx_study.version", "mjx_study.caches", "mjx_study.structure", "mjx_study.progress",
 }  # fmt: skip
 """Small modules that the picture of the packages leaves out."""
 

@@ -13,11 +13,11 @@ import pytest
 from mjx_study import cli
 from mjx_study.bench import plan_bench
 from mjx_study.diagnose.run import diagnose_task
+from mjx_study.execution.lost import first_nonfinite, lost_samples
+from mjx_study.experiment.configuration import StudyConfig
+from mjx_study.experiment.plan import plan_study
 from mjx_study.simulation.dynamics import State, initial_state
 from mjx_study.simulation.scene import put_scene
-from mjx_study.study.configuration import StudyConfig
-from mjx_study.study.lost import first_nonfinite, lost_samples
-from mjx_study.study.plan import plan_study
 from mjx_study.tasks.policy import LinearFeedback, OpenLoop
 from mjx_study.tasks.soundness import check_soundness
 from mjx_study.tasks.task import StudyDefaults, Task

@@ -211,7 +211,7 @@ def test_only_public_names_are_used(path: Path) -> None:
     [
         ("from mjx_study.simulation._mjx import mjx", ["mjx_study.simulation._mjx.mjx"]),
         ("import mjx_study.simulation._mjx", ["mjx_study.simulation._mjx"]),
-        ("from mjx_study.study.gradients import _row", ["mjx_study.study.gradients._row"]),
+        ("from mjx_study.experiment.gradients import _row", ["mjx_study.experiment.gradients._row"]),
         ("task._hidden", ["_hidden"]),
         ("mjx_study.UNHEARD_OF", ["mjx_study.UNHEARD_OF"]),
         ("import mjx_study\nmjx_study.run_study(plan).sizes", []),

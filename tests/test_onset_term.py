@@ -12,13 +12,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from mjx_study.experiment.landscapes import Line, grid, means
 from mjx_study.objective import Simulator
+from mjx_study.results.findings import ERROR_PER_STRENGTH
 from mjx_study.simulation.branches import jump_term
 from mjx_study.simulation.contact import ContactModel, apply_contact, contact_model
 from mjx_study.simulation.dynamics import initial_state, rollout
 from mjx_study.simulation.onset import check_onset, corrected_rollout
-from mjx_study.study.findings import ERROR_PER_STRENGTH
-from mjx_study.study.landscapes import Line, grid, means
 from mjx_study.tasks import make_task
 from mjx_study.tasks.contact_grid import family_grid
 from tests.scenes import floor_scene, option, scene_of

@@ -18,19 +18,21 @@ import estimators
 from estimators import ESTIMATORS, Differentiation, FirstOrder
 from mjx_study import cli, disk
 from mjx_study.cli import motions, options
+from mjx_study.execution.run import load_study, run_study
+from mjx_study.experiment import descents, plan, sampling
+from mjx_study.experiment import iteration as descent
+from mjx_study.experiment.checkpoint import StudyError
+from mjx_study.experiment.configuration import StudyConfig
+from mjx_study.experiment.descents import Backend
+from mjx_study.experiment.iteration import REASONS, begin, make_optimizer
+from mjx_study.experiment.plan import StudyPlan, estimators_of, plan_study
 from mjx_study.files import PolicyFile
 from mjx_study.objective import Simulator
 from mjx_study.reference import ReferenceObjective, Tennis, roll_out
-from mjx_study.study import cell_file, descents, plan, sampling, store
-from mjx_study.study import iteration as descent
-from mjx_study.study.configuration import StudyConfig
-from mjx_study.study.descents import Backend
-from mjx_study.study.findings import findings_of
-from mjx_study.study.iteration import REASONS, begin, make_optimizer
-from mjx_study.study.plan import StudyPlan, estimators_of, plan_study
-from mjx_study.study.run import load_study, run_study
-from mjx_study.study.store import StudyError
-from mjx_study.study.variables import HISTORY, METRIC
+from mjx_study.results.findings import findings_of
+from mjx_study.results.variables import HISTORY, METRIC
+from mjx_study.storage import cell_files as cell_file
+from mjx_study.storage import folder as store
 from mjx_study.tasks import TASKS, make_task
 from mjx_study.tasks.task import StudyDefaults
 

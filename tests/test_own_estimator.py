@@ -15,11 +15,11 @@ from estimators import ESTIMATORS, Estimator, FirstOrder, ZerothOrder, find_esti
 from estimators.choices import CATALOGUE
 from mjx_study import cli
 from mjx_study.cli import options
+from mjx_study.execution.run import load_study
+from mjx_study.experiment.configuration import StudyConfig
 from mjx_study.plots.style import STYLE, combines, style_of
 from mjx_study.report import CAPTIONS
-from mjx_study.study.configuration import StudyConfig
-from mjx_study.study.findings import rows_of
-from mjx_study.study.run import load_study
+from mjx_study.results.findings import rows_of
 from tests.documents import altered
 
 PAGE = (Path(__file__).parents[1] / "docs" / "estimators.md").read_text()

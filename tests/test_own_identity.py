@@ -19,12 +19,13 @@ import numpy as np
 import pytest
 
 from estimators import user_inputs
+from mjx_study.execution import cells as study_cells
+from mjx_study.execution.run import run_study
+from mjx_study.experiment.checkpoint import Checkpoint, StudyError
+from mjx_study.experiment.configuration import StudyConfig
+from mjx_study.experiment.plan import StudyCell, StudyPlan, plan_study
 from mjx_study.files import read_theta
-from mjx_study.study import cells as study_cells
-from mjx_study.study.configuration import StudyConfig
-from mjx_study.study.plan import StudyCell, StudyPlan, plan_study
-from mjx_study.study.run import run_study
-from mjx_study.study.store import Part, Store, StudyError
+from mjx_study.storage.folder import Store
 from tests.documents import planned_arrays
 
 TASK = """
@@ -199,7 +200,7 @@ def world(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[
 
 @pytest.fixture
 def stubbed(monkeypatch: pytest.MonkeyPatch) -> None:
-    def compute_of(plan: StudyPlan) -> Callable[[StudyCell, Part], dict[str, np.ndarray]]:
+    def compute_of(plan: StudyPlan) -> Callable[[StudyCell, Checkpoint], dict[str, np.ndarray]]:
         return lambda cell, part: planned_arrays(plan, cell)
 
     monkeypatch.setitem(study_cells.COMPUTE, "gradients", compute_of)
@@ -240,8 +241,8 @@ def test_what_is_read_while_computing_counts_too(
     """Metrics are traced when the first cell is computed; until then nothing has been read."""
     (tmp_path / "hopping.py").write_text(TASK.format(text="", cost=PLAIN.format(1.0)) + LATE)
 
-    def compute_of(plan: StudyPlan) -> Callable[[StudyCell, Part], dict[str, np.ndarray]]:
-        def compute(cell: StudyCell, part: Part) -> dict[str, np.ndarray]:
+    def compute_of(plan: StudyPlan) -> Callable[[StudyCell, Checkpoint], dict[str, np.ndarray]]:
+        def compute(cell: StudyCell, part: Checkpoint) -> dict[str, np.ndarray]:
             assert plan.seen.keys() == {"file hopping.py"}
             plan.groups[cell.group].task.metrics(SimpleNamespace(qpos=np.zeros((2, 1))))  # type: ignore[misc]
             return planned_arrays(plan, cell)

@@ -10,11 +10,11 @@ import pytest
 from mjx_study import cli
 from mjx_study.cli import options
 from mjx_study.cli.sweep import sweep_fields
+from mjx_study.experiment.configuration import StudyConfig
+from mjx_study.experiment.plan import estimators_of, plan_study
+from mjx_study.experiment.resolution import configured_estimators
 from mjx_study.reference import DoublePendulum, roll_out
 from mjx_study.reference.system import gradients_along
-from mjx_study.study.configuration import StudyConfig
-from mjx_study.study.plan import estimators_of, plan_study
-from mjx_study.study.resolution import configured_estimators
 from mjx_study.tasks import make_task
 
 MOMENTUM = 4 / 1.1**2  # an elastic hit of a bar ten times as heavy, in units of the published cost

@@ -6,7 +6,7 @@ import pytest
 from scipy import stats
 
 from estimators import Evaluation, delta_control_variate, first_order
-from mjx_study.study.reference_gradient import estimate_reference
+from mjx_study.experiment.reference_gradient import estimate_reference
 from tests.estimators.statistics_helpers import assert_mean_is
 from tests.pusher_fixtures import SIGMA, penalty, pusher_simulator, pusher_task, sample_keys
 

@@ -27,18 +27,18 @@ from estimators.registry import label_of
 from mjx_study import cli, disk
 from mjx_study.cli import console
 from mjx_study.cli.studies import as_document
+from mjx_study.execution.run import run_study, warnings_of
+from mjx_study.experiment import sampling
+from mjx_study.experiment.checkpoint import StudyError
+from mjx_study.experiment.configuration import StudyConfig
+from mjx_study.experiment.plan import estimators_of, plan_study
 from mjx_study.objective import MjxObjective, Simulator
 from mjx_study.plots.panels import limit
 from mjx_study.plots.study import plot_study
 from mjx_study.plots.style import save_figure
-from mjx_study.study import sampling
-from mjx_study.study.configuration import StudyConfig
-from mjx_study.study.dataset import dataset_of
-from mjx_study.study.findings import Row, findings_of, rows_of
-from mjx_study.study.plan import estimators_of, plan_study
-from mjx_study.study.run import run_study, warnings_of
-from mjx_study.study.store import StudyError
-from mjx_study.study.variables import GRADIENTS
+from mjx_study.results.findings import Row, findings_of, rows_of
+from mjx_study.results.variables import GRADIENTS
+from mjx_study.storage.dataset import dataset_of
 from mjx_study.tasks import make_task
 from mjx_study.tasks.task import StudyDefaults, Task
 

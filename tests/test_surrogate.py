@@ -9,14 +9,14 @@ import numpy as np
 import optax
 import pytest
 
+from mjx_study.execution.run import run_study
+from mjx_study.experiment.configuration import StudyConfig
+from mjx_study.experiment.descents import Backend
+from mjx_study.experiment.iteration import begin, schedule_factors
+from mjx_study.experiment.plan import estimators_of, plan_study
 from mjx_study.objective import Simulator, simulate
 from mjx_study.simulation.contact import contact_model, soften, stiffness_from_solref
 from mjx_study.simulation.dynamics import State
-from mjx_study.study.configuration import StudyConfig
-from mjx_study.study.descents import Backend
-from mjx_study.study.iteration import begin, schedule_factors
-from mjx_study.study.plan import estimators_of, plan_study
-from mjx_study.study.run import run_study
 from mjx_study.tasks import make_task
 from tests.pusher_fixtures import NO_NOISE, ImpedancePusher, penalty, sample_keys
 

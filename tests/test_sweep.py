@@ -27,17 +27,20 @@ from estimators import AlphaOrder, DiscontinuityGated
 from mjx_study import cli
 from mjx_study.cli import options
 from mjx_study.cli.sweep import solimp, solref, sweep_fields
+from mjx_study.execution.run import load_study, open_store, run_study, warnings_of
+from mjx_study.experiment import sampling
+from mjx_study.experiment.checkpoint import StudyError
+from mjx_study.experiment.configuration import StudyConfig
+from mjx_study.experiment.gradients import Gradients, compute_gradients
+from mjx_study.experiment.plan import estimators_of, plan_study
 from mjx_study.objective import Simulator, simulate
 from mjx_study.plots import study as study_plots
 from mjx_study.report import render_report
+from mjx_study.results.variables import MEASURED, VARIABLES, markdown_table
 from mjx_study.simulation.contact import stiffness_from_solref
-from mjx_study.study import cell_file, sampling, store
-from mjx_study.study.configuration import StudyConfig
-from mjx_study.study.gradients import Gradients, compute_gradients
-from mjx_study.study.plan import estimators_of, plan_study
-from mjx_study.study.run import load_study, open_store, run_study, warnings_of
-from mjx_study.study.store import Store, StudyError
-from mjx_study.study.variables import MEASURED, VARIABLES, markdown_table
+from mjx_study.storage import cell_files as cell_file
+from mjx_study.storage import folder as store
+from mjx_study.storage.folder import Store
 from mjx_study.tasks import make_task
 from tests.documents import study_document
 
@@ -223,7 +226,7 @@ import json, os, random, signal, sys, time
 from pathlib import Path
 import mujoco
 import numpy as np
-from mjx_study.study.store import Store
+from mjx_study.storage.folder import Store
 from tests.documents import cell_arrays, study_document
 
 folder, cells = Path(sys.argv[1]), 40

@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from mjx_study.execution import cells as sweep_cells
+from mjx_study.execution.run import load_study, run_study
+from mjx_study.experiment.checkpoint import Checkpoint
+from mjx_study.experiment.configuration import StudyConfig
+from mjx_study.experiment.plan import StudyCell, StudyPlan, plan_study
 from mjx_study.plots.study import plot_study
-from mjx_study.study import cells as sweep_cells
-from mjx_study.study.configuration import StudyConfig
-from mjx_study.study.plan import StudyCell, StudyPlan, plan_study
-from mjx_study.study.run import load_study, run_study
-from mjx_study.study.store import Part
 from mjx_study.table import digits_to_tell_apart
 from tests.documents import planned_arrays
 
@@ -23,8 +23,8 @@ SMALL: dict[str, Any] = {"tasks": ("pusher",), "contact": ("penalty",), "samples
 def stubbed(monkeypatch: pytest.MonkeyPatch) -> None:
     """Cells whose numbers say what they were computed with."""
 
-    def compute_of(plan: StudyPlan) -> Callable[[StudyCell, Part], dict[str, np.ndarray]]:
-        def compute(cell: StudyCell, part: Part) -> dict[str, np.ndarray]:
+    def compute_of(plan: StudyPlan) -> Callable[[StudyCell, Checkpoint], dict[str, np.ndarray]]:
+        def compute(cell: StudyCell, part: Checkpoint) -> dict[str, np.ndarray]:
             seeds = plan.config.batches, len(plan.config.estimators)
             own = {
                 "residual": np.full(seeds[1], cell.model.stiffness),

@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 
 from estimators import Differentiation, Evaluation
+from mjx_study.experiment import gradients, sampling
+from mjx_study.experiment import memory as sweep_memory
+from mjx_study.experiment.configuration import StudyConfig
+from mjx_study.experiment.gradients import compute_gradients
+from mjx_study.experiment.plan import memory_of_seed, plan_study, seeds_together
 from mjx_study.objective import MjxObjective, Simulator
+from mjx_study.results.variables import MEASURED
 from mjx_study.simulation.contact import ContactModel
-from mjx_study.study import gradients, sampling
-from mjx_study.study import memory as sweep_memory
-from mjx_study.study.configuration import StudyConfig
-from mjx_study.study.gradients import compute_gradients
-from mjx_study.study.plan import memory_of_seed, plan_study, seeds_together
-from mjx_study.study.variables import MEASURED
 
 
 class Drawn(MjxObjective):
@@ -88,9 +88,9 @@ PEAK = """
 import resource, sys
 from mjx_study.runtime import configure
 configure(cpu_devices=1)
-from mjx_study.study import gradients, sampling
-from mjx_study.study.gradients import compute_gradients
-from mjx_study.study.plan import plan_study
+from mjx_study.experiment import gradients, sampling
+from mjx_study.experiment.gradients import compute_gradients
+from mjx_study.experiment.plan import plan_study
 from tests.test_sweep_memory import Stub, config
 
 sampling.Simulator, gradients.traces_folder = Stub, lambda: None

@@ -38,8 +38,8 @@ from mjx_study.claims.theory import (
     relative_bias,
     variances_of,
 )
+from mjx_study.experiment.configuration import StudyConfig
 from mjx_study.runtime import local_devices
-from mjx_study.study.configuration import StudyConfig
 
 STIFFNESSES: Final = (10.0, 100.0, 1000.0, 1200.0)
 """Contact stiffnesses of the pusher [N/m]."""

@@ -20,12 +20,12 @@ import estimators
 from estimators import Estimator, GradientEstimate, Objective
 from estimators.confidence import student_quantile
 from mjx_study.choices import REFERENCE
+from mjx_study.execution.run import run_study
+from mjx_study.experiment.configuration import StudyConfig
+from mjx_study.experiment.landscapes import Line, means
 from mjx_study.objective import Simulator
 from mjx_study.reference import FunctionObjective, smoothed
 from mjx_study.simulation.contact import ContactModel
-from mjx_study.study.configuration import StudyConfig
-from mjx_study.study.landscapes import Line, means
-from mjx_study.study.run import run_study
 from mjx_study.tasks import make_task
 from mjx_study.tasks.contact_grid import backward_grid, family_grid
 from mjx_study.tasks.task import Task

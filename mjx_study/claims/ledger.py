@@ -22,8 +22,8 @@ from mjx_study.choices import REFERENCE
 from mjx_study.claims.laboratory import EFFORTS, Effort, Laboratory, Statistic
 from mjx_study.disk import prepare_folder, write_whole
 from mjx_study.identity import VERSIONED, code_of, git_revision
+from mjx_study.progress import Progress, silent
 from mjx_study.runtime import environment, precision
-from mjx_study.study.configuration import Progress
 from mjx_study.version import version_of
 
 ALPHA: Final = 0.05
@@ -151,7 +151,7 @@ def measure_ledger(
     claims: Sequence[Claim],
     effort: str,
     folder: Path | None = None,
-    progress: Progress = lambda done, total, what: None,
+    progress: Progress = silent,
     *,
     verdicts: int,
     command: str | None = None,

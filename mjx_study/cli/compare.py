@@ -6,9 +6,9 @@ from functools import partial
 from estimators.choices import CATALOGUE
 from mjx_study.choices import FAMILIES
 from mjx_study.cli.options import Parser
+from mjx_study.experiment.configuration import StudyConfig
 from mjx_study.option import BUILDER_OPTIONS
-from mjx_study.study.configuration import StudyConfig
-from mjx_study.study.variables import COLUMNS, DETAILS, MARKS, explained
+from mjx_study.results.variables import COLUMNS, DETAILS, MARKS, explained
 from mjx_study.table import described
 
 EPILOG = f"""\
@@ -54,7 +54,7 @@ def add(command: Parser) -> None:
 def run(options: argparse.Namespace) -> int:
     from mjx_study.cli.console import gradient_lines, rows_as_json
     from mjx_study.cli.studies import run_one, study_fields
-    from mjx_study.study.plan import StudyPlan, plan_study
+    from mjx_study.experiment.plan import StudyPlan, plan_study
 
     def planned() -> StudyPlan:
         return plan_study(StudyConfig(**study_fields(options), seeds=1))

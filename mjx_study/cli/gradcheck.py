@@ -7,7 +7,7 @@ from mjx_study.choices import CHECKED_STATES, CHECKED_STEPS, CHECKED_STIFFNESS, 
 from mjx_study.cli.options import Parser, UsageError, configure_process, given_options, task_of, usage_errors
 from mjx_study.cli.output import computing, print_report
 from mjx_study.option import OPTIONS, Option
-from mjx_study.study.variables import explained
+from mjx_study.results.variables import explained
 
 UNEXERCISED = 3
 """Exit code if nothing is wrong but something was never exercised."""
@@ -108,11 +108,11 @@ def run(options: argparse.Namespace) -> int:
 
 def _run_mean(options: argparse.Namespace) -> int:
     from estimators import make_estimator
+    from mjx_study.diagnose.means import ALONG_MEANS, check_mean, lines_of, path_of
     from mjx_study.diagnose.setting import setting_of
-    from mjx_study.gradcheck import check_mean, plan_gradcheck
-    from mjx_study.gradcheck.mean import ALONG_MEANS, lines_of, path_of
-    from mjx_study.study.effect import reads_onset, refuse_unread
-    from mjx_study.study.resolution import check_estimators
+    from mjx_study.experiment.effect import reads_onset, refuse_unread
+    from mjx_study.experiment.resolution import check_estimators
+    from mjx_study.gradcheck import plan_gradcheck
 
     chosen = MEAN | given_options(options, *MEAN)
     with usage_errors():

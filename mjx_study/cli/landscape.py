@@ -2,11 +2,11 @@
 
 import argparse
 
-from mjx_study.choices import REFERENCE
+from mjx_study.choices import REFERENCE, takes_stiffness
 from mjx_study.cli.options import Parser, given_options
+from mjx_study.experiment.configuration import StudyConfig
 from mjx_study.option import BUILDER_OPTIONS
-from mjx_study.study.configuration import StudyConfig, takes_stiffness
-from mjx_study.study.variables import explained
+from mjx_study.results.variables import explained
 
 EPILOG = f"""\
 examples:
@@ -44,7 +44,7 @@ def add(command: Parser) -> None:
 def run(options: argparse.Namespace) -> int:
     from mjx_study.cli.console import curve_lines, curves
     from mjx_study.cli.studies import run_one, study_fields
-    from mjx_study.study.plan import StudyPlan, plan_study
+    from mjx_study.experiment.plan import StudyPlan, plan_study
     from mjx_study.tasks import task_with_options
 
     def planned() -> StudyPlan:

@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 
 from mjx_study import objective
-from mjx_study.choices import CONES, is_file
+from mjx_study.choices import CONES, is_file, refuse_untaken
 from mjx_study.cli.options import (
     UsageError,
     configure_process,
@@ -24,13 +24,12 @@ from mjx_study.cli.options import (
 )
 from mjx_study.cli.output import attempt, computing, print_report
 from mjx_study.disk import prepare_folder, write_whole
+from mjx_study.experiment.resolution import at_theta
 from mjx_study.limits import MOST_STEPS, check_count
 from mjx_study.option import BUILDER_OPTIONS, SCENE_OPTIONS, as_arguments
 from mjx_study.plots.style import save_figure
 from mjx_study.render import Motion, RenderError, animate, check_format, resolve_renderer, strip, stroboscope
 from mjx_study.simulation.scene import load_model
-from mjx_study.study.configuration import refuse_untaken
-from mjx_study.study.resolution import at_theta
 from mjx_study.table import format_table, number
 from mjx_study.tasks.contact_grid import ContactPoint, family_grid
 from mjx_study.tasks.network import with_network

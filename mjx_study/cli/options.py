@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any, Final, NoReturn
 from estimators.choices import suggestion, unknown
 from mjx_study.choices import FAMILIES, PRECISIONS, TASK_DESCRIPTIONS, unknown_task
 from mjx_study.cli.output import complain
+from mjx_study.experiment.configuration import StudyConfig
 from mjx_study.option import BUILDER_OPTIONS, CONTACTS, OPTIONS, TASKS, Option, refuse_overflow
-from mjx_study.study.configuration import StudyConfig
 
 if TYPE_CHECKING:
     import mjx_study.files
@@ -194,7 +194,7 @@ def known_task(text: str) -> str:
 
 
 def _cluster(text: str) -> str:
-    """Parse a cluster, as for `mjx_study.study.cluster.connected`."""
+    """Parse a cluster, as for `mjx_study.execution.cluster.connected`."""
     if re.fullmatch(r"(local|slurm)(:[1-9]\d{0,4})?|(tcp|tls|ws|wss|ucx)://\S+", text):
         return text
     wanted = "local:N, slurm:N or an address such as tcp://host:8786"

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, Final, NoReturn
 
 from mjx_study.disk import remove_temporary_folders
-from mjx_study.study.configuration import Progress
+from mjx_study.progress import Progress
 
 RESUMABLE: Final = "the same command resumes where it stopped"
 INTERRUPTED: Final = "nothing was written"

@@ -12,17 +12,17 @@ import xarray as xr
 
 from mjx_study.cli.options import UsageError, configure_process, given_options, theta_of, usage_errors
 from mjx_study.cli.output import RESUMABLE, attempt, computing, print_report
+from mjx_study.execution.cluster import connected
+from mjx_study.execution.forecast import forecast_study
+from mjx_study.execution.lost import all_lost
+from mjx_study.execution.run import load_study, open_store, run_study, warnings_of
+from mjx_study.experiment.checkpoint import StudyError
+from mjx_study.experiment.configuration import StudyConfig
+from mjx_study.experiment.plan import StudyPlan
 from mjx_study.plots.study import plot_study
 from mjx_study.plots.style import save_figures
-from mjx_study.study.cluster import connected
-from mjx_study.study.configuration import StudyConfig
-from mjx_study.study.dataset import as_plain
-from mjx_study.study.forecast import forecast_study
-from mjx_study.study.lost import all_lost
-from mjx_study.study.plan import StudyPlan
-from mjx_study.study.run import load_study, open_store, run_study, warnings_of
-from mjx_study.study.store import Store, StudyError
-from mjx_study.table import digits_to_tell_apart, size
+from mjx_study.storage.folder import Store
+from mjx_study.table import as_plain, digits_to_tell_apart, size
 
 KEPT = "results.nc (every number), study.json (the configuration), cells/ (checkpoints)"
 INTACT = "existing files are complete, and the same command resumes"

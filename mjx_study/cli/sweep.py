@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from mjx_study.choices import TASK_DESCRIPTIONS
 from mjx_study.cli.options import Parser, UsageError, known_task
+from mjx_study.experiment.configuration import StudyConfig
 from mjx_study.option import BUILDER_OPTIONS, MOST_VALUES, OPTIONS, Interval, Option
-from mjx_study.study.configuration import StudyConfig
 
 if TYPE_CHECKING:
     from pydantic import BaseModel
@@ -78,7 +78,7 @@ def run(options: argparse.Namespace) -> int:
     if options.output is None and not options.dry_run:
         raise UsageError("no folder for the study: give --output, or --dry-run. See mjx-study sweep --help")
     from mjx_study.cli.studies import run_sweep
-    from mjx_study.study.plan import plan_study
+    from mjx_study.experiment.plan import plan_study
 
     return run_sweep(options, lambda: plan_study(StudyConfig(**sweep_fields(options))))
 

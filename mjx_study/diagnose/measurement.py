@@ -15,14 +15,14 @@ import numpy as np
 
 from estimators import ORACLES, Circulation, Estimator, make_estimator, oracles_of, variance_interval
 from estimators.mean_check import NODES
-from mjx_study.gradcheck.mean import MOST_PATHS, along_means, reach_of, unmixed
+from mjx_study.diagnose.means import MAX_PATHS, along_means, reach_of, unmixed
+from mjx_study.experiment.sampling import cell_keys, draw_batches, unconverged
+from mjx_study.experiment.tally import onset_numbers
 from mjx_study.objective import Simulator, chunk_for
+from mjx_study.results.variables import ONSETS
 from mjx_study.runtime import local_devices, precision
 from mjx_study.simulation.contact import ContactModel
 from mjx_study.simulation.scene import num_constraint_rows
-from mjx_study.study.sampling import cell_keys, draw_batches, unconverged
-from mjx_study.study.tally import onset_numbers
-from mjx_study.study.variables import ONSETS
 from mjx_study.tasks.task import Task
 
 ESTIMATORS: Final = ("zobg", "fobg", "aobg", "fobg_onset", "aobg_onset")
@@ -83,7 +83,7 @@ class Measurement:
     """Measurements of the estimators under one contact model.
 
     Attributes:
-        onsets: `mjx_study.study.variables.ONSETS` of the first-order batch.
+        onsets: `mjx_study.results.variables.ONSETS` of the first-order batch.
         unconverged: number of rollouts in which the solver did not converge.
         estimators: the estimators, best first.
     """
@@ -149,8 +149,8 @@ def affordable(seconds: float, chunk: int) -> int:
         seconds: time of one call of all programs [s].
         chunk: number of samples in it, including a baseline.
     """
-    calls = max(1, round(BUDGET_SECONDS / (seconds * MOST_PATHS * (NODES + 1))))
-    return min(SAMPLES, MOST_PATHS * chunk * calls - 1)
+    calls = max(1, round(BUDGET_SECONDS / (seconds * MAX_PATHS * (NODES + 1))))
+    return min(SAMPLES, MAX_PATHS * chunk * calls - 1)
 
 
 def measure(

@@ -8,22 +8,21 @@ import textwrap
 from collections.abc import Iterator
 from typing import Any, Final
 
+from mjx_study.diagnose.means import ALONG_MEANS
 from mjx_study.diagnose.measurement import RESOLVED_SE, SAMPLES, TARGET_ERROR, Measured, Measurement
-from mjx_study.diagnose.setting import Setting, Touch
+from mjx_study.diagnose.setting import ContactSummary, RolloutSetting
 from mjx_study.gradcheck import GradcheckReport
 from mjx_study.gradcheck.diagnosis import MEANING
-from mjx_study.gradcheck.mean import ALONG_MEANS
+from mjx_study.results.findings import ERROR_PER_STRENGTH, LEAST_SPREAD, MOST_STRENGTH, NOTABLE_SHARE, linear_error
+from mjx_study.results.variables import DIAGNOSIS
 from mjx_study.runtime import environment
-from mjx_study.study.dataset import as_plain
-from mjx_study.study.findings import ERROR_PER_STRENGTH, LEAST_SPREAD, MOST_STRENGTH, NOTABLE_SHARE, linear_error
-from mjx_study.study.variables import DIAGNOSIS
-from mjx_study.table import format_table, percent, with_error
+from mjx_study.table import as_plain, format_table, percent, with_error
 from mjx_study.tasks.task import Task
 
 OF_CONTACT: Final = ("time", "speed", "damping", "stiffness", "travel", "impedance", "stable")
 OF_ESTIMATOR: Final = ("error", "interval", "mean", "seconds")
 """Columns of the two tables, in `DIAGNOSIS`."""
-FEWEST_SAMPLES: Final = 100
+MIN_SAMPLES: Final = 100
 """Number of samples below which the page warns."""
 SMOOTH_SHARE: Final = 0.01
 """Share of the approach speed lost in the first step below which force counts as setting in without a jump."""
@@ -34,9 +33,9 @@ LEGEND: Final = (
 )
 ONE_DIGIT_UNCERTAINTY: Final = 0.5
 """Relative standard error beyond which an error is shown with one digit."""
-MOST_ERROR: Final = 100.0
+MAX_ERROR: Final = 100.0
 """Upper end beyond which the interval of a relative error is uninformative."""
-MOST_SHOWN: Final = 6
+MAX_SHOWN: Final = 6
 """Number of contacts listed in the text, least resolved first."""
 
 
@@ -54,9 +53,9 @@ class Diagnosis(Measurement):
 
     subject: str
     task: Task
-    setting: Setting
+    setting: RolloutSetting
     contact: str
-    touches: tuple[Touch, ...]
+    touches: tuple[ContactSummary, ...]
     derivatives: GradcheckReport
     warnings: tuple[str, ...]
     options: str
@@ -144,7 +143,7 @@ class Diagnosis(Measurement):
                 f"{each.impedance:g}",
                 "stable" if each.stable else "UNSTABLE",
             ]
-            for each in worst[:MOST_SHOWN]
+            for each in worst[:MAX_SHOWN]
         ]
         more = len(worst) - len(rows)
         return [*lines, *format_table(rows, header), *([f"  and {more} more"] if more else [])]
@@ -161,7 +160,7 @@ class Diagnosis(Measurement):
                 [
                     f"  {each.estimator}",
                     shown,
-                    f"{least} to {most}" if high * self._scale <= MOST_ERROR * self.norm else f"at least {least}",
+                    f"{least} to {most}" if high * self._scale <= MAX_ERROR * self.norm else f"at least {least}",
                     mean if judged else "not judged",
                     f"{1e3 * each.seconds:.3g}",
                 ]
@@ -218,7 +217,7 @@ class Diagnosis(Measurement):
                 f"the step in contact is unstable: {unstable[0].pair}, h^2 k = {unstable[0].stiffness:.2g}; take a "
                 "smaller --timestep or a softer contact"
             )
-        if self.samples < FEWEST_SAMPLES:
+        if self.samples < MIN_SAMPLES:
             yield f"{self.samples} samples are few: --samples {SAMPLES} takes longer and says more"
         if self.best.verdict == "undecided" and self.resolved:
             yield f"the mean of {self.best.estimator} could not be judged with {self.samples} samples: take more"

@@ -2,14 +2,14 @@
 
 from typing import Final
 
-from mjx_study.choices import is_file
+from mjx_study.choices import is_file, refuse_untaken, takes_stiffness
 from mjx_study.diagnose.measurement import SAMPLES, chunk_of, estimators_of, measure
 from mjx_study.diagnose.page import Diagnosis
 from mjx_study.diagnose.setting import setting_of, touches_of
+from mjx_study.experiment.memory import check_memory
 from mjx_study.gradcheck import gradcheck, plan_gradcheck, plan_scene_gradcheck
 from mjx_study.objective import Simulator
-from mjx_study.study.configuration import Progress, refuse_untaken, takes_stiffness
-from mjx_study.study.memory import check_memory
+from mjx_study.progress import Progress, silent
 from mjx_study.tasks.contact_grid import family_grid
 from mjx_study.tasks.soundness import check_soundness
 from mjx_study.tasks.task import Task
@@ -28,7 +28,7 @@ def diagnose_task(
     samples: int | None = None,
     seed: int = 0,
     options: str = "",
-    progress: Progress = lambda done, total, what: None,
+    progress: Progress = silent,
 ) -> Diagnosis:
     """Measure everything under one contact model.
 

@@ -20,7 +20,7 @@ _SLIDE, _HINGE = int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HIN
 
 
 @dataclasses.dataclass(frozen=True)
-class Setting:
+class RolloutSetting:
     """The setting for which a diagnosis holds.
 
     Attributes:
@@ -49,7 +49,7 @@ class Setting:
         return f"{noise}; {self.params} parameter{plural}; {self.horizon} steps of {self.timestep:g} s"
 
 
-def setting_of(subject: str, task: Task) -> Setting:
+def setting_of(subject: str, task: Task) -> RolloutSetting:
     host = task.scene.host
     if not task.policy.at_start:
         added_to, units = "every control", {_unit_of_control(host, index) for index in range(host.nu)}
@@ -57,7 +57,9 @@ def setting_of(subject: str, task: Task) -> Setting:
         added_to = "the initial velocities" if is_file(subject) else "theta"
         units = {getattr(task.policy, "unit", "")}
     unit = "" if "" in units else " or ".join(sorted(units))
-    return Setting(task.noise, task.sigma, unit, added_to, task.scene.timestep, task.horizon, task.policy.num_params)
+    return RolloutSetting(
+        task.noise, task.sigma, unit, added_to, task.scene.timestep, task.horizon, task.policy.num_params
+    )
 
 
 def _unit_of_control(host: mujoco.MjModel, index: int) -> str:
@@ -72,7 +74,7 @@ def _unit_of_control(host: mujoco.MjModel, index: int) -> str:
 
 
 @dataclasses.dataclass(frozen=True)
-class Touch:
+class ContactSummary:
     """A contact that begins in the zero-noise rollout, and how well a step resolves it.
 
     Attributes:
@@ -96,7 +98,7 @@ class Touch:
     stable: bool
 
 
-def touches_of(task: Task, cell: ContactPoint) -> Iterator[Touch]:
+def touches_of(task: Task, cell: ContactPoint) -> Iterator[ContactSummary]:
     """Find the contacts that begin in the zero-noise rollout, with the C engine."""
     no_noise = jnp.zeros((), task.theta.dtype)
     states, *_ = compiled_rollout(task)(task.theta, cell.contact, jax.random.key(0), no_noise)
@@ -113,7 +115,7 @@ def touches_of(task: Task, cell: ContactPoint) -> Iterator[Touch]:
         before = now.keys()
 
 
-def touch_of(host: mujoco.MjModel, data: mujoco.MjData, contact: Any, time: float, timestep: float) -> Touch:
+def touch_of(host: mujoco.MjModel, data: mujoco.MjData, contact: Any, time: float, timestep: float) -> ContactSummary:
     """Describe a contact in the engine's data that has just begun."""
     solref = np.array(contact.solref)
     if solref[0] > 0 and not host.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_REFSAFE:
@@ -123,7 +125,7 @@ def touch_of(host: mujoco.MjModel, data: mujoco.MjData, contact: Any, time: floa
     pyramid = contact.dim > 1 and host.opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
     rows = data.efc_vel[first : first + (edges if pyramid else 1)]
     speed = -float(np.mean(rows)) if first >= 0 else 0.0
-    return Touch(
+    return ContactSummary(
         pair=" and ".join(host.geom(geom).name or f"geom {geom}" for geom in contact.geom),
         time=time,
         speed=speed,

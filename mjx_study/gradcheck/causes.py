@@ -52,7 +52,7 @@ class DegenerateContact:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Place:
+class FindingContext:
     """Where a finding occurs.
 
     Attributes:
@@ -117,21 +117,21 @@ def _degenerate(host: mujoco.MjModel, geoms: tuple[int, ...], cause: str) -> Deg
     return DegenerateContact(cause, movers, frozenset(moved.tolist()))
 
 
-def cause_of_fault(place: Place, output: Coordinate, source: Coordinate, *, stock: bool = False) -> str:
+def cause_of_fault(context: FindingContext, output: Coordinate, source: Coordinate, *, stock: bool = False) -> str:
     """Return the likely reason why a derivative is wrong, zero or NaN."""
-    return next(_faults(place, output, source, stock), "unknown")
+    return next(_faults(context, output, source, stock), "unknown")
 
 
-def cause_of_kink(place: Place, output: Coordinate, source: Coordinate) -> str:
+def cause_of_kink(context: FindingContext, output: Coordinate, source: Coordinate) -> str:
     """Return the switch that makes the step nonsmooth."""
-    return next(_kinks(place, output, source))
+    return next(_kinks(context, output, source))
 
 
-def _faults(place: Place, output: Coordinate, source: Coordinate, stock: bool) -> Iterator[str]:
-    host, state, stages = place.host, place.state, place.stages
-    if place.singular:
+def _faults(context: FindingContext, output: Coordinate, source: Coordinate, stock: bool) -> Iterator[str]:
+    host, state, stages = context.host, context.state, context.stages
+    if context.singular:
         yield SINGULAR
-    if not np.all(np.isfinite(place.qacc)):
+    if not np.all(np.isfinite(context.qacc)):
         yield "the step itself is not finite"
     for joint, first, dof in quaternions(host):
         if joint != source.joint:
@@ -148,10 +148,10 @@ def _faults(place: Place, output: Coordinate, source: Coordinate, stock: bool) -
                 f"the spring of {joint_name(host, joint)} at its reference orientation: MJX's difference of "
                 "quaternions has derivative zero at a zero angle"
             )
-    if source.name.startswith("solref") and np.any((place.solref[:, 0] <= 0) & (place.solref[:, 1] == 0)):
+    if source.name.startswith("solref") and np.any((context.solref[:, 0] <= 0) & (context.solref[:, 1] == 0)):
         yield "solref (-k, 0): MJX divides by the square of the damping ratio, here 0, in the branch it does not take"
-    depth, power = (stages["margin"] - stages["dist"])[place.touching], place.solimp[:, 4]
-    if source.name == "solimp[power]" and np.any(depth > place.solimp[:, 2].min()):
+    depth, power = (stages["margin"] - stages["dist"])[context.touching], context.solimp[:, 4]
+    if source.name == "solimp[power]" and np.any(depth > context.solimp[:, 2].min()):
         yield "penetration beyond solimp's width: MJX takes the logarithm of 1 - |r| / width, which is negative there"
     if not np.all(power == np.round(power)):
         yield "a non-integer power in solimp: MJX raises a negative number to it"
@@ -163,30 +163,30 @@ def _faults(place: Place, output: Coordinate, source: Coordinate, stock: bool) -
     clamped = host.tendon_actfrclimited.any() and source.block in ("ctrl", "act", "qpos", "qvel")
     if clamped and np.any(stages["qfrc_actuator"] == 0):
         yield "a tendon's limited actuator force is zero, and MJX divides by it in the branch it does not take"
-    if host.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC and len(place.touching) and not state.qvel.any():
+    if host.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC and len(context.touching) and not state.qvel.any():
         yield "the elliptic cone at zero tangential velocity"
-    if stock and num_constraint_rows(place.layout.scene.template) and output.block != "act":
+    if stock and num_constraint_rows(context.layout.scene.template) and output.block != "act":
         yield "mjx.step differentiates the iterations of its solver and line search, not the solution they approach"
 
 
-def _kinks(place: Place, output: Coordinate, source: Coordinate) -> Iterator[str]:
-    host = place.host
+def _kinks(context: FindingContext, output: Coordinate, source: Coordinate) -> Iterator[str]:
+    host = context.host
     if source.block == "ctrl":
-        column = place.layout.columns("ctrl").index(place.layout.inputs.index(source))
-        reached = np.abs(host.actuator_ctrlrange[column] - place.state.control[column]).min() < NEAR_DISTANCE
+        column = context.layout.columns("ctrl").index(context.layout.inputs.index(source))
+        reached = np.abs(host.actuator_ctrlrange[column] - context.state.control[column]).min() < NEAR_DISTANCE
         if host.actuator_ctrllimited[column] and reached:
             yield "a control is at the end of its range, where MuJoCo clips it"
     if output.block != "act":  # unaffected by contacts
-        yield from _parameter_kinks(place, source)
-        yield from _constraint_kinks(place)
+        yield from _parameter_kinks(context, source)
+        yield from _constraint_kinks(context)
     if np.any(host.actuator_dyntype == mujoco.mjtDyn.mjDYN_MUSCLE):
         yield "a muscle's activation or velocity is where its curves change"
-    yield from (contact.cause for contact in place.degenerate if contact.concerns(output, source))
+    yield from (contact.cause for contact in context.degenerate if contact.concerns(output, source))
     yield "a clip, a maximum or a choice between features switches here"
 
 
-def _parameter_kinks(place: Place, source: Coordinate) -> Iterator[str]:
-    solref, solimp, option = place.solref, place.solimp, place.host.opt
+def _parameter_kinks(context: FindingContext, source: Coordinate) -> Iterator[str]:
+    solref, solimp, option = context.solref, context.solimp, context.host.opt
     entry = {"solimp[d_0]": 0, "solimp[d_width]": 1, "solimp[midpoint]": 3}.get(source.name)
     if entry is not None:
         bounds = np.array([[mujoco.mjMINIMP, mujoco.mjMAXIMP]])
@@ -205,23 +205,23 @@ def _parameter_kinks(place: Place, source: Coordinate) -> Iterator[str]:
         yield "MuJoCo selects or mixes the parameters of two geoms, which tie here"
 
 
-def _constraint_kinks(place: Place) -> Iterator[str]:
-    host, stages = place.host, place.stages
+def _constraint_kinks(context: FindingContext) -> Iterator[str]:
+    host, stages = context.host, context.stages
     gap = stages["dist"] - stages["margin"]
     for contact in np.flatnonzero(np.abs(gap) < NEAR_DISTANCE):
         pair = " and ".join(geom_label(host, int(geom)) for geom in stages["geom"][contact])
         yield f"contact of {pair} is at its onset ({abs(gap[contact]):.1e} m away)"
     for joint in np.flatnonzero(host.jnt_limited & np.isin(host.jnt_type, (_SLIDE, _HINGE))):
         (low, high), margin = host.jnt_range[joint], host.jnt_margin[joint]
-        position = place.state.qpos[host.jnt_qposadr[joint]]
+        position = context.state.qpos[host.jnt_qposadr[joint]]
         if min(abs(position - low - margin), abs(high - position - margin)) < NEAR_DISTANCE:
             yield f"{joint_name(host, int(joint))} is at its limit"
     from_limits = np.abs(stages["ten_length"][:, None] - host.tendon_range).min(axis=1, initial=np.inf)
     if np.any(host.tendon_limited.astype(bool) & (from_limits < NEAR_DISTANCE)):
         yield "a tendon is at its limit"
     rows, reference, loss = np.abs(stages["efc_J"]), np.abs(stages["efc_aref"]), stages["efc_frictionloss"]
-    size = reference + rows @ np.abs(place.qacc)
-    if np.any((rows.max(axis=1, initial=0.0) > 0) & (np.abs(place.slack) <= 1e-5 * np.maximum(size, 1e-9))):
+    size = reference + rows @ np.abs(context.qacc)
+    if np.any((rows.max(axis=1, initial=0.0) > 0) & (np.abs(context.slack) <= 1e-5 * np.maximum(size, 1e-9))):
         yield "a constraint is between pushing and letting go (its force is zero but about to act)"
-    if np.any((loss > 0) & (np.abs(np.abs(stages["efc_D"] * place.slack) - loss) < 1e-4 * loss)):
+    if np.any((loss > 0) & (np.abs(np.abs(stages["efc_D"] * context.slack) - loss) < 1e-4 * loss)):
         yield "friction loss is between sticking and sliding"

@@ -8,19 +8,19 @@ from typing import Final
 import jax.numpy as jnp
 import mujoco
 
-from mjx_study.choices import CHECKED_STATES, CHECKED_STEPS
+from mjx_study.choices import CHECKED_STATES, CHECKED_STEPS, refuse_untaken, takes_stiffness
 from mjx_study.choices import CHECKED_STIFFNESS as STIFFNESS
 from mjx_study.gradcheck.coordinates import make_coordinates
 from mjx_study.gradcheck.cost import CostPrograms, check_cost, judge_closed_forms
-from mjx_study.gradcheck.programs import Compiler, Programs, Setting
+from mjx_study.gradcheck.programs import Compiler, ContactCase, Programs
 from mjx_study.gradcheck.report import CostCheck, Finding, GradcheckReport, StepCheck, gravity
 from mjx_study.gradcheck.states import start_of, states_of
 from mjx_study.gradcheck.steps import check_state, collect, step_check
 from mjx_study.gradcheck.values import EngineStep
+from mjx_study.progress import Progress, silent
 from mjx_study.runtime import environment
 from mjx_study.simulation.engine import quiet_engine
 from mjx_study.simulation.scene import Scene
-from mjx_study.study.configuration import Progress, refuse_untaken, takes_stiffness
 from mjx_study.tasks.contact_grid import ContactPoint, family_grid
 from mjx_study.tasks.mjcf import scene_task
 from mjx_study.tasks.task import Task
@@ -142,7 +142,7 @@ def _check(task: Task, states: int) -> None:
 
 
 @quiet_engine()  # intermediate states may cause warnings
-def gradcheck(plan: GradcheckPlan, progress: Progress = lambda done, total, what: None) -> GradcheckReport:
+def gradcheck(plan: GradcheckPlan, progress: Progress = silent) -> GradcheckReport:
     """Run all checks of a plan; `progress` is called with (parts done, their total number, the next)."""
     task, compiler = plan.subject, Compiler()
     done, total = itertools.count(), 1 + len(plan.cells) * (plan.states + plan.is_task)
@@ -153,15 +153,15 @@ def gradcheck(plan: GradcheckPlan, progress: Progress = lambda done, total, what
     begin("compiling")
     layouts = [make_coordinates(task.scene, cell.contact) for cell in plan.cells]
     programs = Programs(layouts[0], compiler)
-    settings = [Setting(cell.contact, layout.scales) for cell, layout in zip(plan.cells, layouts, strict=True)]
-    programs.start(settings[0], start_of(task.scene), stock=plan.stock)
+    cases = [ContactCase(cell.contact, layout.scales) for cell, layout in zip(plan.cells, layouts, strict=True)]
+    programs.start(cases[0], start_of(task.scene), stock=plan.stock)
     costs = CostPrograms(task, plan.seed, compiler) if plan.is_task else None
     if costs is not None:
         costs.compile(plan.cells[0].contact)
     cost_checks: list[CostCheck] = []
     step_checks: list[StepCheck] = []
     findings: list[Finding] = []
-    for cell, layout, setting in zip(plan.cells, layouts, settings, strict=True):
+    for cell, layout, case in zip(plan.cells, layouts, cases, strict=True):
         visited = None
         if costs is not None:
             begin(f"{cell.label}: gradient of the cost")
@@ -172,7 +172,7 @@ def gradcheck(plan: GradcheckPlan, progress: Progress = lambda done, total, what
         checks = []
         for sample in samples:
             begin(f"{cell.label}: {sample.label}")
-            checks.append(check_state(programs, engine_step, setting, sample, stock=plan.stock))
+            checks.append(check_state(programs, engine_step, case, sample, stock=plan.stock))
         found = collect(cell, programs.layout, checks)
         step_checks.append(step_check(cell, programs.layout, checks, found, coverage))
         findings += found

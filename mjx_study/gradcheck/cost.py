@@ -25,7 +25,7 @@ DIFFERENCE_TOLERANCE: Final = 1e-6
 MODES_TOLERANCE: Final = 1e-9
 CLOSED_FORM_TOLERANCE: Final = 1e-3
 """Relative distance from the closed form's gradient that counts as agreement."""
-MOST_GROWTH: Final = 2.0
+MAX_GROWTH: Final = 2.0
 """Allowed growth of the distance with stiffness, which should bring the two models together."""
 
 
@@ -100,7 +100,7 @@ def judge_closed_forms(checks: Sequence[CostCheck]) -> list[Finding]:
     findings = []
     for stiffness, distance, contact in known:
         softest, nearest, _ = known[0]
-        grows = distance > max(CLOSED_FORM_TOLERANCE, MOST_GROWTH * nearest)
+        grows = distance > max(CLOSED_FORM_TOLERANCE, MAX_GROWTH * nearest)
         if not distance <= CLOSED_FORM_TOLERANCE:
             text = f"the gradient is {distance:.1e} of its norm from the closed form's"
             text += f", farther than at {softest:g} N/m ({nearest:.1e})" if grows else ""

@@ -14,11 +14,11 @@ TOLERANCE: Final = 1e-6
 MODES_TOLERANCE: Final = 1e-6
 """Allowed relative difference of forward and reverse mode; rounding alone reaches 1e-7 in ill-conditioned solves."""
 RESIDUAL_TOLERANCE: Final = 1e-6
-LEAST_SCALE: Final = 1e-3
+MIN_SCALE: Final = 1e-3
 """Smallest scale of a row's entries, relative to the largest row of its kind."""
-LEAST_STEEPNESS: Final = 0.1
+MIN_STEEPNESS: Final = 0.1
 """Difference of one-sided slopes, relative to a row's largest entry, that rounding cannot explain."""
-MOST_UNCERTAINTY: Final = 1e-5
+MAX_UNCERTAINTY: Final = 1e-5
 """Relative uncertainty above which a difference is imprecise; such entries are left out of the worst error."""
 
 VERDICTS: Final = ("right", "unresolved", "kink", "jump", "unconverged", "zero", "nan", "engine", "wrong", "value")
@@ -76,8 +76,8 @@ def judge(
     vague = 3 * truth.uncertainty >= np.maximum(size, TOLERANCE * scale)
     codes[right & vague & (size > 0)] = UNRESOLVED  # two zeros agree, whatever their uncertainty
     # The mean of two slopes agrees with central differences, and anything agrees with differences over a jump.
-    codes[truth.kink & within & ~outside & (~right | (truth.gap > LEAST_SCALE * scale))] = KINK
-    codes[truth.jump & (~right | (truth.gap > LEAST_STEEPNESS * scale))] = JUMP
+    codes[truth.kink & within & ~outside & (~right | (truth.gap > MIN_SCALE * scale))] = KINK
+    codes[truth.jump & (~right | (truth.gap > MIN_STEEPNESS * scale))] = JUMP
     if degenerate is not None:
         codes[degenerate & truth.rough & ~right] = JUMP
     codes[~np.isfinite(jacobian)] = NAN
@@ -89,7 +89,7 @@ def row_scales(
 ) -> Float[np.ndarray, "outputs inputs"]:
     """Error scale of an entry: the largest derivative or difference in its row over the same block.
 
-    Rows that hardly depend on a block, and so hold only rounding, get `LEAST_SCALE` of the largest row of their kind.
+    Rows that hardly depend on a block, and so hold only rounding, get `MIN_SCALE` of the largest row of their kind.
     """
     scale = np.empty(jacobian.shape)
     size = np.where(np.isfinite(jacobian), np.abs(jacobian), 0.0)
@@ -101,7 +101,7 @@ def row_scales(
         largest = size[:, columns].max(axis=1)
         for kind in dict.fromkeys(kinds):
             rows = kinds == kind
-            floor = max(LEAST_SCALE * float(largest[rows].max()), 1e-10)
+            floor = max(MIN_SCALE * float(largest[rows].max()), 1e-10)
             scale[np.ix_(rows, columns)] = np.maximum(largest[rows], floor)[:, None]
     return scale
 
@@ -142,7 +142,7 @@ def worst_error(
 ) -> float:
     """Worst relative error of all entries, right or wrong, that have a derivative that differences resolve."""
     scale = row_scales(layout, jacobian, truth)
-    counted = ~np.isin(codes, (KINK, JUMP)) & (truth.uncertainty <= MOST_UNCERTAINTY * scale)
+    counted = ~np.isin(codes, (KINK, JUMP)) & (truth.uncertainty <= MAX_UNCERTAINTY * scale)
     figures = np.where(counted, np.abs(jacobian - truth.value) / scale, 0.0)[:, list(columns)]
     return float("inf") if np.isnan(figures).any() else float(figures.max(initial=0.0))
 

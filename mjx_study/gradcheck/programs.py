@@ -65,7 +65,7 @@ def _compile(lowered: Any) -> Callable[..., Any]:
     return lowered.compile()
 
 
-class Setting(NamedTuple):
+class ContactCase(NamedTuple):
     """A contact model, None for the MJCF's own, and the units of its parameters."""
 
     contact: ContactModel | None
@@ -112,9 +112,9 @@ class Programs:
         inputs = len(layout.inputs)
         self._sizes = sorted({layout.num_state if layout.scene.uses_jacobian else inputs, inputs})
 
-    def start(self, setting: Setting, base: HostState, *, stock: bool) -> None:
+    def start(self, case: ContactCase, base: HostState, *, stock: bool) -> None:
         """Start compiling the programs of `linear`, `exact`, `stock_step` and, on request, `stock`."""
-        point, inputs, outputs = _point(setting, base), len(self.layout.inputs), len(self.layout.outputs)
+        point, inputs, outputs = _point(case, base), len(self.layout.inputs), len(self.layout.outputs)
         for size in reversed(self._sizes):
             self.compiler.start(self._linear, point, _unit_rows(0, size), _unit_rows(0, outputs))
         self.compiler.start(self._exact, point, jnp.asarray(base.qpos), np.zeros((BATCH, inputs)))
@@ -123,10 +123,10 @@ class Programs:
             self.compiler.start(self._stock, point, _unit_rows(0, inputs))
 
     def exact(
-        self, setting: Setting, base: HostState, reference: Array, changes: Float[np.ndarray, "batch inputs"]
+        self, case: ContactCase, base: HostState, reference: Array, changes: Float[np.ndarray, "batch inputs"]
     ) -> Exact:
         """Take the converged step after each change, the first of which is zero; positions relative to `reference`."""
-        point = _point(setting, base)
+        point = _point(case, base)
         padded = np.pad(changes, ((0, -len(changes) % BATCH), (0, 0)))
         chunks = padded.reshape(-1, BATCH, padded.shape[1])
         found = [self.compiler.run(self._exact, point, reference, chunk) for chunk in chunks]
@@ -134,9 +134,9 @@ class Programs:
         outputs = np.concatenate([np.asarray(output) for output, *_ in found])
         return Exact(_host(after, base), stages, outputs[: len(changes)])
 
-    def linear(self, setting: Setting, base: HostState) -> Linear:
+    def linear(self, case: ContactCase, base: HostState) -> Linear:
         """Compute the value and derivatives of the project's own step at a state."""
-        found = [self._derivatives(size, setting, base) for size in self._sizes]
+        found = [self._derivatives(size, case, base) for size in self._sizes]
         own, tape = found[0], found[-1]
         if own is tape:
             return own
@@ -145,20 +145,20 @@ class Programs:
         reverse = np.concatenate([own.reverse, tape.reverse[:, parameters]], axis=1)
         return Linear(own.qpos, own.residual, forward, reverse, tape.reverse)
 
-    def stock_step(self, setting: Setting, base: HostState) -> HostState:
+    def stock_step(self, case: ContactCase, base: HostState) -> HostState:
         """Return the state after `mjx.step`, run to convergence from the warm start."""
-        return _host(self.compiler.run(self._stock_step, _point(setting, base)), base)
+        return _host(self.compiler.run(self._stock_step, _point(case, base)), base)
 
-    def stock(self, setting: Setting, base: HostState) -> Float[np.ndarray, "outputs inputs"]:
+    def stock(self, case: ContactCase, base: HostState) -> Float[np.ndarray, "outputs inputs"]:
         """Jacobian of `mjx.step` by forward mode."""
-        inputs, point = len(self.layout.inputs), _point(setting, base)
+        inputs, point = len(self.layout.inputs), _point(case, base)
         pushes = [_unit_rows(first, inputs) for first in range(0, inputs, DIRECTIONS)]
         rows = [np.asarray(self.compiler.run(self._stock, point, push)) for push in pushes]
         return np.concatenate(rows)[:inputs].T
 
-    def _derivatives(self, inputs: int, setting: Setting, base: HostState) -> Linear:
+    def _derivatives(self, inputs: int, case: ContactCase, base: HostState) -> Linear:
         """Derivatives with respect to the first inputs."""
-        outputs, point = len(self.layout.outputs), _point(setting, base)
+        outputs, point = len(self.layout.outputs), _point(case, base)
         found = [
             self.compiler.run(self._linear, point, _unit_rows(first, inputs), _unit_rows(first, outputs))
             for first in range(0, max(inputs, outputs), DIRECTIONS)
@@ -228,9 +228,9 @@ def _mjx_step(scene, model, state, control):
     return State(data.qpos, data.qvel, data.act, data.qacc), jnp.zeros(())
 
 
-def _point(setting: Setting, base: HostState) -> tuple[Setting, State, Array]:
+def _point(case: ContactCase, base: HostState) -> tuple[ContactCase, State, Array]:
     arrays = (jnp.asarray(part) for part in (base.qpos, base.qvel, base.act, base.warmstart))
-    return setting, State(*arrays), jnp.asarray(base.control)
+    return case, State(*arrays), jnp.asarray(base.control)
 
 
 def _host(after: State, base: HostState) -> HostState:

@@ -7,10 +7,9 @@ from typing import Any, Final
 
 from mjx_study.gradcheck.coverage import Coverage
 from mjx_study.gradcheck.diagnosis import FAILURES, MEANING, VERDICTS
-from mjx_study.study.dataset import as_plain
-from mjx_study.table import format_table
+from mjx_study.table import as_plain, format_table
 
-MOST_SHOWN: Final = 12
+MAX_SHOWN: Final = 12
 """Maximum number of findings in the text, unless all are requested."""
 OTHERS: Final = {"value": "mjx.step", "engine": "the C engine", "engine_mismatch": "the C engine"}
 """Source of the compared number, if not finite differences."""
@@ -247,7 +246,7 @@ class GradcheckReport:
         alike: dict[tuple[str, str, str], list[Finding]] = {}
         for finding in self.findings:
             alike.setdefault((finding.who, finding.verdict, finding.cause), []).append(finding)
-        shown = list(alike.values()) if verbose else list(alike.values())[:MOST_SHOWN]
+        shown = list(alike.values()) if verbose else list(alike.values())[:MAX_SHOWN]
         lines: list[str] = []
         for group in shown:
             contacts = list(dict.fromkeys(finding.contact for finding in group))

@@ -26,7 +26,7 @@ POSES: Final = 30
 """Number of random poses tried for parts that no rollout reached."""
 FALL: Final = 50
 """Number of steps of the rollout from each pose."""
-MOST_EXCESS: Final = 0.01
+MAX_EXCESS: Final = 0.01
 """Largest excess of a pose beyond a limit, relative to the range."""
 LOOK: Final = 200
 """Number of states searched at once for one that exercises a missing part."""
@@ -114,7 +114,7 @@ def _even(samples: list[Sample], count: int) -> list[Sample]:
     """Up to `count` evenly spaced samples."""
     if count >= len(samples):
         return samples
-    return [samples[int(round(place))] for place in np.linspace(0, len(samples) - 1, count + 2)[1:-1]]
+    return [samples[int(round(index))] for index in np.linspace(0, len(samples) - 1, count + 2)[1:-1]]
 
 
 def _elsewhere(host: mujoco.MjModel, start: HostState, horizon: int, random: np.random.Generator) -> Iterator[Sample]:
@@ -172,6 +172,6 @@ def _posed(host: mujoco.MjModel, state: HostState, random: np.random.Generator) 
     qpos = state.qpos.copy()
     for joint in np.flatnonzero(host.jnt_limited & np.isin(host.jnt_type, _SCALAR)):
         low, high = host.jnt_range[joint]
-        share = random.choice([-MOST_EXCESS, 1 + MOST_EXCESS, random.uniform()])
+        share = random.choice([-MAX_EXCESS, 1 + MAX_EXCESS, random.uniform()])
         qpos[host.jnt_qposadr[joint]] = low + share * (high - low)
     return dataclasses.replace(state, qpos=qpos)

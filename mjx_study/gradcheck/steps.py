@@ -8,12 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_study.gradcheck import diagnosis
-from mjx_study.gradcheck.causes import SINGULAR, Place, cause_of_fault, cause_of_kink
+from mjx_study.gradcheck.causes import SINGULAR, FindingContext, cause_of_fault, cause_of_kink
 from mjx_study.gradcheck.coordinates import Coordinates
 from mjx_study.gradcheck.coverage import Coverage
 from mjx_study.gradcheck.diagnosis import ENGINE, NAN, RIGHT, UNRESOLVED, VERDICTS, Codes, judge, worst_error
 from mjx_study.gradcheck.differences import Differences, moves, solution_noise, take_differences
-from mjx_study.gradcheck.programs import Programs, Setting
+from mjx_study.gradcheck.programs import ContactCase, Programs
 from mjx_study.gradcheck.report import Entry, Finding, StepCheck
 from mjx_study.gradcheck.states import Sample
 from mjx_study.gradcheck.values import EngineStep, Values, compare_values
@@ -45,7 +45,7 @@ class StateCheck:
     values: Values
     engine_truth: Differences
     engine: Codes | None
-    place: Place
+    context: FindingContext
 
     def of(self, who: str) -> dict[str, Codes]:
         """Verdicts on the derivatives of the project or of `mjx.step`."""
@@ -53,30 +53,30 @@ class StateCheck:
 
 
 def check_state(
-    programs: Programs, engine_step: EngineStep, setting: Setting, sample: Sample, *, stock: bool = False
+    programs: Programs, engine_step: EngineStep, case: ContactCase, sample: Sample, *, stock: bool = False
 ) -> StateCheck:
     """Run all comparisons of a step and its derivatives; with `stock`, differentiate `mjx.step` too."""
     layout = programs.layout
-    linear = programs.linear(setting, sample.state)
+    linear = programs.linear(case, sample.state)
     reference = jnp.asarray(linear.qpos)
     ladder = moves(np.eye(len(layout.inputs)))
-    qacc = programs.exact(setting, sample.state, reference, ladder[:1]).after.warmstart
+    qacc = programs.exact(case, sample.state, reference, ladder[:1]).after.warmstart
     solved = dataclasses.replace(sample.state, warmstart=qacc)
-    exact = programs.exact(setting, solved, reference, ladder)
+    exact = programs.exact(case, solved, reference, ladder)
     noise = solution_noise(layout, exact.stages, qacc)
     truth = take_differences(exact.outputs, noise)
     engine_truth = take_differences(
         engine_step.outputs(solved, linear.qpos, ladder), engine_step.noise(solved, linear.qpos)
     )
-    stock_step = programs.stock_step(setting, solved)
+    stock_step = programs.stock_step(case, solved)
     values = compare_values(layout, engine_step, solved, exact.after, stock_step, exact.stages, noise)
 
-    model = apply_contact(layout.scene.model, setting.contact)
+    model = apply_contact(layout.scene.model, case.contact)
     solref, solimp = np.asarray(model.geom_solref), np.asarray(model.geom_solimp)
-    place = Place(layout, sample.state, exact.stages, qacc, solref, solimp)
+    context = FindingContext(layout, sample.state, exact.stages, qacc, solref, solimp)
     degenerate = np.array(
         [
-            [any(contact.concerns(output, source) for contact in place.degenerate) for source in layout.inputs]
+            [any(contact.concerns(output, source) for contact in context.degenerate) for source in layout.inputs]
             for output in layout.outputs
         ]
     )
@@ -85,7 +85,7 @@ def check_state(
     excused = degenerate & truth.rough
     others = list(derivatives.values())[1:]
     apart = max(diagnosis.modes_apart(layout, linear.forward, other, excused) for other in others)
-    converged = None if linear.residual <= 1e-10 else programs.linear(setting, solved).forward
+    converged = None if linear.residual <= 1e-10 else programs.linear(case, solved).forward
     starved = not linear.residual <= diagnosis.RESIDUAL_TOLERANCE
     judged = {
         mode: judge(layout, jacobian, truth, converged, starved=starved, degenerate=degenerate)
@@ -95,9 +95,9 @@ def check_state(
     if engine is not None:
         judged = {mode: diagnosis.resolved_by(codes, engine) for mode, codes in judged.items()}
     if stock:
-        derivatives[STOCK] = programs.stock(setting, sample.state)
+        derivatives[STOCK] = programs.stock(case, sample.state)
         judged[STOCK] = judge(layout, derivatives[STOCK], truth, degenerate=degenerate)
-    return StateCheck(sample, linear.residual, derivatives, truth, judged, apart, values, engine_truth, engine, place)
+    return StateCheck(sample, linear.residual, derivatives, truth, judged, apart, values, engine_truth, engine, context)
 
 
 def step_check(
@@ -168,11 +168,11 @@ def _of_entries(check: StateCheck, layout: Coordinates) -> Iterator[_Found]:
                 continue  # inherited from the step, so already attributed to the project
             output, source = layout.outputs[row], layout.inputs[column]
             if not smooth:
-                cause = cause_of_kink(check.place, output, source)
+                cause = cause_of_kink(check.context, output, source)
             elif verdict == "unconverged":
                 cause = _budget(layout)
             else:
-                cause = cause_of_fault(check.place, output, source, stock=who == STOCK)
+                cause = cause_of_fault(check.context, output, source, stock=who == STOCK)
             modes = tuple(mode for mode, codes in judged.items() if codes[row, column] == worst[row, column])
             derivative, difference, gap = (
                 float(values[row, column])
@@ -200,7 +200,7 @@ def _of_state(check: StateCheck, layout: Coordinates) -> Iterator[_Found]:
         yield ("project", "unconverged", (), cause), "", check.residual, None, None
     if not check.modes <= diagnosis.MODES_TOLERANCE:
         text = f"the two modes of differentiation disagree by {check.modes:.1e}"
-        cause = f"{text}: {SINGULAR}" if check.place.singular else text
+        cause = f"{text}: {SINGULAR}" if check.context.singular else text
         yield ("project", "wrong", (), cause), "", check.modes, None, None
     if values.verdict:
         who = STOCK if values.verdict == "value" and values.agrees_with_engine else "project"

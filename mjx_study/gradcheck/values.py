@@ -19,10 +19,10 @@ from mjx_study.simulation.engine import HostState, converged_host, host_data
 TOLERANCE: Final = 1e-8
 """Relative difference above which two implementations differ in a quantity."""
 FAR: Final = 1e100
-LEAST_ROW: Final = 1e-12
+MIN_ROW: Final = 1e-12
 """Size below which a constraint row counts as zero."""
 ROUNDING: Final = 1e-14
-LEAST_TURNING: Final = 1e-8
+MIN_TURNING: Final = 1e-8
 """Angular velocity [rad/s] below which, in every component, MJX treats the step of an orientation as zero."""
 WARMSTARTS: Final = (0.0, 0.5, 1.001)
 """Alternative warm starts, relative to the solution, whose results differ only by rounding."""
@@ -69,7 +69,7 @@ class EngineStep:
         """Return (position relative to `reference`, velocity, activation) after a step from each changed state."""
         layout, data, rows = self.layout, host_data(self.host, base), []
         for change in changes:
-            self._place(data, base, change[: layout.num_state])
+            self._set_state(data, base, change[: layout.num_state])
             self._set_parameters(change[layout.num_state :] * layout.scales)
             mujoco.mj_step(self.host, data)
             rows.append(np.concatenate([_tangent(self.host, reference, data.qpos), data.qvel, data.act]))
@@ -83,7 +83,7 @@ class EngineStep:
         starts = [dataclasses.replace(base, warmstart=factor * base.warmstart) for factor in WARMSTARTS]
         return np.max([np.abs(self.outputs(start, reference, still) - exact)[0] for start in starts], axis=0)
 
-    def _place(self, data: mujoco.MjData, base: HostState, change: Float[np.ndarray, " changes"]) -> None:
+    def _set_state(self, data: mujoco.MjData, base: HostState, change: Float[np.ndarray, " changes"]) -> None:
         host, lengths = self.host, quaternions(self.host)
         ends = np.cumsum([host.nv, len(lengths), host.nv, host.na]).tolist()
         tangent, stretch, qvel, act, control = np.split(change, ends)
@@ -196,7 +196,7 @@ def _apart(
     still = np.zeros(host.nv)  # angular velocities that MJX treats as zero
     for _, _, first in quaternions(host):
         turning = np.abs(ours.qvel[first : first + 3])
-        still[first : first + 3] = np.where(turning.max() <= LEAST_TURNING, turning, 0.0)
+        still[first : first + 3] = np.where(turning.max() <= MIN_TURNING, turning, 0.0)
     unseen = (ROUNDING * max(1.0, _largest(before.qpos)) + timestep * still, ROUNDING * speed, ROUNDING)
     scales = (timestep * speed, timestep * force, activation)
     parts = np.split(_change(host, theirs, ours), [host.nv, 2 * host.nv])
@@ -276,12 +276,12 @@ def _contacts(host: mujoco.MjModel, data: mujoco.MjData, stages: dict[str, Any])
     ours: dict[tuple[int, ...], list[np.ndarray]] = defaultdict(list)
     theirs: dict[tuple[int, ...], list[np.ndarray]] = defaultdict(list)
     for index in np.flatnonzero(stages["dist"] < stages["margin"]):
-        place = np.concatenate([stages["dist"][[index]], stages["pos"][index], stages["frame"][index].ravel()])
-        ours[tuple(sorted(stages["geom"][index].tolist()))].append(place)
+        geometry = np.concatenate([stages["dist"][[index]], stages["pos"][index], stages["frame"][index].ravel()])
+        ours[tuple(sorted(stages["geom"][index].tolist()))].append(geometry)
     for contact in data.contact:
         if contact.exclude == 0:
-            place = np.concatenate([[contact.dist], contact.pos, contact.frame])
-            theirs[tuple(sorted(contact.geom.tolist()))].append(place)
+            geometry = np.concatenate([[contact.dist], contact.pos, contact.frame])
+            theirs[tuple(sorted(contact.geom.tolist()))].append(geometry)
     texts = []
     for pair in sorted(ours.keys() | theirs.keys()):
         mine, its = np.array(ours[pair]), np.array(theirs[pair])
@@ -307,7 +307,7 @@ def _rows(host: mujoco.MjModel, data: mujoco.MjData, stages: dict[str, Any], *, 
     """
     here = {name: stages[name] for name in ROWS}
     there = {"efc_J": _jacobian(host, data), "efc_aref": data.efc_aref, "efc_D": data.efc_D}
-    live, alive = (np.abs(rows["efc_J"]).max(axis=1, initial=0.0) > LEAST_ROW for rows in (here, there))
+    live, alive = (np.abs(rows["efc_J"]).max(axis=1, initial=0.0) > MIN_ROW for rows in (here, there))
     kinds, labels = stages["efc_type"], _labels(host, data)
     found: list[Found] = []
     for kind in np.union1d(kinds[live], data.efc_type[alive]):
@@ -339,7 +339,7 @@ def _matched(distances: Float[np.ndarray, "ours theirs"]) -> tuple[np.ndarray, n
 def _distances(ours: np.ndarray, theirs: np.ndarray) -> Float[np.ndarray, "ours theirs"]:
     """Pairwise distances, relative to the largest magnitude."""
     mine, its = (rows.reshape(len(rows), -1) for rows in (ours, theirs))
-    return cdist(mine, its, "chebyshev") / max(_largest(mine), _largest(its), LEAST_ROW)
+    return cdist(mine, its, "chebyshev") / max(_largest(mine), _largest(its), MIN_ROW)
 
 
 def _jacobian(host: mujoco.MjModel, data: mujoco.MjData) -> Float[np.ndarray, "rows nv"]:

@@ -11,8 +11,8 @@ from matplotlib.figure import Figure
 
 from mjx_study.plots.panels import a_few, against_stiffness, counted, estimators, line, make_panels, model_title
 from mjx_study.plots.style import line_with_band, robust_limits, style_of
-from mjx_study.study.findings import line_of, onset_of
-from mjx_study.study.variables import DERIVED, DESCENTS, LANDSCAPES
+from mjx_study.results.findings import line_of, onset_of
+from mjx_study.results.variables import DERIVED, DESCENTS, LANDSCAPES
 
 MOST_COST_RATIO: Final = 1e7
 """Maximum ratio of the ends of an axis of costs; beyond it a descent counts as diverged."""

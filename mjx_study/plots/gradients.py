@@ -27,7 +27,7 @@ from mjx_study.plots.panels import (
     stiffness_axis,
 )
 from mjx_study.plots.style import line_with_band
-from mjx_study.study.variables import COORDINATES, GRADIENTS
+from mjx_study.results.variables import COORDINATES, GRADIENTS
 
 WHOLE: Final = "as large as the gradient"
 

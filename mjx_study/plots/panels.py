@@ -11,9 +11,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from mjx_study.plots.style import NO_CONTACT, TITLES, combines, line_with_band, style_of
+from mjx_study.results.findings import estimators_of, label_in
+from mjx_study.results.variables import COORDINATES
 from mjx_study.simulation.contact import stable
-from mjx_study.study.findings import estimators_of, label_in
-from mjx_study.study.variables import COORDINATES
 
 UNSTABLE: Final = "unstable step"
 MOST_PANELS: Final = 6

@@ -18,8 +18,8 @@ from mjx_study.plots.edges import UNDRAWN, drawable
 from mjx_study.plots.gradients import alpha, bias, comparison, error_against_samples, variance
 from mjx_study.plots.panels import UNSTABLE, families, make_panels, number, positive, unstable
 from mjx_study.plots.style import TITLES, fit_texts, legend_below, mark_clipped
-from mjx_study.study.findings import onset_of
-from mjx_study.study.variables import COORDINATES, DESCENTS, GRADIENTS
+from mjx_study.results.findings import onset_of
+from mjx_study.results.variables import COORDINATES, DESCENTS, GRADIENTS
 from mjx_study.table import digits_to_tell_apart
 
 MOST_FIGURES: Final = 12

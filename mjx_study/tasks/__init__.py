@@ -13,11 +13,11 @@ from mjx_study.tasks.gripper import gripper
 from mjx_study.tasks.landing import landing
 from mjx_study.tasks.mjcf import mjcf_task
 from mjx_study.tasks.momentum_transfer import momentum_transfer
-from mjx_study.tasks.own import own_task, registered_place
 from mjx_study.tasks.pusher import pusher
 from mjx_study.tasks.sliding_box import sliding_box
 from mjx_study.tasks.task import Task
 from mjx_study.tasks.tennis import tennis
+from mjx_study.tasks.user_task import registered_name, user_task
 
 TASKS: Final[dict[str, Callable[..., Task]]] = {
     "pusher": pusher,
@@ -53,11 +53,11 @@ def make_task(name: str, **options: Any) -> Task:
         if "model" in options:
             raise ValueError(f"model replaces the MJCF of a task, but {name} is a file already")
         return mjcf_task(name, **options)
-    if (place := registered_place(name)) is not None:
-        return own_task(place, options)
+    if (place := registered_name(name)) is not None:
+        return user_task(place, options)
     if ":" in name:
         try:
-            return own_task(name, options)
+            return user_task(name, options)
         except MissingModuleError as error:
             raise ValueError(unknown_task(name, f" ({error})")) from None
     raise ValueError(unknown_task(name))

@@ -18,7 +18,7 @@ from mjx_study.tasks.task import StudyDefaults, Task
 
 NOISE: Final = 0.1
 """Noise level: share of the middle actuator's half range, or [m/s, rad/s] for initial velocities."""
-LEAST_MOTION: Final = 1e-9
+MIN_MOTION: Final = 1e-9
 """Displacement that counts as motion [m or rad]."""
 _FREE, _BALL = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL)
 
@@ -89,7 +89,7 @@ def _rests(host: mujoco.MjModel, start: State, control: np.ndarray, horizon: int
     with quiet_engine():
         for _ in range(horizon):
             mujoco.mj_step(host, data)
-    return bool(np.all(np.abs(data.qpos[measured] - origin) < LEAST_MOTION))
+    return bool(np.all(np.abs(data.qpos[measured] - origin) < MIN_MOTION))
 
 
 def _unit_of_velocities(host: mujoco.MjModel) -> str:

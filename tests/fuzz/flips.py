@@ -12,10 +12,11 @@ import pytest
 
 from mjx_study import compiled
 from mjx_study.caches import ProgramCache
+from mjx_study.execution import times
+from mjx_study.execution.run import load_study
+from mjx_study.experiment.checkpoint import StudyError
 from mjx_study.stopwatch import Spent
-from mjx_study.study import times
-from mjx_study.study.run import load_study
-from mjx_study.study.store import Store, StudyError
+from mjx_study.storage.folder import Store
 from tests.fuzz import studies
 from tests.fuzz.answers import Row, SilentError
 

@@ -18,10 +18,10 @@ from typing import Any, Final
 import numpy as np
 
 from mjx_study.disk import temporary_name
-from mjx_study.study.cell_file import digest_of_arrays
-from mjx_study.study.document import sealed
-from mjx_study.study.run import load_study
-from mjx_study.study.store import Store
+from mjx_study.execution.run import load_study
+from mjx_study.storage.cell_files import digest_of_arrays
+from mjx_study.storage.folder import Store
+from mjx_study.storage.manifest import sealed
 from tests.faults import put_no_file
 
 VALUES: Final = (

@@ -16,10 +16,10 @@ from mjx_study import bench, cli, diagnose, gradcheck, tasks
 from mjx_study.choices import is_file
 from mjx_study.claims import ledger
 from mjx_study.cli import motions, options, studies
+from mjx_study.execution import run
+from mjx_study.experiment.configuration import StudyConfig
+from mjx_study.experiment.plan import plan_study
 from mjx_study.runtime import print_warning
-from mjx_study.study import run
-from mjx_study.study.configuration import StudyConfig
-from mjx_study.study.plan import plan_study
 from mjx_study.tasks import make_task
 from tests.fuzz import strategies
 from tests.fuzz.answers import Planned, Row, answer

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Final
 
 from mjx_study import cli
-from mjx_study.study.store import Store
+from mjx_study.storage.folder import Store
 from tests.fuzz.answers import answer
 
 ANALYTIC: Final = ("pusher", "--horizon", "4", "--contact", "reference", "--stiffness", "10,100", "--chunk-size", "4")

@@ -36,7 +36,7 @@ def only(report: GradcheckReport, verdict: str) -> Finding:
 
 @pytest.fixture
 def configured(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The tests' own settings stand: JAX takes its devices once per process."""
+    """The tests' own cases stand: JAX takes its devices once per process."""
     monkeypatch.setattr(options, "configure", lambda **_: None)
 
 

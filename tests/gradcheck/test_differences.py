@@ -10,7 +10,7 @@ import pytest
 
 from mjx_study.gradcheck.coordinates import make_coordinates
 from mjx_study.gradcheck.differences import RATIO, SIZES, Differences, moves, solution_noise, take_differences
-from mjx_study.gradcheck.programs import Programs, Setting
+from mjx_study.gradcheck.programs import ContactCase, Programs
 from mjx_study.simulation.engine import HostState
 from mjx_study.simulation.scene import put_scene
 
@@ -105,11 +105,11 @@ def test_forces_that_cancel_are_rounded() -> None:
     xml = f"""<mujoco><worldbody><body><joint name="x" type="slide"/><geom size=".1" mass="1"/></body></worldbody>
     <equality>{pull.format(1e5)}{pull.format(1 - 1e5)}</equality><actuator><motor joint="x"/></actuator></mujoco>"""
     layout = make_coordinates(put_scene(mujoco.MjModel.from_xml_string(xml), "scene"), None)
-    programs, setting, ladder = Programs(layout), Setting(None, layout.scales), moves(np.eye(3)[2:])
+    programs, case, ladder = Programs(layout), ContactCase(None, layout.scales), moves(np.eye(3)[2:])
     nothing, zero = np.zeros(0), np.zeros(1)
     state = HostState(zero, zero, nothing, zero, zero)
     for _ in range(2):  # the second time from the solution
-        exact = programs.exact(setting, state, jnp.zeros(1), ladder)
+        exact = programs.exact(case, state, jnp.zeros(1), ladder)
         state = dataclasses.replace(state, warmstart=exact.after.warmstart)
     noise = solution_noise(layout, exact.stages, state.warmstart)
     assert not take_differences(exact.outputs, noise).rough.any()

@@ -13,7 +13,7 @@ import pytest
 
 from mjx_study.gradcheck import coordinates as layouts
 from mjx_study.gradcheck.coordinates import Coordinates, make_coordinates
-from mjx_study.gradcheck.programs import Programs, Setting, _stages
+from mjx_study.gradcheck.programs import ContactCase, Programs, _stages
 from mjx_study.gradcheck.values import EngineStep, Values, compare_values, difference_of_engines
 from mjx_study.simulation import integration, patches
 from mjx_study.simulation._mjx import mjx
@@ -138,12 +138,12 @@ def test_parameters_change_in_the_contact_model(monkeypatch: pytest.MonkeyPatch)
 def value_check(xml: str, qpos: list[float], qvel: list[float], **doctored: Any) -> Values:
     """The values of one step, with whatever is planted, and with other quantities in place of MJX's."""
     own = layout(xml)
-    programs, setting = Programs(own), Setting(None, own.scales)
+    programs, case = Programs(own), ContactCase(None, own.scales)
     state = HostState(np.array(qpos), np.array(qvel), np.zeros(0), np.zeros(0), np.zeros(len(qvel)))
     for _ in range(2):  # the second time from the solution
-        exact = programs.exact(setting, state, jnp.asarray(qpos), np.zeros((1, len(own.inputs))))
+        exact = programs.exact(case, state, jnp.asarray(qpos), np.zeros((1, len(own.inputs))))
         state = dataclasses.replace(state, warmstart=exact.after.warmstart)
-    stock = programs.stock_step(setting, state)
+    stock = programs.stock_step(case, state)
     return compare_values(own, EngineStep(own, None), state, exact.after, stock, exact.stages | doctored)
 
 

@@ -1,0 +1,254 @@
+"""Tests the advice of `mjx-study diagnose` on models that it was not made with, for docs/diagnose.md.
+
+    python -m experiments.advice [PART OF A CASE'S NAME ...]    # the cases that data/advice.jsonl lacks, then the page
+    python -m experiments.advice --page                         # the page alone
+
+Each case compares the estimator that a diagnosis recommends with the best of the five by an independent measurement:
+other random numbers, many batches of the size advised, and a reference gradient from values alone. Compared are root
+mean squared errors after equal seconds, one second on this machine.
+"""
+
+import argparse
+import dataclasses
+import json
+import math
+from collections.abc import Iterator
+from typing import Any, Final
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from estimators import GradientEstimate, make_estimator, oracles_of, squared_bias_of_means
+from estimators.confidence import coverage_interval
+from experiments.pages import DATA, DOCS, with_table
+from mjx_study.choices import DEFAULT_SOLIMP, DEFAULT_SOLREF, STIFF_SOLIMP
+from mjx_study.diagnose import ESTIMATORS, measure
+from mjx_study.experiment.gradients import reference_of
+from mjx_study.experiment.sampling import cell_keys, draw_batches
+from mjx_study.objective import MjxObjective, Simulator, chunk_for
+from mjx_study.runtime import configure, local_devices
+from mjx_study.simulation.contact import contact_model
+from mjx_study.simulation.scene import load_scene
+from mjx_study.table import percent
+from mjx_study.tasks import make_task
+from mjx_study.tasks.mjcf import scene_task
+from mjx_study.tasks.task import Task
+
+RESULTS: Final = DATA / "advice.jsonl"
+HELD_OUT: Final = DATA / "held_out"
+PAGE: Final = DOCS / "diagnose.md"
+KNOWN: Final = ("momentum_transfer",)
+"""Tasks on which the rules of `diagnose` were found; every other model is held out."""
+CONTACTS: Final = {
+    "default": (DEFAULT_SOLREF, DEFAULT_SOLIMP),
+    "soft": ((0.06, 1.0), DEFAULT_SOLIMP),
+    "stiff": ((-1e4, -100.0), STIFF_SOLIMP),
+    "bouncy": ((-5e3, -10.0), DEFAULT_SOLIMP),
+    "ringing": ((0.03, 0.2), DEFAULT_SOLIMP),
+    "half": (DEFAULT_SOLREF, (0.5, 0.95, 0.001, 0.5, 2.0)),
+    "smooth": (DEFAULT_SOLREF, (1e-4, 0.95, 0.02, 0.5, 2.0)),
+}
+FINE: Final = ("cart", "balls")
+"""Models that are taken at half the timestep, too, with the default contact."""
+HORIZON: Final = 80
+SAMPLES: Final = 300
+"""Of each batch of a diagnosis."""
+TOTAL: Final = 2000
+"""Samples of each estimator in the independent measurement."""
+SIZES: Final = (20, 200)
+"""Least and largest size of its batches."""
+PARTS: Final = (8_000, 100, 500)
+"""Pairs of rollouts of the reference, and samples for its control variates."""
+FACTOR: Final = 2.0
+DRAWS: Final = 1000
+SEEDS: Final = (0, 1)
+"""Of the diagnosis, and of the independent measurement."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Case:
+    """One model at one timestep, under one contact."""
+
+    model: str
+    contact: str
+    halved: bool = False
+
+    @property
+    def name(self) -> str:
+        """In the results."""
+        return f"{self.model}, {self.contact}{', half the timestep' if self.halved else ''}"
+
+
+def cases() -> Iterator[Case]:
+    """All of them, those of one program after another. The joint limit of the pendulum is no contact."""
+    held_out = sorted(path.stem for path in HELD_OUT.glob("*.xml"))
+    for model in held_out + list(KNOWN):
+        yield from (Case(model, contact) for contact in (CONTACTS if model != "pendulum" else ("default",)))
+    for model in (*FINE, "pendulum"):
+        yield Case(model, "default", halved=True)
+
+
+def task_of(case: Case) -> Task:
+    """The task of a case."""
+    if case.model in KNOWN:
+        return make_task(case.model)
+    scene, horizon = load_scene(HELD_OUT / f"{case.model}.xml"), HORIZON
+    if case.halved:
+        scene, horizon = load_scene(HELD_OUT / f"{case.model}.xml", timestep=scene.timestep / 2), 2 * HORIZON
+    return scene_task(scene, horizon=horizon)
+
+
+def reference(objective: MjxObjective, key: Any) -> GradientEstimate:
+    """The gradient from values alone; medians of first-order gradients only serve as control variates."""
+    odd, candidate, pilot = (
+        jax.random.split(part, size) for part, size in zip(jax.random.split(key, 3), PARTS, strict=True)
+    )
+    task = objective.simulator.task
+    other = jnp.median(objective.differentiate_corrected(task.theta, jax.random.clone(candidate)).gradient, axis=0)
+    return reference_of(task, objective, odd, candidate, objective.evaluate(task.theta, pilot), other)
+
+
+def measured(objective: MjxObjective, size: int) -> tuple[dict[str, np.ndarray], dict[str, float]]:
+    """Means of many batches by estimator, (batches, params), and seconds of a sample."""
+    task, count = objective.simulator.task, TOTAL // size
+    chosen = [make_estimator(name, gamma=task.defaults.gamma, sigma=task.sigma) for name in ESTIMATORS]
+    keys = cell_keys(SEEDS[1], count)
+    drawn, seconds, _ = draw_batches(objective, task.theta, keys, oracles_of(chosen), size, slice(count))
+    means = {each.name: np.asarray(jax.jit(jax.vmap(lambda part, e=each: e(part).mean))(drawn)) for each in chosen}
+    return means, {each.name: sum(seconds[need] for need in each.needs) / (size * count) for each in chosen}
+
+
+def factors(
+    means: dict[str, np.ndarray], seconds: dict[str, float], size: int, truth: GradientEstimate, advised: str
+) -> dict[str, Any]:
+    """How many times the least error the advised estimator's is after a second, with a 95 % interval.
+
+    The noise of the reference and of the means is taken off the squared bias. In the interval both are drawn again,
+    the same for all estimators, and their noise taken off twice, since it is in there twice.
+    """
+    rng, count = np.random.default_rng(0), len(next(iter(means.values())))
+    noise = np.asarray(jnp.atleast_2d(jnp.cov(truth.per_sample, rowvar=False))) / len(truth.per_sample)
+    gradients = rng.multivariate_normal(np.asarray(truth.mean), noise, DRAWS, method="svd")
+    picked = rng.integers(count, size=(DRAWS, count))
+
+    def error(biases: Any, variance: Any, name: str) -> Any:
+        return np.sqrt(np.maximum(biases, 0.0) + variance * size * seconds[name])
+
+    found, drawn = {}, {}
+    for name, each in means.items():
+        spread = np.sum(np.var(each, axis=0, ddof=1))
+        bias, _ = squared_bias_of_means(jnp.asarray(each), truth)
+        found[name] = float(error(float(bias), spread, name))
+        again = each[picked]
+        gaps = np.sum((again.mean(axis=1) - gradients) ** 2, axis=1)
+        spreads = np.sum(np.var(again, axis=1, ddof=1), axis=1)
+        drawn[name] = error(gaps - 2 * (np.trace(noise) + spread / count), spreads, name)
+    least = np.min(list(drawn.values()), axis=0)
+    low, high = np.quantile(drawn[advised] / least, (0.025, 0.975))
+    best = min(found, key=lambda name: found[name])
+    norm = float(jnp.linalg.norm(truth.mean))
+    return {
+        "best": best,
+        "factor": _short(found[advised] / found[best]),
+        "interval": [_short(low), _short(high)],
+        "errors": {name: _short(value / norm) for name, value in found.items()},
+        "milliseconds": {name: _short(1e3 * value) for name, value in seconds.items()},
+        "pairs": PARTS[0],
+        "reference_error": _short(math.sqrt(np.trace(noise)) / norm),
+    }
+
+
+def _short(value: float) -> float:
+    return float(f"{value:.3g}")
+
+
+def result(case: Case, simulator: Simulator) -> dict[str, Any]:
+    """One line of the results."""
+    solref, solimp = CONTACTS[case.contact]
+    contact = contact_model(solref, solimp, scene=simulator.task.scene) if case.model != "pendulum" else None
+    advice = measure(simulator, contact, SAMPLES, SEEDS[0])
+    needed = advice.samples_needed
+    size = int(np.clip(needed, *SIZES)) if math.isfinite(needed) else SIZES[1]
+    objective = simulator.objective(contact)
+    means, seconds = measured(objective, size)
+    truth = reference(objective, jax.random.key(SEEDS[1] + 1))
+    told = {
+        "case": case.name,
+        "model": case.model,
+        "held_out": case.model not in KNOWN,
+        "advised": advice.best.estimator,
+    }
+    said = {each.estimator: each.verdict for each in advice.estimators if each.paths}
+    return told | {"size": size, **factors(means, seconds, size, truth, advice.best.estimator), "means": said}
+
+
+def read() -> list[dict[str, Any]]:
+    """The results so far, in the order of the cases."""
+    lines = RESULTS.read_text().splitlines() if RESULTS.exists() else []
+    by_name = {each["case"]: each for each in map(json.loads, lines)}
+    return [by_name[case.name] for case in cases() if case.name in by_name]
+
+
+def verdict(each: dict[str, Any]) -> str:
+    """Whether the interval of the factor lies below the limit, beyond, or about it."""
+    low, high = each["interval"]
+    return "good" if high <= FACTOR else "bad" if low > FACTOR else "undecided"
+
+
+def table(results: list[dict[str, Any]]) -> str:
+    """For the page, in Markdown."""
+    lines = ["| models | cases | undecided | within a factor of two | share, 95 % interval | largest factor |"]
+    lines += ["| --- " * 6 + "|"]
+    for what, held_out in (("held out", True), ("known", False)):
+        some = [each for each in results if each["held_out"] is held_out]
+        if not some:
+            continue
+        decided = [each for each in some if verdict(each) != "undecided"]
+        good = [verdict(each) == "good" for each in decided]
+        share, low, high = coverage_interval(jnp.array(good), 0.95)
+        names = ", ".join(f"`{name}`" for name in dict.fromkeys(each["model"] for each in some))
+        row = [f"{what}: {names}", len(some), len(some) - len(decided), f"{sum(good)} of {len(good)}"]
+        row += [f"{percent(share)} ({percent(low)} to {percent(high)})", max(each["factor"] for each in decided)]
+        lines.append(f"| {' | '.join(map(str, row))} |")
+    factors = [each["factor"] for each in results]
+    within, worst = sum(each <= FACTOR for each in factors), max(factors)
+    note = (
+        f"{len(results)} of the {len(list(cases()))} cases of the script were run. By the factor without its interval, "
+    )
+    note += f"{within} of {len(results)} are within two, undecided ones included; the largest is {worst}."
+    return "\n".join([*lines, "", f"*{note}*"])
+
+
+def write_page() -> None:
+    """Put the table into the page."""
+    PAGE.write_text(with_table(PAGE.read_text(), "advice", table(read())))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("parts", nargs="*")
+    parser.add_argument("--page", action="store_true")
+    options = parser.parse_args()
+    configure(cpu_devices=1)
+    mujoco.set_mju_user_warning(lambda message: None)
+    done, made = {each["case"] for each in read()}, {}
+    for case in cases():
+        if (
+            options.page
+            or case.name in done
+            or not (not options.parts or any(part in case.name for part in options.parts))
+        ):
+            continue
+        if (key := (case.model, case.halved)) not in made:
+            made = {key: Simulator(task_of(case), chunk_size=chunk_for(SAMPLES, local_devices()))}
+        line = result(case, made[key])
+        with RESULTS.open("a") as file:
+            file.write(json.dumps(line) + "\n")
+        print(f"{line['case']}: {line['advised']}, {line['factor']:g} {line['interval']}", flush=True)
+    write_page()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,279 @@
+"""Writes the tables of docs/coverage.md: how often each interval covers, how often each test rejects.
+
+    python -m experiments.coverage
+
+A minute on one core. Everything between the markers of the page is replaced; the text around it is written by hand.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, Final, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+import estimators
+from estimators import ENOUGH_EFFECTIVE, ESTIMATORS, make_estimator, summarise
+from experiments.pages import DOCS, with_table
+from mjx_study.reference import LinearQuadratic, ReferenceObjective
+from mjx_study.results.findings import DETECTED_SE
+from mjx_study.runtime import configure
+from mjx_study.table import percent
+
+PAGE: Final = DOCS / "coverage.md"
+SAMPLES: Final = (10, 50, 400)
+TRIALS: Final = 2000
+TOGETHER: Final = 100
+"""Trials that are computed at once."""
+PARAMS: Final = 3
+DRAWS: Final = 199
+REFERENCE: Final = (100, 0.05)
+"""Samples of the reference, and its standard error over the gradient's norm."""
+BIAS: Final = 0.3
+"""Bias over the gradient's norm where a relative error is estimated."""
+SEEDS: Final = 10
+"""Batches behind an estimate of a squared bias."""
+RARE: Final = 0.01
+
+
+class Kind(NamedTuple):
+    """Samples of noise of mean zero.
+
+    Attributes:
+        draw: of a key and a number of samples; (samples, PARAMS).
+        variance: of one sample, the trace of its covariance.
+    """
+
+    draw: Callable[[Array, int], Array]
+    variance: float
+
+
+def _rare(key: Array, samples: int) -> Array:
+    """1 / RARE with probability RARE, less its mean, in the first parameter."""
+    event = jax.random.bernoulli(key, RARE, (samples,)) / RARE - 1.0
+    return event[:, None] * jnp.eye(1, PARAMS)
+
+
+KINDS: Final = {
+    "Gaussian": Kind(lambda key, n: jax.random.normal(key, (n, PARAMS)), float(PARAMS)),
+    "Student's t, 3 degrees": Kind(lambda key, n: jax.random.t(key, 3.0, (n, PARAMS)), 3.0 * PARAMS),
+    "lognormal": Kind(
+        lambda key, n: jnp.exp(jax.random.normal(key, (n, PARAMS))) - np.exp(0.5), (np.e - 1) * np.e * PARAMS
+    ),
+    f"an event of {percent(RARE)}": Kind(_rare, 1 / RARE - 1),
+}
+COLUMNS: Final = {
+    "mean": "mean ± 1.96 se",
+    "apart": f"mean off by {DETECTED_SE:g} se",
+    "variance": "variance",
+    "variances": "two variances told apart",
+    "relative_error": "relative error",
+    "debiased_error": "debiased",
+    "cosine": "cosine",
+    "debiased_cosine": "debiased",
+    "squared_bias": "squared bias",
+    "epsilon": "epsilon",
+}
+"""What is printed of each kind of samples: shares of the trials."""
+
+
+def trials(kind: Kind, samples: int, count: int) -> dict[str, np.ndarray]:
+    """What `count` batches say, and whether that is true; by trial.
+
+    The gradient is as long as half a standard deviation of a sample; rare samples carry the whole of it.
+    """
+    rare = kind.draw is _rare
+    length = 1.0 if rare else 0.5 * kind.variance**0.5
+    gradient = length * jnp.eye(1, PARAMS)[0]
+    offset = BIAS * length * jnp.eye(PARAMS)[1]
+    others, uncertainty = REFERENCE
+
+    def one(key: Array) -> dict[str, Array]:
+        streams = jax.random.split(key, 3)
+        batch = summarise(gradient + kind.draw(streams[0], samples))
+        scale = uncertainty * length * (others / PARAMS) ** 0.5
+        reference = summarise(gradient + scale * jax.random.normal(streams[1], (others, PARAMS)))
+        lower, upper = estimators.variance_interval(batch, 0.95)
+        off = jnp.abs(batch.mean - gradient)[0] / batch.standard_error[0]
+        epsilon = estimators.bernstein_epsilon(
+            batch, failure_probability=0.05, variance_proxy="variance", radius="max_deviation"
+        )
+        test = estimators.bias_test(batch, reference, streams[2], num_draws=DRAWS)
+        biased = summarise(batch.per_sample + offset)
+        found = estimators.compare(biased, reference)
+        said = {
+            "mean": off <= 1.96,
+            "apart": off > DETECTED_SE,
+            "variance": (lower <= kind.variance) & (kind.variance <= upper),
+            "epsilon": jnp.linalg.norm(batch.mean - gradient) <= epsilon,
+            "rejects": test.p_value <= 0.05,
+            "believable": test.effective_samples >= ENOUGH_EFFECTIVE,
+        }
+        for name, exact in (("error", BIAS), ("cosine", (1 + BIAS**2) ** -0.5)):
+            raw = "relative_error" if name == "error" else name
+            for field in (raw, f"debiased_{name}"):
+                said[field] = jnp.abs(getattr(found, field) - exact) <= 1.96 * getattr(found, f"{field}_se")
+        return said | {"lower": lower, "upper": upper, "biased": biased.mean, "reference": reference}
+
+    return _map(one, jax.random.split(jax.random.key(samples), count)) | {"bias": BIAS * length}
+
+
+def _map(function: Callable[[Array], Any], keys: Array) -> Any:
+    """Over all keys, some at a time, as NumPy arrays."""
+    program = jax.jit(lambda keys: jax.lax.map(function, keys, batch_size=TOGETHER))
+    return jax.tree.map(np.asarray, program(keys))
+
+
+def shares(found: dict[str, Any]) -> dict[str, float]:
+    """Each column's share of the trials."""
+    said = {name: float(np.mean(found[name])) for name in COLUMNS if name in found}
+    apart = found["upper"][::2] < found["lower"][1::2]
+    apart |= found["lower"][::2] > found["upper"][1::2]
+    groups = len(found["biased"]) // SEEDS
+    means = jnp.asarray(found["biased"][: groups * SEEDS].reshape(groups, SEEDS, PARAMS))
+    references = jax.tree.map(lambda leaf: jnp.asarray(leaf[: groups * SEEDS : SEEDS]), found["reference"])
+    value, error = jax.jit(jax.vmap(estimators.squared_bias_of_means))(means, references)
+    held = np.abs(np.asarray(value) - found["bias"] ** 2) <= 1.96 * np.asarray(error)
+    return said | {"variances": float(np.mean(apart)), "squared_bias": float(np.mean(held))}
+
+
+def coverage_rows(name: str, samples: int, count: int = TRIALS) -> tuple[list[str], list[str]]:
+    """One row of the table of intervals, and one of the table of the test for bias."""
+    found = trials(KINDS[name], samples, count)
+    said = shares(found)
+    return (
+        [name, str(samples), *(_share(said[column]) for column in COLUMNS)],
+        [name, str(samples), *_verdicts(found)],
+    )
+
+
+def _verdicts(found: dict[str, Any]) -> list[str]:
+    rejects, believable = found["rejects"], found["believable"]
+    among = _share(float(np.mean(rejects[believable]))) if np.sum(believable) >= 50 else "-"
+    return [_share(float(np.mean(rejects))), _share(float(np.mean(believable))), among]
+
+
+def rare_row(expected: float, samples: int, count: int = TRIALS) -> list[str]:
+    """The test for bias where so many of a batch's samples, on average, carry the whole gradient."""
+    probability = expected / samples
+
+    def one(key: Array) -> dict[str, Array]:
+        event, noise, draws = jax.random.split(key, 3)
+        batch = summarise(jax.random.bernoulli(event, probability, (samples, 1)) / probability)
+        reference = summarise(1.0 + 0.01 * jax.random.normal(noise, (REFERENCE[0], 1)))
+        test = estimators.bias_test(batch, reference, draws, num_draws=DRAWS)
+        plain = jnp.abs(batch.mean - 1.0)[0] > 1.96 * batch.standard_error[0]
+        return {
+            "rejects": test.p_value <= 0.05,
+            "believable": test.effective_samples >= ENOUGH_EFFECTIVE,
+            "plain": plain,
+        }
+
+    found = _map(one, jax.random.split(jax.random.key(1), count))
+    return [f"{expected:g}", str(samples), _share(float(np.mean(found["plain"]))), *_verdicts(found)]
+
+
+def dimension_row(params: int, bias: float, uncertainty: float, samples: int = 400, count: int = 300) -> list[str]:
+    """Relative error and cosine where noise of an eighth of the gradient's norm is spread over many parameters."""
+    gradient, others = jnp.eye(1, params)[0], 600
+    offset = bias * jnp.roll(gradient, 1)
+
+    def one(key: Array) -> estimators.Comparison:
+        mine, theirs = jax.random.split(key)
+        noise = 0.125 * (samples / params) ** 0.5 * jax.random.normal(mine, (samples, params))
+        reference = uncertainty * (others / params) ** 0.5 * jax.random.normal(theirs, (others, params))
+        return estimators.compare(summarise(gradient + offset + noise), summarise(gradient + reference))
+
+    found = _map(one, jax.random.split(jax.random.key(2), count))
+    row = [str(params), f"{uncertainty:g}", f"{bias:g}"]
+    for field, exact in (
+        ("relative_error", bias),
+        ("debiased_error", bias),
+        ("cosine", (1 + bias**2) ** -0.5),
+        ("debiased_cosine", (1 + bias**2) ** -0.5),
+    ):
+        value, error = getattr(found, field), getattr(found, f"{field}_se")
+        held = np.mean(np.abs(value - exact) <= 1.96 * error)
+        row += [f"{np.mean(value):.3f} ± {np.mean(error):.3f}", _share(float(held))]
+    return row
+
+
+WEIGHED: Final = ("ivw", "ivw_h", "total_propagation", "ddcg")
+
+
+def weights_rows(samples: int, count: int = 20_000) -> list[list[str]]:
+    """Relative bias and variance of the mean with either kind of weights, on a linear-quadratic problem."""
+    weight = np.array([[1.0, 0.2], [0.2, 0.5]])
+    system = LinearQuadratic(
+        np.array([[0.9, 0.3], [-0.2, 0.8]]), np.array([[0.5, 0.1], [-0.3, 0.7]]), weight, np.diag([0.3, 0.2]), weight
+    )
+    problems = {
+        "feedback": (ReferenceObjective(system, (1.0, -0.5), 3, 0.4, "feedback"), np.array([0.4, 0.1, 0.2, 0.5])),
+        "open loop": (ReferenceObjective(system, (1.0, -0.5), 3, 0.4), np.full(6, -0.2)),
+    }
+    rows = []
+    for problem, (objective, theta) in problems.items():
+        needed = estimators.oracles_of(ESTIMATORS[name] for name in WEIGHED)
+        drawn = estimators.draw(needed, objective, jnp.asarray(theta), jax.random.key(3), samples * count)
+        many = jax.random.split(jax.random.key(4), 400_000)
+        exact = np.mean(np.asarray(objective.differentiate(jnp.asarray(theta), many).gradient), axis=0)
+        drawn = jax.tree.map(lambda leaf: jnp.asarray(leaf).reshape(count, samples, *leaf.shape[1:]), drawn)
+        for name in WEIGHED:
+            mine = {oracle: drawn[oracle] for oracle in ESTIMATORS[name].needs}
+            row, errors = [problem, name, str(samples)], []
+            for weights in estimators.WEIGHTS:
+                estimator = make_estimator(name, sigma=objective.sigma, weights=weights)
+                program = jax.jit(jax.vmap(lambda batch, estimator=estimator: estimator(batch).mean))
+                means = np.asarray(program(mine))
+                bias = np.linalg.norm(np.mean(means, axis=0) - exact) / np.linalg.norm(exact)
+                errors.append(np.sum(np.var(means, axis=0)))
+                row.append(percent(float(bias), 1))
+            rows.append([*row, f"{errors[1] / errors[0]:.2f}"])
+    return rows
+
+
+def _share(value: float) -> str:
+    return f"{value:.3f}" if 0 < value < 0.1 else f"{value:.2f}"
+
+
+def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """In Markdown."""
+    lines = [header, ["---"] * len(header), *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def tables() -> dict[str, str]:
+    """Every table of the page, by its name."""
+    both = [coverage_rows(name, samples) for name in KINDS for samples in SAMPLES]
+    test = ["rejects at 5 %", "believable", "rejects of those"]
+    wide = ["relative error", "covers", "debiased", "covers", "cosine", "covers", "debiased", "covers"]
+    return {
+        "intervals": table(["samples of", "n", *COLUMNS.values()], [row for row, _ in both]),
+        "test": table(["samples of", "n", *test], [row for _, row in both]),
+        "rare": table(
+            ["rare samples expected", "n", "z test", *test],
+            [rare_row(expected, n) for expected, n in ((0.1, 50), (0.4, 50), (1, 50), (3.2, 400), (8, 400), (20, 400))],
+        ),
+        "dimensions": table(
+            ["parameters", "reference ±", "true error", *wide],
+            [dimension_row(*case) for case in ((5, 0.3, 0.02), (200, 0.3, 0.02), (200, 0.3, 0.1), (200, 0.0, 0.02))],
+        ),
+        "weights": table(
+            ["problem", "estimator", "N", "bias, plug-in", "bias, cross-fitted", "variance, cross-fitted / plug-in"],
+            [*weights_rows(10), *weights_rows(40, 5000)],
+        ),
+    }
+
+
+def main() -> None:
+    configure()
+    page = PAGE.read_text()
+    for name, text in tables().items():
+        page = with_table(page, name, text)
+    PAGE.write_text(page)
+    print(f"written: {PAGE}")
+
+
+if __name__ == "__main__":
+    main()

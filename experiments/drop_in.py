@@ -1,0 +1,102 @@
+"""Prints the table of docs/differentiable-mjx.md: `mjx_study.step` against `mjx.step`, on this machine.
+
+    python -m experiments.drop_in
+    python -m experiments.drop_in --batch 1024    # on an accelerator
+
+A few minutes on one core, most of it compiling. Stock's gradient is the one it has, of a step of one solver iteration.
+"""
+
+import argparse
+import statistics
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Final
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from mujoco import mjx
+
+import mjx_study
+from experiments.pages import ROOT
+
+TESTED: Final = Path(mjx.__file__).parent / "test_data"
+MODELS: Final = {
+    "`pusher` of this project": ROOT / "models" / "pusher.xml",
+    "`convex`": TESTED / "convex.xml",
+    "`barkour_v0`, a quadruped": TESTED / "barkour_v0" / "assets" / "barkour_v0_mjx.xml",
+    "`humanoid`": TESTED / "humanoid" / "humanoid.xml",
+}
+STEPS: Final = 20
+REPEATS: Final = 9
+SETTLING: Final = 0.3
+"""Time before the first state [s], in which bodies fall to the floor."""
+
+
+def start_states(host: mujoco.MjModel, batch: int) -> tuple[np.ndarray, np.ndarray]:
+    """A batch of positions and velocities, in contact where the model has a floor."""
+    data, noise = mujoco.MjData(host), np.random.default_rng(0)
+    if host.nkey:
+        mujoco.mj_resetDataKeyframe(host, data, 0)
+    while data.time < SETTLING:
+        mujoco.mj_step(host, data)
+    return np.tile(data.qpos, (batch, 1)), data.qvel + 0.1 * noise.standard_normal((batch, host.nv))
+
+
+def measured(path: Path, batch: int) -> dict[str, float]:
+    """Median seconds of a batch of rollouts and of their gradients, through both steps, interleaved."""
+    host = mujoco.MjModel.from_xml_path(str(path))
+    model, data = mjx.put_model(host), mjx.make_data(host)
+    qpos, qvel = start_states(host, batch)
+    controls = np.zeros((batch, STEPS, host.nu))
+
+    def program(step: Callable[..., mjx.Data], iterations: int, gradient: bool) -> Callable[[], Any]:
+        stepped = model.replace(opt=model.opt.replace(iterations=iterations))
+
+        def last(qvel, controls, qpos):
+            def advance(data, control):
+                return step(stepped, data.replace(ctrl=control)), None
+
+            end = jax.lax.scan(advance, data.replace(qpos=qpos, qvel=qvel), controls)[0]
+            return jnp.sum(end.qpos) + jnp.sum(end.qvel)
+
+        function = jax.grad(last, argnums=(0, 1)) if gradient else last
+        compiled = jax.jit(jax.vmap(function)).lower(qvel, controls, qpos).compile()
+        return lambda: compiled(qvel, controls, qpos)
+
+    budget = int(host.opt.iterations)
+    programs = {
+        "stock": program(mjx.step, budget, gradient=False),
+        "ours": program(mjx_study.step, budget, gradient=False),
+        "stock_gradient": program(mjx.step, 1, gradient=True),
+        "gradient": program(mjx_study.step, budget, gradient=True),
+        "gradient_once": program(mjx_study.step, 1, gradient=True),
+    }
+    times: dict[str, list[float]] = {name: [] for name in programs}
+    for _ in range(REPEATS + 1):
+        for name, call in programs.items():
+            start = time.perf_counter()
+            jax.block_until_ready(call())
+            times[name].append(time.perf_counter() - start)
+    return {name: statistics.median(seconds[1:]) for name, seconds in times.items()} | {"nv": host.nv, "budget": budget}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--batch", type=int, default=64, help="rollouts at once")
+    batch = parser.parse_args().batch
+    mjx_study.configure(cpu_devices=1)
+    print("| model | DoF | rollouts / stock | gradients / stock, one iteration | the same, budget of the model |")
+    print("| --- " * 5 + "|")
+    for name, path in MODELS.items():
+        found = measured(path, batch)
+        over = [found["stock"] / found["ours"]]
+        over += [found["stock_gradient"] / found[each] for each in ("gradient_once", "gradient")]
+        budget = f"{over.pop():.2f} ({found['budget']:g})"
+        print(f"| {name} | {found['nv']:g} | {over[0]:.2f} | {over[1]:.2f} | {budget} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()

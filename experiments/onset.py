@@ -1,0 +1,160 @@
+"""Prints the tables of docs/onset-correction.md.
+
+python -m experiments.onset            # momentum_transfer and ball_wall, by quadrature; half an hour on one core
+python -m experiments.onset tennis     # means along four directions of the gains; an hour on one core
+python -m experiments.onset rule       # error of the linear term over the onset strength, 11 contact laws
+"""
+
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from estimators import NOISES, first_order, zeroth_order
+from experiments.atlas.measure import task_of
+from mjx_study.experiment.landscapes import Line, Means, grid, means
+from mjx_study.experiment.resolution import direction_of
+from mjx_study.experiment.tally import onset_numbers
+from mjx_study.objective import Simulator
+from mjx_study.results.variables import ONSETS
+from mjx_study.runtime import configure
+from mjx_study.simulation.contact import contact_model, family_model
+from mjx_study.table import percent
+from mjx_study.tasks import make_task
+from mjx_study.tasks.task import Task
+
+ANGLES = {"momentum_transfer": (0.3, 0.5, 0.7), "ball_wall": (0.2, 0.7, 0.9)}
+TREATMENTS = ("none", "linear", "jump")
+TIMESTEPS = (0.004, 0.002, 0.001, 0.0005)
+POINTS = 20_000
+CHUNK = 1000
+DIRECTIONS, SAMPLES, PAIRS, REACHES = 4, 20_000, 40_000, (0.01, 0.02, 0.04)  # of tennis
+LAWS = (
+    *(((constant, 1.0), (0.9, 0.95)) for constant in (0.01, 0.02, 0.04)),
+    *(((0.02, damping), (0.9, 0.95)) for damping in (0.5, 2.0)),
+    *(((0.02, 1.0), impedance) for impedance in ((0.5, 0.5), (0.7, 0.7), (0.9, 0.9), (0.95, 0.95), (0.99, 0.99))),
+    ((0.02, 1.0), (0.5, 0.95)),
+)
+"""solref and the impedances at and below touch; it rises over 1 mm."""
+RULED = (
+    ("momentum_transfer", 0.001, ANGLES["momentum_transfer"]),
+    ("momentum_transfer", 0.002, ANGLES["momentum_transfer"]),
+    ("ball_wall", 0.002, ANGLES["ball_wall"][:1]),
+)
+"""Task, timestep and angles whose error is compared with the onset strength."""
+
+
+def measure(task: Task, angles: tuple[float, ...]) -> tuple[Means, list[list[float]]]:
+    """Means at the angles through MuJoCo's default contact; deviations there of one ZoBG and one FoBG sample."""
+    contact = family_model("mujoco_default", task.scene, effective_mass=task.effective_mass)
+    position = np.array(angles)
+    points = grid(position.min(), position.max(), task.sigma, POINTS, task.noise)
+    values, slopes = Line(task)(points, contact)
+    noise, deviations = NOISES[task.noise], []
+    for at in position:
+        w = (points - at) / task.sigma
+        zeroth = (values - np.interp(at, points, values)) * w / task.sigma  # Gaussian noise
+        deviations.append([_deviation(each, noise.density(w)) for each in (zeroth, slopes)])
+    return means(points, values, slopes, position, task.sigma, task.noise), deviations
+
+
+def _deviation(samples: np.ndarray, weights: np.ndarray) -> float:
+    mean = np.average(samples, weights=weights)
+    return float(np.average((samples - mean) ** 2, weights=weights) ** 0.5)
+
+
+def tennis() -> None:
+    """Print means and deviations along random directions of the gains, and the differences of the mean cost."""
+    tasks = {onset: make_task("tennis").replace(onset=onset) for onset in TREATMENTS}
+    plain = tasks["none"]
+    contact = family_model("mujoco_default", plain.scene, effective_mass=plain.effective_mass)
+    objectives = {onset: Simulator(task, CHUNK).objective(contact) for onset, task in tasks.items()}
+    keys, pairs = (jax.random.split(jax.random.key(seed), size) for seed, size in enumerate((SAMPLES, PAIRS)))
+    along = [direction_of("random", plain.policy.num_params, seed) for seed in range(DIRECTIONS)]
+    _print("`tennis`, direction", [str(1 + index) for index in range(DIRECTIONS)])
+    for reach in REACHES:
+        ends = [
+            [objectives["none"].evaluate(plain.theta + t * each, pairs).value for t in (-reach, reach)]
+            for each in along
+        ]
+        _row(f"difference over ± {reach}", [np.asarray(above - below) / (2 * reach) for below, above in ends])
+    zeroth = zeroth_order(objectives["none"].evaluate(plain.theta, keys), "zero_noise").per_sample
+    found = {"ZoBG": np.asarray(zeroth)}
+    for onset, objective in objectives.items():
+        differentiate = objective.differentiate if onset == "none" else objective.differentiate_corrected
+        found[onset] = np.asarray(first_order(differentiate(plain.theta, keys)).per_sample)
+    for name, samples in found.items():
+        _row(name, [samples @ each for each in along])
+    for name, samples in found.items():
+        _print(f"deviation: {name}", [f"{np.std(samples @ each, ddof=1):.0f}" for each in along])
+
+
+def rule() -> None:
+    """Print the error of the linear term as a share of what it adds, over the onset strength."""
+    cases = []
+    for name, timestep, angles in RULED:
+        task = task_of(name, timestep)
+        lines = [Line(task.replace(onset=onset)) for onset in ("none", "linear")]
+        simulator, position = Simulator(task.replace(onset="linear"), CHUNK), np.array(angles)
+        points = grid(position.min(), position.max(), task.sigma, POINTS, task.noise)
+        keys = jax.random.split(jax.random.key(0), 512)
+        for solref, impedance in LAWS:
+            contact = contact_model(solref, (*impedance, 0.001, 0.5, 2.0), scene=task.scene)
+            plain, linear = (means(points, *line(points, contact), position, task.sigma, task.noise) for line in lines)
+            share = np.abs(linear.first - linear.slope) / np.abs(linear.first - plain.first)
+            unsure = (linear.slope_error + linear.first_error) / np.abs(linear.first - plain.first)
+            objective = simulator.objective(contact)
+            for at, angle in enumerate(angles):
+                events = objective.differentiate_corrected(jnp.array([angle]), keys).events
+                strength = dict(zip(ONSETS, onset_numbers(np.asarray(events)), strict=True))["onset_strength"]
+                cases.append(share[at] / strength)
+                cells = (share[at], unsure[at], strength, cases[-1])
+                _print(
+                    f"{name}, {1e3 * timestep:g} ms, {angle}, {solref}, {impedance}", [f"{each:.3g}" for each in cells]
+                )
+    print(f"{len(cases)} cases: {min(cases):.2g} to {max(cases):.2g}, median {np.median(cases):.2g}")
+
+
+def main() -> None:
+    """Print Markdown."""
+    configure(cpu_devices=1)
+    if chosen := sys.argv[1:]:
+        {"tennis": tennis, "rule": rule}[chosen[0]]()
+        return
+    for name, angles in ANGLES.items():
+        found = {onset: measure(make_task(name).replace(onset=onset), angles) for onset in TREATMENTS}
+        plain, deviations = found["none"]
+        _print(f"`{name}`", [f"{angle} rad" for angle in angles])
+        _print("slope", _with_errors(plain.slope, plain.slope_error))
+        for onset, (each, _) in found.items():
+            _print(onset, _with_errors(each.first, each.first_error))
+        _print("deviation: ZoBG", [f"{zeroth:.3g}" for zeroth, _ in deviations])
+        each = [[own[index][1] for _, own in found.values()] for index in range(len(angles))]
+        _print("FoBG, linear, jump", [", ".join(f"{value:.2g}" for value in row) for row in each])
+        for onset in ("linear", "jump"):
+            ratios = [(zeroth / own[1]) ** 2 for (zeroth, _), own in zip(deviations, found[onset][1], strict=True)]
+            _print(f"variance of ZoBG over {onset}", [f"{ratio:.2g}" for ratio in ratios])
+    _print("`momentum_transfer`, h", [f"{angle} rad" for angle in ANGLES["momentum_transfer"]])
+    for timestep in TIMESTEPS:
+        task = task_of("momentum_transfer", timestep)
+        for onset in ("linear", "jump"):
+            each, _ = measure(task.replace(onset=onset), ANGLES["momentum_transfer"])
+            _print(f"{onset}, {1e3 * timestep:g} ms", [percent(error, 2) for error in abs(each.first / each.slope - 1)])
+
+
+def _row(name: str, samples: list[np.ndarray]) -> None:
+    values = [(np.mean(each), np.std(each, ddof=1) / len(each) ** 0.5) for each in samples]
+    _print(name, [f"{mean:.0f} ± {error:.0f}" for mean, error in values])
+
+
+def _with_errors(values: np.ndarray, errors: np.ndarray) -> list[str]:
+    return [f"{value:.5f} ± {error:.1g}" for value, error in zip(values, errors, strict=True)]
+
+
+def _print(name: str, cells: list[str]) -> None:
+    print(f"| {name} | {' | '.join(cells)} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()

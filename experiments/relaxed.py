@@ -1,0 +1,49 @@
+"""The tables of surrogate derivatives in first-order-bias.md: means and spread of first-order gradients, by quadrature.
+
+Run as python -m experiments.relaxed; half an hour on two cores, nothing is kept.
+"""
+
+import dataclasses
+import math
+
+import numpy as np
+
+from mjx_study.claims.laboratory import EFFORTS, RELAXATIONS, Laboratory, Landscape, Slopes
+from mjx_study.runtime import configure
+
+ANGLES = {"momentum_transfer": (0.3, 0.5, 0.7), "ball_wall": (0.2, 0.7, 0.9)}
+FAMILIES = ("mujoco_default", "mujoco_stiff")
+STIFFNESS = 10_000.0
+TREATMENTS: dict[str, dict[str, str]] = {"exact": {}, "onset term": {"onset": "linear"}} | {
+    name: {"relaxed": name} for name in RELAXATIONS
+}
+
+
+def standard_deviation(at: Slopes) -> float:
+    """Of one first-order gradient, by the quadrature's landscape."""
+    table, sigma = at.objective.function, at.objective.sigma
+    assert isinstance(table, Landscape)
+    weight = np.exp(-0.5 * ((table.points - at.theta) / sigma) ** 2)
+    mean = float(np.average(table.slopes, weights=weight))
+    return math.sqrt(float(np.average((table.slopes - mean) ** 2, weights=weight)))
+
+
+def main() -> None:
+    """Print Markdown."""
+    configure()
+    lab = Laboratory(dataclasses.replace(EFFORTS["quick"], density=120))
+    for task, angles in ANGLES.items():
+        header = [task, "contact", *(f"{angle}: E[FoBG] / slope, deviation" for angle in angles)]
+        print(f"\n| {' | '.join(header)} |\n|{' --- |' * len(header)}")
+        for family in FAMILIES:
+            for name, treatment in TREATMENTS.items():
+                row = [name, f"`{family}`"]
+                for angle in angles:
+                    at = lab.slopes(task, family, angle, stiffness=STIFFNESS, **treatment)  # type: ignore[arg-type]
+                    share, error = at.first / at.gradient, sum(at.errors)
+                    row.append(f"{share:.3g} ± {error:.1g}, {standard_deviation(at) / abs(at.gradient):.2g}")
+                print(f"| {' | '.join(row)} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,198 @@
+"""Check an estimator's mean by its integral along a path, compared with the difference of the mean cost.
+
+The mean of first-order gradients can be wrong even if the derivative of every step is right, which no check of single
+steps reveals.
+"""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from typing import Any, Final
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from estimators import Estimator, GradientEstimate, Objective, oracles_of
+from estimators.mean_check import TOLERANCE, Circulation, circulations
+from estimators.registry import label_of
+from mjx_study.experiment.configuration import check_span
+from mjx_study.experiment.resolution import check_estimators, direction_of
+from mjx_study.experiment.sampling import cell_keys, draw_batches
+from mjx_study.objective import Simulator, chunk_for
+from mjx_study.progress import Progress, silent
+from mjx_study.results.variables import MEANS
+from mjx_study.runtime import local_devices
+from mjx_study.table import as_plain, format_table, percent
+from mjx_study.tasks.contact_grid import ContactPoint
+from mjx_study.tasks.task import Task
+
+HALF_LENGTH: Final = 2.0
+"""Length of the path to either side of theta, in standard deviations of noise on theta."""
+FEEDBACK: Final = 0.02
+"""The same for noise on the controls, in the unit of theta."""
+ALONG_MEANS: Final = "means"
+"""Value of `direction` for paths along the estimators' own means, see `along_means`."""
+MAX_PATHS: Final = 3
+SHARES: Final = ("relative_gap", "detectable")
+"""Columns shown in per cent."""
+MIN_SHARE: Final = 1e-3
+"""Smallest share of a mean orthogonal to the others that warrants a path along it."""
+
+
+@dataclasses.dataclass(frozen=True)
+class MeanCheck:
+    """Check of one estimator for one contact model; made by `mjx_study.gradcheck.check_mean`.
+
+    Attributes:
+        contact, stiffness: contact model and its stiffness [N/m], 0 if not defined by one.
+        estimator: name of the estimator whose mean is checked.
+        circulation: integral of its mean, compared with the difference of the cost.
+        verdict: "right" within `estimators.mean_check.TOLERANCE`, "biased", or "undecided".
+    """
+
+    contact: str
+    stiffness: float
+    estimator: str
+    circulation: Circulation
+    verdict: str
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain data, including the gap and its 99.9 % interval as shares of the difference."""
+        numbers = {name: float(value) for name, value in vars(self.circulation).items()}
+        scale = abs(numbers["difference"]) or math.nan
+        numbers |= {"half_width": float(self.circulation.half_width), "relative_gap": numbers["gap"] / scale}
+        numbers |= {"detectable": 2 * numbers["half_width"] / scale}
+        named = {"contact": self.contact, "stiffness": self.stiffness, "estimator": self.estimator}
+        return as_plain(named | numbers | {"verdict": self.verdict})
+
+
+def reach_of(task: Task) -> float:
+    """Default half length of a path through a task's theta [unit of theta]."""
+    return HALF_LENGTH * task.sigma if task.policy.additive else FEEDBACK
+
+
+def path_of(task: Task, span: Sequence[float] | None, direction: str) -> str:
+    """Describe the path, or paths, along which means are checked."""
+    low, high = span or (-reach_of(task), reach_of(task))
+    unit = getattr(task.policy, "unit", "")
+    through = f"theta = {float(task.theta[0]):g}" if task.policy.num_params == 1 else f"theta, direction {direction}"
+    return f"path: {low:.3g} to {high:.3g}{f' {unit}' if unit else ''} about {through}"
+
+
+def along_means(
+    estimators: Sequence[Estimator],
+    objective: Objective,
+    theta: Float[Array, " params"],
+    reach: float,
+    estimates: Sequence[GradientEstimate],
+    samples: int,
+    seed: int,
+) -> list[list[Circulation]]:
+    """Check means along up to three orthogonal paths, which share the samples; results by path and estimator.
+
+    The first path follows the most precise estimate, the others the orthogonal parts of the next ones: only there does
+    a bias orthogonal to the gradient show. Their differences of the mean cost are replaced by the first path's, so that
+    all gaps are shares of the gradient.
+    """
+    paths = [reach * jnp.asarray(unit, theta.dtype) for unit in _at_right_angles(estimates)]
+    each = max(2, samples // len(paths))
+    found = [
+        circulations(estimators, objective, theta - along, theta + along, jax.random.key(seed), each) for along in paths
+    ]
+    return [
+        [dataclasses.replace(one, difference=first.difference) for one, first in zip(path, found[0], strict=True)]
+        for path in found
+    ]
+
+
+def _at_right_angles(estimates: Sequence[GradientEstimate]) -> list[np.ndarray]:
+    """Orthonormal vectors that span the means, the most precise first, without negligible parts."""
+    units: list[np.ndarray] = []
+    for estimate in sorted(estimates, key=lambda each: float(each.variance / jnp.sum(each.mean**2))):
+        left = mean = np.asarray(estimate.mean, float)
+        for unit in units:
+            left = left - (left @ unit) * unit
+        size = float(np.linalg.norm(left))
+        if len(units) < MAX_PATHS and size > MIN_SHARE * float(np.linalg.norm(mean)):
+            units.append(left / size)
+    return units or [np.eye(len(np.asarray(estimates[0].mean)))[0]]
+
+
+def unmixed(estimators: Sequence[Estimator], batches: dict[str, Any]) -> list[GradientEstimate]:
+    """Compute the estimates that use a single batch, without interpolation; all if there are none."""
+    single = [estimator for estimator in estimators if len(estimator.needs) == 1]
+    return [estimator(batches) for estimator in single or estimators]
+
+
+def check_mean(
+    task: Task,
+    cells: Sequence[ContactPoint],
+    estimators: Sequence[Estimator],
+    *,
+    samples: int,
+    seed: int,
+    names: Sequence[str] = (),
+    span: Sequence[float] | None = None,
+    direction: str = "random",
+    tolerance: float = TOLERANCE,
+    progress: Progress = silent,
+) -> list[MeanCheck]:
+    """Check every estimator for every contact model.
+
+    Args:
+        task: task with the theta that the path passes through, and its onset treatment.
+        cells: contact models to check the estimators for.
+        estimators: estimators with their options; they share the samples.
+        samples: samples at each node of the path.
+        seed: random seed of the samples and of a random direction.
+        names: names of the estimators in the checks; by default their own.
+        span: ends of the path, from theta along the direction [unit of theta]; None for two standard deviations of the
+            noise to either side, or 0.02 for noise on the controls.
+        direction: "random", the index of a parameter, or "means" for the paths of `along_means`.
+        tolerance: share of the cost's difference within which a mean is right.
+        progress: called with (contact models done, their total number, label of the next).
+
+    Raises:
+        ValueError: an estimator's formula does not apply to the task, or the direction is invalid.
+    """
+    check_estimators(estimators, task)
+    check_span(span)
+    low, high = span or (-reach_of(task), reach_of(task))
+    axis = "random" if direction == ALONG_MEANS else direction
+    along = jnp.asarray(direction_of(axis, task.policy.num_params, seed), task.theta.dtype)
+    simulator = Simulator(task, chunk_size=chunk_for(samples, local_devices(), [task]))
+    found, ends = [], (task.theta + low * along, task.theta + high * along)
+    for index, cell in enumerate(cells):
+        progress(index, len(cells), cell.label)
+        objective, key = simulator.objective(cell.contact), jax.random.key(seed)
+        if direction == ALONG_MEANS:
+            batches, _, _ = draw_batches(
+                objective, task.theta, cell_keys(seed, 1), oracles_of(estimators), samples, slice(1)
+            )
+            estimates = unmixed(estimators, jax.tree.map(lambda leaf: leaf[0], batches))
+            paths = along_means(estimators, objective, task.theta, reach_of(task), estimates, samples, seed)
+        else:
+            paths = [circulations(estimators, objective, *ends, key, samples)]
+        found += [
+            MeanCheck(cell.family, cell.stiffness_or_zero, name, each, each.verdict(tolerance))
+            for numbers in paths
+            for name, each in zip(names or [estimator.name for estimator in estimators], numbers, strict=True)
+        ]
+    progress(len(cells), len(cells), "done")
+    return found
+
+
+def lines_of(checks: Sequence[MeanCheck], onset: str = "none") -> list[str]:
+    """Format the checks as a table; its columns are described in `MEANS`."""
+
+    def shown(name: str, value: Any) -> str:
+        return percent(value, 1) if name in SHARES and value is not None else MEANS[name].text(value)
+
+    rows = []
+    for check in checks:
+        told, stiffness = check.as_dict(), f"{check.stiffness:g}" if check.stiffness else "-"
+        numbers = [shown(name, told[name]) for name in MEANS if name != "verdict"]
+        rows.append([check.contact, stiffness, label_of(check.estimator, onset), *numbers, check.verdict])
+    return format_table(rows, ["contact", "K [N/m]", "estimator", *(variable.heading for variable in MEANS.values())])

@@ -1,0 +1,1 @@
+"""Computation of a study's cells, here or on a cluster."""

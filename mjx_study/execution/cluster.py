@@ -1,0 +1,289 @@
+"""Compute a study's cells on several machines with Dask: workers return arrays, and only the client writes files.
+
+A worker has one task at a time, a cell or a block of a cell whose batches are split, and gets the next once the client
+has its arrays. A worker that dies thus loses a single, known task. Workers keep compiled programs by the content of the
+study, and a task goes to a worker that has compiled its program, if there is one. The client merges blocks.
+"""
+
+import functools
+import logging
+import math
+import os
+import pickle
+import queue
+import re
+import sys
+import threading
+import time
+from collections import Counter, defaultdict, deque
+from collections.abc import Callable, Generator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
+from glob import glob
+from typing import Any, Final
+
+from mjx_study.disk import temporary_folder
+from mjx_study.execution.cells import Computation
+from mjx_study.execution.times import recording
+from mjx_study.experiment.blocks import Arrays
+from mjx_study.experiment.checkpoint import Checkpoint, StudyError
+from mjx_study.experiment.plan import StudyPlan, blocks_of, plan_study
+from mjx_study.identity import differences, versions
+from mjx_study.runtime import available_cores, configure, precision
+from mjx_study.stopwatch import Stopwatch
+from mjx_study.watchdog import watch
+
+TRIES: Final = 3
+"""Attempts at a task before its cell counts as failed."""
+CONNECT_SECONDS: Final = 30
+"""Timeout for reaching a scheduler."""
+POLL_SECONDS: Final = 1.0
+"""Interval between polls of the workers."""
+SELDOM: Final = {
+    "distributed.admin.tick.interval": "1s",
+    "distributed.admin.system-monitor.interval": "5s",
+    "distributed.worker.memory.monitor-interval": "1s",
+    "distributed.worker.profile.enabled": False,
+}
+"""Intervals of Dask's housekeeping, which this process does for every local worker: with 100 workers, the defaults keep
+a core busy."""
+PRIVATE: Final = {"distributed.scheduler.http.routes": [], "distributed.worker.http.routes": []}
+"""Pages of local workers, which anybody on the machine could read: none."""
+GPUS: Final = "/dev/nvidia[0-9]*"
+_ONE_AT_A_TIME, _SET_UP = threading.Lock(), threading.Event()
+Task = tuple[int, int | None]
+"""Index of a cell, and number of one of its tasks in `Blocks`; None for a whole cell."""
+
+
+class WorkerRefusedError(Exception):
+    """A worker's numbers would differ from the client's."""
+
+
+@contextmanager
+def connected(cluster: str) -> Generator[Any]:
+    """Connect a `distributed.Client` to a scheduler's address, or to workers that live as long as the context.
+
+    Args:
+        cluster: "local:N", N local processes, which only this process can connect to; "slurm:N", N workers as
+            configured in Dask's jobqueue.yaml; or an address such as "tcp://host:8786". Without N, one process per
+            core, or one Slurm worker.
+
+    Raises:
+        ValueError: Dask is not installed, or the cluster cannot be reached.
+    """
+    kind, _, count = cluster.partition(":")
+    address: Any = cluster
+    with ExitStack() as stack:  # closes the client and any workers started here
+        try:
+            import dask.config
+            import distributed
+
+            logging.getLogger("distributed").setLevel(logging.CRITICAL)  # this module reports on workers
+            if kind == "local":
+                scratch = {"temporary-directory": stack.enter_context(temporary_folder())}
+                stack.enter_context(dask.config.set(SELDOM | PRIVATE | scratch))
+                local = distributed.LocalCluster(
+                    n_workers=int(count or available_cores()),
+                    threads_per_worker=1,
+                    processes=True,
+                    dashboard_address="127.0.0.1:0",  # of the server of HTTP, which has nothing to serve
+                    scheduler_kwargs={"dashboard": False},
+                    silence_logs=logging.CRITICAL,
+                    security=distributed.Security.temporary(),  # anybody on this machine may connect to a port
+                )
+                address = stack.enter_context(local)
+            elif kind == "slurm":
+                from dask_jobqueue.slurm import SLURMCluster
+
+                address = stack.enter_context(SLURMCluster())
+                address.scale(int(count or 1))
+            client = stack.enter_context(distributed.Client(address, timeout=CONNECT_SECONDS, set_as_default=False))
+        except ImportError as error:
+            raise ValueError(f"a cluster needs Dask ({error}): pip install 'mjx-study[cluster]'") from error
+        except OSError as error:
+            raise ValueError(f"cannot reach the cluster {cluster}: {error}") from error
+        yield client
+
+
+def cells_on(
+    client: Any, plan: StudyPlan, parts: Mapping[int, Checkpoint], told: Callable[[int], None]
+) -> Generator[tuple[int, Arrays | str]]:
+    """Compute cells on a cluster whose workers may come and go.
+
+    Args:
+        parts: checkpoint of each cell to compute, by index; finished blocks are added to it.
+        told: called with the number of workers whenever it changes.
+
+    Yields:
+        Index and arrays of each cell in order of completion, or the reason why it failed `TRIES` times.
+
+    Raises:
+        StudyError: a worker has other versions, or the connection to the scheduler is lost.
+    """
+    study, computation = _packed(plan), Computation(plan)
+    begun = {
+        index: computation.compute.restored(plan.cells[index], part)
+        for index, part in parts.items()
+        if blocks_of(plan, plan.cells[index]) > 1
+    }
+    waiting: dict[Any, deque[Task]] = defaultdict(deque)
+    has: dict[Any, set[str]] = defaultdict(set)  # workers that have compiled a program
+    at: dict[Any, tuple[Task, str]] = {}  # task and worker of each future
+    ended: queue.SimpleQueue[Any] = queue.SimpleQueue()
+    tries: Counter[Task] = Counter()
+
+    def program_of(index: int) -> Any:
+        return plan.program_of(plan.cells[index])
+
+    def begin(worker: str) -> None:
+        for program in _program_for(worker, waiting, has):
+            task = waiting[program].popleft()
+            has[program].add(worker)
+            index, block = task
+            kept = dict(parts[index].kept) if block is None else {}
+            future = client.submit(_compute, study, index, kept, block, workers=[worker], pure=False)
+            at[future] = task, worker
+            future.add_done_callback(fetch)
+
+    def fetch(future: Any) -> None:
+        """Runs in a thread of Dask, which blocks here if the worker is lost before its arrays arrive."""
+        try:
+            outcome = future.result()
+        except BaseException as error:  # any exception on the worker, or a cancellation
+            outcome = error
+        ended.put((future, outcome))
+
+    def tried(task: Task, reason: str) -> Generator[tuple[int, str]]:
+        """Count a failed attempt; yield the cell's failure if it was the last attempt at it or at one of its blocks."""
+        index, block = task
+        if block is not None and index not in begun:
+            return  # another of its blocks has exhausted its attempts
+        tries[task] += 1
+        tasks = waiting[program_of(index)]
+        if tries[task] >= TRIES:
+            begun.pop(index, None)
+            waiting[program_of(index)] = deque(other for other in tasks if other[0] != index)
+            yield index, reason
+        elif block is None:
+            tasks.append(task)
+        else:
+            tasks.appendleft(task)  # finished blocks wait to be merged with it
+
+    def merged(index: int) -> tuple[int, Arrays]:
+        return index, computation.compute.merged(plan.cells[index], begun.pop(index))
+
+    def ended_with(task: Task, arrays: Arrays) -> Generator[tuple[int, Arrays]]:
+        """Yield the arrays of a cell if this was its last task."""
+        index, block = task
+        if block is None:
+            yield index, arrays
+        elif index in begun:
+            blocks = begun[index]
+            blocks.add(block, arrays)
+            parts[index].save(blocks.arrays())
+            left = len(blocks.missing)
+            parts[index].report(blocks.tasks - left, blocks.tasks, f"{plan.label(plan.cells[index])}, in blocks")
+            if not left:
+                yield merged(index)
+
+    for index in parts:
+        tasks = begun[index].missing if index in begun else [None]
+        waiting[program_of(index)].extend((index, task) for task in tasks)
+        if not tasks:
+            yield merged(index)
+    looked, count = -math.inf, -1
+    try:
+        while at or any(waiting.values()):
+            if time.monotonic() - looked >= POLL_SECONDS:
+                workers, looked = set(client.nthreads()), time.monotonic()
+                for holders in has.values():
+                    holders &= workers
+                for future, (task, worker) in list(at.items()):
+                    if worker not in workers:
+                        del at[future]
+                        future.cancel()
+                        yield from tried(task, f"lost its worker {TRIES} times (killed, crashed or out of memory)")
+                for worker in workers - {worker for _, worker in at.values()}:
+                    begin(worker)
+                if len(workers) != count:
+                    count = len(workers)
+                    told(count)
+            # Assign new tasks to all idle workers before writing any arrays, which takes time.
+            done = []
+            for future, outcome in _all_of(ended):
+                if future in at:
+                    task, worker = at.pop(future)
+                    if isinstance(outcome, WorkerRefusedError):
+                        raise StudyError(str(outcome)) from outcome
+                    begin(worker)
+                    done.append((task, outcome))
+            for task, outcome in done:
+                if isinstance(outcome, BaseException):
+                    yield from tried(task, f"{type(outcome).__name__}: {outcome}".partition("\n")[0])
+                else:
+                    yield from ended_with(task, outcome)
+    except OSError as error:
+        raise StudyError(f"lost the scheduler ({error}); the same command resumes") from error
+    finally:
+        with suppress(OSError):
+            client.cancel(list(at))
+
+
+def _all_of(ended: queue.SimpleQueue[Any]) -> Generator[Any]:
+    """Empty the queue, waiting a while for the first item."""
+    with suppress(queue.Empty):
+        yield ended.get(timeout=POLL_SECONDS)
+        for _ in range(ended.qsize()):
+            yield ended.get_nowait()
+
+
+def _program_for(worker: str, waiting: Mapping[Any, deque[Any]], has: Mapping[Any, set[str]]) -> list[Any]:
+    """Choose the program of a worker's next cell; none if workers that have one compiled will be sooner.
+
+    Prefers programs that the worker has compiled, then those with the most cells per worker that has them.
+    """
+    left = {program: len(cells) for program, cells in waiting.items() if cells}
+    own = [program for program in left if worker in has[program]]
+    new = [program for program, cells in left.items() if cells > len(has[program])]
+    return sorted(own or new, key=lambda program: left[program] / (1 + len(has[program])))[-1:]
+
+
+def _packed(plan: StudyPlan) -> bytes:
+    """Pack the configuration, and what a worker's own plan must agree with."""
+    import cloudpickle
+
+    return cloudpickle.dumps((plan.config, plan.chunk_size, precision(), versions(), plan.contents))
+
+
+def _compute(study: bytes, index: int, kept: Arrays, block: int | None) -> Arrays:
+    with _ONE_AT_A_TIME:
+        plan, computation, watch = _prepared(study)
+        cell = plan.cells[index]
+        with recording(watch):
+            return computation(cell, Checkpoint(kept)) if block is None else computation.compute.block(cell, block)
+
+
+@functools.lru_cache(maxsize=4)
+def _prepared(study: bytes) -> tuple[StudyPlan, Computation, Stopwatch]:
+    """Set up JAX once; return the plan, its `Computation` with compiled programs, and a stopwatch."""
+    from distributed import get_worker
+
+    config, chunk, asked, *client = pickle.loads(study)
+    if not _SET_UP.is_set():
+        if (gpu := _gpu(get_worker().name)) is not None:
+            os.environ["CUDA_VISIBLE_DEVICES"] = gpu
+        configure(precision=asked, cpu_devices=1)
+        watch(functools.partial(print, file=sys.stderr))  # a worker that hangs is lost, and its task tried again
+        _SET_UP.set()
+    plan = plan_study(config)
+    ours = versions(), plan.contents
+    if told := differences(*({**one, **other} for one, other in (client, ours))):
+        raise WorkerRefusedError(f"the worker {get_worker().address} is refused: {told} ('there' is the client)")
+    plan = plan.with_chunk(chunk)
+    return plan, Computation(plan), Stopwatch()
+
+
+def _gpu(worker: Any) -> str | None:
+    """GPU of a worker whose name is a number or ends with one after a hyphen; None leaves the choice to JAX."""
+    visible, number = os.environ.get("CUDA_VISIBLE_DEVICES"), re.fullmatch(r"(?:.*-)?(\d+)", str(worker))
+    gpus = visible.split(",") if visible else [path.removeprefix("/dev/nvidia") for path in sorted(glob(GPUS))]
+    return gpus[int(number[1]) % len(gpus)] if number and len(gpus) > 1 else None

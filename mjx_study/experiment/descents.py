@@ -1,0 +1,306 @@
+"""Gradient descent in a cell: every estimator, several seeds at once, resuming from the last checkpoint.
+
+All seeds of an estimator advance in one compiled program. With MJX, its rollouts and updates stay on one device, and
+estimators run in parallel on as many devices as there are; analytic systems are simulated in NumPy. Iteration i of seed
+s has its own random key, so an interrupted run ends bitwise identical to an uninterrupted one; all estimators share
+these keys.
+"""
+
+import dataclasses
+import math
+import threading
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import cached_property, partial
+from typing import Any, Final
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Key
+
+from estimators import Estimator, draw
+from estimators.registry import draw_at, sample_keys
+from mjx_study.compiled import Compiled
+from mjx_study.experiment.checkpoint import Checkpoint
+from mjx_study.experiment.iteration import Descent, Record, advance, begin, going, make_optimizer, schedule_factors
+from mjx_study.experiment.plan import StudyCell, StudyPlan, estimators_of
+from mjx_study.experiment.sampling import rollouts_of
+from mjx_study.objective import Simulator, TracedObjective, simulate
+from mjx_study.reference import Reference
+from mjx_study.results.variables import HISTORY, METRIC, START
+from mjx_study.simulation.contact import ContactModel, soften
+from mjx_study.tasks.contact_grid import ContactPoint
+
+REPORT_EVERY: Final = 10
+"""Iterations between progress reports, which wait for the device."""
+SAVE_SECONDS: Final = 20.0
+"""Seconds between checkpoints."""
+TOGETHER: Final = 1000
+"""Rollouts of an analytic system per batch; more take memory and save little time."""
+
+
+def compute_descents(plan: StudyPlan) -> Callable[..., dict[str, np.ndarray]]:
+    """Return a function that computes cells and keeps compiled programs between them."""
+    backends: dict[tuple[Any, ...], Backend] = {}
+
+    def compute(cell: StudyCell, part: Checkpoint = Checkpoint()) -> dict[str, np.ndarray]:  # noqa: B008, it is empty
+        key = (cell.group, cell.sigma, cell.samples, cell.model.stiffness_or_zero if cell.model.analytic else None)
+        if key not in backends:
+            backends[key] = Backend(plan, cell)
+        backend, kept = backends[key], dict(part.kept)
+        runs = [
+            _Run(backend, cell.model, each, index, kept, part) for index, each in enumerate(estimators_of(plan, cell))
+        ]
+        with ThreadPoolExecutor(backend.threads) as pool:
+            each_in_turn = map if backend.threads == 1 else pool.map
+            list(each_in_turn(_Run.descend, runs))
+        numbers = [run.numbers() for run in runs]
+        found = {name: np.stack([each[name] for each in numbers], axis=-1) for name in numbers[0] if name != "theta"}
+        found["theta"] = np.stack([each["theta"] for each in numbers], axis=1)  # (seed, estimator, param)
+        mean, error = backend.cost(backend.task.theta, cell.model)
+        start = backend.metrics(backend.task.theta, cell.model)
+        found |= {"start_cost": np.array(mean), "start_cost_se": np.array(error)}
+        found |= {START + name: np.array(value) for name, value in start.items()}
+        return kept | {name: np.asarray(array, float) for name, array in found.items()}
+
+    return compute
+
+
+class Backend:
+    """Source of rollouts: MJX, in programs shared by all contact models, or an analytic system on the host."""
+
+    def __init__(self, plan: StudyPlan, cell: StudyCell):
+        group, config = plan.groups[cell.group], plan.config
+        self.task, self.recipe, self.samples = group.task.replace(sigma=cell.sigma), group.descent, cell.samples
+        self.config, self.seeds = config, config.batches
+        self.optimizer = make_optimizer(config.settings.optimizer, self.recipe.learning_rate, self.recipe.decay)
+        self.simulator = None if cell.model.analytic else Simulator(self.task, chunk_size=plan.chunk_size)
+        self.saving = threading.Lock()
+        iterations = self.recipe.iterations
+        self._stiffness = schedule_factors(config.stiffness_schedule, iterations, most=1.0)
+        self._sigma = self.task.sigma * schedule_factors(config.sigma_schedule, iterations)
+        self._iterations: dict[Estimator, Callable[..., tuple[Descent, Record]]] = {}
+
+    @property
+    def threads(self) -> int:
+        """Number of estimators to advance in parallel."""
+        return 1 if self.simulator is None else len(self.simulator.devices)
+
+    def place(self, state: Descent, index: int) -> Descent:
+        """Put the state of an estimator on its device; on CPUs always the first, see `spread`."""
+        if self.simulator is None:
+            return state
+        device = self.simulator.devices[index % self.threads]
+        return jax.device_put(state, self.simulator.devices[0] if device.platform == "cpu" else device)
+
+    def iteration(
+        self, estimator: Estimator, model: ContactPoint
+    ) -> Callable[[Descent, Key[Array, " seeds"], int], tuple[Descent, Record]]:
+        """Return an iteration of all seeds under one contact model, by index; compiled once for all contact models."""
+
+        def update(state: Descent, drawn: dict[str, Any]) -> tuple[Descent, Record]:
+            return advance(state, drawn, estimator, self.optimizer)
+
+        if (simulator := self.simulator) is not None:
+            if estimator not in self._iterations:
+
+                def simulated_update(contact, sigma, state: Descent, keys):
+                    objective = TracedObjective(simulator, contact, sigma)
+                    batches = partial(draw, estimator.needs, objective, num_samples=self.samples)
+                    return update(state, jax.vmap(batches)(state.theta, keys))
+
+                made_of = "descent", estimator, self.optimizer, self.task, self.samples, simulator.chunk_size
+                self._iterations[estimator] = Compiled(simulated_update, *made_of)
+            simulated = self._iterations[estimator]
+
+            def on_device(state: Descent, keys: Key[Array, " seeds"], index: int) -> tuple[Descent, Record]:
+                factor, contact = self._stiffness[index], model.contact
+                contact = contact if contact is None or factor == 1 else soften(contact, factor)
+                return simulated(contact, self._sigma[index], state, keys)
+
+            return on_device
+        compiled = self._iterations.setdefault(estimator, jax.jit(update))
+        count = max(1, TOGETHER // self.samples)
+
+        def on_host(state: Descent, keys: Key[Array, " seeds"], index: int) -> tuple[Descent, Record]:
+            task = self.task.replace(sigma=float(self._sigma[index]))
+            reference = task.analytic(model.stiffness_or_zero * float(self._stiffness[index]))
+            groups = [slice(first, first + count) for first in range(0, self.seeds, count)]
+            parts = [self._together(estimator.needs, reference, state.theta[some], keys[some]) for some in groups]
+            return compiled(state, jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts))
+
+        return on_host
+
+    def _together(
+        self,
+        needs: Sequence[str],
+        reference: Reference,
+        theta: Float[Array, "seeds params"],
+        keys: Key[Array, " seeds"],
+    ) -> dict[str, Any]:
+        """Draw the batches of several seeds as one, so that NumPy's loops over steps run once for all."""
+        each = jnp.repeat(theta, self.samples, axis=0)
+        drawn = draw_at(needs, reference, each, [jnp.ravel(part) for part in self._sample_keys(keys)])
+        return jax.tree.map(lambda leaf: leaf.reshape(len(theta), self.samples, *leaf.shape[1:]), drawn)
+
+    @cached_property
+    def _sample_keys(self) -> Callable[[Key[Array, " seeds"]], list[Key[Array, "seeds samples"]]]:
+        """`sample_keys` over several seeds."""
+        return jax.jit(jax.vmap(partial(sample_keys, num_samples=self.samples)))
+
+    def cost(self, theta: Float[Array, " params"], model: ContactPoint) -> tuple[float, float]:
+        """Mean cost with noise at theta, over samples with the same noise for every theta, and its standard error."""
+        analytic, simulator = self.task.analytic, self.simulator
+        objective = analytic(model.stiffness_or_zero) if simulator is None else simulator.objective(model.contact)
+        value = np.asarray(objective.evaluate(theta, self._evaluation_keys()).value)
+        value = value[np.isfinite(value)]
+        if len(value) < 2:
+            return math.nan, math.nan
+        return float(np.mean(value)), float(np.std(value, ddof=1) / math.sqrt(len(value)))
+
+    def metrics(self, theta: Float[Array, " params"], model: ContactPoint) -> dict[str, float]:
+        """Means of the task's metrics over the rollouts of `cost`, nonfinite values excluded."""
+        if self.simulator is None:
+            found = self.task.analytic(model.stiffness_or_zero).observe(theta, self._evaluation_keys())
+        elif self.task.metrics is None:
+            return {}
+        else:
+            found = jax.device_get(self._observe(theta, model.contact, self._evaluation_keys()))
+        return {name: float(np.mean(values, where=np.isfinite(values))) for name, values in sorted(found.items())}
+
+    def _evaluation_keys(self) -> Key[Array, " samples"]:
+        key = jax.random.fold_in(jax.random.key(self.config.seed), 2**31 - 1)
+        return jax.random.split(key, self.config.settings.evaluation_samples)
+
+    @cached_property
+    def _observe(self) -> Compiled:
+        """Program for the task's metrics of each sample, as a function of theta, contact and keys."""
+
+        def one(theta: Float[Array, " params"], contact: ContactModel | None, key: Key[Array, ""]) -> dict[str, Array]:
+            states, *_ = simulate(self.task, theta, contact, key, 1.0)
+            return self.task.metrics(states)  # type: ignore[misc]
+
+        return Compiled(jax.vmap(one, (None, None, 0)), "metrics", self.task)
+
+
+@dataclasses.dataclass
+class _Run:
+    """Descents of one estimator from all seeds; `index` is its place among those of the cell, whose checkpoint `kept`
+    all add to."""
+
+    backend: Backend
+    model: ContactPoint
+    estimator: Estimator
+    index: int
+    kept: dict[str, np.ndarray]
+    part: Checkpoint
+
+    def __post_init__(self) -> None:
+        """Begin at the start, or restore a run from its checkpoint; and compile an iteration."""
+        backend, index = self.backend, self.index
+        self.state = begin(backend.optimizer, backend.task.theta, backend.seeds)
+        self.records: list[Record] = []
+        self.seconds: list[float] = []
+        if f"seconds_{index}" in self.kept:
+            with self.part.restored():
+                self._restore()
+        self.already = len(self.records)
+        self.state = backend.place(self.state, index)
+        seeds = jnp.arange(backend.seeds)
+        keys = jax.vmap(lambda seed: jax.random.fold_in(jax.random.key(backend.config.seed), seed))(seeds)
+        fold_in = jax.vmap(jax.random.fold_in, (0, None))
+        self._keys_of = jax.jit(lambda iteration: fold_in(jax.random.clone(keys), iteration))
+        self._iterate = backend.iteration(self.estimator, self.model)
+        if self.already < backend.recipe.iterations and bool(jnp.any(going(self.state))):
+            first = self._keys_of(self.already)
+            jax.block_until_ready(self._iterate(self.state, first, self.already))  # compile; discard the result
+
+    def _restore(self) -> None:
+        """Take state, records and times from the checkpoint; KeyError or ValueError if it is not of this run."""
+        leaves, structure = jax.tree.flatten(self.state)
+        length = self.kept[f"seconds_{self.index}"].size
+        if length > self.backend.recipe.iterations:
+            raise ValueError(f"it has {length} iterations")
+
+        def kept(name: str, shape: tuple[int, ...], kind: str) -> np.ndarray:
+            array = self.kept[name]
+            if array.shape != shape or array.dtype.kind != kind:
+                raise ValueError(f"{name} has shape {array.shape} and type {array.dtype}")
+            return array
+
+        state = [kept(f"state_{self.index}_{i}", leaf.shape, leaf.dtype.kind) for i, leaf in enumerate(leaves)]
+        each = length, self.backend.seeds
+        columns = [kept(f"history_{self.index}_{name}", each, "f") for name in HISTORY]
+        self.state = structure.unflatten(map(jnp.asarray, state))
+        self.records += [Record(*map(jnp.asarray, row)) for row in zip(*columns, strict=True)]
+        self.seconds += map(float, kept(f"seconds_{self.index}", (length,), "f"))
+
+    def descend(self) -> None:
+        """Run the remaining iterations, writing a checkpoint now and then and at the end."""
+        iterations, done, pending = self.backend.recipe.iterations, self.already, []
+        last = saved = time.perf_counter()
+        while done < iterations and (pending or bool(jnp.any(going(self.state)))):
+            self.state, record = self._iterate(self.state, self._keys_of(done), done)
+            pending.append(record)
+            done += 1
+            if len(pending) >= REPORT_EVERY:
+                last = self._collect(pending, last)
+                total = len(self.backend.config.estimators) * iterations
+                self.part.report(self.index * iterations + done, total, self.estimator.name)
+                if last - saved > SAVE_SECONDS:
+                    self._save()
+                    saved = last = time.perf_counter()
+        if pending:
+            self._collect(pending, last)
+        if done > self.already:
+            self._save()
+
+    def _collect(self, pending: list[Record], since: float) -> float:
+        """Fetch records from the device, and return when they arrived."""
+        self.records += jax.device_get(pending)
+        now, elapsed = time.perf_counter(), self.seconds[-1] if self.seconds else 0.0
+        self.seconds += [elapsed + (now - since) * (place + 1) / len(pending) for place in range(len(pending))]
+        pending.clear()
+        return now
+
+    def _save(self) -> None:
+        with self.backend.saving:
+            leaves = jax.tree.leaves(self.state)
+            self.kept.update({f"state_{self.index}_{leaf}": np.asarray(value) for leaf, value in enumerate(leaves)})
+            self.kept.update({f"history_{self.index}_{name}": values for name, values in self._history().items()})
+            self.kept[f"seconds_{self.index}"] = np.array(self.seconds)
+            self.part.save(dict(self.kept))
+
+    def _history(self) -> dict[str, Float[np.ndarray, "iterations seeds"]]:
+        shape = len(self.records), self.backend.seeds
+        return {
+            name: np.array([getattr(record, name) for record in self.records], float).reshape(shape) for name in HISTORY
+        }
+
+    def numbers(self) -> dict[str, np.ndarray]:
+        """Numbers of the run, once it has ended."""
+        backend, history = self.backend, self._history()
+        costs = [backend.cost(theta, self.model) for theta in self.state.theta]
+        metrics = [backend.metrics(theta, self.model) for theta in self.state.theta]
+        reason = np.asarray(self.state.reason)
+        done = np.sum(~np.isnan(history["nonfinite"]), axis=0)
+        calls = [rollouts_of(each, backend.samples, backend.task.random_start) for each in self.estimator.needs]
+        found = {name: _padded(values, backend.recipe.iterations) for name, values in history.items()}
+        return found | {
+            "theta": np.asarray(self.state.theta),
+            "seconds": _padded(np.array(self.seconds), backend.recipe.iterations),
+            "stopped_at": np.where(reason > 0, done, np.nan),
+            "reason": np.where(reason > 0, reason, np.nan),
+            "final_cost": np.array([mean for mean, _ in costs]),
+            "final_cost_se": np.array([error for _, error in costs]),
+            "rollouts": np.array(sum(rollouts for rollouts, _ in calls)),
+            **{METRIC + name: np.array([each[name] for each in metrics]) for name in metrics[0]},
+        }
+
+
+def _padded(values: np.ndarray, length: int) -> np.ndarray:
+    """Pad values with NaN to a length along the first axis."""
+    missing = [(0, length - len(values))] + [(0, 0)] * (values.ndim - 1)
+    return np.pad(np.asarray(values, float), missing, constant_values=np.nan)

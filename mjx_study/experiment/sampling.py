@@ -1,0 +1,125 @@
+"""Sample a cell: keys, batches of every oracle over seeds, and solver residuals."""
+
+import time
+from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
+from functools import partial
+from typing import Any, Final
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, Key
+
+from estimators import ORACLES, Linearisation
+from mjx_study.experiment.memory import batches_at_once, padded_size
+from mjx_study.experiment.plan import StudyCell, StudyPlan
+from mjx_study.objective import MjxObjective, Simulator
+from mjx_study.reference import Reference
+
+MOST_RESIDUAL: Final = {"float64": 1e-6, "float32": 1e-3}
+"""Relative solver residual above which a sample is reported as unconverged."""
+
+
+class Objectives:
+    """The objective of each cell of a plan; all contact models and noises of a group share compiled programs."""
+
+    def __init__(self, plan: StudyPlan):
+        self._plan, self._compiled = plan, {}
+
+    def simulator(self, group: int) -> Simulator:
+        if group not in self._compiled:
+            self._compiled[group] = Simulator(self._plan.groups[group].task, chunk_size=self._plan.chunk_size)
+        return self._compiled[group]
+
+    def __call__(self, cell: StudyCell) -> MjxObjective | Reference:
+        if cell.model.analytic:
+            return self._plan.groups[cell.group].task.replace(sigma=cell.sigma).analytic(cell.model.stiffness_or_zero)
+        return self.simulator(cell.group).objective(cell.model.contact, cell.sigma)
+
+
+def cell_keys(seed: int, seeds: int) -> dict[str, Any]:
+    """Independent keys for each seed's batches, the reference and the tests; the same in every cell."""
+    zeroth, first, odd, candidate, test = jax.random.split(jax.random.key(seed), 5)
+    by_order = [jax.random.split(stream, seeds) for stream in (zeroth, first)]
+    return {"order": by_order, "reference": (odd, candidate), "test": test}
+
+
+@partial(jax.jit, static_argnums=2)
+def sample_keys(key: Key[Array, ""], first: int | Int[Array, ""], count: int) -> Key[Array, " count"]:
+    """Keys of consecutive samples of a batch, each a function of its index alone."""
+    indices = jnp.asarray(first, jnp.uint32) + jnp.arange(count, dtype=jnp.uint32)
+    return jax.vmap(lambda index: jax.random.fold_in(key, index))(indices)
+
+
+_keys_of_seeds = jax.jit(jax.vmap(sample_keys, (0, None, None)), static_argnums=2)
+
+
+def draw_batches(
+    objective: Any,
+    theta: Array,
+    keys: dict[str, Any],
+    oracles: Sequence[str],
+    samples: int,
+    seeds: slice,
+    first: int = 0,
+    *,
+    device: AbstractContextManager[Any] = nullcontext(),  # noqa: B008, it has no state
+) -> tuple[dict[str, Any], dict[str, float], dict[str, np.ndarray]]:
+    """Draw batches of every oracle, with a leading axis of seeds.
+
+    Args:
+        samples, first: number of samples per batch, and index of the first one if the batch is part of a larger one.
+        device: context held during each timed call.
+
+    Returns:
+        By oracle: the batch, its computing time [s], and each rollout's solver residual.
+    """
+    together = batches_at_once(samples)
+    drawn, seconds, residuals = {}, {}, {}
+    for name in oracles:
+        streams: Key[Array, " seeds"] = jax.random.clone(keys["order"][ORACLES[name].order])[seeds]
+        parts, seconds[name] = [], 0.0
+        for start in range(0, len(streams), together):
+            some = jax.random.clone(streams)[start : start + together]
+            flat = _keys_of_seeds(some, first, padded_size(samples))[:, :samples].reshape(-1)
+            with device:
+                begun = time.perf_counter()
+                batch = jax.block_until_ready(getattr(objective, ORACLES[name].method)(theta, flat))
+                seconds[name] += time.perf_counter() - begun
+            residuals[name] = np.concatenate([residuals.get(name, np.zeros(0)), residuals_of(batch)])
+            parts.append(jax.tree.map(lambda leaf: leaf.reshape(len(leaf) // samples, samples, *leaf.shape[1:]), batch))
+        drawn[name] = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
+    return drawn, seconds, residuals
+
+
+def rollouts_of(oracle: str, samples: int, random_start: bool) -> tuple[int, int]:
+    """Number of rollouts in a batch, baselines included, and how many of them are differentiated."""
+    return sum(rows for _, rows in calls_of(oracle, samples, random_start)), samples * ORACLES[oracle].order
+
+
+def calls_of(oracle: str, samples: int, random_start: bool) -> list[tuple[str, int]]:
+    """Programs of `MjxObjective` called for a batch, each with its number of rows, baselines included."""
+    baselines = samples if random_start else min(samples, 1)
+    return {
+        "evaluation": [("value", samples + baselines)],
+        "pair": [("value", 2 * samples + baselines)],
+        "steps": [("steps", samples), ("steps", baselines)],
+        "step_pair": [("steps", 2 * samples), ("steps", baselines)],
+        "differentiation": [("gradient", samples)],
+        "corrected": [("corrected", samples)],
+        "step_differentiation": [("step_gradient", samples)],
+        "linearisation": [("linearisation", samples), ("steps", baselines)],
+    }[oracle]
+
+
+def residuals_of(batch: Any) -> Float[np.ndarray, " rollouts"]:
+    """Each rollout's solver residual in a batch of any kind; empty for an analytic system."""
+    parts = batch if isinstance(batch, tuple) else (batch,)
+    steps = [part.steps if isinstance(part, Linearisation) else part for part in parts]
+    return np.concatenate([np.zeros(0) if part.residual is None else np.asarray(part.residual) for part in steps])
+
+
+def unconverged(residuals: np.ndarray, precision: str) -> int:
+    """Number of residuals that are too large or nonfinite."""
+    return int(np.sum(~(residuals <= MOST_RESIDUAL[precision])))

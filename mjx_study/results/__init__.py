@@ -1,0 +1,1 @@
+"""Quantities of a study, and the findings that they support."""

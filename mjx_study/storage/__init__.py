@@ -1,0 +1,1 @@
+"""The folder of a study: its manifest, cells and labelled arrays."""

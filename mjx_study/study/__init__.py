@@ -1,1 +1,0 @@
-"""Studies: configuration, planning, computation of cells, and storage."""

@@ -1,0 +1,49 @@
+"""gradcheck --mean: through MuJoCo's default contact first order is biased, with the onset term it is not."""
+
+import json
+
+import jax.numpy as jnp
+import pytest
+
+from estimators import make_estimator
+from mjx_study.cli import main, options
+from mjx_study.diagnose.means import check_mean, lines_of
+from mjx_study.tasks import make_task
+from mjx_study.tasks.contact_grid import family_grid
+
+
+@pytest.mark.slow
+def test_the_bias_of_first_order_is_found_and_is_gone_with_the_onset_term() -> None:
+    task = make_task("momentum_transfer").replace(theta=jnp.full(1, 0.3))
+    cells, _ = family_grid(task, ("mujoco_default",))
+    chosen = [make_estimator(name) for name in ("fobg", "fobg_onset")]
+    plain, corrected = check_mean(task, cells, chosen, samples=400, seed=0)
+    assert plain.verdict == "biased" and plain.circulation.gap > 0.4 * abs(plain.circulation.difference)
+    assert corrected.verdict == "right"
+    assert 2 * corrected.circulation.half_width < 0.05 * abs(corrected.circulation.difference)
+    assert len(lines_of([plain, corrected])) >= 3
+
+
+def test_estimators_take_their_options(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """A norm that no sample reaches clips none."""
+    monkeypatch.setattr(options, "configure", lambda **_: None)
+    chosen = ["--estimators", "fobg,fobg_clipped", "--max-norm", "1e9", "--samples", "5", "--json"]
+    main(["gradcheck", "tests.carts:walled_cart", "--contact", "penalty", "--stiffness", "10", "--mean", *chosen])
+    plain, clipped = json.loads(capsys.readouterr().out)["checks"]
+    assert clipped == plain | {"estimator": "fobg_clipped"}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["pusher", "--samples", "9"], "--samples is for --mean"),
+        (["pusher", "--window", "9"], "--window is for --mean"),
+        (["pusher", "--mean", "--estimators", "fobg_clipped"], "'fobg_clipped' needs the option --max-norm; set it"),
+        (["model.xml", "--mean"], "no MJCF file at model.xml"),
+        (["tennis", "--mean", "--estimators", "delta"], "'delta' needs noise that is added to theta itself"),
+        (["tennis", "--mean", "--onset", "jump", "--estimators", "total_propagation"], "have no onset term"),
+    ],
+)
+def test_what_has_no_meaning_is_refused(arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["gradcheck", *arguments]) == 2
+    assert message in capsys.readouterr().err
