@@ -47,29 +47,20 @@ from estimators.confidence import (
     variance_interval,
     variance_upper_bound,
 )
+from estimators.estimator import ESTIMATORS, Batches, Estimator, register
 from estimators.interpolation import alpha_order, constrained_alpha, interpolate, inverse_variance_alpha, weigh_batches
 from estimators.mean_check import Circulation, circulation
 from estimators.noise import NOISES, NoiseDensity
-from estimators.registry import (
-    ESTIMATORS,
-    Batches,
-    Estimator,
-    draw,
-    estimate,
-    find_estimator,
-    make_estimator,
-    oracles_of,
-    register,
-)
+from estimators.recursion import total_propagation, truncated_first_order
+from estimators.registry import find_estimator, make_estimator, oracles_of
 from estimators.samples import Rows
+from estimators.sampling import draw, estimate
 from estimators.statistics import norm_quantiles, summarise
 from estimators.stepwise import (
     antithetic_cost_to_go,
     cost_to_go,
     discontinuity_gated,
     stepwise_inverse_variance,
-    total_propagation,
-    truncated_first_order,
 )
 from estimators.zeroth_first import (
     BASELINES,

@@ -123,6 +123,13 @@ def choose_alpha(
     )
 
 
+def inverse_variance_choice(zeroth: GradientEstimate, first: GradientEstimate) -> AlphaChoice:
+    """Choose a weight with `inverse_variance_alpha` and record its inputs."""
+    alpha = inverse_variance_alpha(zeroth.variance, first.variance)
+    discrepancy = jnp.linalg.norm(first.mean - zeroth.mean)
+    return AlphaChoice(alpha, None, discrepancy, zeroth.variance, first.variance)
+
+
 def alpha_order(
     zeroth: GradientEstimate, first: GradientEstimate, *, gamma: float | Scalar, epsilon: float | Scalar
 ) -> GradientEstimate:

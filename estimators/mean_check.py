@@ -12,8 +12,10 @@ from jaxtyping import Array, Float, Int, Key
 from estimators.batches import Objective
 from estimators.choices import ORACLES
 from estimators.confidence import ENOUGH_EFFECTIVE, effective_samples
+from estimators.estimator import Estimator
 from estimators.pytree import register_pytree
-from estimators.registry import Estimator, draw, oracles_of
+from estimators.registry import oracles_of
+from estimators.sampling import draw
 from estimators.statistics import summarise
 
 NODES: Final = 9

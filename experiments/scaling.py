@@ -411,11 +411,11 @@ def draw(documents: list[dict[str, Any]], output: Path) -> None:
     from matplotlib.ticker import LogLocator
 
     from mjx_study.disk import write_whole
-    from mjx_study.plots.style import STYLE
+    from mjx_study.plots.style import style_of
 
     figure = Figure(figsize=(2.6 * len(PANELS), 3.2), layout="constrained")
     panels = dict(zip(PANELS, figure.subplots(1, len(PANELS)), strict=True))
-    names = {"gradient": ("gradients", *STYLE["fobg"]), "value": ("rollouts", *STYLE["zobg"])}
+    names = {"gradient": ("gradients", *style_of("fobg")[1:]), "value": ("rollouts", *style_of("zobg")[1:])}
     wide = {"ms": 7.5, "markerfacecolor": "none", "linewidth": 3.0, "alpha": 0.6}
     units: list[str] = []
     for document, line in zip(documents, ("-", "--", ":"), strict=False):

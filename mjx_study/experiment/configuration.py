@@ -6,12 +6,13 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Union
 
-from estimators.choices import CATALOGUE, PLUG_IN, PUBLISHED_TOLERANCE
+from estimators.choices import PLUG_IN, PUBLISHED_TOLERANCE
+from estimators.registry import ESTIMATORS
 from mjx_study.choices import refuse_untaken
 from mjx_study.option import Checked
 
 if TYPE_CHECKING:
-    import estimators.registry
+    import estimators.estimator
     import mjx_study.tasks.task
 
 OF_KIND: Final[dict[str, tuple[str, ...]]] = {
@@ -104,7 +105,7 @@ class StudyConfig(Checked):
 
     tasks: tuple[Union[str, "mjx_study.tasks.task.Task"], ...]
     kind: str | None = None
-    estimators: tuple[Union[str, "estimators.registry.Estimator"], ...] = ("zobg", "fobg", "aobg")
+    estimators: tuple[Union[str, "estimators.estimator.Estimator"], ...] = ("zobg", "fobg", "aobg")
     theta: tuple[float, ...] | None = None
     network: tuple[int, ...] | None = None
     contact: tuple[str, ...] | None = None
@@ -165,7 +166,7 @@ class StudyConfig(Checked):
         if self.theta is not None and len(self.tasks) > 1:
             raise ValueError("`theta` is for a single task; give one task, or omit it")
         if not self.estimators:
-            raise ValueError(f"no estimator given; choose from {', '.join(CATALOGUE)}")
+            raise ValueError(f"no estimator given; choose from {', '.join(ESTIMATORS)}")
         refuse_repeats("estimator", self.estimator_names)
         refuse_repeats("contact family", self.contact or ())
         if self.contact is not None:
@@ -219,7 +220,7 @@ class StudyConfig(Checked):
     @property
     def estimator_names(self) -> tuple[str, ...]:
         """Names of the estimators; `module:class` of objects of your own."""
-        return tuple(each if isinstance(each, str) else each.place() for each in self.estimators)
+        return tuple(each if isinstance(each, str) else each.qualified_name() for each in self.estimators)
 
     @property
     def task_names(self) -> list[str]:

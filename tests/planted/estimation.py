@@ -109,7 +109,7 @@ ESTIMATORS: Final = (
     ),
     Defect(
         "cut-one-step-early",
-        "estimators/stepwise.py",
+        "estimators/recursion.py",
         "jnp.arange(1, horizon + 1) % window != 0",
         "jnp.arange(horizon) % window != 0",
         "windows counted from the wrong end",
