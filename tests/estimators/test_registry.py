@@ -33,11 +33,11 @@ leave_one_out = jax.jit(estimators.leave_one_out)
 HESSIAN = np.array([[1.0, 0.4], [0.4, 0.5]])
 OBJECTIVE = objectives.quadratic(HESSIAN, 0.5)
 THETA = np.array([1.5, -2.0])
-OPTIONS: dict[str, Any] = {"gamma": 50.0, "failure_probability": 0.1, "sigma": 0.5, "max_norm": 3.0, "window": 1}
+OPTIONS: dict[str, Any] = {"gamma": 50.0, "failure_probability": 0.1, "sigma": 0.5}
 
 
 def made(name: str, **changes: Any) -> Estimator:
-    return make_estimator(name, **OPTIONS | changes)
+    return make_estimator(name, **vars(ESTIMATORS[name].example()) | OPTIONS | changes)
 
 
 class Spy:
@@ -74,10 +74,10 @@ def test_every_estimator_calls_the_oracles_that_it_names_with_independent_keys(n
     )
 
 
-def test_the_table_is_keyed_by_name():
-    assert len(ESTIMATORS) == 15 and len(ORACLES) == 8
+def test_estimators_and_oracles_describe_themselves():
     for name, entry in ESTIMATORS.items():
         assert issubclass(entry, Estimator) and entry.name == name and entry.description and entry.label
+        assert entry.formula and entry.unbiased and isinstance(entry.example(), entry)
         assert isinstance(made(name), entry) and made(name) == made(name) and hash(made(name)) == hash(made(name))
     for name, oracle in ORACLES.items():
         assert oracle.name == name and oracle.order in (0, 1)
