@@ -12,7 +12,7 @@ from typing import Annotated, Any, Final
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, field_validator
 
-from estimators.catalogue import suggestion
+from estimators.choices import suggestion
 from mjx_study.disk import read_bytes
 from mjx_study.option import BUILDER_OPTIONS, OPTIONS
 

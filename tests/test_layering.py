@@ -159,7 +159,7 @@ def test_every_layer_is_used_once_and_files_are_found() -> None:
 @pytest.mark.parametrize(
     ("module", "source", "wrong"),
     [
-        ("estimators.types", "import mjx_study.reference.noise", {"mjx_study.reference.noise"}),
+        ("estimators.batches", "import mjx_study.reference.system", {"mjx_study.reference.system"}),
         ("mjx_study.tasks.task", "def f():\n    from mjx_study.objective import Simulator", {"mjx_study.objective"}),
         ("mjx_study.tasks.task", "from ..objective import Simulator", {"mjx_study.objective"}),
         ("mjx_study.tasks.task", "from mjx_study import objective", {"mjx_study.objective"}),

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NoReturn
 
-from estimators.catalogue import suggestion, unknown
+from estimators.choices import suggestion, unknown
 from mjx_study.choices import FAMILIES, PRECISIONS, TASK_DESCRIPTIONS, unknown_task
 from mjx_study.cli.output import complain
 from mjx_study.experiment.configuration import StudyConfig

@@ -16,8 +16,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from estimators import Estimator, GradientEstimate, Objective, oracles_of
-from estimators.estimator import label_of
 from estimators.mean_check import TOLERANCE, Circulation, circulations
+from estimators.registry import label_of
 from mjx_study.diagnose.columns import MEANS
 from mjx_study.experiment.configuration import check_span
 from mjx_study.experiment.resolution import check_estimators, direction_of

@@ -6,7 +6,8 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Union
 
-from estimators.catalogue import CATALOGUE, PLUG_IN, PUBLISHED_TOLERANCE
+from estimators.choices import PLUG_IN, PUBLISHED_TOLERANCE
+from estimators.registry import ESTIMATORS
 from mjx_study.choices import refuse_untaken
 from mjx_study.option import Checked
 
@@ -165,7 +166,7 @@ class StudyConfig(Checked):
         if self.theta is not None and len(self.tasks) > 1:
             raise ValueError("`theta` is for a single task; give one task, or omit it")
         if not self.estimators:
-            raise ValueError(f"no estimator given; choose from {', '.join(CATALOGUE)}")
+            raise ValueError(f"no estimator given; choose from {', '.join(ESTIMATORS)}")
         refuse_repeats("estimator", self.estimator_names)
         refuse_repeats("contact family", self.contact or ())
         if self.contact is not None:
@@ -219,7 +220,7 @@ class StudyConfig(Checked):
     @property
     def estimator_names(self) -> tuple[str, ...]:
         """Names of the estimators; `module:class` of objects of your own."""
-        return tuple(each if isinstance(each, str) else each.place() for each in self.estimators)
+        return tuple(each if isinstance(each, str) else each.qualified_name() for each in self.estimators)
 
     @property
     def task_names(self) -> list[str]:

@@ -5,7 +5,6 @@ from collections.abc import Iterable, Sequence
 from typing import Final
 
 from estimators import ESTIMATORS, ORACLES, Estimator, find_estimator
-from estimators.catalogue import CATALOGUE
 from mjx_study.choices import REFERENCE, takes_stiffness
 from mjx_study.experiment.configuration import StudyConfig
 from mjx_study.experiment.resolution import OF_ESTIMATORS
@@ -26,7 +25,7 @@ def refuse_unread(chosen: Sequence[str | Estimator], given: Iterable[str]) -> No
         name = "gamma" if option == "published" else option
         if name not in read:
             names = ", ".join(each.name for each in found)
-            able = ", ".join(each for each in CATALOGUE if name in _fields(ESTIMATORS[each]))
+            able = ", ".join(each for each in ESTIMATORS if name in _fields(ESTIMATORS[each]))
             raise ValueError(f"`{option}` has no effect on {names}: omit it, or name one that it acts on: {able}")
 
 

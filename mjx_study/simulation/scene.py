@@ -12,7 +12,7 @@ import jax
 import mujoco
 import numpy as np
 
-from estimators.catalogue import suggestion
+from estimators.choices import suggestion
 from mjx_study.choices import CONES, INTEGRATORS, SOLVERS, unknown
 from mjx_study.limits import MOST_GIB
 from mjx_study.simulation._mjx import mjx
