@@ -292,8 +292,8 @@ def measure_busy(cells: int, samples: int, seeds: int) -> None:
     import numpy as np
 
     from mjx_study.execution.run import run_study
-    from mjx_study.experiment.configuration import StudyConfig
     from mjx_study.experiment.plan import plan_study
+    from mjx_study.options.configuration import StudyConfig
     from mjx_study.runtime import configure, environment
 
     configure()
@@ -528,8 +528,8 @@ def measure_workers(workers: list[int], cells: int, samples: int) -> None:
 
     from mjx_study.execution import cluster
     from mjx_study.execution.run import run_study
-    from mjx_study.experiment.configuration import StudyConfig
     from mjx_study.experiment.plan import plan_study
+    from mjx_study.options.configuration import StudyConfig
     from mjx_study.runtime import configure
 
     configure(cpu_devices=1)

@@ -12,8 +12,8 @@ from make_figures import save
 
 from mjx_study.cli.output import shown_progress
 from mjx_study.execution.run import load_study, run_study
-from mjx_study.experiment.configuration import StudyConfig
 from mjx_study.experiment.plan import plan_study
+from mjx_study.options.configuration import StudyConfig
 from mjx_study.plots.study import plot_study
 from mjx_study.runtime import configure
 

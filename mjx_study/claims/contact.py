@@ -38,7 +38,7 @@ from mjx_study.claims.theory import (
     relative_bias,
     variances_of,
 )
-from mjx_study.experiment.configuration import StudyConfig
+from mjx_study.options.configuration import StudyConfig
 from mjx_study.runtime import local_devices
 
 STIFFNESSES: Final = (10.0, 100.0, 1000.0, 1200.0)

@@ -15,7 +15,7 @@ from mjx_study.choices import REFERENCE
 from mjx_study.claims.laboratory import Laboratory, Statistic, difference_of, log_variance, mean_of
 from mjx_study.claims.ledger import Claim, above, below
 from mjx_study.claims.theory import FACTOR, FIVE, STIFFNESS
-from mjx_study.experiment.configuration import StudyConfig
+from mjx_study.options.configuration import StudyConfig
 
 BALL, BAR, SOFT, STIFF = "ball_wall", "momentum_transfer", "pusher, 10 N/m", "pusher, 1000 N/m"
 SLIDE, GAME = "sliding_box", "tennis"

@@ -6,7 +6,7 @@ from typing import Any, Final
 
 from estimators.places import MissingModuleError
 from mjx_study.choices import is_file, unknown_task
-from mjx_study.option import OPTIONS, as_arguments, check
+from mjx_study.options.option import OPTIONS, as_arguments, check
 from mjx_study.tasks.ball_wall import ball_wall
 from mjx_study.tasks.double_pendulum import double_pendulum
 from mjx_study.tasks.gripper import gripper
