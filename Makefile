@@ -27,17 +27,17 @@ figures: $(STAMP) ## Make the figures and films of docs/ again
 	cp results/onset/landscape.png docs/onset.png
 	$(BIN)/mjx-study optimise pusher --contact penalty --stiffness 1000 --output results/optimisation
 	cp results/optimisation/descent.png docs/optimisation.png
-	$(BIN)/python docs/make_figures.py
+	$(BIN)/python -m experiments.figures
 	$(BIN)/mjx-study rollout ball_wall --theta 0.75 --stiffness 1e4 --slow 2
 	for task in momentum_transfer tennis double_pendulum; do $(BIN)/mjx-study rollout $$task || exit; done
 	for task in ball_wall momentum_transfer tennis double_pendulum; do \
 		cp results/$$task-rollout/rollout.gif docs/film_$$task.gif || exit; done
 
 study: $(STAMP) ## Sweep stiffness and draw the README's figures of it again (half an hour; resumable)
-	$(BIN)/python docs/make_study.py
+	$(BIN)/python -m experiments.stiffness
 
 coverage: $(STAMP) ## Measure again what docs/coverage.md says of intervals and tests (a few minutes)
-	$(BIN)/python docs/make_coverage.py
+	$(BIN)/python -m experiments.coverage
 
 test: $(STAMP) ## Run the tests, less the slow ones (PYTEST_ARGS='-k name' in place of two workers)
 	$(BIN)/python -m pytest $(PYTEST_ARGS)
@@ -72,7 +72,7 @@ lint: $(STAMP) ## Check style, formatting and types
 	$(BIN)/basedpyright
 
 docs: $(STAMP) ## Build the site into build/site; a dead link or a faulty docstring is an error (half a minute)
-	$(BIN)/python docs/make_site.py
+	$(BIN)/python -m tools.site
 
 dist: $(STAMP) ## Build sdist and wheel into dist, and check what is in them
 	rm -rf dist

@@ -1,12 +1,12 @@
-"""What docs/diagnose.md says of its advice is what docs/advice.jsonl holds; and how its script tells good from bad."""
+"""docs/diagnose.md states the results in advice.jsonl; good, bad and undecided advice are classified as planted."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from docs import make_advice as advice
 from estimators.statistics import summarise
+from experiments import advice
 
 RESULTS = advice.read()
 TRUTH = 2.0

@@ -1,4 +1,4 @@
-"""docs/atlas.md says what docs/atlas.npz holds; cells are distinct; verdicts and rules tell what was planted."""
+"""docs/atlas.md states what atlas.npz holds; cells are distinct; planted verdicts and rules are found."""
 
 from pathlib import Path
 
@@ -6,8 +6,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from docs import atlas_page as page
-from docs import make_atlas as atlas
+from experiments.atlas import measure as atlas
+from experiments.atlas import page
 from mjx_study.table import percent
 
 TABLE = page.read(atlas.RESULTS)

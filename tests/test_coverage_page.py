@@ -1,25 +1,16 @@
 """docs/coverage.md says what its script computes: some rows again, and the shape of all of them."""
 
-import importlib.util
 import re
 from pathlib import Path
-from types import ModuleType
 
 import jax
 import numpy as np
 import pytest
 
+from experiments import coverage
+
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = (ROOT / "docs" / "coverage.md").read_text()
-
-
-@pytest.fixture(scope="module")
-def script() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("make_coverage", ROOT / "docs" / "make_coverage.py")
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 def rows(name: str) -> list[list[str]]:
@@ -39,25 +30,25 @@ def same(found: list[str], said: list[str]) -> None:
 
 
 @pytest.mark.parametrize("kind", ["lognormal"])
-def test_intervals_and_the_test_for_bias(script: ModuleType, kind: str) -> None:
+def test_intervals_and_the_test_for_bias(kind: str) -> None:
     assert jax.config.read("jax_enable_x64")
-    intervals, test = script.coverage_rows(kind, 10)
+    intervals, test = coverage.coverage_rows(kind, 10)
     for found, name in ((intervals, "intervals"), (test, "test")):
         (said,) = [row for row in rows(name) if row[:2] == [kind, "10"]]
         same(found, said)
 
 
 @pytest.mark.slow
-def test_rare_samples(script: ModuleType) -> None:
+def test_rare_samples() -> None:
     """The fast suite has the same case in `test_bias`, by fewer trials."""
     (said,) = [row for row in rows("rare") if row[:2] == ["0.4", "50"]]
-    same(script.rare_row(0.4, 50), said)
+    same(coverage.rare_row(0.4, 50), said)
 
 
-def test_every_kind_and_size_is_there(script: ModuleType) -> None:
-    expected = [[kind, str(samples)] for kind in script.KINDS for samples in script.SAMPLES]
+def test_every_kind_and_size_is_there() -> None:
+    expected = [[kind, str(samples)] for kind in coverage.KINDS for samples in coverage.SAMPLES]
     assert [row[:2] for row in rows("intervals")] == expected == [row[:2] for row in rows("test")]
-    assert all(len(row) == 2 + len(script.COLUMNS) for row in rows("intervals"))
+    assert all(len(row) == 2 + len(coverage.COLUMNS) for row in rows("intervals"))
 
 
 def test_what_the_page_says_of_its_tables() -> None:

@@ -25,7 +25,7 @@ from mjx_study.objective import Simulator
 from mjx_study.tasks import make_task
 from mjx_study.tasks.mjcf import mjcf_task
 
-HELD_OUT = Path(__file__).parents[1] / "docs" / "held_out"
+HELD_OUT = Path(__file__).parents[1] / "experiments" / "data" / "held_out"
 GRAVITY, HEIGHT, TIMESTEP = 9.81, 0.05, 0.002
 K, B = 3e4, 60.0  # [1/s^2], [1/s]: it bounces
 BALL = """<mujoco><option timestep="{h}"/>

@@ -9,10 +9,10 @@ from typing import Any, ClassVar
 import pytest
 import yaml
 
-from docs import make_site
+from tools import site
 
 ROOT = Path(__file__).parents[1]
-OWN = make_site.places()
+OWN = site.places()
 
 
 def pages_of(nav: Any) -> list[str]:
@@ -24,7 +24,7 @@ def pages_of(nav: Any) -> list[str]:
 def test_every_page_is_in_the_navigation_once() -> None:
     nav = pages_of(yaml.safe_load((ROOT / "mkdocs.yml").read_text())["nav"])
     staged = [str(place) for place in OWN.values() if place.suffix == ".md"]
-    made = [f"reference/{name}.md" for name in ("commands", *make_site.PACKAGES)]
+    made = [f"reference/{name}.md" for name in ("commands", *site.PACKAGES)]
     assert sorted(nav) == sorted(staged + made)
     assert {f"docs/{path.name}" for path in (ROOT / "docs").glob("*.md")} <= {str(source) for source in OWN}
 
@@ -40,24 +40,24 @@ def test_every_page_is_in_the_navigation_once() -> None:
     ],
 )
 def test_links_are_the_sites(page: str, text: str, expected: str) -> None:
-    assert make_site.adapted(text, Path(page), OWN) == expected
+    assert site.adapted(text, Path(page), OWN) == expected
 
 
 def test_a_link_that_leads_nowhere_is_refused() -> None:
     with pytest.raises(FileNotFoundError, match="nowhere"):
-        make_site.adapted("[a](nowhere.md)", Path("docs/tasks.md"), OWN)
+        site.adapted("[a](nowhere.md)", Path("docs/tasks.md"), OWN)
 
 
 def test_formulas_become_mathml() -> None:
-    found = make_site.adapted("with $`a_0`$\n\n```math\n\\frac{a}{b}\n```\n", Path("README.md"), OWN)
+    found = site.adapted("with $`a_0`$\n\n```math\n\\frac{a}{b}\n```\n", Path("README.md"), OWN)
     assert "<msub><mi>a</mi><mn>0</mn></msub>" in found and "<mfrac>" in found and "`" not in found
 
 
-@pytest.mark.parametrize("package", make_site.PACKAGES)
+@pytest.mark.parametrize("package", site.PACKAGES)
 def test_the_page_of_names_has_all_public_ones(package: str) -> None:
-    page = make_site.page_of_names(package)
+    page = site.page_of_names(package)
     names = [line.removeprefix("::: ") for line in page.splitlines() if line.startswith("::: ")]
-    assert sorted(names) == sorted(f"{package}.{name}" for name in make_site.import_module(package).__all__)
+    assert sorted(names) == sorted(f"{package}.{name}" for name in site.import_module(package).__all__)
 
 
 def left_out(found: Any) -> set[str]:
@@ -74,9 +74,9 @@ def left_out(found: Any) -> set[str]:
     return {name for name in own if not name.startswith("_")} - set(named)
 
 
-@pytest.mark.parametrize("package", make_site.PACKAGES)
+@pytest.mark.parametrize("package", site.PACKAGES)
 def test_a_section_of_arguments_or_attributes_names_all_of_them(package: str) -> None:
-    module = make_site.import_module(package)
+    module = site.import_module(package)
     public = {name: getattr(module, name) for name in module.__all__}
     for name, owner in list(public.items()):
         if isinstance(owner, type):
@@ -115,7 +115,7 @@ def test_what_a_section_leaves_out_is_found() -> None:
 
 
 def test_boxes_of_a_diagram_are_apart_and_arrows_lead_down() -> None:
-    found = make_site.drawn([("a", "b"), ("a", "c"), ("c", "d"), ("b", "d"), ("a", "d")])
+    found = site.drawn([("a", "b"), ("a", "c"), ("c", "d"), ("b", "d"), ("a", "d")])
     boxes = {tuple(part.split('"')[1::2][:2]) for part in found.split("<rect ")[1:]}
     assert len(boxes) == 4
     for line in found.split("<line ")[1:]:

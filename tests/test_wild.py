@@ -1,22 +1,16 @@
 """Environments of MuJoCo Playground, if it is installed: exact gradients where stock MJX has none."""
 
-import importlib.util
-from pathlib import Path
+import importlib
 
 import numpy as np
 import pytest
-
-SCRIPT = Path(__file__).parents[1] / "docs" / "make_wild.py"
 
 
 @pytest.mark.slow
 def test_a_gradient_through_somebody_elses_environment_is_that_of_differences(monkeypatch: pytest.MonkeyPatch) -> None:
     """A hopper's, over five steps of the environment, with its own solver's budget and converged."""
     pytest.importorskip("mujoco_playground", reason="needs `pip install playground`")
-    spec = importlib.util.spec_from_file_location("make_wild", SCRIPT)
-    assert spec is not None and spec.loader is not None
-    wild = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(wild)
+    wild = importlib.import_module("experiments.wild")
     monkeypatch.setattr(wild, "STEPS", 5)
     found = wild.single(wild.environment("HopperHop"))
     assert found["stock_own"].startswith("Reverse-mode differentiation does not work")

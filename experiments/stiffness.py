@@ -1,23 +1,19 @@
 """Draws docs/variance.png, docs/bias*.png, docs/achieved.png and docs/map.png: what the README says about stiffness.
 
-    python docs/make_study.py
+    python -m experiments.stiffness
 
 Six sweeps, in results/study/; half an hour on two cores, and it goes on where it was stopped.
 """
 
-from pathlib import Path
 from typing import Final
 
-from make_figures import save
-
+from experiments.pages import DOCS, ROOT, save_figure
 from mjx_study.cli.output import shown_progress
 from mjx_study.execution.run import load_study, run_study
 from mjx_study.experiment.plan import plan_study
 from mjx_study.options.configuration import StudyConfig
 from mjx_study.plots.study import plot_study
 from mjx_study.runtime import configure
-
-HERE: Final = Path(__file__).parent
 
 
 def decades(first: int, last: int, count: int) -> tuple[float, ...]:
@@ -72,11 +68,11 @@ FIGURES: Final = {"map": "map_stiffness_sigma", "bias_gripper": "bias", "bias_la
 def main() -> None:
     configure()
     for name, config in SWEEPS.items():
-        folder = HERE.parent / "results" / "study" / name
+        folder = ROOT / "results" / "study" / name
         with shown_progress() as progress:
             run_study(plan_study(config), folder, progress)
-        path = HERE / f"{name}.png"
-        save(plot_study(load_study(folder))[FIGURES.get(name, name)], path)
+        path = DOCS / f"{name}.png"
+        save_figure(plot_study(load_study(folder))[FIGURES.get(name, name)], path)
         print(f"written: {path}")
 
 

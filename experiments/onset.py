@@ -1,8 +1,8 @@
 """Prints the tables of docs/onset-correction.md.
 
-python docs/make_onset.py            # momentum_transfer and ball_wall, by quadrature; half an hour on one core
-python docs/make_onset.py tennis     # means along four directions of the gains; an hour on one core
-python docs/make_onset.py rule       # error of the linear term over the onset strength, 11 contact laws
+python -m experiments.onset            # momentum_transfer and ball_wall, by quadrature; half an hour on one core
+python -m experiments.onset tennis     # means along four directions of the gains; an hour on one core
+python -m experiments.onset rule       # error of the linear term over the onset strength, 11 contact laws
 """
 
 import sys
@@ -10,9 +10,9 @@ import sys
 import jax
 import jax.numpy as jnp
 import numpy as np
-from make_atlas import task_of
 
 from estimators import NOISES, first_order, zeroth_order
+from experiments.atlas.measure import task_of
 from mjx_study.experiment.landscapes import Line, Means, grid, means
 from mjx_study.experiment.resolution import direction_of
 from mjx_study.experiment.tally import onset_numbers

@@ -1,7 +1,7 @@
 """Prints the table of docs/differentiable-mjx.md: `mjx_study.step` against `mjx.step`, on this machine.
 
-    python docs/make_drop_in.py
-    python docs/make_drop_in.py --batch 1024    # on an accelerator
+    python -m experiments.drop_in
+    python -m experiments.drop_in --batch 1024    # on an accelerator
 
 A few minutes on one core, most of it compiling. Stock's gradient is the one it has, of a step of one solver iteration.
 """
@@ -20,10 +20,11 @@ import numpy as np
 from mujoco import mjx
 
 import mjx_study
+from experiments.pages import ROOT
 
 TESTED: Final = Path(mjx.__file__).parent / "test_data"
 MODELS: Final = {
-    "`pusher` of this project": Path(__file__).parents[1] / "models" / "pusher.xml",
+    "`pusher` of this project": ROOT / "models" / "pusher.xml",
     "`convex`": TESTED / "convex.xml",
     "`barkour_v0`, a quadruped": TESTED / "barkour_v0" / "assets" / "barkour_v0_mjx.xml",
     "`humanoid`": TESTED / "humanoid" / "humanoid.xml",

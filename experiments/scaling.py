@@ -1,12 +1,12 @@
 """Measures what docs/scaling.md says, and draws docs/scaling.png.
 
-    python docs/make_scaling.py engine --workers 20 --cells 10000 --seconds 0.1
-    python docs/make_scaling.py workers --workers 1 2 4 --cells 200
-    python docs/make_scaling.py cost --seconds 600 --output docs/scaling_cpu.json
-    python docs/make_scaling.py devices --tasks pusher tennis --samples 100000 1000000
-    python docs/make_scaling.py busy
-    python docs/make_scaling.py fit docs/scaling_cpu.json
-    python docs/make_scaling.py figure docs/scaling_cpu.json --output docs/scaling.png
+    python -m experiments.scaling engine --workers 20 --cells 10000 --seconds 0.1
+    python -m experiments.scaling workers --workers 1 2 4 --cells 200
+    python -m experiments.scaling cost --seconds 600 --output experiments/data/scaling_cpu.json
+    python -m experiments.scaling devices --tasks pusher tennis --samples 100000 1000000
+    python -m experiments.scaling busy
+    python -m experiments.scaling fit experiments/data/scaling_cpu.json
+    python -m experiments.scaling figure experiments/data/scaling_cpu.json --output docs/scaling.png
 
 `engine` runs cells that sleep, on as many local workers as asked for: what a cell computes is replaced by sleep; the
 client, Dask, the transfer of arrays and the folder are those of a sweep.

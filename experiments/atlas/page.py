@@ -1,6 +1,6 @@
 """What the atlas says: dimensionless groups, verdicts, rules with how often they are right, figures, docs/atlas.md.
 
-Everything on the page is made from docs/atlas.npz, which docs/make_atlas.py computed.
+Everything on the page is made from experiments/data/atlas.npz, which experiments.atlas.measure computed.
 """
 
 import dataclasses
@@ -18,14 +18,14 @@ from matplotlib.lines import Line2D
 
 from estimators import ENOUGH_EFFECTIVE
 from estimators.confidence import coverage_interval
+from experiments.pages import DOCS, save_figure, with_table
 from mjx_study.diagnose import SMOOTH_SHARE, WIDTH_RATIO
 from mjx_study.results.findings import ERROR_PER_STRENGTH, LEAST_SPREAD, MOST_STRENGTH
 from mjx_study.table import percent
 
 Table = Any
 """A pandas.DataFrame with a row for each cell; pandas comes without types."""
-HERE: Final = Path(__file__).parent
-PAGE: Final = HERE / "atlas.md"
+PAGE: Final = DOCS / "atlas.md"
 TOLERANCE: Final = 0.2
 """Share of the slope within which a mean counts as right."""
 QUANTILE: Final = 2.58
@@ -569,16 +569,13 @@ FIGURES: Final = {
 def written(text: str, table: Table) -> str:
     """The page with its tables made again."""
     for name, make in TABLES.items():
-        start, end = f"<!-- table: {name} -->\n", "\n<!-- end -->"
-        before, found, rest = text.partition(start)
-        assert found, f"the page has no table {name}"
-        text = f"{before}{start}{make(table)}{end}{rest.partition(end.lstrip())[2]}"
+        text = with_table(text, name, make(table))
     return text
 
 
-def make_page(path: Path, save: Callable[[Figure, Path], None]) -> None:
+def make_page(path: Path) -> None:
     """Figures and tables of docs/atlas.md."""
     table = read(path)
     for name, make in FIGURES.items():
-        save(make(table), HERE / f"atlas_{name}.png")
+        save_figure(make(table), DOCS / f"atlas_{name}.png")
     PAGE.write_text(written(PAGE.read_text(), table))

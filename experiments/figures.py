@@ -1,19 +1,17 @@
 """Draws docs/tasks.png, docs/physics.png and docs/onset-correction.png: the tasks as MJX simulates them, what is known
 of each without MJX, and first-order gradients with and without the onset term.
 
-    python docs/make_figures.py             all of them
-    python docs/make_figures.py physics     one of them: tasks, physics or onset-correction
+    python -m experiments.figures             all of them
+    python -m experiments.figures physics     one of them: tasks, physics or onset-correction
 
 It takes a minute or two, most of it to compile; compiled programs are kept between runs.
 """
 
 import copy
-import io
 import math
 import sys
 from collections.abc import Callable, Sequence
 from functools import cache
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -24,8 +22,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.transforms import Affine2D
-from PIL import Image
 
+from experiments.pages import DOCS, DPI, save_figure
 from mjx_study.experiment.landscapes import Line, grid, means
 from mjx_study.objective import rollout_cost
 from mjx_study.reference import (
@@ -47,8 +45,6 @@ from mjx_study.tasks import make_task
 from mjx_study.tasks.contact_grid import family_grid
 from mjx_study.tasks.task import Task
 
-HERE = Path(__file__).parent
-DPI = 130
 BLUE, ORANGE, GREEN, PINK, SKY, YELLOW = PALETTE
 GREY, INK, WALL = "0.45", "0.2", "#B4B4B4"
 TARGET = (0.0, 2.5)  # of tennis [m]
@@ -676,16 +672,9 @@ def main(names: list[str]) -> None:
         sys.exit(f"no figure {', '.join(unknown)}; there are {', '.join(FIGURES)}")
     configure(cpu_devices=1)
     for name in names or list(FIGURES):
-        path = HERE / f"{name}.png"
-        save(FIGURES[name](), path)
+        path = DOCS / f"{name}.png"
+        save_figure(FIGURES[name](), path)
         print(f"written: {path}, {path.stat().st_size // 1000} kB")
-
-
-def save(figure: Figure, path: Path) -> None:
-    """A PNG of 256 colours, a third of the size."""
-    picture = io.BytesIO()
-    figure.savefig(picture, dpi=DPI)
-    Image.open(picture).convert("RGB").quantize(256, kmeans=3, dither=Image.Dither.NONE).save(path, optimize=True)
 
 
 if __name__ == "__main__":

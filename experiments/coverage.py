@@ -1,13 +1,11 @@
 """Writes the tables of docs/coverage.md: how often each interval covers, how often each test rejects.
 
-    python docs/make_coverage.py
+    python -m experiments.coverage
 
 A minute on one core. Everything between the markers of the page is replaced; the text around it is written by hand.
 """
 
-import re
 from collections.abc import Callable, Iterable, Sequence
-from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import jax
@@ -17,12 +15,13 @@ from jax import Array
 
 import estimators
 from estimators import ENOUGH_EFFECTIVE, ESTIMATORS, make_estimator, summarise
+from experiments.pages import DOCS, with_table
 from mjx_study.reference import LinearQuadratic, ReferenceObjective
 from mjx_study.results.findings import DETECTED_SE
 from mjx_study.runtime import configure
 from mjx_study.table import percent
 
-PAGE: Final = Path(__file__).parent / "coverage.md"
+PAGE: Final = DOCS / "coverage.md"
 SAMPLES: Final = (10, 50, 400)
 TRIALS: Final = 2000
 TOGETHER: Final = 100
@@ -271,9 +270,7 @@ def main() -> None:
     configure()
     page = PAGE.read_text()
     for name, text in tables().items():
-        block = rf"(<!-- table: {name} -->\n).*?(\n<!-- end -->)"
-        page, found = re.subn(block, lambda match, text=text: f"{match[1]}{text}{match[2]}", page, flags=re.DOTALL)
-        assert found == 1, name
+        page = with_table(page, name, text)
     PAGE.write_text(page)
     print(f"written: {PAGE}")
 

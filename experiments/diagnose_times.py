@@ -1,6 +1,6 @@
 """Prints the table of times of docs/diagnose.md: `mjx-study diagnose` of MJCFs, without and with compiled programs.
 
-    python docs/make_diagnose_times.py FILE.xml ...
+    python -m experiments.diagnose_times FILE.xml ...
 
 Each file is diagnosed twice, in processes of their own; the first starts with an empty compilation cache.
 """

@@ -1,9 +1,9 @@
 """Makes the tables of docs/in-the-wild.md: gradients through environments of MuJoCo Playground.
 
     pip install playground
-    python docs/make_wild.py HopperHop >> found.jsonl            # one rollout: stock, here, finite differences
-    python docs/make_wild.py HopperHop none >> found.jsonl       # means without the onset term, or "linear": with it
-    python docs/make_wild.py table found.jsonl
+    python -m experiments.wild HopperHop >> found.jsonl            # one rollout: stock, here, finite differences
+    python -m experiments.wild HopperHop none >> found.jsonl       # means without the onset term, or "linear": with it
+    python -m experiments.wild table found.jsonl
 
 The function is the distance that a body gets forward, of a constant action. Means go on, a batch a line, until stopped.
 """

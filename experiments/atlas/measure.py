@@ -1,7 +1,7 @@
 """Computes the atlas: where first-order gradients are worth having, over more than 10,000 cells, for docs/atlas.md.
 
-    python docs/make_atlas.py run --output DIR [--workers N] [--seconds S]    # cells that DIR lacks, into DIR/atlas.npz
-    python docs/make_atlas.py page [DIR/atlas.npz]    # docs/atlas.npz, the figures and the tables of docs/atlas.md
+    python -m experiments.atlas run --output DIR [--workers N] [--seconds S]    # cells missing in DIR/atlas.npz
+    python -m experiments.atlas page [DIR/atlas.npz]    # data/atlas.npz, the figures and the tables of docs/atlas.md
 
 A cell is one task at one timestep under one contact model, with one sigma and one theta, on random numbers of its own.
 All that differs between the cells of a task and timestep is traced, so that they share two compiled programs; several
@@ -30,6 +30,7 @@ from scipy.stats import qmc
 
 from estimators import Evaluation, antithetic, effective_samples, squared_bias_of_means, variance_interval, zeroth_order
 from estimators.statistics import summarise
+from experiments.pages import DATA
 from mjx_study.compiled import Compiled
 from mjx_study.diagnose import touch_of
 from mjx_study.disk import write_whole
@@ -49,8 +50,7 @@ from mjx_study.tasks import make_task
 from mjx_study.tasks.contact_grid import family_grid
 from mjx_study.tasks.task import Task
 
-HERE: Final = Path(__file__).parent
-RESULTS: Final = HERE / "atlas.npz"
+RESULTS: Final = DATA / "atlas.npz"
 FAMILIES: Final = ("penalty", "impedance", "mujoco", "mujoco_stiff", "smooth_onset")
 UNDAMPED: Final = ("penalty", "impedance")
 """Families that keep the task's own damping; the others' damping ratio varies."""
@@ -540,15 +540,10 @@ def main() -> None:
     page.add_argument("results", type=Path, nargs="?", default=RESULTS)
     options = parser.parse_args()
     if options.command == "page":  # imported here, since matplotlib takes a second in every worker
-        from atlas_page import make_page
-        from make_figures import save
+        from experiments.atlas.page import make_page
 
         if options.results != RESULTS:
             write_whole(RESULTS, lambda file: file.write(options.results.read_bytes()))
-        make_page(RESULTS, save)
+        make_page(RESULTS)
         return
     run(options.output, options.workers, options.seconds, options.cells, options.only)
-
-
-if __name__ == "__main__":
-    main()

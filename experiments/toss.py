@@ -1,6 +1,6 @@
 """Prints the table of docs/onset-correction.md on DiffMJX's scenes, described anew by their published numbers.
 
-    python docs/make_toss.py
+    python -m experiments.toss
 
 Half an hour on two cores, most of it compiling. Paulus et al., arXiv 2506.14186: a point on a spring and a damper; a
 ball and a cube thrown to the floor, whose cost is where they come to be sideways.

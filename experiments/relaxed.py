@@ -1,6 +1,6 @@
 """The tables of surrogate derivatives in first-order-bias.md: means and spread of first-order gradients, by quadrature.
 
-Run as python docs/make_relaxed.py; half an hour on two cores, nothing is kept.
+Run as python -m experiments.relaxed; half an hour on two cores, nothing is kept.
 """
 
 import dataclasses

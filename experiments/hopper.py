@@ -1,6 +1,6 @@
-"""A one-legged hopper that lands on its foot through MuJoCo's default contact and is to move forward.
+"""A one-legged hopper that lands on its foot through MuJoCo's default contact and shall move forward.
 
-An own task in one file, as docs/extending.md describes, and what docs/in-the-wild.md trains: `docs.hopper:hopper`.
+A task in one file, as docs/extending.md describes; docs/in-the-wild.md trains it as `experiments.hopper:hopper`.
 """
 
 import jax

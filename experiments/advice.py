@@ -1,7 +1,7 @@
 """Tests the advice of `mjx-study diagnose` on models that it was not made with, for docs/diagnose.md.
 
-    python docs/make_advice.py [PART OF A CASE'S NAME ...]    # the cases that docs/advice.jsonl lacks, then the page
-    python docs/make_advice.py --page                         # the page alone
+    python -m experiments.advice [PART OF A CASE'S NAME ...]    # the cases that data/advice.jsonl lacks, then the page
+    python -m experiments.advice --page                         # the page alone
 
 Each case compares the estimator that a diagnosis recommends with the best of the five by an independent measurement:
 other random numbers, many batches of the size advised, and a reference gradient from values alone. Compared are root
@@ -12,9 +12,7 @@ import argparse
 import dataclasses
 import json
 import math
-import re
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any, Final
 
 import jax
@@ -24,6 +22,7 @@ import numpy as np
 
 from estimators import GradientEstimate, make_estimator, oracles_of, squared_bias_of_means
 from estimators.confidence import coverage_interval
+from experiments.pages import DATA, DOCS, with_table
 from mjx_study.choices import DEFAULT_SOLIMP, DEFAULT_SOLREF, STIFF_SOLIMP
 from mjx_study.diagnose import ESTIMATORS, measure
 from mjx_study.experiment.gradients import reference_of
@@ -37,9 +36,9 @@ from mjx_study.tasks import make_task
 from mjx_study.tasks.mjcf import scene_task
 from mjx_study.tasks.task import Task
 
-HERE: Final = Path(__file__).parent
-RESULTS: Final = HERE / "advice.jsonl"
-PAGE: Final = HERE / "diagnose.md"
+RESULTS: Final = DATA / "advice.jsonl"
+HELD_OUT: Final = DATA / "held_out"
+PAGE: Final = DOCS / "diagnose.md"
 KNOWN: Final = ("momentum_transfer",)
 """Tasks on which the rules of `diagnose` were found; every other model is held out."""
 CONTACTS: Final = {
@@ -84,7 +83,7 @@ class Case:
 
 def cases() -> Iterator[Case]:
     """All of them, those of one program after another. The joint limit of the pendulum is no contact."""
-    held_out = sorted(path.stem for path in (HERE / "held_out").glob("*.xml"))
+    held_out = sorted(path.stem for path in HELD_OUT.glob("*.xml"))
     for model in held_out + list(KNOWN):
         yield from (Case(model, contact) for contact in (CONTACTS if model != "pendulum" else ("default",)))
     for model in (*FINE, "pendulum"):
@@ -95,9 +94,9 @@ def task_of(case: Case) -> Task:
     """The task of a case."""
     if case.model in KNOWN:
         return make_task(case.model)
-    scene, horizon = load_scene(HERE / "held_out" / f"{case.model}.xml"), HORIZON
+    scene, horizon = load_scene(HELD_OUT / f"{case.model}.xml"), HORIZON
     if case.halved:
-        scene, horizon = load_scene(HERE / "held_out" / f"{case.model}.xml", timestep=scene.timestep / 2), 2 * HORIZON
+        scene, horizon = load_scene(HELD_OUT / f"{case.model}.xml", timestep=scene.timestep / 2), 2 * HORIZON
     return scene_task(scene, horizon=horizon)
 
 
@@ -224,12 +223,7 @@ def table(results: list[dict[str, Any]]) -> str:
 
 def write_page() -> None:
     """Put the table into the page."""
-    block = r"(<!-- table: advice -->\n).*?(\n<!-- end -->)"
-    page, found = re.subn(
-        block, lambda match: f"{match[1]}{table(read())}{match[2]}", PAGE.read_text(), flags=re.DOTALL
-    )
-    assert found == 1
-    PAGE.write_text(page)
+    PAGE.write_text(with_table(PAGE.read_text(), "advice", table(read())))
 
 
 def main() -> None:

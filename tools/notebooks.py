@@ -1,6 +1,6 @@
 """Runs notebooks from top to bottom and keeps their outputs, without the times of the run.
 
-python docs/make_notebooks.py notebooks/1_stiffness_sweep.ipynb
+python tools/notebooks.py notebooks/1_stiffness_sweep.ipynb
 """
 
 import sys

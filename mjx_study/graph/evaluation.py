@@ -1,0 +1,83 @@
+"""Evaluate graphs of scalars by JAX operations."""
+
+import itertools
+import math
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, Final
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from mjx_study.graph.function import ScalarFunction, array_of, bind_whole
+from mjx_study.graph.nodes import Node, needed_for, no_type_check
+
+_FUNCTIONS: Final = {
+    lax.add_p: lax.add,
+    lax.and_p: lax.bitwise_and,
+    lax.eq_p: lax.eq,
+    lax.gt_p: lax.gt,
+    lax.lt_p: lax.lt,
+    lax.max_p: lax.max,
+    lax.min_p: lax.min,
+    lax.mul_p: lax.mul,
+    lax.neg_p: lax.neg,
+    lax.or_p: lax.bitwise_or,
+    lax.select_n_p: lax.select_n,
+}
+"""Functions for operations that rules add; they supply the primitive parameters of the installed JAX version."""
+
+
+def evaluated(function: ScalarFunction) -> Callable[..., list[jax.Array]]:
+    """Return a function of the inputs that computes the leaves of the result, one scalar operation after the other."""
+
+    def program(*inputs: jax.Array) -> list[jax.Array]:
+        values: dict[int, Any] = {}
+        for array, nodes in zip(inputs, function.inputs, strict=True):
+            values |= {node.number: array[index] for index, node in np.ndenumerate(nodes)}
+        _emit(function.needed, values)
+        return [
+            array_of([values[each.number] if isinstance(each, Node) else each for each in output.flat], aval)
+            for output, aval in zip(function.outputs, function.avals, strict=True)
+        ]
+
+    return program
+
+
+@no_type_check
+def _emit(nodes: Iterable[Node], values: dict[int, Any]) -> None:
+    """Compute nodes with JAX, arguments first, and add them to `values`."""
+    for node in nodes:
+        if node.number in values:
+            continue
+        arguments = [values[each.number] if isinstance(each, Node) else each for each in node.arguments]
+        match node.operation:
+            case "output":
+                place, index = node.parameters
+                found = arguments[0][place][index]
+            case "whole":
+                equation, avals = node.parameters
+                left = iter(arguments)
+                arrays = [array_of(itertools.islice(left, math.prod(aval.shape)), aval) for aval in avals]
+                found = bind_whole(equation, arrays)
+            case "loop":
+                found = _emit_loop(node, arguments, values)
+            case primitive if node.parameters:
+                found = primitive.bind(*arguments, **node.parameters)
+            case primitive:
+                found = _FUNCTIONS.get(primitive, primitive.bind)(*arguments)
+        values[node.number] = found
+
+
+def _emit_loop(node: Node, arguments: list[Any], values: dict[int, Any]) -> Any:
+    carried, again, after = node.parameters
+    fixed = {each.number: values[each.number] for each in node.arguments[len(carried) :]}
+
+    def at(carry: Sequence[Any], outputs: Sequence[Any]) -> list[Any]:
+        local = fixed | {each.number: value for each, value in zip(carried, carry, strict=True)}
+        _emit(needed_for(outputs), local)
+        return [local[each.number] if isinstance(each, Node) else jnp.asarray(each) for each in outputs]
+
+    start = [jnp.asarray(each) for each in arguments[: len(carried)]]
+    return lax.while_loop(lambda carry: at(carry, again)[0], lambda carry: at(carry, after), start)

@@ -1,0 +1,159 @@
+"""Capture functions of small arrays as graphs of scalars, from their jaxprs."""
+
+import itertools
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Final
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import ShapedArray, Tracer
+from jax.extend.core import Literal
+
+from mjx_study.graph.nodes import (
+    ELEMENTWISE,
+    Node,
+    ScalarGraph,
+    constants,
+    entries_of,
+    filled,
+    needed_for,
+    no_type_check,
+)
+from mjx_study.graph.rules import RULES
+
+_SAME: Final = frozenset({"copy", "copy_p", "name", "optimization_barrier"})
+_CALLS: Final = {"closed_call": "call_jaxpr", "jit": "jaxpr", "pjit": "jaxpr"}
+
+
+@dataclass(frozen=True)
+class ScalarFunction:
+    """A function of arrays as a graph.
+
+    Attributes:
+        graph: the graph that its nodes belong to.
+        inputs: one array of nodes per traced leaf of the arguments.
+        outputs: one array of nodes and NumPy scalars per leaf of the result.
+        avals: types of the outputs.
+        structure: pytree of the outputs.
+    """
+
+    graph: ScalarGraph
+    inputs: list[np.ndarray]
+    outputs: list[np.ndarray]
+    avals: Sequence[Any]
+    structure: Any
+
+    @cached_property
+    def needed(self) -> list[Node]:
+        """Nodes that the outputs depend on, arguments first."""
+        return needed_for(entries_of(self.outputs))
+
+
+def is_input(leaf: Any) -> bool:
+    """Whether a leaf of a captured function's arguments is one of its inputs; others are constants."""
+    return isinstance(leaf, Tracer | jax.ShapeDtypeStruct)
+
+
+def capture(function: Callable[..., Any], *arguments: Any, most: int) -> ScalarFunction:
+    """Write `function(*arguments)` out as a graph.
+
+    Args:
+        arguments: pytrees of arrays; traced ones and `jax.ShapeDtypeStruct`s become inputs, others constants.
+        most: maximum number of scalar operations.
+
+    Raises:
+        TooLargeError: it has more operations.
+    """
+    jaxpr, shape = jax.make_jaxpr(function, return_shape=True)(*arguments)
+    graph, leaves = ScalarGraph(most), jax.tree.leaves(arguments)
+    arrays = [graph.fresh("input", leaf.shape, leaf.dtype) if is_input(leaf) else constants(leaf) for leaf in leaves]
+    outputs = _run(graph, jaxpr.jaxpr, [constants(each) for each in jaxpr.consts], arrays)
+    inputs = [array for array, leaf in zip(arrays, leaves, strict=True) if is_input(leaf)]
+    return ScalarFunction(graph, inputs, outputs, jaxpr.out_avals, jax.tree.structure(shape))
+
+
+@no_type_check
+def _run(
+    graph: ScalarGraph, jaxpr: Any, closed: Sequence[np.ndarray], inputs: Sequence[np.ndarray]
+) -> list[np.ndarray]:
+    """Evaluate a jaxpr; array entries are nodes or NumPy scalars."""
+    values = dict(zip((*jaxpr.constvars, *jaxpr.invars), (*closed, *inputs), strict=True))
+
+    def read(atom: Any) -> np.ndarray:
+        if isinstance(atom, Literal):
+            kind: Any = atom.aval
+            return constants(np.asarray(atom.val, kind.dtype))
+        return values[atom]
+
+    for equation in jaxpr.eqns:
+        outputs = _equation(graph, equation, [read(atom) for atom in equation.invars])
+        values |= zip(equation.outvars, outputs, strict=True)
+    return [read(atom) for atom in jaxpr.outvars]
+
+
+@no_type_check
+def _equation(graph: ScalarGraph, equation: Any, inputs: list[np.ndarray]) -> Sequence[np.ndarray]:
+    name, parameters = equation.primitive.name, equation.params
+    avals: list[Any] = [each.aval for each in equation.invars]
+    aval: Any = equation.outvars[0].aval
+    if not any(math.prod(each.aval.shape) for each in equation.outvars):
+        return [filled(each.aval.shape, ()) for each in equation.outvars]
+    if name in _SAME:
+        return inputs
+    if name in ELEMENTWISE:
+        return [graph.elementwise(equation.primitive, inputs, aval, **parameters)]
+    if name in _CALLS:
+        inner = parameters[_CALLS[name]]
+        return _run(graph, inner.jaxpr, [constants(each) for each in inner.consts], inputs)
+    if name in RULES and (outputs := RULES[name](graph, inputs, aval, parameters)) is not None:
+        return outputs
+    if name == "while":
+        return _loop(graph, equation, inputs)
+    if not any(isinstance(each, Node) for each in entries_of(inputs)):
+        with jax.ensure_compile_time_eval():
+            arrays = [array_of(each.flat, of) for each, of in zip(inputs, avals, strict=True)]
+            return [constants(each) for each in bind_whole(equation, arrays)]
+    node = graph.node("whole", tuple(entries_of(inputs)), (equation, avals), None)
+    return graph.outputs(node, [each.aval for each in equation.outvars])
+
+
+def _loop(graph: ScalarGraph, equation: Any, inputs: list[np.ndarray]) -> list[np.ndarray]:
+    """While loop over scalars, with loop invariants computed beforehand."""
+    parameters, avals = equation.params, [each.aval for each in equation.outvars]
+    first, second = parameters["cond_nconsts"], parameters["cond_nconsts"] + parameters["body_nconsts"]
+    during = [graph.fresh("carry", aval.shape, aval.dtype) for aval in avals]
+
+    def inside(of: str, consts: list[np.ndarray]) -> list[Any]:
+        inner = parameters[of]
+        return entries_of(_run(graph, inner.jaxpr, [constants(each) for each in inner.consts], [*consts, *during]))
+
+    again, after = inside("cond_jaxpr", inputs[:first]), inside("body_jaxpr", inputs[first:second])
+    carried = entries_of(during)
+    needed, changing = needed_for([*again, *after]), {each.number for each in carried}
+    for each in needed:
+        if any(isinstance(argument, Node) and argument.number in changing for argument in each.arguments):
+            changing.add(each.number)
+    fixed = [each for each in needed if each.number not in changing]
+    start = entries_of(inputs[second:])
+    node = graph.node("loop", (*start, *fixed), (carried, again, after), None)
+    flat = [ShapedArray((), each.dtype) for each in carried]
+    scalars = iter([each[()] for each in graph.outputs(node, flat)])
+    return [filled(aval.shape, itertools.islice(scalars, math.prod(aval.shape))) for aval in avals]
+
+
+def bind_whole(equation: Any, arrays: Sequence[jax.Array]) -> Sequence[jax.Array]:
+    """Apply an operation to whole arrays, with its own differentiation rule if it has one."""
+    parameters = equation.primitive.get_bind_params(equation.params)
+    functions, parameters = parameters if isinstance(parameters, tuple) else ((), parameters)  # depends on JAX version
+    found = equation.primitive.bind(*functions, *arrays, **parameters)
+    return found if equation.primitive.multiple_results else [found]
+
+
+@no_type_check
+def array_of(entries: Iterable[Any], aval: Any) -> jax.Array:
+    scalars = [jnp.asarray(each, aval.dtype) for each in entries]
+    return jnp.stack(scalars).reshape(aval.shape) if scalars else jnp.zeros(aval.shape, aval.dtype)
