@@ -15,7 +15,7 @@ import pytest
 
 from mjx_study.choices import CONES, INTEGRATORS, SOLVERS
 from mjx_study.cli.options import TASK_OPTIONS, Parser, given_options
-from mjx_study.option import as_arguments
+from mjx_study.options.option import as_arguments
 from mjx_study.simulation.dynamics import State
 from mjx_study.simulation.limitations import FLAGS
 from mjx_study.simulation.scene import (

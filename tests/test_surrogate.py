@@ -10,11 +10,11 @@ import optax
 import pytest
 
 from mjx_study.execution.run import run_study
-from mjx_study.experiment.configuration import StudyConfig
 from mjx_study.experiment.descents import Backend
 from mjx_study.experiment.iteration import begin, schedule_factors
 from mjx_study.experiment.plan import estimators_of, plan_study
 from mjx_study.objective import Simulator, simulate
+from mjx_study.options.configuration import StudyConfig
 from mjx_study.simulation.contact import contact_model, soften, stiffness_from_solref
 from mjx_study.simulation.dynamics import State
 from mjx_study.tasks import make_task
