@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from jax.ad_checkpoint import checkpoint_name
 
-from mjx_study.simulation.derivative_rule import refusing, with_rule
+from mjx_study.graph.derivative_rule import refusing, with_rule
 from mjx_study.simulation.drop_in import step
 from mjx_study.simulation.dynamics import State, rollout
 from mjx_study.simulation.onset import corrected_rollout

@@ -1,9 +1,9 @@
 """Capture functions of small arrays as graphs of scalars, from their jaxprs."""
 
+import dataclasses
 import itertools
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Final
 
@@ -29,16 +29,17 @@ _SAME: Final = frozenset({"copy", "copy_p", "name", "optimization_barrier"})
 _CALLS: Final = {"closed_call": "call_jaxpr", "jit": "jaxpr", "pjit": "jaxpr"}
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class ScalarFunction:
     """A function of arrays as a graph.
 
     Attributes:
         graph: the graph that its nodes belong to.
-        inputs: one array of nodes per traced leaf of the arguments.
-        outputs: one array of nodes and NumPy scalars per leaf of the result.
+        inputs: one array of nodes per input.
+        outputs: one array of nodes and NumPy scalars per output.
         avals: types of the outputs.
         structure: pytree of the outputs.
+        derived: what has been derived from it, by kind.
     """
 
     graph: ScalarGraph
@@ -46,11 +47,18 @@ class ScalarFunction:
     outputs: list[np.ndarray]
     avals: Sequence[Any]
     structure: Any
+    derived: dict[Any, Any] = dataclasses.field(default_factory=dict, init=False)
 
     @cached_property
     def needed(self) -> list[Node]:
         """Nodes that the outputs depend on, arguments first."""
         return needed_for(entries_of(self.outputs))
+
+    def of_used(self) -> tuple["ScalarFunction", list[int]]:
+        """Return the function of those inputs that its outputs depend on, and their places among all."""
+        needed = {node.number for node in self.needed}
+        used = [place for place, each in enumerate(self.inputs) if any(node.number in needed for node in each.flat)]
+        return dataclasses.replace(self, inputs=[self.inputs[place] for place in used]), used
 
 
 def is_input(leaf: Any) -> bool:
@@ -71,17 +79,24 @@ def capture(function: Callable[..., Any], *arguments: Any, most: int) -> ScalarF
     jaxpr, shape = jax.make_jaxpr(function, return_shape=True)(*arguments)
     graph, leaves = ScalarGraph(most), jax.tree.leaves(arguments)
     arrays = [graph.fresh("input", leaf.shape, leaf.dtype) if is_input(leaf) else constants(leaf) for leaf in leaves]
-    outputs = _run(graph, jaxpr.jaxpr, [constants(each) for each in jaxpr.consts], arrays)
+    outputs = run(graph, jaxpr, arrays)
+    graph.most = None
     inputs = [array for array, leaf in zip(arrays, leaves, strict=True) if is_input(leaf)]
     return ScalarFunction(graph, inputs, outputs, jaxpr.out_avals, jax.tree.structure(shape))
 
 
 @no_type_check
-def _run(
-    graph: ScalarGraph, jaxpr: Any, closed: Sequence[np.ndarray], inputs: Sequence[np.ndarray]
-) -> list[np.ndarray]:
-    """Evaluate a jaxpr; array entries are nodes or NumPy scalars."""
-    values = dict(zip((*jaxpr.constvars, *jaxpr.invars), (*closed, *inputs), strict=True))
+def inlined(graph: ScalarGraph, function: Callable[..., Any], *arrays: np.ndarray) -> list[np.ndarray]:
+    """Add a function of floating-point arrays of nodes to a graph; its leaves."""
+    kinds = [jax.ShapeDtypeStruct(each.shape, each.flat[0].dtype if each.size else np.dtype(float)) for each in arrays]
+    return run(graph, jax.make_jaxpr(function)(*kinds), arrays)
+
+
+@no_type_check
+def run(graph: ScalarGraph, closed: Any, inputs: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Evaluate a closed jaxpr; array entries are nodes or NumPy scalars."""
+    jaxpr, consts = closed.jaxpr, [constants(each) for each in closed.consts]
+    values = dict(zip((*jaxpr.constvars, *jaxpr.invars), (*consts, *inputs), strict=True))
 
     def read(atom: Any) -> np.ndarray:
         if isinstance(atom, Literal):
@@ -107,8 +122,7 @@ def _equation(graph: ScalarGraph, equation: Any, inputs: list[np.ndarray]) -> Se
     if name in ELEMENTWISE:
         return [graph.elementwise(equation.primitive, inputs, aval, **parameters)]
     if name in _CALLS:
-        inner = parameters[_CALLS[name]]
-        return _run(graph, inner.jaxpr, [constants(each) for each in inner.consts], inputs)
+        return run(graph, parameters[_CALLS[name]], inputs)
     if name in RULES and (outputs := RULES[name](graph, inputs, aval, parameters)) is not None:
         return outputs
     if name == "while":
@@ -128,8 +142,7 @@ def _loop(graph: ScalarGraph, equation: Any, inputs: list[np.ndarray]) -> list[n
     during = [graph.fresh("carry", aval.shape, aval.dtype) for aval in avals]
 
     def inside(of: str, consts: list[np.ndarray]) -> list[Any]:
-        inner = parameters[of]
-        return entries_of(_run(graph, inner.jaxpr, [constants(each) for each in inner.consts], [*consts, *during]))
+        return entries_of(run(graph, parameters[of], [*consts, *during]))
 
     again, after = inside("cond_jaxpr", inputs[:first]), inside("body_jaxpr", inputs[first:second])
     carried = entries_of(during)

@@ -70,15 +70,19 @@ class Node:
 
 @no_type_check
 class ScalarGraph:
-    """The operations of a function, without duplicates."""
+    """The operations of a function, without duplicates.
 
-    def __init__(self, most: int):
-        self._count, self._most = 0, most
+    Attributes:
+        most: maximum number of nodes, beyond which new ones raise `TooLargeError`; None for any number.
+    """
+
+    def __init__(self, most: int | None):
+        self.most, self._count = most, 0
         self._known: dict[Any, Node] = {}
 
     def node(self, operation: Any, arguments: tuple[Any, ...], parameters: Any, dtype: Any) -> Node:
         self._count += 1
-        if self._count > self._most:
+        if self.most is not None and self._count > self.most:
             raise TooLargeError
         return Node(self._count, operation, arguments, parameters, dtype)
 

@@ -15,9 +15,9 @@ import mujoco
 from jaxtyping import Array, Bool, Float
 
 from mjx_study.choices import unknown
+from mjx_study.graph.derivative_rule import instantiated, with_rule
 from mjx_study.simulation import constraint
 from mjx_study.simulation._mjx import mjx
-from mjx_study.simulation.derivative_rule import instantiated, with_rule
 from mjx_study.simulation.dynamics import SAVE_SOLUTION, Qvel, State, fwd_position
 from mjx_study.simulation.integration import difference_position, integrate_position
 from mjx_study.simulation.onset import differentiated_once, onset_term, tangent_of, without_derivative

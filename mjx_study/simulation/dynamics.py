@@ -25,11 +25,11 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
 from estimators.pytree import register_pytree
+from mjx_study.graph.derivative_rule import instantiated, with_rule
 from mjx_study.graph.scalars import traced_part, unrolled
 from mjx_study.simulation import constraint
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.constraint import Qvel, Scalar
-from mjx_study.simulation.derivative_rule import instantiated, with_rule
 from mjx_study.simulation.integration import integrate_position
 from mjx_study.simulation.linear_algebra import MOST_UNROLLED, product, solve_positive_definite
 from mjx_study.simulation.patches import patched

@@ -37,11 +37,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from mjx_study.choices import ONSETS, unknown
+from mjx_study.graph.derivative_rule import refusing, with_rule
 from mjx_study.graph.scalars import traced_part
 from mjx_study.simulation import constraint
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.constraint import Rows, Scalar
-from mjx_study.simulation.derivative_rule import refusing, with_rule
 from mjx_study.simulation.dynamics import (
     SAVE_SOLUTION,
     ControlLaw,
