@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.extend.core import jaxpr_as_fun
 
 from mjx_study.graph.function import ScalarFunction, array_of, bind_whole
 from mjx_study.graph.nodes import Node, needed_for, no_type_check
@@ -43,6 +44,12 @@ def evaluated(function: ScalarFunction) -> Callable[..., list[jax.Array]]:
         ]
 
     return program
+
+
+def written_out(function: ScalarFunction) -> Callable[..., list[jax.Array]]:
+    """`evaluated` as a program, which JAX batches and differentiates once for all programs that use it."""
+    types = [jax.ShapeDtypeStruct(each.shape, each.flat[0].dtype) for each in function.inputs]
+    return jax.jit(jaxpr_as_fun(jax.make_jaxpr(evaluated(function))(*types)))
 
 
 @no_type_check

@@ -1,9 +1,9 @@
 """Capture functions of small arrays as graphs of scalars, from their jaxprs."""
 
+import dataclasses
 import itertools
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Final
 
@@ -29,7 +29,7 @@ _SAME: Final = frozenset({"copy", "copy_p", "name", "optimization_barrier"})
 _CALLS: Final = {"closed_call": "call_jaxpr", "jit": "jaxpr", "pjit": "jaxpr"}
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class ScalarFunction:
     """A function of arrays as a graph.
 
@@ -51,6 +51,12 @@ class ScalarFunction:
     def needed(self) -> list[Node]:
         """Nodes that the outputs depend on, arguments first."""
         return needed_for(entries_of(self.outputs))
+
+    def of_used(self) -> tuple["ScalarFunction", list[int]]:
+        """Return the function of those inputs that its outputs depend on, and their places among all."""
+        needed = {node.number for node in self.needed}
+        used = [place for place, each in enumerate(self.inputs) if any(node.number in needed for node in each.flat)]
+        return dataclasses.replace(self, inputs=[self.inputs[place] for place in used]), used
 
 
 def is_input(leaf: Any) -> bool:

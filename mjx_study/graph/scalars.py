@@ -14,10 +14,12 @@ from typing import Any, Final
 import jax
 import numpy as np
 from jax.core import Tracer
-from jax.extend.core import jaxpr_as_fun
 
-from mjx_study.graph.evaluation import evaluated
-from mjx_study.graph.function import capture
+from mjx_study.graph.build import native_identity
+from mjx_study.graph.c import NotWrittenError
+from mjx_study.graph.evaluation import written_out
+from mjx_study.graph.function import ScalarFunction, capture
+from mjx_study.graph.native import NativeFunction
 from mjx_study.graph.nodes import TooLargeError, no_type_check
 
 MOST_SCALARS: Final = {"cpu": 12_000, "gpu": 6_000, "tpu": 6_000}
@@ -42,7 +44,7 @@ def unrolled(function: Callable[..., Any], *arguments: Any) -> Any:
     if not inputs:
         return function(*arguments)
     most = MOST_SCALARS[jax.default_backend()]
-    key = _name(function), structure, tuple(map(_content, leaves)), most
+    key = _name(function), structure, tuple(map(_content, leaves)), most, native_identity()
     if key not in _WRITTEN_OUT:
         while len(_WRITTEN_OUT) >= MOST_KEPT:
             del _WRITTEN_OUT[next(iter(_WRITTEN_OUT))]
@@ -72,14 +74,23 @@ def _written_out(
 ) -> Callable[..., Any] | None:
     """Build a function of the traced leaves of the arguments; None if it takes too many operations."""
     try:
-        captured = capture(function, *arguments, most=2 * most)
+        captured, used = capture(function, *arguments, most=2 * most).of_used()
     except TooLargeError:
         return None
     if len(captured.needed) > most:
         return None
-    traced = [leaf for leaf in leaves if isinstance(leaf, Tracer)]
-    called = jax.jit(jaxpr_as_fun(jax.make_jaxpr(evaluated(captured))(*traced)))
-    return lambda *free: jax.tree.unflatten(captured.structure, called(*free))
+    called = _end_of(captured)
+    return lambda *free: jax.tree.unflatten(captured.structure, called(*(free[place] for place in used)))
+
+
+def _end_of(captured: ScalarFunction) -> Callable[..., list[jax.Array]]:
+    """Native code where it can be built, else JAX operations."""
+    if native_identity() is not None and captured.inputs:
+        try:
+            return NativeFunction(captured)
+        except NotWrittenError:
+            pass
+    return written_out(captured)
 
 
 def traced_part(tree: Any) -> tuple[list[Any], Callable[[list[Any]], Any]]:
