@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from mjx_study.graph import scalars
+from mjx_study.graph.build import SWITCH
 from mjx_study.graph.scalars import traced_part, unrolled
 
 TABLE = np.arange(12.0).reshape(4, 3) - 5
@@ -118,7 +119,8 @@ def _operations(function, *arguments) -> list[str]:
     return [name for each in jaxpr.eqns if (name := each.primitive.name) not in moves]
 
 
-def test_constants_fold_and_what_occurs_twice_or_for_nothing_is_dropped():
+def test_constants_fold_and_what_occurs_twice_or_for_nothing_is_dropped(monkeypatch):
+    monkeypatch.setenv(SWITCH, "0")
     turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
     def function(x):
@@ -130,7 +132,9 @@ def test_constants_fold_and_what_occurs_twice_or_for_nothing_is_dropped():
     assert sorted(operations) == ["add", "mul", "neg", "sin"]
 
 
-def test_what_does_not_change_in_a_loop_is_computed_before_it():
+def test_what_does_not_change_in_a_loop_is_computed_before_it(monkeypatch):
+    monkeypatch.setenv(SWITCH, "0")
+
     def function(x):
         return jax.lax.while_loop(lambda y: y < 9.0, lambda y: y * jnp.cosh(x[0]) + 1, x[1])
 

@@ -39,7 +39,7 @@ def _pad(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: Parameters) 
     array, filler = inputs
     if any(low < 0 or high < 0 or between for low, high, between in parameters["padding_config"]):
         return None
-    padded = np.full(aval.shape, filler[()], object)
+    padded = filled(aval.shape, itertools.repeat(filler[()], math.prod(aval.shape)))
     lows = [low for low, _, _ in parameters["padding_config"]]
     padded[tuple(slice(low, low + size) for low, size in zip(lows, array.shape, strict=True))] = array
     return [padded]
