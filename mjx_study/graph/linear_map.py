@@ -89,22 +89,6 @@ def implicit_derivative(function: ScalarFunction, moving: tuple[int, ...], solve
 
 
 @no_type_check
-def implicit_jacobian(function: ScalarFunction, moving: tuple[int, ...], solve: Solve) -> ScalarFunction:
-    """Jacobian of (results, root) over the inputs at `moving`; see `implicit_derivative`."""
-
-    def derived() -> ScalarFunction:
-        graph, inputs = function.graph, np.concatenate([function.inputs[place] for place in moving])
-        gap, *results = function.outputs
-        results = np.concatenate(results)
-        response = _solved(function, solve, jacobian(graph, gap, inputs))
-        through = lambda over, over_root, response: over + over_root @ response  # noqa: E731
-        blocks = jacobian(graph, results, inputs), jacobian(graph, results, function.inputs[-1]), response
-        return _function(function, [], [*inlined(graph, through, *blocks), response])
-
-    return _once(function, ("jacobian", moving, solve), derived)
-
-
-@no_type_check
 def _solved(function: ScalarFunction, solve: Solve, right_side: np.ndarray) -> np.ndarray:
     """-G_a^-1 times the right-hand side."""
     slope = jacobian(function.graph, function.outputs[0], function.inputs[-1])

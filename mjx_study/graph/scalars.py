@@ -53,8 +53,13 @@ def captured_once(function: Callable[..., Any], *arguments: Any) -> ScalarFuncti
             captured = capture(function, *arguments, most=2 * most)
         except TooLargeError:
             captured = None
-        _CAPTURED[key] = captured if captured and len(captured.needed) <= most else None
+        _CAPTURED[key] = captured if captured and is_small(captured) else None
     return _CAPTURED[key]
+
+
+def is_small(function: ScalarFunction) -> bool:
+    """Whether a graph is worth compiling: it has at most `MOST_SCALARS` operations."""
+    return len(function.needed) <= MOST_SCALARS[jax.default_backend()]
 
 
 def _name(function: Callable[..., Any]) -> Any:

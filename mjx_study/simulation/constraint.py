@@ -50,6 +50,9 @@ POLISHING_STEPS: Final = 4
 EPSILON: Final = 1e-14
 """Relative rounding error of a force in the solver's equation."""
 
+SAVE_SOLUTION: Final = jax.checkpoint_policies.save_only_these_names("qacc")
+"""Policy of `jax.checkpoint` that recomputes steps in the backward pass without running their solver again."""
+
 
 def row_force(model: mjx.Model, data: mjx.Data, slack: Rows) -> Rows:
     """Force of each constraint row [N or N m] at the slack J a - aref [m/s^2 or rad/s^2]: MuJoCo's force law f.
