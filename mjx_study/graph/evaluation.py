@@ -17,15 +17,20 @@ from mjx_study.graph.nodes import Node, needed_for, no_type_check
 _FUNCTIONS: Final = {
     lax.add_p: lax.add,
     lax.and_p: lax.bitwise_and,
+    lax.div_p: lax.div,
     lax.eq_p: lax.eq,
     lax.gt_p: lax.gt,
     lax.lt_p: lax.lt,
     lax.max_p: lax.max,
     lax.min_p: lax.min,
     lax.mul_p: lax.mul,
+    lax.ne_p: lax.ne,
     lax.neg_p: lax.neg,
+    lax.not_p: lax.bitwise_not,
     lax.or_p: lax.bitwise_or,
     lax.select_n_p: lax.select_n,
+    lax.sqrt_p: lax.sqrt,
+    lax.sub_p: lax.sub,
 }
 """Functions for operations that rules add; they supply the primitive parameters of the installed JAX version."""
 

@@ -72,8 +72,8 @@ class Node:
 class ScalarGraph:
     """The operations of a function, without duplicates."""
 
-    def __init__(self, most: int):
-        self._count, self._most = 0, most
+    def __init__(self, most: int, values_only: bool = False):
+        self._count, self._most, self.values_only = 0, most, values_only
         self._known: dict[Any, Node] = {}
 
     def node(self, operation: Any, arguments: tuple[Any, ...], parameters: Any, dtype: Any) -> Node:

@@ -16,10 +16,9 @@ import numpy as np
 from jax.core import Tracer
 
 from mjx_study.graph.build import native_identity
-from mjx_study.graph.c import NotWrittenError
 from mjx_study.graph.evaluation import written_out
-from mjx_study.graph.function import ScalarFunction, capture
-from mjx_study.graph.native import NativeFunction
+from mjx_study.graph.function import capture
+from mjx_study.graph.native import as_native
 from mjx_study.graph.nodes import TooLargeError, no_type_check
 
 MOST_SCALARS: Final = {"cpu": 12_000, "gpu": 6_000, "tpu": 6_000}
@@ -74,23 +73,21 @@ def _written_out(
 ) -> Callable[..., Any] | None:
     """Build a function of the traced leaves of the arguments; None if it takes too many operations."""
     try:
-        captured, used = capture(function, *arguments, most=2 * most).of_used()
+        captured = capture(function, *arguments, most=2 * most)
     except TooLargeError:
         return None
     if len(captured.needed) > most:
         return None
-    called = _end_of(captured)
+    used = captured.used
+    captured = captured.of(used)
+    called = None
+    if native_identity() is not None and used:
+        values = captured
+        if any(node.operation == "whole" for node in captured.needed):
+            values = capture(function, *arguments, most=2 * most, values_only=True).of(used)
+        called = as_native(values, captured)
+    called = called or written_out(captured)
     return lambda *free: jax.tree.unflatten(captured.structure, called(*(free[place] for place in used)))
-
-
-def _end_of(captured: ScalarFunction) -> Callable[..., list[jax.Array]]:
-    """Native code where it can be built, else JAX operations."""
-    if native_identity() is not None and captured.inputs:
-        try:
-            return NativeFunction(captured)
-        except NotWrittenError:
-            pass
-    return written_out(captured)
 
 
 def traced_part(tree: Any) -> tuple[list[Any], Callable[[list[Any]], Any]]:
