@@ -24,9 +24,12 @@ _FUNCTIONS: Final = {
     lax.max_p: lax.max,
     lax.min_p: lax.min,
     lax.mul_p: lax.mul,
+    lax.ne_p: lax.ne,
     lax.neg_p: lax.neg,
+    lax.not_p: lax.bitwise_not,
     lax.or_p: lax.bitwise_or,
     lax.select_n_p: lax.select_n,
+    lax.sqrt_p: lax.sqrt,
     lax.sub_p: lax.sub,
 }
 """Functions for operations that rules add; they supply the primitive parameters of the installed JAX version."""

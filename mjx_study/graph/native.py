@@ -11,23 +11,32 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
 from mjx_study.graph.build import build_library, library_ready
-from mjx_study.graph.c import source_of
+from mjx_study.graph.c import NotWrittenError, source_of
 from mjx_study.graph.evaluation import written_out
 from mjx_study.graph.function import ScalarFunction
 
 
-class NativeFunction:
-    """A captured function as a library, and as a JAX program for derivatives and where there is no library.
+def as_native(values: ScalarFunction, function: ScalarFunction) -> "NativeFunction | None":
+    """Begin to build native code for a function's values; None if it cannot be written.
 
-    Raises:
-        NotWrittenError: native code cannot be written for it.
+    Args:
+        values: the function captured for its values only.
+        function: the function, which derivatives are taken of.
     """
+    try:
+        return NativeFunction(source_of(values), function)
+    except NotWrittenError:
+        return None
 
-    def __init__(self, function: ScalarFunction):
+
+class NativeFunction:
+    """A captured function as a library, and as a JAX program for derivatives and where there is no library."""
+
+    def __init__(self, source: str, function: ScalarFunction):
         self._function = function
         self.inputs = [ShapedArray(each.shape, each.flat[0].dtype) for each in function.inputs]
         self.outputs = function.avals
-        self.name = build_library(source_of(function))
+        self.name = build_library(source)
 
     def __call__(self, *inputs: jax.Array) -> list[jax.Array]:
         return _native.bind(*inputs, function=self, batch=())

@@ -74,10 +74,11 @@ class ScalarGraph:
 
     Attributes:
         most: maximum number of nodes, beyond which new ones raise `TooLargeError`; None for any number.
+        values_only: whether calls with a derivative of their own are written out, too, which loses it.
     """
 
-    def __init__(self, most: int | None):
-        self.most, self._count = most, 0
+    def __init__(self, most: int | None, values_only: bool = False):
+        self.most, self.values_only, self._count = most, values_only, 0
         self._known: dict[Any, Node] = {}
 
     def node(self, operation: Any, arguments: tuple[Any, ...], parameters: Any, dtype: Any) -> Node:

@@ -4,20 +4,18 @@ JAX traces and differentiates nothing inside: the derivative of such a function 
 either mode, in scans, batches and checkpoints.
 """
 
-import contextlib
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
 
 from mjx_study.graph.build import native_identity
-from mjx_study.graph.c import NotWrittenError
 from mjx_study.graph.derivative_rule import Transpose, flat_with_rule, instantiated
 from mjx_study.graph.differentiation import NotDifferentiableError
 from mjx_study.graph.evaluation import written_out
 from mjx_study.graph.function import ScalarFunction
 from mjx_study.graph.linear_map import LinearMap, derivative
-from mjx_study.graph.native import NativeFunction
+from mjx_study.graph.native import as_native
 
 
 def computed(function: ScalarFunction, inputs: Sequence[Any], transpose: Transpose | None = None) -> list[Any]:
@@ -58,14 +56,9 @@ def _program(function: ScalarFunction) -> Callable[..., list[jax.Array]]:
     """Native code where it can be built, else JAX operations."""
     key = "program", native_identity()
     if key not in function.derived:
-        of_used, used = function.of_used()
-        end = _end(of_used)
+        used, native = function.used, None
+        if native_identity() is not None and used:
+            native = as_native(function.derived.get("values", function).of(used), function.of(used))
+        end = native or written_out(function.of(used))
         function.derived[key] = lambda *inputs: end(*(inputs[place] for place in used))
     return function.derived[key]
-
-
-def _end(function: ScalarFunction) -> Callable[..., list[jax.Array]]:
-    if native_identity() is not None and function.inputs:
-        with contextlib.suppress(NotWrittenError):
-            return NativeFunction(function)
-    return written_out(function)
