@@ -69,7 +69,7 @@ def prepare(name: str) -> Prepared:
 def jacobian(name: str) -> np.ndarray:
     """The Jacobian program's, in reverse mode."""
     case = prepare(name)
-    assert case.scene.uses_jacobian
+    assert case.scene.uses_graph
 
     def after(model, point):
         return step_flat(case.scene, model, point, jnp.asarray(case.warmstart))[0]
@@ -189,7 +189,7 @@ def test_both_programs_and_both_modes_agree(name: str) -> None:
     """The tape, forwards and backwards, equals the Jacobian program."""
     case, expected = prepare(name), jacobian(name)
     scene = dataclasses.replace(case.scene, adjoint="tape")
-    assert not scene.uses_jacobian
+    assert not scene.uses_graph
 
     def both(model, point):
         after, push = jax.linearize(lambda x: step_flat(scene, model, x, jnp.asarray(case.warmstart))[0], point)
@@ -283,7 +283,7 @@ def test_activation_and_control_each_have_their_column() -> None:
         <general joint="x" dyntype="filter" dynprm="{tau}" gainprm="3"/><motor joint="x" gear="5"/>
         </actuator></mujoco>"""
     )
-    assert scene.uses_jacobian
+    assert scene.uses_graph
     point = jnp.array([0.1, 0.2, 0.3, 0.4, 0.5])
     after = compiled(jax.jacfwd(lambda x: step_flat(scene, scene.model, x, jnp.zeros(1))[0]), point)(point)
     speed = np.array([0, 1, 3 * h / mass, 0, 5 * h / mass])
@@ -406,7 +406,7 @@ PENDULUM = """
 def pendulum():
     """A pendulum with an activated motor: our step and MJX's at any timestep."""
     scene = scene_of(PENDULUM)
-    assert not scene.has_constraints and not scene.uses_jacobian
+    assert not scene.has_constraints and not scene.uses_graph
 
     def with_timestep(timestep):
         return scene.model.replace(opt=scene.model.opt.replace(timestep=timestep))

@@ -108,7 +108,9 @@ def test_a_functions_own_derivative_is_kept():
 def _inside(function, *arguments):
     """The jaxpr of a function, or of the one that it calls and nothing else."""
     jaxpr = jax.make_jaxpr(function)(*arguments).jaxpr
-    return jaxpr.eqns[0].params["jaxpr"].jaxpr if [each.primitive.name for each in jaxpr.eqns] == ["jit"] else jaxpr
+    while len(jaxpr.eqns) == 1 and jaxpr.eqns[0].primitive.name in ("jit", "ruled"):
+        jaxpr = jaxpr.eqns[0].params["jaxpr"].jaxpr
+    return jaxpr
 
 
 def _operations(function, *arguments) -> list[str]:
@@ -165,8 +167,8 @@ def test_what_is_too_large_stays_so_when_its_partial_is_made_anew(monkeypatch):
 
 def test_a_function_is_written_out_once_for_arguments_of_equal_content(monkeypatch):
     written = []
-    out = scalars._written_out
-    monkeypatch.setattr(scalars, "_written_out", lambda *given: written.append(given) or out(*given))
+    out = scalars.capture
+    monkeypatch.setattr(scalars, "capture", lambda *given, **named: written.append(given) or out(*given, **named))
     function = lambda power, table, x: jnp.asarray(table) @ x**power  # noqa: E731
 
     def at(x, table=ROW, power=2):
@@ -182,7 +184,7 @@ def test_a_function_is_written_out_once_for_arguments_of_equal_content(monkeypat
     assert len(written) == 4
     monkeypatch.setattr(scalars, "MOST_KEPT", 1)
     at(ROW, power=4)
-    assert len(written) == 5 and len(scalars._WRITTEN_OUT) == 1
+    assert len(written) == 5 and len(scalars._CAPTURED) == 1
 
 
 def test_without_anything_traced_the_function_is_called():

@@ -32,16 +32,17 @@ _WITH_RULES: Final = {"custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_
 """Calls with a derivative of their own, which are operations on whole arrays unless only values are wanted."""
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class ScalarFunction:
     """A function of arrays as a graph.
 
     Attributes:
         graph: the graph that its nodes belong to.
-        inputs: one array of nodes per traced leaf of the arguments.
-        outputs: one array of nodes and NumPy scalars per leaf of the result.
+        inputs: one array of nodes per input.
+        outputs: one array of nodes and NumPy scalars per output.
         avals: types of the outputs.
         structure: pytree of the outputs.
+        derived: what has been derived from it, by kind.
     """
 
     graph: ScalarGraph
@@ -49,6 +50,7 @@ class ScalarFunction:
     outputs: list[np.ndarray]
     avals: Sequence[Any]
     structure: Any
+    derived: dict[Any, Any] = dataclasses.field(default_factory=dict, init=False)
 
     @cached_property
     def needed(self) -> list[Node]:
@@ -60,11 +62,6 @@ class ScalarFunction:
         """Places of the inputs that the outputs depend on."""
         needed = {node.number for node in self.needed}
         return [place for place, each in enumerate(self.inputs) if any(node.number in needed for node in each.flat)]
-
-    @property
-    def types(self) -> list[ShapedArray]:
-        """Types of the inputs."""
-        return [ShapedArray(each.shape, each.flat[0].dtype if each.size else np.dtype(float)) for each in self.inputs]
 
     def of(self, places: Sequence[int]) -> "ScalarFunction":
         """Return the function of some of its inputs, which does not depend on the others."""
@@ -90,17 +87,24 @@ def capture(function: Callable[..., Any], *arguments: Any, most: int, values_onl
     jaxpr, shape = jax.make_jaxpr(function, return_shape=True)(*arguments)
     graph, leaves = ScalarGraph(most, values_only), jax.tree.leaves(arguments)
     arrays = [graph.fresh("input", leaf.shape, leaf.dtype) if is_input(leaf) else constants(leaf) for leaf in leaves]
-    outputs = _run(graph, jaxpr.jaxpr, [constants(each) for each in jaxpr.consts], arrays)
+    outputs = run(graph, jaxpr, arrays)
+    graph.most = None
     inputs = [array for array, leaf in zip(arrays, leaves, strict=True) if is_input(leaf)]
     return ScalarFunction(graph, inputs, outputs, jaxpr.out_avals, jax.tree.structure(shape))
 
 
 @no_type_check
-def _run(
-    graph: ScalarGraph, jaxpr: Any, closed: Sequence[np.ndarray], inputs: Sequence[np.ndarray]
-) -> list[np.ndarray]:
-    """Evaluate a jaxpr; array entries are nodes or NumPy scalars."""
-    values = dict(zip((*jaxpr.constvars, *jaxpr.invars), (*closed, *inputs), strict=True))
+def inlined(graph: ScalarGraph, function: Callable[..., Any], *arrays: np.ndarray) -> list[np.ndarray]:
+    """Add a function of floating-point arrays of nodes to a graph; its leaves."""
+    kinds = [jax.ShapeDtypeStruct(each.shape, each.flat[0].dtype if each.size else np.dtype(float)) for each in arrays]
+    return run(graph, jax.make_jaxpr(function)(*kinds), arrays)
+
+
+@no_type_check
+def run(graph: ScalarGraph, closed: Any, inputs: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Evaluate a closed jaxpr; array entries are nodes or NumPy scalars."""
+    jaxpr, consts = closed.jaxpr, [constants(each) for each in closed.consts]
+    values = dict(zip((*jaxpr.constvars, *jaxpr.invars), (*consts, *inputs), strict=True))
 
     def read(atom: Any) -> np.ndarray:
         if isinstance(atom, Literal):
@@ -126,7 +130,7 @@ def _equation(graph: ScalarGraph, equation: Any, inputs: list[np.ndarray]) -> Se
     if name in ELEMENTWISE:
         return [graph.elementwise(equation.primitive, inputs, aval, **parameters)]
     if name in _CALLS or (graph.values_only and name in _WITH_RULES):
-        return _call(graph, parameters[(_CALLS | _WITH_RULES)[name]], inputs)
+        return run(graph, parameters[(_CALLS | _WITH_RULES)[name]], inputs)
     if name == "cond":
         return _branch(graph, equation, inputs)
     if name == "scan":
@@ -144,18 +148,13 @@ def _equation(graph: ScalarGraph, equation: Any, inputs: list[np.ndarray]) -> Se
 
 
 @no_type_check
-def _call(graph: ScalarGraph, jaxpr: Any, inputs: Sequence[np.ndarray]) -> list[np.ndarray]:
-    return _run(graph, jaxpr.jaxpr, [constants(each) for each in jaxpr.consts], inputs)
-
-
-@no_type_check
 def _branch(graph: ScalarGraph, equation: Any, inputs: Sequence[np.ndarray]) -> list[np.ndarray]:
     """Compute all branches and select one, as under `vmap`."""
     index, *operands = inputs
     branches, avals = equation.params["branches"], [each.aval for each in equation.outvars]
     if not isinstance(index[()], Node):
-        return _call(graph, branches[min(max(int(index), 0), len(branches) - 1)], operands)
-    first, *others = (_call(graph, each, operands) for each in branches)
+        return run(graph, branches[min(max(int(index), 0), len(branches) - 1)], operands)
+    first, *others = (run(graph, each, operands) for each in branches)
     kind = index[()].dtype
     for place, other in enumerate(others, 1):
         here = filled((), [graph.scalar(lax.ge_p, (index[()], kind.type(place)), np.dtype(bool))])
@@ -175,7 +174,7 @@ def _scan(graph: ScalarGraph, equation: Any, inputs: Sequence[np.ndarray]) -> li
     stacked = [np.empty(aval.shape, object) for aval in avals]
     passes = range(parameters["length"])
     for at in reversed(passes) if parameters["reverse"] else passes:
-        outputs = _call(graph, parameters["jaxpr"], [*consts, *carry, *(each[at] for each in rows)])
+        outputs = run(graph, parameters["jaxpr"], [*consts, *carry, *(each[at] for each in rows)])
         carry = outputs[: len(carry)]
         for every, one in zip(stacked, outputs[len(carry) :], strict=True):
             every[at] = one
@@ -189,7 +188,7 @@ def _loop(graph: ScalarGraph, equation: Any, inputs: list[np.ndarray]) -> list[n
     during = [graph.fresh("carry", aval.shape, aval.dtype) for aval in avals]
 
     def inside(of: str, consts: list[np.ndarray]) -> list[Any]:
-        return entries_of(_call(graph, parameters[of], [*consts, *during]))
+        return entries_of(run(graph, parameters[of], [*consts, *during]))
 
     again, after = inside("cond_jaxpr", inputs[:first]), inside("body_jaxpr", inputs[first:second])
     carried = entries_of(during)
