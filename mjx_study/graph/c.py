@@ -65,14 +65,7 @@ def source_of(function: ScalarFunction, platform: str = "cpu") -> str:
     forms_out = [(math.prod(aval.shape), aval.dtype, aval.ndim) for aval in function.avals]
     if platform == "gpu":
         samples = [_text("prelude.cu"), "SAMPLES {", "BEGIN", *body.lines, "}"]
-        handler = [
-            _batch(forms_in, forms_out),
-            "#ifdef __CUDACC_RTC__",
-            *samples,
-            "#else",
-            _text("launcher.c"),
-            "#endif",
-        ]
+        parts = ["#ifdef __CUDACC_RTC__", *samples, "#else", _text("launcher.c"), "#endif"]
         return "\n".join([_batch(forms_in, forms_out), *parts, ""])
     wide = any(dtype.itemsize == 8 for dtype in body.dtypes)
     return "\n".join(

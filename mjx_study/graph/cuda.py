@@ -10,8 +10,7 @@ from typing import Any, Final
 import jax
 
 MOST_OPTIMISED: Final = 300_000
-"""Maximum length of a source [characters] worth more than the simplest optimisations of the assembler: with more, longer
-sources keep more values alive than there are registers."""
+"""Maximum length of a source [characters] that is worth full optimisation, which in longer ones spills registers."""
 
 
 @functools.cache
