@@ -30,7 +30,7 @@ int prepare(void) {
 }
 
 XLA_FFI_Error *handler(XLA_FFI_CallFrame *frame) {
-  XLA_FFI_Extension_Base *extension = frame->extension_start;
+  __typeof__(frame->extension_start) extension = frame->extension_start;  // its type has changed names
   if (extension && extension->type == XLA_FFI_Extension_Metadata) {
     XLA_FFI_Metadata *about = ((XLA_FFI_Metadata_Extension *)extension)->metadata;
     about->api_version.major_version = XLA_FFI_API_MAJOR;
