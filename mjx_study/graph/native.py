@@ -12,40 +12,50 @@ from jax.interpreters import ad, batching, mlir
 
 from mjx_study.graph.build import build_library, library_ready
 from mjx_study.graph.c import NotWrittenError, source_of
-from mjx_study.graph.evaluation import written_out
 from mjx_study.graph.function import ScalarFunction
 
 
-def as_native(values: ScalarFunction, function: ScalarFunction) -> "NativeFunction | None":
-    """Begin to build native code for a function's values; None if it cannot be written.
+def as_native(
+    values: ScalarFunction, used: Sequence[int], in_jax: Callable[[], Callable[..., list[jax.Array]]]
+) -> "NativeFunction | None":
+    """Begin to build native code for a function; None if it cannot be written.
 
     Args:
-        values: the function captured for its values only.
-        function: the function, which derivatives are taken of.
+        values: the function, captured for its values only.
+        used: places of the inputs that it depends on.
+        in_jax: makes the function of JAX operations, for derivatives and where there is no library.
     """
     try:
-        return NativeFunction(source_of(values, jax.default_backend()), function)
+        return NativeFunction(values, used, in_jax)
     except NotWrittenError:
         return None
 
 
 class NativeFunction:
-    """A captured function as a library, and as a JAX program for derivatives and where there is no library."""
+    """A function of arrays as a library; see `as_native`."""
 
-    def __init__(self, source: str, function: ScalarFunction):
-        self._function = function
-        self.inputs = [ShapedArray(each.shape, each.flat[0].dtype) for each in function.inputs]
-        self.outputs = function.avals
+    def __init__(self, values: ScalarFunction, used: Sequence[int], in_jax: Callable[[], Any]):
+        self._used, self._types, self._in_jax = used, values.types, in_jax
+        self.inputs = [self._types[place] for place in used]
+        self.outputs = values.avals
         self.platform = jax.default_backend()
-        self.name = build_library(source)
+        self.name = build_library(source_of(values.of(used), self.platform))
 
     def __call__(self, *inputs: jax.Array) -> list[jax.Array]:
-        return _native.bind(*inputs, function=self, batch=())
+        return _native.bind(*(inputs[place] for place in self._used), function=self, batch=())
 
     @cached_property
-    def program(self) -> Callable[..., list[jax.Array]]:
-        """The function in JAX operations."""
-        return written_out(self._function)
+    def in_jax(self) -> Callable[..., list[jax.Array]]:
+        """The function of the used inputs in JAX operations."""
+        program = self._in_jax()
+
+        def of_used(*inputs: jax.Array) -> list[jax.Array]:
+            every = [jnp.zeros(aval.shape, aval.dtype) for aval in self._types]
+            for place, each in zip(self._used, inputs, strict=True):
+                every[place] = each
+            return program(*every)
+
+        return of_used
 
 
 def _plain(function: NativeFunction, batch: tuple[int, ...]) -> Callable[..., list[jax.Array]]:
@@ -53,7 +63,7 @@ def _plain(function: NativeFunction, batch: tuple[int, ...]) -> Callable[..., li
 
     def program(*inputs: jax.Array) -> list[jax.Array]:
         axes = tuple(0 if each.ndim > aval.ndim else None for each, aval in zip(inputs, function.inputs, strict=True))
-        each = function.program
+        each = function.in_jax
         for _ in batch:
             each = jax.vmap(each, axes)
         return each(*inputs)

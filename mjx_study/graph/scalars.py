@@ -7,7 +7,7 @@ folds constants, eliminates common subexpressions, and drops what no output need
 act on contiguous arrays over the batch under `vmap`, and fuse.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from typing import Any, Final
 
@@ -23,9 +23,11 @@ from mjx_study.graph.nodes import TooLargeError, no_type_check
 
 MOST_SCALARS: Final = {"cpu": 12_000, "gpu": 6_000, "tpu": 6_000}
 """Maximum number of scalar operations, by backend; XLA's compile time grows faster than linearly in it."""
+MOST_NATIVE: Final = 200_000
+"""Maximum number of scalar operations in native code."""
 
-_WRITTEN_OUT: Final[dict[Any, Callable[..., Any] | None]] = {}
-"""Graphs as functions, keyed by everything they depend on; None if too large. JAX batches and differentiates each of
+_WRITTEN_OUT: Final[dict[Any, Callable[..., Any]]] = {}
+"""Graphs as functions, keyed by everything they depend on. JAX batches and differentiates each of
 them once for all programs that use it."""
 MOST_KEPT: Final = 64
 """Maximum number of functions in `_WRITTEN_OUT`."""
@@ -42,14 +44,12 @@ def unrolled(function: Callable[..., Any], *arguments: Any) -> Any:
     inputs = [leaf for leaf in leaves if isinstance(leaf, Tracer)]
     if not inputs:
         return function(*arguments)
-    most = MOST_SCALARS[jax.default_backend()]
-    key = _name(function), structure, tuple(map(_content, leaves)), most, native_identity()
+    key = _name(function), structure, tuple(map(_content, leaves)), jax.default_backend(), native_identity()
     if key not in _WRITTEN_OUT:
         while len(_WRITTEN_OUT) >= MOST_KEPT:
             del _WRITTEN_OUT[next(iter(_WRITTEN_OUT))]
-        _WRITTEN_OUT[key] = _written_out(function, arguments, leaves, most)
-    program = _WRITTEN_OUT[key]
-    return function(*arguments) if program is None else program(*inputs)
+        _WRITTEN_OUT[key] = _written_out(function, arguments)
+    return _WRITTEN_OUT[key](*inputs)
 
 
 def _name(function: Callable[..., Any]) -> Any:
@@ -68,26 +68,37 @@ def _content(leaf: Any) -> Any:
     return array.shape, array.dtype.str, array.tobytes()
 
 
-def _written_out(
-    function: Callable[..., Any], arguments: tuple[Any, ...], leaves: Sequence[Any], most: int
-) -> Callable[..., Any] | None:
-    """Build a function of the traced leaves of the arguments; None if it takes too many operations."""
+def _written_out(function: Callable[..., Any], arguments: tuple[Any, ...]) -> Callable[..., Any]:
+    """Build a function of the traced leaves of the arguments: native code, JAX operations, or the function as it is."""
+    leaves, structure = jax.tree.flatten(arguments)
+    fixed = [None if isinstance(leaf, Tracer) else leaf for leaf in leaves]
+    native, most = native_identity() is not None, MOST_SCALARS[jax.default_backend()]
+
+    def itself(*inputs: jax.Array) -> Any:
+        given = iter(inputs)
+        return function(*structure.unflatten([next(given) if leaf is None else leaf for leaf in fixed]))
+
     try:
-        captured = capture(function, *arguments, most=2 * most)
+        captured = capture(function, *arguments, most=2 * (MOST_NATIVE if native else most))
     except TooLargeError:
-        return None
-    if len(captured.needed) > most:
-        return None
-    used = captured.used
-    captured = captured.of(used)
-    called = None
-    if native_identity() is not None and used:
+        return itself
+    small, used = len(captured.needed) <= most, captured.used
+
+    def in_jax() -> Callable[..., list[jax.Array]]:
+        if small:
+            return written_out(captured)
+        return jax.jit(lambda *inputs: jax.tree.leaves(itself(*inputs)))
+
+    found = None
+    if native and used and len(captured.needed) <= MOST_NATIVE:
         values = captured
         if any(node.operation == "whole" for node in captured.needed):
-            values = capture(function, *arguments, most=2 * most, values_only=True).of(used)
-        called = as_native(values, captured)
-    called = called or written_out(captured)
-    return lambda *free: jax.tree.unflatten(captured.structure, called(*(free[place] for place in used)))
+            values = capture(function, *arguments, most=2 * MOST_NATIVE, values_only=True)
+        found = as_native(values, used, in_jax)
+    if found is None and not small:
+        return itself
+    found = found or in_jax()
+    return lambda *inputs: jax.tree.unflatten(captured.structure, found(*inputs))
 
 
 def traced_part(tree: Any) -> tuple[list[Any], Callable[[list[Any]], Any]]:
