@@ -23,6 +23,7 @@ import jax.ffi
 
 from mjx_study.caches import read_cached, write_cached
 from mjx_study.disk import temporary_folder
+from mjx_study.graph import cuda
 from mjx_study.runtime import available_cores, libraries_folder, processor
 from mjx_study.version import version_of
 
@@ -58,14 +59,16 @@ def compiler() -> tuple[tuple[str, ...], str] | None:
 
 def native_identity() -> str | None:
     """Digest of what libraries depend on besides their source; None if there are to be none."""
-    if os.environ.get(SWITCH) == "0" or jax.default_backend() != "cpu" or compiler() is None:
+    if os.environ.get(SWITCH) == "0" or compiler() is None:
+        return None
+    if jax.default_backend() != "cpu" and cuda.target() is None:
         return None
     return _identity()
 
 
 @functools.cache
 def _identity() -> str:
-    return _digest(compiler(), _FLAGS_HERE, processor(), version_of("jaxlib"))
+    return _digest(compiler(), _FLAGS_HERE, processor(), cuda.target(), version_of("jaxlib"))
 
 
 _FLAGS_HERE: Final = ("-mcpu=native" if os.uname().machine in ("arm64", "aarch64") else "-march=native", *FLAGS)
@@ -118,27 +121,30 @@ def _build(name: str, source: str) -> Any:
         written.write_text(source)
         command, _ = compiler() or (("cc",), "")
         include = f"-I{jax.ffi.include_dir()}"
+        if cuda.target() is not None:
+            try:
+                Path(folder, "kernel").write_bytes(cuda.compile_kernel(source))
+            except ValueError as error:
+                return _failed(written, "NVRTC", str(error))
         done = subprocess.run(
-            [*command, *_FLAGS_HERE, include, written.name, "-o", library.name, "-lm"],
+            [*command, *_FLAGS_HERE, include, written.name, "-o", library.name, "-lm", "-ldl"],
             cwd=folder,
             capture_output=True,
             text=True,
         )
         if done.returncode:
-            kept = _keep(written, source + "".join(f"\n// {line}" for line in done.stderr.splitlines()))
-            print(f"mjx-study: {command[0]} failed, steps run through XLA: see the end of {kept}", file=sys.stderr)
-            return None
+            return _failed(written, command[0], done.stderr)
         content = library.read_bytes()
     if (at := libraries_folder()) is not None:
         write_cached(at / name, content)
     return _loaded(name, content)
 
 
-def _keep(path: Path, text: str) -> Path:
-    """Keep a source that failed to compile."""
-    kept = Path(tempfile.mkdtemp(prefix="mjx-study-failed-"), path.name)
-    kept.write_text(text)
-    return kept
+def _failed(written: Path, compiler: str, errors: str) -> None:
+    """Keep a source that failed to compile, with the compiler's errors at its end."""
+    kept = Path(tempfile.mkdtemp(prefix="mjx-study-failed-"), written.name)
+    kept.write_text(written.read_text() + "".join(f"\n// {line}" for line in errors.splitlines()))
+    print(f"mjx-study: {compiler} failed, steps run through XLA: see the end of {kept}", file=sys.stderr)
 
 
 def _cached(name: str) -> Any:
@@ -153,5 +159,9 @@ def _loaded(name: str, content: bytes) -> Any:
         path = Path(folder, f"{name}.so")
         path.write_bytes(content)
         library = ctypes.CDLL(str(path))
-    jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(library.handler), platform="cpu")
+    on_gpu = cuda.target() is not None
+    if on_gpu and (error := library.prepare()):
+        print(f"mjx-study: error {error} of the CUDA driver: steps run through XLA, more slowly", file=sys.stderr)
+        return None
+    jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(library.handler), platform="CUDA" if on_gpu else "cpu")
     return library

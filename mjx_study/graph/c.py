@@ -35,12 +35,18 @@ _NAMES: Final = {np.dtype(name): f"{name[0]}{8 * np.dtype(name).itemsize}" for n
 }
 
 
+MAX_ARGUMENT: Final = 4000
+"""Maximum size of a kernel's argument [bytes]."""
+
+
 class NotWrittenError(Exception):
     """The graph has an operation or a type that C is not written for."""
 
 
-def source_of(function: ScalarFunction) -> str:
+def source_of(function: ScalarFunction, platform: str = "cpu") -> str:
     """Write a function of arrays as C: a handler of XLA's foreign function interface for batches of samples.
+
+    For "gpu" the same text is the source of a kernel in CUDA and of the handler that starts it.
 
     The handler takes the inputs and gives the outputs with the batch as their fastest dimension; inputs may have none.
 
@@ -57,6 +63,10 @@ def source_of(function: ScalarFunction) -> str:
             body.store(place, at, value, aval.dtype)
     forms_in = [(array.size, array.flat[0].dtype, array.ndim) for array in function.inputs]
     forms_out = [(math.prod(aval.shape), aval.dtype, aval.ndim) for aval in function.avals]
+    if platform == "gpu":
+        samples = [_text("prelude.cu"), "SAMPLES {", "BEGIN", *body.lines, "}"]
+        parts = ["#ifdef __CUDACC_RTC__", *samples, "#else", _text("launcher.c"), "#endif"]
+        return "\n".join([_batch(forms_in, forms_out), *parts, ""])
     wide = any(dtype.itemsize == 8 for dtype in body.dtypes)
     return "\n".join(
         [
@@ -74,11 +84,33 @@ def source_of(function: ScalarFunction) -> str:
     )
 
 
+Forms = Sequence[tuple[int, Any, int]]
+"""Entries, type and dimensions of arrays."""
+
+
+def _batch(inputs: Forms, outputs: Forms) -> str:
+    """Argument of a kernel, for the kernel and for what starts it."""
+    if 12 * len(inputs) + 8 * len(outputs) > MAX_ARGUMENT:
+        raise NotWrittenError(f"{len(inputs)} inputs and {len(outputs)} outputs")
+    return f"""\
+#define THREADS 128
+#define NUM_IN {len(inputs)}
+#define NUM_OUT {len(outputs)}
+#define RANKS_OF_INPUTS {", ".join(str(rank) for *_, rank in inputs)}
+#define RANK_OF_OUTPUT {outputs[0][2]}
+struct batch {{
+  long count;
+  const char *in[NUM_IN];
+  char *out[NUM_OUT];
+  int shared[NUM_IN];  // whether an array is the same for all samples
+}};"""
+
+
 def _text(name: str) -> str:
     return resources.files("mjx_study.graph").joinpath(name).read_text()
 
 
-def _forms(arrays: Sequence[tuple[int, Any, int]]) -> str:
+def _forms(arrays: Forms) -> str:
     """Initialisers of the handler's descriptions of arrays: entries, bytes of an entry, dimensions."""
     return ", ".join(f"{{{size}, {np.dtype(dtype).itemsize}, {rank}}}" for size, dtype, rank in arrays)
 
@@ -240,7 +272,7 @@ def _select(dtype: Any) -> str:
 def _converted(value: str, old: np.dtype[Any], new: np.dtype[Any]) -> str:
     of, to = _type(old), _type(new)
     if of == "mask":
-        return f"select_{to}({value}, ({to}){{0}}, ALL({to}, 1))"
+        return f"select_{to}({value}, ALL({to}, 0), ALL({to}, 1))"
     if to == "mask":
         return f"MASK({value} != 0)"
     if old.kind == "f" and new.kind in "iu":

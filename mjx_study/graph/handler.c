@@ -52,7 +52,7 @@ static void batch(long count, const char *const *from, const int *shared, char *
 }
 
 XLA_FFI_Error *handler(XLA_FFI_CallFrame *frame) {
-  XLA_FFI_Extension_Base *extension = frame->extension_start;
+  __typeof__(frame->extension_start) extension = frame->extension_start;  // its type has changed names
   if (extension && extension->type == XLA_FFI_Extension_Metadata) {
     XLA_FFI_Api_Version *version = &((XLA_FFI_Metadata_Extension *)extension)->metadata->api_version;
     version->major_version = XLA_FFI_API_MAJOR;

@@ -24,7 +24,7 @@ def as_native(values: ScalarFunction, function: ScalarFunction) -> "NativeFuncti
         function: the function, which derivatives are taken of.
     """
     try:
-        return NativeFunction(source_of(values), function)
+        return NativeFunction(source_of(values, jax.default_backend()), function)
     except NotWrittenError:
         return None
 
@@ -36,6 +36,7 @@ class NativeFunction:
         self._function = function
         self.inputs = [ShapedArray(each.shape, each.flat[0].dtype) for each in function.inputs]
         self.outputs = function.avals
+        self.platform = jax.default_backend()
         self.name = build_library(source)
 
     def __call__(self, *inputs: jax.Array) -> list[jax.Array]:
@@ -93,8 +94,8 @@ def _evaluate(*inputs: Any, function: NativeFunction, batch: tuple[int, ...]) ->
     return jax.jit(partial(_native.bind, function=function, batch=batch))(*inputs)
 
 
-def _lower(context: Any, *operands: Any, function: NativeFunction, batch: tuple[int, ...]) -> Any:
-    if not library_ready(function.name):
+def _lower(platform: str, context: Any, *operands: Any, function: NativeFunction, batch: tuple[int, ...]) -> Any:
+    if function.platform != platform or not library_ready(function.name):
         return mlir.lower_fun(_plain(function, batch), multiple_results=True)(context, *operands)
     ins = [_layout(at.ndim, at.ndim - aval.ndim) for at, aval in zip(context.avals_in, function.inputs, strict=True)]
     outs = [_layout(each.ndim, len(batch)) for each in context.avals_out]
@@ -116,5 +117,6 @@ _native.def_impl(_evaluate)
 _native.def_abstract_eval(_types)
 ad.primitive_jvps[_native] = _differentiate
 batching.primitive_batchers[_native] = _batch
-mlir.register_lowering(_native, _lower, platform="cpu")
+mlir.register_lowering(_native, partial(_lower, "cpu"), platform="cpu")
+mlir.register_lowering(_native, partial(_lower, "gpu"), platform="cuda")
 mlir.register_lowering(_native, mlir.lower_fun(_lower_plain, multiple_results=True))

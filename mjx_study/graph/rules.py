@@ -128,5 +128,6 @@ RULES: Final[dict[str, Rule]] = {
     "slice": _slice,
     "stack": lambda _, inputs, __, parameters: [np.stack(inputs, parameters["axis"])],
     "tile": lambda _, inputs, __, parameters: [np.tile(inputs[0], parameters["reps"])],
+    "unstack": lambda _, inputs, __, parameters: list(np.moveaxis(inputs[0], parameters["axis"], 0)),
     "transpose": lambda _, inputs, __, parameters: [inputs[0].transpose(parameters["permutation"])],
 }
