@@ -9,7 +9,7 @@ import xarray as xr
 from mjx_study.choices import REFERENCE
 from mjx_study.claims.laboratory import REAL, TIMED, Laboratory, Statistic, mean_of, times_of
 from mjx_study.claims.theory import STIFFNESS
-from mjx_study.experiment.configuration import StudyConfig
+from mjx_study.options.configuration import StudyConfig
 from mjx_study.runtime import local_devices
 
 STIFFNESSES: Final = (10.0, 100.0, 1000.0, 1200.0)
