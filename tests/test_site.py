@@ -12,7 +12,7 @@ import yaml
 from tools import site
 
 ROOT = Path(__file__).parents[1]
-OWN = site.places()
+PATHS = site.site_paths()
 
 
 def pages_of(nav: Any) -> list[str]:
@@ -23,10 +23,10 @@ def pages_of(nav: Any) -> list[str]:
 
 def test_every_page_is_in_the_navigation_once() -> None:
     nav = pages_of(yaml.safe_load((ROOT / "mkdocs.yml").read_text())["nav"])
-    staged = [str(place) for place in OWN.values() if place.suffix == ".md"]
+    staged = [str(place) for place in PATHS.values() if place.suffix == ".md"]
     made = [f"reference/{name}.md" for name in ("commands", "variables", *site.PACKAGES)]
     assert sorted(nav) == sorted(staged + made)
-    assert {f"docs/{path.name}" for path in (ROOT / "docs").glob("*.md")} <= {str(source) for source in OWN}
+    assert {f"docs/{path.name}" for path in (ROOT / "docs").glob("*.md")} <= {str(source) for source in PATHS}
 
 
 @pytest.mark.parametrize(
@@ -40,16 +40,16 @@ def test_every_page_is_in_the_navigation_once() -> None:
     ],
 )
 def test_links_are_the_sites(page: str, text: str, expected: str) -> None:
-    assert site.adapted(text, Path(page), OWN) == expected
+    assert site.adapted(text, Path(page), PATHS) == expected
 
 
 def test_a_link_that_leads_nowhere_is_refused() -> None:
     with pytest.raises(FileNotFoundError, match="nowhere"):
-        site.adapted("[a](nowhere.md)", Path("docs/tasks.md"), OWN)
+        site.adapted("[a](nowhere.md)", Path("docs/tasks.md"), PATHS)
 
 
 def test_formulas_become_mathml() -> None:
-    found = site.adapted("with $`a_0`$\n\n```math\n\\frac{a}{b}\n```\n", Path("README.md"), OWN)
+    found = site.adapted("with $`a_0`$\n\n```math\n\\frac{a}{b}\n```\n", Path("README.md"), PATHS)
     assert "<msub><mi>a</mi><mn>0</mn></msub>" in found and "<mfrac>" in found and "`" not in found
 
 
