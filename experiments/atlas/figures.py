@@ -10,7 +10,7 @@ from matplotlib.lines import Line2D
 
 from estimators.confidence import coverage_interval
 from experiments.atlas.table import GROUPS, TOLERANCE, VERDICTS, Table, bodies_meet, plain_is_off, term_acts, verdicts
-from mjx_study.diagnose import SMOOTH_SHARE
+from mjx_study.diagnose.advice import SMOOTH_SHARE
 from mjx_study.results.findings import ERROR_PER_STRENGTH, LEAST_SPREAD, MOST_STRENGTH
 from mjx_study.table import percent
 

@@ -22,7 +22,7 @@ from experiments.atlas.table import (
     verdicts,
 )
 from experiments.pages import save_figure, write_tables
-from mjx_study.diagnose import SMOOTH_SHARE
+from mjx_study.diagnose.advice import SMOOTH_SHARE
 from mjx_study.table import markdown_table
 
 PAGE: Final = DOCS / "atlas.md"

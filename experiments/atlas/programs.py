@@ -16,7 +16,7 @@ from estimators import Evaluation, antithetic, effective_samples, squared_bias_o
 from estimators.statistics import summarise
 from experiments.atlas.design import COLUMNS, Cell, contact_of
 from mjx_study.compiled import Compiled
-from mjx_study.diagnose import touch_of
+from mjx_study.diagnose.setting import touch_of
 from mjx_study.experiment.reference_gradient import estimate_reference
 from mjx_study.experiment.resolution import direction_of
 from mjx_study.experiment.sampling import unconverged

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from estimators import ENOUGH_EFFECTIVE
-from mjx_study.diagnose import SMOOTH_SHARE, WIDTH_RATIO
+from mjx_study.diagnose.advice import SMOOTH_SHARE, WIDTH_RATIO
 from mjx_study.results.findings import ERROR_PER_STRENGTH, LEAST_SPREAD, MOST_STRENGTH
 
 Table = Any
