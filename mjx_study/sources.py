@@ -11,7 +11,7 @@ import types
 from pathlib import Path
 from typing import Final
 
-from estimators.seen import INSTALLED
+from estimators.user_inputs import INSTALLED
 
 BY_VERSION: Final = {"mjx_study", "estimators", "mujoco", "jax", "jaxlib", "numpy", "scipy", "optax", "builtins"}
 """Modules whose code is identified by version."""

@@ -16,7 +16,7 @@ PATHS = {module_of(path): path.relative_to(ROOT) for path in FILES}
 LOADED = """
 import sys
 from mjx_study.execution.run import run_study
-from mjx_study.experiment.configuration import StudyConfig
+from mjx_study.options.configuration import StudyConfig
 from mjx_study.runtime import configure
 options = {"contact": ("reference",), "stiffness": (1000.0,), "estimators": ("zobg", "fobg"), "samples": (4,)}
 configure(cpu_devices=1)

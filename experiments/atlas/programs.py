@@ -13,6 +13,7 @@ import mujoco
 import numpy as np
 
 from estimators import Evaluation, antithetic, effective_samples, squared_bias_of_means, variance_interval, zeroth_order
+from estimators.noise import batch_noise, noise_score
 from estimators.statistics import summarise
 from experiments.atlas.design import COLUMNS, Cell, contact_of
 from mjx_study.compiled import Compiled
@@ -22,7 +23,6 @@ from mjx_study.experiment.resolution import direction_of
 from mjx_study.experiment.sampling import unconverged
 from mjx_study.experiment.tally import onset_numbers
 from mjx_study.objective import SamplePrograms, rollout_cost, spread
-from mjx_study.reference.noise import batch_noise, noise_score
 from mjx_study.results.variables import ONSETS
 from mjx_study.runtime import local_devices
 from mjx_study.simulation.contact import ContactModel, stable

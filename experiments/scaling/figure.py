@@ -6,7 +6,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator
 
 from experiments.scaling.cost import BASE
-from mjx_study.plots.style import STYLE
+from mjx_study.plots.style import style_of
 
 PANELS: Final = {
     "samples": "samples of a call",
@@ -22,7 +22,7 @@ def scaling_figure(documents: list[dict[str, Any]]) -> Figure:
     """Draw a row of panels; lines of a second machine are dashed, of a third dotted, gradients wide and hollow."""
     figure = Figure(figsize=(2.6 * len(PANELS), 3.2), layout="constrained")
     panels = dict(zip(PANELS, figure.subplots(1, len(PANELS)), strict=True))
-    names = {"gradient": ("gradients", *STYLE["fobg"]), "value": ("rollouts", *STYLE["zobg"])}
+    names = {"gradient": ("gradients", *style_of("fobg")[1:]), "value": ("rollouts", *style_of("zobg")[1:])}
     wide = {"ms": 7.5, "markerfacecolor": "none", "linewidth": 3.0, "alpha": 0.6}
     units: list[str] = []
     for document, line in zip(documents, ("-", "--", ":"), strict=False):

@@ -21,7 +21,7 @@ from mjx_study.claims.laboratory import (
     times_of,
 )
 from mjx_study.claims.theory import STIFFNESS, at, errors_of, relative_bias, variances_of
-from mjx_study.experiment.configuration import StudyConfig
+from mjx_study.options.configuration import StudyConfig
 from mjx_study.runtime import local_devices
 
 STIFFNESSES: Final = (10.0, 100.0, 1000.0, 1200.0)

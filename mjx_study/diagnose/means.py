@@ -16,13 +16,13 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from estimators import Estimator, GradientEstimate, Objective, oracles_of
-from estimators.estimator import label_of
 from estimators.mean_check import TOLERANCE, Circulation, circulations
+from estimators.registry import label_of
 from mjx_study.diagnose.columns import MEANS
-from mjx_study.experiment.configuration import check_span
 from mjx_study.experiment.resolution import check_estimators, direction_of
 from mjx_study.experiment.sampling import cell_keys, draw_batches
 from mjx_study.objective import Simulator, chunk_for
+from mjx_study.options.configuration import check_span
 from mjx_study.progress import Progress, silent
 from mjx_study.runtime import local_devices
 from mjx_study.table import Column, as_plain, tabulate

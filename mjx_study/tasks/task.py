@@ -9,10 +9,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
-from estimators.places import described
+from estimators.noise import check_density, check_sigma
+from estimators.user_code import describe_error
 from mjx_study.choices import TASK_DESCRIPTIONS
 from mjx_study.reference import Reference
-from mjx_study.reference.noise import check_density, check_sigma
 from mjx_study.simulation.contact import effective_mass
 from mjx_study.simulation.dynamics import State
 from mjx_study.simulation.onset import check_onset
@@ -223,4 +223,4 @@ def _traced(name: str, part: str, function: Callable[..., Any], *arguments: Any)
     try:
         return jax.eval_shape(function, *arguments)
     except (Exception, SystemExit) as error:
-        raise ValueError(f"{name}: the {part} raised {described(error)}") from error
+        raise ValueError(f"{name}: the {part} raised {describe_error(error)}") from error

@@ -11,7 +11,8 @@ from collections.abc import Collection, Mapping
 from numbers import Integral, Real
 from typing import Any, ClassVar, Final
 
-from estimators.catalogue import BASELINES, CATALOGUE, DENSITIES, VARIANCE_PROXIES, WEIGHTS, suggestion, unknown
+from estimators.choices import BASELINES, DENSITIES, VARIANCE_PROXIES, WEIGHTS, suggestion, unknown
+from estimators.registry import ESTIMATORS
 from mjx_study.choices import CONES, FAMILIES, INTEGRATORS, ONSETS, REFERENCE, SOLVERS
 
 MOST_VALUES: Final = 10_000
@@ -251,7 +252,7 @@ OPTIONS: Final[dict[str, Option]] = {
         _number("backward_stiffness", float, "(0, inf)", "K", "stiffness of --backward", unit="N/m", unset="unchanged"),
         _number("backward_margin", float, "(0, inf)", "M", "distance where --backward begins", unit="m", unset=MJCF),
         _choice("kind", KINDS, "KIND", "kind of study", unset="from --iterations and --points"),
-        _choice("estimators", CATALOGUE, "NAME", "see `mjx-study estimators`", label="estimator", own=True),
+        _choice("estimators", ESTIMATORS, "NAME", "see `mjx-study estimators`", label="estimator", own=True),
         _choice("contact", CONTACTS, "FAMILY", "contact family: {}", label="contact family", unset=TASKS),
         _number("stiffness", float, "(0, inf)", "K", "contact stiffness", unit="N/m", unset=TASKS),
         _number("damping", float, "[0, inf)", "B", "contact damping", unit="N s/m", unset="the family's"),

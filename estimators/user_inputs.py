@@ -66,7 +66,7 @@ def observing(*names: str) -> Generator[None]:
         observation.settle()
 
 
-def seen_by(names: Iterable[str]) -> dict[str, str]:
+def inputs_read(names: Iterable[str]) -> dict[str, str]:
     """Digests of what was read on behalf of modules so far in this process, by "file PATH" (relative to the current
     directory if within it) and "variable NAME"."""
     for observation in _ACTIVE:
@@ -75,7 +75,7 @@ def seen_by(names: Iterable[str]) -> dict[str, str]:
     return dict(sorted(found.items()))
 
 
-def seen_now(names: Iterable[str]) -> Mapping[str, str]:
+def inputs_now(names: Iterable[str]) -> Mapping[str, str]:
     """Digests of what the same names hold now."""
     readers = {FILE: _digest_of_file, VARIABLE: lambda name: _digest_of_text(os.environ.get(name))}
     kinds = {name: kind for name in names for kind in readers if name.startswith(kind)}

@@ -10,9 +10,9 @@ from collections.abc import Callable
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from estimators.catalogue import unknown
+from estimators.batches import Differentiation, Evaluation, GradientEstimate
+from estimators.choices import unknown
 from estimators.statistics import summarise
-from estimators.types import Differentiation, Evaluation, GradientEstimate
 
 
 def none(evaluation: Evaluation) -> Float[Array, " samples"]:

@@ -1,4 +1,4 @@
-"""Names and one-line descriptions of estimators and their choices, free of imports that compute."""
+"""Names that users choose from, and oracles; free of imports that compute."""
 
 import difflib
 from collections.abc import Iterable
@@ -62,94 +62,6 @@ ORACLES: Final[dict[str, Oracle]] = {
         Oracle("linearisation", 1, "linearise", "derivatives of steps"),
     )
 }
-
-
-@dataclass(frozen=True)
-class Entry:
-    """An estimator's name on the command line, label in legends, oracles in the order of the arguments of `combine`,
-    one-line description, and options without a default."""
-
-    name: str
-    label: str
-    needs: tuple[str, ...]
-    description: str
-    required: tuple[str, ...] = ()
-
-
-CATALOGUE: dict[str, Entry] = {
-    entry.name: entry
-    for entry in (
-        Entry("zobg", "ZoBG", ("evaluation",), "zeroth order: values times scores"),
-        Entry("zobg_antithetic", "ZoBG (antithetic)", ("pair",), "zeroth order over pairs of opposite noise"),
-        Entry(
-            "zobg_to_go", "ZoBG (costs to go)", ("steps",), "zeroth order: costs to go times the scores of single steps"
-        ),
-        Entry(
-            "zobg_to_go_antithetic",
-            "ZoBG (to go, antithetic)",
-            ("step_pair",),
-            "costs to go over pairs of opposite noise",
-        ),
-        Entry("fobg", "FoBG", ("differentiation",), "first order: gradients of the samples"),
-        Entry("fobg_onset", "FoBG (onset)", ("corrected",), "first order, corrected where contact begins and ends"),
-        Entry(
-            "fobg_clipped",
-            "FoBG (clipped)",
-            ("differentiation",),
-            "first order, the norm of every sample bounded",
-            ("max_norm",),
-        ),
-        Entry(
-            "fobg_truncated",
-            "FoBG (truncated)",
-            ("linearisation",),
-            "first order, the adjoint cut every few steps",
-            ("window",),
-        ),
-        Entry(
-            "aobg",
-            "AoBG",
-            ("evaluation", "differentiation"),
-            "alpha order: the two interpolated with an error of at most gamma",
-        ),
-        Entry(
-            "aobg_onset",
-            "AoBG (onset)",
-            ("evaluation", "corrected"),
-            "alpha order, its first-order batch corrected where contact begins and ends",
-        ),
-        Entry(
-            "ivw",
-            "IVW",
-            ("evaluation", "differentiation"),
-            "inverse-variance weighting: alpha order with gamma infinite",
-        ),
-        Entry(
-            "ivw_h", "IVW-H", ("steps", "step_differentiation"), "inverse-variance weights for every step and control"
-        ),
-        Entry(
-            "total_propagation",
-            "total propagation",
-            ("linearisation",),
-            "inverse-variance weights inside the backward recursion",
-        ),
-        Entry(
-            "ddcg",
-            "DDCG",
-            ("evaluation", "step_differentiation"),
-            "inverse-variance weighting where a test finds no discontinuity, else zeroth order",
-            ("sigma",),
-        ),
-        Entry(
-            "delta",
-            "delta",
-            ("evaluation", "differentiation"),
-            "first-order mean plus a zeroth-order estimate of the remainder; noise on theta itself",
-            ("sigma",),
-        ),
-    )
-}
-"""Estimators by name; `register` adds user-defined ones."""
 
 
 def unknown(label: str, value: object, choices: Iterable[str], more: str = "") -> str:

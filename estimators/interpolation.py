@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from estimators.catalogue import CROSS_FITTED, PLUG_IN, WEIGHTS, unknown
-from estimators.rows import Rows, weigh
-from estimators.types import AlphaChoice, GradientEstimate
+from estimators.batches import AlphaChoice, GradientEstimate
+from estimators.choices import CROSS_FITTED, PLUG_IN, WEIGHTS, unknown
+from estimators.samples import Rows, weigh
 
 FEWEST_SAMPLES: Final = 4
 """Two in each half, the fewest for a variance."""
@@ -121,6 +121,13 @@ def choose_alpha(
         variance_zeroth=zeroth.variance,
         variance_first=first.variance,
     )
+
+
+def inverse_variance_choice(zeroth: GradientEstimate, first: GradientEstimate) -> AlphaChoice:
+    """Choose a weight with `inverse_variance_alpha` and record its inputs."""
+    alpha = inverse_variance_alpha(zeroth.variance, first.variance)
+    discrepancy = jnp.linalg.norm(first.mean - zeroth.mean)
+    return AlphaChoice(alpha, None, discrepancy, zeroth.variance, first.variance)
 
 
 def alpha_order(

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import estimators
-from estimators import GradientEstimate, blocks, make_estimator, summarise
-from estimators.blocks import Parts, moments_of
+from estimators import GradientEstimate, make_estimator, merged_samples, summarise
+from estimators.merged_samples import Parts, moments_of
 from estimators.statistics import merged_estimates
 
 SAMPLES, BLOCK, PARAMS = 4096, 512, 5
@@ -136,7 +136,7 @@ def test_what_is_kept_does_not_grow_with_the_samples(monkeypatch: pytest.MonkeyP
              for many in (1024, 4096) for each in rows[:1]]  # fmt: skip
     assert sizes[1] <= 1.1 * sizes[0]  # as many extremes, of which more or fewer are of two kinds
     assert sum(leaf.size for leaf in jax.tree.leaves(in_blocks(rows))) > 1.5 * sizes[1]  # of all norms
-    assert len(in_blocks(rows)[-1].extremes) <= 6 * blocks.EXTREMES
+    assert len(in_blocks(rows)[-1].extremes) <= 6 * merged_samples.EXTREMES
 
 
 def test_rows_of_merged_samples_are_refused() -> None:

@@ -9,7 +9,7 @@ from contextlib import contextmanager, suppress
 from operator import attrgetter
 from pathlib import Path
 
-from estimators.seen import observing
+from estimators.user_inputs import observing
 
 
 class MissingModuleError(ValueError):
@@ -37,7 +37,7 @@ def find_attribute(place: str, noun: str, kind: type) -> object:
     except (Exception, SystemExit) as error:
         if isinstance(error, ModuleNotFoundError) and f"{module}.".startswith(f"{error.name}."):
             raise MissingModuleError(f"there is no module {error.name!r} here or installed") from error
-        raise ValueError(f"importing {module} raised {described(error)}") from error
+        raise ValueError(f"importing {module} raised {describe_error(error)}") from error
     try:
         return attrgetter(name)(loaded)
     except AttributeError:
@@ -50,7 +50,7 @@ def find_attribute(place: str, noun: str, kind: type) -> object:
         raise ValueError(f"{module} has no {name!r}; it has {', '.join(own) or f'no {noun}'}") from None
 
 
-def described(error: BaseException) -> str:
+def describe_error(error: BaseException) -> str:
     """Format an error's type and message in one line, with the innermost line of user code in its traceback."""
     text = f"{type(error).__name__}: {' '.join(str(error).split())}".removesuffix(": ")
     caught, *frames = traceback.extract_tb(error.__traceback__)

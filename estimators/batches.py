@@ -6,9 +6,9 @@ from typing import Protocol, runtime_checkable
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key
 
-from estimators.blocks import Merged
+from estimators.merged_samples import Merged
 from estimators.pytree import register_pytree
-from estimators.rows import Rows
+from estimators.samples import Rows
 
 
 @register_pytree

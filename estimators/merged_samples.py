@@ -14,11 +14,11 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
 from estimators.pytree import register_pytree
-from estimators.rows import Deviations
+from estimators.samples import Deviations
 
 EXTREMES: Final = 32
 """Samples kept for each kind of extreme."""
-MOST_THINNED: Final = 2**14
+MAX_THINNED: Final = 2**14
 """Maximum number of samples of a batch whose norms are kept; larger batches are subsampled at a regular stride."""
 
 Block = Float[np.ndarray, "samples parts params"]
@@ -165,7 +165,7 @@ def moments_of(parts: Sequence[Float[Any, "samples params"]], first: int, every:
 
 @dataclass(frozen=True)
 class Merged:
-    """Samples reduced to their moments, with the interface of `estimators.rows.Rows`.
+    """Samples reduced to their moments, with the interface of `estimators.samples.Rows`.
 
     They belong to one batch, or to two batches weighted row by row; the weights need not be known when the samples are
     drawn. Counts, means, (co)variances, concentration and `second_moment` agree with those from rows up to rounding.
@@ -176,7 +176,7 @@ class Merged:
       sample is among the largest of a part or of the sum of both at equal spread.
     - `log_spread`: exact for the extremes, second order for the rest, each of which has less than 1/`EXTREMES` of the
       spread; the relative error is below that share, and about the largest share of any sample if there are no tails.
-    - `norm_quantiles`: from at most `MOST_THINNED` thinned samples, so ranks have a standard error of 0.4 % (at the
+    - `norm_quantiles`: from at most `MAX_THINNED` thinned samples, so ranks have a standard error of 0.4 % (at the
       median); exact for fewer samples. The maximum is that of `top`.
     - `perturbed_means`: different draws from the same distribution.
 
