@@ -68,7 +68,8 @@ def left_out(found: Any) -> set[str]:
         return set()
     named = ", ".join(re.findall(r"^ {4}(\S[^:\n]*):", section[1], re.MULTILINE)).replace("*", "").split(", ")
     if dataclasses.is_dataclass(found):
-        own = {field.name for field in dataclasses.fields(found)}
+        declared = vars(found).get("__annotations__", {})  # a base class documents its fields
+        own = {field.name for field in dataclasses.fields(found) if field.name in declared}
     else:
         own = inspect.signature(found).parameters.keys() - {"self"}
     return {name for name in own if not name.startswith("_")} - set(named)
