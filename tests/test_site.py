@@ -84,12 +84,3 @@ def test_a_section_of_arguments_or_attributes_names_all_of_them(package: str) ->
             methods = inspect.getmembers(owner, inspect.isroutine)
             public |= {f"{name}.{part}": method for part, method in methods if not part.startswith("_")}
     assert not {name: missing for name, each in public.items() if (missing := left_out(each))}
-
-
-def test_boxes_of_a_diagram_are_apart_and_arrows_lead_down() -> None:
-    found = site.drawn([("a", "b"), ("a", "c"), ("c", "d"), ("b", "d"), ("a", "d")])
-    boxes = {tuple(part.split('"')[1::2][:2]) for part in found.split("<rect ")[1:]}
-    assert len(boxes) == 4
-    for line in found.split("<line ")[1:]:
-        _, top, _, bottom = map(float, line.split('"')[1:8:2])
-        assert top < bottom

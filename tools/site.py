@@ -68,40 +68,7 @@ def adapted(text: str, page: Path, paths: dict[Path, Path]) -> str:
 
     text = re.sub(r"(!?)\[((?:[^\[\]]|\[[^\]]*\])*)\]\(([^)\s]+)\)", link, text)
     text = re.sub(r"```math\n(.*?)```", lambda found: convert(found[1], display="block"), text, flags=re.DOTALL)
-    text = re.sub(r"\$`([^`]+)`\$", lambda found: f"<span>{convert(found[1])}</span>", text)
-    return re.sub(
-        r"```mermaid\n(.*?)```", lambda found: drawn(re.findall(r"(\w+) --> (\w+)", found[1])), text, flags=re.DOTALL
-    )
-
-
-def drawn(arrows: list[tuple[str, str]]) -> str:
-    """A diagram without loops as SVG: each box below those that point to it, under the middle of them."""
-    rows: dict[str, int] = {}
-    boxes = dict.fromkeys(box for arrow in arrows for box in arrow)
-    for _ in boxes:
-        rows = {box: max((rows.get(start, 0) + 1 for start, end in arrows if end == box), default=0) for box in boxes}
-    columns: dict[str, float] = {}
-    for row in range(max(rows.values()) + 1):
-        above = {box: [columns[start] for start, end in arrows if end == box] for box in boxes if rows[box] == row}
-        wish = {box: sum(xs) / len(xs) if xs else 0.0 for box, xs in above.items()}
-        order = sorted(wish, key=lambda box: wish[box])
-        middle = sum(wish.values()) / len(wish)
-        columns |= {box: middle + 130 * (place - (len(order) - 1) / 2) for place, box in enumerate(order)}
-    left, right, bottom = min(columns.values()) - 60, max(columns.values()) + 60, 64 * max(rows.values()) + 34
-    lines = [
-        f'<line x1="{columns[a]:.0f}" y1="{64 * rows[a] + 31}" x2="{columns[b]:.0f}" y2="{64 * rows[b] - 4}"/>'
-        for a, b in arrows
-    ]
-    texts = [
-        f'<rect x="{x - 52:.0f}" y="{64 * rows[box] + 1}" width="104" height="30" rx="4"/>'
-        f'<text x="{x:.0f}" y="{64 * rows[box] + 21}">{box}</text>'
-        for box, x in columns.items()
-    ]
-    size = 'viewBox="0 0 8 8" refX="7" refY="4" markerWidth="8" markerHeight="8"'
-    head = f'<marker id="head" {size} orient="auto"><path d="M0 0L8 4L0 8z"/></marker>'
-    return (
-        f'<svg class="diagram" viewBox="{left:.0f} 0 {right - left:.0f} {bottom}">{head}{"".join(lines + texts)}</svg>'
-    )
+    return re.sub(r"\$`([^`]+)`\$", lambda found: f"<span>{convert(found[1])}</span>", text)
 
 
 def parts_of_notebook(path: Path, paths: dict[Path, Path]) -> Iterator[str]:
