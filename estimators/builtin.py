@@ -26,9 +26,9 @@ class Formula(Estimator):
     computes: ClassVar[str]
     """The function, as module:name."""
 
-    def combine(self, *batches: Any) -> "estimators.batches.GradientEstimate":
+    def combine(self, *args: Any, **kwargs: Any) -> "estimators.batches.GradientEstimate":
         options = {field.name: getattr(self, field.name) for field in fields(self)}
-        return pkgutil.resolve_name(self.computes)(*batches, **options)
+        return pkgutil.resolve_name(self.computes)(*args, **kwargs, **options)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,9 +50,9 @@ class Interpolation(Baselined):
 class Paired(Baselined):
     """Base of estimators with a batch of pairs of opposite noise."""
 
-    def combine(self, *batches: Any) -> "estimators.batches.GradientEstimate":
-        (pair,) = batches
-        return super().combine(*pair)
+    def combine(self, *args: Any, **kwargs: Any) -> "estimators.batches.GradientEstimate":
+        (pair,) = args
+        return super().combine(*pair, **kwargs)
 
 
 @register
@@ -164,7 +164,7 @@ class OneWeight(Interpolation):
     def choose(self, zeroth: Any, first: Any) -> "estimators.batches.AlphaChoice":
         """Choose the weight of two estimates."""
 
-    def combine(self, *batches: Any) -> "estimators.batches.GradientEstimate":
+    def combine(self, *args: Any, **kwargs: Any) -> "estimators.batches.GradientEstimate":
         from estimators.interpolation import apply_choice, weigh_batches
 
         def choose(*batches: Any) -> "estimators.batches.AlphaChoice":
@@ -173,7 +173,7 @@ class OneWeight(Interpolation):
         def mix(choice: Any, *batches: Any) -> "estimators.batches.GradientEstimate":
             return apply_choice(choice, *self.parts(*batches))
 
-        return weigh_batches(choose, mix, batches, self.weights)
+        return weigh_batches(choose, mix, args, self.weights)
 
     def parts(self, *batches: Any) -> "tuple[estimators.batches.GradientEstimate, ...]":
         from estimators.zeroth_first import first_order, zeroth_order
@@ -193,6 +193,8 @@ class AlphaOrder(OneWeight):
     """Alpha order: the two interpolated with an error of at most gamma.
 
     Attributes:
+        baseline: A name in `BASELINES`, for the zeroth-order batch.
+        weights: A name in `WEIGHTS`, the source of alpha.
         gamma: Largest acceptable error, > 0 or infinity, [cost/param].
         failure_probability: Failure probability of the confidence radius, in (0, 1); see `bernstein_epsilon`.
         variance_proxy: "variance", "second_moment" or "upper_bound".

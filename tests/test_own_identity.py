@@ -34,7 +34,7 @@ from collections import deque
 from functools import cached_property, lru_cache, partial
 from pathlib import Path
 import jax, jax.numpy as jnp, numpy as np
-from mjx_study.tasks import pusher
+from mjx_study.tasks.pusher import pusher
 
 {text}
 
@@ -309,7 +309,7 @@ print(json.dumps(contents({name: [make_task(f"{name}:hop")] for name in sys.argv
 """
 STATELESS = """
 import logging, threading
-from mjx_study.tasks import pusher
+from mjx_study.tasks.pusher import pusher
 
 LOG, LOCK, NAMES = logging.getLogger(__name__), threading.Lock(), {"b", "a", "c"}
 

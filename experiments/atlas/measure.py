@@ -33,7 +33,7 @@ from estimators.noise import batch_noise, noise_score
 from estimators.statistics import summarise
 from experiments.pages import DATA
 from mjx_study.compiled import Compiled
-from mjx_study.diagnose import touch_of
+from mjx_study.diagnose.setting import touch_of
 from mjx_study.disk import write_whole
 from mjx_study.experiment.reference_gradient import estimate_reference
 from mjx_study.experiment.resolution import direction_of

@@ -23,7 +23,7 @@ from typing import Any, Final
 import numpy as np
 
 from estimators.user_inputs import inputs_now
-from mjx_study.disk import MOST_BYTES, check_no_link, open_regular, prepare_folder, read_whole, write_whole
+from mjx_study.disk import MAX_BYTES, check_no_link, open_regular, prepare_folder, read_whole, write_whole
 from mjx_study.experiment.checkpoint import StudyError, reason_of
 from mjx_study.experiment.plan import StudyPlan
 from mjx_study.files import digest_of_json
@@ -125,7 +125,7 @@ class Store:
         format."""
         path = folder / "study.json"
         try:
-            content = read_whole(path, follow=False, most=MOST_BYTES)
+            content = read_whole(path, follow=False, most=MAX_BYTES)
             version = read_format(content)
             document = read_document(content) if version == FORMAT else {}
         except FileNotFoundError as error:

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float, Key
 
 from estimators.noise import check_density, check_sigma
 from estimators.user_code import describe_error
+from mjx_study.choices import TASK_DESCRIPTIONS
 from mjx_study.reference import Reference
 from mjx_study.simulation.contact import effective_mass
 from mjx_study.simulation.dynamics import State
@@ -106,7 +107,7 @@ class Task:
 
     Attributes:
         name: name on the command line.
-        description: one line, for tables and reports.
+        description: one line, for tables and reports; by default that of the built-in task of this name.
         scene: the compiled model; a contact model replaces its contact parameters.
         horizon: number of steps H.
         policy: maps theta, noise and state to initial state and controls.
@@ -145,6 +146,7 @@ class Task:
     defaults: StudyDefaults = StudyDefaults()
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "description", self.description or TASK_DESCRIPTIONS.get(self.name, ""))
         theta = jnp.asarray(self.theta)
         object.__setattr__(self, "theta", jnp.asarray(theta, theta.dtype))
         if self.horizon < 1:
