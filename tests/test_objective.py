@@ -294,7 +294,7 @@ def test_a_linear_policys_score_is_its_vector_jacobian_product():
     np.testing.assert_allclose(policy.score(theta, states, noise), expected, rtol=1e-14)
 
 
-def test_baseline_of_a_random_start_is_each_samples_own(closed_loop):
+def test_each_sample_has_the_baseline_of_its_random_start(closed_loop):
     assert closed_loop.task.random_start and not pusher_task().random_start
     noisy = closed_loop.objective(penalty(100.0)).evaluate(GAINS, sample_keys(5))
     silent = closed_loop.objective(penalty(100.0), NO_NOISE).differentiate(GAINS, sample_keys(5))
@@ -332,7 +332,7 @@ def test_odd_part_refuses_feedback(closed_loop):
 # What can fail
 
 
-def test_a_sample_that_is_not_finite_is_counted_and_left_out():
+def test_nonfinite_samples_are_counted_and_left_out():
     def breaks(state, control):
         return jnp.where(control[0] > LIMIT, jnp.nan, jnp.sum(state.qpos**2) + jnp.sum(control**2))
 
@@ -353,7 +353,7 @@ def test_a_sample_that_is_not_finite_is_counted_and_left_out():
     np.testing.assert_allclose(first.mean, np.asarray(differentiation.gradient)[~over].mean(0), rtol=1e-12)
 
 
-def test_theta_that_is_not_a_number_ends_and_is_counted(simulator):
+def test_nan_parameters_end_and_are_counted(simulator):
     """The solver's loop meets NaN in every sample and must leave."""
     theta = pusher_task().theta.at[100].set(jnp.nan)
     objective = simulator.objective(penalty(10.0))

@@ -166,7 +166,7 @@ def test_landscape_takes_it(folder: Path, capsys: pytest.CaptureFixture[str]) ->
         assert np.all(np.isclose(mine, zeroth, rtol=1e-9) | np.isclose(mine, first, rtol=1e-9))
 
 
-def test_findings_tell_its_bias(capsys: pytest.CaptureFixture[str]) -> None:
+def test_findings_report_its_bias(capsys: pytest.CaptureFixture[str]) -> None:
     """The mean of one is twice the gradient; that of the other is right."""
     arguments = ["--samples", "400", "--reference-samples", "400", "--estimators", f"{DOUBLED},{CAUTIOUS}"]
     found = document(capsys, "compare", *ANALYTIC, *arguments)["findings"]
@@ -255,7 +255,7 @@ def test_a_registered_one_has_a_name(monkeypatch: pytest.MonkeyPatch) -> None:
         register(type("Nameless", (Estimator,), {"combine": lambda self: None}))
 
 
-def test_every_estimator_has_a_style_of_its_own() -> None:
+def test_every_estimator_has_its_own_style() -> None:
     styles = [style_of(name) for name in ESTIMATORS]
     assert len({label for label, *_ in styles}) == len({tuple(rest) for _, *rest in styles}) == len(ESTIMATORS)
     assert style_of(OWN) == style_of(OWN) and style_of(OWN)[0] == "SignAgreement"
