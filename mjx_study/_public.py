@@ -3,9 +3,9 @@
 import mjx_study._matplotlib  # noqa: F401
 from mjx_study.choices import FAMILIES
 from mjx_study.execution.run import load_study, run_study
-from mjx_study.experiment.configuration import StudyConfig
 from mjx_study.experiment.plan import estimators_of, plan_study
 from mjx_study.objective import MjxObjective, Simulator, simulate
+from mjx_study.options.configuration import StudyConfig
 from mjx_study.plots.study import plot_study
 from mjx_study.report import StudyAccessor
 from mjx_study.runtime import configure

@@ -17,8 +17,8 @@ from mjx_study import compiled, identity
 from mjx_study.compiled import Compiled
 from mjx_study.execution.run import run_study
 from mjx_study.experiment import gradients
-from mjx_study.experiment.configuration import StudyConfig
 from mjx_study.objective import Simulator, programs
+from mjx_study.options.configuration import StudyConfig
 from mjx_study.tasks import Task, make_task
 from tests.carts import cart
 

@@ -21,9 +21,9 @@ from mjx_study.disk import write_whole
 from mjx_study.execution import cells as sweep_cells
 from mjx_study.execution.run import load_study, run_study, warnings_of
 from mjx_study.experiment.checkpoint import Checkpoint, StudyError
-from mjx_study.experiment.configuration import StudyConfig
 from mjx_study.experiment.plan import StudyCell, StudyPlan, plan_study
 from mjx_study.identity import contents, differences, git_revision
+from mjx_study.options.configuration import StudyConfig
 from mjx_study.simulation.scene import models_folder
 from mjx_study.storage import cell_files as cell_file
 from mjx_study.storage import folder as store

@@ -26,10 +26,10 @@ from mjx_study.cli.studies import as_document
 from mjx_study.execution.run import load_study, run_study
 from mjx_study.experiment import landscapes, sampling
 from mjx_study.experiment import plan as plan_module
-from mjx_study.experiment.configuration import StudyConfig
 from mjx_study.experiment.landscapes import Line, applies, closed_form, compute_landscapes, grid, means
 from mjx_study.experiment.plan import StudyPlan, plan_study
 from mjx_study.experiment.resolution import line_of
+from mjx_study.options.configuration import StudyConfig
 from mjx_study.plots.study import plot_study
 from mjx_study.reference import BallWall, FunctionObjective, Heaviside, Quadratic, smoothed
 from mjx_study.results.findings import curves_of, findings_of

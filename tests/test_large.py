@@ -18,10 +18,10 @@ from mjx_study.execution.cluster import TRIES
 from mjx_study.execution.run import load_study, run_study
 from mjx_study.experiment import gradients
 from mjx_study.experiment.blocks import REFERENCE, Arrays, Blocks
-from mjx_study.experiment.configuration import StudyConfig
 from mjx_study.experiment.gradients import Gradients, compute_gradients
 from mjx_study.experiment.plan import StudyPlan, block_of, blocks_of, plan_study
 from mjx_study.experiment.sampling import sample_keys
+from mjx_study.options.configuration import StudyConfig
 from mjx_study.results.variables import MEASURED
 from mjx_study.storage.folder import Store
 from tests.poison import ACCOUNT, RAISE, SLOW

@@ -15,7 +15,7 @@ from estimators import ESTIMATORS, Estimator, FirstOrder, ZerothOrder, find_esti
 from mjx_study import cli
 from mjx_study.cli import options
 from mjx_study.execution.run import load_study
-from mjx_study.experiment.configuration import StudyConfig
+from mjx_study.options.configuration import StudyConfig
 from mjx_study.plots.style import combines, style_of
 from mjx_study.report import CAPTIONS
 from mjx_study.results.findings import rows_of

@@ -22,9 +22,9 @@ from estimators import user_inputs
 from mjx_study.execution import cells as study_cells
 from mjx_study.execution.run import run_study
 from mjx_study.experiment.checkpoint import Checkpoint, StudyError
-from mjx_study.experiment.configuration import StudyConfig
 from mjx_study.experiment.plan import StudyCell, StudyPlan, plan_study
-from mjx_study.files import read_theta
+from mjx_study.options.configuration import StudyConfig
+from mjx_study.options.files import read_theta
 from mjx_study.storage.folder import Store
 from tests.documents import planned_arrays
 

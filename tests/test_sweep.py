@@ -30,10 +30,10 @@ from mjx_study.cli.sweep import solimp, solref, sweep_fields
 from mjx_study.execution.run import load_study, open_store, run_study, warnings_of
 from mjx_study.experiment import sampling
 from mjx_study.experiment.checkpoint import StudyError
-from mjx_study.experiment.configuration import StudyConfig
 from mjx_study.experiment.gradients import Gradients, compute_gradients
 from mjx_study.experiment.plan import estimators_of, plan_study
 from mjx_study.objective import Simulator, simulate
+from mjx_study.options.configuration import StudyConfig
 from mjx_study.plots import study as study_plots
 from mjx_study.report import render_report
 from mjx_study.results.variables import MEASURED

@@ -10,8 +10,8 @@ import pytest
 from mjx_study.execution import cells as sweep_cells
 from mjx_study.execution.run import load_study, run_study
 from mjx_study.experiment.checkpoint import Checkpoint
-from mjx_study.experiment.configuration import StudyConfig
 from mjx_study.experiment.plan import StudyCell, StudyPlan, plan_study
+from mjx_study.options.configuration import StudyConfig
 from mjx_study.plots.study import plot_study
 from mjx_study.table import digits_to_tell_apart
 from tests.documents import planned_arrays

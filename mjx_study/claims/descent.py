@@ -14,7 +14,7 @@ from estimators import FirstOrder, ZerothOrder
 from mjx_study.choices import REFERENCE
 from mjx_study.claims.laboratory import Laboratory, Statistic, difference_of, log_variance, mean_of
 from mjx_study.claims.theory import STIFFNESS
-from mjx_study.experiment.configuration import StudyConfig
+from mjx_study.options.configuration import StudyConfig
 
 SPANS: Final = {"ball_wall": (0.0, 1.5), "momentum_transfer": (0.0, 1.0)}
 """Range of angles that a descent may reach [rad]."""

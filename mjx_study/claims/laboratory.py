@@ -21,9 +21,9 @@ from estimators import Estimator, GradientEstimate, Objective
 from estimators.confidence import student_quantile
 from mjx_study.choices import REFERENCE
 from mjx_study.execution.run import run_study
-from mjx_study.experiment.configuration import StudyConfig
 from mjx_study.experiment.landscapes import Line, means
 from mjx_study.objective import Simulator
+from mjx_study.options.configuration import StudyConfig
 from mjx_study.reference import FunctionObjective, smoothed
 from mjx_study.simulation.contact import ContactModel
 from mjx_study.tasks import make_task
@@ -196,7 +196,7 @@ class Laboratory:
         return task.replace(onset=onset)
 
     def _contact(self, task: Task, family: str, stiffness: float, relaxed: str | None = None) -> ContactModel | None:
-        """Contact model of a family, with its own derivatives or those of one of `RELAXATIONS`."""
+        """Contact model of a family, with exact derivatives or those of one of `RELAXATIONS`."""
         (cell,), _ = family_grid(task, (family,), (stiffness,))
         if relaxed is not None:
             other, factor, margin = RELAXATIONS[relaxed]

@@ -6,8 +6,8 @@ from functools import partial
 from estimators.registry import ESTIMATORS
 from mjx_study.choices import FAMILIES
 from mjx_study.cli.options import Parser
-from mjx_study.experiment.configuration import StudyConfig
-from mjx_study.option import BUILDER_OPTIONS
+from mjx_study.options.configuration import StudyConfig
+from mjx_study.options.option import BUILDER_OPTIONS
 from mjx_study.results.variables import COLUMNS, DETAILS, MARKS, explained
 from mjx_study.table import described
 

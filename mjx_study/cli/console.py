@@ -14,9 +14,9 @@ import xarray as xr
 from estimators import ENOUGH_EFFECTIVE
 from estimators.registry import label_of
 from mjx_study.choices import FAMILIES, REFERENCE
-from mjx_study.experiment.configuration import StudyConfig
 from mjx_study.experiment.iteration import REASONS
-from mjx_study.option import SCENE_OPTIONS
+from mjx_study.options.configuration import StudyConfig
+from mjx_study.options.option import SCENE_OPTIONS
 from mjx_study.results.findings import Row, curves_of, findings_of, line_of, onset_of, remains, rows_of
 from mjx_study.results.variables import COLUMNS, DEBIASED, DERIVED, DETAILS, HISTORY, MARKS, METRIC, QUANTITIES, START
 from mjx_study.table import format_table, number, percent, with_error

@@ -7,7 +7,7 @@ from mjx_study.choices import FAMILIES, is_file
 from mjx_study.cli.options import TASK_OPTIONS, Parser, configure_process, given_options, task_of, usage_errors
 from mjx_study.cli.output import computing, print_report
 from mjx_study.diagnose.columns import CONTACTS, ESTIMATES
-from mjx_study.option import OPTIONS
+from mjx_study.options.option import OPTIONS
 from mjx_study.table import explain
 
 EPILOG = f"""\

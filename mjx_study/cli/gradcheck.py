@@ -7,7 +7,7 @@ from mjx_study.choices import CHECKED_STATES, CHECKED_STEPS, CHECKED_STIFFNESS, 
 from mjx_study.cli.options import Parser, UsageError, configure_process, given_options, task_of, usage_errors
 from mjx_study.cli.output import computing, print_report
 from mjx_study.diagnose.columns import MEANS
-from mjx_study.option import OPTIONS, Option
+from mjx_study.options.option import OPTIONS, Option
 from mjx_study.table import explain
 
 UNEXERCISED = 3
@@ -111,8 +111,8 @@ def _run_mean(options: argparse.Namespace) -> int:
     from estimators import make_estimator
     from mjx_study.diagnose.means import ALONG_MEANS, check_mean, lines_of, path_of
     from mjx_study.diagnose.setting import setting_of
-    from mjx_study.experiment.effect import reads_onset, refuse_unread
     from mjx_study.experiment.resolution import check_estimators
+    from mjx_study.experiment.unused_options import reads_onset, reject_unread
     from mjx_study.gradcheck import plan_gradcheck
 
     chosen = MEAN | given_options(options, *MEAN)
@@ -124,7 +124,7 @@ def _run_mean(options: argparse.Namespace) -> int:
         settings |= {"gamma": task.defaults.gamma, "sigma": task.sigma}
         found = [make_estimator(name, **settings) for name in chosen["estimators"]]
         check_estimators(found, task)
-        refuse_unread(chosen["estimators"], given_options(options, "max_norm", "window"))
+        reject_unread(chosen["estimators"], given_options(options, "max_norm", "window"))
         if options.onset not in (None, "none") and not reads_onset(chosen["estimators"], options.onset):
             raise UsageError("--onset has no effect on these estimators: add fobg")
         if options.span is not None and options.direction == ALONG_MEANS:

@@ -19,10 +19,10 @@ from estimators import Estimator, GradientEstimate, Objective, oracles_of
 from estimators.mean_check import TOLERANCE, Circulation, circulations
 from estimators.registry import label_of
 from mjx_study.diagnose.columns import MEANS
-from mjx_study.experiment.configuration import check_span
 from mjx_study.experiment.resolution import check_estimators, direction_of
 from mjx_study.experiment.sampling import cell_keys, draw_batches
 from mjx_study.objective import Simulator, chunk_for
+from mjx_study.options.configuration import check_span
 from mjx_study.progress import Progress, silent
 from mjx_study.runtime import local_devices
 from mjx_study.table import Column, as_plain, tabulate
@@ -34,7 +34,7 @@ HALF_LENGTH: Final = 2.0
 FEEDBACK: Final = 0.02
 """The same for noise on the controls, in the unit of theta."""
 ALONG_MEANS: Final = "means"
-"""Value of `direction` for paths along the estimators' own means, see `along_means`."""
+"""Value of `direction` for paths along the estimators' means, see `along_means`."""
 MAX_PATHS: Final = 3
 MIN_SHARE: Final = 1e-3
 """Smallest share of a mean orthogonal to the others that warrants a path along it."""

@@ -26,9 +26,9 @@ from mjx_study.execution.lost import lost_samples, total
 from mjx_study.execution.times import recording
 from mjx_study.experiment.blocks import Arrays
 from mjx_study.experiment.checkpoint import Checkpoint
-from mjx_study.experiment.configuration import StudyConfig
 from mjx_study.experiment.plan import StudyPlan, plan_study
 from mjx_study.identity import differences, versions
+from mjx_study.options.configuration import StudyConfig
 from mjx_study.progress import Progress, silent
 from mjx_study.storage.dataset import dataset_of, write_dataset
 from mjx_study.storage.folder import Store, open_store

@@ -15,8 +15,6 @@ from estimators.interpolation import check_weights
 from estimators.noise import check_sigma
 from estimators.user_inputs import inputs_read
 from mjx_study.choices import CONES, REFERENCE
-from mjx_study.experiment.configuration import SAMPLES, Settings, StudyConfig
-from mjx_study.experiment.effect import refuse_idle
 from mjx_study.experiment.iteration import make_optimizer, schedule_factors
 from mjx_study.experiment.memory import (
     AT_ONCE,
@@ -31,10 +29,12 @@ from mjx_study.experiment.memory import (
     padded_size,
 )
 from mjx_study.experiment.resolution import at_theta, configured_estimators, line_of, recipe_of
+from mjx_study.experiment.unused_options import reject_unused
 from mjx_study.identity import contents, estimator_contents
 from mjx_study.limits import MOST_CELLS, MOST_GIB, MOST_PROGRAMS, check_count
 from mjx_study.objective import chunk_for
-from mjx_study.option import BUILDER_OPTIONS
+from mjx_study.options.configuration import SAMPLES, NamedTask, Settings, StudyConfig
+from mjx_study.options.option import BUILDER_OPTIONS
 from mjx_study.runtime import local_devices
 from mjx_study.table import digits_to_tell_apart
 from mjx_study.tasks import TASKS, task_with_options
@@ -176,7 +176,7 @@ def plan_study(config: StudyConfig, built: Mapping[str, Task] | None = None) -> 
     groups: list[Group] = []
     cells: list[StudyCell] = []
     messages: list[str] = []
-    sound: list[str | Task] = []
+    sound: list[object] = []
     for which, timestep, cone in itertools.product(*variants):
         task = _build(config, which, timestep, cone, built or {})
         if config.network is not None:
@@ -230,7 +230,7 @@ def plan_study(config: StudyConfig, built: Mapping[str, Task] | None = None) -> 
             if config.theta is not None and group.task.policy.num_params == 1:
                 raise ValueError("`theta` has one entry, and the line is its range: give `span` instead")
             line_of(group.task, settings.points, config.span, config.direction, config.seed)
-    refuse_idle(config, [(group.task, group.models) for group in groups])
+    reject_unused(config, [(group.task, group.models) for group in groups])
     return plan
 
 
@@ -322,12 +322,14 @@ def seeds_together(plan: StudyPlan, cell: StudyCell) -> int:
 
 
 def _build(
-    config: StudyConfig, which: str | Task, timestep: float | None, cone: str | None, built: Mapping[str, Task]
+    config: StudyConfig, which: str | NamedTask, timestep: float | None, cone: str | None, built: Mapping[str, Task]
 ) -> Task:
     chosen = {"timestep": timestep, "cone": cone} | {name: getattr(config, name) for name in BUILDER_OPTIONS}
     chosen = {name: value for name, value in chosen.items() if value is not None}
     changes = {"onset": config.onset} | ({} if config.noise is None else {"noise": config.noise})
-    if isinstance(which, Task):
+    if not isinstance(which, str):
+        if not isinstance(which, Task):
+            raise ValueError(f"tasks takes names and Tasks, got {type(which).__name__}")
         if chosen:
             raise ValueError(f"{', '.join(chosen)}: only for a task given by name; build this one with it instead")
         check_shapes(which)

@@ -66,7 +66,7 @@ def plan_gradcheck(
 
     Args:
         task: the task, in float64, with the theta of its gradient.
-        families: contact families; by default the task's own if it has no contact, else `CONTACT`.
+        families: contact families; by default `CONTACT`, or `mjcf` for a task without contact.
         stiffnesses: stiffnesses for families that take one [N/m]; by default `STIFFNESS`, or the task's if those are in
             another range.
         seed: random seed of initial states, states and directions.
@@ -109,10 +109,7 @@ def plan_scene_gradcheck(
         stiffnesses: stiffnesses for families that take one [N/m].
         seed: random seed of the states.
         pair: names of the two geoms whose contact has the stiffness; every contact gets the same solref.
-        damping: override of each family's damping [N s/m].
         horizon: number of steps of the rollout from which states are taken.
-        states: number of states per contact model, at least 1.
-        stock: whether to check the derivative of `mjx.step` too.
 
     Raises:
         ValueError: as for `plan_gradcheck`, or a stiffness without a pair.

@@ -26,8 +26,8 @@ from estimators.user_inputs import inputs_now
 from mjx_study.disk import MAX_BYTES, check_no_link, open_regular, prepare_folder, read_whole, write_whole
 from mjx_study.experiment.checkpoint import StudyError, reason_of
 from mjx_study.experiment.plan import StudyPlan
-from mjx_study.files import digest_of_json
 from mjx_study.identity import ACCEPT, differences
+from mjx_study.options.files import digest_of_json
 from mjx_study.storage.arrays import check_cell
 from mjx_study.storage.cell_files import CellFile
 from mjx_study.storage.manifest import document_of, read_document, read_format, sealed

@@ -13,9 +13,9 @@ from estimators import Estimator, find_estimator
 from estimators.choices import ORACLES
 from estimators.registry import ESTIMATORS, label_of
 from mjx_study.experiment.plan import StudyCell, StudyPlan, estimators_of
-from mjx_study.files import Finite, digest_of_json, validated
 from mjx_study.identity import git_revision, versions
-from mjx_study.option import OPTIONS
+from mjx_study.options.files import Finite, digest_of_json, validated
+from mjx_study.options.option import OPTIONS
 from mjx_study.runtime import environment
 from mjx_study.table import digits_to_tell_apart
 

@@ -7,7 +7,7 @@ from typing import Any, Final
 
 from estimators.user_code import MissingModuleError
 from mjx_study.choices import TASK_DESCRIPTIONS, is_file, unknown_task
-from mjx_study.option import OPTIONS, as_arguments, check
+from mjx_study.options.option import OPTIONS, as_arguments, check
 from mjx_study.tasks.mjcf import mjcf_task
 from mjx_study.tasks.task import Task
 from mjx_study.tasks.user_task import build_user_task, registered_name

@@ -6,9 +6,9 @@ from typing import Final
 
 from estimators import ESTIMATORS, ORACLES, Estimator, find_estimator
 from mjx_study.choices import REFERENCE, takes_stiffness
-from mjx_study.experiment.configuration import StudyConfig
 from mjx_study.experiment.resolution import OF_ESTIMATORS
-from mjx_study.option import SCENE_OPTIONS
+from mjx_study.options.configuration import StudyConfig
+from mjx_study.options.option import SCENE_OPTIONS
 from mjx_study.tasks.contact_grid import ContactPoint
 from mjx_study.tasks.task import Task
 
@@ -16,7 +16,7 @@ CORRECTED: Final = "corrected"
 """Oracle with an onset term, linear unless `onset` asks for another."""
 
 
-def refuse_unread(chosen: Sequence[str | Estimator], given: Iterable[str]) -> None:
+def reject_unread(chosen: Sequence[str | Estimator], given: Iterable[str]) -> None:
     """Raise ValueError for an option of estimators that none of the chosen ones reads; objects have options of their
     own."""
     found = [find_estimator(each) for each in chosen]
@@ -35,14 +35,14 @@ def reads_onset(chosen: Iterable[str | Estimator], onset: str = "jump") -> bool:
     return bool(needed - {CORRECTED} if onset == "linear" else needed)
 
 
-def refuse_idle(config: StudyConfig, grids: Sequence[tuple[Task, Sequence[ContactPoint]]]) -> None:
+def reject_unused(config: StudyConfig, grids: Sequence[tuple[Task, Sequence[ContactPoint]]]) -> None:
     """Raise ValueError for what was given and has no effect in any cell: an option that differs from its default, or an
     onset estimator.
 
     Args:
         grids: tasks, each with its contact models.
     """
-    refuse_unread(config.estimators, [name for name in (*OF_ESTIMATORS, "published") if config.given(name)])
+    reject_unread(config.estimators, [name for name in (*OF_ESTIMATORS, "published") if config.given(name)])
     along = config.settings.kind == "landscapes"  # which have the mean of FoBG, whatever the estimators
     simulated = [task for task, models in grids if not all(each.analytic for each in models)]
     touching = any(task.scene.has_constraints for task in simulated)

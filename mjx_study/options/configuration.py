@@ -4,16 +4,15 @@ import dataclasses
 import math
 from collections import Counter
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Final, Union
+from typing import TYPE_CHECKING, Any, ClassVar, Final, Protocol, Union, runtime_checkable
 
 from estimators.choices import PLUG_IN, PUBLISHED_TOLERANCE
 from estimators.registry import ESTIMATORS
 from mjx_study.choices import refuse_untaken
-from mjx_study.option import Checked
+from mjx_study.options.option import Checked
 
 if TYPE_CHECKING:
     import estimators.estimator
-    import mjx_study.tasks.task
 
 OF_KIND: Final[dict[str, tuple[str, ...]]] = {
     "gradients": ("reference_samples", "block_size", "confidence"),
@@ -23,6 +22,16 @@ OF_KIND: Final[dict[str, tuple[str, ...]]] = {
 }  # fmt: skip
 """Options specific to one kind of study."""
 ASKED_BY: Final = {"descents": "give `iterations` as well", "landscapes": "give `points` as well"}
+
+
+@runtime_checkable
+class NamedTask(Protocol):
+    """A task given as an object, a `mjx_study.Task`."""
+
+    @property
+    def name(self) -> str: ...
+
+
 SAMPLES: Final = 100
 """Samples per batch unless the configuration or a recipe sets another number."""
 
@@ -103,7 +112,7 @@ class StudyConfig(Checked):
 
     ranges: ClassVar = {"samples": "[3, 1e7]"}
 
-    tasks: tuple[Union[str, "mjx_study.tasks.task.Task"], ...]
+    tasks: tuple[str | NamedTask, ...]
     kind: str | None = None
     estimators: tuple[Union[str, "estimators.estimator.Estimator"], ...] = ("zobg", "fobg", "aobg")
     theta: tuple[float, ...] | None = None

@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError,
 
 from estimators.choices import suggestion
 from mjx_study.disk import read_bytes
-from mjx_study.option import BUILDER_OPTIONS, OPTIONS
+from mjx_study.options.option import BUILDER_OPTIONS, OPTIONS
 
 Finite = Annotated[float, Field(allow_inf_nan=False, strict=True)]
 _ADAPTER: Final = functools.cache(TypeAdapter)
