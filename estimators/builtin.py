@@ -96,7 +96,7 @@ class AntitheticCostToGo(Paired):
     """Costs to go over pairs of opposite noise."""
 
     name, label, needs = "zobg_to_go_antithetic", "ZoBG (to go, antithetic)", ("step_pair",)
-    formula, unbiased = "both", "for symmetric noise"
+    formula, unbiased = "the mean of `zobg_to_go` over the pair $`w, -w`$", "for symmetric noise"
     style = "#0072B2", "X"
     separable = True
 
@@ -120,7 +120,7 @@ class OnsetFirstOrder(FirstOrder):
     """First order, corrected where contact begins and ends."""
 
     name, label, needs = "fobg_onset", "FoBG (onset)", ("corrected",)
-    formula = "the same with the [onset term](onset-correction.md): the linear one, or what `--onset` says"
+    formula = "`fobg` with the [onset term](onset-correction.md): the linear one, or what `--onset` says"
     unbiased = "where f is continuous; nearly, also where a contact force sets in or ends with a jump"
     style = "#7A2E00", "s"
 
@@ -131,7 +131,7 @@ class ClippedFirstOrder(Formula):
     """First order, the norm of every sample bounded."""
 
     name, label, needs = "fobg_clipped", "FoBG (clipped)", ("differentiation",)
-    formula, unbiased = "the same, clipped to a norm of `--max-norm`", "no"
+    formula, unbiased = "`fobg`, each sample clipped to a norm of `--max-norm`", "no"
     style = "#E69F00", "<"
     separable = True
 
@@ -146,7 +146,7 @@ class TruncatedFirstOrder(Formula):
     """First order, the adjoint cut every few steps."""
 
     name, label, needs = "fobg_truncated", "FoBG (truncated)", ("linearisation",)
-    formula, unbiased = "the same, the adjoint cut every `--window` steps", "no"
+    formula, unbiased = "`fobg`, the adjoint cut every `--window` steps", "no"
     style = "#E69F00", ">"
     separable = True
 
@@ -237,7 +237,7 @@ class OnsetAlphaOrder(AlphaOrder):
     """Alpha order, its first-order batch corrected where contact begins and ends."""
 
     name, label, needs = "aobg_onset", "AoBG (onset)", ("evaluation", "corrected")
-    formula, unbiased = "the same with `fobg_onset` in place of `fobg`", "likewise"
+    formula = "`aobg` with `fobg_onset` in place of `fobg`"
     style = "#8FBF5A", "D"
 
 
@@ -246,7 +246,7 @@ class InverseVariance(OneWeight):
     """Inverse-variance weighting: alpha order with gamma infinite."""
 
     name, label, needs = "ivw", "IVW", ("evaluation", "differentiation")
-    formula, unbiased = "alpha order with gamma infinite", "where f is continuous, for a given alpha"
+    formula, unbiased = "`aobg` with gamma infinite", "where f is continuous, for a given alpha"
     style = "#CC79A7", "^"
 
     def choose(self, zeroth: Any, first: Any) -> "estimators.batches.AlphaChoice":
@@ -261,7 +261,7 @@ class StepwiseInverseVariance(Interpolation):
 
     name, label, needs = "ivw_h", "IVW-H", ("steps", "step_differentiation")
     formula = r"an inverse-variance weight for every step and control, then pulled back through $`D\pi`$"
-    unbiased = "likewise"
+    unbiased = "where f is continuous, for given weights"
     style = "#CC79A7", "p"
 
     computes = "estimators.stepwise:stepwise_inverse_variance"
@@ -273,7 +273,7 @@ class TotalPropagation(Interpolation):
 
     name, label, needs = "total_propagation", "total propagation", ("linearisation",)
     formula = "an inverse-variance weight at every step of the backward recursion; the mixture propagates further back"
-    unbiased = "likewise"
+    unbiased = "where f is continuous, for given weights"
     style = "#332288", "*"
 
     computes = "estimators.recursion:total_propagation"

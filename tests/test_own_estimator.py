@@ -198,6 +198,16 @@ def test_a_dry_run_takes_it(command: str, folder: Path, capsys: pytest.CaptureFi
     assert not (folder / "out").exists()
 
 
+def test_examples_of_estimators_with_required_options_are_accepted(capsys: pytest.CaptureFixture[str]) -> None:
+    entries = document(capsys, "estimators")["estimators"]
+    needy = [entry for entry in entries if entry["requires"]]
+    assert [entry["name"] for entry in needy] == ["fobg_clipped", "fobg_truncated"]
+    for entry in needy:
+        (program, command, _, *options) = entry["example"].split()
+        assert (program, command) == ("mjx-study", "compare")
+        assert cli.main([command, *ANALYTIC, *options, "--samples", "8", "--dry-run"]) == 0
+
+
 def test_rollout_takes_its_policy(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = ["--contact", "reference", "--horizon", "4", "--samples", "4", "--seeds", "1", "--iterations", "1"]
     (found,) = document(capsys, "optimise", "pusher", *arguments, "--estimators", OWN, "--output", "out")["runs"]
