@@ -190,14 +190,6 @@ def test_gradcheck_takes_it(capsys: pytest.CaptureFixture[str]) -> None:
     assert any(re.match(r" *penalty +10 +SignAgreement ", line) for line in table)
 
 
-@pytest.mark.parametrize("command", ["compare", "landscape", "optimise", "sweep"])
-def test_a_dry_run_takes_it(command: str, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    one = [*ANALYTIC[:-1], "10", "--estimators", OWN, "--samples", "8", "--output", "out", "--dry-run"]
-    told = document(capsys, command, *one)
-    assert told["cells"] == 1 and told["rollouts"] >= 16 and told["gradients"] >= 8
-    assert not (folder / "out").exists()
-
-
 def test_examples_of_estimators_with_required_options_are_accepted(capsys: pytest.CaptureFixture[str]) -> None:
     entries = document(capsys, "estimators")["estimators"]
     needy = [entry for entry in entries if entry["requires"]]
@@ -206,14 +198,6 @@ def test_examples_of_estimators_with_required_options_are_accepted(capsys: pytes
         (program, command, _, *options) = entry["example"].split()
         assert (program, command) == ("mjx-study", "compare")
         assert cli.main([command, *ANALYTIC, *options, "--samples", "8", "--dry-run"]) == 0
-
-
-def test_rollout_takes_its_policy(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    arguments = ["--contact", "reference", "--horizon", "4", "--samples", "4", "--seeds", "1", "--iterations", "1"]
-    (found,) = document(capsys, "optimise", "pusher", *arguments, "--estimators", OWN, "--output", "out")["runs"]
-    policy = ["--theta", "out/policy-my_estimators.SignAgreement.json", "--renderer", "drawing", "--output", "seen"]
-    facts = document(capsys, "rollout", "pusher", *policy)
-    assert facts["theta"] == found["theta"][0] and facts["steps"] == 4 and facts["finite"]
 
 
 @pytest.mark.parametrize(
