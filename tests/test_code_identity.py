@@ -19,8 +19,10 @@ PACKAGED = [
     for path in sorted((ROOT / package).rglob("*"))
     if path.is_file() and path.suffix != ".pyc"
 ]
-NO_CODE = {"estimators/py.typed", "mjx_study/py.typed", "mjx_study/templates/report.html"}
-NO_CODE |= {"mjx_study/claims/claims.toml", "mjx_study/claims/page.md"}
+NO_CODE = {
+    *("estimators/py.typed", "mjx_study/py.typed", "mjx_study/templates/report.html"),
+    *("mjx_study/claims/claims.toml", "mjx_study/claims/page.md"),
+}
 LOADED = """
 import sys
 from mjx_study.execution.run import run_study
