@@ -17,7 +17,7 @@ import estimators
 from estimators import ENOUGH_EFFECTIVE, ESTIMATORS, make_estimator, summarise
 from experiments.pages import DOCS, with_table
 from mjx_study.reference import LinearQuadratic, ReferenceObjective
-from mjx_study.results.findings import DETECTED_SE
+from mjx_study.results.curves import DETECTED_SE
 from mjx_study.runtime import configure
 from mjx_study.table import percent
 

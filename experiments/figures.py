@@ -24,7 +24,7 @@ from matplotlib.figure import Figure
 from matplotlib.transforms import Affine2D
 
 from experiments.pages import DOCS, DPI, save_figure
-from mjx_study.experiment.landscapes import Line, grid, means
+from mjx_study.experiment.quadrature import Line, grid, means
 from mjx_study.objective import rollout_cost
 from mjx_study.reference import (
     BallWall,

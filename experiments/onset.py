@@ -13,7 +13,7 @@ import numpy as np
 
 from estimators import NOISES, first_order, zeroth_order
 from experiments.atlas.measure import task_of
-from mjx_study.experiment.landscapes import Line, Means, grid, means
+from mjx_study.experiment.quadrature import Line, Means, grid, means
 from mjx_study.experiment.resolution import direction_of
 from mjx_study.experiment.tally import onset_numbers
 from mjx_study.objective import Simulator

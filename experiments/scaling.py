@@ -138,10 +138,10 @@ class Programs:
         """What is run, and a call that runs it and returns seconds, on a CPU the processor's unless `wall`."""
         import jax
         import numpy as np
+        from mjx_study.stopwatch import timed
 
         from mjx_study.objective import Simulator, spread
         from mjx_study.simulation.scene import num_constraint_rows
-        from mjx_study.stopwatch import timed
 
         task, chunk = self.task(model, horizon), chunk or min(samples, self.chunk)
         key = model, horizon, chunk

@@ -9,11 +9,12 @@ from typing import Final
 
 from experiments.pages import DOCS, ROOT, save_figure
 from mjx_study.cli.output import shown_progress
-from mjx_study.execution.run import load_study, run_study
+from mjx_study.execution.run import run_study
 from mjx_study.experiment.configuration import StudyConfig
 from mjx_study.experiment.plan import plan_study
 from mjx_study.plots.study import plot_study
 from mjx_study.runtime import configure
+from mjx_study.storage.folder import load_study
 
 
 def decades(first: int, last: int, count: int) -> tuple[float, ...]:

@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 
 import mjx_study as study
-from mjx_study.experiment.landscapes import Line, grid, means
+from mjx_study.experiment.quadrature import Line, grid, means
 from mjx_study.simulation.contact import ContactModel
 from mjx_study.simulation.scene import put_scene
 

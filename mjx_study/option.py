@@ -12,7 +12,7 @@ from numbers import Integral, Real
 from typing import Any, ClassVar, Final
 
 from estimators.catalogue import BASELINES, CATALOGUE, DENSITIES, VARIANCE_PROXIES, WEIGHTS, suggestion, unknown
-from mjx_study.choices import CONES, FAMILIES, INTEGRATORS, ONSETS, REFERENCE, SOLVERS
+from mjx_study.choices import CONES, FAMILIES, INTEGRATORS, KINDS, ONSETS, REFERENCE, SOLVERS
 
 MOST_VALUES: Final = 10_000
 """Maximum number of values in a list or range."""
@@ -225,8 +225,6 @@ def _choice(name: str, choices: Collection[str], metavar: str, line: str, **more
 
 TASKS: Final = "the task's"
 MJCF: Final = "the MJCF's"
-KINDS: Final = ("gradients", "descents", "landscapes")
-"""Kinds of study."""
 CONTACTS: Final = (*FAMILIES, REFERENCE)
 """Contact families of a study, and the analytic reference."""
 OPTIONS: Final[dict[str, Option]] = {

@@ -19,7 +19,7 @@ from mjx_study.diagnose import ESTIMATORS, ContactSummary, Diagnosis, Measured, 
 from mjx_study.diagnose.means import along_means
 from mjx_study.diagnose.measurement import affordable, chunk_of
 from mjx_study.diagnose.setting import setting_of
-from mjx_study.experiment.landscapes import Line, grid, means
+from mjx_study.experiment.quadrature import Line, grid, means
 from mjx_study.gradcheck import Finding
 from mjx_study.objective import Simulator
 from mjx_study.tasks import make_task

@@ -23,7 +23,6 @@ LAYERS = [
     "mjx_study.caches",
     "mjx_study.runtime",
     "mjx_study.watchdog",
-    "mjx_study.stopwatch",
     "mjx_study.table",
     "mjx_study.progress",
     "mjx_study.limits",
@@ -40,6 +39,7 @@ LAYERS = [
     "mjx_study.compiled",
     "mjx_study.objective",
     "mjx_study.results",
+    "mjx_study.plots",
     "mjx_study.experiment",
     "mjx_study.storage",
     "mjx_study.execution",
@@ -47,7 +47,6 @@ LAYERS = [
     "mjx_study.diagnose",
     "mjx_study.bench",
     "mjx_study.render",
-    "mjx_study.plots",
     "mjx_study.claims",
     "mjx_study.report",
     "mjx_study.cli",
@@ -230,7 +229,7 @@ def test_import_has_no_global_effect() -> None:
 
 ARCHITECTURE = (ROOT / "docs" / "architecture.md").read_text()
 BESIDE = {"mjx_study.choices", "mjx_study._matplotlib", "mjx_study.runtime", "mjx_study.table", "mjx_study.disk"} | {
-    "mjx_study.stopwatch", "mjx_study.watchdog", "mjx_study.limits", "mjx_study.option", "mjx_study.files",
+    "mjx_study.watchdog", "mjx_study.limits", "mjx_study.option", "mjx_study.files",
     "mjx_study._public", "mjx_study.sources", "mjx_study.digest", "mjx_study.identity", "mjx_study.compiled",
     "mjx_study.version", "mjx_study.caches", "mjx_study.structure", "mjx_study.progress",
 }  # fmt: skip

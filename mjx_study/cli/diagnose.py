@@ -7,7 +7,7 @@ from mjx_study.choices import FAMILIES, is_file
 from mjx_study.cli.options import TASK_OPTIONS, Parser, configure_process, given_options, task_of, usage_errors
 from mjx_study.cli.output import computing, print_report
 from mjx_study.option import OPTIONS
-from mjx_study.results.variables import explained
+from mjx_study.results.variables import DIAGNOSIS, explained
 
 EPILOG = f"""\
 examples:
@@ -15,7 +15,7 @@ examples:
   mjx-study diagnose robot.xml                 no cost is needed: one is made from the bodies' positions
 
 columns of the contacts and of the estimators:
-{explained("diagnosis")}
+{explained(DIAGNOSIS)}
 
 The error is that of a gradient from as many samples as this machine computes in a second. Means are checked along
 paths, as in gradcheck --mean, and so is the bias. At least 23 samples are drawn, whatever --samples. Exit code 1 if a

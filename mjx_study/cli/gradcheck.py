@@ -7,7 +7,7 @@ from mjx_study.choices import CHECKED_STATES, CHECKED_STEPS, CHECKED_STIFFNESS, 
 from mjx_study.cli.options import Parser, UsageError, configure_process, given_options, task_of, usage_errors
 from mjx_study.cli.output import computing, print_report
 from mjx_study.option import OPTIONS, Option
-from mjx_study.results.variables import explained
+from mjx_study.results.variables import MEANS, explained
 
 UNEXERCISED = 3
 """Exit code if nothing is wrong but something was never exercised."""
@@ -36,7 +36,7 @@ derivative errors: both are reported but do not fail.
 
 With --mean: does an estimator's mean integrate to the difference of the mean cost along a path through theta? No
 reference gradient is needed. Exit code 0: all are right. 1: one is biased. 3: undecided. Columns:
-{explained("means")}
+{explained(MEANS)}
 """
 MEAN = {
     "estimators": ("zobg", "fobg"),
