@@ -5,7 +5,6 @@
     python -m experiments.scaling cost --seconds 600 --output experiments/data/scaling_cpu.json
     python -m experiments.scaling devices --tasks pusher tennis --samples 100000 1000000
     python -m experiments.scaling busy
-    python -m experiments.scaling fit experiments/data/scaling_cpu.json
     python -m experiments.scaling figure experiments/data/scaling_cpu.json --output docs/scaling.png
 
 `engine` runs cells that sleep, on as many local workers as asked for: what a cell computes is replaced by sleep; the
@@ -23,8 +22,6 @@ fit into `--seconds`, and goes on where the file ends.
 
 `busy` sweeps contact models on an accelerator and prints the share of a cell's time in which a kernel runs, by JAX's
 profiler.
-
-`fit` prints the constants of the rough model of times (mjx_study/execution/times.py) that these measurements give.
 """
 
 import argparse
@@ -138,7 +135,6 @@ class Programs:
         """What is run, and a call that runs it and returns seconds, on a CPU the processor's unless `wall`."""
         import jax
         import numpy as np
-        from mjx_study.stopwatch import timed
 
         from mjx_study.objective import Simulator, spread
         from mjx_study.simulation.scene import num_constraint_rows
@@ -155,23 +151,12 @@ class Programs:
 
         def call() -> float:
             begun = clock()
-            with timed(kind):
-                spread(program, shared, (keys, noise), chunk, self.devices[:devices])
+            spread(program, shared, (keys, noise), chunk, self.devices[:devices])
             return clock() - begun
 
         sizes = {"dof": int(task.scene.host.nv), "constraints": num_constraint_rows(task.scene.template)}
         told = {"kind": kind, "samples": samples, "chunk": chunk, "devices": devices, "steps": horizon}
         return told | sizes, call
-
-
-def compiled(call: Callable[[], float]) -> dict[str, float]:
-    """Compile; seconds of tracing and compilation, none where that was done."""
-    from mjx_study.stopwatch import Stopwatch
-
-    with Stopwatch().running() as watch:
-        call()
-    (spent,) = watch.spent.values()
-    return {"tracing": spent.tracing, "compiling": spent.compiling} if spent.setups else {}
 
 
 def plan(programs: Programs) -> list[tuple[str, int, dict[str, Any]]]:
@@ -213,7 +198,7 @@ def measure_cost(seconds: float, output: Path, axes: list[str]) -> None:
         document |= {"measured": [r for r in json.loads(output.read_text())["measured"] if r["axis"] not in axes]}
     _, base = programs.run("value", programs.chunk)
     per_step = programs.chunk * HORIZON
-    compiled(base)
+    base()  # compile
     bases: list[float] = []
     for axis, at, arguments in plan(programs):
         known = ((row["axis"], row["at"], row["kind"]) for row in document["measured"])
@@ -223,7 +208,7 @@ def measure_cost(seconds: float, output: Path, axes: list[str]) -> None:
             document["left_out"].append([axis, at, arguments["kind"]])
             continue
         told, call = programs.run(**arguments)
-        found = {"axis": axis, "at": at} | told | compiled(call)
+        found = {"axis": axis, "at": at} | told | {"first call": call()}
         pairs = [(base(), call())]
         while len(pairs) < REPEATS and sum(own for _, own in pairs) < LONG:
             pairs.append((base(), call()))
@@ -330,69 +315,7 @@ def measure_busy(cells: int, samples: int, seeds: int) -> None:
     print(json.dumps(environment() | told))
 
 
-# Model and figure
-
-
-def fit(document: dict[str, Any]) -> dict[str, Any]:
-    """The constants of the rough model, see `mjx_study.execution.times`: of times and of compilation, and their errors.
-
-    Returns:
-        Constants to two digits, and as `spread` the factor by which measured times and those of the model differ, as
-        the largest and as the root mean square of logarithms.
-    """
-    import numpy as np
-
-    rows = document["measured"]
-    for row in rows:
-        row["each"] = row["seconds"] / row["steps"] / math.ceil(row["samples"] / row["chunk"])
-    alone = [row for row in rows if row["devices"] == 1]
-
-    def of(axis: str, kind: str) -> list[dict[str, Any]]:
-        return [row for row in alone if row["axis"] == axis and row["kind"] == kind]
-
-    overheads = []
-    for kind in KINDS:
-        chunks, each = (np.array([row[name] for row in of("chunk", kind)], float) for name in ("chunk", "each"))
-        slope, start = np.polyfit(chunks, each, 1, w=1 / each)
-        overheads.append(max(1.0, start / slope))
-    overhead = two_digits(math.sqrt(math.prod(overheads)))
-    own = of("kind", "value")[0]["ratio"]
-    factors = {row["kind"]: two_digits(row["ratio"] / own) for row in alone if row["axis"] == "kind"}
-    sized = [row for row in alone if row["axis"] in ("contacts", "dof", "bodies", "horizon", "chunk", "samples")]
-
-    def powers(values: Any, rows: Any) -> tuple[Any, Any]:
-        """Constant and powers of 1 + degrees of freedom and 1 + constraint rows; and what is left."""
-        sizes = np.array([[1.0, math.log(1 + row["dof"]), math.log(1 + row["constraints"])] for row in rows])
-        found = np.linalg.lstsq(sizes, np.log(values), rcond=None)[0]
-        return found, np.log(values) - sizes @ found
-
-    times = [row["each"] / (row["chunk"] + overhead) / factors[row["kind"]] for row in sized]
-    (rate, *exponents), left = powers(times, sized)
-    fresh = [row for row in alone if row.get("compiling", 0) > 0]
-    setups = {}
-    for name in ("tracing", "compiling"):
-        own = [row[name] / factors[row["kind"]] ** 0.5 for row in fresh]
-        (constant, *grown), rest = powers(own, fresh)
-        setups[name] = [two_digits(math.exp(constant)), *map(two_digits, grown)]
-        setups[f"spread of {name}"] = apart(rest)
-    return {
-        "overhead": overhead,
-        "rate": two_digits(math.exp(rate)),
-        "powers": [two_digits(power) for power in exponents],
-        "factors": factors,
-        "spread": apart(left),
-    } | setups
-
-
-def two_digits(value: float) -> float:
-    return float(f"{value:.2g}")
-
-
-def apart(logarithms: Any) -> list[float]:
-    """Factors: the largest, and the root mean square."""
-    import numpy as np
-
-    return [two_digits(math.exp(np.max(np.abs(logarithms)))), two_digits(math.exp(np.sqrt(np.mean(logarithms**2))))]
+# Figure
 
 
 PANELS: Final = {
@@ -466,10 +389,12 @@ def measure_engine(workers: int, cells: int, seconds: float, programs: int, numb
     import numpy as np
 
     from mjx_study.execution import cluster
-    from mjx_study.experiment.checkpoint import Checkpoint
+    from mjx_study.execution.cells import Cells
+    from mjx_study.experiment.study import Work
+    from mjx_study.progress import silent
     from mjx_study.storage.folder import Store
 
-    def sleep(study: bytes, index: int, kept: Any, block: Any) -> Any:
+    def sleep(study: bytes, index: int, kept: Any, unit: int) -> Any:
         import time
 
         import numpy
@@ -486,17 +411,25 @@ def measure_engine(workers: int, cells: int, seconds: float, programs: int, numb
         def program_of(self, cell: int) -> int:
             return cell % programs
 
+        def label(self, cell: int) -> str:
+            return str(cell)
+
+    class Computation:
+        """Cells of one work unit."""
+
+        def begin(self, cell: int, checkpoint: Any) -> Work:
+            return Work()
+
     index = {"cells": [{"label": str(cell), "at": {}} for cell in range(cells)], "config": {}}
-    replaced = {"_compute": sleep, "_packed": lambda plan: b"", "Computation": lambda plan: None}
-    replaced["blocks_of"] = lambda plan, cell: 1
+    replaced = {"_compute": sleep, "_packed": lambda plan: b""}
     with tempfile.TemporaryDirectory() as name, mock.patch.multiple(cluster, **replaced):
         store, writing = Store(Path(name), index), 0.0
         (Path(name) / "cells").mkdir()
         with cluster.connected(f"local:{workers}") as client:
             client.wait_for_workers(workers)
             begun, processor = time.perf_counter(), time.process_time()
-            parts = {cell: Checkpoint() for cell in range(cells)}
-            for done, arrays in cluster.cells_on(client, Plan(), parts, lambda _: None):  # type: ignore[arg-type]
+            given = Cells(Plan(), Computation(), silent)  # type: ignore[arg-type]
+            for done, arrays in cluster.compute_there(client, given, range(cells)):
                 assert isinstance(arrays, dict) and np.all(arrays["values"] == done)
                 before = time.perf_counter()
                 store.write(done, arrays)
@@ -578,8 +511,6 @@ def main() -> None:
     profiled.add_argument("--cells", type=int, default=65)
     profiled.add_argument("--samples", type=int, default=4000)
     profiled.add_argument("--seeds", type=int, default=10)
-    fit_command = commands.add_parser("fit", help="print the constants of the model")
-    fit_command.add_argument("measured", type=Path)
     drawn = commands.add_parser("figure", help="draw")
     drawn.add_argument("measured", type=Path, nargs="+")
     drawn.add_argument("--output", type=Path, required=True)
@@ -595,8 +526,6 @@ def main() -> None:
         measure_devices(**options)
     elif command == "busy":
         measure_busy(**options)
-    elif command == "fit":
-        print(json.dumps(fit(json.loads(options["measured"].read_text())), indent=1))
     else:
         draw([json.loads(path.read_text()) for path in options["measured"]], options["output"])
 

@@ -17,7 +17,7 @@ from mjx_study.tasks.pusher import pusher
 from mjx_study.tasks.sliding_box import sliding_box
 from mjx_study.tasks.task import Task
 from mjx_study.tasks.tennis import tennis
-from mjx_study.tasks.user_task import registered_name, user_task
+from mjx_study.tasks.user_task import build_user_task, registered_name
 
 TASKS: Final[dict[str, Callable[..., Task]]] = {
     "pusher": pusher,
@@ -54,10 +54,10 @@ def make_task(name: str, **options: Any) -> Task:
             raise ValueError(f"model replaces the MJCF of a task, but {name} is a file already")
         return mjcf_task(name, **options)
     if (place := registered_name(name)) is not None:
-        return user_task(place, options)
+        return build_user_task(place, options)
     if ":" in name:
         try:
-            return user_task(name, options)
+            return build_user_task(name, options)
         except MissingModuleError as error:
             raise ValueError(unknown_task(name, f" ({error})")) from None
     raise ValueError(unknown_task(name))

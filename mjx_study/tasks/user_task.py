@@ -19,7 +19,7 @@ def registered_name(name: str) -> str | None:
     return next(iter(places), None)
 
 
-def user_task(place: str, options: dict[str, Any]) -> Task:
+def build_user_task(place: str, options: dict[str, Any]) -> Task:
     """Return the task at a place: a Task, or the result of a function of the options.
 
     The current directory counts as importable, in the console script too.
