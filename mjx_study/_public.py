@@ -3,10 +3,10 @@
 import mjx_study._matplotlib  # noqa: F401
 from mjx_study.choices import FAMILIES
 from mjx_study.execution.run import run_study
-from mjx_study.experiment.configuration import StudyConfig
 from mjx_study.experiment.plan import plan_study
 from mjx_study.experiment.study import estimators_of
 from mjx_study.objective import MjxObjective, Simulator, simulate
+from mjx_study.options.configuration import StudyConfig
 from mjx_study.plots.study import plot_study
 from mjx_study.report import StudyAccessor
 from mjx_study.runtime import configure

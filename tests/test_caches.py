@@ -182,7 +182,7 @@ def test_other_structures_are_refused(tree: Any) -> None:
         ({"class": ["os", "system"], "fields": []}, "is no class of so many fields"),
         ({"class": ["mjx_study.nowhere", "It"], "fields": []}, "is no class of so many fields"),
         ({"class": ["tests.test_caches", "Own"], "fields": [0]}, "is no class of so many fields"),
-        ({"class": ["estimators.types", "Differentiation"], "fields": [0]}, "is no class of so many fields"),
+        ({"class": ["estimators.batches", "Differentiation"], "fields": [0]}, "is no class of so many fields"),
         ({"class": ["mjx_study.disk", "os"], "fields": []}, "is no class of so many fields"),
     ],
 )

@@ -17,8 +17,8 @@ from mjx_study import compiled, identity
 from mjx_study.compiled import Compiled
 from mjx_study.execution.run import run_study
 from mjx_study.experiment import gradient_numbers, gradients
-from mjx_study.experiment.configuration import StudyConfig
 from mjx_study.objective import Simulator, programs
+from mjx_study.options.configuration import StudyConfig
 from mjx_study.tasks import Task, make_task
 from tests.carts import cart
 
@@ -109,7 +109,7 @@ def test_code_versions_settings_and_the_form_of_arguments_count(monkeypatch: pyt
     ours = path()
     assert ours == path() != path("another")
     with monkeypatch.context() as patch:
-        patch.setattr(identity, "_own_code", lambda without: "other")
+        patch.setattr(identity, "computing_code", lambda: "other")
         assert path() != ours
     version = identity.version_of
     with monkeypatch.context() as patch:

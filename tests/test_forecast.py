@@ -10,8 +10,8 @@ from mjx_study import cli
 from mjx_study.cli import options
 from mjx_study.execution.forecast import forecast_study
 from mjx_study.execution.run import run_study
-from mjx_study.experiment.configuration import StudyConfig
 from mjx_study.experiment.plan import plan_study
+from mjx_study.options.configuration import StudyConfig
 from mjx_study.table import count, size
 
 DESCENTS = (

@@ -20,10 +20,10 @@ from mjx_study.digest import digest_of
 from mjx_study.disk import write_whole
 from mjx_study.execution.run import run_study
 from mjx_study.experiment.checkpoint import StudyError
-from mjx_study.experiment.configuration import StudyConfig
 from mjx_study.experiment.plan import plan_study
 from mjx_study.experiment.study import StudyCell, StudyPlan
 from mjx_study.identity import contents, differences, git_revision
+from mjx_study.options.configuration import StudyConfig
 from mjx_study.results.warnings import warnings_of
 from mjx_study.simulation.scene import models_folder
 from mjx_study.storage import cell_files as cell_file
@@ -35,7 +35,7 @@ from tests.documents import altered, planned_arrays, stub_cells
 
 MODULE = """
 from functools import partial
-from mjx_study.tasks import pusher
+from mjx_study.tasks.pusher import pusher
 from helping import WEIGHT, weighed
 
 def cost(state, factor=1.0):

@@ -26,11 +26,11 @@ from mjx_study.cli.studies import as_document
 from mjx_study.execution.run import run_study
 from mjx_study.experiment import landscapes, sampling
 from mjx_study.experiment import plan as plan_module
-from mjx_study.experiment.configuration import StudyConfig
 from mjx_study.experiment.plan import plan_study
 from mjx_study.experiment.quadrature import Line, applies, closed_form, grid, means
 from mjx_study.experiment.resolution import line_of
 from mjx_study.experiment.study import StudyPlan
+from mjx_study.options.configuration import StudyConfig
 from mjx_study.plots.study import plot_study
 from mjx_study.reference import BallWall, FunctionObjective, Heaviside, Quadratic, smoothed
 from mjx_study.results.curves import curves_of

@@ -29,8 +29,7 @@ LAYERS = [
     "mjx_study.reference",
     "mjx_study.graph",
     "mjx_study.simulation",
-    "mjx_study.option",
-    "mjx_study.files",
+    "mjx_study.options",
     "mjx_study.tasks",
     "mjx_study.sources",
     "mjx_study.digest",
@@ -38,12 +37,12 @@ LAYERS = [
     "mjx_study.structure",
     "mjx_study.compiled",
     "mjx_study.objective",
+    "mjx_study.gradcheck",
     "mjx_study.results",
     "mjx_study.plots",
     "mjx_study.experiment",
     "mjx_study.storage",
     "mjx_study.execution",
-    "mjx_study.gradcheck",
     "mjx_study.diagnose",
     "mjx_study.bench",
     "mjx_study.render",
@@ -158,7 +157,7 @@ def test_every_layer_is_used_once_and_files_are_found() -> None:
 @pytest.mark.parametrize(
     ("module", "source", "wrong"),
     [
-        ("estimators.types", "import mjx_study.reference.noise", {"mjx_study.reference.noise"}),
+        ("estimators.batches", "import mjx_study.reference.system", {"mjx_study.reference.system"}),
         ("mjx_study.tasks.task", "def f():\n    from mjx_study.objective import Simulator", {"mjx_study.objective"}),
         ("mjx_study.tasks.task", "from ..objective import Simulator", {"mjx_study.objective"}),
         ("mjx_study.tasks.task", "from mjx_study import objective", {"mjx_study.objective"}),
@@ -229,7 +228,7 @@ def test_import_has_no_global_effect() -> None:
 
 ARCHITECTURE = (ROOT / "docs" / "architecture.md").read_text()
 BESIDE = {"mjx_study.choices", "mjx_study._matplotlib", "mjx_study.runtime", "mjx_study.table", "mjx_study.disk"} | {
-    "mjx_study.watchdog", "mjx_study.limits", "mjx_study.option", "mjx_study.files",
+    "mjx_study.watchdog", "mjx_study.limits", "mjx_study.options",
     "mjx_study._public", "mjx_study.sources", "mjx_study.digest", "mjx_study.identity", "mjx_study.compiled",
     "mjx_study.version", "mjx_study.caches", "mjx_study.structure", "mjx_study.progress",
 }  # fmt: skip

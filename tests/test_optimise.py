@@ -22,13 +22,13 @@ from mjx_study.execution.run import run_study
 from mjx_study.experiment import descents, plan, sampling
 from mjx_study.experiment import iteration as descent
 from mjx_study.experiment.checkpoint import Checkpoint, StudyError
-from mjx_study.experiment.configuration import StudyConfig
 from mjx_study.experiment.descents import Backend
 from mjx_study.experiment.iteration import REASONS, begin, make_optimizer
 from mjx_study.experiment.plan import plan_study
 from mjx_study.experiment.study import StudyPlan, estimators_of
-from mjx_study.files import PolicyFile
 from mjx_study.objective import Simulator
+from mjx_study.options.configuration import StudyConfig
+from mjx_study.options.files import PolicyFile
 from mjx_study.reference import ReferenceObjective, Tennis, roll_out
 from mjx_study.results.kind import findings_of
 from mjx_study.results.variables import HISTORY, METRIC

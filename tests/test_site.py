@@ -4,7 +4,7 @@ import dataclasses
 import inspect
 import re
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import pytest
 import yaml
@@ -24,7 +24,7 @@ def pages_of(nav: Any) -> list[str]:
 def test_every_page_is_in_the_navigation_once() -> None:
     nav = pages_of(yaml.safe_load((ROOT / "mkdocs.yml").read_text())["nav"])
     staged = [str(place) for place in OWN.values() if place.suffix == ".md"]
-    made = [f"reference/{name}.md" for name in ("commands", *site.PACKAGES)]
+    made = [f"reference/{name}.md" for name in ("commands", "variables", *site.PACKAGES)]
     assert sorted(nav) == sorted(staged + made)
     assert {f"docs/{path.name}" for path in (ROOT / "docs").glob("*.md")} <= {str(source) for source in OWN}
 
@@ -83,35 +83,6 @@ def test_a_section_of_arguments_or_attributes_names_all_of_them(package: str) ->
             methods = inspect.getmembers(owner, inspect.isroutine)
             public |= {f"{name}.{part}": method for part, method in methods if not part.startswith("_")}
     assert not {name: missing for name, each in public.items() if (missing := left_out(each))}
-
-
-def test_what_a_section_leaves_out_is_found() -> None:
-    def function(a: int, b: int, *rest: int, c: int = 0, **others: int) -> None:
-        """Of numbers.
-
-        Args:
-            a, b: two numbers, and
-                c: in a line that goes on.
-            *rest: more numbers.
-
-        Raises:
-            others: never.
-        """
-
-    @dataclasses.dataclass
-    class Fields:
-        """Of a class.
-
-        Attributes:
-            one: a number.
-        """
-
-        none: ClassVar[int] = 0
-        one: int
-        two: int
-
-    assert left_out(function) == {"c", "others"}
-    assert left_out(Fields) == {"two"}
 
 
 def test_boxes_of_a_diagram_are_apart_and_arrows_lead_down() -> None:

@@ -23,17 +23,17 @@ from estimators import (
     InverseVariance,
     summarise,
 )
-from estimators.estimator import label_of
+from estimators.registry import label_of
 from mjx_study import cli, disk
 from mjx_study.cli import console
 from mjx_study.cli.studies import as_document
 from mjx_study.execution.run import run_study
 from mjx_study.experiment import sampling
 from mjx_study.experiment.checkpoint import StudyError
-from mjx_study.experiment.configuration import StudyConfig
 from mjx_study.experiment.plan import plan_study
 from mjx_study.experiment.study import estimators_of
 from mjx_study.objective import MjxObjective, Simulator
+from mjx_study.options.configuration import StudyConfig
 from mjx_study.plots.panels import limit
 from mjx_study.plots.study import plot_study
 from mjx_study.plots.style import save_figure
@@ -210,7 +210,8 @@ class Half(FirstOrder):
 
     name = "half"
 
-    def combine(self, differentiation: Differentiation) -> GradientEstimate:
+    def combine(self, *batches: Differentiation) -> GradientEstimate:
+        (differentiation,) = batches
         return summarise(differentiation.gradient / 2)
 
 

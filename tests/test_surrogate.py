@@ -10,12 +10,12 @@ import optax
 import pytest
 
 from mjx_study.execution.run import run_study
-from mjx_study.experiment.configuration import StudyConfig
 from mjx_study.experiment.descents import Backend
 from mjx_study.experiment.iteration import begin, schedule_factors
 from mjx_study.experiment.plan import plan_study
 from mjx_study.experiment.study import estimators_of
 from mjx_study.objective import Simulator, simulate
+from mjx_study.options.configuration import StudyConfig
 from mjx_study.simulation.contact import contact_model, soften, stiffness_from_solref
 from mjx_study.simulation.dynamics import State
 from mjx_study.tasks import make_task
@@ -40,7 +40,7 @@ def by_hand(task, states, controls) -> np.ndarray:
     return found
 
 
-@pytest.mark.parametrize("adjoint", ["jacobian", pytest.param("tape", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("adjoint", ["graph", pytest.param("tape", marks=pytest.mark.slow)])
 def test_costs_are_of_one_contact_and_derivatives_of_the_other(adjoint: str) -> None:
     task = make_task("pusher", horizon=HORIZON, adjoint=adjoint)
     simulator, theta = Simulator(task, chunk_size=1), jnp.linspace(0.1, 0.6, HORIZON)

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from mjx_study.execution.run import run_study
-from mjx_study.experiment.configuration import StudyConfig
 from mjx_study.experiment.plan import plan_study
 from mjx_study.experiment.study import StudyCell, StudyPlan
+from mjx_study.options.configuration import StudyConfig
 from mjx_study.plots.study import plot_study
 from mjx_study.storage.folder import load_study
 from mjx_study.table import digits_to_tell_apart
@@ -82,7 +82,7 @@ def test_noises_and_timesteps_that_six_digits_do_not_tell_apart(tmp_path: Path) 
 
 
 MODULE = """
-from mjx_study.tasks import pusher
+from mjx_study.tasks.pusher import pusher
 from mjx_study.tasks.task import StudyDefaults
 
 def stern(horizon=2, **options):

@@ -13,10 +13,10 @@ import pytest
 from estimators import Differentiation, Evaluation
 from mjx_study.experiment import gradients, sampling
 from mjx_study.experiment import memory as sweep_memory
-from mjx_study.experiment.configuration import StudyConfig
 from mjx_study.experiment.gradients import seeds_together
 from mjx_study.experiment.plan import plan_study
 from mjx_study.objective import MjxObjective, Simulator
+from mjx_study.options.configuration import StudyConfig
 from mjx_study.results.variables import MEASURED
 from mjx_study.simulation.contact import ContactModel
 from tests.documents import numbers_of

@@ -1,8 +1,8 @@
-"""Builds the site that mkdocs.yml describes: stages its pages in build/pages; Zensical makes build/site of them.
+"""Build the site that mkdocs.yml describes: stage its pages in build/pages, from which Zensical makes build/site.
 
-The pages are written for GitHub, too. What the site needs is done on the copies: links lead from page to page, formulas
-become MathML and the diagram SVG (no scripts, no network), and notebooks become pages with the outputs that they have.
-The pages of names and of commands come from docstrings and from the parser.
+The pages are written for GitHub and adapted in the copies: links lead from page to page, formulas become MathML (no
+scripts, no network), and notebooks become pages with their outputs. Pages of public names, commands and variables come
+from docstrings, the parser and `mjx_study.results.variables`.
 """
 
 import ast
@@ -24,17 +24,19 @@ import nbformat
 from latex2mathml.converter import convert
 
 from mjx_study import cli
+from mjx_study.results.variables import VARIABLES
+from mjx_study.table import markdown_table
 
 ROOT = Path(__file__).parents[1]
 PAGES = ROOT / "build" / "pages"
 PIPED: Final = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
 PACKAGES = ("mjx_study", "mjx_study.gradcheck", "estimators")
 OUTPUT = {"image/png": "png", "text/html": "html", "text/plain": "text"}
-"""Kinds of output that notebooks have, the best first."""
+"""Kinds of notebook outputs, the best first."""
 
 
 def places() -> dict[Path, Path]:
-    """Where the site has a file of the project; both paths are relative."""
+    """Return the site's path of each file of the project; both paths are relative."""
     own = {Path("README.md"): Path("index.md")}
     own |= {Path(f"{name}.md"): Path(f"{name.lower()}.md") for name in ("CHANGELOG", "CONTRIBUTING")}
     for path in sorted((ROOT / "docs").glob("*")):
@@ -46,9 +48,9 @@ def places() -> dict[Path, Path]:
 
 
 def adapted(text: str, page: Path, own: dict[Path, Path]) -> str:
-    """A page's text as the site has it: its links, formulas (a fence of `math`, or $`...`$) and diagrams.
+    """Adapt a page's links and formulas (a fence of `math`, or $`...`$) for the site.
 
-    A file that the site does not have is named and not linked.
+    Links to files outside the site become plain text.
     """
 
     def link(found: re.Match[str]) -> str:
@@ -103,7 +105,7 @@ def drawn(arrows: list[tuple[str, str]]) -> str:
 
 
 def parts_of_notebook(path: Path, own: dict[Path, Path]) -> Iterator[str]:
-    """A notebook as Markdown; its pictures are left where its page goes."""
+    """Yield a notebook as Markdown, and write its pictures beside the page."""
     folder, pictures = (PAGES / own[path]).parent, 0
     title, *cells = nbformat.read(ROOT / path, as_version=4).cells
     yield adapted(title.source, path, own) + f"\n\n[Download the notebook]({path.name}){{ .notebook download }}"
@@ -129,13 +131,15 @@ def parts_of_notebook(path: Path, own: dict[Path, Path]) -> Iterator[str]:
 
 
 def page_of_names(package: str) -> str:
-    """Every public name of a package by the module that it comes from."""
+    """Return the page of a package: every public name by module."""
     folder = ROOT / package.replace(".", "/")
     source = next(path for path in (folder / "_public.py", folder / "__init__.py") if path.is_file())
-    names: dict[str, list[str]] = {}
+    public, names = import_module(package).__all__, dict[str, list[str]]()
     for node in ast.parse(source.read_text()).body:
         if isinstance(node, ast.ImportFrom) and node.module:
-            names.setdefault(node.module, []).extend(alias.asname or alias.name for alias in node.names)
+            imported = [alias.asname or alias.name for alias in node.names]
+            if exported := [name for name in imported if name in public]:
+                names.setdefault(node.module, []).extend(exported)
     parts = [f"# {package}", (import_module(package).__doc__ or "").strip()]
     for module, those in names.items():
         about = (import_module(module).__doc__ or "").strip().partition("\n")[0]
@@ -143,8 +147,17 @@ def page_of_names(package: str) -> str:
     return "\n\n".join(parts)
 
 
+def page_of_variables() -> str:
+    """Return the page of variables: a table for each kind of study."""
+    parts = ["# Variables of a study", "Dimensions are those within a cell; see [studies](../studies.md#in-python)."]
+    for kind, variables in VARIABLES.items():
+        rows = [(f"`{name}`", ", ".join(each.dims), each.unit, each.description) for name, each in variables.items()]
+        parts += [f"## {kind.capitalize()}", markdown_table(rows, ("name", "dimensions", "unit", "meaning"))]
+    return "\n\n".join(parts)
+
+
 def page_of_commands() -> str:
-    """The help of every command."""
+    """Return the page of commands: the help of each."""
     return "\n\n".join(
         ["# Command line", help_of(), *(f"## mjx-study {name}\n\n{help_of(name)}" for name in cli.COMMANDS)]
     )
@@ -158,7 +171,7 @@ def help_of(*command: str) -> str:
 
 
 def main() -> None:
-    """Stage all of it anew, and build; any issue is an error."""
+    """Stage all pages and build the site; any issue is an error."""
     shutil.rmtree(PAGES, ignore_errors=True)
     own = places()
     for source, place in own.items():
@@ -173,7 +186,8 @@ def main() -> None:
             shutil.copy(ROOT / source, target)
     os.environ["COLUMNS"] = "100"  # of the help
     (PAGES / "reference").mkdir()
-    for name, text in [("commands", page_of_commands()), *((name, page_of_names(name)) for name in PACKAGES)]:
+    pages = {"commands": page_of_commands(), "variables": page_of_variables()}
+    for name, text in (pages | {name: page_of_names(name) for name in PACKAGES}).items():
         (PAGES / "reference" / f"{name}.md").write_text(text)
     build = subprocess.run([sys.executable, "-m", "zensical", "build", "--strict", "--clean"], cwd=ROOT, **PIPED)
     print(build.stdout, end="")

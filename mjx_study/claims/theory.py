@@ -10,7 +10,6 @@ import numpy as np
 
 import estimators
 from estimators import AlphaOrder, FirstOrder, GradientEstimate, InverseVariance, ZerothOrder, constrained_alpha
-from mjx_study.choices import REFERENCE
 from mjx_study.claims.laboratory import (
     Laboratory,
     Slopes,
@@ -25,24 +24,12 @@ from mjx_study.claims.laboratory import (
     ratio_of,
     share_of,
 )
-from mjx_study.claims.ledger import Claim, above, below, within
 from mjx_study.reference import Heaviside, RelaxedHeaviside
 
-FIVE: Final = ("penalty", "impedance", "mujoco_default", "mujoco_stiff", "smooth_onset")
-"""Contact families of the landscapes."""
 STIFFNESS: Final = 10_000.0
 """Contact stiffness of the landscapes, for families that take one [N/m]."""
-HIT, EDGE, SHORT, WALL = (
-    "momentum_transfer, 0.5 rad", "momentum_transfer, 0.75 rad", "ball_wall, 0.2 rad", "ball_wall, 0.7 rad",
-)  # fmt: skip
-# Not closer to the edge: at 0.77 rad the bias of the default contact crosses zero (31 % at 0.76, -13 % at 0.78).
 STEP, RAMP = "step", "ramp of 0.01 sigma"
-NEGLIGIBLE_BIAS: Final = 0.1
-"""Share of the gradient below which a bias is negligible."""
-FACTOR: Final = math.log10(1.25)
-"""Ratios of variances or errors closer to 1 than this count as equal."""
-JUMPS: Final = {STEP: (REFERENCE,), EDGE: (REFERENCE, *FIVE), WALL: (REFERENCE, *FIVE)}
-SMOOTH: Final = {HIT: (REFERENCE, *FIVE), SHORT: (REFERENCE, *FIVE)}
+"""Analytic systems."""
 
 
 def at(lab: Laboratory, system: str, family: str, stiffness: float = STIFFNESS, **changes: Any) -> Slopes:
@@ -182,143 +169,3 @@ def compared(lab: Laboratory, system: str, family: str, one: str, other: str) ->
     known = {"zobg": ZerothOrder(), "fobg": FirstOrder(), "ivw": InverseVariance(), "aobg": bounded}
     first, second = batches([known[one], known[other]], point, 200, 2 * lab.effort.batches)
     return errors_of(first, second, point.gradient)
-
-
-SLOPES: Final = "mjx-study landscape {} --contact penalty,mujoco_default,smooth_onset"
-CLAIMS: Final = (
-    Claim(
-        "zobg-unbiased",
-        "section 3.1, lemma on ZoBG",
-        "The zeroth-order estimate is unbiased where the cost jumps.",
-        within("(E[ZoBG] - grad F) / grad F", -NEGLIGIBLE_BIAS, NEGLIGIBLE_BIAS),
-        JUMPS,
-        zeroth_bias,
-        SLOPES.format("ball_wall"),
-    ),
-    Claim(
-        "fobg-biased-at-jumps",
-        "section 3.1, Heaviside; figure of ball with wall and momentum transfer",
-        "The first-order estimate is biased where the cost jumps.",
-        above("|E[FoBG] - grad F| / |grad F|", NEGLIGIBLE_BIAS),
-        JUMPS,
-        bias,
-        SLOPES.format("momentum_transfer"),
-    ),
-    Claim(
-        "jump-without-variance",
-        "section 3.1, Heaviside",
-        "At a jump the biased first-order estimate has at most a tenth of zeroth order's variance; at a step, none.",
-        below("log10 Var[FoBG] / Var[ZoBG]", -1.0, 1.0),
-        {system: (REFERENCE,) for system in JUMPS},
-        variances,
-        SLOPES.format("momentum_transfer"),
-    ),
-    Claim(
-        "variance-hides-bias",
-        "section 3.2; conclusion",
-        "At a jump, a batch's own variance does not show that first order is wrong.",
-        above("share of batches of 100 whose own 95 % interval misses grad F", 0.5),
-        JUMPS,
-        blind,
-        SLOPES.format("momentum_transfer"),
-    ),
-    Claim(
-        "fobg-unbiased-away",
-        "section 3.1, lemma on FoBG",
-        "Away from jumps of the cost the first-order estimate is unbiased.",
-        within("(E[FoBG] - grad F) / grad F", -NEGLIGIBLE_BIAS, NEGLIGIBLE_BIAS),
-        {RAMP: (REFERENCE,), **SMOOTH},
-        relative_bias,
-        SLOPES.format("momentum_transfer"),
-    ),
-    Claim(
-        "ramp-looks-like-a-jump",
-        "section 3.2, empirical bias",
-        "A steep ramp has the first-order samples of a jump: most batches of 10 are all zero, mean and variance.",
-        above("share of batches of 10 in which every gradient is 0", 0.5),
-        {RAMP: (REFERENCE,)},
-        silent,
-        "mjx-study claims --quick --only ramp-looks-like-a-jump",
-    ),
-    Claim(
-        "empirical-bias-in-contact",
-        "section 3.2, empirical bias; section 5.1",
-        "At the edge of a contact, batches of first-order gradients look more certain than they are.",
-        above("share of batches of 50 whose 95 % interval misses E[FoBG]", 0.1),
-        {RAMP: (REFERENCE,), EDGE: FIVE, WALL: FIVE},
-        overconfident,
-        SLOPES.format("ball_wall"),
-    ),
-    Claim(
-        "lemma-rare-events",
-        "section 3.2, lemma on variance and empirical bias",
-        "Empirical bias implies variance: Var z >= Delta_0^2 / beta.",
-        below("log10 max Delta_0^2 / (beta Var[FoBG])", 1e-9),
-        {RAMP: (REFERENCE,), EDGE: FIVE, WALL: FIVE},
-        rare,
-        "mjx-study claims --quick --only lemma-rare-events",
-    ),
-    Claim(
-        "friction-variance",
-        "section 3.2, Coulomb friction",
-        "With slip tolerance nu the first-order variance grows as 1 / nu.",
-        within("exponent of nu", -1.1, -0.9),
-        {"ramps of 0.003 to 0.1 sigma": (REFERENCE,)},
-        friction,
-        "mjx-study claims --quick --only friction-variance",
-    ),
-    Claim(
-        "lemma-zobg-variance",
-        "section 3.3, lemma on ZoBG's variance (with H m, not H n)",
-        "The variance of a zeroth-order sample without a baseline is at most B_V^2 B_pi^2 H m / sigma^2.",
-        below("log10 Var[ZoBG] / bound", 0.0),
-        JUMPS,
-        bound,
-        "mjx-study compare momentum_transfer --estimators zobg --baseline none",
-    ),
-    Claim(
-        "lemma-accuracy",
-        "section 4.1, lemma on robustness (delta the probability of failure)",
-        "Where epsilon + alpha B <= gamma, the error is at most gamma with probability 1 - delta, here 0.95.",
-        above("share of batches of 4000 that are", 0.95),
-        JUMPS,
-        accurate,
-        "mjx-study compare ball_wall --estimators zobg,fobg,aobg --gamma 0.01",
-    ),
-    Claim(
-        "lemma-closed-form",
-        "section 4.1, lemma on the closed form",
-        "The closed form of alpha solves the constrained problem.",
-        below("largest distance to the best of 20,001 weights", 1e-4),
-        {"random problems": (REFERENCE,)},
-        solution,
-        "mjx-study claims --quick --only lemma-closed-form",
-    ),
-    Claim(
-        "ivw-inaccurate-at-jumps",
-        "section 4.1",
-        "Near jumps inverse-variance weighting alone is less accurate than zeroth order.",
-        above("log10 of the mean squared error, IVW's over ZoBG's", FACTOR, -FACTOR),
-        JUMPS,
-        lambda lab, system, family: compared(lab, system, family, "ivw", "zobg"),
-        "mjx-study compare ball_wall --estimators zobg,fobg,ivw",
-    ),
-    Claim(
-        "bound-helps-at-jumps",
-        "section 4.1",
-        "Near jumps the interpolation bounded by gamma, here |grad F| / 2, beats inverse-variance weighting.",
-        below("log10 of the mean squared error, AoBG's over IVW's", -FACTOR, FACTOR),
-        JUMPS,
-        lambda lab, system, family: compared(lab, system, family, "aobg", "ivw"),
-        "mjx-study compare ball_wall --estimators zobg,fobg,aobg,ivw",
-    ),
-    Claim(
-        "aobg-gains-away",
-        "section 4.1; section 5.1",
-        "Away from jumps the interpolation, with the same bound, is more accurate than zeroth order.",
-        below("log10 of the mean squared error, AoBG's over ZoBG's", -FACTOR, FACTOR),
-        SMOOTH,
-        lambda lab, system, family: compared(lab, system, family, "aobg", "zobg"),
-        "mjx-study compare momentum_transfer --estimators zobg,fobg,aobg",
-    ),
-)

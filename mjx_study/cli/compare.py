@@ -3,11 +3,11 @@
 import argparse
 from functools import partial
 
-from estimators.catalogue import CATALOGUE
+from estimators.registry import ESTIMATORS
 from mjx_study.choices import FAMILIES
 from mjx_study.cli.options import Parser
-from mjx_study.experiment.configuration import StudyConfig
-from mjx_study.option import BUILDER_OPTIONS
+from mjx_study.options.configuration import StudyConfig
+from mjx_study.options.option import BUILDER_OPTIONS
 from mjx_study.results.variables import COLUMNS, DETAILS, GRADIENTS, MARKS, explained
 from mjx_study.table import described
 
@@ -19,7 +19,7 @@ examples:
   mjx-study compare pusher --json > pusher.json
 
 estimators:
-{described({item.name: item.description for item in CATALOGUE.values()})}
+{described({item.name: item.description for item in ESTIMATORS.values()})}
 
 contact families (K: from --stiffness):
 {described({item.name: item.description for item in FAMILIES.values()})}

@@ -12,11 +12,11 @@ import numpy as np
 import xarray as xr
 
 from estimators import ENOUGH_EFFECTIVE
-from estimators.estimator import label_of
+from estimators.registry import label_of
 from mjx_study.choices import FAMILIES, REFERENCE
-from mjx_study.experiment.configuration import StudyConfig
 from mjx_study.experiment.iteration import REASONS
-from mjx_study.option import SCENE_OPTIONS
+from mjx_study.options.configuration import StudyConfig
+from mjx_study.options.option import SCENE_OPTIONS
 from mjx_study.results.curves import curves_of, line_of
 from mjx_study.results.kind import findings_of
 from mjx_study.results.rows import Row, onset_of, remains, rows_of

@@ -6,8 +6,9 @@ import shlex
 from mjx_study.choices import FAMILIES, is_file
 from mjx_study.cli.options import TASK_OPTIONS, Parser, configure_process, given_options, task_of, usage_errors
 from mjx_study.cli.output import computing, print_report
-from mjx_study.option import OPTIONS
-from mjx_study.results.variables import DIAGNOSIS, explained
+from mjx_study.diagnose.columns import CONTACTS, ESTIMATES
+from mjx_study.options.option import OPTIONS
+from mjx_study.table import explain
 
 EPILOG = f"""\
 examples:
@@ -15,7 +16,7 @@ examples:
   mjx-study diagnose robot.xml                 no cost is needed: one is made from the bodies' positions
 
 columns of the contacts and of the estimators:
-{explained(DIAGNOSIS)}
+{explain(*CONTACTS, *ESTIMATES)}
 
 The error is that of a gradient from as many samples as this machine computes in a second. Means are checked along
 paths, as in gradcheck --mean, and so is the bias. At least 23 samples are drawn, whatever --samples. Exit code 1 if a
@@ -31,7 +32,8 @@ def add(command: Parser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Measure and print; return 1 if a derivative is wrong."""
-    from mjx_study.diagnose import diagnose_task
+    from mjx_study.diagnose.page import document_of, page_lines
+    from mjx_study.diagnose.run import diagnose_task
 
     with usage_errors():
         configure_process(options)
@@ -55,7 +57,7 @@ def run(options: argparse.Namespace) -> int:
             options=flags,
             progress=progress,
         )
-    print_report(options, found.as_json(), found.lines())
+    print_report(options, document_of(found), page_lines(found))
     return 0 if found.derivatives.passed else 1
 
 

@@ -6,8 +6,9 @@ from typing import Any
 from mjx_study.choices import CHECKED_STATES, CHECKED_STEPS, CHECKED_STIFFNESS, is_file
 from mjx_study.cli.options import Parser, UsageError, configure_process, given_options, task_of, usage_errors
 from mjx_study.cli.output import computing, print_report
-from mjx_study.option import OPTIONS, Option
-from mjx_study.results.variables import MEANS, explained
+from mjx_study.diagnose.columns import MEANS
+from mjx_study.options.option import OPTIONS, Option
+from mjx_study.table import explain
 
 UNEXERCISED = 3
 """Exit code if nothing is wrong but something was never exercised."""
@@ -36,7 +37,7 @@ derivative errors: both are reported but do not fail.
 
 With --mean: does an estimator's mean integrate to the difference of the mean cost along a path through theta? No
 reference gradient is needed. Exit code 0: all are right. 1: one is biased. 3: undecided. Columns:
-{explained(MEANS)}
+{explain(*MEANS)}
 """
 MEAN = {
     "estimators": ("zobg", "fobg"),
@@ -110,8 +111,8 @@ def _run_mean(options: argparse.Namespace) -> int:
     from estimators import make_estimator
     from mjx_study.diagnose.means import ALONG_MEANS, check_mean, lines_of, path_of
     from mjx_study.diagnose.setting import setting_of
-    from mjx_study.experiment.effect import reads_onset, refuse_unread
     from mjx_study.experiment.resolution import check_estimators
+    from mjx_study.experiment.unused_options import reads_onset, reject_unread
     from mjx_study.gradcheck import plan_gradcheck
 
     chosen = MEAN | given_options(options, *MEAN)
@@ -123,7 +124,7 @@ def _run_mean(options: argparse.Namespace) -> int:
         settings |= {"gamma": task.defaults.gamma, "sigma": task.sigma}
         found = [make_estimator(name, **settings) for name in chosen["estimators"]]
         check_estimators(found, task)
-        refuse_unread(chosen["estimators"], given_options(options, "max_norm", "window"))
+        reject_unread(chosen["estimators"], given_options(options, "max_norm", "window"))
         if options.onset not in (None, "none") and not reads_onset(chosen["estimators"], options.onset):
             raise UsageError("--onset has no effect on these estimators: add fobg")
         if options.span is not None and options.direction == ALONG_MEANS:

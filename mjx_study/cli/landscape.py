@@ -4,8 +4,8 @@ import argparse
 
 from mjx_study.choices import REFERENCE, takes_stiffness
 from mjx_study.cli.options import Parser, given_options
-from mjx_study.experiment.configuration import StudyConfig
-from mjx_study.option import BUILDER_OPTIONS
+from mjx_study.options.configuration import StudyConfig
+from mjx_study.options.option import BUILDER_OPTIONS
 from mjx_study.results.variables import LANDSCAPES, explained
 
 EPILOG = f"""\

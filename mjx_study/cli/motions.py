@@ -26,7 +26,7 @@ from mjx_study.cli.output import attempt, computing, print_report
 from mjx_study.disk import prepare_folder, write_whole
 from mjx_study.experiment.resolution import at_theta
 from mjx_study.limits import MOST_STEPS, check_count
-from mjx_study.option import BUILDER_OPTIONS, SCENE_OPTIONS, as_arguments
+from mjx_study.options.option import BUILDER_OPTIONS, SCENE_OPTIONS, as_arguments
 from mjx_study.plots.style import save_figure
 from mjx_study.render import Motion, RenderError, animate, check_format, resolve_renderer, strip, stroboscope
 from mjx_study.simulation.scene import load_model

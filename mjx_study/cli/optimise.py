@@ -8,8 +8,8 @@ from typing import Any
 from mjx_study.choices import REFERENCE, takes_stiffness
 from mjx_study.cli.options import Parser, given_options
 from mjx_study.disk import write_whole
-from mjx_study.experiment.configuration import StudyConfig
-from mjx_study.option import BUILDER_OPTIONS
+from mjx_study.options.configuration import StudyConfig
+from mjx_study.options.option import BUILDER_OPTIONS
 from mjx_study.results.variables import DESCENTS, explained
 
 EPILOG = f"""\
@@ -77,7 +77,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _save_policies(document: dict[str, Any], folder: Path) -> list[Path]:
-    from mjx_study.files import digest_of_json
+    from mjx_study.options.files import digest_of_json
 
     config, written = document["config"], []
     kept = {name: config[name] for name in ("task", "stiffness", "damping", "cone", *BUILDER_OPTIONS, "network")}

@@ -9,14 +9,14 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NoReturn
 
-from estimators.catalogue import suggestion, unknown
+from estimators.choices import suggestion, unknown
 from mjx_study.choices import FAMILIES, PRECISIONS, TASK_DESCRIPTIONS, unknown_task
 from mjx_study.cli.output import complain
-from mjx_study.experiment.configuration import StudyConfig
-from mjx_study.option import BUILDER_OPTIONS, CONTACTS, OPTIONS, TASKS, Option, refuse_overflow
+from mjx_study.options.configuration import StudyConfig
+from mjx_study.options.option import BUILDER_OPTIONS, CONTACTS, OPTIONS, TASKS, Option, refuse_overflow
 
 if TYPE_CHECKING:
-    import mjx_study.files
+    import mjx_study.options.files
     import mjx_study.tasks.task
 
 
@@ -221,9 +221,9 @@ def theta_of(options: argparse.Namespace) -> tuple[float, ...] | None:
 
 def theta_and_policy(
     options: argparse.Namespace,
-) -> "tuple[tuple[float, ...] | None, mjx_study.files.PolicyFile | None]":
+) -> "tuple[tuple[float, ...] | None, mjx_study.options.files.PolicyFile | None]":
     """Return the parameters given by `--theta`, and the policy file that holds them, which must be for the task."""
-    from mjx_study.files import read_theta
+    from mjx_study.options.files import read_theta
 
     if options.theta is None:
         return None, None

@@ -6,7 +6,7 @@ from pathlib import Path
 from mjx_study.choices import FIGURE_FORMATS, FIGURE_STYLES
 from mjx_study.cli.options import Parser, usage_errors
 from mjx_study.cli.output import attempt, print_report
-from mjx_study.option import Option
+from mjx_study.options.option import Option
 
 FORMAT = Option("format", str, "FORMAT", f"of: {', '.join(FIGURE_FORMATS)}", choices=FIGURE_FORMATS, many=True)
 EPILOG = """\

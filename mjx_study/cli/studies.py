@@ -17,8 +17,8 @@ from mjx_study.execution.forecast import forecast_study
 from mjx_study.execution.lost import all_lost
 from mjx_study.execution.run import run_study
 from mjx_study.experiment.checkpoint import StudyError
-from mjx_study.experiment.configuration import StudyConfig
 from mjx_study.experiment.study import StudyPlan
+from mjx_study.options.configuration import StudyConfig
 from mjx_study.plots.study import plot_study
 from mjx_study.plots.style import save_figures
 from mjx_study.results.warnings import warnings_of

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from mjx_study.choices import TASK_DESCRIPTIONS
 from mjx_study.cli.options import Parser, UsageError, known_task
-from mjx_study.experiment.configuration import StudyConfig
-from mjx_study.option import BUILDER_OPTIONS, MOST_VALUES, OPTIONS, Interval, Option
+from mjx_study.options.configuration import StudyConfig
+from mjx_study.options.option import BUILDER_OPTIONS, MOST_VALUES, OPTIONS, Interval, Option
 
 if TYPE_CHECKING:
     from pydantic import BaseModel
@@ -86,7 +86,7 @@ def run(options: argparse.Namespace) -> int:
 def sweep_fields(options: argparse.Namespace) -> dict[str, Any]:
     """Fields of a sweep's configuration; flags take precedence over the file."""
     from mjx_study.cli.studies import study_fields
-    from mjx_study.files import read_toml
+    from mjx_study.options.files import read_toml
 
     fields = ({} if options.config is None else read_toml(options.config, _schema())) | study_fields(options)
     if "tasks" not in fields:

@@ -15,14 +15,14 @@ from typing import Any, Final
 
 import xarray as xr
 
-from estimators.seen import observing
+from estimators.user_inputs import observing
 from mjx_study.execution.cells import Cells, Executor, compute_here
 from mjx_study.execution.cluster import compute_there, connected
 from mjx_study.experiment.checkpoint import Arrays
-from mjx_study.experiment.configuration import StudyConfig
 from mjx_study.experiment.plan import plan_study
 from mjx_study.experiment.study import StudyPlan
 from mjx_study.identity import differences, versions
+from mjx_study.options.configuration import StudyConfig
 from mjx_study.progress import Progress, silent
 from mjx_study.storage.dataset import dataset_of, write_dataset
 from mjx_study.storage.folder import Store, open_store

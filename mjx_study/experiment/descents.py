@@ -22,16 +22,16 @@ import xarray as xr
 from jaxtyping import Array, Float, Key
 
 from estimators import Estimator, draw
-from estimators.estimator import draw_at, sample_keys
+from estimators.sampling import draw_at, sample_keys
 from mjx_study.compiled import Compiled
 from mjx_study.experiment.checkpoint import Arrays, Checkpoint
-from mjx_study.experiment.configuration import StudyConfig
 from mjx_study.experiment.iteration import Descent, Record, advance, begin, going, make_optimizer, schedule_factors
 from mjx_study.experiment.memory import check_memory
 from mjx_study.experiment.resolution import recipe_of
 from mjx_study.experiment.sampling import rollouts_of
 from mjx_study.experiment.study import Computation, StudyCell, StudyKind, StudyPlan, done, estimators_of
 from mjx_study.objective import Simulator, TracedObjective, simulate
+from mjx_study.options.configuration import StudyConfig
 from mjx_study.reference import Reference
 from mjx_study.results.findings import descent_findings
 from mjx_study.results.kind import Drawing

@@ -20,7 +20,7 @@ from jaxtyping import Array, Key
 
 import estimators
 from estimators import ORACLES, Evaluation, GradientEstimate
-from estimators.blocks import MOST_THINNED, moments_of
+from estimators.merged_samples import MAX_THINNED, moments_of
 from estimators.statistics import merged_estimates
 from mjx_study.compiled import type_of
 from mjx_study.experiment.checkpoint import Arrays, Checkpoint
@@ -213,7 +213,7 @@ class GradientComputation(Computation):
         objective, theta = self._objective(cell), self._plan.task_of(cell).theta
         chosen, size = estimators_of(self._plan, cell), block_of(self._plan, cell)
         seed, index = Blocks.position(unit, blocks_of(self._plan, cell))
-        first, every = index * size, math.ceil(cell.samples / MOST_THINNED)
+        first, every = index * size, math.ceil(cell.samples / MAX_THINNED)
         count, oracles = min(size, cell.samples - first), estimators.oracles_of(chosen)
         some = slice(seed, seed + 1)
         drawn, seconds, residuals = draw_batches(

@@ -6,17 +6,17 @@ from collections.abc import Mapping
 
 import jax
 
-from estimators.alpha import check_weights
+from estimators.interpolation import check_weights
+from estimators.noise import check_sigma
 from mjx_study.choices import CONES, REFERENCE
-from mjx_study.experiment.configuration import SAMPLES, StudyConfig
-from mjx_study.experiment.effect import refuse_idle
 from mjx_study.experiment.memory import largest_batch
 from mjx_study.experiment.resolution import at_theta
 from mjx_study.experiment.study import Group, StudyCell, StudyKind, StudyPlan, estimators_of
+from mjx_study.experiment.unused_options import reject_unused
 from mjx_study.limits import MOST_CELLS, MOST_PROGRAMS, check_count
 from mjx_study.objective import chunk_for
-from mjx_study.option import BUILDER_OPTIONS
-from mjx_study.reference.noise import check_sigma
+from mjx_study.options.configuration import SAMPLES, NamedTask, StudyConfig
+from mjx_study.options.option import BUILDER_OPTIONS
 from mjx_study.results.kind import find_kind
 from mjx_study.runtime import local_devices
 from mjx_study.tasks import TASKS, task_with_options
@@ -44,7 +44,7 @@ def plan_study(config: StudyConfig, built: Mapping[str, Task] | None = None) -> 
     groups: list[Group] = []
     cells: list[StudyCell] = []
     messages: list[str] = []
-    sound: list[str | Task] = []
+    sound: list[object] = []
     for which, timestep, cone in itertools.product(*variants):
         task = _build(config, which, timestep, cone, built or {})
         if config.network is not None:
@@ -81,7 +81,7 @@ def plan_study(config: StudyConfig, built: Mapping[str, Task] | None = None) -> 
         if config.surrogate and corrected:
             raise ValueError(f"{corrected[0]} corrects exact derivatives: omit it or `backward`")
         kind.check(plan, cell)
-    refuse_idle(config, [(group.task, group.models) for group in groups], first_order=kind.first_order)
+    reject_unused(config, [(group.task, group.models) for group in groups], first_order=kind.first_order)
     return plan
 
 
@@ -98,12 +98,14 @@ def _contact_models(config: StudyConfig, task: Task) -> Grid:
 
 
 def _build(
-    config: StudyConfig, which: str | Task, timestep: float | None, cone: str | None, built: Mapping[str, Task]
+    config: StudyConfig, which: str | NamedTask, timestep: float | None, cone: str | None, built: Mapping[str, Task]
 ) -> Task:
     chosen = {"timestep": timestep, "cone": cone} | {name: getattr(config, name) for name in BUILDER_OPTIONS}
     chosen = {name: value for name, value in chosen.items() if value is not None}
     changes = {"onset": config.onset} | ({} if config.noise is None else {"noise": config.noise})
-    if isinstance(which, Task):
+    if not isinstance(which, str):
+        if not isinstance(which, Task):
+            raise ValueError(f"tasks takes names and Tasks, got {type(which).__name__}")
         if chosen:
             raise ValueError(f"{', '.join(chosen)}: only for a task given by name; build this one with it instead")
         check_shapes(which)

@@ -20,10 +20,10 @@ import numpy as np
 from jaxtyping import Float
 
 from estimators import NOISES
+from estimators.noise import split_sample_key
 from mjx_study.compiled import Compiled
 from mjx_study.objective import rollout_cost, spread
 from mjx_study.reference import FunctionObjective, Reference, ScalarFunction, smoothed
-from mjx_study.reference.noise import split_sample_key
 from mjx_study.runtime import local_devices
 from mjx_study.simulation.contact import ContactModel
 from mjx_study.tasks.task import Task

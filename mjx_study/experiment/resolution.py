@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from estimators import Estimator, make_estimator
-from mjx_study.experiment.configuration import StudyConfig, check_span
+from mjx_study.options.configuration import StudyConfig, check_span
 from mjx_study.tasks.task import Recipe, Task
 
 BOUND: Final = ("gamma", "failure_probability", "variance_proxy", "radius")

@@ -17,12 +17,12 @@ import numpy as np
 
 import estimators
 from estimators import Estimator, find_estimator
-from estimators.seen import seen_by
+from estimators.user_inputs import inputs_read
 from mjx_study.experiment.checkpoint import Arrays, Checkpoint
-from mjx_study.experiment.configuration import Settings, StudyConfig
 from mjx_study.experiment.memory import bytes_per_sample, check_batches, padded_size
 from mjx_study.experiment.resolution import configured_estimators
 from mjx_study.identity import contents, estimator_contents
+from mjx_study.options.configuration import Settings, StudyConfig
 from mjx_study.results.kind import StudyResults, find_kind
 from mjx_study.table import digits_to_tell_apart
 from mjx_study.tasks import TASKS
@@ -163,7 +163,7 @@ class StudyPlan:
     @property
     def seen(self) -> dict[str, str]:
         """Digests of files and environment variables that user-defined code has read so far."""
-        return seen_by(self.user_modules)
+        return inputs_read(self.user_modules)
 
     def label(self, cell: StudyCell) -> str:
         """A cell's name in messages."""

@@ -110,7 +110,7 @@ class Programs:
         self.compiler = compiler or Compiler()
         # Small scenes have a Jacobian over the state; derivatives of large ones, and over parameters, use the tape.
         inputs = len(layout.inputs)
-        self._sizes = sorted({layout.num_state if layout.scene.uses_jacobian else inputs, inputs})
+        self._sizes = sorted({layout.num_state if layout.scene.uses_graph else inputs, inputs})
 
     def start(self, case: ContactCase, base: HostState, *, stock: bool) -> None:
         """Start compiling the programs of `linear`, `exact`, `stock_step` and, on request, `stock`."""

@@ -12,7 +12,7 @@ from matplotlib.colors import TwoSlopeNorm
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from estimators.estimator import label_of
+from estimators.registry import label_of
 from mjx_study.plots.edges import UNDRAWN, drawable
 from mjx_study.plots.panels import UNSTABLE, families, make_panels, number, positive, unstable
 from mjx_study.plots.style import TITLES, fit_texts, legend_below, mark_clipped

@@ -5,7 +5,7 @@ from typing import Final
 import numpy as np
 import xarray as xr
 
-from estimators.estimator import label_of
+from estimators.registry import label_of
 from mjx_study.results.findings import NOTABLE_SHARE
 from mjx_study.results.rows import SETTING, model_name, onset_of
 from mjx_study.results.variables import THETA

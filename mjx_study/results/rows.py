@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 
 from estimators import ENOUGH_EFFECTIVE, ESTIMATORS
-from estimators.estimator import label_of
+from estimators.registry import label_of
 from mjx_study.results.variables import GRADIENTS, ONSETS
 from mjx_study.table import number, with_error
 

@@ -7,7 +7,7 @@ import numpy as np
 import xarray as xr
 
 from estimators import ENOUGH_EFFECTIVE
-from estimators.estimator import label_of
+from estimators.registry import label_of
 from mjx_study.results.rows import onset_of
 
 MOST_NAMED: Final = 3

@@ -17,8 +17,8 @@ from mjx_study.choices import is_file
 from mjx_study.claims import ledger
 from mjx_study.cli import motions, options, studies
 from mjx_study.execution import run
-from mjx_study.experiment.configuration import StudyConfig
 from mjx_study.experiment.plan import plan_study
+from mjx_study.options.configuration import StudyConfig
 from mjx_study.runtime import print_warning
 from mjx_study.tasks import make_task
 from tests.fuzz import strategies
