@@ -48,7 +48,7 @@ def counts(path: Path) -> bool:
 
 def test_all_that_a_study_imports_counts() -> None:
     static = imported_by(RUN, *KINDS.values())
-    assert {"mjx_study.simulation.dynamics", "mjx_study.experiment.gradients", "estimators.types"} <= static
+    assert {"mjx_study.simulation.dynamics", "mjx_study.experiment.gradients", "estimators.samples"} <= static
     assert not [name for name in static if not counts(PATHS[name])]
 
 
