@@ -1,5 +1,6 @@
 """The code that results depend on is all that a study imports while it computes, and nothing beyond."""
 
+import hashlib
 import shutil
 import subprocess
 import sys
@@ -8,7 +9,9 @@ from pathlib import Path
 import pytest
 
 from mjx_study.choices import KINDS
+from mjx_study.digest import FORMER, digest_of
 from mjx_study.identity import NOT_COMPUTING, computing_code, differences
+from mjx_study.reference import MomentumTransfer
 from tests.test_layering import FILES, LAYERS, ROOT, module_of, read
 
 RUN = "mjx_study.execution.run"
@@ -20,10 +23,7 @@ PACKAGED = [
     for path in sorted((ROOT / package).rglob("*"))
     if path.is_file() and path.suffix != ".pyc"
 ]
-NO_CODE = {
-    *("estimators/py.typed", "mjx_study/py.typed", "mjx_study/templates/report.html"),
-    *("mjx_study/claims/claims.toml", "mjx_study/claims/page.md"),
-}
+NO_CODE = {"estimators/py.typed", "mjx_study/py.typed", "mjx_study/templates/report.html"}
 LOADED = """
 import sys
 from mjx_study.execution.run import run_study
@@ -99,6 +99,13 @@ def test_a_change_of_a_file_changes_the_digest_if_the_file_counts(tree: Path) ->
         (tree / path).write_bytes(content + b"# changed\n")
         assert (digest() != before) is counts(path), path
         (tree / path).write_bytes(content)
+
+
+def test_a_moved_class_keeps_its_digest() -> None:
+    """Classes of this package are digested by name alone; folders of tasks that hold one outlive a move."""
+    assert FORMER.keys() <= IMPORTS.keys() and not IMPORTS.keys() & set(FORMER.values())
+    text = "class\0mjx_study.reference.launch\0MomentumTransfer\0\n"
+    assert digest_of(MomentumTransfer) == hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def test_folders_of_other_code_are_refused_in_a_line() -> None:
