@@ -29,11 +29,9 @@ from mjx_study.version import version_of
 SWITCH: Final = "MJX_STUDY_NATIVE"
 """Environment variable; 0 does without native code."""
 FLAGS: Final = (
-    *("-std=gnu11", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math", "-fwrapv"),
+    *("-O2", "-std=gnu11", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math", "-fwrapv"),
     *("-shared", "-fPIC", "-w"),
 )
-MOST_OPTIMISED: Final = 100_000
-"""Maximum length of a source [characters] that is worth more than the compiler's simplest optimisations."""
 PREFIX: Final = "mjx_study_"
 """Beginning of the names of libraries, which are those of their XLA targets."""
 
@@ -119,10 +117,9 @@ def _build(name: str, source: str) -> Any:
         written, library = Path(folder, f"{name}.c"), Path(folder, f"{name}.so")
         written.write_text(source)
         command, _ = compiler() or (("cc",), "")
-        level = "-O2" if len(source) < MOST_OPTIMISED else "-O1"
         include = f"-I{jax.ffi.include_dir()}"
         done = subprocess.run(
-            [*command, level, *_FLAGS_HERE, include, written.name, "-o", library.name, "-lm"],
+            [*command, *_FLAGS_HERE, include, written.name, "-o", library.name, "-lm"],
             cwd=folder,
             capture_output=True,
             text=True,

@@ -45,10 +45,9 @@ def _selected(graph: ScalarGraph, here: Any, yes: np.ndarray, no: np.ndarray, av
 def _dynamic_slice(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: Any) -> Arrays:
     array, *starts = inputs
     last = [whole - size for whole, size in zip(array.shape, aval.shape, strict=True)]
-    result = None
+    result = array[_window([0] * array.ndim, aval.shape)]
     for first, here in _cases(graph, _clipped(graph, [each[()] for each in starts], last), last):
-        window = array[_window(first, aval.shape)]
-        result = window if result is None else _selected(graph, here, window, result, aval)
+        result = _selected(graph, here, array[_window(first, aval.shape)], result, aval)
     return [result]
 
 

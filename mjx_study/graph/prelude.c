@@ -16,7 +16,7 @@
 #endif
 #define LANES (VECTOR / (WIDE ? 8 : 4))
 
-#define EACH for (int lane = 0; lane < LANES; lane++)
+#define EACH _Pragma("GCC unroll 16") for (int lane = 0; lane < LANES; lane++)
 #define ONE static inline __attribute__((always_inline))  // inlined wherever it is used
 #define APART static __attribute__((noinline))
 

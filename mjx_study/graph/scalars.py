@@ -15,12 +15,15 @@ import jax
 import numpy as np
 from jax.core import Tracer
 
+from mjx_study.graph.build import native_identity
 from mjx_study.graph.function import ScalarFunction, capture, is_input
 from mjx_study.graph.nodes import TooLargeError, no_type_check
 from mjx_study.graph.operation import computed
 
 MOST_SCALARS: Final = {"cpu": 12_000, "gpu": 6_000, "tpu": 6_000}
 """Maximum number of scalar operations, by backend; XLA's compile time grows faster than linearly in it."""
+MOST_NATIVE: Final = 200_000
+"""Maximum number of scalar operations in native code."""
 
 _CAPTURED: Final[dict[Any, ScalarFunction | None]] = {}
 """Graphs, keyed by everything they depend on; None if too large."""
@@ -29,7 +32,7 @@ MOST_KEPT: Final = 64
 
 
 def unrolled(function: Callable[..., Any], *arguments: Any) -> Any:
-    """Evaluate `function(*arguments)` entry by entry, or as is if that takes more than `MOST_SCALARS` operations.
+    """Evaluate `function(*arguments)` entry by entry, or as is if that takes more than `most_scalars` operations.
 
     Untraced arrays among the arguments are constants. The result equals the function's up to rounding, except that 0
     times infinity or NaN is 0 where the 0 is a constant. Forward and reverse mode differentiate it like the function
@@ -42,9 +45,9 @@ def unrolled(function: Callable[..., Any], *arguments: Any) -> Any:
 
 
 def captured_once(function: Callable[..., Any], *arguments: Any) -> ScalarFunction | None:
-    """`capture`, once for all programs; None if it takes more than `MOST_SCALARS` operations."""
+    """`capture`, once for all programs; None if it takes more than `most_scalars` operations."""
     leaves, structure = jax.tree.flatten(arguments)
-    most = MOST_SCALARS[jax.default_backend()]
+    most = most_scalars()
     key = _name(function), structure, tuple(map(_content, leaves)), most
     if key not in _CAPTURED:
         while len(_CAPTURED) >= MOST_KEPT:
@@ -60,8 +63,13 @@ def captured_once(function: Callable[..., Any], *arguments: Any) -> ScalarFuncti
 
 
 def is_small(function: ScalarFunction) -> bool:
-    """Whether a graph is worth compiling: it has at most `MOST_SCALARS` operations."""
-    return len(function.needed) <= MOST_SCALARS[jax.default_backend()]
+    """Whether a graph is worth compiling: it has at most `most_scalars` operations."""
+    return len(function.needed) <= most_scalars()
+
+
+def most_scalars() -> int:
+    """Maximum number of scalar operations here: `MOST_NATIVE`, or `MOST_SCALARS` without native code."""
+    return MOST_SCALARS[jax.default_backend()] if native_identity() is None else MOST_NATIVE
 
 
 def _name(function: Callable[..., Any]) -> Any:
