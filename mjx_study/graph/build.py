@@ -1,7 +1,7 @@
 """Build C into libraries for this processor, once: by the system's compiler, into a cache checked before it is used.
 
 A library's name is a digest of everything that it depends on: source, compiler, flags, processor and version of XLA's
-interface. Without a compiler, or with MJX_STUDY_NATIVE=0, nothing is built.
+interface.
 """
 
 import ctypes
@@ -19,6 +19,7 @@ from concurrent.futures import Future
 from pathlib import Path
 from typing import Any, Final
 
+import jax
 import jax.ffi
 
 from mjx_study.caches import read_cached, write_cached
@@ -26,8 +27,6 @@ from mjx_study.disk import temporary_folder
 from mjx_study.runtime import available_cores, libraries_folder, processor
 from mjx_study.version import version_of
 
-SWITCH: Final = "MJX_STUDY_NATIVE"
-"""Environment variable; 0 does without native code."""
 FLAGS: Final = (
     *("-O2", "-std=gnu11", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math", "-fwrapv"),
     *("-shared", "-fPIC", "-w"),
@@ -56,15 +55,9 @@ def compiler() -> tuple[tuple[str, ...], str] | None:
     return None
 
 
-def native_identity() -> str | None:
-    """Digest of what libraries depend on besides their source; None if there are to be none."""
-    if os.environ.get(SWITCH) == "0" or jax.default_backend() != "cpu" or compiler() is None:
-        return None
-    return _identity()
-
-
 @functools.cache
-def _identity() -> str:
+def build_identity() -> str:
+    """Digest of what libraries depend on besides their source."""
     return _digest(compiler(), _FLAGS_HERE, processor(), version_of("jaxlib"))
 
 
@@ -77,7 +70,7 @@ def _digest(*parts: Any) -> str:
 
 def build_library(source: str) -> str:
     """Begin to build a library in the background, unless it is known, and return its name."""
-    name = PREFIX + _digest(source, _identity())
+    name = PREFIX + _digest(source, build_identity())
     with _LOCK:
         if name not in _BUILT:
             _BUILT[name] = future = Future()
@@ -105,11 +98,12 @@ def libraries_in(content: bytes) -> set[str]:
 
 
 def _finish(name: str, source: str, future: Future[Any]) -> None:
+    found = None
     try:
         with _AT_ONCE:
-            future.set_result(_cached(name) or _build(name, source))
-    except BaseException as error:
-        future.set_exception(error)
+            found = _cached(name) or _build(name, source)
+    finally:
+        future.set_result(found)
 
 
 def _build(name: str, source: str) -> Any:
@@ -148,10 +142,14 @@ def _cached(name: str) -> Any:
 
 
 def _loaded(name: str, content: bytes) -> Any:
-    """Load a library, register its handler with XLA, and return it."""
+    """Load a library, register its handler with XLA, and return it; None if that fails."""
     with temporary_folder() as folder:  # the file whose digest was checked, whatever becomes of the one in the cache
         path = Path(folder, f"{name}.so")
         path.write_bytes(content)
-        library = ctypes.CDLL(str(path))
-    jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(library.handler), platform="cpu")
+        try:
+            library = ctypes.CDLL(str(path))
+            jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(library.handler), platform="cpu")
+        except (OSError, AttributeError, jax.errors.JaxRuntimeError) as error:
+            print(f"mjx-study: native code cannot be loaded, steps run through XLA: {error}", file=sys.stderr)
+            return None
     return library
