@@ -115,7 +115,7 @@ def test_bad_options_are_refused(options: dict[str, Any], message: str) -> None:
 
 def test_the_adjoint_is_chosen_by_size_or_by_name() -> None:
     body = '<body><joint type="slide"/><geom size=".1" contype="0"/></body>'
-    hosts = [mujoco.MjModel.from_xml_string(floor_scene(joints * body)) for joints in (10, 11)]
+    hosts = [mujoco.MjModel.from_xml_string(floor_scene(joints * body)) for joints in (8, 9)]
     chosen = [[put_scene(host, "here", adjoint=name).uses_graph for name in ADJOINTS] for host in hosts]
     assert chosen == [[True, True, False], [False, True, False]]
     assert not make_task("tennis", adjoint="tape").scene.uses_graph

@@ -58,13 +58,13 @@ def test_the_pusher_is_right(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_a_wrong_derivative_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    right = dynamics.step_jacobian
+    right = dynamics.step_change
 
     def slightly_wrong(*arguments):
-        over_step, over_qacc = right(*arguments)
-        return over_step * (1 + 1e-4), over_qacc
+        qpos, qvel, act, qacc = right(*arguments)
+        return qpos, qvel * (1 + 1e-4), act, qacc
 
-    monkeypatch.setattr(dynamics, "step_jacobian", slightly_wrong)
+    monkeypatch.setattr(dynamics, "step_change", slightly_wrong)
     report = check(f"<worldbody>{BALL.format(name='x', axis='1 0 0')}</worldbody>")
     assert not report.passed and {finding.verdict for finding in report.findings} == {"wrong"}
     assert report.lines()[-1] == "SOMETHING IS WRONG: see above"
@@ -116,13 +116,13 @@ def test_an_upright_cylinder_excuses_its_own_entries_and_no_other(monkeypatch: p
 
     The tilt is 1e-9 rad, which differences reach across. The planted fault is in a slider that touches nothing.
     """
-    right = dynamics.step_jacobian
+    right = dynamics.step_change
 
     def wrong_beside(*arguments):
-        over_step, over_qacc = right(*arguments)
-        return over_step.at[3].multiply(1 + 1e-3), over_qacc  # the slider's velocity
+        qpos, qvel, act, qacc = right(*arguments)
+        return qpos, qvel.at[3].multiply(1 + 1e-3), act, qacc  # the slider's
 
-    monkeypatch.setattr(dynamics, "step_jacobian", wrong_beside)
+    monkeypatch.setattr(dynamics, "step_change", wrong_beside)
     cylinder = (
         '<body pos="0 0 .0999"><joint name="z" type="slide" axis="0 0 1"/><joint name="a" axis="1 0 0"/>'
         '<joint name="b" axis="0 1 0"/><geom name="can" type="cylinder" size=".1 .1" mass="1"/></body>'
