@@ -25,7 +25,7 @@ SWITCH: Final = "MJX_STUDY_NATIVE"
 def native_identity() -> str | None:
     """Digest of what native code depends on besides its source: processor, compiler and flags.
 
-    None if there is to be none: with `SWITCH`, on accelerators that CUDA does not serve, and without compilers that work.
+    None if there is to be none: with `SWITCH`, on accelerators other than NVIDIA's, and without compilers that work.
     """
     served = jax.default_backend() == "cpu" or cuda.target() is not None
     wanted = os.environ.get(SWITCH) != "0" and served
