@@ -29,9 +29,7 @@ def test_the_recommended_estimator_is_within_a_factor_of_two() -> None:
     ("bias", "seconds", "factor", "expected"),
     [(0.0, 1.0, 1.0, "good"), (0.0, 2.25, 1.5, "good"), (0.0, 16.0, 4.0, "bad"), (1.0, 1e-6, 100.0, "bad")],
 )
-def test_a_factor_compares_errors_after_equal_seconds(
-    bias: float, seconds: float, factor: float, expected: str
-) -> None:
+def test_factors_compare_errors_at_equal_times(bias: float, seconds: float, factor: float, expected: str) -> None:
     """An estimator of unit error after a second (a hundredth of that if it is biased) against another."""
     size, count = 50, 400
     keys = jax.random.split(jax.random.key(0), 3)
