@@ -18,13 +18,14 @@ import pytest
 
 from mjx_study import cli
 from mjx_study.cli import options
-from mjx_study.execution.run import load_study
 from mjx_study.experiment import plan as plan_module
-from mjx_study.experiment.plan import StudyPlan, plan_study
+from mjx_study.experiment.plan import plan_study
+from mjx_study.experiment.study import StudyPlan
 from mjx_study.options.configuration import StudyConfig
 from mjx_study.options.option import OPTIONS, SCENE_OPTIONS, as_arguments
 from mjx_study.plots.style import PAGE
-from mjx_study.results.findings import rows_of
+from mjx_study.results.rows import rows_of
+from mjx_study.storage.folder import load_study
 from mjx_study.tasks import TASKS
 from tests.documents import stages_of
 

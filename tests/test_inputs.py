@@ -13,7 +13,6 @@ import pytest
 from estimators import AlphaOrder
 from mjx_study import cli
 from mjx_study.cli import options
-from mjx_study.execution.run import open_store
 from mjx_study.experiment.iteration import make_optimizer
 from mjx_study.experiment.plan import plan_study
 from mjx_study.limits import MOST_CELLS, MOST_MODELS, check_count
@@ -22,6 +21,7 @@ from mjx_study.options.files import digest_of_json, read_theta
 from mjx_study.options.option import OPTIONS, Interval
 from mjx_study.runtime import default_cache
 from mjx_study.simulation.scene import SceneError, load_model
+from mjx_study.storage.folder import open_store
 from mjx_study.storage.manifest import read_document, sealed
 
 BODY = "<worldbody><body><freejoint/><geom size='0.1'/></body></worldbody>"

@@ -10,7 +10,7 @@ from mjx_study.cli.options import Parser, given_options
 from mjx_study.disk import write_whole
 from mjx_study.options.configuration import StudyConfig
 from mjx_study.options.option import BUILDER_OPTIONS
-from mjx_study.results.variables import explained
+from mjx_study.results.variables import DESCENTS, explained
 
 EPILOG = f"""\
 Every estimator starts from the task's theta, or from --theta, and draws the same noise. --learning-rate, --iterations
@@ -28,7 +28,7 @@ examples:
   mjx-study rollout pusher --theta out/policy-aobg.json
 
 columns of the table:
-{explained("descents", "final_cost", "best_cost", "alpha", "seed_rollouts", "seconds")}
+{explained(DESCENTS, "final_cost", "best_cost", "alpha", "seed_rollouts", "seconds")}
 
 A task's own counts, such as hit, have a column each. Costs and counts are means over --evaluation-samples rollouts,
 the same for all, ± their standard deviation over seeds; alpha is the mean over the last tenth of the iterations.
@@ -54,7 +54,8 @@ def add(command: Parser) -> None:
 def run(options: argparse.Namespace) -> int:
     from mjx_study.cli.console import descent_lines, descents
     from mjx_study.cli.studies import run_one, study_fields
-    from mjx_study.experiment.plan import StudyPlan, plan_study
+    from mjx_study.experiment.plan import plan_study
+    from mjx_study.experiment.study import StudyPlan
     from mjx_study.tasks import task_with_options
 
     def planned() -> StudyPlan:

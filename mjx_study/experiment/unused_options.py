@@ -35,15 +35,17 @@ def reads_onset(chosen: Iterable[str | Estimator], onset: str = "jump") -> bool:
     return bool(needed - {CORRECTED} if onset == "linear" else needed)
 
 
-def reject_unused(config: StudyConfig, grids: Sequence[tuple[Task, Sequence[ContactPoint]]]) -> None:
+def reject_unused(
+    config: StudyConfig, grids: Sequence[tuple[Task, Sequence[ContactPoint]]], *, first_order: bool = False
+) -> None:
     """Raise ValueError for what was given and has no effect in any cell: an option that differs from its default, or an
     onset estimator.
 
     Args:
         grids: tasks, each with its contact models.
+        first_order: whether cells have means of first-order gradients whatever the estimators are.
     """
     reject_unread(config.estimators, [name for name in (*OF_ESTIMATORS, "published") if config.given(name)])
-    along = config.settings.kind == "landscapes"  # which have the mean of FoBG, whatever the estimators
     simulated = [task for task, models in grids if not all(each.analytic for each in models)]
     touching = any(task.scene.has_constraints for task in simulated)
     families = [
@@ -62,8 +64,8 @@ def reject_unused(config: StudyConfig, grids: Sequence[tuple[Task, Sequence[Cont
         ("stiffness", chosen or takes_stiffness(families), such),
         ("damping", takes_stiffness(set(families) - {REFERENCE}), such),
         ("cone", touching, "nothing that is simulated has contact"),
-        ("onset", touching and (along or reads_onset(config.estimators, config.onset)), corrected),
-        ("backward", touching and (along or reads_onset(config.estimators)), needed),
+        ("onset", touching and (first_order or reads_onset(config.estimators, config.onset)), corrected),
+        ("backward", touching and (first_order or reads_onset(config.estimators)), needed),
         ("backward_stiffness", takes_stiffness(set(config.backward) - {"none"}), "no family of `backward` takes one"),
         *((name, simulated, "nothing is simulated") for name in SCENE_OPTIONS),
     ):

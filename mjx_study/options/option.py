@@ -13,7 +13,7 @@ from typing import Any, ClassVar, Final
 
 from estimators.choices import BASELINES, DENSITIES, VARIANCE_PROXIES, WEIGHTS, suggestion, unknown
 from estimators.registry import ESTIMATORS
-from mjx_study.choices import CONES, FAMILIES, INTEGRATORS, ONSETS, REFERENCE, SOLVERS
+from mjx_study.choices import CONES, FAMILIES, INTEGRATORS, KINDS, ONSETS, REFERENCE, SOLVERS
 
 MOST_VALUES: Final = 10_000
 """Maximum number of values in a list or range."""
@@ -226,8 +226,6 @@ def _choice(name: str, choices: Collection[str], metavar: str, line: str, **more
 
 TASKS: Final = "the task's"
 MJCF: Final = "the MJCF's"
-KINDS: Final = ("gradients", "descents", "landscapes")
-"""Kinds of study."""
 CONTACTS: Final = (*FAMILIES, REFERENCE)
 """Contact families of a study, and the analytic reference."""
 OPTIONS: Final[dict[str, Option]] = {
