@@ -86,4 +86,4 @@ def label_of(name: str, onset: str = "none") -> str:
 def markdown_table() -> str:
     """Table of all registered estimators, as in docs/estimators.md."""
     rows = [f"| `{name}` | {each.formula} | {each.unbiased} |" for name, each in ESTIMATORS.items()]
-    return "\n".join(["| name | sample | unbiased |", "| --- | --- | --- |", *rows])
+    return "\n".join(["| name | sample | unbiased |", "|---|---|---|", *rows])

@@ -201,15 +201,15 @@ def verdict(each: dict[str, Any]) -> str:
 def table(results: list[dict[str, Any]]) -> str:
     """Format the table of the page."""
     rows = []
-    for what, held_out in (("held out", True), ("known", False)):
-        some = [each for each in results if each["held_out"] is held_out]
-        if not some:
+    for label, held_out in (("held out", True), ("known", False)):
+        group = [each for each in results if each["held_out"] is held_out]
+        if not group:
             continue
-        decided = [each for each in some if verdict(each) != "undecided"]
+        decided = [each for each in group if verdict(each) != "undecided"]
         good = [verdict(each) == "good" for each in decided]
         share, low, high = coverage_interval(jnp.array(good), 0.95)
-        names = ", ".join(f"`{name}`" for name in dict.fromkeys(each["model"] for each in some))
-        row = [f"{what}: {names}", len(some), len(some) - len(decided), f"{sum(good)} of {len(good)}"]
+        names = ", ".join(f"`{name}`" for name in dict.fromkeys(each["model"] for each in group))
+        row = [f"{label}: {names}", len(group), len(group) - len(decided), f"{sum(good)} of {len(good)}"]
         row += [f"{percent(share)} ({percent(low)} to {percent(high)})", max(each["factor"] for each in decided)]
         rows.append(row)
     factors = [each["factor"] for each in results]

@@ -181,9 +181,9 @@ def dimension_row(params: int, bias: float, uncertainty: float, samples: int = 4
     offset = bias * jnp.roll(gradient, 1)
 
     def one(key: Array) -> estimators.Comparison:
-        mine, theirs = jax.random.split(key)
-        noise = 0.125 * (samples / params) ** 0.5 * jax.random.normal(mine, (samples, params))
-        reference = uncertainty * (others / params) ** 0.5 * jax.random.normal(theirs, (others, params))
+        batch_key, reference_key = jax.random.split(key)
+        noise = 0.125 * (samples / params) ** 0.5 * jax.random.normal(batch_key, (samples, params))
+        reference = uncertainty * (others / params) ** 0.5 * jax.random.normal(reference_key, (others, params))
         return estimators.compare(summarise(gradient + offset + noise), summarise(gradient + reference))
 
     found = _map(one, jax.random.split(jax.random.key(2), count))
@@ -235,12 +235,12 @@ def weights_columns(samples: int, count: int) -> list[list[str]]:
         exact = np.mean(np.asarray(objective.differentiate(jnp.asarray(theta), many).gradient), axis=0)
         drawn = jax.tree.map(lambda leaf: jnp.asarray(leaf).reshape(count, samples, *leaf.shape[1:]), drawn)
         for name in WEIGHED:
-            mine = {oracle: drawn[oracle] for oracle in ESTIMATORS[name].needs}
+            batches = {oracle: drawn[oracle] for oracle in ESTIMATORS[name].needs}
             row, errors = [problem, name], []
             for weights in estimators.WEIGHTS:
                 estimator = make_estimator(name, sigma=objective.sigma, weights=weights)
                 program = jax.jit(jax.vmap(lambda batch, estimator=estimator: estimator(batch).mean))
-                means = np.asarray(program(mine))
+                means = np.asarray(program(batches))
                 bias = np.linalg.norm(np.mean(means, axis=0) - exact) / np.linalg.norm(exact)
                 errors.append(np.sum(np.var(means, axis=0)))
                 row.append(f"{100 * bias:.1f}")

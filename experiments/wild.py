@@ -180,14 +180,14 @@ def tables(lines: Iterable[dict[str, Any]]) -> str:
     first = markdown_table(rows, (*header, "converged: here", "off differences of 1e-6, 1e-7, 1e-8 by"))
     rows = []
     for name, onset in dict.fromkeys((line["name"], line["onset"]) for line in batches):
-        mine = [line for line in batches if (line["name"], line["onset"]) == (name, onset)]
+        group = [line for line in batches if (line["name"], line["onset"]) == (name, onset)]
         intervals = []
         for field in ("difference", "gap"):
-            values = np.array([line[field] for line in mine])
-            wide = stats.t.ppf((1 + CONFIDENCE) / 2, len(mine) - 1) * stats.sem(values)
-            intervals.append(f"{np.mean(values):.3g} ± {wide:.2g}")
-        least = min(line["effective"] for line in mine)
-        rows.append([f"`{name}`", onset, BATCH * len(mine), *intervals, f"{least:.1f}"])
+            values = np.array([line[field] for line in group])
+            half = stats.t.ppf((1 + CONFIDENCE) / 2, len(group) - 1) * stats.sem(values)
+            intervals.append(f"{np.mean(values):.3g} ± {half:.2g}")
+        least = min(line["effective"] for line in group)
+        rows.append([f"`{name}`", onset, BATCH * len(group), *intervals, f"{least:.1f}"])
     header = ("environment", "onset", "N", "difference [m]", "gap [m]", "smallest effective N")
     return f"{first}\n\n{markdown_table(rows, header)}"
 

@@ -22,9 +22,10 @@ from mjx_study.version import version_of
 
 VERSIONED: Final = ("mjx-study", "mujoco", "mujoco-mjx", "jax", "jaxlib", "numpy", "optax")
 """Packages whose version may affect results."""
+SOURCES: Final = (".py", ".c", ".cu")
+"""Suffixes of files with code."""
 NOT_COMPUTING: Final = frozenset(
-    ["cli", "plots", "render", "gradcheck", "diagnose", "claims"]
-    + ["bench.py", "report.py", "_public.py", "__main__.py", "__init__.py"]
+    ["cli", "plots", "render", "gradcheck", "diagnose", "claims", "bench.py", "report.py", "_public.py", "__main__.py"]
 )
 """Parts of mjx_study that no study imports while it computes, and so do not affect results; all others count."""
 DIGEST: Final = re.compile("[0-9a-f]{12,64}")
@@ -104,9 +105,9 @@ def differences(theirs: Mapping[str, Any], ours: Mapping[str, Any]) -> str | Non
 @functools.cache
 def computing_code(package: Path = Path(__file__).parent) -> str:
     """Digest of the source of `estimators` and of mjx_study, except `NOT_COMPUTING`."""
-    files = sorted([*package.rglob("*.py"), *(package.parent / "estimators").rglob("*.py")])
+    files = [*package.rglob("*"), *(package.parent / "estimators").rglob("*")]
     sha = hashlib.sha256()
-    for path in files:
+    for path in sorted(path for path in files if path.suffix in SOURCES):
         if path.relative_to(package.parent).parts[:2] not in {(package.name, part) for part in NOT_COMPUTING}:
             sha.update(str(path.relative_to(package.parent)).encode() + b"\0" + path.read_bytes())
     return sha.hexdigest()[:12]

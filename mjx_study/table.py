@@ -41,7 +41,8 @@ def format_table(rows: Sequence[Sequence[str]], header: Sequence[str]) -> list[s
 
 def markdown_table(rows: Iterable[Sequence[Any]], header: Sequence[str]) -> str:
     """Format a table in Markdown, without a line feed at its end."""
-    return "\n".join(f"| {' | '.join(map(str, row))} |" for row in (header, ["---"] * len(header), *rows))
+    lines = [f"| {' | '.join(map(str, row))} |" for row in (header, *rows)]
+    return "\n".join([lines[0], "|" + "---|" * len(header), *lines[1:]])
 
 
 def number(value: float | None, digits: int = 3) -> str:

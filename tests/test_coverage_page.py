@@ -1,4 +1,4 @@
-"""docs/coverage.md says what its script computes: some rows again, and the shape of all of them."""
+"""docs/coverage.md agrees with its script: some rows recomputed, and the shape of all of them."""
 
 import re
 from pathlib import Path

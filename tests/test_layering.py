@@ -1,7 +1,6 @@
 """Imports only point down the layers and never in a circle, and importing has no effect on the process."""
 
 import ast
-import pkgutil
 import re
 import subprocess
 import sys
@@ -227,48 +226,12 @@ def test_import_has_no_global_effect() -> None:
 
 
 ARCHITECTURE = (ROOT / "docs" / "architecture.md").read_text()
-BESIDE = {"mjx_study.choices", "mjx_study._matplotlib", "mjx_study.runtime", "mjx_study.table", "mjx_study.disk"} | {
-    "mjx_study.watchdog", "mjx_study.limits", "mjx_study.options",
-    "mjx_study._public", "mjx_study.sources", "mjx_study.digest", "mjx_study.identity", "mjx_study.compiled",
-    "mjx_study.version", "mjx_study.caches", "mjx_study.structure", "mjx_study.progress",
-}  # fmt: skip
-"""Small modules that the picture of the packages leaves out."""
 
 
-def package_imports() -> dict[str, set[str]]:
-    """The packages of the picture, with those that each imports."""
-    found: dict[str, set[str]] = {}
-    for path in FILES:
-        module = module_of(path)
-        package = LAYERS[layer_of(module)]
-        if package in BESIDE | {"mjx_study", "mjx_study.__main__"}:
-            continue
-        imported = {
-            LAYERS[layer_of(name)] for name in imports_of(path.read_text(), module, is_package=path.stem == "__init__")
-        }
-        found.setdefault(package, set()).update(imported - BESIDE - {package})
-    return found
-
-
-def test_the_picture_of_the_packages_is_right() -> None:
-    """Its arrows are the imports, less those that follow from others."""
-    imports = package_imports()
-
-    def beyond(package: str) -> set[str]:
-        return imports[package].union(*(beyond(each) for each in imports[package]))
-
-    expected = {
-        (package, other)
-        for package, others in imports.items()
-        for other in others
-        if not any(other in beyond(between) for between in others - {other})
-    }
-    drawn = {tuple(line.split(" --> ")) for line in ARCHITECTURE.replace("    ", "").splitlines() if " --> " in line}
-    assert drawn == {tuple(each.removeprefix("mjx_study.") for each in pair) for pair in expected}
-
-
-def test_what_the_page_names_is_there() -> None:
-    named = set(re.findall(r"`((?:mjx_study|estimators)(?:\.\w+)+)`", ARCHITECTURE))
-    assert len(named) > 15
-    for place in named:
-        assert pkgutil.resolve_name(place) is not None
+def test_the_page_names_packages_and_modules_in_the_order_of_the_layers() -> None:
+    """Packages in the table; modules of a single file in the paragraph below it."""
+    table, beside = ARCHITECTURE.partition("## Three options")[0].split("Modules of a single file", 1)
+    names = [each.removeprefix("mjx_study.") for each in LAYERS if each != "mjx_study" and "._" not in each]
+    packages = [name for name in names if (ROOT / name).is_dir() or (ROOT / "mjx_study" / name).is_dir()]
+    assert re.findall(r"^\| `(\w+)` \|", table, re.MULTILINE) == packages
+    assert set(re.findall(r"`(\w+)`", beside)) == set(names) - set(packages)

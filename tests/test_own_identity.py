@@ -174,7 +174,7 @@ def world(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[
     """Writes the files that the cases read, with other content each time; nothing is imported before."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
-    monkeypatch.setattr(user_inputs, "_SEEN", defaultdict(dict))
+    monkeypatch.setattr(user_inputs, "_RECORDED", defaultdict(dict))
     (tmp_path / "below").mkdir()
 
     def write(scale: float) -> None:
@@ -232,7 +232,7 @@ def late(**options): return hop(**options).replace(metrics=metrics)
 """
 
 
-def test_what_is_read_while_computing_counts_too(
+def test_inputs_read_while_computing_count(
     tmp_path: Path, world: Callable[[float], None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Metrics are traced when the first cell is computed; until then nothing has been read."""
@@ -273,7 +273,7 @@ def test_reads_of_users_count_and_no_others(tmp_path: Path, monkeypatch: pytest.
     """Not those of this package and of libraries, nor of files that are made meanwhile, nor outside `observing`."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr(user_inputs, "_SEEN", defaultdict(dict))
+    monkeypatch.setattr(user_inputs, "_RECORDED", defaultdict(dict))
     monkeypatch.delenv("MINE", raising=False)
     (tmp_path / "outside.py").write_text(OUTSIDE)
     (tmp_path / "mine.txt").write_text("mine")

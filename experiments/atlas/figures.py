@@ -95,12 +95,12 @@ def bias_figure(table: Table) -> Figure:
     """Draw the decided relative bias of plain first order against four groups, and shares of cells that are off."""
     met = table[bodies_meet(table) & np.isfinite(table.fobg_off)]
     figure, axes = panels(2, 4, 3.0)
-    for place, group in enumerate(("h_b", "strength", "crossing", "travel")):
-        scatter(axes[place], met, group, "fobg_relative", (1e-3, 1e2))
-        axes[place].axhline(TOLERANCE, color="black", linewidth=0.6)
+    for index, group in enumerate(("h_b", "strength", "crossing", "travel")):
+        scatter(axes[index], met, group, "fobg_relative", (1e-3, 1e2))
+        axes[index].axhline(TOLERANCE, color="black", linewidth=0.6)
         for name, part in met.groupby("contact", sort=False):
-            binned(axes[place + 4], part[group], part.fobg_off, COLOURS[name])
-        axes[place + 4].set(xscale="log", xlabel=symbol_of(group), ylim=(-0.03, 1.03))
+            binned(axes[index + 4], part[group], part.fobg_off, COLOURS[name])
+        axes[index + 4].set(xscale="log", xlabel=symbol_of(group), ylim=(-0.03, 1.03))
     axes[0].set_ylabel("relative bias of first order")
     axes[4].set_ylabel(f"share off by more than {percent(TOLERANCE)}")
     key(figure, COLOURS)
@@ -109,10 +109,10 @@ def bias_figure(table: Table) -> Figure:
 
 def onset_figure(table: Table) -> Figure:
     """Draw the share that the onset term leaves of what it adds, where force jumps and plain first order is off."""
-    some = table[term_acts(table)]
+    selected = table[term_acts(table)]
     figure, axes = panels(1, 3)
     for each, group in zip(axes, ("strength", "crossing", "limit"), strict=True):
-        for name, part in some.groupby("task", sort=False):
+        for name, part in selected.groupby("task", sort=False):
             each.scatter(part[group], part.left.clip(1e-3, 10), s=5, color=TASKS[name], alpha=0.6, linewidths=0)
         each.set(xscale="log", yscale="log", xlabel=symbol_of(group), ylim=(1e-3, 10))
     strength = np.array([SMOOTH_SHARE, MOST_STRENGTH])
@@ -133,8 +133,8 @@ def timestep_figure(table: Table) -> Figure:
     figure, axes = panels(1, 3)
     for name, cells in table.groupby("task", sort=False):
         steps = [(1e3 * timestep, verdicts(part)) for timestep, part in cells.groupby("timestep")]
-        for place, each in enumerate(axes):
-            decided = [(x, found[place]) for x, found in steps if len(found[place]) >= BINS]
+        for index, each in enumerate(axes):
+            decided = [(x, found[index]) for x, found in steps if len(found[index]) >= BINS]
             if not decided:
                 continue
             x, middle, low, high = np.array([(x, *coverage_interval(each, 0.95)) for x, each in decided]).T
@@ -153,11 +153,11 @@ def timestep_figure(table: Table) -> Figure:
 def samples_figure(table: Table) -> Figure:
     """Draw first order's gain in variance times seconds, and the rollouts until its bias costs it the lead."""
     figure, axes = panels(1, 2, 4.4)
-    for each, x, y, some, limits in (
+    for each, x, y, selected, limits in (
         (axes[0], "limit", "worth", table[table.worth.notna()], (1e-7, 1e7)),
         (axes[1], "strength", "until", table[plain_is_off(table)], (1e-1, 1e5)),
     ):
-        for name, part in some.groupby("task", sort=False):
+        for name, part in selected.groupby("task", sort=False):
             each.scatter(part[x], part[y].clip(*limits), s=3, color=TASKS[name], alpha=0.5, linewidths=0)
         each.set(xscale="log", yscale="log", xlabel=symbol_of(x), ylim=limits)
     axes[0].axhline(1, color="black", linewidth=0.6)

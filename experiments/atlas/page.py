@@ -63,8 +63,8 @@ def jump_table(table: Table) -> str:
         part = table[bodies_meet(table) & (table.task == name)]
         jumps = part.strength > SMOOTH_SHARE
         rows.append([f"`{name}`"])
-        for some in (part[~jumps], part[jumps]):
-            rows[-1] += [share(some.fobg_off.dropna().to_numpy() == 1), int(some.fobg_off.isna().sum())]
+        for selected in (part[~jumps], part[jumps]):
+            rows[-1] += [share(selected.fobg_off.dropna().to_numpy() == 1), int(selected.fobg_off.isna().sum())]
     head = ("task", "off, no jump", "undecided", "off, force jumps", "undecided")
     return markdown_table(rows, head)
 
@@ -89,11 +89,11 @@ def groups_table(table: Table) -> str:
     """Format the share of each verdict in the quarters of the cells by each dimensionless group."""
     rows = []
     for group, (symbol, meaning) in GROUPS.items():
-        some = table if group in OF_THE_DESIGN else table[bodies_meet(table)]
-        values = some[group][np.isfinite(some[group])]
-        edges = np.unique(np.quantile(values, np.linspace(0, 1, 5)))
+        selected = table if group in OF_THE_DESIGN else table[bodies_meet(table)]
+        values = selected[group]
+        edges = np.unique(np.quantile(values[np.isfinite(values)], np.linspace(0, 1, 5)))
         parts = [
-            some[(some[group] >= low) & ((some[group] < high) | (high == edges[-1]) & (some[group] == high))]
+            selected[(values >= low) & ((values < high) | (high == edges[-1]) & (values == high))]
             for low, high in itertools.pairwise(edges)
         ]
         columns = zip(*(verdicts(part) for part in parts), strict=True)
@@ -133,8 +133,8 @@ def samples_table(table: Table) -> str:
         worth = part.worth.quantile([0.25, 0.5, 0.75])
         off = part[plain_is_off(part)]
         rows.append([f"`{name}`", len(part), *(f"{each:.2g}" for each in worth), len(off)])
-        some = off.until.quantile([0.25, 0.5, 0.75]) if len(off) >= BINS else worth * np.nan
-        rows[-1] += [f"{each:.2g}" if np.isfinite(each) else "-" for each in some]
+        selected = off.until.quantile([0.25, 0.5, 0.75]) if len(off) >= BINS else worth * np.nan
+        rows[-1] += [f"{each:.2g}" if np.isfinite(each) else "-" for each in selected]
     quartiles = ("lower quartile", "median", "upper quartile")
     head = ("task", "stable cells", *quartiles, "of these, mean off", *quartiles)
     return markdown_table(rows, head)

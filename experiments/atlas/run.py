@@ -59,9 +59,9 @@ class Job:
 
 def jobs() -> list[Job]:
     """Return all jobs, longest first."""
-    whole = [Job(program, 0, 1) for program in range(len(PROGRAMS))]
-    counts = [math.ceil(job.seconds / LARGEST) for job in whole]
-    split = [Job(job.program, part, parts) for job, parts in zip(whole, counts, strict=True) for part in range(parts)]
+    unsplit = [Job(program, 0, 1) for program in range(len(PROGRAMS))]
+    counts = [math.ceil(job.seconds / LARGEST) for job in unsplit]
+    split = [Job(job.program, part, parts) for job, parts in zip(unsplit, counts, strict=True) for part in range(parts)]
     return sorted(split, key=lambda job: -job.seconds)
 
 
@@ -75,8 +75,8 @@ def compute(job: Job, folder: Path, done: frozenset[int], end: float, most: int 
     """
     configure(cpu_devices=1)
     mujoco.set_mju_user_warning(lambda message: None)
-    mine = list(cells_of(job.program))[job.part :: job.parts][:most]
-    missing = [cell for cell in mine if cell.index not in done]
+    planned = list(cells_of(job.program))[job.part :: job.parts][:most]
+    missing = [cell for cell in planned if cell.index not in done]
     if not missing or time.time() > end - FEWEST:
         return 0
     programs, parts, longest = Programs(task_of(*PROGRAMS[job.program])), [], 0.0
@@ -95,8 +95,8 @@ def write(path: Path, parts: Sequence[dict[str, np.ndarray]], **more: Any) -> No
     """Write the columns of all parts as float32 with `DIGITS` bits, sorted by cell and without duplicates."""
     joined = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     _, kept = np.unique(joined["index"], return_index=True)
-    whole = joined["index"][kept].astype(np.int32)
-    columns = {name: rounded(each[kept]) for name, each in joined.items()} | {"index": whole}
+    indices = joined["index"][kept].astype(np.int32)
+    columns = {name: rounded(each[kept]) for name, each in joined.items()} | {"index": indices}
     write_whole(path, lambda file: np.savez_compressed(file, **columns, **more))
 
 

@@ -179,12 +179,12 @@ def robot_panel(name: str, seed: int, view: str, shown: Sequence[tuple[int, str]
     def draw(axes: Axes) -> None:
         drawing = drawing_of(task, qpos, view)
         drawing.scenery(axes)
-        for place, (step, text) in enumerate(shown):
+        for rank, (step, text) in enumerate(shown):
             for added in drawing.pose(axes, step):
-                added.set_transform(Affine2D().translate(place * apart, 0) + axes.transData)
+                added.set_transform(Affine2D().translate(rank * apart, 0) + axes.transData)
             note(
                 axes,
-                place * apart,
+                rank * apart,
                 corners["high"][1] - 0.04 * apart,
                 f"{step * task.scene.timestep:g} s: {text}",
                 va="top",

@@ -1,26 +1,14 @@
-"""Claims about simulated contact: stiffness, chaos, geometry, friction, and the bias where contact begins."""
+"""Statistics of studies: the variance of first order by stiffness, timestep and horizon, and its cost."""
 
-import dataclasses
 from typing import Any, Final
 
 import jax
 import numpy as np
 import xarray as xr
 
-from estimators import FirstOrder
 from mjx_study.choices import REFERENCE
-from mjx_study.claims.laboratory import (
-    REAL,
-    TIMED,
-    Laboratory,
-    Slopes,
-    Statistic,
-    batches,
-    exact,
-    mean_of,
-    times_of,
-)
-from mjx_study.claims.theory import STIFFNESS, at, errors_of, relative_bias, variances_of
+from mjx_study.claims.laboratory import REAL, TIMED, Laboratory, Statistic, mean_of, times_of
+from mjx_study.claims.theory import STIFFNESS
 from mjx_study.options.configuration import StudyConfig
 from mjx_study.runtime import local_devices
 
@@ -28,10 +16,8 @@ STIFFNESSES: Final = (10.0, 100.0, 1000.0, 1200.0)
 """Contact stiffnesses of the pusher [N/m]."""
 CRITICAL: Final = 14.14
 """Critical damping of 1000 N/m between the pusher's bodies, of effective mass 0.05 kg [N s/m]."""
-HALF_STEP: Final = {"pusher": 0.0025, "momentum_transfer": 0.001}
-"""Half of the tasks' timesteps [s]."""
-DOME_SIGMA: Final = 0.03
-"""Noise of the claims on the dome [rad]."""
+HALF_STEP: Final = 0.0025
+"""Half of the pusher's timestep [s]."""
 
 
 def study(lab: Laboratory, task: str, **changes: Any) -> xr.Dataset:
@@ -46,7 +32,7 @@ def pusher(lab: Laboratory, *, half: bool = False, damping: float | None = None)
     if damping is not None:
         return study(lab, "pusher", contact=("penalty", "impedance"), stiffness=(1000.0,), damping=damping)
     if half:
-        return study(lab, "pusher", contact=REAL, stiffness=STIFFNESSES[2:], timestep=(HALF_STEP["pusher"],))
+        return study(lab, "pusher", contact=REAL, stiffness=STIFFNESSES[2:], timestep=(HALF_STEP,))
     return study(lab, "pusher", contact=(REFERENCE, *REAL), stiffness=STIFFNESSES)
 
 
@@ -101,60 +87,3 @@ def chaos(lab: Laboratory, system: str, family: str) -> Statistic:
     horizon = int(system.partition(", ")[2].removesuffix(" steps"))
     half = (lab.effort.samples // 2,)
     return ratio(study(lab, "double_pendulum", contact=(family,), horizon=horizon, samples=half), family, None)
-
-
-def dome(lab: Laboratory, system: str, family: str) -> Statistic:
-    names = system, system.replace(":dome", "")
-    return variances_of(lab, *(at(lab, name, family, sigma=DOME_SIGMA) for name in names))
-
-
-def biases_of(one: Slopes, other: Slopes) -> Statistic:
-    """Relative bias on one landscape as a share of that on another."""
-    share = one.relative / other.relative
-    slack = (sum(one.errors) + abs(share) * sum(other.errors)) / abs(other.relative)
-    return exact(share, slack, other.points)
-
-
-def timestep(lab: Laboratory, system: str, family: str) -> Statistic:
-    half = at(lab, system, family, timestep=HALF_STEP["momentum_transfer"])
-    return biases_of(half, at(lab, system, family))
-
-
-def cure_cost(lab: Laboratory, system: str, family: str) -> Statistic:
-    return variances_of(lab, at(lab, system, family, onset="linear"), at(lab, system, family))
-
-
-def _relaxed(lab: Laboratory, system: str, family: str, onset: str = "none") -> tuple[Slopes, Slopes]:
-    """Return a landscape with the derivatives of the relaxation named by the system, and one with exact ones."""
-    where, _, relaxed = system.rpartition(", ")
-    return at(lab, where, family, relaxed=relaxed), at(lab, where, family, onset=onset)
-
-
-def relaxed_cost(lab: Laboratory, system: str, family: str) -> Statistic:
-    return variances_of(lab, *_relaxed(lab, system, family))
-
-
-def smooth_cost(lab: Laboratory, system: str, family: str) -> Statistic:
-    return variances_of(lab, *(at(lab, system, name) for name in (family, "mujoco")))
-
-
-def relaxed_bias(lab: Laboratory, system: str, family: str) -> Statistic:
-    where, _, relaxed = system.rpartition(", ")
-    return relative_bias(lab, where, family, relaxed=relaxed)
-
-
-def relaxed_share(lab: Laboratory, system: str, family: str) -> Statistic:
-    share = biases_of(*_relaxed(lab, system, family))
-    return dataclasses.replace(share, estimate=abs(share.estimate))
-
-
-def onset_or_relaxed(lab: Laboratory, system: str, family: str) -> Statistic:
-    relaxed, corrected = _relaxed(lab, system, family, onset="linear")
-    (one,), (other,) = (batches([FirstOrder()], each, 200, 2 * lab.effort.batches) for each in (corrected, relaxed))
-    return errors_of(one, other, corrected.gradient)
-
-
-def softened(lab: Laboratory, system: str, family: str) -> Statistic:
-    one, other = (at(lab, system, family, stiffness=stiffness) for stiffness in (3e3, 3e4))
-    share = one.gradient / other.gradient
-    return exact(abs(share - 1), one.errors[0] * abs(share) + abs(share) * other.errors[0], one.points)

@@ -196,7 +196,7 @@ class Laboratory:
         return task.replace(onset=onset)
 
     def _contact(self, task: Task, family: str, stiffness: float, relaxed: str | None = None) -> ContactModel | None:
-        """Contact model of a family, with its own derivatives or those of one of `RELAXATIONS`."""
+        """Contact model of a family, with exact derivatives or those of one of `RELAXATIONS`."""
         (cell,), _ = family_grid(task, (family,), (stiffness,))
         if relaxed is not None:
             other, factor, margin = RELAXATIONS[relaxed]

@@ -78,12 +78,9 @@ def undecided(document: dict[str, Any]) -> list[str]:
 
 def markdown(document: dict[str, Any]) -> str:
     """Return the text of docs/claims.md."""
-    header, *rows = cells(document)
-    linked = [[f"[{name}](#{name})", *verdicts] for name, *verdicts in rows]
     return TEMPLATE.read_text().format(
         counts=verdict_counts(document),
         run=run_summary(document),
-        matrix=markdown_table(linked, header),
         claims="\n\n".join(map(_section, document["claims"])),
     )
 

@@ -1,7 +1,8 @@
-"""Claims about jumps, their relaxations, and the lemmas, by closed forms and MJX landscapes over one parameter."""
+"""Statistics of closed forms and of MJX landscapes over one parameter: biases, variances, errors, and the lemmas."""
 
-import dataclasses
 import math
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any, Final
 
 import jax
@@ -30,39 +31,73 @@ STIFFNESS: Final = 10_000.0
 """Contact stiffness of the landscapes, for families that take one [N/m]."""
 STEP, RAMP = "step", "ramp of 0.01 sigma"
 """Analytic systems."""
+Changes = Mapping[str, Any]
+NONE: Final[Changes] = MappingProxyType({})
+"""No changes of a landscape."""
 
 
 def at(lab: Laboratory, system: str, family: str, stiffness: float = STIFFNESS, **changes: Any) -> Slopes:
-    """Landscape of a system under a family, at the angle given in its name; changes as for `Laboratory.slopes`."""
+    """Landscape of a system under a family, at the angle and with the relaxed derivatives given in its name.
+
+    Changes are those of `Laboratory.slopes`; `relaxed="none"` stands for exact derivatives.
+    """
     if system == STEP:
         return closed_form(Heaviside(), 0.5, 1.0)
     if system == RAMP:
         return closed_form(RelaxedHeaviside(0.01), 0.0, 1.0)
-    task, _, angle = system.partition(", ")
+    task, angle, *relaxed = system.split(", ")
+    changes = {"relaxed": relaxed[0] if relaxed else None} | changes
+    changes["relaxed"] = None if changes["relaxed"] == "none" else changes["relaxed"]
     return lab.slopes(task, family, float(angle.removesuffix(" rad")), stiffness=stiffness, **changes)
 
 
-def relative_bias(lab: Laboratory, system: str, family: str, **changes: Any) -> Statistic:
+def pair(lab: Laboratory, system: str, family: str, one: Changes, other: Changes) -> list[Slopes]:
+    """Two landscapes with changes, which may replace the system or the family."""
+    named: dict[str, Any] = {"system": system, "family": family}
+    return [at(lab, **(named | dict(changes))) for changes in (one, other)]
+
+
+def relative_bias(lab: Laboratory, system: str, family: str, absolute: bool = False, **changes: Any) -> Statistic:
     """(E[FoBG] - grad F) / grad F of a landscape."""
     found = at(lab, system, family, **changes)
-    return exact(found.relative, sum(found.errors), found.points)
+    return exact(abs(found.relative) if absolute else found.relative, sum(found.errors), found.points)
 
 
-def variances_of(lab: Laboratory, one: Slopes, other: Slopes) -> Statistic:
+def bias_ratio(
+    lab: Laboratory, system: str, family: str, one: Changes = NONE, other: Changes = NONE, absolute: bool = False
+) -> Statistic:
+    """Relative bias on one landscape as a share of that on another."""
+    first, second = pair(lab, system, family, one, other)
+    share = first.relative / second.relative
+    slack = (sum(first.errors) + abs(share) * sum(second.errors)) / abs(second.relative)
+    return exact(abs(share) if absolute else share, slack, second.points)
+
+
+def variance_ratio(lab: Laboratory, system: str, family: str, one: Changes = NONE, other: Changes = NONE) -> Statistic:
     """log10 of FoBG's variance on one landscape over that on another."""
-    return difference_of(*(log_variance(batch(FirstOrder(), each, lab.effort.draws)) for each in (one, other)))
+    points = pair(lab, system, family, one, other)
+    return difference_of(*(log_variance(batch(FirstOrder(), each, lab.effort.draws)) for each in points))
+
+
+def error_ratio(lab: Laboratory, system: str, family: str, one: Changes = NONE, other: Changes = NONE) -> Statistic:
+    """log10 of FoBG's mean squared error in batches of 200 on one landscape over that on another, both about the
+    gradient of the first."""
+    points = pair(lab, system, family, one, other)
+    (first,), (second,) = (batches([FirstOrder()], each, 200, 2 * lab.effort.batches) for each in points)
+    return errors_of(first, second, points[0].gradient)
+
+
+def moved_gradient(lab: Laboratory, system: str, family: str, one: Changes, other: Changes) -> Statistic:
+    """Relative distance between the gradients of two landscapes."""
+    first, second = pair(lab, system, family, one, other)
+    share = first.gradient / second.gradient
+    return exact(abs(share - 1), first.errors[0] * abs(share) + abs(share) * second.errors[0], first.points)
 
 
 def errors_of(one: GradientEstimate, other: GradientEstimate, gradient: float) -> Statistic:
     """log10 of the ratio of two mean squared errors over the same batches."""
     squared = [(np.asarray(each.mean)[:, 0] - gradient) ** 2 for each in (one, other)]
     return ratio_of(squared[0], squared[1], "batches")
-
-
-def bias(lab: Laboratory, system: str, family: str) -> Statistic:
-    """|E[FoBG] - grad F| / |grad F|."""
-    found = relative_bias(lab, system, family)
-    return dataclasses.replace(found, estimate=abs(found.estimate))
 
 
 def zeroth_bias(lab: Laboratory, system: str, family: str) -> Statistic:
@@ -82,21 +117,13 @@ def silent(lab: Laboratory, system: str, family: str) -> Statistic:
     return share_of(np.all(np.asarray(found.per_sample) == 0, axis=(1, 2)), "batches")
 
 
-def missed(lab: Laboratory, point: Slopes, truth: float, samples: int, quantile: float) -> Statistic:
-    """Share of batches whose own interval for the first-order mean, with a quantile of Student's t, misses a number."""
+def missed(lab: Laboratory, system: str, family: str, *, truth: str, samples: int, quantile: float) -> Statistic:
+    """Share of batches whose interval for the first-order mean, with a quantile of Student's t, misses a number of
+    the landscape."""
+    point = at(lab, system, family)
     (found,) = batches([FirstOrder()], point, samples, 5 * lab.effort.batches)
-    gap = np.abs(np.asarray(found.mean)[:, 0] - truth)
+    gap = np.abs(np.asarray(found.mean)[:, 0] - getattr(point, truth))
     return share_of(gap > quantile * np.asarray(found.standard_error)[:, 0], "batches")
-
-
-def blind(lab: Laboratory, system: str, family: str) -> Statistic:
-    point = at(lab, system, family)
-    return missed(lab, point, point.gradient, 100, 1.984)
-
-
-def overconfident(lab: Laboratory, system: str, family: str) -> Statistic:
-    point = at(lab, system, family)
-    return missed(lab, point, point.first, 50, 2.01)
 
 
 def rare(lab: Laboratory, system: str, family: str) -> Statistic:

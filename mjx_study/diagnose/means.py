@@ -34,7 +34,7 @@ HALF_LENGTH: Final = 2.0
 FEEDBACK: Final = 0.02
 """The same for noise on the controls, in the unit of theta."""
 ALONG_MEANS: Final = "means"
-"""Value of `direction` for paths along the estimators' own means, see `along_means`."""
+"""Value of `direction` for paths along the estimators' means, see `along_means`."""
 MAX_PATHS: Final = 3
 MIN_SHARE: Final = 1e-3
 """Smallest share of a mean orthogonal to the others that warrants a path along it."""

@@ -66,7 +66,7 @@ def plan_gradcheck(
 
     Args:
         task: the task, in float64, with the theta of its gradient.
-        families: contact families; by default the task's own if it has no contact, else `CONTACT`.
+        families: contact families; by default `CONTACT`, or `mjcf` for a task without contact.
         stiffnesses: stiffnesses for families that take one [N/m]; by default `STIFFNESS`, or the task's if those are in
             another range.
         seed: random seed of initial states, states and directions.
@@ -111,7 +111,7 @@ def plan_scene_gradcheck(
         pair: names of the two geoms whose contact has the stiffness; every contact gets the same solref.
         damping: override of each family's damping [N s/m].
         horizon: number of steps of the rollout from which states are taken.
-        states: number of states per contact model, at least 1.
+        states: number of states per contact model.
         stock: whether to check the derivative of `mjx.step` too.
 
     Raises:

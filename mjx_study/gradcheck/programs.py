@@ -66,7 +66,7 @@ def _compile(lowered: Any) -> Callable[..., Any]:
 
 
 class ContactCase(NamedTuple):
-    """A contact model, None for the MJCF's own, and the units of its parameters."""
+    """A contact model, None for the MJCF's, and the units of its parameters."""
 
     contact: ContactModel | None
     scales: Float[np.ndarray, " parameters"]
@@ -135,7 +135,7 @@ class Programs:
         return Exact(_host(after, base), stages, outputs[: len(changes)])
 
     def linear(self, case: ContactCase, base: HostState) -> Linear:
-        """Compute the value and derivatives of the project's own step at a state."""
+        """Compute the value and derivatives of the project's step at a state."""
         found = [self._derivatives(size, case, base) for size in self._sizes]
         own, tape = found[0], found[-1]
         if own is tape:

@@ -61,7 +61,7 @@ class Finding:
 
     Attributes:
         contact: label of the contact model, such as penalty, K = 100 N/m.
-        who: owner of the derivative: `project`, or `mjx.step` for MJX's own.
+        who: owner of the derivative: `project` or `mjx.step`.
         verdict: kink, jump, unconverged, zero, nan, engine, wrong, value, engine_mismatch or apart.
         modes: differentiation modes that show it: forward, reverse, tape.
         cause: likely cause, in one sentence.
@@ -77,7 +77,7 @@ class Finding:
 
     @property
     def fails(self) -> bool:
-        """Whether it fails the check, because the project's own derivative is not as it should be."""
+        """Whether it fails the check, because the project's derivative is at fault."""
         return self.who == "project" and self.verdict in FAILURES
 
     def line(self) -> str:
@@ -154,7 +154,7 @@ class StepCheck:
         stock: error of the derivative of `mjx.step`; None if not requested, infinite if NaN.
         residual: largest relative solver residual.
         coverage: parts of the model that the states exercise.
-        verdict: worst of the findings on the project's own derivative.
+        verdict: worst of the findings on the project's derivative.
     """
 
     contact: str

@@ -1,4 +1,4 @@
-"""Every verdict on an entry, and where each begins."""
+"""Every verdict on an entry, and its threshold."""
 
 import dataclasses
 from functools import cache

@@ -39,7 +39,7 @@ def start(xml: str = PLAIN) -> HostState:
 
 
 def stages_of(engine: EngineStep, state: HostState) -> dict[str, Any]:
-    """The engine's own quantities in the place of MJX's."""
+    """The engine's quantities in the place of MJX's."""
     data = host_data(engine.host, state)
     mujoco.mj_forward(engine.host, data)
     names = ("xpos", "ten_length", "actuator_length", "qfrc_bias", "qfrc_passive", "act_dot", "qfrc_actuator")
@@ -122,7 +122,7 @@ def test_parameters_change_in_the_contact_model(monkeypatch: pytest.MonkeyPatch)
 
 
 def value_check(xml: str, qpos: list[float], qvel: list[float], **doctored: Any) -> Values:
-    """The values of one step, with whatever is planted, and with other quantities in place of MJX's."""
+    """The values of one step, with planted faults and other quantities in place of MJX's."""
     own = layout(xml)
     programs, case = Programs(own), ContactCase(None, own.scales)
     state = HostState(np.array(qpos), np.array(qvel), np.zeros(0), np.zeros(0), np.zeros(len(qvel)))
@@ -135,7 +135,7 @@ def value_check(xml: str, qpos: list[float], qvel: list[float], **doctored: Any)
 
 @pytest.fixture
 def planted(monkeypatch: pytest.MonkeyPatch) -> Generator[pytest.MonkeyPatch]:
-    """What is planted is traced anew, and leaves no trace."""
+    """A planted fault is traced anew, and leaves no trace."""
     jax.clear_caches()
     yield monkeypatch
     jax.clear_caches()
@@ -196,7 +196,7 @@ def mixed_stages() -> dict[str, Any]:
 
 
 def mixed_difference(stages: dict[str, Any]) -> tuple[str, bool]:
-    """What differs where the constrained acceleration does."""
+    """The difference reported for another constrained acceleration."""
     nothing = np.zeros(0)
     state = HostState(BENT, MOVING, nothing, nothing, 0 * MOVING)
     return difference_of_engines(EngineStep(layout(MIXED), None).host, state, stages, MOVING, 0 * MOVING)
@@ -219,8 +219,8 @@ def test_rows_are_compared_whatever_their_order() -> None:
         ("efc_aref", "EQUALITY", "reference accelerations of joint equality rows"),
     ],
 )
-def test_rows_that_differ_are_no_documented_difference(name: str, kind: str, cause: str) -> None:
-    """Beside one that is."""
+def test_different_rows_are_not_a_documented_difference(name: str, kind: str, cause: str) -> None:
+    """Beside a documented one."""
     stages = dict(mixed_stages())
     chosen = stages["efc_type"] == int(getattr(mujoco.mjtConstraint, f"mjCNSTR_{kind}"))
     stages[name] = np.where(np.reshape(chosen, (-1, *[1] * (stages[name].ndim - 1))), 1.001, 1.0) * stages[name]
@@ -237,7 +237,7 @@ def test_contacts_with_other_tangents_are_placed_differently() -> None:
     assert documented and "their normals by 0.0e+00 and their tangents by 1.0e+00" in found, found
 
 
-def test_a_row_that_one_engine_lacks_is_no_documented_difference() -> None:
+def test_a_missing_row_is_not_a_documented_difference() -> None:
     stages = dict(mixed_stages())
     active = np.flatnonzero(np.abs(stages["efc_J"]).max(axis=1) > 0)
     stages["efc_J"] = stages["efc_J"] * (np.arange(len(stages["efc_J"])) != active[-1])[:, None]
@@ -273,8 +273,8 @@ RESTING = """<mujoco><worldbody><geom type="plane" size="1 1 .1"/><body pos="0 0
 
 
 @pytest.mark.parametrize("name", ["dist", "pos", "frame", "efc_J", "efc_aref", "efc_D", "xpos", "qM", "qacc_smooth"])
-def test_what_is_not_a_number_differs(name: str) -> None:
-    """And is compared nevertheless: no step ends in a traceback."""
+def test_nonfinite_quantities_differ(name: str) -> None:
+    """They are compared nevertheless, without a traceback."""
     host = mujoco.MjModel.from_xml_string(RESTING)
     state = HostState(host.qpos0.copy(), np.zeros(6), np.zeros(0), np.zeros(0), np.zeros(6))
     engine = EngineStep(make_coordinates(put_scene(host, "box"), None), None)
