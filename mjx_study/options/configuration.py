@@ -14,14 +14,18 @@ from mjx_study.options.option import Checked
 if TYPE_CHECKING:
     import estimators.estimator
 
+DEFAULT_KIND: Final = "gradients"
 OF_KIND: Final[dict[str, tuple[str, ...]]] = {
     "gradients": ("reference_samples", "block_size", "confidence"),
     "descents": ("iterations", "optimizer", "learning_rate", "decay", "stiffness_schedule", "sigma_schedule",
                  "evaluation_samples", "network"),
-    "landscapes": ("span", "direction"),
+    "landscapes": ("points", "span", "direction"),
 }  # fmt: skip
 """Options specific to one kind of study."""
-ASKED_BY: Final = {"descents": "give `iterations` as well", "landscapes": "give `points` as well"}
+ASKED_BY: Final = {"descents": "iterations", "landscapes": "points"}
+"""Options that ask for a kind of study where none is given."""
+NEEDED: Final = {"landscapes": "points"}
+"""Options without which there is no such study."""
 
 
 @runtime_checkable
@@ -32,6 +36,8 @@ class NamedTask(Protocol):
     def name(self) -> str: ...
 
 
+SEEDS: Final = {"landscapes": 1}
+"""Number of seeds where it is not given, for kinds of study in which it is not 10."""
 SAMPLES: Final = 100
 """Samples per batch unless the configuration or a recipe sets another number."""
 
@@ -193,15 +199,14 @@ class StudyConfig(Checked):
         if self.iterations is not None and self.points is not None:
             raise ValueError("`iterations` are for descents and `points` for landscapes: give one of them")
         kind = self.settings.kind
-        if kind == "landscapes" and self.points is None:
-            raise ValueError("landscapes need `points`: give their number")
-        if kind != "landscapes" and self.points is not None:
-            raise ValueError(f"`points` are for landscapes, and `kind` is {kind}: omit one of them")
+        if kind in NEEDED and not self.given(NEEDED[kind]):
+            raise ValueError(f"{kind} need `{NEEDED[kind]}`: give their number")
         for other, options in OF_KIND.items():
             given = [f"`{name}`" for name in options if self.given(name)]
             if other != kind and given:
                 listed = f"{' and '.join(given)} {'is' if len(given) == 1 else 'are'}"
-                advice = ASKED_BY.get(other) if self.kind is None else f"`kind` is {kind}"
+                asked = f"give `{ASKED_BY[other]}` as well" if other in ASKED_BY else None
+                advice = asked if self.kind is None else f"`kind` is {kind}"
                 raise ValueError(f"{listed} for {other}: {advice or 'omit it'}")
         check_span(self.span)
 
@@ -211,9 +216,9 @@ class StudyConfig(Checked):
     @property
     def settings(self) -> Settings:
         """The options whose defaults depend on the kind of study, with these in place of None."""
-        of_points = "gradients" if self.points is None else "landscapes"
         given = {field.name: getattr(self, field.name) for field in dataclasses.fields(Settings)}
-        given["kind"] = self.kind or (of_points if self.iterations is None else "descents")
+        asked = (kind for kind, option in ASKED_BY.items() if getattr(self, option) is not None)
+        given["kind"] = self.kind or next(asked, DEFAULT_KIND)
         return Settings(**{name: value for name, value in given.items() if value is not None})
 
     def given(self, name: str) -> bool:
@@ -224,7 +229,7 @@ class StudyConfig(Checked):
         """Return all fields, with the defaults of the study's kind in place of None."""
         fields = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
         settings = vars(self.settings)
-        return fields | {name: settings[name] for name in ("kind", *OF_KIND[settings["kind"]]) if name in settings}
+        return fields | {name: settings[name] for name in ("kind", *OF_KIND.get(settings["kind"], ())) if name in settings}
 
     @property
     def estimator_names(self) -> tuple[str, ...]:
@@ -244,7 +249,7 @@ class StudyConfig(Checked):
     @property
     def batches(self) -> int:
         """Number of seeds, given or by default."""
-        return self.seeds or (1 if self.settings.kind == "landscapes" else 10)
+        return self.seeds or SEEDS.get(self.settings.kind, 10)
 
 
 def refuse_repeats(label: str, values: Sequence[object]) -> None:
