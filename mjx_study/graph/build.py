@@ -26,11 +26,14 @@ from mjx_study.caches import read_cached, write_cached
 from mjx_study.disk import temporary_folder
 from mjx_study.runtime import available_cores, libraries_folder, processor
 from mjx_study.version import version_of
+from mjx_study.watchdog import elsewhere
 
 FLAGS: Final = (
     *("-O2", "-std=gnu11", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math", "-fwrapv"),
     *("-shared", "-fPIC", "-w"),
 )
+MOST_SECONDS: Final = 600
+"""Maximum time for a compiler to run [s]."""
 PREFIX: Final = "mjx_study_"
 """Beginning of the names of libraries, which are those of their XLA targets."""
 
@@ -48,7 +51,7 @@ def compiler() -> tuple[tuple[str, ...], str] | None:
         words = tuple(shlex.split(command))
         if shutil.which(words[0]) is None:
             continue
-        found = subprocess.run([*words, "--version"], capture_output=True, text=True)
+        found = _run(*words, "--version")
         if found.returncode == 0:
             return words, found.stdout
     print("mjx-study: no C compiler found: steps run through XLA, more slowly", file=sys.stderr)
@@ -112,12 +115,8 @@ def _build(name: str, source: str) -> Any:
         written.write_text(source)
         command, _ = compiler() or (("cc",), "")
         include = f"-I{jax.ffi.include_dir()}"
-        done = subprocess.run(
-            [*command, *_FLAGS_HERE, include, written.name, "-o", library.name, "-lm"],
-            cwd=folder,
-            capture_output=True,
-            text=True,
-        )
+        with elsewhere():
+            done = _run(*command, *_FLAGS_HERE, include, written.name, "-o", library.name, "-lm", folder=folder)
         if done.returncode:
             kept = _keep(written, source + "".join(f"\n// {line}" for line in done.stderr.splitlines()))
             print(f"mjx-study: {command[0]} failed, steps run through XLA: see the end of {kept}", file=sys.stderr)
@@ -126,6 +125,13 @@ def _build(name: str, source: str) -> Any:
     if (at := libraries_folder()) is not None:
         write_cached(at / name, content)
     return _loaded(name, content)
+
+
+def _run(*command: str, folder: str | None = None) -> subprocess.CompletedProcess[str]:
+    try:
+        return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=MOST_SECONDS)
+    except (OSError, subprocess.TimeoutExpired) as error:
+        return subprocess.CompletedProcess(command, 1, "", str(error))
 
 
 def _keep(path: Path, text: str) -> Path:
