@@ -1,7 +1,7 @@
 """Build C into libraries for this processor, once: by the system's compiler, into a cache checked before it is used.
 
 A library's name is a digest of everything that it depends on: source, compiler, flags, processor and version of XLA's
-interface. Without a compiler, or with MJX_STUDY_NATIVE=0, nothing is built.
+interface.
 """
 
 import ctypes
@@ -19,19 +19,21 @@ from concurrent.futures import Future
 from pathlib import Path
 from typing import Any, Final
 
+import jax
 import jax.ffi
 
 from mjx_study.caches import read_cached, write_cached
 from mjx_study.disk import temporary_folder
 from mjx_study.runtime import available_cores, libraries_folder, processor
 from mjx_study.version import version_of
+from mjx_study.watchdog import elsewhere
 
-SWITCH: Final = "MJX_STUDY_NATIVE"
-"""Environment variable; 0 does without native code."""
 FLAGS: Final = (
     *("-O2", "-std=gnu11", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math", "-fwrapv"),
     *("-shared", "-fPIC", "-w"),
 )
+MOST_SECONDS: Final = 600
+"""Maximum time for a compiler to run [s]."""
 PREFIX: Final = "mjx_study_"
 """Beginning of the names of libraries, which are those of their XLA targets."""
 
@@ -49,22 +51,16 @@ def compiler() -> tuple[tuple[str, ...], str] | None:
         words = tuple(shlex.split(command))
         if shutil.which(words[0]) is None:
             continue
-        found = subprocess.run([*words, "--version"], capture_output=True, text=True)
+        found = _run(*words, "--version")
         if found.returncode == 0:
             return words, found.stdout
     print("mjx-study: no C compiler found: steps run through XLA, more slowly", file=sys.stderr)
     return None
 
 
-def native_identity() -> str | None:
-    """Digest of what libraries depend on besides their source; None if there are to be none."""
-    if os.environ.get(SWITCH) == "0" or jax.default_backend() != "cpu" or compiler() is None:
-        return None
-    return _identity()
-
-
 @functools.cache
-def _identity() -> str:
+def build_identity() -> str:
+    """Digest of what libraries depend on besides their source."""
     return _digest(compiler(), _FLAGS_HERE, processor(), version_of("jaxlib"))
 
 
@@ -77,7 +73,7 @@ def _digest(*parts: Any) -> str:
 
 def build_library(source: str) -> str:
     """Begin to build a library in the background, unless it is known, and return its name."""
-    name = PREFIX + _digest(source, _identity())
+    name = PREFIX + _digest(source, build_identity())
     with _LOCK:
         if name not in _BUILT:
             _BUILT[name] = future = Future()
@@ -105,11 +101,12 @@ def libraries_in(content: bytes) -> set[str]:
 
 
 def _finish(name: str, source: str, future: Future[Any]) -> None:
+    found = None
     try:
         with _AT_ONCE:
-            future.set_result(_cached(name) or _build(name, source))
-    except BaseException as error:
-        future.set_exception(error)
+            found = _cached(name) or _build(name, source)
+    finally:
+        future.set_result(found)
 
 
 def _build(name: str, source: str) -> Any:
@@ -118,12 +115,8 @@ def _build(name: str, source: str) -> Any:
         written.write_text(source)
         command, _ = compiler() or (("cc",), "")
         include = f"-I{jax.ffi.include_dir()}"
-        done = subprocess.run(
-            [*command, *_FLAGS_HERE, include, written.name, "-o", library.name, "-lm"],
-            cwd=folder,
-            capture_output=True,
-            text=True,
-        )
+        with elsewhere():
+            done = _run(*command, *_FLAGS_HERE, include, written.name, "-o", library.name, "-lm", folder=folder)
         if done.returncode:
             kept = _keep(written, source + "".join(f"\n// {line}" for line in done.stderr.splitlines()))
             print(f"mjx-study: {command[0]} failed, steps run through XLA: see the end of {kept}", file=sys.stderr)
@@ -132,6 +125,13 @@ def _build(name: str, source: str) -> Any:
     if (at := libraries_folder()) is not None:
         write_cached(at / name, content)
     return _loaded(name, content)
+
+
+def _run(*command: str, folder: str | None = None) -> subprocess.CompletedProcess[str]:
+    try:
+        return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=MOST_SECONDS)
+    except (OSError, subprocess.TimeoutExpired) as error:
+        return subprocess.CompletedProcess(command, 1, "", str(error))
 
 
 def _keep(path: Path, text: str) -> Path:
@@ -148,10 +148,14 @@ def _cached(name: str) -> Any:
 
 
 def _loaded(name: str, content: bytes) -> Any:
-    """Load a library, register its handler with XLA, and return it."""
+    """Load a library, register its handler with XLA, and return it; None if that fails."""
     with temporary_folder() as folder:  # the file whose digest was checked, whatever becomes of the one in the cache
         path = Path(folder, f"{name}.so")
         path.write_bytes(content)
-        library = ctypes.CDLL(str(path))
-    jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(library.handler), platform="cpu")
+        try:
+            library = ctypes.CDLL(str(path))
+            jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(library.handler), platform="cpu")
+        except (OSError, AttributeError, jax.errors.JaxRuntimeError) as error:
+            print(f"mjx-study: native code cannot be loaded, steps run through XLA: {error}", file=sys.stderr)
+            return None
     return library

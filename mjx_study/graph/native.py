@@ -1,19 +1,51 @@
 """Functions of small arrays as native code, called by XLA for a whole batch at once."""
 
+import os
+from collections import Counter
 from collections.abc import Callable, Sequence
-from functools import cached_property, partial
-from typing import Any
+from functools import cache, cached_property, partial
+from typing import Any, Final
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
-from mjx_study.graph.build import build_library, library_ready
+from mjx_study.graph.build import build_identity, build_library, compiler, known_libraries, library_ready
 from mjx_study.graph.c import NotWrittenError, source_of
 from mjx_study.graph.evaluation import written_out
-from mjx_study.graph.function import ScalarFunction
+from mjx_study.graph.function import ScalarFunction, capture
+
+SWITCH: Final = "MJX_STUDY_NATIVE"
+"""Environment variable; 0 does without native code."""
+
+
+_LEFT: Final[Counter[str]] = Counter()
+"""Numbers of functions left to XLA, by reason."""
+
+
+def native_identity() -> str | None:
+    """Digest of what native code depends on besides its source: processor, compiler and flags.
+
+    None if there is to be none: on accelerators, with `SWITCH`, and without a compiler that works.
+    """
+    wanted = os.environ.get(SWITCH) != "0" and jax.default_backend() == "cpu"
+    return build_identity() if wanted and compiler() is not None and _works() else None
+
+
+def native_summary() -> str:
+    """Libraries that this process has loaded, and how many functions are left to XLA and why."""
+    loaded = sum(map(library_ready, known_libraries())) if native_identity() else 0
+    return f"{loaded} libraries" + "".join(f", {count} through XLA: {why}" for why, count in _LEFT.items())
+
+
+@cache
+def _works() -> bool:
+    """Whether the smallest of functions can be built."""
+    function = capture(lambda x: x + 1, jax.ShapeDtypeStruct((), np.float32), most=9)
+    return library_ready(build_library(source_of(function)))
 
 
 def as_native(values: ScalarFunction, function: ScalarFunction) -> "NativeFunction | None":
@@ -25,7 +57,8 @@ def as_native(values: ScalarFunction, function: ScalarFunction) -> "NativeFuncti
     """
     try:
         return NativeFunction(source_of(values), function)
-    except NotWrittenError:
+    except NotWrittenError as error:
+        _LEFT[str(error)] += 1
         return None
 
 
@@ -34,7 +67,7 @@ class NativeFunction:
 
     def __init__(self, source: str, function: ScalarFunction):
         self._function = function
-        self.inputs = [ShapedArray(each.shape, each.flat[0].dtype) for each in function.inputs]
+        self.inputs = function.types
         self.outputs = function.avals
         self.name = build_library(source)
 
@@ -95,6 +128,7 @@ def _evaluate(*inputs: Any, function: NativeFunction, batch: tuple[int, ...]) ->
 
 def _lower(context: Any, *operands: Any, function: NativeFunction, batch: tuple[int, ...]) -> Any:
     if not library_ready(function.name):
+        _LEFT["not built"] += 1
         return mlir.lower_fun(_plain(function, batch), multiple_results=True)(context, *operands)
     ins = [_layout(at.ndim, at.ndim - aval.ndim) for at, aval in zip(context.avals_in, function.inputs, strict=True)]
     outs = [_layout(each.ndim, len(batch)) for each in context.avals_out]
