@@ -6,6 +6,7 @@ import sys
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -85,7 +86,7 @@ def test_operations_of_floats(name):
     if name == "log":  # of a subnormal number XLA's is that of 0
         points = points[~((points != 0) & (np.abs(points) < 1e-300))]
     compare(FLOATS[name], points)
-    compare(FLOATS[name], points.astype(np.float32), rtol=1e-5)
+    compare(FLOATS[name], jnp.asarray(points).astype(jnp.float32), rtol=1e-5)
 
 
 @pytest.mark.parametrize("name", PAIRS)
@@ -252,3 +253,12 @@ def test_processes_build_at_once(tmp_path):
         out, error = each.communicate()
         assert out.decode().splitlines()[-1] == "[2. 2. 2.]", error
         assert b"native" in out
+
+
+def test_the_page_shows_what_is_written():
+    page = (Path(__file__).parents[1] / "docs" / "native.md").read_text()
+    python, shown = (page.partition(f"```{language}\n")[2].partition("```")[0] for language in ("python", "c"))
+    names: dict[str, Any] = {"jnp": jnp}
+    exec(python, names)
+    written = c.source_of(capture(names["push"], jax.ShapeDtypeStruct((2,), float), most=99))
+    assert f"{{\n{shown}}}\n" in written
