@@ -91,8 +91,9 @@ def _section(claim: dict[str, Any]) -> str:
     for each in claim["evidence"]:
         estimate = f"{_number(each['estimate'])} ({_interval(each)})"
         system, before = "" if each["system"] == before else each["system"], each["system"]
-        rows.append([system, f"`{each['family']}`", estimate, _verdict(each)])
-    table = markdown_table(rows, ("system", "contact", "estimate (interval)", "verdict"))
+        verdict = "" if each["verdict"] == "holds" else _verdict(each)
+        rows.append([system, f"`{each['family']}`", estimate, verdict])
+    table = markdown_table(rows, ("system", "contact", "estimate (interval)", "unless it holds"))
     return (
         f"## {claim['id']}\n\n{claim['statement']} *({claim['place']}.)*\n\n"
         f"Statistic: {claim['quantity']}; {claim['criterion']}. `{claim['show']}`\n\n{table}"
