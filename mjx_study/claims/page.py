@@ -93,7 +93,7 @@ def _section(claim: dict[str, Any]) -> str:
         system, before = "" if each["system"] == before else each["system"], each["system"]
         verdict = "" if each["verdict"] == "holds" else _verdict(each)
         rows.append([system, f"`{each['family']}`", estimate, verdict])
-    table = markdown_table(rows, ("system", "contact", "estimate (interval)", "unless it holds"))
+    table = markdown_table(rows, ("system", "contact", "estimate (interval)", "verdict"))
     return (
         f"## {claim['id']}\n\n{claim['statement']} *({claim['place']}.)*\n\n"
         f"Statistic: {claim['quantity']}; {claim['criterion']}. `{claim['show']}`\n\n{table}"
