@@ -229,7 +229,9 @@ class StudyConfig(Checked):
         """Return all fields, with the defaults of the study's kind in place of None."""
         fields = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
         settings = vars(self.settings)
-        return fields | {name: settings[name] for name in ("kind", *OF_KIND.get(settings["kind"], ())) if name in settings}
+        return fields | {
+            name: settings[name] for name in ("kind", *OF_KIND.get(settings["kind"], ())) if name in settings
+        }
 
     @property
     def estimator_names(self) -> tuple[str, ...]:
