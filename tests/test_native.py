@@ -280,7 +280,11 @@ def test_steps_and_their_derivatives(monkeypatch, name):
     controls = jnp.asarray(draw.normal(size=(9, 12, scene.host.nu)))
 
     def total(controls):
-        state, states = lax.scan(lambda state, u: (step(scene, scene.model, state, u)[0],) * 2, start, controls)
+        def advance(state, u):
+            after = step(scene, scene.model, state, u)[0]
+            return after, after
+
+        state, states = lax.scan(advance, start, controls)
         return jnp.sum(state.qpos) + jnp.sum(state.qvel), states
 
     found = []
