@@ -16,7 +16,7 @@ from estimators.catalogue import CATALOGUE
 from mjx_study import cli
 from mjx_study.cli import options
 from mjx_study.execution.run import load_study
-from mjx_study.options.configuration import StudyConfig
+from mjx_study.options.configuration import OPTIONS
 from mjx_study.plots.style import STYLE, combines, style_of
 from mjx_study.report import CAPTIONS
 from mjx_study.results.findings import rows_of
@@ -250,7 +250,7 @@ def test_a_registered_one_has_a_name(monkeypatch: pytest.MonkeyPatch) -> None:
         name, label = "twice", "FoBG, twice"
 
     assert ESTIMATORS["twice"] is Twice and make_estimator("twice") == Twice() != FirstOrder()
-    assert CATALOGUE["twice"].label == "FoBG, twice" and StudyConfig.option("estimators").check(("twice",))
+    assert CATALOGUE["twice"].label == "FoBG, twice" and OPTIONS["estimators"].check(("twice",))
     assert style_of("twice")[0] == "FoBG, twice"
     with pytest.raises(ValueError, match="there is already an estimator 'twice'"):
         register(Twice)
