@@ -217,7 +217,7 @@ class StudyConfig:
 
     def __post_init__(self) -> None:
         for name, option in OPTIONS.items():
-            if (value := getattr(self, name)) is not None or option.default is not None:
+            if (value := self._named(name)) is not None or option.default is not None:
                 option.check(value)
         for name in AXES:
             values = self._named(name)
@@ -259,8 +259,10 @@ class StudyConfig:
 
     def _named(self, name: str) -> Any:
         """Value of a field, with names in place of objects."""
-        named: Mapping[str, Any] = {"tasks": self.task_names, "estimators": self.estimator_names}
-        return named[name] if name in named else getattr(self, name)
+        value = getattr(self, name)
+        if name in ("tasks", "estimators") and not isinstance(value, str):
+            return self.task_names if name == "tasks" else self.estimator_names
+        return value
 
     @property
     def settings(self) -> Settings:
@@ -289,7 +291,7 @@ class StudyConfig:
     @property
     def task_names(self) -> list[str]:
         """Names of the tasks."""
-        return [which if isinstance(which, str) else which.name for which in self.tasks]
+        return [each.name if isinstance(each, NamedTask) else each for each in self.tasks]
 
     @property
     def surrogate(self) -> bool:

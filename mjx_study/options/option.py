@@ -55,7 +55,7 @@ class Option:
         interval: range of its numbers, such as "(0, inf)".
         unit: unit of its numbers.
         choices: accepted names, in addition to numbers if there is an interval.
-        allows_user_code: whether it also accepts a `module:name`, or an object.
+        allows_user_code: whether it also accepts a `module:name`.
         study: the kind of study that it is for; "" for all.
         many: whether it takes a list.
         read_rows: function that reads a list of lists of numbers from text, for an option that takes such lists.
@@ -147,8 +147,6 @@ class Option:
                 raise ValueError(
                     f"does not accept {short(value)}{suggestion(value, self.choices) or f'; choose from {listed}'}"
                 )
-        elif self.allows_user_code and not isinstance(value, str | Real | None):
-            return
         elif not isinstance(value, wanted) or (isinstance(value, bool) and self.kind is not bool):
             raise ValueError(f"must be {words}, got {short(value)}")
         elif self.interval and value not in Interval(self.interval):
