@@ -1,5 +1,5 @@
-# Everything is run from a virtual environment that `make` makes by itself in .venv. It needs Python
-# 3.11-3.13 with pip and venv, and a package index that pip can reach; nothing else.
+# Everything runs from a virtual environment that `make` creates in .venv. It needs Python 3.11-3.13
+# with pip and venv, and a package index that pip can reach.
 
 PYTHON ?= python3
 PYTEST_ARGS ?= -n 2 --dist loadfile --no-loadscope-reorder
@@ -21,7 +21,7 @@ help: ## List the targets
 demo: $(STAMP) ## Compare the gradient estimators on the pusher, into results/pusher
 	$(BIN)/mjx-study compare pusher --output results/pusher
 
-figures: $(STAMP) ## Make the figures and films of docs/ again
+figures: $(STAMP) ## Regenerate the smaller figures and the films of docs/
 	$(BIN)/mjx-study compare pusher --output results/pusher && cp results/pusher/comparison.png docs/pusher.png
 	$(BIN)/mjx-study landscape momentum_transfer --contact penalty,mujoco_default,smooth_onset --output results/onset
 	cp results/onset/landscape.png docs/onset.png
@@ -33,16 +33,27 @@ figures: $(STAMP) ## Make the figures and films of docs/ again
 	for task in ball_wall momentum_transfer tennis double_pendulum; do \
 		cp results/$$task-rollout/rollout.gif docs/film_$$task.gif || exit; done
 
-study: $(STAMP) ## Sweep stiffness and draw the README's figures of it again (half an hour; resumable)
-	$(BIN)/python -m experiments.stiffness
+FAMILIES := penalty,mujoco,mujoco_stiff
+ROBOTS := --contact penalty,mujoco,smooth_onset --samples 1000 --reference-samples 20000
+SWEEP := $(BIN)/mjx-study sweep
+study: $(STAMP) ## Sweep stiffness for the README's figures (half an hour; resumable)
+	$(SWEEP) pusher --contact $(FAMILIES) --stiffness 10:1e4:13:log --output results/variance
+	$(SWEEP) momentum_transfer --contact penalty,mujoco,smooth_onset --stiffness 1e3:1e5:5:log --reference-samples 3000 --output results/bias
+	$(SWEEP) gripper --stiffness 300,1000,3000 $(ROBOTS) --output results/bias_gripper
+	$(SWEEP) landing --stiffness 1e3,3e3,1e4 $(ROBOTS) --output results/bias_landing
+	$(SWEEP) pusher --contact $(FAMILIES) --stiffness 10:1e4:7:log --iterations 500 --samples 10 --seeds 5 --output results/achieved
+	$(SWEEP) pusher --contact $(FAMILIES) --stiffness 10:1e4:9:log --sigma 0.01:1:5:log --seeds 3 --output results/map
+	for figure in variance bias bias_gripper/bias bias_landing/bias achieved map/map_stiffness_sigma; do \
+		folder=$${figure%/*}; $(BIN)/mjx-study plot results/$$folder --format png || exit; \
+		cp results/$$folder/$${figure#*/}.png docs/$$folder.png || exit; done
 
-coverage: $(STAMP) ## Measure again what docs/coverage.md says of intervals and tests (a few minutes)
+coverage: $(STAMP) ## Measure the tables of docs/coverage.md (a few minutes)
 	$(BIN)/python -m experiments.coverage
 
-test: $(STAMP) ## Run the tests, less the slow ones (PYTEST_ARGS='-k name' in place of two workers)
+test: $(STAMP) ## Run the tests except slow ones (PYTEST_ARGS='-k name' replaces the two workers)
 	$(BIN)/python -m pytest $(PYTEST_ARGS)
 
-test-all: $(STAMP) ## Run all the tests, the slow ones too, and those of test-newer-jax
+test-all: $(STAMP) ## Run all tests, and those of test-newer-jax
 	$(BIN)/python -m pytest -m '' $(PYTEST_ARGS)
 	$(MAKE) --no-print-directory test-newer-jax
 
@@ -60,10 +71,10 @@ test-newer-jax: ## Run the tests of devices on the newest JAX, if there is a Pyt
 		$(NEWEST)/bin/python -c 'import jax; print("JAX", jax.__version__)' && \
 		$(NEWEST)/bin/python -m pytest -p no:cacheprovider $(PYTEST_ARGS) $(addprefix tests/test_,$(NEWEST_TESTS)); fi
 
-defects: $(STAMP) ## Plant defects one at a time; say what catches each, here and in docs/testing.md (a quarter of an hour)
+defects: $(STAMP) ## Plant defects one at a time, and report in docs/testing.md what catches each (a quarter of an hour)
 	$(BIN)/python -m tests.planted --everything --page docs/testing.md
 
-fuzz: $(STAMP) ## Answer thousands of hostile inputs; say here and in docs/testing.md what came of them (ten minutes)
+fuzz: $(STAMP) ## Answer thousands of hostile inputs, and report in docs/testing.md (ten minutes)
 	$(BIN)/python -m tests.fuzz --page docs/testing.md
 
 lint: $(STAMP) ## Check style, formatting and types
@@ -74,7 +85,7 @@ lint: $(STAMP) ## Check style, formatting and types
 docs: $(STAMP) ## Build the site into build/site; a dead link or a faulty docstring is an error (half a minute)
 	$(BIN)/python -m tools.site
 
-dist: $(STAMP) ## Build sdist and wheel into dist, and check what is in them
+dist: $(STAMP) ## Build sdist and wheel into dist, and check their contents
 	rm -rf dist
 	$(BIN)/check-manifest --no-build-isolation
 	$(BIN)/python -m build --no-isolation
@@ -84,17 +95,17 @@ dist: $(STAMP) ## Build sdist and wheel into dist, and check what is in them
 	cd build/wheel && PYTHONPATH= $(CURDIR)/$(BIN)/python -m mjx_study tasks
 	cd build/wheel && PYTHONPATH= $(CURDIR)/$(BIN)/python -c 'import mjx_study as m; [m.make_task(name) for name in m.TASKS]'
 
-format: $(STAMP) ## Put imports and formatting right
+format: $(STAMP) ## Fix imports and formatting
 	$(BIN)/ruff check --fix-only .
 	$(BIN)/ruff format .
 
-lock: $(UV) ## Bring requirements.lock up to pyproject.toml (LOCK_ARGS=--upgrade also renews the pins)
+lock: $(UV) ## Update requirements.lock from pyproject.toml (LOCK_ARGS=--upgrade renews the pins)
 	$(UV) pip compile --universal --python-version 3.11 --fork-strategy fewest --extra dev \
 		--generate-hashes --no-emit-index-url --no-emit-find-links \
 		--custom-compile-command 'make lock' --quiet $(LOCK_ARGS) pyproject.toml -o requirements.lock
 
-clean: ## Remove the environment, the caches and what was built; results/ stays
-	rm -rf $(VENV) .venv-lock .venv-newest build dist *.egg-info .pytest_cache .ruff_cache .hypothesis
+clean: ## Remove environments, caches and builds, but not results/
+	rm -rf $(VENV) .venv-lock .venv-newest build dist .cache *.egg-info .pytest_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # Every file that pip installs here is pinned by its hash: the build backend comes from the lock as well.

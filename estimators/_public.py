@@ -1,6 +1,18 @@
 """Public names of `estimators`, imported when one of them is first accessed."""
 
-from estimators.alpha import alpha_order, constrained_alpha, interpolate, inverse_variance_alpha, weigh_batches
+from estimators.batches import (
+    AlphaChoice,
+    Differentiation,
+    Evaluation,
+    GradientEstimate,
+    Linearisation,
+    Objective,
+    PairedObjective,
+    StepDifferentiation,
+    StepEvaluation,
+    StepwiseObjective,
+    pull_back,
+)
 from estimators.builtin import (
     AlphaOrder,
     Antithetic,
@@ -16,7 +28,7 @@ from estimators.builtin import (
     TruncatedFirstOrder,
     ZerothOrder,
 )
-from estimators.catalogue import ORACLES, VARIANCE_PROXIES, WEIGHTS, Oracle
+from estimators.choices import ORACLES, VARIANCE_PROXIES, WEIGHTS, Oracle
 from estimators.comparison import (
     BiasTest,
     Comparison,
@@ -35,20 +47,22 @@ from estimators.confidence import (
     variance_interval,
     variance_upper_bound,
 )
-from estimators.estimator import (
-    ESTIMATORS,
-    Batches,
-    Estimator,
-    draw,
-    estimate,
-    find_estimator,
-    make_estimator,
-    oracles_of,
-    register,
-)
+from estimators.estimator import ESTIMATORS, Batches, Estimator, register
+from estimators.interpolation import alpha_order, constrained_alpha, interpolate, inverse_variance_alpha, weigh_batches
 from estimators.mean_check import Circulation, circulation
 from estimators.noise import NOISES, NoiseDensity
-from estimators.orders import (
+from estimators.recursion import total_propagation, truncated_first_order
+from estimators.registry import find_estimator, make_estimator, oracles_of
+from estimators.samples import Rows
+from estimators.sampling import draw, estimate
+from estimators.statistics import norm_quantiles, summarise
+from estimators.stepwise import (
+    antithetic_cost_to_go,
+    cost_to_go,
+    discontinuity_gated,
+    stepwise_inverse_variance,
+)
+from estimators.zeroth_first import (
     BASELINES,
     antithetic,
     clipped_first_order,
@@ -58,29 +72,6 @@ from estimators.orders import (
     none,
     zero_noise,
     zeroth_order,
-)
-from estimators.rows import Rows
-from estimators.statistics import norm_quantiles, summarise
-from estimators.stepwise import (
-    antithetic_cost_to_go,
-    cost_to_go,
-    discontinuity_gated,
-    stepwise_inverse_variance,
-    total_propagation,
-    truncated_first_order,
-)
-from estimators.types import (
-    AlphaChoice,
-    Differentiation,
-    Evaluation,
-    GradientEstimate,
-    Linearisation,
-    Objective,
-    PairedObjective,
-    StepDifferentiation,
-    StepEvaluation,
-    StepwiseObjective,
-    pull_back,
 )
 
 __all__ = [

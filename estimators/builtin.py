@@ -1,212 +1,229 @@
-"""The built-in estimators, each a formula with its options."""
+"""The built-in estimators. Their formulas are in other modules, imported when an estimate is computed."""
 
+import pkgutil
 from abc import abstractmethod
-from collections.abc import Callable
 from dataclasses import dataclass, fields
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
-import jax.numpy as jnp
-
-from estimators.alpha import apply_choice, check_weights, choose_alpha, inverse_variance_alpha, weigh_batches
-from estimators.catalogue import CATALOGUE, MAX_DEVIATION, PLUG_IN, PUBLISHED_TOLERANCE
-from estimators.confidence import bernstein_epsilon, check_confidence_arguments
-from estimators.estimator import Estimator, register
-from estimators.orders import (
-    antithetic,
-    clipped_first_order,
-    delta_control_variate,
-    find_baseline,
-    first_order,
-    zeroth_order,
+from estimators.choices import (
+    BASELINES,
+    MAX_DEVIATION,
+    PLUG_IN,
+    PUBLISHED_TOLERANCE,
+    VARIANCE_PROXIES,
+    WEIGHTS,
 )
-from estimators.stepwise import (
-    antithetic_cost_to_go,
-    check_tolerance,
-    check_window,
-    cost_to_go,
-    discontinuity_gated,
-    stepwise_inverse_variance,
-    total_propagation,
-    truncated_first_order,
-)
-from estimators.types import AlphaChoice, Differentiation, Evaluation, GradientEstimate, StepEvaluation
+from estimators.estimator import Estimator, option, register
 
-
-def _check_positive(name: str, value: float) -> None:
-    if not 0.0 < value < float("inf"):
-        raise ValueError(f"{name} must be positive and finite; got {value}")
+if TYPE_CHECKING:
+    import estimators.batches
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Formula(Estimator):
-    """Base of estimators that apply `formula` to their batches, with their options as keywords."""
+class Formula(Estimator):
+    """Base of estimators that apply a function to their batches, with their options as keywords."""
 
-    formula: ClassVar[Callable[..., GradientEstimate]]
+    computes: ClassVar[str]
+    """The function, as module:name."""
 
-    def combine(self, *args: Any, **kwargs: Any) -> GradientEstimate:
+    def combine(self, *batches: Any) -> "estimators.batches.GradientEstimate":
         options = {field.name: getattr(self, field.name) for field in fields(self)}
-        return type(self).formula(*args, **kwargs, **options)
+        return pkgutil.resolve_name(self.computes)(*batches, **options)
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Baselined(_Formula):
-    """Base of estimators with a zeroth-order batch; `baseline` is a name in `BASELINES`."""
+class Baselined(Formula):
+    """Base of estimators with a zeroth-order batch."""
 
-    baseline: str = "zero_noise"
-
-    def __post_init__(self) -> None:
-        find_baseline(self.baseline)
+    baseline: str = option("baseline of zeroth-order estimates", choices=BASELINES, default="zero_noise")
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Interpolation(_Baselined):
-    """Base of estimators that weight two batches; `weights` is a name in `WEIGHTS`."""
+class Interpolation(Baselined):
+    """Base of estimators that weight two batches."""
 
-    weights: str = PLUG_IN
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_weights(self.weights)
+    weights: str = option(
+        "weights of interpolations: plug_in, or cross_fitted (unbiased)", choices=WEIGHTS, default=PLUG_IN
+    )
 
 
-@register
-class ZerothOrder(_Baselined, entry=CATALOGUE["zobg"]):
-    """See `estimators.zeroth_order`."""
+class Paired(Baselined):
+    """Base of estimators with a batch of pairs of opposite noise."""
 
-    separable = True
-    formula = staticmethod(zeroth_order)
+    def combine(self, *batches: Any) -> "estimators.batches.GradientEstimate":
+        (pair,) = batches
+        return super().combine(*pair)
 
 
 @register
-class Antithetic(_Baselined, entry=CATALOGUE["zobg_antithetic"]):
-    """See `estimators.antithetic`."""
+class ZerothOrder(Baselined):
+    """Zeroth order: values times scores."""
 
-    separable = True
-
-    @staticmethod
-    def formula(pair: tuple[Evaluation, Evaluation], baseline: str) -> GradientEstimate:
-        return antithetic(*pair, baseline)
-
-
-@register
-class CostToGo(_Baselined, entry=CATALOGUE["zobg_to_go"]):
-    """See `estimators.cost_to_go`."""
-
-    separable = True
-    formula = staticmethod(cost_to_go)
-
-
-@register
-class AntitheticCostToGo(_Baselined, entry=CATALOGUE["zobg_to_go_antithetic"]):
-    """See `estimators.antithetic_cost_to_go`."""
-
+    name, label, needs = "zobg", "ZoBG", ("evaluation",)
+    formula, unbiased = r"$`(V_1 - b)\, s`$", "always"
+    style = "#0072B2", "o"
     separable = True
 
-    @staticmethod
-    def formula(pair: tuple[StepEvaluation, StepEvaluation], baseline: str) -> GradientEstimate:
-        return antithetic_cost_to_go(*pair, baseline)
+    computes = "estimators.zeroth_first:zeroth_order"
 
 
 @register
-class FirstOrder(_Formula, entry=CATALOGUE["fobg"]):
-    """See `estimators.first_order`."""
+class Antithetic(Paired):
+    """Zeroth order over pairs of opposite noise."""
 
+    name, label, needs = "zobg_antithetic", "ZoBG (antithetic)", ("pair",)
+    formula, unbiased = "the mean of `zobg` over the pair $`w, -w`$", "for symmetric noise"
+    style = "#56B4E9", "v"
     separable = True
-    formula = staticmethod(first_order)
+
+    computes = "estimators.zeroth_first:antithetic"
 
 
 @register
-class OnsetFirstOrder(FirstOrder, entry=CATALOGUE["fobg_onset"]):
-    """See `estimators.first_order`; the batch is corrected where contact begins and ends."""
+class CostToGo(Baselined):
+    """Zeroth order: costs to go times the scores of single steps."""
+
+    name, label, needs = "zobg_to_go", "ZoBG (costs to go)", ("steps",)
+    formula, unbiased = r"$`\sum_h D\pi^\top \nabla\psi(w_h)\, (V_h - b_h)`$", "always"
+    style = "#56B4E9", "P"
+    separable = True
+
+    computes = "estimators.stepwise:cost_to_go"
+
+
+@register
+class AntitheticCostToGo(Paired):
+    """Costs to go over pairs of opposite noise."""
+
+    name, label, needs = "zobg_to_go_antithetic", "ZoBG (to go, antithetic)", ("step_pair",)
+    formula, unbiased = "both", "for symmetric noise"
+    style = "#0072B2", "X"
+    separable = True
+
+    computes = "estimators.stepwise:antithetic_cost_to_go"
+
+
+@register
+class FirstOrder(Formula):
+    """First order: gradients of the samples."""
+
+    name, label, needs = "fobg", "FoBG", ("differentiation",)
+    formula, unbiased = r"$`\nabla_\theta V_1`$", "where f is continuous"
+    style = "#D55E00", "s"
+    separable = True
+
+    computes = "estimators.zeroth_first:first_order"
+
+
+@register
+class OnsetFirstOrder(FirstOrder):
+    """First order, corrected where contact begins and ends."""
+
+    name, label, needs = "fobg_onset", "FoBG (onset)", ("corrected",)
+    formula = "the same with the [onset term](onset-correction.md): the linear one, or what `--onset` says"
+    unbiased = "where f is continuous; nearly, also where a contact force sets in or ends with a jump"
+    style = "#7A2E00", "s"
 
 
 @register
 @dataclass(frozen=True, kw_only=True)
-class ClippedFirstOrder(_Formula, entry=CATALOGUE["fobg_clipped"]):
-    """See `estimators.clipped_first_order`.
+class ClippedFirstOrder(Formula):
+    """First order, the norm of every sample bounded."""
 
-    `max_norm` is the largest norm of a sample, > 0, [cost/param].
-    """
-
+    name, label, needs = "fobg_clipped", "FoBG (clipped)", ("differentiation",)
+    formula, unbiased = "the same, clipped to a norm of `--max-norm`", "no"
+    style = "#E69F00", "<"
     separable = True
-    formula = staticmethod(clipped_first_order)
 
-    max_norm: float
+    max_norm: float = option("fobg_clipped: norm at which samples are clipped", "(0, inf)", metavar="G", example=1000.0)
 
-    def __post_init__(self) -> None:
-        _check_positive("max_norm", self.max_norm)
+    computes = "estimators.zeroth_first:clipped_first_order"
 
 
 @register
 @dataclass(frozen=True, kw_only=True)
-class TruncatedFirstOrder(_Formula, entry=CATALOGUE["fobg_truncated"]):
-    """See `estimators.truncated_first_order`.
+class TruncatedFirstOrder(Formula):
+    """First order, the adjoint cut every few steps."""
 
-    `window` is the number of steps between cuts of the adjoint, >= 1.
-    """
-
+    name, label, needs = "fobg_truncated", "FoBG (truncated)", ("linearisation",)
+    formula, unbiased = "the same, the adjoint cut every `--window` steps", "no"
+    style = "#E69F00", ">"
     separable = True
-    formula = staticmethod(truncated_first_order)
 
-    window: int
+    window: int = option("fobg_truncated: steps between cuts", "[1, 1000000]", metavar="H", example=20)
 
-    def __post_init__(self) -> None:
-        check_window(self.window)
+    computes = "estimators.recursion:truncated_first_order"
 
 
-class _OneWeight(_Interpolation):
+class OneWeight(Interpolation):
     """Base of estimators with a single weight for two batches."""
 
     separable = True
 
     @abstractmethod
-    def choose(self, zeroth: GradientEstimate, first: GradientEstimate) -> AlphaChoice:
-        """Choose the weight."""
+    def choose(self, zeroth: Any, first: Any) -> "estimators.batches.AlphaChoice":
+        """Choose the weight of two estimates."""
 
-    def combine(self, evaluation: Evaluation, differentiation: Differentiation) -> GradientEstimate:
-        def choose(*batches: Any) -> AlphaChoice:
+    def combine(self, *batches: Any) -> "estimators.batches.GradientEstimate":
+        from estimators.interpolation import apply_choice, weigh_batches
+
+        def choose(*batches: Any) -> "estimators.batches.AlphaChoice":
             return self.choose(*self.parts(*batches))
 
-        def mix(choice: AlphaChoice, *batches: Any) -> GradientEstimate:
+        def mix(choice: Any, *batches: Any) -> "estimators.batches.GradientEstimate":
             return apply_choice(choice, *self.parts(*batches))
 
-        return weigh_batches(choose, mix, (evaluation, differentiation), self.weights)
+        return weigh_batches(choose, mix, batches, self.weights)
 
-    def parts(
-        self, evaluation: Evaluation, differentiation: Differentiation
-    ) -> tuple[GradientEstimate, GradientEstimate]:
+    def parts(self, *batches: Any) -> "tuple[estimators.batches.GradientEstimate, ...]":
+        from estimators.zeroth_first import first_order, zeroth_order
+
+        evaluation, differentiation = batches
         return zeroth_order(evaluation, self.baseline), first_order(differentiation)
 
-    def join(self, zeroth: GradientEstimate, first: GradientEstimate) -> GradientEstimate:
+    def join(self, zeroth: Any, first: Any) -> "estimators.batches.GradientEstimate":
+        from estimators.interpolation import apply_choice
+
         return apply_choice(self.choose(zeroth, first), zeroth, first)
 
 
 @register
 @dataclass(frozen=True, kw_only=True)
-class AlphaOrder(_OneWeight, entry=CATALOGUE["aobg"]):
-    """See `estimators.constrained_alpha`.
+class AlphaOrder(OneWeight):
+    """Alpha order: the two interpolated with an error of at most gamma.
 
     Attributes:
-        baseline: A name in `BASELINES`, for the zeroth-order batch.
-        weights: A name in `WEIGHTS`, the source of alpha.
         gamma: Largest acceptable error, > 0 or infinity, [cost/param].
         failure_probability: Failure probability of the confidence radius, in (0, 1); see `bernstein_epsilon`.
         variance_proxy: "variance", "second_moment" or "upper_bound".
         radius: "max_deviation" or a bound >= 0 on ||g_i - E g||, [cost/param].
     """
 
-    gamma: float = float("inf")
-    failure_probability: float = 0.05
-    variance_proxy: str = "variance"
-    radius: str | float = MAX_DEVIATION
+    name, label, needs = "aobg", "AoBG", ("evaluation", "differentiation")
+    formula = (
+        r"$`\alpha\, g_1 + (1 - \alpha)\, g_0`$ of `fobg` and `zobg`; alpha of least variance such that "
+        r"$`\varepsilon + \alpha B \le \gamma`$ (`--gamma`)"
+    )
+    unbiased = "bias at most gamma, if epsilon is valid"
+    style = "#009E73", "D"
+
+    gamma: float = option("AoBG's accuracy bound; inf for none", "(0, inf]", metavar="G", default=float("inf"))
+    failure_probability: float = option("failure probability of epsilon", "(0, 1)", metavar="P", default=0.05)
+    variance_proxy: str = option("variance in epsilon: {}", choices=VARIANCE_PROXIES, metavar="S2", default="variance")
+    radius: str | float = option(
+        "R in epsilon, or max_deviation", "[0, inf)", choices=(MAX_DEVIATION,), metavar="R", default=MAX_DEVIATION
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not self.gamma > 0.0:
-            raise ValueError(f"gamma must be positive; got {self.gamma}; float('inf') sets no limit")
+        from estimators.confidence import check_confidence_arguments
+
         check_confidence_arguments(self.failure_probability, self.variance_proxy, self.radius)
 
-    def choose(self, zeroth: GradientEstimate, first: GradientEstimate) -> AlphaChoice:
+    def choose(self, zeroth: Any, first: Any) -> "estimators.batches.AlphaChoice":
+        from estimators.confidence import bernstein_epsilon
+        from estimators.interpolation import choose_alpha
+
         epsilon = bernstein_epsilon(
             zeroth, failure_probability=self.failure_probability, variance_proxy=self.variance_proxy, radius=self.radius
         )
@@ -214,69 +231,88 @@ class AlphaOrder(_OneWeight, entry=CATALOGUE["aobg"]):
 
 
 @register
-class OnsetAlphaOrder(AlphaOrder, entry=CATALOGUE["aobg_onset"]):
-    """See `estimators.alpha_order`; the first-order batch is corrected where contact begins and ends."""
+class OnsetAlphaOrder(AlphaOrder):
+    """Alpha order, its first-order batch corrected where contact begins and ends."""
+
+    name, label, needs = "aobg_onset", "AoBG (onset)", ("evaluation", "corrected")
+    formula, unbiased = "the same with `fobg_onset` in place of `fobg`", "likewise"
+    style = "#8FBF5A", "D"
 
 
 @register
-class InverseVariance(_OneWeight, entry=CATALOGUE["ivw"]):
-    """See `estimators.inverse_variance_alpha`."""
+class InverseVariance(OneWeight):
+    """Inverse-variance weighting: alpha order with gamma infinite."""
 
-    def choose(self, zeroth: GradientEstimate, first: GradientEstimate) -> AlphaChoice:
-        alpha = inverse_variance_alpha(zeroth.variance, first.variance)
-        discrepancy = jnp.linalg.norm(first.mean - zeroth.mean)
-        return AlphaChoice(alpha, None, discrepancy, zeroth.variance, first.variance)
+    name, label, needs = "ivw", "IVW", ("evaluation", "differentiation")
+    formula, unbiased = "alpha order with gamma infinite", "where f is continuous, for a given alpha"
+    style = "#CC79A7", "^"
 
+    def choose(self, zeroth: Any, first: Any) -> "estimators.batches.AlphaChoice":
+        from estimators.interpolation import inverse_variance_choice
 
-@register
-class StepwiseInverseVariance(_Interpolation, entry=CATALOGUE["ivw_h"]):
-    """See `estimators.stepwise_inverse_variance`."""
-
-    formula = staticmethod(stepwise_inverse_variance)
+        return inverse_variance_choice(zeroth, first)
 
 
 @register
-class TotalPropagation(_Interpolation, entry=CATALOGUE["total_propagation"]):
-    """See `estimators.total_propagation`."""
+class StepwiseInverseVariance(Interpolation):
+    """Inverse-variance weights for every step and control."""
 
-    formula = staticmethod(total_propagation)
+    name, label, needs = "ivw_h", "IVW-H", ("steps", "step_differentiation")
+    formula = r"an inverse-variance weight for every step and control, then pulled back through $`D\pi`$"
+    unbiased = "likewise"
+    style = "#CC79A7", "p"
+
+    computes = "estimators.stepwise:stepwise_inverse_variance"
+
+
+@register
+class TotalPropagation(Interpolation):
+    """Inverse-variance weights inside the backward recursion."""
+
+    name, label, needs = "total_propagation", "total propagation", ("linearisation",)
+    formula = "an inverse-variance weight at every step of the backward recursion; the mixture propagates further back"
+    unbiased = "likewise"
+    style = "#332288", "*"
+
+    computes = "estimators.recursion:total_propagation"
 
 
 @register
 @dataclass(frozen=True, kw_only=True)
-class DiscontinuityGated(_Interpolation, entry=CATALOGUE["ddcg"]):
-    """See `estimators.discontinuity_gated`.
+class DiscontinuityGated(Interpolation):
+    """Inverse-variance weighting where a test finds no discontinuity, else zeroth order."""
 
-    `sigma` is the noise's standard deviation, > 0, [control]; `tolerance` is c of the test, in [0, 1).
-    """
-
+    name, label, needs = "ddcg", "DDCG", ("evaluation", "step_differentiation")
+    formula = (
+        r"`ivw` if $`\operatorname{tr} \operatorname{Cov}[\nabla_w f] \ge 2 (1 - c) \operatorname{Var}[f] / \sigma^2 "
+        r"- 2 \lVert \mathbb{E} \nabla_w f \rVert^2`$, else `zobg`"
+    )
+    unbiased = "where the test is right"
+    style = "#009E73", "h"
     gaussian = True
-    formula = staticmethod(discontinuity_gated)
 
-    sigma: float
-    tolerance: float = PUBLISHED_TOLERANCE
+    sigma: float = option("standard deviation of the noise", "(0, inf)", metavar="S", unit="control", example=0.1)
+    tolerance: float = option(
+        "ddcg: tolerance of its discontinuity test", "[0, 1)", metavar="C", default=PUBLISHED_TOLERANCE
+    )
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _check_positive("sigma", self.sigma)
-        check_tolerance(self.tolerance)
+    computes = "estimators.stepwise:discontinuity_gated"
 
 
 @register
 @dataclass(frozen=True, kw_only=True)
-class DeltaMethod(_Formula, entry=CATALOGUE["delta"]):
-    """See `estimators.delta_control_variate`.
+class DeltaMethod(Estimator):
+    """First-order mean plus a zeroth-order estimate of the remainder; noise on theta itself."""
 
-    `sigma` is the noise's standard deviation, > 0, [param].
-    """
-
+    name, label, needs = "delta", "delta", ("evaluation", "differentiation")
+    formula = "$`g + (f - f(0) - w^\\top g)\\, s`$, g the mean of `fobg`"
+    unbiased = "always; noise on theta itself"
+    style = "#999933", "d"
     gaussian = additive = True
 
-    sigma: float
+    sigma: float = option("standard deviation of the noise", "(0, inf)", metavar="S", unit="param", example=0.1)
 
-    def __post_init__(self) -> None:
-        _check_positive("sigma", self.sigma)
+    def combine(self, evaluation: Any, differentiation: Any) -> "estimators.batches.GradientEstimate":
+        from estimators.zeroth_first import delta_control_variate, first_order
 
-    @staticmethod
-    def formula(evaluation: Evaluation, differentiation: Differentiation, sigma: float) -> GradientEstimate:
-        return delta_control_variate(evaluation, first_order(differentiation).mean, sigma)
+        return delta_control_variate(evaluation, first_order(differentiation).mean, self.sigma)

@@ -6,11 +6,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
+from estimators.batches import GradientEstimate
 from estimators.confidence import effective_samples
 from estimators.pytree import register_pytree
-from estimators.rows import finite_rows
+from estimators.samples import finite_rows
 from estimators.statistics import summarise
-from estimators.types import GradientEstimate
 
 Scalar = Float[Array, ""]
 

@@ -10,9 +10,9 @@ import numpy as np
 from jax.scipy.special import ndtri
 from jaxtyping import Array, Bool, Float
 
-from estimators.catalogue import MAX_DEVIATION, VARIANCE_PROXIES, unknown
+from estimators.batches import GradientEstimate
+from estimators.choices import MAX_DEVIATION, VARIANCE_PROXIES, unknown
 from estimators.pytree import register_pytree
-from estimators.types import GradientEstimate
 
 ENOUGH_EFFECTIVE: Final = 3.0
 """Effective samples below which errors and biases should not be trusted; docs/coverage.md explains the choice."""

@@ -1,32 +1,58 @@
-"""The estimator protocol, the batches that estimators use, and estimators by name: built-in and user-defined ones."""
+"""The base class of estimators, and their options.
+
+Nothing here computes. An estimator describes itself, so listing estimators must import neither JAX nor NumPy: the
+modules of the built-in classes import both only when an estimate is computed.
+"""
 
 import dataclasses
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, ClassVar, TypeVar
+from collections.abc import Collection, Mapping
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
-import jax
-from jaxtyping import Array, Float, Key
+from estimators.choices import LEAVE_ONE_OUT, ORACLES, PLUG_IN, unknown
+from estimators.intervals import Interval
 
-from estimators.catalogue import CATALOGUE, LEAVE_ONE_OUT, ORACLES, PLUG_IN, Entry, unknown
-from estimators.places import MissingModuleError, find_attribute, importable_here
-from estimators.types import GradientEstimate, Objective
+if TYPE_CHECKING:
+    import estimators.batches
 
 Batches = Mapping[str, Any]
 """Batches by oracle name."""
+
+
+def option(
+    line: str, interval: str = "", *, choices: Collection[str] = (), default: Any = dataclasses.MISSING,
+    example: Any = None, metavar: str = "NAME", unit: str = "",
+) -> Any:  # fmt: skip
+    """Declare an option of an estimator: a dataclass field that is checked on construction.
+
+    Args:
+        line: One line for the help, in which {} stands for the choices.
+        interval: Range of its numbers, such as "(0, inf)".
+        choices: Accepted names, in addition to numbers if there is an interval.
+        default: Value unless another is given; without one, the option is required.
+        example: Value in examples, for a required option.
+        metavar: Placeholder for a value in the help.
+        unit: Unit of its numbers.
+    """
+    described = {"line": line, "interval": interval, "choices": choices, "metavar": metavar, "unit": unit}
+    return dataclasses.field(default=default, metadata=described | {"example": example})
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Estimator(ABC):
     """A formula with its options, applied to batches that several estimators can share.
 
-    A subclass is a frozen dataclass whose fields are its options, checked on construction. Instances are hashable and
-    can be static under `jit`.
+    A subclass is a frozen dataclass whose fields are its options; those declared by `option` are checked on
+    construction. Instances are hashable and can be static under `jit`. The first line of the docstring is the
+    description.
 
     Attributes:
+        name: Name on the command line and in files.
         label: Legend label, if other than the name.
-        description: One line; by default the first line of the docstring or the catalogue's.
         needs: Oracles in `ORACLES`, in the order of the arguments of `combine`.
+        formula: Gradient of one sample, in Markdown with LaTeX.
+        unbiased: When the estimate is unbiased, in Markdown.
+        style: Colour and marker in figures; by default chosen by the name.
         gaussian: Whether the formula holds for Gaussian noise only.
         additive: Whether it holds for noise on theta itself only.
         separable: Whether each row of `parts` depends only on the same row of the batches.
@@ -36,22 +62,32 @@ class Estimator(ABC):
     label: ClassVar[str] = ""
     description: ClassVar[str] = ""
     needs: ClassVar[tuple[str, ...]]
+    formula: ClassVar[str] = ""
+    unbiased: ClassVar[str] = ""
+    style: ClassVar[tuple[str, str] | None] = None
     gaussian: ClassVar[bool] = False
     additive: ClassVar[bool] = False
     separable: ClassVar[bool] = False
 
-    def __init_subclass__(cls, entry: Entry | None = None) -> None:
-        """Take name, label, needs and description from a catalogue entry, if given."""
+    def __init_subclass__(cls) -> None:
         line = (cls.__doc__ or "").partition("\n")[0].removesuffix(".")
         cls.description = line[:1].lower() + line[1:]
-        if entry is not None:
-            cls.name, cls.label, cls.needs, cls.description = entry.name, entry.label, entry.needs, entry.description
+
+    def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):
+            interval, value = field.metadata.get("interval"), getattr(self, field.name)
+            if isinstance(value, str):
+                if (choices := field.metadata.get("choices")) and value not in choices:
+                    more = ", or give a number" if interval else ""
+                    raise ValueError(unknown(field.name.replace("_", " "), value, choices, more))
+            elif interval and value not in Interval(interval):
+                raise ValueError(f"{field.name} must be {Interval(interval)}; got {value}")
 
     @abstractmethod
-    def combine(self, *args: Any, **kwargs: Any) -> GradientEstimate:
+    def combine(self, *args: Any, **kwargs: Any) -> "estimators.batches.GradientEstimate":
         """Combine the required batches, one per argument, into an estimate."""
 
-    def __call__(self, batches: Batches) -> GradientEstimate:
+    def __call__(self, batches: Batches) -> "estimators.batches.GradientEstimate":
         """Compute the estimate from drawn batches.
 
         Args:
@@ -79,17 +115,17 @@ class Estimator(ABC):
         apart = getattr(self, "baseline", None) != LEAVE_ONE_OUT and getattr(self, "weights", PLUG_IN) == PLUG_IN
         return self.separable and apart
 
-    def parts(self, *args: Any, **kwargs: Any) -> tuple[GradientEstimate, ...]:
+    def parts(self, *args: Any, **kwargs: Any) -> "tuple[estimators.batches.GradientEstimate, ...]":
         """Return the one or two estimates that `join` combines; arguments as for `combine`."""
         return (self.combine(*args, **kwargs),)
 
-    def join(self, *args: Any, **kwargs: Any) -> GradientEstimate:
+    def join(self, *args: Any, **kwargs: Any) -> "estimators.batches.GradientEstimate":
         """Combine the parts, one per argument, into the estimate."""
         (estimate,) = args
         return estimate
 
     @classmethod
-    def place(cls) -> str:
+    def qualified_name(cls) -> str:
         """Name by which `find_estimator` finds the class: that under which it is registered, or `module:class`."""
         return cls.name if ESTIMATORS.get(cls.name) is cls else f"{cls.__module__}:{cls.__qualname__}"
 
@@ -98,168 +134,39 @@ class Estimator(ABC):
         """Options without a default."""
         return tuple(field.name for field in dataclasses.fields(cls) if field.default is dataclasses.MISSING)
 
+    @classmethod
+    def example(cls) -> "Estimator":
+        """Return an instance, with the examples of its required options."""
+        required = {field.name: field for field in dataclasses.fields(cls) if field.name in cls.required()}
+        return cls(**{name: field.metadata.get("example") for name, field in required.items()})
+
 
 ESTIMATORS: dict[str, type[Estimator]] = {}
-"""Estimators by name; `estimators.catalogue.CATALOGUE` describes them."""
+"""Registered estimators by name; those of `estimators.builtin` once it is imported."""
 EstimatorClass = TypeVar("EstimatorClass", bound=type[Estimator])
 
 
 def register(estimator: EstimatorClass) -> EstimatorClass:
-    """Add a class to `ESTIMATORS` and the catalogue; a decorator to apply above that of the dataclass.
+    """Add a class to `ESTIMATORS`, and so to commands, tables and figures; a decorator above that of the dataclass.
 
     Raises:
         ValueError: The class needs an unknown oracle, or its name is taken.
     """
-    _check_class(estimator, estimator.__name__)
-    name = estimator.name
-    if name in ESTIMATORS:
-        raise ValueError(f"there is already an estimator {name!r}: choose another name")
-    ESTIMATORS[name] = estimator
-    entry = Entry(name, estimator.label, estimator.needs, estimator.description, estimator.required())
-    CATALOGUE.setdefault(name, entry)
+    check_class(estimator, estimator.__name__)
+    if estimator.name in ESTIMATORS:
+        raise ValueError(f"there is already an estimator {estimator.name!r}: choose another name")
+    ESTIMATORS[estimator.name] = estimator
     return estimator
 
 
-def label_of(name: str, onset: str = "none") -> str:
-    """Label of an estimator in texts and figures, with the onset term that its first-order batch has; that of
-    `module:name` is its name."""
-    found = ESTIMATORS.get(name)
-    label = (found.label if found else "") or name.rpartition(":")[2]
-    if onset == "none" or found is None or not any(ORACLES[oracle].order for oracle in found.needs):
-        return label
-    term = "onset" if onset == "linear" else onset
-    if "corrected" in found.needs:
-        return label.replace("onset", term)
-    return f"{label[:-1]}, {term})" if label.endswith(")") else f"{label} ({term})"
-
-
-def find_estimator(name: str | Estimator) -> Estimator | type[Estimator]:
-    """Look up an estimator by name; an unknown one is a ValueError.
-
-    Args:
-        name: Key in `ESTIMATORS`, or `module:attribute` for a user-defined class or object, importable from the current
-            directory too. An estimator is its own.
-    """
-    if isinstance(name, Estimator):
-        return name
-    if name in ESTIMATORS:
-        return ESTIMATORS[name]
-    reason = ""
-    if ":" in name:
-        try:
-            with importable_here():
-                found = find_attribute(name, "estimator", Estimator)
-        except MissingModuleError as error:
-            reason = f" ({error})"
-        else:
-            return _check_class(found, name)
-    raise ValueError(unknown("estimator", name, ESTIMATORS, ", or module:name of your own") + reason)
-
-
-def _check_class(found: Any, place: str) -> Any:
+def check_class(found: Any, name: str) -> Any:
+    """Return an estimator or its class; a ValueError for anything else, or where something required is missing."""
     if not isinstance(found, Estimator) and not (isinstance(found, type) and issubclass(found, Estimator)):
-        raise ValueError(f"{place} is neither an Estimator nor an Estimator class, but of type {type(found).__name__}")
+        raise ValueError(f"{name} is neither an Estimator nor an Estimator class, but of type {type(found).__name__}")
     missing = [part for part in ("name", "needs") if not getattr(found, part, None)]
     missing += sorted(getattr(found, "__abstractmethods__", ()))
     if missing:
-        raise ValueError(f"{place} has no {' and no '.join(missing)}: an Estimator needs them")
+        raise ValueError(f"{name} has no {' and no '.join(missing)}: an Estimator needs them")
     if others := set(found.needs) - set(ORACLES):
-        raise ValueError(f"{place} needs {', '.join(sorted(others))}; the oracles are {', '.join(ORACLES)}")
+        raise ValueError(f"{name} needs {', '.join(sorted(others))}; the oracles are {', '.join(ORACLES)}")
     return found
-
-
-def make_estimator(which: str | Estimator, **options: Any) -> Estimator:
-    """Return an estimator with its options set.
-
-    Args:
-        which: As for `find_estimator`; an object is returned as is.
-        **options: Options of this or other estimators. Those it does not have and those that are None are ignored.
-
-    Raises:
-        ValueError: There is no such estimator, or a required option is missing or out of range.
-    """
-    found = find_estimator(which) if isinstance(which, str) else which
-    if isinstance(found, Estimator):
-        return found
-    own = {field.name for field in dataclasses.fields(found)}
-    given = {name: value for name, value in options.items() if name in own and value is not None}
-    for name in found.required():
-        if name not in given:
-            raise ValueError(f"{found.name!r} needs the option `{name}`; set it")
-    return found(**given)
-
-
-def oracles_of(estimators: Iterable[Estimator | type[Estimator]], *others: str) -> tuple[str, ...]:
-    """Return the oracles that the estimators need, plus the others given, in the order of `ORACLES`."""
-    needed = {*others, *(oracle for estimator in estimators for oracle in estimator.needs)}
-    return tuple(name for name in ORACLES if name in needed)
-
-
-def draw(
-    oracles: Iterable[str], objective: Objective, theta: Float[Array, " params"], key: Key[Array, ""], num_samples: int
-) -> dict[str, Any]:
-    """Draw batches by name in `ORACLES`; those of order 0 and those of order 1 use separate sets of keys.
-
-    Args:
-        oracles: Names in `ORACLES`; those of the same order share their samples.
-        objective: Objective to sample.
-        theta: Parameters, [param].
-        key: Random key; consumed.
-        num_samples: Samples per batch, >= 1.
-
-    Raises:
-        ValueError: The objective lacks a method that an oracle calls.
-    """
-    return draw_at(oracles, objective, theta, sample_keys(key, num_samples))
-
-
-def sample_keys(key: Key[Array, ""], num_samples: int) -> list[Key[Array, " samples"]]:
-    """Split a key into the sample keys of each order, as `draw` does."""
-    return [jax.random.split(order_key, num_samples) for order_key in jax.random.split(key)]
-
-
-def draw_at(
-    oracles: Iterable[str],
-    objective: Objective,
-    theta: Float[Array, "*samples params"],
-    keys: Sequence[Key[Array, " samples"]],
-) -> dict[str, Any]:
-    """Draw with keys from `sample_keys`; theta may have one row per sample if the objective supports it."""
-    batches = {}
-    for name in oracles:
-        oracle = ORACLES[name]
-        method = getattr(objective, oracle.method, None)
-        if method is None:
-            raise ValueError(f"{type(objective).__name__} has no method {oracle.method} for {oracle.phrase}")
-        batches[name] = method(theta, jax.random.clone(keys[oracle.order]))  # shared on purpose
-    return batches
-
-
-def estimate(
-    estimator: str | Estimator,
-    objective: Objective,
-    theta: Float[Array, " params"],
-    key: Key[Array, ""],
-    num_samples: int,
-) -> GradientEstimate:
-    """Draw only the batches that an estimator needs, and estimate grad F(theta).
-
-    The two orders use independent keys; for the same key, each order's samples are the same for every estimator.
-
-    Args:
-        estimator: Estimator object, or the name of one whose options are left at their defaults.
-        objective: F, with the methods that the estimator's oracles call.
-        theta: Parameters, [param].
-        key: Random key; consumed.
-        num_samples: Samples per batch, >= 1.
-
-    Raises:
-        ValueError: The name is unknown, an option or a method of the objective is missing, `num_samples` is below 1, or
-            theta has the wrong length.
-    """
-    estimator = make_estimator(estimator)
-    if num_samples < 1:
-        raise ValueError(f"num_samples must be at least 1, and at least 2 for a variance; got {num_samples}")
-    if theta.shape != (objective.num_params,):
-        raise ValueError(f"theta must have shape ({objective.num_params},), the objective's; got {theta.shape}")
-    return estimator(draw(estimator.needs, objective, theta, key, num_samples))

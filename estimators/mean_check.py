@@ -9,12 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
-from estimators.catalogue import ORACLES
+from estimators.batches import Objective
+from estimators.choices import ORACLES
 from estimators.confidence import ENOUGH_EFFECTIVE, effective_samples
-from estimators.estimator import Estimator, draw, oracles_of
+from estimators.estimator import Estimator
 from estimators.pytree import register_pytree
+from estimators.registry import oracles_of
+from estimators.sampling import draw
 from estimators.statistics import summarise
-from estimators.types import Objective
 
 NODES: Final = 9
 """Quadrature nodes along a path."""

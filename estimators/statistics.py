@@ -6,9 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from estimators.blocks import Merged, Parts
-from estimators.rows import Rows, centre, finite_rows
-from estimators.types import GradientEstimate
+from estimators.batches import GradientEstimate
+from estimators.merged_samples import Merged, Parts
+from estimators.samples import Rows, centre, finite_rows
 
 
 def summarise(per_sample: Float[Array, "samples params"]) -> GradientEstimate:

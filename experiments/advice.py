@@ -1,11 +1,11 @@
-"""Tests the advice of `mjx-study diagnose` on models that it was not made with, for docs/diagnose.md.
+"""Test of the advice of `mjx-study diagnose` on models that were not used to make it, for docs/diagnose.md.
 
-    python -m experiments.advice [PART OF A CASE'S NAME ...]    # the cases that data/advice.jsonl lacks, then the page
-    python -m experiments.advice --page                         # the page alone
+    python -m experiments.advice [PART OF A CASE'S NAME ...]    # cases missing in data/advice.jsonl, then the page
+    python -m experiments.advice --page                         # only the page
 
 Each case compares the estimator that a diagnosis recommends with the best of the five by an independent measurement:
-other random numbers, many batches of the size advised, and a reference gradient from values alone. Compared are root
-mean squared errors after equal seconds, one second on this machine.
+other random numbers, many batches of the advised size, and a reference gradient from values alone. It compares root
+mean squared errors after one second of computing on this machine.
 """
 
 import argparse
@@ -22,16 +22,17 @@ import numpy as np
 
 from estimators import GradientEstimate, make_estimator, oracles_of, squared_bias_of_means
 from estimators.confidence import coverage_interval
-from experiments.pages import DATA, DOCS, with_table
+from experiments import DATA, DOCS
+from experiments.pages import write_tables
 from mjx_study.choices import DEFAULT_SOLIMP, DEFAULT_SOLREF, STIFF_SOLIMP
-from mjx_study.diagnose import ESTIMATORS, measure
+from mjx_study.diagnose.measurement import ESTIMATORS, measure
 from mjx_study.experiment.gradients import reference_of
 from mjx_study.experiment.sampling import cell_keys, draw_batches
 from mjx_study.objective import MjxObjective, Simulator, chunk_for
 from mjx_study.runtime import configure, local_devices
 from mjx_study.simulation.contact import contact_model
 from mjx_study.simulation.scene import load_scene
-from mjx_study.table import percent
+from mjx_study.table import markdown_table, percent
 from mjx_study.tasks import make_task
 from mjx_study.tasks.mjcf import scene_task
 from mjx_study.tasks.task import Task
@@ -40,7 +41,7 @@ RESULTS: Final = DATA / "advice.jsonl"
 HELD_OUT: Final = DATA / "held_out"
 PAGE: Final = DOCS / "diagnose.md"
 KNOWN: Final = ("momentum_transfer",)
-"""Tasks on which the rules of `diagnose` were found; every other model is held out."""
+"""Tasks on which the rules of `diagnose` were developed; every other model is held out."""
 CONTACTS: Final = {
     "default": (DEFAULT_SOLREF, DEFAULT_SOLIMP),
     "soft": ((0.06, 1.0), DEFAULT_SOLIMP),
@@ -51,20 +52,20 @@ CONTACTS: Final = {
     "smooth": (DEFAULT_SOLREF, (1e-4, 0.95, 0.02, 0.5, 2.0)),
 }
 FINE: Final = ("cart", "balls")
-"""Models that are taken at half the timestep, too, with the default contact."""
+"""Models that are also run at half the timestep, with the default contact."""
 HORIZON: Final = 80
 SAMPLES: Final = 300
-"""Of each batch of a diagnosis."""
+"""Samples per batch of a diagnosis."""
 TOTAL: Final = 2000
-"""Samples of each estimator in the independent measurement."""
+"""Samples per estimator in the independent measurement."""
 SIZES: Final = (20, 200)
-"""Least and largest size of its batches."""
+"""Smallest and largest batch size in the independent measurement."""
 PARTS: Final = (8_000, 100, 500)
-"""Pairs of rollouts of the reference, and samples for its control variates."""
+"""Pairs of rollouts of the reference, and numbers of samples for its control variates."""
 FACTOR: Final = 2.0
 DRAWS: Final = 1000
 SEEDS: Final = (0, 1)
-"""Of the diagnosis, and of the independent measurement."""
+"""Seeds of the diagnosis and of the independent measurement."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,12 +78,12 @@ class Case:
 
     @property
     def name(self) -> str:
-        """In the results."""
+        """Name of the case in the results."""
         return f"{self.model}, {self.contact}{', half the timestep' if self.halved else ''}"
 
 
 def cases() -> Iterator[Case]:
-    """All of them, those of one program after another. The joint limit of the pendulum is no contact."""
+    """Yield all cases, grouped by compiled program. The pendulum has a joint limit and no contact."""
     held_out = sorted(path.stem for path in HELD_OUT.glob("*.xml"))
     for model in held_out + list(KNOWN):
         yield from (Case(model, contact) for contact in (CONTACTS if model != "pendulum" else ("default",)))
@@ -91,7 +92,7 @@ def cases() -> Iterator[Case]:
 
 
 def task_of(case: Case) -> Task:
-    """The task of a case."""
+    """Return the task of a case."""
     if case.model in KNOWN:
         return make_task(case.model)
     scene, horizon = load_scene(HELD_OUT / f"{case.model}.xml"), HORIZON
@@ -101,7 +102,7 @@ def task_of(case: Case) -> Task:
 
 
 def reference(objective: MjxObjective, key: Any) -> GradientEstimate:
-    """The gradient from values alone; medians of first-order gradients only serve as control variates."""
+    """Return the gradient from values; medians of first-order gradients only serve as control variates."""
     odd, candidate, pilot = (
         jax.random.split(part, size) for part, size in zip(jax.random.split(key, 3), PARTS, strict=True)
     )
@@ -111,7 +112,7 @@ def reference(objective: MjxObjective, key: Any) -> GradientEstimate:
 
 
 def measured(objective: MjxObjective, size: int) -> tuple[dict[str, np.ndarray], dict[str, float]]:
-    """Means of many batches by estimator, (batches, params), and seconds of a sample."""
+    """Return the means of many batches by estimator (batches, params), and seconds per sample."""
     task, count = objective.simulator.task, TOTAL // size
     chosen = [make_estimator(name, gamma=task.defaults.gamma, sigma=task.sigma) for name in ESTIMATORS]
     keys = cell_keys(SEEDS[1], count)
@@ -123,10 +124,10 @@ def measured(objective: MjxObjective, size: int) -> tuple[dict[str, np.ndarray],
 def factors(
     means: dict[str, np.ndarray], seconds: dict[str, float], size: int, truth: GradientEstimate, advised: str
 ) -> dict[str, Any]:
-    """How many times the least error the advised estimator's is after a second, with a 95 % interval.
+    """Return the advised estimator's error over the smallest one, after one second each, with a 95 % interval.
 
-    The noise of the reference and of the means is taken off the squared bias. In the interval both are drawn again,
-    the same for all estimators, and their noise taken off twice, since it is in there twice.
+    The noise of the reference and of the means is subtracted from the squared bias. The interval resamples both,
+    jointly for all estimators, and subtracts their noise twice, since it enters twice.
     """
     rng, count = np.random.default_rng(0), len(next(iter(means.values())))
     noise = np.asarray(jnp.atleast_2d(jnp.cov(truth.per_sample, rowvar=False))) / len(truth.per_sample)
@@ -165,7 +166,7 @@ def _short(value: float) -> float:
 
 
 def result(case: Case, simulator: Simulator) -> dict[str, Any]:
-    """One line of the results."""
+    """Measure a case; return one line of the results."""
     solref, solimp = CONTACTS[case.contact]
     contact = contact_model(solref, solimp, scene=simulator.task.scene) if case.model != "pendulum" else None
     advice = measure(simulator, contact, SAMPLES, SEEDS[0])
@@ -174,56 +175,56 @@ def result(case: Case, simulator: Simulator) -> dict[str, Any]:
     objective = simulator.objective(contact)
     means, seconds = measured(objective, size)
     truth = reference(objective, jax.random.key(SEEDS[1] + 1))
-    told = {
+    line = {
         "case": case.name,
         "model": case.model,
         "held_out": case.model not in KNOWN,
         "advised": advice.best.estimator,
     }
-    said = {each.estimator: each.verdict for each in advice.estimators if each.paths}
-    return told | {"size": size, **factors(means, seconds, size, truth, advice.best.estimator), "means": said}
+    verdicts = {each.estimator: each.verdict for each in advice.estimators if each.paths}
+    return line | {"size": size, **factors(means, seconds, size, truth, advice.best.estimator), "means": verdicts}
 
 
 def read() -> list[dict[str, Any]]:
-    """The results so far, in the order of the cases."""
+    """Return the results so far, in the order of the cases."""
     lines = RESULTS.read_text().splitlines() if RESULTS.exists() else []
     by_name = {each["case"]: each for each in map(json.loads, lines)}
     return [by_name[case.name] for case in cases() if case.name in by_name]
 
 
 def verdict(each: dict[str, Any]) -> str:
-    """Whether the interval of the factor lies below the limit, beyond, or about it."""
+    """Classify the factor by whether its interval lies below the limit, above it, or on both sides."""
     low, high = each["interval"]
     return "good" if high <= FACTOR else "bad" if low > FACTOR else "undecided"
 
 
 def table(results: list[dict[str, Any]]) -> str:
-    """For the page, in Markdown."""
-    lines = ["| models | cases | undecided | within a factor of two | share, 95 % interval | largest factor |"]
-    lines += ["| --- " * 6 + "|"]
-    for what, held_out in (("held out", True), ("known", False)):
-        some = [each for each in results if each["held_out"] is held_out]
-        if not some:
+    """Format the table of the page."""
+    rows = []
+    for label, held_out in (("held out", True), ("known", False)):
+        group = [each for each in results if each["held_out"] is held_out]
+        if not group:
             continue
-        decided = [each for each in some if verdict(each) != "undecided"]
+        decided = [each for each in group if verdict(each) != "undecided"]
         good = [verdict(each) == "good" for each in decided]
         share, low, high = coverage_interval(jnp.array(good), 0.95)
-        names = ", ".join(f"`{name}`" for name in dict.fromkeys(each["model"] for each in some))
-        row = [f"{what}: {names}", len(some), len(some) - len(decided), f"{sum(good)} of {len(good)}"]
+        names = ", ".join(f"`{name}`" for name in dict.fromkeys(each["model"] for each in group))
+        row = [f"{label}: {names}", len(group), len(group) - len(decided), f"{sum(good)} of {len(good)}"]
         row += [f"{percent(share)} ({percent(low)} to {percent(high)})", max(each["factor"] for each in decided)]
-        lines.append(f"| {' | '.join(map(str, row))} |")
+        rows.append(row)
     factors = [each["factor"] for each in results]
     within, worst = sum(each <= FACTOR for each in factors), max(factors)
     note = (
         f"{len(results)} of the {len(list(cases()))} cases of the script were run. By the factor without its interval, "
     )
     note += f"{within} of {len(results)} are within two, undecided ones included; the largest is {worst}."
-    return "\n".join([*lines, "", f"*{note}*"])
+    header = ("models", "cases", "undecided", "within a factor of two", "share, 95 % interval", "largest factor")
+    return f"{markdown_table(rows, header)}\n\n*{note}*"
 
 
 def write_page() -> None:
-    """Put the table into the page."""
-    PAGE.write_text(with_table(PAGE.read_text(), "advice", table(read())))
+    """Write the table into the page."""
+    write_tables(PAGE, {"advice": table(read())})
 
 
 def main() -> None:

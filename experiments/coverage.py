@@ -1,11 +1,11 @@
-"""Writes the tables of docs/coverage.md: how often each interval covers, how often each test rejects.
+"""Tables of docs/coverage.md: how often each interval covers, how often each test rejects.
 
     python -m experiments.coverage
 
-A minute on one core. Everything between the markers of the page is replaced; the text around it is written by hand.
+A minute on one core. Only the tables of the page are replaced.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any, Final, NamedTuple
 
 import jax
@@ -15,30 +15,31 @@ from jax import Array
 
 import estimators
 from estimators import ENOUGH_EFFECTIVE, ESTIMATORS, make_estimator, summarise
-from experiments.pages import DOCS, with_table
+from experiments import DOCS
+from experiments.pages import write_tables
 from mjx_study.reference import LinearQuadratic, ReferenceObjective
 from mjx_study.results.findings import DETECTED_SE
 from mjx_study.runtime import configure
-from mjx_study.table import percent
+from mjx_study.table import markdown_table, percent
 
 PAGE: Final = DOCS / "coverage.md"
-SAMPLES: Final = (10, 50, 400)
+SAMPLES: Final = (10, 400)
 TRIALS: Final = 2000
 TOGETHER: Final = 100
-"""Trials that are computed at once."""
+"""Trials computed together."""
 PARAMS: Final = 3
 DRAWS: Final = 199
 REFERENCE: Final = (100, 0.05)
-"""Samples of the reference, and its standard error over the gradient's norm."""
+"""Number of samples of the reference, and its standard error over the gradient's norm."""
 BIAS: Final = 0.3
-"""Bias over the gradient's norm where a relative error is estimated."""
+"""True relative error: bias over the gradient's norm."""
 SEEDS: Final = 10
-"""Batches behind an estimate of a squared bias."""
+"""Number of batches per estimate of a squared bias."""
 RARE: Final = 0.01
 
 
 class Kind(NamedTuple):
-    """Samples of noise of mean zero.
+    """A distribution of noise with mean zero.
 
     Attributes:
         draw: of a key and a number of samples; (samples, PARAMS).
@@ -50,7 +51,7 @@ class Kind(NamedTuple):
 
 
 def _rare(key: Array, samples: int) -> Array:
-    """1 / RARE with probability RARE, less its mean, in the first parameter."""
+    """Draw 1 / RARE with probability RARE, minus its mean, in the first parameter."""
     event = jax.random.bernoulli(key, RARE, (samples,)) / RARE - 1.0
     return event[:, None] * jnp.eye(1, PARAMS)
 
@@ -67,7 +68,7 @@ COLUMNS: Final = {
     "mean": "mean ± 1.96 se",
     "apart": f"mean off by {DETECTED_SE:g} se",
     "variance": "variance",
-    "variances": "two variances told apart",
+    "variances": "two variances differ",
     "relative_error": "relative error",
     "debiased_error": "debiased",
     "cosine": "cosine",
@@ -75,11 +76,11 @@ COLUMNS: Final = {
     "squared_bias": "squared bias",
     "epsilon": "epsilon",
 }
-"""What is printed of each kind of samples: shares of the trials."""
+"""Columns of the table of intervals; each holds a share of the trials."""
 
 
 def trials(kind: Kind, samples: int, count: int) -> dict[str, np.ndarray]:
-    """What `count` batches say, and whether that is true; by trial.
+    """Estimate from `count` batches, and compare each estimate with the truth.
 
     The gradient is as long as half a standard deviation of a sample; rare samples carry the whole of it.
     """
@@ -102,7 +103,7 @@ def trials(kind: Kind, samples: int, count: int) -> dict[str, np.ndarray]:
         test = estimators.bias_test(batch, reference, streams[2], num_draws=DRAWS)
         biased = summarise(batch.per_sample + offset)
         found = estimators.compare(biased, reference)
-        said = {
+        measured = {
             "mean": off <= 1.96,
             "apart": off > DETECTED_SE,
             "variance": (lower <= kind.variance) & (kind.variance <= upper),
@@ -113,21 +114,21 @@ def trials(kind: Kind, samples: int, count: int) -> dict[str, np.ndarray]:
         for name, exact in (("error", BIAS), ("cosine", (1 + BIAS**2) ** -0.5)):
             raw = "relative_error" if name == "error" else name
             for field in (raw, f"debiased_{name}"):
-                said[field] = jnp.abs(getattr(found, field) - exact) <= 1.96 * getattr(found, f"{field}_se")
-        return said | {"lower": lower, "upper": upper, "biased": biased.mean, "reference": reference}
+                measured[field] = jnp.abs(getattr(found, field) - exact) <= 1.96 * getattr(found, f"{field}_se")
+        return measured | {"lower": lower, "upper": upper, "biased": biased.mean, "reference": reference}
 
     return _map(one, jax.random.split(jax.random.key(samples), count)) | {"bias": BIAS * length}
 
 
 def _map(function: Callable[[Array], Any], keys: Array) -> Any:
-    """Over all keys, some at a time, as NumPy arrays."""
+    """Apply a function to all keys, `TOGETHER` at a time; return NumPy arrays."""
     program = jax.jit(lambda keys: jax.lax.map(function, keys, batch_size=TOGETHER))
     return jax.tree.map(np.asarray, program(keys))
 
 
 def shares(found: dict[str, Any]) -> dict[str, float]:
-    """Each column's share of the trials."""
-    said = {name: float(np.mean(found[name])) for name in COLUMNS if name in found}
+    """Return each column's share of the trials."""
+    measured = {name: float(np.mean(found[name])) for name in COLUMNS if name in found}
     apart = found["upper"][::2] < found["lower"][1::2]
     apart |= found["lower"][::2] > found["upper"][1::2]
     groups = len(found["biased"]) // SEEDS
@@ -135,15 +136,15 @@ def shares(found: dict[str, Any]) -> dict[str, float]:
     references = jax.tree.map(lambda leaf: jnp.asarray(leaf[: groups * SEEDS : SEEDS]), found["reference"])
     value, error = jax.jit(jax.vmap(estimators.squared_bias_of_means))(means, references)
     held = np.abs(np.asarray(value) - found["bias"] ** 2) <= 1.96 * np.asarray(error)
-    return said | {"variances": float(np.mean(apart)), "squared_bias": float(np.mean(held))}
+    return measured | {"variances": float(np.mean(apart)), "squared_bias": float(np.mean(held))}
 
 
 def coverage_rows(name: str, samples: int, count: int = TRIALS) -> tuple[list[str], list[str]]:
-    """One row of the table of intervals, and one of the table of the test for bias."""
+    """Return a row of the table of intervals, and one of the table of the test for bias."""
     found = trials(KINDS[name], samples, count)
-    said = shares(found)
+    share = shares(found)
     return (
-        [name, str(samples), *(_share(said[column]) for column in COLUMNS)],
+        [name, str(samples), *(_share(share[column]) for column in COLUMNS)],
         [name, str(samples), *_verdicts(found)],
     )
 
@@ -155,7 +156,7 @@ def _verdicts(found: dict[str, Any]) -> list[str]:
 
 
 def rare_row(expected: float, samples: int, count: int = TRIALS) -> list[str]:
-    """The test for bias where so many of a batch's samples, on average, carry the whole gradient."""
+    """Return a row on the test for bias where, on average, `expected` samples of a batch carry the whole gradient."""
     probability = expected / samples
 
     def one(key: Array) -> dict[str, Array]:
@@ -175,14 +176,14 @@ def rare_row(expected: float, samples: int, count: int = TRIALS) -> list[str]:
 
 
 def dimension_row(params: int, bias: float, uncertainty: float, samples: int = 400, count: int = 300) -> list[str]:
-    """Relative error and cosine where noise of an eighth of the gradient's norm is spread over many parameters."""
+    """Return a row on relative error and cosine with noise of an eighth of the gradient's norm."""
     gradient, others = jnp.eye(1, params)[0], 600
     offset = bias * jnp.roll(gradient, 1)
 
     def one(key: Array) -> estimators.Comparison:
-        mine, theirs = jax.random.split(key)
-        noise = 0.125 * (samples / params) ** 0.5 * jax.random.normal(mine, (samples, params))
-        reference = uncertainty * (others / params) ** 0.5 * jax.random.normal(theirs, (others, params))
+        batch_key, reference_key = jax.random.split(key)
+        noise = 0.125 * (samples / params) ** 0.5 * jax.random.normal(batch_key, (samples, params))
+        reference = uncertainty * (others / params) ** 0.5 * jax.random.normal(reference_key, (others, params))
         return estimators.compare(summarise(gradient + offset + noise), summarise(gradient + reference))
 
     found = _map(one, jax.random.split(jax.random.key(2), count))
@@ -202,8 +203,22 @@ def dimension_row(params: int, bias: float, uncertainty: float, samples: int = 4
 WEIGHED: Final = ("ivw", "ivw_h", "total_propagation", "ddcg")
 
 
-def weights_rows(samples: int, count: int = 20_000) -> list[list[str]]:
-    """Relative bias and variance of the mean with either kind of weights, on a linear-quadratic problem."""
+def weights_rows(sizes: Mapping[int, int]) -> list[list[str]]:
+    """Return rows on bias and variance with either kind of weights, on a linear-quadratic problem.
+
+    Args:
+        sizes: number of batches by the number of samples of each.
+    """
+    columns = [weights_columns(samples, count) for samples, count in sizes.items()]
+    names = [row[:2] for row in columns[0]]
+    return [
+        [*name, *(", ".join(cells) for cells in zip(*(rows[index][2:] for rows in columns), strict=True))]
+        for index, name in enumerate(names)
+    ]
+
+
+def weights_columns(samples: int, count: int) -> list[list[str]]:
+    """Return problem, estimator, bias with plug-in and cross-fitted weights [%], and the ratio of variances."""
     weight = np.array([[1.0, 0.2], [0.2, 0.5]])
     system = LinearQuadratic(
         np.array([[0.9, 0.3], [-0.2, 0.8]]), np.array([[0.5, 0.1], [-0.3, 0.7]]), weight, np.diag([0.3, 0.2]), weight
@@ -220,15 +235,15 @@ def weights_rows(samples: int, count: int = 20_000) -> list[list[str]]:
         exact = np.mean(np.asarray(objective.differentiate(jnp.asarray(theta), many).gradient), axis=0)
         drawn = jax.tree.map(lambda leaf: jnp.asarray(leaf).reshape(count, samples, *leaf.shape[1:]), drawn)
         for name in WEIGHED:
-            mine = {oracle: drawn[oracle] for oracle in ESTIMATORS[name].needs}
-            row, errors = [problem, name, str(samples)], []
+            batches = {oracle: drawn[oracle] for oracle in ESTIMATORS[name].needs}
+            row, errors = [problem, name], []
             for weights in estimators.WEIGHTS:
                 estimator = make_estimator(name, sigma=objective.sigma, weights=weights)
                 program = jax.jit(jax.vmap(lambda batch, estimator=estimator: estimator(batch).mean))
-                means = np.asarray(program(mine))
+                means = np.asarray(program(batches))
                 bias = np.linalg.norm(np.mean(means, axis=0) - exact) / np.linalg.norm(exact)
                 errors.append(np.sum(np.var(means, axis=0)))
-                row.append(percent(float(bias), 1))
+                row.append(f"{100 * bias:.1f}")
             rows.append([*row, f"{errors[1] / errors[0]:.2f}"])
     return rows
 
@@ -237,42 +252,32 @@ def _share(value: float) -> str:
     return f"{value:.3f}" if 0 < value < 0.1 else f"{value:.2f}"
 
 
-def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """In Markdown."""
-    lines = [header, ["---"] * len(header), *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
-
-
 def tables() -> dict[str, str]:
-    """Every table of the page, by its name."""
+    """Return every table of the page by its name."""
     both = [coverage_rows(name, samples) for name in KINDS for samples in SAMPLES]
     test = ["rejects at 5 %", "believable", "rejects of those"]
     wide = ["relative error", "covers", "debiased", "covers", "cosine", "covers", "debiased", "covers"]
     return {
-        "intervals": table(["samples of", "n", *COLUMNS.values()], [row for row, _ in both]),
-        "test": table(["samples of", "n", *test], [row for _, row in both]),
-        "rare": table(
-            ["rare samples expected", "n", "z test", *test],
+        "intervals": markdown_table([row for row, _ in both], ["samples of", "n", *COLUMNS.values()]),
+        "test": markdown_table([row for _, row in both], ["samples of", "n", *test]),
+        "rare": markdown_table(
             [rare_row(expected, n) for expected, n in ((0.1, 50), (0.4, 50), (1, 50), (3.2, 400), (8, 400), (20, 400))],
+            ["rare samples expected", "n", "z test", *test],
         ),
-        "dimensions": table(
-            ["parameters", "reference ±", "true error", *wide],
+        "dimensions": markdown_table(
             [dimension_row(*case) for case in ((5, 0.3, 0.02), (200, 0.3, 0.02), (200, 0.3, 0.1), (200, 0.0, 0.02))],
+            ["parameters", "reference ±", "true error", *wide],
         ),
-        "weights": table(
-            ["problem", "estimator", "N", "bias, plug-in", "bias, cross-fitted", "variance, cross-fitted / plug-in"],
-            [*weights_rows(10), *weights_rows(40, 5000)],
+        "weights": markdown_table(
+            weights_rows({10: 20_000, 40: 5000}),
+            ["problem", "estimator", "bias [%], plug-in", "cross-fitted", "variance, cross-fitted / plug-in"],
         ),
     }
 
 
 def main() -> None:
     configure()
-    page = PAGE.read_text()
-    for name, text in tables().items():
-        page = with_table(page, name, text)
-    PAGE.write_text(page)
-    print(f"written: {PAGE}")
+    write_tables(PAGE, tables())
 
 
 if __name__ == "__main__":

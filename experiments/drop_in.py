@@ -1,14 +1,13 @@
-"""Prints the table of docs/differentiable-mjx.md: `mjx_study.step` against `mjx.step`, on this machine.
+"""Table of docs/differentiable-mjx.md: `mjx_study.step` against `mjx.step`, on this machine.
 
     python -m experiments.drop_in
     python -m experiments.drop_in --batch 1024    # on an accelerator
 
-A few minutes on one core, most of it compiling. Stock's gradient is the one it has, of a step of one solver iteration.
+A few minutes on one core, most of it compiling. Stock's gradient is of one solver iteration.
 """
 
 import argparse
 import statistics
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
@@ -20,7 +19,10 @@ import numpy as np
 from mujoco import mjx
 
 import mjx_study
-from experiments.pages import ROOT
+from experiments import ROOT
+from experiments.pages import markdown_row
+from experiments.timing import interleaved
+from mjx_study.table import markdown_table
 
 TESTED: Final = Path(mjx.__file__).parent / "test_data"
 MODELS: Final = {
@@ -32,11 +34,11 @@ MODELS: Final = {
 STEPS: Final = 20
 REPEATS: Final = 9
 SETTLING: Final = 0.3
-"""Time before the first state [s], in which bodies fall to the floor."""
+"""Time before the first state, in which bodies fall to the floor [s]."""
 
 
 def start_states(host: mujoco.MjModel, batch: int) -> tuple[np.ndarray, np.ndarray]:
-    """A batch of positions and velocities, in contact where the model has a floor."""
+    """Return a batch of positions and velocities, in contact if the model has a floor."""
     data, noise = mujoco.MjData(host), np.random.default_rng(0)
     if host.nkey:
         mujoco.mj_resetDataKeyframe(host, data, 0)
@@ -46,7 +48,7 @@ def start_states(host: mujoco.MjModel, batch: int) -> tuple[np.ndarray, np.ndarr
 
 
 def measured(path: Path, batch: int) -> dict[str, float]:
-    """Median seconds of a batch of rollouts and of their gradients, through both steps, interleaved."""
+    """Return median seconds of a batch of rollouts and of their gradients, through both steps."""
     host = mujoco.MjModel.from_xml_path(str(path))
     model, data = mjx.put_model(host), mjx.make_data(host)
     qpos, qvel = start_states(host, batch)
@@ -64,7 +66,7 @@ def measured(path: Path, batch: int) -> dict[str, float]:
 
         function = jax.grad(last, argnums=(0, 1)) if gradient else last
         compiled = jax.jit(jax.vmap(function)).lower(qvel, controls, qpos).compile()
-        return lambda: compiled(qvel, controls, qpos)
+        return lambda: jax.block_until_ready(compiled(qvel, controls, qpos))
 
     budget = int(host.opt.iterations)
     programs = {
@@ -74,12 +76,7 @@ def measured(path: Path, batch: int) -> dict[str, float]:
         "gradient": program(mjx_study.step, budget, gradient=True),
         "gradient_once": program(mjx_study.step, 1, gradient=True),
     }
-    times: dict[str, list[float]] = {name: [] for name in programs}
-    for _ in range(REPEATS + 1):
-        for name, call in programs.items():
-            start = time.perf_counter()
-            jax.block_until_ready(call())
-            times[name].append(time.perf_counter() - start)
+    times = interleaved(programs, REPEATS + 1)
     return {name: statistics.median(seconds[1:]) for name, seconds in times.items()} | {"nv": host.nv, "budget": budget}
 
 
@@ -88,14 +85,14 @@ def main() -> None:
     parser.add_argument("--batch", type=int, default=64, help="rollouts at once")
     batch = parser.parse_args().batch
     mjx_study.configure(cpu_devices=1)
-    print("| model | DoF | rollouts / stock | gradients / stock, one iteration | the same, budget of the model |")
-    print("| --- " * 5 + "|")
+    header = "model", "DoF", "rollouts / stock", "gradients / stock, one iteration", "gradients / stock, model's budget"
+    print(markdown_table([], header))
     for name, path in MODELS.items():
         found = measured(path, batch)
-        over = [found["stock"] / found["ours"]]
-        over += [found["stock_gradient"] / found[each] for each in ("gradient_once", "gradient")]
-        budget = f"{over.pop():.2f} ({found['budget']:g})"
-        print(f"| {name} | {found['nv']:g} | {over[0]:.2f} | {over[1]:.2f} | {budget} |", flush=True)
+        ratios = [found["stock"] / found["ours"]]
+        ratios += [found["stock_gradient"] / found[each] for each in ("gradient_once", "gradient")]
+        rollouts, once, full = (f"{ratio:.2f}" for ratio in ratios)
+        print(markdown_row(name, found["nv"], rollouts, once, f"{full} ({found['budget']:g})"), flush=True)
 
 
 if __name__ == "__main__":

@@ -1,56 +1,22 @@
-"""A one-legged hopper that lands on its foot through MuJoCo's default contact and shall move forward.
+"""A one-legged hopper that must land on its foot, through MuJoCo's default contact, and move forward.
 
-A task in one file, as docs/extending.md describes; docs/in-the-wild.md trains it as `experiments.hopper:hopper`.
+A task of a user, as docs/extending.md describes; docs/in-the-wild.md trains it as `experiments.hopper:hopper`.
 """
 
 import jax
 import jax.numpy as jnp
-import mujoco
 from jaxtyping import Array, Key
 
 import mjx_study as study
+from experiments import DATA
 
-MJCF = """
-<mujoco model="hopper">
-  <option timestep="0.005" iterations="20" ls_iterations="10" tolerance="1e-10"/>
-  <default>
-    <joint axis="0 1 0" damping="1" armature="0.02" limited="true"/>
-    <geom type="capsule" size="0.04" contype="0" conaffinity="0"/>
-  </default>
-  <worldbody>
-    <geom name="floor" type="plane" size="10 1 1" contype="1"/>
-    <body name="torso" pos="0 0 0.9">
-      <joint name="x" type="slide" axis="1 0 0" limited="false" damping="0" armature="0"/>
-      <joint name="z" type="slide" axis="0 0 1" limited="false" damping="0" armature="0"/>
-      <joint name="pitch" type="hinge" limited="false" damping="0" armature="0"/>
-      <geom name="torso" fromto="0 0 0 0 0 0.3" size="0.06" mass="5" conaffinity="1"/>
-      <body name="thigh">
-        <joint name="hip" range="-90 60"/>
-        <geom fromto="0 0 0 0 0 -0.4" mass="2"/>
-        <body name="shin" pos="0 0 -0.4">
-          <joint name="knee" range="0 130"/>
-          <geom fromto="0 0 0 0 0 -0.4" mass="1"/>
-          <body name="foot" pos="0 0 -0.4">
-            <joint name="ankle" range="-60 60"/>
-            <geom name="foot" fromto="-0.08 0 -0.03 0.16 0 -0.03" mass="0.5" conaffinity="1"/>
-          </body>
-        </body>
-      </body>
-    </body>
-  </worldbody>
-  <actuator>
-    <motor joint="hip" gear="60"/>
-    <motor joint="knee" gear="60"/>
-    <motor joint="ankle" gear="30"/>
-  </actuator>
-</mujoco>"""
 BENT = jnp.array([-0.4, 0.8, -0.4])
-"""Hip, knee and ankle in the air [rad]."""
+"""Angles of hip, knee and ankle in the air [rad]."""
 
 
 def hopper(horizon: int = 100) -> study.Task:
-    """Half a second from a random fall; the cost is minus the distance, and of leaning, crouching and torque."""
-    scene = study.put_scene(mujoco.MjModel.from_xml_string(MJCF), "hopper")
+    """Return half a second from a random fall; the cost is minus the distance, plus leaning, crouching and torque."""
+    scene = study.load_scene(DATA / "hopper.xml")
     step = scene.timestep
 
     def start(key: Key[Array, ""]) -> study.State:

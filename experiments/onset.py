@@ -1,4 +1,4 @@
-"""Prints the tables of docs/onset-correction.md.
+"""Tables of docs/onset-correction.md.
 
 python -m experiments.onset            # momentum_transfer and ball_wall, by quadrature; half an hour on one core
 python -m experiments.onset tennis     # means along four directions of the gains; an hour on one core
@@ -12,7 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from estimators import NOISES, first_order, zeroth_order
-from experiments.atlas.measure import task_of
+from experiments.atlas.design import task_of
+from experiments.pages import markdown_row
 from mjx_study.experiment.landscapes import Line, Means, grid, means
 from mjx_study.experiment.resolution import direction_of
 from mjx_study.experiment.tally import onset_numbers
@@ -36,17 +37,17 @@ LAWS = (
     *(((0.02, 1.0), impedance) for impedance in ((0.5, 0.5), (0.7, 0.7), (0.9, 0.9), (0.95, 0.95), (0.99, 0.99))),
     ((0.02, 1.0), (0.5, 0.95)),
 )
-"""solref and the impedances at and below touch; it rises over 1 mm."""
+"""solref, and the impedances at the surface and at full width; they differ over 1 mm."""
 RULED = (
     ("momentum_transfer", 0.001, ANGLES["momentum_transfer"]),
     ("momentum_transfer", 0.002, ANGLES["momentum_transfer"]),
     ("ball_wall", 0.002, ANGLES["ball_wall"][:1]),
 )
-"""Task, timestep and angles whose error is compared with the onset strength."""
+"""Tasks, timesteps and angles at which the error is compared with the onset strength."""
 
 
 def measure(task: Task, angles: tuple[float, ...]) -> tuple[Means, list[list[float]]]:
-    """Means at the angles through MuJoCo's default contact; deviations there of one ZoBG and one FoBG sample."""
+    """Return means at the angles, and standard deviations of one ZoBG and one FoBG sample, with the default contact."""
     contact = family_model("mujoco_default", task.scene, effective_mass=task.effective_mass)
     position = np.array(angles)
     points = grid(position.min(), position.max(), task.sigma, POINTS, task.noise)
@@ -117,7 +118,7 @@ def rule() -> None:
 
 
 def main() -> None:
-    """Print Markdown."""
+    """Run the command line."""
     configure(cpu_devices=1)
     if chosen := sys.argv[1:]:
         {"tennis": tennis, "rule": rule}[chosen[0]]()
@@ -153,7 +154,7 @@ def _with_errors(values: np.ndarray, errors: np.ndarray) -> list[str]:
 
 
 def _print(name: str, cells: list[str]) -> None:
-    print(f"| {name} | {' | '.join(cells)} |", flush=True)
+    print(markdown_row(name, *cells), flush=True)
 
 
 if __name__ == "__main__":

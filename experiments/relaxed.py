@@ -1,6 +1,8 @@
-"""The tables of surrogate derivatives in first-order-bias.md: means and spread of first-order gradients, by quadrature.
+"""Tables of docs/first-order-bias.md: means and spread of first-order gradients with surrogate derivatives.
 
-Run as python -m experiments.relaxed; half an hour on two cores, nothing is kept.
+    python -m experiments.relaxed
+
+Half an hour on two cores, by quadrature.
 """
 
 import dataclasses
@@ -8,8 +10,10 @@ import math
 
 import numpy as np
 
+from experiments.pages import markdown_row
 from mjx_study.claims.laboratory import EFFORTS, RELAXATIONS, Laboratory, Landscape, Slopes
 from mjx_study.runtime import configure
+from mjx_study.table import markdown_table
 
 ANGLES = {"momentum_transfer": (0.3, 0.5, 0.7), "ball_wall": (0.2, 0.7, 0.9)}
 FAMILIES = ("mujoco_default", "mujoco_stiff")
@@ -20,7 +24,7 @@ TREATMENTS: dict[str, dict[str, str]] = {"exact": {}, "onset term": {"onset": "l
 
 
 def standard_deviation(at: Slopes) -> float:
-    """Of one first-order gradient, by the quadrature's landscape."""
+    """Return the standard deviation of one first-order gradient, by quadrature over the landscape."""
     table, sigma = at.objective.function, at.objective.sigma
     assert isinstance(table, Landscape)
     weight = np.exp(-0.5 * ((table.points - at.theta) / sigma) ** 2)
@@ -29,12 +33,12 @@ def standard_deviation(at: Slopes) -> float:
 
 
 def main() -> None:
-    """Print Markdown."""
+    """Print the tables."""
     configure()
     lab = Laboratory(dataclasses.replace(EFFORTS["quick"], density=120))
     for task, angles in ANGLES.items():
         header = [task, "contact", *(f"{angle}: E[FoBG] / slope, deviation" for angle in angles)]
-        print(f"\n| {' | '.join(header)} |\n|{' --- |' * len(header)}")
+        print("\n" + markdown_table([], header))
         for family in FAMILIES:
             for name, treatment in TREATMENTS.items():
                 row = [name, f"`{family}`"]
@@ -42,7 +46,7 @@ def main() -> None:
                     at = lab.slopes(task, family, angle, stiffness=STIFFNESS, **treatment)  # type: ignore[arg-type]
                     share, error = at.first / at.gradient, sum(at.errors)
                     row.append(f"{share:.3g} ± {error:.1g}, {standard_deviation(at) / abs(at.gradient):.2g}")
-                print(f"| {' | '.join(row)} |", flush=True)
+                print(markdown_row(*row), flush=True)
 
 
 if __name__ == "__main__":

@@ -1,9 +1,9 @@
-"""Prints the table of docs/onset-correction.md on DiffMJX's scenes, described anew by their published numbers.
+"""Table of docs/onset-correction.md on DiffMJX's scenes, rebuilt from their published numbers.
 
     python -m experiments.toss
 
 Half an hour on two cores, most of it compiling. Paulus et al., arXiv 2506.14186: a point on a spring and a damper; a
-ball and a cube thrown to the floor, whose cost is where they come to be sideways.
+ball and a cube thrown to the floor, whose cost is their final sideways position.
 """
 
 import dataclasses
@@ -16,9 +16,11 @@ import mujoco
 import numpy as np
 
 import mjx_study as study
+from experiments.pages import markdown_row
 from mjx_study.experiment.landscapes import Line, grid, means
 from mjx_study.simulation.contact import ContactModel
 from mjx_study.simulation.scene import put_scene
+from mjx_study.table import markdown_table
 
 STIFFNESS, DAMPING, START, SPREAD, SECONDS = 50.0, 1.0, 1.0, 0.1, 2.0  # of the point: [1/s^2], [1/s], [m], [m], [s]
 TOSSED: Final = """<mujoco>
@@ -35,7 +37,7 @@ HEIGHT, DRIFT, SPEED, SIGMA, HORIZON, POINTS = 0.2, -0.1, -2.0, 0.05, 1000, 1600
 
 
 def point(start: np.ndarray, timestep: float, *, pulls: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Distance to 1 m after two seconds, and its derivative through the steps.
+    """Return the distance to 1 m after two seconds, and its derivative through the steps.
 
     Args:
         start: heights, all at -1 m/s.
@@ -53,7 +55,7 @@ def point(start: np.ndarray, timestep: float, *, pulls: bool) -> tuple[np.ndarra
 
 
 def tossed(geom: str, onset: str) -> study.Task:
-    """Where an object thrown to the floor comes to be sideways, by the speed of the throw."""
+    """Return the task of an object thrown to the floor: its final sideways position by the speed of the throw."""
     scene = put_scene(mujoco.MjModel.from_xml_string(TOSSED.format(GEOMS[geom])), geom)
 
     def start_at(start: study.State, parameters: jax.Array) -> study.State:
@@ -74,22 +76,19 @@ def tossed(geom: str, onset: str) -> study.Task:
     )
 
 
-def row(*cells: str) -> None:
-    """Print a row of the table."""
-    print(f"| {' | '.join(cells)} |", flush=True)
-
-
 def main() -> None:
     """Print the table."""
     jax.config.update("jax_enable_x64", True)
-    row("scene", "slope", "E[FoBG]", "with the linear term")
-    row(*["---"] * 4)
+    print(markdown_table([], ("scene", "slope", "E[FoBG]", "with the linear term")))
     points = grid(START, START, SPREAD, 4000, "gaussian")
     for pulls, timestep in itertools.product((True, False), (0.1, 0.001)):
         found = means(points, *point(points, timestep, pulls=pulls), np.array([START]), SPREAD, "gaussian")
         what = "as published" if pulls else "without its pull"
-        numbers = told(found.slope, found.slope_error), told(found.first, found.first_error)
-        row(f"point, {what}, h = {1e3 * timestep:g} ms", *numbers, "")
+        numbers = (
+            _with_error(found.slope, found.slope_error),
+            _with_error(found.first, found.first_error),
+        )
+        print(markdown_row(f"point, {what}, h = {1e3 * timestep:g} ms", *numbers, ""))
     points = grid(SPEED, SPEED, SIGMA, POINTS, "gaussian")
     for geom in GEOMS:
         lines = [Line(tossed(geom, onset)) for onset in ("none", "linear")]
@@ -98,12 +97,15 @@ def main() -> None:
             plain, corrected = (
                 means(points, *line(points, contact), np.array([SPEED]), SIGMA, "gaussian") for line in lines
             )
-            numbers = [told(plain.slope, plain.slope_error), told(plain.first, plain.first_error)]
-            row(f"{geom}, solimp[0] = {name}", *numbers, told(corrected.first, corrected.first_error))
+            numbers = [
+                _with_error(plain.slope, plain.slope_error),
+                _with_error(plain.first, plain.first_error),
+            ]
+            numbers.append(_with_error(corrected.first, corrected.first_error))
+            print(markdown_row(f"{geom}, solimp[0] = {name}", *numbers), flush=True)
 
 
-def told(value: np.ndarray, error: np.ndarray) -> str:
-    """A mean with the error of its quadrature."""
+def _with_error(value: np.ndarray, error: np.ndarray) -> str:
     return f"{value[0]:.3g} ± {error[0]:.1g}"
 
 

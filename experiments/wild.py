@@ -1,11 +1,12 @@
-"""Makes the tables of docs/in-the-wild.md: gradients through environments of MuJoCo Playground.
+"""Tables of docs/in-the-wild.md: gradients through environments of MuJoCo Playground.
 
     pip install playground
     python -m experiments.wild HopperHop >> found.jsonl            # one rollout: stock, here, finite differences
     python -m experiments.wild HopperHop none >> found.jsonl       # means without the onset term, or "linear": with it
     python -m experiments.wild table found.jsonl
 
-The function is the distance that a body gets forward, of a constant action. Means go on, a batch a line, until stopped.
+The function is the distance that a body moves forward under a constant action. Means run until stopped, one line
+per batch.
 """
 
 import json
@@ -26,17 +27,18 @@ from scipy import stats
 import mjx_study
 from estimators import Differentiation, Evaluation, FirstOrder, circulation
 from mjx_study import differentiable_mjx
+from mjx_study.table import markdown_table
 
 STEPS: Final = 100
-"""Of one rollout."""
+"""Steps of a single rollout."""
 MEAN_STEPS: Final = 50
-"""Of each rollout behind a mean."""
+"""Steps of each rollout of a mean."""
 SIGMA: Final = 0.1
-"""Standard deviation of the noise on the actions of means."""
+"""Standard deviation of the noise on actions, for means."""
 SIZES: Final = (1e-4, 1e-5, 1e-6, 1e-7, 1e-8)
-"""Of finite differences, in the unit of the action."""
+"""Steps of finite differences, in the unit of the action."""
 REACH: Final = 0.05
-"""Half the length of the path along which means are integrated, in the unit of the action."""
+"""Half the length of the path of integration, in the unit of the action."""
 NODES: Final = 3
 BATCH: Final = 100
 CONFIDENCE: Final = 0.99
@@ -44,9 +46,9 @@ CONVERGED: Final[dict[str, Any]] = {"iterations": 50, "ls_iterations": 20, "tole
 
 
 def environment(name: str) -> Any:
-    """An environment in MJX's JAX implementation.
+    """Load an environment with MJX's JAX implementation.
 
-    Go1's meshes are not in the package. They are only seen, never touched: an icosahedron takes their place.
+    Go1's meshes are not in the package. They are only drawn, so an icosahedron takes their place.
     """
     overrides = {"impl": "jax"}
     if name != "Go1Joystick":
@@ -61,11 +63,11 @@ def environment(name: str) -> Any:
 
 
 class Distance:
-    """Distance forward of a body, as an objective of a constant action; initial states and noise are random.
+    """Distance forward under a constant action, with random initial states and noise, as an objective.
 
     Attributes:
-        environment: of MuJoCo Playground.
-        onset: of `differentiable_mjx`.
+        environment: an environment of MuJoCo Playground.
+        onset: argument of `differentiable_mjx`.
     """
 
     def __init__(self, environment: Any, onset: str = "none", chunk: int = BATCH):
@@ -80,7 +82,7 @@ class Distance:
         return self.environment.action_size
 
     def of(self, action: Float[Array, " params"], start: Any, noise: Float[Array, "steps params"]) -> Float[Array, ""]:
-        """From a state of the environment [m]."""
+        """Return the distance from a state of the environment [m]."""
 
         def advance(state, noise):
             state = self.environment.step(state, action + noise)
@@ -90,7 +92,7 @@ class Distance:
         return last.data.xpos[1, 0] - start.data.xpos[1, 0]
 
     def start(self, key: Key[Array, ""]) -> Any:
-        """A state as the environment draws it, with the types that a step returns."""
+        """Draw a state of the environment, with the types that a step returns."""
         state = self.environment.reset(jax.random.key_data(key))
         following = jax.eval_shape(self.environment.step, state, jnp.zeros(self.num_params))
         return jax.tree.map(lambda leaf, like: jnp.asarray(leaf, like.dtype), state, following)
@@ -101,7 +103,7 @@ class Distance:
         return self.of(action, jax.lax.stop_gradient(self.start(start)), drawn)
 
     def evaluate(self, theta: Float[Array, " params"], keys: Key[Array, " samples"]) -> Evaluation:
-        """Through stock MJX; without a score, so that there are no zeroth-order estimates."""
+        """Evaluate through stock MJX; without a score, since no zeroth-order estimate is needed."""
         value = self._values(theta, keys)
         return Evaluation(value, jnp.full((len(keys), self.num_params), jnp.nan), jnp.zeros_like(value))
 
@@ -111,13 +113,13 @@ class Distance:
 
 
 def with_options(environment: Any, options: dict[str, Any]) -> None:
-    """Give the environment's model other options of the solver."""
+    """Set options of the solver in the environment's model."""
     model = environment._mjx_model
     environment._mjx_model = model.replace(opt=model.opt.replace(**options))
 
 
 def single(environment: Any) -> dict[str, Any]:
-    """Of one rollout without noise: the gradient by stock and here, against finite differences."""
+    """Differentiate one rollout without noise through stock MJX and this step, against finite differences."""
     budget = environment.mj_model.opt.iterations, environment.mj_model.opt.ls_iterations
     found: dict[str, Any] = {"nv": environment.mj_model.nv, "steps": STEPS * environment.n_substeps, "budget": budget}
     objective = Distance(environment)
@@ -152,7 +154,7 @@ def single(environment: Any) -> dict[str, Any]:
 
 
 def means(environment: Any, onset: str, samples: int) -> Iterator[dict[str, float]]:
-    """First-order gradients integrated along a random direction against the distance's difference, a batch a time."""
+    """Integrate first-order gradients along a random direction, against the difference of the distance, by batch."""
     with_options(environment, CONVERGED)
     action = 0.1 * jnp.ones(environment.action_size)
     along = np.random.default_rng(1).standard_normal(environment.action_size)
@@ -164,31 +166,30 @@ def means(environment: Any, onset: str, samples: int) -> Iterator[dict[str, floa
 
 
 def tables(lines: Iterable[dict[str, Any]]) -> str:
-    """What was found, in Markdown."""
+    """Format the results of both kinds of runs as two Markdown tables."""
     lines = list(lines)
     singles, batches = ([line for line in lines if bool(line["onset"]) == mean] for mean in (False, True))
-    rows = [
-        "| environment | DoF, steps | budget | stock | at one iteration | here | differences | converged: here |"
-        " off differences of 1e-6, 1e-7, 1e-8 by |",
-        "| --- | --- | --- | --- | --- | --- | --- | --- | --- |",
-    ]
+    rows = []
     for line in singles:
         stock = line["stock_own"] if isinstance(line["stock_own"], str) else f"{line['stock_own']:.4g}"
         off = ", ".join(f"{abs(found / line['ours'] - 1):.0e}" for found in line["differences"][2:])
         slopes = (line["stock_one"], line["ours_own"], line["differences_own"][-1], line["ours"])
         cells = [f"`{line['name']}`", f"{line['nv']}, {line['steps']}", str(line["budget"]), stock]
-        rows.append("| " + " | ".join([*cells, *(f"{slope:.4g}" for slope in slopes), off]) + " |")
-    rows += ["", "| environment | onset | N | difference [m] | gap [m] | smallest effective N |", "| --- " * 6 + "|"]
+        rows.append([*cells, *(f"{slope:.4g}" for slope in slopes), off])
+    header = ("environment", "DoF, steps", "budget", "stock", "at one iteration", "here", "differences")
+    first = markdown_table(rows, (*header, "converged: here", "off differences of 1e-6, 1e-7, 1e-8 by"))
+    rows = []
     for name, onset in dict.fromkeys((line["name"], line["onset"]) for line in batches):
-        mine = [line for line in batches if (line["name"], line["onset"]) == (name, onset)]
+        group = [line for line in batches if (line["name"], line["onset"]) == (name, onset)]
         intervals = []
         for field in ("difference", "gap"):
-            values = np.array([line[field] for line in mine])
-            wide = stats.t.ppf((1 + CONFIDENCE) / 2, len(mine) - 1) * stats.sem(values)
-            intervals.append(f"{np.mean(values):.3g} ± {wide:.2g}")
-        least = min(line["effective"] for line in mine)
-        rows.append(f"| `{name}` | {onset} | {BATCH * len(mine)} | {' | '.join(intervals)} | {least:.1f} |")
-    return "\n".join(rows)
+            values = np.array([line[field] for line in group])
+            half = stats.t.ppf((1 + CONFIDENCE) / 2, len(group) - 1) * stats.sem(values)
+            intervals.append(f"{np.mean(values):.3g} ± {half:.2g}")
+        least = min(line["effective"] for line in group)
+        rows.append([f"`{name}`", onset, BATCH * len(group), *intervals, f"{least:.1f}"])
+    header = ("environment", "onset", "N", "difference [m]", "gap [m]", "smallest effective N")
+    return f"{first}\n\n{markdown_table(rows, header)}"
 
 
 def main() -> None:

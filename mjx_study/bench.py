@@ -23,11 +23,11 @@ import numpy as np
 from mujoco import rollout
 
 from estimators import FirstOrder, ZerothOrder
+from estimators.noise import split_sample_key, standard_noise
 from mjx_study.compiled import Compiled
 from mjx_study.experiment.memory import check_memory
 from mjx_study.objective import Simulator, chunk_for, simulate, spread
 from mjx_study.progress import Progress, silent
-from mjx_study.reference.noise import split_sample_key, standard_noise
 from mjx_study.runtime import environment, local_devices
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.contact import ContactModel, apply_contact

@@ -2,7 +2,7 @@
 
 JAX's cache of compiled programs trusts what it finds: it decompresses it, with a checksum or without one, by the
 library that is installed, and runs it. Here its entries are digested like everything else; one that does not match is
-discarded, and compiled again.
+discarded, and the program is recompiled.
 """
 
 import functools

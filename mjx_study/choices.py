@@ -5,7 +5,7 @@ from collections.abc import Iterable
 from importlib import metadata
 from typing import Final
 
-from estimators.catalogue import unknown
+from estimators.choices import unknown
 
 PRECISIONS: Final = ("float64", "float32")
 CONES: Final = ("pyramidal", "elliptic")

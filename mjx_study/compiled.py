@@ -20,6 +20,7 @@ import jax
 import jax.export
 
 from mjx_study.caches import read_cached, write_cached
+from mjx_study.graph.build import known_libraries, libraries_in, library_ready, native_identity
 from mjx_study.identity import trace_contents
 from mjx_study.runtime import precision, traces_folder
 from mjx_study.structure import describe, restore
@@ -113,7 +114,7 @@ class Compiled:
         if folder is None or self._contents is None:
             return None
         settings = [(name, value) for name, value in jax.config.values.items() if not UNTRACED.search(name)]
-        text = repr((self._contents, jax.default_backend(), precision(), settings, form))
+        text = repr((self._contents, jax.default_backend(), native_identity(), precision(), settings, form))
         return folder / f"{hashlib.sha256(text.encode()).hexdigest()[:32]}.trace"
 
     def _export(self, path: Path, types: Sequence[jax.ShapeDtypeStruct], form: Any) -> Callable[..., Any]:
@@ -126,7 +127,10 @@ class Compiled:
             return found
 
         try:
-            trace = jax.export.export(jax.jit(of_leaves))(*types).serialize()
+            jitted = jax.jit(of_leaves)
+            jitted.trace(*types)  # which names the libraries of native code that it calls
+            allowed = [jax.export.DisabledSafetyCheck.custom_call(name) for name in known_libraries()]
+            trace = jax.export.export(jitted, disabled_checks=allowed)(*types).serialize()
             described = json.dumps(describe(outputs[0])).encode()
         except ValueError:  # an operation that cannot be exported, or outputs of a class of others
             return self._whole
@@ -158,10 +162,11 @@ def type_of(leaf: Any) -> jax.ShapeDtypeStruct:
 
 
 def _read(path: Path) -> Callable[..., Any] | None:
-    """Load the function whose trace is in a file; None if the file is missing or unreadable."""
+    """Load the function whose trace is in a file; None if the file is missing or unreadable, or a library of native
+    code that it calls is."""
     kept = read_cached(path)
     try:
-        return None if kept is None else _load(kept)
+        return None if kept is None or not all(map(library_ready, libraries_in(kept))) else _load(kept)
     except Exception:  # JAX may raise anything; the trace is then made and written again
         return None
 

@@ -215,7 +215,7 @@ class Digest:
                 self._all(f"global {name}", (value,))
 
     def _global(self, module: str, name: str, value: Any, names: set[str]) -> None:
-        """Add what a function reads from a module: data by a digest of its own, which has a name in messages; of
+        """Add what a function reads from a module: data by a separate digest, which has a name in messages; of
         another module those of the names that the function uses."""
         if isinstance(value, types.ModuleType):
             if is_users(value.__name__):
@@ -225,14 +225,14 @@ class Digest:
         if isinstance(value, CODE) or hasattr(value, "__wrapped__"):
             self._all(f"global {name}", (value,))
             return
-        told = f"global {name} of {module}"
-        if told not in self.globals:
-            self.globals[told] = ""  # while it is made, since it may contain functions that read it
+        label = f"global {name} of {module}"
+        if label not in self.globals:
+            self.globals[label] = ""  # while it is made, since it may contain functions that read it
             digest = Digest(exact=self._exact)
             digest.sources, digest.globals = self.sources, self.globals
             digest.add(value)
-            self.globals[told] = digest.hexdigest()
-        self._note(told, self.globals[told])
+            self.globals[label] = digest.hexdigest()
+        self._note(label, self.globals[label])
 
     def _code(self, code: types.CodeType) -> None:
         self._note("code", code.co_code.hex())

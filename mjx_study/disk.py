@@ -24,7 +24,7 @@ TEMPORARY: Final = ".mjx-study"
 SEALED: Final = re.compile(rf"(\..+\.[0-9a-f]{{12}})([0-9a-f]{{12}}){re.escape(TEMPORARY)}", re.DOTALL)
 """Temporary names: a dot, the file's name, random digits, and a checksum of all that."""
 _FOLDERS: Final[set[str]] = set()
-MOST_BYTES: Final = 100_000_000
+MAX_BYTES: Final = 100_000_000
 """Maximum size of a file that users supply [bytes]."""
 
 
@@ -191,8 +191,8 @@ def read_whole(path: Path, *, follow: bool = True, most: int | None = None) -> b
 
 
 def read_bytes(path: Path) -> bytes:
-    """Read a regular file of at most `MOST_BYTES`; anything else is a ValueError."""
+    """Read a regular file of at most `MAX_BYTES`; anything else is a ValueError."""
     try:
-        return read_whole(path, most=MOST_BYTES)
+        return read_whole(path, most=MAX_BYTES)
     except OSError as error:
         raise ValueError(f"cannot read {path}: {error.strerror or error}") from error

@@ -22,8 +22,12 @@ from mjx_study.version import version_of
 
 VERSIONED: Final = ("mjx-study", "mujoco", "mujoco-mjx", "jax", "jaxlib", "numpy", "optax")
 """Packages whose version may affect results."""
-ABOVE: Final = ("cli", "plots", "render", "gradcheck", "claims", "report.py", "bench.py", "diagnose")
-"""Parts of mjx_study that use studies, and so do not affect their results."""
+SOURCES: Final = (".py", ".c", ".cu")
+"""Suffixes of files with code."""
+NOT_COMPUTING: Final = frozenset(
+    ["cli", "plots", "render", "gradcheck", "diagnose", "claims", "bench.py", "report.py", "_public.py", "__main__.py"]
+)
+"""Parts of mjx_study that no study imports while it computes, and so do not affect results; all others count."""
 DIGEST: Final = re.compile("[0-9a-f]{12,64}")
 """Digests, which messages do not show."""
 ACCEPT: Final = "choose another folder, or accept the mixture by --accept-versions"
@@ -31,8 +35,8 @@ ACCEPT: Final = "choose another folder, or accept the mixture by --accept-versio
 
 
 def versions() -> dict[str, str]:
-    """Versions of the packages that compute, and a digest of this package's code."""
-    return {name: version_of(name) for name in VERSIONED} | {"code of mjx-study": _own_code()}
+    """Versions of the packages that compute, and a digest of this package's computing code."""
+    return {name: version_of(name) for name in VERSIONED} | {"code of mjx-study": computing_code()}
 
 
 def git_revision(root: Path | None = None) -> str | None:
@@ -67,7 +71,7 @@ def trace_contents(made_of: Any) -> str | None:
 
     None if code from outside this package is involved, whose imports are not all followed.
     """
-    digest = Digest((made_of, [version_of(name) for name in VERSIONED], _own_code(ABOVE)), exact=True)
+    digest = Digest((made_of, [version_of(name) for name in VERSIONED], computing_code()), exact=True)
     return None if digest.sources.foreign else digest.hexdigest()
 
 
@@ -90,31 +94,28 @@ def differences(theirs: Mapping[str, Any], ours: Mapping[str, Any]) -> str | Non
     different = [name for name in dict(theirs) | dict(ours) if theirs.get(name) != ours.get(name)]
     digests = {name for name in different for each in (theirs, ours) if DIGEST.fullmatch(str(each.get(name)))}
     different.sort(key=lambda name: name in digests and (name not in theirs or name not in ours))
-    told = []
+    described = []
     for name in different[:3]:
         there, here = ("none" if each.get(name) is None else each[name] for each in (theirs, ours))
-        told.append(f"{name} differs" if name in digests else f"{name} {there} there and {here} here")
-    told += [f"{len(different) - 3} more"] if len(different) > 3 else []
-    return ", ".join(told) or None
+        described.append(f"{name} differs" if name in digests else f"{name} {there} there and {here} here")
+    described += [f"{len(different) - 3} more"] if len(different) > 3 else []
+    return ", ".join(described) or None
 
 
 @functools.cache
-def _own_code(without: tuple[str, ...] = ()) -> str:
-    """Digest of this package's source, except some parts of mjx_study."""
-    package = Path(__file__).parent
-    files = sorted([*package.rglob("*.py"), *(package.parent / "estimators").rglob("*.py")])
-    left_out = [package / part for part in without]
+def computing_code(package: Path = Path(__file__).parent) -> str:
+    """Digest of the source of `estimators` and of mjx_study, except `NOT_COMPUTING`."""
+    files = [*package.rglob("*"), *(package.parent / "estimators").rglob("*")]
     sha = hashlib.sha256()
-    for path in files:
-        if not any(path.is_relative_to(part) for part in left_out):
+    for path in sorted(path for path in files if path.suffix in SOURCES):
+        if path.relative_to(package.parent).parts[:2] not in {(package.name, part) for part in NOT_COMPUTING}:
             sha.update(str(path.relative_to(package.parent)).encode() + b"\0" + path.read_bytes())
     return sha.hexdigest()[:12]
 
 
 @functools.cache
 def code_of(module: str) -> str:
-    """Digest the code behind a ledger measurement: an imported module, its imports from its own package, and the code
-    below."""
+    """Digest the code behind a measurement: an imported module, what it imports from its package, and what computes."""
     package, found, waiting = module.rpartition(".")[0], {}, [module]
     while waiting:
         name = waiting.pop()
@@ -123,5 +124,5 @@ def code_of(module: str) -> str:
             found[name] = path.read_bytes()
             waiting += imports(found[name], package)
     models = sorted(models_folder().rglob("*.xml"))
-    text = repr((sorted(found.items()), [path.read_bytes() for path in models], _own_code(ABOVE)))
+    text = repr((sorted(found.items()), [path.read_bytes() for path in models], computing_code()))
     return hashlib.sha256(text.encode()).hexdigest()[:16]

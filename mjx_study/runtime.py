@@ -118,7 +118,7 @@ def default_cache() -> Path | None:
         root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     except RuntimeError:
         return None
-    return root / "mjx-study" / hashlib.sha256(f"private\n{_processor()}".encode()).hexdigest()[:12]
+    return root / "mjx-study" / hashlib.sha256(f"private\n{processor()}".encode()).hexdigest()[:12]
 
 
 def traces_folder() -> Path | None:
@@ -126,8 +126,15 @@ def traces_folder() -> Path | None:
     return _TRACES[0] if _TRACES else None
 
 
+def libraries_folder() -> Path | None:
+    """Folder for native code kept between runs: beside the traces, or in `default_cache` without them."""
+    folder = _TRACES[0].parent if _TRACES else default_cache()
+    return None if folder is None else folder / "native"
+
+
 @functools.cache
-def _processor() -> str:
+def processor() -> str:
+    """The processor's name and instructions."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:
@@ -137,7 +144,7 @@ def _processor() -> str:
 
 
 def processor_name() -> str:
-    names = [line.split(":", 1)[1].strip() for line in _processor().splitlines() if line.startswith("model name")]
+    names = [line.split(":", 1)[1].strip() for line in processor().splitlines() if line.startswith("model name")]
     return names[0] if names else platform.machine()
 
 

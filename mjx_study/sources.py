@@ -1,4 +1,4 @@
-"""Source files of the user's code: of modules, and of those beside them that they import, loaded or not.
+"""Source files of the user's code: of modules, and of the neighbouring ones that they import, loaded or not.
 
 Code of this package, of the libraries below it and of the standard library is identified by version instead.
 """
@@ -11,7 +11,7 @@ import types
 from pathlib import Path
 from typing import Final
 
-from estimators.seen import INSTALLED
+from estimators.user_inputs import INSTALLED
 
 BY_VERSION: Final = {"mjx_study", "estimators", "mujoco", "jax", "jaxlib", "numpy", "scipy", "optax", "builtins"}
 """Modules whose code is identified by version."""
@@ -40,7 +40,7 @@ class Sources:
         if self._read(path, root):
             for value in list(vars(sys.modules[module]).values()):
                 other = value.__name__ if isinstance(value, types.ModuleType) else getattr(value, "__module__", None)
-                if isinstance(other, str) and _beside(other, module, root):
+                if isinstance(other, str) and _is_neighbour(other, module, root):
                     self.add(other)
             if is_users(module):
                 self._imported(path, root, module)
@@ -83,7 +83,7 @@ def source_file(module: str) -> Path | None:
     return Path(file) if file is not None and Path(file).is_file() else None
 
 
-def _beside(other: str, module: str, root: Path) -> bool:
+def _is_neighbour(other: str, module: str, root: Path) -> bool:
     """Whether a module is in the same package as another, or in the same folder tree."""
     path = source_file(other)
     if path is None or other.partition(".")[0] == module.partition(".")[0]:

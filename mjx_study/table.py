@@ -3,8 +3,10 @@
 import dataclasses
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
+Item = TypeVar("Item")
+Key = TypeVar("Key")
 ROUNDING: Final = 1e-12
 """Error over the value below which it is one of rounding."""
 
@@ -37,9 +39,10 @@ def format_table(rows: Sequence[Sequence[str]], header: Sequence[str]) -> list[s
     return ["  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in (header, *rows)]
 
 
-def markdown_table(rows: Iterable[Sequence[str]], header: Sequence[str]) -> str:
+def markdown_table(rows: Iterable[Sequence[Any]], header: Sequence[str]) -> str:
     """Format a table in Markdown, without a line feed at its end."""
-    return "\n".join(f"| {' | '.join(row)} |" for row in (header, ["---"] * len(header), *rows))
+    lines = [f"| {' | '.join(map(str, row))} |" for row in (header, *rows)]
+    return "\n".join([lines[0], "|" + "---|" * len(header), *lines[1:]])
 
 
 def number(value: float | None, digits: int = 3) -> str:
@@ -66,12 +69,25 @@ def with_error(value: float, error: float | None, digits: int = 3) -> str:
 
 
 def _to_decimals(value: float, decimals: int) -> str:
-    """Format to decimals, of which there are fewer than none for large errors."""
+    """Format to a number of decimals, which is negative for large errors."""
     rounded = round(value, decimals)
     if rounded == 0 or 1e-4 <= abs(rounded) < 1e6:
         return f"{rounded:.{max(0, decimals)}f}" if rounded else "0"
     mantissa, exponent = f"{rounded:.{max(0, decimals + math.floor(math.log10(abs(rounded))))}e}".split("e")
     return f"{mantissa}e{int(exponent)}"
+
+
+def plural(count: int, noun: str) -> str:
+    """Format a count with its noun."""
+    return f"{count} {noun}{'' if count == 1 else 's'}"
+
+
+def grouped(items: Iterable[Item], key: Callable[[Item], Key]) -> dict[Key, list[Item]]:
+    """Group items by a key, in the order in which the keys occur."""
+    groups: dict[Key, list[Item]] = {}
+    for item in items:
+        groups.setdefault(key(item), []).append(item)
+    return groups
 
 
 def percent(share: float, digits: int = 0) -> str:
@@ -95,6 +111,11 @@ def as_plain(document: Any) -> Any:
     if isinstance(document, list | tuple):
         return [as_plain(item) for item in document]
     return None if isinstance(document, float) and not math.isfinite(document) else document
+
+
+def explain(*columns: Column) -> str:
+    """Format the headings of columns with their meanings, a line each."""
+    return described({column.heading: column.meaning for column in columns})
 
 
 def digits_to_tell_apart(values: Iterable[float | int], least: int = 6) -> int:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from estimators.blocks import moments_of
+from estimators.merged_samples import moments_of
 from mjx_study.experiment.blocks import Blocks, pack
 from mjx_study.experiment.checkpoint import Checkpoint, StudyError
 from mjx_study.experiment.tally import Tally

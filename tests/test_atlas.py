@@ -6,44 +6,52 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from experiments.atlas import measure as atlas
-from experiments.atlas import page
+from experiments.atlas import design, page, run, table
+from experiments.pages import replace_tables
 from mjx_study.table import percent
 
-TABLE = page.read(atlas.RESULTS)
+TABLE = table.read(run.RESULTS)
 
 
 def test_the_page_says_what_the_file_says() -> None:
     text = page.PAGE.read_text()
-    assert page.written(text, TABLE) == text
-    assert atlas.RESULTS.stat().st_size < 1.5e6
+    assert replace_tables(text, page.tables(TABLE)) == text
+    assert run.RESULTS.stat().st_size < 1.5e6
 
 
-def _off(part: page.Table, verdict: str = "fobg_off") -> tuple[int, int]:
+def _off(part: table.Table, verdict: str = "fobg_off") -> tuple[int, int]:
     """Cells with a verdict, and those decided."""
     return int((part[verdict] == 1).sum()), int(part[verdict].notna().sum())
 
 
-def _share(part: page.Table, verdict: str = "above") -> str:
+def _share(part: table.Table, verdict: str = "above") -> str:
     yes, decided = _off(part, verdict)
     return percent(yes / decided)
 
 
 def _statements() -> list[str]:
     """Sentences of the page that no table holds, with their numbers from the file."""
-    met, wide = TABLE[page._met(TABLE)], TABLE[page._wide(TABLE)]
-    forces, (momentum, wall) = TABLE[TABLE.task.isin(page.FORCES)], (TABLE[TABLE.task == n] for n in page.LAUNCHED)
+    met, wide = TABLE[table.bodies_meet(TABLE)], TABLE[table.noise_is_wide(TABLE)]
+    forces, (momentum, wall) = TABLE[TABLE.task.isin(table.FORCES)], (TABLE[TABLE.task == n] for n in table.LAUNCHED)
     tenth, third = (
         (lambda t: t[(t.limit > 0.1) & (t.limit < 1 / 3)]),
         (lambda t: t[(t.limit > 0.03) & (t.limit < 1 / 3)]),
     )
     damped = forces[forces.b > 0]
-    low = met[(met.task == "momentum_transfer") & (met.strength <= page.SMOOTH_SHARE)]
+    low = met[(met.task == "momentum_transfer") & (met.strength <= table.SMOOTH_SHARE)]
     smooth = met[(met.task == "ball_wall") & (met.contact == "smooth_onset")]
     soft, stiff = smooth[smooth.stiffness < 5e3], smooth[smooth.stiffness >= 5e3]
     bar = wide[wide.task == "momentum_transfer"]
     inside = bar[(bar.strength >= 0.03) & (bar.strength < 0.8)]
     assert _off(inside, "beyond")[0] == 0 and len(set(_off(bar[bar.strength > 1], "beyond"))) == 1
+    jumping = met[(met.strength > table.SMOOTH_SHARE) & (met.slope.abs() > 5 * met.slope_se)]
+    largest = jumping.task.map(TABLE.groupby("task").timestep.max())
+    alike = jumping[largest**2 * jumping.k + 2 * largest * jumping.b < 4]
+    bias = alike.groupby(["task", "timestep"]).fobg_relative.median()
+    left = met[(met.fobg_off == 1) & (met.strength > table.SMOOTH_SHARE)].groupby(["task", "timestep"])
+    stiffest = TABLE[TABLE.stiffness >= TABLE.groupby("task").stiffness.transform(lambda each: each.quantile(0.75))]
+    above = {key: _share(part) for key, part in stiffest.groupby(["task", "timestep"])}
+    off = {key: percent(part.fobg_onset_off.dropna().mean()) for key, part in left}
     tennis = met[met.task == "tennis"]
     assert len(set(_off(tennis))) == 1
     return [
@@ -59,6 +67,13 @@ def _statements() -> list[str]:
         + "above 1.5 kN/m {} of {}.".format(*_off(low[low.stiffness >= 1500])),
         "{} of {} cells with a smooth onset below 5 kN/m are off, ".format(*_off(soft))
         + "and {} of {} above".format(*_off(stiff)),
+        "{:.2g}, {:.2g} and {:.2g} times the slope on `ball_wall` at 1, 2 and 4 ms, ".format(*bias["ball_wall"])
+        + "and {:.2g}, {:.2g} and {:.2g} times on".format(*bias["momentum_transfer"]),
+        f"{off['momentum_transfer', 0.004]} of the cells of `momentum_transfer` are off at 4 ms and "
+        f"{off['momentum_transfer', 0.001]} at 1 ms, of `ball_wall` {off['ball_wall', 0.004]} and "
+        f"{off['ball_wall', 0.001]}.",
+        f"in {above['pusher', 0.01]} at 10 ms and in {above['pusher', 0.0025]} at 2.5 ms; of `momentum_transfer` in "
+        f"{above['momentum_transfer', 0.004]} at 4 ms and {above['momentum_transfer', 0.001]} at 1 ms.",
         f"it holds in all {_off(inside, 'beyond')[1]} decided cells with a strength between 0.03 and 0.8 and in none "
         f"of the {_off(bar[bar.strength > 1], 'beyond')[1]} above 1",
     ]
@@ -73,75 +88,74 @@ def test_sentences_of_the_page_have_the_numbers_of_the_file() -> None:
 def test_cells_are_computed_again_with_the_same_numbers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Another machine rounds otherwise, which changes chaotic cells, so the median is compared."""
     monkeypatch.delenv("XLA_FLAGS", raising=False)  # without optimisation programs round otherwise
-    atlas.run(tmp_path, 1, 3600.0, atlas.BLOCK, ["momentum_transfer at 0.004", "pusher at 0.0025"])
-    found = atlas.read(tmp_path / atlas.RESULTS.name)
+    run.run(tmp_path, 1, 3600.0, run.BLOCK, ["momentum_transfer at 0.004", "pusher at 0.0025"])
+    found = run.read(tmp_path / run.RESULTS.name)
     kept = TABLE.set_index("index").loc[found["index"]]
-    assert len(kept) == 2 * atlas.BLOCK
+    assert len(kept) == 2 * run.BLOCK
     for name in ("slope", "zobg_variance", "fobg_variance", "fobg_bias", "fobg_onset_bias"):
         errors = np.abs(found[name] - kept[name]) / np.abs(kept[name])
-        assert errors[kept[name] != 0].groupby(kept.program).median().max() <= 2**-atlas.DIGITS
+        assert errors[kept[name] != 0].groupby(kept.program).median().max() <= 2**-run.DIGITS
 
 
 @pytest.mark.slow
 def test_no_two_cells_share_a_contact_model_a_sigma_or_a_theta() -> None:
-    cells = [cell for program in range(len(atlas.PROGRAMS)) for cell in atlas.cells_of(program)]
-    assert len(cells) == atlas.CELLS >= 10_000
+    cells = [cell for program in range(len(design.PROGRAMS)) for cell in design.cells_of(program)]
+    assert len(cells) == design.CELLS >= 10_000
     assert [cell.index for cell in cells] == list(range(len(cells)))
     for names in (("stiffness",), ("program", "sigma"), ("program", "theta")):
         assert len({tuple(getattr(cell, name) for name in names) for cell in cells}) > 0.999 * len(cells)
 
 
 def test_the_file_holds_the_cells_of_the_design() -> None:
-    np.testing.assert_array_equal(TABLE["index"], np.arange(atlas.CELLS))
+    np.testing.assert_array_equal(TABLE["index"], np.arange(design.CELLS))
     program = int(TABLE.program.iloc[0])
-    cells = {cell.index: cell for cell in atlas.cells_of(program)}
+    cells = {cell.index: cell for cell in design.cells_of(program)}
     for _, row in TABLE[TABLE.program == program].iterrows():
         cell = cells[int(row["index"])]
         for name in ("family", "stiffness", "width", "sigma", "theta"):
-            assert row[name] == pytest.approx(getattr(cell, name), rel=2**-atlas.DIGITS)
+            assert row[name] == pytest.approx(getattr(cell, name), rel=2**-run.DIGITS)
 
 
 def test_parts_are_joined_and_a_cell_that_was_computed_twice_is_kept_once(tmp_path: Path) -> None:
     for part, indices in enumerate([[3, 1], [1, 2]]):
         columns = {"index": np.array(indices, float), "slope": np.array(indices) / 3}
-        atlas.write(tmp_path / f"part-{part}.npz", [columns])
-    assert atlas.condense(tmp_path) == 3
+        run.write(tmp_path / f"part-{part}.npz", [columns])
+    assert run.condense(tmp_path) == 3
     assert [path.name for path in tmp_path.iterdir()] == ["atlas.npz"]
-    assert atlas.condense(tmp_path) == 3 and len(atlas.about(tmp_path / "atlas.npz")["environments"]) == 1
-    found = atlas.read(tmp_path / "atlas.npz")
+    assert run.condense(tmp_path) == 3 and len(run.about(tmp_path / "atlas.npz")["environments"]) == 1
+    found = run.read(tmp_path / "atlas.npz")
     np.testing.assert_array_equal(found["index"], [1, 2, 3])
     np.testing.assert_array_equal(found["environment"], 0)
-    np.testing.assert_allclose(found["slope"], np.array([1, 2, 3]) / 3, rtol=2**-atlas.DIGITS)
+    np.testing.assert_allclose(found["slope"], np.array([1, 2, 3]) / 3, rtol=2**-run.DIGITS)
 
 
 def test_rounding_keeps_what_is_no_number() -> None:
-    np.testing.assert_array_equal(atlas.rounded(np.array([np.nan, np.inf, -np.inf, 0.0])), [np.nan, np.inf, -np.inf, 0])
+    np.testing.assert_array_equal(run.rounded(np.array([np.nan, np.inf, -np.inf, 0.0])), [np.nan, np.inf, -np.inf, 0])
 
 
-def planted(threshold: float, flipped: float, size: int = 4000) -> page.Table:
+def planted(threshold: float, flipped: float, size: int = 4000) -> table.Table:
     """Cells whose verdict is 1 above a threshold, but for a share of them."""
     rng = np.random.default_rng(0)
     group = np.exp(rng.normal(size=size))
     verdict = (group > threshold) ^ (rng.random(size) < flipped)
-    table = pd.DataFrame({"index": np.arange(size), "group": group, "verdict": verdict.astype(float)})
-    table.attrs["families"] = ["one"]
-    return table
+    cells = pd.DataFrame({"index": np.arange(size), "group": group, "verdict": verdict.astype(float)})
+    return cells
 
 
 @pytest.mark.parametrize(("threshold", "flipped"), [(0.5, 0.0), (2.0, 0.1)])
 def test_a_rule_is_as_often_right_as_planted_and_its_threshold_is_found(threshold: float, flipped: float) -> None:
     """Standard error of a share: 0.01 at 1000 cells; the threshold is one of 99 quantiles."""
-    table = planted(threshold, flipped)
-    rule = page.Rule("", "group", threshold, "verdict", lambda table: table.group > 0)
-    fit, test = page.halves(table)
+    cells = planted(threshold, flipped)
+    rule = table.Rule("", "group", threshold, "verdict", lambda cells: cells.group > 0)
+    fit, test = table.halves(cells)
     assert not set(fit["index"]) & set(test["index"])
     assert rule.fitted(rule.judged(fit)) == pytest.approx(threshold, rel=0.1)
-    expected = (table.group > threshold).to_numpy()
-    verdict = (table.verdict == 1).to_numpy()
-    holds, holds_not = rule.hits(table, threshold)
-    assert np.mean(holds) == pytest.approx(np.mean(expected[verdict])) and len(holds) + len(holds_not) == len(table)
+    expected = (cells.group > threshold).to_numpy()
+    verdict = (cells.verdict == 1).to_numpy()
+    holds, holds_not = rule.hits(cells, threshold)
+    assert np.mean(holds) == pytest.approx(np.mean(expected[verdict])) and len(holds) + len(holds_not) == len(cells)
     assert np.mean(holds_not) == pytest.approx(np.mean(~expected[~verdict]))
-    assert rule.balanced(table, threshold) > rule.balanced(table, 4 * threshold) + 0.05
+    assert rule.balanced(cells, threshold) > rule.balanced(cells, 4 * threshold) + 0.05
 
 
 @pytest.mark.parametrize(
@@ -159,4 +173,4 @@ def test_a_rule_is_as_often_right_as_planted_and_its_threshold_is_found(threshol
 def test_a_mean_is_off_where_its_interval_and_the_reference_s_say_so(bias, error, uncertain, effective, expected):
     columns = {"bias": bias, "bias_se": error, "effective": effective, "lost": 0.0}
     cell = {f"fobg_{name}": [value] for name, value in columns.items()} | {"slope": [-1.0], "slope_se": [uncertain]}
-    np.testing.assert_array_equal(page._off(pd.DataFrame(cell), "fobg"), [expected])
+    np.testing.assert_array_equal(table.is_off(pd.DataFrame(cell), "fobg"), [expected])

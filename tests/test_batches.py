@@ -135,7 +135,7 @@ def test_linearising_on_the_tape(make: Callable[..., Task]) -> None:
     """Forward mode through the tape program gives the Jacobians of the Jacobian program."""
     keys = jax.random.split(jax.random.key(4), 2)
     task = make()
-    assert task.scene.uses_jacobian
+    assert task.scene.uses_graph
     small, large = (
         Simulator(each, chunk_size=1).objective(None).linearise(task.theta, jax.random.clone(keys))
         for each in (task, make(adjoint="tape"))

@@ -1,4 +1,4 @@
-"""Caches on disk: private, checked before use, and made again when they are not what was written."""
+"""Caches on disk: private, checked before use, and remade if damaged."""
 
 import json
 import os
@@ -32,7 +32,7 @@ def test_a_digest_is_checked() -> None:
 
 
 @pytest.mark.parametrize("kind", ["fifo", "socket", "folder", "device"])
-def test_what_is_no_cached_file_is_none(kind: str, tmp_path: Path) -> None:
+def test_non_regular_files_are_not_read(kind: str, tmp_path: Path) -> None:
     path = tmp_path / "entry"
     assert read_cached(path) is None
     put_no_file(path, kind)
@@ -74,7 +74,7 @@ def test_a_private_folder_is_this_users_alone(tmp_path: Path, monkeypatch: pytes
 
 @pytest.fixture
 def settings_kept() -> Iterator[None]:
-    """JAX's settings are afterwards what they were before."""
+    """Restore JAX's settings."""
     names = ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs", "jax_enable_x64")
     before = {name: jax.config.values[name] for name in names}
     yield
@@ -184,7 +184,7 @@ def test_other_structures_are_refused(tree: Any) -> None:
         ({"class": ["os", "system"], "fields": []}, "is no class of so many fields"),
         ({"class": ["mjx_study.nowhere", "It"], "fields": []}, "is no class of so many fields"),
         ({"class": ["tests.test_caches", "Own"], "fields": [0]}, "is no class of so many fields"),
-        ({"class": ["estimators.types", "Differentiation"], "fields": [0]}, "is no class of so many fields"),
+        ({"class": ["estimators.batches", "Differentiation"], "fields": [0]}, "is no class of so many fields"),
         ({"class": ["mjx_study.disk", "os"], "fields": []}, "is no class of so many fields"),
     ],
 )

@@ -109,7 +109,7 @@ def test_code_versions_settings_and_the_form_of_arguments_count(monkeypatch: pyt
     ours = path()
     assert ours == path() != path("another")
     with monkeypatch.context() as patch:
-        patch.setattr(identity, "_own_code", lambda without: "other")
+        patch.setattr(identity, "computing_code", lambda: "other")
         assert path() != ours
     version = identity.version_of
     with monkeypatch.context() as patch:

@@ -1,4 +1,4 @@
-"""Faults of the disk and of processes: nothing half written, nothing lost that was there, one line, no wait."""
+"""Faults of the disk and of processes: no half-written file, no lost one, one line, no wait."""
 
 import errno
 import json
@@ -29,7 +29,7 @@ def numbers(index: int) -> dict[str, np.ndarray]:
 
 
 def study(folder: Path) -> Store:
-    """Begin a study or go on with it, and write what is missing."""
+    """Begin or resume a study, and write the missing cells."""
     store = Store.create(folder, DOCUMENT)
     for index in store.missing:
         with store.claims() as claim:
@@ -40,7 +40,7 @@ def study(folder: Path) -> Store:
 
 
 def check_whole(folder: Path) -> int:
-    """How many cells there are; each has its own numbers, and every other file is complete."""
+    """Number of cells, each with its own numbers; every other file is complete."""
     if not (folder / "study.json").exists():
         return 0
     store = Store.open(folder)
@@ -59,7 +59,7 @@ def leftovers(folder: Path) -> list[Path]:
     [(errno.ENOSPC, False), (errno.ENOSPC, True), (errno.EIO, False), (errno.EROFS, True)],
     ids=["full once", "full", "broken once", "read-only"],
 )
-def test_a_fault_at_any_write_leaves_what_is_complete(tmp_path: Path, code: int, lasting: bool) -> None:
+def test_a_fault_at_any_write_keeps_complete_files(tmp_path: Path, code: int, lasting: bool) -> None:
     """A disk that is full, broken or read-only at the first write of a study, the second, and so on."""
     folders = [tmp_path / "0"]
     for at in every_fault(code, lambda: study(folders[-1]), lasting=lasting):
@@ -114,7 +114,7 @@ def run_alone(code: str, *arguments: str) -> str:
 
 
 def test_killed_at_any_system_call_a_file_is_the_old_or_the_new_one(tmp_path: Path) -> None:
-    """And what the dead process began is removed when the folder is opened next."""
+    """Temporary files of the dead process are removed when the folder is next opened."""
     points, left, changed = map(int, run_alone(KILLED, str(tmp_path)).split())
     assert points > 20 and left > 5 and changed >= 2
 
@@ -156,7 +156,7 @@ def test_what_a_living_process_writes_stays(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["fifo", "socket", "folder", "device"])
-def test_what_is_no_file_is_refused_at_once(tmp_path: Path, kind: str) -> None:
+def test_non_regular_files_are_refused_at_once(tmp_path: Path, kind: str) -> None:
     folder = tmp_path / "study"
     study(folder)
     with deadline(5):

@@ -67,15 +67,15 @@ def prepare(name: str) -> Prepared:
 
 @cache
 def jacobian(name: str) -> np.ndarray:
-    """The Jacobian program's, in reverse mode."""
+    """The graph's, in reverse mode."""
     case = prepare(name)
-    assert case.scene.uses_jacobian
+    scene = case.scene
+    assert dynamics._slope(scene, scene.model, [*split(scene, case.point), case.warmstart])
 
-    def after(model, point):
-        return step_flat(case.scene, model, point, jnp.asarray(case.warmstart))[0]
+    def after(point):
+        return step_flat(scene, scene.model, point, jnp.asarray(case.warmstart))[0]
 
-    program = compiled(jax.jacrev(after, 1), case.scene.model, case.point)
-    return np.asarray(program(case.scene.model, case.point))
+    return np.asarray(compiled(jax.jacrev(after), case.point)(case.point))
 
 
 def polished_step(scene: Scene, model, point: jax.Array) -> jax.Array:
@@ -186,10 +186,10 @@ def test_reverse_mode_is_the_central_difference(name: str) -> None:
     [pytest.param(name, marks=[] if name == "sphere-sphere condim 1" else [pytest.mark.slow]) for name in CASES],
 )
 def test_both_programs_and_both_modes_agree(name: str) -> None:
-    """The tape, forwards and backwards, equals the Jacobian program."""
+    """The tape, forwards and backwards, and the graph's matrix equal the graph in reverse mode."""
     case, expected = prepare(name), jacobian(name)
     scene = dataclasses.replace(case.scene, adjoint="tape")
-    assert not scene.uses_jacobian
+    assert not scene.uses_graph
 
     def both(model, point):
         after, push = jax.linearize(lambda x: step_flat(scene, model, x, jnp.asarray(case.warmstart))[0], point)
@@ -200,6 +200,13 @@ def test_both_programs_and_both_modes_agree(name: str) -> None:
     forward, reverse = compiled(both, case.scene.model, case.point)(case.scene.model, case.point)
     assert_close_by_rows(forward, expected, 1e-10)
     assert_close_by_rows(reverse, expected, 1e-10)
+
+    def matrix(point):
+        _, qacc, _ = step_flat(case.scene, case.scene.model, point, jnp.asarray(case.warmstart))
+        return dynamics.step_jacobian(case.scene, case.scene.model, *split(case.scene, point), qacc)[0]
+
+    found = compiled(matrix, case.point)(case.point)
+    assert_close_by_rows(found, expected[case.scene.host.nq :], 1e-12)
 
 
 # A sphere that slides on the plane: cheap enough for what needs several programs.
@@ -283,7 +290,7 @@ def test_activation_and_control_each_have_their_column() -> None:
         <general joint="x" dyntype="filter" dynprm="{tau}" gainprm="3"/><motor joint="x" gear="5"/>
         </actuator></mujoco>"""
     )
-    assert scene.uses_jacobian
+    assert scene.uses_graph
     point = jnp.array([0.1, 0.2, 0.3, 0.4, 0.5])
     after = compiled(jax.jacfwd(lambda x: step_flat(scene, scene.model, x, jnp.zeros(1))[0]), point)(point)
     speed = np.array([0, 1, 3 * h / mass, 0, 5 * h / mass])
@@ -406,7 +413,7 @@ PENDULUM = """
 def pendulum():
     """A pendulum with an activated motor: our step and MJX's at any timestep."""
     scene = scene_of(PENDULUM)
-    assert not scene.has_constraints and not scene.uses_jacobian
+    assert not scene.has_constraints and not scene.uses_graph
 
     def with_timestep(timestep):
         return scene.model.replace(opt=scene.model.opt.replace(timestep=timestep))

@@ -14,13 +14,13 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
 
-from estimators import Estimator
+from estimators import ESTIMATORS, Estimator
 from mjx_study import plots
 from mjx_study._matplotlib import matplotlib
 from mjx_study.plots.edges import UNDRAWN
 from mjx_study.plots.panels import UNSTABLE, counted, number
 from mjx_study.plots.study import MOST_DECADES, plot_study
-from mjx_study.plots.style import STYLE, STYLES, combines, fit_to_paper, mark_clipped
+from mjx_study.plots.style import STYLES, combines, fit_to_paper, mark_clipped, style_of
 from mjx_study.report import render_report
 from mjx_study.results.variables import CELL, ONSETS, VARIABLES
 from mjx_study.storage.manifest import describe_estimator
@@ -116,7 +116,7 @@ def test_curves_and_intervals_beyond_the_limits_are_marked() -> None:
 
 def test_no_estimator_is_black_or_grey() -> None:
     """Which mean costs and references are."""
-    assert min(np.ptp(to_rgb(colour)) for colour, _ in STYLE.values()) > 0.3
+    assert min(np.ptp(to_rgb(colour)) for _, colour, _ in map(style_of, ESTIMATORS)) > 0.3
 
 
 def test_a_long_stretch_beyond_the_limits_is_marked_once() -> None:
@@ -136,11 +136,11 @@ def test_every_kind_of_figure_marks_what_its_limits_clip() -> None:
     assert {x for x, _ in marks(unsure.axes[1], "v")} == {100.0}
     far = xr.where(along("iteration", *range(40)) > 20, along("estimator", 1.0, 1e6, 1.0), 1.0)
     descent = plot_study(study("descents", models, cost=far, start_cost=2.0, cost_se=0.0))["descent"]
-    assert {colour for _, colour in marks(descent.axes[0], "^")} == {to_hex(STYLE["fobg"][0])}
+    assert {colour for _, colour in marks(descent.axes[0], "^")} == {to_hex(style_of("fobg")[1])}
     steep = xr.where(along("point", *range(41)) == 20, along("estimator", 0.0, 1e6, 0.0), 0.0)
     rising = along("point", *range(41)) * 1.0
     (landscape,) = plot_study(study("landscapes", models[:1], slope=steep, slope_se=0.0, smoothed=rising)).values()
-    assert marks(landscape.axes[1], "^") == [(20.0, to_hex(STYLE["fobg"][0]))]
+    assert marks(landscape.axes[1], "^") == [(20.0, to_hex(style_of("fobg")[1]))]
     assert "beyond the axis (hollow: its interval)" in legend_of(landscape)
 
 
@@ -202,7 +202,7 @@ def test_achieved_costs_are_above_one_baseline_and_none_is_drawn_at_it() -> None
     curves = {line.get_label(): np.asarray(line.get_ydata(), float) for line in axes.lines}
     np.testing.assert_allclose(curves["ZoBG"], [np.nan, 2, 6])  # the baseline itself: not on a logarithmic axis
     np.testing.assert_allclose(curves["FoBG"], [1, 3, 7])
-    assert marks(axes, "v") == [(10.0, to_hex(STYLE["zobg"][0]))]
+    assert marks(axes, "v") == [(10.0, to_hex(style_of("zobg")[1]))]
     assert axes.get_ylim()[1] == pytest.approx(3 * (9 + 4 - 3))
     assert "3" in axes.get_ylabel().split()[-1] and "lowest" in axes.get_ylabel()
     assert figure.get_suptitle().endswith("(1 seed)")

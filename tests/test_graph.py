@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from mjx_study.graph import scalars
+from mjx_study.graph.build import SWITCH
 from mjx_study.graph.scalars import traced_part, unrolled
 
 TABLE = np.arange(12.0).reshape(4, 3) - 5
@@ -107,7 +108,9 @@ def test_a_functions_own_derivative_is_kept():
 def _inside(function, *arguments):
     """The jaxpr of a function, or of the one that it calls and nothing else."""
     jaxpr = jax.make_jaxpr(function)(*arguments).jaxpr
-    return jaxpr.eqns[0].params["jaxpr"].jaxpr if [each.primitive.name for each in jaxpr.eqns] == ["jit"] else jaxpr
+    while len(jaxpr.eqns) == 1 and jaxpr.eqns[0].primitive.name in ("jit", "ruled"):
+        jaxpr = jaxpr.eqns[0].params["jaxpr"].jaxpr
+    return jaxpr
 
 
 def _operations(function, *arguments) -> list[str]:
@@ -116,7 +119,8 @@ def _operations(function, *arguments) -> list[str]:
     return [name for each in jaxpr.eqns if (name := each.primitive.name) not in moves]
 
 
-def test_constants_fold_and_what_occurs_twice_or_for_nothing_is_dropped():
+def test_constants_fold_and_what_occurs_twice_or_for_nothing_is_dropped(monkeypatch):
+    monkeypatch.setenv(SWITCH, "0")
     turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
     def function(x):
@@ -128,7 +132,9 @@ def test_constants_fold_and_what_occurs_twice_or_for_nothing_is_dropped():
     assert sorted(operations) == ["add", "mul", "neg", "sin"]
 
 
-def test_what_does_not_change_in_a_loop_is_computed_before_it():
+def test_what_does_not_change_in_a_loop_is_computed_before_it(monkeypatch):
+    monkeypatch.setenv(SWITCH, "0")
+
     def function(x):
         return jax.lax.while_loop(lambda y: y < 9.0, lambda y: y * jnp.cosh(x[0]) + 1, x[1])
 
@@ -145,12 +151,14 @@ def test_a_constant_zero_times_infinity_is_zero():
 @pytest.mark.parametrize("most", [3, 11])
 def test_what_is_too_large_is_left_as_it_is(monkeypatch, most):
     monkeypatch.setitem(scalars.MOST_SCALARS, "cpu", most)
+    monkeypatch.setattr(scalars, "MOST_NATIVE", most)
     function = lambda x: jnp.outer(x, x) @ jnp.cos(x)  # noqa: E731
     assert _operations(lambda x: unrolled(function, x), ROW) == _operations(function, ROW)
 
 
 def test_what_is_too_large_stays_so_when_its_partial_is_made_anew(monkeypatch):
     monkeypatch.setitem(scalars.MOST_SCALARS, "cpu", 3)
+    monkeypatch.setattr(scalars, "MOST_NATIVE", 3)
     function = lambda power, table, x: table @ jnp.cos(x) ** power  # noqa: E731
     for _ in range(2):
         found = jax.jit(lambda x: unrolled(partial(function, 2), TABLE, x))(ROW)
@@ -159,8 +167,8 @@ def test_what_is_too_large_stays_so_when_its_partial_is_made_anew(monkeypatch):
 
 def test_a_function_is_written_out_once_for_arguments_of_equal_content(monkeypatch):
     written = []
-    out = scalars._written_out
-    monkeypatch.setattr(scalars, "_written_out", lambda *given: written.append(given) or out(*given))
+    out = scalars.capture
+    monkeypatch.setattr(scalars, "capture", lambda *given, **named: written.append(given) or out(*given, **named))
     function = lambda power, table, x: jnp.asarray(table) @ x**power  # noqa: E731
 
     def at(x, table=ROW, power=2):
@@ -176,7 +184,7 @@ def test_a_function_is_written_out_once_for_arguments_of_equal_content(monkeypat
     assert len(written) == 4
     monkeypatch.setattr(scalars, "MOST_KEPT", 1)
     at(ROW, power=4)
-    assert len(written) == 5 and len(scalars._WRITTEN_OUT) == 1
+    assert len(written) == 5 and len(scalars._CAPTURED) == 1
 
 
 def test_without_anything_traced_the_function_is_called():

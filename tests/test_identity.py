@@ -34,7 +34,7 @@ from tests.documents import altered, planned_arrays
 
 MODULE = """
 from functools import partial
-from mjx_study.tasks import pusher
+from mjx_study.tasks.pusher import pusher
 from helping import WEIGHT, weighed
 
 def cost(state, factor=1.0):

@@ -38,11 +38,11 @@ LAYERS = [
     "mjx_study.structure",
     "mjx_study.compiled",
     "mjx_study.objective",
+    "mjx_study.gradcheck",
     "mjx_study.results",
     "mjx_study.experiment",
     "mjx_study.storage",
     "mjx_study.execution",
-    "mjx_study.gradcheck",
     "mjx_study.diagnose",
     "mjx_study.bench",
     "mjx_study.render",
@@ -158,7 +158,7 @@ def test_every_layer_is_used_once_and_files_are_found() -> None:
 @pytest.mark.parametrize(
     ("module", "source", "wrong"),
     [
-        ("estimators.types", "import mjx_study.reference.noise", {"mjx_study.reference.noise"}),
+        ("estimators.batches", "import mjx_study.reference.system", {"mjx_study.reference.system"}),
         ("mjx_study.tasks.task", "def f():\n    from mjx_study.objective import Simulator", {"mjx_study.objective"}),
         ("mjx_study.tasks.task", "from ..objective import Simulator", {"mjx_study.objective"}),
         ("mjx_study.tasks.task", "from mjx_study import objective", {"mjx_study.objective"}),
@@ -228,44 +228,15 @@ def test_import_has_no_global_effect() -> None:
 
 
 ARCHITECTURE = (ROOT / "docs" / "architecture.md").read_text()
-BESIDE = {"mjx_study.choices", "mjx_study._matplotlib", "mjx_study.runtime", "mjx_study.table", "mjx_study.disk"} | {
-    "mjx_study.stopwatch", "mjx_study.watchdog", "mjx_study.limits", "mjx_study.options",
-    "mjx_study._public", "mjx_study.sources", "mjx_study.digest", "mjx_study.identity", "mjx_study.compiled",
-    "mjx_study.version", "mjx_study.caches", "mjx_study.structure", "mjx_study.progress",
-}  # fmt: skip
-"""Small modules that the picture of the packages leaves out."""
 
 
-def package_imports() -> dict[str, set[str]]:
-    """The packages of the picture, with those that each imports."""
-    found: dict[str, set[str]] = {}
-    for path in FILES:
-        module = module_of(path)
-        package = LAYERS[layer_of(module)]
-        if package in BESIDE | {"mjx_study", "mjx_study.__main__"}:
-            continue
-        imported = {
-            LAYERS[layer_of(name)] for name in imports_of(path.read_text(), module, is_package=path.stem == "__init__")
-        }
-        found.setdefault(package, set()).update(imported - BESIDE - {package})
-    return found
-
-
-def test_the_picture_of_the_packages_is_right() -> None:
-    """Its arrows are the imports, less those that follow from others."""
-    imports = package_imports()
-
-    def beyond(package: str) -> set[str]:
-        return imports[package].union(*(beyond(each) for each in imports[package]))
-
-    expected = {
-        (package, other)
-        for package, others in imports.items()
-        for other in others
-        if not any(other in beyond(between) for between in others - {other})
-    }
-    drawn = {tuple(line.split(" --> ")) for line in ARCHITECTURE.replace("    ", "").splitlines() if " --> " in line}
-    assert drawn == {tuple(each.removeprefix("mjx_study.") for each in pair) for pair in expected}
+def test_the_page_names_packages_and_modules_in_the_order_of_the_layers() -> None:
+    """Packages in the table; modules of a single file in the paragraph below it."""
+    table, beside = ARCHITECTURE.partition("## Three options")[0].split("Modules of a single file", 1)
+    names = [each.removeprefix("mjx_study.") for each in LAYERS if each != "mjx_study" and "._" not in each]
+    packages = [name for name in names if (ROOT / name).is_dir() or (ROOT / "mjx_study" / name).is_dir()]
+    assert re.findall(r"^\| `(\w+)` \|", table, re.MULTILINE) == packages
+    assert set(re.findall(r"`(\w+)`", beside)) == set(names) - set(packages)
 
 
 def test_what_the_page_names_is_there() -> None:

@@ -6,8 +6,9 @@ import jax.numpy as jnp
 import pytest
 
 from estimators import make_estimator
+from mjx_study import gradcheck
 from mjx_study.cli import main, options
-from mjx_study.diagnose.means import check_mean, lines_of
+from mjx_study.diagnose.means import MeanCheck, check_mean, lines_of
 from mjx_study.tasks import make_task
 from mjx_study.tasks.contact_grid import family_grid
 
@@ -22,6 +23,12 @@ def test_the_bias_of_first_order_is_found_and_is_gone_with_the_onset_term() -> N
     assert corrected.verdict == "right"
     assert 2 * corrected.circulation.half_width < 0.05 * abs(corrected.circulation.difference)
     assert len(lines_of([plain, corrected])) >= 3
+
+
+def test_checks_of_means_are_importable_from_gradcheck() -> None:
+    assert gradcheck.check_mean is check_mean and gradcheck.MeanCheck is MeanCheck
+    with pytest.raises(AttributeError, match="module 'mjx_study.gradcheck' has no attribute 'check_median'"):
+        _ = gradcheck.check_median
 
 
 def test_estimators_take_their_options(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
@@ -43,6 +50,8 @@ def test_estimators_take_their_options(monkeypatch: pytest.MonkeyPatch, capsys: 
         ),
     ],
 )
-def test_what_has_no_meaning_is_refused(arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_meaningless_options_are_refused(
+    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(["gradcheck", *arguments]) == 2
     assert message in capsys.readouterr().err

@@ -56,7 +56,7 @@ def refused(folder: Path, content: str | bytes, says: str) -> None:
         "<robot><link><visual><geometry><mesh filename='pipe'/></geometry></visual></link></robot>",
     ],
 )  # fmt: skip
-def test_what_is_no_file_is_never_opened(folder: Path, body: str) -> None:
+def test_non_regular_files_are_never_opened(folder: Path, body: str) -> None:
     """Wherever MuJoCo would look for it."""
     (folder / "sub" / "above.xml").write_text("<mujocoinclude><include file='pipe'/></mujocoinclude>")
     (folder / "sub" / "beside.xml").write_text("<mujocoinclude><include file='sub/pipe'/></mujocoinclude>")

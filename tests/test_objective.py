@@ -160,7 +160,7 @@ def test_evaluating_never_differentiates_the_dynamics(monkeypatch):
         raise RuntimeError("differentiated")
 
     simulator = Simulator(pusher_task(), chunk_size=3, devices=tuple(local_devices()[:1]))
-    monkeypatch.setattr(dynamics, "step_jacobian", forbidden)
+    monkeypatch.setattr(dynamics, "step_change", forbidden)
     objective, theta = simulator.objective(penalty(10.0)), pusher_task().theta
     alone = objective.evaluate(theta, sample_keys(7))
     with pytest.raises(RuntimeError, match="differentiated"):

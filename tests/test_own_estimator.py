@@ -12,12 +12,11 @@ import numpy as np
 import pytest
 
 from estimators import ESTIMATORS, Estimator, FirstOrder, ZerothOrder, find_estimator, make_estimator, register
-from estimators.catalogue import CATALOGUE
 from mjx_study import cli
 from mjx_study.cli import options
 from mjx_study.execution.run import load_study
 from mjx_study.options.configuration import OPTIONS
-from mjx_study.plots.style import STYLE, combines, style_of
+from mjx_study.plots.style import combines, style_of
 from mjx_study.report import CAPTIONS
 from mjx_study.results.findings import rows_of
 from tests.documents import altered
@@ -137,7 +136,6 @@ def test_reading_imports_nothing(
     """Not the estimators and tasks that a study names, which are drawn as they would be where they are known."""
     with monkeypatch.context() as patch:
         patch.setitem(ESTIMATORS, "registered", FirstOrder)
-        patch.setitem(CATALOGUE, "registered", CATALOGUE["fobg"])
         options_ = ["--estimators", f"zobg,{place}", *STUDIES["gradients"], "--chunk-size", "4", "--output", "out"]
         assert cli.main(["sweep", *ANALYTIC, *options_]) == 0
     sys.modules.pop("my_estimators", None)
@@ -241,17 +239,16 @@ def test_an_object_keeps_its_options_and_a_class_takes_those_that_it_has(folder:
 
 
 def test_a_registered_one_has_a_name(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(CATALOGUE, "twice", CATALOGUE["fobg"])  # taken out again after the test
-    monkeypatch.setitem(ESTIMATORS, "twice", FirstOrder)
-    del ESTIMATORS["twice"], CATALOGUE["twice"]
+    monkeypatch.setitem(ESTIMATORS, "twice", FirstOrder)  # removed again after the test
+    del ESTIMATORS["twice"]
 
     @register
     class Twice(FirstOrder):
         name, label = "twice", "FoBG, twice"
 
     assert ESTIMATORS["twice"] is Twice and make_estimator("twice") == Twice() != FirstOrder()
-    assert CATALOGUE["twice"].label == "FoBG, twice" and OPTIONS["estimators"].check(("twice",))
-    assert style_of("twice")[0] == "FoBG, twice"
+    assert OPTIONS["estimators"].check(("twice",))
+    assert style_of("twice") == ("FoBG, twice", *style_of("fobg")[1:])
     with pytest.raises(ValueError, match="there is already an estimator 'twice'"):
         register(Twice)
     with pytest.raises(ValueError, match="Nameless has no name and no needs"):
@@ -259,8 +256,8 @@ def test_a_registered_one_has_a_name(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_every_estimator_has_a_style_of_its_own() -> None:
-    assert set(STYLE) == set(ESTIMATORS)
-    assert len({style_of(name) for name in ESTIMATORS}) == len({style_of(name)[1:] for name in ESTIMATORS}) == 15
+    styles = [style_of(name) for name in ESTIMATORS]
+    assert len({label for label, *_ in styles}) == len({tuple(rest) for _, *rest in styles}) == len(ESTIMATORS)
     assert style_of(OWN) == style_of(OWN) and style_of(OWN)[0] == "SignAgreement"
-    assert style_of(OWN)[1:] not in STYLE.values()
+    assert style_of(OWN)[1:] not in [estimator.style for estimator in ESTIMATORS.values()]
     assert style_of("zobg")[0] == ZerothOrder.label and jax.tree.leaves(ZerothOrder()) == [ZerothOrder()]

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from estimators import seen
+from estimators import user_inputs
 from mjx_study.execution import cells as study_cells
 from mjx_study.execution.run import run_study
 from mjx_study.experiment.checkpoint import Checkpoint, StudyError
@@ -34,7 +34,7 @@ from collections import deque
 from functools import cached_property, lru_cache, partial
 from pathlib import Path
 import jax, jax.numpy as jnp, numpy as np
-from mjx_study.tasks import pusher
+from mjx_study.tasks.pusher import pusher
 
 {text}
 
@@ -174,7 +174,7 @@ def world(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[
     """Writes the files that the cases read, with other content each time; nothing is imported before."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
-    monkeypatch.setattr(seen, "_SEEN", defaultdict(dict))
+    monkeypatch.setattr(user_inputs, "_SEEN", defaultdict(dict))
     (tmp_path / "below").mkdir()
 
     def write(scale: float) -> None:
@@ -279,22 +279,24 @@ def test_reads_of_users_count_and_no_others(tmp_path: Path, monkeypatch: pytest.
     """Not those of this package and of libraries, nor of files that are made meanwhile, nor outside `observing`."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr(seen, "_SEEN", defaultdict(dict))
+    monkeypatch.setattr(user_inputs, "_SEEN", defaultdict(dict))
     monkeypatch.delenv("MINE", raising=False)
     (tmp_path / "outside.py").write_text(OUTSIDE)
     (tmp_path / "mine.txt").write_text("mine")
     (tmp_path / "theta.json").write_text("[1.0]")
     outside = importlib.import_module("outside")
     outside.read()
-    assert seen.seen_by(["outside"]) == {}
-    with seen.observing("outside"):
+    assert user_inputs.inputs_read(["outside"]) == {}
+    with user_inputs.observing("outside"):
         outside.read()
         read_theta(tmp_path / "theta.json")
-    found = seen.seen_by(["outside"])
+    found = user_inputs.inputs_read(["outside"])
     assert found.keys() == {"file mine.txt", "variable MINE", "variable PATH"} and found["variable MINE"] == "absent"
-    assert seen.seen_now(found) == found and seen.seen_by(["another"]) == {}
+    assert user_inputs.inputs_now(found) == found and user_inputs.inputs_read(["another"]) == {}
     monkeypatch.setenv("MINE", "1")
-    assert [name for name, digest in seen.seen_now(found).items() if digest != found[name]] == ["variable MINE"]
+    assert [name for name, digest in user_inputs.inputs_now(found).items() if digest != found[name]] == [
+        "variable MINE"
+    ]
     del sys.modules["outside"]
 
 
@@ -307,7 +309,7 @@ print(json.dumps(contents({name: [make_task(f"{name}:hop")] for name in sys.argv
 """
 STATELESS = """
 import logging, threading
-from mjx_study.tasks import pusher
+from mjx_study.tasks.pusher import pusher
 
 LOG, LOCK, NAMES = logging.getLogger(__name__), threading.Lock(), {"b", "a", "c"}
 

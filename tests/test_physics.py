@@ -15,9 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from estimators.noise import split_sample_key
 from mjx_study.objective import simulate
 from mjx_study.reference import BallWall, MomentumTransfer, SlidingBox, Tennis, draw_start, roll_out
-from mjx_study.reference.noise import split_sample_key
 from mjx_study.simulation.contact import ContactModel, ContactWarning
 from mjx_study.tasks import make_task
 from mjx_study.tasks.contact_grid import family_grid

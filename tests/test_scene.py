@@ -106,7 +106,7 @@ def test_numeric_options_reach_mjx() -> None:
         ({"iterations": 0}, "iterations must be a positive whole number, got 0"),
         ({"iterations": 0.5}, "iterations must be a positive whole number, got 0.5"),
         ({"ls_iterations": 2.5}, "ls_iterations must be a positive whole number, got 2.5"),
-        ({"adjoint": "unrolled"}, "unknown adjoint 'unrolled'; choose from auto, jacobian, tape"),
+        ({"adjoint": "unrolled"}, "unknown adjoint 'unrolled'; choose from auto, graph, tape"),
     ],
 )
 def test_bad_options_are_refused(options: dict[str, Any], message: str) -> None:
@@ -116,12 +116,12 @@ def test_bad_options_are_refused(options: dict[str, Any], message: str) -> None:
 
 def test_the_adjoint_is_chosen_by_size_or_by_name() -> None:
     body = '<body><joint type="slide"/><geom size=".1" contype="0"/></body>'
-    hosts = [mujoco.MjModel.from_xml_string(floor_scene(joints * body)) for joints in (10, 11)]
-    chosen = [[put_scene(host, "here", adjoint=name).uses_jacobian for name in ADJOINTS] for host in hosts]
+    hosts = [mujoco.MjModel.from_xml_string(floor_scene(joints * body)) for joints in (8, 9)]
+    chosen = [[put_scene(host, "here", adjoint=name).uses_graph for name in ADJOINTS] for host in hosts]
     assert chosen == [[True, True, False], [False, True, False]]
-    assert not make_task("tennis", adjoint="tape").scene.uses_jacobian
-    with pytest.raises(SceneError, match="double_pendulum: the adjoint 'jacobian' does not support RK4"):
-        load_scene("double_pendulum", adjoint="jacobian")
+    assert not make_task("tennis", adjoint="tape").scene.uses_graph
+    with pytest.raises(SceneError, match="double_pendulum: the adjoint 'graph' does not support RK4"):
+        load_scene("double_pendulum", adjoint="graph")
 
 
 def test_a_missing_file_or_name_is_refused(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from jax.ad_checkpoint import checkpoint_name
 
-from mjx_study.simulation.derivative_rule import refusing, with_rule
+from mjx_study.graph.derivative_rule import refusing, with_rule
 from mjx_study.simulation.drop_in import step
 from mjx_study.simulation.dynamics import State, rollout
 from mjx_study.simulation.onset import corrected_rollout
@@ -197,7 +197,7 @@ ROUTES: dict[str, Callable[[Contact], Function]] = {
     "looped": partial(by_steps, repeat=looped),
     "checkpointed": partial(by_steps, repeat=checkpointed),
     "batched": lambda contact: lambda x: jax.vmap(by_steps(contact))(jnp.stack([x, x + 0.01]))[0],
-    "jacobian": partial(by_rollout, adjoint="jacobian"),
+    "graph": partial(by_rollout, adjoint="graph"),
     "tape": partial(by_rollout, adjoint="tape"),
 }
 
@@ -212,6 +212,6 @@ def test_hessians_are_the_engines(name: str, route: str) -> None:
 @pytest.mark.parametrize("compose", [COMPOSITIONS["forward over reverse"], COMPOSITIONS["forward over forward"]])
 def test_the_onset_term_has_no_second_derivative(compose: Callable[[Function], Function]) -> None:
     contact = MODELS["slider"]
-    for function in (by_steps(contact, onset="linear"), by_rollout(contact, "jacobian", corrected=True)):
+    for function in (by_steps(contact, onset="linear"), by_rollout(contact, "graph", corrected=True)):
         with pytest.raises(TypeError, match="derivatives with the onset term are of first order"):
             jax.eval_shape(compose(function), jnp.zeros(2))

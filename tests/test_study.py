@@ -23,7 +23,7 @@ from estimators import (
     InverseVariance,
     summarise,
 )
-from estimators.estimator import label_of
+from estimators.registry import label_of
 from mjx_study import cli, disk
 from mjx_study.cli import console
 from mjx_study.cli.studies import as_document
@@ -207,7 +207,8 @@ class Half(FirstOrder):
 
     name = "half"
 
-    def combine(self, differentiation: Differentiation) -> GradientEstimate:
+    def combine(self, *batches: Differentiation) -> GradientEstimate:
+        (differentiation,) = batches
         return summarise(differentiation.gradient / 2)
 
 

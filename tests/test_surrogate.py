@@ -39,7 +39,7 @@ def by_hand(task, states, controls) -> np.ndarray:
     return found
 
 
-@pytest.mark.parametrize("adjoint", ["jacobian", pytest.param("tape", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("adjoint", ["graph", pytest.param("tape", marks=pytest.mark.slow)])
 def test_costs_are_of_one_contact_and_derivatives_of_the_other(adjoint: str) -> None:
     task = make_task("pusher", horizon=HORIZON, adjoint=adjoint)
     simulator, theta = Simulator(task, chunk_size=1), jnp.linspace(0.1, 0.6, HORIZON)

@@ -86,7 +86,7 @@ def test_noises_and_timesteps_that_six_digits_do_not_tell_apart(tmp_path: Path) 
 
 
 MODULE = """
-from mjx_study.tasks import pusher
+from mjx_study.tasks.pusher import pusher
 from mjx_study.tasks.task import StudyDefaults
 
 def stern(horizon=2, **options):

@@ -1,4 +1,4 @@
-"""Runs notebooks from top to bottom and keeps their outputs, without the times of the run.
+"""Run notebooks from top to bottom and keep their outputs, without times.
 
 python tools/notebooks.py notebooks/1_stiffness_sweep.ipynb
 """

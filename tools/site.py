@@ -1,8 +1,8 @@
-"""Builds the site that mkdocs.yml describes: stages its pages in build/pages; Zensical makes build/site of them.
+"""Build the site that mkdocs.yml describes: stage its pages in build/pages, from which Zensical makes build/site.
 
-The pages are written for GitHub, too. What the site needs is done on the copies: links lead from page to page, formulas
-become MathML and the diagram SVG (no scripts, no network), and notebooks become pages with the outputs that they have.
-The pages of names and of commands come from docstrings and from the parser.
+The pages are written for GitHub and adapted in the copies: links lead from page to page, formulas become MathML (no
+scripts, no network), and notebooks become pages with their outputs. Pages of public names, commands and variables come
+from docstrings, the parser and `mjx_study.results.variables`.
 """
 
 import ast
@@ -24,41 +24,43 @@ import nbformat
 from latex2mathml.converter import convert
 
 from mjx_study import cli
+from mjx_study.results.variables import VARIABLES
+from mjx_study.table import markdown_table
 
 ROOT = Path(__file__).parents[1]
 PAGES = ROOT / "build" / "pages"
 PIPED: Final = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
 PACKAGES = ("mjx_study", "mjx_study.gradcheck", "estimators")
 OUTPUT = {"image/png": "png", "text/html": "html", "text/plain": "text"}
-"""Kinds of output that notebooks have, the best first."""
+"""Kinds of notebook outputs, the best first."""
 
 
-def places() -> dict[Path, Path]:
-    """Where the site has a file of the project; both paths are relative."""
-    own = {Path("README.md"): Path("index.md")}
-    own |= {Path(f"{name}.md"): Path(f"{name.lower()}.md") for name in ("CHANGELOG", "CONTRIBUTING")}
-    for path in sorted((ROOT / "docs").glob("*")):
+def site_paths() -> dict[Path, Path]:
+    """Return the site's path of each file of the project; both paths are relative."""
+    paths = {Path("README.md"): Path("index.md")}
+    paths |= {Path(f"{name}.md"): Path(f"{name.lower()}.md") for name in ("CHANGELOG", "CONTRIBUTING")}
+    for path in [*sorted((ROOT / "docs").glob("*")), *(ROOT / "tools").glob("site.*")]:
         if path.suffix in (".css", ".gif", ".js", ".md", ".png"):
-            own[path.relative_to(ROOT)] = Path(path.name)
+            paths[path.relative_to(ROOT)] = Path(path.name)
     for path in sorted((ROOT / "notebooks").glob("*.ipynb")):
-        own[path.relative_to(ROOT)] = Path("notebooks", f"{path.stem}.md")
-    return own
+        paths[path.relative_to(ROOT)] = Path("notebooks", f"{path.stem}.md")
+    return paths
 
 
-def adapted(text: str, page: Path, own: dict[Path, Path]) -> str:
-    """A page's text as the site has it: its links, formulas (a fence of `math`, or $`...`$) and diagrams.
+def adapted(text: str, page: Path, paths: dict[Path, Path]) -> str:
+    """Adapt a page's links and formulas (a fence of `math`, or $`...`$) for the site.
 
-    A file that the site does not have is named and not linked.
+    Links to files outside the site become plain text.
     """
 
     def link(found: re.Match[str]) -> str:
         bang, label, target = found.groups()
-        place, _, anchor = target.partition("#")
-        if not place or "://" in target:
+        file, _, anchor = target.partition("#")
+        if not file or "://" in target:
             return found[0]
-        source = Path(os.path.normpath(page.parent / place))
-        if source in own:
-            there = os.path.relpath(own[source], own[page].parent)
+        source = Path(os.path.normpath(page.parent / file))
+        if source in paths:
+            there = os.path.relpath(paths[source], paths[page].parent)
             return f"{bang}[{label}]({there}{'#' * bool(anchor)}{anchor})"
         if not (ROOT / source).exists():
             raise FileNotFoundError(f"{page} links to {target}")
@@ -66,51 +68,18 @@ def adapted(text: str, page: Path, own: dict[Path, Path]) -> str:
 
     text = re.sub(r"(!?)\[((?:[^\[\]]|\[[^\]]*\])*)\]\(([^)\s]+)\)", link, text)
     text = re.sub(r"```math\n(.*?)```", lambda found: convert(found[1], display="block"), text, flags=re.DOTALL)
-    text = re.sub(r"\$`([^`]+)`\$", lambda found: f"<span>{convert(found[1])}</span>", text)
-    return re.sub(
-        r"```mermaid\n(.*?)```", lambda found: drawn(re.findall(r"(\w+) --> (\w+)", found[1])), text, flags=re.DOTALL
-    )
+    return re.sub(r"\$`([^`]+)`\$", lambda found: f"<span>{convert(found[1])}</span>", text)
 
 
-def drawn(arrows: list[tuple[str, str]]) -> str:
-    """A diagram without loops as SVG: each box below those that point to it, under the middle of them."""
-    rows: dict[str, int] = {}
-    boxes = dict.fromkeys(box for arrow in arrows for box in arrow)
-    for _ in boxes:
-        rows = {box: max((rows.get(start, 0) + 1 for start, end in arrows if end == box), default=0) for box in boxes}
-    columns: dict[str, float] = {}
-    for row in range(max(rows.values()) + 1):
-        above = {box: [columns[start] for start, end in arrows if end == box] for box in boxes if rows[box] == row}
-        wish = {box: sum(xs) / len(xs) if xs else 0.0 for box, xs in above.items()}
-        order = sorted(wish, key=lambda box: wish[box])
-        middle = sum(wish.values()) / len(wish)
-        columns |= {box: middle + 130 * (place - (len(order) - 1) / 2) for place, box in enumerate(order)}
-    left, right, bottom = min(columns.values()) - 60, max(columns.values()) + 60, 64 * max(rows.values()) + 34
-    lines = [
-        f'<line x1="{columns[a]:.0f}" y1="{64 * rows[a] + 31}" x2="{columns[b]:.0f}" y2="{64 * rows[b] - 4}"/>'
-        for a, b in arrows
-    ]
-    texts = [
-        f'<rect x="{x - 52:.0f}" y="{64 * rows[box] + 1}" width="104" height="30" rx="4"/>'
-        f'<text x="{x:.0f}" y="{64 * rows[box] + 21}">{box}</text>'
-        for box, x in columns.items()
-    ]
-    size = 'viewBox="0 0 8 8" refX="7" refY="4" markerWidth="8" markerHeight="8"'
-    head = f'<marker id="head" {size} orient="auto"><path d="M0 0L8 4L0 8z"/></marker>'
-    return (
-        f'<svg class="diagram" viewBox="{left:.0f} 0 {right - left:.0f} {bottom}">{head}{"".join(lines + texts)}</svg>'
-    )
-
-
-def parts_of_notebook(path: Path, own: dict[Path, Path]) -> Iterator[str]:
-    """A notebook as Markdown; its pictures are left where its page goes."""
-    folder, pictures = (PAGES / own[path]).parent, 0
+def parts_of_notebook(path: Path, paths: dict[Path, Path]) -> Iterator[str]:
+    """Yield a notebook as Markdown, and write its pictures beside the page."""
+    folder, pictures = (PAGES / paths[path]).parent, 0
     title, *cells = nbformat.read(ROOT / path, as_version=4).cells
-    yield adapted(title.source, path, own) + f"\n\n[Download the notebook]({path.name}){{ .notebook download }}"
+    yield adapted(title.source, path, paths) + f"\n\n[Download the notebook]({path.name}){{ .notebook download }}"
     for cell in cells:
         if "install" in cell.metadata.get("tags", ()):
             continue
-        yield adapted(cell.source, path, own) if cell.cell_type == "markdown" else f"```python\n{cell.source}\n```"
+        yield adapted(cell.source, path, paths) if cell.cell_type == "markdown" else f"```python\n{cell.source}\n```"
         for output in cell.get("outputs", ()):
             if output.output_type == "stream":
                 yield f"``` {{ .text .output }}\n{output.text.rstrip()}\n```"
@@ -129,13 +98,15 @@ def parts_of_notebook(path: Path, own: dict[Path, Path]) -> Iterator[str]:
 
 
 def page_of_names(package: str) -> str:
-    """Every public name of a package by the module that it comes from."""
+    """Return the page of a package: every public name by module."""
     folder = ROOT / package.replace(".", "/")
     source = next(path for path in (folder / "_public.py", folder / "__init__.py") if path.is_file())
-    names: dict[str, list[str]] = {}
+    public, names = import_module(package).__all__, dict[str, list[str]]()
     for node in ast.parse(source.read_text()).body:
         if isinstance(node, ast.ImportFrom) and node.module:
-            names.setdefault(node.module, []).extend(alias.asname or alias.name for alias in node.names)
+            imported = [alias.asname or alias.name for alias in node.names]
+            if exported := [name for name in imported if name in public]:
+                names.setdefault(node.module, []).extend(exported)
     parts = [f"# {package}", (import_module(package).__doc__ or "").strip()]
     for module, those in names.items():
         about = (import_module(module).__doc__ or "").strip().partition("\n")[0]
@@ -143,8 +114,17 @@ def page_of_names(package: str) -> str:
     return "\n\n".join(parts)
 
 
+def page_of_variables() -> str:
+    """Return the page of variables: a table for each kind of study."""
+    parts = ["# Variables of a study", "Dimensions are those within a cell; see [studies](../studies.md#in-python)."]
+    for kind, variables in VARIABLES.items():
+        rows = [(f"`{name}`", ", ".join(each.dims), each.unit, each.description) for name, each in variables.items()]
+        parts += [f"## {kind.capitalize()}", markdown_table(rows, ("name", "dimensions", "unit", "meaning"))]
+    return "\n\n".join(parts)
+
+
 def page_of_commands() -> str:
-    """The help of every command."""
+    """Return the page of commands: the help of each."""
     return "\n\n".join(
         ["# Command line", help_of(), *(f"## mjx-study {name}\n\n{help_of(name)}" for name in cli.COMMANDS)]
     )
@@ -158,22 +138,23 @@ def help_of(*command: str) -> str:
 
 
 def main() -> None:
-    """Stage all of it anew, and build; any issue is an error."""
+    """Stage all pages and build the site; any issue is an error."""
     shutil.rmtree(PAGES, ignore_errors=True)
-    own = places()
-    for source, place in own.items():
-        target = PAGES / place
+    paths = site_paths()
+    for source, path in paths.items():
+        target = PAGES / path
         target.parent.mkdir(parents=True, exist_ok=True)
         if source.suffix == ".ipynb":
-            target.write_text("\n\n".join(parts_of_notebook(source, own)))
+            target.write_text("\n\n".join(parts_of_notebook(source, paths)))
             shutil.copy(ROOT / source, target.parent)
         elif source.suffix == ".md":
-            target.write_text(adapted((ROOT / source).read_text(), source, own))
+            target.write_text(adapted((ROOT / source).read_text(), source, paths))
         else:
             shutil.copy(ROOT / source, target)
     os.environ["COLUMNS"] = "100"  # of the help
     (PAGES / "reference").mkdir()
-    for name, text in [("commands", page_of_commands()), *((name, page_of_names(name)) for name in PACKAGES)]:
+    pages = {"commands": page_of_commands(), "variables": page_of_variables()}
+    for name, text in (pages | {name: page_of_names(name) for name in PACKAGES}).items():
         (PAGES / "reference" / f"{name}.md").write_text(text)
     build = subprocess.run([sys.executable, "-m", "zensical", "build", "--strict", "--clean"], cwd=ROOT, **PIPED)
     print(build.stdout, end="")

@@ -3,9 +3,9 @@
 from typing import Final
 
 from mjx_study.claims import contact, descent, theory
-from mjx_study.claims.ledger import Claim
+from mjx_study.claims.claim import Claim, load_claims
 
-CLAIMS: Final[dict[str, Claim]] = {claim.id: claim for claim in (*theory.CLAIMS, *contact.CLAIMS, *descent.CLAIMS)}
+CLAIMS: Final[dict[str, Claim]] = load_claims({"theory": theory, "contact": contact, "descent": descent})
 """Claims by id, in the order of the ledger."""
 NUM_VERDICTS: Final = sum(len(claim.cases) for claim in CLAIMS.values())
 """Number of verdicts in the whole ledger, for which the intervals hold simultaneously."""

@@ -30,6 +30,12 @@ from mjx_study.tasks import make_task
 from mjx_study.tasks.contact_grid import backward_grid, family_grid
 from mjx_study.tasks.task import Task
 
+FAMILIES: Final = (
+    REFERENCE, "penalty", "impedance", "mujoco", "mujoco_default", "mujoco_stiff", "smooth_onset", "mjcf",
+)  # fmt: skip
+"""Columns of the verdict matrix."""
+REAL: Final = FAMILIES[1:-1]
+"""MJX contact families to compare; "mjcf" is for systems without contact."""
 TIMED: Final = 64
 """Samples per device in a timed batch."""
 REPEATS: Final = 12
@@ -121,7 +127,7 @@ def ratio_of(top: np.ndarray, bottom: np.ndarray, of: str) -> Statistic:
 class Landscape:
     """Cost and derivative of an MJX rollout over one parameter, on a fine uniform grid, piecewise constant.
 
-    A `Function`, so that estimators and descents run on it as on an analytic system, without simulating again.
+    A `Function`, so that estimators and descents run on it as on an analytic system, without another simulation.
     Beyond the grid, its end cells go on.
     """
 
@@ -177,8 +183,8 @@ class Laboratory:
     def _study(self, config: StudyConfig) -> xr.Dataset:
         folder = None
         if self._folder is not None:
-            told = repr(config.resolved() | {"tasks": config.task_names, "effort": self.effort})
-            digest = hashlib.sha256(told.encode()).hexdigest()[:12]
+            settings = repr(config.resolved() | {"tasks": config.task_names, "effort": self.effort})
+            digest = hashlib.sha256(settings.encode()).hexdigest()[:12]
             folder = self._folder / f"{re.sub(r'[^a-z_]+', '-', config.task_names[0])}-{config.settings.kind}-{digest}"
         return run_study(config, folder, accept_versions=self._accept)
 
@@ -190,7 +196,7 @@ class Laboratory:
         return task.replace(onset=onset)
 
     def _contact(self, task: Task, family: str, stiffness: float, relaxed: str | None = None) -> ContactModel | None:
-        """Contact model of a family, with its own derivatives or those of one of `RELAXATIONS`."""
+        """Contact model of a family, with exact derivatives or those of one of `RELAXATIONS`."""
         (cell,), _ = family_grid(task, (family,), (stiffness,))
         if relaxed is not None:
             other, factor, margin = RELAXATIONS[relaxed]

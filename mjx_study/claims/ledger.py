@@ -1,4 +1,4 @@
-"""Claims, verdicts from measurements, and measuring and storing a ledger of claims.
+"""Verdicts from measurements, and measuring and storing a ledger of claims.
 
 A verdict is determined by an interval. Each claim fixes beforehand the values of a statistic for which it holds, and
 optionally those for which its opposite does. A measured interval within the first means holds; within the second,
@@ -7,10 +7,9 @@ has level 1 - ALPHA / m, with m the number of verdicts of the whole ledger (Bonf
 """
 
 import dataclasses
-import hashlib
 import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -18,102 +17,15 @@ import jax.numpy as jnp
 from scipy.stats import t as student
 
 from estimators import coverage_interval
-from mjx_study.choices import REFERENCE
-from mjx_study.claims.laboratory import EFFORTS, Effort, Laboratory, Statistic
+from mjx_study.claims.claim import Claim, Criterion, Range
+from mjx_study.claims.laboratory import EFFORTS, Laboratory, Statistic
 from mjx_study.disk import prepare_folder, write_whole
-from mjx_study.identity import VERSIONED, code_of, git_revision
+from mjx_study.identity import git_revision
 from mjx_study.progress import Progress, silent
-from mjx_study.runtime import environment, precision
-from mjx_study.version import version_of
+from mjx_study.runtime import environment
 
 ALPHA: Final = 0.05
 """Probability that any interval of a ledger misses its value."""
-VERDICTS: Final = ("holds", "fails", "reversed", "undecided")
-FAMILIES: Final = (
-    REFERENCE, "penalty", "impedance", "mujoco", "mujoco_default", "mujoco_stiff", "smooth_onset", "mjcf",
-)  # fmt: skip
-"""Columns of the verdict matrix."""
-REAL: Final = FAMILIES[1:-1]
-"""MJX contact families to compare; "mjcf" is for systems without contact."""
-Range = tuple[float, float]
-
-
-@dataclasses.dataclass(frozen=True)
-class Criterion:
-    """Criterion of a claim, fixed before measurement: a statistic, and its values for which claim or opposite hold."""
-
-    quantity: str
-    holds: Range
-    reversed: Range | None = None
-
-    def verdict(self, interval: Range) -> str:
-        """Return one of `VERDICTS`."""
-        low, high = interval
-        if not (math.isfinite(low) or math.isfinite(high)):
-            return "undecided"
-        if self.holds[0] <= low and high <= self.holds[1]:
-            return "holds"
-        if self.reversed is not None and self.reversed[0] <= low and high <= self.reversed[1]:
-            return "reversed"
-        return "fails" if high < self.holds[0] or low > self.holds[1] else "undecided"
-
-    def lines(self) -> str:
-        """Describe the ranges."""
-        told = f"holds {_range(self.holds)}"
-        return told if self.reversed is None else f"{told}, reversed {_range(self.reversed)}"
-
-
-def above(quantity: str, bound: float, opposite: float | None = None) -> Criterion:
-    """Criterion that a quantity is above a bound; reversed below another."""
-    return Criterion(quantity, (bound, math.inf), None if opposite is None else (-math.inf, opposite))
-
-
-def below(quantity: str, bound: float, opposite: float | None = None) -> Criterion:
-    """Criterion that a quantity is below a bound; reversed above another."""
-    return Criterion(quantity, (-math.inf, bound), None if opposite is None else (opposite, math.inf))
-
-
-def within(quantity: str, low: float, high: float) -> Criterion:
-    return Criterion(quantity, (low, high))
-
-
-@dataclasses.dataclass(frozen=True)
-class Claim:
-    """A statement that measurements can refute.
-
-    Attributes:
-        id: name on the command line.
-        place: section of the paper that states it, or the open question that it answers.
-        systems: systems to measure, each with its contact families.
-        measure: computes the statistic of the criterion for a system and family.
-        show: command that demonstrates it.
-    """
-
-    id: str
-    place: str
-    statement: str
-    criterion: Criterion
-    systems: dict[str, tuple[str, ...]]
-    measure: Callable[[Laboratory, str, str], Statistic]
-    show: str
-
-    @property
-    def cases(self) -> list[tuple[str, str]]:
-        """Pairs of system and family, each with its own verdict."""
-        return [(system, family) for system, families in self.systems.items() for family in families]
-
-    def key(self, effort: Effort) -> str:
-        """Digest of the claim, the effort and the precision."""
-        return _digest(self.id, self.criterion, self.systems, effort, precision())
-
-    def made_by(self) -> str:
-        """Digest of the code that measures the claim, and of library versions."""
-        versions = [version_of(name) for name in VERSIONED if name != "mjx-study"]
-        return _digest(code_of(self.measure.__module__), versions)
-
-
-def _digest(*parts: Any) -> str:
-    return hashlib.sha256(repr(parts).encode()).hexdigest()[:16]
 
 
 def interval_of(statistic: Statistic, level: float) -> Range:
@@ -181,12 +93,12 @@ def measure_ledger(
             kept = {**ours, "revision": git_revision(), "cases": []}
         for system, family in claim.cases[len(kept["cases"]) :]:
             progress(done + len(kept["cases"]), total, f"{claim.id}: {system}, {family}")
-            statistic = claim.measure(lab, system, family)
+            statistic = claim.statistic(lab, system, family)
             kept["cases"].append({"system": system, "family": family, **dataclasses.asdict(statistic)})
             if path is not None:
                 write_whole(path, lambda file, kept=kept: file.write(json.dumps(kept, indent=1).encode()))
         done += len(claim.cases)
-        found.append(_told(claim, kept, 1 - ALPHA / verdicts))
+        found.append(_with_evidence(claim, kept, 1 - ALPHA / verdicts))
     progress(total, total, "done")
     return {
         "effort": dataclasses.asdict(chosen),
@@ -200,7 +112,7 @@ def measure_ledger(
     }
 
 
-def _told(claim: Claim, kept: dict[str, Any], level: float) -> dict[str, Any]:
+def _with_evidence(claim: Claim, kept: dict[str, Any], level: float) -> dict[str, Any]:
     """Return a claim with its evidence as plain data; nonfinite numbers become None."""
     evidence = []
     for case in kept["cases"]:
@@ -224,10 +136,3 @@ def _told(claim: Claim, kept: dict[str, Any], level: float) -> dict[str, Any]:
         "revision": kept["revision"],
         "evidence": evidence,
     }
-
-
-def _range(part: Range) -> str:
-    low, high = part
-    if math.isinf(high):
-        return f"above {low:g}"
-    return f"below {high:g}" if math.isinf(low) else f"from {low:g} to {high:g}"

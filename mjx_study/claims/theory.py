@@ -1,7 +1,8 @@
-"""Claims about jumps, their relaxations, and the lemmas, by closed forms and MJX landscapes over one parameter."""
+"""Statistics of closed forms and of MJX landscapes over one parameter: biases, variances, errors, and the lemmas."""
 
-import dataclasses
 import math
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any, Final
 
 import jax
@@ -10,7 +11,6 @@ import numpy as np
 
 import estimators
 from estimators import AlphaOrder, FirstOrder, GradientEstimate, InverseVariance, ZerothOrder, constrained_alpha
-from mjx_study.choices import REFERENCE
 from mjx_study.claims.laboratory import (
     Laboratory,
     Slopes,
@@ -25,57 +25,79 @@ from mjx_study.claims.laboratory import (
     ratio_of,
     share_of,
 )
-from mjx_study.claims.ledger import Claim, above, below, within
 from mjx_study.reference import Heaviside, RelaxedHeaviside
 
-FIVE: Final = ("penalty", "impedance", "mujoco_default", "mujoco_stiff", "smooth_onset")
-"""Contact families of the landscapes."""
 STIFFNESS: Final = 10_000.0
 """Contact stiffness of the landscapes, for families that take one [N/m]."""
-HIT, EDGE, SHORT, WALL = (
-    "momentum_transfer, 0.5 rad", "momentum_transfer, 0.75 rad", "ball_wall, 0.2 rad", "ball_wall, 0.7 rad",
-)  # fmt: skip
-# Not closer to the edge: at 0.77 rad the bias of the default contact crosses zero (31 % at 0.76, -13 % at 0.78).
 STEP, RAMP = "step", "ramp of 0.01 sigma"
-NEGLIGIBLE_BIAS: Final = 0.1
-"""Share of the gradient below which a bias is negligible."""
-FACTOR: Final = math.log10(1.25)
-"""Ratios of variances or errors closer to 1 than this count as equal."""
-JUMPS: Final = {STEP: (REFERENCE,), EDGE: (REFERENCE, *FIVE), WALL: (REFERENCE, *FIVE)}
-SMOOTH: Final = {HIT: (REFERENCE, *FIVE), SHORT: (REFERENCE, *FIVE)}
+"""Analytic systems."""
+Changes = Mapping[str, Any]
+NONE: Final[Changes] = MappingProxyType({})
+"""No changes of a landscape."""
 
 
 def at(lab: Laboratory, system: str, family: str, stiffness: float = STIFFNESS, **changes: Any) -> Slopes:
-    """Landscape of a system under a family, at the angle given in its name; changes as for `Laboratory.slopes`."""
+    """Landscape of a system under a family, at the angle and with the relaxed derivatives given in its name.
+
+    Changes are those of `Laboratory.slopes`; `relaxed="none"` stands for exact derivatives.
+    """
     if system == STEP:
         return closed_form(Heaviside(), 0.5, 1.0)
     if system == RAMP:
         return closed_form(RelaxedHeaviside(0.01), 0.0, 1.0)
-    task, _, angle = system.partition(", ")
+    task, angle, *relaxed = system.split(", ")
+    changes = {"relaxed": relaxed[0] if relaxed else None} | changes
+    changes["relaxed"] = None if changes["relaxed"] == "none" else changes["relaxed"]
     return lab.slopes(task, family, float(angle.removesuffix(" rad")), stiffness=stiffness, **changes)
 
 
-def relative_bias(lab: Laboratory, system: str, family: str, **changes: Any) -> Statistic:
+def pair(lab: Laboratory, system: str, family: str, one: Changes, other: Changes) -> list[Slopes]:
+    """Two landscapes with changes, which may replace the system or the family."""
+    named: dict[str, Any] = {"system": system, "family": family}
+    return [at(lab, **(named | dict(changes))) for changes in (one, other)]
+
+
+def relative_bias(lab: Laboratory, system: str, family: str, absolute: bool = False, **changes: Any) -> Statistic:
     """(E[FoBG] - grad F) / grad F of a landscape."""
     found = at(lab, system, family, **changes)
-    return exact(found.relative, sum(found.errors), found.points)
+    return exact(abs(found.relative) if absolute else found.relative, sum(found.errors), found.points)
 
 
-def variances_of(lab: Laboratory, one: Slopes, other: Slopes) -> Statistic:
+def bias_ratio(
+    lab: Laboratory, system: str, family: str, one: Changes = NONE, other: Changes = NONE, absolute: bool = False
+) -> Statistic:
+    """Relative bias on one landscape as a share of that on another."""
+    first, second = pair(lab, system, family, one, other)
+    share = first.relative / second.relative
+    slack = (sum(first.errors) + abs(share) * sum(second.errors)) / abs(second.relative)
+    return exact(abs(share) if absolute else share, slack, second.points)
+
+
+def variance_ratio(lab: Laboratory, system: str, family: str, one: Changes = NONE, other: Changes = NONE) -> Statistic:
     """log10 of FoBG's variance on one landscape over that on another."""
-    return difference_of(*(log_variance(batch(FirstOrder(), each, lab.effort.draws)) for each in (one, other)))
+    points = pair(lab, system, family, one, other)
+    return difference_of(*(log_variance(batch(FirstOrder(), each, lab.effort.draws)) for each in points))
+
+
+def error_ratio(lab: Laboratory, system: str, family: str, one: Changes = NONE, other: Changes = NONE) -> Statistic:
+    """log10 of FoBG's mean squared error in batches of 200 on one landscape over that on another, both about the
+    gradient of the first."""
+    points = pair(lab, system, family, one, other)
+    (first,), (second,) = (batches([FirstOrder()], each, 200, 2 * lab.effort.batches) for each in points)
+    return errors_of(first, second, points[0].gradient)
+
+
+def moved_gradient(lab: Laboratory, system: str, family: str, one: Changes, other: Changes) -> Statistic:
+    """Relative distance between the gradients of two landscapes."""
+    first, second = pair(lab, system, family, one, other)
+    share = first.gradient / second.gradient
+    return exact(abs(share - 1), first.errors[0] * abs(share) + abs(share) * second.errors[0], first.points)
 
 
 def errors_of(one: GradientEstimate, other: GradientEstimate, gradient: float) -> Statistic:
     """log10 of the ratio of two mean squared errors over the same batches."""
     squared = [(np.asarray(each.mean)[:, 0] - gradient) ** 2 for each in (one, other)]
     return ratio_of(squared[0], squared[1], "batches")
-
-
-def bias(lab: Laboratory, system: str, family: str) -> Statistic:
-    """|E[FoBG] - grad F| / |grad F|."""
-    found = relative_bias(lab, system, family)
-    return dataclasses.replace(found, estimate=abs(found.estimate))
 
 
 def zeroth_bias(lab: Laboratory, system: str, family: str) -> Statistic:
@@ -95,21 +117,13 @@ def silent(lab: Laboratory, system: str, family: str) -> Statistic:
     return share_of(np.all(np.asarray(found.per_sample) == 0, axis=(1, 2)), "batches")
 
 
-def missed(lab: Laboratory, point: Slopes, truth: float, samples: int, quantile: float) -> Statistic:
-    """Share of batches whose own interval for the first-order mean, with a quantile of Student's t, misses a number."""
+def missed(lab: Laboratory, system: str, family: str, *, truth: str, samples: int, quantile: float) -> Statistic:
+    """Share of batches whose interval for the first-order mean, with a quantile of Student's t, misses a number of
+    the landscape."""
+    point = at(lab, system, family)
     (found,) = batches([FirstOrder()], point, samples, 5 * lab.effort.batches)
-    gap = np.abs(np.asarray(found.mean)[:, 0] - truth)
+    gap = np.abs(np.asarray(found.mean)[:, 0] - getattr(point, truth))
     return share_of(gap > quantile * np.asarray(found.standard_error)[:, 0], "batches")
-
-
-def blind(lab: Laboratory, system: str, family: str) -> Statistic:
-    point = at(lab, system, family)
-    return missed(lab, point, point.gradient, 100, 1.984)
-
-
-def overconfident(lab: Laboratory, system: str, family: str) -> Statistic:
-    point = at(lab, system, family)
-    return missed(lab, point, point.first, 50, 2.01)
 
 
 def rare(lab: Laboratory, system: str, family: str) -> Statistic:
@@ -182,143 +196,3 @@ def compared(lab: Laboratory, system: str, family: str, one: str, other: str) ->
     known = {"zobg": ZerothOrder(), "fobg": FirstOrder(), "ivw": InverseVariance(), "aobg": bounded}
     first, second = batches([known[one], known[other]], point, 200, 2 * lab.effort.batches)
     return errors_of(first, second, point.gradient)
-
-
-SLOPES: Final = "mjx-study landscape {} --contact penalty,mujoco_default,smooth_onset"
-CLAIMS: Final = (
-    Claim(
-        "zobg-unbiased",
-        "section 3.1, lemma on ZoBG",
-        "The zeroth-order estimate is unbiased where the cost jumps.",
-        within("(E[ZoBG] - grad F) / grad F", -NEGLIGIBLE_BIAS, NEGLIGIBLE_BIAS),
-        JUMPS,
-        zeroth_bias,
-        SLOPES.format("ball_wall"),
-    ),
-    Claim(
-        "fobg-biased-at-jumps",
-        "section 3.1, Heaviside; figure of ball with wall and momentum transfer",
-        "The first-order estimate is biased where the cost jumps.",
-        above("|E[FoBG] - grad F| / |grad F|", NEGLIGIBLE_BIAS),
-        JUMPS,
-        bias,
-        SLOPES.format("momentum_transfer"),
-    ),
-    Claim(
-        "jump-without-variance",
-        "section 3.1, Heaviside",
-        "At a jump the biased first-order estimate has at most a tenth of zeroth order's variance; at a step, none.",
-        below("log10 Var[FoBG] / Var[ZoBG]", -1.0, 1.0),
-        {system: (REFERENCE,) for system in JUMPS},
-        variances,
-        SLOPES.format("momentum_transfer"),
-    ),
-    Claim(
-        "variance-hides-bias",
-        "section 3.2; conclusion",
-        "At a jump, a batch's own variance does not show that first order is wrong.",
-        above("share of batches of 100 whose own 95 % interval misses grad F", 0.5),
-        JUMPS,
-        blind,
-        SLOPES.format("momentum_transfer"),
-    ),
-    Claim(
-        "fobg-unbiased-away",
-        "section 3.1, lemma on FoBG",
-        "Away from jumps of the cost the first-order estimate is unbiased.",
-        within("(E[FoBG] - grad F) / grad F", -NEGLIGIBLE_BIAS, NEGLIGIBLE_BIAS),
-        {RAMP: (REFERENCE,), **SMOOTH},
-        relative_bias,
-        SLOPES.format("momentum_transfer"),
-    ),
-    Claim(
-        "ramp-looks-like-a-jump",
-        "section 3.2, empirical bias",
-        "A steep ramp has the first-order samples of a jump: most batches of 10 are all zero, mean and variance.",
-        above("share of batches of 10 in which every gradient is 0", 0.5),
-        {RAMP: (REFERENCE,)},
-        silent,
-        "mjx-study claims --quick --only ramp-looks-like-a-jump",
-    ),
-    Claim(
-        "empirical-bias-in-contact",
-        "section 3.2, empirical bias; section 5.1",
-        "At the edge of a contact, batches of first-order gradients look more certain than they are.",
-        above("share of batches of 50 whose 95 % interval misses E[FoBG]", 0.1),
-        {RAMP: (REFERENCE,), EDGE: FIVE, WALL: FIVE},
-        overconfident,
-        SLOPES.format("ball_wall"),
-    ),
-    Claim(
-        "lemma-rare-events",
-        "section 3.2, lemma on variance and empirical bias",
-        "Empirical bias implies variance: Var z >= Delta_0^2 / beta.",
-        below("log10 max Delta_0^2 / (beta Var[FoBG])", 1e-9),
-        {RAMP: (REFERENCE,), EDGE: FIVE, WALL: FIVE},
-        rare,
-        "mjx-study claims --quick --only lemma-rare-events",
-    ),
-    Claim(
-        "friction-variance",
-        "section 3.2, Coulomb friction",
-        "With slip tolerance nu the first-order variance grows as 1 / nu.",
-        within("exponent of nu", -1.1, -0.9),
-        {"ramps of 0.003 to 0.1 sigma": (REFERENCE,)},
-        friction,
-        "mjx-study claims --quick --only friction-variance",
-    ),
-    Claim(
-        "lemma-zobg-variance",
-        "section 3.3, lemma on ZoBG's variance (with H m, not H n)",
-        "The variance of a zeroth-order sample without a baseline is at most B_V^2 B_pi^2 H m / sigma^2.",
-        below("log10 Var[ZoBG] / bound", 0.0),
-        JUMPS,
-        bound,
-        "mjx-study compare momentum_transfer --estimators zobg --baseline none",
-    ),
-    Claim(
-        "lemma-accuracy",
-        "section 4.1, lemma on robustness (delta the probability of failure)",
-        "Where epsilon + alpha B <= gamma, the error is at most gamma with probability 1 - delta, here 0.95.",
-        above("share of batches of 4000 that are", 0.95),
-        JUMPS,
-        accurate,
-        "mjx-study compare ball_wall --estimators zobg,fobg,aobg --gamma 0.01",
-    ),
-    Claim(
-        "lemma-closed-form",
-        "section 4.1, lemma on the closed form",
-        "The closed form of alpha solves the constrained problem.",
-        below("largest distance to the best of 20,001 weights", 1e-4),
-        {"random problems": (REFERENCE,)},
-        solution,
-        "mjx-study claims --quick --only lemma-closed-form",
-    ),
-    Claim(
-        "ivw-inaccurate-at-jumps",
-        "section 4.1",
-        "Near jumps inverse-variance weighting alone is less accurate than zeroth order.",
-        above("log10 of the mean squared error, IVW's over ZoBG's", FACTOR, -FACTOR),
-        JUMPS,
-        lambda lab, system, family: compared(lab, system, family, "ivw", "zobg"),
-        "mjx-study compare ball_wall --estimators zobg,fobg,ivw",
-    ),
-    Claim(
-        "bound-helps-at-jumps",
-        "section 4.1",
-        "Near jumps the interpolation bounded by gamma, here |grad F| / 2, beats inverse-variance weighting.",
-        below("log10 of the mean squared error, AoBG's over IVW's", -FACTOR, FACTOR),
-        JUMPS,
-        lambda lab, system, family: compared(lab, system, family, "aobg", "ivw"),
-        "mjx-study compare ball_wall --estimators zobg,fobg,aobg,ivw",
-    ),
-    Claim(
-        "aobg-gains-away",
-        "section 4.1; section 5.1",
-        "Away from jumps the interpolation, with the same bound, is more accurate than zeroth order.",
-        below("log10 of the mean squared error, AoBG's over ZoBG's", -FACTOR, FACTOR),
-        SMOOTH,
-        lambda lab, system, family: compared(lab, system, family, "aobg", "zobg"),
-        "mjx-study compare momentum_transfer --estimators zobg,fobg,aobg",
-    ),
-)

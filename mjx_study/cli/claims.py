@@ -40,7 +40,7 @@ def run(options: argparse.Namespace) -> int:
     """Measure the claims and print their verdicts."""
     from mjx_study.claims import CLAIMS, NUM_VERDICTS
     from mjx_study.claims.ledger import measure_ledger
-    from mjx_study.claims.page import count, draw_matrix, markdown, table, told, undecided
+    from mjx_study.claims.page import draw_matrix, markdown, matrix_lines, run_summary, undecided, verdict_counts
     from mjx_study.disk import prepare_folder, write_whole
     from mjx_study.plots.style import save_figure
 
@@ -83,6 +83,6 @@ def run(options: argparse.Namespace) -> int:
         return [*written, *save_figure(draw_matrix(document), options.output, "claims", ("png",))]
 
     written, failure = attempt(write) if options.output else ([], None)
-    lines = [*table(document), "", count(document), told(document)]
-    lines += [f"undecided: {line}" for line in undecided(document)]
+    lines = [*matrix_lines(document), "", verdict_counts(document), run_summary(document)]
+    lines += undecided(document)
     return print_report(options, document, [*lines, *(f"written: {path}" for path in written)], failure)

@@ -3,7 +3,7 @@
 import argparse
 from functools import partial
 
-from estimators.catalogue import CATALOGUE
+from estimators.registry import ESTIMATORS
 from mjx_study.choices import FAMILIES
 from mjx_study.cli.options import study_fields
 from mjx_study.options.configuration import BUILDER_OPTIONS, StudyConfig
@@ -19,7 +19,7 @@ examples:
   mjx-study compare pusher --json > pusher.json
 
 estimators:
-{described({item.name: item.description for item in CATALOGUE.values()})}
+{described({item.name: item.description for item in ESTIMATORS.values()})}
 
 contact families (K: from --stiffness):
 {described({item.name: item.description for item in FAMILIES.values()})}

@@ -12,7 +12,7 @@ import numpy as np
 import xarray as xr
 
 from estimators import ENOUGH_EFFECTIVE
-from estimators.estimator import label_of
+from estimators.registry import label_of
 from mjx_study.choices import FAMILIES, REFERENCE
 from mjx_study.experiment.iteration import REASONS
 from mjx_study.options.configuration import OPTIONS, SCENE_OPTIONS

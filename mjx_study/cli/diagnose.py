@@ -6,9 +6,10 @@ import shlex
 from mjx_study.choices import FAMILIES, is_file
 from mjx_study.cli.options import configure_process, given_options, task_of, usage_errors
 from mjx_study.cli.output import computing, print_report
+from mjx_study.diagnose.columns import CONTACTS, ESTIMATES
 from mjx_study.options.configuration import OPTIONS
 from mjx_study.options.parser import MIDDLE, TASK_OPTIONS, Parser
-from mjx_study.results.variables import explained
+from mjx_study.table import explain
 
 EPILOG = f"""\
 examples:
@@ -16,7 +17,7 @@ examples:
   mjx-study diagnose robot.xml                 no cost is needed: one is made from the bodies' positions
 
 columns of the contacts and of the estimators:
-{explained("diagnosis")}
+{explain(*CONTACTS, *ESTIMATES)}
 
 The error is that of a gradient from as many samples as this machine computes in a second. Means are checked along
 paths, as in gradcheck --mean, and so is the bias. At least 23 samples are drawn, whatever --samples. Exit code 1 if a
@@ -32,7 +33,8 @@ def add(command: Parser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Measure and print; return 1 if a derivative is wrong."""
-    from mjx_study.diagnose import diagnose_task
+    from mjx_study.diagnose.page import document_of, page_lines
+    from mjx_study.diagnose.run import diagnose_task
     from mjx_study.tasks.contact_grid import single_contact
 
     with usage_errors():
@@ -57,7 +59,7 @@ def run(options: argparse.Namespace) -> int:
             options=flags,
             progress=progress,
         )
-    print_report(options, found.as_json(), found.lines())
+    print_report(options, document_of(found), page_lines(found))
     return 0 if found.derivatives.passed else 1
 
 

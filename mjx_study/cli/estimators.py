@@ -2,7 +2,8 @@
 
 import argparse
 
-from estimators.catalogue import CATALOGUE, DENSITIES, ORACLES
+from estimators.choices import DENSITIES, ORACLES
+from estimators.registry import ESTIMATORS
 from mjx_study.cli.output import print_report
 from mjx_study.options.parser import Parser
 
@@ -18,8 +19,8 @@ def add(command: Parser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     entries, rows = [], []
-    for name, item in CATALOGUE.items():
-        flags = [f"--{option.replace('_', '-')}" for option in item.required if option != "sigma"]
+    for name, item in ESTIMATORS.items():
+        flags = [f"--{option.replace('_', '-')}" for option in item.required() if option != "sigma"]
         needs = " + ".join(ORACLES[oracle].contents for oracle in item.needs)
         entries.append({"name": name, "description": item.description, "needs": list(item.needs), "requires": flags})
         rows.append((name, ", ".join([needs, *flags]), item.description))

@@ -6,10 +6,11 @@ import dataclasses
 from mjx_study.choices import CHECKED_STATES, CHECKED_STEPS, CHECKED_STIFFNESS, is_file
 from mjx_study.cli.options import configure_process, given_options, task_of, usage_errors
 from mjx_study.cli.output import computing, print_report
+from mjx_study.diagnose.columns import MEANS
 from mjx_study.options.configuration import OPTIONS
 from mjx_study.options.option import Option, OptionError, reject_unused
 from mjx_study.options.parser import Parser
-from mjx_study.results.variables import explained
+from mjx_study.table import explain
 
 UNEXERCISED = 3
 """Exit code if nothing is wrong but something was never exercised."""
@@ -39,9 +40,9 @@ derivative errors: both are reported but do not fail.
 
 With --mean: does an estimator's mean integrate to the difference of the mean cost along a path through theta? No
 reference gradient is needed. Exit code 0: all are right. 1: one is biased. 3: undecided. Columns:
-{explained("means")}
+{explain(*MEANS)}
 """
-MEANS = {
+MEAN_OPTIONS = {
     option.name: option
     for option in (
         dataclasses.replace(OPTIONS["estimators"], default=("zobg", "fobg")),
@@ -73,7 +74,7 @@ def add(command: Parser) -> None:
     command.add_option(STATES)
     command.add_flag("--stock", "also check the derivative of mjx.step itself")
     command.add_flag("--mean", "check the means of estimators instead of derivatives")
-    for option in MEANS.values():
+    for option in MEAN_OPTIONS.values():
         command.add_option(option, filled=False, line=f"with --mean: {option.line}")
     command.add_flag("--details", "print every entry of every finding")
     command.add_process_options()
@@ -83,12 +84,12 @@ def run(options: argparse.Namespace) -> int:
     """Check and print; return 1 if something is wrong, 3 if something was not exercised."""
     from mjx_study.gradcheck import gradcheck, plan_gradcheck, plan_scene_gradcheck
 
-    given = [name for name in (*MEANS, *DERIVATIVES) if getattr(options, name) not in (None, False)]
+    given = [name for name in (*MEAN_OPTIONS, *DERIVATIVES) if getattr(options, name) not in (None, False)]
     with usage_errors():
         reject_unused(
             given,
             (DERIVATIVES, not options.mean, "is for derivatives of steps: omit it, or --mean"),
-            (MEANS, options.mean, "is for --mean"),
+            (MEAN_OPTIONS, options.mean, "is for --mean"),
             (["pair"], is_file(options.task), "is for files: a task has a pair of geoms already"),
         )
     if options.mean:
@@ -118,7 +119,7 @@ def _run_mean(options: argparse.Namespace) -> int:
     from mjx_study.experiment.unused_options import reads_onset, reject_unread
     from mjx_study.gradcheck import plan_gradcheck
 
-    chosen = {name: option.default for name, option in MEANS.items()} | given_options(options, *MEANS)
+    chosen = {name: option.default for name, option in MEAN_OPTIONS.items()} | given_options(options, *MEAN_OPTIONS)
     names, onset, seed = chosen["estimators"], chosen["onset"], options.seed or 0
     with usage_errors():
         configure_process(options)

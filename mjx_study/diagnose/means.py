@@ -7,6 +7,7 @@ steps reveals.
 import dataclasses
 import math
 from collections.abc import Sequence
+from operator import itemgetter
 from typing import Any, Final
 
 import jax
@@ -15,16 +16,16 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from estimators import Estimator, GradientEstimate, Objective, oracles_of
-from estimators.estimator import label_of
 from estimators.mean_check import TOLERANCE, Circulation, circulations
+from estimators.registry import label_of
+from mjx_study.diagnose.columns import MEANS
 from mjx_study.experiment.resolution import check_estimators, direction_of
 from mjx_study.experiment.sampling import cell_keys, draw_batches
 from mjx_study.objective import Simulator, chunk_for
 from mjx_study.options.configuration import check_span
 from mjx_study.progress import Progress, silent
-from mjx_study.results.variables import MEANS
 from mjx_study.runtime import local_devices
-from mjx_study.table import as_plain, format_table, percent
+from mjx_study.table import Column, as_plain, tabulate
 from mjx_study.tasks.contact_grid import ContactPoint
 from mjx_study.tasks.task import Task
 
@@ -33,17 +34,15 @@ HALF_LENGTH: Final = 2.0
 FEEDBACK: Final = 0.02
 """The same for noise on the controls, in the unit of theta."""
 ALONG_MEANS: Final = "means"
-"""Value of `direction` for paths along the estimators' own means, see `along_means`."""
+"""Value of `direction` for paths along the estimators' means, see `along_means`."""
 MAX_PATHS: Final = 3
-SHARES: Final = ("relative_gap", "detectable")
-"""Columns shown in per cent."""
 MIN_SHARE: Final = 1e-3
 """Smallest share of a mean orthogonal to the others that warrants a path along it."""
 
 
 @dataclasses.dataclass(frozen=True)
 class MeanCheck:
-    """Check of one estimator for one contact model; made by `mjx_study.gradcheck.check_mean`.
+    """Check of one estimator for one contact model; made by `check_mean`.
 
     Attributes:
         contact, stiffness: contact model and its stiffness [N/m], 0 if not defined by one.
@@ -121,7 +120,7 @@ def _at_right_angles(estimates: Sequence[GradientEstimate]) -> list[np.ndarray]:
 
 
 def unmixed(estimators: Sequence[Estimator], batches: dict[str, Any]) -> list[GradientEstimate]:
-    """Compute the estimates that use a single batch, without interpolation; all if there are none."""
+    """Compute the estimates that use a single batch, without interpolation; by default all."""
     single = [estimator for estimator in estimators if len(estimator.needs) == 1]
     return [estimator(batches) for estimator in single or estimators]
 
@@ -185,14 +184,10 @@ def check_mean(
 
 
 def lines_of(checks: Sequence[MeanCheck], onset: str = "none") -> list[str]:
-    """Format the checks as a table; its columns are described in `MEANS`."""
-
-    def shown(name: str, value: Any) -> str:
-        return percent(value, 1) if name in SHARES and value is not None else MEANS[name].text(value)
-
-    rows = []
-    for check in checks:
-        told, stiffness = check.as_dict(), f"{check.stiffness:g}" if check.stiffness else "-"
-        numbers = [shown(name, told[name]) for name in MEANS if name != "verdict"]
-        rows.append([check.contact, stiffness, label_of(check.estimator, onset), *numbers, check.verdict])
-    return format_table(rows, ["contact", "K [N/m]", "estimator", *(variable.heading for variable in MEANS.values())])
+    """Format the checks as a table."""
+    identity = (
+        Column("contact", itemgetter("contact")),
+        Column("K [N/m]", lambda row: f"{row['stiffness']:g}" if row["stiffness"] else "-"),
+        Column("estimator", lambda row: label_of(row["estimator"], onset)),
+    )
+    return tabulate([check.as_dict() for check in checks], [*identity, *MEANS])

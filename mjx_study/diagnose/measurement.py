@@ -160,7 +160,7 @@ def measure(
 
     Args:
         simulator: its compiled programs serve every contact model.
-        contact: the contact model; None for the MJCF's own.
+        contact: the contact model; None for the MJCF's.
         samples: see `diagnose_task`.
         seed: random seed.
     """

@@ -4,7 +4,7 @@ from typing import Final
 
 from mjx_study.choices import is_file, takes_stiffness
 from mjx_study.diagnose.measurement import SAMPLES, chunk_of, estimators_of, measure
-from mjx_study.diagnose.page import Diagnosis
+from mjx_study.diagnose.result import Diagnosis
 from mjx_study.diagnose.setting import setting_of, touches_of
 from mjx_study.experiment.memory import check_memory
 from mjx_study.gradcheck import gradcheck, plan_gradcheck, plan_scene_gradcheck

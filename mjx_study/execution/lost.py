@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 import xarray as xr
 
-from estimators.estimator import label_of
+from estimators.registry import label_of
 from mjx_study.experiment.plan import StudyPlan
 from mjx_study.experiment.sampling import cell_keys, sample_keys
 from mjx_study.objective.batches import compiled_rollout

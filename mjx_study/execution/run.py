@@ -19,7 +19,7 @@ from typing import Any, Final
 import xarray as xr
 
 from estimators import ENOUGH_EFFECTIVE
-from estimators.seen import observing
+from estimators.user_inputs import observing
 from mjx_study.execution.cells import Computation
 from mjx_study.execution.cluster import cells_on, connected
 from mjx_study.execution.lost import lost_samples, total

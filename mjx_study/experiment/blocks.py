@@ -12,7 +12,7 @@ from typing import Any, Final
 import numpy as np
 
 from estimators import ORACLES
-from estimators.blocks import Moments
+from estimators.merged_samples import Moments
 from mjx_study.experiment.tally import Tally
 
 REFERENCE: Final = 0

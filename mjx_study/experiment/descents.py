@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Array, Float, Key
 
 from estimators import Estimator, draw
-from estimators.estimator import draw_at, sample_keys
+from estimators.sampling import draw_at, sample_keys
 from mjx_study.compiled import Compiled
 from mjx_study.experiment.checkpoint import Checkpoint
 from mjx_study.experiment.iteration import Descent, Record, advance, begin, going, make_optimizer, schedule_factors

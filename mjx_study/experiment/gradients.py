@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, Key
 
 import estimators
 from estimators import ORACLES, Batches, Estimator, Evaluation, GradientEstimate
-from estimators.blocks import MOST_THINNED, moments_of
+from estimators.merged_samples import MAX_THINNED, moments_of
 from estimators.statistics import merged_estimates
 from mjx_study.compiled import Compiled, type_of
 from mjx_study.experiment.blocks import REFERENCE, Arrays, Blocks, pack
@@ -120,7 +120,7 @@ class Gradients:
             return {"reference": np.asarray(self._reference(cell, objective, pilot).per_sample)}
         chosen, size = estimators_of(self._plan, cell), block_of(self._plan, cell)
         seed, place = self.begun(cell, {}).place(task)
-        first, every = place * size, math.ceil(cell.samples / MOST_THINNED)
+        first, every = place * size, math.ceil(cell.samples / MAX_THINNED)
         count, oracles = min(size, cell.samples - first), estimators.oracles_of(chosen)
         some = slice(seed, seed + 1)
         drawn, seconds, residuals = draw_batches(

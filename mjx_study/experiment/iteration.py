@@ -14,7 +14,7 @@ import optax
 from jaxtyping import Array, Bool, Float, Int
 
 from estimators import Estimator, Linearisation, StepEvaluation
-from estimators.catalogue import suggestion
+from estimators.choices import suggestion
 from estimators.pytree import register_pytree
 
 MOST_COST_RATIO: Final = 1e6

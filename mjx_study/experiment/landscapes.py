@@ -32,13 +32,13 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from estimators import NOISES, Estimator
+from estimators.noise import split_sample_key
 from mjx_study.compiled import Compiled
 from mjx_study.experiment.plan import StudyCell, StudyPlan, estimators_of, oracles_of
 from mjx_study.experiment.resolution import line_of
 from mjx_study.experiment.sampling import Objectives, cell_keys, draw_batches, unconverged
 from mjx_study.objective import rollout_cost, spread
 from mjx_study.reference import FunctionObjective, Reference, ScalarFunction, smoothed
-from mjx_study.reference.noise import split_sample_key
 from mjx_study.runtime import local_devices, precision
 from mjx_study.simulation.contact import ContactModel
 from mjx_study.tasks.task import Task

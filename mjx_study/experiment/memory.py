@@ -6,7 +6,7 @@ from typing import Final
 import jax
 
 from estimators import ESTIMATORS, Estimator
-from estimators.blocks import EXTREMES
+from estimators.merged_samples import EXTREMES
 from mjx_study.limits import MOST_GIB
 from mjx_study.tasks.task import Task
 
@@ -70,7 +70,7 @@ def bytes_per_sample(task: Task, oracles: Sequence[str], estimators: int, draws:
 
 
 def bytes_of_moments(estimators: Sequence[Estimator], params: int) -> int:
-    """Memory of a block's moments [bytes], see `estimators.blocks.Moments`."""
+    """Memory of a block's moments [bytes], see `estimators.merged_samples.Moments`."""
     sizes = [(1 + params,) if len(each.needs) == 1 else (1 + params, 1 + params, 3 + 2 * params) for each in estimators]
     return 8 * sum(size * (size + 6 * EXTREMES) for each in sizes for size in each)
 

@@ -11,8 +11,9 @@ import jax
 
 import estimators
 from estimators import Estimator, find_estimator
-from estimators.alpha import check_weights
-from estimators.seen import seen_by
+from estimators.interpolation import check_weights
+from estimators.noise import check_sigma
+from estimators.user_inputs import inputs_read
 from mjx_study.choices import CONES, REFERENCE
 from mjx_study.experiment.iteration import make_optimizer, schedule_factors
 from mjx_study.experiment.memory import (
@@ -34,7 +35,6 @@ from mjx_study.limits import MOST_CELLS, MOST_GIB, MOST_PROGRAMS, check_count
 from mjx_study.objective import chunk_for
 from mjx_study.options.configuration import BUILDER_OPTIONS, OPTIONS, SAMPLES, NamedTask, Settings, StudyConfig
 from mjx_study.options.option import OptionError
-from mjx_study.reference.noise import check_sigma
 from mjx_study.runtime import local_devices
 from mjx_study.table import digits_to_tell_apart
 from mjx_study.tasks import TASKS, task_with_options
@@ -149,7 +149,7 @@ class StudyPlan:
     @property
     def seen(self) -> dict[str, str]:
         """Digests of files and environment variables that user-defined code has read so far."""
-        return seen_by(self.places)
+        return inputs_read(self.places)
 
     def label(self, cell: StudyCell) -> str:
         """A cell's name in messages."""

@@ -5,7 +5,6 @@ from collections.abc import Iterable, Sequence
 from typing import Final
 
 from estimators import ESTIMATORS, ORACLES, Estimator, find_estimator
-from estimators.catalogue import CATALOGUE
 from mjx_study.choices import REFERENCE, takes_stiffness
 from mjx_study.experiment.resolution import ESTIMATOR_OPTIONS
 from mjx_study.options.configuration import SCENE_OPTIONS, StudyConfig
@@ -28,7 +27,7 @@ def reject_unread(chosen: Sequence[str | Estimator], given: Iterable[str]) -> No
     names = ", ".join(each.name for each in found)
     for option in given:
         name = "gamma" if option == "published" else option
-        able = ", ".join(each for each in CATALOGUE if name in _fields(ESTIMATORS[each]))
+        able = ", ".join(each for each in ESTIMATORS if name in _fields(ESTIMATORS[each]))
         reason = f"has no effect on {names}: omit it, or choose an estimator that it acts on: {able}"
         reject_unused([option], ([option], name in read, reason))
 

@@ -23,6 +23,7 @@ from mjx_study.progress import Progress, silent
 from mjx_study.runtime import environment
 from mjx_study.simulation.engine import quiet_engine
 from mjx_study.simulation.scene import Scene
+from mjx_study.table import plural
 from mjx_study.tasks.contact_grid import ContactPoint, family_grid
 from mjx_study.tasks.mjcf import scene_task
 from mjx_study.tasks.task import Task
@@ -67,7 +68,7 @@ def plan_gradcheck(
 
     Args:
         task: the task, in float64, with the theta of its gradient.
-        families: contact families; by default the task's own if it has no contact, else `CONTACT`.
+        families: contact families; by default `CONTACT`, or `mjcf` for a task without contact.
         stiffnesses: stiffnesses for families that take one [N/m]; by default `STIFFNESS`, or the task's if those are in
             another range.
         seed: random seed of initial states, states and directions.
@@ -110,10 +111,7 @@ def plan_scene_gradcheck(
         stiffnesses: stiffnesses for families that take one [N/m].
         seed: random seed of the states.
         pair: names of the two geoms whose contact has the stiffness; every contact gets the same solref.
-        damping: override of each family's damping [N s/m].
         horizon: number of steps of the rollout from which states are taken.
-        states: number of states per contact model, at least 1.
-        stock: whether to check the derivative of `mjx.step` too.
 
     Raises:
         ValueError: as for `plan_gradcheck`, or a stiffness without a pair.
@@ -193,21 +191,13 @@ def gradcheck(plan: GradcheckPlan, progress: Progress = silent) -> GradcheckRepo
 
 def _summary(plan: GradcheckPlan) -> str:
     host = plan.subject.scene.host
-    parts = [f"{_count(host.nv, 'degree')} of freedom"]
-    parts += [_count(number, noun) for number, noun in ((host.na, "activation"), (host.nu, "control")) if number]
-    taken = f"{_count(plan.states, 'state')} along {_count(plan.subject.horizon, 'step')} of {host.opt.timestep:g} s"
+    parts = [f"{plural(host.nv, 'degree')} of freedom"]
+    parts += [plural(number, noun) for number, noun in ((host.na, "activation"), (host.nu, "control")) if number]
+    taken = f"{plural(plan.states, 'state')} along {plural(plan.subject.horizon, 'step')} of {host.opt.timestep:g} s"
     return f"{', '.join(parts)}; {taken}"
 
 
 def unoffered(host: mujoco.MjModel) -> list[str]:
     """Features of the model that a step's derivative does not cover."""
-    notes = []
-    if host.nsensor:
-        notes.append(f"{_count(host.nsensor, 'sensor')}: not computed by a step, so without a derivative")
-    if host.nmocap:
-        notes.append(f"{_count(host.nmocap, 'mocap pose')}: not an input of a step, so without a derivative")
-    return notes
-
-
-def _count(number: int, noun: str) -> str:
-    return f"{number} {noun}{'' if number == 1 else 's'}"
+    features = [(host.nsensor, "sensor", "not computed by a step"), (host.nmocap, "mocap pose", "no input of a step")]
+    return [f"{plural(count, noun)}: {why}, so without a derivative" for count, noun, why in features if count]

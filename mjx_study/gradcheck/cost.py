@@ -7,12 +7,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from estimators.noise import split_sample_key
 from mjx_study.gradcheck.diagnosis import worst_verdict
 from mjx_study.gradcheck.differences import moves, take_differences
 from mjx_study.gradcheck.programs import Compiler
 from mjx_study.gradcheck.report import CostCheck, Entry, Finding
 from mjx_study.objective import rollout_cost
-from mjx_study.reference.noise import split_sample_key
 from mjx_study.simulation.contact import ContactModel
 from mjx_study.simulation.engine import HostState
 from mjx_study.tasks.contact_grid import ContactPoint

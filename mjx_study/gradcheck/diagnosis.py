@@ -1,4 +1,4 @@
-"""Verdict on each entry of a Jacobian: right, what is wrong with it, or why there is no derivative."""
+"""Verdict on each entry of a Jacobian: right, its fault, or why there is no derivative."""
 
 from collections.abc import Sequence
 from typing import Final
@@ -148,5 +148,5 @@ def worst_error(
 
 
 def worst_verdict(verdicts: Sequence[str]) -> str:
-    """Return the worst of some verdicts; right if there are none."""
+    """Return the worst verdict, by default right."""
     return max(verdicts, key=VERDICTS.index, default="right")

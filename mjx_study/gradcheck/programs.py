@@ -66,7 +66,7 @@ def _compile(lowered: Any) -> Callable[..., Any]:
 
 
 class ContactCase(NamedTuple):
-    """A contact model, None for the MJCF's own, and the units of its parameters."""
+    """A contact model, None for the MJCF's, and the units of its parameters."""
 
     contact: ContactModel | None
     scales: Float[np.ndarray, " parameters"]
@@ -110,7 +110,7 @@ class Programs:
         self.compiler = compiler or Compiler()
         # Small scenes have a Jacobian over the state; derivatives of large ones, and over parameters, use the tape.
         inputs = len(layout.inputs)
-        self._sizes = sorted({layout.num_state if layout.scene.uses_jacobian else inputs, inputs})
+        self._sizes = sorted({layout.num_state if layout.scene.uses_graph else inputs, inputs})
 
     def start(self, case: ContactCase, base: HostState, *, stock: bool) -> None:
         """Start compiling the programs of `linear`, `exact`, `stock_step` and, on request, `stock`."""
@@ -135,7 +135,7 @@ class Programs:
         return Exact(_host(after, base), stages, outputs[: len(changes)])
 
     def linear(self, case: ContactCase, base: HostState) -> Linear:
-        """Compute the value and derivatives of the project's own step at a state."""
+        """Compute the value and derivatives of the project's step at a state."""
         found = [self._derivatives(size, case, base) for size in self._sizes]
         own, tape = found[0], found[-1]
         if own is tape:

@@ -3,11 +3,12 @@
 import dataclasses
 import math
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, Final
 
 from mjx_study.gradcheck.coverage import Coverage
 from mjx_study.gradcheck.diagnosis import FAILURES, MEANING, VERDICTS
-from mjx_study.table import as_plain, format_table
+from mjx_study.table import Column, as_plain, grouped, tabulate
 
 MAX_SHOWN: Final = 12
 """Maximum number of findings in the text, unless all are requested."""
@@ -24,7 +25,13 @@ HEADINGS: Final = {
     "engine": "C engine",
     "stock": "mjx.step",
 }
-"""Headings of tables, where they are not an attribute's name."""
+"""Headings of columns that are not named after the attribute."""
+OF_COST: Final = "contact stiffness gradient_norm modes difference one_sided closed_form residual verdict"
+OF_STEP: Final = (
+    "contact stiffness states modes differences parameters stock_step engine_step engine stock residual "
+    "unresolved verdict"
+)
+"""Attributes in the columns of the two tables."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,7 +61,7 @@ class Finding:
 
     Attributes:
         contact: label of the contact model, such as penalty, K = 100 N/m.
-        who: owner of the derivative: `project`, or `mjx.step` for MJX's own.
+        who: owner of the derivative: `project` or `mjx.step`.
         verdict: kink, jump, unconverged, zero, nan, engine, wrong, value, engine_mismatch or apart.
         modes: differentiation modes that show it: forward, reverse, tape.
         cause: likely cause, in one sentence.
@@ -70,7 +77,7 @@ class Finding:
 
     @property
     def fails(self) -> bool:
-        """Whether it fails the check, because the project's own derivative is not as it should be."""
+        """Whether it fails the check, because the project's derivative is at fault."""
         return self.who == "project" and self.verdict in FAILURES
 
     def line(self) -> str:
@@ -147,7 +154,7 @@ class StepCheck:
         stock: error of the derivative of `mjx.step`; None if not requested, infinite if NaN.
         residual: largest relative solver residual.
         coverage: parts of the model that the states exercise.
-        verdict: worst of the findings on the project's own derivative.
+        verdict: worst of the findings on the project's derivative.
     """
 
     contact: str
@@ -212,10 +219,8 @@ class GradcheckReport:
         """Return the report as text; `verbose` lists every entry of every finding."""
         lines = [f"{self.subject}: {self.summary}", ""]
         if self.costs:
-            shown = "contact stiffness gradient_norm modes difference one_sided closed_form residual verdict"
-            lines += ["gradient of the whole cost", *_table(self.costs, shown.split()), ""]
-        shown = "contact stiffness states modes differences parameters stock_step engine_step engine stock residual"
-        lines += ["one step", *_table(self.steps, [*shown.split(), "unresolved", "verdict"]), ""]
+            lines += ["gradient of the whole cost", *_table(self.costs, OF_COST), ""]
+        lines += ["one step", *_table(self.steps, OF_STEP), ""]
         lines += self._coverage_lines()
         lines += self._finding_lines(verbose)
         lines += [f"warning: {text}" for text in (*self.warnings, *self._gaps())]
@@ -224,28 +229,23 @@ class GradcheckReport:
 
     def _coverage_lines(self) -> list[str]:
         """Coverage lines, with contact models that share a line grouped."""
-        alike: dict[str, list[str]] = {}
-        for check in self.steps:
-            alike.setdefault(check.coverage.line(), []).append(check.label)
-        lines = [f"{', '.join(labels)}: {line}" if len(alike) > 1 else line for line, labels in alike.items() if line]
+        alike = grouped(self.steps, lambda check: check.coverage.line())
+        labels = {line: ", ".join(check.label for check in checks) for line, checks in alike.items() if line}
+        lines = [f"{label}: {line}" if len(alike) > 1 else line for line, label in labels.items()]
         return ["exercised", *lines, ""] if lines else []
 
     def _gaps(self) -> list[str]:
         """Warnings about parts that no state exercised, grouped."""
-        alike: dict[tuple[str, ...], list[str]] = {}
-        for label, missing in self.unexercised.items():
-            alike.setdefault(missing, []).append(label)
+        unexercised = self.unexercised
         return [
-            f"{', '.join(labels)}: no state exercises {' and '.join(missing)}, whose derivatives are unchecked; more "
-            "--states, a longer --horizon, another --seed or an MJCF whose first keyframe is closer to it may"
-            for missing, labels in alike.items()
+            f"{', '.join(labels)}: no state exercises {' and '.join(missing)}, whose derivatives are unchecked; try "
+            "more --states, a longer --horizon, another --seed or an MJCF whose first keyframe is closer to it"
+            for missing, labels in grouped(unexercised, unexercised.__getitem__).items()
         ]
 
     def _finding_lines(self, verbose: bool) -> list[str]:
         """Findings, one line per kind and cause, whatever the number of contact models that show it."""
-        alike: dict[tuple[str, str, str], list[Finding]] = {}
-        for finding in self.findings:
-            alike.setdefault((finding.who, finding.verdict, finding.cause), []).append(finding)
+        alike = grouped(self.findings, lambda finding: (finding.who, finding.verdict, finding.cause))
         shown = list(alike.values()) if verbose else list(alike.values())[:MAX_SHOWN]
         lines: list[str] = []
         for group in shown:
@@ -259,20 +259,20 @@ class GradcheckReport:
                     for entry in finding.entries
                 ]
         if len(shown) < len(alike):
-            lines.append(f"and {len(alike) - len(shown)} more of the kind (--details shows all)")
+            lines.append(f"and {len(alike) - len(shown)} more (--details lists all)")
         verdicts = dict.fromkeys(finding.verdict for finding in self.findings)
         lines += [f"{verdict}: {MEANING[verdict]}" for verdict in verdicts if verdict in MEANING]
         return [*lines, ""] if lines else []
 
 
-def _table(checks: Sequence[CostCheck | StepCheck], names: Sequence[str]) -> list[str]:
+def _table(checks: Sequence[CostCheck | StepCheck], names: str) -> list[str]:
     """A table of attributes, without empty columns."""
-    columns = {HEADINGS.get(name, name): [_cell(name, getattr(check, name)) for check in checks] for name in names}
-    kept = {heading: cells for heading, cells in columns.items() if set(cells) - {"-"}}
-    return format_table(list(zip(*kept.values(), strict=True)), list(kept))
+    columns = [Column(HEADINGS.get(name, name), partial(_cell, name=name)) for name in names.split()]
+    return tabulate(checks, columns, omit="-")
 
 
-def _cell(name: str, value: Any) -> str:
+def _cell(check: CostCheck | StepCheck, name: str) -> str:
+    value = getattr(check, name)
     if name == "verdict":
         return f"right, but {value}s" if value in ("kink", "jump") else value
     if name == "stiffness":

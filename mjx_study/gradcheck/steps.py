@@ -1,7 +1,6 @@
 """Check the steps of one contact model: all comparisons at each state, their findings, and a row of the table."""
 
 import dataclasses
-from collections import defaultdict
 from collections.abc import Iterator, Sequence
 
 import jax.numpy as jnp
@@ -18,11 +17,12 @@ from mjx_study.gradcheck.report import Entry, Finding, StepCheck
 from mjx_study.gradcheck.states import Sample
 from mjx_study.gradcheck.values import EngineStep, Values, compare_values
 from mjx_study.simulation.contact import apply_contact
+from mjx_study.table import grouped
 from mjx_study.tasks.contact_grid import ContactPoint
 
 STOCK = "mjx.step"
-_Found = tuple[tuple[str, str, tuple[str, ...], str], str, float, float | None, float | None]
-"""Owner of the derivative, verdict, modes and cause; and name, derivative, difference and gap of an entry."""
+_Kind = tuple[str, str, tuple[str, ...], str]
+"""Owner of the derivative, verdict, modes and cause, which the entries of a finding have in common."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -46,6 +46,11 @@ class StateCheck:
     engine_truth: Differences
     engine: Codes | None
     context: FindingContext
+
+    def entry(self, name: str, derivative: float, difference: float | None = None, gap: float | None = None) -> Entry:
+        """An entry at this state."""
+        time = self.sample.index * self.context.layout.scene.timestep
+        return Entry(self.sample.label, self.sample.index, time, name, derivative, difference, gap)
 
     def of(self, who: str) -> dict[str, Codes]:
         """Verdicts on the derivatives of the project or of `mjx.step`."""
@@ -143,21 +148,16 @@ def step_check(
 
 def collect(cell: ContactPoint, layout: Coordinates, checks: Sequence[StateCheck]) -> list[Finding]:
     """Group the findings for one contact model."""
-    groups: dict[tuple[str, str, tuple[str, ...], str], list[Entry]] = defaultdict(list)
-    for check in checks:
-        label, index = check.sample.label, check.sample.index
-        found = (*_of_entries(check, layout), *_of_engine(check, layout), *_of_state(check, layout))
-        for key, name, derivative, difference, gap in found:
-            time = index * layout.scene.timestep
-            groups[key].append(Entry(label, index, time, name, derivative, difference, gap))
-    return [Finding(cell.label, *key, tuple(entries)) for key, entries in groups.items()]
+    found = [each for check in checks for part in (_of_entries, _of_engine, _of_state) for each in part(check, layout)]
+    alike = grouped(found, lambda each: each[0])
+    return [Finding(cell.label, *kind, tuple(entry for _, entry in entries)) for kind, entries in alike.items()]
 
 
 def _worst_codes(judged: dict[str, Codes]) -> Codes:
     return np.max(list(judged.values()), axis=0)
 
 
-def _of_entries(check: StateCheck, layout: Coordinates) -> Iterator[_Found]:
+def _of_entries(check: StateCheck, layout: Coordinates) -> Iterator[tuple[_Kind, Entry]]:
     for who in ("project", STOCK) if STOCK in check.judged else ("project",):
         judged = check.of(who)
         worst = _worst_codes(judged)
@@ -178,34 +178,34 @@ def _of_entries(check: StateCheck, layout: Coordinates) -> Iterator[_Found]:
                 float(values[row, column])
                 for values in (check.derivatives[modes[0]], check.truth.value, check.truth.gap)
             )
-            name = f"d {output} / d {source}"
-            yield (who, verdict, modes, cause), name, derivative, difference, None if smooth else gap
+            entry = check.entry(f"d {output} / d {source}", derivative, difference, None if smooth else gap)
+            yield (who, verdict, modes, cause), entry
 
 
-def _of_engine(check: StateCheck, layout: Coordinates) -> Iterator[_Found]:
-    """Findings where the C engine's step has the same value but a different derivative."""
+def _of_engine(check: StateCheck, layout: Coordinates) -> Iterator[tuple[_Kind, Entry]]:
+    """Findings where the C engine's step has the same value but another derivative."""
     if check.engine is None:
         return
     apart = diagnosis.disagreements(check.judged["forward"], check.truth, check.engine, check.engine_truth)
-    key = ("project", VERDICTS[ENGINE], (), "the derivative is that of this step, and the C engine's has another")
+    kind = ("project", VERDICTS[ENGINE], (), "the derivative is that of this step, but the C engine's step has another")
     for row, column in np.argwhere(apart).tolist():
         ours, theirs = (float(each[row, column]) for each in (check.derivatives["forward"], check.engine_truth.value))
-        yield key, f"d {layout.outputs[row]} / d {layout.inputs[column]}", ours, theirs, None
+        yield kind, check.entry(f"d {layout.outputs[row]} / d {layout.inputs[column]}", ours, theirs)
 
 
-def _of_state(check: StateCheck, layout: Coordinates) -> Iterator[_Found]:
+def _of_state(check: StateCheck, layout: Coordinates) -> Iterator[tuple[_Kind, Entry]]:
     values = check.values
     if not check.residual <= diagnosis.RESIDUAL_TOLERANCE:
         cause = f"residual {check.residual:.1e}; {_budget(layout)}"
-        yield ("project", "unconverged", (), cause), "", check.residual, None, None
+        yield ("project", "unconverged", (), cause), check.entry("", check.residual)
     if not check.modes <= diagnosis.MODES_TOLERANCE:
         text = f"the two modes of differentiation disagree by {check.modes:.1e}"
         cause = f"{text}: {SINGULAR}" if check.context.singular else text
-        yield ("project", "wrong", (), cause), "", check.modes, None, None
+        yield ("project", "wrong", (), cause), check.entry("", check.modes)
     if values.verdict:
         who = STOCK if values.verdict == "value" and values.agrees_with_engine else "project"
-        name = f"change of {layout.outputs[values.coordinate]}"
-        yield (who, values.verdict, (), values.cause), name, *values.numbers, None
+        entry = check.entry(f"change of {layout.outputs[values.coordinate]}", *values.numbers)
+        yield (who, values.verdict, (), values.cause), entry
 
 
 def _budget(layout: Coordinates) -> str:

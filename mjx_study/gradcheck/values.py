@@ -1,4 +1,4 @@
-"""Compare the steps of this project, `mjx.step` and the C engine; if they differ, tell which, where and why."""
+"""Compare the steps of this project, `mjx.step` and the C engine; if they differ, report which, where and why."""
 
 import copy
 import dataclasses
@@ -212,7 +212,7 @@ def difference_of_engines(
     ours: Float[np.ndarray, " nv"],
     theirs: Float[np.ndarray, " nv"],
 ) -> tuple[str, bool]:
-    """Describe the differences between the steps of the C engine and MJX, and tell whether all are documented.
+    """Describe the differences between the steps of the C engine and MJX, and whether all are documented.
 
     Args:
         stages: MJX's intermediate quantities at the state.
@@ -332,7 +332,7 @@ def _rows(host: mujoco.MjModel, data: mujoco.MjData, stages: dict[str, Any], *, 
 
 
 def _matched(distances: Float[np.ndarray, "ours theirs"]) -> tuple[np.ndarray, np.ndarray]:
-    """Indices of pairs with the least total distance; what is not finite is matched last."""
+    """Indices of pairs with the least total distance; nonfinite ones are matched last."""
     return linear_sum_assignment(np.nan_to_num(distances, nan=FAR, posinf=FAR))
 
 

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.extend.core import jaxpr_as_fun
 
 from mjx_study.graph.function import ScalarFunction, array_of, bind_whole
 from mjx_study.graph.nodes import Node, needed_for, no_type_check
@@ -16,15 +17,20 @@ from mjx_study.graph.nodes import Node, needed_for, no_type_check
 _FUNCTIONS: Final = {
     lax.add_p: lax.add,
     lax.and_p: lax.bitwise_and,
+    lax.div_p: lax.div,
     lax.eq_p: lax.eq,
     lax.gt_p: lax.gt,
     lax.lt_p: lax.lt,
     lax.max_p: lax.max,
     lax.min_p: lax.min,
     lax.mul_p: lax.mul,
+    lax.ne_p: lax.ne,
     lax.neg_p: lax.neg,
+    lax.not_p: lax.bitwise_not,
     lax.or_p: lax.bitwise_or,
     lax.select_n_p: lax.select_n,
+    lax.sqrt_p: lax.sqrt,
+    lax.sub_p: lax.sub,
 }
 """Functions for operations that rules add; they supply the primitive parameters of the installed JAX version."""
 
@@ -43,6 +49,12 @@ def evaluated(function: ScalarFunction) -> Callable[..., list[jax.Array]]:
         ]
 
     return program
+
+
+def written_out(function: ScalarFunction) -> Callable[..., list[jax.Array]]:
+    """`evaluated` as a program, which JAX batches and differentiates once for all programs that use it."""
+    types = [jax.ShapeDtypeStruct(each.shape, each.flat[0].dtype) for each in function.inputs]
+    return jax.jit(jaxpr_as_fun(jax.make_jaxpr(evaluated(function))(*types)))
 
 
 @no_type_check

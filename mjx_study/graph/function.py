@@ -1,15 +1,16 @@
 """Capture functions of small arrays as graphs of scalars, from their jaxprs."""
 
+import dataclasses
 import itertools
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Final
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jax.core import ShapedArray, Tracer
 from jax.extend.core import Literal
 
@@ -27,18 +28,21 @@ from mjx_study.graph.rules import RULES
 
 _SAME: Final = frozenset({"copy", "copy_p", "name", "optimization_barrier"})
 _CALLS: Final = {"closed_call": "call_jaxpr", "jit": "jaxpr", "pjit": "jaxpr"}
+_WITH_RULES: Final = {"custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr", "ruled": "jaxpr"}
+"""Calls with a derivative of their own, which are operations on whole arrays unless only values are wanted."""
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class ScalarFunction:
     """A function of arrays as a graph.
 
     Attributes:
         graph: the graph that its nodes belong to.
-        inputs: one array of nodes per traced leaf of the arguments.
-        outputs: one array of nodes and NumPy scalars per leaf of the result.
+        inputs: one array of nodes per input.
+        outputs: one array of nodes and NumPy scalars per output.
         avals: types of the outputs.
         structure: pytree of the outputs.
+        derived: what has been derived from it, by kind.
     """
 
     graph: ScalarGraph
@@ -46,11 +50,22 @@ class ScalarFunction:
     outputs: list[np.ndarray]
     avals: Sequence[Any]
     structure: Any
+    derived: dict[Any, Any] = dataclasses.field(default_factory=dict, init=False)
 
     @cached_property
     def needed(self) -> list[Node]:
         """Nodes that the outputs depend on, arguments first."""
         return needed_for(entries_of(self.outputs))
+
+    @cached_property
+    def used(self) -> list[int]:
+        """Places of the inputs that the outputs depend on."""
+        needed = {node.number for node in self.needed}
+        return [place for place, each in enumerate(self.inputs) if any(node.number in needed for node in each.flat)]
+
+    def of(self, places: Sequence[int]) -> "ScalarFunction":
+        """Return the function of some of its inputs, which does not depend on the others."""
+        return dataclasses.replace(self, inputs=[self.inputs[place] for place in places])
 
 
 def is_input(leaf: Any) -> bool:
@@ -58,30 +73,38 @@ def is_input(leaf: Any) -> bool:
     return isinstance(leaf, Tracer | jax.ShapeDtypeStruct)
 
 
-def capture(function: Callable[..., Any], *arguments: Any, most: int) -> ScalarFunction:
+def capture(function: Callable[..., Any], *arguments: Any, most: int, values_only: bool = False) -> ScalarFunction:
     """Write `function(*arguments)` out as a graph.
 
     Args:
         arguments: pytrees of arrays; traced ones and `jax.ShapeDtypeStruct`s become inputs, others constants.
         most: maximum number of scalar operations.
+        values_only: whether to write out calls with a derivative of their own, too, which loses it.
 
     Raises:
         TooLargeError: it has more operations.
     """
     jaxpr, shape = jax.make_jaxpr(function, return_shape=True)(*arguments)
-    graph, leaves = ScalarGraph(most), jax.tree.leaves(arguments)
+    graph, leaves = ScalarGraph(most, values_only), jax.tree.leaves(arguments)
     arrays = [graph.fresh("input", leaf.shape, leaf.dtype) if is_input(leaf) else constants(leaf) for leaf in leaves]
-    outputs = _run(graph, jaxpr.jaxpr, [constants(each) for each in jaxpr.consts], arrays)
+    outputs = run(graph, jaxpr, arrays)
+    graph.most = None
     inputs = [array for array, leaf in zip(arrays, leaves, strict=True) if is_input(leaf)]
     return ScalarFunction(graph, inputs, outputs, jaxpr.out_avals, jax.tree.structure(shape))
 
 
 @no_type_check
-def _run(
-    graph: ScalarGraph, jaxpr: Any, closed: Sequence[np.ndarray], inputs: Sequence[np.ndarray]
-) -> list[np.ndarray]:
-    """Evaluate a jaxpr; array entries are nodes or NumPy scalars."""
-    values = dict(zip((*jaxpr.constvars, *jaxpr.invars), (*closed, *inputs), strict=True))
+def inlined(graph: ScalarGraph, function: Callable[..., Any], *arrays: np.ndarray) -> list[np.ndarray]:
+    """Add a function of floating-point arrays of nodes to a graph; its leaves."""
+    kinds = [jax.ShapeDtypeStruct(each.shape, each.flat[0].dtype if each.size else np.dtype(float)) for each in arrays]
+    return run(graph, jax.make_jaxpr(function)(*kinds), arrays)
+
+
+@no_type_check
+def run(graph: ScalarGraph, closed: Any, inputs: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Evaluate a closed jaxpr; array entries are nodes or NumPy scalars."""
+    jaxpr, consts = closed.jaxpr, [constants(each) for each in closed.consts]
+    values = dict(zip((*jaxpr.constvars, *jaxpr.invars), (*consts, *inputs), strict=True))
 
     def read(atom: Any) -> np.ndarray:
         if isinstance(atom, Literal):
@@ -106,9 +129,12 @@ def _equation(graph: ScalarGraph, equation: Any, inputs: list[np.ndarray]) -> Se
         return inputs
     if name in ELEMENTWISE:
         return [graph.elementwise(equation.primitive, inputs, aval, **parameters)]
-    if name in _CALLS:
-        inner = parameters[_CALLS[name]]
-        return _run(graph, inner.jaxpr, [constants(each) for each in inner.consts], inputs)
+    if name in _CALLS or (graph.values_only and name in _WITH_RULES):
+        return run(graph, parameters[(_CALLS | _WITH_RULES)[name]], inputs)
+    if name == "cond":
+        return _branch(graph, equation, inputs)
+    if name == "scan":
+        return _scan(graph, equation, inputs)
     if name in RULES and (outputs := RULES[name](graph, inputs, aval, parameters)) is not None:
         return outputs
     if name == "while":
@@ -121,6 +147,40 @@ def _equation(graph: ScalarGraph, equation: Any, inputs: list[np.ndarray]) -> Se
     return graph.outputs(node, [each.aval for each in equation.outvars])
 
 
+@no_type_check
+def _branch(graph: ScalarGraph, equation: Any, inputs: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Compute all branches and select one, as under `vmap`."""
+    index, *operands = inputs
+    branches, avals = equation.params["branches"], [each.aval for each in equation.outvars]
+    if not isinstance(index[()], Node):
+        return run(graph, branches[min(max(int(index), 0), len(branches) - 1)], operands)
+    first, *others = (run(graph, each, operands) for each in branches)
+    kind = index[()].dtype
+    for place, other in enumerate(others, 1):
+        here = filled((), [graph.scalar(lax.ge_p, (index[()], kind.type(place)), np.dtype(bool))])
+        pairs = zip(first, other, avals, strict=True)
+        first = [graph.elementwise(lax.select_n_p, [here, old, new], aval) for old, new, aval in pairs]
+    return first
+
+
+@no_type_check
+def _scan(graph: ScalarGraph, equation: Any, inputs: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Write out all passes of a loop of known length."""
+    parameters = equation.params
+    first = parameters["num_consts"]
+    second = first + parameters["num_carry"]
+    consts, carry, rows = inputs[:first], list(inputs[first:second]), inputs[second:]
+    avals = [each.aval for each in equation.outvars[len(carry) :]]
+    stacked = [np.empty(aval.shape, object) for aval in avals]
+    passes = range(parameters["length"])
+    for at in reversed(passes) if parameters["reverse"] else passes:
+        outputs = run(graph, parameters["jaxpr"], [*consts, *carry, *(each[at] for each in rows)])
+        carry = outputs[: len(carry)]
+        for every, one in zip(stacked, outputs[len(carry) :], strict=True):
+            every[at] = one
+    return [*carry, *stacked]
+
+
 def _loop(graph: ScalarGraph, equation: Any, inputs: list[np.ndarray]) -> list[np.ndarray]:
     """While loop over scalars, with loop invariants computed beforehand."""
     parameters, avals = equation.params, [each.aval for each in equation.outvars]
@@ -128,8 +188,7 @@ def _loop(graph: ScalarGraph, equation: Any, inputs: list[np.ndarray]) -> list[n
     during = [graph.fresh("carry", aval.shape, aval.dtype) for aval in avals]
 
     def inside(of: str, consts: list[np.ndarray]) -> list[Any]:
-        inner = parameters[of]
-        return entries_of(_run(graph, inner.jaxpr, [constants(each) for each in inner.consts], [*consts, *during]))
+        return entries_of(run(graph, parameters[of], [*consts, *during]))
 
     again, after = inside("cond_jaxpr", inputs[:first]), inside("body_jaxpr", inputs[first:second])
     carried = entries_of(during)

@@ -70,15 +70,20 @@ class Node:
 
 @no_type_check
 class ScalarGraph:
-    """The operations of a function, without duplicates."""
+    """The operations of a function, without duplicates.
 
-    def __init__(self, most: int):
-        self._count, self._most = 0, most
+    Attributes:
+        most: maximum number of nodes, beyond which new ones raise `TooLargeError`; None for any number.
+        values_only: whether calls with a derivative of their own are written out, too, which loses it.
+    """
+
+    def __init__(self, most: int | None, values_only: bool = False):
+        self.most, self.values_only, self._count = most, values_only, 0
         self._known: dict[Any, Node] = {}
 
     def node(self, operation: Any, arguments: tuple[Any, ...], parameters: Any, dtype: Any) -> Node:
         self._count += 1
-        if self._count > self._most:
+        if self.most is not None and self._count > self.most:
             raise TooLargeError
         return Node(self._count, operation, arguments, parameters, dtype)
 

@@ -7,48 +7,69 @@ folds constants, eliminates common subexpressions, and drops what no output need
 act on contiguous arrays over the batch under `vmap`, and fuse.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from typing import Any, Final
 
 import jax
 import numpy as np
 from jax.core import Tracer
-from jax.extend.core import jaxpr_as_fun
 
-from mjx_study.graph.evaluation import evaluated
-from mjx_study.graph.function import capture
+from mjx_study.graph.build import native_identity
+from mjx_study.graph.function import ScalarFunction, capture, is_input
 from mjx_study.graph.nodes import TooLargeError, no_type_check
+from mjx_study.graph.operation import computed
 
 MOST_SCALARS: Final = {"cpu": 12_000, "gpu": 6_000, "tpu": 6_000}
 """Maximum number of scalar operations, by backend; XLA's compile time grows faster than linearly in it."""
+MOST_NATIVE: Final = 200_000
+"""Maximum number of scalar operations in native code."""
 
-_WRITTEN_OUT: Final[dict[Any, Callable[..., Any] | None]] = {}
-"""Graphs as functions, keyed by everything they depend on; None if too large. JAX batches and differentiates each of
-them once for all programs that use it."""
+_CAPTURED: Final[dict[Any, ScalarFunction | None]] = {}
+"""Graphs, keyed by everything they depend on; None if too large."""
 MOST_KEPT: Final = 64
-"""Maximum number of functions in `_WRITTEN_OUT`."""
+"""Maximum number of graphs in `_CAPTURED`."""
 
 
 def unrolled(function: Callable[..., Any], *arguments: Any) -> Any:
-    """Evaluate `function(*arguments)` entry by entry, or as is if that takes more than `MOST_SCALARS` operations.
+    """Evaluate `function(*arguments)` entry by entry, or as is if that takes more than `most_scalars` operations.
 
     Untraced arrays among the arguments are constants. The result equals the function's up to rounding, except that 0
     times infinity or NaN is 0 where the 0 is a constant. Forward and reverse mode differentiate it like the function
     itself.
     """
-    leaves, structure = jax.tree.flatten(arguments)
-    inputs = [leaf for leaf in leaves if isinstance(leaf, Tracer)]
-    if not inputs:
+    inputs = [leaf for leaf in jax.tree.leaves(arguments) if isinstance(leaf, Tracer)]
+    if not inputs or (captured := captured_once(function, *arguments)) is None:
         return function(*arguments)
-    most = MOST_SCALARS[jax.default_backend()]
+    return jax.tree.unflatten(captured.structure, computed(captured, inputs))
+
+
+def captured_once(function: Callable[..., Any], *arguments: Any) -> ScalarFunction | None:
+    """`capture`, once for all programs; None if it takes more than `most_scalars` operations."""
+    leaves, structure = jax.tree.flatten(arguments)
+    most = most_scalars()
     key = _name(function), structure, tuple(map(_content, leaves)), most
-    if key not in _WRITTEN_OUT:
-        while len(_WRITTEN_OUT) >= MOST_KEPT:
-            del _WRITTEN_OUT[next(iter(_WRITTEN_OUT))]
-        _WRITTEN_OUT[key] = _written_out(function, arguments, leaves, most)
-    program = _WRITTEN_OUT[key]
-    return function(*arguments) if program is None else program(*inputs)
+    if key not in _CAPTURED:
+        while len(_CAPTURED) >= MOST_KEPT:
+            del _CAPTURED[next(iter(_CAPTURED))]
+        try:
+            captured = capture(function, *arguments, most=2 * most)
+        except TooLargeError:
+            captured = None
+        _CAPTURED[key] = captured if captured and is_small(captured) else None
+        if captured and any(node.operation == "whole" for node in captured.needed):
+            captured.derived["values"] = capture(function, *arguments, most=2 * most, values_only=True)
+    return _CAPTURED[key]
+
+
+def is_small(function: ScalarFunction) -> bool:
+    """Whether a graph is worth compiling: it has at most `most_scalars` operations."""
+    return len(function.needed) <= most_scalars()
+
+
+def most_scalars() -> int:
+    """Maximum number of scalar operations here: `MOST_NATIVE`, or `MOST_SCALARS` without native code."""
+    return MOST_SCALARS[jax.default_backend()] if native_identity() is None else MOST_NATIVE
 
 
 def _name(function: Callable[..., Any]) -> Any:
@@ -61,25 +82,10 @@ def _name(function: Callable[..., Any]) -> Any:
 @no_type_check
 def _content(leaf: Any) -> Any:
     """Return what a graph depends on: the type of traced leaves, the value of others."""
-    if isinstance(leaf, Tracer):
-        return jax.typeof(leaf)
+    if is_input(leaf):
+        return leaf.shape, leaf.dtype.str
     array = np.asarray(leaf)
     return array.shape, array.dtype.str, array.tobytes()
-
-
-def _written_out(
-    function: Callable[..., Any], arguments: tuple[Any, ...], leaves: Sequence[Any], most: int
-) -> Callable[..., Any] | None:
-    """Build a function of the traced leaves of the arguments; None if it takes too many operations."""
-    try:
-        captured = capture(function, *arguments, most=2 * most)
-    except TooLargeError:
-        return None
-    if len(captured.needed) > most:
-        return None
-    traced = [leaf for leaf in leaves if isinstance(leaf, Tracer)]
-    called = jax.jit(jaxpr_as_fun(jax.make_jaxpr(evaluated(captured))(*traced)))
-    return lambda *free: jax.tree.unflatten(captured.structure, called(*free))
 
 
 def traced_part(tree: Any) -> tuple[list[Any], Callable[[list[Any]], Any]]:

@@ -11,11 +11,11 @@ import numpy as np
 from jaxtyping import Array, Float, Key
 
 from estimators import Differentiation, Evaluation, Linearisation, StepDifferentiation, StepEvaluation
+from estimators.noise import check_sigma
 from mjx_study.compiled import Compiled
 from mjx_study.objective.chunks import rounds, spread
 from mjx_study.objective.cost import simulate
 from mjx_study.objective.programs import SamplePrograms
-from mjx_study.reference.noise import check_sigma
 from mjx_study.runtime import local_devices
 from mjx_study.simulation.contact import ContactModel
 from mjx_study.stopwatch import timed

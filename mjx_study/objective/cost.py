@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
-from mjx_study.reference.noise import split_sample_key, standard_noise
+from estimators.noise import split_sample_key, standard_noise
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.branches import jump_term
 from mjx_study.simulation.contact import ContactModel, apply_contact

@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from estimators.noise import noise_score, split_sample_key, standard_noise
 from mjx_study.objective.cost import before_each_step, derivative_model, last_of, rollout_cost
-from mjx_study.reference.noise import noise_score, split_sample_key, standard_noise
 from mjx_study.simulation.contact import apply_contact
 from mjx_study.simulation.dynamics import State, step
 from mjx_study.simulation.onset import as_row

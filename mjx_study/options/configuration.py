@@ -11,9 +11,8 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Final, Protocol, Union, runtime_checkable
 
-from estimators.catalogue import (
+from estimators.choices import (
     BASELINES,
-    CATALOGUE,
     DENSITIES,
     MAX_DEVIATION,
     PLUG_IN,
@@ -22,6 +21,7 @@ from estimators.catalogue import (
     WEIGHTS,
     suggestion,
 )
+from estimators.registry import ESTIMATORS
 from mjx_study.choices import CONES, FAMILIES, INTEGRATORS, ONSETS, REFERENCE, SOLVERS, takes_stiffness
 from mjx_study.options.numbers import MAX_VALUES
 from mjx_study.options.option import OptionError, Rows, declared, options_of
@@ -109,7 +109,7 @@ class StudyConfig:
         None, "KIND", "kind of study: {}", choices=STUDIES, unset="from --iterations and --points"
     )
     estimators: tuple[Union[str, "estimators.estimator.Estimator"], ...] = declared(
-        ("zobg", "fobg", "aobg"), "NAME", "see `mjx-study estimators`", choices=CATALOGUE, allows_user_code=True
+        ("zobg", "fobg", "aobg"), "NAME", "see `mjx-study estimators`", choices=ESTIMATORS, allows_user_code=True
     )
     theta: tuple[float, ...] | None = declared(None, "X", "policy parameters", "(-inf, inf)", unset=UNSET_TASK)
     network: tuple[int, ...] | None = declared(
@@ -286,7 +286,7 @@ class StudyConfig:
     @property
     def estimator_names(self) -> tuple[str, ...]:
         """Names of the estimators; `module:class` of objects of your own."""
-        return tuple(each if isinstance(each, str) else each.place() for each in self.estimators)
+        return tuple(each if isinstance(each, str) else each.qualified_name() for each in self.estimators)
 
     @property
     def task_names(self) -> list[str]:

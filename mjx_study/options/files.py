@@ -11,7 +11,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from estimators.catalogue import suggestion
+from estimators.choices import suggestion
 from mjx_study.disk import read_bytes
 from mjx_study.options.configuration import BUILDER_OPTIONS, OPTIONS
 from mjx_study.options.option import OptionError

@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from numbers import Integral, Real
 from typing import Any, Final, get_args, get_origin
 
-from estimators.catalogue import suggestion
+from estimators.choices import suggestion
 from mjx_study.options.numbers import MAX_VALUES, Interval, expand_range, parse_number, plain, short
 
 KINDS: Final[dict[type, tuple[type, str]]] = {

@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Final, NoReturn
 
-from estimators.catalogue import suggestion, unknown
+from estimators.choices import suggestion, unknown
 from mjx_study.choices import FAMILIES, PRECISIONS, TASK_DESCRIPTIONS, unknown_task
 from mjx_study.options.configuration import BUILDER_OPTIONS, CONTACTS, OPTIONS, UNSET_TASK
 from mjx_study.options.option import Option, OptionError, flag_of

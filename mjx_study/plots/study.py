@@ -12,7 +12,7 @@ from matplotlib.colors import TwoSlopeNorm
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from estimators.estimator import label_of
+from estimators.registry import label_of
 from mjx_study.plots.descents import achieved, descent, landscape
 from mjx_study.plots.edges import UNDRAWN, drawable
 from mjx_study.plots.gradients import alpha, bias, comparison, error_against_samples, variance

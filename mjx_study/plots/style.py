@@ -18,32 +18,12 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 from matplotlib.transforms import ScaledTranslation
 
-from estimators import ESTIMATORS
-from estimators.estimator import label_of
+from estimators.registry import ESTIMATORS, label_of
 from mjx_study.choices import FAMILIES
 from mjx_study.disk import write_whole
 
-STYLE: Final = {
-    "zobg": ("#0072B2", "o"),
-    "zobg_antithetic": ("#56B4E9", "v"),
-    "zobg_to_go": ("#56B4E9", "P"),
-    "zobg_to_go_antithetic": ("#0072B2", "X"),
-    "fobg": ("#D55E00", "s"),
-    "fobg_onset": ("#7A2E00", "s"),
-    "fobg_clipped": ("#E69F00", "<"),
-    "fobg_truncated": ("#E69F00", ">"),
-    "aobg": ("#009E73", "D"),
-    "aobg_onset": ("#8FBF5A", "D"),
-    "ivw": ("#CC79A7", "^"),
-    "ivw_h": ("#CC79A7", "p"),
-    "total_propagation": ("#332288", "*"),
-    "ddcg": ("#009E73", "h"),
-    "delta": ("#999933", "d"),
-}
-"""Okabe-Ito colours and four more, distinguishable in print and by colour-blind readers;
-markers repeat the distinction. Black and grey are for what is no estimator's."""
 OTHERS: Final = (("#882255", "#AA4499", "#332288", "#88CCEE", "#DDCC77", "#661100", "#999933"), "1234+x|_")
-"""Colours, of Tol's muted scheme, and markers for user-defined estimators."""
+"""Colours, of Tol's muted scheme, and markers for estimators that choose none; black and grey are for the rest."""
 NO_CONTACT: Final = 1.0
 """Position of models without a stiffness on a stiffness axis [N/m]."""
 TITLES: Final = {
@@ -61,10 +41,11 @@ assert set(TITLES) >= set(FAMILIES)
 
 
 def style_of(name: str, onset: str = "none") -> tuple[str, str, str]:
-    """Label, colour and marker of an estimator under an onset term; those of user-defined ones depend on the name."""
-    colours, markers = OTHERS
-    drawn = zlib.crc32(name.encode())
-    return label_of(name, onset), *STYLE.get(name, (colours[drawn % len(colours)], markers[drawn // 7 % len(markers)]))
+    """Label, colour and marker of an estimator under an onset term; the last two by its name if its class has none."""
+    (colours, markers), found, drawn = OTHERS, ESTIMATORS.get(name), zlib.crc32(name.encode())
+    by_name = colours[drawn % len(colours)], markers[drawn // 7 % len(markers)]
+    colour, marker = (found.style if found else None) or by_name
+    return label_of(name, onset), colour, marker
 
 
 def combines(name: str, described: Mapping[str, Any]) -> bool:

@@ -12,9 +12,9 @@ from mjx_study.reference.function import (
     Smoothed,
     smoothed,
 )
-from mjx_study.reference.launch import BallWall, MomentumTransfer
 from mjx_study.reference.linear_quadratic import LinearQuadratic
 from mjx_study.reference.objective import PARAMETRISATIONS, FunctionObjective, Reference, ReferenceObjective
+from mjx_study.reference.projectiles import BallWall, MomentumTransfer
 from mjx_study.reference.system import Gradients, QuadraticCost, Rollout, System, roll_out, value_and_gradients
 from mjx_study.reference.tennis import Tennis, draw_start, tennis_metrics
 from mjx_study.reference.two_bodies import Pusher, SlidingBox

@@ -18,7 +18,7 @@ import scipy
 from jaxtyping import Float
 
 from estimators import NOISES
-from mjx_study.reference.noise import check_density, check_sigma
+from estimators.noise import check_density, check_sigma
 
 Values = Float[np.ndarray, "*batch"]
 Points = Float[np.ndarray, "*batch params"]

@@ -12,8 +12,8 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float
 
+from estimators.noise import check_sigma
 from mjx_study.reference.function import Smoothed
-from mjx_study.reference.noise import check_sigma
 from mjx_study.reference.system import ControlJacobians, Controls, Costs, StateJacobians, States
 
 

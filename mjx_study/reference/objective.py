@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Array, Float, Key
 
 from estimators import Differentiation, Evaluation, Linearisation, PairedObjective, StepDifferentiation, StepEvaluation
+from estimators.noise import batch_noise, check_density, check_sigma, noise_score, split_sample_key
 from mjx_study.reference.function import Function
-from mjx_study.reference.noise import batch_noise, check_density, check_sigma, noise_score, split_sample_key
 from mjx_study.reference.system import Rollout, System, gradients_along, roll_out, value_and_gradients
 
 PARAMETRISATIONS: Final = ("controls", "feedback", "start")

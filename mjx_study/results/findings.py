@@ -12,7 +12,7 @@ import numpy as np
 import xarray as xr
 
 from estimators import ENOUGH_EFFECTIVE, ESTIMATORS, ORACLES
-from estimators.estimator import label_of
+from estimators.registry import label_of
 from mjx_study.results.variables import GRADIENTS, ONSETS, THETA
 from mjx_study.table import digits_to_tell_apart, number, percent, with_error
 

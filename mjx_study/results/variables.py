@@ -140,33 +140,8 @@ DERIVED: Final = {
 """Quantities of tables that a Dataset does not hold."""
 VARIABLES: Final = {"gradients": GRADIENTS, "descents": DESCENTS, "landscapes": LANDSCAPES}
 """Variables by kind of study."""
-MEANS: Final = {
-    "difference": Variable((), "cost", "difference of the mean cost between the ends of the path", "difference"),
-    "gap": Variable((), "cost", "integral of the estimator's mean along the path, less the difference", "gap"),
-    "half_width": Variable((), "cost", "half-width of the gap's 99.9 % interval", "±"),
-    "quadrature": Variable((), "cost", "part of the half-width that comes from the quadrature", "quadrature"),
-    "relative_gap": Variable((), "1", "gap as a share of the difference", "share"),
-    "detectable": Variable((), "1", "smallest share certain to be detected", "finds"),
-    "verdict": Variable((), "1", "right (within 5 %), biased, or undecided: too few samples", "verdict"),
-}
-"""Columns of `gradcheck --mean`."""
-DIAGNOSIS: Final = {
-    "time": Variable((), "s", "time at which the contact begins", "t [s]"),
-    "speed": Variable((), "m/s", "approach speed", "v [m/s]", 2),
-    "damping": Variable((), "1", "damping of the contact over one step h", "h b", 2),
-    "stiffness": Variable((), "1", "its stiffness over one step", "h^2 k", 2),
-    "travel": Variable((), "1", "travel per step over the depth over which the impedance rises", "h v / width", 2),
-    "impedance": Variable((), "1", "d_0, at first touch: 0 is a smooth onset, MuJoCo's 0.9 a jump", "impedance"),
-    "stable": Variable((), "1", "whether the step in contact is stable: not if h^2 k >= 4 - 2 h b", "step"),
-    "error": Variable((), "1", "bias and standard deviation after a second of computing, relative", "error"),
-    "interval": Variable((), "1", "interval of the error, as the variance has one", "95 % interval"),
-    "mean": Variable((), "1", "right (within 5 %), off by so much, unbiased in theory, or undecided", "mean"),
-    "seconds": replace(GRADIENTS["seconds_per_sample"], digits=3),
-}
-"""Columns of `diagnose`: of its contacts, and of its estimators from `error` on."""
-TABLES: Final = {"means": MEANS, "diagnosis": DIAGNOSIS}
-QUANTITIES: Final = {kind: variables | COORDINATES | DERIVED for kind, variables in VARIABLES.items()} | TABLES
-"""All quantities by kind of study, and those of tables of other commands."""
+QUANTITIES: Final = {kind: variables | COORDINATES | DERIVED for kind, variables in VARIABLES.items()}
+"""All quantities by kind of study."""
 DEBIASED: Final = {"relative_error": "debiased_error", "cosine": "debiased_cosine"}
 """Quantities that noise biases, and the corrected ones, which tables show beside them."""
 COLUMNS: Final = (
@@ -197,12 +172,3 @@ def explained(kind: str, *names: str) -> str:
     """Explain columns of a table for the help; all of them if none is named."""
     shown = [QUANTITIES[kind][name] for name in names or QUANTITIES[kind]]
     return described({variable.heading: variable.description for variable in shown})
-
-
-def markdown_table(kind: str) -> str:
-    """Format the table of variables in docs/studies.md."""
-    rows = [
-        f"| `{name}` | {', '.join(variable.dims) or '-'} | {variable.unit} | {variable.description} |"
-        for name, variable in VARIABLES[kind].items()
-    ]
-    return "\n".join([f"| {kind} | within a cell | unit | meaning |", "| --- | --- | --- | --- |", *rows])

@@ -25,9 +25,9 @@ import numpy as np
 from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Bool, Float
 
+from mjx_study.graph.derivative_rule import with_rule
 from mjx_study.graph.scalars import traced_part
 from mjx_study.simulation._mjx import mjx
-from mjx_study.simulation.derivative_rule import with_rule
 from mjx_study.simulation.linear_algebra import MOST_UNROLLED, product, solve_positive_definite
 from mjx_study.simulation.patches import AT_FIRST_TOUCH, RELAXING, patched
 from mjx_study.simulation.scene import num_constraint_rows
@@ -49,6 +49,9 @@ GENEROUS: Final = (100, 50)
 POLISHING_STEPS: Final = 4
 EPSILON: Final = 1e-14
 """Relative rounding error of a force in the solver's equation."""
+
+SAVE_SOLUTION: Final = jax.checkpoint_policies.save_only_these_names("qacc")
+"""Policy of `jax.checkpoint` that recomputes steps in the backward pass without running their solver again."""
 
 
 def row_force(model: mjx.Model, data: mjx.Data, slack: Rows) -> Rows:

@@ -15,10 +15,10 @@ import mujoco
 from jaxtyping import Array, Bool, Float
 
 from mjx_study.choices import unknown
+from mjx_study.graph.derivative_rule import instantiated, with_rule
 from mjx_study.simulation import constraint
 from mjx_study.simulation._mjx import mjx
-from mjx_study.simulation.derivative_rule import instantiated, with_rule
-from mjx_study.simulation.dynamics import SAVE_SOLUTION, Qvel, State, fwd_position
+from mjx_study.simulation.dynamics import Qvel, State, fwd_position
 from mjx_study.simulation.integration import difference_position, integrate_position
 from mjx_study.simulation.onset import differentiated_once, onset_term, tangent_of, without_derivative
 from mjx_study.simulation.patches import Place, patched
@@ -62,10 +62,10 @@ def step(model: mjx.Model, data: mjx.Data, *, onset: str = "none") -> mjx.Data:
         )
     with patched(_SOLVE):
         if onset == "none":
-            following = jax.checkpoint(mjx.step, policy=SAVE_SOLUTION)(model, data)
+            following = jax.checkpoint(mjx.step, policy=constraint.SAVE_SOLUTION)(model, data)
         else:
             preceding = _preceding_contact(model, data)
-            following = jax.checkpoint(_corrected_step, policy=SAVE_SOLUTION)(model, data, preceding)
+            following = jax.checkpoint(_corrected_step, policy=constraint.SAVE_SOLUTION)(model, data, preceding)
     return jax.tree.map(lambda new, old: new.astype(jax.typeof(old).dtype), following, data)
 
 

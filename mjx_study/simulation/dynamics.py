@@ -1,43 +1,47 @@
 r"""One simulation step and whole rollouts, differentiable through contact.
 
 A step is MJX's own pipeline around the solve of `constraint`. It agrees with `mjx.step` up to solver convergence, and
-its derivative is that of the converged step. Two programs compute the derivative:
+its derivative is that of the converged step, by the implicit function theorem at the solver's result: for the step S at
+a given acceleration a, and the solver's equation G(x, a) = 0,
 
-- the *Jacobian* program, by default for models with few coordinates: the Jacobian of the velocity update with respect
-  to state and control by the implicit function theorem, once per step. Reverse mode stores only these
-  nv (nq + nv + na + nu) numbers per step and replays neither the solver nor the kinematics.
-- the *tape* program, for larger models and for derivatives with respect to model parameters: ordinary automatic
-  differentiation around the implicit solve, each step recomputed in the backward pass (`jax.checkpoint`) but with the
-  solver's result saved, so that the solver does not run again.
+    da/dx = -G_a^{-1} G_x,   dS/dx = S_x + S_a da/dx.
 
-The scene's `adjoint` and the differentiated inputs determine the program; both give the same numbers.
+Reverse mode stores a step's inputs and acceleration; it neither runs the solver again nor forms a matrix. Two programs
+compute the derivative, with the same numbers:
+
+- the *graph*, for models with few degrees of freedom: JAX traces G and S once and without derivatives, and their graph
+  is differentiated (`mjx_study.graph.linear_map`).
+- the *tape*, for larger models, for what a graph does not cover, and for derivatives with respect to model parameters:
+  JAX differentiates MJX's operations.
+
+The scene's `adjoint` and the differentiated inputs determine the program.
 """
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, Final
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import mujoco
 from jax.core import Tracer
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
 from estimators.pytree import register_pytree
-from mjx_study.graph.scalars import traced_part, unrolled
+from mjx_study.graph.derivative_rule import instantiated, with_rule
+from mjx_study.graph.differentiation import NotDifferentiableError
+from mjx_study.graph.linear_map import LinearMap, implicit_derivative
+from mjx_study.graph.operation import applied
+from mjx_study.graph.scalars import captured_once, is_small, traced_part, unrolled
 from mjx_study.simulation import constraint
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.constraint import Qvel, Scalar
-from mjx_study.simulation.derivative_rule import instantiated, with_rule
 from mjx_study.simulation.integration import integrate_position
-from mjx_study.simulation.linear_algebra import MOST_UNROLLED, product, solve_positive_definite
+from mjx_study.simulation.linear_algebra import MOST_UNROLLED, solve_positive_definite
 from mjx_study.simulation.patches import patched
 from mjx_study.simulation.scene import Scene
-
-SAVE_SOLUTION: Final = jax.checkpoint_policies.save_only_these_names("qacc")
-"""Policy of `jax.checkpoint` that recomputes steps in the backward pass without running their solver again."""
-
 
 Qpos = Float[Array, " nq"]
 Act = Float[Array, " na"]
@@ -87,13 +91,11 @@ def step(scene: Scene, model: mjx.Model, state: State, control: Control) -> tupl
         The state after the step, and the solver's relative residual (see `constraint.residual`).
     """
     if scene.host.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
-        return entry_by_entry(partial(_runge_kutta, scene), model, state, control), jnp.zeros_like(state.qpos, shape=())
-    update = _jacobian_update if scene.uses_jacobian else _tape_update
-    qvel, act, qacc, residual = update(
-        scene, model, state.qpos, state.qvel, state.act, control, jax.lax.stop_gradient(state.warmstart)
-    )
-    qpos = integrate_position(scene.host, state.qpos, qvel, model.opt.timestep)
-    return State(qpos, qvel, act, jax.lax.stop_gradient(qacc)), jax.lax.stop_gradient(residual)
+        advance = jax.checkpoint(entry_by_entry, static_argnums=0)
+        return advance(partial(_runge_kutta, scene), model, state, control), jnp.zeros_like(state.qpos, shape=())
+    following, residual = _differentiable_step(scene, model, state, control)
+    warmstart, residual = jax.lax.stop_gradient((following.warmstart, residual))
+    return dataclasses.replace(following, warmstart=warmstart), residual
 
 
 def exact_step(scene: Scene, model: mjx.Model, state: State, control: Control) -> tuple[State, Scalar, mjx.Data]:
@@ -128,9 +130,7 @@ def _solved(solver: constraint.Solver, scene: Scene, model: mjx.Model, state: St
     """State after a step, residual, and `smooth_stages`; no derivatives."""
     data = smooth_stages(scene, model, state, control).replace(qacc_warmstart=state.warmstart)
     qacc = solver(model, data)
-    qvel, act = advance_velocity(model, data, qacc)
-    qpos = integrate_position(scene.host, state.qpos, qvel, model.opt.timestep)
-    return State(qpos, qvel, act, qacc), constraint.residual(model, data, qacc), data
+    return State(*_integrated(scene, model, data, qacc), qacc), constraint.residual(model, data, qacc), data
 
 
 def entry_by_entry(function: Callable[..., Any], model: mjx.Model, *arguments: Any) -> Any:
@@ -199,8 +199,6 @@ def rollout(
             following, residual = surrogate_step(scene, model, backward, state, control)
         return following, (following, control, residual)
 
-    if not scene.uses_jacobian:
-        advance = jax.checkpoint(advance, policy=SAVE_SOLUTION)
     _, (states, controls, residuals) = jax.lax.scan(advance, start, jnp.arange(horizon))
     trajectory = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), start, states)
     return trajectory, controls, residuals
@@ -240,54 +238,117 @@ def advance_velocity(model: mjx.Model, data: mjx.Data, qacc: Qvel) -> tuple[Qvel
     return data.qvel, data.act
 
 
-@partial(jax.jit, static_argnames="solve")
-def _constrained_update(
-    model: mjx.Model, data: mjx.Data, qvel: Array, act: Array, control: Array, warmstart: Array, solve=constraint.solve
-):
-    """Velocity update by `constraint.solve`, or by `constraint.run_solver` without derivatives."""
-    data = force_stage(model, fwd_position(model, data), qvel, act, control)
-    qacc = solve(model, data.replace(qacc_warmstart=warmstart))
-    return *advance_velocity(model, data, qacc), qacc, constraint.residual(model, data, qacc)
-
-
-def _tape_update(scene: Scene, model: mjx.Model, qpos: Array, *inputs: Array):
-    """Velocity update (qpos, qvel, act, control, warmstart) -> (qvel, act, qacc, residual)."""
-    return _constrained_update(model, scene.template.replace(qpos=qpos), *inputs)
-
-
-def _jacobian_update(scene: Scene, model: mjx.Model, *inputs: Array):
-    """`_tape_update` with derivatives by the Jacobian program, except with respect to the model."""
+def _differentiable_step(scene: Scene, model: mjx.Model, state: State, control: Control) -> tuple[State, Scalar]:
+    """`step`, with a derivative of the acceleration, too: for second derivatives."""
     traced_model, whole = traced_part(model)
 
-    def solved(traced, qpos, *inputs):
-        update = partial(_constrained_update, solve=constraint.run_solver)
-        return entry_by_entry(update, whole(traced), scene.template.replace(qpos=qpos), *inputs)
+    def solved(traced: Any, state: State, control: Control) -> tuple[State, Scalar]:
+        return entry_by_entry(partial(_values, scene), whole(traced), state, control)
 
-    def rule(primals, changes):
-        traced, qpos, qvel, act, control, _ = primals
+    def rule(primals: Any, changes: Any) -> Any:
+        following, residual = advance(*primals)
+        traced, *point = primals[0], primals[1].qpos, primals[1].qvel, primals[1].act, primals[2]
+        moved = changes[1].qpos, changes[1].qvel, changes[1].act, changes[2]
         if jax.tree.leaves(changes[0]):
-            through = lambda traced, *inputs: _tape_update(scene, whole(traced), *inputs)  # noqa: E731
-            return jax.jvp(through, primals, instantiated(primals, changes))
-        value = update(*primals)
-        over_step, over_qacc = step_jacobian(scene, whole(traced), qpos, qvel, act, control, value[2])
-        direction = jnp.concatenate(instantiated(primals[1:5], changes[1:5]))
-        out, qacc_out = product(over_step, direction), product(over_qacc, direction)
-        nv = qvel.shape[0]
-        # The tangent of qacc is for second derivatives: the Jacobian is a function of qacc.
-        return value, (out[:nv], out[nv:], qacc_out, jnp.zeros_like(value[3]))
+            through = lambda qacc, traced, *point: _at_solution(scene, whole(traced), qacc, *point)  # noqa: E731
+            change = _by_tape(through, following.warmstart, (traced, *point), (changes[0], *moved))
+        else:
+            moved = instantiated(tuple(point), moved)
+            change = step_change(scene, whole(traced), tuple(point), following.warmstart, moved)
+        return (following, residual), (State(*change), jnp.zeros_like(residual))
 
-    update = with_rule(solved, rule)
-    return update(traced_model, *inputs)
+    advance = with_rule(solved, rule)
+    return advance(traced_model, state, control)
+
+
+def _values(scene: Scene, model: mjx.Model, state: State, control: Control) -> tuple[State, Scalar]:
+    return _solved(constraint.run_solver, scene, model, state, control)[:2]
+
+
+Point = tuple[Qpos, Qvel, Act, Control]
+"""Positions, velocities, activations and controls before a step, or their changes."""
+
+
+def step_change(
+    scene: Scene, model: mjx.Model, point: Point, qacc: Qvel, change: Point
+) -> tuple[Qpos, Qvel, Act, Qvel]:
+    """Change of a step's (qpos', qvel', act') and acceleration, linear in the change of what precedes it.
+
+    Args:
+        scene: static part of the model; its own contact parameters are not used.
+        model: the model to step, with any contact model applied.
+        point: what precedes the step.
+        qacc: the converged constrained acceleration there.
+        change: change of the point.
+    """
+    inputs = [*(leaf for leaf in jax.tree.leaves(model) if isinstance(leaf, Tracer)), *point, qacc]
+    if (slope := _slope(scene, model, inputs)) is None:
+        return _by_tape(partial(_at_solution, scene, model), qacc, point, change)
+    qpos, qvel, act, acceleration = applied(slope, inputs, change)
+    return qpos, qvel, act, acceleration
+
+
+def _slope(scene: Scene, model: mjx.Model, inputs: Sequence[Any]) -> LinearMap | None:
+    """Derivative of the step's graph over `Point`, the inputs between those of the model and the acceleration."""
+    if not scene.uses_graph or isinstance(model.body_mass, Tracer):
+        return None
+    kind = lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype)  # noqa: E731
+    like = jax.tree.map(lambda leaf: kind(leaf) if isinstance(leaf, Tracer) else leaf, model)
+    equations = captured_once(partial(_equations, scene), like, *map(kind, inputs[-5:]))
+    if equations is None:
+        return None
+    over = tuple(range(len(inputs) - 5, len(inputs) - 1))
+    try:
+        slope = implicit_derivative(equations, over, solve_positive_definite)
+    except NotDifferentiableError:
+        return None
+    return slope if is_small(slope.push) else None
+
+
+def _equations(
+    scene: Scene, model: mjx.Model, qpos: Array, qvel: Array, act: Array, control: Array, qacc: Array
+) -> tuple[Qvel, Qpos, Qvel, Act]:
+    """Left side of the solver's equation G, and the step S, at any acceleration."""
+    data = force_stage(model, position_stage(scene, model, qpos), qvel, act, control)
+    return constraint.imbalance(model, data, qacc), *_integrated(scene, model, data, qacc)
+
+
+def _at_solution(
+    scene: Scene, model: mjx.Model, known: Array, qpos: Array, qvel: Array, act: Array, control: Array
+) -> tuple[Qpos, Qvel, Act, Qvel]:
+    """Step and acceleration, whose value is known, with the derivatives of the step."""
+    data = force_stage(model, position_stage(scene, model, qpos), qvel, act, control)
+    qacc = constraint.solve(model, data.replace(qacc_warmstart=known), lambda _, data: data.qacc_warmstart)
+    return *_integrated(scene, model, data, qacc), qacc
+
+
+def _integrated(scene: Scene, model: mjx.Model, data: mjx.Data, qacc: Array) -> tuple[Qpos, Qvel, Act]:
+    qvel, act = advance_velocity(model, data, qacc)
+    return integrate_position(scene.host, data.qpos, qvel, model.opt.timestep), qvel, act
+
+
+def _by_tape(function: Callable[..., Any], qacc: Qvel, point: tuple[Any, ...], change: tuple[Any, ...]) -> Any:
+    """Change of `function(qacc, *point)` with the leaves of the point, those without change None.
+
+    Reverse mode stores the arguments and recomputes the rest.
+    """
+    leaves, structure = jax.tree.flatten(point)
+    changes = dict(enumerate(structure.flatten_up_to(change)))
+    changes = {place: each for place, each in changes.items() if each is not None}
+
+    def along(leaves: list[Any], qacc: Array, changes: dict[int, Any]) -> Any:
+        def through(moving: dict[int, Any]) -> Any:
+            return function(qacc, *structure.unflatten([moving.get(at, leaf) for at, leaf in enumerate(leaves)]))
+
+        return jax.jvp(through, ({place: leaves[place] for place in changes},), (changes,))[1]
+
+    return jax.checkpoint(along)(leaves, qacc, changes)
 
 
 def step_jacobian(
     scene: Scene, model: mjx.Model, qpos: Qpos, qvel: Qvel, act: Act, control: Control, qacc: Qvel
 ) -> tuple[Float[Array, "nv_na inputs"], Float[Array, "nv inputs"]]:
     r"""Compute the Jacobians of (qvel', act') and of qacc over the columns (qpos, qvel, act, control).
-
-    For the step S at a given acceleration a, and the solver's equation G(x, a) = 0,
-
-        da/dx = -G_a^{-1} G_x,   dS/dx = S_x + S_a da/dx.
 
     Args:
         scene: static part of the model; its own contact parameters are not used.
@@ -298,34 +359,11 @@ def step_jacobian(
         control: controls there, (nu,).
         qacc: the converged constrained acceleration there.
     """
-    return entry_by_entry(_jacobian, model, scene.template, qpos, qvel, act, control, qacc)
-
-
-@jax.jit
-def _jacobian(model: mjx.Model, template: mjx.Data, qpos: Array, qvel: Array, act: Array, control: Array, qacc: Array):
-    def positions(qpos):
-        return fwd_position(model, template.replace(qpos=qpos))
-
-    def equations(data, qvel, act, control, qacc):
-        data = force_stage(model, data, qvel, act, control)
-        return jnp.concatenate([constraint.imbalance(model, data, qacc), *advance_velocity(model, data, qacc)])
-
-    def columns(function, point):
-        push = lambda direction: jax.jvp(function, (point,), (direction,))[1]  # noqa: E731
-        return jax.vmap(push, out_axes=-1)(jnp.eye(point.shape[0], dtype=point.dtype))
-
-    positioned = positions(qpos)
-    blocks = [
-        (lambda x: equations(positions(x), qvel, act, control, qacc), qpos),
-        (lambda x: equations(positioned, x, act, control, qacc), qvel),
-        (lambda x: equations(positioned, qvel, x, control, qacc), act),
-        (lambda x: equations(positioned, qvel, act, x, qacc), control),
-    ]
-    over_inputs = jnp.concatenate([columns(*block) for block in blocks if block[1].size], axis=1)
-    over_qacc = columns(lambda x: equations(positioned, qvel, act, control, x), qacc)
-    nv = qvel.shape[0]
-    response = -solve_positive_definite(over_qacc[:nv], over_inputs[:nv])
-    return over_inputs[nv:] + over_qacc[nv:] @ response, response
+    point = qpos, qvel, act, control
+    flat, unflatten = ravel_pytree(point)
+    column = lambda change: step_change(scene, model, point, qacc, unflatten(change))  # noqa: E731
+    _, over_qvel, over_act, over_qacc = jax.vmap(column, out_axes=-1)(jnp.eye(len(flat), dtype=flat.dtype))
+    return jnp.concatenate([over_qvel, over_act]), over_qacc
 
 
 def _runge_kutta(scene: Scene, model: mjx.Model, state: State, control: Control) -> State:

@@ -37,13 +37,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from mjx_study.choices import ONSETS, unknown
+from mjx_study.graph.derivative_rule import refusing, with_rule
 from mjx_study.graph.scalars import traced_part
 from mjx_study.simulation import constraint
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.constraint import Rows, Scalar
-from mjx_study.simulation.derivative_rule import refusing, with_rule
 from mjx_study.simulation.dynamics import (
-    SAVE_SOLUTION,
     ControlLaw,
     Controls,
     State,
@@ -52,8 +51,7 @@ from mjx_study.simulation.dynamics import (
     force_stage,
     rollout,
     solved_step,
-    step,
-    step_jacobian,
+    step_change,
 )
 from mjx_study.simulation.integration import difference_position, integrate_position
 from mjx_study.simulation.linear_algebra import product
@@ -95,36 +93,28 @@ def corrected_rollout(
     if not scene.has_constraints:
         return *rollout(scene, model, start, control_law, horizon), OnsetCounts.none(start.qpos.dtype)
     model = without_derivative(model)
-    jacobian = scene.uses_jacobian
 
     def observe(state: State, index: Int[Array, ""]):
         control = jax.lax.stop_gradient(control_law(index, state))
         following, residual, guards = solved_step(scene, model, state, control)
-        over_step = None
-        if jacobian:
-            over_step, _ = step_jacobian(scene, model, state.qpos, state.qvel, state.act, control, following.warmstart)
-        return following, (state, control, following, residual, guards, over_step)
+        return following, (state, control, following, residual, guards)
 
-    _, (before, controls, after, residuals, guards, jacobians) = jax.lax.scan(
+    _, (before, controls, after, residuals, guards) = jax.lax.scan(
         observe, jax.lax.stop_gradient(start), jnp.arange(horizon)
     )
     spread, shift, counts = _corrections(scene, model, before, controls, guards, slots)
     spread, shift = weight * spread, weight * shift
 
     def follow(change: State, known):
-        index, fixed, fixed_after, over_step, spread, shift = known
+        index, fixed, fixed_control, fixed_after, spread, shift = known
         state = jax.tree.map(lambda value, moved: value + tangent_of(moved), fixed, change)
         control = control_law(index, state)
         moved = tangent_of(difference_position(scene.host, fixed.qpos, state.qpos))
         velocity = tangent_along(shift, moved - scene.timestep * change.qvel)
         carried = tangent_of(integrate_position(scene.host, fixed.qpos, velocity, scene.timestep))
-        if jacobian:
-            inputs = change.qpos + carried, change.qvel + velocity, change.act, tangent_of(control)
-            qvel, act = jnp.split(tangent_along(over_step, jnp.concatenate(inputs)), [scene.host.nv])
-        else:
-            shifted = State(state.qpos + carried, state.qvel + velocity, state.act, fixed.warmstart)
-            stepped, _ = step(scene, model, shifted, control)
-            qvel, act = tangent_of(stepped.qvel), tangent_of(stepped.act)
+        point = fixed.qpos, fixed.qvel, fixed.act, fixed_control
+        inputs = change.qpos + carried, change.qvel + velocity, change.act, tangent_of(control)
+        _, qvel, act, _ = map(tangent_of, step_change(scene, model, point, fixed_after.warmstart, inputs))
         qvel = qvel + tangent_along(spread, moved)
         qpos = integrate_position(
             scene.host, fixed.qpos + change.qpos + carried, fixed_after.qvel + qvel, scene.timestep
@@ -132,9 +122,7 @@ def corrected_rollout(
         following = State(tangent_of(qpos), qvel, act, jnp.zeros_like(qvel))
         return following, (following, tangent_of(control))
 
-    if not jacobian:
-        follow = jax.checkpoint(follow, policy=SAVE_SOLUTION)
-    known = (jnp.arange(horizon), before, after, jacobians, spread, shift)
+    known = (jnp.arange(horizon), before, controls, after, spread, shift)
     _, (changes, over_controls) = jax.lax.scan(follow, jax.tree.map(tangent_of, start), known)
     states = jax.tree.map(jnp.add, after, changes)
     trajectory = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), start, states)

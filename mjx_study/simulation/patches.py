@@ -17,8 +17,8 @@ import jax.numpy as jnp
 import mujoco
 from jaxtyping import Array, Float
 
+from mjx_study.graph.derivative_rule import instantiated, with_rule
 from mjx_study.simulation._mjx import mjx
-from mjx_study.simulation.derivative_rule import instantiated, with_rule
 from mjx_study.simulation.integration import rotate_quaternion, rotation_between
 from mjx_study.simulation.linear_algebra import cholesky, solve_factored
 

@@ -12,12 +12,13 @@ import jax
 import mujoco
 import numpy as np
 
-from estimators.catalogue import suggestion
+from estimators.choices import suggestion
 from mjx_study.choices import CONES, INTEGRATORS, SOLVERS, unknown
 from mjx_study.limits import MOST_GIB
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.contact_pair import frictionless_pair, geom_label
 from mjx_study.simulation.limitations import FLAGS, ignored, lacking
+from mjx_study.simulation.linear_algebra import MOST_UNROLLED
 from mjx_study.simulation.mjcf_compile import compile_file
 from mjx_study.simulation.mjcf_files import RefusedFileError
 
@@ -27,11 +28,8 @@ _ENUMERATED: Final = {
     "integrator": {name: mujoco.mjtIntegrator.__members__[f"mjINT_{name.upper()}"] for name in INTEGRATORS},
 }
 SceneOption = str | float | int | Sequence[str]
-ADJOINTS: Final = ("auto", "jacobian", "tape")
+ADJOINTS: Final = ("auto", "graph", "tape")
 """Ways to differentiate steps (see `Scene.adjoint`)."""
-JACOBIAN_COLUMNS: Final = {"cpu": 20, "gpu": 13, "tpu": 13}
-"""Maximum number of columns (nq + nv + na + nu) for which "auto" forms a step's Jacobian, by backend; beyond, the tape
-is cheaper (docs/performance.md)."""
 _POSITIVE: Final = ("timestep", "iterations", "ls_iterations", "tolerance")
 
 
@@ -53,18 +51,15 @@ class Scene:
         template: empty `mjx.Data`.
         adjoint: how steps are differentiated; the derivatives agree to rounding.
 
-            - "jacobian": each step forms its Jacobian column by column in forward mode. Reverse mode stores
-              nv (nq + nv + na + nu) numbers per step and replays nothing; the work grows with the number of
-              columns. Not for RK4.
-            - "tape": automatic differentiation around the implicit solve. The work hardly depends on the number of
-              columns; reverse mode reruns each step and differentiates MJX's own operations in reverse (fault 13 in
-              `docs/gradient-faults.md`).
-            - "auto": the Jacobian up to `JACOBIAN_COLUMNS` columns, which depend on the backend, else the tape.
+            - "graph": as graphs of scalar operations (`mjx_study.graph`), where they can be; not for RK4.
+            - "tape": automatic differentiation of MJX's own operations around the implicit solve; reverse mode computes
+              each step again (fault 13 in `docs/gradient-faults.md`).
+            - "auto": graphs up to `MOST_UNROLLED` degrees of freedom, else the tape.
 
             Derivatives with respect to the model always use the tape.
 
     Raises:
-        SceneError: unknown adjoint, or "jacobian" with RK4.
+        SceneError: unknown adjoint, or "graph" with RK4.
     """
 
     name: str
@@ -76,15 +71,14 @@ class Scene:
     def __post_init__(self) -> None:
         if self.adjoint not in ADJOINTS:
             raise SceneError(unknown("adjoint", self.adjoint, ADJOINTS))
-        if self.adjoint == "jacobian" and self._explicit:
-            raise SceneError(f"{self.name}: the adjoint 'jacobian' does not support RK4; choose auto or tape")
+        if self.adjoint == "graph" and self._explicit:
+            raise SceneError(f"{self.name}: the adjoint 'graph' does not support RK4; choose auto or tape")
 
     @property
-    def uses_jacobian(self) -> bool:
-        """Whether steps form their Jacobian rather than using the tape."""
-        host = self.host
-        small = host.nq + host.nv + host.na + host.nu <= JACOBIAN_COLUMNS[jax.default_backend()]
-        return self.adjoint == "jacobian" or (self.adjoint == "auto" and small and not self._explicit)
+    def uses_graph(self) -> bool:
+        """Whether steps are differentiated as graphs, where they can be, rather than by the tape."""
+        small = self.host.nv <= MOST_UNROLLED
+        return self.adjoint == "graph" or (self.adjoint == "auto" and small and not self._explicit)
 
     @property
     def _explicit(self) -> bool:

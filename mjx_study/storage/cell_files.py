@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 from pydantic import BaseModel, ConfigDict
 
-from mjx_study.disk import MOST_BYTES, read_whole, write_whole
+from mjx_study.disk import MAX_BYTES, read_whole, write_whole
 from mjx_study.experiment.checkpoint import StudyError, reason_of
 from mjx_study.options.files import digest_of_json
 from mjx_study.storage.arrays import MOST_CELL_BYTES, read_arrays, write_arrays
@@ -87,7 +87,7 @@ class CellFile:
     def read_failure(self) -> str:
         """Read why the cell could not be computed; StudyError if the file is damaged."""
         try:
-            found = validated(_Failure, read_whole(self.failure, follow=False, most=MOST_BYTES))
+            found = validated(_Failure, read_whole(self.failure, follow=False, most=MAX_BYTES))
             if found.digest != self._digest(found.reason):
                 raise ValueError("its digest does not match")
         except (OSError, ValueError) as error:

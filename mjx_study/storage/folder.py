@@ -22,8 +22,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from estimators.seen import seen_now
-from mjx_study.disk import MOST_BYTES, check_no_link, open_regular, prepare_folder, read_whole, write_whole
+from estimators.user_inputs import inputs_now
+from mjx_study.disk import MAX_BYTES, check_no_link, open_regular, prepare_folder, read_whole, write_whole
 from mjx_study.experiment.checkpoint import StudyError, reason_of
 from mjx_study.experiment.plan import StudyPlan
 from mjx_study.identity import ACCEPT, differences
@@ -86,7 +86,7 @@ class Store:
         document, kept = as_plain({"format": FORMAT} | document), cls.open(folder)
         theirs, ours = ({**parts["contents"], **parts["config"]} for parts in map(_identity, (kept.document, document)))
         seen = kept.document.get("seen", {})
-        if told := differences(theirs, ours) or differences(seen, seen_now(seen)):
+        if told := differences(theirs, ours) or differences(seen, inputs_now(seen)):
             raise StudyError(f"{folder} holds another study ({told}); choose another folder")
         there, asked = _iterations(kept.document), _iterations(document)
         if asked < there:
@@ -110,7 +110,7 @@ class Store:
         self._write_document()
 
     def record(self, seen: Mapping[str, str]) -> None:
-        """Add to study.json what else the user's code has read; see `estimators.seen`."""
+        """Add to study.json what else the user's code has read; see `estimators.user_inputs`."""
         before = self.document.get("seen", {})
         if new := {name: digest for name, digest in seen.items() if name not in before}:
             self.document["seen"] = before | new
@@ -125,7 +125,7 @@ class Store:
         format."""
         path = folder / "study.json"
         try:
-            content = read_whole(path, follow=False, most=MOST_BYTES)
+            content = read_whole(path, follow=False, most=MAX_BYTES)
             version = read_format(content)
             document = read_document(content) if version == FORMAT else {}
         except FileNotFoundError as error:

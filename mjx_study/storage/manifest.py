@@ -10,8 +10,8 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from estimators import Estimator, find_estimator
-from estimators.catalogue import CATALOGUE, ORACLES
-from estimators.estimator import label_of
+from estimators.choices import ORACLES
+from estimators.registry import ESTIMATORS, label_of
 from mjx_study.experiment.plan import StudyCell, StudyPlan, estimators_of
 from mjx_study.identity import git_revision, versions
 from mjx_study.options.configuration import OPTIONS
@@ -113,7 +113,7 @@ class StudyDocument(_Part):
                 raise ValueError(f"cells.{index}.at is no place on the axes")
         config = self.config
         for name in config.estimators:
-            if name not in CATALOGUE and name not in self.described:
+            if name not in ESTIMATORS and name not in self.described:
                 raise ValueError(f"config.estimators has {name!r}, which is neither built in nor described")
         inner = config.seeds * len(config.estimators) * max(config.iterations or 1, config.points or 1)
         if math.prod(axes.values()) * inner > MOST_NUMBERS:
@@ -181,7 +181,7 @@ def document_of(plan: StudyPlan, command: str | None) -> dict[str, Any]:
 def describe_estimator(which: str | Estimator) -> dict[str, Any]:
     """What figures and reports need of an estimator, so that reading a study imports none."""
     found = find_estimator(which)
-    name = which if isinstance(which, str) else found.place()
+    name = which if isinstance(which, str) else found.qualified_name()
     return {"label": label_of(name), "needs": list(found.needs)}
 
 

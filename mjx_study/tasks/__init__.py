@@ -2,36 +2,26 @@
 
 from collections.abc import Callable, Mapping
 from functools import partial
+from importlib import import_module
 from typing import Any, Final
 
-from estimators.places import MissingModuleError
-from mjx_study.choices import is_file, unknown_task
+from estimators.user_code import MissingModuleError
+from mjx_study.choices import TASK_DESCRIPTIONS, is_file, unknown_task
 from mjx_study.options.configuration import OPTIONS, as_arguments
 from mjx_study.options.option import OptionError
-from mjx_study.tasks.ball_wall import ball_wall
-from mjx_study.tasks.double_pendulum import double_pendulum
-from mjx_study.tasks.gripper import gripper
-from mjx_study.tasks.landing import landing
 from mjx_study.tasks.mjcf import mjcf_task
-from mjx_study.tasks.momentum_transfer import momentum_transfer
-from mjx_study.tasks.pusher import pusher
-from mjx_study.tasks.sliding_box import sliding_box
 from mjx_study.tasks.task import Task
-from mjx_study.tasks.tennis import tennis
 from mjx_study.tasks.user_task import build_user_task, registered_name
 
-TASKS: Final[dict[str, Callable[..., Task]]] = {
-    "pusher": pusher,
-    "sliding_box": sliding_box,
-    "ball_wall": ball_wall,
-    "ball_wall:dome": partial(ball_wall, "dome"),
-    "momentum_transfer": momentum_transfer,
-    "tennis": tennis,
-    "gripper": gripper,
-    "landing": landing,
-    "double_pendulum": double_pendulum,
-    "double_pendulum:published": partial(double_pendulum, "published"),
-}
+
+def _builder(name: str) -> Callable[..., Task]:
+    """The function named after its module; the part of the name after a colon is its first argument."""
+    system, _, variant = name.partition(":")
+    builder = getattr(import_module(f"mjx_study.tasks.{system}"), system)
+    return partial(builder, variant) if variant else builder
+
+
+TASKS: Final[dict[str, Callable[..., Task]]] = {name: _builder(name) for name in TASK_DESCRIPTIONS}
 """Task builders by name; variants of a system have their own names, such as `ball_wall:dome`."""
 
 

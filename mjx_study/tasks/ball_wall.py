@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import mujoco
 from jaxtyping import Array, Float
 
-from mjx_study.choices import TASK_DESCRIPTIONS, unknown
+from mjx_study.choices import unknown
 from mjx_study.reference import BallWall, FunctionObjective
 from mjx_study.simulation.dynamics import State, initial_state
 from mjx_study.simulation.scene import SceneError, SceneOption, load_model, put_scene, require
@@ -70,7 +70,6 @@ def ball_wall(
     name = "ball_wall" if variant == "box" else f"ball_wall:{variant}"
     return Task(
         name=name,
-        description=TASK_DESCRIPTIONS[name],
         scene=scene,
         horizon=horizon,
         policy=InitialStatePolicy(1, horizon, scene.host.nu, start_at, "rad"),

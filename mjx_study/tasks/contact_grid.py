@@ -1,4 +1,4 @@
-"""Contact models of a study: families over stiffnesses, or MuJoCo's own parameters, with their warnings."""
+"""Contact models of a study: families over stiffnesses, or MuJoCo's parameters, with their warnings."""
 
 import dataclasses
 import itertools
@@ -32,7 +32,7 @@ class ContactPoint:
     Attributes:
         family: name of the contact family, "reference", or solref and solimp.
         stiffness: spring stiffness K [N/m]; None without contact or spring.
-        contact: the contact model; None for the MJCF's own and for the reference.
+        contact: the contact model; None for the MJCF's and for the reference.
         digits: significant digits of the stiffness in messages, enough to distinguish the models of a sweep.
     """
 

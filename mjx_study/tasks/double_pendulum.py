@@ -16,7 +16,7 @@ from typing import Final
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from mjx_study.choices import TASK_DESCRIPTIONS, unknown
+from mjx_study.choices import unknown
 from mjx_study.reference import DoublePendulum, ReferenceObjective
 from mjx_study.simulation.dynamics import State, initial_state
 from mjx_study.simulation.scene import SceneOption, load_scene, require
@@ -60,7 +60,6 @@ def double_pendulum(
     name = "double_pendulum" if start == "default" else f"double_pendulum:{start}"
     return Task(
         name=name,
-        description=TASK_DESCRIPTIONS[name],
         scene=scene,
         horizon=horizon,
         policy=InitialStatePolicy(4, horizon, scene.host.nu, start_at),

@@ -13,7 +13,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
-from mjx_study.choices import TASK_DESCRIPTIONS
 from mjx_study.simulation.dynamics import State, initial_state
 from mjx_study.simulation.scene import SceneOption, load_scene, require
 from mjx_study.tasks.network import Network
@@ -60,7 +59,6 @@ def gripper(*, horizon: int = HORIZON, model: str | Path = "gripper", **scene_op
     policy = Network(horizon, scene.host.nu, 14, features, HIDDEN)
     return Task(
         name="gripper",
-        description=TASK_DESCRIPTIONS["gripper"],
         scene=scene,
         horizon=horizon,
         policy=policy,

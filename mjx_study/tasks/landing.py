@@ -14,7 +14,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
-from mjx_study.choices import TASK_DESCRIPTIONS
 from mjx_study.simulation.dynamics import State, initial_state
 from mjx_study.simulation.scene import SceneOption, load_scene, require
 from mjx_study.tasks.network import Network
@@ -68,7 +67,6 @@ def landing(*, horizon: int = HORIZON, model: str | Path = "landing", **scene_op
     policy = Network(horizon, host.nu, 13, features, HIDDEN)
     return Task(
         name="landing",
-        description=TASK_DESCRIPTIONS["landing"],
         scene=scene,
         horizon=horizon,
         policy=policy,

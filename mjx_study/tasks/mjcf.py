@@ -36,7 +36,7 @@ def scene_task(scene: Scene, *, horizon: int = CHECKED_STEPS, pair: tuple[str, s
     cost has no gradient, all parameters are raised by one standard deviation of the noise.
 
     Args:
-        scene: the scene; its contact parameters are the MJCF's own.
+        scene: the scene; its contact parameters are those of the MJCF.
         pair: names of the two geoms whose contact stiffness is swept, or None.
 
     Raises:
@@ -63,12 +63,12 @@ def scene_task(scene: Scene, *, horizon: int = CHECKED_STEPS, pair: tuple[str, s
     else:
         policy, changed = InitialStatePolicy(host.nv, horizon, 0, push, _unit_of_velocities(host)), "initial velocities"
         theta, sigma = np.zeros(host.nv), NOISE
-    told = f"half the squared displacement of {what} after {horizon} steps, by the {changed}"
+    cost = f"half the squared displacement of {what} after {horizon} steps, by the {changed}"
     if _rests(host, start, theta[: host.nu], horizon, measured):
-        theta, told = theta + sigma, f"{told}, which are raised by {sigma:g} since nothing moves otherwise"
+        theta, cost = theta + sigma, f"{cost}, which are raised by {sigma:g} since nothing moves otherwise"
     return Task(
         name=scene.name,
-        description=told,
+        description=cost,
         scene=scene,
         horizon=horizon,
         policy=policy,

@@ -14,7 +14,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from mjx_study.choices import TASK_DESCRIPTIONS
 from mjx_study.reference import FunctionObjective, MomentumTransfer
 from mjx_study.simulation.dynamics import State, initial_state
 from mjx_study.simulation.scene import SceneOption, load_scene, require
@@ -57,7 +56,6 @@ def momentum_transfer(
 
     return Task(
         name="momentum_transfer",
-        description=TASK_DESCRIPTIONS["momentum_transfer"],
         scene=scene,
         horizon=horizon,
         policy=InitialStatePolicy(1, horizon, scene.host.nu, start_at, "rad"),

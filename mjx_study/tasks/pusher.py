@@ -12,7 +12,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from mjx_study.choices import TASK_DESCRIPTIONS
 from mjx_study.reference import Pusher, ReferenceObjective
 from mjx_study.simulation.dynamics import State, initial_state
 from mjx_study.simulation.scene import SceneOption, load_scene, require
@@ -51,7 +50,6 @@ def pusher(*, horizon: int = HORIZON, model: str | Path = "pusher", **scene_opti
 
     return Task(
         name="pusher",
-        description=TASK_DESCRIPTIONS["pusher"],
         scene=scene,
         horizon=horizon,
         policy=OpenLoop(horizon, scene.host.nu),

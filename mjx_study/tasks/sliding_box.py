@@ -13,7 +13,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from mjx_study.choices import TASK_DESCRIPTIONS
 from mjx_study.reference import ReferenceObjective, SlidingBox
 from mjx_study.simulation.dynamics import State, initial_state
 from mjx_study.simulation.scene import SceneOption, load_scene, require
@@ -55,7 +54,6 @@ def sliding_box(*, horizon: int = HORIZON, model: str | Path = "sliding_box", **
 
     return Task(
         name="sliding_box",
-        description=TASK_DESCRIPTIONS["sliding_box"],
         scene=scene,
         horizon=horizon,
         policy=OpenLoop(horizon, scene.host.nu),

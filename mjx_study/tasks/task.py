@@ -9,9 +9,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
-from estimators.places import described
+from estimators.noise import check_density, check_sigma
+from estimators.user_code import describe_error
+from mjx_study.choices import TASK_DESCRIPTIONS
 from mjx_study.reference import Reference
-from mjx_study.reference.noise import check_density, check_sigma
 from mjx_study.simulation.contact import effective_mass
 from mjx_study.simulation.dynamics import State
 from mjx_study.simulation.onset import check_onset
@@ -106,7 +107,7 @@ class Task:
 
     Attributes:
         name: name on the command line.
-        description: one line, for tables and reports.
+        description: one line, for tables and reports; by default that of the built-in task of this name.
         scene: the compiled model; a contact model replaces its contact parameters.
         horizon: number of steps H.
         policy: maps theta, noise and state to initial state and controls.
@@ -145,6 +146,7 @@ class Task:
     defaults: StudyDefaults = StudyDefaults()
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "description", self.description or TASK_DESCRIPTIONS.get(self.name, ""))
         theta = jnp.asarray(self.theta)
         object.__setattr__(self, "theta", jnp.asarray(theta, theta.dtype))
         if self.horizon < 1:
@@ -221,4 +223,4 @@ def _traced(name: str, part: str, function: Callable[..., Any], *arguments: Any)
     try:
         return jax.eval_shape(function, *arguments)
     except (Exception, SystemExit) as error:
-        raise ValueError(f"{name}: the {part} raised {described(error)}") from error
+        raise ValueError(f"{name}: the {part} raised {describe_error(error)}") from error

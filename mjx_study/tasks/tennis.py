@@ -12,7 +12,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
-from mjx_study.choices import TASK_DESCRIPTIONS
 from mjx_study.reference import ReferenceObjective, Tennis, draw_start, tennis_metrics
 from mjx_study.simulation.dynamics import State, initial_state
 from mjx_study.simulation.scene import SceneOption, load_model, put_scene, require
@@ -64,7 +63,6 @@ def tennis(
 
     return Task(
         name="tennis",
-        description=TASK_DESCRIPTIONS["tennis"],
         scene=scene,
         horizon=horizon,
         policy=LinearFeedback(horizon, scene.host.nu, FEATURES, features),

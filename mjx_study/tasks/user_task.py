@@ -5,8 +5,8 @@ from collections.abc import Callable, Sequence
 from importlib import metadata
 from typing import Any
 
-from estimators.places import described, find_attribute, importable_here
-from estimators.seen import observing
+from estimators.user_code import describe_error, find_attribute, importable_here
+from estimators.user_inputs import observing
 from mjx_study.choices import TASK_GROUP
 from mjx_study.tasks.task import Task, check_shapes
 
@@ -51,7 +51,7 @@ def _build(place: str, builder: object, options: dict[str, Any]) -> Task:
     try:
         task = builder(**options)
     except (Exception, SystemExit) as error:
-        raise ValueError(f"{place} raised {described(error)}") from error
+        raise ValueError(f"{place} raised {describe_error(error)}") from error
     if not isinstance(task, Task):
         raise ValueError(f"{place} returned an object of type {type(task).__name__} instead of a Task")
     return task

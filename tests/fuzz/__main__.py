@@ -12,7 +12,7 @@ import pytest
 
 from mjx_study import configure
 from mjx_study.cli import options as of_commands
-from mjx_study.table import format_table
+from mjx_study.table import format_table, markdown_table
 from tests.fuzz import FUZZERS, fuzz
 from tests.fuzz.answers import Row
 from tests.planted.__main__ import MARK as END
@@ -37,11 +37,10 @@ def cells(row: Row) -> list[str]:
 
 
 def markdown(rows: Sequence[Row]) -> str:
-    """The table of the page."""
+    """Format the table of the page."""
     tried, wrong = sum(row.inputs for row in rows), sum(row.wrong for row in rows)
-    lines = [f"{tried:,} inputs, {wrong} answered wrongly.", "", f"| {' | '.join(HEADER)} |"]
-    lines += ["| --- |" + " ---: |" * (len(HEADER) - 1), *(f"| {' | '.join(cells(row))} |" for row in rows)]
-    return "\n".join(lines) + "\n"
+    table = markdown_table([(row.kind, row.inputs, row.wrong) for row in rows], ("input", "tried", "wrong"))
+    return f"{tried:,} inputs, {wrong} answered wrongly.\n\n{table}\n"
 
 
 def put_into(page: Path, table: str) -> None:

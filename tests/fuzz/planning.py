@@ -12,10 +12,12 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from mjx_study import bench, cli, diagnose, gradcheck, tasks
+from mjx_study import bench, cli, gradcheck, tasks
 from mjx_study.choices import is_file
 from mjx_study.claims import ledger
 from mjx_study.cli import motions, options, studies
+from mjx_study.diagnose import means
+from mjx_study.diagnose import run as diagnosis
 from mjx_study.execution import run
 from mjx_study.experiment.plan import plan_study
 from mjx_study.options.configuration import StudyConfig
@@ -62,7 +64,7 @@ def stub(monkeypatch: pytest.MonkeyPatch) -> None:
     mujoco.set_mju_user_warning(print_warning)  # as `configure` does
     for module, names in (
         (studies, ("_compute_in", "run_study")),
-        (gradcheck, ("gradcheck", "check_mean")), (bench, ("run_bench",)), (diagnose, ("diagnose_task",)),
+        (gradcheck, ("gradcheck",)), (means, ("check_mean",)), (bench, ("run_bench",)), (diagnosis, ("diagnose_task",)),
         (motions, ("_simulate_task", "_simulate_passive")), (ledger, ("measure_ledger",)),
     ):  # fmt: skip
         for name in names:

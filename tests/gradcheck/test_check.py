@@ -1,4 +1,4 @@
-"""The check passes what is right, and finds, names and explains what is not."""
+"""The check passes right derivatives, and finds, names and explains the others."""
 
 import json
 from pathlib import Path
@@ -36,7 +36,7 @@ def only(report: GradcheckReport, verdict: str) -> Finding:
 
 @pytest.fixture
 def configured(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The tests' own cases stand: JAX takes its devices once per process."""
+    """Keep the tests' settings: JAX takes its devices once per process."""
     monkeypatch.setattr(options, "configure", lambda **_: None)
 
 
@@ -58,19 +58,19 @@ def test_the_pusher_is_right(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_a_wrong_derivative_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    right = dynamics.step_jacobian
+    right = dynamics.step_change
 
     def slightly_wrong(*arguments):
-        over_step, over_qacc = right(*arguments)
-        return over_step * (1 + 1e-4), over_qacc
+        qpos, qvel, act, qacc = right(*arguments)
+        return qpos, qvel * (1 + 1e-4), act, qacc
 
-    monkeypatch.setattr(dynamics, "step_jacobian", slightly_wrong)
+    monkeypatch.setattr(dynamics, "step_change", slightly_wrong)
     report = check(f"<worldbody>{BALL.format(name='x', axis='1 0 0')}</worldbody>")
     assert not report.passed and {finding.verdict for finding in report.findings} == {"wrong"}
     assert report.lines()[-1] == "SOMETHING IS WRONG: see above"
 
 
-def test_a_kink_is_told_from_a_wrong_derivative() -> None:
+def test_a_kink_is_not_a_wrong_derivative() -> None:
     """Without a first push the bodies rest exactly at the onset of contact, where a difference straddles it."""
     task = make_task("pusher", horizon=6)
     task = task.replace(theta=task.theta.at[0].set(0.0))
@@ -81,7 +81,7 @@ def test_a_kink_is_told_from_a_wrong_derivative() -> None:
 
 
 @pytest.mark.slow
-def test_a_jump_is_told_from_a_wrong_derivative() -> None:
+def test_a_jump_is_not_a_wrong_derivative() -> None:
     """MuJoCo's default contact begins with its damping force: a ball that arrives with speed meets a jump."""
     falling = BALL.format(name="z", axis="0 0 1").replace("<body", '<body pos="0 0 .1"')
     key = '<keyframe><key qpos="0" qvel="-1"/></keyframe>'
@@ -112,17 +112,17 @@ def test_a_joint_at_its_limit_is_named() -> None:
 
 @pytest.mark.slow
 def test_an_upright_cylinder_excuses_its_own_entries_and_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its three contact points turn with the direction in which it tilts, however little; what stands beside does not.
+    """Its three contact points turn with the direction in which it tilts, however little; bodies beside it do not jump.
 
     The tilt is 1e-9 rad, which differences reach across. The planted fault is in a slider that touches nothing.
     """
-    right = dynamics.step_jacobian
+    right = dynamics.step_change
 
     def wrong_beside(*arguments):
-        over_step, over_qacc = right(*arguments)
-        return over_step.at[3].multiply(1 + 1e-3), over_qacc  # the slider's velocity
+        qpos, qvel, act, qacc = right(*arguments)
+        return qpos, qvel.at[3].multiply(1 + 1e-3), act, qacc  # the slider's
 
-    monkeypatch.setattr(dynamics, "step_jacobian", wrong_beside)
+    monkeypatch.setattr(dynamics, "step_change", wrong_beside)
     cylinder = (
         '<body pos="0 0 .0999"><joint name="z" type="slide" axis="0 0 1"/><joint name="a" axis="1 0 0"/>'
         '<joint name="b" axis="0 1 0"/><geom name="can" type="cylinder" size=".1 .1" mass="1"/></body>'
@@ -174,7 +174,7 @@ def test_a_nan_fails_in_the_mode_that_has_it() -> None:
 
 
 @pytest.mark.slow
-def test_an_unconverged_solve_is_told_from_a_wrong_derivative() -> None:
+def test_an_unconverged_solve_is_not_a_wrong_derivative() -> None:
     """One iteration on two contacts that compete; given its budget, the same scene is right."""
     sliding = (
         '<geom type="plane" size="1 1 1"/><body pos="0 0 .0996"><joint name="z" type="slide" axis="0 0 1"/>'
@@ -230,7 +230,7 @@ def test_a_stiffness_needs_the_pair_that_it_acts_on() -> None:
         plan_scene_gradcheck(scene, ["penalty"], [10.0], seed=0, pair=("pusher", "nothing"))
 
 
-def test_plans_refuse_what_cannot_be_checked() -> None:
+def test_plans_are_refused() -> None:
     task = make_task("pusher", horizon=3)
     with jax.enable_x64(False):
         single = make_task("pusher", horizon=3)
@@ -260,7 +260,7 @@ def test_plans_refuse_what_cannot_be_checked() -> None:
         (["broken.xml"], "broken.xml"),
     ],
 )
-def test_bad_requests_are_said_in_a_line(
+def test_invalid_requests_are_refused_in_one_line(
     arguments: list[str],
     message: str,
     tmp_path: Path,

@@ -1,7 +1,8 @@
-"""Every verdict on an entry, and where each begins."""
+"""Every verdict on an entry, and its threshold."""
 
 import dataclasses
 from functools import cache
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -64,49 +65,44 @@ def test_names_of_the_layout() -> None:
     assert [str(output) for output in layout().outputs] == ["qpos[x]", "qvel[x]"]
 
 
-def test_right_within_the_tolerance_and_the_uncertainty() -> None:
-    assert verdict(0.5) == "right"
-    assert verdict(0.5 * (1 + 0.9e-6)) == "right"
-    assert verdict(0.5 * (1 + 1.1e-5)) == "wrong"
-    assert verdict(0.51, uncertainty=0.004) == "right"
+NAN, INF = float("nan"), float("inf")
 
 
-def test_an_entry_as_small_as_its_uncertainty_is_unresolved() -> None:
-    assert verdict(0.5, uncertainty=0.1) == "right"
-    assert verdict(0.5, uncertainty=0.2) == "unresolved"
-    assert verdict(0.0, value=0.1, uncertainty=0.2) == "unresolved"
-    assert verdict(0.0, value=0.0, uncertainty=0.2) == "right"  # differences are zero as well
+@pytest.mark.parametrize(
+    ("entry", "expected", "differences"),
+    [
+        (0.5, "right", {}),
+        (0.5 * (1 + 0.9e-6), "right", {}),
+        (0.5 * (1 + 1.1e-5), "wrong", {}),
+        (0.51, "wrong", {}),
+        (0.51, "right", {"uncertainty": 0.004}),
+        # as small as its uncertainty, unless differences are zero as well
+        (0.5, "right", {"uncertainty": 0.1}),
+        (0.5, "unresolved", {"uncertainty": 0.2}),
+        (0.0, "unresolved", {"value": 0.1, "uncertainty": 0.2}),
+        (0.0, "right", {"value": 0.0, "uncertainty": 0.2}),
+        (0.0, "zero", {}),
+        (0.0, "right", {"value": 0.0}),
+        # nothing excuses a derivative that is not a number
+        (NAN, "nan", {}),
+        (INF, "nan", {}),
+        (NAN, "nan", {"kink": True, "jump": True, "gap": 1.0}),
+        # zero is one of the slopes 0 and 1, but neither of the slopes 0.4 and 0.6
+        (0.75, "kink", {"kink": True, "gap": 0.5}),
+        (2.0, "wrong", {"kink": True, "gap": 0.5}),
+        (0.0, "kink", {"kink": True, "gap": 1.0}),
+        (0.0, "zero", {"kink": True, "gap": 0.2}),
+        (7.0, "jump", {"jump": True}),
+        (0.0, "jump", {"jump": True}),
+        (0.51, "unconverged", {"converged": 0.5}),
+        (0.51, "wrong", {"converged": 0.51}),
+    ],
+)
+def test_verdicts(entry: float, expected: str, differences: dict[str, Any]) -> None:
+    assert verdict(entry, **differences) == expected
 
 
-def test_wrong() -> None:
-    assert verdict(0.51) == "wrong"
-
-
-def test_nan() -> None:
-    assert verdict(float("nan")) == "nan"
-    assert verdict(float("inf")) == "nan"
-    assert verdict(float("nan"), kink=True, jump=True, gap=1.0) == "nan"  # nothing excuses it
-
-
-def test_a_silent_zero() -> None:
-    assert verdict(0.0) == "zero"
-    assert verdict(0.0, value=0.0) == "right"
-
-
-def test_a_kink_excuses_a_derivative_between_its_slopes() -> None:
-    assert verdict(0.75, kink=True, gap=0.5) == "kink"
-    assert verdict(2.0, kink=True, gap=0.5) == "wrong"
-    # zero is one of the slopes 0 and 1, and none of the slopes 0.4 and 0.6
-    assert verdict(0.0, kink=True, gap=1.0) == "kink"
-    assert verdict(0.0, kink=True, gap=0.2) == "zero"
-
-
-def test_a_jump_excuses_any_derivative() -> None:
-    assert verdict(7.0, jump=True) == "jump"
-    assert verdict(0.0, jump=True) == "jump"
-
-
-def test_a_degenerate_contact_excuses_what_it_enters_and_what_jumps() -> None:
+def test_a_degenerate_contact_excuses_its_entries_that_jump() -> None:
     """Not an entry where differences are smooth, nor one that does not depend on it."""
     derivative, rough = TRUE.copy(), TRUE < 0
     derivative[1] *= 2
@@ -132,12 +128,7 @@ def test_the_engine_is_a_judge() -> None:
     assert (vague == diagnosis.UNRESOLVED).all() and (resolved_by(vague, ours) == diagnosis.RIGHT).all()
 
 
-def test_an_unconverged_solve_is_told_from_a_wrong_derivative() -> None:
-    assert verdict(0.51, converged=0.5) == "unconverged"
-    assert verdict(0.51, converged=0.51) == "wrong"
-
-
-def test_the_error_leaves_out_what_differences_do_not_resolve() -> None:
+def test_the_error_leaves_out_unresolved_entries() -> None:
     none, never = np.zeros_like(TRUE), np.zeros(TRUE.shape, bool)
     truth = Differences(TRUE * (1 + 1e-7), none, none, never, never, never)
     right, columns = np.full(TRUE.shape, diagnosis.RIGHT), range(TRUE.shape[1])
@@ -155,6 +146,6 @@ def test_modes_are_compared_by_rows_and_blocks() -> None:
     assert modes_apart(layout(), TRUE, other) == 0
 
 
-def test_the_gravest_verdict() -> None:
+def test_the_worst_verdict() -> None:
     assert worst_verdict([]) == "right"
     assert worst_verdict(["kink", "zero", "jump"]) == "zero"

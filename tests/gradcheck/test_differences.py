@@ -1,4 +1,4 @@
-"""Differences over a ladder of steps find the derivative, or what is there in its place."""
+"""Differences over a ladder of steps find the derivative, or the kind of nonsmoothness."""
 
 import dataclasses
 from collections.abc import Callable
@@ -59,7 +59,7 @@ def test_a_kink_with_curvature() -> None:
     assert found.gap[0, 0] == pytest.approx(300, rel=1e-3)
 
 
-def test_a_kink_nearby_is_none_here() -> None:
+def test_a_nearby_kink_does_not_count() -> None:
     """Where short steps do not reach it, there is a derivative."""
     found = read(lambda x: 2 * x + np.maximum(x - 2e-6, 0.0), noise=1e-17)
     assert not found.kink[0, 0] and not found.jump[0, 0]
@@ -80,13 +80,13 @@ def test_a_jump_that_is_odd() -> None:
     assert found.gap[0, 0] > 100
 
 
-def test_an_odd_jump_nearby_is_none_here() -> None:
+def test_a_nearby_odd_jump_does_not_count() -> None:
     found = read(lambda x: 1e-3 * np.sign(x) * (np.abs(x) > 2e-6) + 2 * x, noise=1e-18)
     assert not found.jump[0, 0] and not found.kink[0, 0]
     assert found.value[0, 0] == pytest.approx(2, rel=1e-6)
 
 
-def test_rounding_is_no_jump() -> None:
+def test_rounding_is_not_a_jump() -> None:
     found = read(lambda x: np.ones_like(x), noise=1e-16)
     assert not found.jump[0, 0] and not found.kink[0, 0]
     assert abs(found.value[0, 0]) <= found.uncertainty[0, 0]
@@ -97,9 +97,9 @@ def test_the_ladder_ends_below_what_a_contact_can_show() -> None:
 
 
 def test_forces_that_cancel_are_rounded() -> None:
-    """Two constraints pull a slider apart: its velocity follows from their difference, which is no jump.
+    """Two constraints pull a slider apart: its velocity follows from their difference, which does not jump.
 
-    Rounding of half the size that is expected looks like one wherever that size is not told.
+    Rounding of half the expected size looks like one unless that size is given.
     """
     pull = '<joint joint1="x" polycoef="{} 0 0 0 0"/>'
     xml = f"""<mujoco><worldbody><body><joint name="x" type="slide"/><geom size=".1" mass="1"/></body></worldbody>

@@ -1,4 +1,4 @@
-"""The check on MJCF files that no one here wrote: MJX's own test models, as `docs/gradient-faults.md` says."""
+"""The check on foreign MJCF files, MJX's test models: verdicts as `docs/gradient-faults.md` says."""
 
 import re
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""What a report says and how the command exits, without a computation."""
+"""Lines of a report and exit codes of the command, without a computation."""
 
 import dataclasses
 
@@ -44,7 +44,7 @@ def wrong(verdict: str) -> Finding:
     return Finding("penalty", "project", verdict, (), "a reason", (Entry("start", 0, 0.0, "qvel[x]", 1.0, 2.0),))
 
 
-def test_what_is_never_exercised_is_a_warning_and_another_exit_code(
+def test_unexercised_parts_are_a_warning_and_another_exit_code(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     unexercised = dataclasses.replace(STEP, coverage=STICKING)
@@ -61,7 +61,7 @@ def test_what_is_never_exercised_is_a_warning_and_another_exit_code(
     assert report(unexercised).as_json()["unexercised"] == {"penalty, K = 100 N/m": ["slide"]}
 
 
-def test_what_the_model_cannot_reach_is_told_and_no_gap() -> None:
+def test_unreachable_parts_are_reported_and_not_missing() -> None:
     step = dataclasses.replace(
         STEP, coverage=count_coverage(PARTS - {"slide"}, [{"contact", "stick", "limit"}], {"slide": 2})
     )
@@ -94,7 +94,7 @@ def test_unresolved_entries_are_counted() -> None:
 
 
 @pytest.mark.parametrize(
-    ("verdict", "fails", "said"),
+    ("verdict", "fails", "text"),
     [
         ("value", True, "qvel[x] = 1, mjx.step 2"),
         ("engine", True, "qvel[x] = 1, the C engine 2"),
@@ -102,12 +102,12 @@ def test_unresolved_entries_are_counted() -> None:
         ("wrong", True, "qvel[x] = 1, differences 2"),
     ],
 )
-def test_a_finding_says_what_it_is_compared_with(verdict: str, fails: bool, said: str) -> None:
-    assert wrong(verdict).fails is fails and said in wrong(verdict).line()
+def test_a_finding_names_the_source_of_the_other_number(verdict: str, fails: bool, text: str) -> None:
+    assert wrong(verdict).fails is fails and text in wrong(verdict).line()
     assert report(STEP, findings=(wrong(verdict),)).passed is not fails
 
 
-def test_what_has_no_derivative_is_said() -> None:
+def test_features_without_a_derivative_are_named() -> None:
     xml = """<mujoco><worldbody><body mocap="true"/><body><joint name="x"/><geom size=".1"/></body></worldbody>
     <sensor><jointpos joint="x"/><jointvel joint="x"/></sensor></mujoco>"""
     sensors, mocap = unoffered(mujoco.MjModel.from_xml_string(xml))

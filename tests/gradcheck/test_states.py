@@ -1,4 +1,4 @@
-"""States that exercise what a model has, and what is said where they do not; with the C engine alone."""
+"""States exercise all parts of a model, or the missing parts are reported; with the C engine alone."""
 
 import mujoco
 import numpy as np
@@ -28,7 +28,7 @@ def scene(world: str, option: str = "") -> Scene:
 
 
 @pytest.mark.parametrize("cone", ["pyramidal", "elliptic"])
-def test_what_a_slow_rollout_misses_is_looked_for(cone: str) -> None:
+def test_parts_that_a_slow_rollout_misses_are_searched(cone: str) -> None:
     samples, found = sampled(FLOOR + PUCK + ARM, 6, f'<option cone="{cone}"/>')
     assert found.missing == () and len(samples) == found.states == 6
     for part in ("stick", "slide", "limit", "held", "slipping"):
@@ -36,21 +36,21 @@ def test_what_a_slow_rollout_misses_is_looked_for(cone: str) -> None:
     assert samples[0].label == "start, at rest" and any("pushed" in s.label or "pose" in s.label for s in samples)
 
 
-def test_a_part_out_of_reach_is_said() -> None:
+def test_an_unreached_part_is_reported() -> None:
     _, found = sampled(
         FLOOR.replace("/>", ' pos="0 0 -90"/>') + PUCK.replace("<freejoint/>", '<joint type="slide"/>'), 3
     )
     assert found.missing == ("contact",) and "contact in 0" in found.line()
 
 
-def test_fewer_states_than_parts_are_said() -> None:
+def test_too_few_states_leave_parts_missing() -> None:
     samples, found = sampled(FLOOR + PUCK + ARM, 1)
     assert len(samples) == 1 and {"slide", "limit"} <= set(found.missing)
 
 
 @pytest.mark.parametrize("count", [1, 4, 9])
 @pytest.mark.parametrize("horizon", [1, 3, 50])
-def test_there_are_as_many_states_as_asked_for(count: int, horizon: int) -> None:
+def test_the_number_of_states_is_as_requested(count: int, horizon: int) -> None:
     samples, _ = sampled(FLOOR + PUCK, count, horizon=horizon)
     assert len(samples) == count
     assert len({(tuple(s.state.qpos), tuple(s.state.qvel)) for s in samples}) == count
@@ -149,7 +149,7 @@ def chain(random: np.random.Generator) -> mujoco.MjModel:
     return mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{still}{bodies}{'</body>' * 3}</worldbody></mujoco>")
 
 
-def test_what_is_called_out_of_reach_is_never_touched() -> None:
+def test_unreachable_geoms_never_touch() -> None:
     """100 random chains in 200 random poses each."""
     random, apart, met = np.random.default_rng(0), 0, 0
     for _ in range(100):

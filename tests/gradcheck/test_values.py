@@ -1,4 +1,4 @@
-"""Whose step it is that differs: this project's, MJX's, or the C engine's as documented."""
+"""Which step differs: this project's, MJX's, or the C engine's as documented."""
 
 import dataclasses
 from collections.abc import Generator
@@ -39,7 +39,7 @@ def start(xml: str = PLAIN) -> HostState:
 
 
 def stages_of(engine: EngineStep, state: HostState) -> dict[str, Any]:
-    """The engine's own quantities in the place of MJX's."""
+    """The engine's quantities in the place of MJX's."""
     data = host_data(engine.host, state)
     mujoco.mj_forward(engine.host, data)
     names = ("xpos", "ten_length", "actuator_length", "qfrc_bias", "qfrc_passive", "act_dot", "qfrc_actuator")
@@ -60,42 +60,28 @@ def compare(ours: float, stock: float, xml: str = PLAIN, **stages: Any) -> Value
     return compare_values(layout(xml), engine, state, mine, theirs, stages_of(engine, state) | stages)
 
 
-def test_three_equal_steps() -> None:
-    found = compare(0.0, 0.0)
-    assert found.verdict is None and found.engine == found.stock == 0
+@pytest.mark.parametrize(
+    ("ours", "stock", "xml", "verdict", "cause"),
+    [
+        (0.0, 0.0, PLAIN, None, ""),
+        (1e-16, -1e-16, PLAIN, None, ""),
+        (1e-3, 0.0, PLAIN, "value", "this project's step is not that of mjx.step; the C engine agrees with mjx.step"),
+        (0.0, 1e-3, PLAIN, "value", "mjx.step differs from the step"),
+        (1e-3, 1e-3, PLAIN, "engine", "the integration: the state after the step differs, its acceleration does not"),
+        (1e-3, 1e-3, SERVO, "engine_mismatch", "MJX's implicitfast damps as if no force or control were clamped"),
+    ],
+)
+def test_which_step_differs(ours: float, stock: float, xml: str, verdict: str | None, cause: str) -> None:
+    found = compare(ours, stock, xml)
+    assert found.verdict == verdict and cause in found.cause
+    assert found.agrees_with_engine is (ours < 1e-8)
+    if verdict is not None and ours != stock:
+        assert str(layout(xml).outputs[found.coordinate]) == "qvel[x]"
+        assert found.numbers[0] - found.numbers[1] == pytest.approx(ours - stock)
 
 
-def test_a_defect_here() -> None:
-    found = compare(1e-3, 0.0)
-    assert found.verdict == "value" and found.cause.endswith("the C engine agrees with mjx.step")
-    assert str(layout().outputs[found.coordinate]) == "qvel[x]" and found.numbers[0] - found.numbers[
-        1
-    ] == pytest.approx(1e-3)
-
-
-def test_mjx_alone_differs() -> None:
-    found = compare(0.0, 1e-3)
-    assert (
-        found.verdict == "value"
-        and found.agrees_with_engine
-        and found.cause.startswith("mjx.step differs from the step")
-    )
-    assert not compare(1e-3, 0.0).agrees_with_engine
-
-
-def test_mjx_differs_from_the_engine_for_no_known_reason() -> None:
-    found = compare(1e-3, 1e-3)
-    assert found.verdict == "engine" and "its acceleration does not" in found.cause
+def test_the_first_quantity_that_differs_is_named() -> None:
     assert compare(1e-3, 1e-3, qfrc_bias=np.array([9.0])).cause.startswith("the bias force differs")
-
-
-def test_a_documented_difference() -> None:
-    found = compare(1e-3, 1e-3, SERVO)
-    assert found.verdict == "engine_mismatch" and "as if no force or control were clamped" in found.cause
-
-
-def test_rounding_is_no_difference() -> None:
-    assert compare(1e-16, -1e-16).verdict is None
 
 
 def test_at_rest_rounding_is_all_that_moves() -> None:
@@ -136,7 +122,7 @@ def test_parameters_change_in_the_contact_model(monkeypatch: pytest.MonkeyPatch)
 
 
 def value_check(xml: str, qpos: list[float], qvel: list[float], **doctored: Any) -> Values:
-    """The values of one step, with whatever is planted, and with other quantities in place of MJX's."""
+    """The values of one step, with planted faults and other quantities in place of MJX's."""
     own = layout(xml)
     programs, case = Programs(own), ContactCase(None, own.scales)
     state = HostState(np.array(qpos), np.array(qvel), np.zeros(0), np.zeros(0), np.zeros(len(qvel)))
@@ -149,7 +135,7 @@ def value_check(xml: str, qpos: list[float], qvel: list[float], **doctored: Any)
 
 @pytest.fixture
 def planted(monkeypatch: pytest.MonkeyPatch) -> Generator[pytest.MonkeyPatch]:
-    """What is planted is traced anew, and leaves no trace."""
+    """A planted fault is traced anew, and leaves no trace."""
     jax.clear_caches()
     yield monkeypatch
     jax.clear_caches()
@@ -210,7 +196,7 @@ def mixed_stages() -> dict[str, Any]:
 
 
 def mixed_difference(stages: dict[str, Any]) -> tuple[str, bool]:
-    """What differs where the constrained acceleration does."""
+    """The difference reported for another constrained acceleration."""
     nothing = np.zeros(0)
     state = HostState(BENT, MOVING, nothing, nothing, 0 * MOVING)
     return difference_of_engines(EngineStep(layout(MIXED), None).host, state, stages, MOVING, 0 * MOVING)
@@ -233,8 +219,8 @@ def test_rows_are_compared_whatever_their_order() -> None:
         ("efc_aref", "EQUALITY", "reference accelerations of joint equality rows"),
     ],
 )
-def test_rows_that_differ_are_no_documented_difference(name: str, kind: str, cause: str) -> None:
-    """Beside one that is."""
+def test_different_rows_are_not_a_documented_difference(name: str, kind: str, cause: str) -> None:
+    """Beside a documented one."""
     stages = dict(mixed_stages())
     chosen = stages["efc_type"] == int(getattr(mujoco.mjtConstraint, f"mjCNSTR_{kind}"))
     stages[name] = np.where(np.reshape(chosen, (-1, *[1] * (stages[name].ndim - 1))), 1.001, 1.0) * stages[name]
@@ -251,7 +237,7 @@ def test_contacts_with_other_tangents_are_placed_differently() -> None:
     assert documented and "their normals by 0.0e+00 and their tangents by 1.0e+00" in found, found
 
 
-def test_a_row_that_one_engine_lacks_is_no_documented_difference() -> None:
+def test_a_missing_row_is_not_a_documented_difference() -> None:
     stages = dict(mixed_stages())
     active = np.flatnonzero(np.abs(stages["efc_J"]).max(axis=1) > 0)
     stages["efc_J"] = stages["efc_J"] * (np.arange(len(stages["efc_J"])) != active[-1])[:, None]
@@ -287,8 +273,8 @@ RESTING = """<mujoco><worldbody><geom type="plane" size="1 1 .1"/><body pos="0 0
 
 
 @pytest.mark.parametrize("name", ["dist", "pos", "frame", "efc_J", "efc_aref", "efc_D", "xpos", "qM", "qacc_smooth"])
-def test_what_is_not_a_number_differs(name: str) -> None:
-    """And is compared nevertheless: no step ends in a traceback."""
+def test_nonfinite_quantities_differ(name: str) -> None:
+    """They are compared nevertheless, without a traceback."""
     host = mujoco.MjModel.from_xml_string(RESTING)
     state = HostState(host.qpos0.copy(), np.zeros(6), np.zeros(0), np.zeros(0), np.zeros(6))
     engine = EngineStep(make_coordinates(put_scene(host, "box"), None), None)

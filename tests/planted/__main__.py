@@ -18,7 +18,7 @@ from functools import cache
 from pathlib import Path
 
 from mjx_study.cli.gradcheck import UNEXERCISED
-from mjx_study.table import format_table
+from mjx_study.table import format_table, markdown_table
 from tests.planted import DEFECTS
 from tests.planted.defect import Defect, plant
 from tests.planted.models import MODELS
@@ -164,18 +164,14 @@ def summary(verdicts: Sequence[Verdict]) -> str:
 
 
 def markdown(verdicts: Sequence[Verdict]) -> str:
-    """The table of the page."""
-    lines = [
-        f"{summary(verdicts)}.",
-        "",
-        "| defect | what it is | fast tests | gradcheck |",
-        "| --- | --- | --- | --- |",
-    ]
+    """Format the table of the page: defects by file and by what caught them."""
+    found: dict[str, tuple[list[str], list[str], list[str]]] = {}
     for verdict in verdicts:
-        name, file, test, checked = row(verdict)
-        test = test if test in ("passes", "not run") else f"`{test.split('[')[0]}`"
-        lines.append(f"| {name} | `{file}`: {verdict.defect.why} | {test} | {checked} |")
-    return "\n".join(lines) + "\n"
+        column = 0 if verdict.test else 1 if verdict.gradcheck else 2
+        found.setdefault(verdict.defect.file, ([], [], []))[column].append(verdict.defect.name)
+    rows = [(f"`{file}`", *map(", ".join, names)) for file, names in found.items()]
+    table = markdown_table(rows, ("file", "caught by the fast tests", "by gradcheck alone", "by nothing"))
+    return f"{summary(verdicts)}.\n\n{table}\n"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -212,7 +208,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     print(summary(verdicts))
     if options.page is not None:
         head = options.page.read_text().partition(MARK)[0]
-        options.page.write_text(f"{head}{MARK}\n{markdown(verdicts)}")
+        options.page.write_text(f"{head}{MARK}\n## Planted defects\n\n{markdown(verdicts)}")
     return 1 if any(each.test == "" and not each.caught for each in verdicts) else 0
 
 

@@ -5,7 +5,7 @@ from typing import Final
 from tests.planted.defect import Defect
 
 UNBIASED, VARIANCES = "tests/estimators/test_unbiasedness.py", "tests/estimators/test_variances.py"
-STEPWISE, CHOICE = "tests/estimators/test_stepwise.py", "tests/estimators/test_alpha_order.py"
+STEPWISE, CHOICE = "tests/estimators/test_stepwise.py", "tests/estimators/test_interpolation.py"
 
 OBJECTIVE: Final = (
     Defect(
@@ -42,7 +42,7 @@ OBJECTIVE: Final = (
     ),
     Defect(
         "score-without-its-scale",
-        "mjx_study/reference/noise.py",
+        "estimators/noise.py",
         "NOISES[density].score(noise / sigma) / sigma",
         "NOISES[density].score(noise / sigma)",
         "the score of standard noise; right at sigma = 1",
@@ -53,7 +53,7 @@ OBJECTIVE: Final = (
 ESTIMATORS: Final = (
     Defect(
         "mean-of-all-as-baseline",
-        "estimators/orders.py",
+        "estimators/zeroth_first.py",
         "(jnp.sum(value) - value) / jnp.maximum(num_others, 1.0)",
         "jnp.sum(value) / (num_others + 1.0)",
         "the batch's mean depends on the sample: biased by 1/N",
@@ -61,7 +61,7 @@ ESTIMATORS: Final = (
     ),
     Defect(
         "weights-swapped",
-        "estimators/alpha.py",
+        "estimators/interpolation.py",
         "ratio = variance_first / jnp.where(variance_zeroth == 0, 1.0, variance_zeroth)",
         "ratio = variance_zeroth / jnp.where(variance_first == 0, 1.0, variance_first)",
         "each estimate weighed by its own variance",
@@ -69,7 +69,7 @@ ESTIMATORS: Final = (
     ),
     Defect(
         "variance-of-a-mixture",
-        "estimators/alpha.py",
+        "estimators/interpolation.py",
         "(1.0 - alpha, alpha), ((1.0 - alpha) ** 2, alpha**2)",
         "(1.0 - alpha, alpha), (1.0 - alpha, alpha)",
         "variances weighed as means are",
@@ -93,7 +93,7 @@ ESTIMATORS: Final = (
     ),
     Defect(
         "control-variate-scale",
-        "estimators/orders.py",
+        "estimators/zeroth_first.py",
         "linear = scale**2 * jnp.sum",
         "linear = scale * jnp.sum",
         "sigma in place of its square: unbiased still, but no longer a control variate",
@@ -101,7 +101,7 @@ ESTIMATORS: Final = (
     ),
     Defect(
         "pairs-as-samples",
-        "estimators/orders.py",
+        "estimators/zeroth_first.py",
         "return summarise((above + below) / 2.0)",
         "return summarise(jnp.concatenate([above, below]))",
         "the halves of a pair are not independent: the same mean, another standard error",
@@ -109,7 +109,7 @@ ESTIMATORS: Final = (
     ),
     Defect(
         "cut-one-step-early",
-        "estimators/stepwise.py",
+        "estimators/recursion.py",
         "jnp.arange(1, horizon + 1) % window != 0",
         "jnp.arange(horizon) % window != 0",
         "windows counted from the wrong end",
@@ -120,7 +120,7 @@ ESTIMATORS: Final = (
 REFERENCES: Final = (
     Defect(
         "range-slope",
-        "mjx_study/reference/launch.py",
+        "mjx_study/reference/projectiles.py",
         "slope = 2 * self.speed**2 / self.gravity * np.cos(2 * angle)",
         "slope = self.speed**2 / self.gravity * np.cos(2 * angle)",
         "the inner derivative of sin(2 angle) forgotten",

@@ -15,6 +15,7 @@ from estimators import (
     truncated_first_order,
     zeroth_order,
 )
+from estimators.noise import split_sample_key, standard_noise
 from mjx_study.reference import (
     DoublePendulum,
     FunctionObjective,
@@ -28,7 +29,6 @@ from mjx_study.reference import (
     smoothed,
     value_and_gradients,
 )
-from mjx_study.reference.noise import split_sample_key, standard_noise
 from tests.estimators import objectives
 from tests.estimators.statistics_helpers import assert_mean_is
 from tests.reference.functions import FUNCTIONS, JUMPING, QUADRATIC, FunctionCase

@@ -1,0 +1,146 @@
+"""Claims that measurements can refute: a statistic, and its values for which a claim or its opposite holds."""
+
+import dataclasses
+import hashlib
+import math
+import tomllib
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from types import ModuleType
+from typing import Any, Final
+
+from mjx_study.claims.laboratory import Effort, Laboratory, Statistic
+from mjx_study.identity import VERSIONED, code_of
+from mjx_study.runtime import precision
+from mjx_study.version import version_of
+
+DEFINITIONS: Final = Path(__file__).with_name("claims.toml")
+VERDICTS: Final = ("holds", "fails", "reversed", "undecided")
+Range = tuple[float, float]
+
+
+@dataclasses.dataclass(frozen=True)
+class Criterion:
+    """Criterion of a claim, fixed before measurement: a statistic, and its values for which claim or opposite hold."""
+
+    quantity: str
+    holds: Range
+    reversed: Range | None = None
+
+    def verdict(self, interval: Range) -> str:
+        """Return one of `VERDICTS`."""
+        low, high = interval
+        if not (math.isfinite(low) or math.isfinite(high)):
+            return "undecided"
+        if self.holds[0] <= low and high <= self.holds[1]:
+            return "holds"
+        if self.reversed is not None and self.reversed[0] <= low and high <= self.reversed[1]:
+            return "reversed"
+        return "fails" if high < self.holds[0] or low > self.holds[1] else "undecided"
+
+    def lines(self) -> str:
+        """Describe the ranges."""
+        holds = f"holds {_range(self.holds)}"
+        return holds if self.reversed is None else f"{holds}, reversed {_range(self.reversed)}"
+
+
+def above(quantity: str, bound: float, opposite: float | None = None) -> Criterion:
+    """Criterion that a quantity is above a bound; reversed below another."""
+    return Criterion(quantity, (bound, math.inf), None if opposite is None else (-math.inf, opposite))
+
+
+def below(quantity: str, bound: float, opposite: float | None = None) -> Criterion:
+    """Criterion that a quantity is below a bound; reversed above another."""
+    return Criterion(quantity, (-math.inf, bound), None if opposite is None else (opposite, math.inf))
+
+
+@dataclasses.dataclass(frozen=True)
+class Claim:
+    """A statement that measurements can refute.
+
+    Attributes:
+        id: name on the command line.
+        place: section of the paper that states it, or the open question that it answers.
+        systems: systems to measure, each with its contact families.
+        measure: computes the statistic of the criterion for a system and family, with `options`.
+        show: command that demonstrates it.
+    """
+
+    id: str
+    place: str
+    statement: str
+    criterion: Criterion
+    systems: Mapping[str, tuple[str, ...]]
+    measure: Callable[..., Statistic]
+    show: str = ""
+    options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+
+    @property
+    def cases(self) -> list[tuple[str, str]]:
+        """Pairs of system and family, each with its own verdict."""
+        return [(system, family) for system, families in self.systems.items() for family in families]
+
+    def statistic(self, lab: Laboratory, system: str, family: str) -> Statistic:
+        """Measure one case."""
+        return self.measure(lab, system, family, **self.options)
+
+    def key(self, effort: Effort) -> str:
+        """Digest of what the claim requires, whatever its wording, the effort and the precision."""
+        return _digest(self.id, self.criterion.holds, self.criterion.reversed, self.systems, effort, precision())
+
+    def made_by(self) -> str:
+        """Digest of the code that measures the claim, and of library versions."""
+        versions = [version_of(name) for name in VERSIONED if name != "mjx-study"]
+        return _digest(code_of(self.measure.__module__), versions, sorted(self.options.items()))
+
+
+def load_claims(modules: Mapping[str, ModuleType], path: Path = DEFINITIONS) -> dict[str, Claim]:
+    """Read claims by id, in the order of the file; the functions that measure them are in `modules`."""
+    definitions = tomllib.loads(path.read_text())
+    families, systems = definitions["families"], definitions["systems"]
+
+    def claim(name: str, fields: dict[str, Any]) -> Claim:
+        module, function = fields["measure"].split(".")
+        chosen = systems[fields["systems"]] if isinstance(fields["systems"], str) else fields["systems"]
+        expanded = {
+            system: tuple(each for group in groups for each in families.get(group, [group]))
+            for system, groups in chosen.items()
+        }
+        return Claim(
+            name,
+            fields["place"],
+            fields["statement"],
+            _criterion(fields),
+            expanded,
+            getattr(modules[module], function),
+            fields.get("show", f"mjx-study claims --quick --only {name}"),
+            fields.get("options", {}),
+        )
+
+    return {name: claim(name, fields) for name, fields in definitions["claims"].items()}
+
+
+def _criterion(fields: dict[str, Any]) -> Criterion:
+    if "within" in fields:
+        return Criterion(fields["quantity"], (fields["within"][0], fields["within"][1]))
+    make, bound = (above, fields["above"]) if "above" in fields else (below, fields["below"])
+    return make(fields["quantity"], *(_bound(each) for each in (bound, fields.get("reversed")) if each is not None))
+
+
+def _bound(value: float | str) -> float:
+    """A number, or the logarithm of one such as "-log10 1.25"."""
+    if isinstance(value, str):
+        sign, _, number = value.partition("log10 ")
+        return math.copysign(math.log10(float(number)), -1 if sign else 1)
+    return value
+
+
+def _range(part: Range) -> str:
+    low, high = part
+    if math.isinf(high):
+        return f"above {low:g}"
+    return f"below {high:g}" if math.isinf(low) else f"from {low:g} to {high:g}"
+
+
+def _digest(*parts: Any) -> str:
+    return hashlib.sha256(repr(parts).encode()).hexdigest()[:16]

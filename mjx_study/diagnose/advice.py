@@ -1,0 +1,131 @@
+"""Cautions about the numbers of a diagnosis, and advice drawn from them."""
+
+import math
+from collections.abc import Iterator
+from typing import Final
+
+from mjx_study.diagnose.measurement import SAMPLES, TARGET_ERROR
+from mjx_study.diagnose.result import Diagnosis, round_up
+from mjx_study.results.findings import ERROR_PER_STRENGTH, LEAST_SPREAD, MOST_STRENGTH, NOTABLE_SHARE, linear_error
+from mjx_study.table import percent
+
+MIN_SAMPLES: Final = 100
+"""Number of samples below which the page warns."""
+SMOOTH_SHARE: Final = 0.01
+"""Share of the approach speed lost in the first step below which force counts as setting in without a jump."""
+WIDTH_RATIO: Final = 3.0
+"""Recommended width of the impedance's rise, as a multiple of a step's travel."""
+
+Advice = tuple[str, str]
+"""A recommendation, and options of `compare` that demonstrate it."""
+
+
+def cautions(found: Diagnosis) -> Iterator[str]:
+    """Caveats about the numbers on the page."""
+    if found.lost:
+        yield f"{found.lost} samples are not finite and were left out: try a smaller --timestep or --sigma"
+    if found.unconverged:
+        yield (
+            f"in {found.unconverged} rollouts the contact solver did not converge: their derivatives are not those "
+            "of the simulated step; raise --solver-iterations and --solver-ls-iterations"
+        )
+    if unstable := [each for each in found.touches if not each.stable]:
+        yield (
+            f"the step in contact is unstable: {unstable[0].pair}, h^2 k = {unstable[0].stiffness:.2g}; take a "
+            "smaller --timestep or a softer contact"
+        )
+    if found.samples < MIN_SAMPLES:
+        yield f"{found.samples} samples are few: --samples {SAMPLES} takes longer and resolves more"
+    if found.best.verdict == "undecided" and found.resolved:
+        yield f"{found.samples} samples do not decide whether the mean of {found.best.estimator} is right: take more"
+    if not found.derivatives.passed:
+        yield "derivatives of a step are not right (see below): do not trust a first-order estimate"
+
+
+def advise(found: Diagnosis) -> Iterator[Advice]:
+    """Recommendations: the best estimator, the bias of first order, and whether its correction can be trusted."""
+    if not found.resolved:
+        more = "more --samples may resolve it (see above); or take" if found.norm else "take"
+        yield (
+            f"no estimator can be recommended: with {found.samples} samples the gradient is not significantly "
+            f"different from 0; {more} another start or cost, in a task of your own (docs/extending.md)",
+            "",
+        )
+        return
+    yield _best(found)
+    if not found.onsets.get("onsets"):
+        yield (
+            "no contact begins, so the result says nothing about contact: take a longer --horizon, a larger --sigma or "
+            "another start (for a file, its first keyframe)",
+            "",
+        )
+        return
+    by_name = {each.estimator: each for each in found.estimators}
+    if by_name["fobg"].verdict == "biased":
+        yield _bias(found)
+    elif not found.best.estimator.endswith("_onset"):
+        return  # the onset term is not recommended
+    yield from _onset(found)
+
+
+def _best(found: Diagnosis) -> Advice:
+    best, bias = found.best, found.bias_text(found.best)
+    if math.isfinite(found.samples_needed):
+        many = round_up(found.samples_needed)
+        needed = f"a relative error of {percent(TARGET_ERROR)} needs {many} sample{'' if many == '1' else 's'}"
+        needed += f"; its bias of {bias} remains" if best.verdict == "biased" else ""
+    else:
+        needed = f"its bias of {bias} remains, however many samples"
+    return f"at {found.setting.level}, take {best.estimator}; {needed}", ""
+
+
+def _bias(found: Diagnosis) -> Advice:
+    by_name, timestep = {each.estimator: each for each in found.estimators}, found.task.scene.timestep
+    text = f"plain first order is biased by {found.bias_text(by_name['fobg'])}, "
+    corrected = by_name["fobg_onset"].verdict == "right"
+    if max([each.jump for each in found.touches] or [found.onsets["onset_strength"]]) <= SMOOTH_SHARE:
+        text += "though force sets in without a jump: something else jumps, as where corners and edges touch, "
+        text += "and only zobg is sure to be unbiased"
+    elif corrected:
+        text += "because contact sets in with a jump: the onset term corrects that"
+    else:
+        text += "and contact sets in with a jump, the usual cause"
+    if travel := max((each.speed * timestep for each in found.touches if each.jump > SMOOTH_SHARE), default=0.0):
+        rising = f'solimp="0 0.95 {WIDTH_RATIO * travel:.1g}"'
+        text += f"; an impedance that rises from 0 has no jump: {rising} in the MJCF"
+    return text, "--onset linear" if corrected else ""
+
+
+def _onset(found: Diagnosis) -> Iterator[Advice]:
+    """Whether the onset term can be trusted, unless its mean was measured to be right."""
+    by_name, timestep = {each.estimator: each for each in found.estimators}, found.task.scene.timestep
+    plain, corrected = by_name["fobg"], by_name["fobg_onset"]
+    spread, strength = found.onsets["onset_spread"], found.onsets["onset_strength"]
+    linear = ERROR_PER_STRENGTH * strength
+    if corrected.verdict == "right":
+        if spread < LEAST_SPREAD:
+            yield (
+                f"the noise is narrow for onset terms (the first contact varies by {spread:.2g} steps; "
+                f"{LEAST_SPREAD:g} usually suffice), but fobg_onset is right here, by the check of the mean",
+                "",
+            )
+    elif spread < LEAST_SPREAD:
+        finer = f"--timestep {timestep * spread / LEAST_SPREAD:.1g}, or " if spread > 0 else ""
+        yield f"for fobg_onset and aobg_onset the noise is too narrow: take {finer}a larger --sigma", ""
+    elif (
+        corrected.verdict == "biased"
+        and corrected.bias > linear * (plain.bias + corrected.bias)
+        and (strength <= MOST_STRENGTH)
+    ):
+        yield (
+            f"the onset term leaves a bias of {found.bias_text(corrected)}, which its own error does not "
+            "explain; the usual causes are corners, edges, grazing and rolling contact: take zobg there",
+            "",
+        )
+    elif linear > NOTABLE_SHARE:
+        step = timestep * NOTABLE_SHARE / linear
+        yield (
+            f"{linear_error(strength)}: --timestep {step:.1g} brings that down to {percent(NOTABLE_SHARE)}; the "
+            "error of --onset jump is only of second order in the step",
+            "--onset jump",
+        )

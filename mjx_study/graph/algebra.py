@@ -1,0 +1,98 @@
+"""Rules for factorisations, triangular systems and sorting, written out as the textbook algorithms (see `rules`)."""
+
+import itertools
+from collections.abc import Sequence
+from typing import Any, Final
+
+import numpy as np
+from jax import lax
+
+from mjx_study.graph.nodes import ScalarGraph, constants, no_type_check
+
+Arrays = list[np.ndarray]
+
+
+@no_type_check
+class _Arithmetic:
+    """Operations on scalars of one type."""
+
+    def __init__(self, graph: ScalarGraph, dtype: Any):
+        self._graph, self._dtype = graph, dtype
+
+    def less(self, value: Any, pairs: Sequence[tuple[Any, Any]]) -> Any:
+        """Subtract the products of pairs."""
+        for pair in pairs:
+            value = self.of(lax.sub_p, value, self.of(lax.mul_p, *pair))
+        return value
+
+    def of(self, primitive: Any, *arguments: Any) -> Any:
+        return self._graph.scalar(primitive, arguments, self._dtype)
+
+
+@no_type_check
+def _cholesky(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: Any) -> Arrays:
+    """Lower factor; NaN where the matrix is not positive definite."""
+    scalars = _Arithmetic(graph, aval.dtype)
+    factors = constants(np.zeros(aval.shape, aval.dtype))
+    for at in np.ndindex(*aval.shape[:-2]):
+        matrix, lower = inputs[0][at], factors[at]
+        for j, i in itertools.combinations_with_replacement(range(len(matrix)), 2):
+            rest = scalars.less(matrix[i, j], list(zip(lower[i, :j], lower[j, :j], strict=True)))
+            lower[i, j] = scalars.of(lax.sqrt_p, rest) if i == j else scalars.of(lax.div_p, rest, lower[j, j])
+    return [factors]
+
+
+@no_type_check
+def _triangular_solve(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: Any) -> Arrays:
+    """Solve op(A) X = B, or X op(A) = B as op(A)^T X^T = B^T, by substitution."""
+    scalars, left, unit = _Arithmetic(graph, aval.dtype), parameters["left_side"], parameters["unit_diagonal"]
+    matrices, right = inputs
+    turned = parameters["transpose_a"] == left
+    matrices = matrices.swapaxes(-1, -2) if turned else matrices
+    solutions = (right if left else right.swapaxes(-1, -2)).copy()
+    rows = range(matrices.shape[-1])
+    downwards = parameters["lower"] != turned
+    for at in np.ndindex(*matrices.shape[:-2]):
+        matrix, solution = matrices[at], solutions[at]
+        for i in rows if downwards else reversed(rows):
+            known = rows[:i] if downwards else rows[i + 1 :]
+            for column in range(solution.shape[1]):
+                rest = scalars.less(solution[i, column], [(matrix[i, k], solution[k, column]) for k in known])
+                solution[i, column] = rest if unit else scalars.of(lax.div_p, rest, matrix[i, i])
+    return [solutions if left else solutions.swapaxes(-1, -2)]
+
+
+@no_type_check
+def _sort(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: Any) -> Arrays:
+    """Exchange neighbours that are out of order until none is; stable, with NaN last."""
+    axis, keys = parameters["dimension"], parameters["num_keys"]
+    arrays = [np.moveaxis(each, axis, 0).copy() for each in inputs]
+    size = len(arrays[0])
+    for row in np.ndindex(*arrays[0].shape[1:]):
+        for at in (at for end in range(size - 1, 0, -1) for at in range(end)):
+            here, after = (at, *row), (at + 1, *row)
+            swap = _precedes(graph, [each[after] for each in arrays[:keys]], [each[here] for each in arrays[:keys]])
+            for each in arrays:
+                low, high = each[here], each[after]
+                each[here] = graph.scalar(lax.select_n_p, (swap, low, high), low.dtype)
+                each[after] = graph.scalar(lax.select_n_p, (swap, high, low), low.dtype)
+    return [np.moveaxis(each, 0, axis) for each in arrays]
+
+
+@no_type_check
+def _precedes(graph: ScalarGraph, one: Sequence[Any], other: Sequence[Any]) -> Any:
+    """Whether a vector of keys comes before another in lexicographic order."""
+    logic = _Arithmetic(graph, np.dtype(bool))
+    (a, *rest_a), (b, *rest_b) = one, other
+    before = logic.of(lax.lt_p, a, b)
+    if a.dtype.kind == "f":
+        numbers = logic.of(lax.and_p, logic.of(lax.eq_p, a, a), logic.of(lax.ne_p, b, b))
+        before = logic.of(lax.or_p, before, numbers)
+    if not rest_a:
+        return before
+    after = _precedes(graph, other[:1], one[:1])
+    later = logic.of(lax.and_p, logic.of(lax.not_p, after), _precedes(graph, rest_a, rest_b))
+    return logic.of(lax.or_p, before, later)
+
+
+ALGEBRA: Final = {"cholesky": _cholesky, "sort": _sort, "triangular_solve": _triangular_solve}

@@ -1,0 +1,167 @@
+"""Build C into libraries for this processor, once: by the system's compiler, into a cache checked before it is used.
+
+A library's name is a digest of everything that it depends on: source, compiler, flags, processor and version of XLA's
+interface. Without a compiler, or with MJX_STUDY_NATIVE=0, nothing is built.
+"""
+
+import ctypes
+import functools
+import hashlib
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import tempfile
+import threading
+from concurrent.futures import Future
+from pathlib import Path
+from typing import Any, Final
+
+import jax.ffi
+
+from mjx_study.caches import read_cached, write_cached
+from mjx_study.disk import temporary_folder
+from mjx_study.graph import cuda
+from mjx_study.runtime import available_cores, libraries_folder, processor
+from mjx_study.version import version_of
+
+SWITCH: Final = "MJX_STUDY_NATIVE"
+"""Environment variable; 0 does without native code."""
+FLAGS: Final = (
+    *("-O2", "-std=gnu11", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math", "-fwrapv"),
+    *("-shared", "-fPIC", "-w"),
+)
+PREFIX: Final = "mjx_study_"
+"""Beginning of the names of libraries, which are those of their XLA targets."""
+
+_BUILT: Final[dict[str, Future[Any]]] = {}
+"""Handlers by name, None where the build failed; their libraries stay loaded."""
+_LOCK: Final = threading.Lock()
+_AT_ONCE: Final = threading.BoundedSemaphore(available_cores())
+
+
+@functools.cache
+def compiler() -> tuple[tuple[str, ...], str] | None:
+    """Command and version of the system's C compiler: `$CC`, cc, gcc or clang. None, and a line that says so, without
+    one."""
+    for command in filter(None, (os.environ.get("CC"), "cc", "gcc", "clang")):
+        words = tuple(shlex.split(command))
+        if shutil.which(words[0]) is None:
+            continue
+        found = subprocess.run([*words, "--version"], capture_output=True, text=True)
+        if found.returncode == 0:
+            return words, found.stdout
+    print("mjx-study: no C compiler found: steps run through XLA, more slowly", file=sys.stderr)
+    return None
+
+
+def native_identity() -> str | None:
+    """Digest of what libraries depend on besides their source; None if there are to be none."""
+    if os.environ.get(SWITCH) == "0" or compiler() is None:
+        return None
+    if jax.default_backend() != "cpu" and cuda.target() is None:
+        return None
+    return _identity()
+
+
+@functools.cache
+def _identity() -> str:
+    return _digest(compiler(), _FLAGS_HERE, processor(), cuda.target(), version_of("jaxlib"))
+
+
+_FLAGS_HERE: Final = ("-mcpu=native" if os.uname().machine in ("arm64", "aarch64") else "-march=native", *FLAGS)
+
+
+def _digest(*parts: Any) -> str:
+    return hashlib.sha256(repr(parts).encode()).hexdigest()[:40]
+
+
+def build_library(source: str) -> str:
+    """Begin to build a library in the background, unless it is known, and return its name."""
+    name = PREFIX + _digest(source, _identity())
+    with _LOCK:
+        if name not in _BUILT:
+            _BUILT[name] = future = Future()
+            threading.Thread(target=_finish, args=(name, source, future), daemon=True).start()
+    return name
+
+
+def library_ready(name: str) -> bool:
+    """Wait for a library to be built and loaded; whether that succeeded."""
+    with _LOCK:
+        if name not in _BUILT:
+            _BUILT[name] = future = Future()
+            future.set_result(_cached(name))
+    return _BUILT[name].result() is not None
+
+
+def known_libraries() -> list[str]:
+    """Names of all libraries that this process has begun to build, or loaded."""
+    return list(_BUILT)
+
+
+def libraries_in(content: bytes) -> set[str]:
+    """Names of the libraries that an exported program calls."""
+    return {found.decode() for found in re.findall(rf"{PREFIX}[0-9a-f]{{40}}".encode(), content)}
+
+
+def _finish(name: str, source: str, future: Future[Any]) -> None:
+    try:
+        with _AT_ONCE:
+            future.set_result(_cached(name) or _build(name, source))
+    except BaseException as error:
+        future.set_exception(error)
+
+
+def _build(name: str, source: str) -> Any:
+    with temporary_folder() as folder:
+        written, library = Path(folder, f"{name}.c"), Path(folder, f"{name}.so")
+        written.write_text(source)
+        command, _ = compiler() or (("cc",), "")
+        include = f"-I{jax.ffi.include_dir()}"
+        if cuda.target() is not None:
+            try:
+                Path(folder, "kernel").write_bytes(cuda.compile_kernel(source))
+            except ValueError as error:
+                return _failed(written, "NVRTC", str(error))
+        done = subprocess.run(
+            [*command, *_FLAGS_HERE, include, written.name, "-o", library.name, "-lm", "-ldl"],
+            cwd=folder,
+            capture_output=True,
+            text=True,
+        )
+        if done.returncode:
+            return _failed(written, command[0], done.stderr)
+        content = library.read_bytes()
+    if (at := libraries_folder()) is not None:
+        write_cached(at / name, content)
+    return _loaded(name, content)
+
+
+def _failed(written: Path, compiler: str, errors: str) -> None:
+    """Keep a source that failed to compile, with the compiler's errors at its end."""
+    kept = Path(tempfile.mkdtemp(prefix="mjx-study-failed-"), written.name)
+    kept.write_text(written.read_text() + "".join(f"\n// {line}" for line in errors.splitlines()))
+    print(f"mjx-study: {compiler} failed, steps run through XLA: see the end of {kept}", file=sys.stderr)
+
+
+def _cached(name: str) -> Any:
+    at = libraries_folder()
+    content = None if at is None else read_cached(at / name)
+    return None if content is None else _loaded(name, content)
+
+
+def _loaded(name: str, content: bytes) -> Any:
+    """Load a library, register its handler with XLA, and return it."""
+    with temporary_folder() as folder:  # the file whose digest was checked, whatever becomes of the one in the cache
+        path = Path(folder, f"{name}.so")
+        path.write_bytes(content)
+        library = ctypes.CDLL(str(path))
+    on_gpu = cuda.target() is not None
+    if on_gpu and (error := library.prepare()):
+        print(f"mjx-study: error {error} of the CUDA driver: steps run through XLA, more slowly", file=sys.stderr)
+        return None
+    jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(library.handler), platform="CUDA" if on_gpu else "cpu")
+    return library

@@ -1,0 +1,206 @@
+"""Derivatives of graphs, in forward and reverse mode.
+
+Nodes and their derivatives share one graph, so that what both compute is computed once. Derivatives are sparse: an
+entry that is always zero is no node. Each operation has JAX's derivative, at kinks, too (1/2 at the tie of a maximum,
+0 where a value is clamped), with a few rules written out below that cost fewer operations.
+
+Loops and operations on whole arrays have none (`NotDifferentiableError`). The derivative of a solver's loop is that of
+the equation that it solves, see `implicit`.
+"""
+
+import itertools
+from collections.abc import Mapping, Sequence
+from functools import cache
+from typing import Any, Final
+
+import jax
+import numpy as np
+from jax import lax
+
+from mjx_study.graph.function import run
+from mjx_study.graph.nodes import Node, ScalarGraph, entries_of, filled, needed_for, no_type_check
+
+Sparse = dict[int, Any]
+"""Entries by column; others are zero."""
+_BOOL: Final = np.dtype(bool)
+
+
+class NotDifferentiableError(Exception):
+    """The derivative would have to pass a loop or an operation on whole arrays."""
+
+
+@no_type_check
+def push(
+    graph: ScalarGraph, outputs: Sequence[np.ndarray], inputs: Sequence[np.ndarray], changes: Sequence[np.ndarray]
+) -> list[np.ndarray]:
+    """Changes of the outputs with those of the inputs, by forward mode; all are arrays of entries.
+
+    Raises:
+        NotDifferentiableError: it passes a loop or an operation on whole arrays.
+    """
+    seeds = {at.number: {0: change} for at, change in zip(entries_of(inputs), entries_of(changes), strict=True)}
+    return _arrays(outputs, _pushed(graph, entries_of(outputs), seeds))
+
+
+@no_type_check
+def pull(
+    graph: ScalarGraph, outputs: Sequence[np.ndarray], inputs: Sequence[np.ndarray], adjoints: Sequence[np.ndarray]
+) -> list[np.ndarray]:
+    """Adjoints of the inputs from those of the outputs, by reverse mode; all are arrays of entries.
+
+    Raises:
+        NotDifferentiableError: it passes a loop or an operation on whole arrays.
+    """
+    needed, ends = needed_for(entries_of(outputs)), {each.number for each in entries_of(inputs)}
+    moving = set(ends)
+    for node in needed:
+        if _passes(node) and any(_in(moving, each) for each in node.arguments):
+            moving.add(node.number)
+    known: dict[int, Sparse] = {}
+    for output, adjoint in zip(entries_of(outputs), entries_of(adjoints), strict=True):
+        if _in(moving, output):
+            _accumulate(graph, known.setdefault(output.number, {}), {0: adjoint}, output.dtype)
+    for node in reversed(needed):
+        if node.number in ends or node.number not in known:
+            continue
+        _refuse(node)
+        for place, argument in enumerate(node.arguments):
+            if _in(moving, argument):
+                term = _along(graph, node, place, known[node.number][0], argument.dtype)
+                _accumulate(graph, known.setdefault(argument.number, {}), {0: term}, argument.dtype)
+    return _arrays(inputs, [known.get(each.number, {}) for each in entries_of(inputs)])
+
+
+@no_type_check
+def jacobian(graph: ScalarGraph, outputs: np.ndarray, inputs: np.ndarray) -> np.ndarray:
+    """Matrix of the derivatives of a vector of outputs over a vector of inputs, by forward mode.
+
+    Raises:
+        NotDifferentiableError: it passes a loop or an operation on whole arrays.
+    """
+    seeds = {each.number: {column: each.dtype.type(1)} for column, each in enumerate(inputs)}
+    rows = _pushed(graph, list(outputs), seeds)
+    entries = [
+        row.get(column, output.dtype.type(0))
+        for row, output in zip(rows, outputs, strict=True)
+        for column in range(len(inputs))
+    ]
+    return filled((len(outputs), len(inputs)), entries)
+
+
+@no_type_check
+def _arrays(like: Sequence[np.ndarray], found: Sequence[Sparse]) -> list[np.ndarray]:
+    entries = iter([each.get(0, old.dtype.type(0)) for each, old in zip(found, entries_of(like), strict=True)])
+    return [filled(each.shape, itertools.islice(entries, each.size)) for each in like]
+
+
+@no_type_check
+def _pushed(graph: ScalarGraph, outputs: Sequence[Any], seeds: Mapping[int, Sparse]) -> list[Sparse]:
+    """Changes of the outputs, from those of the inputs by number, for several columns at once."""
+    known = dict(seeds)
+    for node in needed_for(outputs):
+        if node.number not in known and (change := _change(graph, node, known)):
+            known[node.number] = change
+    return [known.get(each.number, {}) if isinstance(each, Node) else {} for each in outputs]
+
+
+@no_type_check
+def _change(graph: ScalarGraph, node: Node, known: Mapping[int, Sparse]) -> Sparse:
+    """Change of a node from those of its arguments."""
+    changes = [known.get(each.number, {}) if isinstance(each, Node) else {} for each in node.arguments]
+    if not any(changes) or not _passes(node):
+        return {}
+    if node.operation in ("whole", "loop"):
+        return next(filter(None, changes))  # its outputs refuse to pass it on
+    _refuse(node)
+    total: Sparse = {}
+    if node.operation is lax.select_n_p:
+        which, zero = node.arguments[0], node.dtype.type(0)
+        for at in sorted({at for change in changes for at in change}):
+            entries = (which, *(change.get(at, zero) for change in changes[1:]))
+            _accumulate(graph, total, {at: graph.scalar(lax.select_n_p, entries, node.dtype)}, node.dtype)
+        return total
+    for place, change in enumerate(changes):
+        terms = {at: _along(graph, node, place, entry, node.dtype) for at, entry in change.items()}
+        _accumulate(graph, total, terms, node.dtype)
+    return total
+
+
+@no_type_check
+def _in(numbers: set[int], entry: Any) -> bool:
+    return isinstance(entry, Node) and entry.number in numbers
+
+
+@no_type_check
+def _passes(node: Node) -> bool:
+    """Whether a change of its arguments may change a node (not an integer or truth value)."""
+    return node.dtype is None or node.dtype.kind == "f"
+
+
+@no_type_check
+def _refuse(node: Node) -> None:
+    if isinstance(node.operation, str):
+        source = node.arguments[0] if node.arguments else node
+        what = source.parameters[0].primitive.name if source.operation == "whole" else source.operation
+        raise NotDifferentiableError(what)
+
+
+@no_type_check
+def _accumulate(graph: ScalarGraph, total: Sparse, terms: Sparse, dtype: Any) -> None:
+    for at, term in terms.items():
+        if isinstance(term, Node) or term != 0:
+            total[at] = graph.scalar(lax.add_p, (total[at], term), dtype) if at in total else term
+
+
+@no_type_check
+def _along(graph: ScalarGraph, node: Node, place: int, change: Any, kind: Any) -> Any:
+    """Multiply a change by the derivative of a node over an argument; `kind` is the result's type."""
+    dtype, arguments = node.dtype, node.arguments
+
+    def scalar(primitive: Any, *entries: Any) -> Any:
+        return graph.scalar(primitive, entries, dtype)
+
+    match node.operation.name:
+        case "add" | "add_any":
+            return change
+        case "sub":
+            return scalar(lax.neg_p, change) if place else change
+        case "neg":
+            return scalar(lax.neg_p, change)
+        case "mul":
+            return scalar(lax.mul_p, change, arguments[1 - place])
+        case "div":
+            inverse = scalar(lax.div_p, dtype.type(1), arguments[1])
+            slope = scalar(lax.neg_p, scalar(lax.mul_p, node, inverse)) if place else inverse
+            return scalar(lax.mul_p, change, slope)
+        case "max" | "min" as name:
+            compare = lax.gt_p if name == "max" else lax.lt_p
+            wins = graph.scalar(compare, (arguments[place], arguments[1 - place]), _BOOL)
+            ties = graph.scalar(lax.eq_p, arguments, _BOOL)
+            strict = scalar(lax.select_n_p, wins, dtype.type(0), dtype.type(1))
+            return scalar(lax.mul_p, change, scalar(lax.select_n_p, ties, strict, dtype.type(0.5)))
+        case "select_n":
+            entries = [change if at == place else dtype.type(0) for at in range(1, len(arguments))]
+            return scalar(lax.select_n_p, arguments[0], *entries)
+        case "convert_element_type":
+            return _converted(graph, change, kind)
+    closed = _rule(node.operation, place, tuple(each.dtype for each in arguments), tuple(node.parameters.items()))
+    (result,) = run(graph, closed, [filled((), [each]) for each in (change, *arguments)])
+    return result[()]
+
+
+@no_type_check
+def _converted(graph: ScalarGraph, value: Any, dtype: Any) -> Any:
+    parameters = {"new_dtype": dtype, "weak_type": False, "sharding": None}
+    return graph.scalar(lax.convert_element_type_p, (value,), dtype, **parameters)
+
+
+@cache
+def _rule(primitive: Any, place: int, dtypes: tuple[Any, ...], parameters: tuple[tuple[str, Any], ...]) -> Any:
+    """Jaxpr of a change times JAX's derivative of an operation over an argument: of (change, arguments)."""
+
+    def along(change: Any, *arguments: Any) -> Any:
+        at = lambda x: primitive.bind(*arguments[:place], x, *arguments[place + 1 :], **dict(parameters))  # noqa: E731
+        return jax.jvp(at, (arguments[place],), (change,))[1]
+
+    return jax.make_jaxpr(along)(*(jax.ShapeDtypeStruct((), each) for each in (dtypes[place], *dtypes)))

@@ -1,0 +1,76 @@
+// Called by XLA with arrays of a whole batch, which is their fastest dimension; arrays without one are the same for all
+// samples. These, and the last vector, pass through `padded`, whose surplus lanes repeat the last sample.
+
+struct array {
+  long entries, bytes, rank;
+};
+static const struct array IN[] = {INPUTS};
+static const struct array OUT[] = {OUTPUTS};
+#define NUM_IN (long)(sizeof(IN) / sizeof(IN[0]))
+#define NUM_OUT (long)(sizeof(OUT) / sizeof(OUT[0]))
+
+static void pad(char *to, const char *from, struct array form, long step, long left) {
+  for (long at = 0; at < form.entries; at++)
+    EACH memcpy(to + (at * LANES + lane) * form.bytes, from + at * step + (lane < left ? lane : left - 1) * form.bytes,
+                form.bytes);
+}
+
+static void unpad(char *to, const char *from, struct array form, long step, long left) {
+  for (long at = 0; at < form.entries; at++) memcpy(to + at * step, from + at * LANES * form.bytes, left * form.bytes);
+}
+
+static void batch(long count, const char *const *from, const int *shared, char *const *to) {
+  static __thread char padded[LANES * BYTES + 1];
+  const char *in[NUM_IN];
+  char *out[NUM_OUT], *spare[NUM_IN + NUM_OUT], *free = padded;
+  long in_step[NUM_IN], out_step[NUM_OUT];
+  for (long k = 0; k < NUM_IN; k++) spare[k] = free, free += LANES * IN[k].entries * IN[k].bytes;
+  for (long k = 0; k < NUM_OUT; k++) spare[NUM_IN + k] = free, free += LANES * OUT[k].entries * OUT[k].bytes;
+  for (long k = 0; k < NUM_IN; k++) {
+    if (shared[k]) pad(spare[k], from[k], IN[k], IN[k].bytes, 1);
+    in_step[k] = (shared[k] ? LANES : count) * IN[k].bytes;
+  }
+  for (long k = 0; k < NUM_OUT; k++) out_step[k] = count * OUT[k].bytes;
+  for (long first = 0; first < count; first += LANES) {
+    long left = count - first;
+    for (long k = 0; k < NUM_IN; k++) {
+      in[k] = shared[k] ? spare[k] : from[k] + first * IN[k].bytes;
+      if (left < LANES && !shared[k]) {
+        pad(spare[k], in[k], IN[k], in_step[k], left);
+        in[k] = spare[k], in_step[k] = LANES * IN[k].bytes;
+      }
+    }
+    for (long k = 0; k < NUM_OUT; k++) {
+      out[k] = left < LANES ? spare[NUM_IN + k] : to[k] + first * OUT[k].bytes;
+      if (left < LANES) out_step[k] = LANES * OUT[k].bytes;
+    }
+    samples(in, in_step, out, out_step);
+    if (left < LANES)
+      for (long k = 0; k < NUM_OUT; k++)
+        unpad(to[k] + first * OUT[k].bytes, out[k], OUT[k], count * OUT[k].bytes, left);
+  }
+}
+
+XLA_FFI_Error *handler(XLA_FFI_CallFrame *frame) {
+  __typeof__(frame->extension_start) extension = frame->extension_start;  // its type has changed names
+  if (extension && extension->type == XLA_FFI_Extension_Metadata) {
+    XLA_FFI_Api_Version *version = &((XLA_FFI_Metadata_Extension *)extension)->metadata->api_version;
+    version->major_version = XLA_FFI_API_MAJOR;
+    version->minor_version = XLA_FFI_API_MINOR;
+    return NULL;
+  }
+  const char *in[NUM_IN];
+  char *out[NUM_OUT];
+  int shared[NUM_IN];
+  for (long k = 0; k < NUM_IN; k++) {
+    XLA_FFI_Buffer *buffer = frame->args.args[k];
+    in[k] = buffer->data;
+    shared[k] = buffer->rank == IN[k].rank;
+  }
+  for (long k = 0; k < NUM_OUT; k++) out[k] = ((XLA_FFI_Buffer *)frame->rets.rets[k])->data;
+  XLA_FFI_Buffer *result = frame->rets.rets[0];
+  long count = 1;
+  for (long axis = 0; axis < result->rank - OUT[0].rank; axis++) count *= result->dims[axis];
+  batch(count, in, shared, out);
+  return NULL;
+}

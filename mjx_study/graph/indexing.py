@@ -1,0 +1,155 @@
+"""Rules for operations that read or write at indices, known ones or computed.
+
+A computed index becomes a selection among its possible values: one case each, as `rules` describes rules.
+"""
+
+import itertools
+import math
+from collections.abc import Iterator, Sequence
+from typing import Any, Final
+
+import numpy as np
+from jax import lax
+
+from mjx_study.graph.nodes import Node, ScalarGraph, filled, no_type_check
+
+Arrays = list[np.ndarray]
+_CLIP: Final = lax.GatherScatterMode.CLIP
+
+
+@no_type_check
+def _cases(graph: ScalarGraph, index: Sequence[Any], last: Sequence[Any]) -> Iterator[tuple[list[int], Any]]:
+    """Possible values from 0 to `last` of a vector of indices, and the condition that it has them."""
+    spans = [range(most + 1) if isinstance(at, Node) else (int(at),) for at, most in zip(index, last, strict=True)]
+    for values in itertools.product(*spans):
+        here = np.bool_(True)
+        for at, value in zip(index, values, strict=True):
+            if isinstance(at, Node):
+                equal = graph.scalar(lax.eq_p, (at, at.dtype.type(value)), np.dtype(bool))
+                here = graph.scalar(lax.and_p, (here, equal), np.dtype(bool))
+        yield list(values), here
+
+
+@no_type_check
+def _clipped(graph: ScalarGraph, index: Sequence[Any], last: Sequence[Any]) -> list[Any]:
+    low = [graph.scalar(lax.max_p, (at, at.dtype.type(0)), at.dtype) for at in index]
+    return [graph.scalar(lax.min_p, (at, at.dtype.type(most)), at.dtype) for at, most in zip(low, last, strict=True)]
+
+
+@no_type_check
+def _selected(graph: ScalarGraph, here: Any, yes: np.ndarray, no: np.ndarray, aval: Any) -> np.ndarray:
+    return graph.elementwise(lax.select_n_p, [filled((), [here]), no, yes], aval.update(shape=yes.shape))
+
+
+@no_type_check
+def _dynamic_slice(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: Any) -> Arrays:
+    array, *starts = inputs
+    last = [whole - size for whole, size in zip(array.shape, aval.shape, strict=True)]
+    result = array[_window([0] * array.ndim, aval.shape)]
+    for first, here in _cases(graph, _clipped(graph, [each[()] for each in starts], last), last):
+        result = _selected(graph, here, array[_window(first, aval.shape)], result, aval)
+    return [result]
+
+
+@no_type_check
+def _dynamic_update_slice(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: Any) -> Arrays:
+    array, update, *starts = inputs
+    last = [whole - size for whole, size in zip(array.shape, update.shape, strict=True)]
+    result = array.copy()
+    for first, here in _cases(graph, _clipped(graph, [each[()] for each in starts], last), last):
+        window = _window(first, update.shape)
+        result[window] = _selected(graph, here, update, result[window], aval)
+    return [result]
+
+
+@no_type_check
+def _window(first: Any, sizes: Any) -> tuple[slice, ...]:
+    return tuple(slice(at, at + size) for at, size in zip(first, sizes, strict=True))
+
+
+@no_type_check
+class _Windows:
+    """Where a gather reads or a scatter writes in an array of a shape."""
+
+    def __init__(self, graph: ScalarGraph, shape: Sequence[int], sizes: Sequence[int], numbers: Any, mode: Any):
+        self._graph, self._sizes, self._numbers, self._clip = graph, sizes, numbers, mode == _CLIP
+        self._flat, self._last = np.arange(math.prod(shape)).reshape(shape), np.array(shape) - sizes
+        dropped = (*numbers.collapsed_slice_dims, *numbers.operand_batching_dims)
+        self.kept = [size for dim, size in enumerate(sizes) if dim not in dropped]
+
+    def cases(self, indices: np.ndarray, at: tuple[int, ...]) -> Iterator[tuple[np.ndarray | None, Any]]:
+        """Places of the window's entries for one vector of indices, None out of bounds, and each case's condition; both
+        flat."""
+        numbers = self._numbers
+        index, last = list(indices[at]), [self._last[dim] for dim in numbers.start_index_map]
+        index = _clipped(self._graph, index, last) if self._clip else index
+        for values, here in _cases(self._graph, index, last):
+            start = np.zeros(self._flat.ndim, int)
+            start[list(numbers.start_index_map)] = values
+            start[list(numbers.operand_batching_dims)] = [at[dim] for dim in numbers.start_indices_batching_dims]
+            inside = np.all((start >= 0) & (start <= self._last))
+            yield self._flat[_window(start, self._sizes)].reshape(-1) if inside else None, here
+
+
+@no_type_check
+def _gather(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: Any) -> Arrays:
+    array, indices = inputs
+    numbers, fill = parameters["dimension_numbers"], parameters["fill_value"]
+    if fill is None:
+        fill = (
+            np.nan if np.issubdtype(aval.dtype, np.inexact) else np.iinfo(aval.dtype).min if aval.dtype != bool else 1
+        )
+    windows = _Windows(graph, array.shape, parameters["slice_sizes"], numbers, parameters["mode"])
+    outside = filled(
+        (math.prod(windows.kept),), itertools.repeat(np.asarray(fill, aval.dtype)[()], math.prod(windows.kept))
+    )
+    batch, pool = indices.shape[:-1], array.reshape(-1)
+    found = np.empty((*batch, len(outside)), object)
+    for at in np.ndindex(*batch):
+        row = outside
+        for places, here in windows.cases(indices, at):
+            row = row if places is None else _selected(graph, here, pool[places], row, aval)
+        found[at] = row
+    found = found.reshape(*batch, *windows.kept)
+    return [np.moveaxis(found, range(len(batch), found.ndim), numbers.offset_dims)]
+
+
+@no_type_check
+def _scatter(combine: Any) -> Any:
+    def rule(graph: ScalarGraph, inputs: Arrays, aval: Any, parameters: Any) -> Arrays:
+        array, indices, updates = inputs
+        given = parameters["dimension_numbers"]
+        numbers = lax.GatherDimensionNumbers(
+            given.update_window_dims,
+            given.inserted_window_dims,
+            given.scatter_dims_to_operand_dims,
+            given.operand_batching_dims,
+            given.scatter_indices_batching_dims,
+        )
+        sizes = iter(updates.shape[dim] for dim in numbers.offset_dims)
+        dropped = (*numbers.collapsed_slice_dims, *numbers.operand_batching_dims)
+        sizes = [1 if dim in dropped else next(sizes) for dim in range(array.ndim)]
+        windows = _Windows(graph, array.shape, sizes, numbers, parameters["mode"])
+        batch = indices.shape[:-1]
+        moved = np.moveaxis(updates, numbers.offset_dims, range(len(batch), updates.ndim))
+        rows = moved.reshape(*batch, math.prod(windows.kept))
+        result = array.reshape(-1).copy()
+        for at in np.ndindex(*batch):
+            for places, here in windows.cases(indices, at):
+                if places is not None:
+                    old, new = result[places], rows[at]
+                    if combine is not None:
+                        new = graph.elementwise(combine, [old, new], aval.update(shape=new.shape))
+                    result[places] = _selected(graph, here, new, old, aval)
+        return [result.reshape(array.shape)]
+
+    return rule
+
+
+INDEXING: Final = {
+    "dynamic_slice": _dynamic_slice,
+    "dynamic_update_slice": _dynamic_update_slice,
+    "gather": _gather,
+    "scatter": _scatter(None),
+    "scatter-add": _scatter(lax.add_p),
+}

@@ -1,0 +1,122 @@
+"""Functions of small arrays as native code, called by XLA for a whole batch at once."""
+
+from collections.abc import Callable, Sequence
+from functools import cached_property, partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.core import ShapedArray
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
+
+from mjx_study.graph.build import build_library, library_ready
+from mjx_study.graph.c import NotWrittenError, source_of
+from mjx_study.graph.evaluation import written_out
+from mjx_study.graph.function import ScalarFunction
+
+
+def as_native(values: ScalarFunction, function: ScalarFunction) -> "NativeFunction | None":
+    """Begin to build native code for a function's values; None if it cannot be written.
+
+    Args:
+        values: the function captured for its values only.
+        function: the function, which derivatives are taken of.
+    """
+    try:
+        return NativeFunction(source_of(values, jax.default_backend()), function)
+    except NotWrittenError:
+        return None
+
+
+class NativeFunction:
+    """A captured function as a library, and as a JAX program for derivatives and where there is no library."""
+
+    def __init__(self, source: str, function: ScalarFunction):
+        self._function = function
+        self.inputs = [ShapedArray(each.shape, each.flat[0].dtype) for each in function.inputs]
+        self.outputs = function.avals
+        self.platform = jax.default_backend()
+        self.name = build_library(source)
+
+    def __call__(self, *inputs: jax.Array) -> list[jax.Array]:
+        return _native.bind(*inputs, function=self, batch=())
+
+    @cached_property
+    def program(self) -> Callable[..., list[jax.Array]]:
+        """The function in JAX operations."""
+        return written_out(self._function)
+
+
+def _plain(function: NativeFunction, batch: tuple[int, ...]) -> Callable[..., list[jax.Array]]:
+    """The function as JAX operations, of arrays with leading dimensions `batch` or without."""
+
+    def program(*inputs: jax.Array) -> list[jax.Array]:
+        axes = tuple(0 if each.ndim > aval.ndim else None for each, aval in zip(inputs, function.inputs, strict=True))
+        each = function.program
+        for _ in batch:
+            each = jax.vmap(each, axes)
+        return each(*inputs)
+
+    return program
+
+
+def _differentiate(primals: Any, tangents: Any, *, function: NativeFunction, batch: tuple[int, ...]) -> Any:
+    outputs = _native.bind(*primals, function=function, batch=batch)
+    changes = jax.jvp(_plain(function, batch), tuple(primals), tuple(map(ad.instantiate_zeros, tangents)))[1]
+    return outputs, [ad.Zero(each.aval) if each.dtype == jax.float0 else each for each in changes]
+
+
+def _batch(
+    arguments: Sequence[Any], axes: Sequence[Any], *, function: NativeFunction, batch: tuple[int, ...]
+) -> tuple[list[Any], list[int]]:
+    size = next(each.shape[axis] for each, axis in zip(arguments, axes, strict=True) if axis is not None)
+    batch = (size, *batch)
+
+    def spread(array: Any, axis: Any, aval: Any) -> Any:
+        if axis is not None:
+            array = jnp.moveaxis(array, axis, 0)
+            array = array.reshape(size, *(1,) * (len(batch) + aval.ndim - array.ndim), *array.shape[1:])
+        elif array.ndim == aval.ndim:
+            return array
+        return jnp.broadcast_to(array, (*batch, *aval.shape))
+
+    spreads = [spread(*each) for each in zip(arguments, axes, function.inputs, strict=True)]
+    outputs = _native.bind(*spreads, function=function, batch=batch)
+    return outputs, [0] * len(outputs)
+
+
+def _types(*inputs: Any, function: NativeFunction, batch: tuple[int, ...]) -> list[ShapedArray]:
+    return [ShapedArray((*batch, *aval.shape), aval.dtype) for aval in function.outputs]
+
+
+def _evaluate(*inputs: Any, function: NativeFunction, batch: tuple[int, ...]) -> list[jax.Array]:
+    return jax.jit(partial(_native.bind, function=function, batch=batch))(*inputs)
+
+
+def _lower(platform: str, context: Any, *operands: Any, function: NativeFunction, batch: tuple[int, ...]) -> Any:
+    if function.platform != platform or not library_ready(function.name):
+        return mlir.lower_fun(_plain(function, batch), multiple_results=True)(context, *operands)
+    ins = [_layout(at.ndim, at.ndim - aval.ndim) for at, aval in zip(context.avals_in, function.inputs, strict=True)]
+    outs = [_layout(each.ndim, len(batch)) for each in context.avals_out]
+    return jax.ffi.ffi_lowering(function.name, operand_layouts=ins, result_layouts=outs)(context, *operands)
+
+
+def _layout(rank: int, batched: int) -> tuple[int, ...]:
+    """Dimensions of an array from the fastest to the slowest: those of the batch first."""
+    return *reversed(range(batched)), *reversed(range(batched, rank))
+
+
+def _lower_plain(*inputs: Any, function: NativeFunction, batch: tuple[int, ...]) -> list[jax.Array]:
+    return _plain(function, batch)(*inputs)
+
+
+_native = Primitive("native")
+_native.multiple_results = True
+_native.def_impl(_evaluate)
+_native.def_abstract_eval(_types)
+ad.primitive_jvps[_native] = _differentiate
+batching.primitive_batchers[_native] = _batch
+mlir.register_lowering(_native, partial(_lower, "cpu"), platform="cpu")
+mlir.register_lowering(_native, partial(_lower, "gpu"), platform="cuda")
+mlir.register_lowering(_native, mlir.lower_fun(_lower_plain, multiple_results=True))

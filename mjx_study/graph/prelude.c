@@ -1,0 +1,171 @@
+#include <math.h>
+#include <stddef.h>
+#include <stdint.h>
+#include <string.h>
+
+#include "xla/ffi/api/c_api.h"
+
+// Vectors of samples: as many lanes for every type as fit the processor's vectors in the widest type of the graph.
+
+#if defined(__AVX512F__)
+#define VECTOR 64
+#elif defined(__AVX__)
+#define VECTOR 32
+#else
+#define VECTOR 16
+#endif
+#define LANES (VECTOR / (WIDE ? 8 : 4))
+
+#define EACH _Pragma("GCC unroll 16") for (int lane = 0; lane < LANES; lane++)
+#define ONE static inline __attribute__((always_inline))  // inlined wherever it is used
+#define APART static __attribute__((noinline))
+
+#define VECTOR_OF(name, scalar)                                      \
+  typedef scalar name __attribute__((vector_size(sizeof(scalar) * LANES))); \
+  typedef scalar name##_anywhere __attribute__((vector_size(sizeof(scalar) * LANES), aligned(1), may_alias));
+VECTOR_OF(f64, double)
+VECTOR_OF(f32, float)
+VECTOR_OF(i64, int64_t)
+VECTOR_OF(i32, int32_t)
+VECTOR_OF(i16, int16_t)
+VECTOR_OF(i8, int8_t)
+VECTOR_OF(u64, uint64_t)
+VECTOR_OF(u32, uint32_t)
+VECTOR_OF(u16, uint16_t)
+VECTOR_OF(u8, uint8_t)
+
+// Booleans: all bits set, or none. Constants: x - 0 is x, -0 too.
+
+#if WIDE
+typedef i64 mask;
+#else
+typedef i32 mask;
+#endif
+#define AS(type, value) __builtin_convertvector(value, type)
+#define MASK(comparison) AS(mask, comparison)
+#define ALL(type, constant) ((constant) - (type){0})
+
+ONE int any(mask m) {
+  int64_t bits = 0;
+  EACH bits |= m[lane];
+  return bits != 0;
+}
+
+ONE mask select_bool(mask m, mask no, mask yes) { return (m & yes) | (~m & no); }
+
+#define SELECT(type, bits)                                 \
+  ONE type select_##type(mask m, type no, type yes) {      \
+    bits chosen = AS(bits, m);                             \
+    return (type)((chosen & (bits)yes) | (~chosen & (bits)no)); \
+  }
+SELECT(f64, i64)
+SELECT(f32, i32)
+SELECT(i64, i64)
+SELECT(i32, i32)
+SELECT(i16, i16)
+SELECT(i8, i8)
+SELECT(u64, i64)
+SELECT(u32, i32)
+SELECT(u16, i16)
+SELECT(u8, i8)
+
+// Inputs and outputs: entry `at` of an array, for all lanes. Booleans are bytes in memory.
+
+#define PLACE(array, at) (array[0] + (at) * array##_step)
+#define LOAD(type, place, at) (*(const type##_anywhere *)(in[place] + (at) * in_step[place]))
+#define STORE(type, place, at, value) (*(type##_anywhere *)(out[place] + (at) * out_step[place]) = (value))
+#define LOAD_BOOL(place, at) MASK(LOAD(u8, place, at) != 0)
+#define STORE_BOOL(place, at, value) STORE(u8, place, at, AS(u8, (value) & 1))
+
+// Operations of floats, as JAX defines them: extremes propagate NaN, signs keep zeros.
+
+#define FLOATS(type, scalar, bits, suffix, sign_bit)                                              \
+  ONE type abs_##type(type x) { return (type)((bits)x & ~(bits)ALL(type, -0.0##suffix)); }        \
+  ONE type max_##type(type a, type b) { return select_##type(MASK((a > b) | (a != a)), b, a); }   \
+  ONE type min_##type(type a, type b) { return select_##type(MASK((a < b) | (a != a)), b, a); }   \
+  ONE type sign_##type(type x) {                                                                  \
+    type one = (type)(((bits)x & (bits)ALL(type, -0.0##suffix)) | (bits)ALL(type, 1.0##suffix));  \
+    return select_##type(MASK((x > 0) | (x < 0)), x, one);                                        \
+  }                                                                                               \
+  ONE type sqrt_##type(type x) {                                                                  \
+    type r;                                                                                       \
+    EACH r[lane] = __builtin_sqrt##suffix(x[lane]);                                               \
+    return r;                                                                                     \
+  }
+#define UNARY(type, name, function)     \
+  APART type name##_##type(type x) {    \
+    type r;                             \
+    EACH r[lane] = function(x[lane]);   \
+    return r;                           \
+  }
+#define BINARY(type, name, function)           \
+  APART type name##_##type(type x, type y) {   \
+    type r;                                    \
+    EACH r[lane] = function(x[lane], y[lane]); \
+    return r;                                  \
+  }
+#define FUNCTION(name) UNARY(f64, name, name) UNARY(f32, name, name##f)
+FLOATS(f64, double, i64, , 63)
+FLOATS(f32, float, i32, f, 31)
+FUNCTION(acos)
+FUNCTION(asin)
+FUNCTION(atan)
+FUNCTION(ceil)
+FUNCTION(cos)
+FUNCTION(cosh)
+FUNCTION(erf)
+FUNCTION(exp)
+FUNCTION(expm1)
+FUNCTION(floor)
+FUNCTION(log)
+FUNCTION(log1p)
+FUNCTION(rint)
+FUNCTION(round)
+FUNCTION(sin)
+FUNCTION(sinh)
+FUNCTION(tan)
+FUNCTION(tanh)
+BINARY(f64, atan2, atan2)
+BINARY(f32, atan2, atan2f)
+BINARY(f64, pow, pow)
+BINARY(f32, pow, powf)
+BINARY(f64, rem, fmod)
+BINARY(f32, rem, fmodf)
+
+// Operations of integers: division by zero gives -1, with the dividend as remainder.
+
+#define INTEGERS(type, scalar)                                                                       \
+  ONE type max_##type(type a, type b) { return select_##type(MASK(a > b), b, a); }                   \
+  ONE type min_##type(type a, type b) { return select_##type(MASK(a < b), b, a); }                   \
+  ONE type sign_##type(type x) { return (type)((x > 0) & 1) - (type)((x < 0) & 1); }                 \
+  ONE scalar lane_div_##type(scalar x, scalar y) { return !y ? -1 : y == (scalar)-1 && (scalar)-1 < 0 ? -x : x / y; } \
+  ONE scalar lane_rem_##type(scalar x, scalar y) { return !y ? x : y == (scalar)-1 && (scalar)-1 < 0 ? 0 : x % y; }   \
+  BINARY(type, div, lane_div_##type)                                                                 \
+  BINARY(type, rem, lane_rem_##type)
+INTEGERS(i64, int64_t)
+INTEGERS(i32, int32_t)
+INTEGERS(i16, int16_t)
+INTEGERS(i8, int8_t)
+INTEGERS(u64, uint64_t)
+INTEGERS(u32, uint32_t)
+INTEGERS(u16, uint16_t)
+INTEGERS(u8, uint8_t)
+
+// Floats to integers: towards zero, saturated; NaN gives 0.
+
+#define ROUNDED(to, scalar, least, most)                                                             \
+  APART to to##_of_f64(f64 x) {                                                                      \
+    to r;                                                                                            \
+    EACH r[lane] = x[lane] >= (double)(most) ? (most) : x[lane] <= (double)(least) ? (least)         \
+                   : x[lane] != x[lane] ? 0 : (scalar)x[lane];                                       \
+    return r;                                                                                        \
+  }                                                                                                  \
+  ONE to to##_of_f32(f32 x) { return to##_of_f64(AS(f64, x)); }
+ROUNDED(i64, int64_t, INT64_MIN, INT64_MAX)
+ROUNDED(i32, int32_t, INT32_MIN, INT32_MAX)
+ROUNDED(i16, int16_t, INT16_MIN, INT16_MAX)
+ROUNDED(i8, int8_t, INT8_MIN, INT8_MAX)
+ROUNDED(u64, uint64_t, 0, UINT64_MAX)
+ROUNDED(u32, uint32_t, 0, UINT32_MAX)
+ROUNDED(u16, uint16_t, 0, UINT16_MAX)
+ROUNDED(u8, uint8_t, 0, UINT8_MAX)

@@ -1,0 +1,104 @@
+// One sample per thread: the types and operations of prelude.c for a single lane.
+
+#define ONE static __device__ __forceinline__
+#define INFINITY __int_as_float(0x7f800000)
+#define NAN __int_as_float(0x7fffffff)
+
+typedef double f64;
+typedef float f32;
+typedef long long i64;
+typedef int i32;
+typedef short i16;
+typedef signed char i8;
+typedef unsigned long long u64;
+typedef unsigned int u32;
+typedef unsigned short u16;
+typedef unsigned char u8;
+typedef int mask;  // -1 or 0
+
+#define AS(type, value) ((type)(value))
+#define MASK(comparison) (-(mask)(comparison))
+#define ALL(type, constant) ((type)(constant))
+#define SAMPLES extern "C" __global__ void __launch_bounds__(THREADS) samples(const struct batch batch)
+#define BEGIN                                               \
+  const long lane = blockIdx.x * (long)THREADS + threadIdx.x; \
+  if (lane >= batch.count) return;
+
+ONE int any(mask m) { return m; }
+
+#define SELECT(type) \
+  ONE type select_##type(mask m, type no, type yes) { return m ? yes : no; }
+ONE mask select_bool(mask m, mask no, mask yes) { return m ? yes : no; }
+
+// Inputs and outputs: entry `at` of an array, for this sample. Booleans are bytes in memory.
+
+#define PLACE_IN(place, at) (batch.shared[place] ? (at) : (at) * batch.count + lane)
+#define LOAD(type, place, at) (((const type *)batch.in[place])[PLACE_IN(place, at)])
+#define STORE(type, place, at, value) ((type *)batch.out[place])[(at) * batch.count + lane] = (value)
+#define LOAD_BOOL(place, at) MASK(LOAD(u8, place, at) != 0)
+#define STORE_BOOL(place, at, value) STORE(u8, place, at, (value) & 1)
+
+// Operations of floats, as JAX defines them: extremes propagate NaN, signs keep zeros.
+
+#define UNARY(type, name, function) \
+  ONE type name##_##type(type x) { return function(x); }
+#define BINARY(type, name, function) \
+  ONE type name##_##type(type x, type y) { return function(x, y); }
+#define FUNCTION(name) UNARY(f64, name, name) UNARY(f32, name, name##f)
+#define FLOATS(type)                                                                   \
+  SELECT(type)                                                                         \
+  ONE type max_##type(type a, type b) { return a > b || a != a ? a : b; }              \
+  ONE type min_##type(type a, type b) { return a < b || a != a ? a : b; }              \
+  ONE type sign_##type(type x) { return x > 0 ? (type)1 : x < 0 ? (type)-1 : x; }
+FLOATS(f64)
+FLOATS(f32)
+UNARY(f64, abs, fabs)
+UNARY(f32, abs, fabsf)
+FUNCTION(acos)
+FUNCTION(asin)
+FUNCTION(atan)
+FUNCTION(ceil)
+FUNCTION(cos)
+FUNCTION(cosh)
+FUNCTION(erf)
+FUNCTION(exp)
+FUNCTION(expm1)
+FUNCTION(floor)
+FUNCTION(log)
+FUNCTION(log1p)
+FUNCTION(rint)
+FUNCTION(round)
+FUNCTION(sin)
+FUNCTION(sinh)
+FUNCTION(sqrt)
+FUNCTION(tan)
+FUNCTION(tanh)
+BINARY(f64, atan2, atan2)
+BINARY(f32, atan2, atan2f)
+BINARY(f64, pow, pow)
+BINARY(f32, pow, powf)
+BINARY(f64, rem, fmod)
+BINARY(f32, rem, fmodf)
+
+// Operations of integers: division by zero gives -1, with the dividend as remainder. Floats become integers towards
+// zero, saturated; NaN gives 0.
+
+#define INTEGERS(type, least, most)                                                                           \
+  SELECT(type)                                                                                                \
+  ONE type max_##type(type a, type b) { return a > b ? a : b; }                                               \
+  ONE type min_##type(type a, type b) { return a < b ? a : b; }                                               \
+  ONE type sign_##type(type x) { return (type)(x > 0) - (type)(x < 0); }                                      \
+  ONE type div_##type(type x, type y) { return !y ? -1 : y == (type)-1 && (type)-1 < 0 ? -x : x / y; }        \
+  ONE type rem_##type(type x, type y) { return !y ? x : y == (type)-1 && (type)-1 < 0 ? 0 : x % y; }          \
+  ONE type type##_of_f64(f64 x) {                                                                             \
+    return x >= (f64)(most) ? (most) : x <= (f64)(least) ? (least) : x != x ? 0 : (type)x;                    \
+  }                                                                                                           \
+  ONE type type##_of_f32(f32 x) { return type##_of_f64(x); }
+INTEGERS(i64, -9223372036854775807LL - 1, 9223372036854775807LL)
+INTEGERS(i32, -2147483647 - 1, 2147483647)
+INTEGERS(i16, -32768, 32767)
+INTEGERS(i8, -128, 127)
+INTEGERS(u64, 0, 18446744073709551615ULL)
+INTEGERS(u32, 0, 4294967295U)
+INTEGERS(u16, 0, 65535)
+INTEGERS(u8, 0, 255)

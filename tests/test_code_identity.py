@@ -1,0 +1,100 @@
+"""The code that results depend on is all that a study imports while it computes, and nothing beyond."""
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from mjx_study.identity import NOT_COMPUTING, computing_code, differences
+from tests.test_layering import FILES, LAYERS, ROOT, module_of, read
+
+RUN = "mjx_study.execution.run"
+IMPORTS = {module_of(path): read(path) for path in FILES}
+PATHS = {module_of(path): path.relative_to(ROOT) for path in FILES}
+PACKAGED = [
+    path.relative_to(ROOT)
+    for package in ("estimators", "mjx_study")
+    for path in sorted((ROOT / package).rglob("*"))
+    if path.is_file() and path.suffix != ".pyc"
+]
+NO_CODE = {"estimators/py.typed", "mjx_study/py.typed", "mjx_study/templates/report.html"}
+NO_CODE |= {"mjx_study/claims/claims.toml", "mjx_study/claims/page.md"}
+LOADED = """
+import sys
+from mjx_study.execution.run import run_study
+from mjx_study.options.configuration import StudyConfig
+from mjx_study.runtime import configure
+options = {"contact": ("reference",), "stiffness": (1000.0,), "estimators": ("zobg", "fobg"), "samples": (4,)}
+configure(cpu_devices=1)
+run_study(StudyConfig(tasks=("ball_wall",), seeds=1, **options))
+print(*(name for name in sys.modules if name.partition(".")[0] in ("mjx_study", "estimators")))
+"""
+
+
+def imported_by(root: str) -> set[str]:
+    """A module, and all that it imports, directly or not, at its top or within functions; packages included.
+
+    What the package itself imports is for type checkers and for `mjx_study.NAME`.
+    """
+    found, waiting = set(), [root]
+    while waiting:
+        name = waiting.pop()
+        if name in IMPORTS and name not in found:
+            found.add(name)
+            waiting += [*(IMPORTS[name] if name != "mjx_study" else ()), name.rpartition(".")[0]]
+    return found
+
+
+def counts(path: Path) -> bool:
+    """Whether a change of a file changes the digest: any file of the packages, unless it is known not to compute."""
+    return str(path) not in NO_CODE and (path.parts[0] != "mjx_study" or path.parts[1] not in NOT_COMPUTING)
+
+
+def test_all_that_a_study_imports_counts() -> None:
+    static = imported_by(RUN)
+    assert {"mjx_study.simulation.dynamics", "mjx_study.experiment.gradients", "estimators.types"} <= static
+    assert not [name for name in static if not counts(PATHS[name])]
+
+
+def test_all_that_a_study_loads_counts() -> None:
+    done = subprocess.run([sys.executable, "-c", LOADED], capture_output=True, text=True, cwd=ROOT)
+    assert done.returncode == 0, done.stderr
+    loaded = set(done.stdout.split()) & PATHS.keys()
+    assert {"mjx_study", "mjx_study.objective"} <= loaded and not [name for name in loaded if not counts(PATHS[name])]
+
+
+def test_parts_above_execution_do_not_count() -> None:
+    above = LAYERS[LAYERS.index("mjx_study.execution") + 1 :]
+    names = {path.parts[1] for path in PATHS.values() if path.parts[0] == "mjx_study"}
+    assert names >= NOT_COMPUTING
+    assert {name.partition(".")[2] for name in above} <= {part.removesuffix(".py") for part in NOT_COMPUTING} | {""}
+
+
+@pytest.fixture
+def tree(tmp_path: Path) -> Path:
+    """A copy of the sources."""
+    for path in PACKAGED:
+        (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(ROOT / path, tmp_path / path)
+    return tmp_path
+
+
+def test_a_change_of_a_file_changes_the_digest_if_the_file_counts(tree: Path) -> None:
+    def digest() -> str:
+        return computing_code.__wrapped__(tree / "mjx_study")
+
+    before = digest()
+    assert before == computing_code()
+    assert {"mjx_study/simulation/dynamics.py", "mjx_study/graph/prelude.c"} <= set(map(str, PACKAGED))
+    for path in PACKAGED:
+        content = (tree / path).read_bytes()
+        (tree / path).write_bytes(content + b"# changed\n")
+        assert (digest() != before) is counts(path), path
+        (tree / path).write_bytes(content)
+
+
+def test_folders_of_other_code_are_refused_in_a_line() -> None:
+    """Those of versions whose digest covered plots and commands are, too."""
+    assert differences({"code of mjx-study": "0" * 12}, {"code of mjx-study": "1" * 12}) == "code of mjx-study differs"

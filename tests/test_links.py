@@ -1,0 +1,47 @@
+"""Relative links of the pages and notebooks lead to a file of the project and to a heading of it."""
+
+import os
+import re
+from pathlib import Path
+
+import nbformat
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PAGES = [*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md"), *(ROOT / "notebooks").glob("*.ipynb")]
+
+
+def prose(path: Path) -> str:
+    """The Markdown of a page or notebook, without code."""
+    text = path.read_text()
+    if path.suffix == ".ipynb":
+        cells = nbformat.reads(text, as_version=4).cells
+        text = "\n\n".join(cell.source for cell in cells if cell.cell_type == "markdown")
+    return re.sub(r"^```.*?^```", "", text, flags=re.DOTALL | re.MULTILINE)
+
+
+def anchors(path: Path) -> list[str]:
+    """Anchors of a page's headings, as GitHub and the site make them."""
+    headings = re.findall(r"^#+ (.*)$", prose(path), re.MULTILINE)
+    return [re.sub(r"[^\w -]", "", heading).lower().replace(" ", "-") for heading in headings]
+
+
+def dead_links(text: str, page: Path) -> list[str]:
+    """Links of a page that lead nowhere."""
+    dead = []
+    for target in re.findall(r"\]\(([^)\s]+)\)", text):
+        place, _, anchor = target.partition("#")
+        path = Path(os.path.normpath(page.parent / place)) if place else page
+        if not target.startswith("https://") and not (path.exists() and (not anchor or anchor in anchors(path))):
+            dead.append(target)
+    return dead
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_links_lead_somewhere(page: Path) -> None:
+    assert not dead_links(prose(page), page)
+
+
+def test_a_dead_link_is_found() -> None:
+    text = "[a](docs/tasks.md#pusher) [b](docs/tasks.md#pushed) [c](nowhere.md) [d](https://b.org) [e](#tasks)"
+    assert dead_links(text, ROOT / "README.md") == ["docs/tasks.md#pushed", "nowhere.md"]
