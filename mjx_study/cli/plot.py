@@ -11,10 +11,10 @@ from mjx_study.options.parser import Parser
 
 FORMAT = Option("format", str, "FORMAT", "of: {}", choices=FIGURE_FORMATS, many=True, default=("png", "pdf"))
 EPILOG = """\
-Draws whatever the study has numbers for: variance, bias and alpha against stiffness, error against samples, maps over
-two swept parameters; for descents, achieved cost against stiffness, and cost against iterations, rollouts and seconds;
-for landscapes, costs and slopes. Works while the study is still being computed. --style paper gives column or page
-width, no title, and embedded 8-point type.
+Draws every figure for which the study has numbers: variance, bias and alpha against stiffness, error against samples,
+maps over two swept parameters; for descents, achieved cost against stiffness, and cost against iterations, rollouts and
+seconds; for landscapes, costs and slopes. Works while the study is still being computed. --style paper gives column or
+page width, no title, and embedded 8-point type.
 
 examples:
   mjx-study plot out

@@ -16,7 +16,7 @@ from mjx_study.tasks.task import Recipe, Task
 BOUND: Final = ("gamma", "failure_probability", "variance_proxy", "radius")
 """Constants of AoBG's bound."""
 ESTIMATOR_OPTIONS: Final = ("baseline", "max_norm", "window", "tolerance", "weights", *BOUND)
-"""Options of a configuration that estimators own."""
+"""Options of a configuration that estimators read."""
 SPAN_SIGMAS: Final = 10.0
 """Half the default length of a line through many parameters, in standard deviations of the noise."""
 
@@ -118,7 +118,7 @@ class ThetaLine:
 
 
 def line_of(task: Task, points: int, span: Sequence[float] | None, direction: str | None, seed: int) -> ThetaLine:
-    """Return the line through a task's theta; for a scalar parameter, its range, whatever theta is.
+    """Return the line through a task's theta; for a scalar parameter, its range, independent of theta.
 
     Args:
         span: first and last t; None for the task's, or `SPAN_SIGMAS` to either side.

@@ -20,8 +20,7 @@ FIRST_ORDER: Final = (
 
 
 def reject_unread(chosen: Sequence[str | Estimator], given: Iterable[str]) -> None:
-    """Raise OptionError for an option of estimators that none of the chosen ones reads; objects have options of their
-    own."""
+    """Raise OptionError for an estimators' option that none of the chosen ones reads; objects read none."""
     found = [find_estimator(each) for each in chosen]
     read = {name for each in found if isinstance(each, type) for name in _fields(each)}
     names = ", ".join(each.name for each in found)
@@ -50,7 +49,7 @@ def reject_unused_options(
         grids: tasks, each with its contact models.
     """
     reject_unread(config.estimators, [name for name in (*ESTIMATOR_OPTIONS, "published") if name in given])
-    along = config.settings.kind == "landscapes"  # which have the mean of FoBG, whatever the estimators
+    along = config.settings.kind == "landscapes"  # which have the mean of FoBG with any estimators
     simulated = [task for task, models in grids if not all(each.analytic for each in models)]
     touching = any(task.scene.has_constraints for task in simulated)
     families = {

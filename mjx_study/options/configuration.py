@@ -99,7 +99,7 @@ class StudyConfig:
     """Everything that determines a study of gradient estimates, descents or landscapes.
 
     A field that is None takes the default in parentheses. Landscapes need `points`, and descents `iterations` or
-    `kind`. Objects among tasks and estimators have options of their own.
+    `kind`. Tasks and estimators given as objects keep their options.
     """
 
     tasks: tuple[str | NamedTask, ...] = dataclasses.field(
@@ -194,7 +194,7 @@ class StudyConfig:
         None, "M", "distance where --backward begins", "(0, inf)", unit="m", unset=UNSET_MJCF
     )
     horizon: int | None = declared(None, "H", "number of steps", "[1, 1000000]", unset=UNSET_TASK)
-    model: str | None = declared(None, "FILE.xml", "MJCF that replaces the task's own")
+    model: str | None = declared(None, "FILE.xml", "MJCF that replaces that of the task")
     integrator: str | None = declared(None, "NAME", "integrator: {}", choices=INTEGRATORS, unset=UNSET_MJCF)
     solver: str | None = declared(None, "NAME", "constraint solver: {}", choices=SOLVERS, unset=UNSET_MJCF)
     solver_iterations: int | None = declared(None, "N", "iterations of the solver", "[1, 100000]", unset=UNSET_MJCF)
@@ -285,7 +285,7 @@ class StudyConfig:
 
     @property
     def estimator_names(self) -> tuple[str, ...]:
-        """Names of the estimators; `module:class` of objects of your own."""
+        """Names of the estimators; `module:class` for user-defined objects."""
         return tuple(each if isinstance(each, str) else each.qualified_name() for each in self.estimators)
 
     @property
