@@ -47,7 +47,7 @@ from estimators.confidence import (
     variance_interval,
     variance_upper_bound,
 )
-from estimators.estimator import ESTIMATORS, Batches, Estimator, register
+from estimators.estimator import ESTIMATORS, Batches, Estimator, option, register
 from estimators.interpolation import alpha_order, constrained_alpha, interpolate, inverse_variance_alpha, weigh_batches
 from estimators.mean_check import Circulation, circulation
 from estimators.noise import NOISES, NoiseDensity
@@ -84,8 +84,8 @@ __all__ = [
     "alpha_order", "antithetic", "antithetic_cost_to_go", "bernstein_epsilon", "bias_test", "circulation",
     "clipped_first_order", "compare", "constrained_alpha", "cost_to_go", "coverage_interval", "delta_control_variate",
     "discontinuity_gated", "draw", "effective_samples", "empirical_bias", "estimate", "find_estimator", "first_order",
-    "interpolate", "inverse_variance_alpha", "leave_one_out", "make_estimator", "none", "norm_quantiles", "oracles_of",
-    "pull_back", "register", "squared_bias_of_means", "stepwise_inverse_variance", "summarise", "total_propagation",
-    "truncated_first_order", "variance_interval", "variance_upper_bound", "weigh_batches", "zero_noise",
-    "zeroth_order",
+    "interpolate", "inverse_variance_alpha", "leave_one_out", "make_estimator", "none", "norm_quantiles", "option",
+    "oracles_of", "pull_back", "register", "squared_bias_of_means", "stepwise_inverse_variance", "summarise",
+    "total_propagation", "truncated_first_order", "variance_interval", "variance_upper_bound", "weigh_batches",
+    "zero_noise", "zeroth_order",
 ]  # fmt: skip

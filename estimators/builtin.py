@@ -26,9 +26,9 @@ class Formula(Estimator):
     computes: ClassVar[str]
     """The function, as module:name."""
 
-    def combine(self, *batches: Any) -> "estimators.batches.GradientEstimate":
+    def combine(self, *args: Any, **kwargs: Any) -> "estimators.batches.GradientEstimate":
         options = {field.name: getattr(self, field.name) for field in fields(self)}
-        return pkgutil.resolve_name(self.computes)(*batches, **options)
+        return pkgutil.resolve_name(self.computes)(*args, **kwargs, **options)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,9 +50,9 @@ class Interpolation(Baselined):
 class Paired(Baselined):
     """Base of estimators with a batch of pairs of opposite noise."""
 
-    def combine(self, *batches: Any) -> "estimators.batches.GradientEstimate":
-        (pair,) = batches
-        return super().combine(*pair)
+    def combine(self, *args: Any, **kwargs: Any) -> "estimators.batches.GradientEstimate":
+        (pair,) = args
+        return super().combine(*pair, **kwargs)
 
 
 @register
@@ -96,7 +96,7 @@ class AntitheticCostToGo(Paired):
     """Costs to go over pairs of opposite noise."""
 
     name, label, needs = "zobg_to_go_antithetic", "ZoBG (to go, antithetic)", ("step_pair",)
-    formula, unbiased = "both", "for symmetric noise"
+    formula, unbiased = "the mean of `zobg_to_go` over the pair $`w, -w`$", "for symmetric noise"
     style = "#0072B2", "X"
     separable = True
 
@@ -120,7 +120,7 @@ class OnsetFirstOrder(FirstOrder):
     """First order, corrected where contact begins and ends."""
 
     name, label, needs = "fobg_onset", "FoBG (onset)", ("corrected",)
-    formula = "the same with the [onset term](onset-correction.md): the linear one, or what `--onset` says"
+    formula = "`fobg` with the [onset term](onset-correction.md): the linear one, or what `--onset` says"
     unbiased = "where f is continuous; nearly, also where a contact force sets in or ends with a jump"
     style = "#7A2E00", "s"
 
@@ -131,7 +131,7 @@ class ClippedFirstOrder(Formula):
     """First order, the norm of every sample bounded."""
 
     name, label, needs = "fobg_clipped", "FoBG (clipped)", ("differentiation",)
-    formula, unbiased = "the same, clipped to a norm of `--max-norm`", "no"
+    formula, unbiased = "`fobg`, each sample clipped to a norm of `--max-norm`", "no"
     style = "#E69F00", "<"
     separable = True
 
@@ -146,7 +146,7 @@ class TruncatedFirstOrder(Formula):
     """First order, the adjoint cut every few steps."""
 
     name, label, needs = "fobg_truncated", "FoBG (truncated)", ("linearisation",)
-    formula, unbiased = "the same, the adjoint cut every `--window` steps", "no"
+    formula, unbiased = "`fobg`, the adjoint cut every `--window` steps", "no"
     style = "#E69F00", ">"
     separable = True
 
@@ -164,7 +164,7 @@ class OneWeight(Interpolation):
     def choose(self, zeroth: Any, first: Any) -> "estimators.batches.AlphaChoice":
         """Choose the weight of two estimates."""
 
-    def combine(self, *batches: Any) -> "estimators.batches.GradientEstimate":
+    def combine(self, *args: Any, **kwargs: Any) -> "estimators.batches.GradientEstimate":
         from estimators.interpolation import apply_choice, weigh_batches
 
         def choose(*batches: Any) -> "estimators.batches.AlphaChoice":
@@ -173,7 +173,7 @@ class OneWeight(Interpolation):
         def mix(choice: Any, *batches: Any) -> "estimators.batches.GradientEstimate":
             return apply_choice(choice, *self.parts(*batches))
 
-        return weigh_batches(choose, mix, batches, self.weights)
+        return weigh_batches(choose, mix, args, self.weights)
 
     def parts(self, *batches: Any) -> "tuple[estimators.batches.GradientEstimate, ...]":
         from estimators.zeroth_first import first_order, zeroth_order
@@ -193,6 +193,8 @@ class AlphaOrder(OneWeight):
     """Alpha order: the two interpolated with an error of at most gamma.
 
     Attributes:
+        baseline: A name in `BASELINES`, for the zeroth-order batch.
+        weights: A name in `WEIGHTS`, the source of alpha.
         gamma: Largest acceptable error, > 0 or infinity, [cost/param].
         failure_probability: Failure probability of the confidence radius, in (0, 1); see `bernstein_epsilon`.
         variance_proxy: "variance", "second_moment" or "upper_bound".
@@ -235,7 +237,7 @@ class OnsetAlphaOrder(AlphaOrder):
     """Alpha order, its first-order batch corrected where contact begins and ends."""
 
     name, label, needs = "aobg_onset", "AoBG (onset)", ("evaluation", "corrected")
-    formula, unbiased = "the same with `fobg_onset` in place of `fobg`", "likewise"
+    formula = "`aobg` with `fobg_onset` in place of `fobg`"
     style = "#8FBF5A", "D"
 
 
@@ -244,7 +246,7 @@ class InverseVariance(OneWeight):
     """Inverse-variance weighting: alpha order with gamma infinite."""
 
     name, label, needs = "ivw", "IVW", ("evaluation", "differentiation")
-    formula, unbiased = "alpha order with gamma infinite", "where f is continuous, for a given alpha"
+    formula, unbiased = "`aobg` with gamma infinite", "where f is continuous, for a given alpha"
     style = "#CC79A7", "^"
 
     def choose(self, zeroth: Any, first: Any) -> "estimators.batches.AlphaChoice":
@@ -259,7 +261,7 @@ class StepwiseInverseVariance(Interpolation):
 
     name, label, needs = "ivw_h", "IVW-H", ("steps", "step_differentiation")
     formula = r"an inverse-variance weight for every step and control, then pulled back through $`D\pi`$"
-    unbiased = "likewise"
+    unbiased = "where f is continuous, for given weights"
     style = "#CC79A7", "p"
 
     computes = "estimators.stepwise:stepwise_inverse_variance"
@@ -271,7 +273,7 @@ class TotalPropagation(Interpolation):
 
     name, label, needs = "total_propagation", "total propagation", ("linearisation",)
     formula = "an inverse-variance weight at every step of the backward recursion; the mixture propagates further back"
-    unbiased = "likewise"
+    unbiased = "where f is continuous, for given weights"
     style = "#332288", "*"
 
     computes = "estimators.recursion:total_propagation"

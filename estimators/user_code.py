@@ -16,8 +16,8 @@ class MissingModuleError(ValueError):
     """The module of a `module:name` cannot be found."""
 
 
-def find_attribute(place: str, noun: str, kind: type) -> object:
-    """Return the object at a `module:name`.
+def find_attribute(qualified_name: str, noun: str, kind: type) -> object:
+    """Return the object of a `module:name`.
 
     Args:
         noun: Name of the object in messages.
@@ -27,7 +27,7 @@ def find_attribute(place: str, noun: str, kind: type) -> object:
         MissingModuleError: The module does not exist.
         ValueError: Importing the module raises, or it lacks the name; the message lists its names.
     """
-    module, _, name = place.partition(":")
+    module, _, name = qualified_name.partition(":")
     if not all(part.isidentifier() for part in module.split(".")) or module.endswith(".py"):
         raise MissingModuleError(f"{module!r} is not a module name: write it as in an import, without a folder or .py")
     importlib.invalidate_caches()
@@ -41,21 +41,21 @@ def find_attribute(place: str, noun: str, kind: type) -> object:
     try:
         return attrgetter(name)(loaded)
     except AttributeError:
-        own = [
+        defined = [
             label
             for label, value in vars(loaded).items()
             if isinstance(value, kind)
             or ((inspect.isfunction(value) or inspect.isclass(value)) and value.__module__ == loaded.__name__)
         ]
-        raise ValueError(f"{module} has no {name!r}; it has {', '.join(own) or f'no {noun}'}") from None
+        raise ValueError(f"{module} has no {name!r}; it has {', '.join(defined) or f'no {noun}'}") from None
 
 
 def describe_error(error: BaseException) -> str:
     """Format an error's type and message in one line, with the innermost line of user code in its traceback."""
     text = f"{type(error).__name__}: {' '.join(str(error).split())}".removesuffix(": ")
     caught, *frames = traceback.extract_tb(error.__traceback__)
-    ours = (str(Path(caught.filename).parent), importlib.__file__, "<frozen importlib")
-    frames = [frame for frame in frames if not frame.filename.startswith(ours)]
+    internal = (str(Path(caught.filename).parent), importlib.__file__, "<frozen importlib")
+    frames = [frame for frame in frames if not frame.filename.startswith(internal)]
     if not frames:
         return text
     last = [frame for frame in frames if frame.filename == frames[0].filename][-1]

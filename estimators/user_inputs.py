@@ -1,8 +1,8 @@
-"""What user-defined code reads while it is imported, built and traced: files, modules and environment variables.
+"""Inputs that user-defined code reads while it is imported, built and traced: files, modules, environment variables.
 
-Digests of objects cannot reach any of this. A read counts where the innermost frame outside libraries is the user's, so
-that neither what this package reads counts, nor what libraries read for themselves. Not seen are reads by compiled
-code, other processes and the network, listings of folders, and what was read before `observing` began.
+Digests of objects do not cover them. A read counts where the innermost frame outside libraries is the user's, so
+that reads by this package and by libraries for themselves do not count. Not observed are reads by compiled code, by
+other processes and from the network, listings of folders, and reads before `observing` began.
 """
 
 import hashlib
@@ -19,13 +19,13 @@ from types import FrameType
 from typing import Any, Final, no_type_check
 
 FILE, VARIABLE = "file ", "variable "
-"""Beginnings of the names of what is seen."""
+"""Prefixes of the names of inputs."""
 ABSENT: Final = "absent"
 OURS: Final = tuple(str(Path(__file__).resolve().parents[1] / name) + os.sep for name in ("estimators", "mjx_study"))
 STANDARD: Final = tuple({str(Path(sysconfig.get_paths()[name])) + os.sep for name in ("stdlib", "platstdlib")})
 INSTALLED: Final = ("site-packages", "dist-packages")
 NO_DATA: Final = ("/proc/", "/sys/", "/dev/")
-_SEEN: dict[str, dict[str, str]] = defaultdict(dict)
+_RECORDED: dict[str, dict[str, str]] = defaultdict(dict)
 _ACTIVE: list["_Observation"] = []
 
 
@@ -39,7 +39,7 @@ class _Observation:
         self.variables: dict[str, str] = {}
 
     def settle(self) -> None:
-        """Add digests of what is new to what was seen; files written meanwhile are no inputs."""
+        """Add digests of new inputs to those already recorded; files written meanwhile are not inputs."""
         loaded = [getattr(sys.modules[name], "__file__", None) for name in set(sys.modules) - self.modules]
         sources = {file for file in loaded if isinstance(file, str) and _owner(file) == "user"}
         self.modules |= set(sys.modules)
@@ -50,7 +50,7 @@ class _Observation:
         self.read.clear()
         self.variables.clear()
         for name in self.names:
-            _SEEN[name].update(found)
+            _RECORDED[name].update(found)
 
 
 @contextmanager
@@ -67,16 +67,16 @@ def observing(*names: str) -> Generator[None]:
 
 
 def inputs_read(names: Iterable[str]) -> dict[str, str]:
-    """Digests of what was read on behalf of modules so far in this process, by "file PATH" (relative to the current
+    """Return digests of the inputs read for modules so far in this process, by "file PATH" (relative to the current
     directory if within it) and "variable NAME"."""
     for observation in _ACTIVE:
         observation.settle()
-    found = {name: digest for module in names for name, digest in _SEEN[module].items()}
+    found = {name: digest for module in names for name, digest in _RECORDED[module].items()}
     return dict(sorted(found.items()))
 
 
 def inputs_now(names: Iterable[str]) -> Mapping[str, str]:
-    """Digests of what the same names hold now."""
+    """Return current digests of inputs by the same names."""
     readers = {FILE: _digest_of_file, VARIABLE: lambda name: _digest_of_text(os.environ.get(name))}
     kinds = {name: kind for name in names for kind in readers if name.startswith(kind)}
     return {name: readers[kind](name.removeprefix(kind)) for name, kind in kinds.items()}
@@ -127,7 +127,7 @@ def _reader(frame: FrameType | None, *, through: tuple[str, ...]) -> str:
 
 
 @no_type_check
-def _heard(event: str, arguments: tuple[Any, ...]) -> None:
+def _audit(event: str, arguments: tuple[Any, ...]) -> None:
     """Audit hook: note files that user-defined code opens, by itself or through a library."""
     if not _ACTIVE or event != "open":
         return
@@ -144,7 +144,7 @@ def _heard(event: str, arguments: tuple[Any, ...]) -> None:
 
 
 def _within_caches(path: str) -> bool:
-    """Whether a file is in the user's cache or JAX's, where libraries keep what they can make again."""
+    """Whether a file is in the user's cache or JAX's, whose files libraries can recreate."""
     roots = [os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")]
     if "jax" in sys.modules:
         roots.append(sys.modules["jax"].config.jax_compilation_cache_dir or roots[0])
@@ -153,8 +153,8 @@ def _within_caches(path: str) -> bool:
 
 @cache
 def _install() -> None:
-    """Hear of opened files and of variables that are read; the process keeps the hooks, which are idle elsewhere."""
-    sys.addaudithook(_heard)
+    """Install hooks for opened files and variables that are read; they stay, idle outside `observing`."""
+    sys.addaudithook(_audit)
     kind: Any = type(os.environ)
     whole = kind.__getitem__
 
@@ -162,9 +162,9 @@ def _install() -> None:
     def getitem(self: Any, key: Any) -> Any:
         if _ACTIVE and isinstance(key, str) and _reader(sys._getframe(1), through=("standard",)) == "user":
             value = self._data.get(self.encodekey(key))
-            told = _digest_of_text(None if value is None else self.decodevalue(value))
+            digest = _digest_of_text(None if value is None else self.decodevalue(value))
             for observation in _ACTIVE:
-                observation.variables[VARIABLE + key] = told
+                observation.variables[VARIABLE + key] = digest
         return whole(self, key)
 
     kind.__getitem__ = getitem

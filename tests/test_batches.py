@@ -76,7 +76,7 @@ def test_the_batches_agree(drawn) -> None:
         )
 
 
-def test_costs_to_go_are_sums_of_what_is_left(drawn) -> None:
+def test_costs_to_go_are_sums_of_remaining_costs(drawn) -> None:
     """Their differences are the running costs, which `simulate` gives one by one."""
     task, objective, batches = drawn
     steps = batches["steps"]

@@ -12,10 +12,10 @@ import pytest
 
 from mjx_study import cli
 from mjx_study.cli import options
-from mjx_study.execution.run import load_study
 from mjx_study.options.configuration import OPTIONS, SCENE_OPTIONS, as_arguments
 from mjx_study.plots.style import PAGE
-from mjx_study.results.findings import rows_of
+from mjx_study.results.rows import rows_of
+from mjx_study.storage.folder import load_study
 from mjx_study.tasks import TASKS
 from tests.documents import stages_of
 

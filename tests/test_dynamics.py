@@ -203,7 +203,8 @@ def test_both_programs_and_both_modes_agree(name: str) -> None:
 
     def matrix(point):
         _, qacc, _ = step_flat(case.scene, case.scene.model, point, jnp.asarray(case.warmstart))
-        return dynamics.step_jacobian(case.scene, case.scene.model, *split(case.scene, point), qacc)[0]
+        qpos, qvel, act, control = split(case.scene, point)
+        return dynamics.step_jacobian(case.scene, case.scene.model, qpos, qvel, act, control, qacc)[0]
 
     found = compiled(matrix, case.point)(case.point)
     assert_close_by_rows(found, expected[case.scene.host.nq :], 1e-12)

@@ -1,6 +1,7 @@
-"""Relative links of the pages and notebooks lead to a file of the project and to a heading of it."""
+"""Relative links of pages and notebooks lead to a file and a heading of the project, and names of modules exist."""
 
 import os
+import pkgutil
 import re
 from pathlib import Path
 
@@ -45,3 +46,9 @@ def test_links_lead_somewhere(page: Path) -> None:
 def test_a_dead_link_is_found() -> None:
     text = "[a](docs/tasks.md#pusher) [b](docs/tasks.md#pushed) [c](nowhere.md) [d](https://b.org) [e](#tasks)"
     assert dead_links(text, ROOT / "README.md") == ["docs/tasks.md#pushed", "nowhere.md"]
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if page.name != "CHANGELOG.md"], ids=lambda page: page.name)
+def test_modules_and_names_exist(page: Path) -> None:
+    for name in re.findall(r"`((?:mjx_study|estimators)(?:\.\w+)+)(?:\(.*?\))?`", prose(page)):
+        assert pkgutil.resolve_name(name) is not None

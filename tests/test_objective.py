@@ -137,7 +137,7 @@ def test_a_chunk_of_gradients_fits_into_an_accelerators_memory(simulator):
 
 
 @pytest.mark.parametrize(("samples", "chunk"), [(1, 5), (10, 11), (11, 21), (100, 101), (400, 201), (10**6, 201)])
-def test_chunks_on_a_cpu_are_of_few_sizes_whatever_the_devices(samples, chunk):
+def test_cpu_chunks_have_few_sizes_for_any_number_of_devices(samples, chunk):
     device = SimpleNamespace(platform="cpu", memory_stats=lambda: None)
     assert chunk_for(samples, [device]) == chunk_for(samples, [device] * 3) == chunk
 
@@ -294,7 +294,7 @@ def test_a_linear_policys_score_is_its_vector_jacobian_product():
     np.testing.assert_allclose(policy.score(theta, states, noise), expected, rtol=1e-14)
 
 
-def test_baseline_of_a_random_start_is_each_samples_own(closed_loop):
+def test_each_sample_has_the_baseline_of_its_random_start(closed_loop):
     assert closed_loop.task.random_start and not pusher_task().random_start
     noisy = closed_loop.objective(penalty(100.0)).evaluate(GAINS, sample_keys(5))
     silent = closed_loop.objective(penalty(100.0), NO_NOISE).differentiate(GAINS, sample_keys(5))
@@ -332,7 +332,7 @@ def test_odd_part_refuses_feedback(closed_loop):
 # What can fail
 
 
-def test_a_sample_that_is_not_finite_is_counted_and_left_out():
+def test_nonfinite_samples_are_counted_and_left_out():
     def breaks(state, control):
         return jnp.where(control[0] > LIMIT, jnp.nan, jnp.sum(state.qpos**2) + jnp.sum(control**2))
 
@@ -353,7 +353,7 @@ def test_a_sample_that_is_not_finite_is_counted_and_left_out():
     np.testing.assert_allclose(first.mean, np.asarray(differentiation.gradient)[~over].mean(0), rtol=1e-12)
 
 
-def test_theta_that_is_not_a_number_ends_and_is_counted(simulator):
+def test_nan_parameters_end_and_are_counted(simulator):
     """The solver's loop meets NaN in every sample and must leave."""
     theta = pusher_task().theta.at[100].set(jnp.nan)
     objective = simulator.objective(penalty(10.0))
@@ -428,42 +428,34 @@ def test_memory_of_a_thousand_gradients(large):
 # Refusals
 
 
-@pytest.mark.parametrize("sigma", [0.0, -1.0, float("nan"), float("inf")])
-def test_refuses_a_noise_level(simulator, sigma):
-    with pytest.raises(ValueError, match="sigma must be positive and finite"):
-        pusher_task().replace(sigma=sigma)
+BATCHES = ("evaluate", "differentiate", "evaluate_odd")
+SIGMA_RANGE, THETA_SHAPE = "sigma must be positive and finite", r"theta has shape \(199,\), the policy needs \(200,\)"
+
+
+@pytest.mark.parametrize("name", BATCHES)
+@pytest.mark.parametrize(
+    ("sigma", "params", "samples", "message"),
+    [
+        *[(sigma, HORIZON, 2, SIGMA_RANGE) for sigma in (0.0, -1.0, float("nan"), float("inf"))],
+        (None, HORIZON - 1, 2, THETA_SHAPE),
+        (None, HORIZON, 0, "at least one key"),
+    ],
+)
+def test_batches_refuse(simulator, name: str, sigma: float | None, params: int, samples: int, message: str):
     objective = simulator.objective(penalty(10.0), sigma)
-    for run in (objective.evaluate, objective.differentiate, objective.evaluate_odd):
-        with pytest.raises(ValueError, match="sigma must be positive and finite"):
-            run(pusher_task().theta, sample_keys(2))
+    with pytest.raises(ValueError, match=message):
+        getattr(objective, name)(jnp.zeros(params), sample_keys(2)[:samples])
 
 
-def test_refuses_an_empty_chunk():
-    with pytest.raises(ValueError, match="chunk_size must be at least 1 sample, got 0"):
-        Simulator(pusher_task(), chunk_size=0)
-
-
-def test_refuses_an_unknown_task():
-    with pytest.raises(ValueError, match=r"unknown task 'pushr'; did you mean pusher\?"):
-        make_task("pushr")
-
-
-def test_refuses_a_horizon_without_steps():
-    with pytest.raises(ValueError, match="horizon must be at least 1 step, got 0"):
-        make_task("pusher", horizon=0)
-
-
-def test_refuses_theta_of_another_length(simulator):
-    with pytest.raises(ValueError, match=r"theta has shape \(199,\), the policy needs \(200,\)"):
-        pusher_task().replace(theta=jnp.zeros(199))
-    objective = simulator.objective(penalty(10.0))
-    for run in (objective.evaluate, objective.differentiate, objective.evaluate_odd):
-        with pytest.raises(ValueError, match=r"theta has shape \(199,\), the policy needs \(200,\)"):
-            run(jnp.zeros(199), sample_keys(2))
-
-
-def test_refuses_no_samples(simulator):
-    objective = simulator.objective(penalty(10.0))
-    for run in (objective.evaluate, objective.differentiate, objective.evaluate_odd):
-        with pytest.raises(ValueError, match="at least one key"):
-            run(pusher_task().theta, sample_keys(1)[:0])
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Simulator(pusher_task(), chunk_size=0), "chunk_size must be at least 1 sample, got 0"),
+        (lambda: make_task("pusher", horizon=0), "horizon must be at least 1 step, got 0"),
+        (lambda: pusher_task().replace(sigma=0.0), SIGMA_RANGE),
+        (lambda: pusher_task().replace(theta=jnp.zeros(HORIZON - 1)), THETA_SHAPE),
+    ],
+)
+def test_tasks_and_simulators_refuse(make, message: str):
+    with pytest.raises(ValueError, match=message):
+        make()

@@ -194,9 +194,7 @@ def test_options_that_do_not_go_together(fields: dict[str, Any], message: str) -
         ("sweep pusher --config nowhere.toml --output out", "cannot read nowhere.toml: No such file or directory"),
         ("sweep pusher --cluster local:0 --output out", "argument --cluster: must be local:N, slurm:N or an address"),
         ("optimise double_pendulum --reference --stiffness 3", "--stiffness has no effect: double_pendulum names no"),
-        (
-            "--window has no effect on zobg, fobg, aobg: omit it, or choose an ",
-        ),
+        ("optimise pusher --reference --window 3", "--window has no effect on zobg, fobg, aobg: omit it"),
         ("optimise pusher --reference --contact penalty", "--contact penalty is what --reference replaces: omit one"),
         ("optimise pusher --seeds 100000", "GiB of memory, and the limit is 16 GiB"),
         ("optimise pusher --network 100000,100000", "parameters of a network are planned, and the limit is 10000000"),

@@ -21,11 +21,11 @@ from mjx_study.choices import TASK_GROUP
 from mjx_study.cli import options as settings
 from mjx_study.cli.gradcheck import UNEXERCISED
 from mjx_study.diagnose.measurement import ESTIMATORS
-from mjx_study.execution.run import load_study
 from mjx_study.experiment.plan import plan_study
 from mjx_study.gradcheck import plan_gradcheck
 from mjx_study.options.configuration import StudyConfig
-from mjx_study.results.findings import rows_of
+from mjx_study.results.rows import rows_of
+from mjx_study.storage.folder import load_study
 from mjx_study.tasks import make_task
 from mjx_study.tasks.task import Task
 

@@ -2,7 +2,6 @@
 
 import math
 from collections import Counter
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -79,12 +78,9 @@ def undecided(document: dict[str, Any]) -> list[str]:
 
 def markdown(document: dict[str, Any]) -> str:
     """Return the text of docs/claims.md."""
-    header, *rows = cells(document)
-    linked = [[f"[{name}](#{name})", *verdicts] for name, *verdicts in rows]
     return TEMPLATE.read_text().format(
         counts=verdict_counts(document),
         run=run_summary(document),
-        matrix=_table(linked, header),
         claims="\n\n".join(map(_section, document["claims"])),
     )
 
@@ -96,16 +92,11 @@ def _section(claim: dict[str, Any]) -> str:
         estimate = f"{_number(each['estimate'])} ({_interval(each)})"
         system, before = "" if each["system"] == before else each["system"], each["system"]
         rows.append([system, f"`{each['family']}`", estimate, _verdict(each)])
-    table = _table(rows, ("system", "contact", "estimate (interval)", "verdict"))
+    table = markdown_table(rows, ("system", "contact", "estimate (interval)", "verdict"))
     return (
         f"## {claim['id']}\n\n{claim['statement']} *({claim['place']}.)*\n\n"
         f"Statistic: {claim['quantity']}; {claim['criterion']}. `{claim['show']}`\n\n{table}"
     )
-
-
-def _table(rows: list[list[str]], header: Sequence[str]) -> str:
-    """Format a table of the page, which has a short rule below the header."""
-    return markdown_table(rows, header).replace("| --- ", "|---")
 
 
 def _verdict(each: dict[str, Any]) -> str:

@@ -3,7 +3,7 @@
 import argparse
 
 from estimators.choices import DENSITIES, ORACLES
-from estimators.registry import ESTIMATORS
+from estimators.registry import ESTIMATORS, options_of
 from mjx_study.cli.output import print_report
 from mjx_study.options.parser import Parser
 
@@ -20,10 +20,15 @@ def add(command: Parser) -> None:
 def run(options: argparse.Namespace) -> int:
     entries, rows = [], []
     for name, item in ESTIMATORS.items():
-        flags = [f"--{option.replace('_', '-')}" for option in item.required() if option != "sigma"]
+        examples = {option: field.metadata["example"] for option, field in options_of([item]).items()}
+        examples.pop("sigma", None)  # that of the noise
+        values = {f"--{option.replace('_', '-')}": examples[option] for option in examples if option in item.required()}
+        command = f"mjx-study compare pusher --estimators {name}"
+        command += "".join(f" {flag} {value}" for flag, value in values.items())
+        entry = {part: getattr(item, part) for part in ("name", "label", "description", "needs", "formula", "unbiased")}
+        entries.append(entry | {"requires": list(values), "options": list(examples), "example": command})
         needs = " + ".join(ORACLES[oracle].contents for oracle in item.needs)
-        entries.append({"name": name, "description": item.description, "needs": list(item.needs), "requires": flags})
-        rows.append((name, ", ".join([needs, *flags]), item.description))
+        rows.append((name, ", ".join([needs, *values]), item.description))
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = [f"{name:<{widths[0]}}  {needs:<{widths[1]}}  {description}" for name, needs, description in rows]
     lines += ["", "noise densities (--noise)"]

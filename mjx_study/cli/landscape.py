@@ -7,7 +7,7 @@ from mjx_study.cli.options import given_options, study_fields
 from mjx_study.options.configuration import BUILDER_OPTIONS, StudyConfig
 from mjx_study.options.option import OptionError
 from mjx_study.options.parser import MIDDLE, Parser
-from mjx_study.results.variables import explained
+from mjx_study.results.variables import LANDSCAPES, explained
 
 EPILOG = f"""\
 examples:
@@ -16,7 +16,7 @@ examples:
   mjx-study landscape pusher --direction 0 --span=-2,2   the first of 200 forces
 
 columns of the table, the minimum of the mean cost along the line:
-{explained("landscapes", "least_at", "least_cost")}
+{explained(LANDSCAPES, "least_at", "least_cost")}
 
 The figure shows costs above, and slopes below, with 95 % bands. Where the mean cost with noise has a slope that the
 mean of FoBG lacks, the cost jumps: first-order gradients do not see jumps.
@@ -45,7 +45,8 @@ def add(command: Parser) -> None:
 def run(options: argparse.Namespace) -> int:
     from mjx_study.cli.console import curve_lines, curves
     from mjx_study.cli.studies import run_one
-    from mjx_study.experiment.plan import StudyPlan, plan_study
+    from mjx_study.experiment.plan import plan_study
+    from mjx_study.experiment.study import StudyPlan
     from mjx_study.tasks import task_with_options
 
     def planned() -> StudyPlan:

@@ -11,7 +11,7 @@ from mjx_study.disk import write_whole
 from mjx_study.options.configuration import BUILDER_OPTIONS, UNSET_TASK, StudyConfig
 from mjx_study.options.option import OptionError
 from mjx_study.options.parser import MIDDLE, Parser
-from mjx_study.results.variables import explained
+from mjx_study.results.variables import DESCENTS, explained
 
 EPILOG = f"""\
 All estimators start from the task's theta, or from --theta, and draw the same noise. --learning-rate, --iterations and
@@ -29,7 +29,7 @@ examples:
   mjx-study rollout pusher --theta out/policy-aobg.json
 
 columns of the table:
-{explained("descents", "final_cost", "best_cost", "alpha", "seed_rollouts", "seconds")}
+{explained(DESCENTS, "final_cost", "best_cost", "alpha", "seed_rollouts", "seconds")}
 
 Each task metric, such as hit, has its own column. Costs and metrics are means over --evaluation-samples rollouts, the
 same for all estimators, ± the standard deviation over seeds; alpha is the mean over the last tenth of the iterations.
@@ -54,7 +54,8 @@ def add(command: Parser) -> None:
 def run(options: argparse.Namespace) -> int:
     from mjx_study.cli.console import descent_lines, descents
     from mjx_study.cli.studies import run_one
-    from mjx_study.experiment.plan import StudyPlan, plan_study
+    from mjx_study.experiment.plan import plan_study
+    from mjx_study.experiment.study import StudyPlan
 
     def planned() -> StudyPlan:
         if options.reference and options.contact not in (None, REFERENCE):

@@ -33,9 +33,10 @@ def add(command: Parser) -> None:
 def run(options: argparse.Namespace) -> int:
     from mjx_study._matplotlib import matplotlib
     from mjx_study.disk import prepare_folder
-    from mjx_study.execution.run import load_study, warnings_of
     from mjx_study.plots.study import plot_study
     from mjx_study.plots.style import STYLES, fit_to_paper, save_figures
+    from mjx_study.results.warnings import warnings_of
+    from mjx_study.storage.folder import load_study
 
     with usage_errors():
         dataset = load_study(options.folder)

@@ -5,6 +5,7 @@ branches. A loop runs until it has ended in all lanes, and a lane in which it ha
 gives does not depend on the samples beside it.
 """
 
+import itertools
 import math
 from collections.abc import Iterable, Sequence
 from importlib import resources
@@ -15,6 +16,7 @@ from jax import lax
 
 from mjx_study.graph.function import ScalarFunction
 from mjx_study.graph.nodes import Node, needed_for, no_type_check
+from mjx_study.graph.parts import Loop, Statement, in_parts
 
 _OPERATORS: Final = {
     **{"add": "+", "add_any": "+", "sub": "-", "mul": "*", "and": "&", "or": "|", "xor": "^"},
@@ -37,6 +39,8 @@ _NAMES: Final = {np.dtype(name): f"{name[0]}{8 * np.dtype(name).itemsize}" for n
 
 MAX_ARGUMENT: Final = 4000
 """Maximum size of a kernel's argument [bytes]."""
+MOST_TOGETHER: Final = {"cpu": 500, "gpu": 20_000}
+"""Maximum number of statements in a function; compilers allocate registers in more than linear time."""
 
 
 class NotWrittenError(Exception):
@@ -53,32 +57,24 @@ def source_of(function: ScalarFunction, platform: str = "cpu") -> str:
     Raises:
         NotWrittenError: an operation or a type is not covered.
     """
-    body = _Writer()
-    for place, array in enumerate(function.inputs):
-        for at, node in enumerate(array.flat):
-            body.loaded(node, place, at)
-    body.write(function.needed)
-    for place, (array, aval) in enumerate(zip(function.outputs, function.avals, strict=True)):
-        for at, value in enumerate(array.flat):
-            body.store(place, at, value, aval.dtype)
-    forms_in = [(array.size, array.flat[0].dtype, array.ndim) for array in function.inputs]
-    forms_out = [(math.prod(aval.shape), aval.dtype, aval.ndim) for aval in function.avals]
+    writer = _Writer(function)
+    functions, num_kept = in_parts(writer.statements(), writer.loads, MOST_TOGETHER[platform])
+    forms_in = [(math.prod(each.shape), each.dtype, each.ndim) for each in function.types]
+    forms_out = [(math.prod(each.shape), each.dtype, each.ndim) for each in function.avals]
     if platform == "gpu":
-        samples = [_text("prelude.cu"), "SAMPLES {", "BEGIN", *body.lines, "}"]
-        parts = ["#ifdef __CUDACC_RTC__", *samples, "#else", _text("launcher.c"), "#endif"]
-        return "\n".join([_batch(forms_in, forms_out), *parts, ""])
-    wide = any(dtype.itemsize == 8 for dtype in body.dtypes)
+        kernel = [_text("prelude.cu"), *functions, _text("kernel.cu")]
+        parts = ["#ifdef __CUDACC_RTC__", *kernel, "#else", _text("launcher.c"), "#endif"]
+        return "\n".join([_batch(forms_in, forms_out), f"#define KEPT {num_kept}", *parts, ""])
+    wide = any(dtype.itemsize == 8 for dtype in writer.dtypes)
     return "\n".join(
         [
             f"#define WIDE {int(wide)}",
             f"#define INPUTS {_forms(forms_in)}",
             f"#define OUTPUTS {_forms(forms_out)}",
             f"#define BYTES {sum(size * np.dtype(dtype).itemsize for size, dtype, _ in forms_in + forms_out)}",
+            f"#define KEPT {num_kept}",
             _text("prelude.c"),
-            "static void samples(const char *const *in, const long *in_step, char *const *out, const long *out_step) {",
-            *body.lines,
-            "}",
-            "",
+            *functions,
             _text("handler.c"),
         ]
     )
@@ -136,68 +132,103 @@ def _constant(value: Any) -> str:
 
 @no_type_check
 class _Writer:
-    """Statements that compute nodes, and the C expressions of those computed so far."""
+    """Statements that compute a function; the variable of a node has its number."""
 
-    def __init__(self):
-        self.lines: list[str] = []
+    def __init__(self, function: ScalarFunction):
+        self._function = function
         self.dtypes: set[Any] = set()
-        self._names: dict[int, str] = {}
+        self.loads: dict[int, str] = {}
+        self._stores: dict[int, list[str]] = {}
+        self._names: dict[int, int] = {}
+        self._uses: set[int] = set()
+        self._before: list[str] = []
 
-    def value(self, argument: Any) -> str:
-        self.dtypes.add(argument.dtype)
-        return self._names[argument.number] if isinstance(argument, Node) else _constant(argument)
+    def statements(self) -> list[Statement | Loop]:
+        """All statements, with every output stored as soon as it is known."""
+        for place, array in enumerate(self._function.inputs):
+            for at, node in enumerate(array.flat):
+                self._load(node, place, at)
+        constant = []
+        for place, (array, aval) in enumerate(zip(self._function.outputs, self._function.avals, strict=True)):
+            for at, entry in enumerate(array.flat):
+                kind, value = _type(aval.dtype), "{}" if isinstance(entry, Node) else _constant(entry)
+                self.dtypes.add(aval.dtype)
+                store = "STORE_BOOL(" if kind == "mask" else f"STORE({kind}, "
+                text = f"{store}{place}, {at}, {value});"
+                if isinstance(entry, Node):
+                    self._stores.setdefault(entry.number, []).append(text)
+                else:
+                    constant.append(Statement(text, frozenset()))
+        known = [self._stored(number, number) for number in self.loads if number in self._stores]
+        return [*itertools.chain(*known), *self._written(self._function.needed), *constant]
 
-    def loaded(self, node: Node, place: int, at: int) -> None:
+    def _load(self, node: Node, place: int, at: int) -> None:
         kind = _type(node.dtype)
         self.dtypes.add(node.dtype)
-        self._names[node.number] = f"x{node.number}"
         load = f"LOAD_BOOL({place}, {at})" if kind == "mask" else f"LOAD({kind}, {place}, {at})"
-        self.lines.append(f"{kind} x{node.number} = {load};")
+        self.loads[node.number] = f"{kind} x{node.number} = {load};"
+        self._names[node.number] = node.number
 
-    def store(self, place: int, at: int, value: Any, dtype: Any) -> None:
-        kind = _type(dtype)
-        form = f"STORE_BOOL({place}, {at}, " if kind == "mask" else f"STORE({kind}, {place}, {at}, "
-        self.lines.append(f"{form}{self.value(value)});")
+    def _stored(self, number: int, name: int) -> list[Statement]:
+        return [Statement(each.format(f"x{name}"), frozenset({name})) for each in self._stores.get(number, ())]
 
-    def write(self, nodes: Iterable[Node]) -> None:
+    def _value(self, argument: Any) -> str:
+        self.dtypes.add(argument.dtype)
+        if not isinstance(argument, Node):
+            return _constant(argument)
+        name = self._names[argument.number]
+        self._uses.add(name)
+        return f"x{name}"
+
+    def _statement(self, lines: list[str], defines: dict[int, str]) -> Statement:
+        uses, self._uses = frozenset(self._uses), set()
+        return Statement("\n".join(lines), uses, defines, len(lines))
+
+    def _written(self, nodes: Iterable[Node]) -> list[Statement | Loop]:
+        found: list[Statement | Loop] = []
         for node in nodes:
             if node.number in self._names:
                 continue
+            self._names[node.number] = node.number
             match node.operation:
                 case "loop":
-                    self._loop(node)
-                    self._names[node.number] = ""
+                    found += self._loop(node)
                 case "output":
                     (loop,), (place, _) = node.arguments, node.parameters
                     self._names[node.number] = self._names[loop.parameters[0][place].number]
                 case "whole":
                     raise NotWrittenError(node.parameters[0].primitive.name)
                 case primitive:
-                    self._names[node.number] = name = f"x{node.number}"
                     self.dtypes.add(node.dtype)
-                    self.lines.append(f"{_type(node.dtype)} {name} = {self._expression(primitive.name, node)};")
+                    kind = _type(node.dtype)
+                    line = f"{kind} x{node.number} = {self._expression(primitive.name, node)};"
+                    lines, self._before = [*self._before, line], []
+                    found.append(self._statement(lines, {node.number: kind}))
+            found += self._stored(node.number, self._names[node.number])
+        return found
 
-    def _loop(self, node: Node) -> None:
+    def _loop(self, node: Node) -> list[Statement | Loop]:
         carried, again, after = node.parameters
-        for each, start in zip(carried, node.arguments, strict=False):
-            self.lines.append(f"{_type(each.dtype)} x{each.number} = {self.value(start)};")
-            self._names[each.number] = f"x{each.number}"
-        outside = dict(self._names)
-        self.lines.append("for (;;) {")
-        self.write(needed_for(again))
-        self.lines.append(f"mask again = {self.value(again[0])};\nif (!any(again)) break;")
-        self.write(needed_for(after))
-        kinds = [_select(each.dtype) for each in carried]
-        self.lines += [
-            f"{_type(each.dtype)} next{place} = {kind}(again, x{each.number}, {self.value(value)});"
-            for place, (each, kind, value) in enumerate(zip(carried, kinds, after, strict=True))
+        kinds = {each.number: _type(each.dtype) for each in carried}
+        starts = zip(kinds.items(), node.arguments, strict=False)
+        begin = self._statement([f"{kind} x{at} = {self._value(start)};" for (at, kind), start in starts], kinds)
+        outside = dict(self._names) | {at: at for at in kinds}
+        self._names = dict(outside)
+        test = self._written(needed_for(again))
+        test.append(self._statement([f"mask x{node.number} = {self._value(again[0])};"], {node.number: "mask"}))
+        body = self._written(needed_for(after))
+        self._uses |= {node.number, *kinds}
+        lines = [
+            f"{kinds[each.number]} next{each.number} = "
+            f"{_select(each.dtype)}(x{node.number}, x{each.number}, {self._value(value)});"
+            for each, value in zip(carried, after, strict=True)
         ]
-        self.lines += [f"x{each.number} = next{place};" for place, each in enumerate(carried)]
-        self.lines.append("}")
+        body.append(self._statement([*lines, *(f"x{at} = next{at};" for at in kinds)], kinds))
         self._names = outside
+        return [begin, Loop(test, node.number, body)]
 
     def _expression(self, name: str, node: Node) -> str:
-        values = [self.value(each) for each in node.arguments]
+        values = [self._value(each) for each in node.arguments]
         (first, *others), kind, parameters = values, _type(node.dtype), node.parameters or {}
         of = node.arguments[0].dtype
         match name:
@@ -248,7 +279,7 @@ class _Writer:
         product, square, left = None, base, abs(exponent)
         for place in range(left.bit_length()):
             if place:
-                self.lines.append(f"{kind} {name}_{place} = {square} * {square};")
+                self._before.append(f"{kind} {name}_{place} = {square} * {square};")
                 square = f"{name}_{place}"
             if left >> place & 1:
                 product = square if product is None else f"{product} * {square}"

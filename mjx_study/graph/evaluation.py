@@ -53,8 +53,7 @@ def evaluated(function: ScalarFunction) -> Callable[..., list[jax.Array]]:
 
 def written_out(function: ScalarFunction) -> Callable[..., list[jax.Array]]:
     """`evaluated` as a program, which JAX batches and differentiates once for all programs that use it."""
-    types = [jax.ShapeDtypeStruct(each.shape, each.flat[0].dtype) for each in function.inputs]
-    return jax.jit(jaxpr_as_fun(jax.make_jaxpr(evaluated(function))(*types)))
+    return jax.jit(jaxpr_as_fun(jax.make_jaxpr(evaluated(function))(*function.types)))
 
 
 @no_type_check

@@ -63,6 +63,11 @@ class ScalarFunction:
         needed = {node.number for node in self.needed}
         return [place for place, each in enumerate(self.inputs) if any(node.number in needed for node in each.flat)]
 
+    @property
+    def types(self) -> list[ShapedArray]:
+        """Types of the inputs."""
+        return [ShapedArray(each.shape, each.flat[0].dtype if each.size else np.dtype(float)) for each in self.inputs]
+
     def of(self, places: Sequence[int]) -> "ScalarFunction":
         """Return the function of some of its inputs, which does not depend on the others."""
         return dataclasses.replace(self, inputs=[self.inputs[place] for place in places])

@@ -21,6 +21,7 @@ static void unpad(char *to, const char *from, struct array form, long step, long
 
 static void batch(long count, const char *const *from, const int *shared, char *const *to) {
   static __thread char padded[LANES * BYTES + 1];
+  static __thread char kept[VECTOR * KEPT + 1] __attribute__((aligned(VECTOR)));
   const char *in[NUM_IN];
   char *out[NUM_OUT], *spare[NUM_IN + NUM_OUT], *free = padded;
   long in_step[NUM_IN], out_step[NUM_OUT];
@@ -44,7 +45,7 @@ static void batch(long count, const char *const *from, const int *shared, char *
       out[k] = left < LANES ? spare[NUM_IN + k] : to[k] + first * OUT[k].bytes;
       if (left < LANES) out_step[k] = LANES * OUT[k].bytes;
     }
-    samples(in, in_step, out, out_step);
+    samples(in, in_step, out, out_step, kept);
     if (left < LANES)
       for (long k = 0; k < NUM_OUT; k++)
         unpad(to[k] + first * OUT[k].bytes, out[k], OUT[k], count * OUT[k].bytes, left);

@@ -26,7 +26,7 @@ int prepare(void) {
   launch = (launch_kernel)dlsym(driver, "cuLaunchKernel");
   if (!load || !get || !launch) return -1;
   int failed = load(&library, kernel_image, NULL, NULL, 0, NULL, NULL, 0);
-  return failed ? failed : get(&kernel, library, "samples");
+  return failed ? failed : get(&kernel, library, "kernel");
 }
 
 XLA_FFI_Error *handler(XLA_FFI_CallFrame *frame) {

@@ -19,6 +19,9 @@
 #define EACH _Pragma("GCC unroll 16") for (int lane = 0; lane < LANES; lane++)
 #define ONE static inline __attribute__((always_inline))  // inlined wherever it is used
 #define APART static __attribute__((noinline))
+#define PART static
+#define ARGUMENTS const char *const *in, const long *in_step, char *const *out, const long *out_step, char *kept
+#define PASSED in, in_step, out, out_step, kept
 
 #define VECTOR_OF(name, scalar)                                      \
   typedef scalar name __attribute__((vector_size(sizeof(scalar) * LANES))); \
@@ -38,8 +41,10 @@ VECTOR_OF(u8, uint8_t)
 
 #if WIDE
 typedef i64 mask;
+typedef i64_anywhere mask_anywhere;
 #else
 typedef i32 mask;
+typedef i32_anywhere mask_anywhere;
 #endif
 #define AS(type, value) __builtin_convertvector(value, type)
 #define MASK(comparison) AS(mask, comparison)
@@ -71,11 +76,15 @@ SELECT(u8, i8)
 
 // Inputs and outputs: entry `at` of an array, for all lanes. Booleans are bytes in memory.
 
-#define PLACE(array, at) (array[0] + (at) * array##_step)
 #define LOAD(type, place, at) (*(const type##_anywhere *)(in[place] + (at) * in_step[place]))
 #define STORE(type, place, at, value) (*(type##_anywhere *)(out[place] + (at) * out_step[place]) = (value))
 #define LOAD_BOOL(place, at) MASK(LOAD(u8, place, at) != 0)
 #define STORE_BOOL(place, at, value) STORE(u8, place, at, AS(u8, (value) & 1))
+
+// Values that several functions use.
+
+#define RECALL(type, slot) (*(const type##_anywhere *)(kept + (slot) * VECTOR))
+#define KEEP(type, slot, value) (*(type##_anywhere *)(kept + (slot) * VECTOR) = (value))
 
 // Operations of floats, as JAX defines them: extremes propagate NaN, signs keep zeros.
 

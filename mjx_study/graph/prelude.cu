@@ -19,10 +19,10 @@ typedef int mask;  // -1 or 0
 #define AS(type, value) ((type)(value))
 #define MASK(comparison) (-(mask)(comparison))
 #define ALL(type, constant) ((type)(constant))
-#define SAMPLES extern "C" __global__ void __launch_bounds__(THREADS) samples(const struct batch batch)
-#define BEGIN                                               \
-  const long lane = blockIdx.x * (long)THREADS + threadIdx.x; \
-  if (lane >= batch.count) return;
+#define APART static __device__
+#define PART static __device__
+#define ARGUMENTS const struct batch &batch, const long lane, char *kept
+#define PASSED batch, lane, kept
 
 ONE int any(mask m) { return m; }
 
@@ -35,6 +35,8 @@ ONE mask select_bool(mask m, mask no, mask yes) { return m ? yes : no; }
 #define PLACE_IN(place, at) (batch.shared[place] ? (at) : (at) * batch.count + lane)
 #define LOAD(type, place, at) (((const type *)batch.in[place])[PLACE_IN(place, at)])
 #define STORE(type, place, at, value) ((type *)batch.out[place])[(at) * batch.count + lane] = (value)
+#define KEEP(type, slot, value) (*(type *)(kept + (slot) * 8) = (value))
+#define RECALL(type, slot) (*(const type *)(kept + (slot) * 8))
 #define LOAD_BOOL(place, at) MASK(LOAD(u8, place, at) != 0)
 #define STORE_BOOL(place, at, value) STORE(u8, place, at, (value) & 1)
 

@@ -19,7 +19,7 @@ CPU_CHUNKS: Final = (5, 11, 21, 51, 101, 201)
 programs; one more than round numbers, for the baseline."""
 MAX_CHUNK: Final = {"cpu": CPU_CHUNKS[-1], "gpu": 2**17 + 1, "tpu": 2**17 + 1}
 """Maximum number of samples per device and call, by backend."""
-MOST_SHARE: Final = 0.25
+MAX_SHARE: Final = 0.25
 """Maximum share of an accelerator's memory for the gradients of a chunk."""
 
 
@@ -62,24 +62,19 @@ def spread(program: Compiled, shared: Any, rows: Sequence[np.ndarray], chunk: in
     return jax.tree.map(lambda *leaves: join.concatenate(leaves)[:count], *outputs)
 
 
-def rounds(samples: int, chunk: int, devices: int) -> int:
-    """Number of sequential calls that samples take, in chunks on several devices at once."""
-    return math.ceil(math.ceil(samples / chunk) / devices)
-
-
 def chunk_for(samples: int, devices: Sequence[Any], tasks: Sequence[Task] = ()) -> int:
     """Choose the chunk size for `samples` and their baseline.
 
     On CPUs, the smallest of `CPU_CHUNKS` that holds them, or the largest. On accelerators, the size that needs the
     fewest calls (at least one per device), evenly filled, with at most as many samples as task gradients fit into
-    `MOST_SHARE` of the memory.
+    `MAX_SHARE` of the memory.
     """
     platform = devices[0].platform
     if platform == "cpu":
         return min((size for size in CPU_CHUNKS if size > samples), default=CPU_CHUNKS[-1])
     each = math.ceil((samples + 1) / len(devices))
     memory = (devices[0].memory_stats() or {}).get("bytes_limit", math.inf)
-    most = max(1, int(min(MAX_CHUNK[platform], MOST_SHARE * memory / max(map(_gradient_bytes, tasks), default=1))))
+    most = max(1, int(min(MAX_CHUNK[platform], MAX_SHARE * memory / max(map(_gradient_bytes, tasks), default=1))))
     return math.ceil(each / math.ceil(each / most))
 
 

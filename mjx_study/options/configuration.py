@@ -22,15 +22,13 @@ from estimators.choices import (
     suggestion,
 )
 from estimators.registry import ESTIMATORS
-from mjx_study.choices import CONES, FAMILIES, INTEGRATORS, ONSETS, REFERENCE, SOLVERS, takes_stiffness
+from mjx_study.choices import CONES, FAMILIES, INTEGRATORS, KINDS, ONSETS, REFERENCE, SOLVERS, takes_stiffness
 from mjx_study.options.numbers import MAX_VALUES
 from mjx_study.options.option import OptionError, Rows, declared, options_of
 
 if TYPE_CHECKING:
     import estimators.estimator
 
-STUDIES: Final = ("gradients", "descents", "landscapes")
-"""Kinds of study."""
 CONTACTS: Final = (*FAMILIES, REFERENCE)
 """Contact families of a study, and the analytic reference."""
 UNSET_TASK: Final = "the task's"
@@ -106,7 +104,7 @@ class StudyConfig:
         metadata={"metavar": "TASK", "line": "names of tasks, or tasks", "allows_user_code": True}
     )
     kind: str | None = declared(
-        None, "KIND", "kind of study: {}", choices=STUDIES, unset="from --iterations and --points"
+        None, "KIND", "kind of study: {}", choices=KINDS, unset="from --iterations and --points"
     )
     estimators: tuple[Union[str, "estimators.estimator.Estimator"], ...] = declared(
         ("zobg", "fobg", "aobg"), "NAME", "see `mjx-study estimators`", choices=ESTIMATORS, allows_user_code=True

@@ -2,9 +2,8 @@
 
 import dataclasses
 import math
-from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import Any, Final, Protocol, runtime_checkable
+from typing import Final, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +13,18 @@ from jaxtyping import Array, Float, Key
 from estimators import Differentiation, Evaluation, Linearisation, PairedObjective, StepDifferentiation, StepEvaluation
 from estimators.noise import batch_noise, check_density, check_sigma, noise_score, split_sample_key
 from mjx_study.reference.function import Function
-from mjx_study.reference.system import Rollout, System, gradients_along, roll_out, value_and_gradients
+from mjx_study.reference.system import (
+    ControlJacobians,
+    Controls,
+    Costs,
+    Rollout,
+    StateJacobians,
+    States,
+    System,
+    gradients_along,
+    roll_out,
+    value_and_gradients,
+)
 
 PARAMETRISATIONS: Final = ("controls", "feedback", "start")
 """Possible meanings of theta in a `ReferenceObjective`."""
@@ -43,17 +53,16 @@ class Reference(PairedObjective, Protocol):
         ...
 
 
-class _Evaluations(ABC):
-    """Evaluations of an objective, from those for given initial states and noise."""
+class _Rollouts:
+    """Batches of rollouts of a policy on an analytic system; attributes as in `ReferenceObjective`."""
 
-    @abstractmethod
-    def _draw(self, keys) -> tuple[Any, np.ndarray]: ...
-    @abstractmethod
-    def _evaluation(self, theta, starts, noise) -> Evaluation: ...
-    @abstractmethod
-    def _steps(self, theta, starts, noise) -> StepEvaluation: ...
-    @abstractmethod
-    def differentiate(self, theta: Theta, keys: Keys) -> Differentiation: ...
+    system: System
+    start: Start | None
+    horizon: int
+    sigma: float
+    parametrises: str
+    noise: str
+    metrics: Callable[[Float[np.ndarray, "samples steps states"]], dict[str, np.ndarray]] | None
 
     def evaluate(self, theta: Theta, keys: Keys) -> Evaluation:
         return self._evaluation(theta, *self._draw(keys))
@@ -72,49 +81,6 @@ class _Evaluations(ABC):
     def differentiate_corrected(self, theta: Theta, keys: Keys) -> Differentiation:
         """`differentiate`: analytic systems, whose springs set in without a jump, and functions have no onset term."""
         return self.differentiate(theta, keys)
-
-
-@dataclasses.dataclass(frozen=True)
-class ReferenceObjective(_Evaluations):
-    """F(theta) = E V_1 of a policy on an analytic system, with noise w of standard deviation sigma.
-
-    `parametrises` determines the meaning of theta and where the noise acts:
-
-    - "controls": u_h = theta_h + w_h; theta is (horizon, controls), flattened.
-    - "feedback": u_h = Theta x_h + w_h; theta is the matrix Theta, (controls, states), flattened. Score
-      sum_h w_h x_h^T / sigma^2.
-    - "start": x_1 = theta + w, all controls 0; theta is the initial state.
-
-    Attributes:
-        system: the system, with its cost.
-        start: initial state, or a function of a key that draws one; each sample then has its own zero-noise rollout as
-            baseline. None if theta is the initial state.
-        horizon: number of steps.
-        sigma: standard deviation of the noise, in the unit of the quantity it is added to.
-        parametrises: meaning of theta, see above.
-        noise: name of the noise density in `estimators.NOISES`.
-        metrics: function that computes named metrics from rollout states including the initial one; None for none.
-    """
-
-    system: System
-    start: Start | None
-    horizon: int
-    sigma: float
-    parametrises: str = "controls"
-    noise: str = "gaussian"
-    metrics: Callable[[Float[np.ndarray, "samples steps states"]], dict[str, np.ndarray]] | None = None
-
-    def __post_init__(self) -> None:
-        check_sigma(self.sigma)
-        check_density(self.noise)
-        if self.parametrises not in PARAMETRISATIONS:
-            raise ValueError(f"parametrises is {self.parametrises!r}; choose from {', '.join(PARAMETRISATIONS)}")
-        if self.horizon < 1:
-            raise ValueError(f"horizon must be at least 1 step, got {self.horizon}")
-        if (self.start is None) != (self.parametrises == "start"):
-            raise ValueError("give a start, or None if theta is the initial state")
-        if isinstance(self.start, tuple) and len(self.start) != self.system.num_states:
-            raise ValueError(f"the start must have {self.system.num_states} entries, got {len(self.start)}")
 
     @property
     def num_params(self) -> int:
@@ -197,7 +163,8 @@ class ReferenceObjective(_Evaluations):
         return self._steps_along(self._roll_out(theta, starts, noise), theta, starts, noise)
 
     def _steps_along(self, rollout: Rollout, theta, starts, noise) -> StepEvaluation:
-        to_go = (part.value_to_go[..., : noise.shape[1]] for part in (rollout, self._zero_noise(theta, starts, noise)))
+        both = rollout, self._zero_noise(theta, starts, noise)
+        to_go = (part.value_to_go[..., : noise.shape[1]] if self.horizon else part.value[..., None] for part in both)
         value, baseline = (jnp.asarray(np.broadcast_to(part, noise.shape[:2])) for part in to_go)
         score = jnp.asarray(noise_score(jnp.asarray(noise), self.sigma, self.noise))
         return StepEvaluation(value, baseline, score, self._policy_jacobian(rollout.states))
@@ -221,7 +188,9 @@ class ReferenceObjective(_Evaluations):
 
     def _policy(self, theta, start, noise):
         """Initial state, open-loop controls and feedback matrix, if any, as arguments for `roll_out`."""
-        theta = _checked(theta, self.num_params)
+        theta = np.asarray(theta, float)
+        if theta.ndim > 2 or theta.shape[-1:] != (self.num_params,):
+            raise ValueError(f"theta must have shape ({self.num_params},), got {theta.shape}")
         shaped = theta.reshape(*theta.shape[:-1], *self._shape)  # with a sample axis if there is one theta per sample
         if self.parametrises == "start":
             return shaped + noise[..., 0, :], np.zeros((self.horizon, self.system.num_controls))
@@ -235,11 +204,84 @@ class ReferenceObjective(_Evaluations):
 
 
 @dataclasses.dataclass(frozen=True)
-class FunctionObjective(_Evaluations):
+class ReferenceObjective(_Rollouts):
+    """F(theta) = E V_1 of a policy on an analytic system, with noise w of standard deviation sigma.
+
+    `parametrises` determines the meaning of theta and where the noise acts:
+
+    - "controls": u_h = theta_h + w_h; theta is (horizon, controls), flattened.
+    - "feedback": u_h = Theta x_h + w_h; theta is the matrix Theta, (controls, states), flattened. Score
+      sum_h w_h x_h^T / sigma^2.
+    - "start": x_1 = theta + w, all controls 0; theta is the initial state.
+
+    Attributes:
+        system: the system, with its cost.
+        start: initial state, or a function of a key that draws one; each sample then has its own zero-noise rollout as
+            baseline. None if theta is the initial state.
+        horizon: number of steps.
+        sigma: standard deviation of the noise, in the unit of the quantity it is added to.
+        parametrises: meaning of theta, see above.
+        noise: name of the noise density in `estimators.NOISES`.
+        metrics: function that computes named metrics from rollout states including the initial one; None for none.
+    """
+
+    system: System
+    start: Start | None
+    horizon: int
+    sigma: float
+    parametrises: str = "controls"
+    noise: str = "gaussian"
+    metrics: Callable[[Float[np.ndarray, "samples steps states"]], dict[str, np.ndarray]] | None = None
+
+    def __post_init__(self) -> None:
+        check_sigma(self.sigma)
+        check_density(self.noise)
+        if self.parametrises not in PARAMETRISATIONS:
+            raise ValueError(f"parametrises is {self.parametrises!r}; choose from {', '.join(PARAMETRISATIONS)}")
+        if self.horizon < 1:
+            raise ValueError(f"horizon must be at least 1 step, got {self.horizon}")
+        if (self.start is None) != (self.parametrises == "start"):
+            raise ValueError("give a start, or None if theta is the initial state")
+        if isinstance(self.start, tuple) and len(self.start) != self.system.num_states:
+            raise ValueError(f"the start must have {self.system.num_states} entries, got {len(self.start)}")
+
+
+@dataclasses.dataclass(frozen=True)
+class _FinalCost:
+    """A system whose state is the argument of a function, its final cost; it takes no steps."""
+
+    function: Function
+    num_controls: int = 0
+
+    @property
+    def num_states(self) -> int:
+        return self.function.num_params
+
+    def step(self, state: States, control: Controls) -> States:
+        return state
+
+    def jacobians(self, state: States, control: Controls) -> tuple[StateJacobians, ControlJacobians]:
+        return np.zeros((*state.shape, self.num_states)), np.zeros((*state.shape, 0))
+
+    def cost(self, state: States, control: Controls) -> Costs:
+        return np.zeros(state.shape[:-1])
+
+    def cost_gradients(self, state: States, control: Controls) -> tuple[States, Controls]:
+        return np.zeros(state.shape), np.zeros(control.shape)
+
+    def final_cost(self, state: States) -> Costs:
+        return self.function.value(state)
+
+    def final_gradient(self, state: States) -> States:
+        return self.function.gradient(state)
+
+
+@dataclasses.dataclass(frozen=True)
+class FunctionObjective(_Rollouts):
     """F(theta) = E f(theta + w) for a function of the parameters alone, with noise w of standard deviation sigma.
 
-    Its samples are also rollouts: of a single step, or, in `linearise`, without steps and from theta + w, with f as the
-    final cost. There is no initial state to draw, and there are no metrics.
+    Its samples are rollouts without steps, from theta + w, with f as the final cost. There is no initial state to draw,
+    and there are no metrics.
 
     Attributes:
         function: f.
@@ -250,66 +292,11 @@ class FunctionObjective(_Evaluations):
     function: Function
     sigma: float
     noise: str = "gaussian"
+    system: System = dataclasses.field(init=False, repr=False)
+
+    start, horizon, parametrises, metrics = None, 0, "start", None
 
     def __post_init__(self) -> None:
         check_sigma(self.sigma)
         check_density(self.noise)
-
-    @property
-    def num_params(self) -> int:
-        return self.function.num_params
-
-    def differentiate(self, theta: Theta, keys: Keys) -> Differentiation:
-        points = self._point(theta) + self._draw(keys)[1]
-        return Differentiation(jnp.asarray(self.function.value(points)), jnp.asarray(self.function.gradient(points)))
-
-    def differentiate_steps(self, theta: Theta, keys: Keys) -> StepDifferentiation:
-        batch = self.differentiate(theta, keys)
-        return StepDifferentiation(batch.value, batch.gradient[:, None], None)
-
-    def linearise(self, theta: Theta, keys: Keys) -> Linearisation:
-        _, noise = self._draw(keys)
-        samples, size = noise.shape
-        none = jnp.zeros((samples, 0, size))
-        return Linearisation(
-            steps=self._steps(theta, None, noise),
-            cost_state=none,
-            cost_control=none[:, :, :0],
-            final_state=jnp.asarray(self.function.gradient(self._point(theta) + noise)),
-            over_state=jnp.zeros((samples, 0, size, size)),
-            over_control=jnp.zeros((samples, 0, size, 0)),
-            policy_state=None,
-            start_jacobian=jnp.broadcast_to(jnp.eye(size), (samples, size, size)),
-        )
-
-    def value_and_gradient(
-        self, theta: Float[Array, " params"], key: Key[Array, ""]
-    ) -> tuple[float, Float[np.ndarray, " params"]]:
-        point = self._point(theta)
-        return float(self.function.value(point)), self.function.gradient(point)
-
-    def observe(self, theta: Theta, keys: Keys) -> dict[str, np.ndarray]:
-        return {}
-
-    def _evaluation(self, theta, starts, noise) -> Evaluation:
-        point = self._point(theta)
-        baseline = np.broadcast_to(self.function.value(point), len(noise))
-        score = noise_score(jnp.asarray(noise), self.sigma, self.noise)
-        return Evaluation(*map(jnp.asarray, (self.function.value(point + noise), score, baseline)))
-
-    def _steps(self, theta, starts, noise) -> StepEvaluation:
-        batch = self._evaluation(theta, starts, noise)
-        return StepEvaluation(batch.value[:, None], batch.baseline[:, None], batch.score[:, None], None)
-
-    def _draw(self, keys) -> tuple[None, np.ndarray]:
-        return None, self.sigma * np.asarray(batch_noise(keys, (1, self.num_params), self.noise)[1])[:, 0]
-
-    def _point(self, theta) -> np.ndarray:
-        return _checked(theta, self.num_params)
-
-
-def _checked(theta, size: int) -> np.ndarray:
-    theta = np.asarray(theta, float)
-    if theta.ndim > 2 or theta.shape[-1:] != (size,):
-        raise ValueError(f"theta must have shape ({size},), got {theta.shape}")
-    return theta
+        object.__setattr__(self, "system", _FinalCost(self.function))

@@ -32,7 +32,7 @@ from jaxtyping import Array, Float, Int, Key
 
 from mjx_study.reference.system import ControlJacobians, Controls, Costs, QuadraticCost, StateJacobians, States
 
-MOST_TURNED: Final = 1e-3
+MAX_TURNED: Final = 1e-3
 """Bound on the deviation of a velocity that was not reflected [rad]."""
 MAX_IMPACTS: Final = 4
 """Maximum number of impacts per step; a ball still approaching the paddle afterwards passes through."""
@@ -144,7 +144,7 @@ def tennis_metrics(
     first = velocity[..., :1, :]
     across = first[..., 0] * velocity[..., 1] - first[..., 1] * velocity[..., 0]
     along = first[..., 0] * velocity[..., 0] + first[..., 1] * velocity[..., 1]
-    turned = (abs(across) > MOST_TURNED * abs(along)) | (along < 0)
+    turned = (abs(across) > MAX_TURNED * abs(along)) | (along < 0)
     away = position[..., -1, :] - np.array(Tennis.goal[:2])
     return {"hit": turned.any(-1) * 1.0, "distance [m]": (away**2).sum(-1) ** 0.5}
 

@@ -24,7 +24,7 @@ _ANGLE: Final = np.linspace(0, 2 * np.pi, 97)[:-1]
 CIRCLE: Final = np.stack([np.cos(_ANGLE), np.sin(_ANGLE)], axis=1)
 """Points of a unit circle; circles are drawn as this polygon."""
 _MESH_POINTS: Final = 400
-_MOST_TRACES: Final = 6
+_MAX_TRACES: Final = 6
 _FIXED_LAYER, _TRACE_LAYER, _MOVING_LAYER = 1, 2, 3
 Geom = mujoco.mjtGeom
 
@@ -187,7 +187,7 @@ class Drawing:
         """Path (times, 2) and colour of each moving body, or of each mechanism if there are many bodies."""
         model, moving = self.motion.model, self.motion.moving
         bodies, centres = np.flatnonzero(moving), self.motion.poses.centre
-        if len(bodies) > _MOST_TRACES:
+        if len(bodies) > _MAX_TRACES:
             bodies, centres = np.flatnonzero(moving & ~moving[model.body_parentid]), self.motion.poses.subtree
         paths = []
         for body in bodies:

@@ -22,12 +22,12 @@ from mjx_study.render.drawing import Drawing
 from mjx_study.render.motion import Motion, resolve_view
 from mjx_study.render.opengl import RenderError, images
 
-MOST_FILM_FRAMES: Final = 120
+MAX_FILM_FRAMES: Final = 120
 """Maximum number of frames in a film; longer ones have fewer per second."""
 FRAMES_PER_SECOND: Final = 25
 LAST_FRAME: Final = 0.5
 """Extra time for the last frame [s], so that a loop ends visibly."""
-MOST_GIF_BYTES: Final = 1_000_000
+MAX_GIF_BYTES: Final = 1_000_000
 """Size of a GIF above which its pictures are made smaller [bytes]."""
 _WIDTH: Final = 9.0  # of a strip [inches]
 _GAP: Final = 0.14
@@ -166,7 +166,7 @@ def frame_times(motion: Motion, slow: float = 1.0) -> tuple[Int[np.ndarray, " fr
     if not (slow > 0 and math.isfinite(slow)):
         raise ValueError(f"slow must be a positive number, got {slow}")
     shown = motion.duration * slow
-    count = max(2, min(MOST_FILM_FRAMES, len(motion.time), round(shown * FRAMES_PER_SECOND) + 1))
+    count = max(2, min(MAX_FILM_FRAMES, len(motion.time), round(shown * FRAMES_PER_SECOND) + 1))
     indices = motion.at(count)
     ends = np.round(100 * slow * (motion.time[indices] - motion.time[0])).astype(int)
     lengths = np.append(np.maximum(np.diff(ends), 2), round(100 * LAST_FRAME))
@@ -237,9 +237,9 @@ def _gif(frames: np.ndarray, lengths: np.ndarray, colours: int) -> bytes:
     images = [Image.fromarray(frame) for frame in frames]
     while True:
         content = _encode(images, lengths, colours)
-        if len(content) <= MOST_GIF_BYTES or images[0].width < 200:
+        if len(content) <= MAX_GIF_BYTES or images[0].width < 200:
             return content
-        factor = max(0.5, 0.95 * math.sqrt(MOST_GIF_BYTES / len(content)))
+        factor = max(0.5, 0.95 * math.sqrt(MAX_GIF_BYTES / len(content)))
         size = tuple(max(1, round(factor * side)) for side in images[0].size)
         images = [image.resize(size, Image.Resampling.LANCZOS) for image in images]  # type: ignore[arg-type]
 

@@ -23,7 +23,7 @@ def check(name: str, objective: Any, start=START, end=END, samples: int = 50_000
 
 
 @pytest.mark.parametrize("name", [name for name, each in ESTIMATORS.items() if each.unbiased != "no"])
-def test_what_is_unbiased_passes_on_a_smooth_objective(name: str) -> None:
+def test_unbiased_estimators_pass_on_a_smooth_objective(name: str) -> None:
     """A quadratic, whose difference is known; a bias of a tenth would be found."""
     found = check(name, objectives.quadratic(HESSIAN, 0.3))
     exact = (END @ HESSIAN @ END - START @ HESSIAN @ START) / 2
@@ -70,7 +70,7 @@ def test_a_path_too_long_for_its_nodes_is_not_judged_right() -> None:
     assert check("fobg", wave, jnp.zeros(1), 0.05 * jnp.ones(1), 5000).verdict() == "right"
 
 
-def test_what_has_no_meaning_is_refused() -> None:
+def test_meaningless_arguments_are_refused_by_circulation() -> None:
     fobg = make_estimator("fobg")
     with pytest.raises(ValueError, match="nodes must be an odd number; got 4"):
         circulation(

@@ -62,7 +62,7 @@ def numbers(estimate: GradientEstimate) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("kind", ["gaussian", "heavy", "lost", "far"])
-def test_blocks_tell_what_rows_do(kind: str) -> None:
+def test_merged_statistics_equal_those_of_all_rows(kind: str) -> None:
     for name, (rows, merged) in estimates(drawn(kind)).items():
         exact = numbers(rows)
         for what, value in numbers(merged).items():
@@ -106,7 +106,7 @@ def test_thinned_norms_are_a_sample_of_all() -> None:
         assert median != pytest.approx(float(np.median(norms)), rel=1e-6)  # it is a substitute
 
 
-def test_equal_rows_have_no_variance_in_blocks_either() -> None:
+def test_equal_rows_in_blocks_have_zero_variance() -> None:
     row = np.array([0.1, 1e6 / 3, -7.7])
     (merged,) = merged_estimates(reduce(merge, [moments_of([np.tile(row, (50, 1))], 0, 1)] * 3), 150)
     assert merged.variance == 0.0 and estimators.effective_samples(merged).count == 0.0
@@ -130,7 +130,7 @@ def test_blocks_without_a_finite_sample_count_for_nothing() -> None:
         assert np.all(np.isnan(estimators.norm_quantiles(none, (0.5, 1.0))))
 
 
-def test_what_is_kept_does_not_grow_with_the_samples(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_moments_do_not_grow_with_the_samples(monkeypatch: pytest.MonkeyPatch) -> None:
     rows = drawn("gaussian")
     sizes = [sum(leaf.size for leaf in jax.tree.leaves(in_blocks((each[:many], each[:many]), many // 256)))
              for many in (1024, 4096) for each in rows[:1]]  # fmt: skip

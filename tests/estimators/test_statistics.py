@@ -61,7 +61,7 @@ def test_too_few_rows_are_undefined_and_no_exception():
         assert np.all(np.isnan(variance_interval(estimate, 0.9)))
 
 
-def test_equal_rows_have_no_variance_at_all():
+def test_equal_rows_have_zero_variance():
     rows = jnp.broadcast_to(jnp.array([0.1, 1e6 / 3, -7.7]), (977, 3))
     estimate = summarise(rows)
     assert estimate.variance == 0.0

@@ -102,7 +102,7 @@ def test_less_variance_where_theory_says_so(lots) -> None:
 
 
 @pytest.mark.parametrize("name", [*BLIND, *SIGHTED])
-def test_what_each_makes_of_a_jump(name: str) -> None:
+def test_estimators_at_a_jump(name: str) -> None:
     """Zeroth order finds the jump's slope, inverse variances trust the flat derivative, DDCG's test sees the jump."""
     objective, theta = objectives.heaviside(0.6), [0.3]
     exact = objectives.heaviside_gradient(jnp.asarray(theta), 0.6)
@@ -134,7 +134,7 @@ def few() -> tuple[Differentiation, StepDifferentiation, Linearisation, StepEval
     return draw(keys)
 
 
-def test_all_batches_tell_the_same_story(few) -> None:
+def test_all_kinds_of_batches_agree_on_the_same_rollouts(few) -> None:
     differentiation, by_step, linearisation, steps, evaluation = few
     pulled = pull_back(by_step.noise_gradient, by_step.policy_jacobian)
     np.testing.assert_allclose(pulled, differentiation.gradient, rtol=1e-12)

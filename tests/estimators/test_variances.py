@@ -99,7 +99,7 @@ def test_antithetic_pairs_leave_no_variance_of_curvature():
     assert_variance_is(single, gradient, zeroth_variance_of_quadratic(), resolution=0.06)
 
 
-def test_costs_to_go_drop_what_came_before():
+def test_costs_to_go_omit_earlier_costs():
     """Step costs c_h w_h: sample h is w_h sum_{k >= h} c_k w_k / sigma^2, of variance 2 c_h^2 + sum_{k > h} c_k^2.
 
     With total costs it is (d + 1) sum c^2.

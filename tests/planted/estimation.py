@@ -38,7 +38,7 @@ OBJECTIVE: Final = (
         "jnp.cumsum(running[::-1])[::-1] + self.task.final_cost",
         "jnp.cumsum(running) + self.task.final_cost",
         "costs up to a step in place of those from it on",
-        ("tests/test_batches.py::test_costs_to_go_are_sums_of_what_is_left",),
+        ("tests/test_batches.py::test_costs_to_go_are_sums_of_remaining_costs",),
     ),
     Defect(
         "score-without-its-scale",

@@ -257,7 +257,7 @@ def test_refuses(make, match):
         make()
 
 
-def test_refuses_to_smooth_what_it_cannot():
+def test_a_function_without_breakpoints_is_refused():
     class Bare:
         num_params = 1
 

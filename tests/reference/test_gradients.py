@@ -134,6 +134,6 @@ def test_batches_of_starts_and_controls_are_broadcast(case: RolloutCase):
         (np.zeros(4), np.zeros((5, 1)), np.zeros((4, 1)), r"must be \(1, 4\), got shape \(4, 1\)"),
     ],
 )
-def test_refuses_what_does_not_fit(start, controls, feedback, match):
+def test_shapes_that_do_not_match_are_refused(start, controls, feedback, match):
     with pytest.raises(ValueError, match=match):
         roll_out(STEPS["pusher"].system, start, controls, feedback)

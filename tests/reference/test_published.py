@@ -76,7 +76,7 @@ def test_their_settings_are_the_published_ones(name: str) -> None:
         assert own == (settings["mu"], settings["vs"], settings["width"])
 
 
-def test_every_task_is_the_published_system_or_says_in_what_it_differs() -> None:
+def test_every_task_states_its_differences_from_the_published_system() -> None:
     systems = {name.split(":")[0] for name in TASKS} - set(OWN)
     assert systems == {*DIFFER, "pusher", "sliding_box"}
     page = (PAGES / "published-systems.md").read_text()

@@ -1,0 +1,157 @@
+"""Divide long sequences of C statements into functions, with what several of them use in memory.
+
+Compilers allocate registers in time that grows faster than linearly with the length of a function, and keep values in
+memory anyway that are used far from where they are computed.
+"""
+
+import heapq
+import itertools
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True)
+class Statement:
+    """Statements that stay together.
+
+    Attributes:
+        text: the C code; variable `x5` has number 5.
+        uses: numbers of the variables that it reads and does not declare.
+        defines: types of the variables that it declares or assigns, by number.
+        size: number of lines.
+    """
+
+    text: str
+    uses: frozenset[int]
+    defines: Mapping[int, str] = field(default_factory=dict)
+    size: int = 1
+
+
+@dataclass(frozen=True)
+class Loop:
+    """A loop that computes `test`, ends if the mask with the number `again` is empty, and computes `body`."""
+
+    test: Sequence["Statement | Loop"]
+    again: int
+    body: Sequence["Statement | Loop"]
+
+    def together(self) -> Statement:
+        inside = [each.together() if isinstance(each, Loop) else each for each in (*self.test, *self.body)]
+        split = len(self.test)
+        lines = [each.text for each in inside]
+        lines.insert(split, f"if (!any(x{self.again})) break;")
+        own = {at for each in inside for at in each.defines if at not in each.uses}
+        assigned = {at: kind for each in inside for at, kind in each.defines.items() if at not in own}
+        uses = frozenset(at for each in inside for at in each.uses) - own
+        text = "\n".join(["for (;;) {", *lines, "}"])
+        return Statement(text, uses, assigned, sum(each.size for each in inside))
+
+
+def in_parts(items: Iterable[Statement | Loop], loads: Mapping[int, str], most: int) -> tuple[list[str], int]:
+    """Write functions of at most about `most` lines, the last of which, `samples`, calls the others.
+
+    Args:
+        loads: declarations of variables that any function may repeat, by number.
+
+    Returns:
+        The functions, and how many values they keep in memory.
+    """
+    parts = _Parts(loads, most)
+    parts.place(items)
+    parts.close()
+    return parts.written()
+
+
+class _Parts:
+    def __init__(self, loads: Mapping[int, str], most: int):
+        self._loads, self._most = loads, most
+        self._open: list[Statement] = []
+        self._parts: list[list[Statement]] = []
+        self._driver: list[str | int] = []  # lines, and numbers of masks that end a loop
+        self._loops: list[tuple[int, int]] = []  # first and last part
+
+    def place(self, items: Iterable[Statement | Loop]) -> None:
+        for item in items:
+            statement = item.together() if isinstance(item, Loop) else item
+            if isinstance(item, Loop) and statement.size > self._most:
+                self._divide(item)
+                continue
+            if sum(each.size for each in self._open) + statement.size > self._most:
+                self.close()
+            self._open.append(statement)
+
+    def _divide(self, loop: Loop) -> None:
+        self.close()
+        first = len(self._parts)
+        self._driver.append("for (;;) {")
+        self.place(loop.test)
+        self.close()
+        self._driver.append(loop.again)
+        self.place(loop.body)
+        self.close()
+        self._driver.append("}")
+        self._loops.append((first, len(self._parts) - 1))
+
+    def close(self) -> None:
+        if self._open:
+            self._driver.append(f"part{len(self._parts)}(PASSED);")
+            self._parts.append(self._open)
+            self._open = []
+
+    def written(self) -> tuple[list[str], int]:
+        kinds = {at: kind for part in self._parts for each in part for at, kind in each.defines.items()}
+        slots, size = self._slots()
+        functions = []
+        for place, part in enumerate(self._parts):
+            own: set[int] = set()
+            used: dict[int, None] = {}
+            for each in part:
+                used |= dict.fromkeys(at for at in sorted(each.uses) if at not in own)
+                own |= set(each.defines) - each.uses
+            recalled = [self._loads.get(at) or f"{kinds[at]} x{at} = RECALL({kinds[at]}, {slots[at]});" for at in used]
+            changed = dict.fromkeys(at for each in part for at in each.defines if at in slots)
+            functions.append(
+                "\n".join(
+                    [
+                        f"APART void part{place}(ARGUMENTS) {{",
+                        *recalled,
+                        *(each.text for each in part),
+                        *(f"KEEP({kinds[at]}, {slots[at]}, x{at});" for at in changed),
+                        "}",
+                    ]
+                )
+            )
+        driver = [
+            line if isinstance(line, str) else f"if (!any(RECALL(mask, {slots[line]}))) break;" for line in self._driver
+        ]
+        return [*functions, "\n".join(["PART void samples(ARGUMENTS) {", *driver, "}"])], size
+
+    def _slots(self) -> tuple[dict[int, int], int]:
+        """Places in memory of the variables that several parts use, and their number; free ones are used again."""
+        first: dict[int, int] = {}
+        last: dict[int, int] = {}
+        for place, part in enumerate(self._parts):
+            for each in part:
+                for at in each.defines:
+                    first.setdefault(at, place)
+                for at in (*each.uses, *each.defines):
+                    last[at] = place
+        for line in self._driver:
+            if isinstance(line, int):
+                last[line] += 1
+        for at, begin in first.items():
+            for start, end in self._loops:
+                if begin < start <= last[at]:
+                    last[at] = max(last[at], end)
+        slots: dict[int, int] = {}
+        free: list[int] = []
+        ends: list[tuple[int, int]] = []
+        fresh = itertools.count()
+        for at, begin in sorted(first.items(), key=lambda each: each[1]):
+            if last[at] == begin:
+                continue
+            while ends and ends[0][0] < begin:
+                heapq.heappush(free, heapq.heappop(ends)[1])
+            slots[at] = heapq.heappop(free) if free else next(fresh)
+            heapq.heappush(ends, (last[at], slots[at]))
+        return slots, next(fresh)
