@@ -26,6 +26,7 @@ from estimators import FirstOrder, ZerothOrder
 from estimators.noise import split_sample_key, standard_noise
 from mjx_study.compiled import Compiled
 from mjx_study.experiment.memory import check_memory
+from mjx_study.graph.native import native_summary
 from mjx_study.objective import Simulator, chunk_for, simulate, spread
 from mjx_study.progress import Progress, silent
 from mjx_study.runtime import environment, local_devices
@@ -99,6 +100,7 @@ class BenchReport:
         return [
             f"{self.task}: {self.samples} samples of {self.horizon} steps, {self.contact}, "
             f"{machine['precision']}, {len(machine['devices'])} x {machine['backend']} ({device})",
+            f"native code: {machine['native']}",
             "per sample:",
             *(
                 f"  {label:<46} {1e3 * self.seconds[name]:8.3f} ms  {rates[name]:8.3f} million steps/s"
@@ -182,7 +184,7 @@ def run_bench(plan: BenchPlan, progress: Progress = silent) -> BenchReport:
         seconds=seconds,
         value_memory=simulator.memory("value", cell.contact, samples) / 2**20,
         gradient_memory=simulator.memory("gradient", cell.contact, samples) / 2**20,
-        environment=environment(),
+        environment=environment() | {"native": native_summary()},
     )
 
 

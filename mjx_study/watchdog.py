@@ -24,6 +24,7 @@ STANDSTILL: Final = (
 )
 NAME: Final = "watchdog"
 _AWAITED: Final[list[int]] = []
+_ELSEWHERE: Final[list[int]] = []
 
 
 @contextmanager
@@ -34,6 +35,16 @@ def awaited() -> Generator[None]:
         yield
     finally:
         _AWAITED.pop()
+
+
+@contextmanager
+def elsewhere() -> Generator[None]:
+    """Mark that another process, such as a compiler, works for this one."""
+    _ELSEWHERE.append(0)
+    try:
+        yield
+    finally:
+        _ELSEWHERE.pop()
 
 
 def watch(complain: Callable[[str], None], seconds: int = SECONDS, tick: float = 1.0) -> None:
@@ -55,7 +66,7 @@ def watch(complain: Callable[[str], None], seconds: int = SECONDS, tick: float =
         still, before = 0, _spent()
         while True:
             time.sleep(tick)
-            if not _AWAITED or _spent() - before > LEAST * tick * (still + 1):
+            if not _AWAITED or _ELSEWHERE or _spent() - before > LEAST * tick * (still + 1):
                 still, before = 0, _spent()
                 continue
             still += 1

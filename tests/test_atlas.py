@@ -13,14 +13,14 @@ from mjx_study.table import percent
 TABLE = table.read(run.RESULTS)
 
 
-def test_the_page_says_what_the_file_says() -> None:
+def test_tables_of_the_page_are_those_of_the_file() -> None:
     text = page.PAGE.read_text()
     assert replace_tables(text, page.tables(TABLE)) == text
     assert run.RESULTS.stat().st_size < 1.5e6
 
 
 def _off(part: table.Table, verdict: str = "fobg_off") -> tuple[int, int]:
-    """Cells with a verdict, and those decided."""
+    """Number of cells with a verdict, and of those decided."""
     return int((part[verdict] == 1).sum()), int(part[verdict].notna().sum())
 
 
@@ -79,14 +79,14 @@ def _statements() -> list[str]:
     ]
 
 
-def test_sentences_of_the_page_have_the_numbers_of_the_file() -> None:
+def test_sentences_of_the_page_have_numbers_of_the_file() -> None:
     text = " ".join(page.PAGE.read_text().split())
     assert not [each for each in _statements() if each not in text]
 
 
 @pytest.mark.slow
-def test_cells_are_computed_again_with_the_same_numbers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Another machine rounds otherwise, which changes chaotic cells, so the median is compared."""
+def test_recomputed_cells_have_the_same_numbers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Compare medians, since another machine rounds differently, which changes chaotic cells."""
     monkeypatch.delenv("XLA_FLAGS", raising=False)  # without optimisation programs round otherwise
     run.run(tmp_path, 1, 3600.0, run.BLOCK, ["momentum_transfer at 0.004", "pusher at 0.0025"])
     found = run.read(tmp_path / run.RESULTS.name)
@@ -116,7 +116,7 @@ def test_the_file_holds_the_cells_of_the_design() -> None:
             assert row[name] == pytest.approx(getattr(cell, name), rel=2**-run.DIGITS)
 
 
-def test_parts_are_joined_and_a_cell_that_was_computed_twice_is_kept_once(tmp_path: Path) -> None:
+def test_parts_are_joined_without_duplicate_cells(tmp_path: Path) -> None:
     for part, indices in enumerate([[3, 1], [1, 2]]):
         columns = {"index": np.array(indices, float), "slope": np.array(indices) / 3}
         run.write(tmp_path / f"part-{part}.npz", [columns])
@@ -129,12 +129,12 @@ def test_parts_are_joined_and_a_cell_that_was_computed_twice_is_kept_once(tmp_pa
     np.testing.assert_allclose(found["slope"], np.array([1, 2, 3]) / 3, rtol=2**-run.DIGITS)
 
 
-def test_rounding_keeps_what_is_no_number() -> None:
+def test_rounding_keeps_nan_infinity_and_zero() -> None:
     np.testing.assert_array_equal(run.rounded(np.array([np.nan, np.inf, -np.inf, 0.0])), [np.nan, np.inf, -np.inf, 0])
 
 
 def planted(threshold: float, flipped: float, size: int = 4000) -> table.Table:
-    """Cells whose verdict is 1 above a threshold, but for a share of them."""
+    """Cells whose verdict is 1 above a threshold, except for a flipped share."""
     rng = np.random.default_rng(0)
     group = np.exp(rng.normal(size=size))
     verdict = (group > threshold) ^ (rng.random(size) < flipped)
@@ -143,7 +143,7 @@ def planted(threshold: float, flipped: float, size: int = 4000) -> table.Table:
 
 
 @pytest.mark.parametrize(("threshold", "flipped"), [(0.5, 0.0), (2.0, 0.1)])
-def test_a_rule_is_as_often_right_as_planted_and_its_threshold_is_found(threshold: float, flipped: float) -> None:
+def test_planted_accuracy_and_threshold_of_a_rule_are_found(threshold: float, flipped: float) -> None:
     """Standard error of a share: 0.01 at 1000 cells; the threshold is one of 99 quantiles."""
     cells = planted(threshold, flipped)
     rule = table.Rule("", "group", threshold, "verdict", lambda cells: cells.group > 0)
@@ -170,7 +170,7 @@ def test_a_rule_is_as_often_right_as_planted_and_its_threshold_is_found(threshol
         (0.22, 0.02, 0.01, 30.0, np.nan),
     ],
 )
-def test_a_mean_is_off_where_its_interval_and_the_reference_s_say_so(bias, error, uncertain, effective, expected):
+def test_a_mean_is_off_beyond_both_intervals(bias, error, uncertain, effective, expected):
     columns = {"bias": bias, "bias_se": error, "effective": effective, "lost": 0.0}
     cell = {f"fobg_{name}": [value] for name, value in columns.items()} | {"slope": [-1.0], "slope_se": [uncertain]}
     np.testing.assert_array_equal(table.is_off(pd.DataFrame(cell), "fobg"), [expected])

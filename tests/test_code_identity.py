@@ -10,8 +10,9 @@ import pytest
 
 from mjx_study.choices import KINDS
 from mjx_study.digest import FORMER, digest_of
-from mjx_study.identity import NOT_COMPUTING, computing_code, differences
+from mjx_study.identity import NOT_COMPUTING, computing_code, contents, differences
 from mjx_study.reference import MomentumTransfer
+from mjx_study.tasks import make_task
 from tests.test_layering import FILES, LAYERS, ROOT, module_of, read
 
 RUN = "mjx_study.execution.run"
@@ -99,6 +100,22 @@ def test_a_change_of_a_file_changes_the_digest_if_the_file_counts(tree: Path) ->
         (tree / path).write_bytes(content + b"# changed\n")
         assert (digest() != before) is counts(path), path
         (tree / path).write_bytes(content)
+
+
+TASKS_OF_0_1 = {
+    "pusher": "5b28e22fc7986058",
+    "sliding_box": "811bb5ec7f975d5a",
+    "ball_wall": "5973a39ce012e441",
+    "momentum_transfer": "09286b973cffa55f",
+    "tennis": "03caf6341cb9ce0e",
+    "double_pendulum": "67326dfa2023e920",
+}
+
+
+@pytest.mark.parametrize("name", TASKS_OF_0_1)
+def test_folders_of_built_in_tasks_are_recognised(name: str) -> None:
+    """Those of version 0.1.0: another digest refuses every unfinished study of the task."""
+    assert contents({name: [make_task(name)]})[f"task {name}"] == TASKS_OF_0_1[name]
 
 
 def test_a_moved_class_keeps_its_digest() -> None:

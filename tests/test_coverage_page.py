@@ -1,4 +1,4 @@
-"""docs/coverage.md agrees with its script: some rows recomputed, and the shape of all of them."""
+"""docs/coverage.md agrees with its script: some rows are recomputed, all have the right shape."""
 
 import re
 from pathlib import Path
@@ -14,13 +14,13 @@ PAGE = (ROOT / "docs" / "coverage.md").read_text()
 
 
 def rows(name: str) -> list[list[str]]:
-    """Of a table of the page, less its header."""
+    """Rows of a table of the page, without its header."""
     (text,) = re.findall(rf"<!-- table: {name} -->\n(.*?)\n<!-- end -->", PAGE, re.DOTALL)
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines()[2:]]
 
 
 def same(found: list[str], said: list[str]) -> None:
-    """Words as they are, numbers within the last digit and a trial or two that rounding turns."""
+    """Equal words, and numbers within the last digit, since rounding may turn a trial or two."""
     assert len(found) == len(said)
     for one, other in zip(found, said, strict=True):
         try:
@@ -40,19 +40,19 @@ def test_intervals_and_the_test_for_bias(kind: str) -> None:
 
 @pytest.mark.slow
 def test_rare_samples() -> None:
-    """The fast suite has the same case in `test_bias`, by fewer trials."""
+    """The fast suite has the same case in `test_bias`, with fewer trials."""
     (said,) = [row for row in rows("rare") if row[:2] == ["0.4", "50"]]
     same(coverage.rare_row(0.4, 50), said)
 
 
-def test_every_kind_and_size_is_there() -> None:
+def test_tables_have_every_kind_and_size() -> None:
     expected = [[kind, str(samples)] for kind in coverage.KINDS for samples in coverage.SAMPLES]
     assert [row[:2] for row in rows("intervals")] == expected == [row[:2] for row in rows("test")]
     assert all(len(row) == 2 + len(coverage.COLUMNS) for row in rows("intervals"))
 
 
-def test_what_the_page_says_of_its_tables() -> None:
-    """The sentences that a change of the estimators could make false."""
+def test_sentences_of_the_page_hold() -> None:
+    """Sentences that a change of the estimators could falsify."""
     for row in rows("rare"):
         assert float(row[3]) < 0.06  # rejects at 5 %, whether believable or not
     for row in rows("dimensions"):

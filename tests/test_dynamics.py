@@ -275,6 +275,18 @@ def test_elliptic_contact_without_tangential_velocity() -> None:
         assert 0 < derivative(point)[3, 3] < 1
 
 
+def test_a_step_that_is_no_graph_has_the_same_derivative(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In both modes, by its matrix; small models keep forward mode, in which cases not taken do not count."""
+    extra = 'cone="elliptic" solver="Newton"'
+    expected = sliding_jacobian(extra)(at(-0.0004))
+    monkeypatch.setattr(dynamics, "_slope", lambda *arguments: None)
+    scene, point = sliding(extra), jnp.asarray(at(-0.0004))
+    assert_close_by_rows(state_jacobian(scene)(at(-0.0004)), expected, 1e-12)
+    after = lambda x: step_flat(scene, scene.model, x, jnp.zeros(3))[0]  # noqa: E731
+    assert_close_by_rows(compiled(jax.jacrev(after), point)(point), expected, 1e-12)
+    assert "remat" not in str(jax.make_jaxpr(jax.jacrev(after))(point))
+
+
 def test_without_contact_the_derivative_is_free_fall() -> None:
     scene = sliding()
     expected = np.block([[np.eye(3), scene.timestep * np.eye(3)], [np.zeros((3, 3)), np.eye(3)]])

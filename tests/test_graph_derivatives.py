@@ -234,7 +234,7 @@ def solved(x: Any, force: Any) -> Any:
     return [*equations(x, force, root)[1:], root]
 
 
-def test_the_implicit_derivative_is_that_of_the_converged_loop() -> None:
+def test_the_implicit_derivative_is_that_of_the_loop() -> None:
     function, force = captured(equations, ROW, 1.0, ROW), jnp.array(0.8)
     root = solved(ROW, force)[-1]
     expected = jax.jit(jax.jacfwd(solved, argnums=(0, 1)))(ROW, force)

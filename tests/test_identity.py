@@ -313,27 +313,6 @@ def test_a_run_made_longer_survives_a_kill(tmp_path: Path, monkeypatch: pytest.M
     assert descended(tmp_path, 8).drop_vars("seconds").equals(descended(None, 8).drop_vars("seconds"))
 
 
-def test_a_run_of_other_contents_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    descended(tmp_path, 2)
-    other = make_task("ball_wall").replace(final_cost=lambda state: state.qpos[0])
-    with pytest.raises(StudyError, match="another study .task ball_wall "):
-        descended(tmp_path, 3, other)
-    monkeypatch.setattr(identity, "precision", lambda: "float32")
-    with pytest.raises(StudyError, match="another study .precision float64 there and float32 here"):
-        descended(tmp_path, 3)
-
-
-def test_a_run_of_other_versions_needs_a_flag_and_remembers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    descended(tmp_path, 2)
-    other_jax(monkeypatch)
-    assert descended(tmp_path, 2).attrs["mixed_versions"] == ""
-    with pytest.raises(StudyError, match="was computed with other versions .jax .* --accept-versions"):
-        descended(tmp_path, 3)
-    for iterations in (3, 4):
-        found = warnings_of(descended(tmp_path, iterations, accept_versions=True))
-        assert any("different versions: jax" in text and "and 99.0" in text for text in found)
-
-
 def test_what_differs_is_told() -> None:
     assert differences({"a": 1, "b": 2}, {"b": 3, "c": 4}) == (
         "a 1 there and none here, b 2 there and 3 here, c none there and 4 here"

@@ -1,4 +1,4 @@
-"""The notebooks run from top to bottom, show what a run of them gave, and use nothing that is private."""
+"""Notebooks run from top to bottom, keep the outputs of one run, and use only public names."""
 
 import ast
 import os
@@ -16,9 +16,9 @@ import mjx_study
 ROOT = Path(__file__).parents[1]
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 LARGEST = 300_000
-"""Bytes of a notebook with its outputs."""
+"""Largest notebook with its outputs [bytes]."""
 LONGEST = 120
-"""Seconds of a run at full size with its programs compiled; the README promises fewer."""
+"""Limit of a full run with compiled programs, as the README promises [s]."""
 SMALL = {
     "1_stiffness_sweep": "STIFFNESS, SEEDS, SAMPLES, REFERENCE_SAMPLES = (10.0, 1200.0), 3, 8, 40",
     "2_which_estimator": "SAMPLES, REFERENCE_SAMPLES, ITERATIONS = 8, 20, 3",
@@ -30,7 +30,7 @@ SMALL = {
         "STATES, STEPS, FORCES, POINTS = 1, 5, 3, 3\nCONTACT, HORIZON = ('mujoco_default', 'smooth_onset'), 190"
     ),
 }
-"""In place of the cell of parameters, so that a run is short."""
+"""Parameters of a short run."""
 ABSOLUTE = re.compile(r"(?<![\w.~])/(?:home|root|Users|tmp|var|usr|opt|mnt|srv|private|proc)/|[A-Z]:\\\\")
 
 each = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
@@ -45,7 +45,7 @@ def code_cells(notebook: nbformat.NotebookNode) -> list[Any]:
 
 
 def python(cell: Any) -> ast.Module:
-    """A cell's code without its magics."""
+    """Parse a cell's code without its magics."""
     return ast.parse("\n".join(line for line in cell.source.splitlines() if not line.startswith("%")))
 
 
@@ -54,14 +54,14 @@ def assigned(source: str) -> set[str]:
 
 
 def shown(output: Any) -> list[str]:
-    """What a reader sees of an output, pictures left out."""
+    """Texts of an output."""
     if output.output_type == "stream":
         return [output.text]
     return [text for kind, text in output.get("data", {}).items() if kind.startswith("text/")]
 
 
 def private(tree: ast.AST) -> list[str]:
-    """Names that code uses although they are not public."""
+    """Private names that code uses."""
     modules = [name for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) for name in [f"{node.module}"]]
     attributes = [node for node in ast.walk(tree) if isinstance(node, ast.Attribute)]
     ours = [node.attr for node in attributes if isinstance(node.value, ast.Name) and node.value.id == "mjx_study"]
@@ -75,7 +75,7 @@ def test_there_is_one_for_each_question() -> None:
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """An empty folder to run in, as a reader would."""
+    """An empty folder to run in."""
     monkeypatch.setenv("IPYTHONDIR", str(tmp_path / "ipython"))  # no start-up files of whoever runs the tests
     monkeypatch.delenv("XLA_FLAGS")  # a reader's programs are optimised
     path = tmp_path / "run"
@@ -97,7 +97,7 @@ def execute(notebook: nbformat.NotebookNode, folder: Path, timeout: int = 600) -
 @pytest.mark.slow
 @each
 def test_runs(path: Path, folder: Path) -> None:
-    """At a small size, in an empty folder, where it leaves nothing behind."""
+    """At a small size, without leaving files."""
     notebook = read(path)
     (parameters,) = [cell for cell in code_cells(notebook) if "parameters" in cell.metadata.get("tags", ())]
     assert assigned(SMALL[path.stem]) == assigned(parameters.source)
@@ -126,7 +126,7 @@ def test_a_warm_run_takes_under_two_minutes(path: Path, folder: Path, monkeypatc
 
 
 @each
-def test_outputs_are_of_one_whole_run(path: Path) -> None:
+def test_outputs_come_from_one_complete_run(path: Path) -> None:
     cells = code_cells(read(path))
     assert [cell.execution_count for cell in cells] == list(range(1, len(cells) + 1))
     outputs = [output for cell in cells for output in cell.outputs]
@@ -137,7 +137,7 @@ def test_outputs_are_of_one_whole_run(path: Path) -> None:
 
 
 @each
-def test_nothing_of_the_machine_is_kept(path: Path) -> None:
+def test_outputs_reveal_nothing_of_the_machine(path: Path) -> None:
     notebook = read(path)
     texts = [cell.source for cell in notebook.cells]
     texts += [text for cell in code_cells(notebook) for output in cell.outputs for text in shown(output)]
@@ -163,8 +163,8 @@ def test_the_title_asks_and_the_text_answers(path: Path) -> None:
     assert install.metadata.tags == ["install"] and "mjx_study.configure()" in setup.source
 
 
-def test_the_same_cell_installs_where_there_is_no_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """From the wheel beside the notebook, and for the GPU if there is one. Where there is the package, nothing runs."""
+def test_the_first_cell_installs_a_missing_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """From the wheel beside the notebook, with CUDA if there is a GPU; it does nothing if the package is installed."""
     (source,) = {code_cells(read(path))[0].source for path in NOTEBOOKS}
     commands: list[list[str]] = []
     monkeypatch.setattr("subprocess.run", lambda command, check: commands.append(command))

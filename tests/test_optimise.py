@@ -21,7 +21,7 @@ from mjx_study.cli import motions, options
 from mjx_study.execution.run import run_study
 from mjx_study.experiment import descents, plan, sampling
 from mjx_study.experiment import iteration as descent
-from mjx_study.experiment.checkpoint import Checkpoint, StudyError
+from mjx_study.experiment.checkpoint import Checkpoint
 from mjx_study.experiment.descents import Backend
 from mjx_study.experiment.iteration import REASONS, begin, make_optimizer
 from mjx_study.experiment.plan import plan_study
@@ -195,21 +195,6 @@ def test_a_run_killed_in_its_middle_goes_on(tmp_path: Path, monkeypatch: pytest.
         np.testing.assert_array_equal(resumed.isel(dict.fromkeys(OUTER, 0))[name], whole[name])
     assert min(reports[1:-1]) > descents.REPORT_EVERY  # nothing before it is computed again
     assert not store.Store.open(tmp_path).part_path(0).exists()
-
-
-def test_a_folder_of_another_run_or_a_damaged_file_is_refused(tmp_path: Path) -> None:
-    study = config(estimators=("zobg",), iterations=1, contact=("reference",))
-    descend(study, tmp_path)
-    path = tmp_path / "cells" / "00000.npz"
-    kept = path.read_bytes()
-    other = config(estimators=("zobg",), iterations=1, contact=("reference",), sigma=(0.2,))
-    with pytest.raises(StudyError, match="holds another study .sigma .* there and .*; choose another folder"):
-        descend(other, tmp_path)
-    for damaged in (kept[: len(kept) // 2], b"nonsense", kept[:200] + bytes([kept[200] ^ 1]) + kept[201:]):
-        path.write_bytes(damaged)
-        with pytest.raises(StudyError, match="is damaged .*; move it away to compute it again"):
-            descend(study, tmp_path)
-        assert path.read_bytes() == damaged
 
 
 def test_a_seed_that_diverges_stops_and_the_others_go_on() -> None:

@@ -1,4 +1,4 @@
-"""What the README shows works as it stands there."""
+"""The README's example runs, and its tables are complete."""
 
 import re
 import subprocess
@@ -32,7 +32,7 @@ def test_the_python_example_runs(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_citation_is_of_this_version() -> None:
+def test_the_citation_has_this_version() -> None:
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
     assert citation["version"] == version("mjx-study") and f"version = {{{version('mjx-study')}}}" in README
     assert {"cff-version", "message", "title", "authors"} <= set(citation)  # what the schema requires

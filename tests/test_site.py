@@ -1,4 +1,4 @@
-"""The site has every page once, and what is written for GitHub reads as well there."""
+"""The site has every page once, and adapts links and formulas that are written for GitHub."""
 
 import dataclasses
 import inspect
@@ -39,11 +39,11 @@ def test_every_page_is_in_the_navigation_once() -> None:
         ("docs/tasks.md", "$HOME and $x$", "$HOME and $x$"),
     ],
 )
-def test_links_are_the_sites(page: str, text: str, expected: str) -> None:
+def test_links_lead_to_pages_of_the_site(page: str, text: str, expected: str) -> None:
     assert site.adapted(text, Path(page), PATHS) == expected
 
 
-def test_a_link_that_leads_nowhere_is_refused() -> None:
+def test_a_dead_link_is_refused() -> None:
     with pytest.raises(FileNotFoundError, match="nowhere"):
         site.adapted("[a](nowhere.md)", Path("docs/tasks.md"), PATHS)
 
@@ -54,14 +54,14 @@ def test_formulas_become_mathml() -> None:
 
 
 @pytest.mark.parametrize("package", site.PACKAGES)
-def test_the_page_of_names_has_all_public_ones(package: str) -> None:
+def test_the_page_of_a_package_has_all_public_names(package: str) -> None:
     page = site.page_of_names(package)
     names = [line.removeprefix("::: ") for line in page.splitlines() if line.startswith("::: ")]
     assert sorted(names) == sorted(f"{package}.{name}" for name in site.import_module(package).__all__)
 
 
 def left_out(found: Any) -> set[str]:
-    """What a section of arguments or attributes does not name; nothing where there is no section."""
+    """Arguments or attributes that a docstring's section leaves out; none without a section."""
     text = inspect.cleandoc(found.__doc__ or "") + "\n"
     section = re.search(r"^(?:Args|Attributes):\n((?: .*\n|\n)+)", text, re.MULTILINE)
     if section is None:
@@ -76,7 +76,7 @@ def left_out(found: Any) -> set[str]:
 
 
 @pytest.mark.parametrize("package", site.PACKAGES)
-def test_a_section_of_arguments_or_attributes_names_all_of_them(package: str) -> None:
+def test_docstrings_describe_all_arguments_or_attributes(package: str) -> None:
     module = site.import_module(package)
     public = {name: getattr(module, name) for name in module.__all__}
     for name, owner in list(public.items()):

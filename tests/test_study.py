@@ -24,7 +24,7 @@ from estimators import (
     summarise,
 )
 from estimators.registry import label_of
-from mjx_study import cli, disk
+from mjx_study import cli
 from mjx_study.cli import console
 from mjx_study.cli.studies import as_document
 from mjx_study.execution.run import run_study
@@ -180,16 +180,6 @@ def test_results_do_not_depend_on_the_chunk_size() -> None:
         np.testing.assert_allclose(chosen[0][name], chosen[1][name], rtol=1e-12)
 
 
-def test_a_cell_does_not_depend_on_the_cells_before_it(spied) -> None:
-    """The reference of a stiff contact, alone and after twelve softer ones."""
-    found, _, _ = spied
-    stiffness = float(found["stiffness"][12])
-    alone = compare(stiffness=(stiffness,), contact=("penalty",), chunk_size=4)
-    assert found["contact"].values[12] == "penalty" and stiffness == pytest.approx(1000)
-    for name in ("gradient", "reference"):
-        np.testing.assert_array_equal(alone[name].isel(model=0), found[name].isel(model=12))
-
-
 def test_a_second_run_gives_the_same_numbers(spied) -> None:
     found, _, _ = spied
     again = compare(stiffness=(10.0,), contact=("penalty",), chunk_size=4)
@@ -233,14 +223,6 @@ def test_estimators_as_objects_have_their_own_options(tmp_path: Path) -> None:
         plan_study(config(estimators=(DiscontinuityGated(sigma=7.0),), **chosen))
     with pytest.raises(ValueError, match="`estimators` has aobg twice"):
         config(estimators=("aobg", AlphaOrder()), **chosen)
-
-
-def test_a_dataset_says_what_a_study_is_good_for(spied) -> None:
-    found, _, _ = spied
-    table = found.mjx_study.table()
-    assert len(table) == 78 and set(table["estimator"]) == {"zobg", "fobg", "aobg"}
-    assert table["variance_seconds"].notnull().all() and set(found.mjx_study.plot()) == {"comparison"}
-    assert found.mjx_study.findings() == findings_of(found) and found.mjx_study.report().startswith("<!doctype html>")
 
 
 def test_findings_follow_the_intervals() -> None:
@@ -457,19 +439,6 @@ def test_the_unstable_band_begins_at_the_limit() -> None:
     k = np.array([10.0, 1000.0, 50_000.0]) / 0.05
     critical = limit(0.05 * k, np.transpose([-k, -2 * np.sqrt(k)]), 1, 0.01)
     assert critical == pytest.approx(0.05 * (2 * (math.sqrt(2) - 1) / 0.01) ** 2, rel=0.01)
-
-
-def test_a_file_is_whole_or_absent(tmp_path) -> None:
-    target = tmp_path / "results.json"
-    target.write_text("before")
-
-    def fail(file):
-        file.write(b"half")
-        raise RuntimeError("disk full")
-
-    with pytest.raises(RuntimeError, match="disk full"):
-        disk.write_whole(target, fail)
-    assert target.read_text() == "before" and list(tmp_path.iterdir()) == [target]
 
 
 @pytest.mark.parametrize(

@@ -39,11 +39,8 @@ from mjx_study.report import render_report
 from mjx_study.results.variables import MEASURED
 from mjx_study.results.warnings import warnings_of
 from mjx_study.simulation.contact import stiffness_from_solref
-from mjx_study.storage import cell_files as cell_file
-from mjx_study.storage import folder as store
 from mjx_study.storage.folder import Store, load_study, open_store
 from mjx_study.tasks import make_task
-from tests.documents import numbers_of, study_document
 
 pytestmark = pytest.mark.usefixtures("shared_programs")
 
@@ -162,17 +159,6 @@ def test_one_compilation_serves_all_contact_models(tmp_path: Path, monkeypatch: 
         assert sizes["value"] == sizes["gradient"] == 1, sizes
 
 
-def test_a_cell_does_not_depend_on_the_others(undisturbed: Path, tmp_path: Path) -> None:
-    """Computed alone, in another process's order, or beside others: the same bits."""
-    plan = plan_study(config())
-    kept = Store.open(undisturbed)
-    last = len(plan.cells) - 1
-    alone = numbers_of(plan, plan.cells[last])
-    for name, array in kept.read(last).items():
-        if name not in MEASURED:
-            np.testing.assert_array_equal(array, alone[name], err_msg=name)
-
-
 def test_a_cell_is_sampled_beside_the_statistics_of_the_last_one(undisturbed: Path, tmp_path, monkeypatch) -> None:
     plan = plan_study(config())
     begun = [threading.Event() for _ in (*plan.cells, "done")]
@@ -189,24 +175,6 @@ def test_a_cell_is_sampled_beside_the_statistics_of_the_last_one(undisturbed: Pa
     monkeypatch.setattr(GradientComputation, "_in_order", beside)
     data = run_study(plan, tmp_path / "study", lambda done, total, what: begun[done].set())
     assert same(data, load_study(undisturbed))
-
-
-def test_descents_are_labelled(descents: Path) -> None:
-    data = load_study(descents)
-    assert data["cost"].dims == (
-        "task",
-        "timestep",
-        "cone",
-        "model",
-        "sigma",
-        "samples",
-        "iteration",
-        "seed",
-        "estimator",
-    )
-    assert data.sizes["iteration"] == 4 and bool((data["final_cost"] < data["start_cost"]).sel(estimator="fobg").all())
-    assert bool(data["stopped_at"].isnull().all())
-    assert data["rollouts"].squeeze().isel(model=0).values.tolist() == [4, 9]
 
 
 # Disturbances. The command runs in processes of its own, which are killed, starved and raced; on one device, not two.
@@ -310,43 +278,6 @@ def copy_of(folder: Path, to: Path) -> Path:
     return to
 
 
-def test_missing_cells_are_computed_and_no_others(undisturbed: Path, tmp_path: Path) -> None:
-    folder = copy_of(undisturbed, tmp_path / "out")
-    before = {path.name: path.stat().st_mtime_ns for path in (folder / "cells").iterdir()}
-    (folder / "cells" / "00003.npz").unlink()
-    unfinished = load_study(folder)
-    assert unfinished.attrs["missing_cells"] == 1 and int(unfinished["reference_norm"].isnull().sum()) == 1
-    assert "1 cells are not computed yet" in " ".join(warnings_of(unfinished))
-    result = run_study(plan_study(config()), folder)
-    assert result.attrs["computed_cells"] == 1 and same(result, load_study(undisturbed))
-    after = {path.name: path.stat().st_mtime_ns for path in (folder / "cells").iterdir()}
-    assert {name for name in after if after[name] != before[name]} == {"00003.npz"}
-
-
-@pytest.mark.parametrize("damage", ["truncated", "flipped", "foreign", "nonsense"])
-def test_a_damaged_cell_is_refused_and_left_alone(undisturbed: Path, tmp_path: Path, damage: str) -> None:
-    folder = copy_of(undisturbed, tmp_path / "out")
-    path = folder / "cells" / "00002.npz"
-    content = path.read_bytes()
-    if damage == "truncated":
-        path.write_bytes(content[: len(content) // 2])
-    elif damage == "flipped":
-        middle = content.index(b"variance.npy") + 200
-        path.write_bytes(content[:middle] + bytes([content[middle] ^ 4]) + content[middle + 1 :])
-    elif damage == "nonsense":
-        path.write_bytes(b"nonsense")
-    else:
-        other = Store.create(tmp_path / "other", study_document(3))
-        other.write(2, Store.open(undisturbed).read(2))
-        path.write_bytes(other.path(2).read_bytes())
-    damaged = path.read_bytes()
-    says = "is a cell of another study" if damage == "foreign" else "is damaged"
-    for use in (lambda: run_study(plan_study(config()), folder), lambda: load_study(folder)):
-        with pytest.raises(StudyError, match=f"00002.npz {says}.*; move it away to compute it again"):
-            use()
-    assert path.read_bytes() == damaged
-
-
 def test_a_folder_of_another_study_is_refused(undisturbed: Path, tmp_path: Path) -> None:
     folder = copy_of(undisturbed, tmp_path / "out")
     before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
@@ -390,27 +321,6 @@ def test_a_full_disk_leaves_what_is_complete(undisturbed: Path, tmp_path: Path) 
     assert not list((folder / "cells").iterdir())
     assert run_study(plan_study(config()), folder).attrs["computed_cells"] == 8
     assert same(load_study(folder), load_study(undisturbed))
-
-
-def test_a_write_that_fails_keeps_the_cells_before_it(
-    undisturbed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    whole, calls = store.write_whole, [0]
-
-    def failing(path: Path, write: Any) -> Path:
-        calls[0] += 1
-        if calls[0] > 4:  # study.json and three cells fit
-            raise OSError(28, "No space left on device")
-        return whole(path, write)
-
-    for module in (store, cell_file):
-        monkeypatch.setattr(module, "write_whole", failing)
-    with pytest.raises(OSError, match="No space left"):
-        run_study(plan_study(config()), tmp_path / "out")
-    monkeypatch.undo()
-    assert len(Store.open(tmp_path / "out").missing) == 5
-    result = run_study(plan_study(config()), tmp_path / "out")
-    assert result.attrs["computed_cells"] == 5 and same(result, load_study(undisturbed))
 
 
 def test_a_folder_that_cannot_be_written_to_is_refused(tmp_path: Path) -> None:
@@ -504,17 +414,6 @@ def test_every_axis_gets_its_figures(undisturbed: Path, descents: Path, landscap
             bottom = [axes for axes, place in places if place is not None and place.is_last_row()]
             assert bottom and all(axes.get_xlabel() or axes.get_xticklabels() for axes in bottom), name
             assert any(axes.get_ylabel() for axes in figure.axes), name
-
-
-def test_an_unfinished_study_can_be_drawn(undisturbed: Path, tmp_path: Path) -> None:
-    folder = copy_of(undisturbed, tmp_path / "out")
-    for index in (1, 2, 3, 6):
-        (folder / "cells" / f"{index:05d}.npz").unlink()
-    assert "variance" in study_plots.plot_study(load_study(folder))
-    for path in (folder / "cells").iterdir():
-        path.unlink()
-    assert study_plots.plot_study(load_study(folder)) == {}
-    assert "no cell is computed" in render_report(load_study(folder))
 
 
 def test_the_commands_write_figures_and_a_page(

@@ -7,8 +7,8 @@ import pytest
 
 
 @pytest.mark.slow
-def test_a_gradient_through_somebody_elses_environment_is_that_of_differences(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A hopper's, over five steps of the environment, with its own solver's budget and converged."""
+def test_gradients_through_an_environment_are_those_of_differences(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A hopper's over five steps, with the solver's own budget and converged."""
     pytest.importorskip("mujoco_playground", reason="needs `pip install playground`")
     wild = importlib.import_module("experiments.wild")
     monkeypatch.setattr(wild, "STEPS", 5)

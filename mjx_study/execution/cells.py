@@ -67,7 +67,8 @@ class Cells:
     def announce(self, index: int) -> None:
         """Report that this process computes a cell next."""
         program = self.plan.program_of(self.plan.cells[index])
-        self.report(self.label(index) + ("" if program in self._compiled else " (compiling first)"))
+        label = self.label(index) + ("" if program in self._compiled else " (compiling first)")
+        self._progress(self.done + len(self._works), len(self.plan.cells), label)
         self._compiled.add(program)
 
     def report(self, what: str) -> None:

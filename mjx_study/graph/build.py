@@ -27,11 +27,14 @@ from mjx_study.disk import temporary_folder
 from mjx_study.graph import cuda
 from mjx_study.runtime import available_cores, libraries_folder, processor
 from mjx_study.version import version_of
+from mjx_study.watchdog import elsewhere
 
 FLAGS: Final = (
     *("-O2", "-std=gnu11", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math", "-fwrapv"),
     *("-shared", "-fPIC", "-w"),
 )
+MOST_SECONDS: Final = 600
+"""Maximum time for a compiler to run [s]."""
 PREFIX: Final = "mjx_study_"
 """Beginning of the names of libraries, which are those of their XLA targets."""
 
@@ -49,7 +52,7 @@ def compiler() -> tuple[tuple[str, ...], str] | None:
         words = tuple(shlex.split(command))
         if shutil.which(words[0]) is None:
             continue
-        found = subprocess.run([*words, "--version"], capture_output=True, text=True)
+        found = _run(*words, "--version")
         if found.returncode == 0:
             return words, found.stdout
     print("mjx-study: no C compiler found: steps run through XLA, more slowly", file=sys.stderr)
@@ -113,17 +116,13 @@ def _build(name: str, source: str) -> Any:
         written.write_text(source)
         command, _ = compiler() or (("cc",), "")
         include = f"-I{jax.ffi.include_dir()}"
-        if cuda.target() is not None:
-            try:
-                Path(folder, "kernel").write_bytes(cuda.compile_kernel(source))
-            except ValueError as error:
-                return _failed(written, "NVRTC", str(error))
-        done = subprocess.run(
-            [*command, *_FLAGS_HERE, include, written.name, "-o", library.name, "-lm", "-ldl"],
-            cwd=folder,
-            capture_output=True,
-            text=True,
-        )
+        with elsewhere():
+            if cuda.target() is not None:
+                try:
+                    Path(folder, "kernel").write_bytes(cuda.compile_kernel(source))
+                except ValueError as error:
+                    return _failed(written, "NVRTC", str(error))
+            done = _run(*command, *_FLAGS_HERE, include, written.name, "-o", library.name, "-lm", "-ldl", folder=folder)
         if done.returncode:
             return _failed(written, command[0], done.stderr)
         content = library.read_bytes()
@@ -137,6 +136,13 @@ def _failed(written: Path, compiler: str, errors: str) -> None:
     kept = Path(tempfile.mkdtemp(prefix="mjx-study-failed-"), written.name)
     kept.write_text(written.read_text() + "".join(f"\n// {line}" for line in errors.splitlines()))
     print(f"mjx-study: {compiler} failed, steps run through XLA: see the end of {kept}", file=sys.stderr)
+
+
+def _run(*command: str, folder: str | None = None) -> subprocess.CompletedProcess[str]:
+    try:
+        return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=MOST_SECONDS)
+    except (OSError, subprocess.TimeoutExpired) as error:
+        return subprocess.CompletedProcess(command, 1, "", str(error))
 
 
 def _cached(name: str) -> Any:

@@ -126,7 +126,7 @@ def _constant(value: Any) -> str:
     if isinstance(value, int):
         return f"ALL({kind}, {value + 1} - 1)" if value < 0 else f"ALL({kind}, {value}{'u' if kind[0] == 'u' else ''})"
     if math.isfinite(value):
-        return f"ALL({kind}, {value.hex()}{'f' if kind == 'f32' else ''})"
+        return f"ALL({kind}, {value!r}{'f' if kind == 'f32' else ''})"
     return f"ALL({kind}, {'NAN' if math.isnan(value) else 'INFINITY' if value > 0 else '-INFINITY'})"
 
 

@@ -92,11 +92,9 @@ def pull(
 @no_type_check
 def _taken(graph: ScalarGraph, which: Any, case: int) -> tuple[Any, bool]:
     """Condition under which a selection takes a case."""
-    return (
-        (which, bool(case))
-        if which.dtype == _BOOL
-        else (graph.scalar(lax.eq_p, (which, which.dtype.type(case)), _BOOL), True)
-    )
+    if which.dtype == _BOOL:
+        return which, bool(case)
+    return graph.scalar(lax.eq_p, (which, which.dtype.type(case)), _BOOL), True
 
 
 @no_type_check

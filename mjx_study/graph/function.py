@@ -172,9 +172,12 @@ def _branch(graph: ScalarGraph, equation: Any, inputs: Sequence[np.ndarray]) -> 
 def _scan(graph: ScalarGraph, equation: Any, inputs: Sequence[np.ndarray]) -> list[np.ndarray]:
     """Write out all passes of a loop of known length."""
     parameters = equation.params
-    first = parameters["num_consts"]
-    second = first + parameters["num_carry"]
-    consts, carry, rows = inputs[:first], list(inputs[first:second]), inputs[second:]
+    if "ft_in" in parameters:  # from JAX 0.11 on
+        consts, carry, rows = map(list, parameters["ft_in"].update(inputs).unpack())
+    else:
+        first = parameters["num_consts"]
+        second = first + parameters["num_carry"]
+        consts, carry, rows = inputs[:first], list(inputs[first:second]), inputs[second:]
     avals = [each.aval for each in equation.outvars[len(carry) :]]
     stacked = [np.empty(aval.shape, object) for aval in avals]
     passes = range(parameters["length"])

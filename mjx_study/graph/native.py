@@ -1,6 +1,7 @@
 """Functions of small arrays as native code, called by XLA for a whole batch at once."""
 
 import os
+from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import cache, cached_property, partial
 from typing import Any, Final
@@ -13,13 +14,17 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
 from mjx_study.graph import cuda
-from mjx_study.graph.build import build_identity, build_library, compiler, library_ready
+from mjx_study.graph.build import build_identity, build_library, compiler, known_libraries, library_ready
 from mjx_study.graph.c import NotWrittenError, source_of
 from mjx_study.graph.evaluation import written_out
 from mjx_study.graph.function import ScalarFunction, capture
 
 SWITCH: Final = "MJX_STUDY_NATIVE"
 """Environment variable; 0 does without native code."""
+
+
+_LEFT: Final[Counter[str]] = Counter()
+"""Numbers of functions left to XLA, by reason."""
 
 
 def native_identity() -> str | None:
@@ -30,6 +35,12 @@ def native_identity() -> str | None:
     served = jax.default_backend() == "cpu" or cuda.target() is not None
     wanted = os.environ.get(SWITCH) != "0" and served
     return build_identity() if wanted and compiler() is not None and _works() else None
+
+
+def native_summary() -> str:
+    """Libraries that this process has loaded, and how many functions are left to XLA and why."""
+    loaded = sum(map(library_ready, known_libraries())) if native_identity() else 0
+    return f"{loaded} libraries" + "".join(f", {count} through XLA: {why}" for why, count in _LEFT.items())
 
 
 @cache
@@ -48,7 +59,8 @@ def as_native(values: ScalarFunction, function: ScalarFunction) -> "NativeFuncti
     """
     try:
         return NativeFunction(source_of(values, jax.default_backend()), function)
-    except NotWrittenError:
+    except NotWrittenError as error:
+        _LEFT[str(error)] += 1
         return None
 
 
@@ -119,6 +131,7 @@ def _evaluate(*inputs: Any, function: NativeFunction, batch: tuple[int, ...]) ->
 
 def _lower(platform: str, context: Any, *operands: Any, function: NativeFunction, batch: tuple[int, ...]) -> Any:
     if function.platform != platform or not library_ready(function.name):
+        _LEFT["not built"] += 1
         return mlir.lower_fun(_plain(function, batch), multiple_results=True)(context, *operands)
     ins = [_layout(at.ndim, at.ndim - aval.ndim) for at, aval in zip(context.avals_in, function.inputs, strict=True)]
     outs = [_layout(each.ndim, len(batch)) for each in context.avals_out]

@@ -33,6 +33,13 @@ CONTACTS: Final = (*FAMILIES, REFERENCE)
 """Contact families of a study, and the analytic reference."""
 UNSET_TASK: Final = "the task's"
 UNSET_MJCF: Final = "the MJCF's"
+DEFAULT_KIND: Final = "gradients"
+ASKED_BY: Final = {"descents": "iterations", "landscapes": "points"}
+"""Options that ask for a kind of study where none is given."""
+NEEDED: Final = {"landscapes": "points"}
+"""Options without which there is no such study."""
+SEEDS: Final = {"landscapes": 1}
+"""Number of seeds where it is not given, for kinds of study in which it is not 10."""
 SAMPLES: Final = 100
 """Samples per batch unless the configuration or a recipe sets another number."""
 AXES: Final = (
@@ -139,7 +146,7 @@ class StudyConfig:
     iterations: int | None = declared(
         None, "N", "iterations of the optimiser", "[1, 10000000]", study="descents", unset=UNSET_TASK
     )
-    points: int | None = declared(None, "N", "points on the line", "[2, 100000]")
+    points: int | None = declared(None, "N", "points on the line", "[2, 100000]", study="landscapes")
     span: tuple[float, ...] | None = declared(
         None, "LO,HI", "range of the line", "(-inf, inf)", study="landscapes", unset=UNSET_TASK
     )
@@ -242,18 +249,16 @@ class StudyConfig:
         kind = self.settings.kind
         if self.iterations is not None and self.points is not None:
             raise OptionError("iterations", "is for descents and {} for landscapes: omit one of them", "points")
-        if kind == "landscapes" and self.points is None:
-            raise OptionError("points", "must be given for landscapes")
-        if kind != "landscapes" and self.points is not None:
-            raise OptionError("points", f"is for landscapes, and {{}} is {kind}: omit one of them", "kind")
+        if kind in NEEDED and not self.given(NEEDED[kind]):
+            raise OptionError(NEEDED[kind], f"must be given for {kind}")
         for name, option in OPTIONS.items():
-            if option.study not in ("", kind) and self.given(name):
-                asks = {"descents": "iterations", "landscapes": "points"}.get(option.study)
-                if self.kind is not None:
-                    raise OptionError(name, f"is for {option.study}, and {{}} is {kind}", "kind")
-                raise OptionError(
-                    name, f"is for {option.study}: {'give {} as well' if asks else 'omit it'}", asks or ""
-                )
+            if option.study in ("", kind) or not self.given(name):
+                continue
+            if self.kind is not None:
+                raise OptionError(name, f"is for {option.study}, and {{}} is {kind}: omit one of them", "kind")
+            if option.study not in ASKED_BY:
+                raise OptionError(name, f"is for {option.study}: omit it")
+            raise OptionError(name, f"is for {option.study}: give {{}} as well", ASKED_BY[option.study])
 
     def _named(self, name: str) -> Any:
         """Value of a field, with names in place of objects."""
@@ -265,9 +270,9 @@ class StudyConfig:
     @property
     def settings(self) -> Settings:
         """The options whose defaults depend on the kind of study, with these in place of None."""
-        of_points = "gradients" if self.points is None else "landscapes"
         given = {field.name: getattr(self, field.name) for field in dataclasses.fields(Settings)}
-        given["kind"] = self.kind or (of_points if self.iterations is None else "descents")
+        asked = (kind for kind, option in ASKED_BY.items() if getattr(self, option) is not None)
+        given["kind"] = self.kind or next(asked, DEFAULT_KIND)
         return Settings(**{name: value for name, value in given.items() if value is not None})
 
     def given(self, name: str) -> bool:
@@ -299,7 +304,7 @@ class StudyConfig:
     @property
     def batches(self) -> int:
         """Number of seeds, given or by default."""
-        return self.seeds or (1 if self.settings.kind == "landscapes" else 10)
+        return self.seeds or SEEDS.get(self.settings.kind, 10)
 
 
 OPTIONS: Final = options_of(StudyConfig)

@@ -30,11 +30,9 @@ MOST_DECADES: Final = 6
 def plot_study(dataset: xr.Dataset) -> dict[str, Figure]:
     """Plot every figure that a study has data for, by file name without suffix."""
     figures: dict[str, Figure] = {}
-    if not dataset.data_vars:
-        return figures
-    computed = kind_of(dataset).computed
-    finite = dataset.map(drawable, keep_attrs=True).assign({computed: dataset[computed]})
-    for name, drawing in drawings_of(dataset).items():
+    drawings, computed = drawings_of(dataset), kind_of(dataset).computed
+    finite = dataset.map(drawable, keep_attrs=True).assign({computed: dataset[computed]} if drawings else {})
+    for name, drawing in drawings.items():
         for suffix, title, part in itertools.islice(_slices(finite, computed, drawing.keep), MAX_FIGURES):
             if (figure := drawing.draw(part, title)) is not None:
                 mark_clipped(figure)
@@ -45,7 +43,9 @@ def plot_study(dataset: xr.Dataset) -> dict[str, Figure]:
 
 
 def drawings_of(dataset: xr.Dataset) -> dict[str, Drawing]:
-    """Figures of a study's kind, and a map of FoBG over ZoBG if two parameters are swept."""
+    """Figures of a study's kind, and a map of FoBG over ZoBG if two parameters are swept; none without numbers."""
+    if not dataset.data_vars:
+        return {}
     kind = kind_of(dataset)
     found = kind.drawings(dataset)
     pair = [name for name in COORDINATES if len(np.unique(dataset[name].values)) > 1][:2]
