@@ -1,28 +1,18 @@
 """The command line as a user meets it: figures that are true, one line for what is wrong, nothing written then."""
 
 import contextlib
-import dataclasses
 import io
 import json
 import os
 import re
-import signal
-import subprocess
-import sys
-import time
 from pathlib import Path
 from typing import Any, NoReturn
 
-import jax.numpy as jnp
 import pytest
 
 from mjx_study import cli
 from mjx_study.cli import options
-from mjx_study.experiment import plan as plan_module
-from mjx_study.experiment.plan import plan_study
-from mjx_study.experiment.study import StudyPlan
-from mjx_study.options.configuration import StudyConfig
-from mjx_study.options.option import OPTIONS, SCENE_OPTIONS, as_arguments
+from mjx_study.options.configuration import OPTIONS, SCENE_OPTIONS, as_arguments
 from mjx_study.plots.style import PAGE
 from mjx_study.results.rows import rows_of
 from mjx_study.storage.folder import load_study
@@ -123,69 +113,10 @@ def test_what_compare_wrote_can_be_drawn_and_reported(
     assert float(re.search(r'width="([\d.]+)pt"', picture).group(1)) == pytest.approx(72 * PAGE)  # type: ignore[union-attr]
 
 
-def test_compare_prints_json_and_nothing_else(capsys: pytest.CaptureFixture[str]) -> None:
-    arguments = ["compare", "pusher", *SMALL, "--stiffness", "10", "--contact", "penalty", "--gamma", "inf", "--json"]
-    assert cli.main(arguments) == 0
-    document = json.loads(capsys.readouterr().out)
-    assert document["config"]["gamma"] == "inf"
-    assert [row["estimator"] for row in document["rows"]] == ["zobg", "fobg", "aobg"]
-
-
 def test_warnings_about_the_contact_reach_the_reader(capsys: pytest.CaptureFixture[str]) -> None:
     arguments = ["compare", "pusher", *SMALL, "--stiffness", "1e4", "--contact", "penalty", "--estimators", "zobg"]
     assert cli.main(arguments) == 0
     assert "warning: penalty, K = 10000 N/m: h^2 k" in capsys.readouterr().out
-
-
-@pytest.mark.slow
-def test_one_nan_sample_does_not_poison_the_table(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def with_a_nan(config: StudyConfig) -> StudyPlan:
-        plan = plan_study(config)
-        (group,) = plan.groups
-        # A cost that is undefined for about one rollout in four.
-        threshold = float(group.task.theta[0]) * 0.75e-5
-
-        def final_cost(state):
-            return jnp.where(state.qpos[0] > threshold, group.task.final_cost(state), jnp.nan)
-
-        task = group.task.replace(final_cost=final_cost)
-        return dataclasses.replace(plan, groups=(dataclasses.replace(group, task=task),))
-
-    monkeypatch.setattr(plan_module, "plan_study", with_a_nan)
-    arguments = ["compare", "pusher", *SMALL, "--samples", "32", "--stiffness", "10", "--contact", "penalty"]
-    assert cli.main(arguments) == 0
-    printed = capsys.readouterr().out
-    assert re.search(r"warning: \d+ samples overflowed or became NaN and were left out", printed)
-    row = next(line for line in printed.splitlines() if "ZoBG" in line)
-    assert "nan" not in row
-
-
-def test_help_teaches(capsys: pytest.CaptureFixture[str]) -> None:
-    for command in ([], ["compare"], ["gradcheck"], ["bench"], ["tasks"]):
-        with pytest.raises(SystemExit) as stop:
-            cli.main([*command, "--help"])
-        assert stop.value.code == 0
-    text = capsys.readouterr().out
-    for taught in ("mjx-study compare pusher", "penalty", "zobg", "N/m", "epsilon", "residual"):
-        assert taught in text
-
-
-@pytest.mark.parametrize(("command", "analytic"), [("compare", True), ("diagnose", False), ("gradcheck", False)])
-def test_help_lists_the_families_that_a_command_takes(
-    command: str, analytic: bool, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with pytest.raises(SystemExit):
-        cli.main([command, "--help"])
-    families = re.search(r"--contact FAMILY\S*\s+contact family: ([^(]*)", capsys.readouterr().out)
-    assert families and ("reference" in families[1]) == analytic and "penalty" in families[1]
-
-
-def test_the_contact_of_surrogate_derivatives_is_named(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        cli.main(["compare", "--help"])
-    assert re.search(r"--backward-stiffness K\s+stiffness of --backward \[N/m\]", capsys.readouterr().out)
 
 
 def test_version(capsys: pytest.CaptureFixture[str]) -> None:
@@ -204,94 +135,6 @@ def test_tasks(capsys: pytest.CaptureFixture[str]) -> None:
     assert list(tasks) == list(TASKS)
     assert tasks["pusher"]["params"] == 200 and tasks["pusher"]["effective_mass"] == pytest.approx(0.05)
     assert tasks["double_pendulum"]["effective_mass"] is None
-
-
-OPTION = "unknown option --stifness; did you mean --stiffness? See mjx-study compare --help"
-
-
-@pytest.mark.parametrize(
-    ("arguments", "says"),
-    [
-        (["compare", "pushr"], "unknown task 'pushr'; did you mean pusher? See mjx-study compare --help"),
-        (["compare", "hop"], "unknown task 'hop'; choose from pusher"),
-        (
-            ["sweep", "pushr", "--output", "out"],
-            "unknown task 'pushr'; did you mean pusher? See mjx-study sweep --help",
-        ),
-        (["compare", "pusher", "--estimators", "zobg,fobgg"], "unknown estimator 'fobgg'; did you mean fobg?"),
-        (["compare", "pusher", "--contact", "penalti"], "unknown contact family 'penalti'; did you mean penalty?"),
-        (["compare", "pusher", "--estimators", ""], "no estimator given"),
-        (["compare", "pusher", "--contact", "spring"], "unknown contact family 'spring'; choose from penalty"),
-        (["compare", "pusher", "--samples", "-5"], "argument --samples: must be at least 3"),
-        (["compare", "pusher", "--samples", "0"], "--samples: must be at least 3 and at most 10000000, got 0"),
-        (["compare", "pusher", "--samples", "many"], "--samples: must be a whole number, got 'many'"),
-        (["compare", "pusher", "--reference-samples", "0"], "--reference-samples: must be at least 3"),
-        (["compare", "pusher", "--sigma", "0"], "--sigma: must be positive and finite"),
-        (["compare", "pusher", "--sigma", "-0.1"], "--sigma: must be positive and finite"),
-        (["compare", "pusher", "--sigma", "nan"], "--sigma: must be positive and finite"),
-        (["compare", "pusher", "--stiffness", "10,-5"], "--stiffness: must be positive and finite"),
-        (["compare", "pusher", "--stiffness", "0"], "--stiffness: must be positive and finite"),
-        (["compare", "pusher", "--stiffness", "ten"], "--stiffness: must be a number, got 'ten'"),
-        (["compare", "pusher", "--stiffness", ""], "no stiffness given"),
-        (["compare", "pusher", "--stiffness", "100,100"], "stiffness given twice: 100.0"),
-        (["compare", "pusher", "--estimators", "zobg,zobg"], "estimator given twice: zobg"),
-        (["compare", "pusher", "--damping", "-1"], "--damping: must be at least 0 and finite, got -1"),
-        (["compare", "pusher", "--gamma", "0"], "--gamma: must be positive, got 0"),
-        (["compare", "pusher", "--gamma", "big"], "argument --gamma: must be a number, got 'big'"),
-        (
-            ["compare", "pusher", "--radius", "huge"],
-            "unknown radius 'huge'; choose from max_deviation, or give a number",
-        ),
-        (["compare", "pusher", "--variance-proxy", "std"], "unknown variance proxy 'std'; choose from variance"),
-        (
-            ["compare", "pusher", "--failure-probability", "2"],
-            "--failure-probability: must be positive and less than 1, got 2",
-        ),
-        (["compare", "pusher", "--confidence", "95"], "--confidence: must be positive and less than 1, got 95"),
-        (["compare", "pusher", "--seed", "-1"], "--seed: must be at least 0"),
-        (["compare", "pusher", "--horizon", "0"], "--horizon: must be at least 1"),
-        (["compare", "pusher", "--chunk-size", "0"], "--chunk-size: must be at least 1"),
-        (["compare", "pusher", "--cone", "square"], "--cone: unknown cone 'square'; choose from pyramidal, elliptic"),
-        (["compare", "pusher", "--cone", "elliptic"], "MJX cannot run pusher: condim=1 with ConeType.ELLIPTIC"),
-        (["compare", "pusher", "--precision", "float16"], "unknown precision 'float16'; did you mean float64?"),
-        (["compare", "pusher", "--model", "nowhere.xml"], "no MJCF file at nowhere.xml"),
-        (["compare", "pusher", "--model", "tennis_racket"], "no model named 'tennis_racket'; did you mean tennis?"),
-        (["compare", "pusher", "--stifness", "10"], OPTION),
-        (["compare", "--stifness=10", "pusher"], OPTION),
-        (["compare", "pusher", "--estimator", "zobg"], "unknown option --estimator; did you mean --estimators? See"),
-        (["compare", "pusher", "--backward-s=1"], "unknown option --backward-s; did you mean --backward-stiffness?"),
-        (
-            ["compare", "pusher", "--iterations", "3"],
-            "unknown option --iterations; did you mean --solver-iterations?",
-        ),
-        (["compare", "pusher", "--baseline", "zero"], "unknown baseline 'zero'; did you mean zero_noise?"),
-        (["compare", "pusher", "--backward-margin", "1"], "--backward-margin needs a contact family in --backward"),
-        (["compare", "pusher", "--estimators", "fobg_clipped"], "'fobg_clipped' needs the option --max-norm; set it"),
-        (["compare", "pusher", "--estimators", "ivw_h", "--block-size", "2"], "omit --block-size: batches of any size"),
-        (["compare", "pusher", "--contact", "mjcf", "--damping", "1"], "takes no damping; omit --damping"),
-        (["optimise", "pusher", "--optimizer", "adm"], "optax has no optimiser 'adm' that takes a learning rate; did"),
-        (["sweep", "pusher", "--decay", "1", "--output", "x"], "--decay is for descents: give --iterations as well"),
-        (["compare", "pusher", "--no-such-option"], "unknown option --no-such-option. See mjx-study compare --help"),
-        (["compare", "pusher", "more"], "unexpected argument more. See mjx-study compare --help"),
-        (["--versoin"], "unknown option --versoin; did you mean --version? See mjx-study --help"),
-        (["compare"], "TASK"),
-        (["compre", "pusher"], "mjx-study: unknown command 'compre'; did you mean compare? See mjx-study --help"),
-        (["explain", "pusher"], "unknown command 'explain'; choose from compare"),
-        ([], "COMMAND"),
-        (["gradcheck", "puhser"], "unknown task 'puhser'; did you mean pusher? See mjx-study gradcheck --help"),
-        (["gradcheck", "pusher", "--contact", ""], "no contact model to check"),
-        (["gradcheck", "pusher", "--verbose"], "unknown option --verbose"),
-        (["bench", "pusher", "--samples", "0"], "--samples: must be at least 1"),
-    ],
-    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
-)
-def test_bad_options_get_one_line(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path, arguments: list[str], says: str
-) -> None:
-    untouched = tmp_path / "out"
-    extra = ["--output", str(untouched)] if arguments[:1] == ["compare"] and len(arguments) > 1 else []
-    assert says in refused(capsys, *arguments, *extra)
-    assert not untouched.exists()
 
 
 def test_iterations_of_the_solver_and_of_a_descent_are_different_options() -> None:
@@ -362,23 +205,3 @@ def test_the_log_level_of_xla_is_the_users_where_it_is_set(monkeypatch: pytest.M
         if given is None:
             monkeypatch.delenv("TF_CPP_MIN_LOG_LEVEL")
         assert cli.main(["estimators"]) == 0 and os.environ["TF_CPP_MIN_LOG_LEVEL"] == found
-
-
-def test_interruption_leaves_only_what_is_complete(tmp_path: Path) -> None:
-    folder = tmp_path / "out"
-    # A shell's background job ignores the interrupt, and so would its children.
-    listen = "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler)"
-    command = [sys.executable, "-c", f"{listen}; from mjx_study.cli import main; sys.exit(main())"]
-    command += ["compare", "pusher", "--output", str(folder)]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    deadline = time.monotonic() + 60
-    while not folder.exists():  # made once the options are checked, before computing
-        assert time.monotonic() < deadline and process.poll() is None
-        time.sleep(0.05)
-    time.sleep(1)
-    process.send_signal(signal.SIGINT)
-    out, err = process.communicate(timeout=120)
-    assert process.returncode == 130
-    assert err.strip().splitlines()[-1] == "mjx-study: interrupted; the same command resumes where it stopped"
-    assert out == "" and "Traceback" not in err
-    assert {path.name for path in folder.rglob("*")} <= {"study.json", "study.lock", "cells"}

@@ -14,7 +14,7 @@ import pytest
 from estimators import ESTIMATORS, Estimator, FirstOrder, ZerothOrder, find_estimator, make_estimator, register
 from mjx_study import cli, experiment
 from mjx_study.cli import options
-from mjx_study.options.configuration import StudyConfig
+from mjx_study.options.configuration import OPTIONS
 from mjx_study.plots.style import combines, style_of
 from mjx_study.results.rows import rows_of
 from mjx_study.storage.folder import load_study
@@ -242,7 +242,7 @@ def test_a_registered_one_has_a_name(monkeypatch: pytest.MonkeyPatch) -> None:
         name, label = "twice", "FoBG, twice"
 
     assert ESTIMATORS["twice"] is Twice and make_estimator("twice") == Twice() != FirstOrder()
-    assert StudyConfig.option("estimators").check(("twice",))
+    assert OPTIONS["estimators"].check(("twice",))
     assert style_of("twice") == ("FoBG, twice", *style_of("fobg")[1:])
     with pytest.raises(ValueError, match="there is already an estimator 'twice'"):
         register(Twice)

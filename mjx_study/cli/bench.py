@@ -2,19 +2,22 @@
 
 import argparse
 
-from mjx_study.cli.options import Parser, configure_process, task_of, usage_errors
+from mjx_study.cli.options import configure_process, task_of, usage_errors
 from mjx_study.cli.output import computing, print_report
+from mjx_study.options.parser import Parser
 
 EPILOG = """\
-Rates in one run on this machine: rollouts and gradients, against jax.grad through mjx.step (with the one solver
-iteration that it can differentiate) and against the C engine's centred mjd_transitionFD with an adjoint, on as many
-threads.
+Measures rollouts and gradients per second in a single run on this machine, and compares them with jax.grad through
+mjx.step (with one solver iteration, all that it can differentiate) and with the C engine's centred mjd_transitionFD
+and an adjoint, on the same number of threads.
 """
 
 
 def add(command: Parser) -> None:
     command.add_task_options()
-    command.add_option("samples", 1000, line="samples in the batch that is timed")
+    command.add_option(
+        "samples", many=False, interval="[1, 1e7]", default=1000, line="samples in the batch that is timed"
+    )
 
 
 def run(options: argparse.Namespace) -> int:

@@ -32,6 +32,7 @@ from mjx_study.experiment.sampling import rollouts_of
 from mjx_study.experiment.study import Computation, StudyCell, StudyKind, StudyPlan, done, estimators_of
 from mjx_study.objective import Simulator, TracedObjective, simulate
 from mjx_study.options.configuration import StudyConfig
+from mjx_study.options.option import OptionError
 from mjx_study.reference import Reference
 from mjx_study.results.findings import descent_findings
 from mjx_study.results.kind import Drawing
@@ -78,10 +79,10 @@ class Descents(StudyKind):
         if config.stiffness_schedule and any(
             model.stiffness is None or (model.contact is None and not model.analytic) for model in group.models
         ):
-            raise ValueError("`stiffness_schedule` needs contact models with a stiffness; mjcf has none to set")
+            raise OptionError("stiffness_schedule", "needs contact models with a stiffness; mjcf has none to set")
         fixed = [each.name for each in chosen if hasattr(each, "sigma")]
         if config.sigma_schedule and fixed:
-            raise ValueError(f"{fixed[0]} holds for one sigma; omit it or `sigma_schedule`")
+            raise OptionError("sigma_schedule", f"changes sigma, and {fixed[0]} holds for one: omit one of them")
         history = HISTORY_NUMBERS * config.batches * recipe.iterations
         check_memory(group.task, chosen, config.batches * cell.samples, other=history)
         check_memory(group.task, (), plan.settings.evaluation_samples)

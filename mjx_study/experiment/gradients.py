@@ -48,6 +48,7 @@ from mjx_study.experiment.study import Computation, Result, StudyCell, StudyKind
 from mjx_study.experiment.tally import Tally
 from mjx_study.limits import MOST_GIB
 from mjx_study.objective import BlankObjective, MjxObjective
+from mjx_study.options.option import OptionError
 from mjx_study.reference import Reference
 from mjx_study.results.findings import gradient_findings
 from mjx_study.results.kind import Drawing
@@ -71,12 +72,12 @@ class Gradients(StudyKind):
     finite = "gradient_norm"
 
     def check_memory(self, plan: StudyPlan) -> None:
-        """Raise ValueError for batches that do not fit into memory, or a block size with estimators that need whole
-        batches."""
+        """Raise ValueError for batches that do not fit into memory, OptionError for a block size with estimators that
+        need whole batches."""
         whole = [each.name for each in estimators_of(plan, plan.cells[0]) if not each.mergeable]
         if whole and plan.config.block_size is not None:
-            verb = "needs" if len(whole) == 1 else "need"
-            raise ValueError(f"{', '.join(whole)} {verb} whole batches, omit `block_size`: {blocks_take(whole)}")
+            reason = f"splits batches, and {', '.join(whole)} must have whole ones: omit it; {blocks_take(whole)}"
+            raise OptionError("block_size", reason)
         check_batches(plan.memory, whole)
 
     def memory(self, plan: StudyPlan, cell: StudyCell) -> int:

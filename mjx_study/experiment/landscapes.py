@@ -28,6 +28,7 @@ from mjx_study.experiment.quadrature import QUADRATURE, Line, Means, applies, cl
 from mjx_study.experiment.resolution import line_of
 from mjx_study.experiment.sampling import Objectives, cell_keys, draw_batches, rollouts_of, unconverged
 from mjx_study.experiment.study import Computation, StudyCell, StudyKind, StudyPlan, done, estimators_of
+from mjx_study.options.option import OptionError
 from mjx_study.results.curves import landscape_findings
 from mjx_study.results.kind import Drawing
 from mjx_study.results.variables import LANDSCAPES
@@ -53,7 +54,7 @@ class Landscapes(StudyKind):
     def check(self, plan: StudyPlan, cell: StudyCell) -> None:
         config, task = plan.config, plan.task_of(cell)
         if config.theta is not None and task.policy.num_params == 1:
-            raise ValueError("`theta` has one entry, and the line is its range: give `span` instead")
+            raise OptionError("theta", "has one entry, and the line is its range: give {} instead", "span")
         line_of(task, plan.settings.points, config.span, config.direction, config.seed)
 
     def rollouts(self, plan: StudyPlan, cell: StudyCell) -> np.ndarray:

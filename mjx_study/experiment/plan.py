@@ -1,5 +1,6 @@
 """Plan a study: check its configuration and resolve it into cells, computing nothing."""
 
+import dataclasses
 import itertools
 import math
 from collections.abc import Mapping
@@ -12,31 +13,36 @@ from mjx_study.choices import CONES, REFERENCE
 from mjx_study.experiment.memory import largest_batch
 from mjx_study.experiment.resolution import at_theta
 from mjx_study.experiment.study import Group, StudyCell, StudyKind, StudyPlan, estimators_of
-from mjx_study.experiment.unused_options import reject_unused
+from mjx_study.experiment.unused_options import reject_unused_options
 from mjx_study.limits import MOST_CELLS, MOST_PROGRAMS, check_count
 from mjx_study.objective import chunk_for
-from mjx_study.options.configuration import SAMPLES, NamedTask, StudyConfig
-from mjx_study.options.option import BUILDER_OPTIONS
+from mjx_study.options.configuration import BUILDER_OPTIONS, OPTIONS, SAMPLES, NamedTask, StudyConfig
+from mjx_study.options.option import OptionError
 from mjx_study.results.kind import find_kind
 from mjx_study.runtime import local_devices
 from mjx_study.tasks import TASKS, task_with_options
-from mjx_study.tasks.contact_grid import Grid, backward_grid, family_grid, solver_grid
+from mjx_study.tasks.contact_grid import Grid, backward_grid, family_grid, single_defaults, solver_grid
 from mjx_study.tasks.network import with_network
 from mjx_study.tasks.soundness import check_soundness
 from mjx_study.tasks.task import Task, check_shapes
 
 
-def plan_study(config: StudyConfig, built: Mapping[str, Task] | None = None) -> StudyPlan:
+def plan_study(config: StudyConfig, built: Mapping[str, Task] | None = None, *, single: bool = False) -> StudyPlan:
     """Check a configuration and resolve its defaults, computing nothing.
 
     Args:
         config: what to study; fields that are None take their defaults.
         built: tasks already built by the caller, by name, with the configuration's `BUILDER_OPTIONS` and the MJCF's
             timestep and cone.
+        single: whether the contact families and stiffnesses that the configuration leaves open are those of a single
+            run (`mjx_study.tasks.contact_grid.single_defaults`), and not all of the task's.
 
     Raises:
         ValueError: the configuration cannot be run; the message says what is accepted.
     """
+    built, given = dict(built or {}), [name for name in OPTIONS if config.given(name)]
+    if single:
+        config = _as_single(config, built)
     kind: StudyKind = find_kind(config.settings.kind)
     variants = config.tasks, config.timestep or (None,), config.cone or (None,)
     programs = math.prod(map(len, variants))
@@ -46,10 +52,10 @@ def plan_study(config: StudyConfig, built: Mapping[str, Task] | None = None) -> 
     messages: list[str] = []
     sound: list[object] = []
     for which, timestep, cone in itertools.product(*variants):
-        task = _build(config, which, timestep, cone, built or {})
+        task = _build(config, which, timestep, cone, built)
         if config.network is not None:
             if REFERENCE in (config.contact or ()):
-                raise ValueError("a network needs MJX: the analytic references use the task's own policy")
+                raise OptionError("network", "needs MJX: the analytic references use the policy of the task")
             task = with_network(task, config.network, jax.random.key(config.seed))
         task = at_theta(task, config.theta)
         if which not in sound and not (which in TASKS and config.theta is config.model is None):
@@ -79,21 +85,32 @@ def plan_study(config: StudyConfig, built: Mapping[str, Task] | None = None) -> 
     for cell in {cell.group: cell for cell in cells}.values():
         corrected = [each.name for each in estimators_of(plan, cell) if "corrected" in each.needs]
         if config.surrogate and corrected:
-            raise ValueError(f"{corrected[0]} corrects exact derivatives: omit it or `backward`")
+            raise OptionError("backward", f"replaces the derivatives that {corrected[0]} corrects: omit one of them")
         kind.check(plan, cell)
-    reject_unused(config, [(group.task, group.models) for group in groups], first_order=kind.first_order)
+    grids = [(group.task, group.models) for group in groups]
+    reject_unused_options(config, given, grids, first_order=kind.first_order)
     return plan
 
 
+def _as_single(config: StudyConfig, built: dict[str, Task]) -> StudyConfig:
+    """The configuration of a single run; the first task is built, and added to those that are."""
+    first = config.tasks[0]
+    task = _build(config, first, None, None, built)
+    if isinstance(first, str):
+        built[first] = task
+    contact, stiffness = single_defaults(task, config.contact, config.stiffness)
+    return dataclasses.replace(config, contact=contact, stiffness=stiffness)
+
+
 def _contact_models(config: StudyConfig, task: Task) -> Grid:
-    """A task's contact models, and warnings about them; ValueError if there are none."""
+    """A task's contact models, and warnings about them; OptionError if there are none."""
     models, found = family_grid(task, config.contact, config.stiffness, config.damping)
     if config.solref or config.solimp:
         more, also = solver_grid(task, config.solref, config.solimp)
         models, found = models + more, found + also
     models, also = backward_grid(task, models, config.backward, config.backward_stiffness, config.backward_margin)
     if not models:
-        raise ValueError("no contact model: give at least one contact family, `solref` or `solimp`")
+        raise OptionError("contact", "needs at least one contact family, or {} or {}", "solref", "solimp")
     return models, found + also
 
 
@@ -105,9 +122,9 @@ def _build(
     changes = {"onset": config.onset} | ({} if config.noise is None else {"noise": config.noise})
     if not isinstance(which, str):
         if not isinstance(which, Task):
-            raise ValueError(f"tasks takes names and Tasks, got {type(which).__name__}")
+            raise OptionError("tasks", f"takes names and Tasks, got {type(which).__name__}")
         if chosen:
-            raise ValueError(f"{', '.join(chosen)}: only for a task given by name; build this one with it instead")
+            raise OptionError(next(iter(chosen)), "is for tasks given by name: build this one with it instead")
         check_shapes(which)
         return which.replace(**changes)
     if which in built and timestep is None and cone is None:
