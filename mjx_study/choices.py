@@ -1,7 +1,7 @@
 """Names that users choose from, with one-line descriptions; free of imports that compute."""
 
 import dataclasses
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from importlib import metadata
 from typing import Final
 
@@ -98,15 +98,6 @@ FAMILIES: Final = {
 def takes_stiffness(families: Iterable[str]) -> bool:
     """Whether any of the contact families, "reference" included, has a stiffness."""
     return any(family not in FAMILIES or FAMILIES[family].swept for family in families)
-
-
-def refuse_untaken(families: Sequence[str], *, stiffness: object, damping: object) -> None:
-    """Raise ValueError for a stiffness or damping, not None, that none of the contact families takes."""
-    undamped = [family for family in families if family != REFERENCE]
-    for name, value, able in (("stiffness", stiffness, families), ("damping", damping, undamped)):
-        if value is not None and not takes_stiffness(able):
-            chosen = f"contact {', '.join(families)}" if families else "`solref` or `solimp` alone"
-            raise ValueError(f"{chosen} takes no {name}; omit `{name}`, or add a family that does, such as mujoco")
 
 
 TASK_GROUP: Final = "mjx_study.tasks"

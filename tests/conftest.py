@@ -71,7 +71,7 @@ def programs() -> tuple[dict[Any, Any], dict[Any, Any]]:
 def shared_programs(programs: tuple[dict[Any, Any], dict[Any, Any]]) -> Iterator[None]:
     """Studies that need the same task and chunk size share them with all that is compiled."""
     from mjx_study.experiment import descents, plan, sampling
-    from mjx_study.options.option import BUILDER_OPTIONS
+    from mjx_study.options.configuration import BUILDER_OPTIONS
     from mjx_study.runtime import precision  # not above: type checking is switched on after this file is imported
     from mjx_study.tasks import TASKS
 

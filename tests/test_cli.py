@@ -21,8 +21,7 @@ from mjx_study.cli import options
 from mjx_study.execution.run import load_study
 from mjx_study.experiment import plan as plan_module
 from mjx_study.experiment.plan import StudyPlan, plan_study
-from mjx_study.options.configuration import StudyConfig
-from mjx_study.options.option import OPTIONS, SCENE_OPTIONS, as_arguments
+from mjx_study.options.configuration import OPTIONS, SCENE_OPTIONS, StudyConfig, as_arguments
 from mjx_study.plots.style import PAGE
 from mjx_study.results.findings import rows_of
 from mjx_study.tasks import TASKS
@@ -203,94 +202,6 @@ def test_tasks(capsys: pytest.CaptureFixture[str]) -> None:
     assert list(tasks) == list(TASKS)
     assert tasks["pusher"]["params"] == 200 and tasks["pusher"]["effective_mass"] == pytest.approx(0.05)
     assert tasks["double_pendulum"]["effective_mass"] is None
-
-
-OPTION = "unknown option --stifness; did you mean --stiffness? See mjx-study compare --help"
-
-
-@pytest.mark.parametrize(
-    ("arguments", "says"),
-    [
-        (["compare", "pushr"], "unknown task 'pushr'; did you mean pusher? See mjx-study compare --help"),
-        (["compare", "hop"], "unknown task 'hop'; choose from pusher"),
-        (
-            ["sweep", "pushr", "--output", "out"],
-            "unknown task 'pushr'; did you mean pusher? See mjx-study sweep --help",
-        ),
-        (["compare", "pusher", "--estimators", "zobg,fobgg"], "unknown estimator 'fobgg'; did you mean fobg?"),
-        (["compare", "pusher", "--contact", "penalti"], "unknown contact family 'penalti'; did you mean penalty?"),
-        (["compare", "pusher", "--estimators", ""], "no estimator given"),
-        (["compare", "pusher", "--contact", "spring"], "unknown contact family 'spring'; choose from penalty"),
-        (["compare", "pusher", "--samples", "-5"], "argument --samples: must be at least 3"),
-        (["compare", "pusher", "--samples", "0"], "--samples: must be at least 3 and at most 10000000, got 0"),
-        (["compare", "pusher", "--samples", "many"], "--samples: must be a whole number, got 'many'"),
-        (["compare", "pusher", "--reference-samples", "0"], "--reference-samples: must be at least 3"),
-        (["compare", "pusher", "--sigma", "0"], "--sigma: must be positive and finite"),
-        (["compare", "pusher", "--sigma", "-0.1"], "--sigma: must be positive and finite"),
-        (["compare", "pusher", "--sigma", "nan"], "--sigma: must be positive and finite"),
-        (["compare", "pusher", "--stiffness", "10,-5"], "--stiffness: must be positive and finite"),
-        (["compare", "pusher", "--stiffness", "0"], "--stiffness: must be positive and finite"),
-        (["compare", "pusher", "--stiffness", "ten"], "--stiffness: must be a number, got 'ten'"),
-        (["compare", "pusher", "--stiffness", ""], "no stiffness given"),
-        (["compare", "pusher", "--stiffness", "100,100"], "stiffness given twice: 100.0"),
-        (["compare", "pusher", "--estimators", "zobg,zobg"], "estimator given twice: zobg"),
-        (["compare", "pusher", "--damping", "-1"], "--damping: must be at least 0 and finite, got -1"),
-        (["compare", "pusher", "--gamma", "0"], "--gamma: must be positive, got 0"),
-        (["compare", "pusher", "--gamma", "big"], "argument --gamma: must be a number, got 'big'"),
-        (
-            ["compare", "pusher", "--radius", "huge"],
-            "unknown radius 'huge'; choose from max_deviation, or give a number",
-        ),
-        (["compare", "pusher", "--variance-proxy", "std"], "unknown variance proxy 'std'; choose from variance"),
-        (
-            ["compare", "pusher", "--failure-probability", "2"],
-            "--failure-probability: must be positive and less than 1, got 2",
-        ),
-        (["compare", "pusher", "--confidence", "95"], "--confidence: must be positive and less than 1, got 95"),
-        (["compare", "pusher", "--seed", "-1"], "--seed: must be at least 0"),
-        (["compare", "pusher", "--horizon", "0"], "--horizon: must be at least 1"),
-        (["compare", "pusher", "--chunk-size", "0"], "--chunk-size: must be at least 1"),
-        (["compare", "pusher", "--cone", "square"], "--cone: unknown cone 'square'; choose from pyramidal, elliptic"),
-        (["compare", "pusher", "--cone", "elliptic"], "MJX cannot run pusher: condim=1 with ConeType.ELLIPTIC"),
-        (["compare", "pusher", "--precision", "float16"], "unknown precision 'float16'; did you mean float64?"),
-        (["compare", "pusher", "--model", "nowhere.xml"], "no MJCF file at nowhere.xml"),
-        (["compare", "pusher", "--model", "tennis_racket"], "no model named 'tennis_racket'; did you mean tennis?"),
-        (["compare", "pusher", "--stifness", "10"], OPTION),
-        (["compare", "--stifness=10", "pusher"], OPTION),
-        (["compare", "pusher", "--estimator", "zobg"], "unknown option --estimator; did you mean --estimators? See"),
-        (["compare", "pusher", "--backward-s=1"], "unknown option --backward-s; did you mean --backward-stiffness?"),
-        (
-            ["compare", "pusher", "--iterations", "3"],
-            "unknown option --iterations; did you mean --solver-iterations?",
-        ),
-        (["compare", "pusher", "--baseline", "zero"], "unknown baseline 'zero'; did you mean zero_noise?"),
-        (["compare", "pusher", "--backward-margin", "1"], "--backward-margin needs a contact family in --backward"),
-        (["compare", "pusher", "--estimators", "fobg_clipped"], "'fobg_clipped' needs the option --max-norm; set it"),
-        (["compare", "pusher", "--estimators", "ivw_h", "--block-size", "2"], "omit --block-size: batches of any size"),
-        (["compare", "pusher", "--contact", "mjcf", "--damping", "1"], "takes no damping; omit --damping"),
-        (["optimise", "pusher", "--optimizer", "adm"], "optax has no optimiser 'adm' that takes a learning rate; did"),
-        (["sweep", "pusher", "--decay", "1", "--output", "x"], "--decay is for descents: give --iterations as well"),
-        (["compare", "pusher", "--no-such-option"], "unknown option --no-such-option. See mjx-study compare --help"),
-        (["compare", "pusher", "more"], "unexpected argument more. See mjx-study compare --help"),
-        (["--versoin"], "unknown option --versoin; did you mean --version? See mjx-study --help"),
-        (["compare"], "TASK"),
-        (["compre", "pusher"], "mjx-study: unknown command 'compre'; did you mean compare? See mjx-study --help"),
-        (["explain", "pusher"], "unknown command 'explain'; choose from compare"),
-        ([], "COMMAND"),
-        (["gradcheck", "puhser"], "unknown task 'puhser'; did you mean pusher? See mjx-study gradcheck --help"),
-        (["gradcheck", "pusher", "--contact", ""], "no contact model to check"),
-        (["gradcheck", "pusher", "--verbose"], "unknown option --verbose"),
-        (["bench", "pusher", "--samples", "0"], "--samples: must be at least 1"),
-    ],
-    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
-)
-def test_bad_options_get_one_line(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path, arguments: list[str], says: str
-) -> None:
-    untouched = tmp_path / "out"
-    extra = ["--output", str(untouched)] if arguments[:1] == ["compare"] and len(arguments) > 1 else []
-    assert says in refused(capsys, *arguments, *extra)
-    assert not untouched.exists()
 
 
 def test_iterations_of_the_solver_and_of_a_descent_are_different_options() -> None:

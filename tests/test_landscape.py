@@ -329,25 +329,6 @@ def test_theta_has_its_unit(drawn: tuple[Path, str], tmp_path: Path) -> None:
     assert pusher["position"].attrs["units"] == "unit of theta"
 
 
-@pytest.mark.parametrize(
-    ("arguments", "says"),
-    [
-        (["--points", "1"], "--points: must be at least 2"),
-        (["--samples", "2"], "--samples: must be at least 3"),
-        (["--span", "1,0"], "--span must be two numbers, the lower one first"),
-        (["--span", "1"], "--span must be two numbers"),
-        (["--seed", "-1"], "--seed: must be at least 0"),
-        (["--contact", ""], "no contact model"),
-        (["--sigma", "0"], "--sigma: must be positive"),
-        (["--contact", "spring"], "unknown contact family"),
-    ],
-)
-def test_bad_options_get_one_line(capsys: pytest.CaptureFixture[str], arguments: list[str], says: str) -> None:
-    assert cli.main(["landscape", "ball_wall", *arguments]) == 2
-    printed = capsys.readouterr()
-    assert says in printed.err and printed.err.count("\n") == 1 and printed.out == ""
-
-
 @pytest.mark.parametrize("command", ["optimise", "landscape", "compare"])
 def test_a_family_without_stiffness_is_taken_as_it_is(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """The default stiffness is for families that take one."""
@@ -360,12 +341,7 @@ def test_a_family_without_stiffness_is_taken_as_it_is(command: str, monkeypatch:
         raise Planned
 
     monkeypatch.setattr(studies, "_compute", compute)
-    if command != "compare":
+    if command == "landscape":
         monkeypatch.setattr(plan_module, "task_with_options", None)  # the task is built once, by the command
     with pytest.raises(Planned):
         cli.main([command, "momentum_transfer", "--contact", "mujoco_default", "--horizon", "4"])
-
-
-def test_directions_are_checked(capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["landscape", "pusher", "--direction", "200"]) == 2
-    assert "--direction must be random or a parameter's index, 0 to 199" in capsys.readouterr().err

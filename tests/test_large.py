@@ -147,10 +147,13 @@ def test_a_study_in_blocks_goes_on_where_it_was_stopped(tmp_path: Path, monkeypa
 
 def test_what_needs_whole_batches_is_refused() -> None:
     able = "batches of any size are for zobg, zobg_antithetic, .*, aobg, .*ivw, without leave_one_out and cross_fitted$"
-    with pytest.raises(ValueError, match=f"^ivw_h, total_propagation need whole batches, omit `block_size`: {able}"):
+    with pytest.raises(
+        ValueError,
+        match=f"^`block_size` splits batches, and ivw_h, total_propagation must have whole ones: omit it; {able}",
+    ):
         planned(estimators=("zobg", "ivw_h", "total_propagation"))
     for changes in ({"baseline": "leave_one_out"}, {"weights": "cross_fitted", "estimators": ("ivw",)}):
-        with pytest.raises(ValueError, match="needs? whole batches, omit `block_size`"):
+        with pytest.raises(ValueError, match="`block_size` splits batches"):
             planned(**changes)
     large: dict[str, Any] = {"samples": (10_000_000,), "block_size": None}
     with pytest.raises(ValueError, match=f"and more seeds; or omit delta: {able}"):

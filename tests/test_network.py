@@ -80,4 +80,4 @@ def test_a_network_is_optimised_and_replayed(
     assert cli.main(["optimise", "pusher", "--network", "4", "--reference"]) == 2
     assert "a network needs MJX" in capsys.readouterr().err
     assert cli.main(["optimise", "pusher", "--network", "wide"]) == 2
-    assert "--network: must be a whole number, got 'wide'" in capsys.readouterr().err
+    assert "--network must be a whole number, got 'wide'" in capsys.readouterr().err

@@ -27,7 +27,7 @@ from mjx_study.experiment.iteration import REASONS, begin, make_optimizer
 from mjx_study.experiment.plan import StudyPlan, estimators_of, plan_study
 from mjx_study.objective import Simulator
 from mjx_study.options.configuration import StudyConfig
-from mjx_study.options.files import PolicyFile
+from mjx_study.options.files import POLICY_OPTIONS
 from mjx_study.reference import ReferenceObjective, Tennis, roll_out
 from mjx_study.results.findings import findings_of
 from mjx_study.results.variables import HISTORY, METRIC
@@ -108,7 +108,7 @@ def test_a_weight_of_zero_throughout_is_told() -> None:
 def test_a_descent_starts_where_theta_says() -> None:
     (group,) = plan_study(config(horizon=2, theta=(0.5, -0.5))).groups
     assert group.task.theta.tolist() == [0.5, -0.5]
-    with pytest.raises(ValueError, match="theta has 2 numbers; pusher needs 13, all of them finite"):
+    with pytest.raises(ValueError, match="`theta` has 2 numbers; pusher needs 13, all of them finite"):
         plan_study(config(horizon=2, theta=(0.5, -0.5), network=(2,)))
 
 
@@ -260,32 +260,10 @@ def test_any_optimiser_of_optax(name: str) -> None:
     assert np.all(np.asarray(update) < 0)
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"estimators": ()}, "no estimator given; choose from zobg"),
-        ({"estimators": ("gobg",)}, "unknown estimator 'gobg'"),
-        ({"estimators": ("zobg", "zobg")}, "given twice: zobg"),
-        ({"seeds": 0}, "seeds must be at least 1 and at most 100000, got 0"),
-        ({"samples": (1,)}, "samples must be at least 3 and at most 10000000, got 1"),
-        ({"seed": -1}, "seed must be at least 0"),
-        ({"optimizer": "ascent"}, "optax has no optimiser 'ascent'"),
-        ({"optimizer": "apply_updates"}, "optax has no optimiser 'apply_updates'"),
-        ({"learning_rate": 0.0}, "learning_rate must be positive and finite, got 0"),
-        ({"decay": 3.0}, "decay must be at least 0 and at most 2, got 3"),
-        ({"estimators": ("fobg_truncated",)}, "'fobg_truncated' needs the option `window`"),
-        ({"noise": "laplace", "estimators": ("delta",)}, "'delta' holds for Gaussian noise only"),
-    ],
-)
-def test_what_cannot_be_run_is_refused(changes: dict[str, Any], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        plan_study(config(**changes))
-
-
 def test_a_task_without_recipe_or_reference_says_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     bare = make_task("pusher", horizon=3).replace(defaults=StudyDefaults(), reference=None)
     monkeypatch.setattr(plan, "task_with_options", lambda *_, **__: bare)
-    with pytest.raises(ValueError, match="pusher has no recipe: give `learning_rate`, `samples`$"):
+    with pytest.raises(ValueError, match="`learning_rate` must be given, as must `samples`: pusher has no recipe$"):
         plan_study(config(horizon=3, samples=None, learning_rate=None))
     (group,) = plan_study(config(horizon=3)).groups
     assert group.recipe is not None and group.recipe.decay == 0.0
@@ -437,7 +415,7 @@ def test_a_policy_is_replayed(
     facts = json.loads(capsys.readouterr().out)
     assert facts["theta"] == theta and facts["steps"] == 8
     kept = json.loads(policy.read_text())
-    assert PolicyFile.model_fields.keys() <= kept.keys()
+    assert {"task", "theta", "digest", *POLICY_OPTIONS} <= kept.keys()
     del kept["digest"]  # as somebody does who changes the file
     (changed := tmp_path / "changed.json").write_text(json.dumps(kept | {"timestep": 0.0025, "solver": "cg"}))
     simulate, _ = motions._plan_task(cli.parser().parse_args(["rollout", "pusher", "--theta", str(changed)]))
@@ -458,7 +436,7 @@ def test_a_policy_is_replayed(
 def test_bad_options_get_one_line(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, written) -> None:
     monkeypatch.setattr(options, "configure", lambda **_: None)
     for arguments, says in (
-        (["pusher", "--estimators", "gobg"], "unknown estimator 'gobg'"),
+        (["pusher", "--estimators", "gobg"], "--estimators does not accept 'gobg'"),
         (["pusher", "--reference", "--sigma", "0.3", "--output", str(written[0])], "holds another study"),
     ):
         assert cli.main(["optimise", *arguments]) == 2

@@ -15,7 +15,7 @@ from estimators import ESTIMATORS, Estimator, FirstOrder, ZerothOrder, find_esti
 from mjx_study import cli
 from mjx_study.cli import options
 from mjx_study.execution.run import load_study
-from mjx_study.options.configuration import StudyConfig
+from mjx_study.options.configuration import OPTIONS
 from mjx_study.plots.style import combines, style_of
 from mjx_study.report import CAPTIONS
 from mjx_study.results.findings import rows_of
@@ -241,7 +241,7 @@ def test_a_registered_one_has_a_name(monkeypatch: pytest.MonkeyPatch) -> None:
         name, label = "twice", "FoBG, twice"
 
     assert ESTIMATORS["twice"] is Twice and make_estimator("twice") == Twice() != FirstOrder()
-    assert StudyConfig.option("estimators").check(("twice",))
+    assert OPTIONS["estimators"].check(("twice",))
     assert style_of("twice") == ("FoBG, twice", *style_of("fobg")[1:])
     with pytest.raises(ValueError, match="there is already an estimator 'twice'"):
         register(Twice)

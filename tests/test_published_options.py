@@ -1,15 +1,12 @@
 """What the published examples chose, offered beside the defaults: constants of AoBG's bound, and a pendulum's start."""
 
-from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 import pytest
 
-from mjx_study import cli
 from mjx_study.cli import options
-from mjx_study.cli.sweep import sweep_fields
 from mjx_study.experiment.plan import estimators_of, plan_study
 from mjx_study.experiment.resolution import configured_estimators
 from mjx_study.options.configuration import StudyConfig
@@ -55,35 +52,6 @@ def alpha_order(config: StudyConfig) -> Any:
 def test_every_study_takes_them(kind: str) -> None:
     changes: dict[str, Any] = {"points": 3} if kind == "landscapes" else {}
     assert alpha_order(StudyConfig(tasks=("tennis",), kind=kind, published=True, **changes)).radius == 1000.0
-
-
-def test_published_constants_stand_alone() -> None:
-    task = make_task("pusher", horizon=3)
-    with pytest.raises(ValueError, match="`published` sets `gamma`, .*: omit `gamma`, `radius`"):
-        configured_estimators(StudyConfig(tasks=("pusher",), published=True, gamma=1.0, radius=2.0), task)
-    with pytest.raises(ValueError, match="double_pendulum has no published constants of the bound"):
-        configured_estimators(StudyConfig(tasks=("double_pendulum",), published=True), make_task("double_pendulum"))
-
-
-@pytest.mark.parametrize(
-    ("arguments", "says"),
-    [
-        (["compare", "pusher", "--published", "--gamma", "1"], "omit --gamma"),
-        (["optimise", "double_pendulum", "--published"], "has no published constants"),
-    ],
-)
-def test_one_line_where_they_cannot_be_had(capsys: pytest.CaptureFixture[str], arguments: list[str], says: str) -> None:
-    assert cli.main(arguments) == 2
-    printed = capsys.readouterr()
-    assert says in printed.err and printed.err.count("\n") == 1 and printed.out == ""
-
-
-@pytest.mark.parametrize(("value", "kept"), [("true", True), ("false", False)])
-def test_a_file_of_options_may_ask_for_them(tmp_path: Path, value: str, kept: bool) -> None:
-    path = tmp_path / "study.toml"
-    path.write_text(f'tasks = ["pusher"]\npublished = {value}\n')
-    parsed = cli.parser().parse_args(["sweep", "--config", str(path), "--output", "x"])
-    assert sweep_fields(parsed)["published"] is kept
 
 
 def test_what_they_do_to_the_weight_of_first_order_gradients() -> None:

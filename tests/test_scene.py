@@ -14,8 +14,9 @@ import numpy as np
 import pytest
 
 from mjx_study.choices import CONES, INTEGRATORS, SOLVERS
-from mjx_study.cli.options import TASK_OPTIONS, Parser, given_options
-from mjx_study.options.option import as_arguments
+from mjx_study.cli.options import given_options
+from mjx_study.options.configuration import as_arguments
+from mjx_study.options.parser import TASK_OPTIONS, Parser
 from mjx_study.simulation.dynamics import State
 from mjx_study.simulation.limitations import FLAGS
 from mjx_study.simulation.scene import (

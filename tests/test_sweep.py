@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import math
 import os
 import random
 import re
@@ -26,7 +25,7 @@ import estimators
 from estimators import AlphaOrder, DiscontinuityGated
 from mjx_study import cli
 from mjx_study.cli import options
-from mjx_study.cli.sweep import solimp, solref, sweep_fields
+from mjx_study.cli.sweep import sweep_fields
 from mjx_study.execution.run import load_study, open_store, run_study, warnings_of
 from mjx_study.experiment import sampling
 from mjx_study.experiment.checkpoint import StudyError
@@ -454,125 +453,6 @@ def test_landscapes_are_labelled_and_right(landscapes: Path, by_hand: Simulator)
 
 
 # The command's text, figures and page.
-
-
-@pytest.mark.parametrize(
-    ("text", "values"),
-    [
-        ("10", [10.0]),
-        ("10:1000:3:log", [10.0, 100.0, 1000.0]),
-        ("0:1:5", [0.0, 0.25, 0.5, 0.75, 1.0]),
-        ("-1e4:-1e2:3:log", [-1e4, -1e3, -1e2]),
-    ],
-)
-def test_ranges(text: str, values: list[float]) -> None:
-    assert solimp(text) == (tuple(values),)
-
-
-def test_lists_from_text_numbers_and_files() -> None:
-    stiffness, samples = StudyConfig.option("stiffness"), StudyConfig.option("samples")
-    assert stiffness.parse("10:100:2:log,1000") == (10.0, 100.0, 1000.0)
-    assert samples.read([3, 10]) == (3, 10) and samples.read(5) == (5,) and samples.parse("1e3") == (1000,)
-    assert samples.parse("3:9:3") == (3, 6, 9) and stiffness.read([3]) == (3.0,)
-    assert solref("-100,-1000;-5") == ((-100.0, -5.0), (-1000.0, -5.0)) == solref([[-100, -5], [-1000, -5]])
-    assert solimp("0.9,0.95,0.001,0.5,2") == ((0.9, 0.95, 0.001, 0.5, 2.0),)
-    for wrong in (
-        "10:1000",
-        "1:10:1",
-        "0:10:3:log",
-        "1:2:3:lin",
-        "1:nan:3",
-        "1:inf:3:log",
-        "-1:1:3:log",
-        "1e-300:1e300:3:log",
-    ):
-        with pytest.raises(ValueError, match="is neither a number nor a range"):
-            stiffness.parse(wrong)
-    with pytest.raises(ValueError, match="must be of at most 10000 values"):
-        stiffness.parse("1:1e9:1000000000")
-    with pytest.raises(ValueError, match="must be a whole number, got '2.5'"):
-        samples.parse("2.5")
-    with pytest.raises(ValueError, match="must be a number, got 'x'"):
-        stiffness.read(["x"])
-
-
-def test_a_file_and_flags_are_one_configuration(tmp_path: Path) -> None:
-    path = tmp_path / "study.toml"
-    path.write_text('tasks = ["pusher"]\nstiffness = "10:1000:3:log"\nsamples = [4, 8]\nseeds = 2\nhorizon = 9\n')
-    parsed = cli.parser().parse_args(["sweep", "--config", str(path), "--seeds", "3", "--output", "x"])
-    assert StudyConfig(**sweep_fields(parsed)) == StudyConfig(
-        tasks=("pusher",), stiffness=(10.0, 100.0, 1000.0), samples=(4, 8), seeds=3, horizon=9
-    )
-
-
-@pytest.mark.parametrize(
-    ("line", "says"),
-    [
-        ('seeds = "2"', "study.toml: seeds: must be a whole number, got '2'"),
-        ("seeds = 2.5", "seeds: must be a whole number, got 2.5"),
-        ("horizon = true", "horizon: must be a whole number, got True"),
-        ('gamma = "x"', "gamma: must be a number, got 'x'"),
-        ("optimizer = 3", "optimizer: must be text, got 3"),
-        ("radius = true", "radius: must be a number, got True"),
-        ("window = 1.5", "window: must be a whole number, got 1.5"),
-        ("contact = [3]", "contact: must be text, got 3"),
-        ('samples = ["x"]', "samples: must be a whole number, got 'x'"),
-        ("colour = 1", "colour: there is no such option"),
-        ("stifness = 10", "stifness: there is no such option; did you mean stiffness?"),
-        ('task = "pusher"', "task: there is no such option; did you mean tasks?"),
-    ],
-)
-def test_a_file_with_a_value_of_another_kind_gets_one_line(tmp_path: Path, line: str, says: str) -> None:
-    path = tmp_path / "study.toml"
-    path.write_text(f'tasks = ["pusher"]\n{line}\n')
-    with pytest.raises(ValueError, match=re.escape(says)):
-        sweep_fields(cli.parser().parse_args(["sweep", "--config", str(path), "--output", "x"]))
-    path.write_text('tasks = ["pusher"]\npoints = 3\ndirection = 3\ngamma = 5\n')
-    fields = sweep_fields(cli.parser().parse_args(["sweep", "--config", str(path), "--output", "x"]))
-    assert fields["direction"] == "3" and fields["gamma"] == 5
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"tasks": ()}, "no task given"),
-        ({"tasks": ("puhser",)}, "unknown task 'puhser'"),
-        ({"estimators": ("gobg",)}, "unknown estimator 'gobg'"),
-        ({"contact": ("soft",)}, "unknown contact family 'soft'"),
-        ({"stiffness": ()}, "no stiffness given"),
-        ({"stiffness": (10.0, 10.0)}, "stiffness given twice: 10.0"),
-        ({"samples": (2,)}, "samples must be at least 3"),
-        ({"iterations": 3, "points": 3}, "give one of them"),
-        ({"kind": "gradients", "points": 3}, "`points` are for landscapes, and `kind` is gradients"),
-        ({"span": (0.0, 1.0)}, "`span` is for landscapes: give `points` as well"),
-        ({"learning_rate": math.nan}, "learning_rate must be positive and finite, got nan"),
-        ({"learning_rate": 0.1}, "`learning_rate` is for descents: give `iterations` as well"),
-        ({"optimizer": "adam", "decay": 0.5}, "`optimizer` and `decay` are for descents: give `iterations` as well"),
-        ({"points": 3, "evaluation_samples": 10}, "`evaluation_samples` is for descents"),
-        ({"iterations": 3, "learning_rate": math.nan}, "learning.rate must be positive and finite, got nan"),
-        ({"iterations": 3, "direction": "0"}, "`direction` is for landscapes"),
-        ({"iterations": 3, "reference_samples": 9}, "`reference_samples` is for gradients: omit it"),
-        (
-            {"contact": (), "solref": ((-1000.0, -5.0),)},
-            "`solref` or `solimp` alone takes no stiffness; omit `stiffness`",
-        ),
-        ({"contact": ("mjcf",), "stiffness": None, "damping": 1.0}, "contact mjcf takes no damping; omit `damping`"),
-        ({"points": 1}, "points must be at least 2 and at most 100000, got 1"),
-        ({"points": 3, "span": (1.0, 0.0)}, "`span` must be two numbers, the lower one first"),
-        ({"points": 3, "direction": "20"}, "`direction` must be random or a parameter's index, 0 to 19; got 20"),
-        ({"contact": ("mjcf",)}, "contact mjcf takes no stiffness; omit `stiffness`"),
-        ({"seeds": 0}, "seeds must be at least 1 and at most 100000, got 0"),
-        ({"timestep": (2.0,)}, "timestep must be positive and less than 1, got 2"),
-        ({"sigma": (-1.0,)}, "sigma must be positive"),
-        ({"contact": (), "stiffness": None}, "no contact model"),
-        ({"solref": ((1.0, 2.0, 3.0),)}, "solref takes 2 numbers and solimp 5, got 3 and 5"),
-        ({"iterations": 3, "optimizer": "ascent"}, "optax has no optimiser 'ascent'"),
-        ({"estimators": ("fobg_truncated",)}, "'fobg_truncated' needs the option `window`"),
-    ],
-)
-def test_what_cannot_be_swept_is_refused(changes: dict[str, Any], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        plan_study(config(**changes))
 
 
 def test_a_timestep_keeps_the_duration() -> None:

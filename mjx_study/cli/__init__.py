@@ -15,8 +15,9 @@ from collections.abc import Sequence
 from importlib import import_module
 from typing import Final
 
-from mjx_study.cli.options import Parser, UsageError, refuse_unusable
+from mjx_study.cli.options import refuse_unusable
 from mjx_study.cli.output import OutputError, complain, encodable, ending, written_out
+from mjx_study.options.parser import Parser, UsageError
 from mjx_study.version import summary, version_of
 
 ENDED = "existing files are complete"

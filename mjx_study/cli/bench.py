@@ -2,8 +2,9 @@
 
 import argparse
 
-from mjx_study.cli.options import Parser, configure_process, task_of, usage_errors
+from mjx_study.cli.options import configure_process, task_of, usage_errors
 from mjx_study.cli.output import computing, print_report
+from mjx_study.options.parser import Parser
 
 EPILOG = """\
 Rates in one run on this machine: rollouts and gradients, against jax.grad through mjx.step (with the one solver
@@ -14,7 +15,9 @@ threads.
 
 def add(command: Parser) -> None:
     command.add_task_options()
-    command.add_option("samples", 1000, line="samples in the batch that is timed")
+    command.add_option(
+        "samples", many=False, interval="[1, 1e7]", default=1000, line="samples in the batch that is timed"
+    )
 
 
 def run(options: argparse.Namespace) -> int:

@@ -5,8 +5,9 @@ import json
 from pathlib import Path
 
 from mjx_study.choices import unknown
-from mjx_study.cli.options import Parser, UsageError, configure_process, usage_errors
+from mjx_study.cli.options import configure_process, usage_errors
 from mjx_study.cli.output import RESUMABLE, attempt, computing, print_report
+from mjx_study.options.parser import DEVICES, Parser, UsageError
 
 EPILOG = """\
 Each claim has a statistic, a range of values for which the claim holds, and a range for which its opposite holds. The
@@ -32,7 +33,7 @@ def add(command: Parser) -> None:
     command.add_argument("--output", type=Path, metavar="DIR", help="folder for measurements and verdicts; resumable")
     command.add_flag("--list", "print the claims and their criteria; measure nothing")
     command.add_flag("--accept-versions", "resume studies in DIR begun by other versions of the software")
-    command.add_option("devices")
+    command.add_option(DEVICES)
 
 
 def run(options: argparse.Namespace) -> int:

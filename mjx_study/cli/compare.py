@@ -5,9 +5,9 @@ from functools import partial
 
 from estimators.registry import ESTIMATORS
 from mjx_study.choices import FAMILIES
-from mjx_study.cli.options import Parser
-from mjx_study.options.configuration import StudyConfig
-from mjx_study.options.option import BUILDER_OPTIONS
+from mjx_study.cli.options import study_fields
+from mjx_study.options.configuration import BUILDER_OPTIONS, StudyConfig
+from mjx_study.options.parser import Parser
 from mjx_study.results.variables import COLUMNS, DETAILS, MARKS, explained
 from mjx_study.table import described
 
@@ -37,15 +37,15 @@ and with --details:
 
 def add(command: Parser) -> None:
     command.add_task_argument()
-    command.add_fields("sigma", "timestep", "cone", *BUILDER_OPTIONS)
+    command.add_options("sigma", "timestep", "cone", *BUILDER_OPTIONS)
     command.add_process_options()
     command.add_contact_options()
     command.add_theta_option("parameters at which gradients are taken")
-    command.add_fields("estimators", "reference_samples")
-    command.add_option(StudyConfig.option("samples"), (400,))
+    command.add_options("estimators", "reference_samples")
+    command.add_option("samples", default=(400,))
     command.add_estimator_options()
     command.add_backward_options()
-    command.add_fields("confidence", "chunk_size", "block_size")
+    command.add_options("confidence", "chunk_size", "block_size")
     command.add_folder_options()
     command.add_cluster_option()
     command.add_flag("--details", "print all columns")
@@ -53,7 +53,7 @@ def add(command: Parser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     from mjx_study.cli.console import gradient_lines, rows_as_json
-    from mjx_study.cli.studies import run_one, study_fields
+    from mjx_study.cli.studies import run_one
     from mjx_study.experiment.plan import StudyPlan, plan_study
 
     def planned() -> StudyPlan:

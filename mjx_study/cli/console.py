@@ -15,8 +15,7 @@ from estimators import ENOUGH_EFFECTIVE
 from estimators.registry import label_of
 from mjx_study.choices import FAMILIES, REFERENCE
 from mjx_study.experiment.iteration import REASONS
-from mjx_study.options.configuration import StudyConfig
-from mjx_study.options.option import SCENE_OPTIONS
+from mjx_study.options.configuration import OPTIONS, SCENE_OPTIONS
 from mjx_study.results.findings import Row, curves_of, findings_of, line_of, onset_of, remains, rows_of
 from mjx_study.results.variables import COLUMNS, DEBIASED, DERIVED, DETAILS, HISTORY, MARKS, METRIC, QUANTITIES, START
 from mjx_study.table import format_table, number, percent, with_error
@@ -95,7 +94,7 @@ def _table(rows: Sequence[Row], table: Sequence[Column]) -> list[str]:
 
 def _chosen(config: dict[str, Any]) -> str:
     """Options that change what the estimators are, where given."""
-    given = {name: config[name] for name in CHOSEN if config.get(name) not in (None, StudyConfig.default(name))}
+    given = {name: config[name] for name in CHOSEN if config.get(name) not in (None, OPTIONS[name].default)}
     if (theta := given.get("theta")) is not None:
         given["theta"] = ", ".join(f"{each:g}" for each in theta[:MOST_SHOWN]) + (" ..." if theta[MOST_SHOWN:] else "")
     told = {name: ",".join(value) if isinstance(value, list) else value for name, value in given.items()}

@@ -4,10 +4,11 @@ import argparse
 import shlex
 
 from mjx_study.choices import FAMILIES, is_file
-from mjx_study.cli.options import TASK_OPTIONS, Parser, configure_process, given_options, task_of, usage_errors
+from mjx_study.cli.options import configure_process, given_options, task_of, usage_errors
 from mjx_study.cli.output import computing, print_report
 from mjx_study.diagnose.columns import CONTACTS, ESTIMATES
-from mjx_study.options.option import OPTIONS
+from mjx_study.options.configuration import OPTIONS
+from mjx_study.options.parser import MIDDLE, TASK_OPTIONS, Parser
 from mjx_study.table import explain
 
 EPILOG = f"""\
@@ -26,24 +27,25 @@ derivative is wrong.
 
 def add(command: Parser) -> None:
     command.add_task_options()
-    command.add_contact_options("the middle one of the task's sweep", many=False, analytic=False)
-    command.add_option("samples", unset="500, or as many as fit into a minute")
+    command.add_contact_options(MIDDLE, many=False, analytic=False)
+    command.add_option("samples", many=False, interval="[1, 1e7]", unset="500, or as many as fit into a minute")
 
 
 def run(options: argparse.Namespace) -> int:
     """Measure and print; return 1 if a derivative is wrong."""
     from mjx_study.diagnose.page import document_of, page_lines
     from mjx_study.diagnose.run import diagnose_task
+    from mjx_study.tasks.contact_grid import single_contact
 
     with usage_errors():
         configure_process(options)
         task = task_of(options)
-        if not is_file(options.task):  # other commands default to several
-            options.contact = options.contact or task.defaults.main_family
-            if FAMILIES[options.contact].swept:
-                options.stiffness = options.stiffness or task.defaults.middle_stiffness
-    given = given_options(options, "contact", "stiffness", "damping", "sigma", *TASK_OPTIONS)
-    given |= {"seed": options.seed} if options.seed else {}
+        contact, _ = single_contact(task, options.contact, options.stiffness, options.damping)
+    given = given_options(options, "contact", "stiffness", "damping", "sigma", *TASK_OPTIONS, "seed")
+    if not is_file(options.task):  # other commands default to several
+        given["contact"] = contact.family
+        if FAMILIES[contact.family].swept:
+            given["stiffness"] = contact.stiffness
     flags = "".join(f" {OPTIONS[name].flag} {shlex.quote(_text(value))}" for name, value in given.items())
     with computing() as progress, usage_errors():
         found = diagnose_task(
@@ -53,7 +55,7 @@ def run(options: argparse.Namespace) -> int:
             options.stiffness,
             damping=options.damping,
             samples=options.samples,
-            seed=options.seed,
+            seed=options.seed or 0,
             options=flags,
             progress=progress,
         )

@@ -4,8 +4,8 @@ import argparse
 
 from estimators.choices import DENSITIES, ORACLES
 from estimators.registry import ESTIMATORS, options_of
-from mjx_study.cli.options import Parser
 from mjx_study.cli.output import print_report
+from mjx_study.options.parser import Parser
 
 EPILOG = """\
 The second column says what each needs: values (rollouts), pairs (of opposite noise), steps (costs to go), gradients, or

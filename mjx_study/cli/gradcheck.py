@@ -1,18 +1,21 @@
 """mjx-study gradcheck."""
 
 import argparse
-from typing import Any
+import dataclasses
 
 from mjx_study.choices import CHECKED_STATES, CHECKED_STEPS, CHECKED_STIFFNESS, is_file
-from mjx_study.cli.options import Parser, UsageError, configure_process, given_options, task_of, usage_errors
+from mjx_study.cli.options import configure_process, given_options, task_of, usage_errors
 from mjx_study.cli.output import computing, print_report
 from mjx_study.diagnose.columns import MEANS
-from mjx_study.options.option import OPTIONS, Option
+from mjx_study.options.configuration import OPTIONS
+from mjx_study.options.option import Option, OptionError, reject_unused
+from mjx_study.options.parser import Parser
 from mjx_study.table import explain
 
 UNEXERCISED = 3
 """Exit code if nothing is wrong but something was never exercised."""
 PAIR = Option("pair", str, "GEOM,GEOM", "for files: pair of geoms that the stiffness is for", many=True)
+STATES = Option("states", int, "N", "states to check", "[1, 1000]", unset=str(CHECKED_STATES))
 EPILOG = f"""\
 Columns, all relative errors, each the worst over the states:
   modes        reverse mode against forward mode
@@ -39,19 +42,26 @@ With --mean: does an estimator's mean integrate to the difference of the mean co
 reference gradient is needed. Exit code 0: all are right. 1: one is biased. 3: undecided. Columns:
 {explain(*MEANS)}
 """
-MEAN = {
-    "estimators": ("zobg", "fobg"),
-    "onset": "none",
-    "samples": 1000,
-    "sigma": None,
-    "span": None,
-    "direction": "random",
-    "max_norm": None,
-    "window": None,
+MEAN_OPTIONS = {
+    option.name: option
+    for option in (
+        dataclasses.replace(OPTIONS["estimators"], default=("zobg", "fobg")),
+        OPTIONS["onset"],
+        dataclasses.replace(
+            OPTIONS["samples"], many=False, interval="[1, 1e7]", default=1000, line="samples at each node of the path"
+        ),
+        dataclasses.replace(OPTIONS["sigma"], many=False),
+        dataclasses.replace(OPTIONS["span"], line="range of the path", unset="two sigma about theta"),
+        dataclasses.replace(
+            OPTIONS["direction"], default="random", line="random, a parameter's index, or means: paths that these span"
+        ),
+        OPTIONS["max_norm"],
+        OPTIONS["window"],
+    )
 }
-"""Options of --mean, with their defaults."""
-OF_DERIVATIVES = {"states": CHECKED_STATES, "stock": False, "pair": None, "details": False}
-"""Options that --mean does not read, with their defaults."""
+"""Options of --mean."""
+DERIVATIVES = ("states", "stock", "pair", "details")
+"""Options that --mean does not read."""
 
 
 def add(command: Parser) -> None:
@@ -61,19 +71,11 @@ def add(command: Parser) -> None:
     command.add_contact_options(f"{usual}, or the task's if stiffer", families, analytic=False)
     command.add_option(PAIR)
     command.add_builder_options(horizon={"unset": f"the task's; {CHECKED_STEPS} for a file"})
-    command.add_option("states", CHECKED_STATES)
+    command.add_option(STATES)
     command.add_flag("--stock", "also check the derivative of mjx.step itself")
     command.add_flag("--mean", "check the means of estimators instead of derivatives")
-    changes: dict[str, dict[str, Any]] = {
-        "estimators": {"many": True},
-        "span": {"many": True, "line": "range of the path", "unset": "two sigma about theta"},
-        "samples": {"line": "samples at each node of the path"},
-    }
-    for name, default in MEAN.items():
-        more = "; or means: three paths that the means span" if name == "direction" else ""
-        own = changes.get(name, {})
-        own["line"] = f"with --mean: {own.get('line', OPTIONS[name].line)}{more}"
-        command.add_option(name, default, given=False, **own)
+    for option in MEAN_OPTIONS.values():
+        command.add_option(option, filled=False, line=f"with --mean: {option.line}")
     command.add_flag("--details", "print every entry of every finding")
     command.add_process_options()
 
@@ -82,23 +84,26 @@ def run(options: argparse.Namespace) -> int:
     """Check and print; return 1 if something is wrong, 3 if something was not exercised."""
     from mjx_study.gradcheck import gradcheck, plan_gradcheck, plan_scene_gradcheck
 
+    given = [name for name in (*MEAN_OPTIONS, *DERIVATIVES) if getattr(options, name) not in (None, False)]
+    with usage_errors():
+        reject_unused(
+            given,
+            (DERIVATIVES, not options.mean, "is for derivatives of steps: omit it, or --mean"),
+            (MEAN_OPTIONS, options.mean, "is for --mean"),
+            (["pair"], is_file(options.task), "is for files: a task has a pair of geoms already"),
+        )
     if options.mean:
-        if given := [name for name, default in OF_DERIVATIVES.items() if getattr(options, name) != default]:
-            raise UsageError(f"--{given[0]} is for derivatives of steps: omit it, or --mean")
         return _run_mean(options)
-    if given := given_options(options, *MEAN):
-        raise UsageError(f"{OPTIONS[next(iter(given))].flag} is for --mean")
-    common = {name: getattr(options, name) for name in ("seed", "damping", "states", "stock")}
+    common = {"seed": options.seed or 0, "damping": options.damping, "stock": options.stock}
+    common["states"] = options.states or CHECKED_STATES
     with usage_errors():
         configure_process(options)
         task = task_of(options)
         if not is_file(options.task):
-            if options.pair is not None:
-                raise UsageError("--pair is for files; a task has its own")
             plan = plan_gradcheck(task, options.contact, options.stiffness, **common)
         else:
             if options.pair is not None and len(options.pair) != 2:
-                raise UsageError(f"--pair takes the names of two geoms, got {len(options.pair)}")
+                raise OptionError("pair", f"takes the names of two geoms, got {len(options.pair)}")
             common |= {"pair": options.pair, "horizon": task.horizon}
             plan = plan_scene_gradcheck(task.scene, options.contact, options.stiffness, **common)
     with computing() as progress:
@@ -108,39 +113,37 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _run_mean(options: argparse.Namespace) -> int:
-    from estimators import make_estimator
     from mjx_study.diagnose.means import ALONG_MEANS, check_mean, lines_of, path_of
     from mjx_study.diagnose.setting import setting_of
-    from mjx_study.experiment.resolution import check_estimators
+    from mjx_study.experiment.resolution import make_estimators
     from mjx_study.experiment.unused_options import reads_onset, reject_unread
     from mjx_study.gradcheck import plan_gradcheck
 
-    chosen = MEAN | given_options(options, *MEAN)
+    chosen = {name: option.default for name, option in MEAN_OPTIONS.items()} | given_options(options, *MEAN_OPTIONS)
+    names, onset, seed = chosen["estimators"], chosen["onset"], options.seed or 0
     with usage_errors():
         configure_process(options)
-        task = task_of(options).replace(onset=chosen["onset"])
-        plan = plan_gradcheck(task, options.contact, options.stiffness, seed=options.seed, damping=options.damping)
+        task = task_of(options).replace(onset=onset)
+        plan = plan_gradcheck(task, options.contact, options.stiffness, seed=seed, damping=options.damping)
         settings = {name: chosen[name] for name in ("max_norm", "window")}
-        settings |= {"gamma": task.defaults.gamma, "sigma": task.sigma}
-        found = [make_estimator(name, **settings) for name in chosen["estimators"]]
-        check_estimators(found, task)
-        reject_unread(chosen["estimators"], given_options(options, "max_norm", "window"))
-        if options.onset not in (None, "none") and not reads_onset(chosen["estimators"], options.onset):
-            raise UsageError("--onset has no effect on these estimators: add fobg")
-        if options.span is not None and options.direction == ALONG_MEANS:
-            raise UsageError("--span is for one path, and --direction means chooses its own: omit one of them")
-    given = {name: chosen[name] for name in ("samples", "span", "direction")} | {"names": chosen["estimators"]}
+        found = make_estimators(names, settings | {"gamma": task.defaults.gamma}, task)
+        reject_unread(names, given_options(options, "max_norm", "window"))
+        reject_unused(
+            given_options(options, "onset", "span"),
+            (["onset"], onset == "none" or reads_onset(names, onset), "has no effect on these estimators: add fobg"),
+            (["span"], chosen["direction"] != ALONG_MEANS, "is for one path, and --direction means chooses several"),
+        )
+    given = {name: chosen[name] for name in ("samples", "span", "direction")} | {"names": names}
     with computing() as progress:
-        checks = check_mean(task, plan.cells, found, seed=options.seed, progress=progress, **given)
+        checks = check_mean(task, plan.cells, found, seed=seed, progress=progress, **given)
     document = {"checks": [each.as_dict() for each in checks], "warnings": list(plan.warnings)}
-    onset, table = chosen["onset"], lines_of(checks, chosen["onset"])
     lines = [
-        f"{options.task}: {chosen['samples']} samples at each node of the path, seed {options.seed}, float64"
+        f"{options.task}: {chosen['samples']} samples at each node of the path, seed {seed}, float64"
         f"{'' if onset == 'none' else f', onset {onset}'}",
         setting_of(options.task, task).line(),
         path_of(task, chosen["span"], chosen["direction"]),
         "",
-        *table,
+        *lines_of(checks, onset),
         *(f"warning: {text}" for text in plan.warnings),
     ]
     print_report(options, document, lines)

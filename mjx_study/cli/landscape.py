@@ -2,10 +2,11 @@
 
 import argparse
 
-from mjx_study.choices import REFERENCE, takes_stiffness
-from mjx_study.cli.options import Parser, given_options
-from mjx_study.options.configuration import StudyConfig
-from mjx_study.options.option import BUILDER_OPTIONS
+from mjx_study.choices import REFERENCE
+from mjx_study.cli.options import given_options, study_fields
+from mjx_study.options.configuration import BUILDER_OPTIONS, StudyConfig
+from mjx_study.options.option import OptionError
+from mjx_study.options.parser import MIDDLE, Parser
 from mjx_study.results.variables import explained
 
 EPILOG = f"""\
@@ -28,14 +29,14 @@ quadrature over 1500 rollouts and gradients per contact model (more if --noise h
 
 def add(command: Parser) -> None:
     command.add_task_argument()
-    command.add_fields("sigma", "timestep", "cone", *BUILDER_OPTIONS, "noise")
+    command.add_options("sigma", "timestep", "cone", *BUILDER_OPTIONS, "noise")
     command.add_process_options()
-    command.add_contact_options("the middle one of the task's sweep")
+    command.add_contact_options(MIDDLE)
     command.add_theta_option("parameters that the line goes through")
-    command.add_option(StudyConfig.option("estimators"), ("zobg", "fobg"))
-    command.add_option(StudyConfig.option("samples"), (100,))
-    command.add_option("points", 41)
-    command.add_fields("span", "direction", "gamma", "max_norm", "window", "onset", "chunk_size")
+    command.add_option("estimators", default=("zobg", "fobg"))
+    command.add_option("samples", default=(100,))
+    command.add_option("points", default=41)
+    command.add_options("span", "direction", "gamma", "max_norm", "window", "onset", "chunk_size")
     command.add_backward_options()
     command.add_flag("--no-reference", "omit the analytic reference")
     command.add_folder_options()
@@ -43,21 +44,19 @@ def add(command: Parser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     from mjx_study.cli.console import curve_lines, curves
-    from mjx_study.cli.studies import run_one, study_fields
+    from mjx_study.cli.studies import run_one
     from mjx_study.experiment.plan import StudyPlan, plan_study
     from mjx_study.tasks import task_with_options
 
     def planned() -> StudyPlan:
-        """The task's contact models at the middle stiffness of its sweep, and its analytic reference if it has one."""
+        """Every contact family of the task, and its analytic reference if it has one."""
         fields = study_fields(options)
         task = task_with_options(options.task, given_options(options, *BUILDER_OPTIONS))
         fields.setdefault("contact", task.defaults.families)
         if options.no_reference and REFERENCE in fields["contact"]:
-            raise ValueError(f"--no-reference omits --contact {REFERENCE}: omit one of them")
+            raise OptionError("contact", f"{REFERENCE} is what --no-reference omits: omit one of them")
         if not options.no_reference and task.reference is not None and fields.get("onset", "none") == "none":
             fields["contact"] = tuple(dict.fromkeys((REFERENCE, *fields["contact"]))) if fields["contact"] else ()
-        if takes_stiffness(fields["contact"]):
-            fields.setdefault("stiffness", (task.defaults.middle_stiffness,))
-        return plan_study(StudyConfig(**fields, kind="landscapes", seeds=1), {options.task: task})
+        return plan_study(StudyConfig(**fields, kind="landscapes", seeds=1), {options.task: task}, single=True)
 
     return run_one(options, planned, curves, curve_lines, "a figure and the numbers")

@@ -13,30 +13,27 @@ import mujoco
 import numpy as np
 
 from mjx_study import objective
-from mjx_study.choices import CONES, is_file, refuse_untaken
-from mjx_study.cli.options import (
-    UsageError,
-    configure_process,
-    given_options,
-    task_of,
-    theta_and_policy,
-    usage_errors,
-)
+from mjx_study.choices import CONES, is_file
+from mjx_study.cli.options import configure_process, given_options, task_of, theta_and_policy, usage_errors
 from mjx_study.cli.output import attempt, computing, print_report
 from mjx_study.disk import prepare_folder, write_whole
 from mjx_study.experiment.resolution import at_theta
 from mjx_study.limits import MOST_STEPS, check_count
-from mjx_study.options.option import BUILDER_OPTIONS, SCENE_OPTIONS, as_arguments
+from mjx_study.options.configuration import BUILDER_OPTIONS, SCENE_OPTIONS, as_arguments
+from mjx_study.options.option import OptionError, reject_unused
+from mjx_study.options.parser import UsageError
 from mjx_study.plots.style import save_figure
 from mjx_study.render import Motion, RenderError, animate, check_format, resolve_renderer, strip, stroboscope
 from mjx_study.simulation.scene import load_model
 from mjx_study.table import format_table, number
-from mjx_study.tasks.contact_grid import ContactPoint, family_grid
+from mjx_study.tasks.contact_grid import ContactPoint, single_contact
 from mjx_study.tasks.network import with_network
 from mjx_study.tasks.task import Task
 
 FILE_SECONDS: Final = 2.0
 """Duration of a file's rollout without --horizon [s]."""
+OF_TASKS: Final = ("contact", "stiffness", "damping", "noisy", "sigma", "theta", "model", "seed")
+"""Options that a file does not read."""
 MOST_BODIES_LISTED: Final = 12
 """Maximum number of bodies whose final positions are printed."""
 LARGEST_COORDINATE: Final = 1e10
@@ -69,8 +66,12 @@ def run_rollout(options: argparse.Namespace) -> int:
     with usage_errors():
         configure_process(options)
         check_format(options.format)
-        if options.sigma is not None and not options.noisy:
-            raise ValueError("--sigma has an effect only with --noisy")
+        given = [name for name in (*OF_TASKS, "sigma") if getattr(options, name) not in (None, False)]
+        reject_unused(
+            given,
+            (OF_TASKS, not is_file(options.task), f"is for a task: {options.task} moves as its MJCF says"),
+            (["sigma"], options.noisy, "has an effect only with --noisy"),
+        )
         simulate, messages = _plan_file(options) if is_file(options.task) else _plan_task(options)
         resolve_renderer(options.renderer)
         stem = (Path(options.task).stem if is_file(options.task) else options.task).replace(":", "-")
@@ -88,10 +89,6 @@ def run_rollout(options: argparse.Namespace) -> int:
 
 def _plan_file(options: argparse.Namespace) -> tuple[Callable[[], Rollout], tuple[str, ...]]:
     """Return a function that runs the requested simulation, and warnings."""
-    unfit = ("contact", "stiffness", "damping", "noisy", "sigma", "theta", "model", "seed")
-    given = [f"--{name}" for name in unfit if getattr(options, name) not in (None, False)]
-    if given:
-        raise ValueError(f"{', '.join(given)}: only for a task; {options.task} moves as its MJCF says")
     model = load_model(options.task, **as_arguments(given_options(options, "timestep", "cone", *SCENE_OPTIONS)))
     steps = options.horizon or max(1, round(min(FILE_SECONDS / model.opt.timestep, 1e15)))
     check_count(steps, "steps", MOST_STEPS, "give --horizon, or a longer timestep")
@@ -99,25 +96,22 @@ def _plan_file(options: argparse.Namespace) -> tuple[Callable[[], Rollout], tupl
 
 
 def _plan_task(options: argparse.Namespace) -> tuple[Callable[[], Rollout], tuple[str, ...]]:
-    given = {name: getattr(options, name) for name in ("stiffness", "damping")}
     theta, policy = theta_and_policy(options)
-    if policy is not None:
-        for name in ("contact", "stiffness", "damping", "timestep", *BUILDER_OPTIONS):
-            if getattr(options, name) is None:
-                setattr(options, name, getattr(policy, name))
+    found = {} if policy is None else policy.options
+    for name in ("contact", "stiffness", "damping", "timestep", *BUILDER_OPTIONS):
+        if getattr(options, name) is None:
+            setattr(options, name, found.get(name))
     task = task_of(options)
-    if policy is not None and options.cone is None and policy.cone not in (None, CONES[int(task.scene.host.opt.cone)]):
-        options.cone = policy.cone  # only if it differs: a user's own task need not take the option
+    cone = CONES[int(task.scene.host.opt.cone)]
+    if options.cone is None and found.get("cone", cone) != cone:
+        options.cone = found["cone"]  # only if it differs: a user's task need not take the option
         task = task_of(options)
-    if policy is not None and policy.network is not None:
-        task = with_network(task, tuple(policy.network), jax.random.key(0))  # theta replaces its weights
+    if "network" in found:
+        task = with_network(task, tuple(found["network"]), jax.random.key(0))  # theta replaces its weights
     if options.seed and not (options.noisy or task.random_start):
-        raise ValueError("--seed has an effect only with --noisy, as the initial state is fixed")
-    stiffness = task.defaults.middle_stiffness if options.stiffness is None else options.stiffness
-    families = (options.contact or task.defaults.main_family,)
-    refuse_untaken(families, **given)
-    cells, messages = family_grid(task, families, (stiffness,), options.damping)
-    return partial(_simulate_task, at_theta(task, theta), cells[0], options.seed, options.noisy), messages
+        raise OptionError("seed", "has an effect only with --noisy, as the initial state is fixed")
+    contact, messages = single_contact(task, options.contact, options.stiffness, options.damping)
+    return partial(_simulate_task, at_theta(task, theta), contact, options.seed or 0, options.noisy), messages
 
 
 def _simulate_task(task: Task, cell: ContactPoint, seed: int, noisy: bool) -> Rollout:

@@ -5,11 +5,12 @@ import json
 from pathlib import Path
 from typing import Any
 
-from mjx_study.choices import REFERENCE, takes_stiffness
-from mjx_study.cli.options import Parser, given_options
+from mjx_study.choices import REFERENCE
+from mjx_study.cli.options import study_fields
 from mjx_study.disk import write_whole
-from mjx_study.options.configuration import StudyConfig
-from mjx_study.options.option import BUILDER_OPTIONS
+from mjx_study.options.configuration import BUILDER_OPTIONS, UNSET_TASK, StudyConfig
+from mjx_study.options.option import OptionError
+from mjx_study.options.parser import MIDDLE, Parser
 from mjx_study.results.variables import explained
 
 EPILOG = f"""\
@@ -33,43 +34,35 @@ columns of the table:
 A task's own counts, such as hit, have a column each. Costs and counts are means over --evaluation-samples rollouts,
 the same for all, ± their standard deviation over seeds; alpha is the mean over the last tenth of the iterations.
 """
-WRAPPED = ("contact", "stiffness", "sigma", "timestep", "cone", "samples", "backward")
-"""Options with a single value here and a list in a study."""
 
 
 def add(command: Parser) -> None:
     command.add_task_options()
     command.add_theta_option("parameters to start from")
-    command.add_contact_options("the middle one of the task's sweep", many=False)
+    command.add_contact_options(MIDDLE, many=False)
     command.add_flag("--reference", "use the analytic reference instead of MJX")
-    command.add_fields("network", "estimators", "iterations", "samples", samples={"many": False})
-    command.add_option("seeds", 3, line="number of descents, each with noise of its own")
-    command.add_fields("optimizer", "learning_rate", "decay", "stiffness_schedule", "sigma_schedule")
+    command.add_options("network", "estimators", "iterations")
+    command.add_option("samples", many=False, unset=UNSET_TASK)
+    command.add_option("seeds", default=3, line="number of descents, each with noise of its own")
+    command.add_options("optimizer", "learning_rate", "decay", "stiffness_schedule", "sigma_schedule")
     command.add_estimator_options()
     command.add_backward_options(many=False)
-    command.add_fields("evaluation_samples", "chunk_size")
+    command.add_options("evaluation_samples", "chunk_size")
     command.add_folder_options()
 
 
 def run(options: argparse.Namespace) -> int:
     from mjx_study.cli.console import descent_lines, descents
-    from mjx_study.cli.studies import run_one, study_fields
+    from mjx_study.cli.studies import run_one
     from mjx_study.experiment.plan import StudyPlan, plan_study
-    from mjx_study.tasks import task_with_options
 
     def planned() -> StudyPlan:
-        """A single contact model, the given one or the task's own."""
+        if options.reference and options.contact not in (None, REFERENCE):
+            raise OptionError("contact", f"{options.contact} is what --reference replaces: omit one of them")
         fields = study_fields(options)
-        task = task_with_options(options.task, given_options(options, *BUILDER_OPTIONS))
         if options.reference:
-            if options.contact not in (None, REFERENCE):
-                raise ValueError(f"--reference replaces --contact {options.contact}; omit one of them")
-            fields["contact"] = REFERENCE
-        fields.setdefault("contact", task.defaults.main_family)
-        if takes_stiffness((fields["contact"],)):
-            fields.setdefault("stiffness", task.defaults.middle_stiffness)
-        fields |= {name: (fields[name],) for name in WRAPPED if name in fields}
-        return plan_study(StudyConfig(**fields, kind="descents"), {options.task: task})
+            fields["contact"] = (REFERENCE,)
+        return plan_study(StudyConfig(**fields, kind="descents"), single=True)
 
     offer = "a figure, the policies, and a run that can be resumed"
     return run_one(options, planned, descents, descent_lines, offer, _save_policies)

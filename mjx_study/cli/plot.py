@@ -4,11 +4,12 @@ import argparse
 from pathlib import Path
 
 from mjx_study.choices import FIGURE_FORMATS, FIGURE_STYLES
-from mjx_study.cli.options import Parser, usage_errors
+from mjx_study.cli.options import usage_errors
 from mjx_study.cli.output import attempt, print_report
 from mjx_study.options.option import Option
+from mjx_study.options.parser import Parser
 
-FORMAT = Option("format", str, "FORMAT", f"of: {', '.join(FIGURE_FORMATS)}", choices=FIGURE_FORMATS, many=True)
+FORMAT = Option("format", str, "FORMAT", "of: {}", choices=FIGURE_FORMATS, many=True, default=("png", "pdf"))
 EPILOG = """\
 Draws whatever the study has numbers for: variance, bias and alpha against stiffness, error against samples, maps over
 two swept parameters; for descents, achieved cost against stiffness, and cost against iterations, rollouts and seconds;
@@ -26,7 +27,7 @@ def add(command: Parser) -> None:
     command.add_argument("folder", type=Path, metavar="FOLDER", help="folder of a study")
     command.add_argument("--output", type=Path, metavar="DIR", help="default: the study's folder")
     command.add_argument("--style", choices=FIGURE_STYLES, default="screen", help="default: screen")
-    command.add_option(FORMAT, FORMAT.parse("png,pdf"))
+    command.add_option(FORMAT)
 
 
 def run(options: argparse.Namespace) -> int:

@@ -3,8 +3,9 @@
 import argparse
 from pathlib import Path
 
-from mjx_study.cli.options import Parser, usage_errors
+from mjx_study.cli.options import usage_errors
 from mjx_study.cli.output import attempt, print_report
+from mjx_study.options.parser import Parser
 
 EPILOG = """\
 Writes FOLDER/report.html: one self-contained page with warnings, figures, a table, the whole configuration, versions

@@ -4,7 +4,8 @@ import argparse
 from pathlib import Path
 
 from mjx_study.choices import FILM_FORMATS, PLANES, RENDERERS
-from mjx_study.cli.options import Parser
+from mjx_study.options.option import Option
+from mjx_study.options.parser import MIDDLE, Parser
 
 EPILOG = """\
 Simulates one rollout and shows it: strip.png (pictures at equal intervals), stroboscope.png (one picture with ghosts),
@@ -24,14 +25,14 @@ examples:
 
 def add(command: Parser) -> None:
     command.add_task_options()
-    command.add_contact_options("the middle one of the task's sweep", many=False, analytic=False)
+    command.add_contact_options(MIDDLE, many=False, analytic=False)
     command.add_flag("--noisy", "add noise, drawn with --seed (default: none)")
     command.add_theta_option("parameters, and of a policy also its contact, horizon and MJCF options")
-    command.add_option("frames", 6)
+    command.add_option(Option("frames", int, "N", "frames in the film strip", "[1, 100]", default=6))
     command.add_argument("--view", choices=["auto", *PLANES], default="auto", help="default: auto, by the motion")
     command.add_argument("--renderer", choices=RENDERERS, default="auto", help="default: auto, opengl where it works")
     command.add_argument("--format", choices=FILM_FORMATS, default="gif", help="format of the film (default: gif)")
-    command.add_option("slow", 1.0)
+    command.add_option(Option("slow", float, "FACTOR", "slow-motion factor", "(0, 1000]", default=1.0))
     command.add_argument("--output", type=Path, metavar="DIR", help="default: results/TASK-rollout")
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import xarray as xr
 
-from mjx_study.cli.options import UsageError, configure_process, given_options, theta_of, usage_errors
+from mjx_study.cli.options import configure_process, usage_errors
 from mjx_study.cli.output import RESUMABLE, attempt, computing, print_report
 from mjx_study.execution.cluster import connected
 from mjx_study.execution.forecast import forecast_study
@@ -18,7 +18,7 @@ from mjx_study.execution.lost import all_lost
 from mjx_study.execution.run import load_study, open_store, run_study, warnings_of
 from mjx_study.experiment.checkpoint import StudyError
 from mjx_study.experiment.plan import StudyPlan
-from mjx_study.options.configuration import StudyConfig
+from mjx_study.options.parser import UsageError
 from mjx_study.plots.study import plot_study
 from mjx_study.plots.style import save_figures
 from mjx_study.storage.folder import Store
@@ -26,13 +26,6 @@ from mjx_study.table import as_plain, digits_to_tell_apart, size
 
 KEPT = "results.nc (every number), study.json (the configuration), cells/ (checkpoints)"
 INTACT = "existing files are complete, and the same command resumes"
-
-
-def study_fields(options: argparse.Namespace) -> dict[str, Any]:
-    """Fields of a `StudyConfig` set by the options."""
-    fields = given_options(options, *(field.name for field in dataclasses.fields(StudyConfig)))
-    fields |= {"theta": theta_of(options)} if "theta" in fields else {}
-    return fields | ({"tasks": (options.task,)} if hasattr(options, "task") else {})
 
 
 def as_document(dataset: xr.Dataset, own: Callable[[xr.Dataset], dict[str, Any]]) -> dict[str, Any]:

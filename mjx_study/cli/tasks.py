@@ -4,8 +4,9 @@ import argparse
 from typing import Any
 
 from mjx_study.choices import TASK_DESCRIPTIONS
-from mjx_study.cli.options import Parser, configure_process, usage_errors
+from mjx_study.cli.options import configure_process, usage_errors
 from mjx_study.cli.output import print_report
+from mjx_study.options.parser import Parser
 
 EPILOG = ""
 

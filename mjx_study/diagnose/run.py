@@ -2,7 +2,7 @@
 
 from typing import Final
 
-from mjx_study.choices import is_file, refuse_untaken, takes_stiffness
+from mjx_study.choices import is_file, takes_stiffness
 from mjx_study.diagnose.measurement import SAMPLES, chunk_of, estimators_of, measure
 from mjx_study.diagnose.result import Diagnosis
 from mjx_study.diagnose.setting import setting_of, touches_of
@@ -10,7 +10,7 @@ from mjx_study.experiment.memory import check_memory
 from mjx_study.gradcheck import gradcheck, plan_gradcheck, plan_scene_gradcheck
 from mjx_study.objective import Simulator
 from mjx_study.progress import Progress, silent
-from mjx_study.tasks.contact_grid import family_grid
+from mjx_study.tasks.contact_grid import single_contact
 from mjx_study.tasks.soundness import check_soundness
 from mjx_study.tasks.task import Task
 
@@ -45,20 +45,18 @@ def diagnose_task(
     Raises:
         ValueError: there is no such contact model, or the batches do not fit in memory.
     """
-    family = family or task.defaults.main_family
-    refuse_untaken([family], stiffness=stiffness, damping=damping)
-    stiffnesses = [stiffness or task.defaults.middle_stiffness] if takes_stiffness([family]) else None
     check_soundness(task)
-    (cell,), warnings = family_grid(task, [family], stiffnesses, damping)
+    cell, warnings = single_contact(task, family, stiffness, damping)
     check_memory(task, estimators_of(task), samples or SAMPLES)
     progress(0, 4, "rollout without noise")
     touches = tuple(touches_of(task, cell))
     progress(1, 4, "derivatives of steps")
     common = {"seed": seed, "damping": damping, "states": STATES}
     if is_file(subject):
-        plan = plan_scene_gradcheck(task.scene, [family], None, horizon=task.horizon, **common)
+        plan = plan_scene_gradcheck(task.scene, [cell.family], None, horizon=task.horizon, **common)
     else:
-        plan = plan_gradcheck(task, [family], stiffnesses, **common)
+        stiffnesses = [cell.stiffness_or_zero] if takes_stiffness([cell.family]) else None
+        plan = plan_gradcheck(task, [cell.family], stiffnesses, **common)
     derivatives = gradcheck(plan)
     progress(2, 4, "estimators")
     found = measure(Simulator(task, chunk_size=chunk_of(task, samples or SAMPLES)), cell.contact, samples, seed)

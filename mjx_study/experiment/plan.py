@@ -29,16 +29,16 @@ from mjx_study.experiment.memory import (
     padded_size,
 )
 from mjx_study.experiment.resolution import at_theta, configured_estimators, line_of, recipe_of
-from mjx_study.experiment.unused_options import reject_unused
+from mjx_study.experiment.unused_options import reject_unused_options
 from mjx_study.identity import contents, estimator_contents
 from mjx_study.limits import MOST_CELLS, MOST_GIB, MOST_PROGRAMS, check_count
 from mjx_study.objective import chunk_for
-from mjx_study.options.configuration import SAMPLES, NamedTask, Settings, StudyConfig
-from mjx_study.options.option import BUILDER_OPTIONS
+from mjx_study.options.configuration import BUILDER_OPTIONS, OPTIONS, SAMPLES, NamedTask, Settings, StudyConfig
+from mjx_study.options.option import OptionError
 from mjx_study.runtime import local_devices
 from mjx_study.table import digits_to_tell_apart
 from mjx_study.tasks import TASKS, task_with_options
-from mjx_study.tasks.contact_grid import ContactPoint, backward_grid, family_grid, solver_grid
+from mjx_study.tasks.contact_grid import ContactPoint, backward_grid, family_grid, single_defaults, solver_grid
 from mjx_study.tasks.network import with_network
 from mjx_study.tasks.soundness import check_soundness
 from mjx_study.tasks.task import Recipe, Task, check_shapes
@@ -158,17 +158,22 @@ class StudyPlan:
         return f"{group.name}, {cell.model.label}, h = {group.timestep:.{digits}g} s, N = {cell.samples}"
 
 
-def plan_study(config: StudyConfig, built: Mapping[str, Task] | None = None) -> StudyPlan:
+def plan_study(config: StudyConfig, built: Mapping[str, Task] | None = None, *, single: bool = False) -> StudyPlan:
     """Check a configuration and resolve its defaults, computing nothing.
 
     Args:
         config: what to study; fields that are None take their defaults.
         built: tasks already built by the caller, by name, with the configuration's `BUILDER_OPTIONS` and the MJCF's
             timestep and cone.
+        single: whether the contact families and stiffnesses that the configuration leaves open are those of a single
+            run (`mjx_study.tasks.contact_grid.single_defaults`), and not all of the task's.
 
     Raises:
         ValueError: the configuration cannot be run; the message says what is accepted.
     """
+    built, given = dict(built or {}), [name for name in OPTIONS if config.given(name)]
+    if single:
+        config = _as_single(config, built)
     settings = config.settings
     variants = config.tasks, config.timestep or (None,), config.cone or (None,)
     programs = math.prod(map(len, variants))
@@ -178,10 +183,10 @@ def plan_study(config: StudyConfig, built: Mapping[str, Task] | None = None) -> 
     messages: list[str] = []
     sound: list[object] = []
     for which, timestep, cone in itertools.product(*variants):
-        task = _build(config, which, timestep, cone, built or {})
+        task = _build(config, which, timestep, cone, built)
         if config.network is not None:
             if REFERENCE in (config.contact or ()):
-                raise ValueError("a network needs MJX: the analytic references use the task's own policy")
+                raise OptionError("network", "needs MJX: the analytic references use the task's own policy")
             task = with_network(task, config.network, jax.random.key(config.seed))
         task = at_theta(task, config.theta)
         if which not in sound and not (which in TASKS and config.theta is config.model is None):
@@ -198,7 +203,7 @@ def plan_study(config: StudyConfig, built: Mapping[str, Task] | None = None) -> 
         models, also = backward_grid(task, models, config.backward, config.backward_stiffness, config.backward_margin)
         told += also
         if not models:
-            raise ValueError("no contact model: give at least one contact family, `solref` or `solimp`")
+            raise OptionError("contact", "needs at least one contact family, or {} or {}", "solref", "solimp")
         each = len(models) * len(config.sigma or (None,)) * len(counts)
         change = "give fewer contact models, timesteps, sigmas or sample counts"
         check_count(programs * each, "cells", MOST_CELLS, change)
@@ -219,7 +224,7 @@ def plan_study(config: StudyConfig, built: Mapping[str, Task] | None = None) -> 
     for cell in {cell.group: cell for cell in cells}.values():
         group, chosen = groups[cell.group], estimators_of(plan, cell)
         if config.surrogate and (corrected := [each.name for each in chosen if "corrected" in each.needs]):
-            raise ValueError(f"{corrected[0]} corrects exact derivatives: omit it or `backward`")
+            raise OptionError("backward", f"replaces the derivatives that {corrected[0]} corrects: omit one of them")
         if group.recipe is not None:
             make_optimizer(settings.optimizer, group.recipe.learning_rate, group.recipe.decay)
             _check_schedules(config, group, group.recipe.iterations, chosen)
@@ -228,10 +233,20 @@ def plan_study(config: StudyConfig, built: Mapping[str, Task] | None = None) -> 
             check_memory(group.task, (), settings.evaluation_samples)
         elif settings.kind == "landscapes":
             if config.theta is not None and group.task.policy.num_params == 1:
-                raise ValueError("`theta` has one entry, and the line is its range: give `span` instead")
+                raise OptionError("theta", "has one entry, and the line is its range: give {} instead", "span")
             line_of(group.task, settings.points, config.span, config.direction, config.seed)
-    reject_unused(config, [(group.task, group.models) for group in groups])
+    reject_unused_options(config, given, [(group.task, group.models) for group in groups])
     return plan
+
+
+def _as_single(config: StudyConfig, built: dict[str, Task]) -> StudyConfig:
+    """The configuration of a single run; the first task is built, and added to those that are."""
+    first = config.tasks[0]
+    task = _build(config, first, None, None, built)
+    if isinstance(first, str):
+        built[first] = task
+    contact, stiffness = single_defaults(task, config.contact, config.stiffness)
+    return dataclasses.replace(config, contact=contact, stiffness=stiffness)
 
 
 def _whole(plan: StudyPlan) -> list[str]:
@@ -241,8 +256,8 @@ def _whole(plan: StudyPlan) -> list[str]:
         return []
     found = [each.name for each in estimators_of(plan, plan.cells[0]) if not each.mergeable]
     if found and plan.config.block_size is not None:
-        verb = "needs" if len(found) == 1 else "need"
-        raise ValueError(f"{', '.join(found)} {verb} whole batches, omit `block_size`: {blocks_take(found)}")
+        reason = f"splits batches, and {', '.join(found)} must have whole ones: omit it; {blocks_take(found)}"
+        raise OptionError("block_size", reason)
     return found
 
 
@@ -253,10 +268,10 @@ def _check_schedules(config: StudyConfig, group: Group, iterations: int, chosen:
     if config.stiffness_schedule and any(
         model.stiffness is None or (model.contact is None and not model.analytic) for model in group.models
     ):
-        raise ValueError("`stiffness_schedule` needs contact models with a stiffness; mjcf has none to set")
+        raise OptionError("stiffness_schedule", "needs contact models with a stiffness; mjcf has none to set")
     fixed = [each.name for each in chosen if hasattr(each, "sigma")]
     if config.sigma_schedule and fixed:
-        raise ValueError(f"{fixed[0]} holds for one sigma; omit it or `sigma_schedule`")
+        raise OptionError("sigma_schedule", f"changes sigma, and {fixed[0]} holds for one: omit one of them")
 
 
 def oracles_of(config: StudyConfig) -> tuple[str, ...]:
@@ -329,9 +344,9 @@ def _build(
     changes = {"onset": config.onset} | ({} if config.noise is None else {"noise": config.noise})
     if not isinstance(which, str):
         if not isinstance(which, Task):
-            raise ValueError(f"tasks takes names and Tasks, got {type(which).__name__}")
+            raise OptionError("tasks", f"takes names and Tasks, got {type(which).__name__}")
         if chosen:
-            raise ValueError(f"{', '.join(chosen)}: only for a task given by name; build this one with it instead")
+            raise OptionError(next(iter(chosen)), "is for tasks given by name: build this one with it instead")
         check_shapes(which)
         return which.replace(**changes)
     if which in built and timestep is None and cone is None:

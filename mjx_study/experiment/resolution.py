@@ -1,80 +1,91 @@
 """Resolve a configuration for a task: estimators, recipe, parameters, and the line of a landscape."""
 
 import dataclasses
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, Final
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from estimators import Estimator, make_estimator
+from estimators import Estimator, find_estimator, make_estimator
 from mjx_study.options.configuration import StudyConfig, check_span
+from mjx_study.options.option import OptionError
 from mjx_study.tasks.task import Recipe, Task
 
 BOUND: Final = ("gamma", "failure_probability", "variance_proxy", "radius")
 """Constants of AoBG's bound."""
-OF_ESTIMATORS: Final = ("baseline", "max_norm", "window", "tolerance", "weights", *BOUND)
+ESTIMATOR_OPTIONS: Final = ("baseline", "max_norm", "window", "tolerance", "weights", *BOUND)
 """Options of a configuration that estimators own."""
 SPAN_SIGMAS: Final = 10.0
 """Half the default length of a line through many parameters, in standard deviations of the noise."""
 
 
 def recipe_of(config: StudyConfig, task: Task) -> Recipe:
-    """The settings of a task's descents: the configuration's, else those of the task's recipe; ValueError if one is
+    """The settings of a task's descents: the configuration's, else those of the task's recipe; OptionError if one is
     missing."""
     given = {name: getattr(config, name) for name in ("iterations", "learning_rate", "decay")}
     given |= {"samples": None if config.samples is None else max(config.samples)}
     if (recipe := task.defaults.recipe) is not None:
         return dataclasses.replace(recipe, **{name: value for name, value in given.items() if value is not None})
     given["decay"] = given["decay"] or 0.0
-    if missing := [f"`{name}`" for name, value in given.items() if value is None]:
-        raise ValueError(f"{task.name} has no recipe: give {', '.join(missing)}")
+    if missing := [name for name, value in given.items() if value is None]:
+        first, *others = missing
+        more = ", as must {}" * len(others)
+        raise OptionError(first, f"must be given{more}: {task.name} has no recipe", *others)
     return Recipe(**given)
 
 
 def at_theta(task: Task, theta: Sequence[float] | None) -> Task:
-    """The task with other parameters, unchanged for None; ValueError for another number than the policy's, or a
-    nonfinite one."""
+    """The task with other parameters, unchanged for None; OptionError unless they are as many as the policy's, and
+    finite."""
     if theta is None:
         return task
     values = np.asarray(theta, float)
     if values.shape != (task.policy.num_params,) or not np.all(np.isfinite(values)):
-        raise ValueError(
-            f"theta has {values.size} numbers; {task.name} needs {task.policy.num_params}, all of them finite"
-        )
+        needed = f"{task.name} needs {task.policy.num_params}, all of them finite"
+        raise OptionError("theta", f"has {values.size} numbers; {needed}")
     return task.replace(theta=jnp.asarray(values, task.theta.dtype))
 
 
 def configured_estimators(config: StudyConfig, task: Task) -> tuple[Estimator, ...]:
     """Build a configuration's estimators with their options, except those that it holds, and check them against the
-    task.
-
-    ValueError if there is no such estimator, an option is out of range or missing, or an estimator does not support the
-    task.
-    """
-    options = {name: getattr(config, name) for name in OF_ESTIMATORS}
-    options |= bound_constants(config, task) | {"sigma": task.sigma}
-    found = tuple(
-        each if isinstance(each, Estimator) else make_estimator(each, **options) for each in config.estimators
-    )
+    task; ValueError as for `make_estimators`."""
+    options = {name: getattr(config, name) for name in ESTIMATOR_OPTIONS} | bound_constants(config, task)
+    found = make_estimators(config.estimators, options, task)
     for estimator in found:
         if getattr(estimator, "sigma", task.sigma) != task.sigma:
             raise ValueError(f"{estimator.name!r} holds for another sigma than {task.sigma:g}")
+    return found
+
+
+def make_estimators(chosen: Iterable[str | Estimator], options: Mapping[str, Any], task: Task) -> tuple[Estimator, ...]:
+    """Build estimators with the options that they have, and the task's sigma.
+
+    Raises:
+        OptionError: an option of an estimator of this package is missing.
+        ValueError: there is no such estimator, or it does not support the task.
+    """
+    given = {**options, "sigma": task.sigma}
+    for estimator in map(find_estimator, chosen):
+        for name in estimator.required() if isinstance(estimator, type) else ():
+            if name in options and options[name] is None:
+                raise OptionError(name, f"must be given: {estimator.name!r} needs it")
+    found = tuple(each if isinstance(each, Estimator) else make_estimator(each, **given) for each in chosen)
     check_estimators(found, task)
     return found
 
 
 def bound_constants(config: StudyConfig, task: Task) -> dict[str, Any]:
-    """The constants of AoBG's bound, from the configuration or the published example; ValueError if there is none, or
+    """The constants of AoBG's bound, from the configuration or the published example; OptionError if there is none, or
     other constants are given along with it."""
     given = {name: getattr(config, name) for name in BOUND}
     if not config.published:
         return given | {"gamma": task.defaults.gamma if config.gamma is None else config.gamma}
     if task.defaults.published is None:
-        raise ValueError(f"{task.name} has no published constants of the bound; omit `published`")
-    if others := [f"`{name}`" for name in BOUND if config.given(name)]:
-        raise ValueError(f"`published` sets {', '.join(f'`{name}`' for name in BOUND)}: omit {', '.join(others)}")
+        raise OptionError("published", f"has no effect on {task.name}, which has no published constants: omit it")
+    if others := [name for name in BOUND if config.given(name)]:
+        raise OptionError("published", f"sets them as well: omit {', '.join(['{}'] * len(others))}", *others)
     return dataclasses.asdict(task.defaults.published)
 
 
@@ -89,9 +100,8 @@ def check_estimators(estimators: Iterable[Estimator], task: Task) -> None:
                 f"{estimator.name!r} needs noise that is added to theta itself; {task.name} has a feedback policy"
             )
         if task.onset != "none" and "linearisation" in estimator.needs:
-            raise ValueError(
-                f"{estimator.name!r} needs the derivatives of single steps, which have no onset term; omit `onset`"
-            )
+            needed = f"which {estimator.name!r} needs"
+            raise OptionError("onset", f"has no effect on the derivatives of single steps, {needed}: omit one of them")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -129,5 +139,5 @@ def direction_of(direction: str, params: int, seed: int) -> Float[np.ndarray, " 
         drawn = np.random.default_rng(seed).normal(size=params)
         return drawn / np.linalg.norm(drawn) if params > 1 else np.ones(1)
     if not direction.isdecimal() or int(direction) >= params:
-        raise ValueError(f"`direction` must be random or a parameter's index, 0 to {params - 1}; got {direction}")
+        raise OptionError("direction", f"must be random or a parameter's index, 0 to {params - 1}; got {direction}")
     return np.eye(params)[int(direction)]

@@ -1,4 +1,4 @@
-"""Refuse options that were given and that nothing in a study reads."""
+"""Reject options of a study that were given and that nothing in it reads."""
 
 import dataclasses
 from collections.abc import Iterable, Sequence
@@ -6,27 +6,30 @@ from typing import Final
 
 from estimators import ESTIMATORS, ORACLES, Estimator, find_estimator
 from mjx_study.choices import REFERENCE, takes_stiffness
-from mjx_study.experiment.resolution import OF_ESTIMATORS
-from mjx_study.options.configuration import StudyConfig
-from mjx_study.options.option import SCENE_OPTIONS
+from mjx_study.experiment.resolution import ESTIMATOR_OPTIONS
+from mjx_study.options.configuration import SCENE_OPTIONS, StudyConfig
+from mjx_study.options.option import reject_unused
 from mjx_study.tasks.contact_grid import ContactPoint
 from mjx_study.tasks.task import Task
 
 CORRECTED: Final = "corrected"
 """Oracle with an onset term, linear unless `onset` asks for another."""
+FIRST_ORDER: Final = (
+    "has no effect: it changes first-order gradients through simulated contact, and there are none here"
+)
 
 
 def reject_unread(chosen: Sequence[str | Estimator], given: Iterable[str]) -> None:
-    """Raise ValueError for an option of estimators that none of the chosen ones reads; objects have options of their
+    """Raise OptionError for an option of estimators that none of the chosen ones reads; objects have options of their
     own."""
     found = [find_estimator(each) for each in chosen]
     read = {name for each in found if isinstance(each, type) for name in _fields(each)}
+    names = ", ".join(each.name for each in found)
     for option in given:
         name = "gamma" if option == "published" else option
-        if name not in read:
-            names = ", ".join(each.name for each in found)
-            able = ", ".join(each for each in ESTIMATORS if name in _fields(ESTIMATORS[each]))
-            raise ValueError(f"`{option}` has no effect on {names}: omit it, or name one that it acts on: {able}")
+        able = ", ".join(each for each in ESTIMATORS if name in _fields(ESTIMATORS[each]))
+        reason = f"has no effect on {names}: omit it, or choose an estimator that it acts on: {able}"
+        reject_unused([option], ([option], name in read, reason))
 
 
 def reads_onset(chosen: Iterable[str | Estimator], onset: str = "jump") -> bool:
@@ -35,40 +38,46 @@ def reads_onset(chosen: Iterable[str | Estimator], onset: str = "jump") -> bool:
     return bool(needed - {CORRECTED} if onset == "linear" else needed)
 
 
-def reject_unused(config: StudyConfig, grids: Sequence[tuple[Task, Sequence[ContactPoint]]]) -> None:
-    """Raise ValueError for what was given and has no effect in any cell: an option that differs from its default, or an
-    onset estimator.
+def reject_unused_options(
+    config: StudyConfig, given: Sequence[str], grids: Sequence[tuple[Task, Sequence[ContactPoint]]]
+) -> None:
+    """Raise OptionError for an option that was given and has no effect in any cell, and ValueError for an onset
+    estimator without one.
 
     Args:
+        config: the study, with the contact of a single run if it is one.
+        given: names of the options that the user gave.
         grids: tasks, each with its contact models.
     """
-    reject_unread(config.estimators, [name for name in (*OF_ESTIMATORS, "published") if config.given(name)])
+    reject_unread(config.estimators, [name for name in (*ESTIMATOR_OPTIONS, "published") if name in given])
     along = config.settings.kind == "landscapes"  # which have the mean of FoBG, whatever the estimators
     simulated = [task for task, models in grids if not all(each.analytic for each in models)]
     touching = any(task.scene.has_constraints for task in simulated)
-    families = [
+    families = {
         family
         for task, _ in grids
         for family in (task.defaults.families if config.contact is None else config.contact)
         if family != REFERENCE or task.contact_pair is not None
-    ]
-    chosen = any(config.stiffness == (task.defaults.middle_stiffness,) for task, _ in grids)  # by the command
-    such = "no contact model takes one; add a family that does, such as mujoco"
+    }
+    rigid = "has no effect: no contact model takes one; add a family that does, such as mujoco"
     if not any(task.contact_pair for task, _ in grids):
-        such = f"{grids[0][0].name} names no contact whose stiffness could be set (docs/extending.md: contact_pair)"
-    needed = "it changes first-order gradients through simulated contact, and there are none here"
-    corrected = f"{needed} (estimators named _onset have the linear term anyway)"
-    for name, effective, reason in (
-        ("stiffness", chosen or takes_stiffness(families), such),
-        ("damping", takes_stiffness(set(families) - {REFERENCE}), such),
-        ("cone", touching, "nothing that is simulated has contact"),
-        ("onset", touching and (along or reads_onset(config.estimators, config.onset)), corrected),
-        ("backward", touching and (along or reads_onset(config.estimators)), needed),
-        ("backward_stiffness", takes_stiffness(set(config.backward) - {"none"}), "no family of `backward` takes one"),
-        *((name, simulated, "nothing is simulated") for name in SCENE_OPTIONS),
-    ):
-        if config.given(name) and not effective:
-            raise ValueError(f"`{name}` has no effect: {reason}")
+        lacking = "names no contact whose stiffness could be set (docs/extending.md: contact_pair)"
+        rigid = f"has no effect: {grids[0][0].name} {lacking}"
+    surrogates = set(config.backward) - {"none"}
+    reject_unused(
+        given,
+        (["stiffness"], takes_stiffness(families), rigid),
+        (["damping"], takes_stiffness(families - {REFERENCE}), rigid),
+        (["cone"], touching, "has no effect: nothing that is simulated has contact"),
+        (
+            ["onset"],
+            touching and (along or reads_onset(config.estimators, config.onset)),
+            f"{FIRST_ORDER} (estimators named _onset have the linear term anyway)",
+        ),
+        (["backward"], touching and (along or reads_onset(config.estimators)), FIRST_ORDER),
+        (["backward_stiffness"], takes_stiffness(surrogates), "has no effect: no surrogate family takes one"),
+        (SCENE_OPTIONS, bool(simulated), "has no effect: nothing is simulated"),
+    )
     for each in map(find_estimator, config.estimators):
         if CORRECTED in each.needs and not simulated:
             raise ValueError(

@@ -8,7 +8,7 @@ from typing import Final
 import jax.numpy as jnp
 import mujoco
 
-from mjx_study.choices import CHECKED_STATES, CHECKED_STEPS, refuse_untaken, takes_stiffness
+from mjx_study.choices import CHECKED_STATES, CHECKED_STEPS, takes_stiffness
 from mjx_study.choices import CHECKED_STIFFNESS as STIFFNESS
 from mjx_study.gradcheck.coordinates import make_coordinates
 from mjx_study.gradcheck.cost import CostPrograms, check_cost, judge_closed_forms
@@ -17,6 +17,8 @@ from mjx_study.gradcheck.report import CostCheck, Finding, GradcheckReport, Step
 from mjx_study.gradcheck.states import start_of, states_of
 from mjx_study.gradcheck.steps import check_state, collect, step_check
 from mjx_study.gradcheck.values import EngineStep
+from mjx_study.options.configuration import reject_untaken
+from mjx_study.options.option import OptionError
 from mjx_study.progress import Progress, silent
 from mjx_study.runtime import environment
 from mjx_study.simulation.engine import quiet_engine
@@ -85,7 +87,7 @@ def plan_gradcheck(
     cells, messages = family_grid(task, families, usual if stiffnesses is None else stiffnesses, damping)
     if not cells:
         raise ValueError("no contact model to check: give at least one stiffness and one contact family")
-    refuse_untaken(families, stiffness=stiffnesses, damping=damping)
+    reject_untaken(families, stiffness=stiffnesses, damping=damping)
     return GradcheckPlan(task, True, cells, messages, states, seed, stock)
 
 
@@ -116,14 +118,14 @@ def plan_scene_gradcheck(
     """
     if families is None:
         families = ("mjcf",) if stiffnesses is None else ("mujoco",)
-    refuse_untaken(families, stiffness=stiffnesses, damping=damping)
+    reject_untaken(families, stiffness=stiffnesses, damping=damping)
     swept = takes_stiffness(families)
     if swept and stiffnesses is None:
-        raise ValueError("a contact family with a stiffness needs one: give --stiffness in N/m, and --pair")
+        raise OptionError("stiffness", "must be given in N/m, along with {}, for a family that takes one", "pair")
     if swept and pair is None:
-        raise ValueError("a stiffness in N/m requires the effective mass of a contact: give --pair GEOM,GEOM")
+        raise OptionError("stiffness", "in N/m requires the effective mass of a contact: give {} GEOM,GEOM", "pair")
     if pair is not None and not swept:
-        raise ValueError("--pair is for a stiffness: give --stiffness, or omit it")
+        raise OptionError("pair", "is for a stiffness: give {}, or omit it", "stiffness")
     subject = scene_task(scene, horizon=horizon, pair=pair)
     _check(subject, states)
     cells, messages = family_grid(subject, families, stiffnesses or (), damping)
@@ -132,7 +134,7 @@ def plan_scene_gradcheck(
 
 def _check(task: Task, states: int) -> None:
     if task.scene.template.qpos.dtype != jnp.float64:
-        raise ValueError("gradcheck compares with differences and needs float64; leave --precision at its default")
+        raise ValueError("gradcheck compares with differences and needs float64, the default precision")
     if task.scene.host.nv == 0:
         raise ValueError(f"{task.scene.name} has no degree of freedom: there is nothing to differentiate")
     if states < 1:

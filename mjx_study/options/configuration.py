@@ -1,27 +1,59 @@
-"""The configuration of a study; `resolution` derives a task's settings from it."""
+"""The configuration of a study: every option is declared here once.
+
+The command line, its help, TOML files and Python are checked against these declarations. A dataclass holds them rather
+than a pydantic model, since the parser needs them and pydantic alone would add two thirds to the time of `--version`.
+"""
 
 import dataclasses
+import itertools
 import math
 from collections import Counter
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Final, Protocol, Union, runtime_checkable
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Final, Protocol, Union, runtime_checkable
 
-from estimators.choices import PLUG_IN, PUBLISHED_TOLERANCE
+from estimators.choices import (
+    BASELINES,
+    DENSITIES,
+    MAX_DEVIATION,
+    PLUG_IN,
+    PUBLISHED_TOLERANCE,
+    VARIANCE_PROXIES,
+    WEIGHTS,
+    suggestion,
+)
 from estimators.registry import ESTIMATORS
-from mjx_study.choices import refuse_untaken
-from mjx_study.options.option import Checked
+from mjx_study.choices import CONES, FAMILIES, INTEGRATORS, ONSETS, REFERENCE, SOLVERS, takes_stiffness
+from mjx_study.options.numbers import MAX_VALUES
+from mjx_study.options.option import OptionError, Rows, declared, options_of
 
 if TYPE_CHECKING:
     import estimators.estimator
 
-OF_KIND: Final[dict[str, tuple[str, ...]]] = {
-    "gradients": ("reference_samples", "block_size", "confidence"),
-    "descents": ("iterations", "optimizer", "learning_rate", "decay", "stiffness_schedule", "sigma_schedule",
-                 "evaluation_samples", "network"),
-    "landscapes": ("span", "direction"),
-}  # fmt: skip
-"""Options specific to one kind of study."""
-ASKED_BY: Final = {"descents": "give `iterations` as well", "landscapes": "give `points` as well"}
+STUDIES: Final = ("gradients", "descents", "landscapes")
+"""Kinds of study."""
+CONTACTS: Final = (*FAMILIES, REFERENCE)
+"""Contact families of a study, and the analytic reference."""
+UNSET_TASK: Final = "the task's"
+UNSET_MJCF: Final = "the MJCF's"
+SAMPLES: Final = 100
+"""Samples per batch unless the configuration or a recipe sets another number."""
+AXES: Final = (
+    *("tasks", "estimators", "contact", "stiffness", "solref", "solimp"),
+    *("timestep", "cone", "sigma", "samples", "backward"),
+)
+"""Options whose values must be distinct."""
+MAY_BE_EMPTY: Final = ("contact", "solref", "solimp")
+SCENE_OPTIONS: Final = {
+    "integrator": "integrator",
+    "solver": "solver",
+    "solver_iterations": "iterations",
+    "solver_ls_iterations": "ls_iterations",
+    "disable_flag": "disable_flags",
+}
+"""Options that override an MJCF's <option>, so that a model can be adapted to MJX without editing its file, and the
+arguments of `load_scene` that they set."""
+BUILDER_OPTIONS: Final = ("horizon", "model", *SCENE_OPTIONS)
+"""Options passed to the builder of a task."""
 
 
 @runtime_checkable
@@ -30,10 +62,6 @@ class NamedTask(Protocol):
 
     @property
     def name(self) -> str: ...
-
-
-SAMPLES: Final = 100
-"""Samples per batch unless the configuration or a recipe sets another number."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,162 +79,190 @@ class Settings:
     evaluation_samples: int = 200
 
 
+def read_solref(text: str) -> Rows:
+    """Every number of the first column with every one of the second; columns are separated by ;."""
+    columns = [OPTIONS["theta"].parse(column) for column in text.split(";")]
+    if len(columns) != 2:
+        raise ValueError(f"must be two columns separated by ;, such as -1000,-10000;-5, got {len(columns)}")
+    if len(columns[0]) * len(columns[1]) > MAX_VALUES:
+        raise ValueError(f"takes at most {MAX_VALUES} contact models, got {len(columns[0]) * len(columns[1])}")
+    return tuple(itertools.product(*columns))
+
+
+def read_solimp(text: str) -> Rows:
+    """Rows of numbers, separated by ;."""
+    return tuple(OPTIONS["theta"].parse(row) for row in text.split(";"))
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class StudyConfig(Checked):
+class StudyConfig:
     """Everything that determines a study of gradient estimates, descents or landscapes.
 
-    Attributes:
-        tasks: names of tasks, or tasks.
-        kind: gradients, descents or landscapes; None to infer it from iterations and points.
-        estimators: names of estimators, or estimators, which have options of their own.
-        theta: parameters at which gradients are estimated or descents start, for a single task; None for the task's.
-        network: hidden widths of a network that replaces the task's policy in descents; None for the task's policy.
-        contact: contact families, and "reference" for the analytic system; None for each task's. Empty to use only
-            `solref` and `solimp`.
-        stiffness: contact stiffnesses [N/m], for the families that have one; None for each task's.
-        damping: contact damping [N s/m]; None for each family's.
-        solref, solimp: contact models in MuJoCo's own parameters, every solref with every solimp, in addition to the
-            families; if only one is given, the other is MuJoCo's default.
-        timestep: timesteps [s]; None for the MJCF's. Rollouts keep the task's duration unless horizon is given.
-        cone: friction cones, pyramidal or elliptic; None for the MJCF's.
-        sigma: standard deviations of the noise; None for each task's.
-        samples: batch sizes; None for 100, or in descents for each task's recipe.
-        confidence: confidence level of the intervals within a batch.
-        seeds: number of batches per size, or of descents; in landscapes, of batches pooled at each point. None for 10,
-            or 1 in landscapes.
-        iterations: number of iterations of a descent; None for each task's recipe.
-        points: number of points of a landscape, on a line through theta; None for no landscapes.
-        span, direction: range and direction of that line; None for each task's range and a random direction.
-        optimizer: name of an optax optimiser, "sgd" by default.
-        learning_rate, decay: learning_rate / i^decay at iteration i; None for each task's recipe.
-        stiffness_schedule, sigma_schedule: factors by iteration of a descent, as calls of optax schedules, of the
-            contact stiffness (at most 1; the damping ratio is kept) and of sigma; None for 1. Evaluations use 1.
-        reference_samples: number of rollout pairs per reference gradient; None for 600 in studies of gradients.
-        evaluation_samples: number of rollouts that evaluate a final policy; None for 200 in descents.
-        seed: random seed.
-        noise: name of the noise density; None for each task's.
-        baseline: baseline of zeroth-order estimates: zero_noise, leave_one_out or none.
-        gamma: accuracy bound of the alpha-order estimate, in the unit of the gradient; None for each task's.
-        published: use the published example's gamma and next three options, on the scale of the task's cost.
-        failure_probability: failure probability of the confidence radius epsilon.
-        variance_proxy: variance used in epsilon: variance, second_moment or upper_bound.
-        radius: R in epsilon: max_deviation, or a bound in the unit of the gradient.
-        max_norm: norm at which samples of the clipped first-order estimate are clipped, in the unit of the gradient.
-        window: number of steps between cuts of the truncated first-order estimate.
-        tolerance: tolerance of the discontinuity test of "ddcg".
-        weights: weights of interpolating estimators: plug_in or cross_fitted.
-        onset: onset term of first-order gradients: none, linear (`mjx_study.simulation.onset`), or jump, which costs
-            four rollouts per onset (`mjx_study.simulation.branches`).
-        backward: contact families whose derivatives replace the exact ones at the same states, each in turn (surrogate
-            gradients); "none" for exact derivatives.
-        backward_stiffness: stiffness of these families [N/m]; None for that of the simulated contact model.
-        backward_margin: distance at which contact begins in their derivatives [m]; None for the MJCF's.
-        horizon: number of steps; None for each task's.
-        model: an MJCF that replaces the task's own; None for the task's.
-        integrator, solver, solver_iterations, solver_ls_iterations, disable_flag: overrides of the MJCF's <option>,
-            as in `mjx_study.load_scene`; None for the MJCF's.
-        chunk_size: samples per device and call; None to choose it by the number of samples.
-        block_size: samples held at once in studies of gradients; larger batches are split into blocks whose statistics
-            are merged. None for whole batches if they fit in the memory limit.
+    A field that is None takes the default in parentheses. Landscapes need `points`, and descents `iterations` or
+    `kind`. Objects among tasks and estimators have options of their own.
     """
 
-    ranges: ClassVar = {"samples": "[3, 1e7]"}
+    tasks: tuple[str | NamedTask, ...] = dataclasses.field(
+        metadata={"metavar": "TASK", "line": "names of tasks, or tasks", "allows_user_code": True}
+    )
+    kind: str | None = declared(
+        None, "KIND", "kind of study: {}", choices=STUDIES, unset="from --iterations and --points"
+    )
+    estimators: tuple[Union[str, "estimators.estimator.Estimator"], ...] = declared(
+        ("zobg", "fobg", "aobg"), "NAME", "see `mjx-study estimators`", choices=ESTIMATORS, allows_user_code=True
+    )
+    theta: tuple[float, ...] | None = declared(None, "X", "policy parameters", "(-inf, inf)", unset=UNSET_TASK)
+    network: tuple[int, ...] | None = declared(
+        None, "N", "hidden widths of a tanh network that replaces the policy", "[1, 100000]", study="descents"
+    )
+    contact: tuple[str, ...] | None = declared(None, "FAMILY", "contact family: {}", choices=CONTACTS, unset=UNSET_TASK)
+    stiffness: tuple[float, ...] | None = declared(
+        None, "K", "contact stiffness", "(0, inf)", unit="N/m", unset=UNSET_TASK
+    )
+    damping: float | None = declared(None, "B", "contact damping", "[0, inf)", unit="N s/m", unset="the family's")
+    solref: Rows = declared(
+        (), "A;B", "contact models in MuJoCo's terms, every A with every B", "(-inf, inf)", read_rows=read_solref
+    )
+    solimp: Rows = declared(
+        (), "D0,D1,W,M,P", "solimp to combine with them; several separated by ;", "(-inf, inf)", read_rows=read_solimp
+    )
+    timestep: tuple[float, ...] | None = declared(None, "H", "timestep", "(0, 1)", unit="s", unset=UNSET_MJCF)
+    cone: tuple[str, ...] | None = declared(None, "CONE", "friction cone: {}", choices=CONES, unset=UNSET_MJCF)
+    sigma: tuple[float, ...] | None = declared(
+        None, "S", "standard deviation of the noise", "(0, inf)", unset=UNSET_TASK
+    )
+    samples: tuple[int, ...] | None = declared(
+        None, "N", "samples in each batch", "[3, 1e7]", unset=f"{SAMPLES}; of descents, the task's"
+    )
+    confidence: float = declared(0.95, "P", "confidence level of the intervals", "(0, 1)", study="gradients")
+    seeds: int | None = declared(
+        None, "N", "number of batches, or of descents", "[1, 100000]", unset="10; 1 for landscapes"
+    )
+    iterations: int | None = declared(
+        None, "N", "iterations of the optimiser", "[1, 10000000]", study="descents", unset=UNSET_TASK
+    )
+    points: int | None = declared(None, "N", "points on the line", "[2, 100000]")
+    span: tuple[float, ...] | None = declared(
+        None, "LO,HI", "range of the line", "(-inf, inf)", study="landscapes", unset=UNSET_TASK
+    )
+    direction: str | None = declared(None, "DIR", "random, or a parameter's index", study="landscapes", unset="random")
+    optimizer: str | None = declared(None, "NAME", "optax optimiser", study="descents", unset="sgd")
+    learning_rate: float | None = declared(None, "R", "learning rate", "(0, inf)", study="descents", unset=UNSET_TASK)
+    decay: float | None = declared(
+        None, "A", "learning rate / i^A at iteration i", "[0, 2]", study="descents", unset=UNSET_TASK
+    )
+    stiffness_schedule: str | None = declared(
+        None, "CALL", "factor on the stiffness by iteration, an optax schedule", study="descents", unset="1"
+    )
+    sigma_schedule: str | None = declared(
+        None, "CALL", "factor on sigma by iteration, an optax schedule", study="descents", unset="1"
+    )
+    reference_samples: int | None = declared(
+        None, "N", "pairs of rollouts for each reference", "[3, 1e7]", study="gradients", unset="600"
+    )
+    evaluation_samples: int | None = declared(
+        None, "N", "rollouts for the cost of a final policy", "[2, 1e7]", study="descents", unset="200"
+    )
+    seed: int = declared(0, "N", "random seed", "[0, 4294967295]")
+    noise: str | None = declared(None, "NAME", "noise density: {}", choices=DENSITIES, unset=UNSET_TASK)
+    baseline: str = declared("zero_noise", "NAME", "baseline of zeroth-order estimates: {}", choices=BASELINES)
+    gamma: float | None = declared(None, "G", "AoBG's accuracy bound; inf for none", "(0, inf]", unset=UNSET_TASK)
+    published: bool = declared(
+        False, "", "use the published example's gamma, failure probability, variance proxy and radius"
+    )
+    failure_probability: float = declared(0.05, "P", "failure probability of epsilon", "(0, 1)")
+    variance_proxy: str = declared("variance", "S2", "variance in epsilon: {}", choices=VARIANCE_PROXIES)
+    radius: str | float = declared(
+        MAX_DEVIATION, "R", "R in epsilon: max_deviation, or a bound", "[0, inf)", choices=(MAX_DEVIATION,)
+    )
+    max_norm: float | None = declared(None, "G", "fobg_clipped: norm at which samples are clipped", "(0, inf)")
+    window: int | None = declared(None, "H", "fobg_truncated: steps between cuts", "[1, 1000000]")
+    tolerance: float = declared(PUBLISHED_TOLERANCE, "C", "ddcg: tolerance of its discontinuity test", "[0, 1)")
+    weights: str = declared(
+        PLUG_IN, "NAME", "weights of interpolations: plug_in, or cross_fitted (unbiased)", choices=WEIGHTS
+    )
+    onset: str = declared(
+        "none", "NAME", "onset term of first-order gradients: none, linear, or jump (costly)", choices=ONSETS
+    )
+    backward: tuple[str, ...] = declared(
+        ("none",), "FAMILY", "contact whose derivatives are taken", choices=("none", *FAMILIES)
+    )
+    backward_stiffness: float | None = declared(
+        None, "K", "stiffness of --backward", "(0, inf)", unit="N/m", unset="unchanged"
+    )
+    backward_margin: float | None = declared(
+        None, "M", "distance where --backward begins", "(0, inf)", unit="m", unset=UNSET_MJCF
+    )
+    horizon: int | None = declared(None, "H", "number of steps", "[1, 1000000]", unset=UNSET_TASK)
+    model: str | None = declared(None, "FILE.xml", "MJCF that replaces the task's own")
+    integrator: str | None = declared(None, "NAME", "integrator: {}", choices=INTEGRATORS, unset=UNSET_MJCF)
+    solver: str | None = declared(None, "NAME", "constraint solver: {}", choices=SOLVERS, unset=UNSET_MJCF)
+    solver_iterations: int | None = declared(None, "N", "iterations of the solver", "[1, 100000]", unset=UNSET_MJCF)
+    solver_ls_iterations: int | None = declared(
+        None, "N", "iterations of the solver's line search", "[1, 100000]", unset=UNSET_MJCF
+    )
+    disable_flag: tuple[str, ...] | None = declared(None, "FLAG", "flags to disable, named as in the MJCF's <flag>")
+    chunk_size: int | None = declared(None, "N", "samples per device and call", "[1, 1e7]", unset="by the samples")
+    block_size: int | None = declared(
+        None, "N", "samples held at once", "[2, 1e7]", study="gradients", unset="all, if they fit"
+    )
 
-    tasks: tuple[str | NamedTask, ...]
-    kind: str | None = None
-    estimators: tuple[Union[str, "estimators.estimator.Estimator"], ...] = ("zobg", "fobg", "aobg")
-    theta: tuple[float, ...] | None = None
-    network: tuple[int, ...] | None = None
-    contact: tuple[str, ...] | None = None
-    stiffness: tuple[float, ...] | None = None
-    damping: float | None = None
-    solref: tuple[tuple[float, ...], ...] = ()
-    solimp: tuple[tuple[float, ...], ...] = ()
-    timestep: tuple[float, ...] | None = None
-    cone: tuple[str, ...] | None = None
-    sigma: tuple[float, ...] | None = None
-    samples: tuple[int, ...] | None = None
-    confidence: float = 0.95
-    seeds: int | None = None
-    iterations: int | None = None
-    points: int | None = None
-    span: tuple[float, ...] | None = None
-    direction: str | None = None
-    optimizer: str | None = None
-    learning_rate: float | None = None
-    decay: float | None = None
-    stiffness_schedule: str | None = None
-    sigma_schedule: str | None = None
-    reference_samples: int | None = None
-    evaluation_samples: int | None = None
-    seed: int = 0
-    noise: str | None = None
-    baseline: str = "zero_noise"
-    gamma: float | None = None
-    published: bool = False
-    failure_probability: float = 0.05
-    variance_proxy: str = "variance"
-    radius: str | float = "max_deviation"
-    max_norm: float | None = None
-    window: int | None = None
-    tolerance: float = PUBLISHED_TOLERANCE
-    weights: str = PLUG_IN
-    onset: str = "none"
-    backward: tuple[str, ...] = ("none",)
-    backward_stiffness: float | None = None
-    backward_margin: float | None = None
-    horizon: int | None = None
-    model: str | None = None
-    integrator: str | None = None
-    solver: str | None = None
-    solver_iterations: int | None = None
-    solver_ls_iterations: int | None = None
-    disable_flag: tuple[str, ...] | None = None
-    chunk_size: int | None = None
-    block_size: int | None = None
+    def __new__(cls, **given: Any) -> "StudyConfig":
+        """Suggest a name for a misspelt one."""
+        names = [field.name for field in dataclasses.fields(cls)]
+        for name in given:
+            if name not in names:
+                raise TypeError(f"{cls.__name__} has no option {name!r}{suggestion(name, names)}")
+        return super().__new__(cls)
 
     def __post_init__(self) -> None:
-        super().__post_init__()
-        for name in ("tasks", "estimators"):
-            if isinstance(getattr(self, name), str):
-                raise ValueError(f"{name} must be a list, got {getattr(self, name)!r}")
-        if not self.tasks:
-            raise ValueError("no task given")
+        for name, option in OPTIONS.items():
+            if (value := self._named(name)) is not None or option.default is not None:
+                option.check(value)
+        for name in AXES:
+            values = self._named(name)
+            if repeated := [str(value) for value, count in Counter(values or ()).items() if count > 1]:
+                raise OptionError(name, f"has {', '.join(sorted(repeated))} twice")
+            if values is not None and not values and name not in MAY_BE_EMPTY:
+                raise OptionError(name, "must have at least one value")
         if self.theta is not None and len(self.tasks) > 1:
-            raise ValueError("`theta` is for a single task; give one task, or omit it")
-        if not self.estimators:
-            raise ValueError(f"no estimator given; choose from {', '.join(ESTIMATORS)}")
-        refuse_repeats("estimator", self.estimator_names)
-        refuse_repeats("contact family", self.contact or ())
+            raise OptionError("theta", "is for a single task: give one task, or omit it")
         if self.contact is not None:
-            refuse_untaken(self.contact, stiffness=self.stiffness, damping=self.damping)
-        for name in ("tasks", "stiffness", "solref", "solimp", "timestep", "cone", "sigma", "samples", "backward"):
-            values = getattr(self, name)
-            refuse_repeats(name, values or ())
-            if values == () and name not in ("solref", "solimp"):
-                raise ValueError(f"no {name} given: give at least one, or omit it")
+            reject_untaken(self.contact, stiffness=self.stiffness, damping=self.damping)
+        check_span(self.span)
+        self._check_derivatives()
+        self._check_kind()
+
+    def _check_derivatives(self) -> None:
         if self.surrogate and self.onset != "none":
-            raise ValueError("the onset term corrects exact derivatives: omit `onset` or `backward`")
+            raise OptionError("onset", "corrects exact derivatives: omit it or {}", "backward")
         for name in () if self.surrogate else ("backward_stiffness", "backward_margin"):
             if getattr(self, name) is not None:
-                raise ValueError(f"`{name}` needs a contact family in `backward`")
-        if self.iterations is not None and self.points is not None:
-            raise ValueError("`iterations` are for descents and `points` for landscapes: give one of them")
+                raise OptionError(name, "needs a contact family in {}", "backward")
+
+    def _check_kind(self) -> None:
         kind = self.settings.kind
+        if self.iterations is not None and self.points is not None:
+            raise OptionError("iterations", "is for descents and {} for landscapes: omit one of them", "points")
         if kind == "landscapes" and self.points is None:
-            raise ValueError("landscapes need `points`: give their number")
+            raise OptionError("points", "must be given for landscapes")
         if kind != "landscapes" and self.points is not None:
-            raise ValueError(f"`points` are for landscapes, and `kind` is {kind}: omit one of them")
-        for other, options in OF_KIND.items():
-            given = [f"`{name}`" for name in options if self.given(name)]
-            if other != kind and given:
-                listed = f"{' and '.join(given)} {'is' if len(given) == 1 else 'are'}"
-                advice = ASKED_BY.get(other) if self.kind is None else f"`kind` is {kind}"
-                raise ValueError(f"{listed} for {other}: {advice or 'omit it'}")
-        check_span(self.span)
+            raise OptionError("points", f"is for landscapes, and {{}} is {kind}: omit one of them", "kind")
+        for name, option in OPTIONS.items():
+            if option.study not in ("", kind) and self.given(name):
+                asks = {"descents": "iterations", "landscapes": "points"}.get(option.study)
+                if self.kind is not None:
+                    raise OptionError(name, f"is for {option.study}, and {{}} is {kind}", "kind")
+                raise OptionError(
+                    name, f"is for {option.study}: {'give {} as well' if asks else 'omit it'}", asks or ""
+                )
 
     def _named(self, name: str) -> Any:
-        return self.estimator_names if name == "estimators" else super()._named(name)
+        """Value of a field, with names in place of objects."""
+        value = getattr(self, name)
+        if name in ("tasks", "estimators") and not isinstance(value, str):
+            return self.task_names if name == "tasks" else self.estimator_names
+        return value
 
     @property
     def settings(self) -> Settings:
@@ -218,13 +274,14 @@ class StudyConfig(Checked):
 
     def given(self, name: str) -> bool:
         """Whether a field differs from its default."""
-        return getattr(self, name) != self.default(name)
+        return getattr(self, name) != OPTIONS[name].default
 
     def resolved(self) -> dict[str, Any]:
         """Return all fields, with the defaults of the study's kind in place of None."""
-        fields = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        settings = vars(self.settings)
-        return fields | {name: settings[name] for name in ("kind", *OF_KIND[settings["kind"]]) if name in settings}
+        settings, fields = vars(self.settings), dict(vars(self))
+        return fields | {
+            name: value for name, value in settings.items() if name == "kind" or OPTIONS[name].study == settings["kind"]
+        }
 
     @property
     def estimator_names(self) -> tuple[str, ...]:
@@ -234,7 +291,7 @@ class StudyConfig(Checked):
     @property
     def task_names(self) -> list[str]:
         """Names of the tasks."""
-        return [which if isinstance(which, str) else which.name for which in self.tasks]
+        return [each.name if isinstance(each, NamedTask) else each for each in self.tasks]
 
     @property
     def surrogate(self) -> bool:
@@ -247,14 +304,32 @@ class StudyConfig(Checked):
         return self.seeds or (1 if self.settings.kind == "landscapes" else 10)
 
 
-def refuse_repeats(label: str, values: Sequence[object]) -> None:
-    """Raise ValueError for a value that occurs twice."""
-    repeated = {str(value) for value, count in Counter(values).items() if count > 1}
-    if repeated:
-        raise ValueError(f"{label} given twice: {', '.join(sorted(repeated))}")
+OPTIONS: Final = options_of(StudyConfig)
+"""Every option of a study by its name."""
+StudyConfig.__doc__ = "\n".join(
+    [
+        f"{StudyConfig.__doc__}",
+        "    Attributes:",
+        *(f"        {name}: {each.describe()}" for name, each in OPTIONS.items()),
+    ]
+)
+
+
+def as_arguments(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Options that are not None, as arguments of `make_task` and `load_scene`."""
+    return {SCENE_OPTIONS.get(name, name): value for name, value in options.items() if value is not None}
 
 
 def check_span(span: Sequence[float] | None) -> None:
-    """Raise ValueError unless span is None or two numbers in ascending order."""
+    """Raise OptionError unless span is None or two numbers in ascending order."""
     if span is not None and not (len(span) == 2 and 0 < span[1] - span[0] < math.inf):
-        raise ValueError("`span` must be two numbers, the lower one first; got " + ", ".join(map(str, span)))
+        raise OptionError("span", "must be two numbers, the lower one first; got " + ", ".join(map(str, span)))
+
+
+def reject_untaken(families: Sequence[str], *, stiffness: object, damping: object) -> None:
+    """Raise OptionError for a stiffness or damping, not None, that none of the contact families takes."""
+    undamped = [family for family in families if family != REFERENCE]
+    for name, value, able in (("stiffness", stiffness, families), ("damping", damping, undamped)):
+        if value is not None and not takes_stiffness(able):
+            chosen = f"contact {', '.join(families)}" if families else "solref or solimp alone"
+            raise OptionError(name, f"has no effect on {chosen}: omit it, or add a family that takes one, e.g. mujoco")

@@ -1,38 +1,36 @@
-"""Read user-supplied files and validate them against a schema; errors name the file and the key in one line."""
+"""Files that users supply: options in TOML, parameters, and policies; errors name the file and the key in one line."""
 
 import dataclasses
-import functools
 import hashlib
 import json
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Generator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Any, Final
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, field_validator
 
 from estimators.choices import suggestion
 from mjx_study.disk import read_bytes
-from mjx_study.options.option import BUILDER_OPTIONS, OPTIONS
+from mjx_study.options.configuration import BUILDER_OPTIONS, OPTIONS
+from mjx_study.options.option import OptionError
 
-Finite = Annotated[float, Field(allow_inf_nan=False, strict=True)]
-_ADAPTER: Final = functools.cache(TypeAdapter)
-
-
-def validated(schema: Any, content: bytes | str) -> Any:
-    """Read JSON of a type; a ValueError names the first key that violates it."""
-    try:
-        return _ADAPTER(schema).validate_json(content)
-    except ValidationError as error:
-        raise ValueError(told(error)) from None
+POLICY_OPTIONS: Final = ("contact", "stiffness", "damping", "timestep", "cone", "network", *BUILDER_OPTIONS)
+"""Options under which a policy was found."""
 
 
-def _validated(path: Path, content: bytes, schema: Any) -> Any:
-    try:
-        return validated(schema, content)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
+@dataclasses.dataclass(frozen=True)
+class SavedPolicy:
+    """A policy written by `optimise`.
+
+    Attributes:
+        task: name of the task.
+        options: those of `POLICY_OPTIONS` under which it was found, unless they are None.
+    """
+
+    task: str
+    options: Mapping[str, Any]
 
 
 def digest_of_json(document: Mapping[str, Any]) -> str:
@@ -41,74 +39,59 @@ def digest_of_json(document: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(rest, sort_keys=True).encode()).hexdigest()
 
 
-def read_toml(path: Path, schema: type[BaseModel]) -> dict[str, Any]:
-    """Read the options set by a TOML file; ValueError as for `read_bytes`, or if it is not TOML or violates the
-    schema."""
+def read_toml(path: Path) -> dict[str, Any]:
+    """Read the options set by a TOML file; ValueError as for `read_bytes`, or if it is not TOML, or an option is
+    unknown or invalid."""
     content = read_bytes(path)
-    try:
-        found = schema.model_validate(tomllib.loads(content.decode()))
-    except ValidationError as error:
-        raise ValueError(f"{path}: {told(error, schema.model_fields)}") from None
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path} is not TOML: {error}") from error
-    return {name: getattr(found, name) for name in found.model_fields_set}
+    with _naming_file(path):
+        try:
+            found = tomllib.loads(content.decode())
+        except (ValueError, RecursionError) as error:
+            raise ValueError(f"not TOML: {error}") from None
+        for name in found:
+            if name not in OPTIONS:
+                raise ValueError(f"there is no option {name!r}{suggestion(name, OPTIONS)}")
+        return {name: OPTIONS[name].read(value) for name, value in found.items()}
 
 
-def told(error: ValidationError, names: Iterable[str] = ()) -> str:
-    """Describe the first violation of a schema, which may have such names, with its key, and count the others."""
-    found = error.errors(include_url=False, include_input=False)
-    first = found[0]
-    key = ".".join(map(str, first["loc"]))
-    raised = first.get("ctx", {}).get("error")  # from a validator of ours; pydantic adds words to its message
-    reason = str(raised) if isinstance(raised, ValueError) else first["msg"]
-    if first["type"] == "extra_forbidden":
-        reason = f"there is no such option{suggestion(key, names)}"
-    more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
-    return f"{key}{': ' * bool(key)}{' '.join(reason.split())}{more}"
-
-
-class PolicyFile(BaseModel):
-    """A policy written by `optimise`: its parameters, the setting in which they were found, and a digest of it all."""
-
-    model_config = ConfigDict(strict=True)
-
-    task: str
-    theta: list[Finite] = Field(min_length=1)
-    contact: str | None = None
-    stiffness: float | None = None
-    damping: float | None = None
-    cone: str | None = None
-    timestep: float | None = None
-    horizon: int | None = None
-    model: str | None = None
-    integrator: str | None = None
-    solver: str | None = None
-    solver_iterations: int | None = None
-    solver_ls_iterations: int | None = None
-    disable_flag: list[str] | None = None
-    network: list[int] | None = None
-    digest: str | None = None
-
-    @field_validator("contact", "stiffness", "damping", "timestep", "cone", "network", *BUILDER_OPTIONS)
-    @classmethod
-    def _check(cls, value: Any, info: Any) -> Any:
-        option = OPTIONS[str(info.field_name)]
-        if value is None or (option.name == "stiffness" and value == 0):  # no contact has one
-            return None
-        return dataclasses.replace(option, many=isinstance(value, list)).check(value)
-
-
-def read_theta(path: Path) -> tuple[tuple[float, ...], PolicyFile | None]:
+def read_theta(path: Path) -> tuple[tuple[float, ...], SavedPolicy | None]:
     """Read parameters from a policy file, which is returned as well, a .json list or a .npy array; else ValueError."""
     if path.suffix != ".json":
         return _read_array(path), None
     content = read_bytes(path)
-    if content.lstrip().startswith(b"{"):
-        policy = _validated(path, content, PolicyFile)
-        if policy.digest not in (None, digest_of_json(json.loads(content))):
-            raise ValueError(f"{path} is damaged (its digest does not match); if you changed it, remove its digest")
-        return tuple(policy.theta), policy
-    return tuple(_validated(path, content, list[Finite])), None
+    with _naming_file(path):
+        try:
+            found = json.loads(content)
+        except (ValueError, RecursionError) as error:
+            raise ValueError(f"not JSON: {error}") from None
+        policy = _policy_of(found) if isinstance(found, dict) else None
+        theta = OPTIONS["theta"].check(found if policy is None else found.get("theta"))
+        if not theta:
+            raise ValueError("there are no parameters")
+        return tuple(map(float, theta)), policy
+
+
+def _policy_of(document: dict[str, Any]) -> SavedPolicy:
+    if document.get("digest") not in (None, digest_of_json(document)):
+        raise ValueError("the digest does not match, so the file is damaged; if you changed it, remove its digest")
+    if not isinstance(task := document.get("task"), str):
+        raise ValueError(f"task must be the name of a task, got {task!r:.60}")
+    options = {name: value for name in POLICY_OPTIONS if (value := document.get(name)) is not None}
+    if options.get("stiffness") == 0:  # no contact has one
+        del options["stiffness"]
+    for name, value in options.items():
+        dataclasses.replace(OPTIONS[name], many=name in ("network", "disable_flag")).check(value)
+    return SavedPolicy(task, options)
+
+
+@contextmanager
+def _naming_file(path: Path) -> Generator[None]:
+    """Begin errors with a file's name, and spell options as its keys."""
+    try:
+        yield
+    except ValueError as error:
+        reason = error.spelled(str) if isinstance(error, OptionError) else str(error)
+        raise ValueError(f"{path}: {' '.join(reason.split())}") from None
 
 
 def _read_array(path: Path) -> tuple[float, ...]:

@@ -15,8 +15,9 @@ from pydantic import BaseModel, ConfigDict
 
 from mjx_study.disk import MAX_BYTES, read_whole, write_whole
 from mjx_study.experiment.checkpoint import StudyError, reason_of
-from mjx_study.options.files import digest_of_json, validated
+from mjx_study.options.files import digest_of_json
 from mjx_study.storage.arrays import MOST_CELL_BYTES, read_arrays, write_arrays
+from mjx_study.storage.schema import validated
 
 VERSIONS: Final = "versions"
 """Entry that records the versions that computed a cell."""

@@ -14,13 +14,16 @@ from estimators.choices import ORACLES
 from estimators.registry import ESTIMATORS, label_of
 from mjx_study.experiment.plan import StudyCell, StudyPlan, estimators_of
 from mjx_study.identity import git_revision, versions
-from mjx_study.options.files import Finite, digest_of_json, validated
-from mjx_study.options.option import OPTIONS
+from mjx_study.options.configuration import OPTIONS
+from mjx_study.options.files import digest_of_json
+from mjx_study.options.numbers import Interval
 from mjx_study.runtime import environment
+from mjx_study.storage.schema import Finite, validated
 from mjx_study.table import digits_to_tell_apart
 
 MOST_NUMBERS: Final = 500_000_000
 """Maximum size of a variable of a study."""
+SEEDS: Final = Interval(OPTIONS["seeds"].interval)
 Name = Annotated[str, Field(min_length=1, max_length=1000)]
 Count = Annotated[int, Field(ge=1, le=10_000_000)]
 
@@ -33,7 +36,7 @@ class _Config(_Part):
     kind: Literal["gradients", "descents", "landscapes"]
     tasks: list[Name] = Field(min_length=1)
     estimators: list[Name] = Field(min_length=1)
-    seeds: int = Field(ge=1, le=int(OPTIONS["seeds"].interval.high))  # type: ignore[union-attr]
+    seeds: int = Field(ge=1, le=int(SEEDS.high))
     iterations: Count | None
     points: Count | None = None
     confidence: Annotated[float, Field(gt=0, lt=1)] = 0.95

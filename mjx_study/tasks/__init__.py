@@ -7,7 +7,8 @@ from typing import Any, Final
 
 from estimators.user_code import MissingModuleError
 from mjx_study.choices import TASK_DESCRIPTIONS, is_file, unknown_task
-from mjx_study.options.option import OPTIONS, as_arguments, check
+from mjx_study.options.configuration import OPTIONS, as_arguments
+from mjx_study.options.option import OptionError
 from mjx_study.tasks.mjcf import mjcf_task
 from mjx_study.tasks.task import Task
 from mjx_study.tasks.user_task import build_user_task, registered_name
@@ -41,7 +42,7 @@ def make_task(name: str, **options: Any) -> Task:
         return TASKS[name](**options)
     if is_file(name):
         if "model" in options:
-            raise ValueError(f"model replaces the MJCF of a task, but {name} is a file already")
+            raise OptionError("model", f"replaces the MJCF of a task, but {name} is a file already")
         return mjcf_task(name, **options)
     if (place := registered_name(name)) is not None:
         return build_user_task(place, options)
@@ -59,5 +60,5 @@ def task_with_options(name: str, options: Mapping[str, Any]) -> Task:
     if "timestep" in given and "horizon" not in given:
         own = make_task(name, **{key: value for key, value in given.items() if key != "timestep"})
         steps = own.horizon * own.scene.timestep / given["timestep"]
-        given["horizon"] = check(OPTIONS["horizon"], max(1, round(min(steps, 1e15))))
+        given["horizon"] = OPTIONS["horizon"].check(max(1, round(min(steps, 1e15))))
     return make_task(name, **given)

@@ -9,8 +9,10 @@ from contextlib import contextmanager
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_study.choices import DEFAULT_SOLIMP, DEFAULT_SOLREF, FAMILIES, REFERENCE
+from mjx_study.choices import DEFAULT_SOLIMP, DEFAULT_SOLREF, FAMILIES, REFERENCE, takes_stiffness
 from mjx_study.limits import MOST_MODELS, check_count
+from mjx_study.options.configuration import reject_untaken
+from mjx_study.options.option import OptionError
 from mjx_study.simulation.contact import (
     ContactModel,
     ContactWarning,
@@ -93,6 +95,30 @@ def family_grid(
     return tuple(points), tuple(messages)
 
 
+def single_contact(
+    task: Task, family: str | None = None, stiffness: float | None = None, damping: float | None = None
+) -> tuple[ContactPoint, tuple[str, ...]]:
+    """Return the contact model of a single run, and its warnings: by default the task's main family at its middle
+    stiffness. OptionError for a stiffness or damping that the family does not take."""
+    families, stiffnesses = single_defaults(
+        task, None if family is None else (family,), None if stiffness is None else (stiffness,)
+    )
+    reject_untaken(families, stiffness=stiffness, damping=damping)
+    (point,), messages = family_grid(task, families, stiffnesses, damping)
+    return point, messages
+
+
+def single_defaults(
+    task: Task, families: Sequence[str] | None = None, stiffnesses: Sequence[float] | None = None
+) -> tuple[tuple[str, ...], tuple[float, ...] | None]:
+    """Contact families and stiffnesses [N/m] of a single run: the task's main family at its middle stiffness in place
+    of None; no stiffness for families without one."""
+    families = (task.defaults.main_family,) if families is None else tuple(families)
+    if stiffnesses is None and takes_stiffness(families):
+        stiffnesses = (task.defaults.middle_stiffness,)
+    return families, None if stiffnesses is None else tuple(stiffnesses)
+
+
 def backward_grid(
     task: Task,
     points: Sequence[ContactPoint],
@@ -115,7 +141,7 @@ def backward_grid(
     simulated = [point for point in points if not point.analytic]
     for family, point in itertools.product((name for name in families if name != "none"), simulated):
         if point.contact is None:
-            raise ValueError(f"contact {point.family} takes no backward model: choose another family")
+            raise OptionError("backward", f"has no effect on contact {point.family}: choose another family")
         own = (stiffness or point.stiffness) if FAMILIES[family].swept else None
         with _warnings_of_contact() as caught:
             other = _contact(task, family, own, None)
@@ -136,7 +162,7 @@ def check_reference(task: Task) -> None:
     if task.reference is None:
         raise ValueError(f"{task.name} has no analytic reference")
     if task.onset != "none":
-        raise ValueError("the analytic references have no onset term; omit `onset`")
+        raise OptionError("onset", "has no counterpart in the analytic references: omit it")
 
 
 def solver_grid(task: Task, solrefs: Sequence[Sequence[float]], solimps: Sequence[Sequence[float]]) -> Grid:

@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 
 from estimators import ESTIMATORS
 from mjx_study import cli
-from mjx_study.options.configuration import StudyConfig
-from mjx_study.options.option import OPTIONS
+from mjx_study.options.configuration import OPTIONS, StudyConfig
 from mjx_study.simulation.contact import FAMILIES
 from mjx_study.tasks import TASKS
 

@@ -220,7 +220,7 @@ def test_a_stiffness_needs_the_pair_that_it_acts_on() -> None:
     for families, stiffnesses, message in (
         (["penalty"], None, "--pair"),
         (["penalty"], [10.0], "--pair"),
-        (["mujoco_default"], [10.0], "contact mujoco_default takes no stiffness"),
+        (["mujoco_default"], [10.0], "`stiffness` has no effect on contact mujoco_default"),
     ):
         with pytest.raises(ValueError, match=message):
             plan_scene_gradcheck(scene, families, stiffnesses, seed=0)
