@@ -69,7 +69,8 @@ def with_options_of_estimators(configuration: type[ConfigT]) -> type[ConfigT]:
         if name not in configuration.__annotations__:
             kind: Any = field.type
             configuration.__annotations__[name] = kind | None
-            setattr(configuration, name, of_estimators(name, default=None))
+            usual = "" if field.default is MISSING else str(field.default)
+            setattr(configuration, name, of_estimators(name, default=None, unset=usual))
     return configuration
 
 
