@@ -26,7 +26,7 @@ from experiments import DATA, DOCS
 from experiments.pages import write_tables
 from mjx_study.choices import DEFAULT_SOLIMP, DEFAULT_SOLREF, STIFF_SOLIMP
 from mjx_study.diagnose.measurement import ESTIMATORS, measure
-from mjx_study.experiment.gradients import reference_of
+from mjx_study.experiment.reference_gradient import reference_of
 from mjx_study.experiment.sampling import cell_keys, draw_batches
 from mjx_study.objective import MjxObjective, Simulator, chunk_for
 from mjx_study.runtime import configure, local_devices

@@ -18,7 +18,7 @@ from estimators import ENOUGH_EFFECTIVE, ESTIMATORS, make_estimator, summarise
 from experiments import DOCS
 from experiments.pages import write_tables
 from mjx_study.reference import LinearQuadratic, ReferenceObjective
-from mjx_study.results.findings import DETECTED_SE
+from mjx_study.results.curves import DETECTED_SE
 from mjx_study.runtime import configure
 from mjx_study.table import markdown_table, percent
 

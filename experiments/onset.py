@@ -14,7 +14,7 @@ import numpy as np
 from estimators import NOISES, first_order, zeroth_order
 from experiments.atlas.design import task_of
 from experiments.pages import markdown_row
-from mjx_study.experiment.landscapes import Line, Means, grid, means
+from mjx_study.experiment.quadrature import Line, Means, grid, means
 from mjx_study.experiment.resolution import direction_of
 from mjx_study.experiment.tally import onset_numbers
 from mjx_study.objective import Simulator

@@ -17,7 +17,7 @@ import numpy as np
 
 import mjx_study as study
 from experiments.pages import markdown_row
-from mjx_study.experiment.landscapes import Line, grid, means
+from mjx_study.experiment.quadrature import Line, grid, means
 from mjx_study.simulation.contact import ContactModel
 from mjx_study.simulation.scene import put_scene
 from mjx_study.table import markdown_table

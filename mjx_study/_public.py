@@ -2,8 +2,9 @@
 
 import mjx_study._matplotlib  # noqa: F401
 from mjx_study.choices import FAMILIES
-from mjx_study.execution.run import load_study, run_study
-from mjx_study.experiment.plan import estimators_of, plan_study
+from mjx_study.execution.run import run_study
+from mjx_study.experiment.plan import plan_study
+from mjx_study.experiment.study import estimators_of
 from mjx_study.objective import MjxObjective, Simulator, simulate
 from mjx_study.options.configuration import StudyConfig
 from mjx_study.plots.study import plot_study
@@ -23,6 +24,7 @@ from mjx_study.simulation.drop_in import differentiable_mjx, solver_residual, st
 from mjx_study.simulation.dynamics import State, initial_state, rollout, step_jacobian
 from mjx_study.simulation.dynamics import step as scene_step
 from mjx_study.simulation.scene import Scene, SceneError, check_model, load_scene, put_scene
+from mjx_study.storage.folder import load_study
 from mjx_study.tasks import TASKS, make_task
 from mjx_study.tasks.policy import InitialStatePolicy, LinearFeedback, OpenLoop, Policy
 from mjx_study.tasks.task import Recipe, StudyDefaults, Task

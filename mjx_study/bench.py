@@ -33,7 +33,7 @@ from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.contact import ContactModel, apply_contact
 from mjx_study.simulation.dynamics import State
 from mjx_study.simulation.engine import engine_model
-from mjx_study.tasks.contact_grid import ContactPoint, family_grid
+from mjx_study.tasks.contact_grid import ContactPoint, family_grid, single_contact
 from mjx_study.tasks.soundness import check_soundness
 from mjx_study.tasks.task import Task
 
@@ -52,7 +52,7 @@ TIMED: Final = {
     "stock_gradient": "jax.grad through mjx.step, one iteration",
     "engine_gradient": "C engine, mjd_transitionFD and adjoint",
     "onset_base": "first order, MuJoCo's default contact",
-    "onset": "first order with the onset term, likewise",
+    "onset": "first order with the onset term, same contact",
 }
 """What is timed, per sample."""
 RATIOS: Final = {
@@ -131,7 +131,7 @@ def plan_bench(task: Task, samples: int) -> BenchPlan:
         raise ValueError(f"samples must be at least 1, got {samples}")
     check_soundness(task)
     check_memory(task, (ZerothOrder(), FirstOrder()), samples)
-    (cell,), _ = family_grid(task, [task.defaults.main_family], [task.defaults.middle_stiffness])
+    cell, _ = single_contact(task)
     (onset,), _ = family_grid(task, ["mujoco_default"]) if task.contact_pair else ((None,), ())
     return BenchPlan(task, samples, cell, onset)
 

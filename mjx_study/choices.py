@@ -13,6 +13,12 @@ SOLVERS: Final = ("newton", "cg")
 INTEGRATORS: Final = ("euler", "implicitfast", "rk4")
 ONSETS: Final = ("none", "linear", "jump")
 """Treatment of the onset of contact in first-order gradients."""
+KINDS: Final = {
+    "gradients": "mjx_study.experiment.gradients",
+    "descents": "mjx_study.experiment.descents",
+    "landscapes": "mjx_study.experiment.landscapes",
+}
+"""Kinds of study, with the module whose `KIND` defines each."""
 REFERENCE: Final = "reference"
 """Selects the task's analytic system, without MJX, among contact families."""
 TASK_DESCRIPTIONS: Final = {

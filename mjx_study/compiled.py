@@ -20,7 +20,8 @@ import jax
 import jax.export
 
 from mjx_study.caches import read_cached, write_cached
-from mjx_study.graph.build import known_libraries, libraries_in, library_ready, native_identity
+from mjx_study.graph.build import known_libraries, libraries_in, library_ready
+from mjx_study.graph.native import native_identity
 from mjx_study.identity import trace_contents
 from mjx_study.runtime import precision, traces_folder
 from mjx_study.structure import describe, restore

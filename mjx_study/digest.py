@@ -45,6 +45,14 @@ IMPLIED: Final = frozenset(
     "__weakref__ _abc_impl _is_protocol".split()
 )
 """Attributes that say nothing beyond names and source."""
+FORMER: Final = {
+    "mjx_study.reference.projectiles": "mjx_study.reference.launch",
+    "estimators.batches": "estimators.types",
+    "estimators.interpolation": "estimators.alpha",
+    "estimators.samples": "estimators.rows",
+    "estimators.zeroth_first": "estimators.orders",
+}
+"""Names of modules in earlier versions, which stay in digests: a move changes no result."""
 CODE: Final = (type, types.FunctionType, types.BuiltinFunctionType, types.MethodType, functools.partial)
 """Kinds of values that are code rather than data."""
 
@@ -139,7 +147,7 @@ class Digest:
 
     def _class(self, kind: type) -> None:
         """Add a class: by name and source, and of the user's its methods and attributes, inherited ones included."""
-        self._note("class", kind.__module__, kind.__qualname__)
+        self._note("class", FORMER.get(kind.__module__, kind.__module__), kind.__qualname__)
         for each in kind.__mro__:
             self.sources.add(each.__module__)
             if is_users(each.__module__):
@@ -198,7 +206,7 @@ class Digest:
         if by_version(function.__module__):
             function = inspect.unwrap(function)
         home = function.__globals__.get("__name__", function.__module__)  # decorators copy __module__
-        self._note("function", function.__module__, function.__qualname__)
+        self._note("function", FORMER.get(function.__module__, function.__module__), function.__qualname__)
         self._all("holds", (function.__defaults__, function.__kwdefaults__, _closure(function), _state(function)))
         if by_version(home) or by_version(function.__module__):
             return

@@ -6,7 +6,7 @@ import io
 import json
 import math
 from collections.abc import Mapping
-from typing import Any, Final
+from typing import Any
 
 import jinja2
 import numpy as np
@@ -14,34 +14,13 @@ import pandas as pd
 import xarray as xr
 from matplotlib.figure import Figure
 
-from mjx_study.execution.run import warnings_of
 from mjx_study.plots.panels import counted
-from mjx_study.plots.study import plot_study
-from mjx_study.results.findings import findings_of, label_in, model_name, remains, rows_of
-from mjx_study.results.variables import COORDINATES, DEBIASED, QUANTITIES, Variable
+from mjx_study.plots.study import drawings_of, plot_study
+from mjx_study.results.kind import Drawing, findings_of, kind_of
+from mjx_study.results.rows import label_in, model_name, remains
+from mjx_study.results.variables import COORDINATES, DEBIASED, Variable
+from mjx_study.results.warnings import warnings_of
 from mjx_study.table import with_error
-
-CAPTIONS: Final = {
-    "comparison": "Variance of one gradient sample, and relative error of the mean against the reference.",
-    "variance": "Variance of one gradient sample; geometric mean over the seeds.",
-    "bias": "Bias of each estimator against an unbiased zeroth-order reference; a triangle is an upper bound where "
-    "none can be told from zero.",
-    "alpha": "Weight of first-order gradients in the interpolations.",
-    "error_against_samples": "Relative error of the mean gradient against the number of samples.",
-    "map": "First order against zeroth order over two swept parameters.",
-    "achieved": "Cost of the final policies against stiffness.",
-    "landscape": "Cost along a line through theta, and the slope that the mean of each estimator has there.",
-    "descent": "Cost against iterations, rollouts and seconds.",
-}
-ESTIMATED: Final = ("variance", "effective_samples", "top_share", "relative_error", "debiased_error", "squared_bias")
-KINDS: Final = {
-    "gradients": ("gradient estimates", (*ESTIMATED, "alpha", "nonfinite")),
-    "descents": ("gradient descent", ("final_cost", "stopped_seeds", "variance", "alpha", "nonfinite")),
-    "landscapes": ("landscapes", ("least_cost", "least_at", "steepest", "nonfinite")),
-}
-"""Title, and the quantities in the table, by kind of study."""
-PRESENT: Final = ("residual", "rollouts", "unconverged")
-"""For every kind of study, a variable that is finite in every computed cell."""
 
 
 @xr.register_dataset_accessor("mjx_study")
@@ -53,11 +32,7 @@ class StudyAccessor:
 
     def table(self) -> pd.DataFrame:
         """Return a row per contact model, seed and estimator, without variables over iterations, points or theta."""
-        if "variance" in self._dataset:
-            return pd.DataFrame([row.as_dict() for row in rows_of(self._dataset)])
-        long = {"iteration", "point", "param", "solref_entry", "solimp_entry"}
-        short = [name for name, variable in self._dataset.data_vars.items() if not long & set(variable.dims)]
-        return self._dataset[short].to_dataframe().reset_index()
+        return kind_of(self._dataset).table(self._dataset)
 
     def findings(self) -> list[str]:
         """Return what the study's intervals support, as sentences."""
@@ -78,17 +53,16 @@ class StudyAccessor:
 
 @np.errstate(over="ignore", invalid="ignore")  # numbers of a motion that explodes
 def render_report(dataset: xr.Dataset) -> str:
-    config = json.loads(dataset.attrs["config"])
-    title, names = KINDS[config["kind"]]
-    quantities = {name: QUANTITIES[config["kind"]][name] for name in names}
+    config, kind, drawings = json.loads(dataset.attrs["config"]), kind_of(dataset), drawings_of(dataset)
+    quantities = {name: kind.quantities[name] for name in kind.columns}
     pages = jinja2.Environment(loader=jinja2.PackageLoader("mjx_study"), autoescape=True, keep_trailing_newline=True)
     return pages.get_template("report.html").render(
         tasks=", ".join(config["tasks"]),
-        kind=title,
+        kind=kind.title,
         models=dataset.sizes["model"],
         warnings=warnings_of(dataset),
         findings=findings_of(dataset),
-        figures=[_figure(name, figure) for name, figure in plot_study(dataset).items()],
+        figures=[_figure(name, figure, drawings) for name, figure in plot_study(dataset).items()],
         summary=_summary(dataset),
         numbers=_numbers(dataset, quantities),
         meanings={each.heading: each.description for each in quantities.values()},
@@ -98,20 +72,20 @@ def render_report(dataset: xr.Dataset) -> str:
     )
 
 
-def _figure(name: str, figure: Figure) -> tuple[str, str, str]:
+def _figure(name: str, figure: Figure, drawings: Mapping[str, Drawing]) -> tuple[str, str, str]:
     """Name, caption and image of a figure."""
     file = io.BytesIO()
     figure.savefig(file, format="png", dpi=110)
-    caption = next(text for key, text in CAPTIONS.items() if name.startswith(key))
+    caption = next(drawing.caption for key, drawing in drawings.items() if name.startswith(key))
     return name, caption, base64.b64encode(file.getvalue()).decode()
 
 
 def _summary(dataset: xr.Dataset) -> str:
-    """What the numbers in the table are."""
+    """Explain the numbers in the table."""
     seeds, samples = dataset.sizes.get("seed", 1), int(dataset["samples"][-1])
-    told = f"Medians over {seeds} seeds, counts summed" if seeds > 1 else "One seed"
+    seed = f"Medians over {seeds} seeds, counts summed" if seeds > 1 else "One seed"
     return (
-        f"{told}; {counted(samples, 'sample')} in a batch; ± one standard error; -: not defined, or explained by noise."
+        f"{seed}; {counted(samples, 'sample')} in a batch; ± one standard error; -: not defined, or explained by noise."
     )
 
 
@@ -119,10 +93,8 @@ def _numbers(dataset: xr.Dataset, quantities: Mapping[str, Variable]) -> tuple[l
     """Titles of the table of numbers, and a row for each cell and estimator; what all rows of a cell share, once."""
     if not dataset.data_vars:
         return None
-    if "smoothed" in dataset:
-        dataset = _with_extremes(dataset)
-    if "stopped_at" in dataset:
-        dataset = dataset.assign(stopped_seeds=dataset["stopped_at"].notnull())
+    kind = kind_of(dataset)
+    dataset = kind.summarised(dataset)
     axes = ("task", "timestep", "cone", "sigma", "model", "estimator")
     outer = [name for name in axes[:4] if dataset.sizes[name] > 1]
     shown = {name: variable for name, variable in quantities.items() if name in dataset}
@@ -133,25 +105,14 @@ def _numbers(dataset: xr.Dataset, quantities: Mapping[str, Variable]) -> tuple[l
     rows, above = [], None
     for picked in np.ndindex(*(dataset.sizes[name] for name in axes)):
         one = last.isel(dict(zip(axes, picked, strict=True)))
-        if any(np.isfinite(one[name]).all() for name in PRESENT if name in one):
+        if one[kind.computed].notnull().all():
             label = label_in(dataset, one["estimator"].item())
-            place = [model_name(one), *(_shown(one[name].item()) for name in outer), label]
-            row = [*place, *(_text(name, variable, one) for name, variable in shown.items())]
+            where = [model_name(one), *(_shown(one[name].item()) for name in outer), label]
+            row = [*where, *(_text(name, variable, one) for name, variable in shown.items())]
             rows.append(["" if picked[:-1] == above and once else cell for cell, once in zip(row, shared, strict=True)])
             above = picked[:-1]
     filled = [index for index in range(len(titles)) if any(row[index] not in ("", "-") for row in rows)]
     return [titles[index] for index in filled], [[row[index] for index in filled] for row in rows]
-
-
-def _with_extremes(dataset: xr.Dataset) -> xr.Dataset:
-    """Summarise a landscape by its extremes."""
-    least = dataset["smoothed"].fillna(np.inf).argmin("point")
-    return dataset.assign(
-        least_cost=dataset["smoothed"].min("point"),
-        least_cost_se=dataset["smoothed_se"].isel(point=least),
-        least_at=dataset["position"].isel(point=least),
-        steepest=abs(dataset["slope"]).max("point"),
-    )
 
 
 def _text(name: str, variable: Variable, one: xr.Dataset) -> str:

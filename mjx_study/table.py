@@ -138,13 +138,6 @@ def size(number: int | float) -> str:
     return f"{_rounded(number / least)} {unit}"
 
 
-def duration(seconds: float | int) -> str:
-    """Format a time to two digits, in a suitable unit."""
-    longer = (("days", 86400), ("h", 3600), ("min", 60))
-    unit, length = next((each for each in longer if seconds >= 2 * each[1]), ("s", 1))
-    return f"{_rounded(seconds / length)} {unit}"
-
-
 def _rounded(number: float | int) -> str:
     two_digits = float(f"{number:.2g}")
     return f"{two_digits:,.0f}" if two_digits >= 10 else f"{two_digits:g}"

@@ -2,14 +2,19 @@
 
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 
-from mjx_study.experiment.plan import StudyCell, StudyPlan
-from mjx_study.results.variables import VARIABLES
+from mjx_study.execution.cells import Cells, compute_here
+from mjx_study.experiment.checkpoint import Checkpoint
+from mjx_study.experiment.gradients import Gradients
+from mjx_study.experiment.study import Computation, StudyCell, StudyPlan, done
+from mjx_study.progress import silent
+from mjx_study.results.kind import find_kind
 from mjx_study.storage.arrays import required, sizes_of
 from mjx_study.storage.manifest import document_of, sealed
 
@@ -35,8 +40,8 @@ def study_document(cells: int, **changes: Any) -> dict[str, Any]:
 
 def cell_arrays(document: Mapping[str, Any], index: int = 0, **given: Any) -> dict[str, np.ndarray]:
     """What the schema asks of a cell: NaN, and 0 for counts, but for the arrays that are given."""
-    kind, sizes = document["config"]["kind"], sizes_of(document, index)
-    variables = {name: VARIABLES[kind][name] for name in required(kind)}
+    kind, sizes = find_kind(document["config"]["kind"]), sizes_of(document, index)
+    variables = {name: kind.variables[name] for name in required(kind)}
     blank = {
         name: np.full([sizes[dim] for dim in each.dims], np.nan if each.digits else 0.0)
         for name, each in variables.items()
@@ -47,6 +52,25 @@ def cell_arrays(document: Mapping[str, Any], index: int = 0, **given: Any) -> di
 def planned_arrays(plan: StudyPlan, cell: StudyCell, **given: Any) -> dict[str, np.ndarray]:
     """The same for a cell of a plan."""
     return cell_arrays(document_of(plan, None), plan.cells.index(cell), **given)
+
+
+def numbers_of(plan: StudyPlan, cell: StudyCell | None = None) -> dict[str, np.ndarray]:
+    """Compute a cell of a plan, its first unless given."""
+    index = 0 if cell is None else plan.cells.index(cell)
+    return dict(compute_here(Cells(plan, plan.kind.computation(plan), silent), [index]))[index]
+
+
+def stub_cells(patch: pytest.MonkeyPatch, compute: Callable[[StudyPlan, StudyCell], dict[str, np.ndarray]]) -> None:
+    """Let cells of gradients have made-up numbers."""
+
+    class Stubbed(Computation):
+        def __init__(self, plan: StudyPlan):
+            self.plan = plan
+
+        def compute(self, cell: StudyCell, unit: int, checkpoint: Checkpoint) -> Any:
+            return done(compute(self.plan, cell))
+
+    patch.setattr(Gradients, "computation", lambda self, plan: Stubbed(plan))
 
 
 def altered(path: Path, **changes: Any) -> None:

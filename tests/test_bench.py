@@ -91,11 +91,6 @@ def test_the_engines_rival_computes_a_gradient() -> None:
     assert over_start[2] == pytest.approx((last(1e-5, controls) - last(-1e-5, controls)) / 2e-5, rel=1e-4)
 
 
-def test_plans_refuse_an_empty_batch() -> None:
-    with pytest.raises(ValueError, match="samples must be at least 1"):
-        bench.plan_bench(make_task("pusher", horizon=3), 0)
-
-
 def test_plans_take_the_task_s_own_contact() -> None:
     """Its main family at its middle stiffness, also where there is one, or no family of MuJoCo's impedance."""
     task = make_task("pusher", horizon=3)

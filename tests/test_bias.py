@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mjx_study.experiment.landscapes import Line, Means, grid, means
+from mjx_study.experiment.quadrature import Line, Means, grid, means
 from mjx_study.tasks import make_task
 from mjx_study.tasks.contact_grid import family_grid
 

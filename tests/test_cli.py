@@ -1,29 +1,21 @@
 """The command line as a user meets it: figures that are true, one line for what is wrong, nothing written then."""
 
 import contextlib
-import dataclasses
 import io
 import json
 import os
 import re
-import signal
-import subprocess
-import sys
-import time
 from pathlib import Path
 from typing import Any, NoReturn
 
-import jax.numpy as jnp
 import pytest
 
 from mjx_study import cli
 from mjx_study.cli import options
-from mjx_study.execution.run import load_study
-from mjx_study.experiment import plan as plan_module
-from mjx_study.experiment.plan import StudyPlan, plan_study
-from mjx_study.options.configuration import OPTIONS, SCENE_OPTIONS, StudyConfig, as_arguments
+from mjx_study.options.configuration import OPTIONS, SCENE_OPTIONS, as_arguments
 from mjx_study.plots.style import PAGE
-from mjx_study.results.findings import rows_of
+from mjx_study.results.rows import rows_of
+from mjx_study.storage.folder import load_study
 from mjx_study.tasks import TASKS
 from tests.documents import stages_of
 
@@ -121,69 +113,10 @@ def test_what_compare_wrote_can_be_drawn_and_reported(
     assert float(re.search(r'width="([\d.]+)pt"', picture).group(1)) == pytest.approx(72 * PAGE)  # type: ignore[union-attr]
 
 
-def test_compare_prints_json_and_nothing_else(capsys: pytest.CaptureFixture[str]) -> None:
-    arguments = ["compare", "pusher", *SMALL, "--stiffness", "10", "--contact", "penalty", "--gamma", "inf", "--json"]
-    assert cli.main(arguments) == 0
-    document = json.loads(capsys.readouterr().out)
-    assert document["config"]["gamma"] == "inf"
-    assert [row["estimator"] for row in document["rows"]] == ["zobg", "fobg", "aobg"]
-
-
 def test_warnings_about_the_contact_reach_the_reader(capsys: pytest.CaptureFixture[str]) -> None:
     arguments = ["compare", "pusher", *SMALL, "--stiffness", "1e4", "--contact", "penalty", "--estimators", "zobg"]
     assert cli.main(arguments) == 0
     assert "warning: penalty, K = 10000 N/m: h^2 k" in capsys.readouterr().out
-
-
-@pytest.mark.slow
-def test_one_nan_sample_does_not_poison_the_table(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def with_a_nan(config: StudyConfig) -> StudyPlan:
-        plan = plan_study(config)
-        (group,) = plan.groups
-        # A cost that is undefined for about one rollout in four.
-        threshold = float(group.task.theta[0]) * 0.75e-5
-
-        def final_cost(state):
-            return jnp.where(state.qpos[0] > threshold, group.task.final_cost(state), jnp.nan)
-
-        task = group.task.replace(final_cost=final_cost)
-        return dataclasses.replace(plan, groups=(dataclasses.replace(group, task=task),))
-
-    monkeypatch.setattr(plan_module, "plan_study", with_a_nan)
-    arguments = ["compare", "pusher", *SMALL, "--samples", "32", "--stiffness", "10", "--contact", "penalty"]
-    assert cli.main(arguments) == 0
-    printed = capsys.readouterr().out
-    assert re.search(r"warning: \d+ samples overflowed or became NaN and were left out", printed)
-    row = next(line for line in printed.splitlines() if "ZoBG" in line)
-    assert "nan" not in row
-
-
-def test_help_teaches(capsys: pytest.CaptureFixture[str]) -> None:
-    for command in ([], ["compare"], ["gradcheck"], ["bench"], ["tasks"]):
-        with pytest.raises(SystemExit) as stop:
-            cli.main([*command, "--help"])
-        assert stop.value.code == 0
-    text = capsys.readouterr().out
-    for taught in ("mjx-study compare pusher", "penalty", "zobg", "N/m", "epsilon", "residual"):
-        assert taught in text
-
-
-@pytest.mark.parametrize(("command", "analytic"), [("compare", True), ("diagnose", False), ("gradcheck", False)])
-def test_help_lists_the_families_that_a_command_takes(
-    command: str, analytic: bool, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with pytest.raises(SystemExit):
-        cli.main([command, "--help"])
-    families = re.search(r"--contact FAMILY\S*\s+contact family: ([^(]*)", capsys.readouterr().out)
-    assert families and ("reference" in families[1]) == analytic and "penalty" in families[1]
-
-
-def test_the_contact_of_surrogate_derivatives_is_named(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        cli.main(["compare", "--help"])
-    assert re.search(r"--backward-stiffness K\s+stiffness of --backward \[N/m\]", capsys.readouterr().out)
 
 
 def test_version(capsys: pytest.CaptureFixture[str]) -> None:
@@ -272,23 +205,3 @@ def test_the_log_level_of_xla_is_the_users_where_it_is_set(monkeypatch: pytest.M
         if given is None:
             monkeypatch.delenv("TF_CPP_MIN_LOG_LEVEL")
         assert cli.main(["estimators"]) == 0 and os.environ["TF_CPP_MIN_LOG_LEVEL"] == found
-
-
-def test_interruption_leaves_only_what_is_complete(tmp_path: Path) -> None:
-    folder = tmp_path / "out"
-    # A shell's background job ignores the interrupt, and so would its children.
-    listen = "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler)"
-    command = [sys.executable, "-c", f"{listen}; from mjx_study.cli import main; sys.exit(main())"]
-    command += ["compare", "pusher", "--output", str(folder)]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    deadline = time.monotonic() + 60
-    while not folder.exists():  # made once the options are checked, before computing
-        assert time.monotonic() < deadline and process.poll() is None
-        time.sleep(0.05)
-    time.sleep(1)
-    process.send_signal(signal.SIGINT)
-    out, err = process.communicate(timeout=120)
-    assert process.returncode == 130
-    assert err.strip().splitlines()[-1] == "mjx-study: interrupted; the same command resumes where it stopped"
-    assert out == "" and "Traceback" not in err
-    assert {path.name for path in folder.rglob("*")} <= {"study.json", "study.lock", "cells"}

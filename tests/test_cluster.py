@@ -28,10 +28,11 @@ import yaml
 from mjx_study import cli
 from mjx_study.execution import cluster
 from mjx_study.execution.cluster import TRIES
-from mjx_study.execution.run import load_study, run_study, warnings_of
+from mjx_study.execution.run import run_study
 from mjx_study.experiment.checkpoint import StudyError
 from mjx_study.options.configuration import StudyConfig
-from mjx_study.storage.folder import Store
+from mjx_study.results.warnings import warnings_of
+from mjx_study.storage.folder import Store, load_study
 from tests.poison import ACCOUNT, CRASH, RAISE, SLOW
 from tests.test_sweep import same
 

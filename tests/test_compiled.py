@@ -16,7 +16,7 @@ import estimators
 from mjx_study import compiled, identity
 from mjx_study.compiled import Compiled
 from mjx_study.execution.run import run_study
-from mjx_study.experiment import gradients
+from mjx_study.experiment import gradient_numbers, gradients
 from mjx_study.objective import Simulator, programs
 from mjx_study.options.configuration import StudyConfig
 from mjx_study.tasks import Task, make_task
@@ -138,12 +138,12 @@ def test_statistics_of_seeds_and_structures_come_back(folder: Path):
     batches, samples = jax.tree.map(lambda leaf: leaf[None], drawn), np.asarray(len(keys))
     others = samples, reference, jax.random.split(jax.random.key(1), 1)
     with jax.debug_key_reuse(False):
-        first = gradients._seed_numbers(chosen, 0.9)(batches, *others)
-        gradients._seed_numbers.cache_clear()
-        again = gradients._seed_numbers(chosen, 0.9)(batches, *others)
+        first = gradient_numbers.seed_numbers(chosen, 0.9)(batches, *others)
+        gradient_numbers.seed_numbers.cache_clear()
+        again = gradient_numbers.seed_numbers(chosen, 0.9)(batches, *others)
         assert len(list(folder.glob("*.trace"))) == 3
-        padded = jax.tree.map(lambda leaf: gradients._padded(leaf, 2 * len(keys)), batches)
-        filled = gradients._seed_numbers(chosen, 0.9)(padded, *others)
+        padded = jax.tree.map(lambda leaf: gradient_numbers.padded(leaf, 2 * len(keys)), batches)
+        filled = gradient_numbers.seed_numbers(chosen, 0.9)(padded, *others)
     assert first[0]["alpha"] is not None and first[1]["alpha"] is None
     jax.tree.map(np.testing.assert_array_equal, again, first)
     jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-12), filled, first)  # padding is not counted
@@ -155,7 +155,7 @@ def test_statistics_are_compiled_for_the_batches_that_come(
 ):
     """Beside the programs of rollouts, from their forms alone: with another form there would be another trace."""
     monkeypatch.setattr(gradients, "traces_folder", lambda: folder)
-    gradients._seed_numbers.cache_clear()
+    gradient_numbers.seed_numbers.cache_clear()
     needs = {oracle for name in names for oracle in estimators.find_estimator(name).needs}
     chosen = {"contact": ("penalty",), "stiffness": (100.0,), "horizon": 2, "seeds": 3}
     for samples in (6, 6, 5):  # the second time they are compiled; other sizes are padded to the same

@@ -22,7 +22,7 @@ from mjx_study.diagnose.page import document_of, page_lines
 from mjx_study.diagnose.result import Diagnosis
 from mjx_study.diagnose.run import diagnose_task
 from mjx_study.diagnose.setting import setting_of
-from mjx_study.experiment.landscapes import Line, grid, means
+from mjx_study.experiment.quadrature import Line, grid, means
 from mjx_study.gradcheck import Finding
 from mjx_study.objective import Simulator
 from mjx_study.tasks import make_task

@@ -15,12 +15,10 @@ import pytest
 
 from mjx_study import cli, disk
 from mjx_study.cli import options, studies
-from mjx_study.execution import cells as sweep_cells
 from mjx_study.execution.run import run_study
-from mjx_study.experiment.checkpoint import Checkpoint
-from mjx_study.experiment.plan import StudyCell, StudyPlan
+from mjx_study.experiment.study import StudyCell, StudyPlan
 from mjx_study.results.variables import GRADIENTS
-from tests.documents import stages_of
+from tests.documents import stages_of, stub_cells
 
 SIGNALS = """
 import os, signal, sys, time
@@ -172,21 +170,16 @@ def test_a_full_disk_costs_a_landscape_no_number(tmp_path: Path, capsys: pytest.
 def test_a_full_disk_costs_a_study_nothing_that_was_there(
     tmp_path: Path, full: Callable[[], None], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def compute_of(plan: StudyPlan) -> Callable[[StudyCell, Checkpoint], dict[str, np.ndarray]]:
+    def compute(plan: StudyPlan, cell: StudyCell) -> dict[str, np.ndarray]:
+        if cell.samples == 8:
+            full()
         sizes = {"seed": plan.config.batches, "estimator": len(plan.config.estimators)}
+        held = {name: each for name, each in GRADIENTS.items() if "param" not in each.dims}
+        return {
+            name: np.full([sizes[dim] for dim in each.dims], 9.0 if each.digits else 0.0) for name, each in held.items()
+        }
 
-        def compute(cell: StudyCell, part: Checkpoint) -> dict[str, np.ndarray]:
-            if cell.samples == 8:
-                full()
-            held = {name: each for name, each in GRADIENTS.items() if "param" not in each.dims}
-            return {
-                name: np.full([sizes[dim] for dim in each.dims], 9.0 if each.digits else 0.0)
-                for name, each in held.items()
-            }
-
-        return compute
-
-    monkeypatch.setitem(sweep_cells.COMPUTE, "gradients", compute_of)
+    stub_cells(monkeypatch, compute)
     folder = tmp_path / "out"
     arguments = ["sweep", "pusher", "--stiffness", "10", "--contact", "penalty", "--samples", "4,8", "--horizon", "2"]
     out = ended(capsys, *arguments, "--output", str(folder))

@@ -22,7 +22,8 @@ from mjx_study.plots.panels import UNSTABLE, counted, number
 from mjx_study.plots.study import MOST_DECADES, plot_study
 from mjx_study.plots.style import STYLES, combines, fit_to_paper, mark_clipped, style_of
 from mjx_study.report import render_report
-from mjx_study.results.variables import CELL, ONSETS, VARIABLES
+from mjx_study.results.kind import find_kind
+from mjx_study.results.variables import CELL, ONSETS
 from mjx_study.storage.manifest import describe_estimator
 
 OUTER = ("task", "timestep", "cone", "model", "sigma", "samples")
@@ -41,7 +42,7 @@ def study(kind: str, models: list[tuple[str, float]], seeds: int = 1, sigma=(0.1
     sizes = {name: len(values) for name, values in coords.items()} | {"solref_entry": 2}
     data = {}
     changes.setdefault("position", along("point", *range(41)))
-    for name, variable in (VARIABLES[kind] | {"solref": CELL["solref"]}).items():
+    for name, variable in ({**find_kind(kind).variables, "solref": CELL["solref"]}).items():
         dims = (*OUTER, *variable.dims)
         if "param" not in dims:
             full = xr.DataArray(np.full([sizes[dim] for dim in dims], 0.5), dims=dims)
@@ -51,7 +52,7 @@ def study(kind: str, models: list[tuple[str, float]], seeds: int = 1, sigma=(0.1
     used = {dim for array in data.values() for dim in array.dims}
     found = xr.Dataset(data, {name: values for name, values in coords.items() if name in used})
     found = found.assign_coords({n: ("model", [m[k] for m in models]) for k, n in enumerate(("contact", "stiffness"))})
-    config = json.dumps({"confidence": 0.95, "direction": None})
+    config = json.dumps({"confidence": 0.95, "direction": None, "kind": kind})
     return found.assign_attrs(config=config, many_parameters=0)
 
 
@@ -186,7 +187,7 @@ def test_figures_and_reports_of_extreme_numbers_warn_of_nothing(kind: str, value
     counts = {"nonfinite", "unconverged", "position", "residual", *ONSETS}
     config = json.dumps({"confidence": 0.95, "direction": None, "tasks": ["pusher"], "theta": [], "kind": kind})
     for where in (along("model", True, False, False), along("model", True, True, True)):
-        extreme = {name: xr.where(where, value, 0.5) for name in VARIABLES[kind] if name not in counts}
+        extreme = {name: xr.where(where, value, 0.5) for name in find_kind(kind).variables if name not in counts}
         found = study(kind, models, 3, (0.1, 1.0), **extreme)
         assert plot_study(found)
         attrs = {"config": config, "environment": json.dumps({"versions": {}}), "missing_cells": 0}

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mjx_study.graph import scalars
-from mjx_study.graph.build import SWITCH
+from mjx_study.graph.native import SWITCH
 from mjx_study.graph.scalars import traced_part, unrolled
 
 TABLE = np.arange(12.0).reshape(4, 3) - 5

@@ -18,19 +18,20 @@ import xarray as xr
 from mjx_study import identity
 from mjx_study.digest import digest_of
 from mjx_study.disk import write_whole
-from mjx_study.execution import cells as sweep_cells
-from mjx_study.execution.run import load_study, run_study, warnings_of
-from mjx_study.experiment.checkpoint import Checkpoint, StudyError
-from mjx_study.experiment.plan import StudyCell, StudyPlan, plan_study
+from mjx_study.execution.run import run_study
+from mjx_study.experiment.checkpoint import StudyError
+from mjx_study.experiment.plan import plan_study
+from mjx_study.experiment.study import StudyCell, StudyPlan
 from mjx_study.identity import contents, differences, git_revision
 from mjx_study.options.configuration import StudyConfig
+from mjx_study.results.warnings import warnings_of
 from mjx_study.simulation.scene import models_folder
 from mjx_study.storage import cell_files as cell_file
 from mjx_study.storage import folder as store
-from mjx_study.storage.folder import Store
+from mjx_study.storage.folder import Store, load_study
 from mjx_study.tasks import make_task
 from mjx_study.tasks.task import StudyDefaults, Task
-from tests.documents import altered, planned_arrays
+from tests.documents import altered, planned_arrays, stub_cells
 
 MODULE = """
 from functools import partial
@@ -148,11 +149,10 @@ SMALL: dict[str, Any] = {
 
 @pytest.fixture
 def stubbed(monkeypatch: pytest.MonkeyPatch) -> None:
-    def compute_of(plan: StudyPlan) -> Callable[[StudyCell, Checkpoint], dict[str, np.ndarray]]:
-        residual = lambda cell: np.full(len(plan.config.estimators), cell.model.stiffness)  # noqa: E731
-        return lambda cell, part: planned_arrays(plan, cell, residual=residual(cell))
+    def compute(plan: StudyPlan, cell: StudyCell) -> dict[str, np.ndarray]:
+        return planned_arrays(plan, cell, residual=np.full(len(plan.config.estimators), cell.model.stiffness))
 
-    monkeypatch.setitem(sweep_cells.COMPUTE, "gradients", compute_of)
+    stub_cells(monkeypatch, compute)
 
 
 def swept(folder: Path, **changes: Any):

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mjx_study.execution.run import open_store
 from mjx_study.experiment.iteration import make_optimizer
 from mjx_study.experiment.plan import plan_study
 from mjx_study.limits import MOST_CELLS, MOST_MODELS, check_count
@@ -18,6 +17,7 @@ from mjx_study.options.configuration import StudyConfig
 from mjx_study.options.files import digest_of_json, read_theta
 from mjx_study.runtime import default_cache
 from mjx_study.simulation.scene import SceneError, load_model
+from mjx_study.storage.folder import open_store
 from mjx_study.storage.manifest import read_document, sealed
 
 BODY = "<worldbody><body><freejoint/><geom size='0.1'/></body></worldbody>"

@@ -23,22 +23,25 @@ from mjx_study import cli
 from mjx_study.cli import options, studies
 from mjx_study.cli.console import curves
 from mjx_study.cli.studies import as_document
-from mjx_study.execution.run import load_study, run_study
+from mjx_study.execution.run import run_study
 from mjx_study.experiment import landscapes, sampling
 from mjx_study.experiment import plan as plan_module
-from mjx_study.experiment.landscapes import Line, applies, closed_form, compute_landscapes, grid, means
-from mjx_study.experiment.plan import StudyPlan, plan_study
+from mjx_study.experiment.plan import plan_study
+from mjx_study.experiment.quadrature import Line, applies, closed_form, grid, means
 from mjx_study.experiment.resolution import line_of
+from mjx_study.experiment.study import StudyPlan
 from mjx_study.options.configuration import StudyConfig
 from mjx_study.plots.study import plot_study
 from mjx_study.reference import BallWall, FunctionObjective, Heaviside, Quadratic, smoothed
-from mjx_study.results.findings import curves_of, findings_of
+from mjx_study.results.curves import curves_of
+from mjx_study.results.kind import findings_of
 from mjx_study.simulation.dynamics import State
+from mjx_study.storage.folder import load_study
 from mjx_study.tasks import make_task
 from mjx_study.tasks.policy import InitialStatePolicy, LinearFeedback
 from mjx_study.tasks.task import Task
 from tests.carts import WALL, cart
-from tests.documents import altered
+from tests.documents import altered, numbers_of
 
 
 @pytest.fixture(autouse=True)
@@ -283,7 +286,7 @@ def test_samples_that_are_not_finite_are_left_out_and_counted(monkeypatch: pytes
     plan = dataclasses.replace(plan, cells=plan.cells[:1])
     monkeypatch.setattr(sampling.Objectives, "__call__", lambda *_: Broken())
     monkeypatch.setattr(landscapes, "closed_form", lambda *_: None)
-    arrays = compute_landscapes(plan)(plan.cells[0])
+    arrays = numbers_of(plan)
     streams = sampling.cell_keys(0, 1)["order"]
     lost = [int(np.sum(Broken()._noise(jax.random.split(stream[0], 50)) > 0)) for stream in streams]
     assert arrays["nonfinite"].tolist() == [[count] * 2 for count in lost] and min(lost) > 0

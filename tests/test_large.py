@@ -15,21 +15,28 @@ import pytest
 
 from mjx_study import cli
 from mjx_study.execution.cluster import TRIES
-from mjx_study.execution.run import load_study, run_study
+from mjx_study.execution.run import run_study
 from mjx_study.experiment import gradients
-from mjx_study.experiment.blocks import REFERENCE, Arrays, Blocks
-from mjx_study.experiment.gradients import Gradients, compute_gradients
-from mjx_study.experiment.plan import StudyPlan, block_of, blocks_of, plan_study
+from mjx_study.experiment.checkpoint import Arrays, Checkpoint
+from mjx_study.experiment.gradients import GradientComputation, block_of, blocks_of
+from mjx_study.experiment.merged_samples import REFERENCE_UNIT, Blocks
+from mjx_study.experiment.plan import plan_study
 from mjx_study.experiment.sampling import sample_keys
+from mjx_study.experiment.study import StudyPlan
 from mjx_study.options.configuration import StudyConfig
 from mjx_study.results.variables import MEASURED
-from mjx_study.storage.folder import Store
+from mjx_study.storage.folder import Store, load_study
+from tests.documents import numbers_of
 from tests.poison import ACCOUNT, RAISE, SLOW
 from tests.test_sweep import same
 
 SUBSTITUTES = {"bias_p_value", "variance_lower", "variance_upper"}
 """Variables that only rows tell to rounding; the first test of numbers has by how much they differ. Those of norms are
 exact up to 16,384 samples."""
+
+
+Computed = tuple[GradientComputation, StudyPlan, dict[int, Arrays]]
+"""A computation, its plan, and what each work unit of the first cell finds."""
 
 
 def config(**changes: Any) -> StudyConfig:
@@ -64,7 +71,7 @@ def test_blocks_give_the_numbers_of_the_batch() -> None:
     changes: dict[str, Any] = {"samples": (4096,), "estimators": estimators, "max_norm": 50.0, "window": 2}
     whole, blocks = planned(**changes, block_size=None), planned(**changes, block_size=512)
     assert blocks_of(whole, whole.cells[0]) == 1 and blocks_of(blocks, blocks.cells[0]) == 8
-    expected, found = (compute_gradients(plan)(plan.cells[0]) for plan in (whole, blocks))
+    expected, found = (numbers_of(plan) for plan in (whole, blocks))
     assert set(found) == set(expected) > SUBSTITUTES
     for name in set(expected) - SUBSTITUTES - set(MEASURED):
         np.testing.assert_allclose(found[name], expected[name], rtol=1e-11, err_msg=name)
@@ -79,28 +86,36 @@ def test_blocks_give_the_numbers_of_the_batch() -> None:
 
 
 @pytest.fixture(scope="module")
-def cell() -> tuple[Gradients, StudyPlan, dict[int, Arrays]]:
-    """Eleven blocks, of a single seed, and what each task returns."""
+def cell() -> Computed:
+    """Eleven blocks, of a single seed, and what each work unit finds."""
     plan = planned(samples=(84,), seeds=1)
-    compute = compute_gradients(plan)
+    computation = GradientComputation(plan)
     assert blocks_of(plan, plan.cells[0]) == 11
-    return compute, plan, {task: compute.block(plan.cells[0], task) for task in range(12)}
+    units = {unit: computation.compute(plan.cells[0], unit, Checkpoint()).result() for unit in range(12)}
+    return computation, plan, units
 
 
-def in_order(computed: tuple[Gradients, StudyPlan, dict[int, Arrays]], order: Any, *, kept: bool = False) -> Blocks:
-    compute, plan, arrays = computed
-    blocks = compute.begun(plan.cells[0], {})
-    for task in order:
-        blocks.add(int(task), arrays[int(task)])
+def in_order(computed: Computed, order: Any, *, kept: bool = False) -> Blocks:
+    computation, plan, arrays = computed
+
+    def begin(kept: Arrays) -> Blocks:
+        work = computation.begin(plan.cells[0], Checkpoint({name: array.copy() for name, array in kept.items()}))
+        assert isinstance(work, Blocks)
+        return work
+
+    blocks = begin({})
+    for unit in order:
+        blocks.add(int(unit), arrays[int(unit)])
         if kept:
-            blocks = compute.begun(plan.cells[0], {name: array.copy() for name, array in blocks.arrays().items()})
+            blocks = begin(blocks.arrays())
     return blocks
 
 
-def test_not_a_bit_depends_on_the_order_or_on_checkpoints(cell: tuple[Gradients, StudyPlan, dict[int, Arrays]]) -> None:
-    compute, plan, _ = cell
+def test_not_a_bit_depends_on_the_order_or_on_checkpoints(
+    cell: Computed,
+) -> None:
     expected = in_order(cell, range(12))
-    numbers = compute.merged(plan.cells[0], expected)
+    numbers = expected.numbers()
     rng = np.random.default_rng(0)
     for _ in range(20):
         found = in_order(cell, rng.permutation(12), kept=True)
@@ -108,40 +123,43 @@ def test_not_a_bit_depends_on_the_order_or_on_checkpoints(cell: tuple[Gradients,
         assert {name: array.tobytes() for name, array in found.arrays().items()} == {
             name: array.tobytes() for name, array in expected.arrays().items()
         }
-    for name, array in compute.merged(plan.cells[0], found).items():
+    for name, array in found.numbers().items():
         np.testing.assert_array_equal(array, numbers[name], err_msg=name)
 
 
-def test_no_more_is_kept_than_the_logarithm_of_the_blocks(cell: tuple[Gradients, StudyPlan, dict[int, Arrays]]) -> None:
+def test_no_more_is_kept_than_the_logarithm_of_the_blocks(
+    cell: Computed,
+) -> None:
     for late in range(1, 12):
-        order = [task for task in range(12) if task != late]
+        order = [unit for unit in range(12) if unit != late]
         blocks = in_order(cell, order)
         assert blocks.missing == [late] and len(blocks._held) <= 4 + 2  # levels, and the rest of 11
     assert in_order(cell, []).missing == list(range(12))
-    assert in_order(cell, [REFERENCE, 3]).missing == [1, 2, *range(4, 12)]
+    assert in_order(cell, [REFERENCE_UNIT, 3]).missing == [1, 2, *range(4, 12)]
 
 
 def test_a_study_in_blocks_goes_on_where_it_was_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Stopped in the fourth block: the other process computes the rest, to the same bits."""
     done: list[int] = []
-    block = Gradients.block
+    compute = GradientComputation.compute
 
-    def stopping(self: Gradients, cell: Any, task: int) -> Arrays:
+    def stopping(self: GradientComputation, cell: Any, unit: int, checkpoint: Checkpoint) -> Any:
         if len(done) == 4:
             raise KeyboardInterrupt
-        done.append(task)
-        return block(self, cell, task)
+        done.append(unit)
+        return compute(self, cell, unit, checkpoint)
 
-    monkeypatch.setattr(Gradients, "block", stopping)
+    monkeypatch.setattr(GradientComputation, "compute", stopping)
     with pytest.raises(KeyboardInterrupt):
         run_study(config(), tmp_path / "study")
     assert done == [0, 1, 2, 3] and len(list((tmp_path / "study" / "cells").glob("*.part.npz"))) == 1
     rest: list[int] = []
-    monkeypatch.setattr(Gradients, "block", lambda self, cell, task: rest.append(task) or block(self, cell, task))
+    resumed = lambda self, cell, unit, kept: rest.append(unit) or compute(self, cell, unit, kept)  # noqa: E731
+    monkeypatch.setattr(GradientComputation, "compute", resumed)
     told: list[str] = []
     found = run_study(config(), tmp_path / "study", lambda done, total, what: told.append(f"{done} of {total}: {what}"))
     assert rest == list(range(4, 11)) and not list((tmp_path / "study" / "cells").glob("*.part.npz"))
-    assert any(line.startswith("4 of 11: pusher, ") and line.endswith("N = 40, in blocks") for line in told)
+    assert any(line.startswith("5 of 11: pusher, ") and line.endswith("N = 40, in blocks") for line in told)
     assert same(found, run_study(config()))
 
 
@@ -179,7 +197,7 @@ def test_the_first_samples_pick_the_control_variate(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(
         gradients, "reference_of", lambda *args: sizes.append(len(args[4].value)) or reference_of(*args)
     )
-    found = [compute_gradients(plan)(plan.cells[0])["reference"] for plan in (planned(), planned(block_size=None))]
+    found = [numbers_of(plan)["reference"] for plan in (planned(), planned(block_size=None))]
     assert sizes == [12, 12]
     np.testing.assert_allclose(found[0], found[1], rtol=1e-13)
 
@@ -244,14 +262,14 @@ import resource, sys
 from mjx_study.runtime import configure
 configure(cpu_devices=1)
 from mjx_study.experiment import sampling
-from mjx_study.experiment.gradients import compute_gradients
 from mjx_study.experiment.plan import plan_study
+from tests.documents import numbers_of
 from tests.test_sweep_memory import Stub, config
 
 sampling.Simulator = Stub
 plan = plan_study(config(samples=(int(sys.argv[1]),), block_size=10_000, seeds=1, horizon=50))
 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-compute_gradients(plan)(plan.cells[0])
+numbers_of(plan)
 print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1e6)
 """
 

@@ -13,9 +13,10 @@ import pytest
 from mjx_study import cli
 from mjx_study.bench import plan_bench
 from mjx_study.diagnose.run import diagnose_task
-from mjx_study.execution.lost import first_nonfinite, lost_samples
+from mjx_study.execution.lost import first_nonfinite
 from mjx_study.experiment.plan import plan_study
 from mjx_study.options.configuration import StudyConfig
+from mjx_study.results.warnings import lost_samples
 from mjx_study.simulation.dynamics import State, initial_state
 from mjx_study.simulation.scene import put_scene
 from mjx_study.tasks.policy import LinearFeedback, OpenLoop

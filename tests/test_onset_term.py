@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_study.experiment.landscapes import Line, grid, means
+from mjx_study.experiment.quadrature import Line, grid, means
 from mjx_study.objective import Simulator
 from mjx_study.results.findings import ERROR_PER_STRENGTH
 from mjx_study.simulation.branches import jump_term

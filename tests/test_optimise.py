@@ -18,21 +18,23 @@ import estimators
 from estimators import ESTIMATORS, Differentiation, FirstOrder
 from mjx_study import cli, disk
 from mjx_study.cli import motions, options
-from mjx_study.execution.run import load_study, run_study
+from mjx_study.execution.run import run_study
 from mjx_study.experiment import descents, plan, sampling
 from mjx_study.experiment import iteration as descent
-from mjx_study.experiment.checkpoint import StudyError
+from mjx_study.experiment.checkpoint import Checkpoint, StudyError
 from mjx_study.experiment.descents import Backend
 from mjx_study.experiment.iteration import REASONS, begin, make_optimizer
-from mjx_study.experiment.plan import StudyPlan, estimators_of, plan_study
+from mjx_study.experiment.plan import plan_study
+from mjx_study.experiment.study import StudyPlan, estimators_of
 from mjx_study.objective import Simulator
 from mjx_study.options.configuration import StudyConfig
 from mjx_study.options.files import POLICY_OPTIONS
 from mjx_study.reference import ReferenceObjective, Tennis, roll_out
-from mjx_study.results.findings import findings_of
+from mjx_study.results.kind import findings_of
 from mjx_study.results.variables import HISTORY, METRIC
 from mjx_study.storage import cell_files as cell_file
 from mjx_study.storage import folder as store
+from mjx_study.storage.folder import load_study
 from mjx_study.tasks import TASKS, make_task
 from mjx_study.tasks.task import StudyDefaults
 
@@ -96,7 +98,7 @@ def test_a_weight_of_zero_throughout_is_told() -> None:
     stuck = run_study(dataclasses.replace(study, gamma=1e-9))
     (sentence,) = findings_of(stuck)
     assert sentence == (
-        "reference: AoBG equals ZoBG throughout at K = 10, 30 N/m: alpha is 0 in every iteration, generally since its "
+        "reference: AoBG equals ZoBG throughout at K = 10, 30 N/m: alpha is 0 in every iteration, usually because its "
         "bound gamma is below epsilon, the radius of ZoBG's mean (then increase --gamma or --samples), else since no "
         "first-order variance is finite"
     )
@@ -452,7 +454,7 @@ def test_the_descent_costs_little_beside_its_rollouts() -> None:
     """
     planned = plan_study(config(estimators=("aobg",), samples=(100,), horizon=100, iterations=30, seeds=1))
     (group,), (cell,) = planned.groups, planned.cells
-    compute = descents.compute_descents(planned)
+    computation = planned.kind.computation(planned)
     objective = Simulator(group.task, chunk_size=planned.chunk_size).objective(cell.model.contact)
 
     def batch() -> float:
@@ -463,16 +465,20 @@ def test_the_descent_costs_little_beside_its_rollouts() -> None:
         return time.perf_counter() - start
 
     def iteration() -> float:
-        return float(np.min(np.diff(compute(cell)["seconds"][:, 0])))
+        return float(np.min(np.diff(computation.compute(cell, 0, Checkpoint()).result()["seconds"][:, 0])))
 
     pairs = [(iteration(), min(batch() for _ in range(30))) for _ in range(5)]
     least, bare = np.min(pairs, axis=0)
     assert least <= 1.15 * bare, pairs
     small: dict[str, Any] = {"estimators": ("fobg",), "samples": (10,), "horizon": 100, "iterations": 30}
     plans = [plan_study(config(**small, seeds=count)) for count in (1, 10)]
-    computes = [descents.compute_descents(each) for each in plans]
+    computations = [each.kind.computation(each) for each in plans]
     seconds = [
-        [ready(each.cells[0])["seconds"][-1, 0] for each, ready in zip(plans, computes, strict=True)] for _ in range(5)
+        [
+            ready.compute(each.cells[0], 0, Checkpoint()).result()["seconds"][-1, 0]
+            for each, ready in zip(plans, computations, strict=True)
+        ]
+        for _ in range(5)
     ]
     one, ten = np.min(seconds, axis=0)
     assert ten < 0.5 * 10 * one, seconds

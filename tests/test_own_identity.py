@@ -19,14 +19,14 @@ import numpy as np
 import pytest
 
 from estimators import user_inputs
-from mjx_study.execution import cells as study_cells
 from mjx_study.execution.run import run_study
-from mjx_study.experiment.checkpoint import Checkpoint, StudyError
-from mjx_study.experiment.plan import StudyCell, StudyPlan, plan_study
+from mjx_study.experiment.checkpoint import StudyError
+from mjx_study.experiment.plan import plan_study
+from mjx_study.experiment.study import StudyCell, StudyPlan
 from mjx_study.options.configuration import StudyConfig
 from mjx_study.options.files import read_theta
 from mjx_study.storage.folder import Store
-from tests.documents import planned_arrays
+from tests.documents import planned_arrays, stub_cells
 
 TASK = """
 import importlib, os
@@ -200,10 +200,7 @@ def world(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[
 
 @pytest.fixture
 def stubbed(monkeypatch: pytest.MonkeyPatch) -> None:
-    def compute_of(plan: StudyPlan) -> Callable[[StudyCell, Checkpoint], dict[str, np.ndarray]]:
-        return lambda cell, part: planned_arrays(plan, cell)
-
-    monkeypatch.setitem(study_cells.COMPUTE, "gradients", compute_of)
+    stub_cells(monkeypatch, planned_arrays)
 
 
 def swept(folder: Path, task: str = "hopping:hop") -> Any:
@@ -241,15 +238,12 @@ def test_inputs_read_while_computing_count(
     """Metrics are traced when the first cell is computed; until then nothing has been read."""
     (tmp_path / "hopping.py").write_text(TASK.format(text="", cost=PLAIN.format(1.0)) + LATE)
 
-    def compute_of(plan: StudyPlan) -> Callable[[StudyCell, Checkpoint], dict[str, np.ndarray]]:
-        def compute(cell: StudyCell, part: Checkpoint) -> dict[str, np.ndarray]:
-            assert plan.seen.keys() == {"file hopping.py"}
-            plan.groups[cell.group].task.metrics(SimpleNamespace(qpos=np.zeros((2, 1))))  # type: ignore[misc]
-            return planned_arrays(plan, cell)
+    def compute(plan: StudyPlan, cell: StudyCell) -> dict[str, np.ndarray]:
+        assert plan.seen.keys() == {"file hopping.py"}
+        plan.task_of(cell).metrics(SimpleNamespace(qpos=np.zeros((2, 1))))  # type: ignore[misc]
+        return planned_arrays(plan, cell)
 
-        return compute
-
-    monkeypatch.setitem(study_cells.COMPUTE, "gradients", compute_of)
+    stub_cells(monkeypatch, compute)
     world(1.0)
     swept(tmp_path / "out", "hopping:late")
     assert Store.open(tmp_path / "out").document["seen"].keys() == {"file by.txt", "file hopping.py"}

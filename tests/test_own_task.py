@@ -21,11 +21,11 @@ from mjx_study.choices import TASK_GROUP
 from mjx_study.cli import options as settings
 from mjx_study.cli.gradcheck import UNEXERCISED
 from mjx_study.diagnose.measurement import ESTIMATORS
-from mjx_study.execution.run import load_study
 from mjx_study.experiment.plan import plan_study
 from mjx_study.gradcheck import plan_gradcheck
 from mjx_study.options.configuration import StudyConfig
-from mjx_study.results.findings import rows_of
+from mjx_study.results.rows import rows_of
+from mjx_study.storage.folder import load_study
 from mjx_study.tasks import make_task
 from mjx_study.tasks.task import Task
 
@@ -123,30 +123,6 @@ def refused(name: str, **options: Any) -> str:
 
 
 # The page
-
-
-def test_the_example_is_short() -> None:
-    assert len([line for line in PYTHON.splitlines() if line.strip()]) < 20
-    assert len(MJCF.splitlines()) < 25
-
-
-@pytest.mark.slow
-def test_compare(folder: Path) -> None:
-    document = run(folder, "compare", "my_tasks:hopper", "--samples", "4", "--reference-samples", "4")
-    (resolved,) = document["resolved"]
-    assert document["config"]["tasks"] == ["my_tasks:hopper"]
-    assert resolved["horizon"] == [40] and resolved["estimators"]["aobg"]["gamma"] == "inf"
-    assert [row["estimator"] for row in document["rows"]] == ["zobg", "fobg", "aobg"]
-
-
-@pytest.mark.slow
-def test_optimise(folder: Path) -> None:
-    arguments = ["--estimators", "fobg", "--iterations", "2", "--samples", "4", "--seeds", "2", "--learning-rate", "1"]
-    document = run(folder, "optimise", "my_tasks:hopper", *arguments, "--evaluation-samples", "4")
-    (found,) = document["runs"]
-    assert len(found["final_cost"]) == 2 and found["stopped"] == []
-    assert max(found["final_cost"]) < document["start_cost"][0] - 0.05
-    assert len(found["theta"][0]) == 80
 
 
 @pytest.mark.slow
@@ -259,36 +235,12 @@ def test_gradcheck_of_steps_and_means(task: str, document) -> None:
     assert task == "mine:hop" or means[1]["verdict"] == "right"
 
 
-def test_bench(task: str, document) -> None:
-    found = document("bench", task, "--samples", "4")
-    assert found["task"] == task.partition(":")[2] and (found["samples"], found["horizon"]) == (4, 3)
-    assert finite(list(found["ratios"].values())) and all(ratio > 0 for ratio in found["ratios"].values())
-    assert ("onset_per_gradient" in found["ratios"]) == (task == "mine:hop")
-
-
 def test_diagnose(task: str, document) -> None:
     found = document("diagnose", task, "--samples", "23")
     assert found["subject"] == task and found["derivatives"] == "right"
     assert {each["estimator"] for each in found["estimators"]} == set(ESTIMATORS)
     assert finite([each["variance"] for each in found["estimators"]]) and finite(found["gradient_norm"])
     assert (found["best"] in ESTIMATORS) == found["resolved"]
-
-
-@pytest.mark.parametrize(
-    "command",
-    [
-        ["compare", "--samples", "4"],
-        ["landscape", *LINE],
-        ["optimise", "--iterations", "2", "--samples", "4", "--learning-rate", "0.1"],
-        ["sweep", "--samples", "4,8"],
-    ],
-    ids=lambda command: command[0],
-)
-def test_a_dry_run(command: list[str], task: str, document) -> None:
-    name, *own = command
-    told = document(name, task, *own, "--output", "nowhere", "--dry-run")
-    assert told["cells"] >= 1 and told["programs"] >= 1 and told["rollouts"] > told["gradients"] > 0
-    assert not Path("nowhere").exists()
 
 
 @pytest.mark.parametrize("name", ["hopper", "feedback", "thrown"])

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from mjx_study.cli import options
-from mjx_study.experiment.plan import estimators_of, plan_study
+from mjx_study.experiment.plan import plan_study
 from mjx_study.experiment.resolution import configured_estimators
+from mjx_study.experiment.study import estimators_of
 from mjx_study.options.configuration import StudyConfig
 from mjx_study.reference import DoublePendulum, roll_out
 from mjx_study.reference.system import gradients_along

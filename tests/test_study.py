@@ -27,17 +27,20 @@ from estimators.registry import label_of
 from mjx_study import cli, disk
 from mjx_study.cli import console
 from mjx_study.cli.studies import as_document
-from mjx_study.execution.run import run_study, warnings_of
+from mjx_study.execution.run import run_study
 from mjx_study.experiment import sampling
 from mjx_study.experiment.checkpoint import StudyError
-from mjx_study.experiment.plan import estimators_of, plan_study
+from mjx_study.experiment.plan import plan_study
+from mjx_study.experiment.study import estimators_of
 from mjx_study.objective import MjxObjective, Simulator
 from mjx_study.options.configuration import StudyConfig
 from mjx_study.plots.panels import limit
 from mjx_study.plots.study import plot_study
 from mjx_study.plots.style import save_figure
-from mjx_study.results.findings import Row, findings_of, rows_of
+from mjx_study.results.kind import findings_of
+from mjx_study.results.rows import Row, rows_of
 from mjx_study.results.variables import GRADIENTS
+from mjx_study.results.warnings import warnings_of
 from mjx_study.storage.dataset import dataset_of
 from mjx_study.tasks import make_task
 from mjx_study.tasks.task import StudyDefaults, Task
@@ -245,8 +248,8 @@ def test_findings_follow_the_intervals() -> None:
     rows += (row("zobg", 1000, 100), row("fobg", 1000, 1e6))
     (sentence,) = findings_of(result(*rows))
     assert sentence == (
-        "penalty: FoBG's variance is below ZoBG's at K = 10 N/m; above ZoBG's at K = 1000 N/m; not told apart from "
-        "ZoBG's at K = 100 N/m (95 % intervals)"
+        "penalty: FoBG's variance is below ZoBG's at K = 10 N/m; above ZoBG's at K = 1000 N/m; not significantly "
+        "different from ZoBG's at K = 100 N/m (95 % intervals)"
     )
 
 
@@ -284,7 +287,7 @@ def test_seeds_are_counted_and_not_repeated() -> None:
     rows = [row("fobg", 10, 1, relative_error=share, bias_p_value=p) for share, p in zip(shares, p_values, strict=True)]
     parts = [result(row("zobg", 10, variance), each) for each, variance in zip(rows, (100, 100, 1), strict=True)]
     assert findings_of(joined("seed", [0, 1, 2], parts)) == [
-        "penalty: FoBG's variance is not told apart from ZoBG's at K = 10 N/m (95 % intervals)",
+        "penalty: FoBG's variance is not significantly different from ZoBG's at K = 10 N/m (95 % intervals)",
         "penalty: FoBG's mean is biased by 2.5 % at K = 10 N/m in 2 of 3 seeds (p <= 0.001)",
     ]
     below = joined("seed", [0, 1], parts[:2])

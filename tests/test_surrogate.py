@@ -12,7 +12,8 @@ import pytest
 from mjx_study.execution.run import run_study
 from mjx_study.experiment.descents import Backend
 from mjx_study.experiment.iteration import begin, schedule_factors
-from mjx_study.experiment.plan import estimators_of, plan_study
+from mjx_study.experiment.plan import plan_study
+from mjx_study.experiment.study import estimators_of
 from mjx_study.objective import Simulator, simulate
 from mjx_study.options.configuration import StudyConfig
 from mjx_study.simulation.contact import contact_model, soften, stiffness_from_solref

@@ -26,22 +26,24 @@ from estimators import AlphaOrder, DiscontinuityGated
 from mjx_study import cli
 from mjx_study.cli import options
 from mjx_study.cli.sweep import sweep_fields
-from mjx_study.execution.run import load_study, open_store, run_study, warnings_of
+from mjx_study.execution.run import run_study
 from mjx_study.experiment import sampling
 from mjx_study.experiment.checkpoint import StudyError
-from mjx_study.experiment.gradients import Gradients, compute_gradients
-from mjx_study.experiment.plan import estimators_of, plan_study
+from mjx_study.experiment.gradients import GradientComputation
+from mjx_study.experiment.plan import plan_study
+from mjx_study.experiment.study import estimators_of
 from mjx_study.objective import Simulator, simulate
 from mjx_study.options.configuration import StudyConfig
 from mjx_study.plots import study as study_plots
 from mjx_study.report import render_report
 from mjx_study.results.variables import MEASURED
+from mjx_study.results.warnings import warnings_of
 from mjx_study.simulation.contact import stiffness_from_solref
 from mjx_study.storage import cell_files as cell_file
 from mjx_study.storage import folder as store
-from mjx_study.storage.folder import Store
+from mjx_study.storage.folder import Store, load_study, open_store
 from mjx_study.tasks import make_task
-from tests.documents import study_document
+from tests.documents import numbers_of, study_document
 
 pytestmark = pytest.mark.usefixtures("shared_programs")
 
@@ -165,8 +167,7 @@ def test_a_cell_does_not_depend_on_the_others(undisturbed: Path, tmp_path: Path)
     plan = plan_study(config())
     kept = Store.open(undisturbed)
     last = len(plan.cells) - 1
-    compute = compute_gradients(plan)
-    alone = compute(plan.cells[last])
+    alone = numbers_of(plan, plan.cells[last])
     for name, array in kept.read(last).items():
         if name not in MEASURED:
             np.testing.assert_array_equal(array, alone[name], err_msg=name)
@@ -176,7 +177,7 @@ def test_a_cell_is_sampled_beside_the_statistics_of_the_last_one(undisturbed: Pa
     plan = plan_study(config())
     begun = [threading.Event() for _ in (*plan.cells, "done")]
 
-    def beside(self: Gradients, call: Callable[[], Any]) -> Any:
+    def beside(self: GradientComputation, call: Callable[[], Any]) -> Any:
         following = sum(each.is_set() for each in begun)
 
         def late() -> Any:
@@ -185,7 +186,7 @@ def test_a_cell_is_sampled_beside_the_statistics_of_the_last_one(undisturbed: Pa
 
         return self._statistics.submit(late)
 
-    monkeypatch.setattr(Gradients, "_beside", beside)
+    monkeypatch.setattr(GradientComputation, "_in_order", beside)
     data = run_study(plan, tmp_path / "study", lambda done, total, what: begun[done].set())
     assert same(data, load_study(undisturbed))
 

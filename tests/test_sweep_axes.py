@@ -1,20 +1,19 @@
 """Where cells lie: every number of a sweep stands under the values that it was computed with."""
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from mjx_study.execution import cells as sweep_cells
-from mjx_study.execution.run import load_study, run_study
-from mjx_study.experiment.checkpoint import Checkpoint
-from mjx_study.experiment.plan import StudyCell, StudyPlan, plan_study
+from mjx_study.execution.run import run_study
+from mjx_study.experiment.plan import plan_study
+from mjx_study.experiment.study import StudyCell, StudyPlan
 from mjx_study.options.configuration import StudyConfig
 from mjx_study.plots.study import plot_study
+from mjx_study.storage.folder import load_study
 from mjx_study.table import digits_to_tell_apart
-from tests.documents import planned_arrays
+from tests.documents import planned_arrays, stub_cells
 
 SMALL: dict[str, Any] = {"tasks": ("pusher",), "contact": ("penalty",), "samples": (4,), "seeds": 1, "horizon": 2}
 
@@ -23,26 +22,23 @@ SMALL: dict[str, Any] = {"tasks": ("pusher",), "contact": ("penalty",), "samples
 def stubbed(monkeypatch: pytest.MonkeyPatch) -> None:
     """Cells whose numbers say what they were computed with."""
 
-    def compute_of(plan: StudyPlan) -> Callable[[StudyCell, Checkpoint], dict[str, np.ndarray]]:
-        def compute(cell: StudyCell, part: Checkpoint) -> dict[str, np.ndarray]:
-            seeds = plan.config.batches, len(plan.config.estimators)
-            own = {
-                "residual": np.full(seeds[1], cell.model.stiffness),
-                "unconverged": np.full(seeds[1], cell.sigma),
-                "reference_norm": np.asarray(plan.groups[cell.group].timestep),
-                "reference_uncertainty": np.asarray(float(plan.groups[cell.group].task.defaults.gamma)),
-                "variance": np.full(seeds, float(cell.samples)),
-                "alpha": np.full(seeds, 0.5),
-                "squared_bias": np.full(seeds[1], np.nan),
-                "variance_lower": np.full(seeds, cell.samples / 2),
-                "variance_upper": np.full(seeds, 2.0 * cell.samples),
-                **{name: np.ones(seeds) for name in ("relative_error", "relative_error_se")},
-            }
-            return planned_arrays(plan, cell, **own)
+    def compute(plan: StudyPlan, cell: StudyCell) -> dict[str, np.ndarray]:
+        seeds = plan.config.batches, len(plan.config.estimators)
+        own = {
+            "residual": np.full(seeds[1], cell.model.stiffness),
+            "unconverged": np.full(seeds[1], cell.sigma),
+            "reference_norm": np.asarray(plan.groups[cell.group].timestep),
+            "reference_uncertainty": np.asarray(float(plan.groups[cell.group].task.defaults.gamma)),
+            "variance": np.full(seeds, float(cell.samples)),
+            "alpha": np.full(seeds, 0.5),
+            "squared_bias": np.full(seeds[1], np.nan),
+            "variance_lower": np.full(seeds, cell.samples / 2),
+            "variance_upper": np.full(seeds, 2.0 * cell.samples),
+            **{name: np.ones(seeds) for name in ("relative_error", "relative_error_se")},
+        }
+        return planned_arrays(plan, cell, **own)
 
-        return compute
-
-    monkeypatch.setitem(sweep_cells.COMPUTE, "gradients", compute_of)
+    stub_cells(monkeypatch, compute)
 
 
 def swept(folder: Path, **changes: Any):

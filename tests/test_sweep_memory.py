@@ -13,12 +13,13 @@ import pytest
 from estimators import Differentiation, Evaluation
 from mjx_study.experiment import gradients, sampling
 from mjx_study.experiment import memory as sweep_memory
-from mjx_study.experiment.gradients import compute_gradients
-from mjx_study.experiment.plan import memory_of_seed, plan_study, seeds_together
+from mjx_study.experiment.gradients import seeds_together
+from mjx_study.experiment.plan import plan_study
 from mjx_study.objective import MjxObjective, Simulator
 from mjx_study.options.configuration import StudyConfig
 from mjx_study.results.variables import MEASURED
 from mjx_study.simulation.contact import ContactModel
+from tests.documents import numbers_of
 
 
 class Drawn(MjxObjective):
@@ -61,10 +62,10 @@ def test_numbers_do_not_depend_on_how_seeds_are_grouped(monkeypatch: pytest.Monk
     monkeypatch.setattr(gradients, "traces_folder", lambda: None)
     plan = plan_study(config(samples=(8,), seeds=5, estimators=("zobg",)))
     found = []
-    for at_once, groups in ((1e9, 5), (1.0, 1), (2.5 * memory_of_seed(plan, plan.cells[0]), 2)):
+    for at_once, groups in ((1e9, 5), (1.0, 1), (2.5 * plan.memory_of_seed(plan.cells[0]), 2)):
         monkeypatch.setitem(sweep_memory.AT_ONCE, "cpu", at_once)
         assert seeds_together(plan, plan.cells[0]) == groups
-        found.append(compute_gradients(plan)(plan.cells[0]))
+        found.append(numbers_of(plan))
     for other in found[1:]:
         for name, values in found[0].items():
             if name not in MEASURED:
@@ -89,14 +90,14 @@ import resource, sys
 from mjx_study.runtime import configure
 configure(cpu_devices=1)
 from mjx_study.experiment import gradients, sampling
-from mjx_study.experiment.gradients import compute_gradients
 from mjx_study.experiment.plan import plan_study
+from tests.documents import numbers_of
 from tests.test_sweep_memory import Stub, config
 
 sampling.Simulator, gradients.traces_folder = Stub, lambda: None
 plan = plan_study(config(samples=(10_000,), seeds=int(sys.argv[1]), horizon=200))
 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-compute_gradients(plan)(plan.cells[0])
+numbers_of(plan)
 print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1e6)
 """
 

@@ -24,7 +24,8 @@ import nbformat
 from latex2mathml.converter import convert
 
 from mjx_study import cli
-from mjx_study.results.variables import VARIABLES
+from mjx_study.choices import KINDS
+from mjx_study.results.kind import find_kind
 from mjx_study.table import markdown_table
 
 ROOT = Path(__file__).parents[1]
@@ -117,8 +118,9 @@ def page_of_names(package: str) -> str:
 def page_of_variables() -> str:
     """Return the page of variables: a table for each kind of study."""
     parts = ["# Variables of a study", "Dimensions are those within a cell; see [studies](../studies.md#in-python)."]
-    for kind, variables in VARIABLES.items():
-        rows = [(f"`{name}`", ", ".join(each.dims), each.unit, each.description) for name, each in variables.items()]
+    for kind in KINDS:
+        variables = find_kind(kind).variables.items()
+        rows = [(f"`{name}`", ", ".join(each.dims), each.unit, each.description) for name, each in variables]
         parts += [f"## {kind.capitalize()}", markdown_table(rows, ("name", "dimensions", "unit", "meaning"))]
     return "\n\n".join(parts)
 

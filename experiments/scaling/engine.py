@@ -9,14 +9,16 @@ from unittest import mock
 import numpy as np
 
 from mjx_study.execution import cluster
-from mjx_study.experiment.checkpoint import Checkpoint
+from mjx_study.execution.cells import Cells
+from mjx_study.experiment.study import Work
+from mjx_study.progress import silent
 from mjx_study.storage.folder import Store
 
 
 def measure_engine(workers: int, cells: int, seconds: float, programs: int, numbers: int) -> dict[str, Any]:
     """Run the cells and write them; return rates of the whole and of its parts."""
 
-    def sleep(study: bytes, index: int, kept: Any, block: Any) -> Any:
+    def sleep(study: bytes, index: int, kept: Any, unit: int) -> Any:
         import time
 
         import numpy
@@ -33,17 +35,25 @@ def measure_engine(workers: int, cells: int, seconds: float, programs: int, numb
         def program_of(self, cell: int) -> int:
             return cell % programs
 
+        def label(self, cell: int) -> str:
+            return str(cell)
+
+    class Computation:
+        """Cells of one work unit."""
+
+        def begin(self, cell: int, checkpoint: Any) -> Work:
+            return Work()
+
     index = {"cells": [{"label": str(cell), "at": {}} for cell in range(cells)], "config": {}}
-    replaced = {"_compute": sleep, "_packed": lambda plan: b"", "Computation": lambda plan: None}
-    replaced["blocks_of"] = lambda plan, cell: 1
+    replaced = {"_compute": sleep, "_packed": lambda plan: b""}
     with tempfile.TemporaryDirectory() as name, mock.patch.multiple(cluster, **replaced):
         store, writing = Store(Path(name), index), 0.0
         (Path(name) / "cells").mkdir()
         with cluster.connected(f"local:{workers}") as client:
             client.wait_for_workers(workers)
             begun, processor = time.perf_counter(), time.process_time()
-            parts = {cell: Checkpoint() for cell in range(cells)}
-            for done, arrays in cluster.cells_on(client, Plan(), parts, lambda _: None):  # type: ignore[arg-type]
+            given = Cells(Plan(), Computation(), silent)  # type: ignore[arg-type]
+            for done, arrays in cluster.compute_there(client, given, range(cells)):
                 assert isinstance(arrays, dict) and np.all(arrays["values"] == done)
                 before = time.perf_counter()
                 store.write(done, arrays)

@@ -21,7 +21,7 @@ from estimators import Estimator, GradientEstimate, Objective
 from estimators.confidence import student_quantile
 from mjx_study.choices import REFERENCE
 from mjx_study.execution.run import run_study
-from mjx_study.experiment.landscapes import Line, means
+from mjx_study.experiment.quadrature import Line, means
 from mjx_study.objective import Simulator
 from mjx_study.options.configuration import StudyConfig
 from mjx_study.reference import FunctionObjective, smoothed

@@ -7,9 +7,9 @@ from mjx_study.cli.output import computing, print_report
 from mjx_study.options.parser import Parser
 
 EPILOG = """\
-Rates in one run on this machine: rollouts and gradients, against jax.grad through mjx.step (with the one solver
-iteration that it can differentiate) and against the C engine's centred mjd_transitionFD with an adjoint, on as many
-threads.
+Measures rollouts and gradients per second in a single run on this machine, and compares them with jax.grad through
+mjx.step (with one solver iteration, all that it can differentiate) and with the C engine's centred mjd_transitionFD
+and an adjoint, on the same number of threads.
 """
 
 

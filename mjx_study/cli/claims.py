@@ -10,9 +10,10 @@ from mjx_study.cli.output import RESUMABLE, attempt, computing, print_report
 from mjx_study.options.parser import DEVICES, Parser, UsageError
 
 EPILOG = """\
-Each claim has a statistic, a range of values for which the claim holds, and a range for which its opposite holds. The
-statistic's confidence interval decides: holds, fails, reversed, or undecided, with the number of samples that would
-decide. All intervals hold at once with probability 95 % (Bonferroni), whichever claims are run.
+Each claim has a statistic, a range of values in which the claim holds, and a range in which its opposite holds. The
+statistic's confidence interval decides between holds, fails, reversed and undecided; for the last, the number of
+samples that would decide is printed. All intervals hold simultaneously with probability 95 % (Bonferroni), whichever
+claims are run.
 
 With --output, measurements are saved as they are made: a stopped run can be resumed, and a claim whose definition or
 code has changed is measured again. The folder also gets claims.json, claims.md and claims.png.

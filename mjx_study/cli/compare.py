@@ -8,7 +8,7 @@ from mjx_study.choices import FAMILIES
 from mjx_study.cli.options import study_fields
 from mjx_study.options.configuration import BUILDER_OPTIONS, StudyConfig
 from mjx_study.options.parser import Parser
-from mjx_study.results.variables import COLUMNS, DETAILS, MARKS, explained
+from mjx_study.results.variables import COLUMNS, DETAILS, GRADIENTS, MARKS, explained
 from mjx_study.table import described
 
 EPILOG = f"""\
@@ -25,10 +25,10 @@ contact families (K: from --stiffness):
 {described({item.name: item.description for item in FAMILIES.values()})}
 
 columns of the table:
-{explained("gradients", *(name for group in COLUMNS for name in group if name not in DETAILS))}
+{explained(GRADIENTS, *(name for group in COLUMNS for name in group if name not in DETAILS))}
 
 and with --details:
-{explained("gradients", *DETAILS, "top_share")}
+{explained(GRADIENTS, *DETAILS, "top_share")}
 
 {MARKS}
 ?: too few effective samples; do not trust the number.
@@ -54,7 +54,8 @@ def add(command: Parser) -> None:
 def run(options: argparse.Namespace) -> int:
     from mjx_study.cli.console import gradient_lines, rows_as_json
     from mjx_study.cli.studies import run_one
-    from mjx_study.experiment.plan import StudyPlan, plan_study
+    from mjx_study.experiment.plan import plan_study
+    from mjx_study.experiment.study import StudyPlan
 
     def planned() -> StudyPlan:
         return plan_study(StudyConfig(**study_fields(options), seeds=1))

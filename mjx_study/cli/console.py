@@ -16,8 +16,22 @@ from estimators.registry import label_of
 from mjx_study.choices import FAMILIES, REFERENCE
 from mjx_study.experiment.iteration import REASONS
 from mjx_study.options.configuration import OPTIONS, SCENE_OPTIONS
-from mjx_study.results.findings import Row, curves_of, findings_of, line_of, onset_of, remains, rows_of
-from mjx_study.results.variables import COLUMNS, DEBIASED, DERIVED, DETAILS, HISTORY, MARKS, METRIC, QUANTITIES, START
+from mjx_study.results.curves import curves_of, line_of
+from mjx_study.results.kind import findings_of
+from mjx_study.results.rows import Row, onset_of, remains, rows_of
+from mjx_study.results.variables import (
+    COLUMNS,
+    COORDINATES,
+    DEBIASED,
+    DERIVED,
+    DESCENTS,
+    DETAILS,
+    GRADIENTS,
+    HISTORY,
+    MARKS,
+    METRIC,
+    START,
+)
 from mjx_study.table import format_table, number, percent, with_error
 
 Column = tuple[str, Callable[[Row], str]]
@@ -33,7 +47,7 @@ def _debiased(row: Row, name: str) -> str:
     """Format a value and what remains of it without noise."""
     value, debiased, error = (getattr(row, each) for each in (name, DEBIASED[name], f"{DEBIASED[name]}_se"))
     left, doubt = remains(name, value, debiased, error), _doubt(row)
-    return f"{QUANTITIES['gradients'][name].text(value)} -> {left.removesuffix('-') if doubt else left}{doubt}"
+    return f"{GRADIENTS[name].text(value)} -> {left.removesuffix('-') if doubt else left}{doubt}"
 
 
 def _doubt(row: Row) -> str:
@@ -44,7 +58,7 @@ def _doubt(row: Row) -> str:
 def columns(confidence: float, onset: str, *, details: bool, scalar: bool) -> list[list[Column]]:
     """Columns of the comparison: those that identify a row, then groups that a table keeps together; a scalar parameter
     has no cosine."""
-    quantities = QUANTITIES["gradients"]
+    quantities = GRADIENTS | COORDINATES | DERIVED
 
     def interval(row: Row) -> str:
         return (
@@ -125,8 +139,8 @@ def gradient_lines(dataset: xr.Dataset, document: dict[str, Any], details: bool 
         lines += [
             f"Errors are against an unbiased zeroth-order reference gradient, {config['reference_samples']} pairs "
             "of rollouts with a control variate;",
-            f"its own relative uncertainty is {low if low == high else f'{low} to {high}'}, and smaller errors cannot "
-            "be told from zero.",
+            f"its own relative uncertainty is {low if low == high else f'{low} to {high}'}, and smaller errors are "
+            "not significant.",
             MARKS,
         ]
     lines.append("ms: computing time of one sample; variance x s: the variance times it, in seconds.")
@@ -221,8 +235,8 @@ def descent_lines(dataset: xr.Dataset, document: dict[str, Any]) -> list[str]:
         where = f"{where}, K = {config['stiffness']:g} N/m"
     metrics = "".join(f", {name} {number(value, 3)}" for name, value in document["start_metrics"].items())
     decay = f" / i^{config['decay']:g}" if config["decay"] else ""
-    start, (mean, error) = QUANTITIES["descents"]["start_cost"], document["start_cost"]
-    shown = [QUANTITIES["descents"][name].heading for name in DESCENT_COLUMNS]
+    start, (mean, error) = DESCENTS["start_cost"], document["start_cost"]
+    shown = [(DESCENTS | DERIVED)[name].heading for name in DESCENT_COLUMNS]
     headings = ["estimator", *shown[:2], *document["start_metrics"], *shown[2:]]
     lines = [
         f"{config['task']}: {where}; {config['optimizer']}, learning rate {config['learning_rate']:g}{decay}, "
@@ -240,7 +254,7 @@ def descent_lines(dataset: xr.Dataset, document: dict[str, Any]) -> list[str]:
 
 
 def _row(run: dict[str, Any], onset: str) -> list[str]:
-    digits, costs = QUANTITIES["descents"]["final_cost"].digits, _finite(run["final_cost"])
+    digits, costs = DESCENTS["final_cost"].digits, _finite(run["final_cost"])
     length = len(run["seconds"])
     weights = _finite([weight for row in run["history"]["alpha"][-max(1, length // 10) :] for weight in row])
     return [
@@ -248,7 +262,7 @@ def _row(run: dict[str, Any], onset: str) -> list[str]:
         _with_spread(np.mean, costs, digits),
         _with_spread(np.min, costs, digits).partition(" ")[0],
         *(_with_spread(np.mean, _finite(values), 3) for values in run["metrics"].values()),
-        QUANTITIES["descents"]["alpha"].text(float(np.mean(weights))) if len(weights) else "-",
+        DESCENTS["alpha"].text(float(np.mean(weights))) if len(weights) else "-",
         str(run["rollouts_per_iteration"] * length),
         number(run["seconds"][-1], 2) if length else "-",
     ]

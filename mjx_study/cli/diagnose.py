@@ -20,8 +20,8 @@ columns of the contacts and of the estimators:
 {explain(*CONTACTS, *ESTIMATES)}
 
 The error is that of a gradient from as many samples as this machine computes in a second. Means are checked along
-paths, as in gradcheck --mean, and so is the bias. At least 23 samples are drawn, whatever --samples. Exit code 1 if a
-derivative is wrong.
+paths, as in gradcheck --mean, and so is the bias. At least 23 samples are drawn, even if --samples is smaller. Exit
+code 1 if a derivative is wrong.
 """
 
 

@@ -7,7 +7,7 @@ from mjx_study.cli.options import given_options, study_fields
 from mjx_study.options.configuration import BUILDER_OPTIONS, REQUIRED_OPTIONS, StudyConfig
 from mjx_study.options.option import OptionError
 from mjx_study.options.parser import MIDDLE, Parser
-from mjx_study.results.variables import explained
+from mjx_study.results.variables import LANDSCAPES, explained
 
 EPILOG = f"""\
 examples:
@@ -15,15 +15,15 @@ examples:
   mjx-study landscape momentum_transfer --contact penalty,mujoco_default --stiffness 3000,100000
   mjx-study landscape pusher --direction 0 --span=-2,2   the first of 200 forces
 
-columns of the table, which shows where the mean cost is least on the line:
-{explained("landscapes", "least_at", "least_cost")}
+columns of the table, the minimum of the mean cost along the line:
+{explained(LANDSCAPES, "least_at", "least_cost")}
 
 The figure shows costs above, and slopes below, with 95 % bands. Where the mean cost with noise has a slope that the
 mean of FoBG lacks, the cost jumps: first-order gradients do not see jumps.
 
 For a scalar initial-state parameter with a fixed start, both slopes are also computed without sampling error, by
-quadrature over 1500 rollouts and gradients per contact model (more if --noise has heavy tails), whatever --points and
---samples.
+quadrature over 1500 rollouts and gradients per contact model (more if --noise has heavy tails), independently of
+--points and --samples.
 """
 
 
@@ -45,7 +45,8 @@ def add(command: Parser) -> None:
 def run(options: argparse.Namespace) -> int:
     from mjx_study.cli.console import curve_lines, curves
     from mjx_study.cli.studies import run_one
-    from mjx_study.experiment.plan import StudyPlan, plan_study
+    from mjx_study.experiment.plan import plan_study
+    from mjx_study.experiment.study import StudyPlan
     from mjx_study.tasks import task_with_options
 
     def planned() -> StudyPlan:

@@ -11,15 +11,15 @@ from mjx_study.disk import write_whole
 from mjx_study.options.configuration import BUILDER_OPTIONS, UNSET_TASK, StudyConfig
 from mjx_study.options.option import OptionError
 from mjx_study.options.parser import MIDDLE, Parser
-from mjx_study.results.variables import explained
+from mjx_study.results.variables import DESCENTS, explained
 
 EPILOG = f"""\
-Every estimator starts from the task's theta, or from --theta, and draws the same noise. --learning-rate, --iterations
-and --samples default to the task's own, which are the paper's: plain gradient descent.
+All estimators start from the task's theta, or from --theta, and draw the same noise. --learning-rate, --iterations and
+--samples default to the task's recipe, the paper's plain gradient descent.
 
-With --output DIR, a study is written: its numbers (for plot, report, load_study), descent.png and .pdf (cost against
-iterations, rollouts and seconds; alpha), and each estimator's policy of its best seed (policy-NAME.json, for
---theta). The same command resumes a stopped run, repeating at most 20 s, or extends it with more --iterations.
+--output DIR writes a study: its numbers (for plot, report, load_study), descent.png and .pdf (cost against iterations,
+rollouts and seconds; alpha), and for each estimator the policy of its best seed (policy-NAME.json, for --theta). The
+same command resumes a stopped run, repeating at most 20 s, or extends it to more --iterations.
 
 examples:
   mjx-study optimise pusher --contact penalty --stiffness 1000 --output out
@@ -29,10 +29,10 @@ examples:
   mjx-study rollout pusher --theta out/policy-aobg.json
 
 columns of the table:
-{explained("descents", "final_cost", "best_cost", "alpha", "seed_rollouts", "seconds")}
+{explained(DESCENTS, "final_cost", "best_cost", "alpha", "seed_rollouts", "seconds")}
 
-A task's own counts, such as hit, have a column each. Costs and counts are means over --evaluation-samples rollouts,
-the same for all, ± their standard deviation over seeds; alpha is the mean over the last tenth of the iterations.
+Each task metric, such as hit, has its own column. Costs and metrics are means over --evaluation-samples rollouts, the
+same for all estimators, ± the standard deviation over seeds; alpha is the mean over the last tenth of the iterations.
 """
 
 
@@ -43,7 +43,7 @@ def add(command: Parser) -> None:
     command.add_flag("--reference", "use the analytic reference instead of MJX")
     command.add_options("network", "estimators", "iterations")
     command.add_option("samples", many=False, unset=UNSET_TASK)
-    command.add_option("seeds", default=3, line="number of descents, each with noise of its own")
+    command.add_option("seeds", default=3, line="number of descents, each with independent noise")
     command.add_options("optimizer", "learning_rate", "decay", "stiffness_schedule", "sigma_schedule")
     command.add_estimator_options()
     command.add_backward_options(many=False)
@@ -54,7 +54,8 @@ def add(command: Parser) -> None:
 def run(options: argparse.Namespace) -> int:
     from mjx_study.cli.console import descent_lines, descents
     from mjx_study.cli.studies import run_one
-    from mjx_study.experiment.plan import StudyPlan, plan_study
+    from mjx_study.experiment.plan import plan_study
+    from mjx_study.experiment.study import StudyPlan
 
     def planned() -> StudyPlan:
         if options.reference and options.contact not in (None, REFERENCE):

@@ -11,10 +11,10 @@ from mjx_study.options.parser import Parser
 
 FORMAT = Option("format", str, "FORMAT", "of: {}", choices=FIGURE_FORMATS, many=True, default=("png", "pdf"))
 EPILOG = """\
-Draws whatever the study has numbers for: variance, bias and alpha against stiffness, error against samples, maps over
-two swept parameters; for descents, achieved cost against stiffness, and cost against iterations, rollouts and seconds;
-for landscapes, costs and slopes. Works while the study is still being computed. --style paper gives column or page
-width, no title, and embedded 8-point type.
+Draws every figure for which the study has numbers: variance, bias and alpha against stiffness, error against samples,
+maps over two swept parameters; for descents, achieved cost against stiffness, and cost against iterations, rollouts and
+seconds; for landscapes, costs and slopes. Works while the study is still being computed. --style paper gives column or
+page width, no title, and embedded 8-point type.
 
 examples:
   mjx-study plot out
@@ -33,9 +33,10 @@ def add(command: Parser) -> None:
 def run(options: argparse.Namespace) -> int:
     from mjx_study._matplotlib import matplotlib
     from mjx_study.disk import prepare_folder
-    from mjx_study.execution.run import load_study, warnings_of
     from mjx_study.plots.study import plot_study
     from mjx_study.plots.style import STYLES, fit_to_paper, save_figures
+    from mjx_study.results.warnings import warnings_of
+    from mjx_study.storage.folder import load_study
 
     with usage_errors():
         dataset = load_study(options.folder)

@@ -23,8 +23,9 @@ def add(command: Parser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     from mjx_study.disk import prepare_folder, write_whole
-    from mjx_study.execution.run import load_study, warnings_of
     from mjx_study.report import render_report
+    from mjx_study.results.warnings import warnings_of
+    from mjx_study.storage.folder import load_study
 
     with usage_errors():
         dataset = load_study(options.folder)

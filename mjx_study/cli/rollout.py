@@ -10,10 +10,10 @@ from mjx_study.options.parser import MIDDLE, Parser
 EPILOG = """\
 Simulates one rollout and shows it: strip.png (pictures at equal intervals), stroboscope.png (one picture with ghosts),
 rollout.gif or .mp4, and trajectory.npz (time [s], qpos, qvel, controls). Without OpenGL everything is drawn from the
-model's geometry; with it, strip and film are MuJoCo's own renderings.
+model's geometry; with it, MuJoCo renders strip and film.
 
-TASK may also be an MJCF file of your own (FILE.xml): MuJoCo's C engine simulates it, from its first keyframe if it has
-one, for 2 s unless --horizon is given.
+TASK may also be any MJCF file (FILE.xml), which MuJoCo's C engine simulates for 2 s, or for --horizon steps, from its
+first keyframe if it has one.
 
 examples:
   mjx-study rollout pusher

@@ -15,13 +15,14 @@ from mjx_study.cli.output import RESUMABLE, attempt, computing, print_report
 from mjx_study.execution.cluster import connected
 from mjx_study.execution.forecast import forecast_study
 from mjx_study.execution.lost import all_lost
-from mjx_study.execution.run import load_study, open_store, run_study, warnings_of
+from mjx_study.execution.run import run_study
 from mjx_study.experiment.checkpoint import StudyError
-from mjx_study.experiment.plan import StudyPlan
+from mjx_study.experiment.study import StudyPlan
 from mjx_study.options.parser import UsageError
 from mjx_study.plots.study import plot_study
 from mjx_study.plots.style import save_figures
-from mjx_study.storage.folder import Store
+from mjx_study.results.warnings import warnings_of
+from mjx_study.storage.folder import Store, load_study, open_store
 from mjx_study.table import as_plain, digits_to_tell_apart, size
 
 KEPT = "results.nc (every number), study.json (the configuration), cells/ (checkpoints)"
@@ -104,9 +105,8 @@ def _compute_in(store: Store, plan: StudyPlan, options: argparse.Namespace, *, k
 
 def _announce(plan: StudyPlan, options: argparse.Namespace) -> int:
     """Print the forecast cost of a study."""
-    cluster = getattr(options, "cluster", None)
     with usage_errors():
-        found = forecast_study(plan, options.output, accept_versions=options.accept_versions, cluster=cluster)
+        found = forecast_study(plan, options.output, accept_versions=options.accept_versions)
     lines = [*found.lines, *(f"warning: {message}" for message in plan.warnings)]
     return print_report(options, dataclasses.asdict(found) | {"warnings": list(plan.warnings)}, lines)
 
@@ -148,15 +148,13 @@ def run_sweep(options: argparse.Namespace, planned: Callable[[], StudyPlan]) -> 
 
 def _sweep_head(plan: StudyPlan, missing: int) -> list[str]:
     config = plan.config
-    lengths = _listed(group.recipe.iterations for group in plan.groups if group.recipe)
-    kind = {"descents": f"descents of {lengths} iterations", "landscapes": f"{config.points} points"}
     models = {(cell.model.family, cell.model.stiffness) for cell in plan.cells}
     work = missing and (
         f"; {plan.compilations} programs to compile, chunks of {plan.chunk_size} samples, "
         f"about {size(plan.memory)} for the batches of a cell"
     )
     return [
-        f"{', '.join(config.task_names)}: {kind.get(config.settings.kind, config.settings.kind)}, "
+        f"{', '.join(config.task_names)}: {plan.kind.describe(plan)}, "
         f"{', '.join(config.estimator_names)}, seeds {config.batches}",
         f"contact models: {len(models)}, timestep {_listed(group.timestep for group in plan.groups)} s, "
         f"{', '.join(dict.fromkeys(group.cone for group in plan.groups))} cone, "

@@ -1,44 +1,116 @@
-"""Compute a study's cells, by kind of study."""
+"""The cells that a run computes: work units, checkpoints and progress, wherever a unit is computed."""
 
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import Future
-from typing import Any, Final
+from contextlib import suppress
+from typing import Any
 
-from mjx_study.execution.forecast import rest
-from mjx_study.experiment.blocks import Arrays
-from mjx_study.experiment.checkpoint import Checkpoint
-from mjx_study.experiment.descents import compute_descents
-from mjx_study.experiment.gradients import Gradients, compute_gradients, done
-from mjx_study.experiment.landscapes import compute_landscapes
-from mjx_study.experiment.plan import StudyCell, StudyPlan
-from mjx_study.stopwatch import timed
-
-COMPUTE: Final[dict[str, Callable[[StudyPlan], Any]]] = {
-    "gradients": compute_gradients,
-    "descents": compute_descents,
-    "landscapes": compute_landscapes,
-}
+from mjx_study.experiment.checkpoint import Arrays, Checkpoint
+from mjx_study.experiment.study import Computation, StudyPlan, Work
+from mjx_study.progress import Progress
+from mjx_study.storage.folder import Store
 
 
-class Computation:
-    """Computes the cells of a plan by `compute`, which keeps compiled programs; for cells in blocks, see
-    `Gradients`."""
+class Cells:
+    """Cells of a plan, from their checkpoints in a folder, if there is one, to their numbers."""
 
-    def __init__(self, plan: StudyPlan):
-        self._plan, self.compute = plan, COMPUTE[plan.settings.kind](plan)
+    def __init__(self, plan: StudyPlan, computation: Computation, progress: Progress, store: Store | None = None):
+        self.plan, self.computation = plan, computation
+        self._progress, self._store = progress, store
+        self.done = 0
+        self._works: dict[int, tuple[Checkpoint, Work]] = {}
+        self._compiled: set[Any] = {None}
 
-    def __call__(self, cell: StudyCell, part: Checkpoint) -> Arrays:
-        """Compute a cell, resuming from its checkpoint (landscapes have none)."""
-        return self.end(cell, self.begin(cell, part))
+    def begin(self, index: int) -> list[int]:
+        """Begin a cell, and return its unfinished work units."""
+        checkpoint = self._checkpoint(index)
+        work = self.computation.begin(self.plan.cells[index], checkpoint)
+        self._works[index] = checkpoint, work
+        return work.missing
 
-    def begin(self, cell: StudyCell, part: Checkpoint) -> Future[Arrays]:
-        """Sample a cell; on accelerators its statistics may still be running on return."""
-        with timed(rest(self._plan, cell)):
-            if isinstance(self.compute, Gradients):
-                return self.compute.begin(cell, part)
-            return done(self.compute(cell, part))
+    def compute(self, index: int, unit: int) -> Future[Arrays]:
+        """Compute a unit in this process."""
+        return self.computation.compute(self.plan.cells[index], unit, self._works[index][0])
 
-    def end(self, cell: StudyCell, begun: Future[Arrays]) -> Arrays:
-        """Wait for a cell's numbers."""
-        with timed(rest(self._plan, cell), calls=0):
-            return begun.result()
+    def kept(self, index: int) -> Arrays:
+        """Checkpoint of a cell of one unit, which that unit continues."""
+        checkpoint, work = self._works[index]
+        return dict(checkpoint.kept) if work.units == 1 else {}
+
+    def finish(self, index: int, unit: int, arrays: Arrays) -> Arrays | None:
+        """Add what a unit found; return the cell's numbers if no other unit is missing."""
+        checkpoint, work = self._works[index]
+        work.add(unit, arrays)
+        if work.units > 1:
+            checkpoint.save(work.arrays())
+            left = len(work.missing)
+            checkpoint.report(work.units - left, work.units, f"{self.label(index)}, in blocks")
+        return None if work.missing else self.end(index)
+
+    def end(self, index: int) -> Arrays:
+        """The numbers of a cell of which no unit is missing."""
+        self.done += 1
+        return self._works.pop(index)[1].numbers()
+
+    def drop(self, index: int) -> bool:
+        """Give up a cell; False if that has happened before."""
+        return self._works.pop(index, None) is not None
+
+    def running(self, index: int) -> bool:
+        """Whether a cell is begun, and neither finished nor given up."""
+        return index in self._works
+
+    def label(self, index: int) -> str:
+        return self.plan.label(self.plan.cells[index])
+
+    def announce(self, index: int) -> None:
+        """Report that this process computes a cell next."""
+        program = self.plan.program_of(self.plan.cells[index])
+        self.report(self.label(index) + ("" if program in self._compiled else " (compiling first)"))
+        self._compiled.add(program)
+
+    def report(self, what: str) -> None:
+        """Report progress in whole cells."""
+        self._progress(self.done, len(self.plan.cells), what)
+
+    def _checkpoint(self, index: int) -> Checkpoint:
+        """A cell's checkpoint; failing to write it must not cost the cell."""
+        label, store = self.label(index), self._store
+
+        def within(done: int, total: int, what: str) -> None:
+            self._progress(done, total, what) if len(self.plan.cells) == 1 else self.report(label)
+
+        def save(arrays: Arrays) -> None:
+            with suppress(OSError):
+                store.write_part(index, arrays)  # type: ignore[union-attr]
+
+        if store is None:
+            return Checkpoint(report=within)
+        return Checkpoint(store.read_part(index), save, within, str(store.part_path(index)))
+
+
+Executor = Callable[[Cells, Iterable[int]], Generator[tuple[int, Arrays | str]]]
+"""Computes cells, and yields each with its numbers, or with the reason why it failed."""
+
+
+def compute_here(cells: Cells, indices: Iterable[int]) -> Generator[tuple[int, Arrays]]:
+    """Compute cells in this process; on accelerators, a unit begins before the statistics of the one before end."""
+    running: deque[tuple[int, int, Future[Arrays]]] = deque()
+
+    def finished(wait: int) -> Generator[tuple[int, Arrays]]:
+        """Cells whose last unit has ended, waiting until so many units are left."""
+        while len(running) > wait or (running and running[0][2].done()):
+            index, unit, found = running.popleft()
+            if (numbers := cells.finish(index, unit, found.result())) is not None:
+                yield index, numbers
+
+    for index in indices:
+        cells.announce(index)
+        missing = cells.begin(index)
+        if not missing:
+            yield index, cells.end(index)
+        for unit in missing:
+            running.append((index, unit, cells.compute(index, unit)))
+            yield from finished(1)
+    yield from finished(0)

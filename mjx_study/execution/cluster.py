@@ -1,8 +1,8 @@
 """Compute a study's cells on several machines with Dask: workers return arrays, and only the client writes files.
 
-A worker has one task at a time, a cell or a block of a cell whose batches are split, and gets the next once the client
-has its arrays. A worker that dies thus loses a single, known task. Workers keep compiled programs by the content of the
-study, and a task goes to a worker that has compiled its program, if there is one. The client merges blocks.
+A worker has one work unit at a time, and gets the next once the client has its arrays. A worker that dies thus loses a
+single, known unit. Workers keep compiled programs by the content of the study, and a unit goes to a worker that has
+compiled its program, if there is one.
 """
 
 import functools
@@ -16,24 +16,22 @@ import sys
 import threading
 import time
 from collections import Counter, defaultdict, deque
-from collections.abc import Callable, Generator, Mapping
+from collections.abc import Generator, Hashable, Iterable, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from glob import glob
 from typing import Any, Final
 
 from mjx_study.disk import temporary_folder
-from mjx_study.execution.cells import Computation
-from mjx_study.execution.times import recording
-from mjx_study.experiment.blocks import Arrays
-from mjx_study.experiment.checkpoint import Checkpoint, StudyError
-from mjx_study.experiment.plan import StudyPlan, blocks_of, plan_study
+from mjx_study.execution.cells import Cells
+from mjx_study.experiment.checkpoint import Arrays, Checkpoint, StudyError
+from mjx_study.experiment.plan import plan_study
+from mjx_study.experiment.study import Computation, StudyPlan
 from mjx_study.identity import differences, versions
 from mjx_study.runtime import available_cores, configure, precision
-from mjx_study.stopwatch import Stopwatch
 from mjx_study.watchdog import watch
 
 TRIES: Final = 3
-"""Attempts at a task before its cell counts as failed."""
+"""Attempts at a work unit before its cell counts as failed."""
 CONNECT_SECONDS: Final = 30
 """Timeout for reaching a scheduler."""
 POLL_SECONDS: Final = 1.0
@@ -50,8 +48,8 @@ PRIVATE: Final = {"distributed.scheduler.http.routes": [], "distributed.worker.h
 """Pages of local workers, which anybody on the machine could read: none."""
 GPUS: Final = "/dev/nvidia[0-9]*"
 _ONE_AT_A_TIME, _SET_UP = threading.Lock(), threading.Event()
-Task = tuple[int, int | None]
-"""Index of a cell, and number of one of its tasks in `Blocks`; None for a whole cell."""
+WorkUnit = tuple[int, int]
+"""Index of a cell, and one of its work units."""
 
 
 class WorkerRefusedError(Exception):
@@ -104,44 +102,32 @@ def connected(cluster: str) -> Generator[Any]:
         yield client
 
 
-def cells_on(
-    client: Any, plan: StudyPlan, parts: Mapping[int, Checkpoint], told: Callable[[int], None]
-) -> Generator[tuple[int, Arrays | str]]:
-    """Compute cells on a cluster whose workers may come and go.
-
-    Args:
-        parts: checkpoint of each cell to compute, by index; finished blocks are added to it.
-        told: called with the number of workers whenever it changes.
+def compute_there(client: Any, cells: Cells, indices: Iterable[int]) -> Generator[tuple[int, Arrays | str]]:
+    """Compute cells on a cluster whose workers may come and go; an `execution.cells.Executor`.
 
     Yields:
-        Index and arrays of each cell in order of completion, or the reason why it failed `TRIES` times.
+        Index and arrays of each cell in order of completion, or the reason why one of its units failed `TRIES` times.
 
     Raises:
         StudyError: a worker has other versions, or the connection to the scheduler is lost.
     """
-    study, computation = _packed(plan), Computation(plan)
-    begun = {
-        index: computation.compute.restored(plan.cells[index], part)
-        for index, part in parts.items()
-        if blocks_of(plan, plan.cells[index]) > 1
-    }
-    waiting: dict[Any, deque[Task]] = defaultdict(deque)
-    has: dict[Any, set[str]] = defaultdict(set)  # workers that have compiled a program
-    at: dict[Any, tuple[Task, str]] = {}  # task and worker of each future
+    plan, study = cells.plan, _packed(cells.plan)
+    waiting: dict[Hashable, deque[WorkUnit]] = defaultdict(deque)
+    has: dict[Hashable, set[str]] = defaultdict(set)  # workers that have compiled a program
+    at: dict[Any, tuple[WorkUnit, str]] = {}  # unit and worker of each future
     ended: queue.SimpleQueue[Any] = queue.SimpleQueue()
-    tries: Counter[Task] = Counter()
+    tries: Counter[WorkUnit] = Counter()
 
-    def program_of(index: int) -> Any:
+    def program_of(index: int) -> Hashable:
         return plan.program_of(plan.cells[index])
 
     def begin(worker: str) -> None:
         for program in _program_for(worker, waiting, has):
-            task = waiting[program].popleft()
+            index, unit = waiting[program].popleft()
             has[program].add(worker)
-            index, block = task
-            kept = dict(parts[index].kept) if block is None else {}
-            future = client.submit(_compute, study, index, kept, block, workers=[worker], pure=False)
-            at[future] = task, worker
+            kept = cells.kept(index)
+            future = client.submit(_compute, study, index, kept, unit, workers=[worker], pure=False)
+            at[future] = (index, unit), worker
             future.add_done_callback(fetch)
 
     def fetch(future: Any) -> None:
@@ -152,75 +138,60 @@ def cells_on(
             outcome = error
         ended.put((future, outcome))
 
-    def tried(task: Task, reason: str) -> Generator[tuple[int, str]]:
-        """Count a failed attempt; yield the cell's failure if it was the last attempt at it or at one of its blocks."""
-        index, block = task
-        if block is not None and index not in begun:
-            return  # another of its blocks has exhausted its attempts
-        tries[task] += 1
-        tasks = waiting[program_of(index)]
-        if tries[task] >= TRIES:
-            begun.pop(index, None)
-            waiting[program_of(index)] = deque(other for other in tasks if other[0] != index)
-            yield index, reason
-        elif block is None:
-            tasks.append(task)
-        else:
-            tasks.appendleft(task)  # finished blocks wait to be merged with it
+    def failed(index: int, unit: int, reason: str) -> Generator[tuple[int, str]]:
+        """Count a failed attempt; yield the cell's failure if it was the last attempt at one of its units."""
+        if not cells.running(index):
+            return  # another of its units has exhausted its attempts
+        tries[index, unit] += 1
+        units = waiting[program_of(index)]
+        if tries[index, unit] < TRIES:
+            units.append((index, unit))
+            return
+        cells.drop(index)
+        waiting[program_of(index)] = deque(other for other in units if other[0] != index)
+        yield index, reason
 
-    def merged(index: int) -> tuple[int, Arrays]:
-        return index, computation.compute.merged(plan.cells[index], begun.pop(index))
+    def look(count: int) -> Generator[tuple[int, str], None, int]:
+        """Look for workers that are lost, and give units to those that are idle; return the number of workers."""
+        workers = set(client.nthreads())
+        for holders in has.values():
+            holders &= workers
+        for future, (unit, worker) in list(at.items()):
+            if worker not in workers:
+                del at[future]
+                future.cancel()
+                yield from failed(*unit, f"lost its worker {TRIES} times (killed, crashed or out of memory)")
+        for worker in workers - {worker for _, worker in at.values()}:
+            begin(worker)
+        if len(workers) != count:
+            cells.report(f"{len(workers)} workers" if workers else "waiting for workers")
+        return len(workers)
 
-    def ended_with(task: Task, arrays: Arrays) -> Generator[tuple[int, Arrays]]:
-        """Yield the arrays of a cell if this was its last task."""
-        index, block = task
-        if block is None:
-            yield index, arrays
-        elif index in begun:
-            blocks = begun[index]
-            blocks.add(block, arrays)
-            parts[index].save(blocks.arrays())
-            left = len(blocks.missing)
-            parts[index].report(blocks.tasks - left, blocks.tasks, f"{plan.label(plan.cells[index])}, in blocks")
-            if not left:
-                yield merged(index)
-
-    for index in parts:
-        tasks = begun[index].missing if index in begun else [None]
-        waiting[program_of(index)].extend((index, task) for task in tasks)
-        if not tasks:
-            yield merged(index)
+    for index in indices:
+        missing = cells.begin(index)
+        waiting[program_of(index)].extend((index, unit) for unit in missing)
+        if not missing:
+            yield index, cells.end(index)
     looked, count = -math.inf, -1
     try:
         while at or any(waiting.values()):
             if time.monotonic() - looked >= POLL_SECONDS:
-                workers, looked = set(client.nthreads()), time.monotonic()
-                for holders in has.values():
-                    holders &= workers
-                for future, (task, worker) in list(at.items()):
-                    if worker not in workers:
-                        del at[future]
-                        future.cancel()
-                        yield from tried(task, f"lost its worker {TRIES} times (killed, crashed or out of memory)")
-                for worker in workers - {worker for _, worker in at.values()}:
-                    begin(worker)
-                if len(workers) != count:
-                    count = len(workers)
-                    told(count)
-            # Assign new tasks to all idle workers before writing any arrays, which takes time.
+                looked = time.monotonic()
+                count = yield from look(count)
             done = []
-            for future, outcome in _all_of(ended):
+            for future, outcome in _all_of(ended):  # all idle workers get units before any arrays are written
                 if future in at:
-                    task, worker = at.pop(future)
+                    unit, worker = at.pop(future)
                     if isinstance(outcome, WorkerRefusedError):
                         raise StudyError(str(outcome)) from outcome
                     begin(worker)
-                    done.append((task, outcome))
-            for task, outcome in done:
+                    done.append((unit, outcome))
+            for (index, unit), outcome in done:
                 if isinstance(outcome, BaseException):
-                    yield from tried(task, f"{type(outcome).__name__}: {outcome}".partition("\n")[0])
-                else:
-                    yield from ended_with(task, outcome)
+                    yield from failed(index, unit, f"{type(outcome).__name__}: {outcome}".partition("\n")[0])
+                elif cells.running(index) and (numbers := cells.finish(index, unit, outcome)) is not None:
+                    cells.report(cells.label(index))
+                    yield index, numbers
     except OSError as error:
         raise StudyError(f"lost the scheduler ({error}); the same command resumes") from error
     finally:
@@ -254,17 +225,15 @@ def _packed(plan: StudyPlan) -> bytes:
     return cloudpickle.dumps((plan.config, plan.chunk_size, precision(), versions(), plan.contents))
 
 
-def _compute(study: bytes, index: int, kept: Arrays, block: int | None) -> Arrays:
+def _compute(study: bytes, index: int, kept: Arrays, unit: int) -> Arrays:
     with _ONE_AT_A_TIME:
-        plan, computation, watch = _prepared(study)
-        cell = plan.cells[index]
-        with recording(watch):
-            return computation(cell, Checkpoint(kept)) if block is None else computation.compute.block(cell, block)
+        plan, computation = _prepared(study)
+        return computation.compute(plan.cells[index], unit, Checkpoint(kept)).result()
 
 
 @functools.lru_cache(maxsize=4)
-def _prepared(study: bytes) -> tuple[StudyPlan, Computation, Stopwatch]:
-    """Set up JAX once; return the plan, its `Computation` with compiled programs, and a stopwatch."""
+def _prepared(study: bytes) -> tuple[StudyPlan, Computation]:
+    """Set up JAX once; return the plan and its `Computation` with compiled programs."""
     from distributed import get_worker
 
     config, chunk, asked, *client = pickle.loads(study)
@@ -272,14 +241,14 @@ def _prepared(study: bytes) -> tuple[StudyPlan, Computation, Stopwatch]:
         if (gpu := _gpu(get_worker().name)) is not None:
             os.environ["CUDA_VISIBLE_DEVICES"] = gpu
         configure(precision=asked, cpu_devices=1)
-        watch(functools.partial(print, file=sys.stderr))  # a worker that hangs is lost, and its task tried again
+        watch(functools.partial(print, file=sys.stderr))  # a worker that hangs is lost, and its unit tried again
         _SET_UP.set()
     plan = plan_study(config)
     ours = versions(), plan.contents
-    if told := differences(*({**one, **other} for one, other in (client, ours))):
-        raise WorkerRefusedError(f"the worker {get_worker().address} is refused: {told} ('there' is the client)")
+    if different := differences(*({**one, **other} for one, other in (client, ours))):
+        raise WorkerRefusedError(f"the worker {get_worker().address} is refused: {different} ('there' is the client)")
     plan = plan.with_chunk(chunk)
-    return plan, Computation(plan), Stopwatch()
+    return plan, plan.kind.computation(plan)
 
 
 def _gpu(worker: Any) -> str | None:

@@ -1,60 +1,25 @@
-"""Samples that a study lost because they are not finite: where, and from which step on."""
-
-from typing import Final
+"""Why a study has no finite number: the step and the quantity that is the first not to be finite."""
 
 import jax
 import mujoco
 import numpy as np
 import xarray as xr
 
-from estimators.registry import label_of
-from mjx_study.experiment.plan import StudyPlan
 from mjx_study.experiment.sampling import cell_keys, sample_keys
+from mjx_study.experiment.study import StudyPlan
 from mjx_study.objective.batches import compiled_rollout
 from mjx_study.objective.cost import before_each_step, last_of
-from mjx_study.results.findings import onset_of
 from mjx_study.simulation.dynamics import State
 from mjx_study.tasks.task import Task
-
-MOST_NAMED: Final = 3
-"""Maximum number of contact models that a warning names."""
-EXPLODED: Final = 1e30
-"""Size of a gradient, variance or cost that no stable step reaches."""
-SIZES: Final = ("gradient_norm", "variance", "cost", "final_cost")
-
-
-def lost_samples(dataset: xr.Dataset) -> list[str]:
-    """Warnings about samples left out, by contact model and estimator, and about contact models whose step explodes."""
-    counts, messages = dataset.get("nonfinite"), []
-    if counts is not None and (by_model := _per_model(counts, "sum")).max() > 0:
-        estimators = counts.sum([name for name in counts.dims if name not in ("model", "estimator")])
-        labels = [label_of(name, onset_of(dataset)) for name in dataset["estimator"].values.tolist()]
-        told = []
-        for index in np.argsort(-by_model, kind="stable")[: min(MOST_NAMED, np.count_nonzero(by_model))].tolist():
-            each = estimators.isel(model=index).values.astype(int).tolist()
-            shares = ", ".join(f"{label} {count}" for label, count in zip(labels, each, strict=True) if count)
-            told.append(f"{_name(dataset, index)} ({shares})")
-        more = np.count_nonzero(by_model) - len(told)
-        told += [f"{more} more contact models"] if more else []
-        messages.append(f"{total(counts)} samples overflowed or became NaN and were left out: {'; '.join(told)}")
-    largest = np.max([_per_model(dataset[name], "max") for name in SIZES if name in dataset], axis=0, initial=0.0)
-    for index in np.flatnonzero(largest > EXPLODED)[:MOST_NAMED].tolist():
-        messages.append(
-            f"{_name(dataset, index)}: the motion explodes (numbers up to {largest[index]:.0e}), as where the step in "
-            "contact is unstable; use a smaller --timestep, or softer contact"
-        )
-    return messages
 
 
 def all_lost(plan: StudyPlan, dataset: xr.Dataset) -> str | None:
     """Why a study has no number at all, from the first sample of its first cell; None if it has some."""
-    kind = plan.settings.kind
-    known = dataset["nonfinite" if kind == "gradients" else "final_cost" if kind == "descents" else "cost"]
-    left = known < dataset["samples"] if kind == "gradients" else np.isfinite(known)
-    if bool(left.any()) or not bool(dataset["residual"].notnull().any()):
+    kind = plan.kind
+    if bool(np.isfinite(dataset[kind.finite]).any()) or not bool(dataset[kind.computed].notnull().any()):
         return None
     cell = plan.cells[0]
-    task = plan.groups[cell.group].task.replace(sigma=cell.sigma)
+    task = plan.task_of(cell).replace(sigma=cell.sigma)
     if cell.model.analytic:
         return f"all samples are lost: no cost of {task.name} is finite"
     key = sample_keys(cell_keys(plan.config.seed, 1)["order"][0][0], 0, 1)[0]
@@ -89,20 +54,3 @@ def first_nonfinite(task: Task, states: State, controls: jax.Array) -> str:
 def _joints_of_positions(host: mujoco.MjModel) -> np.ndarray:
     """Joint of each entry of qpos."""
     return np.repeat(np.arange(host.njnt), np.diff([*host.jnt_qposadr, host.nq]))
-
-
-def total(counts: xr.DataArray) -> int:
-    """Total count; where estimators share rollouts, the largest over estimators."""
-    shared = "estimator" in counts.dims and not {"seed", "point"} & set(counts.dims)
-    return int(counts.max("estimator").sum() if shared else counts.sum())
-
-
-def _per_model(values: xr.DataArray, how: str) -> np.ndarray:
-    """Sum or maximum of finite values for each contact model."""
-    finite = values.where(np.isfinite(values))
-    return getattr(finite, how)([name for name in values.dims if name != "model"]).fillna(0).values
-
-
-def _name(dataset: xr.Dataset, index: int) -> str:
-    stiffness = float(dataset["stiffness"][index])
-    return f"{dataset['contact'].values[index]}" + (f", K = {stiffness:g} N/m" if stiffness > 0 else "")

@@ -6,6 +6,8 @@ from contextlib import contextmanager
 
 import numpy as np
 
+Arrays = dict[str, np.ndarray]
+
 
 class StudyError(ValueError):
     """A folder holds no study, another study, or a damaged file."""
@@ -27,7 +29,7 @@ class Checkpoint:
     """
 
     kept: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
-    save: Callable[[dict[str, np.ndarray]], None] = lambda arrays: None
+    save: Callable[[Arrays], None] = lambda arrays: None
     report: Callable[[int, int, str], None] = lambda done, total, what: None
     name: str = "the checkpoint"
 

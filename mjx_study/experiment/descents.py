@@ -10,29 +10,39 @@ import dataclasses
 import math
 import threading
 import time
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cached_property, partial
 from typing import Any, Final
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import xarray as xr
 from jaxtyping import Array, Float, Key
 
 from estimators import Estimator, draw
 from estimators.sampling import draw_at, sample_keys
 from mjx_study.compiled import Compiled
-from mjx_study.experiment.checkpoint import Checkpoint
+from mjx_study.experiment.checkpoint import Arrays, Checkpoint
 from mjx_study.experiment.iteration import Descent, Record, advance, begin, going, make_optimizer, schedule_factors
-from mjx_study.experiment.plan import StudyCell, StudyPlan, estimators_of
+from mjx_study.experiment.memory import check_memory
+from mjx_study.experiment.resolution import recipe_of
 from mjx_study.experiment.sampling import rollouts_of
+from mjx_study.experiment.study import Computation, StudyCell, StudyKind, StudyPlan, done, estimators_of
 from mjx_study.objective import Simulator, TracedObjective, simulate
+from mjx_study.options.configuration import StudyConfig
+from mjx_study.options.option import OptionError
 from mjx_study.reference import Reference
-from mjx_study.results.variables import HISTORY, METRIC, START
+from mjx_study.results.findings import descent_findings
+from mjx_study.results.kind import Drawing
+from mjx_study.results.variables import DESCENTS, HISTORY, METRIC, START
 from mjx_study.simulation.contact import ContactModel, soften
 from mjx_study.tasks.contact_grid import ContactPoint
+from mjx_study.tasks.task import Recipe, Task
 
+HISTORY_NUMBERS: Final = 20
+"""Approximate count of numbers kept per iteration and seed, over all estimators."""
 REPORT_EVERY: Final = 10
 """Iterations between progress reports, which wait for the device."""
 SAVE_SECONDS: Final = 20.0
@@ -41,18 +51,94 @@ TOGETHER: Final = 1000
 """Rollouts of an analytic system per batch; more take memory and save little time."""
 
 
-def compute_descents(plan: StudyPlan) -> Callable[..., dict[str, np.ndarray]]:
-    """Return a function that computes cells and keeps compiled programs between them."""
-    backends: dict[tuple[Any, ...], Backend] = {}
+class Descents(StudyKind):
+    """Costs that gradient descent reaches with each estimator."""
 
-    def compute(cell: StudyCell, part: Checkpoint = Checkpoint()) -> dict[str, np.ndarray]:  # noqa: B008, it is empty
+    name, title = "descents", "gradient descent"
+    variables = DESCENTS
+    columns = ("final_cost", "stopped_seeds", "variance", "alpha", "nonfinite")
+    compared = finite = "final_cost"
+    computed = "rollouts"
+
+    def axes(self, config: Mapping[str, Any]) -> dict[str, Sequence[int]]:
+        return {"iteration": range(1, (config["iterations"] or 0) + 1)}
+
+    def describe(self, plan: StudyPlan) -> str:
+        lengths = dict.fromkeys(group.descent.iterations for group in plan.groups)
+        return f"descents of {', '.join(map(str, lengths))} iterations"
+
+    def recipe(self, config: StudyConfig, task: Task) -> Recipe:
+        return recipe_of(config, task)
+
+    def check(self, plan: StudyPlan, cell: StudyCell) -> None:
+        config, group, chosen = plan.config, plan.groups[cell.group], estimators_of(plan, cell)
+        recipe = group.descent
+        make_optimizer(plan.settings.optimizer, recipe.learning_rate, recipe.decay)
+        schedule_factors(config.sigma_schedule, recipe.iterations)
+        schedule_factors(config.stiffness_schedule, recipe.iterations, most=1.0)
+        if config.stiffness_schedule and any(
+            model.stiffness is None or (model.contact is None and not model.analytic) for model in group.models
+        ):
+            raise OptionError("stiffness_schedule", "needs contact models with a stiffness; mjcf has none to set")
+        fixed = [each.name for each in chosen if hasattr(each, "sigma")]
+        if config.sigma_schedule and fixed:
+            raise OptionError("sigma_schedule", f"changes sigma, and {fixed[0]} holds for one: omit one of them")
+        history = HISTORY_NUMBERS * config.batches * recipe.iterations
+        check_memory(group.task, chosen, config.batches * cell.samples, other=history)
+        check_memory(group.task, (), plan.settings.evaluation_samples)
+
+    def batches_at_once(self, config: StudyConfig) -> int:
+        return 1
+
+    def program_of(self, cell: StudyCell) -> Hashable:
+        return super().program_of(cell), cell.sigma, cell.samples
+
+    def programs_per_key(self, config: StudyConfig) -> int:
+        return len(config.estimators)
+
+    def rollouts(self, plan: StudyPlan, cell: StudyCell) -> np.ndarray:
+        task, chosen = plan.task_of(cell), estimators_of(plan, cell)
+        batches = [rollouts_of(each.needs, cell.samples, task) for each in chosen]
+        evaluations = (plan.config.batches * len(chosen) + 1) * plan.settings.evaluation_samples
+        iterations = plan.groups[cell.group].descent.iterations
+        return plan.config.batches * iterations * np.sum(batches, axis=0) + [evaluations, 0]
+
+    def computation(self, plan: StudyPlan) -> "DescentComputation":
+        return DescentComputation(plan)
+
+    def findings(self, dataset: xr.Dataset) -> list[str]:
+        return descent_findings(dataset)
+
+    def drawings(self, dataset: xr.Dataset) -> dict[str, Drawing]:
+        from mjx_study.plots.descents import achieved, descent
+
+        return {
+            "achieved": Drawing(achieved, "Cost of the final policies against stiffness."),
+            "descent": Drawing(descent, "Cost against iterations, rollouts and seconds."),
+        }
+
+    def summarised(self, dataset: xr.Dataset) -> xr.Dataset:
+        """Add the number of stopped seeds."""
+        return dataset.assign(stopped_seeds=dataset["stopped_at"].notnull())
+
+
+KIND: Final = Descents()
+
+
+class DescentComputation(Computation):
+    """Computes the descents of a cell in a single unit, with checkpoints."""
+
+    def __init__(self, plan: StudyPlan):
+        self._plan = plan
+        self._backends: dict[Hashable, Backend] = {}
+
+    def compute(self, cell: StudyCell, unit: int, checkpoint: Checkpoint) -> Future[Arrays]:
         key = (cell.group, cell.sigma, cell.samples, cell.model.stiffness_or_zero if cell.model.analytic else None)
-        if key not in backends:
-            backends[key] = Backend(plan, cell)
-        backend, kept = backends[key], dict(part.kept)
-        runs = [
-            _Run(backend, cell.model, each, index, kept, part) for index, each in enumerate(estimators_of(plan, cell))
-        ]
+        if key not in self._backends:
+            self._backends[key] = Backend(self._plan, cell)
+        backend, kept = self._backends[key], dict(checkpoint.kept)
+        chosen = estimators_of(self._plan, cell)
+        runs = [_Run(backend, cell.model, each, index, kept, checkpoint) for index, each in enumerate(chosen)]
         with ThreadPoolExecutor(backend.threads) as pool:
             each_in_turn = map if backend.threads == 1 else pool.map
             list(each_in_turn(_Run.descend, runs))
@@ -60,12 +146,10 @@ def compute_descents(plan: StudyPlan) -> Callable[..., dict[str, np.ndarray]]:
         found = {name: np.stack([each[name] for each in numbers], axis=-1) for name in numbers[0] if name != "theta"}
         found["theta"] = np.stack([each["theta"] for each in numbers], axis=1)  # (seed, estimator, param)
         mean, error = backend.cost(backend.task.theta, cell.model)
-        start = backend.metrics(backend.task.theta, cell.model)
         found |= {"start_cost": np.array(mean), "start_cost_se": np.array(error)}
+        start = backend.metrics(backend.task.theta, cell.model)
         found |= {START + name: np.array(value) for name, value in start.items()}
-        return kept | {name: np.asarray(array, float) for name, array in found.items()}
-
-    return compute
+        return done(kept | {name: np.asarray(array, float) for name, array in found.items()})
 
 
 class Backend:
@@ -187,15 +271,14 @@ class Backend:
 
 @dataclasses.dataclass
 class _Run:
-    """Descents of one estimator from all seeds; `index` is its place among those of the cell, whose checkpoint `kept`
-    all add to."""
+    """Descents of one estimator, the cell's `index`-th, from all seeds; all estimators add to the arrays `kept`."""
 
     backend: Backend
     model: ContactPoint
     estimator: Estimator
     index: int
     kept: dict[str, np.ndarray]
-    part: Checkpoint
+    checkpoint: Checkpoint
 
     def __post_init__(self) -> None:
         """Begin at the start, or restore a run from its checkpoint; and compile an iteration."""
@@ -204,7 +287,7 @@ class _Run:
         self.records: list[Record] = []
         self.seconds: list[float] = []
         if f"seconds_{index}" in self.kept:
-            with self.part.restored():
+            with self.checkpoint.restored():
                 self._restore()
         self.already = len(self.records)
         self.state = backend.place(self.state, index)
@@ -248,7 +331,7 @@ class _Run:
             if len(pending) >= REPORT_EVERY:
                 last = self._collect(pending, last)
                 total = len(self.backend.config.estimators) * iterations
-                self.part.report(self.index * iterations + done, total, self.estimator.name)
+                self.checkpoint.report(self.index * iterations + done, total, self.estimator.name)
                 if last - saved > SAVE_SECONDS:
                     self._save()
                     saved = last = time.perf_counter()
@@ -271,7 +354,7 @@ class _Run:
             self.kept.update({f"state_{self.index}_{leaf}": np.asarray(value) for leaf, value in enumerate(leaves)})
             self.kept.update({f"history_{self.index}_{name}": values for name, values in self._history().items()})
             self.kept[f"seconds_{self.index}"] = np.array(self.seconds)
-            self.part.save(dict(self.kept))
+            self.checkpoint.save(dict(self.kept))
 
     def _history(self) -> dict[str, Float[np.ndarray, "iterations seeds"]]:
         shape = len(self.records), self.backend.seeds
@@ -286,7 +369,6 @@ class _Run:
         metrics = [backend.metrics(theta, self.model) for theta in self.state.theta]
         reason = np.asarray(self.state.reason)
         done = np.sum(~np.isnan(history["nonfinite"]), axis=0)
-        calls = [rollouts_of(each, backend.samples, backend.task.random_start) for each in self.estimator.needs]
         found = {name: _padded(values, backend.recipe.iterations) for name, values in history.items()}
         return found | {
             "theta": np.asarray(self.state.theta),
@@ -295,7 +377,7 @@ class _Run:
             "reason": np.where(reason > 0, reason, np.nan),
             "final_cost": np.array([mean for mean, _ in costs]),
             "final_cost_se": np.array([error for _, error in costs]),
-            "rollouts": np.array(sum(rollouts for rollouts, _ in calls)),
+            "rollouts": rollouts_of(self.estimator.needs, backend.samples, backend.task)[0],
             **{METRIC + name: np.array([each[name] for each in metrics]) for name in metrics[0]},
         }
 

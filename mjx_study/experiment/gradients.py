@@ -5,62 +5,169 @@ estimates combine both. All cells use the same keys, so differences between cont
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from functools import cache, partial
+from functools import partial
 from threading import Lock
-from typing import Any, Final, TypeVar
+from typing import Any, Final
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Key
+import pandas as pd
+import xarray as xr
+from jaxtyping import Array, Key
 
 import estimators
-from estimators import ORACLES, Batches, Estimator, Evaluation, GradientEstimate
+from estimators import ORACLES, Evaluation, GradientEstimate
 from estimators.merged_samples import MAX_THINNED, moments_of
 from estimators.statistics import merged_estimates
-from mjx_study.compiled import Compiled, type_of
-from mjx_study.experiment.blocks import REFERENCE, Arrays, Blocks, pack
-from mjx_study.experiment.checkpoint import Checkpoint
-from mjx_study.experiment.memory import BIAS_DRAWS, LARGEST_BLOCK, padded_size
-from mjx_study.experiment.plan import (
-    StudyCell,
-    StudyPlan,
-    block_of,
-    blocks_of,
-    estimators_of,
-    oracles_of,
-    padded_samples,
-    seeds_together,
+from mjx_study.compiled import type_of
+from mjx_study.experiment.checkpoint import Arrays, Checkpoint
+from mjx_study.experiment.gradient_numbers import (
+    MOST_KEPT,
+    cell_numbers,
+    estimate_numbers,
+    padded,
+    samples_of_parts,
+    seed_numbers,
 )
-from mjx_study.experiment.reference_gradient import estimate_reference
-from mjx_study.experiment.sampling import Objectives, cell_keys, draw_batches, sample_keys
-from mjx_study.experiment.tally import Tally, numbers_of, together
-from mjx_study.objective import BlankObjective, MjxObjective, Simulator
+from mjx_study.experiment.memory import (
+    AT_ONCE,
+    BLOCK_BYTES,
+    LARGEST_BLOCK,
+    blocks_take,
+    bytes_of_moments,
+    bytes_per_sample,
+    check_batches,
+)
+from mjx_study.experiment.merged_samples import REFERENCE_UNIT, Blocks, pack
+from mjx_study.experiment.reference_gradient import CANDIDATES, reference_of, soft_gradient, takes_candidates
+from mjx_study.experiment.sampling import Objectives, cell_keys, draw_batches, rollouts_of, sample_keys
+from mjx_study.experiment.study import Computation, Result, StudyCell, StudyKind, StudyPlan, Work, done, estimators_of
+from mjx_study.experiment.tally import Tally
+from mjx_study.limits import MOST_GIB
+from mjx_study.objective import BlankObjective, MjxObjective
+from mjx_study.options.option import OptionError
 from mjx_study.reference import Reference
-from mjx_study.results.variables import BATCH, GRADIENTS, ONSETS
+from mjx_study.results.findings import gradient_findings
+from mjx_study.results.kind import Drawing
+from mjx_study.results.rows import rows_of
+from mjx_study.results.variables import GRADIENTS, ONSETS
 from mjx_study.runtime import traces_folder
-from mjx_study.stopwatch import unheard
-from mjx_study.tasks.contact_grid import family_grid
-from mjx_study.tasks.task import Task
 
-Result = TypeVar("Result")
-CANDIDATES: Final = 100
-"""Number of first-order samples whose median is a candidate for the reference's control variate."""
 PILOT: Final = LARGEST_BLOCK
-"""Maximum number of samples of the first batch used to select among the candidates."""
-MOST_KEPT: Final = 1_000_000
-"""Maximum size of a cell's array of mean gradients; larger ones are not kept."""
+"""Maximum number of samples of the first batch used to select among the reference's control variates."""
 
 
-def compute_gradients(plan: StudyPlan) -> "Gradients":
-    """Return the computation of a plan's cells, whole or in blocks, which keeps compiled programs."""
-    return Gradients(plan)
+class Gradients(StudyKind):
+    """Gradient estimates at one theta, compared with a reference gradient."""
+
+    name, title = "gradients", "gradient estimates"
+    variables = GRADIENTS
+    optional = (*ONSETS, "gradient", "reference")
+    columns = ("variance", "effective_samples", "top_share", "relative_error", "debiased_error", "squared_bias")
+    columns = (*columns, "alpha", "nonfinite")
+    compared = "variance"
+    finite = "gradient_norm"
+
+    def check_memory(self, plan: StudyPlan) -> None:
+        """Raise ValueError for batches that do not fit into memory, OptionError for a block size with estimators that
+        need whole batches."""
+        whole = [each.name for each in estimators_of(plan, plan.cells[0]) if not each.mergeable]
+        if whole and plan.config.block_size is not None:
+            reason = f"splits batches, and {', '.join(whole)} must have whole ones: omit it; {blocks_take(whole)}"
+            raise OptionError("block_size", reason)
+        check_batches(plan.memory, whole)
+
+    def memory(self, plan: StudyPlan, cell: StudyCell) -> int:
+        """Memory held at once [bytes]: batches and statistics, or a block, and moments until a batch is complete."""
+        if (blocks := blocks_of(plan, cell)) == 1:
+            return plan.memory_of_seed(cell) * seeds_together(plan, cell)
+        moments = bytes_of_moments(estimators_of(plan, cell), plan.task_of(cell).policy.num_params)
+        kept = plan.config.batches + math.ceil(math.log2(blocks))
+        return block_of(plan, cell) * _bytes_in_block(plan, cell) + 2 * kept * moments
+
+    def size(self, plan: StudyPlan, cell: StudyCell) -> int:
+        parameters = plan.task_of(cell).policy.num_params
+        means = plan.config.batches * len(plan.config.estimators) * parameters
+        return super().size(plan, cell) - (8 * (means + parameters) if means > MOST_KEPT else 0)
+
+    def rollouts(self, plan: StudyPlan, cell: StudyCell) -> np.ndarray:
+        candidates = 0 if cell.model.analytic else CANDIDATES
+        batches = plan.config.batches * rollouts_of(plan.oracles, cell.samples, plan.task_of(cell))
+        return batches + [2 * plan.settings.reference_samples + candidates, candidates]
+
+    def computation(self, plan: StudyPlan) -> "GradientComputation":
+        return GradientComputation(plan)
+
+    def findings(self, dataset: xr.Dataset) -> list[str]:
+        return gradient_findings(dataset)
+
+    def drawings(self, dataset: xr.Dataset) -> dict[str, Drawing]:
+        from mjx_study.plots import gradients as figures
+
+        found = {
+            "comparison": Drawing(
+                figures.comparison,
+                "Variance of one gradient sample, and relative error of the mean against the reference.",
+            )
+        }
+        if dataset.sizes.get("seed", 1) > 1:
+            found = {
+                "variance": Drawing(
+                    figures.variance, "Variance of one gradient sample; geometric mean over the seeds."
+                ),
+                "bias": Drawing(
+                    figures.bias,
+                    "Bias of each estimator against an unbiased zeroth-order reference; a triangle is an upper bound "
+                    "where no bias is significant.",
+                ),
+                "alpha": Drawing(figures.alpha, "Weight of first-order gradients in the interpolations."),
+            }
+        if dataset.sizes["samples"] > 1:
+            caption = "Relative error of the mean gradient against the number of samples."
+            found["error_against_samples"] = Drawing(figures.error_against_samples, caption, keep="samples")
+        return found
+
+    def table(self, dataset: xr.Dataset) -> pd.DataFrame:
+        return pd.DataFrame([row.as_dict() for row in rows_of(dataset)])
 
 
-class Gradients:
-    """Computes the cells of a plan."""
+KIND: Final = Gradients()
+
+
+def block_of(plan: StudyPlan, cell: StudyCell) -> int:
+    """Number of a seed's samples held at once: all of them, or a block if the configuration asks for it, or if the
+    batches would otherwise be rejected."""
+    if plan.config.block_size is not None:
+        return min(plan.config.block_size, cell.samples)
+    fits = plan.memory_of_seed(cell) <= MOST_GIB * 2**30
+    if fits or not all(each.mergeable for each in estimators_of(plan, cell)):
+        return cell.samples
+    even = int(BLOCK_BYTES / _bytes_in_block(plan, cell)) // 2 * 2
+    return min(cell.samples, LARGEST_BLOCK, max(2, even))
+
+
+def blocks_of(plan: StudyPlan, cell: StudyCell) -> int:
+    """Number of blocks per seed; whole batches are one."""
+    return math.ceil(cell.samples / block_of(plan, cell))
+
+
+def _bytes_in_block(plan: StudyPlan, cell: StudyCell) -> int:
+    """Memory per sample of a block, statistics included [bytes]."""
+    return bytes_per_sample(plan.task_of(cell), plan.oracles, 2 * len(plan.config.estimators), draws=0)
+
+
+def seeds_together(plan: StudyPlan, cell: StudyCell) -> int:
+    """Number of seeds that a cell draws at once: as many as fit into memory, in equal groups."""
+    batches = plan.config.batches
+    fitting = max(1, int(AT_ONCE[jax.default_backend()] / plan.memory_of_seed(cell)))
+    return math.ceil(batches / math.ceil(batches / fitting))
+
+
+class GradientComputation(Computation):
+    """Computes the cells of a plan, in whole batches or in blocks."""
 
     def __init__(self, plan: StudyPlan):
         self._plan, self._config, self._objectives = plan, plan.config, Objectives(plan)
@@ -79,61 +186,48 @@ class Gradients:
         pairs = self._config.settings.reference_samples
         return jax.random.split(odd, pairs), jax.random.split(candidate, CANDIDATES)
 
-    def __call__(self, cell: StudyCell, part: Checkpoint = Checkpoint()) -> Arrays:  # noqa: B008, it is empty
-        """Compute a cell's numbers, see `begin`."""
-        return self.begin(cell, part).result()
+    def begin(self, cell: StudyCell, checkpoint: Checkpoint) -> Work:
+        blocks = blocks_of(self._plan, cell)
+        if blocks == 1:
+            return Work()
+        with checkpoint.restored():
+            work = Blocks(self._config.batches, blocks, checkpoint.kept, partial(self._merged, cell))
+            chosen = estimators_of(self._plan, cell)
+            size = self._plan.task_of(cell).policy.num_params
+            work.check([str(index) for index in range(len(chosen))], estimators.oracles_of(chosen), size)
+        return work
 
-    def begin(self, cell: StudyCell, part: Checkpoint) -> Future[Arrays]:
-        """Sample a cell, in whole batches or in blocks, skipping blocks in the checkpoint.
-
-        Returns:
-            The cell's numbers: complete on CPUs; on accelerators the statistics may still be running.
-        """
+    def compute(self, cell: StudyCell, unit: int, checkpoint: Checkpoint) -> Future[Arrays]:
         if blocks_of(self._plan, cell) == 1:
             return self._whole(cell)
-        blocks = self.restored(cell, part)
-        for task in blocks.missing:
-            part.report(task, blocks.tasks, f"{self._plan.label(cell)}, in blocks")
-            blocks.add(task, self.block(cell, task))
-            part.save(blocks.arrays())
-        return done(self.merged(cell, blocks))
+        return done(self._reference_unit(cell) if unit == REFERENCE_UNIT else self._block(cell, unit))
 
-    def restored(self, cell: StudyCell, part: Checkpoint) -> Blocks:
-        """Blocks of a cell, with the finished ones of its checkpoint; StudyError if that does not fit."""
-        with part.restored():
-            blocks = self.begun(cell, part.kept)
-            chosen = estimators_of(self._plan, cell)
-            size = self._plan.groups[cell.group].task.policy.num_params
-            blocks.check([str(index) for index in range(len(chosen))], estimators.oracles_of(chosen), size)
-        return blocks
+    def _reference_unit(self, cell: StudyCell) -> Arrays:
+        """Samples of the reference."""
+        objective = self._objective(cell)
+        keys = sample_keys(self._keys["order"][0][0], 0, min(cell.samples, PILOT))
+        pilot = objective.evaluate(self._plan.task_of(cell).theta, keys)
+        return {"reference": np.asarray(self._reference(cell, objective, pilot).per_sample)}
 
-    def begun(self, cell: StudyCell, kept: Mapping[str, np.ndarray]) -> Blocks:
-        """Blocks of a cell, with the finished ones of a checkpoint."""
-        return Blocks(self._config.batches, blocks_of(self._plan, cell), kept)
-
-    def block(self, cell: StudyCell, task: int) -> Arrays:
-        """Compute one of the tasks of `Blocks`: the reference's samples, or the summary of a block."""
-        objective, task_of = self._objective(cell), self._plan.groups[cell.group].task
-        if task == REFERENCE:
-            keys = sample_keys(self._keys["order"][0][0], 0, min(cell.samples, PILOT))
-            pilot = objective.evaluate(task_of.theta, keys)
-            return {"reference": np.asarray(self._reference(cell, objective, pilot).per_sample)}
+    def _block(self, cell: StudyCell, unit: int) -> Arrays:
+        """Summary of a block."""
+        objective, theta = self._objective(cell), self._plan.task_of(cell).theta
         chosen, size = estimators_of(self._plan, cell), block_of(self._plan, cell)
-        seed, place = self.begun(cell, {}).place(task)
-        first, every = place * size, math.ceil(cell.samples / MAX_THINNED)
+        seed, index = Blocks.position(unit, blocks_of(self._plan, cell))
+        first, every = index * size, math.ceil(cell.samples / MAX_THINNED)
         count, oracles = min(size, cell.samples - first), estimators.oracles_of(chosen)
         some = slice(seed, seed + 1)
         drawn, seconds, residuals = draw_batches(
-            objective, task_of.theta, self._keys, oracles, count, some, first, device=self._device
+            objective, theta, self._keys, oracles, count, some, first, device=self._device
         )
         batches = jax.tree.map(lambda leaf: leaf[0], drawn)
         summary: dict[str, Any] = {name: Tally.of(drawn[name], seconds[name], residuals[name]) for name in oracles}
-        for index, rows in enumerate(jax.device_get(_rows_of_parts(batches, chosen))):
-            summary |= {f"{index}.{part}": each for part, each in enumerate(moments_of(rows, first, every))}
+        for number, rows in enumerate(jax.device_get(samples_of_parts(batches, chosen))):
+            summary |= {f"{number}.{part}": each for part, each in enumerate(moments_of(rows, first, every))}
         return pack(summary)
 
-    def merged(self, cell: StudyCell, blocks: Blocks) -> Arrays:
-        """Compute a cell's numbers from its blocks, all of which must be finished."""
+    def _merged(self, cell: StudyCell, blocks: Blocks) -> Arrays:
+        """A cell's numbers from its blocks, all of which must be finished."""
         chosen, reference = estimators_of(self._plan, cell), estimators.summarise(jnp.asarray(blocks.reference))
         tests, parts, tallies = jax.random.split(self._keys["test"], blocks.seeds), [], []
         for seed in range(blocks.seeds):
@@ -143,22 +237,25 @@ class Gradients:
                 found = [each for name, each in summary.items() if name.startswith(f"{index}.")]
                 estimates.append(estimator.join(*merged_estimates(tuple(found), cell.samples)))
             parts.append(jax.device_get(estimate_numbers(estimates, reference, tests[seed], self._config.confidence)))
-            tallies.append({name: each for name, each in summary.items() if name in estimators.ORACLES})
-        return self._numbers(cell, jax.tree.map(lambda *leaves: np.stack(leaves), *parts), reference, tallies)
+            tallies.append({name: each for name, each in summary.items() if name in ORACLES})
+        numbers = jax.tree.map(lambda *leaves: np.stack(leaves), *parts)
+        return cell_numbers(numbers, reference, chosen, tallies, cell.samples * blocks.seeds)
 
     def _whole(self, cell: StudyCell) -> Future[Arrays]:
-        config, oracles, keys = self._config, oracles_of(self._config), self._keys
-        objective, theta = self._objective(cell), self._plan.groups[cell.group].task.theta
+        """A cell's numbers from whole batches."""
+        config, oracles, keys = self._config, self._plan.oracles, self._keys
+        objective, theta = self._objective(cell), self._plan.task_of(cell).theta
         tests, chosen = jax.random.split(keys["test"], config.batches), estimators_of(self._plan, cell)
-        together, padded = seeds_together(self._plan, cell), partial(_padded, size=padded_samples(self._plan, cell))
+        together = seeds_together(self._plan, cell)
+        pad = partial(padded, size=self._plan.padded_samples(cell))
         reference: GradientEstimate | None = None
         parts: list[Future[Any]] = []
 
         def statistics(drawn: Any, seconds: Any, residuals: Any, keys: Any, compiled: Future[None]) -> Any:
             compiled.result()
-            arguments = jax.tree.map(padded, drawn), np.asarray(cell.samples), reference, keys
+            arguments = jax.tree.map(pad, drawn), np.asarray(cell.samples), reference, keys
             with self._device:
-                numbers = jax.block_until_ready(_seed_numbers(chosen, config.confidence)(*arguments))
+                numbers = jax.block_until_ready(seed_numbers(chosen, config.confidence)(*arguments))
             tallies = {name: Tally.of(drawn[name], seconds[name], residuals[name]) for name in oracles}
             return jax.device_get(numbers), tallies
 
@@ -166,7 +263,7 @@ class Gradients:
             assert reference is not None
             numbers, tallies = zip(*(part.result() for part in parts), strict=True)
             joined = jax.tree.map(lambda *leaves: np.concatenate(leaves), *numbers)
-            return self._numbers(cell, joined, reference, tallies)
+            return cell_numbers(joined, reference, chosen, tallies, cell.samples * config.batches)
 
         for start in range(0, config.batches, together):
             some = slice(start, start + together)
@@ -177,21 +274,19 @@ class Gradients:
                     reference = self._reference(cell, objective, pilot)
             if parts:
                 parts[-1].result()  # keep at most two groups of seeds in memory
-            parts.append(self._beside(partial(statistics, *drawn, tests[some], self._compiling)))
-        return self._beside(all_numbers)
+            parts.append(self._in_order(partial(statistics, *drawn, tests[some], self._compiling)))
+        return self._in_order(all_numbers)
 
-    def _beside(self, call: Callable[[], Result]) -> Future[Result]:
+    def _in_order(self, call: Callable[[], Result]) -> Future[Result]:
         """Call in order; on accelerators in a thread, while the next batches are sampled."""
-        if jax.default_backend() == "cpu":
-            return done(call())
-        return self._statistics.submit(unheard(call))
+        return done(call()) if jax.default_backend() == "cpu" else self._statistics.submit(call)
 
     def _objective(self, cell: StudyCell) -> MjxObjective | Reference:
         """The objective of a cell, with its programs compiled, so that measured times exclude compilation."""
-        objective, theta = self._objectives(cell), self._plan.groups[cell.group].task.theta
+        objective, theta = self._objectives(cell), self._plan.task_of(cell).theta
         if (program := self._plan.program_of(cell)) not in self._warm:
             self._compile_statistics(cell, objective)
-            for name in dict.fromkeys([*oracles_of(self._config), "differentiation"]):  # the control variate needs it
+            for name in dict.fromkeys([*self._plan.oracles, "differentiation"]):  # the control variate needs it
                 getattr(objective, ORACLES[name].method)(theta, jax.random.split(jax.random.key(0), 1))
             self._warm.add(program)
         return objective
@@ -201,12 +296,12 @@ class Gradients:
         in_blocks = blocks_of(self._plan, cell) > 1
         if not isinstance(objective, MjxObjective) or traces_folder() is None or in_blocks:
             return
-        config, task = self._config, self._plan.groups[cell.group].task
+        config, task = self._config, self._plan.task_of(cell)
         blank = BlankObjective(**vars(objective))
         key, seeds = jax.random.split(jax.random.key(0), 1), seeds_together(self._plan, cell)
-        size = padded_samples(self._plan, cell)
+        size = self._plan.padded_samples(cell)
         batches = {
-            name: getattr(blank, ORACLES[name].method)(task.theta, jax.random.clone(key)) for name in oracles_of(config)
+            name: getattr(blank, ORACLES[name].method)(task.theta, jax.random.clone(key)) for name in self._plan.oracles
         }
         drawn = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct((seeds, size, *leaf.shape[1:]), leaf.dtype), batches)
         soft = task.theta if takes_candidates(task) and task.contact_pair is not None else None
@@ -214,8 +309,8 @@ class Gradients:
         reference = reference_of(task, blank, *self._reference_keys, pilot, soft)
         keys = jax.random.split(self._keys["test"], config.batches)[:seeds]
         types = drawn, type_of(np.asarray(size)), jax.tree.map(type_of, reference), type_of(keys)
-        statistics = _seed_numbers(estimators_of(self._plan, cell), config.confidence)
-        self._compiling = self._pool.submit(unheard(statistics.ahead(*types)))
+        statistics = seed_numbers(estimators_of(self._plan, cell), config.confidence)
+        self._compiling = self._pool.submit(statistics.ahead(*types))
 
     def _reference(self, cell: StudyCell, objective: MjxObjective | Reference, pilot: Evaluation) -> GradientEstimate:
         softened = cell.group, cell.sigma
@@ -223,197 +318,4 @@ class Gradients:
             self._soft[softened] = soft_gradient(
                 self._objectives.simulator(cell.group), cell.sigma, self._reference_keys[1]
             )
-        task = self._plan.groups[cell.group].task
-        return reference_of(task, objective, *self._reference_keys, pilot, self._soft.get(softened))
-
-    def _numbers(
-        self, cell: StudyCell, numbers: Any, reference: GradientEstimate, tallies: Sequence[dict[str, Tally]]
-    ) -> Arrays:
-        """Assemble all numbers of a cell from those of its seeds."""
-        samples = cell.samples * self._config.batches
-        arrays = _of_seeds(numbers, self._config.batches) | _bias(numbers, reference)
-        arrays |= _of_batches(estimators_of(self._plan, cell), tallies, samples)
-        if arrays["gradient"].size > MOST_KEPT:
-            del arrays["gradient"]
-        else:
-            arrays["reference"] = np.asarray(reference.mean)
-        return {name: np.asarray(array, float) for name, array in arrays.items()}
-
-
-def done(result: Result) -> Future[Result]:
-    """A future that has its result."""
-    future = Future[Result]()
-    future.set_result(result)
-    return future
-
-
-def _of_batches(
-    chosen: Sequence[Estimator], tallies: Sequence[dict[str, Tally]], samples: int
-) -> dict[str, np.ndarray]:
-    """Times, residuals and onset counts of each estimator's batches."""
-    told = [together(each[oracle] for each in tallies for oracle in estimator.needs) for estimator in chosen]
-    arrays = {
-        "seconds_per_sample": np.array([each.seconds / samples for each in told]),
-        "residual": np.array([each.residual for each in told]),
-        "unconverged": np.array([each.unconverged for each in told]),
-    }
-    numbers = np.stack([numbers_of(each.onsets) for each in told], axis=-1)
-    if np.any(np.isfinite(numbers)):
-        arrays |= dict(zip(ONSETS, numbers, strict=True))
-    return arrays
-
-
-def _of_seeds(numbers: Sequence[dict[str, Any]], seeds: int) -> dict[str, np.ndarray]:
-    """Numbers by seed and estimator, NaN where not applicable, and those of the reference."""
-    arrays = {
-        name: np.stack([np.full(seeds, np.nan) if row[name] is None else row[name] for row in numbers], axis=1)
-        for name, variable in GRADIENTS.items()
-        if variable.dims == BATCH
-    }
-    first = numbers[0]  # the reference's numbers are the same for every estimator and seed
-    arrays["gradient"] = np.stack([row["gradient"] for row in numbers], axis=1)
-    return arrays | {name: np.asarray(first[name][0]) for name, variable in GRADIENTS.items() if not variable.dims}
-
-
-def _bias(numbers: Sequence[dict[str, Any]], reference: GradientEstimate) -> dict[str, np.ndarray]:
-    """Each estimator's bias relative to the norm of the reference, from the means of its seeds."""
-    found = jax.device_get(_biases(np.stack([row["gradient"] for row in numbers]), reference))
-    return {name: np.asarray(each, float) for name, each in found.items()}
-
-
-@jax.jit
-def _biases(means: Float[Array, "estimators seeds params"], reference: GradientEstimate) -> dict[str, Array]:
-    square = jnp.sum(reference.mean**2)
-    squared, errors = zip(*(estimators.squared_bias_of_means(each, reference) for each in means), strict=True)
-    gaps = [jnp.linalg.norm(jnp.mean(each, axis=0) - reference.mean) for each in means]
-    return {
-        "squared_bias": jnp.stack(squared) / square,
-        "squared_bias_se": jnp.stack(errors) / square,
-        "pooled_error": jnp.stack(gaps) / jnp.sqrt(square),
-    }
-
-
-def soft_gradient(simulator: Simulator, sigma: float, keys: Key[Array, " samples"]) -> Float[Array, " params"] | None:
-    """Return the median first-order gradient under the softest contact of the task's sweep, whatever is compared.
-
-    It is a candidate for the reference's control variate under every contact model: beyond some stiffness first-order
-    gradients are noise, while this one still points roughly along the gradient. None if the reference uses no
-    candidates or the task has no contact.
-    """
-    task = simulator.task
-    if task.contact_pair is None or not takes_candidates(task):
-        return None
-    (cell,), _ = family_grid(task, ("penalty",), (min(task.defaults.stiffnesses),))
-    objective = simulator.objective(cell.contact, sigma)
-    return jnp.median(objective.differentiate(task.theta, jax.random.clone(keys)).gradient, axis=0)
-
-
-def reference_of(
-    task: Task,
-    objective: MjxObjective | Reference,
-    odd_keys: Key[Array, " pairs"],
-    candidate_keys: Key[Array, " samples"],
-    pilot: Evaluation,
-    soft: Float[Array, " params"] | None,
-) -> GradientEstimate:
-    """Return the reference gradient of a contact model, independent of which others are compared.
-
-    Args:
-        objective: the task under that contact model, or its analytic system.
-        odd_keys: keys of the rollout pairs.
-        candidate_keys: keys of the first-order samples whose median is a candidate for the control variate.
-        pilot: a batch from other keys, used to select among the candidates.
-        soft: another candidate, see `soft_gradient`.
-    """
-    if not isinstance(objective, MjxObjective) or not takes_candidates(task):
-        plus, minus = objective.evaluate_pair(task.theta, odd_keys)
-        return _antithetic(plus, minus, "zero_noise")
-    own = jnp.median(objective.differentiate(task.theta, candidate_keys).gradient, axis=0)
-    candidates = jnp.stack([own, jnp.zeros_like(own) if soft is None else soft])
-    padding = padded_size(len(pilot.value)) - len(pilot.value)
-    pilot = jax.tree.map(lambda leaf: np.pad(leaf, [(0, padding)] + [(0, 0)] * (leaf.ndim - 1)), pilot)
-    return _reference_gradient(objective.evaluate_odd(task.theta, odd_keys), pilot, candidates, objective.sigma)
-
-
-def takes_candidates(task: Task) -> bool:
-    """Whether the reference is made from odd parts and a control variate."""
-    return task.policy.additive and task.noise == "gaussian"
-
-
-_antithetic = jax.jit(estimators.antithetic, static_argnames="baseline")
-
-
-@partial(jax.jit, static_argnames="sigma")
-def _reference_gradient(
-    odd: Evaluation, pilot: Evaluation, candidates: Float[Array, "candidates params"], sigma: float
-):
-    return estimate_reference(odd, pilot, list(candidates), sigma)
-
-
-@cache
-def _seed_numbers(chosen: tuple[Estimator, ...], confidence: float) -> Compiled:
-    """Compiled statistics of all estimators, batched over seeds: a function of batches, which may be padded, their
-    number of samples, reference and keys."""
-
-    def numbers(batches, samples, reference, key):
-        estimates = [_estimate(estimator, batches, samples) for estimator in chosen]
-        found = estimate_numbers(estimates, reference, key, confidence)
-        padding = len(batches["evaluation"].value) - samples
-        return [row | {"nonfinite": row["nonfinite"] - padding} for row in found]
-
-    return Compiled(jax.vmap(numbers, (0, None, None, 0)), "numbers of seeds", chosen, confidence)
-
-
-def _estimate(estimator: Estimator, batches: Batches, samples: Array) -> GradientEstimate:
-    """The estimate from the first samples of batches, the others being padding if the estimator is mergeable."""
-    if not estimator.mergeable:
-        return estimator(batches)
-    parts = [part.per_sample for part in estimator.parts(*estimator.pick(batches))]
-    real = jnp.arange(len(parts[0]))[:, None] < samples
-    return estimator.join(*(estimators.summarise(jnp.where(real, part, jnp.nan)) for part in parts))
-
-
-def _padded(leaf: Array, size: int) -> Array | np.ndarray:
-    """Batches of several seeds with copies of their last sample, up to a size."""
-    samples = leaf.shape[1]
-    return leaf if samples == size else np.asarray(leaf)[:, np.minimum(np.arange(size), samples - 1)]
-
-
-@partial(jax.jit, static_argnames="chosen")
-def _rows_of_parts(batches: Batches, chosen: tuple[Estimator, ...]) -> list[list[Array]]:
-    """Samples of each estimator's parts."""
-    return [[part.per_sample for part in each.parts(*each.pick(batches))] for each in chosen]
-
-
-def estimate_numbers(
-    estimates: Sequence[GradientEstimate], reference: GradientEstimate, key: Key[Array, ""], confidence: float
-) -> list[dict[str, Any]]:
-    """Compute the numbers of each estimate that depend only on its samples and the reference gradient."""
-    result = []
-    reference_effective = estimators.effective_samples(reference).count
-    for estimate in estimates:
-        lower, upper = estimators.variance_interval(estimate, confidence)
-        median, high, most = estimators.norm_quantiles(estimate, (0.5, 0.9, 1.0))
-        effective = estimators.effective_samples(estimate)
-        test = estimators.bias_test(estimate, reference, jax.random.clone(key), num_draws=BIAS_DRAWS)
-        result.append(
-            {
-                "gradient": estimate.mean,
-                "gradient_norm": jnp.linalg.norm(estimate.mean),
-                "variance": estimate.variance,
-                "variance_lower": lower,
-                "variance_upper": upper,
-                "norm_median": median,
-                "norm_90": high,
-                "norm_max": most,
-                "effective_samples": effective.count,
-                "top_share": effective.top_share,
-                "reference_norm": jnp.linalg.norm(reference.mean),
-                "reference_effective_samples": reference_effective,
-                **{name: getattr(estimate.alpha, name, None) for name in ("alpha", "epsilon", "discrepancy")},
-                "bias_p_value": test.p_value,
-                "nonfinite": estimate.num_nonfinite,
-            }
-            | {name: value for name, value in vars(estimators.compare(estimate, reference)).items() if name != "error"}
-        )
-    return result
+        return reference_of(self._plan.task_of(cell), objective, *self._reference_keys, pilot, self._soft.get(softened))

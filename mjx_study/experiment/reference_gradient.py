@@ -10,11 +10,24 @@ under any contact:
 """
 
 from collections.abc import Sequence
+from functools import partial
+from typing import Final
 
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Array, Float, Key
 
+import estimators
 from estimators import Evaluation, GradientEstimate, delta_control_variate
+from mjx_study.experiment.memory import padded_size
+from mjx_study.objective import MjxObjective, Simulator
+from mjx_study.reference import Reference
+from mjx_study.tasks.contact_grid import family_grid
+from mjx_study.tasks.task import Task
+
+CANDIDATES: Final = 100
+"""Number of first-order samples whose median is a candidate for the control variate."""
 
 
 def estimate_reference(
@@ -39,3 +52,60 @@ def estimate_reference(
         best = jnp.where(gain > explained, jnp.where(usable, slope * candidate, 0.0), best)
         explained = jnp.maximum(explained, gain)
     return delta_control_variate(odd, best, sigma)
+
+
+def soft_gradient(simulator: Simulator, sigma: float, keys: Key[Array, " samples"]) -> Float[Array, " params"] | None:
+    """Return the median first-order gradient under the softest contact of the task's sweep, whatever is compared.
+
+    It is a candidate for the reference's control variate under every contact model: beyond some stiffness first-order
+    gradients are noise, while this one still points roughly along the gradient. None if the reference uses no
+    candidates or the task has no contact.
+    """
+    task = simulator.task
+    if task.contact_pair is None or not takes_candidates(task):
+        return None
+    (cell,), _ = family_grid(task, ("penalty",), (min(task.defaults.stiffnesses),))
+    objective = simulator.objective(cell.contact, sigma)
+    return jnp.median(objective.differentiate(task.theta, jax.random.clone(keys)).gradient, axis=0)
+
+
+def reference_of(
+    task: Task,
+    objective: MjxObjective | Reference,
+    odd_keys: Key[Array, " pairs"],
+    candidate_keys: Key[Array, " samples"],
+    pilot: Evaluation,
+    soft: Float[Array, " params"] | None,
+) -> GradientEstimate:
+    """Return the reference gradient of a contact model, independent of which others are compared.
+
+    Args:
+        objective: the task under that contact model, or its analytic system.
+        odd_keys: keys of the rollout pairs.
+        candidate_keys: keys of the first-order samples whose median is a candidate for the control variate.
+        pilot: a batch from other keys, used to select among the candidates.
+        soft: another candidate, see `soft_gradient`.
+    """
+    if not isinstance(objective, MjxObjective) or not takes_candidates(task):
+        plus, minus = objective.evaluate_pair(task.theta, odd_keys)
+        return _antithetic(plus, minus, "zero_noise")
+    own = jnp.median(objective.differentiate(task.theta, candidate_keys).gradient, axis=0)
+    candidates = jnp.stack([own, jnp.zeros_like(own) if soft is None else soft])
+    padding = padded_size(len(pilot.value)) - len(pilot.value)
+    pilot = jax.tree.map(lambda leaf: np.pad(leaf, [(0, padding)] + [(0, 0)] * (leaf.ndim - 1)), pilot)
+    return _reference_gradient(objective.evaluate_odd(task.theta, odd_keys), pilot, candidates, objective.sigma)
+
+
+def takes_candidates(task: Task) -> bool:
+    """Whether the reference is made from odd parts and a control variate."""
+    return task.policy.additive and task.noise == "gaussian"
+
+
+_antithetic = jax.jit(estimators.antithetic, static_argnames="baseline")
+
+
+@partial(jax.jit, static_argnames="sigma")
+def _reference_gradient(
+    odd: Evaluation, pilot: Evaluation, candidates: Float[Array, "candidates params"], sigma: float
+) -> GradientEstimate:
+    return estimate_reference(odd, pilot, list(candidates), sigma)

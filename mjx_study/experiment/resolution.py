@@ -116,7 +116,7 @@ class ThetaLine:
 
 
 def line_of(task: Task, points: int, span: Sequence[float] | None, direction: str | None, seed: int) -> ThetaLine:
-    """Return the line through a task's theta; for a scalar parameter, its range, whatever theta is.
+    """Return the line through a task's theta; for a scalar parameter, its range, independent of theta.
 
     Args:
         span: first and last t; None for the task's, or `SPAN_SIGMAS` to either side.

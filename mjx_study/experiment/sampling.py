@@ -1,7 +1,7 @@
 """Sample a cell: keys, batches of every oracle over seeds, and solver residuals."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from typing import Any, Final
@@ -13,9 +13,10 @@ from jaxtyping import Array, Float, Int, Key
 
 from estimators import ORACLES, Linearisation
 from mjx_study.experiment.memory import batches_at_once, padded_size
-from mjx_study.experiment.plan import StudyCell, StudyPlan
+from mjx_study.experiment.study import StudyCell, StudyPlan
 from mjx_study.objective import MjxObjective, Simulator
 from mjx_study.reference import Reference
+from mjx_study.tasks.task import Task
 
 MOST_RESIDUAL: Final = {"float64": 1e-6, "float32": 1e-3}
 """Relative solver residual above which a sample is reported as unconverged."""
@@ -93,24 +94,13 @@ def draw_batches(
     return drawn, seconds, residuals
 
 
-def rollouts_of(oracle: str, samples: int, random_start: bool) -> tuple[int, int]:
-    """Number of rollouts in a batch, baselines included, and how many of them are differentiated."""
-    return sum(rows for _, rows in calls_of(oracle, samples, random_start)), samples * ORACLES[oracle].order
-
-
-def calls_of(oracle: str, samples: int, random_start: bool) -> list[tuple[str, int]]:
-    """Programs of `MjxObjective` called for a batch, each with its number of rows, baselines included."""
-    baselines = samples if random_start else min(samples, 1)
-    return {
-        "evaluation": [("value", samples + baselines)],
-        "pair": [("value", 2 * samples + baselines)],
-        "steps": [("steps", samples), ("steps", baselines)],
-        "step_pair": [("steps", 2 * samples), ("steps", baselines)],
-        "differentiation": [("gradient", samples)],
-        "corrected": [("corrected", samples)],
-        "step_differentiation": [("step_gradient", samples)],
-        "linearisation": [("linearisation", samples), ("steps", baselines)],
-    }[oracle]
+def rollouts_of(oracles: Iterable[str], samples: int, task: Task) -> Int[np.ndarray, "2"]:
+    """Number of rollouts in a batch of each oracle, baselines included, and how many of them are differentiated."""
+    baselines, found = samples if task.random_start else min(samples, 1), np.zeros(2, int)
+    for name in oracles:
+        oracle = ORACLES[name]
+        found += [samples * oracle.rollouts + oracle.baseline * baselines, samples * oracle.order]
+    return found
 
 
 def residuals_of(batch: Any) -> Float[np.ndarray, " rollouts"]:

@@ -19,8 +19,7 @@ FIRST_ORDER: Final = (
 
 
 def reject_unread(chosen: Sequence[str | Estimator], given: Iterable[str]) -> None:
-    """Raise OptionError for an option of estimators that none of the chosen ones reads; objects have options of their
-    own."""
+    """Raise OptionError for an estimators' option that none of the chosen ones reads; objects read none."""
     found = [find_estimator(each) for each in chosen]
     read = {name for each in found if isinstance(each, type) for name in _fields(each)}
     names = ", ".join(each.name for each in found)
@@ -38,7 +37,11 @@ def reads_onset(chosen: Iterable[str | Estimator], onset: str = "jump") -> bool:
 
 
 def reject_unused_options(
-    config: StudyConfig, given: Sequence[str], grids: Sequence[tuple[Task, Sequence[ContactPoint]]]
+    config: StudyConfig,
+    given: Sequence[str],
+    grids: Sequence[tuple[Task, Sequence[ContactPoint]]],
+    *,
+    first_order: bool = False,
 ) -> None:
     """Raise OptionError for an option that was given and has no effect in any cell, and ValueError for an onset
     estimator without one.
@@ -47,9 +50,9 @@ def reject_unused_options(
         config: the study, with the contact of a single run if it is one.
         given: names of the options that the user gave.
         grids: tasks, each with its contact models.
+        first_order: whether cells have means of first-order gradients with any estimators.
     """
     reject_unread(config.estimators, [name for name in (*ESTIMATOR_OPTIONS, "published") if name in given])
-    along = config.settings.kind == "landscapes"  # which have the mean of FoBG, whatever the estimators
     simulated = [task for task, models in grids if not all(each.analytic for each in models)]
     touching = any(task.scene.has_constraints for task in simulated)
     families = {
@@ -70,10 +73,10 @@ def reject_unused_options(
         (["cone"], touching, "has no effect: nothing that is simulated has contact"),
         (
             ["onset"],
-            touching and (along or reads_onset(config.estimators, config.onset)),
+            touching and (first_order or reads_onset(config.estimators, config.onset)),
             f"{FIRST_ORDER} (estimators named _onset have the linear term anyway)",
         ),
-        (["backward"], touching and (along or reads_onset(config.estimators)), FIRST_ORDER),
+        (["backward"], touching and (first_order or reads_onset(config.estimators)), FIRST_ORDER),
         (["backward_stiffness"], takes_stiffness(surrogates), "has no effect: no surrogate family takes one"),
         (SCENE_OPTIONS, bool(simulated), "has no effect: nothing is simulated"),
     )

@@ -111,7 +111,10 @@ def plan_scene_gradcheck(
         stiffnesses: stiffnesses for families that take one [N/m].
         seed: random seed of the states.
         pair: names of the two geoms whose contact has the stiffness; every contact gets the same solref.
+        damping: override of each family's damping [N s/m].
         horizon: number of steps of the rollout from which states are taken.
+        states: number of states per contact model.
+        stock: whether to check the derivative of `mjx.step` too.
 
     Raises:
         ValueError: as for `plan_gradcheck`, or a stiffness without a pair.

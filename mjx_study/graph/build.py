@@ -1,7 +1,7 @@
 """Build C into libraries for this processor, once: by the system's compiler, into a cache checked before it is used.
 
 A library's name is a digest of everything that it depends on: source, compiler, flags, processor and version of XLA's
-interface. Without a compiler, or with MJX_STUDY_NATIVE=0, nothing is built.
+interface.
 """
 
 import ctypes
@@ -19,6 +19,7 @@ from concurrent.futures import Future
 from pathlib import Path
 from typing import Any, Final
 
+import jax
 import jax.ffi
 
 from mjx_study.caches import read_cached, write_cached
@@ -27,8 +28,6 @@ from mjx_study.graph import cuda
 from mjx_study.runtime import available_cores, libraries_folder, processor
 from mjx_study.version import version_of
 
-SWITCH: Final = "MJX_STUDY_NATIVE"
-"""Environment variable; 0 does without native code."""
 FLAGS: Final = (
     *("-O2", "-std=gnu11", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math", "-fwrapv"),
     *("-shared", "-fPIC", "-w"),
@@ -57,17 +56,9 @@ def compiler() -> tuple[tuple[str, ...], str] | None:
     return None
 
 
-def native_identity() -> str | None:
-    """Digest of what libraries depend on besides their source; None if there are to be none."""
-    if os.environ.get(SWITCH) == "0" or compiler() is None:
-        return None
-    if jax.default_backend() != "cpu" and cuda.target() is None:
-        return None
-    return _identity()
-
-
 @functools.cache
-def _identity() -> str:
+def build_identity() -> str:
+    """Digest of what libraries depend on besides their source."""
     return _digest(compiler(), _FLAGS_HERE, processor(), cuda.target(), version_of("jaxlib"))
 
 
@@ -80,7 +71,7 @@ def _digest(*parts: Any) -> str:
 
 def build_library(source: str) -> str:
     """Begin to build a library in the background, unless it is known, and return its name."""
-    name = PREFIX + _digest(source, _identity())
+    name = PREFIX + _digest(source, build_identity())
     with _LOCK:
         if name not in _BUILT:
             _BUILT[name] = future = Future()
@@ -108,11 +99,12 @@ def libraries_in(content: bytes) -> set[str]:
 
 
 def _finish(name: str, source: str, future: Future[Any]) -> None:
+    found = None
     try:
         with _AT_ONCE:
-            future.set_result(_cached(name) or _build(name, source))
-    except BaseException as error:
-        future.set_exception(error)
+            found = _cached(name) or _build(name, source)
+    finally:
+        future.set_result(found)
 
 
 def _build(name: str, source: str) -> Any:
@@ -154,14 +146,17 @@ def _cached(name: str) -> Any:
 
 
 def _loaded(name: str, content: bytes) -> Any:
-    """Load a library, register its handler with XLA, and return it."""
+    """Load a library, register its handler with XLA, and return it; None if that fails."""
     with temporary_folder() as folder:  # the file whose digest was checked, whatever becomes of the one in the cache
         path = Path(folder, f"{name}.so")
         path.write_bytes(content)
-        library = ctypes.CDLL(str(path))
-    on_gpu = cuda.target() is not None
-    if on_gpu and (error := library.prepare()):
-        print(f"mjx-study: error {error} of the CUDA driver: steps run through XLA, more slowly", file=sys.stderr)
-        return None
-    jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(library.handler), platform="CUDA" if on_gpu else "cpu")
+        try:
+            library = ctypes.CDLL(str(path))
+            on_gpu = cuda.target() is not None
+            if on_gpu and (error := library.prepare()):
+                raise OSError(f"error {error} of the CUDA driver")
+            jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(library.handler), platform="CUDA" if on_gpu else "cpu")
+        except (OSError, AttributeError, jax.errors.JaxRuntimeError) as error:
+            print(f"mjx-study: native code cannot be loaded, steps run through XLA: {error}", file=sys.stderr)
+            return None
     return library

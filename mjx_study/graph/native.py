@@ -1,19 +1,42 @@
 """Functions of small arrays as native code, called by XLA for a whole batch at once."""
 
+import os
 from collections.abc import Callable, Sequence
-from functools import cached_property, partial
-from typing import Any
+from functools import cache, cached_property, partial
+from typing import Any, Final
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
-from mjx_study.graph.build import build_library, library_ready
+from mjx_study.graph import cuda
+from mjx_study.graph.build import build_identity, build_library, compiler, library_ready
 from mjx_study.graph.c import NotWrittenError, source_of
 from mjx_study.graph.evaluation import written_out
-from mjx_study.graph.function import ScalarFunction
+from mjx_study.graph.function import ScalarFunction, capture
+
+SWITCH: Final = "MJX_STUDY_NATIVE"
+"""Environment variable; 0 does without native code."""
+
+
+def native_identity() -> str | None:
+    """Digest of what native code depends on besides its source: processor, compiler and flags.
+
+    None if there is to be none: with `SWITCH`, on accelerators other than NVIDIA's, and without compilers that work.
+    """
+    served = jax.default_backend() == "cpu" or cuda.target() is not None
+    wanted = os.environ.get(SWITCH) != "0" and served
+    return build_identity() if wanted and compiler() is not None and _works() else None
+
+
+@cache
+def _works() -> bool:
+    """Whether the smallest of functions can be built."""
+    function = capture(lambda x: x + 1, jax.ShapeDtypeStruct((), np.float32), most=9)
+    return library_ready(build_library(source_of(function, jax.default_backend())))
 
 
 def as_native(values: ScalarFunction, function: ScalarFunction) -> "NativeFunction | None":

@@ -9,13 +9,12 @@ from typing import Any
 
 import jax
 
-from mjx_study.graph.build import native_identity
 from mjx_study.graph.derivative_rule import Transpose, flat_with_rule, instantiated
 from mjx_study.graph.differentiation import NotDifferentiableError
 from mjx_study.graph.evaluation import written_out
 from mjx_study.graph.function import ScalarFunction
 from mjx_study.graph.linear_map import LinearMap, derivative
-from mjx_study.graph.native import as_native
+from mjx_study.graph.native import as_native, native_identity
 
 
 def computed(function: ScalarFunction, inputs: Sequence[Any], transpose: Transpose | None = None) -> list[Any]:

@@ -15,8 +15,8 @@ import jax
 import numpy as np
 from jax.core import Tracer
 
-from mjx_study.graph.build import native_identity
 from mjx_study.graph.function import ScalarFunction, capture, is_input
+from mjx_study.graph.native import native_identity
 from mjx_study.graph.nodes import TooLargeError, no_type_check
 from mjx_study.graph.operation import computed
 

@@ -15,7 +15,7 @@ from mjx_study.objective.batches import (
     compiled_rollout,
     contact_for,
 )
-from mjx_study.objective.chunks import MAX_CHUNK, chunk_for, rounds, spread
+from mjx_study.objective.chunks import MAX_CHUNK, chunk_for, spread
 from mjx_study.objective.cost import rollout_cost, simulate
 from mjx_study.objective.programs import SamplePrograms
 
@@ -30,7 +30,6 @@ __all__ = [
     "compiled_rollout",
     "contact_for",
     "rollout_cost",
-    "rounds",
     "simulate",
     "spread",
 ]

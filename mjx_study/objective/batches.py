@@ -13,12 +13,11 @@ from jaxtyping import Array, Float, Key
 from estimators import Differentiation, Evaluation, Linearisation, StepDifferentiation, StepEvaluation
 from estimators.noise import check_sigma
 from mjx_study.compiled import Compiled
-from mjx_study.objective.chunks import rounds, spread
+from mjx_study.objective.chunks import spread
 from mjx_study.objective.cost import simulate
 from mjx_study.objective.programs import SamplePrograms
 from mjx_study.runtime import local_devices
 from mjx_study.simulation.contact import ContactModel
-from mjx_study.stopwatch import timed
 from mjx_study.tasks.task import Task
 
 Theta = Float[Array, " params"]
@@ -91,10 +90,9 @@ class Simulator:
         if len(noise_scale) == 0:
             raise ValueError("there are no samples to run: give at least one key")
         shared = theta, contact, np.asarray(sigma, self.task.scene.template.qpos.dtype)
-        with timed(self.program(name, contact), rounds(len(noise_scale), self.chunk_size, len(self.devices))):
-            return jax.block_until_ready(
-                spread(self._programs[name], shared, (keys, noise_scale), self.chunk_size, self.devices)
-            )
+        return jax.block_until_ready(
+            spread(self._programs[name], shared, (keys, noise_scale), self.chunk_size, self.devices)
+        )
 
     def form(self, name: str, theta: Any, contact: ContactModel | None, sigma: Any) -> Any:
         """Shapes and types of a chunk's outputs of one of `SamplePrograms`, without running it."""
@@ -106,10 +104,6 @@ class Simulator:
         dtype = self.task.scene.template.qpos.dtype
         keys = np.zeros((self.chunk_size, 2), np.uint32)
         return theta, contact, np.asarray(sigma, dtype), keys, np.ones(self.chunk_size, dtype)
-
-    def program(self, name: str, contact: ContactModel | None) -> tuple[str, Task, Any, int]:
-        """Key for the run time of one of `SamplePrograms`: name, task, kind of contact, samples per call."""
-        return name, self.task, jax.tree.structure(contact), self.chunk_size
 
 
 @dataclasses.dataclass(frozen=True)

@@ -62,11 +62,6 @@ def spread(program: Compiled, shared: Any, rows: Sequence[np.ndarray], chunk: in
     return jax.tree.map(lambda *leaves: join.concatenate(leaves)[:count], *outputs)
 
 
-def rounds(samples: int, chunk: int, devices: int) -> int:
-    """Number of sequential calls that samples take, in chunks on several devices at once."""
-    return math.ceil(math.ceil(samples / chunk) / devices)
-
-
 def chunk_for(samples: int, devices: Sequence[Any], tasks: Sequence[Task] = ()) -> int:
     """Choose the chunk size for `samples` and their baseline.
 

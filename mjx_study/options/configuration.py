@@ -14,15 +14,13 @@ from typing import TYPE_CHECKING, Any, Final, Protocol, TypeVar, Union, runtime_
 
 from estimators.choices import DENSITIES, suggestion
 from estimators.registry import ESTIMATORS, options_of_estimators
-from mjx_study.choices import CONES, FAMILIES, INTEGRATORS, ONSETS, REFERENCE, SOLVERS, takes_stiffness
+from mjx_study.choices import CONES, FAMILIES, INTEGRATORS, KINDS, ONSETS, REFERENCE, SOLVERS, takes_stiffness
 from mjx_study.options.numbers import MAX_VALUES
 from mjx_study.options.option import OptionError, Rows, declared, options_of
 
 if TYPE_CHECKING:
     import estimators.estimator
 
-STUDIES: Final = ("gradients", "descents", "landscapes")
-"""Kinds of study."""
 CONTACTS: Final = (*FAMILIES, REFERENCE)
 """Contact families of a study, and the analytic reference."""
 UNSET_TASK: Final = "the task's"
@@ -118,14 +116,14 @@ class StudyConfig:
     """Everything that determines a study of gradient estimates, descents or landscapes.
 
     A field that is None takes the default in parentheses. Landscapes need `points`, and descents `iterations` or
-    `kind`. Objects among tasks and estimators have options of their own.
+    `kind`. Tasks and estimators given as objects keep their options.
     """
 
     tasks: tuple[str | NamedTask, ...] = dataclasses.field(
         metadata={"metavar": "TASK", "line": "names of tasks, or tasks", "allows_user_code": True}
     )
     kind: str | None = declared(
-        None, "KIND", "kind of study: {}", choices=STUDIES, unset="from --iterations and --points"
+        None, "KIND", "kind of study: {}", choices=KINDS, unset="from --iterations and --points"
     )
     estimators: tuple[Union[str, "estimators.estimator.Estimator"], ...] = declared(
         ("zobg", "fobg", "aobg"), "NAME", "see `mjx-study estimators`", choices=ESTIMATORS, allows_user_code=True
@@ -209,7 +207,7 @@ class StudyConfig:
         None, "M", "distance where --backward begins", "(0, inf)", unit="m", unset=UNSET_MJCF
     )
     horizon: int | None = declared(None, "H", "number of steps", "[1, 1000000]", unset=UNSET_TASK)
-    model: str | None = declared(None, "FILE.xml", "MJCF that replaces the task's own")
+    model: str | None = declared(None, "FILE.xml", "MJCF that replaces that of the task")
     integrator: str | None = declared(None, "NAME", "integrator: {}", choices=INTEGRATORS, unset=UNSET_MJCF)
     solver: str | None = declared(None, "NAME", "constraint solver: {}", choices=SOLVERS, unset=UNSET_MJCF)
     solver_iterations: int | None = declared(None, "N", "iterations of the solver", "[1, 100000]", unset=UNSET_MJCF)
@@ -300,7 +298,7 @@ class StudyConfig:
 
     @property
     def estimator_names(self) -> tuple[str, ...]:
-        """Names of the estimators; `module:class` of objects of your own."""
+        """Names of the estimators; `module:class` for user-defined objects."""
         return tuple(each if isinstance(each, str) else each.qualified_name() for each in self.estimators)
 
     @property

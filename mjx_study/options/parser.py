@@ -1,4 +1,4 @@
-"""The command line's parser: options from their declarations, and one line for whatever is wrong."""
+"""The command line's parser: options from their declarations, and errors in one line."""
 
 import argparse
 import dataclasses

@@ -11,7 +11,8 @@ from matplotlib.figure import Figure
 
 from mjx_study.plots.panels import a_few, against_stiffness, counted, estimators, line, make_panels, model_title
 from mjx_study.plots.style import line_with_band, robust_limits, style_of
-from mjx_study.results.findings import line_of, onset_of
+from mjx_study.results.curves import line_of
+from mjx_study.results.rows import onset_of
 from mjx_study.results.variables import DERIVED, DESCENTS, LANDSCAPES
 
 MOST_COST_RATIO: Final = 1e7

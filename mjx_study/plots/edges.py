@@ -7,8 +7,8 @@ import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 
-from mjx_study.execution.lost import EXPLODED
 from mjx_study.plots.panels import positive, unstable
+from mjx_study.results.warnings import EXPLODED
 
 UNDRAWN: Final = "no finite number (below: 0)"
 INSET: Final = 0.03

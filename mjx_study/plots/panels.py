@@ -11,7 +11,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from mjx_study.plots.style import NO_CONTACT, TITLES, combines, line_with_band, style_of
-from mjx_study.results.findings import estimators_of, label_in
+from mjx_study.results.rows import estimators_of, label_in
 from mjx_study.results.variables import COORDINATES
 from mjx_study.simulation.contact import stable
 

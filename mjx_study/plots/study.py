@@ -2,7 +2,7 @@
 
 import itertools
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import partial
 from typing import Final
 
@@ -13,16 +13,15 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from estimators.registry import label_of
-from mjx_study.plots.descents import achieved, descent, landscape
 from mjx_study.plots.edges import UNDRAWN, drawable
-from mjx_study.plots.gradients import alpha, bias, comparison, error_against_samples, variance
 from mjx_study.plots.panels import UNSTABLE, families, make_panels, number, positive, unstable
 from mjx_study.plots.style import TITLES, fit_texts, legend_below, mark_clipped
-from mjx_study.results.findings import onset_of
-from mjx_study.results.variables import COORDINATES, DESCENTS, GRADIENTS
+from mjx_study.results.kind import Drawing, kind_of
+from mjx_study.results.rows import onset_of
+from mjx_study.results.variables import COORDINATES, Variable
 from mjx_study.table import digits_to_tell_apart
 
-MOST_FIGURES: Final = 12
+MAX_FIGURES: Final = 12
 """Maximum number of figures of one kind; further tasks, timesteps and noises are dropped."""
 MOST_DECADES: Final = 6
 """Maximum ratio of FoBG to ZoBG, or of ZoBG to FoBG, that a map tells apart, as a power of ten."""
@@ -33,43 +32,33 @@ def plot_study(dataset: xr.Dataset) -> dict[str, Figure]:
     figures: dict[str, Figure] = {}
     if not dataset.data_vars:
         return figures
-    dataset = dataset.map(drawable, keep_attrs=True)
-
-    def add(kind: str, draw: Callable[[xr.Dataset, str], Figure | None], keep: str = "") -> None:
-        for suffix, title, part in itertools.islice(_slices(dataset, keep), MOST_FIGURES):
-            if (figure := draw(part, title)) is not None:
+    computed = kind_of(dataset).computed
+    finite = dataset.map(drawable, keep_attrs=True).assign({computed: dataset[computed]})
+    for name, drawing in drawings_of(dataset).items():
+        for suffix, title, part in itertools.islice(_slices(finite, computed, drawing.keep), MAX_FIGURES):
+            if (figure := drawing.draw(part, title)) is not None:
                 mark_clipped(figure)
                 legend_below(figure)
                 fit_texts(figure)
-                figures[kind + suffix] = figure
-
-    quantity = _quantity(dataset)
-    kinds: dict[str, Callable[[xr.Dataset, str], Figure | None]] = {
-        "final_cost": {"achieved": achieved, "descent": descent},
-        "variance": {"variance": variance, "bias": bias, "alpha": alpha}
-        if dataset.sizes.get("seed", 1) > 1
-        else {"comparison": comparison},
-        "smoothed": {"landscape": landscape},
-    }[quantity]
-    for kind, draw in kinds.items():
-        add(kind, draw)
-    if quantity == "variance" and dataset.sizes["samples"] > 1:
-        add("error_against_samples", error_against_samples, keep="samples")
-    if quantity == "smoothed":
-        return figures
-    pair = [name for name in COORDINATES if len(np.unique(dataset[name].values)) > 1][:2]
-    if len(pair) == 2 and {"zobg", "fobg"} <= set(dataset["estimator"].values.tolist()):
-        add(f"map_{pair[0]}_{pair[1]}", partial(_ratio_map, quantity=quantity, other=pair[1]), keep=pair[1])
+                figures[name + suffix] = figure
     return figures
 
 
-def _quantity(dataset: xr.Dataset) -> str:
-    """Name of the variable that identifies the kind of study."""
-    return next(name for name in ("final_cost", "smoothed", "variance") if name in dataset)
+def drawings_of(dataset: xr.Dataset) -> dict[str, Drawing]:
+    """Figures of a study's kind, and a map of FoBG over ZoBG if two parameters are swept."""
+    kind = kind_of(dataset)
+    found = kind.drawings(dataset)
+    pair = [name for name in COORDINATES if len(np.unique(dataset[name].values)) > 1][:2]
+    if kind.compared and len(pair) == 2 and {"zobg", "fobg"} <= set(dataset["estimator"].values.tolist()):
+        draw = partial(_ratio_map, variable=kind.variables[kind.compared], quantity=kind.compared, other=pair[1])
+        caption = "First order against zeroth order over two swept parameters."
+        found[f"map_{pair[0]}_{pair[1]}"] = Drawing(draw, caption, keep=pair[1])
+    return found
 
 
-def _slices(dataset: xr.Dataset, keep: str = "") -> Iterator[tuple[str, str, xr.Dataset]]:
-    """Yield parts with one value in every dimension except the contact model, `keep`, and those within a cell.
+def _slices(dataset: xr.Dataset, computed: str, keep: str) -> Iterator[tuple[str, str, xr.Dataset]]:
+    """Yield parts with one value in every dimension except the contact model, `keep`, and those within a cell, and with
+    the contact models for which the variable `computed` is known.
 
     Each comes with a file-name suffix and a title; of several sample counts, the largest unless kept.
     """
@@ -80,7 +69,8 @@ def _slices(dataset: xr.Dataset, keep: str = "") -> Iterator[tuple[str, str, xr.
     taken: set[str] = set()
     for picked in itertools.product(*choices):
         part = dataset.isel(dict(zip(names, picked, strict=True)))
-        part = part.isel(model=np.flatnonzero(_present(part)))
+        known = part[computed].notnull()
+        part = part.isel(model=np.flatnonzero(known.any([name for name in known.dims if name != "model"])))
         if part.sizes["model"] == 0:
             continue
         values = {name: texts[name][index] for name, index in zip(names, picked, strict=True)}
@@ -88,13 +78,13 @@ def _slices(dataset: xr.Dataset, keep: str = "") -> Iterator[tuple[str, str, xr.
         suffix = "".join("_" + re.sub(r"[^\w.+-]", "-", values[name])[:60] for name in varied)
         suffix += f"_{len(taken)}" if suffix in taken else ""
         taken.add(suffix)
-        told = ["".join(each if each.isprintable() else "?" for each in values["task"])] + [
+        shown = ["".join(each if each.isprintable() else "?" for each in values["task"])] + [
             f"{variable.heading} = {values[name]} {variable.shown_unit}".rstrip()
             for name, variable in COORDINATES.items()
             if name in values
         ]
-        told += [f"{values['cone']} cone"] if "cone" in varied else []
-        yield suffix, ", ".join(told), part
+        shown += [f"{values['cone']} cone"] if "cone" in varied else []
+        yield suffix, ", ".join(shown), part
 
 
 def _texts(values: np.ndarray) -> list[str]:
@@ -111,13 +101,7 @@ def _ticks(values: np.ndarray) -> list[str]:
     return [number(value, digits) for value in values.tolist()]
 
 
-def _present(part: xr.Dataset) -> np.ndarray:
-    """Mask of contact models that are computed, be it without a finite number."""
-    known = [part[name].notnull() for name in (_quantity(part), "residual") if name in part]
-    return np.any([each.any([name for name in each.dims if name != "model"]) for each in known], axis=0)
-
-
-def _ratio_map(part: xr.Dataset, title: str, quantity: str, other: str) -> Figure | None:
+def _ratio_map(part: xr.Dataset, title: str, variable: Variable, quantity: str, other: str) -> Figure | None:
     """Plot log10 of FoBG over ZoBG against two swept parameters, one panel per family; blue where FoBG is smaller."""
     found = [(family, rows) for family, rows in families(part) if family] or families(part)
     ratios = []
@@ -153,6 +137,6 @@ def _ratio_map(part: xr.Dataset, title: str, quantity: str, other: str) -> Figur
     assert mesh is not None
     below, above = bool(np.nanmin(known) < -extent), bool(np.nanmax(known) > extent)
     beyond = (("neither", "max"), ("min", "both"))[below][above]
-    told = f"log$_{{10}}$ of {(GRADIENTS | DESCENTS)[quantity].heading},\n{label_of('fobg', onset_of(part))} over ZoBG"
-    figure.colorbar(mesh, ax=list(grid[0]), label=told, extend=beyond)
+    label = f"log$_{{10}}$ of {variable.heading},\n{label_of('fobg', onset_of(part))} over ZoBG"
+    figure.colorbar(mesh, ax=list(grid[0]), label=label, extend=beyond)
     return figure

@@ -1,27 +1,21 @@
-"""Results of a study: a row for each gradient estimate, and findings supported by the intervals."""
+"""Findings that the intervals of gradient estimates and the weights of descents support, as sentences."""
 
 import json
 import math
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
-from types import SimpleNamespace
 from typing import Any, Final
 
 import numpy as np
 import xarray as xr
 
-from estimators import ENOUGH_EFFECTIVE, ESTIMATORS, ORACLES
-from estimators.registry import label_of
-from mjx_study.results.variables import GRADIENTS, ONSETS, THETA
-from mjx_study.table import digits_to_tell_apart, number, percent, with_error
+from estimators import ESTIMATORS, ORACLES
+from mjx_study.results.rows import BIASED_P_VALUE, SETTING, Row, label_in, rows_of
+from mjx_study.table import digits_to_tell_apart, percent
 
-BIASED_P_VALUE: Final = 0.001
-"""p-value at which a mean is called biased: the smallest that the test's 999 draws can yield."""
 OFF_SE: Final = 4.0
 """Standard errors beyond which a mean without a verdict is reported as off."""
-DETECTED_SE: Final = 4.0
-"""Standard errors beyond which two means are considered different."""
 NOTABLE_SHARE: Final = 0.05
 """Share of the largest slope beyond which a difference free of sampling error is reported."""
 MOST_UNCERTAINTY: Final = 0.2
@@ -37,103 +31,18 @@ the other 61."""
 LEAST_SPREAD: Final = 0.75
 """Standard deviation of the first onset's step from which an onset term is accurate to 1.5 % of what it adds; at 0.5
 it can be off by 60 %."""
-SETTING: Final = ("task", "timestep", "cone", "sigma", "samples")
-"""Coordinates shared by all rows of a finding."""
-AXES: Final = (*SETTING, "model", "seed", "estimator")
-"""Dimensions along which there is a row for each place."""
-PLACE: Final = (*AXES, "contact", "stiffness")
-"""Coordinates of a row."""
-BELOW, ABOVE, ALIKE = "below ZoBG's", "above ZoBG's", "not told apart from ZoBG's"
+BELOW, ABOVE, ALIKE = "below ZoBG's", "above ZoBG's", "not significantly different from ZoBG's"
 UNKNOWN: Final = "undecided (too few effective samples)"
 """Verdicts on FoBG's variance."""
 BOUND: Final = "its bound gamma is below epsilon, the radius of ZoBG's mean; increase --gamma or --samples"
 WEIGHTLESS: Final = (
-    "alpha is 0 in every iteration, generally since its bound gamma is below epsilon, the radius of ZoBG's mean (then "
+    "alpha is 0 in every iteration, usually because its bound gamma is below epsilon, the radius of ZoBG's mean (then "
     "increase --gamma or --samples), else since no first-order variance is finite"
 )
 """Why AoBG equals ZoBG: known of a batch, whose epsilon is kept, and supposed of a descent."""
 
 
-class Row(SimpleNamespace):
-    """One gradient estimate: its coordinates and every scalar variable of `GRADIENTS`; None where not applicable."""
-
-    def __getattr__(self, name: str) -> Any:
-        raise AttributeError(f"a row has no {name}")
-
-    @property
-    def believable(self) -> bool:
-        """Whether the batch has enough effective samples for its errors to be meaningful."""
-        return self.effective_samples >= ENOUGH_EFFECTIVE
-
-    @property
-    def bias_verdict(self) -> str:
-        """Result of the test for bias: "biased", "none seen", or "too few effective samples"."""
-        if not min(self.effective_samples, self.reference_effective_samples) >= ENOUGH_EFFECTIVE:
-            return "too few effective samples"
-        return "biased" if self.bias_p_value <= BIASED_P_VALUE else "none seen"
-
-    def as_dict(self) -> dict[str, Any]:
-        """All variables by name, derived ones included."""
-        return vars(self) | {"variance_seconds": self.variance_seconds, "bias_verdict": self.bias_verdict}
-
-    @property
-    def variance_seconds(self) -> float:
-        """Variance times seconds per sample: the variance remaining after one second of computing."""
-        return self.variance * self.seconds_per_sample
-
-
-def rows_of(dataset: xr.Dataset) -> list[Row]:
-    """Return a row for each computed estimate; contact model, seed and estimator vary fastest."""
-    rows, grid = [], dataset["gradient_norm"].transpose(*AXES)
-    names = [name for name, variable in GRADIENTS.items() if name in dataset and "param" not in variable.dims]
-
-    def along(name: str, *last: str) -> np.ndarray:
-        variable = dataset[name].variable
-        return variable.set_dims({**grid.sizes, **variable.sizes}).transpose(*AXES, *last).values
-
-    scalars, coordinates = ({name: along(name) for name in each} for each in (names, PLACE))
-    vectors = {name: along(name, f"{name}_entry") for name in ("solref", "solimp") if name in dataset}
-    for place in np.ndindex(grid.shape):
-        if np.isnan(scalars["residual"][place]):
-            continue  # not computed
-        numbers: dict[str, Any] = {name: values[place].item() for name, values in scalars.items()}
-        for name in ("alpha", "epsilon", "discrepancy", *ONSETS):
-            if name not in numbers or math.isnan(numbers[name]):
-                numbers[name] = None
-        counts = [name for name in numbers if GRADIENTS[name].digits == 0 and numbers[name] is not None]
-        numbers |= {name: int(numbers[name]) for name in counts}
-        at = {name: values[place] for name, values in coordinates.items()}
-        at = {name: value.item() if isinstance(value, np.generic) else value for name, value in at.items()}
-        solver = {name: tuple(values[place].tolist()) for name, values in vectors.items()}
-        rows.append(Row(**at, **solver, **numbers))
-    return rows
-
-
-def remains(name: str, value: float, debiased: float, error: float) -> str:
-    """Format what remains of one of `DEBIASED` without noise: a bound if no error is detected, "-" if noise explains
-    all of it, or if nothing is left and the standard error is unknown."""
-    best = 1.0 if name == "cosine" else 0.0
-    if math.isnan(debiased) or (debiased == best and math.isnan(error)):
-        return "-"
-    if not (debiased == best and 0 < error < math.inf):
-        return with_error(debiased, error)
-    if abs(debiased - value) <= 2 * error:
-        return "-"
-    decimals = 2 if error >= 0.005 else 4
-    above = best - math.ceil(10**decimals * 2 * error) / 10**decimals
-    return f"< {number(2 * error, 2)}" if best == 0 else f"> {above:.{decimals}f}"
-
-
-@np.errstate(over="ignore", invalid="ignore")  # numbers of a motion that explodes
-def findings_of(dataset: xr.Dataset) -> list[str]:
-    """Return the findings supported by a study's intervals, as sentences; none if no cell is computed."""
-    if not dataset.data_vars:
-        return []
-    kind = json.loads(dataset.attrs["config"])["kind"]
-    return {"gradients": _of_gradients, "descents": _of_descents, "landscapes": _of_landscapes}[kind](dataset)
-
-
-def _of_gradients(dataset: xr.Dataset) -> list[str]:
+def gradient_findings(dataset: xr.Dataset) -> list[str]:
     """Report where FoBG's variance exceeds ZoBG's and which means are biased."""
     gammas, confidence = gammas_of(dataset), json.loads(dataset.attrs["config"])["confidence"]
     label = partial(label_in, dataset)
@@ -145,7 +54,7 @@ def _of_gradients(dataset: xr.Dataset) -> list[str]:
     return _by_family(dataset, rows_of(dataset), of)
 
 
-def _of_descents(dataset: xr.Dataset) -> list[str]:
+def descent_findings(dataset: xr.Dataset) -> list[str]:
     """Report where the first-order batch of an AoBG with a bound has no weight in any iteration of any seed."""
     if "alpha" not in dataset:
         return []
@@ -197,22 +106,6 @@ def gammas_of(dataset: xr.Dataset) -> Bounds:
         for estimator, options in entry["estimators"].items()
         if "gamma" in options
     }
-
-
-def onset_of(dataset: xr.Dataset) -> str:
-    """Onset term of a study's first-order batches."""
-    return json.loads(dataset.attrs["config"]).get("onset", "none")
-
-
-def estimators_of(dataset: xr.Dataset) -> dict[str, dict[str, Any]]:
-    """Label and needs of each estimator of a study, by name, as its plan recorded them."""
-    return json.loads(dataset.attrs.get("described", "{}"))
-
-
-def label_in(dataset: xr.Dataset, name: str) -> str:
-    """Label of an estimator in texts and figures of a study; a user-defined one has that which its plan recorded."""
-    known = {} if name in ESTIMATORS else estimators_of(dataset).get(name, {})
-    return known.get("label") or label_of(name, onset_of(dataset))
 
 
 def differentiates(estimator: str) -> bool:
@@ -337,55 +230,3 @@ def _at(rows: Sequence[Row]) -> str:
     digits = digits_to_tell_apart(stiffnesses, least=4)
     rounded = (float(f"{value:.{digits}g}") for value in stiffnesses)
     return f" at K = {', '.join(f'{value:.{digits + 2}g}' for value in rounded)} N/m" if any(stiffnesses) else ""
-
-
-def _of_landscapes(dataset: xr.Dataset) -> list[str]:
-    """Report where the mean of FoBG differs from the slope of the mean cost."""
-    both = {"zobg", "fobg"} <= set(dataset["estimator"].values)
-    name = label_of("fobg", onset_of(dataset))
-    return [f"{label}: {_gap(one, f'E[{name}]')}" for label, one in curves_of(dataset)] if both else []
-
-
-def curves_of(dataset: xr.Dataset) -> list[tuple[str, xr.Dataset]]:
-    """Computed cells of a study of landscapes: contact model, and its numbers along the line."""
-    outer = (*SETTING, "model")
-    places = np.ndindex(*(dataset.sizes[name] for name in outer))
-    cells = [dataset.isel(dict(zip(outer, place, strict=True))) for place in places]
-    return [(model_name(one), one) for one in cells if bool(one["position"].notnull().any())]
-
-
-def model_name(one: xr.Dataset) -> str:
-    """Contact family of a part of a study with one contact model, and its stiffness if it has one."""
-    family = one["contact"].item()
-    stiffness = one["model"].item().removeprefix(family)
-    return f"{family}, K ={stiffness} N/m" if stiffness else family
-
-
-def line_of(dataset: xr.Dataset) -> tuple[str, str]:
-    """Symbol of the position along a landscape's line, and its unit, empty if it is not known."""
-    unit = dataset["position"].attrs.get("units", THETA)
-    return "t" if dataset.attrs["many_parameters"] else "theta", "" if unit == THETA else unit
-
-
-def _gap(one: xr.Dataset, mean: str) -> str:
-    """Report where the mean of FoBG differs from the slope of the mean cost, by quadrature if available."""
-    if "exact_slope" in one and bool(one["exact_slope"].notnull().all()):
-        first, slope = one["exact_first"].values, one["exact_slope"].values
-        largest = float(np.max(np.abs(slope)))
-        error = 3 * (one["exact_slope_error"].values + one["exact_first_error"].values) + NOTABLE_SHARE * largest
-        source, uncertainty = "the mean cost's slope", f"more than {percent(NOTABLE_SHARE)} of its largest value"
-    else:
-        first, slope = (one["slope"].sel(estimator=name).values for name in ("fobg", "zobg"))
-        error = DETECTED_SE * np.hypot(*(one["slope_se"].sel(estimator=name).values for name in ("fobg", "zobg")))
-        source, uncertainty = "E[ZoBG]", f"more than {DETECTED_SE:g} standard errors"
-    seen = np.abs(first - slope) > error
-    if not np.any(seen):
-        return f"{mean} nowhere differs from {source} by {uncertainty}"
-    name, unit = line_of(one)
-    unit = f" {unit}" if unit else ""
-    worst = int(np.argmax(np.where(seen, np.abs(first - slope), -np.inf)))
-    return (
-        f"{mean} differs from {source} by {uncertainty} at {percent(float(np.mean(seen)))} of the points, most at "
-        f"{name} = {one['position'].values[worst]:.3g}{unit}, where it is {first[worst]:.3g} in place of "
-        f"{slope[worst]:.3g}"
-    )

@@ -1,7 +1,7 @@
 """The quantities of a study, each described once for its Dataset, tables, figures, help and documentation."""
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -138,10 +138,6 @@ DERIVED: Final = {
     "steepest": Variable(EACH, "gradient", "steepest slope on the line", "steepest slope"),
 }
 """Quantities of tables that a Dataset does not hold."""
-VARIABLES: Final = {"gradients": GRADIENTS, "descents": DESCENTS, "landscapes": LANDSCAPES}
-"""Variables by kind of study."""
-QUANTITIES: Final = {kind: variables | COORDINATES | DERIVED for kind, variables in VARIABLES.items()}
-"""All quantities by kind of study."""
 DEBIASED: Final = {"relative_error": "debiased_error", "cosine": "debiased_cosine"}
 """Quantities that noise biases, and the corrected ones, which tables show beside them."""
 COLUMNS: Final = (
@@ -160,15 +156,15 @@ MEASURED: Final = ("seconds", "seconds_per_sample")
 """Measured times, the only variables that differ from run to run."""
 
 
-def variables_of(kind: str, names: Iterable[str]) -> dict[str, Variable]:
-    """Return the variables of a kind of study, with the metrics among the given names."""
-    told = {name: f"{name.partition('metric_')[2]}, mean over the rollouts of a final cost" for name in names}
-    metrics = {name: Variable(BATCH, "1", told[name]) for name in told if name.startswith(METRIC)}
-    metrics |= {name: Variable((), "1", told[name]) for name in told if name.startswith(START)}
-    return VARIABLES[kind] | metrics | CELL
+def with_metrics(variables: Mapping[str, Variable], names: Iterable[str]) -> dict[str, Variable]:
+    """Add to the variables of a kind of study those of every kind, and the task's metrics among the given names."""
+    means = {name: f"{name.partition('metric_')[2]}, mean over the rollouts of a final cost" for name in names}
+    metrics = {name: Variable(BATCH, "1", means[name]) for name in means if name.startswith(METRIC)}
+    metrics |= {name: Variable((), "1", means[name]) for name in means if name.startswith(START)}
+    return {**variables, **metrics, **CELL}
 
 
-def explained(kind: str, *names: str) -> str:
-    """Explain columns of a table for the help; all of them if none is named."""
-    shown = [QUANTITIES[kind][name] for name in names or QUANTITIES[kind]]
-    return described({variable.heading: variable.description for variable in shown})
+def explained(variables: Mapping[str, Variable], *names: str) -> str:
+    """Explain columns of a table for the help: the named ones, derived quantities included, or all variables."""
+    known = {**variables, **COORDINATES, **DERIVED}
+    return described({known[name].heading: known[name].description for name in names or variables})

@@ -3,12 +3,13 @@
 import io
 import math
 import zipfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import IO, Any, Final
 
 import numpy as np
 
-from mjx_study.results.variables import METRIC, ONSETS, START, VARIABLES, variables_of
+from mjx_study.results.kind import StudyResults, find_kind
+from mjx_study.results.variables import ONSETS, with_metrics
 
 MOST_CELL_BYTES: Final = 2**31
 """Maximum size of a cell's file [bytes]."""
@@ -21,12 +22,10 @@ HEADERS: Final = {
     (2, 0): np.lib.format.read_array_header_2_0,
 }
 """Readers of .npy headers, by version of the format."""
-KINDS: Final = "fiub"
+NUMBERS: Final = "fiub"
 """Kinds of the types that a variable may have."""
 MOST_COUNT: Final = 10**15
 """Maximum of a variable that counts."""
-SIZES: Final = {"solref_entry": 2, "solimp_entry": 5}
-"""Dimensions of the same size in every study."""
 
 
 def write_arrays(file: IO[bytes], arrays: Mapping[str, np.ndarray]) -> None:
@@ -65,22 +64,15 @@ def _array(content: bytes) -> np.ndarray:
     return flat.reshape(shape, order="F" if by_column else "C")
 
 
-def required(kind: str) -> list[str]:
+def required(kind: StudyResults) -> list[str]:
     """Variables that every cell of a kind of study has."""
-    optional = {*ONSETS, "gradient", "reference"} if kind == "gradients" else set[str]()
-    return [name for name in VARIABLES[kind] if name not in optional and not name.startswith("exact_")]
+    return [name for name in kind.variables if name not in kind.optional]
 
 
 def sizes_of(document: Mapping[str, Any], index: int) -> dict[str, int]:
     """Size of every dimension within a cell."""
     config, task = document["config"], document["resolved"][document["cells"][index]["at"]["task"]]
-    return SIZES | {
-        "seed": config["seeds"],
-        "estimator": len(config["estimators"]),
-        "iteration": config["iterations"] or 0,
-        "point": config.get("points") or 0,
-        "param": task.get("parameters", 1),
-    }
+    return find_kind(config["kind"]).sizes(config, task.get("parameters", 1))
 
 
 def check_cell(arrays: Mapping[str, np.ndarray], document: Mapping[str, Any], index: int) -> None:
@@ -89,21 +81,17 @@ def check_cell(arrays: Mapping[str, np.ndarray], document: Mapping[str, Any], in
     Descents of a task may have fewer iterations than the longest of the study. Counts are neither negative nor huge,
     and not NaN except after the end of a descent and without an onset term.
     """
-    kind, sizes = document["config"]["kind"], sizes_of(document, index)
+    kind, sizes = find_kind(document["config"]["kind"]), sizes_of(document, index)
     if missing := [name for name in required(kind) if name not in arrays]:
         raise ValueError(f"it has no {missing[0]}")
-    metrics: Iterable[str] = [name for name in arrays if name.startswith((METRIC, START))]
-    for name, variable in variables_of(kind, metrics).items():
+    for name, variable in with_metrics(kind.variables, arrays).items():
         if (array := arrays.get(name)) is None:
             continue
-        if array.dtype.kind not in KINDS:
+        if array.dtype.kind not in NUMBERS:
             raise ValueError(f"{name} is of type {array.dtype}, not a number")
         wanted = tuple(sizes[dim] for dim in variable.dims)
-        least = tuple(0 if dim == "iteration" else sizes[dim] for dim in variable.dims)
-        within = len(array.shape) == len(wanted) and all(
-            low <= size <= high for low, size, high in zip(least, array.shape, wanted, strict=True)
-        )
-        if not within:
+        shortened = array.shape[:1] if variable.dims[:1] == ("iteration",) else wanted[:1]
+        if array.shape != shortened + wanted[1:] or array.shape[:1] > wanted[:1]:
             raise ValueError(f"{name} has shape {array.shape}; the study needs {wanted}")
         padded = np.isnan(array) if "iteration" in variable.dims or name in ONSETS else np.zeros(array.shape, bool)
         if not variable.digits and not np.all(padded | ((array >= 0) & (array <= MOST_COUNT))):

@@ -1,6 +1,6 @@
 """Files of one cell: its numbers or a checkpoint of them, and the reason why it could not be computed.
 
-Each holds digests of its content, of the study and of the cell's place in it, and counts only if all three match.
+Each holds digests of its content, of the study and of the cell, and counts only if all three match.
 """
 
 import dataclasses
@@ -36,17 +36,17 @@ class CellFile:
 
     Attributes:
         study: digest of the study.
-        place: digest of the cell's place in it.
+        cell: digest of the cell's index and coordinates.
     """
 
     path: Path
     study: str
-    place: str
+    cell: str
 
     def write(self, arrays: Mapping[str, np.ndarray], versions: Mapping[str, str]) -> None:
         """Write numbers, and the versions that computed them."""
         kept = dict(arrays) | {VERSIONS: np.array(json.dumps(versions))}
-        digest = np.array([digest_of_arrays(kept), self.study, self.place])
+        digest = np.array([digest_of_arrays(kept), self.study, self.cell])
         write_whole(self.path, lambda file: write_arrays(file, {"digest": digest} | kept))
 
     def read(
@@ -57,12 +57,12 @@ class CellFile:
         path = self.path
         try:
             arrays = read_arrays(read_whole(path, follow=False, most=MOST_CELL_BYTES))
-            content, study, place = arrays.pop("digest").tolist()
+            content, study, cell = arrays.pop("digest").tolist()
         except Exception as error:  # numpy and zipfile may raise anything
             raise StudyError(f"{path} is damaged ({reason_of(error)}); move it away to compute it again") from error
         wrong = {
             "a cell of another study": study != self.study,
-            "another cell of this study": place != self.place,
+            "another cell of this study": cell != self.cell,
             "damaged (its digest does not match)": content != digest_of_arrays(arrays),
         }
         if is_that := next((what for what, holds in wrong.items() if holds), None):
@@ -95,7 +95,7 @@ class CellFile:
         return found.reason
 
     def _digest(self, reason: str) -> str:
-        return digest_of_json({"reason": reason, "study": self.study, "place": self.place})
+        return digest_of_json({"reason": reason, "study": self.study, "place": self.cell})
 
 
 def digest_of_arrays(arrays: Mapping[str, np.ndarray]) -> str:

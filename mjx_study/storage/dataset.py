@@ -9,7 +9,8 @@ import numpy as np
 import xarray as xr
 
 from mjx_study.disk import write_whole
-from mjx_study.results.variables import COORDINATES, THETA, variables_of
+from mjx_study.results.kind import find_kind
+from mjx_study.results.variables import COORDINATES, THETA, with_metrics
 
 Cells = Mapping[int, tuple[Mapping[str, np.ndarray], Mapping[str, str]]]
 """Arrays by variable of each cell, by index, with the versions of the software that computed them."""
@@ -21,34 +22,29 @@ def dataset_of(document: Mapping[str, Any], cells: Cells) -> xr.Dataset:
     In the document, each cell has the key "at", its index along every outer dimension, and solref and solimp of its
     contact unless the MJCF's apply.
     """
-    config, places = document["config"], document["cells"]
-    outer = tuple(places[0]["at"])
-    cells = {index: (_solver(places[index]) | dict(arrays), by) for index, (arrays, by) in cells.items()}
+    config, entries = document["config"], document["cells"]
+    outer = tuple(entries[0]["at"])
+    cells = {index: (_solver(entries[index]) | dict(arrays), by) for index, (arrays, by) in cells.items()}
     axes = dict(document["axes"])
     axes |= {name: [float(value) for value in axes[name]] for name in ("timestep", "sigma")}  # JSON may say 1
-    dimensions: dict[str, Sequence[Any]] = axes | {
-        "estimator": config["estimators"],
-        "seed": range(config["seeds"]),
-    }
-    if (iterations := config["iterations"]) is not None:
-        dimensions["iteration"] = range(1, iterations + 1)
-    if (points := config.get("points")) is not None:
-        dimensions["point"] = range(points)
+    kind = find_kind(config["kind"])
+    inner: dict[str, Sequence[Any]] = {"estimator": config["estimators"], "seed": range(config["seeds"])}
+    dimensions = axes | inner | kind.axes(config)
     shape = tuple(len(dimensions[name]) for name in outer)
     data: dict[str, Any] = {}
     units = {entry.get("unit", "") for entry in document["resolved"]}
     unit = (units.pop() if len(units) == 1 else "") or THETA
     names = sorted({name for arrays, _ in cells.values() for name in arrays})
-    for name, variable in variables_of(config["kind"], names).items():
+    for name, variable in with_metrics(kind.variables, names).items():
         held = {index: arrays[name] for index, (arrays, _) in cells.items() if name in arrays}
         if not held:
             continue
         sizes = np.max([array.shape for array in held.values()], axis=0, initial=0).astype(int)  # params may differ
-        inner = [len(dimensions.get(dim, range(size))) for dim, size in zip(variable.dims, sizes, strict=True)]
-        values = np.full((*shape, *inner), np.nan)
+        within = [len(dimensions.get(dim, range(size))) for dim, size in zip(variable.dims, sizes, strict=True)]
+        values = np.full((*shape, *within), np.nan)
         for index, array in held.items():
-            place = tuple(places[index]["at"][dimension] for dimension in outer)
-            values[(*place, *(slice(size) for size in array.shape))] = array
+            at = tuple(entries[index]["at"][dimension] for dimension in outer)
+            values[(*at, *(slice(size) for size in array.shape))] = array
         attributes = {"units": unit if variable.unit == THETA else variable.unit, "long_name": variable.description}
         data[name] = ((*outer, *variable.dims), values, attributes)
     used = {dimension for dims, *_ in data.values() for dimension in dims} | set(outer)
@@ -64,7 +60,7 @@ def dataset_of(document: Mapping[str, Any], cells: Cells) -> xr.Dataset:
         if key not in ("cells", "format") and value is not None
     }
     dataset.attrs["many_parameters"] = int(any(entry.get("parameters", 1) > 1 for entry in document["resolved"]))
-    dataset.attrs["missing_cells"] = len(places) - len(cells)
+    dataset.attrs["missing_cells"] = len(entries) - len(cells)
     dataset.attrs["mixed_versions"] = _mixture([versions for _, versions in cells.values()])
     return dataset
 

@@ -21,15 +21,17 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+import xarray as xr
 
 from estimators.user_inputs import inputs_now
 from mjx_study.disk import MAX_BYTES, check_no_link, open_regular, prepare_folder, read_whole, write_whole
 from mjx_study.experiment.checkpoint import StudyError, reason_of
-from mjx_study.experiment.plan import StudyPlan
+from mjx_study.experiment.study import StudyPlan
 from mjx_study.identity import ACCEPT, differences
 from mjx_study.options.files import digest_of_json
 from mjx_study.storage.arrays import check_cell
 from mjx_study.storage.cell_files import CellFile
+from mjx_study.storage.dataset import dataset_of
 from mjx_study.storage.manifest import document_of, read_document, read_format, sealed
 from mjx_study.table import as_plain
 
@@ -86,17 +88,17 @@ class Store:
         document, kept = as_plain({"format": FORMAT} | document), cls.open(folder)
         theirs, ours = ({**parts["contents"], **parts["config"]} for parts in map(_identity, (kept.document, document)))
         seen = kept.document.get("seen", {})
-        if told := differences(theirs, ours) or differences(seen, inputs_now(seen)):
-            raise StudyError(f"{folder} holds another study ({told}); choose another folder")
+        if different := differences(theirs, ours) or differences(seen, inputs_now(seen)):
+            raise StudyError(f"{folder} holds another study ({different}); choose another folder")
         there, asked = _iterations(kept.document), _iterations(document)
         if asked < there:
             raise StudyError(
                 f"{folder} holds {there} iterations, and {asked} are asked for: give --iterations {there} or more, "
                 "or another folder"
             )
-        told = differences(*(each.get("versions", {}) for each in (kept.document, document)))
-        if told and (kept.missing or asked > there) and not accept_versions:
-            raise StudyError(f"{folder} was computed with other versions ({told}); {ACCEPT}")
+        different = differences(*(each.get("versions", {}) for each in (kept.document, document)))
+        if different and (kept.missing or asked > there) and not accept_versions:
+            raise StudyError(f"{folder} was computed with other versions ({different}); {ACCEPT}")
         return kept
 
     def _extend(self, document: dict[str, Any]) -> None:
@@ -151,7 +153,7 @@ class Store:
     def file(self, index: int, *, part: bool = False) -> CellFile:
         """File of a cell, or of its checkpoint."""
         path = self.part_path(index) if part else self.path(index)
-        return CellFile(path, self._study, self._place(index, part=part))
+        return CellFile(path, self._study, self._cell_digest(index, part=part))
 
     def has(self, index: int) -> bool:
         """Whether a cell's file exists; `read` checks it."""
@@ -181,8 +183,8 @@ class Store:
             return self._versions
         before = self.read_with_versions(index, part=True)[1]
         names = dict.fromkeys([*before, *self._versions])
-        told = {name: [*before.get(name, "none").split(" and "), self._versions.get(name, "none")] for name in names}
-        return {name: " and ".join(dict.fromkeys(each)) for name, each in told.items()}
+        both = {name: [*before.get(name, "none").split(" and "), self._versions.get(name, "none")] for name in names}
+        return {name: " and ".join(dict.fromkeys(each)) for name, each in both.items()}
 
     def read(self, index: int) -> dict[str, np.ndarray]:
         """Read the numbers of a cell; see `read_with_versions`."""
@@ -225,10 +227,10 @@ class Store:
 
             yield claim
 
-    def _place(self, index: int, *, part: bool = False) -> str:
+    def _cell_digest(self, index: int, *, part: bool = False) -> str:
         """Digest of a cell's index and coordinates and, except for checkpoints, of the descents' length."""
         cell, axes = self.document["cells"][index], self.document.get("axes", {})
-        at = {name: axes[name][place] for name, place in cell.get("at", {}).items()}
+        at = {name: axes[name][index] for name, index in cell.get("at", {}).items()}
         iterations = None if part else self.document["config"].get("iterations")
         return digest_of_json({"index": index, "cell": cell, "at": at, "iterations": iterations})
 
@@ -269,3 +271,16 @@ def _identity(document: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
 
 def _iterations(document: Mapping[str, Any]) -> int:
     return document["config"].get("iterations") or 0
+
+
+def load_study(folder: str | Path) -> xr.Dataset:
+    """Load the numbers of a study, even an unfinished one, as labelled arrays; NaN where missing.
+
+    Dimensions: task, timestep, cone, model (a contact model, with coordinates `contact` for its family and
+    `stiffness`), sigma, samples, then seed, estimator, iteration, point and param as far as a variable has them.
+
+    Raises:
+        StudyError: there is no study, or a file of it is damaged.
+    """
+    store = Store.open(Path(folder))
+    return dataset_of(store.document, store.read_all())

@@ -13,7 +13,8 @@ from estimators import Estimator, find_estimator
 from estimators.choices import ORACLES
 from estimators.intervals import Interval
 from estimators.registry import ESTIMATORS, label_of
-from mjx_study.experiment.plan import StudyCell, StudyPlan, estimators_of
+from mjx_study.choices import KINDS
+from mjx_study.experiment.study import StudyCell, StudyPlan, estimators_of
 from mjx_study.identity import git_revision, versions
 from mjx_study.options.configuration import OPTIONS
 from mjx_study.options.files import digest_of_json
@@ -33,7 +34,7 @@ class _Part(BaseModel):
 
 
 class _Config(_Part):
-    kind: Literal["gradients", "descents", "landscapes"]
+    kind: Literal[tuple(KINDS)]  # type: ignore[valid-type]
     tasks: list[Name] = Field(min_length=1)
     estimators: list[Name] = Field(min_length=1)
     seeds: int = Field(ge=1, le=int(SEEDS.high))
@@ -155,11 +156,9 @@ def document_of(plan: StudyPlan, command: str | None) -> dict[str, Any]:
         axes[name].sort()
     index = {name: {value: place for place, value in enumerate(along)} for name, along in axes.items()}
     places = [{name: index[name][value] for name, value in each.items()} for each in exact]
-    fields = plan.config.resolved() | {"tasks": plan.config.task_names, "estimators": plan.config.estimator_names}
     named = zip(plan.config.estimator_names, plan.config.estimators, strict=True)
-    fields |= {"seeds": plan.config.batches, "iterations": plan.iterations}
     return {
-        "config": fields,
+        "config": plan.fields,
         "warnings": list(plan.warnings),
         "contents": plan.contents,
         "seen": plan.seen,

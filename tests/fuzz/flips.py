@@ -12,11 +12,8 @@ import pytest
 
 from mjx_study import compiled
 from mjx_study.caches import ProgramCache
-from mjx_study.execution import times
-from mjx_study.execution.run import load_study
 from mjx_study.experiment.checkpoint import StudyError
-from mjx_study.stopwatch import Spent
-from mjx_study.storage.folder import Store
+from mjx_study.storage.folder import Store, load_study
 from tests.fuzz import studies
 from tests.fuzz.answers import Row, SilentError
 
@@ -83,14 +80,13 @@ def _numbers(folder: Path) -> str:
 
 
 def _of_caches(root: Path, draw: random.Random) -> Iterator[tuple[Path, Callable[[], int]]]:
-    """A program of any content, a record of times and a trace, again and again, with what must read nothing from it."""
+    """A program of any content and a trace, again and again, with what must read nothing from it."""
     programs = ProgramCache(root / "programs")
     (root / "traces").mkdir(parents=True, exist_ok=True)
     with pytest.MonkeyPatch.context() as monkeypatch:
         monkeypatch.setattr(compiled, "traces_folder", lambda: root / "traces")
         compiled.Compiled(jnp.sin, "sine").prepare(1.0)
-    times._write(root / "times", times.other_program("statistics", 10), Spent())
-    (trace,), (record,) = (list((root / name).iterdir()) for name in ("traces", "times"))
+    (trace,) = (root / "traces").iterdir()
 
     def check(path: Path, read: Callable[[Path], Any]) -> int:
         if read(path) is not None:
@@ -103,7 +99,6 @@ def _of_caches(root: Path, draw: random.Random) -> Iterator[tuple[Path, Callable
         programs.put("program", draw.randbytes(draw.choice([0, 1, 64, 65, 5000])))
         read: dict[Path, Callable[[Path], Any]] = {
             root / "programs" / "program-cache": lambda _: programs.get("program"),
-            record: times._read,
             trace: compiled._read,
         }
         yield from ((path, lambda path=path, each=each: check(path, each)) for path, each in read.items())

@@ -18,9 +18,8 @@ from typing import Any, Final
 import numpy as np
 
 from mjx_study.disk import temporary_name
-from mjx_study.execution.run import load_study
 from mjx_study.storage.cell_files import digest_of_arrays
-from mjx_study.storage.folder import Store
+from mjx_study.storage.folder import Store, load_study
 from mjx_study.storage.manifest import sealed
 from tests.faults import put_no_file
 
@@ -183,7 +182,7 @@ def containers(folder: Path) -> Iterator[tuple[str, Forgery, bool]]:
         def written(at: Path, _: Path, versions: str | None = versions) -> None:
             kept = dict(arrays) | ({} if versions is None else {"versions": np.array(versions)})
             file = Store(at, store.document).file(0)
-            signed = np.array([digest_of_arrays(kept), file.study, file.place])
+            signed = np.array([digest_of_arrays(kept), file.study, file.cell])
             np.savez(file.path, digest=signed, **kept)  # type: ignore[arg-type]
 
         yield f"versions of a cell: {name}", written, True

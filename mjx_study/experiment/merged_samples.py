@@ -1,11 +1,11 @@
-"""Batches computed in blocks, whose summaries are merged pairwise in an order fixed by their indices.
+"""Batches computed in blocks of samples, whose summaries are merged pairwise in an order fixed by their indices.
 
 Blocks are the leaves of a binary tree. Two neighbours are merged as soon as both are available, whatever else is
 missing, so the result does not depend on the order in which blocks finish, and each late block leaves at most
 logarithmically many summaries unmerged.
 """
 
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from functools import reduce
 from typing import Any, Final
 
@@ -13,32 +13,44 @@ import numpy as np
 
 from estimators import ORACLES
 from estimators.merged_samples import Moments
+from mjx_study.experiment.checkpoint import Arrays
+from mjx_study.experiment.study import Work
 from mjx_study.experiment.tally import Tally
 
-REFERENCE: Final = 0
-"""Number of the task that computes the reference; the others are blocks, seed by seed."""
-Arrays = dict[str, np.ndarray]
+REFERENCE_UNIT: Final = 0
+"""Work unit that computes the reference's samples; the others are blocks, seed by seed."""
 Summary = dict[str, Any]
 """Summary of a block: moments of each estimator's parts by "ESTIMATOR.PART", and tallies by oracle."""
 
 
-class Blocks:
-    """The finished blocks of a cell."""
+class Blocks(Work):
+    """The blocks of a cell's batches as work units, with the summaries of the finished ones.
 
-    def __init__(self, seeds: int, blocks: int, kept: Mapping[str, np.ndarray]):
+    Attributes:
+        reference: samples of the reference gradient, (pairs, params); None until they are computed.
+    """
+
+    def __init__(
+        self,
+        seeds: int,
+        blocks: int,
+        kept: Mapping[str, np.ndarray],
+        merge: Callable[["Blocks"], Arrays] = lambda blocks: {},
+    ):
         """
         Args:
             blocks: number of blocks per seed.
             kept: arrays of a checkpoint, as returned by `arrays`.
+            merge: computes the cell's numbers once all blocks are finished.
         """
-        self.seeds, self.blocks = seeds, blocks
+        self.seeds, self.blocks, self._merge = seeds, blocks, merge
+        self.units = 1 + seeds * blocks
         self.reference = kept.get("reference")
-        self._held: dict[tuple[int, int, int], Summary] = {}
         packed: dict[tuple[int, int, int], Arrays] = {}
         for name, array in kept.items():
             if name != "reference":
-                seed, level, place, rest = name.split(".", 3)
-                packed.setdefault((int(seed), int(level), int(place)), {})[rest] = array
+                seed, level, index, rest = name.split(".", 3)
+                packed.setdefault((int(seed), int(level), int(index)), {})[rest] = array
         self._held = {node: unpack(arrays) for node, arrays in packed.items()}
 
     def check(self, estimators: Collection[str], oracles: Collection[str], params: int) -> None:
@@ -46,13 +58,13 @@ class Blocks:
         and of so many parameters."""
         done = np.zeros((self.seeds, self.blocks), int)
         first = {name: each.parts for name, each in next(iter(self._held.values()), {}).items()}
-        for (seed, level, place), summary in self._held.items():
-            if not (0 <= seed < self.seeds and 0 <= level < 64 and 0 <= place << level < self.blocks):
-                raise ValueError(f"it has a block {seed}.{level}.{place}")
-            done[seed, place << level : (place + 1) << level] += 1
+        for (seed, level, index), summary in self._held.items():
+            if not (0 <= seed < self.seeds and 0 <= level < 64 and 0 <= index << level < self.blocks):
+                raise ValueError(f"it has a block {seed}.{level}.{index}")
+            done[seed, index << level : (index + 1) << level] += 1
             names = {name.partition(".")[0] for name in summary}
             if names != {*estimators, *oracles}:
-                raise ValueError(f"block {seed}.{level}.{place} is of {', '.join(sorted(names))}")
+                raise ValueError(f"block {seed}.{level}.{index} is of {', '.join(sorted(names))}")
             for each in summary.values():
                 each.check(params) if isinstance(each, Moments) else each.check()
             if {name: each.parts for name, each in summary.items()} != first:
@@ -63,42 +75,39 @@ class Blocks:
             raise ValueError(f"its reference has shape {self.reference.shape}")
 
     @property
-    def tasks(self) -> int:
-        return 1 + self.seeds * self.blocks
-
-    @property
     def missing(self) -> list[int]:
-        """Unfinished tasks, in order."""
         done = np.zeros((self.seeds, self.blocks), bool)
-        for seed, level, place in self._held:
-            done[seed, place << level : (place + 1) << level] = True
-        return [REFERENCE] * (self.reference is None) + (1 + np.flatnonzero(~done)).tolist()
+        for seed, level, index in self._held:
+            done[seed, index << level : (index + 1) << level] = True
+        return [REFERENCE_UNIT] * (self.reference is None) + (1 + np.flatnonzero(~done)).tolist()
 
-    def place(self, task: int) -> tuple[int, int]:
-        """Seed of a task's block, and its index within the seed."""
-        return divmod(task - 1, self.blocks)
+    @staticmethod
+    def position(unit: int, blocks: int) -> tuple[int, int]:
+        """Seed of a unit's block, and its index within the seed."""
+        return divmod(unit - 1, blocks)
 
-    def add(self, task: int, arrays: Arrays) -> None:
-        """Add the arrays of a finished task."""
-        if task == REFERENCE:
+    def add(self, unit: int, arrays: Arrays) -> None:
+        if unit == REFERENCE_UNIT:
             self.reference = arrays["reference"]
             return
-        (seed, place), level, summary = self.place(task), 0, unpack(arrays)
-        while (other := self._held.pop((seed, level, place ^ 1), None)) is not None:
-            summary = _merged(other, summary) if place % 2 else _merged(summary, other)
-            level, place = level + 1, place // 2
-        self._held[seed, level, place] = summary
+        (seed, index), level, summary = self.position(unit, self.blocks), 0, unpack(arrays)
+        while (other := self._held.pop((seed, level, index ^ 1), None)) is not None:
+            summary = _merged(other, summary) if index % 2 else _merged(summary, other)
+            level, index = level + 1, index // 2
+        self._held[seed, level, index] = summary
 
     def arrays(self) -> Arrays:
-        """Return the checkpoint."""
         kept = {} if self.reference is None else {"reference": self.reference}
-        for (seed, level, place), summary in self._held.items():
-            kept |= {f"{seed}.{level}.{place}.{name}": array for name, array in pack(summary).items()}
+        for (seed, level, index), summary in self._held.items():
+            kept |= {f"{seed}.{level}.{index}.{name}": array for name, array in pack(summary).items()}
         return kept
+
+    def numbers(self) -> Arrays:
+        return self._merge(self)
 
     def whole(self, seed: int) -> Summary:
         """Summary of all blocks of a seed, which must be complete."""
-        nodes = sorted((place << level, summary) for (at, level, place), summary in self._held.items() if at == seed)
+        nodes = sorted((index << level, summary) for (at, level, index), summary in self._held.items() if at == seed)
         return reduce(_merged, (summary for _, summary in nodes))
 
 

@@ -1,0 +1,277 @@
+"""A study: its kind, its plan of cells, and the computation of a cell in work units.
+
+A cell is computed in work units: mostly a single one, or blocks whose summaries are merged. Units can be computed in
+any order and anywhere, since each depends on the plan alone.
+"""
+
+import dataclasses
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Hashable
+from concurrent.futures import Future
+from functools import cached_property
+from typing import Any, TypeVar
+
+import jax
+import numpy as np
+
+import estimators
+from estimators import Estimator, find_estimator
+from estimators.user_inputs import inputs_read
+from mjx_study.experiment.checkpoint import Arrays, Checkpoint
+from mjx_study.experiment.memory import bytes_per_sample, check_batches, padded_size
+from mjx_study.experiment.resolution import configured_estimators
+from mjx_study.identity import contents, estimator_contents
+from mjx_study.options.configuration import Settings, StudyConfig
+from mjx_study.results.kind import StudyResults, find_kind
+from mjx_study.table import digits_to_tell_apart
+from mjx_study.tasks import TASKS
+from mjx_study.tasks.contact_grid import ContactPoint
+from mjx_study.tasks.task import Recipe, Task
+from mjx_study.tasks.user_task import registered_name
+
+Result = TypeVar("Result")
+
+
+@dataclasses.dataclass(frozen=True)
+class Group:
+    """Cells that share compiled programs; the task's name in the configuration is unique."""
+
+    name: str
+    task: Task
+    timestep: float
+    cone: str
+    models: tuple[ContactPoint, ...]
+    recipe: Recipe | None = None
+
+    @property
+    def descent(self) -> Recipe:
+        """The recipe, which groups of descents have."""
+        assert self.recipe is not None
+        return self.recipe
+
+
+@dataclasses.dataclass(frozen=True)
+class StudyCell:
+    """One cell of a study, stored as one file; sigma is the standard deviation of the noise."""
+
+    group: int
+    model: ContactPoint
+    sigma: float
+    samples: int
+
+
+@dataclasses.dataclass(frozen=True)
+class StudyPlan:
+    """A checked and resolved study.
+
+    Attributes:
+        cells: cells in the order of computation.
+        warnings: warnings about contact models.
+    """
+
+    config: StudyConfig
+    groups: tuple[Group, ...]
+    cells: tuple[StudyCell, ...]
+    chunk_size: int
+    warnings: tuple[str, ...]
+
+    @cached_property
+    def settings(self) -> Settings:
+        """The configuration's."""
+        return self.config.settings
+
+    @cached_property
+    def kind(self) -> "StudyKind":
+        """The kind of study."""
+        return find_kind(self.settings.kind)
+
+    @cached_property
+    def chosen(self) -> dict[tuple[int, float], tuple[Estimator, ...]]:
+        """Estimators by group and sigma, filled by `estimators_of`."""
+        return {}
+
+    @cached_property
+    def oracles(self) -> tuple[str, ...]:
+        """Oracles that the estimators need, evaluations included."""
+        return estimators.oracles_of(map(find_estimator, self.config.estimators), "evaluation")
+
+    def with_chunk(self, size: int) -> "StudyPlan":
+        """The plan with another chunk size, such as that of a study begun earlier."""
+        return dataclasses.replace(self, chunk_size=size)
+
+    def task_of(self, cell: StudyCell) -> Task:
+        """A cell's task, with the task's own sigma."""
+        return self.groups[cell.group].task
+
+    def program_of(self, cell: StudyCell) -> Hashable:
+        """Key of a cell's compiled programs; None for an analytic system."""
+        return None if cell.model.analytic else self.kind.program_of(cell)
+
+    @property
+    def compilations(self) -> int:
+        """Number of programs to compile."""
+        programs = {self.program_of(cell) for cell in self.cells} - {None}
+        return self.kind.programs_per_key(self.config) * len(programs)
+
+    @property
+    def memory(self) -> int:
+        """Approximate memory of the batches and statistics held at once in the largest cell [bytes]."""
+        different = {(cell.group, cell.samples): cell for cell in self.cells}
+        return max(self.kind.memory(self, cell) for cell in different.values())
+
+    def memory_of_seed(self, cell: StudyCell) -> int:
+        """Memory of the batches and statistics of one seed of a cell [bytes]."""
+        each = bytes_per_sample(self.task_of(cell), self.oracles, len(self.config.estimators))
+        return self.padded_samples(cell) * each
+
+    def padded_samples(self, cell: StudyCell) -> int:
+        """Number of samples to which whole batches are padded for their statistics: their own unless all estimators
+        are mergeable, and so ignore padding."""
+        mergeable = all(each.mergeable for each in estimators_of(self, cell))
+        return padded_size(cell.samples) if mergeable else cell.samples
+
+    @property
+    def iterations(self) -> int | None:
+        """Iterations of the longest descent; None in other kinds of study."""
+        return max((group.recipe.iterations for group in self.groups if group.recipe), default=None)
+
+    @property
+    def fields(self) -> dict[str, Any]:
+        """Fields of the configuration as a manifest holds them."""
+        named = {"tasks": self.config.task_names, "estimators": self.config.estimator_names}
+        return self.config.resolved() | named | {"seeds": self.config.batches, "iterations": self.iterations}
+
+    @property
+    def contents(self) -> dict[str, str]:
+        """Digests of what the numbers depend on: the tasks in all their forms, and user-defined estimators."""
+        forms: dict[str, list[Task]] = {}
+        for group in self.groups:
+            forms.setdefault(group.name, []).append(group.task)
+        return contents(forms) | estimator_contents(
+            dict(zip(self.config.estimator_names, self.config.estimators, strict=True))
+        )
+
+    @property
+    def user_modules(self) -> tuple[str, ...]:
+        """Names of the modules of user-defined tasks and estimators, and of tasks given as objects."""
+        tasks = [each if isinstance(each, str) else f"task {each.name}" for each in self.config.tasks]
+        names = [registered_name(each) or each for each in tasks if each not in TASKS]
+        own = [each for each in self.config.estimator_names if ":" in each]
+        return tuple(dict.fromkeys(each.partition(":")[0] for each in (*names, *own)))
+
+    @property
+    def seen(self) -> dict[str, str]:
+        """Digests of files and environment variables that user-defined code has read so far."""
+        return inputs_read(self.user_modules)
+
+    def label(self, cell: StudyCell) -> str:
+        """A cell's name in messages."""
+        group = self.groups[cell.group]
+        digits = digits_to_tell_apart(each.timestep for each in self.groups)
+        return f"{group.name}, {cell.model.label}, h = {group.timestep:.{digits}g} s, N = {cell.samples}"
+
+
+def estimators_of(plan: StudyPlan, cell: StudyCell) -> tuple[Estimator, ...]:
+    """Build a cell's estimators with their options, and check them against its task."""
+    key = cell.group, cell.sigma
+    if key not in plan.chosen:
+        plan.chosen[key] = configured_estimators(plan.config, plan.task_of(cell).replace(sigma=cell.sigma))
+    return plan.chosen[key]
+
+
+class Work:
+    """The work units of a cell and what the finished ones found; here a single unit, which finds all numbers."""
+
+    units = 1
+
+    def __init__(self) -> None:
+        self._numbers: Arrays | None = None
+
+    @property
+    def missing(self) -> list[int]:
+        """Unfinished units, in order."""
+        return [0] if self._numbers is None else []
+
+    def add(self, unit: int, arrays: Arrays) -> None:
+        """Add what a unit found."""
+        self._numbers = arrays
+
+    def arrays(self) -> Arrays:
+        """The checkpoint of several units."""
+        return {}
+
+    def numbers(self) -> Arrays:
+        """The cell's numbers, once no unit is missing."""
+        assert self._numbers is not None
+        return self._numbers
+
+
+class Computation(ABC):
+    """Computes work units of a plan's cells, and keeps compiled programs between them."""
+
+    def begin(self, cell: StudyCell, checkpoint: Checkpoint) -> Work:
+        """The work units of a cell, less those that its checkpoint holds; StudyError if that does not fit."""
+        return Work()
+
+    @abstractmethod
+    def compute(self, cell: StudyCell, unit: int, checkpoint: Checkpoint) -> Future[Arrays]:
+        """Compute a unit; on accelerators it may still be running on return."""
+
+
+class StudyKind(StudyResults):
+    """A kind of study: how a configuration is checked, and how a cell is computed."""
+
+    first_order: bool = False
+    """Whether cells have means of first-order gradients whatever the estimators are."""
+
+    def describe(self, plan: StudyPlan) -> str:
+        """The kind in the head of a sweep."""
+        return self.name
+
+    def recipe(self, config: StudyConfig, task: Task) -> Recipe | None:
+        """Settings of a task's descents; None in other kinds of study."""
+        return None
+
+    def check(self, plan: StudyPlan, cell: StudyCell) -> None:
+        """Raise ValueError for a configuration that cannot be run; called with one cell of each group."""
+
+    def check_memory(self, plan: StudyPlan) -> None:
+        """Raise ValueError for batches that do not fit into memory."""
+        check_batches(plan.memory)
+
+    def batches_at_once(self, config: StudyConfig) -> int:
+        """Number of batches whose samples run in the same calls."""
+        return config.batches
+
+    def program_of(self, cell: StudyCell) -> Hashable:
+        """Key of the compiled programs of a cell with MJX."""
+        return cell.group, jax.tree.structure(cell.model.contact)
+
+    def programs_per_key(self, config: StudyConfig) -> int:
+        """Number of rollout programs for each key: costs and derivatives."""
+        return 2
+
+    def memory(self, plan: StudyPlan, cell: StudyCell) -> int:
+        """Memory held at once [bytes]: the batches and statistics of all seeds."""
+        return plan.memory_of_seed(cell) * plan.config.batches
+
+    def size(self, plan: StudyPlan, cell: StudyCell) -> int:
+        """Size of a cell's arrays [bytes]."""
+        sizes = self.sizes(plan.fields, plan.task_of(cell).policy.num_params)
+        return sum(8 * math.prod(sizes[dim] for dim in variable.dims) for variable in self.variables.values())
+
+    @abstractmethod
+    def rollouts(self, plan: StudyPlan, cell: StudyCell) -> np.ndarray:
+        """Approximate number of rollouts of a cell, and of those differentiated."""
+
+    @abstractmethod
+    def computation(self, plan: StudyPlan) -> Computation:
+        """The computation of a plan's cells."""
+
+
+def done(result: Result) -> Future[Result]:
+    """A future that has its result."""
+    future = Future[Result]()
+    future.set_result(result)
+    return future

@@ -1,0 +1,115 @@
+"""A study's gradient estimates as rows, and the names of its estimators and contact models in texts and figures."""
+
+import json
+import math
+from types import SimpleNamespace
+from typing import Any, Final
+
+import numpy as np
+import xarray as xr
+
+from estimators import ENOUGH_EFFECTIVE, ESTIMATORS
+from estimators.registry import label_of
+from mjx_study.results.variables import GRADIENTS, ONSETS
+from mjx_study.table import number, with_error
+
+BIASED_P_VALUE: Final = 0.001
+"""p-value at which a mean is called biased: the smallest that the test's 999 draws can yield."""
+SETTING: Final = ("task", "timestep", "cone", "sigma", "samples")
+"""Outer coordinates besides the contact model."""
+AXES: Final = (*SETTING, "model", "seed", "estimator")
+"""Dimensions along which there is a row for each index."""
+COORDINATES_OF_ROWS: Final = (*AXES, "contact", "stiffness")
+
+
+class Row(SimpleNamespace):
+    """One gradient estimate: its coordinates and every scalar variable of `GRADIENTS`; None where not applicable."""
+
+    def __getattr__(self, name: str) -> Any:
+        raise AttributeError(f"a row has no {name}")
+
+    @property
+    def believable(self) -> bool:
+        """Whether the batch has enough effective samples for its errors to be meaningful."""
+        return self.effective_samples >= ENOUGH_EFFECTIVE
+
+    @property
+    def bias_verdict(self) -> str:
+        """Result of the test for bias: "biased", "none seen", or "too few effective samples"."""
+        if not min(self.effective_samples, self.reference_effective_samples) >= ENOUGH_EFFECTIVE:
+            return "too few effective samples"
+        return "biased" if self.bias_p_value <= BIASED_P_VALUE else "none seen"
+
+    def as_dict(self) -> dict[str, Any]:
+        """All variables by name, derived ones included."""
+        return vars(self) | {"variance_seconds": self.variance_seconds, "bias_verdict": self.bias_verdict}
+
+    @property
+    def variance_seconds(self) -> float:
+        """Variance times seconds per sample: the variance remaining after one second of computing."""
+        return self.variance * self.seconds_per_sample
+
+
+def rows_of(dataset: xr.Dataset) -> list[Row]:
+    """Return a row for each computed estimate; contact model, seed and estimator vary fastest."""
+    rows, grid = [], dataset["gradient_norm"].transpose(*AXES)
+    names = [name for name, variable in GRADIENTS.items() if name in dataset and "param" not in variable.dims]
+
+    def along(name: str, *last: str) -> np.ndarray:
+        variable = dataset[name].variable
+        return variable.set_dims({**grid.sizes, **variable.sizes}).transpose(*AXES, *last).values
+
+    scalars, coordinates = ({name: along(name) for name in each} for each in (names, COORDINATES_OF_ROWS))
+    vectors = {name: along(name, f"{name}_entry") for name in ("solref", "solimp") if name in dataset}
+    for index in np.ndindex(grid.shape):
+        if np.isnan(scalars["residual"][index]):
+            continue  # not computed
+        numbers: dict[str, Any] = {name: values[index].item() for name, values in scalars.items()}
+        for name in ("alpha", "epsilon", "discrepancy", *ONSETS):
+            if name not in numbers or math.isnan(numbers[name]):
+                numbers[name] = None
+        counts = [name for name in numbers if GRADIENTS[name].digits == 0 and numbers[name] is not None]
+        numbers |= {name: int(numbers[name]) for name in counts}
+        at = {name: values[index] for name, values in coordinates.items()}
+        at = {name: value.item() if isinstance(value, np.generic) else value for name, value in at.items()}
+        solver = {name: tuple(values[index].tolist()) for name, values in vectors.items()}
+        rows.append(Row(**at, **solver, **numbers))
+    return rows
+
+
+def remains(name: str, value: float, debiased: float, error: float) -> str:
+    """Format what remains of one of `DEBIASED` without noise: a bound if no error is detected, "-" if noise explains
+    all of it, or if nothing is left and the standard error is unknown."""
+    best = 1.0 if name == "cosine" else 0.0
+    if math.isnan(debiased) or (debiased == best and math.isnan(error)):
+        return "-"
+    if not (debiased == best and 0 < error < math.inf):
+        return with_error(debiased, error)
+    if abs(debiased - value) <= 2 * error:
+        return "-"
+    decimals = 2 if error >= 0.005 else 4
+    above = best - math.ceil(10**decimals * 2 * error) / 10**decimals
+    return f"< {number(2 * error, 2)}" if best == 0 else f"> {above:.{decimals}f}"
+
+
+def onset_of(dataset: xr.Dataset) -> str:
+    """Onset term of a study's first-order batches."""
+    return json.loads(dataset.attrs["config"]).get("onset", "none")
+
+
+def estimators_of(dataset: xr.Dataset) -> dict[str, dict[str, Any]]:
+    """Label and needs of each estimator of a study, by name, as its plan recorded them."""
+    return json.loads(dataset.attrs.get("described", "{}"))
+
+
+def label_in(dataset: xr.Dataset, name: str) -> str:
+    """Label of an estimator in texts and figures of a study; a user-defined one has that which its plan recorded."""
+    known = {} if name in ESTIMATORS else estimators_of(dataset).get(name, {})
+    return known.get("label") or label_of(name, onset_of(dataset))
+
+
+def model_name(one: xr.Dataset) -> str:
+    """Contact family of a part of a study with one contact model, and its stiffness if it has one."""
+    family = one["contact"].item()
+    stiffness = one["model"].item().removeprefix(family)
+    return f"{family}, K ={stiffness} N/m" if stiffness else family

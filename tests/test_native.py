@@ -1,0 +1,254 @@
+"""Native code computes what JAX's operations do, for batches of any size, and does without where it must."""
+
+import os
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax
+
+from mjx_study import runtime
+from mjx_study.graph import build, c, native
+from mjx_study.graph.function import capture
+from mjx_study.graph.native import SWITCH, native_identity
+from mjx_study.graph.nodes import ELEMENTWISE
+from mjx_study.graph.scalars import unrolled
+from tests.test_graph import FUNCTIONS, ROW
+
+pytestmark = pytest.mark.skipif(native_identity() is None, reason="there is no C compiler")
+
+SPECIAL = [0.0, -0.0, 1.0, -1.0, 0.3, -0.7, 2.5, -2.5, 3.5, 1e300, -1e300, 5e-324, -1e-310, np.inf, -np.inf, np.nan]
+UNIT = [0.0, -0.0, 1.0, -1.0, 0.3, -0.7, 1e-9, 5e-324, np.nan, 1.5]
+INTEGERS = [0, 1, -1, 7, -7, 2**31 - 1, -(2**31)]
+FLOATS = {
+    **{name: getattr(lax, name) for name in ("abs", "acos", "asin", "atan", "ceil", "cos", "cosh", "erf", "exp")},
+    **{name: getattr(lax, name) for name in ("expm1", "floor", "is_finite", "log", "log1p", "logistic", "neg")},
+    **{name: getattr(lax, name) for name in ("rsqrt", "sign", "sin", "sinh", "sqrt", "square", "tan", "tanh")},
+    "round": lambda x: (lax.round(x, lax.RoundingMethod.TO_NEAREST_EVEN), lax.round(x)),
+    "integer_pow": lambda x: tuple(lax.integer_pow(x, y) for y in (-3, -1, 0, 1, 2, 5, 8)),
+    "convert_element_type": lambda x: tuple(x.astype(kind) for kind in ("int32", "uint8", "bool", "float32", "int64")),
+    "clamp": lambda x: lax.clamp(x.dtype.type(-1), x, x.dtype.type(2)),
+}
+PAIRS = {
+    **{name: getattr(lax, name) for name in ("add", "sub", "mul", "div", "max", "min", "rem", "pow", "atan2")},
+    **{name: getattr(lax, name) for name in ("eq", "ne", "lt", "le", "gt", "ge")},
+    "add_any": lambda x, y: jax.jvp(lambda z: z * z, (x,), (y,)),
+    "select_n": lambda x, y: lax.select_n(x > y, x, y),
+}
+WHOLE = {
+    **{name: getattr(lax, name) for name in ("add", "sub", "mul", "div", "max", "min", "rem", "eq", "lt", "ge")},
+    "and": lax.bitwise_and,
+    "or": lax.bitwise_or,
+    "xor": lax.bitwise_xor,
+    "of one": lambda x, y: (
+        abs(x),
+        -x,
+        ~x,
+        jnp.sign(x),
+        x.astype(float),
+        x.astype(bool),
+        lax.select_n(x % 3, x, y, -x),
+    ),
+    "booleans": lambda x, y: ((x > y) == (y > 1), (x > y) < (y > 1), jnp.maximum(x > y, y > 1), (x > y) ^ (x > 1)),
+}
+
+
+def compare(function, *points, rtol=1e-12, exact=False):
+    """The function under `vmap`, native and in JAX's operations."""
+    with pytest.MonkeyPatch.context() as patch:
+        found = []
+        for switch in ("1", "0"):
+            patch.setenv(SWITCH, switch)
+            program = jax.jit(jax.vmap(lambda *each: unrolled(function, *each)))
+            assert ("native" in str(jax.make_jaxpr(program)(*points))) == (switch == "1")
+            found.append(jax.tree.leaves(program(*points)))
+    for ours, theirs in zip(*found, strict=True):
+        assert ours.dtype == theirs.dtype
+        np.testing.assert_allclose(ours, theirs, rtol=rtol, atol=1e-300 if rtol < 1e-9 else 1e-37)
+
+
+def test_every_operation_is_covered():
+    others = {"not", "copysign"} - ELEMENTWISE
+    named = {*FLOATS, *PAIRS, *WHOLE} - {"of one", "one of three", "booleans"} | {"not"}
+    assert ELEMENTWISE - named == set() and not others - {"copysign"}
+
+
+@pytest.mark.parametrize("name", FLOATS)
+def test_operations_of_floats(name):
+    points = np.asarray(UNIT if name in ("acos", "asin") else SPECIAL)
+    if name == "log":  # of a subnormal number XLA's is that of 0
+        points = points[~((points != 0) & (np.abs(points) < 1e-300))]
+    compare(FLOATS[name], points)
+    compare(FLOATS[name], points.astype(np.float32), rtol=1e-5)
+
+
+@pytest.mark.parametrize("name", PAIRS)
+def test_operations_of_two_floats(name):
+    x, y = (each.reshape(-1) for each in jnp.meshgrid(jnp.asarray(SPECIAL), jnp.asarray(SPECIAL)))
+    compare(PAIRS[name], x, y)
+    compare(PAIRS[name], x.astype(jnp.float32), y.astype(jnp.float32), rtol=1e-5)
+
+
+@pytest.mark.parametrize("name", WHOLE)
+@pytest.mark.parametrize("kind", ["int64", "int32", "int8", "uint16"])
+def test_operations_of_integers(name, kind):
+    values = np.array(INTEGERS).astype(kind)
+    x, y = (each.reshape(-1) for each in jnp.meshgrid(values, values))
+    compare(WHOLE[name], x, y)
+
+
+@pytest.mark.parametrize("name", ["loops", "several computed indices", "whole arrays", "computed slice"])
+@pytest.mark.parametrize("most", [10, 60])
+def test_long_functions_are_divided(monkeypatch, name, most):
+    monkeypatch.setattr(c, "MOST_TOGETHER", most)
+    points = np.random.default_rng(0).normal(size=(9, 3))
+    compare(lambda x: jax.tree.map(lambda leaf: leaf + most, FUNCTIONS[name](x)), points)
+
+
+def test_what_a_sample_gives_depends_on_no_other():
+    """Bitwise, whatever the batch, where loops end at different times."""
+    points = np.random.default_rng(0).normal(size=(37, 3)) * np.geomspace(1e-3, 1e3, 37)[:, None]
+    program = jax.jit(jax.vmap(lambda x: unrolled(FUNCTIONS["loops"], x)))
+    roots, counts = program(points)
+    assert len(np.unique(counts)) > 3
+    for part in (slice(0, 1), slice(3, 12), slice(30, 37), slice(None, None, -1)):
+        np.testing.assert_array_equal(program(points[part])[0], roots[part])
+    np.testing.assert_array_equal(jax.jit(lambda x: unrolled(FUNCTIONS["loops"], x))(points[5])[0], roots[5])
+
+
+def test_batches_of_batches_and_what_does_not_vary():
+    def function(x, y):
+        return jnp.outer(jnp.sin(x), y), jnp.sum(x) > y[0]
+
+    here = lambda x, y: unrolled(function, x, y)  # noqa: E731
+    x, y = np.random.default_rng(0).normal(size=(2, 5, 4, 3))
+    for axes, given in [
+        (((0, None), (0, None)), (x, ROW)),
+        (((0, None), (None, 0)), (x, y[0])),
+        (((None, 0), (0, None)), (x[0], y[:, 0])),
+        (((1, 1), (0, 1)), (x, y.swapaxes(0, 2))),
+    ]:
+        for ours, theirs in zip(
+            jax.jit(jax.vmap(jax.vmap(here, axes[1]), axes[0]))(*given),
+            jax.vmap(jax.vmap(function, axes[1]), axes[0])(*given),
+            strict=True,
+        ):
+            np.testing.assert_allclose(ours, theirs, rtol=1e-15)
+
+
+def test_without_jit_and_without_a_batch():
+    function = lambda x: x**2 + 1  # noqa: E731
+    np.testing.assert_allclose(jax.vmap(lambda x: unrolled(function, x))(jnp.asarray(ROW)), ROW**2 + 1)
+    np.testing.assert_allclose(jax.jit(lambda x: unrolled(function, x))(ROW), ROW**2 + 1)
+
+
+def test_second_derivatives_in_a_scan_and_a_checkpoint():
+    function = lambda x: jnp.sin(x) * x[::-1] ** 3  # noqa: E731
+
+    def total(use, x):
+        step = jax.checkpoint(lambda x, _: (use(x), None))
+        return jnp.sum(lax.scan(step, x, None, length=3)[0])
+
+    here = partial(total, lambda x: unrolled(function, x))
+    for order in (jax.hessian, lambda f: jax.jacrev(jax.jacrev(f)), lambda f: jax.jacfwd(jax.jacfwd(f))):
+        np.testing.assert_allclose(jax.jit(order(here))(ROW), order(partial(total, function))(ROW), rtol=1e-11)
+
+
+@pytest.fixture
+def folder(monkeypatch, tmp_path):
+    """An empty cache of libraries, in a process that knows none."""
+    monkeypatch.setattr(runtime, "_TRACES", [tmp_path / "traces"])
+    monkeypatch.setattr(build, "_BUILT", {})
+    return tmp_path / "native"
+
+
+def source(factor):
+    return c.source_of(capture(lambda x: x * factor, jax.ShapeDtypeStruct((3,), float), most=9))
+
+
+def test_a_library_is_built_once_and_kept(folder, monkeypatch):
+    name = build.build_library(source(2.5))
+    assert build.library_ready(name)
+    assert [path.name for path in folder.iterdir()] == [name] and folder.stat().st_mode & 0o077 == 0
+    monkeypatch.setattr(build, "_BUILT", {})
+    monkeypatch.setattr(build, "_loaded", lambda *given: given)
+    monkeypatch.setattr(build, "_build", None)
+    assert build.build_library(source(2.5)) == name
+    assert build.library_ready(name)
+
+
+@pytest.mark.parametrize(
+    ("factor", "damage"), [(3.5, lambda path: path.write_bytes(path.read_bytes()[:-1] + b"?")), (4.5, os.unlink)]
+)
+def test_a_damaged_library_is_built_again(folder, monkeypatch, factor, damage):
+    name = build.build_library(source(factor))
+    assert build.library_ready(name)
+    damage(folder / name)
+    monkeypatch.setattr(build, "_BUILT", {})
+    monkeypatch.setattr(build, "_loaded", lambda *given: given)
+    assert not build.library_ready(name)
+    monkeypatch.setattr(build, "_BUILT", {})
+    assert build.library_ready(build.build_library(source(factor)))
+    assert (folder / name).exists()
+
+
+def test_threads_share_a_build(folder, monkeypatch):
+    built = []
+    monkeypatch.setattr(build, "_build", lambda name, source: built.append(name) or name)
+    with ThreadPoolExecutor(8) as pool:
+        names = list(pool.map(build.build_library, [source(5.5)] * 8))
+        assert all(pool.map(build.library_ready, names))
+    assert len(set(names)) == len(built) == 1
+
+
+def test_a_failing_compiler_is_reported_and_done_without(folder, monkeypatch, capsys, tmp_path):
+    monkeypatch.setattr(build.tempfile, "tempdir", str(tmp_path))
+    name = build.build_library("this is not C")
+    assert not build.library_ready(name)
+    told = capsys.readouterr().err
+    assert "failed, steps run through XLA: see the end of" in told
+    kept = told.strip().rpartition(" ")[2]
+    assert "this is not C\n// " in Path(kept).read_text()
+    monkeypatch.setattr(native, "library_ready", lambda name: False)
+    found = jax.jit(jax.vmap(lambda x: unrolled(lambda x: x**3 + 7, x)))(ROW)
+    np.testing.assert_allclose(found, ROW**3 + 7)
+
+
+def test_what_cannot_be_loaded_is_reported(folder, capsys):
+    assert build._loaded("mjx_study_nothing", b"no library") is None
+    assert "mjx-study: native code cannot be loaded, steps run through XLA:" in capsys.readouterr().err
+
+
+ALONE = """
+import jax, numpy as np
+jax.config.update("jax_enable_x64", True)
+from mjx_study.graph.scalars import unrolled
+print(jax.make_jaxpr(jax.vmap(lambda x: unrolled(lambda x: x * 2, x)))(np.ones(3)))
+print(jax.jit(jax.vmap(lambda x: unrolled(lambda x: x * 2, x)))(np.ones(3)))
+"""
+
+
+@pytest.mark.parametrize(("setting", "lines"), [({"PATH": "/nowhere"}, 1), ({SWITCH: "0"}, 0)])
+def test_without_a_compiler(setting, lines):
+    environment = {key: value for key, value in os.environ.items() if key != "CC"} | setting
+    done = subprocess.run([sys.executable, "-c", ALONE], capture_output=True, text=True, env=environment)
+    assert done.stdout.splitlines()[-1] == "[2. 2. 2.]" and "native" not in done.stdout
+    assert done.stderr.count("mjx-study: no C compiler found: steps run through XLA, more slowly") == lines
+
+
+def test_processes_build_at_once(tmp_path):
+    environment = os.environ | {"XDG_CACHE_HOME": str(tmp_path)}
+    running = [
+        subprocess.Popen([sys.executable, "-c", ALONE], stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=environment)
+        for _ in range(3)
+    ]
+    for each in running:
+        out, error = each.communicate()
+        assert out.decode().splitlines()[-1] == "[2. 2. 2.]", error
+        assert b"native" in out
