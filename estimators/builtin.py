@@ -35,7 +35,7 @@ class Formula(Estimator):
 class Baselined(Formula):
     """Base of estimators with a zeroth-order batch."""
 
-    baseline: str = option("baseline of zeroth-order estimates", choices=BASELINES, default="zero_noise")
+    baseline: str = option("baseline of zeroth-order estimates: {}", choices=BASELINES, default="zero_noise")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -213,7 +213,11 @@ class AlphaOrder(OneWeight):
     failure_probability: float = option("failure probability of epsilon", "(0, 1)", metavar="P", default=0.05)
     variance_proxy: str = option("variance in epsilon: {}", choices=VARIANCE_PROXIES, metavar="S2", default="variance")
     radius: str | float = option(
-        "R in epsilon, or max_deviation", "[0, inf)", choices=(MAX_DEVIATION,), metavar="R", default=MAX_DEVIATION
+        "R in epsilon: max_deviation, or a bound",
+        "[0, inf)",
+        choices=(MAX_DEVIATION,),
+        metavar="R",
+        default=MAX_DEVIATION,
     )
 
     def __post_init__(self) -> None:

@@ -36,12 +36,16 @@ class Oracle:
         order: 0 if only values are needed, 1 if derivatives are; batches of the same order share their samples.
         method: Method of the objective, called with theta and keys.
         contents: What the batch holds, for messages and tables.
+        rollouts: Number of rollouts of a sample.
+        baseline: Whether the batch also has rollouts without noise.
     """
 
     name: str
     order: int
     method: str
     contents: str
+    rollouts: int = 1
+    baseline: bool = True
 
     @property
     def phrase(self) -> str:
@@ -53,12 +57,12 @@ ORACLES: Final[dict[str, Oracle]] = {
     oracle.name: oracle
     for oracle in (
         Oracle("evaluation", 0, "evaluate", "values"),
-        Oracle("pair", 0, "evaluate_pair", "pairs"),
+        Oracle("pair", 0, "evaluate_pair", "pairs", rollouts=2),
         Oracle("steps", 0, "evaluate_steps", "steps"),
-        Oracle("step_pair", 0, "evaluate_step_pair", "pairs by step"),
-        Oracle("differentiation", 1, "differentiate", "gradients"),
-        Oracle("corrected", 1, "differentiate_corrected", "corrected gradients"),
-        Oracle("step_differentiation", 1, "differentiate_steps", "gradients by step"),
+        Oracle("step_pair", 0, "evaluate_step_pair", "pairs by step", rollouts=2),
+        Oracle("differentiation", 1, "differentiate", "gradients", baseline=False),
+        Oracle("corrected", 1, "differentiate_corrected", "corrected gradients", baseline=False),
+        Oracle("step_differentiation", 1, "differentiate_steps", "gradients by step", baseline=False),
         Oracle("linearisation", 1, "linearise", "derivatives of steps"),
     )
 }

@@ -60,10 +60,10 @@ def oracles_of(estimators: Iterable[Estimator | type[Estimator]], *others: str) 
     return tuple(name for name in ORACLES if name in needed)
 
 
-def options_of(estimators: Iterable[type[Estimator]]) -> dict[str, dataclasses.Field[Any]]:
-    """Return the options that estimators declare, by name; the first declaration of each."""
+def options_of_estimators(*names: str) -> dict[str, dataclasses.Field[Any]]:
+    """Return the options that registered estimators declare, by default all of them; the first declaration of each."""
     found: dict[str, dataclasses.Field[Any]] = {}
-    for estimator in estimators:
+    for estimator in map(ESTIMATORS.__getitem__, names or ESTIMATORS):
         for field in dataclasses.fields(estimator):
             if "line" in field.metadata:
                 found.setdefault(field.name, field)

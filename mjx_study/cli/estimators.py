@@ -3,7 +3,7 @@
 import argparse
 
 from estimators.choices import DENSITIES, ORACLES
-from estimators.registry import ESTIMATORS, options_of
+from estimators.registry import ESTIMATORS, options_of_estimators
 from mjx_study.cli.output import print_report
 from mjx_study.options.parser import Parser
 
@@ -20,7 +20,7 @@ def add(command: Parser) -> None:
 def run(options: argparse.Namespace) -> int:
     entries, rows = [], []
     for name, item in ESTIMATORS.items():
-        examples = {option: field.metadata["example"] for option, field in options_of([item]).items()}
+        examples = {option: field.metadata["example"] for option, field in options_of_estimators(name).items()}
         examples.pop("sigma", None)  # that of the noise
         values = {f"--{option.replace('_', '-')}": examples[option] for option in examples if option in item.required()}
         command = f"mjx-study compare pusher --estimators {name}"

@@ -7,7 +7,7 @@ from mjx_study.choices import CHECKED_STATES, CHECKED_STEPS, CHECKED_STIFFNESS, 
 from mjx_study.cli.options import configure_process, given_options, task_of, usage_errors
 from mjx_study.cli.output import computing, print_report
 from mjx_study.diagnose.columns import MEANS
-from mjx_study.options.configuration import OPTIONS
+from mjx_study.options.configuration import OPTIONS, REQUIRED_OPTIONS
 from mjx_study.options.option import Option, OptionError, reject_unused
 from mjx_study.options.parser import Parser
 from mjx_study.table import explain
@@ -55,8 +55,7 @@ MEAN_OPTIONS = {
         dataclasses.replace(
             OPTIONS["direction"], default="random", line="random, a parameter's index, or means: paths that these span"
         ),
-        OPTIONS["max_norm"],
-        OPTIONS["window"],
+        *(OPTIONS[name] for name in REQUIRED_OPTIONS),
     )
 }
 """Options of --mean."""
@@ -125,9 +124,9 @@ def _run_mean(options: argparse.Namespace) -> int:
         configure_process(options)
         task = task_of(options).replace(onset=onset)
         plan = plan_gradcheck(task, options.contact, options.stiffness, seed=seed, damping=options.damping)
-        settings = {name: chosen[name] for name in ("max_norm", "window")}
+        settings = {name: chosen[name] for name in REQUIRED_OPTIONS}
         found = make_estimators(names, settings | {"gamma": task.defaults.gamma}, task)
-        reject_unread(names, given_options(options, "max_norm", "window"))
+        reject_unread(names, given_options(options, *REQUIRED_OPTIONS))
         reject_unused(
             given_options(options, "onset", "span"),
             (["onset"], onset == "none" or reads_onset(names, onset), "has no effect on these estimators: add fobg"),

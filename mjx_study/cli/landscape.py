@@ -4,7 +4,7 @@ import argparse
 
 from mjx_study.choices import REFERENCE
 from mjx_study.cli.options import given_options, study_fields
-from mjx_study.options.configuration import BUILDER_OPTIONS, StudyConfig
+from mjx_study.options.configuration import BUILDER_OPTIONS, REQUIRED_OPTIONS, StudyConfig
 from mjx_study.options.option import OptionError
 from mjx_study.options.parser import MIDDLE, Parser
 from mjx_study.results.variables import LANDSCAPES, explained
@@ -36,7 +36,7 @@ def add(command: Parser) -> None:
     command.add_option("estimators", default=("zobg", "fobg"))
     command.add_option("samples", default=(100,))
     command.add_option("points", default=41)
-    command.add_options("span", "direction", "gamma", "max_norm", "window", "onset", "chunk_size")
+    command.add_options("span", "direction", "gamma", *REQUIRED_OPTIONS, "onset", "chunk_size")
     command.add_backward_options()
     command.add_flag("--no-reference", "omit the analytic reference")
     command.add_folder_options()

@@ -9,14 +9,12 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from estimators import Estimator, find_estimator, make_estimator
-from mjx_study.options.configuration import StudyConfig, check_span
+from mjx_study.options.configuration import ESTIMATOR_OPTIONS, StudyConfig, check_span
 from mjx_study.options.option import OptionError
 from mjx_study.tasks.task import Recipe, Task
 
 BOUND: Final = ("gamma", "failure_probability", "variance_proxy", "radius")
 """Constants of AoBG's bound."""
-ESTIMATOR_OPTIONS: Final = ("baseline", "max_norm", "window", "tolerance", "weights", *BOUND)
-"""Options of a configuration that estimators read."""
 SPAN_SIGMAS: Final = 10.0
 """Half the default length of a line through many parameters, in standard deviations of the noise."""
 

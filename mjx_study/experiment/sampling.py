@@ -20,10 +20,6 @@ from mjx_study.tasks.task import Task
 
 MOST_RESIDUAL: Final = {"float64": 1e-6, "float32": 1e-3}
 """Relative solver residual above which a sample is reported as unconverged."""
-PAIRS: Final = ("pair", "step_pair")
-"""Oracles that simulate two rollouts per sample."""
-WITHOUT_BASELINE: Final = ("differentiation", "corrected", "step_differentiation")
-"""Oracles whose batches have no rollouts without noise."""
 
 
 class Objectives:
@@ -102,8 +98,8 @@ def rollouts_of(oracles: Iterable[str], samples: int, task: Task) -> Int[np.ndar
     """Number of rollouts in a batch of each oracle, baselines included, and how many of them are differentiated."""
     baselines, found = samples if task.random_start else min(samples, 1), np.zeros(2, int)
     for name in oracles:
-        rows = samples * (2 if name in PAIRS else 1) + (0 if name in WITHOUT_BASELINE else baselines)
-        found += [rows, samples * ORACLES[name].order]
+        oracle = ORACLES[name]
+        found += [samples * oracle.rollouts + oracle.baseline * baselines, samples * oracle.order]
     return found
 
 

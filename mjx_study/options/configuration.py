@@ -9,19 +9,11 @@ import itertools
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Final, Protocol, Union, runtime_checkable
+from dataclasses import MISSING
+from typing import TYPE_CHECKING, Any, Final, Protocol, TypeVar, Union, runtime_checkable
 
-from estimators.choices import (
-    BASELINES,
-    DENSITIES,
-    MAX_DEVIATION,
-    PLUG_IN,
-    PUBLISHED_TOLERANCE,
-    VARIANCE_PROXIES,
-    WEIGHTS,
-    suggestion,
-)
-from estimators.registry import ESTIMATORS
+from estimators.choices import DENSITIES, suggestion
+from estimators.registry import ESTIMATORS, options_of_estimators
 from mjx_study.choices import CONES, FAMILIES, INTEGRATORS, KINDS, ONSETS, REFERENCE, SOLVERS, takes_stiffness
 from mjx_study.options.numbers import MAX_VALUES
 from mjx_study.options.option import OptionError, Rows, declared, options_of
@@ -59,6 +51,32 @@ SCENE_OPTIONS: Final = {
 arguments of `load_scene` that they set."""
 BUILDER_OPTIONS: Final = ("horizon", "model", *SCENE_OPTIONS)
 """Options passed to the builder of a task."""
+
+
+ConfigT = TypeVar("ConfigT")
+ESTIMATOR_OPTIONS: Final = {name: field for name, field in options_of_estimators().items() if name != "sigma"}
+"""Options that estimators declare, by name; `sigma` is that of the noise."""
+REQUIRED_OPTIONS: Final = tuple(name for name, field in ESTIMATOR_OPTIONS.items() if field.default is MISSING)
+"""Those without which an estimator that has them cannot be made."""
+
+
+def of_estimators(name: str, **changes: Any) -> Any:
+    """Declare an option as the estimators that have it do, with changes."""
+    field = ESTIMATOR_OPTIONS[name]
+    about = {"default": None if field.default is MISSING else field.default, **field.metadata} | changes
+    about.pop("example")
+    return declared(**about)
+
+
+def with_options_of_estimators(configuration: type[ConfigT]) -> type[ConfigT]:
+    """Add the options that estimators declare and a configuration does not; None for an estimator's default."""
+    for name, field in ESTIMATOR_OPTIONS.items():
+        if name not in configuration.__annotations__:
+            kind: Any = field.type
+            configuration.__annotations__[name] = kind | None
+            usual = "" if field.default is MISSING else str(field.default)
+            setattr(configuration, name, of_estimators(name, default=None, unset=usual))
+    return configuration
 
 
 @runtime_checkable
@@ -100,6 +118,7 @@ def read_solimp(text: str) -> Rows:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
+@with_options_of_estimators
 class StudyConfig:
     """Everything that determines a study of gradient estimates, descents or landscapes.
 
@@ -170,22 +189,18 @@ class StudyConfig:
     )
     seed: int = declared(0, "N", "random seed", "[0, 4294967295]")
     noise: str | None = declared(None, "NAME", "noise density: {}", choices=DENSITIES, unset=UNSET_TASK)
-    baseline: str = declared("zero_noise", "NAME", "baseline of zeroth-order estimates: {}", choices=BASELINES)
-    gamma: float | None = declared(None, "G", "AoBG's accuracy bound; inf for none", "(0, inf]", unset=UNSET_TASK)
+    baseline: str = of_estimators("baseline")
+    gamma: float | None = of_estimators("gamma", default=None, unset=UNSET_TASK)
     published: bool = declared(
         False, "", "use the published example's gamma, failure probability, variance proxy and radius"
     )
-    failure_probability: float = declared(0.05, "P", "failure probability of epsilon", "(0, 1)")
-    variance_proxy: str = declared("variance", "S2", "variance in epsilon: {}", choices=VARIANCE_PROXIES)
-    radius: str | float = declared(
-        MAX_DEVIATION, "R", "R in epsilon: max_deviation, or a bound", "[0, inf)", choices=(MAX_DEVIATION,)
-    )
-    max_norm: float | None = declared(None, "G", "fobg_clipped: norm at which samples are clipped", "(0, inf)")
-    window: int | None = declared(None, "H", "fobg_truncated: steps between cuts", "[1, 1000000]")
-    tolerance: float = declared(PUBLISHED_TOLERANCE, "C", "ddcg: tolerance of its discontinuity test", "[0, 1)")
-    weights: str = declared(
-        PLUG_IN, "NAME", "weights of interpolations: plug_in, or cross_fitted (unbiased)", choices=WEIGHTS
-    )
+    failure_probability: float = of_estimators("failure_probability")
+    variance_proxy: str = of_estimators("variance_proxy")
+    radius: str | float = of_estimators("radius")
+    max_norm: float | None = of_estimators("max_norm")
+    window: int | None = of_estimators("window")
+    tolerance: float = of_estimators("tolerance")
+    weights: str = of_estimators("weights")
     onset: str = declared(
         "none", "NAME", "onset term of first-order gradients: none, linear, or jump (costly)", choices=ONSETS
     )

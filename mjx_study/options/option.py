@@ -7,7 +7,8 @@ from numbers import Integral, Real
 from typing import Any, Final, get_args, get_origin
 
 from estimators.choices import suggestion
-from mjx_study.options.numbers import MAX_VALUES, Interval, expand_range, parse_number, plain, short
+from estimators.intervals import Interval, plain, short
+from mjx_study.options.numbers import MAX_VALUES, expand_range, parse_number
 
 KINDS: Final[dict[type, tuple[type, str]]] = {
     bool: (bool, "true or false"),

@@ -10,7 +10,7 @@ from typing import Any, Final, NoReturn
 
 from estimators.choices import suggestion, unknown
 from mjx_study.choices import FAMILIES, PRECISIONS, TASK_DESCRIPTIONS, unknown_task
-from mjx_study.options.configuration import BUILDER_OPTIONS, CONTACTS, OPTIONS, UNSET_TASK
+from mjx_study.options.configuration import BUILDER_OPTIONS, CONTACTS, ESTIMATOR_OPTIONS, OPTIONS, UNSET_TASK
 from mjx_study.options.option import Option, OptionError, flag_of
 
 SIMILAR_FLAGS: Final = 0.75
@@ -128,8 +128,7 @@ class Parser(argparse.ArgumentParser):
 
     def add_estimator_options(self) -> None:
         """Add the noise and the estimators' options; see `estimators.ESTIMATORS`."""
-        self.add_options("noise", "baseline", "published", "gamma", "failure_probability", "variance_proxy", "radius")
-        self.add_options("max_norm", "window", "tolerance", "weights", "onset")
+        self.add_options("noise", *ESTIMATOR_OPTIONS, "published", "onset")
 
     def add_backward_options(self, *, many: bool = True) -> None:
         """Add the contact model of surrogate derivatives: one or many."""

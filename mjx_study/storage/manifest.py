@@ -11,13 +11,13 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from estimators import Estimator, find_estimator
 from estimators.choices import ORACLES
+from estimators.intervals import Interval
 from estimators.registry import ESTIMATORS, label_of
 from mjx_study.choices import KINDS
 from mjx_study.experiment.study import StudyCell, StudyPlan, estimators_of
 from mjx_study.identity import git_revision, versions
 from mjx_study.options.configuration import OPTIONS
 from mjx_study.options.files import digest_of_json
-from mjx_study.options.numbers import Interval
 from mjx_study.runtime import environment
 from mjx_study.storage.schema import Finite, validated
 from mjx_study.table import digits_to_tell_apart
