@@ -203,7 +203,8 @@ def test_both_programs_and_both_modes_agree(name: str) -> None:
 
     def matrix(point):
         _, qacc, _ = step_flat(case.scene, case.scene.model, point, jnp.asarray(case.warmstart))
-        return dynamics.step_jacobian(case.scene, case.scene.model, *split(case.scene, point), qacc)[0]
+        qpos, qvel, act, control = split(case.scene, point)
+        return dynamics.step_jacobian(case.scene, case.scene.model, qpos, qvel, act, control, qacc)[0]
 
     found = compiled(matrix, case.point)(case.point)
     assert_close_by_rows(found, expected[case.scene.host.nq :], 1e-12)
@@ -272,6 +273,18 @@ def test_elliptic_contact_without_tangential_velocity() -> None:
         assert_close_by_rows(derivative(point), central_jacobian(step, point, 3e-6), 1e-6)
         # the tangential velocity is braked, at the rate of its own row
         assert 0 < derivative(point)[3, 3] < 1
+
+
+def test_a_step_that_is_no_graph_has_the_same_derivative(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In both modes, by its matrix; small models keep forward mode, in which cases not taken do not count."""
+    extra = 'cone="elliptic" solver="Newton"'
+    expected = sliding_jacobian(extra)(at(-0.0004))
+    monkeypatch.setattr(dynamics, "_slope", lambda *arguments: None)
+    scene, point = sliding(extra), jnp.asarray(at(-0.0004))
+    assert_close_by_rows(state_jacobian(scene)(at(-0.0004)), expected, 1e-12)
+    after = lambda x: step_flat(scene, scene.model, x, jnp.zeros(3))[0]  # noqa: E731
+    assert_close_by_rows(compiled(jax.jacrev(after), point)(point), expected, 1e-12)
+    assert "remat" not in str(jax.make_jaxpr(jax.jacrev(after))(point))
 
 
 def test_without_contact_the_derivative_is_free_fall() -> None:

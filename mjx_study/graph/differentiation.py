@@ -4,6 +4,10 @@ Nodes and their derivatives share one graph, so that what both compute is comput
 entry that is always zero is no node. Each operation has JAX's derivative, at kinks, too (1/2 at the tie of a maximum,
 0 where a value is clamped), with a few rules written out below that cost fewer operations.
 
+Of a selection, only the case that it takes contributes, in reverse mode, too: JAX's reverse mode multiplies the others'
+derivatives by zero, which gives NaN where one is infinite. Here the adjoint of a case counts only where the case is
+taken, which is enforced where adjoints of different cases add up.
+
 Loops and operations on whole arrays have none (`NotDifferentiableError`). The derivative of a solver's loop is that of
 the equation that it solves, see `implicit`.
 """
@@ -22,6 +26,8 @@ from mjx_study.graph.nodes import Node, ScalarGraph, entries_of, filled, needed_
 
 Sparse = dict[int, Any]
 """Entries by column; others are zero."""
+Conditions = tuple[tuple[Any, bool], ...]
+"""Truth values and which of both they are."""
 _BOOL: Final = np.dtype(bool)
 
 
@@ -56,19 +62,53 @@ def pull(
     for node in needed:
         if _passes(node) and any(_in(moving, each) for each in node.arguments):
             moving.add(node.number)
-    known: dict[int, Sparse] = {}
+    known: dict[int, dict[Conditions, Any]] = {}
+
+    def add(node: Any, adjoint: Any, where: Conditions) -> None:
+        if _in(moving, node):
+            _accumulate(graph, known.setdefault(node.number, {}), {where: adjoint}, node.dtype)
+
     for output, adjoint in zip(entries_of(outputs), entries_of(adjoints), strict=True):
-        if _in(moving, output):
-            _accumulate(graph, known.setdefault(output.number, {}), {0: adjoint}, output.dtype)
+        add(output, adjoint, ())
     for node in reversed(needed):
-        if node.number in ends or node.number not in known:
+        if node.number in ends or not (parts := known.get(node.number)):
             continue
         _refuse(node)
+        adjoint, where = _gathered(graph, parts, node.dtype)
         for place, argument in enumerate(node.arguments):
-            if _in(moving, argument):
-                term = _along(graph, node, place, known[node.number][0], argument.dtype)
-                _accumulate(graph, known.setdefault(argument.number, {}), {0: term}, argument.dtype)
-    return _arrays(inputs, [known.get(each.number, {}) for each in entries_of(inputs)])
+            if not _in(moving, argument):
+                continue
+            if node.operation is lax.select_n_p:
+                add(argument, adjoint, (*where, _taken(graph, node.arguments[0], place - 1)))
+            else:
+                add(argument, _along(graph, node, place, adjoint, argument.dtype), where)
+
+    def whole(node: Node) -> Sparse:
+        return {0: _gathered(graph, {(): node.dtype.type(0)} | known.get(node.number, {}), node.dtype)[0]}
+
+    return _arrays(inputs, [whole(each) for each in entries_of(inputs)])
+
+
+@no_type_check
+def _taken(graph: ScalarGraph, which: Any, case: int) -> tuple[Any, bool]:
+    """Condition under which a selection takes a case."""
+    if which.dtype == _BOOL:
+        return which, bool(case)
+    return graph.scalar(lax.eq_p, (which, which.dtype.type(case)), _BOOL), True
+
+
+@no_type_check
+def _gathered(graph: ScalarGraph, parts: dict[Conditions, Any], dtype: Any) -> tuple[Any, Conditions]:
+    """Sum of the parts of an adjoint, and the conditions under which it counts."""
+    parts = dict(parts)
+    while len(parts) > 1:
+        where = max(parts, key=len)
+        here, outer, (condition, value) = parts.pop(where), where[:-1], where[-1]
+        other = parts.pop((*outer, (condition, not value)), dtype.type(0))
+        cases = (other, here) if value else (here, other)
+        _accumulate(graph, parts, {outer: graph.scalar(lax.select_n_p, (condition, *cases), dtype)}, dtype)
+    ((where, adjoint),) = parts.items()
+    return adjoint, where
 
 
 @no_type_check
@@ -146,7 +186,7 @@ def _refuse(node: Node) -> None:
 
 
 @no_type_check
-def _accumulate(graph: ScalarGraph, total: Sparse, terms: Sparse, dtype: Any) -> None:
+def _accumulate(graph: ScalarGraph, total: dict[Any, Any], terms: dict[Any, Any], dtype: Any) -> None:
     for at, term in terms.items():
         if isinstance(term, Node) or term != 0:
             total[at] = graph.scalar(lax.add_p, (total[at], term), dtype) if at in total else term
@@ -179,9 +219,6 @@ def _along(graph: ScalarGraph, node: Node, place: int, change: Any, kind: Any) -
             ties = graph.scalar(lax.eq_p, arguments, _BOOL)
             strict = scalar(lax.select_n_p, wins, dtype.type(0), dtype.type(1))
             return scalar(lax.mul_p, change, scalar(lax.select_n_p, ties, strict, dtype.type(0.5)))
-        case "select_n":
-            entries = [change if at == place else dtype.type(0) for at in range(1, len(arguments))]
-            return scalar(lax.select_n_p, arguments[0], *entries)
         case "convert_element_type":
             return _converted(graph, change, kind)
     closed = _rule(node.operation, place, tuple(each.dtype for each in arguments), tuple(node.parameters.items()))

@@ -6,13 +6,14 @@ a given acceleration a, and the solver's equation G(x, a) = 0,
 
     da/dx = -G_a^{-1} G_x,   dS/dx = S_x + S_a da/dx.
 
-Reverse mode stores a step's inputs and acceleration; it neither runs the solver again nor forms a matrix. Two programs
-compute the derivative, with the same numbers:
+Reverse mode stores a step's inputs and acceleration, and does not run the solver again. Two programs compute the
+derivative, with the same numbers:
 
 - the *graph*, for models with few degrees of freedom: JAX traces G and S once and without derivatives, and their graph
-  is differentiated (`mjx_study.graph.linear_map`).
-- the *tape*, for larger models, for what a graph does not cover, and for derivatives with respect to model parameters:
-  JAX differentiates MJX's operations.
+  is differentiated (`mjx_study.graph.linear_map`). Where that is not possible, JAX forms the step's matrix column by
+  column, in forward mode.
+- the *tape*, for larger models and for derivatives with respect to model parameters: JAX differentiates MJX's
+  operations, in reverse mode by computing them again.
 
 The scene's `adjoint` and the differentiated inputs determine the program.
 """
@@ -39,7 +40,7 @@ from mjx_study.simulation import constraint
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.constraint import Qvel, Scalar
 from mjx_study.simulation.integration import integrate_position
-from mjx_study.simulation.linear_algebra import MOST_UNROLLED, solve_positive_definite
+from mjx_study.simulation.linear_algebra import MOST_UNROLLED, product, solve_positive_definite
 from mjx_study.simulation.patches import patched
 from mjx_study.simulation.scene import Scene
 
@@ -282,10 +283,11 @@ def step_change(
         change: change of the point.
     """
     inputs = [*(leaf for leaf in jax.tree.leaves(model) if isinstance(leaf, Tracer)), *point, qacc]
-    if (slope := _slope(scene, model, inputs)) is None:
-        return _by_tape(partial(_at_solution, scene, model), qacc, point, change)
-    qpos, qvel, act, acceleration = applied(slope, inputs, change)
-    return qpos, qvel, act, acceleration
+    if (slope := _slope(scene, model, inputs)) is not None:
+        qpos, qvel, act, acceleration = applied(slope, inputs, change)
+        return qpos, qvel, act, acceleration
+    by = _by_columns if scene.uses_graph else _by_tape
+    return by(partial(_at_solution, scene, model), qacc, point, change)
 
 
 def _slope(scene: Scene, model: mjx.Model, inputs: Sequence[Any]) -> LinearMap | None:
@@ -343,6 +345,17 @@ def _by_tape(function: Callable[..., Any], qacc: Qvel, point: tuple[Any, ...], c
         return jax.jvp(through, ({place: leaves[place] for place in changes},), (changes,))[1]
 
     return jax.checkpoint(along)(leaves, qacc, changes)
+
+
+def _by_columns(function: Callable[..., Any], qacc: Qvel, point: Point, change: Point) -> Any:
+    """Change of `function(qacc, *point)` by its matrix, formed in forward mode, which reverse mode stores."""
+    flat, unflatten = ravel_pytree(point)
+
+    def along(direction: Array) -> Any:
+        return jax.jvp(partial(function, qacc), point, unflatten(direction))[1]
+
+    columns = jax.vmap(along, out_axes=-1)(jnp.eye(len(flat), dtype=flat.dtype))
+    return jax.tree.map(lambda matrix: product(matrix, ravel_pytree(change)[0]), columns)
 
 
 def step_jacobian(

@@ -51,7 +51,8 @@ class Scene:
         template: empty `mjx.Data`.
         adjoint: how steps are differentiated; the derivatives agree to rounding.
 
-            - "graph": as graphs of scalar operations (`mjx_study.graph`), where they can be; not for RK4.
+            - "graph": as graphs of scalar operations (`mjx_study.graph`); a step that is none, or too large a one, by
+              its matrix, in forward mode. Not for RK4.
             - "tape": automatic differentiation of MJX's own operations around the implicit solve; reverse mode computes
               each step again (fault 13 in `docs/gradient-faults.md`).
             - "auto": graphs up to `MOST_UNROLLED` degrees of freedom, else the tape.
@@ -76,7 +77,7 @@ class Scene:
 
     @property
     def uses_graph(self) -> bool:
-        """Whether steps are differentiated as graphs, where they can be, rather than by the tape."""
+        """Whether steps are differentiated as graphs rather than by the tape."""
         small = self.host.nv <= MOST_UNROLLED
         return self.adjoint == "graph" or (self.adjoint == "auto" and small and not self._explicit)
 

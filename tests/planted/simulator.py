@@ -5,6 +5,7 @@ from typing import Final
 from tests.planted.defect import Defect
 
 STEP = "tests/test_dynamics.py"
+GRAPHS = "tests/test_graph_derivatives.py"
 VALUES, SLOPES = "test_the_step_is_mjxs", "test_reverse_mode_is_the_central_difference"
 LAWS = "tests/test_constraint.py::test_forces_and_imbalance_are_those_of_mjx"
 IMPEDANCE = "tests/test_patches.py::test_stiffness_damping_and_impedance_are_the_c_engines"
@@ -42,25 +43,47 @@ DYNAMICS: Final = (
     ),
     Defect(
         "implicit-part-dropped",
-        "mjx_study/simulation/dynamics.py",
-        "return over_inputs[nv:] + over_qacc[nv:] @ response, response",
-        "return over_inputs[nv:], response",
+        "mjx_study/graph/linear_map.py",
+        "return pull(graph, [gap, *results], inputs, [of_gap, *adjoints[:-1]])",
+        "return pull(graph, results, inputs, adjoints[:-1])",
         "the step differentiated at a fixed acceleration",
-        (f"{STEP}::{SLOPES}[sphere-sphere condim 1]",),
+        (f"{STEP}::{SLOPES}[sphere-sphere condim 1]", f"{GRAPHS}::test_the_implicit_derivative_is_that_of_the_loop"),
         "slider",
     ),
     Defect(
         "columns-swapped",
         "mjx_study/simulation/dynamics.py",
-        """        (lambda x: equations(positioned, qvel, x, control, qacc), act),
-        (lambda x: equations(positioned, qvel, act, x, qacc), control),
-""",
-        """        (lambda x: equations(positioned, qvel, act, x, qacc), control),
-        (lambda x: equations(positioned, qvel, x, control, qacc), act),
-""",
-        "blocks of the Jacobian in another order than the inputs",
+        "change = step_change(scene, whole(traced), tuple(point), following.warmstart, moved)",
+        "change = step_change(scene, whole(traced), tuple(point), following.warmstart, (*moved[:3], moved[3][::-1]))",
+        "controls in another order than the actuators",
         (f"{STEP}::test_activation_and_control_each_have_their_column",),
         "mechanism",
+    ),
+    Defect(
+        "quotient-without-its-denominator",
+        "mjx_study/graph/differentiation.py",
+        "slope = scalar(lax.neg_p, scalar(lax.mul_p, node, inverse)) if place else inverse",
+        "slope = scalar(lax.neg_p, node) if place else inverse",
+        "the quotient rule from memory",
+        (f"{GRAPHS}::test_operations_have_jaxs_derivative[div]",),
+        "slider",
+    ),
+    Defect(
+        "ties-to-one-side",
+        "mjx_study/graph/differentiation.py",
+        "ties, strict, dtype.type(0.5)",
+        "ties, strict, dtype.type(1)",
+        "both arguments of a maximum count in full where they are equal",
+        (f"{GRAPHS}::test_operations_have_jaxs_derivative[max]",),
+    ),
+    Defect(
+        "case-not-taken",
+        "mjx_study/graph/differentiation.py",
+        "return which, bool(case)",
+        "return which, not case",
+        "the cases of a selection in the order of `where`, which is the other one",
+        (f"{GRAPHS}::test_what_a_selection_leaves_out_does_not_count_in_reverse_mode",),
+        "slider",
     ),
     Defect(
         "always-euler",
