@@ -15,6 +15,8 @@ import pytest
 import estimators
 from mjx_study import compiled, identity
 from mjx_study.compiled import Compiled
+from mjx_study.graph import build
+from mjx_study.graph.native import SWITCH, native_identity
 from mjx_study.objective import Simulator, programs
 from mjx_study.study import gradients
 from mjx_study.study.configuration import StudyConfig
@@ -184,3 +186,24 @@ def test_xla_without_the_options_of_graphs_compiles_without_them(monkeypatch: py
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     monkeypatch.setattr(compiled, "GRAPHS", "FUSION,OF_ANOTHER_VERSION")
     assert compiled.compiler_options.__wrapped__() is None
+
+
+@pytest.mark.skipif(native_identity() is None, reason="there is no C compiler")
+def test_a_trace_is_made_again_where_a_library_that_it_calls_is_missing(folder: Path, monkeypatch: pytest.MonkeyPatch):
+    evaluated(pusher())
+    (path,) = folder.glob("*.trace")
+    assert build.libraries_in(path.read_bytes()) <= set(build.known_libraries())
+    monkeypatch.setattr(build, "_BUILT", {})
+    monkeypatch.setattr(build, "libraries_folder", lambda: folder / "empty")
+    monkeypatch.setattr(programs, "rollout_cost", untraceable)
+    with pytest.raises(AssertionError, match="traced"):
+        evaluated(pusher())
+
+
+def test_traces_with_and_without_native_code_are_apart(folder: Path, monkeypatch: pytest.MonkeyPatch):
+    first = evaluated(pusher())
+    jax.clear_caches()
+    monkeypatch.setenv(SWITCH, "0")
+    np.testing.assert_allclose(evaluated(pusher()), first, rtol=1e-12)
+    called = [build.libraries_in(path.read_bytes()) for path in folder.glob("*.trace")]
+    assert sorted(map(bool, called)) == [False, True], called

@@ -15,11 +15,14 @@ import pytest
 from jax import lax
 
 from mjx_study import runtime
+from mjx_study.choices import TASK_DESCRIPTIONS
 from mjx_study.graph import build, c, native
 from mjx_study.graph.function import capture
 from mjx_study.graph.native import SWITCH, native_identity
 from mjx_study.graph.nodes import ELEMENTWISE
 from mjx_study.graph.scalars import unrolled
+from mjx_study.simulation.dynamics import initial_state, step
+from mjx_study.tasks import make_task
 from tests.test_graph import FUNCTIONS, ROW
 
 pytestmark = pytest.mark.skipif(native_identity() is None, reason="there is no C compiler")
@@ -230,6 +233,8 @@ ALONE = """
 import jax, numpy as np
 jax.config.update("jax_enable_x64", True)
 from mjx_study.graph.scalars import unrolled
+from mjx_study.simulation.dynamics import initial_state, step
+from mjx_study.tasks import make_task
 print(jax.make_jaxpr(jax.vmap(lambda x: unrolled(lambda x: x * 2, x)))(np.ones(3)))
 print(jax.jit(jax.vmap(lambda x: unrolled(lambda x: x * 2, x)))(np.ones(3)))
 """
@@ -262,3 +267,25 @@ def test_the_page_shows_what_is_written():
     exec(python, names)
     written = c.source_of(capture(names["push"], jax.ShapeDtypeStruct((2,), float), most=99))
     assert f"{{\n{shown}}}\n" in written
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["pusher", *(pytest.param(each, marks=pytest.mark.slow) for each in sorted({*TASK_DESCRIPTIONS} - {"pusher"}))],
+)
+def test_steps_and_their_derivatives(monkeypatch, name):
+    task = make_task(name)
+    scene, draw = task.scene, np.random.default_rng(0)
+    start = initial_state(scene)
+    controls = jnp.asarray(draw.normal(size=(9, 12, scene.host.nu)))
+
+    def total(controls):
+        state, states = lax.scan(lambda state, u: (step(scene, scene.model, state, u)[0],) * 2, start, controls)
+        return jnp.sum(state.qpos) + jnp.sum(state.qvel), states
+
+    found = []
+    for switch in "10":
+        monkeypatch.setenv(SWITCH, switch)
+        found.append(jax.tree.leaves(jax.jit(jax.vmap(jax.value_and_grad(total, has_aux=True)))(controls)))
+    for ours, theirs in zip(*found, strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-12 * np.max(np.abs(theirs), initial=1e-300))
