@@ -13,6 +13,7 @@ from mjx_study.graph.differentiation import NotDifferentiableError, jacobian, pu
 from mjx_study.graph.evaluation import evaluated
 from mjx_study.graph.function import ScalarFunction, capture
 from mjx_study.graph.linear_map import derivative, implicit_derivative, implicit_jacobian
+from mjx_study.graph.native import native_summary
 from mjx_study.graph.nodes import ELEMENTWISE, entries_of
 from mjx_study.graph.operation import applied, computed
 from mjx_study.simulation.linear_algebra import solve_positive_definite
@@ -190,6 +191,7 @@ def test_jax_differentiates_what_the_graph_does_not(name: str) -> None:
     function = captured(REFUSED[name], ROW)
     for mode in (jax.grad, jax.jacfwd):
         ours = jax.jit(mode(lambda x: computed(function, [x])[0] ** 2))(ROW)
+        assert f"through XLA: derivative of {name}" in native_summary()
         all_close(ours, mode(lambda x: REFUSED[name](x) ** 2)(ROW))
 
 

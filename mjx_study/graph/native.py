@@ -41,6 +41,11 @@ def native_summary() -> str:
     return f"{loaded} libraries" + "".join(f", {count} through XLA: {why}" for why, count in _LEFT.items())
 
 
+def count_left(reason: str) -> None:
+    """Count a function that is left to XLA."""
+    _LEFT[reason] += 1
+
+
 @cache
 def _works() -> bool:
     """Whether the smallest of functions can be built."""
@@ -58,7 +63,7 @@ def as_native(values: ScalarFunction, function: ScalarFunction) -> "NativeFuncti
     try:
         return NativeFunction(source_of(values), function)
     except NotWrittenError as error:
-        _LEFT[str(error)] += 1
+        count_left(str(error))
         return None
 
 
@@ -128,7 +133,7 @@ def _evaluate(*inputs: Any, function: NativeFunction, batch: tuple[int, ...]) ->
 
 def _lower(context: Any, *operands: Any, function: NativeFunction, batch: tuple[int, ...]) -> Any:
     if not library_ready(function.name):
-        _LEFT["not built"] += 1
+        count_left("not built")
         return mlir.lower_fun(_plain(function, batch), multiple_results=True)(context, *operands)
     ins = [_layout(at.ndim, at.ndim - aval.ndim) for at, aval in zip(context.avals_in, function.inputs, strict=True)]
     outs = [_layout(each.ndim, len(batch)) for each in context.avals_out]

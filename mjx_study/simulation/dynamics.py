@@ -18,7 +18,6 @@ derivative, with the same numbers:
 The scene's `adjoint` and the differentiated inputs determine the program.
 """
 
-import contextlib
 import dataclasses
 from collections.abc import Callable
 from functools import partial
@@ -36,7 +35,7 @@ from estimators.pytree import register_pytree
 from mjx_study.graph.derivative_rule import instantiated, with_rule
 from mjx_study.graph.differentiation import NotDifferentiableError
 from mjx_study.graph.linear_map import implicit_derivative, implicit_jacobian
-from mjx_study.graph.native import native_identity
+from mjx_study.graph.native import count_left, native_identity
 from mjx_study.graph.operation import applied, computed
 from mjx_study.graph.scalars import captured_once, is_small, traced_part, unrolled
 from mjx_study.simulation import constraint
@@ -308,16 +307,19 @@ def _by_graph(scene: Scene, model: mjx.Model, point: Point, qacc: Qvel, change: 
         return None
     inputs = [*(leaf for leaf in jax.tree.leaves(model) if isinstance(leaf, Tracer)), *point, qacc]
     over = tuple(range(len(inputs) - 5, len(inputs) - 1))
-    with contextlib.suppress(NotDifferentiableError):
+    try:
         if native_identity() is not None:
             slope = implicit_derivative(equations, over, solve_positive_definite)
             return tuple(applied(slope, inputs, change)) if is_small(slope.push) else None
         matrix = implicit_jacobian(equations, over, solve_positive_definite)
-        if is_small(matrix):
-            (entries,) = computed(matrix, inputs)
-            flat = product(entries, jnp.concatenate(change))
-            return tuple(jnp.split(flat, np.cumsum([scene.host.nq, scene.host.nv, scene.host.na])))
-    return None
+    except NotDifferentiableError as error:
+        count_left(f"derivative of {error}")
+        return None
+    if not is_small(matrix):
+        return None
+    (entries,) = computed(matrix, inputs)
+    flat = product(entries, jnp.concatenate(change))
+    return tuple(jnp.split(flat, np.cumsum([scene.host.nq, scene.host.nv, scene.host.na])))
 
 
 def _equations(
