@@ -7,11 +7,12 @@ A file holds the structure of the outputs as JSON in a line, and the serialised 
 and write it.
 """
 
+import dataclasses
 import hashlib
 import json
 import os
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import cache, cached_property
 from pathlib import Path
 from typing import Any, Final
@@ -130,14 +131,20 @@ class Compiled:
         try:
             jitted = jax.jit(of_leaves)
             jitted.trace(*types)  # which names the libraries of native code that it calls
-            allowed = [jax.export.DisabledSafetyCheck.custom_call(name) for name in known_libraries()]
-            trace = jax.export.export(jitted, disabled_checks=allowed)(*types).serialize()
+            program = jax.export.export(jitted, disabled_checks=_calling(known_libraries()))(*types)
+            called = libraries_in(program.mlir_module_serialized)
+            trace = dataclasses.replace(program, disabled_safety_checks=_calling(called)).serialize()
             described = json.dumps(describe(outputs[0])).encode()
         except ValueError:  # an operation that cannot be exported, or outputs of a class of others
             return self._whole
         kept = described + b"\n" + bytes(trace)
         write_cached(path, kept)
         return _load(kept)
+
+
+def _calling(libraries: Iterable[str]) -> list[jax.export.DisabledSafetyCheck]:
+    """Permission for an exported program to call libraries of native code."""
+    return [jax.export.DisabledSafetyCheck.custom_call(name) for name in sorted(libraries)]
 
 
 @cache

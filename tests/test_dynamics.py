@@ -70,7 +70,7 @@ def jacobian(name: str) -> np.ndarray:
     """The graph's, in reverse mode."""
     case = prepare(name)
     scene = case.scene
-    assert dynamics._slope(scene, scene.model, [*split(scene, case.point), case.warmstart])
+    assert scene.uses_graph
 
     def after(point):
         return step_flat(scene, scene.model, point, jnp.asarray(case.warmstart))[0]
@@ -275,11 +275,21 @@ def test_elliptic_contact_without_tangential_velocity() -> None:
         assert 0 < derivative(point)[3, 3] < 1
 
 
+def test_without_native_code_the_derivative_is_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By the graph's matrix, which XLA computes."""
+    extra = 'cone="elliptic" solver="Newton"'
+    expected = sliding_jacobian(extra)(at(-0.0004))
+    monkeypatch.setenv("MJX_STUDY_NATIVE", "0")
+    scene, point = sliding(extra), jnp.asarray(at(-0.0004))
+    after = lambda x: step_flat(scene, scene.model, x, jnp.zeros(3))[0]  # noqa: E731
+    assert_close_by_rows(compiled(jax.jacrev(after), point)(point), expected, 1e-12)
+
+
 def test_a_step_that_is_no_graph_has_the_same_derivative(monkeypatch: pytest.MonkeyPatch) -> None:
     """In both modes, by its matrix; small models keep forward mode, in which cases not taken do not count."""
     extra = 'cone="elliptic" solver="Newton"'
     expected = sliding_jacobian(extra)(at(-0.0004))
-    monkeypatch.setattr(dynamics, "_slope", lambda *arguments: None)
+    monkeypatch.setattr(dynamics, "_by_graph", lambda *arguments: None)
     scene, point = sliding(extra), jnp.asarray(at(-0.0004))
     assert_close_by_rows(state_jacobian(scene)(at(-0.0004)), expected, 1e-12)
     after = lambda x: step_flat(scene, scene.model, x, jnp.zeros(3))[0]  # noqa: E731

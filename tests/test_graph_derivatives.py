@@ -12,7 +12,8 @@ from jax import lax
 from mjx_study.graph.differentiation import NotDifferentiableError, jacobian, pull, push
 from mjx_study.graph.evaluation import evaluated
 from mjx_study.graph.function import ScalarFunction, capture
-from mjx_study.graph.linear_map import derivative, implicit_derivative
+from mjx_study.graph.linear_map import derivative, implicit_derivative, implicit_jacobian
+from mjx_study.graph.native import native_summary
 from mjx_study.graph.nodes import ELEMENTWISE, entries_of
 from mjx_study.graph.operation import applied, computed
 from mjx_study.simulation.linear_algebra import solve_positive_definite
@@ -190,6 +191,7 @@ def test_jax_differentiates_what_the_graph_does_not(name: str) -> None:
     function = captured(REFUSED[name], ROW)
     for mode in (jax.grad, jax.jacfwd):
         ours = jax.jit(mode(lambda x: computed(function, [x])[0] ** 2))(ROW)
+        assert f"through XLA: derivative of {name}" in native_summary()
         all_close(ours, mode(lambda x: REFUSED[name](x) ** 2)(ROW))
 
 
@@ -248,3 +250,5 @@ def test_the_implicit_derivative_is_that_of_the_loop() -> None:
     of_x = sum(adjoint @ np.asarray(over_x) for adjoint, (over_x, _) in zip(adjoints, expected, strict=True))
     of_force = sum(adjoint @ np.asarray(over) for adjoint, (_, over) in zip(adjoints, expected, strict=True))
     all_close(back, [of_x, of_force], 1e-11)
+    (matrix,) = computed(implicit_jacobian(function, (0,), solve_positive_definite), [ROW, force, root])
+    all_close(matrix, np.concatenate([over_x for over_x, _ in expected]), 1e-11)

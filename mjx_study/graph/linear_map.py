@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.core import ShapedArray
@@ -86,6 +87,26 @@ def implicit_derivative(function: ScalarFunction, moving: tuple[int, ...], solve
         return LinearMap(_function(function, changes, pushed()), lambda: _function(function, adjoints, pulled()))
 
     return _once(function, ("implicit", moving, solve), derived)
+
+
+@no_type_check
+def implicit_jacobian(function: ScalarFunction, moving: tuple[int, ...], solve: Solve) -> ScalarFunction:
+    """Matrix of `implicit_derivative`: rows are the entries of the results and the root, columns those that change.
+
+    Raises:
+        NotDifferentiableError: it passes a loop or an operation on whole arrays.
+    """
+
+    def derived() -> ScalarFunction:
+        graph, inputs = function.graph, np.concatenate([function.inputs[place] for place in moving])
+        gap, *results = function.outputs
+        results = np.concatenate(results)
+        response = _solved(function, solve, jacobian(graph, gap, inputs))
+        through = lambda over, over_root, response: jnp.concatenate([over + over_root @ response, response])  # noqa: E731
+        blocks = jacobian(graph, results, inputs), jacobian(graph, results, function.inputs[-1]), response
+        return _function(function, [], inlined(graph, through, *blocks))
+
+    return _once(function, ("jacobian", moving, solve), derived)
 
 
 @no_type_check

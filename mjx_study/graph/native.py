@@ -43,6 +43,11 @@ def native_summary() -> str:
     return f"{loaded} libraries" + "".join(f", {count} through XLA: {why}" for why, count in _LEFT.items())
 
 
+def count_left(reason: str) -> None:
+    """Count a function that is left to XLA."""
+    _LEFT[reason] += 1
+
+
 @cache
 def _works() -> bool:
     """Whether the smallest of functions can be built."""
@@ -60,7 +65,7 @@ def as_native(values: ScalarFunction, function: ScalarFunction) -> "NativeFuncti
     try:
         return NativeFunction(source_of(values, jax.default_backend()), function)
     except NotWrittenError as error:
-        _LEFT[str(error)] += 1
+        count_left(str(error))
         return None
 
 
@@ -131,7 +136,7 @@ def _evaluate(*inputs: Any, function: NativeFunction, batch: tuple[int, ...]) ->
 
 def _lower(platform: str, context: Any, *operands: Any, function: NativeFunction, batch: tuple[int, ...]) -> Any:
     if function.platform != platform or not library_ready(function.name):
-        _LEFT["not built"] += 1
+        count_left("not built")
         return mlir.lower_fun(_plain(function, batch), multiple_results=True)(context, *operands)
     ins = [_layout(at.ndim, at.ndim - aval.ndim) for at, aval in zip(context.avals_in, function.inputs, strict=True)]
     outs = [_layout(each.ndim, len(batch)) for each in context.avals_out]

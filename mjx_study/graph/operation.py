@@ -14,7 +14,7 @@ from mjx_study.graph.differentiation import NotDifferentiableError
 from mjx_study.graph.evaluation import written_out
 from mjx_study.graph.function import ScalarFunction
 from mjx_study.graph.linear_map import LinearMap, derivative
-from mjx_study.graph.native import as_native, native_identity
+from mjx_study.graph.native import as_native, count_left, native_identity
 
 
 def computed(function: ScalarFunction, inputs: Sequence[Any], transpose: Transpose | None = None) -> list[Any]:
@@ -30,7 +30,8 @@ def computed(function: ScalarFunction, inputs: Sequence[Any], transpose: Transpo
         moving = tuple(place for place, change in enumerate(changes) if change is not None)
         try:
             slope = derivative(function, moving)
-        except NotDifferentiableError:  # JAX differentiates the operations on whole arrays
+        except NotDifferentiableError as error:  # JAX differentiates the operations on whole arrays
+            count_left(f"derivative of {error}")
             return jax.jvp(program, tuple(primals), tuple(instantiated(list(primals), list(changes))))
         value = computed(function, primals, transpose)
         found = iter(applied(slope, primals, [changes[place] for place in moving]))

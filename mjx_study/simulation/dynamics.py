@@ -19,13 +19,14 @@ The scene's `adjoint` and the differentiated inputs determine the program.
 """
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import mujoco
+import numpy as np
 from jax.core import Tracer
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
@@ -33,8 +34,9 @@ from jaxtyping import Array, Bool, Float, Int
 from estimators.pytree import register_pytree
 from mjx_study.graph.derivative_rule import instantiated, with_rule
 from mjx_study.graph.differentiation import NotDifferentiableError
-from mjx_study.graph.linear_map import LinearMap, implicit_derivative
-from mjx_study.graph.operation import applied
+from mjx_study.graph.linear_map import implicit_derivative, implicit_jacobian
+from mjx_study.graph.native import count_left, native_identity
+from mjx_study.graph.operation import applied, computed
 from mjx_study.graph.scalars import captured_once, is_small, traced_part, unrolled
 from mjx_study.simulation import constraint
 from mjx_study.simulation._mjx import mjx
@@ -270,10 +272,12 @@ Point = tuple[Qpos, Qvel, Act, Control]
 """Positions, velocities, activations and controls before a step, or their changes."""
 
 
-def step_change(
-    scene: Scene, model: mjx.Model, point: Point, qacc: Qvel, change: Point
-) -> tuple[Qpos, Qvel, Act, Qvel]:
-    """Change of a step's (qpos', qvel', act') and acceleration, linear in the change of what precedes it.
+StepChange = tuple[Array, ...]
+"""Changes of positions (nq,), velocities (nv,) and activations (na,) after a step, and of its acceleration (nv,)."""
+
+
+def step_change(scene: Scene, model: mjx.Model, point: Point, qacc: Qvel, change: Point) -> StepChange:
+    """Change of a step, linear in the change of what precedes it.
 
     Args:
         scene: static part of the model; its own contact parameters are not used.
@@ -282,29 +286,40 @@ def step_change(
         qacc: the converged constrained acceleration there.
         change: change of the point.
     """
-    inputs = [*(leaf for leaf in jax.tree.leaves(model) if isinstance(leaf, Tracer)), *point, qacc]
-    if (slope := _slope(scene, model, inputs)) is not None:
-        qpos, qvel, act, acceleration = applied(slope, inputs, change)
-        return qpos, qvel, act, acceleration
-    by = _by_columns if scene.uses_graph else _by_tape
-    return by(partial(_at_solution, scene, model), qacc, point, change)
+    if scene.uses_graph:
+        found = _by_graph(scene, model, point, qacc, change)
+        return found or _by_columns(partial(_at_solution, scene, model), qacc, point, change)
+    return _by_tape(partial(_at_solution, scene, model), qacc, point, change)
 
 
-def _slope(scene: Scene, model: mjx.Model, inputs: Sequence[Any]) -> LinearMap | None:
-    """Derivative of the step's graph over `Point`, the inputs between those of the model and the acceleration."""
-    if not scene.uses_graph or isinstance(model.body_mass, Tracer):
+def _by_graph(scene: Scene, model: mjx.Model, point: Point, qacc: Qvel, change: Point) -> StepChange | None:
+    """`step_change` as a graph, if it is one and worth compiling.
+
+    Native code computes products with the derivative or its transpose. XLA would compute each entry of those anew from
+    the start, and is given the matrix.
+    """
+    if isinstance(model.body_mass, Tracer):
         return None
     kind = lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype)  # noqa: E731
     like = jax.tree.map(lambda leaf: kind(leaf) if isinstance(leaf, Tracer) else leaf, model)
-    equations = captured_once(partial(_equations, scene), like, *map(kind, inputs[-5:]))
+    equations = captured_once(partial(_equations, scene), like, *map(kind, (*point, qacc)))
     if equations is None:
         return None
+    inputs = [*(leaf for leaf in jax.tree.leaves(model) if isinstance(leaf, Tracer)), *point, qacc]
     over = tuple(range(len(inputs) - 5, len(inputs) - 1))
     try:
-        slope = implicit_derivative(equations, over, solve_positive_definite)
-    except NotDifferentiableError:
+        if native_identity() is not None:
+            slope = implicit_derivative(equations, over, solve_positive_definite)
+            return tuple(applied(slope, inputs, change)) if is_small(slope.push) else None
+        matrix = implicit_jacobian(equations, over, solve_positive_definite)
+    except NotDifferentiableError as error:
+        count_left(f"derivative of {error}")
         return None
-    return slope if is_small(slope.push) else None
+    if not is_small(matrix):
+        return None
+    (entries,) = computed(matrix, inputs)
+    flat = product(entries, jnp.concatenate(change))
+    return tuple(jnp.split(flat, np.cumsum([scene.host.nq, scene.host.nv, scene.host.na])))
 
 
 def _equations(
