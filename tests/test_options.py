@@ -12,13 +12,13 @@ from typing import Any
 import pytest
 
 from estimators import AlphaOrder
+from estimators.intervals import Interval
 from mjx_study import cli, tasks
 from mjx_study.cli import options
 from mjx_study.cli.sweep import sweep_fields
 from mjx_study.experiment.plan import plan_study
 from mjx_study.options.configuration import OPTIONS, StudyConfig
 from mjx_study.options.files import read_toml
-from mjx_study.options.numbers import Interval
 from mjx_study.options.option import OptionError, flag_of
 from mjx_study.tasks import TASKS
 
