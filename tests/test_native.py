@@ -36,7 +36,9 @@ FLOATS = {
     **{name: getattr(lax, name) for name in ("rsqrt", "sign", "sin", "sinh", "sqrt", "square", "tan", "tanh")},
     "round": lambda x: (lax.round(x, lax.RoundingMethod.TO_NEAREST_EVEN), lax.round(x)),
     "integer_pow": lambda x: tuple(lax.integer_pow(x, y) for y in (-3, -1, 0, 1, 2, 5, 8)),
-    "convert_element_type": lambda x: tuple(x.astype(kind) for kind in ("int32", "uint8", "bool", "float32", "int64")),
+    "convert_element_type": lambda x: tuple(
+        lax.convert_element_type(x, kind) for kind in ("int32", "uint8", "bool", "float32", "int64")
+    ),
     "clamp": lambda x: lax.clamp(x.dtype.type(-1), x, x.dtype.type(2)),
 }
 PAIRS = {
@@ -89,12 +91,17 @@ def test_operations_of_floats(name):
     if name == "log":  # of a subnormal number XLA's is that of 0
         points = points[~((points != 0) & (np.abs(points) < 1e-300))]
     compare(FLOATS[name], points)
-    compare(FLOATS[name], jnp.asarray(points).astype(jnp.float32), rtol=1e-5)
+    with np.errstate(over="ignore"):
+        single = points.astype(np.float32)
+    compare(FLOATS[name], single, rtol=1e-5)
 
 
 @pytest.mark.parametrize("name", PAIRS)
 def test_operations_of_two_floats(name):
     x, y = (each.reshape(-1) for each in jnp.meshgrid(jnp.asarray(SPECIAL), jnp.asarray(SPECIAL)))
+    if name == "rem":  # XLA from JAX 0.11 on gives NaN where a quotient overflows
+        sizes = jnp.abs(x / y)
+        x, y = x[sizes < 1e15], y[sizes < 1e15]
     compare(PAIRS[name], x, y)
     compare(PAIRS[name], x.astype(jnp.float32), y.astype(jnp.float32), rtol=1e-5)
 
