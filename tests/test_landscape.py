@@ -251,7 +251,7 @@ def test_the_line_goes_through_theta() -> None:
     assert group.task.theta.tolist() == [1.0, 2.0, 3.0]
     with pytest.raises(ValueError, match="`theta` has one entry, and the line is its range: give `span` instead"):
         plan_study(config("ball_wall", theta=(1.0,), points=3))
-    with pytest.raises(ValueError, match="landscapes need `points`"):
+    with pytest.raises(ValueError, match="`points` must be given for landscapes"):
         config("ball_wall")
 
 

@@ -412,7 +412,7 @@ def test_a_policy_is_replayed(
         (["rollout", "sliding_box", "--theta", str(policy)], "is a policy of pusher, not of sliding_box"),
         (
             ["rollout", "pusher", "--theta", str(written[0] / "study.json")],
-            "study.json: task: Field required",
+            "study.json: task must be the name of a task",
         ),
         (["rollout", "pusher", "--theta", "nowhere.json"], "cannot read nowhere.json"),
     ):

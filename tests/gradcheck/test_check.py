@@ -218,8 +218,8 @@ def test_stock_derivatives_are_checked_apart() -> None:
 def test_a_stiffness_needs_the_pair_that_it_acts_on() -> None:
     scene = load_scene("pusher")
     for families, stiffnesses, message in (
-        (["penalty"], None, "--pair"),
-        (["penalty"], [10.0], "--pair"),
+        (["penalty"], None, "`pair`"),
+        (["penalty"], [10.0], "`pair`"),
         (["mujoco_default"], [10.0], "`stiffness` has no effect on contact mujoco_default"),
     ):
         with pytest.raises(ValueError, match=message):
@@ -254,7 +254,7 @@ def test_plans_are_refused() -> None:
         (["pusher", "--pair", "a,b"], "--pair is for files"),
         (["FILE", "--pair", "a"], "names of two geoms, got 1"),
         (["FILE", "--model", "FILE"], "a file already"),
-        (["FILE", "--contact", "penalty"], "give --stiffness in N/m, and --pair"),
+        (["FILE", "--contact", "penalty"], "--stiffness must be given in N/m, along with --pair"),
         (["FILE", "--stiffness", "100"], "give --pair GEOM,GEOM"),
         (["missing.xml"], "missing.xml"),
         (["broken.xml"], "broken.xml"),
