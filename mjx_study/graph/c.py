@@ -62,7 +62,7 @@ def source_of(function: ScalarFunction, platform: str = "cpu") -> str:
     forms_in = [(math.prod(each.shape), each.dtype, each.ndim) for each in function.types]
     forms_out = [(math.prod(each.shape), each.dtype, each.ndim) for each in function.avals]
     if platform == "gpu":
-        kernel = [_text("prelude.cu"), *functions, _text("kernel.cu")]
+        kernel = [_text("prelude.cu"), _text("functions.c"), *functions, _text("kernel.cu")]
         parts = ["#ifdef __CUDACC_RTC__", *kernel, "#else", _text("launcher.c"), "#endif"]
         return "\n".join([_batch(forms_in, forms_out), f"#define KEPT {num_kept}", *parts, ""])
     wide = any(dtype.itemsize == 8 for dtype in writer.dtypes)
@@ -74,6 +74,7 @@ def source_of(function: ScalarFunction, platform: str = "cpu") -> str:
             f"#define BYTES {sum(size * np.dtype(dtype).itemsize for size, dtype, _ in forms_in + forms_out)}",
             f"#define KEPT {num_kept}",
             _text("prelude.c"),
+            _text("functions.c"),
             *functions,
             _text("handler.c"),
         ]

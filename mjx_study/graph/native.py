@@ -21,8 +21,6 @@ from mjx_study.graph.function import ScalarFunction, capture
 
 SWITCH: Final = "MJX_STUDY_NATIVE"
 """Environment variable; 0 does without native code."""
-
-
 _LEFT: Final[Counter[str]] = Counter()
 """Numbers of functions left to XLA, by reason."""
 

@@ -88,7 +88,7 @@ SELECT(u8, i8)
 
 // Operations of floats, as JAX defines them: extremes propagate NaN, signs keep zeros.
 
-#define FLOATS(type, scalar, bits, suffix, sign_bit)                                              \
+#define FLOATS(type, bits, suffix)                                                                \
   ONE type abs_##type(type x) { return (type)((bits)x & ~(bits)ALL(type, -0.0##suffix)); }        \
   ONE type max_##type(type a, type b) { return select_##type(MASK((a > b) | (a != a)), b, a); }   \
   ONE type min_##type(type a, type b) { return select_##type(MASK((a < b) | (a != a)), b, a); }   \
@@ -114,32 +114,8 @@ SELECT(u8, i8)
     return r;                                  \
   }
 #define FUNCTION(name) UNARY(f64, name, name) UNARY(f32, name, name##f)
-FLOATS(f64, double, i64, , 63)
-FLOATS(f32, float, i32, f, 31)
-FUNCTION(acos)
-FUNCTION(asin)
-FUNCTION(atan)
-FUNCTION(ceil)
-FUNCTION(cos)
-FUNCTION(cosh)
-FUNCTION(erf)
-FUNCTION(exp)
-FUNCTION(expm1)
-FUNCTION(floor)
-FUNCTION(log)
-FUNCTION(log1p)
-FUNCTION(rint)
-FUNCTION(round)
-FUNCTION(sin)
-FUNCTION(sinh)
-FUNCTION(tan)
-FUNCTION(tanh)
-BINARY(f64, atan2, atan2)
-BINARY(f32, atan2, atan2f)
-BINARY(f64, pow, pow)
-BINARY(f32, pow, powf)
-BINARY(f64, rem, fmod)
-BINARY(f32, rem, fmodf)
+FLOATS(f64, i64, )
+FLOATS(f32, i32, f)
 
 // Operations of integers: division by zero gives -1, with the dividend as remainder.
 

@@ -56,7 +56,7 @@ def captured_once(function: Callable[..., Any], *arguments: Any) -> ScalarFuncti
             captured = capture(function, *arguments, most=2 * most)
         except TooLargeError:
             captured = None
-        _CAPTURED[key] = captured if captured and is_small(captured) else None
+        _CAPTURED[key] = captured = captured if captured and is_small(captured) else None
         if captured and any(node.operation == "whole" for node in captured.needed):
             captured.derived["values"] = capture(function, *arguments, most=2 * most, values_only=True)
     return _CAPTURED[key]
