@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import mjx_study as study
+from mjx_study.graph.native import SWITCH, native_identity
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.contact import apply_contact
 from mjx_study.simulation.drop_in import differentiable_mjx, solver_residual, step
@@ -34,6 +35,7 @@ from tests.test_onset_term import BOUNCING, Law
 
 PAGE = Path(__file__).parents[1] / "docs" / "differentiable-mjx.md"
 MODELS = Path(mjx.__file__).parent / "test_data"
+NATIVE = pytest.mark.skipif(native_identity() is None, reason="there is no C compiler")
 FAST = ("tendon/armature", "tendon/wrap_sidesite")
 CROWDS = {f"humanoid/{count:02}_humanoids" for count in range(2, 11)}  # copies of the first, and slow
 STILL = {"ray", "actuator/general_dyntype"}  # no coordinate; an inertia matrix that is singular
@@ -299,8 +301,11 @@ FALLING = floor_scene(
 )
 
 
-def test_the_backward_pass_does_not_run_the_solver_again() -> None:
-    """The only loop of open end is the solver's; gradients, too, have it once."""
+@pytest.mark.parametrize("ending", ["while[", pytest.param("native[", marks=NATIVE)])
+def test_the_backward_pass_does_not_run_the_solver_again(monkeypatch: pytest.MonkeyPatch, ending: str) -> None:
+    """The only loop of open end is the solver's; gradients, too, have it once. In native code, they call the solved
+    step and the transpose of its derivative once each."""
+    monkeypatch.setenv(SWITCH, "1" if ending == "native[" else "0")
     model, data = device(FALLING)
 
     def last(speed):
@@ -308,7 +313,8 @@ def test_the_backward_pass_does_not_run_the_solver_again() -> None:
         return jax.lax.scan(lambda data, _: (step(model, data), None), start, length=3)[0].qpos[0]
 
     programs = [str(jax.make_jaxpr(function)(-0.1)) for function in (last, jax.grad(last))]
-    assert [program.count("while[") for program in programs] == [1, 1]
+    assert [program.count("while[") for program in programs] == ([1, 1] if ending == "while[" else [0, 0])
+    assert [program.count("native[") for program in programs] == ([0, 0] if ending == "while[" else [1, 2])
 
 
 @pytest.mark.slow
