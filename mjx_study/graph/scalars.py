@@ -55,8 +55,7 @@ def captured_once(function: Callable[..., Any], *arguments: Any) -> ScalarFuncti
         try:
             captured = capture(function, *arguments, most=2 * most)
         except TooLargeError:
-            captured = None
-            count_left(f"more than {most} operations")
+            captured = _left()
         _CAPTURED[key] = captured = captured if captured and is_small(captured) else None
         if captured and any(node.operation == "whole" for node in captured.needed):
             captured.derived["values"] = capture(function, *arguments, most=2 * most, values_only=True)
@@ -64,8 +63,16 @@ def captured_once(function: Callable[..., Any], *arguments: Any) -> ScalarFuncti
 
 
 def is_small(function: ScalarFunction) -> bool:
-    """Whether a graph is worth compiling: it has at most `most_scalars` operations."""
-    return (len(function.needed) if native_identity() is None else function.size) <= most_scalars()
+    """Whether a graph is worth compiling: it has at most `most_scalars` operations; counted if it is not."""
+    if (len(function.needed) if native_identity() is None else function.size) <= most_scalars():
+        return True
+    _left()
+    return False
+
+
+def _left() -> None:
+    if native_identity() is not None:
+        count_left(f"more than {most_scalars()} operations")
 
 
 def most_scalars() -> int:
