@@ -14,6 +14,7 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 import mjx_study as study
+from mjx_study.graph.native import SWITCH, native_identity
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.contact import apply_contact
 from mjx_study.simulation.drop_in import differentiable_mjx, solver_residual, step
@@ -38,6 +39,7 @@ from tests.test_onset_term import BOUNCING, Law
 
 PAGE = Path(__file__).parents[1] / "docs" / "differentiable-mjx.md"
 MODELS = Path(mjx.__file__).parent / "test_data"
+NATIVE = pytest.mark.skipif(native_identity() is None, reason="there is no C compiler")
 FAST = ("tendon/armature",)
 CROWDS = {f"humanoid/{count:02}_humanoids" for count in range(2, 11)}  # copies of the first, and slow
 STILL = {"ray", "actuator/general_dyntype"}  # no coordinate; an inertia matrix that is singular
@@ -285,8 +287,11 @@ def test_what_has_no_derivative_is_refused() -> None:
         study.check_model(host, "sled")
 
 
-def test_the_backward_pass_does_not_run_the_solver_again() -> None:
-    """The only loop of open end is the solver's; gradients, too, have it once."""
+@pytest.mark.parametrize("ending", ["while[", pytest.param("native[", marks=NATIVE)])
+def test_the_backward_pass_does_not_run_the_solver_again(monkeypatch: pytest.MonkeyPatch, ending: str) -> None:
+    """The only loop of open end is the solver's; gradients, too, have it once. In native code, they call the solved
+    step and the transpose of its derivative once each."""
+    monkeypatch.setenv(SWITCH, "1" if ending == "native[" else "0")
     model, data = device(FALLING)
 
     def last(speed):
@@ -294,7 +299,8 @@ def test_the_backward_pass_does_not_run_the_solver_again() -> None:
         return jax.lax.scan(lambda data, _: (step(model, data), None), start, length=3)[0].qpos[0]
 
     programs = [str(jax.make_jaxpr(function)(-0.1)) for function in (last, jax.grad(last))]
-    assert [program.count("while[") for program in programs] == [1, 1]
+    assert [program.count("while[") for program in programs] == ([1, 1] if ending == "while[" else [0, 0])
+    assert [program.count("native[") for program in programs] == ([0, 0] if ending == "while[" else [1, 2])
 
 
 @pytest.mark.parametrize(
@@ -330,7 +336,7 @@ def test_the_onset_term_of_a_step_is_that_of_a_rollout(law: Law, speed: float, g
 
     points = gaps[:, None]
     value, corrected, stock, plain, expected = compiled(jax.vmap(all_of), points)(points)
-    np.testing.assert_array_equal(value, stock)
+    np.testing.assert_allclose(value, stock, rtol=1e-13)
     np.testing.assert_allclose(corrected, expected, rtol=0, atol=0.01 * np.abs(expected - plain).max())
     assert np.abs(expected - plain).min() > 0.1
 

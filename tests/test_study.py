@@ -29,7 +29,7 @@ from mjx_study.experiment import sampling
 from mjx_study.experiment.checkpoint import StudyError
 from mjx_study.experiment.plan import plan_study
 from mjx_study.experiment.study import estimators_of
-from mjx_study.objective import MjxObjective, Simulator
+from mjx_study.objective import BlankObjective, MjxObjective, Simulator
 from mjx_study.options.configuration import StudyConfig
 from mjx_study.plots.panels import limit
 from mjx_study.plots.study import plot_study
@@ -122,7 +122,8 @@ def spied() -> tuple[xr.Dataset, int, dict[str, list[np.ndarray]]]:
         method = getattr(MjxObjective, name)
 
         def recorded(self, theta, batch):
-            keys[name].append(np.asarray(jax.random.key_data(batch)))
+            if not isinstance(self, BlankObjective):
+                keys[name].append(np.asarray(jax.random.key_data(batch)))
             if self.simulator not in simulators:
                 simulators.append(self.simulator)
             return method(self, theta, batch)
