@@ -330,7 +330,7 @@ def test_defaults(write) -> None:
     write(TINY)
     task = make_task("mine:hop")
     assert task.defaults.gamma == float("inf") and task.description == "" and task.defaults.recipe is None
-    cost = task.running_cost(task.draw_start(jax.random.key(0)), jnp.zeros(1))
+    cost = task.costs()[0](task.draw_start(jax.random.key(0)), jnp.zeros(1))
     assert cost == 0 and cost.dtype == jnp.float64
     with pytest.raises(ValueError, match="a task needs a running_cost, a final_cost, or both"):
         Task(
