@@ -2,7 +2,9 @@
 
 import os
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from functools import cache, cached_property, partial
 from typing import Any, Final
 
@@ -23,6 +25,8 @@ SWITCH: Final = "MJX_STUDY_NATIVE"
 """Environment variable; 0 does without native code."""
 _LEFT: Final[Counter[str]] = Counter()
 """Numbers of functions left to XLA, by reason."""
+_POSTPONED: Final[ContextVar[bool]] = ContextVar("postponed", default=False)
+"""Whether functions are called without building their libraries."""
 
 
 def native_identity() -> str | None:
@@ -61,29 +65,61 @@ def as_native(values: ScalarFunction, function: ScalarFunction) -> "NativeFuncti
         function: the function, which derivatives are taken of.
     """
     try:
-        return NativeFunction(source_of(values, jax.default_backend()), function)
+        source = source_of(values, jax.default_backend())
     except NotWrittenError as error:
         count_left(str(error))
         return None
+    return NativeFunction(source, function.types, function.avals, lambda: written_out(function), values)
 
 
 class NativeFunction:
-    """A captured function as a library, and as a JAX program for derivatives and where there is no library."""
+    """A function as a library, and as a JAX program for derivatives and where there is no library.
 
-    def __init__(self, source: str, function: ScalarFunction):
-        self._function = function
-        self.inputs = function.types
-        self.outputs = function.avals
+    Args:
+        source: source of the library.
+        inputs: types of its inputs.
+        outputs: types of its outputs.
+        program: makes the program.
+
+    Attributes:
+        values: graph of the function's values, if it is a graph.
+    """
+
+    def __init__(
+        self,
+        source: str,
+        inputs: Sequence[Any],
+        outputs: Sequence[Any],
+        program: Callable[[], Callable[..., list[jax.Array]]],
+        values: ScalarFunction | None = None,
+    ):
+        self._source, self._program = source, program
+        self.inputs, self.outputs, self.values = inputs, outputs, values
         self.platform = jax.default_backend()
-        self.name = build_library(source)
 
     def __call__(self, *inputs: jax.Array) -> list[jax.Array]:
+        if not _POSTPONED.get():
+            self.build()
         return _native.bind(*inputs, function=self, batch=())
 
     @cached_property
     def program(self) -> Callable[..., list[jax.Array]]:
         """The function in JAX operations."""
-        return written_out(self._function)
+        return self._program()
+
+    def build(self) -> str:
+        """Begin to build the library, unless it is known, and return its name."""
+        return build_library(self._source)
+
+
+@contextmanager
+def building_postponed() -> Generator[None]:
+    """Leave it to whoever needs a library of functions that are called here to build it."""
+    token = _POSTPONED.set(True)
+    try:
+        yield
+    finally:
+        _POSTPONED.reset(token)
 
 
 def _plain(function: NativeFunction, batch: tuple[int, ...]) -> Callable[..., list[jax.Array]]:
@@ -133,12 +169,12 @@ def _evaluate(*inputs: Any, function: NativeFunction, batch: tuple[int, ...]) ->
 
 
 def _lower(platform: str, context: Any, *operands: Any, function: NativeFunction, batch: tuple[int, ...]) -> Any:
-    if function.platform != platform or not library_ready(function.name):
+    if function.platform != platform or not library_ready(name := function.build()):
         count_left("not built")
         return mlir.lower_fun(_plain(function, batch), multiple_results=True)(context, *operands)
     ins = [_layout(at.ndim, at.ndim - aval.ndim) for at, aval in zip(context.avals_in, function.inputs, strict=True)]
     outs = [_layout(each.ndim, len(batch)) for each in context.avals_out]
-    return jax.ffi.ffi_lowering(function.name, operand_layouts=ins, result_layouts=outs)(context, *operands)
+    return jax.ffi.ffi_lowering(name, operand_layouts=ins, result_layouts=outs)(context, *operands)
 
 
 def _layout(rank: int, batched: int) -> tuple[int, ...]:
