@@ -22,6 +22,7 @@ from tests.scenes import (
     central_jacobian,
     compiled,
     floor_scene,
+    in_both_modes,
     option,
     plain_warm_start,
     scene_of,
@@ -191,13 +192,10 @@ def test_both_programs_and_both_modes_agree(name: str) -> None:
     scene = dataclasses.replace(case.scene, adjoint="tape")
     assert not scene.uses_graph
 
-    def both(model, point):
-        after, push = jax.linearize(lambda x: step_flat(scene, model, x, jnp.asarray(case.warmstart))[0], point)
-        pull = jax.linear_transpose(push, point)
-        forward = jax.vmap(push, out_axes=-1)(jnp.eye(point.shape[0]))
-        return forward, jax.vmap(lambda row: pull(row)[0])(jnp.eye(after.shape[0]))
+    def after(point):
+        return step_flat(scene, scene.model, point, jnp.asarray(case.warmstart))[0]
 
-    forward, reverse = compiled(both, case.scene.model, case.point)(case.scene.model, case.point)
+    _, forward, reverse = compiled(in_both_modes(after), case.point)(case.point)
     assert_close_by_rows(forward, expected, 1e-10)
     assert_close_by_rows(reverse, expected, 1e-10)
 

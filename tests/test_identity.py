@@ -242,7 +242,10 @@ DESCENT: dict[str, Any] = {
     "seeds": 2,
     "samples": (5,),
     "evaluation_samples": 5,
+    "optimizer": "adam",
+    "learning_rate": 0.01,
 }
+"""By an optimiser that remembers the gradients before."""
 
 
 def descended(

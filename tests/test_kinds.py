@@ -215,7 +215,13 @@ def test_a_write_that_fails_keeps_the_cells_before_it(
 @each_kind
 def test_a_study_is_drawn_reported_and_tabulated(studies: dict[str, Path], copy: Path, name: str) -> None:
     found = load_study(studies[name])
-    assert set(found.mjx_study.plot()) == FIGURES[name]
+    figures = found.mjx_study.plot()
+    assert set(figures) == FIGURES[name]
+    for figure in figures.values():
+        panels = [(axes, axes.get_subplotspec()) for axes in figure.axes]
+        lowest = [axes for axes, panel in panels if panel is not None and panel.is_last_row()]
+        assert lowest and all(axes.get_xlabel() or axes.get_xticklabels() for axes in lowest)
+        assert any(axes.get_ylabel() for axes in figure.axes)
     assert found.mjx_study.findings() == findings_of(found) and len(found.mjx_study.table()) >= 2
     page = render_report(found)
     assert page.count("data:image/png;base64,") == len(FIGURES[name])

@@ -176,8 +176,6 @@ def test_what_needs_whole_batches_is_refused() -> None:
     large: dict[str, Any] = {"samples": (10_000_000,), "block_size": None}
     with pytest.raises(ValueError, match=f"and more seeds; or omit delta: {able}"):
         planned(**large, estimators=("zobg", "delta"))
-    with pytest.raises(ValueError, match="`block_size` is for gradients: omit it"):
-        planned(points=3, reference_samples=None)
 
 
 def test_ten_million_samples_are_planned_in_blocks() -> None:

@@ -60,12 +60,19 @@ def indexed(fixed, start, rows):
     return lax.scan(lambda x, at: (x + table[at] * fixed[0], at), start, jnp.arange(5))
 
 
+def stopped(fixed, start, rows):
+    """The gradient of a loop with values whose derivative is cut off."""
+    inner = lambda x, row: x * lax.stop_gradient(jnp.sin(x)) + row  # noqa: E731
+    body = lambda x, row: (unrolled(inner, x, row), lax.stop_gradient(row))  # noqa: E731
+    return jax.grad(lambda x: jnp.sum(lax.scan(body, x, rows)[0] ** 2))(start)
+
+
 def nested(fixed, start, rows):
     inner = lambda x, row: lax.fori_loop(0, 3, lambda k, y: y * 0.5 + row, x)  # noqa: E731
     return jax.jit(lambda start: lax.scan(lambda x, row: (inner(x, row), None), start, rows))(start)
 
 
-LOOPS = {each.__name__: each for each in (several, backward, gradient, indexed, nested)}
+LOOPS = {each.__name__: each for each in (several, backward, gradient, indexed, stopped, nested)}
 
 
 def in_a_batch(function):
@@ -122,17 +129,26 @@ def wide(fixed, start, rows):
     return lax.scan(lambda x, row: (x + row[0], None), jnp.zeros(600), rows)
 
 
+def test_loops_without_passes_or_results():
+    empty = lambda x, row: (x, jnp.zeros(0))  # noqa: E731
+    last, nothing = in_a_batch(with_native_scans(lambda _, x, rows: lax.scan(empty, x, rows[:0])))(FIXED, STARTS, ROWS)
+    np.testing.assert_array_equal(last, STARTS)
+    assert nothing.shape == (21, 0, 0)
+    none = in_a_batch(with_native_scans(lambda _, x, rows: lax.scan(empty, x[:0], rows)))(FIXED, STARTS, ROWS)
+    assert [each.shape for each in none] == [(21, 0), (21, 5, 0)]
+
+
 @pytest.mark.parametrize(
     ("loop", "reason"),
     [
         (whole_array, "loop with values of type complex128"),
         (random, "loop over random keys"),
         (long, "loop of more than 1000 operations"),
-        (wide, "or 500 values between passes"),
+        (wide, "or 500 values from pass to pass"),
     ],
 )
 def test_what_stays_a_scan(monkeypatch, loop, reason):
-    monkeypatch.setattr(scans, "MOST_AROUND", 1000)
+    monkeypatch.setattr(scans, "MOST_OPERATIONS", 1000)
     monkeypatch.setattr(native, "_LEFT", native.Counter())
     program = in_a_batch(with_native_scans(loop))
     both = (jax.tree.leaves(each(FIXED, STARTS, ROWS)) for each in (program, in_a_batch(loop)))
@@ -143,7 +159,7 @@ def test_what_stays_a_scan(monkeypatch, loop, reason):
 
 
 def test_steps_of_a_loop_that_stays_are_native(monkeypatch):
-    monkeypatch.setattr(scans, "MOST_AROUND", 2)
+    monkeypatch.setattr(scans, "MOST_OPERATIONS", 2)
     loop = lambda fixed, start, rows: lax.scan(  # noqa: E731
         lambda x, row: (unrolled(lambda y: jnp.sin(y) * 0.123, x) + row * row + fixed[0], None), start, rows
     )
@@ -196,4 +212,4 @@ def test_networks_and_their_libraries(monkeypatch):
     assert traced.count("native[") == 1 and "scan[" not in traced
     monkeypatch.setattr(scans, "MOST_CARRIED", 50)
     agree(task, monkeypatch, ["value", "gradient"])
-    assert "50 values between passes" in native.native_summary()
+    assert "50 values from pass to pass" in native.native_summary()

@@ -20,7 +20,6 @@ from estimators import (
     DiscontinuityGated,
     FirstOrder,
     GradientEstimate,
-    InverseVariance,
     summarise,
 )
 from estimators.registry import label_of
@@ -32,7 +31,7 @@ from mjx_study.experiment import sampling
 from mjx_study.experiment.checkpoint import StudyError
 from mjx_study.experiment.plan import plan_study
 from mjx_study.experiment.study import estimators_of
-from mjx_study.objective import MjxObjective, Simulator
+from mjx_study.objective import BlankObjective, MjxObjective, Simulator
 from mjx_study.options.configuration import StudyConfig
 from mjx_study.plots.panels import limit
 from mjx_study.plots.study import plot_study
@@ -43,7 +42,7 @@ from mjx_study.results.variables import GRADIENTS
 from mjx_study.results.warnings import warnings_of
 from mjx_study.storage.dataset import dataset_of
 from mjx_study.tasks import make_task
-from mjx_study.tasks.task import StudyDefaults, Task
+from mjx_study.tasks.task import StudyDefaults
 
 pytestmark = pytest.mark.usefixtures("shared_programs")
 
@@ -125,7 +124,8 @@ def spied() -> tuple[xr.Dataset, int, dict[str, list[np.ndarray]]]:
         method = getattr(MjxObjective, name)
 
         def recorded(self, theta, batch):
-            keys[name].append(np.asarray(jax.random.key_data(batch)))
+            if not isinstance(self, BlankObjective):
+                keys[name].append(np.asarray(jax.random.key_data(batch)))
             if self.simulator not in simulators:
                 simulators.append(self.simulator)
             return method(self, theta, batch)
@@ -173,26 +173,12 @@ def test_an_alpha_order_row_follows_from_the_other_two(spied) -> None:
         assert both.seconds_per_sample == pytest.approx(zeroth.seconds_per_sample + first.seconds_per_sample)
 
 
-@pytest.mark.slow
-def test_results_do_not_depend_on_the_chunk_size() -> None:
-    chosen = [compare(stiffness=(100.0,), contact=("mujoco",), chunk_size=chunk) for chunk in (2, 9)]
-    for name in ("gradient", "reference"):
-        np.testing.assert_allclose(chosen[0][name], chosen[1][name], rtol=1e-12)
-
-
 def test_a_second_run_gives_the_same_numbers(spied) -> None:
     found, _, _ = spied
     again = compare(stiffness=(10.0,), contact=("penalty",), chunk_size=4)
     np.testing.assert_array_equal(again["gradient"].isel(model=0), found["gradient"].isel(model=0))
     other = compare(stiffness=(10.0,), contact=("penalty",), chunk_size=4, seed=1)
     assert np.all(other["gradient"].values != again["gradient"].values)
-
-
-@pytest.mark.slow
-def test_zeroth_order_alone_does_not_differentiate_for_itself() -> None:
-    found = compare(stiffness=(10.0,), contact=("penalty",), estimators=("zobg",))
-    assert [row.estimator for row in rows_of(found)] == ["zobg"]
-    assert rows_of(found)[0].alpha is None
 
 
 class Half(FirstOrder):
@@ -538,35 +524,12 @@ def test_the_table_fits_the_terminal(monkeypatch: pytest.MonkeyPatch, columns: i
     assert max(map(len, shown)) <= columns
 
 
-def built(**changes: Any) -> Task:
-    (group,) = plan_study(config(**changes)).groups
-    return group.task
-
-
 def test_theta_and_sigma_reach_the_plan() -> None:
-    plan = plan_study(config(estimators=("aobg",), sigma=(0.3,), gamma=5.0))
+    plan = plan_study(config(theta=(0.0, 1.0, 2.0, 3.0), sigma=(0.3,)))
     assert {cell.sigma for cell in plan.cells} == {0.3} and plan.groups[0].cone == "pyramidal"
-    assert estimators_of(plan, plan.cells[0]) == (AlphaOrder(gamma=5.0),)
-    assert jnp.all(plan.groups[0].task.theta == 0.1)
-
-
-def test_weights_reach_the_estimators_and_are_refused_with_the_samples() -> None:
-    plan = plan_study(config(estimators=("ivw",), weights="cross_fitted"))
-    assert estimators_of(plan, plan.cells[0]) == (InverseVariance(weights="cross_fitted"),)
-    with pytest.raises(ValueError, match="at least 4 samples, two in each half; got 3"):
-        plan_study(config(weights="cross_fitted", samples=(3,)))
-
-
-def test_gradients_are_taken_where_theta_says() -> None:
-    task = built(theta=(0.0, 1.0, 2.0, 3.0))
-    np.testing.assert_array_equal(task.theta, np.arange(4))
-    assert task.theta.dtype == jnp.float64
-    with pytest.raises(ValueError, match="`theta` has 1 numbers; pusher needs 4, all of them"):
-        built(theta=(1.0,))
-    with pytest.raises(ValueError, match="`theta` must be finite, got nan"):
-        built(theta=(float("nan"),) * 4)
-    with pytest.raises(ValueError, match="`theta` is for a single task"):
-        built(theta=(1.0,), tasks=("pusher", "ball_wall"))
+    theta = plan.groups[0].task.theta
+    np.testing.assert_array_equal(theta, np.arange(4))
+    assert theta.dtype == jnp.float64
 
 
 def test_a_task_in_place_of_a_name() -> None:

@@ -26,7 +26,7 @@ from mjx_study.graph.nodes import (
 )
 from mjx_study.graph.rules import RULES
 
-_SAME: Final = frozenset({"copy", "copy_p", "name", "optimization_barrier", "stop_gradient"})
+_SAME: Final = frozenset({"copy", "copy_p", "name", "optimization_barrier"})
 _CALLS: Final = {"closed_call": "call_jaxpr", "jit": "jaxpr", "pjit": "jaxpr"}
 _WITH_RULES: Final = {"custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr", "ruled": "jaxpr"}
 """Calls with a derivative of their own, which are operations on whole arrays unless only values are wanted."""
@@ -58,6 +58,11 @@ class ScalarFunction:
         return needed_for(entries_of(self.outputs))
 
     @cached_property
+    def size(self) -> int:
+        """Number of operations, those of loops included."""
+        return _size(self.needed)
+
+    @cached_property
     def used(self) -> list[int]:
         """Places of the inputs that the outputs depend on."""
         needed = {node.number for node in self.needed}
@@ -70,7 +75,17 @@ class ScalarFunction:
 
     def of(self, places: Sequence[int]) -> "ScalarFunction":
         """Return the function of some of its inputs, which does not depend on the others."""
-        return dataclasses.replace(self, inputs=[self.inputs[place] for place in places])
+        key = "of", tuple(places)
+        if key not in self.derived:
+            self.derived[key] = dataclasses.replace(self, inputs=[self.inputs[place] for place in places])
+            if "values" in self.derived:
+                self.derived[key].derived["values"] = self.derived["values"].of(places)
+        return self.derived[key]
+
+
+def _size(nodes: list[Node]) -> int:
+    loops = [each.parameters for each in nodes if each.operation == "loop"]
+    return len(nodes) + sum(_size(needed_for([*again, *after])) for _, again, after in loops)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -150,7 +165,7 @@ def _equation(graph: ScalarGraph, equation: Any, inputs: list[np.ndarray]) -> Se
     aval: Any = equation.outvars[0].aval
     if not any(math.prod(each.aval.shape) for each in equation.outvars):
         return [filled(each.aval.shape, ()) for each in equation.outvars]
-    if name in _SAME:
+    if name in _SAME or (graph.values_only and name == "stop_gradient"):
         return inputs
     if name in ELEMENTWISE:
         return [graph.elementwise(equation.primitive, inputs, aval, **parameters)]
@@ -228,8 +243,7 @@ def _native(
         for array, nodes in zip(inputs, function.inputs, strict=True):
             entries = array[at] if array.ndim > nodes.ndim else array
             values |= zip((node.number for node in nodes.flat), entries.flat, strict=True)
-        with graph.unlimited():
-            _copy(graph, function.needed, values)
+        _copy(graph, function.needed, values)
         for every, array in zip(outputs, function.outputs, strict=True):
             found = (values[each.number] if isinstance(each, Node) else each for each in array.flat)
             every[at] = filled(array.shape, found)[()]

@@ -57,27 +57,30 @@ def _works() -> bool:
     return library_ready(build_library(source_of(function, jax.default_backend())))
 
 
-def as_native(values: ScalarFunction, function: ScalarFunction) -> "NativeFunction | None":
-    """Begin to build native code for a function's values; None if it cannot be written.
+def as_native(values: ScalarFunction, function: ScalarFunction, *, early: bool = True) -> "NativeFunction | None":
+    """Native code for a function's values; None if it cannot be written.
 
     Args:
         values: the function captured for its values only.
         function: the function, which derivatives are taken of.
+        early: whether to begin to build it now, or when a program with it is compiled.
     """
-    try:
-        source = source_of(values, jax.default_backend())
-    except NotWrittenError as error:
-        count_left(str(error))
-        return None
-    return NativeFunction(source, function.types, function.avals, lambda: written_out(function), values)
+    native = NativeFunction(
+        lambda: source_of(values, native.platform),
+        function.types,
+        function.avals,
+        lambda: written_out(function),
+        values,
+    )
+    return native if not early or _POSTPONED.get() or native.begun() else None
 
 
 class NativeFunction:
     """A function as a library, and as a JAX program for derivatives and where there is no library.
 
     Args:
-        source: source of the library.
-        inputs: types of its inputs.
+        write: writes the library's source; it may raise NotWrittenError.
+        inputs: types of the function's inputs.
         outputs: types of its outputs.
         program: makes the program.
 
@@ -87,29 +90,40 @@ class NativeFunction:
 
     def __init__(
         self,
-        source: str,
+        write: Callable[[], str],
         inputs: Sequence[Any],
         outputs: Sequence[Any],
         program: Callable[[], Callable[..., list[jax.Array]]],
         values: ScalarFunction | None = None,
     ):
-        self._source, self._program = source, program
+        self._write, self._program = write, program
         self.inputs, self.outputs, self.values = inputs, outputs, values
         self.platform = jax.default_backend()
 
+    @cached_property
+    def name(self) -> str:
+        """Name of the library, which is being built; it may raise NotWrittenError."""
+        return build_library(self._write())
+
+    def begun(self) -> bool:
+        """Begin to build the library; whether it can be written."""
+        try:
+            return bool(self.name)
+        except NotWrittenError as error:
+            count_left(str(error))
+            return False
+
+    def ready(self) -> bool:
+        """Wait for the library to be built and loaded; whether that succeeded."""
+        return self.begun() and library_ready(self.name)
+
     def __call__(self, *inputs: jax.Array) -> list[jax.Array]:
-        if not _POSTPONED.get():
-            self.build()
         return _native.bind(*inputs, function=self, batch=())
 
     @cached_property
     def program(self) -> Callable[..., list[jax.Array]]:
         """The function in JAX operations."""
         return self._program()
-
-    def build(self) -> str:
-        """Begin to build the library, unless it is known, and return its name."""
-        return build_library(self._source)
 
 
 @contextmanager
@@ -169,12 +183,12 @@ def _evaluate(*inputs: Any, function: NativeFunction, batch: tuple[int, ...]) ->
 
 
 def _lower(platform: str, context: Any, *operands: Any, function: NativeFunction, batch: tuple[int, ...]) -> Any:
-    if function.platform != platform or not library_ready(name := function.build()):
+    if function.platform != platform or not function.ready():
         count_left("not built")
         return mlir.lower_fun(_plain(function, batch), multiple_results=True)(context, *operands)
     ins = [_layout(at.ndim, at.ndim - aval.ndim) for at, aval in zip(context.avals_in, function.inputs, strict=True)]
     outs = [_layout(each.ndim, len(batch)) for each in context.avals_out]
-    return jax.ffi.ffi_lowering(name, operand_layouts=ins, result_layouts=outs)(context, *operands)
+    return jax.ffi.ffi_lowering(function.name, operand_layouts=ins, result_layouts=outs)(context, *operands)
 
 
 def _layout(rank: int, batched: int) -> tuple[int, ...]:

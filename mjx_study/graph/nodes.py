@@ -2,8 +2,7 @@
 
 import math
 import typing
-from collections.abc import Callable, Generator, Iterable, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Final, TypeVar
 
 import jax
@@ -87,13 +86,6 @@ class ScalarGraph:
         if self.most is not None and self._count > self.most:
             raise TooLargeError
         return Node(self._count, operation, arguments, parameters, dtype)
-
-    @contextmanager
-    def unlimited(self) -> Generator[None]:
-        """Let new nodes not count."""
-        most, before, self.most = self.most, self._count, None
-        yield
-        self.most = None if most is None else most + self._count - before
 
     def fresh(self, kind: str, shape: tuple[int, ...], dtype: Any) -> np.ndarray:
         """Create an array of nodes without arguments."""

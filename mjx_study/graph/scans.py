@@ -20,8 +20,9 @@ from mjx_study.graph.function import Passes, ScalarFunction, bind_whole, run, sc
 from mjx_study.graph.native import NativeFunction, building_postponed, count_left, native_identity
 from mjx_study.graph.nodes import ScalarGraph, TooLargeError, constants
 
-MOST_AROUND: Final = 10_000
-"""Maximum number of scalar operations in a pass besides those of native code that it calls."""
+MOST_OPERATIONS: Final = 15_000
+"""Maximum number of scalar operations in a pass. Longer ones spend their time in the native code that they call, which
+programs share."""
 MOST_CARRIED: Final = 500
 """Maximum number of scalars from one pass to the next."""
 
@@ -67,14 +68,16 @@ def _evaluated(closed: ClosedJaxpr, inputs: Sequence[Any]) -> list[Any]:
 
 def _native_scan(equation: Any, inputs: Sequence[Any]) -> Sequence[Any] | None:
     """Outputs of a scan as native code; None if it is to remain a scan."""
-    parameters, num_consts = equation.params, len(scan_inputs(equation, inputs)[0])
-    body, carried = parameters["jaxpr"], len(scan_inputs(equation, inputs)[1])
-    avals = [atom.aval for atom in equation.invars]
-    wanted = [place for place, aval in enumerate(body.out_avals) if aval.size]
+    parameters = equation.params
+    num_consts, carried = map(len, scan_inputs(equation, inputs)[:2])
+    body, avals = parameters["jaxpr"], [atom.aval for atom in equation.invars]
+    wanted = [place for place, aval in enumerate(body.out_avals) if aval.size]  # XLA fails to transpose empty results
     fixed = [
-        not aval.size or (place < num_consts and not isinstance(each, Tracer))
+        not aval.size or (place < num_consts and not isinstance(each, Tracer) and aval.size <= MOST_OPERATIONS)
         for place, (each, aval) in enumerate(zip(inputs, avals, strict=True))
     ]
+    if not wanted or not parameters["length"]:
+        return None
     if any(jnp.issubdtype(aval.dtype, jax.dtypes.extended) for aval in avals):
         count_left("loop over random keys")
         return None
@@ -91,7 +94,7 @@ def _native_scan(equation: Any, inputs: Sequence[Any]) -> Sequence[Any] | None:
         count_left(f"loop with {error}")
         return None
     except TooLargeError:
-        count_left(f"loop of more than {MOST_AROUND} operations around steps, or {MOST_CARRIED} values between passes")
+        count_left(f"loop of more than {MOST_OPERATIONS} operations, or {MOST_CARRIED} values from pass to pass")
         return None
 
     def scan(*some: Any) -> list[Any]:
@@ -103,7 +106,8 @@ def _native_scan(equation: Any, inputs: Sequence[Any]) -> Sequence[Any] | None:
         outputs = bind_whole(equation, every)
         return [outputs[place] for place in wanted]
 
-    native = NativeFunction(source, *passes.avals(function), lambda: scan)
+    native = NativeFunction(lambda: source, *passes.avals(function), lambda: scan)
+    native.begun()
     found = dict(zip(wanted, native(*(jnp.asarray(inputs[place], avals[place].dtype) for place in used)), strict=True))
     outputs = (atom.aval for atom in equation.outvars)
     return [found.get(place, jnp.zeros(aval.shape, aval.dtype)) for place, aval in enumerate(outputs)]
@@ -118,13 +122,11 @@ def _body(
         fixed: whether each input is a constant.
         carried: places of what is carried, which it has in any case.
     """
-    graph = ScalarGraph(MOST_AROUND, values_only=True)
-    given = [
-        (constants(np.zeros(aval.shape, aval.dtype) if not aval.size else np.asarray(each)))
-        if known
-        else graph.fresh("input", aval.shape, aval.dtype)
-        for each, known, aval in zip(inputs, fixed, closed.in_avals, strict=True)
-    ]
+    graph = ScalarGraph(2 * MOST_OPERATIONS, values_only=True)
+    given = []
+    for each, known, aval in zip(inputs, fixed, closed.in_avals, strict=True):
+        value = each if aval.size else np.zeros(aval.shape, aval.dtype)
+        given.append(constants(value) if known else graph.fresh("input", aval.shape, aval.dtype))
     outputs = run(graph, closed, given)
     free = [place for place, known in enumerate(fixed) if not known]
     function = ScalarFunction(
@@ -134,7 +136,7 @@ def _body(
         [closed.out_avals[place] for place in wanted],
         None,
     )
-    if sum(given[place].size for place in carried) > MOST_CARRIED:
+    if function.size > MOST_OPERATIONS or sum(given[place].size for place in carried) > MOST_CARRIED:
         raise TooLargeError
     used = {free[at] for at in function.used}
     places = [place for place in free if place in used or place in carried]
@@ -157,7 +159,7 @@ def _scans(jaxpr: Jaxpr) -> bool:
 def _build(equation: Any) -> None:
     """Begin to build the native code that an operation calls, in the programs that it calls, too."""
     if equation.primitive.name == "native":
-        equation.params["function"].build()
+        equation.params["function"].begun()
     for jaxpr in _inside(equation):
         for each in jaxpr.eqns:
             _build(each)

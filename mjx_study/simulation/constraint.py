@@ -133,19 +133,19 @@ def run_solver(model: mjx.Model, data: mjx.Data) -> Qvel:
 
     Small systems use Newton's method, to rounding; larger ones use MJX's solver within the model's budget.
     """
-    if num_constraint_rows(data) == 0:
-        return data.qacc_smooth
     if OWN_SOLVER and model.nv <= MOST_UNROLLED:
-        return _newton(model, data)
-    return mjx.solve(model, data).qacc
+        return newton(model, data)
+    return data.qacc_smooth if num_constraint_rows(data) == 0 else mjx.solve(model, data).qacc
 
 
-def _newton(model: mjx.Model, data: mjx.Data) -> Qvel:
-    """Solve the solver's equation to rounding by Newton's method with a line search.
+def newton(model: mjx.Model, data: mjx.Data) -> Qvel:
+    """Compute the constrained acceleration to rounding by Newton's method with a line search, ignoring budgets.
 
     If no row exerts a force, the result is the unconstrained acceleration. The loop over a batch ends with its slowest
     sample: seldom after more than two steps, or six where boxes stick and slip.
     """
+    if num_constraint_rows(data) == 0:
+        return data.qacc_smooth
     rows: Any = data._impl
     inertia, jacobian = mjx.full_m(model, data), rows.efc_J
     rounding = MOST_ROUNDINGS * jnp.finfo(inertia.dtype).eps

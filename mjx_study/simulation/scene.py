@@ -14,6 +14,7 @@ import numpy as np
 
 from estimators.choices import suggestion
 from mjx_study.choices import CONES, INTEGRATORS, SOLVERS, unknown
+from mjx_study.graph.native import native_identity
 from mjx_study.limits import MOST_GIB
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.contact_pair import frictionless_pair, geom_label
@@ -55,7 +56,7 @@ class Scene:
               its matrix, in forward mode. Not for RK4.
             - "tape": automatic differentiation of MJX's own operations around the implicit solve; reverse mode computes
               each step again (fault 13 in `docs/gradient-faults.md`).
-            - "auto": graphs up to `MOST_UNROLLED` degrees of freedom, else the tape.
+            - "auto": graphs in native code, and up to `MOST_UNROLLED` degrees of freedom; else the tape.
 
             Derivatives with respect to the model always use the tape.
 
@@ -78,6 +79,11 @@ class Scene:
     @property
     def uses_graph(self) -> bool:
         """Whether steps are differentiated as graphs rather than by the tape."""
+        return self.forms_matrix or (self.adjoint == "auto" and native_identity() is not None and not self._explicit)
+
+    @property
+    def forms_matrix(self) -> bool:
+        """Whether steps that are no graph are differentiated by their matrix rather than by the tape."""
         small = self.host.nv <= MOST_UNROLLED
         return self.adjoint == "graph" or (self.adjoint == "auto" and small and not self._explicit)
 
