@@ -33,7 +33,6 @@ from mjx_study.objective import BlankObjective, MjxObjective, Simulator
 from mjx_study.options.configuration import StudyConfig
 from mjx_study.plots.panels import limit
 from mjx_study.plots.study import plot_study
-from mjx_study.plots.style import save_figure
 from mjx_study.results.kind import findings_of
 from mjx_study.results.rows import Row, rows_of
 from mjx_study.results.variables import GRADIENTS
@@ -392,15 +391,6 @@ def test_an_unconverged_solve_is_counted(monkeypatch: pytest.MonkeyPatch) -> Non
 def test_numbers_that_are_not_finite_become_null_in_json() -> None:
     document = as_json(result(row("fobg", 10, math.inf, cosine=math.nan)))
     assert document["rows"][0]["variance"] is None and document["rows"][0]["cosine"] is None
-
-
-def test_figures_survive_what_cannot_be_drawn(tmp_path) -> None:
-    made_up = result(row("zobg", 10, math.nan), row("fobg", 10, 0.0), row("zobg", 20, 1.0), row("fobg", 20, math.inf))
-    nothing = result(row("zobg", 10, 0.0, relative_error=math.nan), row("zobg", 20, 0.0, relative_error=math.nan))
-    for study in (made_up, nothing):
-        (figure,) = plot_study(study).values()
-        for path in save_figure(figure, tmp_path, "figure"):
-            assert path.stat().st_size > 1000
 
 
 def test_the_unstable_band_begins_at_the_limit() -> None:
