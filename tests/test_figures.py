@@ -276,6 +276,13 @@ def test_a_report_shows_what_there_is_and_once() -> None:
         ]
     }
     page = render_report(lines)
+    figures = re.findall(r'<img alt="(.*?)"', page)
+    assert figures and all(re.fullmatch(r"\w+: .{20,}", each) for each in figures)
+    titles = dict(re.findall(r'<th title="(.*?)">(.*?)</th>', page))
+    assert (
+        all(f"<b>{heading}</b>: {meaning}" in page for meaning, heading in titles.items()) and "nan" in titles.values()
+    )
+    assert 'name="viewport"' in page and "prefers-color-scheme: dark" in page
     assert "<td>gamma</td>" in page and "<td>theta</td>" not in page and "<td>direction</td>" not in page
 
 

@@ -146,6 +146,7 @@ def test_the_cost_is_that_of_the_test_rollouts(begin: Callable[..., tuple[Task, 
     trial = proposal.run_trial(found.drive, change, task.horizon)
     state = initial_state(task.scene)
     last = dataclasses.replace(state, qpos=jnp.asarray(trial.qpos[-1]))
+    assert "(shoulder, elbow)" in written.read_text()
     effort = float(task.costs()[0](state, jnp.asarray(found.drive.neutral + change[0]))) * task.horizon
     assert float(task.costs()[1](last)) == pytest.approx(found.aim.misses(trial, task.horizon), rel=1e-9)
     assert effort == pytest.approx(proposal.WEIGHT * (0.3 / (10 * task.sigma)) ** 2)

@@ -17,6 +17,7 @@ from mjx_study.table import number
 
 IMPORTED: Final = frozenset({"Path", "jnp", "replace", "study"})
 """Names of the file's imports."""
+_JOINT: Final = int(mujoco.mjtTrn.mjTRN_JOINT)
 AXES: Final = ("x", "y", "z")
 MOST_LISTED: Final = 8
 """Maximum number of contacts listed."""
@@ -115,7 +116,7 @@ def _start(host: mujoco.MjModel) -> Iterator[str]:
 def _controls(found: Proposal) -> Iterator[str]:
     """Policy over the actuators, and the cost of their controls."""
     host, drive = found.scene.host, found.drive
-    names = ", ".join(host.actuator(index).name or f"actuator {index}" for index in range(host.nu))
+    names = ", ".join(_actuator(host, index) for index in range(host.nu))
     source = "the first keyframe's" if host.nkey else "zero, or as near to it as their ranges allow"
     yield f"    neutral = jnp.array({_numbers(drive.neutral)})  # controls at the start: {source}"
     yield f"    # theta: the controls of every step ({_comment(names)})"
@@ -126,6 +127,12 @@ def _controls(found: Proposal) -> Iterator[str]:
     yield f"    def running_cost(state, control):  # effort: {WEIGHT:g} if all controls stay {most} from neutral"
     yield f"        return {WEIGHT:g} * jnp.mean(((control - neutral) / {most}) ** 2) / horizon"
     yield ""
+
+
+def _actuator(host: mujoco.MjModel, index: int) -> str:
+    """An actuator's name, or else its joint's, or its number."""
+    joint = host.joint(host.actuator_trnid[index, 0]).name if host.actuator_trntype[index] == _JOINT else ""
+    return host.actuator(index).name or joint or f"actuator {index}"
 
 
 def _velocities(found: Proposal) -> Iterator[str]:
