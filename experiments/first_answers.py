@@ -3,8 +3,8 @@
     python -m experiments.first_answers [--page docs/performance.md] [--only SESSION]
 
 A session is a list of commands on a task of one's own, an arm that swats a box. Each command runs in a process of its
-own; the caches are empty when a session begins. The processor time of each phase is that of the threads in which JAX
-announces tracing and compiling, and of the C compiler; the rest is the commands' own.
+own; the caches are empty when a session begins. The processor time of tracing is that of the threads in which JAX
+announces it, that of native code the C compiler's; XLA compiles in threads of its own, and so counts among the rest.
 """
 
 import argparse
@@ -72,7 +72,7 @@ HIT: Final = "/jax/compilation_cache/cache_hits"
 
 
 class Phases:
-    """Processor seconds of tracing and compiling, and the number of programs that are compiled rather than read."""
+    """Processor seconds of tracing, and the number of programs that are compiled rather than read."""
 
     def __init__(self) -> None:
         self.seconds: Counter[str] = Counter()
@@ -132,7 +132,7 @@ def in_a_process(command: str, folder: Path) -> dict[str, Any]:
 def row_of(command: str, found: dict[str, Any]) -> tuple[str, ...]:
     """A row of the table."""
     processor = found["processor"] + found["compiler"]
-    phases = [found.get("tracing", 0.0), found.get("compiling", 0.0), found["compiler"]]
+    phases = [found.get("tracing", 0.0), found["compiler"]]
     numbers = [found["wall"], processor, *phases, processor - sum(phases)]
     shown = command.replace("swat:swat ", "").replace(" --output out", "").removesuffix(" swat:swat")
     return f"`{shown}`", *(f"{number:.1f}" for number in numbers), str(found["programs"]), f"{found['load']:.1f}"
