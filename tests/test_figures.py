@@ -257,7 +257,7 @@ def numbers_of(found: xr.Dataset) -> dict[tuple[str, ...], list[list[str]]]:
     """Headings of the table in a report, and its rows."""
     page = render_report(found)
     table = page[page.index("<h2>Numbers") : page.index("<h2>Configuration")]
-    headings = tuple(re.findall(r"<th>(.*?)</th>", table))
+    headings = tuple(re.findall(r"<th(?: [^>]*)?>(.*?)</th>", table))
     return {headings: [re.findall(r"<td>(.*?)</td>", row) for row in table.split("\n") if "<td>" in row]}
 
 
