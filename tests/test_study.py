@@ -319,6 +319,14 @@ def test_a_bias_beyond_computing_is_no_number() -> None:
     assert sentence == "penalty: FoBG's mean is biased by more than can be computed at K = 10 N/m (p <= 0.001)"
 
 
+def test_a_bias_is_no_share_of_a_reference_that_is_not_known() -> None:
+    unsure = row("fobg", 10, 1, relative_error=6.2, debiased_error=6.2, bias_p_value=0.001, reference_uncertainty=0.6)
+    assert (
+        findings_of(result(unsure))[0]
+        == "penalty: FoBG's mean is biased by an unknown share at K = 10 N/m (p <= 0.001)"
+    )
+
+
 def test_a_result_that_means_nothing_says_so() -> None:
     """Contact that is never met, a reference as uncertain as the errors, a bound below ZoBG's own radius."""
     same = (row("zobg", 10, 5.0), row("fobg", 10, 1.0), row("zobg", 100, 5.0), row("fobg", 100, 1.0))

@@ -86,6 +86,7 @@ GRADIENTS: Final = {
     "reference_norm": Variable((), "gradient", "norm of the reference gradient"),
     "reference_uncertainty": Variable((), "1", "standard error of the reference, over its norm"),
     "reference_effective_samples": Variable((), "1", "effective number of samples behind the reference's variance"),
+    "reference_pairs": Variable((), "1", "pairs of rollouts behind the reference"),
     "gradient": Variable((*BATCH, "param"), "gradient", "mean gradient"),
     "reference": Variable(("param",), "gradient", "reference gradient"),
 }
