@@ -75,6 +75,14 @@ def inputs_read(names: Iterable[str]) -> dict[str, str]:
     return dict(sorted(found.items()))
 
 
+def sources_and_inputs() -> dict[str, str]:
+    """Return digests of all inputs read so far, and of the files of all user-defined modules that are loaded, by the
+    names of `inputs_read`."""
+    loaded = [getattr(module, "__file__", None) for module in list(sys.modules.values())]
+    sources = {file for file in loaded if isinstance(file, str) and _owner(file) == "user"}
+    return {FILE + _relative(path): _digest_of_file(path) for path in sources} | inputs_read(list(_RECORDED))
+
+
 def inputs_now(names: Iterable[str]) -> Mapping[str, str]:
     """Return current digests of inputs by the same names."""
     readers = {FILE: _digest_of_file, VARIABLE: lambda name: _digest_of_text(os.environ.get(name))}

@@ -1,10 +1,11 @@
 """JAX-compiled functions whose traces outlive the process, since tracing a rollout's gradient takes seconds.
 
 JAX caches what XLA compiles; the trace before it is cached here as StableHLO, keyed by a digest of everything it
-depends on (`identity.trace_contents`). Traces that depend on code from outside this package are not cached.
+depends on (`identity.trace_contents`). User-defined code may read more while it is traced: its files and environment
+variables are kept with the trace, which is made again once one of them differs.
 
-A file holds the structure of the outputs as JSON in a line, and the serialised StableHLO; see `caches` for who may read
-and write it.
+A file holds the structure of the outputs and these inputs as JSON in a line, and the serialised StableHLO; see `caches`
+for who may read and write it.
 """
 
 import dataclasses
@@ -12,7 +13,10 @@ import hashlib
 import json
 import os
 import re
-from collections.abc import Callable, Iterable, Sequence
+import sys
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import nullcontext
 from functools import cache, cached_property
 from pathlib import Path
 from typing import Any, Final
@@ -20,12 +24,14 @@ from typing import Any, Final
 import jax
 import jax.export
 
+from estimators.user_inputs import inputs_now, observing, sources_and_inputs
 from mjx_study.caches import read_cached, write_cached
 from mjx_study.graph.build import known_libraries, libraries_in, library_ready
 from mjx_study.graph.native import native_identity
-from mjx_study.identity import trace_contents
-from mjx_study.runtime import precision, traces_folder
+from mjx_study.identity import TraceContents, trace_contents
+from mjx_study.runtime import available_cores, precision, traces_folder
 from mjx_study.structure import describe, restore
+from mjx_study.tasks.task import Task
 from mjx_study.watchdog import awaited
 
 UNTRACED: Final = re.compile("cache|^jax_log|num_cpu_devices|async_dispatch")
@@ -49,7 +55,8 @@ class Compiled:
     def __init__(self, function: Callable[..., Any], *made_of: Any):
         self.jitted = jax.jit(function)
         self._function, self._made_of = function, made_of
-        self._ready: dict[Path, Callable[..., Any]] = {}
+        self._ready: dict[str, Callable[..., Any]] = {}
+        self._begun: set[str] = set()
 
     @cached_property
     def _whole(self) -> Callable[..., Any]:
@@ -63,7 +70,8 @@ class Compiled:
     @property
     def num_compilations(self) -> int:
         """Number of argument forms compiled in this process."""
-        return sum(each._cache_size() for each in (self._whole, *self._ready.values()))
+        programs = {self._whole, *self._ready.values()}
+        return sum(1 if isinstance(each, jax.stages.Compiled) else each._cache_size() for each in programs)
 
     def prepare(self, *arguments: Any, platform: str | None = None) -> Callable[..., Any]:
         """Trace the function in this thread, or load its cached trace.
@@ -75,19 +83,14 @@ class Compiled:
         Returns:
             A function of arguments of this form, which threads may call in parallel.
         """
-        leaves, form = jax.tree.flatten(arguments)
-        types = [leaf if isinstance(leaf, jax.ShapeDtypeStruct) else type_of(leaf) for leaf in leaves]
-        path = self._path(repr((form, types))) if platform in (None, jax.default_backend()) else None
-        if path is None:
-            jax.eval_shape(self._whole, *arguments)
-            return self._whole
-        if path not in self._ready:
-            self._ready[path] = _read(path) or self._export(path, types, form)
-        return self._ready[path]
+        if platform not in (None, jax.default_backend()):
+            return self._traced(arguments)
+        return self._prepared(*self._form(arguments), arguments)
 
-    @cached_property
-    def _contents(self) -> str | None:
-        return trace_contents(self._made_of) if self._made_of else None
+    def outputs(self, *arguments: Any, platform: str | None = None) -> Any:
+        """Shapes and types of the outputs, without running the function; see `prepare` for the arguments."""
+        ready = self.prepare(*arguments, platform=platform)
+        return ready.out_info if isinstance(ready, jax.stages.Compiled) else jax.eval_shape(ready, *arguments)
 
     def ahead(self, *types: Any) -> Callable[[], None]:
         """Trace the function in this thread, or load its cached trace, for compilation ahead of time.
@@ -96,31 +99,65 @@ class Compiled:
             types: shapes and types of the arguments.
 
         Returns:
-            A function that compiles it in any thread for JAX's default device, so that the next call need not.
+            A function that compiles it in any thread for JAX's default device, so that the next call need not; it does
+            nothing if that has begun before.
         """
-        ready = self.prepare(*types)
+        key, leaves, form = self._form(types)
+        ready = self._prepared(key, leaves, form, types)
+        if key in self._begun:
+            return lambda: None
+        self._begun.add(key)
 
         def compile_it() -> None:
-            if isinstance(ready, jax.stages.Compiled):
-                return
-            executable = ready.lower(*types).compile()
-            for path, each in self._ready.items():
-                if each is ready:
-                    self._ready[path] = executable
+            self._ready[key] = ready.lower(*types).compile()
 
         return compile_it
 
-    def _path(self, form: str) -> Path | None:
-        """Path of the cached trace for a form of arguments; None if it is not cached."""
+    def _form(self, arguments: Any) -> tuple[str, list[jax.ShapeDtypeStruct], Any]:
+        """Key, types and structure of the arguments' form."""
+        leaves, form = jax.tree.flatten(arguments)
+        types = [leaf if isinstance(leaf, jax.ShapeDtypeStruct) else type_of(leaf) for leaf in leaves]
+        return self._key(repr((form, types))), types, form
+
+    def _prepared(self, key: str, types: list[jax.ShapeDtypeStruct], form: Any, arguments: Any) -> Callable[..., Any]:
+        """The traced function of a form of arguments, compiled if `ahead` has."""
+        if key not in self._ready:
+            path = self._path(key)
+            kept = None if path is None else _read(path) or self._export(path, types, form)
+            self._ready[key] = kept or self._traced(arguments)
+        return self._ready[key]
+
+    def _traced(self, arguments: Any) -> Callable[..., Any]:
+        """The function as a program of its own, traced."""
+        jax.eval_shape(self._whole, *arguments)
+        return self._whole
+
+    @cached_property
+    def _contents(self) -> TraceContents | None:
+        if not self._made_of:
+            return None
+        found = trace_contents(self._made_of)
+        if found.opaque:
+            _say_untraceable(found.opaque)
+        return None if found.opaque else found
+
+    def _key(self, form: str) -> str:
+        """What this function's programs depend on besides its contents, for a form of arguments."""
+        simulates = any(isinstance(each, Task) for each in self._made_of)
+        settings = [(name, value) for name, value in jax.config.values.items() if not UNTRACED.search(name)]
+        native = native_identity() if simulates else None
+        return repr((jax.default_backend(), native, precision(), settings, form))
+
+    def _path(self, key: str) -> Path | None:
+        """Path of the cached trace for a key; None if it is not cached."""
         folder = traces_folder()
         if folder is None or self._contents is None:
             return None
-        settings = [(name, value) for name, value in jax.config.values.items() if not UNTRACED.search(name)]
-        text = repr((self._contents, jax.default_backend(), native_identity(), precision(), settings, form))
-        return folder / f"{hashlib.sha256(text.encode()).hexdigest()[:32]}.trace"
+        return folder / f"{hashlib.sha256(repr((self._contents.digest, key)).encode()).hexdigest()[:32]}.trace"
 
-    def _export(self, path: Path, types: Sequence[jax.ShapeDtypeStruct], form: Any) -> Callable[..., Any]:
-        """Trace the function and cache the trace; only trace it if JAX cannot export it."""
+    def _export(self, path: Path, types: Sequence[jax.ShapeDtypeStruct], form: Any) -> Callable[..., Any] | None:
+        """Trace the function and cache the trace; None if JAX cannot export it."""
+        assert self._contents is not None
         outputs: list[Any] = []
 
         def of_leaves(*leaves: Any) -> list[Any]:
@@ -130,16 +167,36 @@ class Compiled:
 
         try:
             jitted = jax.jit(of_leaves)
-            jitted.trace(*types)  # which names the libraries of native code that it calls
+            with observing(path.stem) if self._contents.own else nullcontext():
+                jitted.trace(*types)  # which names the libraries of native code that it calls
+            inputs = sources_and_inputs() if self._contents.own else {}
             program = jax.export.export(jitted, disabled_checks=_calling(known_libraries()))(*types)
             called = libraries_in(program.mlir_module_serialized)
             trace = dataclasses.replace(program, disabled_safety_checks=_calling(called)).serialize()
-            described = json.dumps(describe(outputs[0])).encode()
+            described = json.dumps({"outputs": describe(outputs[0]), "inputs": inputs}).encode()
         except ValueError:  # an operation that cannot be exported, or outputs of a class of others
-            return self._whole
+            return None
         kept = described + b"\n" + bytes(trace)
         write_cached(path, kept)
         return _load(kept)
+
+
+class Builds:
+    """Programs that are compiled side by side, while this thread traces the next one."""
+
+    def __init__(self) -> None:
+        self._pool = ThreadPoolExecutor(available_cores(), thread_name_prefix="compile")
+        self._running: list[Future[None]] = []
+
+    def start(self, program: Compiled, *types: Any) -> None:
+        """Trace a program, and begin to compile it for JAX's default device; see `Compiled.ahead`."""
+        self._running.append(self._pool.submit(program.ahead(*types)))
+
+    def wait(self) -> None:
+        """Wait for all programs, so that what is timed afterwards has the machine to itself."""
+        with awaited():
+            while self._running:
+                self._running.pop(0).result()
 
 
 def _calling(libraries: Iterable[str]) -> list[jax.export.DisabledSafetyCheck]:
@@ -169,9 +226,18 @@ def type_of(leaf: Any) -> jax.ShapeDtypeStruct:
     return jax.ShapeDtypeStruct(kind.shape, kind.dtype, weak_type=kind.weak_type)
 
 
+@cache
+def _say_untraceable(opaque: tuple[str, ...]) -> None:
+    """Say why programs of a task are not kept between runs."""
+    print(
+        f"mjx-study: {opaque[0]} holds data that cannot be digested: the task's programs are traced anew in every run",
+        file=sys.stderr,
+    )
+
+
 def _read(path: Path) -> Callable[..., Any] | None:
-    """Load the function whose trace is in a file; None if the file is missing or unreadable, or a library of native
-    code that it calls is."""
+    """Load the function whose trace is in a file; None if the file is missing or unreadable, a library of native code
+    that it calls is missing, or an input differs."""
     kept = read_cached(path)
     try:
         return None if kept is None or not all(map(library_ready, libraries_in(kept))) else _load(kept)
@@ -179,8 +245,11 @@ def _read(path: Path) -> Callable[..., Any] | None:
         return None
 
 
-def _load(kept: bytes) -> Callable[..., Any]:
+def _load(kept: bytes) -> Callable[..., Any] | None:
     described, _, trace = kept.partition(b"\n")
-    exported, structure = jax.export.deserialize(bytearray(trace)), restore(json.loads(described))
+    found: Mapping[str, Any] = json.loads(described)
+    if inputs_now(found["inputs"]) != found["inputs"]:
+        return None
+    exported, structure = jax.export.deserialize(bytearray(trace)), restore(found["outputs"])
     call = lambda *arguments: structure.unflatten(exported.call(*jax.tree.leaves(arguments)))  # noqa: E731
     return jax.jit(call, compiler_options=compiler_options())

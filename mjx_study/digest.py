@@ -38,6 +38,8 @@ STATELESS: Final = frozenset(
     "multiprocessing subprocess tempfile".split()
 )
 """Modules of the standard library whose objects are no data: they differ from process to process."""
+HARMLESS: Final = frozenset("logging threading _thread weakref _weakref".split())
+"""Those of them that no trace depends on."""
 IMPLIED: Final = frozenset(
     "__abstractmethods__ __annotate__ __annotate_func__ __annotations__ __annotations_cache__ __classcell__ "
     "__dataclass_fields__ __dataclass_params__ __dict__ __doc__ __firstlineno__ __match_args__ __module__ __name__ "
@@ -71,6 +73,7 @@ class Digest:
     Attributes:
         sources: source files of functions and classes from outside this package.
         globals: digests of the data that user-defined functions read from their modules, by "global NAME of MODULE".
+        opaque: types of values whose content cannot be digested.
     """
 
     def __init__(self, *values: Any, exact: bool = False) -> None:
@@ -79,6 +82,7 @@ class Digest:
         self._seen: dict[int, tuple[int, Any]] = {}
         self.sources = Sources()
         self.globals: dict[str, str] = {}
+        self.opaque: list[str] = []
         for value in values:
             self.add(value)
 
@@ -124,6 +128,7 @@ class Digest:
             self._function(value)
         elif type(value).__module__.partition(".")[0] in STATELESS:
             self._note("stateless", type(value).__qualname__)
+            self._unseen(value)
         else:
             self._object(value)
 
@@ -141,9 +146,25 @@ class Digest:
         elif (kind.__reduce_ex__, kind.__reduce__) != (object.__reduce_ex__, object.__reduce__) or not (
             hasattr(value, "__dict__") or _slots(kind)
         ):
-            self._all("reduced", _reduced(value))
+            self._all("reduced", self._reduced(value))
         if state := _state(value):
             self._all("attributes", sorted(state.items()))
+
+    def _reduced(self, value: Any) -> list[Any]:
+        """What pickle would keep of an object without attributes, such as a slice; its name, if it keeps nothing."""
+        try:
+            reduced = value.__reduce_ex__(2)
+        except Exception:  # the user's class may raise anything
+            self._unseen(value)
+            return [getattr(value, "__name__", None)]
+        parts = reduced if isinstance(reduced, tuple) else (reduced,)
+        return [list(part) if isinstance(part, Iterator) else part for part in parts]
+
+    def _unseen(self, value: Any) -> None:
+        """Note a value whose content does not enter, unless traces cannot depend on it."""
+        kind, top = type(value), type(value).__module__.partition(".")[0]
+        if top not in HARMLESS and (top == "builtins" or not by_version(top) or top in STATELESS):
+            self.opaque.append(f"a value of type {kind.__module__}.{kind.__qualname__}")
 
     def _class(self, kind: type) -> None:
         """Add a class: by name and source, and of the user's its methods and attributes, inherited ones included."""
@@ -237,7 +258,7 @@ class Digest:
         if label not in self.globals:
             self.globals[label] = ""  # while it is made, since it may contain functions that read it
             digest = Digest(exact=self._exact)
-            digest.sources, digest.globals = self.sources, self.globals
+            digest.sources, digest.globals, digest.opaque = self.sources, self.globals, self.opaque
             digest.add(value)
             self.globals[label] = digest.hexdigest()
         self._note(label, self.globals[label])
@@ -275,16 +296,6 @@ def _state(value: Any) -> dict[str, Any]:
         held["__wrapped__"] = wrapped
     held |= own
     return {name: held[name] for name in held if not isinstance(getattr(kind, name, None), functools.cached_property)}
-
-
-def _reduced(value: Any) -> list[Any]:
-    """What pickle would keep of an object without attributes, such as a slice; its name, if it keeps nothing."""
-    try:
-        reduced = value.__reduce_ex__(2)
-    except Exception:  # the user's class may raise anything
-        return [getattr(value, "__name__", None)]
-    parts = reduced if isinstance(reduced, tuple) else (reduced,)
-    return [list(part) if isinstance(part, Iterator) else part for part in parts]
 
 
 def _members(kind: type) -> dict[str, Any]:

@@ -8,11 +8,13 @@ import functools
 import hashlib
 import re
 import subprocess
+import sys
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Final
 
 from estimators import Estimator, find_estimator
+from estimators.user_inputs import INSTALLED
 from mjx_study.digest import Digest
 from mjx_study.runtime import precision
 from mjx_study.simulation.scene import models_folder
@@ -66,13 +68,37 @@ def contents(tasks: Mapping[str, Iterable[Task]]) -> dict[str, str]:
     return found | dict(sorted(parts.items()))
 
 
-def trace_contents(made_of: Any) -> str | None:
-    """Digest everything a trace depends on except its arguments and JAX's settings: exact values and models, and code.
+@dataclasses.dataclass(frozen=True)
+class TraceContents:
+    """What a trace depends on except its arguments and JAX's settings.
 
-    None if code from outside this package is involved, whose imports are not all followed.
+    Attributes:
+        digest: of exact values and models, and code.
+        own: whether user-defined or installed code is involved.
+        opaque: values whose content cannot be digested.
+    """
+
+    digest: str
+    own: bool
+    opaque: tuple[str, ...]
+
+
+def trace_contents(made_of: Any) -> TraceContents:
+    """Digest everything a trace depends on except its arguments and JAX's settings.
+
+    Installed packages enter by the names of their folders of metadata, which hold the versions.
     """
     digest = Digest((made_of, [version_of(name) for name in VERSIONED], computing_code()), exact=True)
-    return None if digest.sources.foreign else digest.hexdigest()
+    if digest.sources.foreign:
+        digest.add((sorted(digest.parts.items()), installed_packages()))
+    return TraceContents(digest.hexdigest(), digest.sources.foreign, tuple(digest.opaque))
+
+
+@functools.cache
+def installed_packages() -> tuple[str, ...]:
+    """Names and versions of all installed packages."""
+    folders = [Path(entry) for entry in sys.path if set(INSTALLED) & set(Path(entry).parts)]
+    return tuple(sorted(each.name for folder in folders for each in folder.glob("*.dist-info")))
 
 
 def estimator_contents(chosen: Mapping[str, str | Estimator]) -> dict[str, str]:

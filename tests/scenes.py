@@ -42,6 +42,13 @@ def slider(condim: int = 3, friction: float = 0.5, mass: float = 1.0, height: fl
     )
 
 
+FALLING: Final = floor_scene(
+    '<body pos="0 0 .1"><joint type="slide" axis="0 0 1"/><geom size=".1" mass="1" condim="1"/></body>',
+    option(5e-4),
+    'condim="1"',
+)
+"""A ball above the floor, or in it, that can only move up and down; without friction."""
+
 FREE_BOX: Final = '<body pos="0 0 .0998"><freejoint/><geom name="box" type="box" size=".1 .12 .1" mass="1"/></body>'
 
 CAPSULE: Final = """
@@ -153,6 +160,18 @@ def scene_of(source: str, name: str = "test", **options: Any) -> Scene:
 def compiled(function: Callable[..., Any], *examples: Any) -> Callable[..., Any]:
     """The function compiled for these arguments with the least optimisation."""
     return jax.jit(function).lower(*examples).compile(compiler_options={"xla_backend_optimization_level": "0"})
+
+
+def in_both_modes(function: Callable[[Any], Any]) -> Callable[[Any], tuple[Any, Any, Any]]:
+    """A function's value at a vector, and its Jacobian by forward and by reverse mode; linearised once."""
+
+    def at(point: Any) -> tuple[Any, Any, Any]:
+        value, push = jax.linearize(function, point)
+        pull = jax.linear_transpose(push, point)
+        forward = jax.vmap(push, out_axes=-1)(jnp.eye(point.shape[0]))
+        return value, forward, jax.vmap(lambda row: pull(row)[0])(jnp.eye(value.shape[0]))
+
+    return at
 
 
 _PLAIN: Final = jax.make_user_context(False)

@@ -1,7 +1,10 @@
 """Traces that outlive the process: found again to the bit, and never where anything that they are made of differs."""
 
 import dataclasses
+import importlib
 import re
+import sys
+from collections import defaultdict
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -13,16 +16,16 @@ import numpy as np
 import pytest
 
 import estimators
+from estimators import user_inputs
 from mjx_study import compiled, identity
 from mjx_study.compiled import Compiled
 from mjx_study.execution.run import run_study
-from mjx_study.experiment import gradient_numbers, gradients
+from mjx_study.experiment import gradient_numbers
 from mjx_study.graph import build
 from mjx_study.graph.native import SWITCH, native_identity
 from mjx_study.objective import Simulator, programs
 from mjx_study.options.configuration import StudyConfig
 from mjx_study.tasks import Task, make_task
-from tests.carts import cart
 
 KEYS = jax.random.split(jax.random.key(0), 2)
 
@@ -106,7 +109,8 @@ def test_what_differs_in_a_bit_has_a_trace_of_its_own(other: str):
 
 def test_code_versions_settings_and_the_form_of_arguments_count(monkeypatch: pytest.MonkeyPatch):
     def path(form: str = "form") -> Path | None:
-        return Compiled(jnp.sin, "rollout", pusher())._path(form)
+        program = Compiled(jnp.sin, "rollout", pusher())
+        return program._path(program._key(form))
 
     ours = path()
     assert ours == path() != path("another")
@@ -122,9 +126,75 @@ def test_code_versions_settings_and_the_form_of_arguments_count(monkeypatch: pyt
     assert path() == ours
 
 
-def test_code_from_outside_is_traced_in_every_process(folder: Path):
-    evaluated(cart())
-    assert not list(folder.iterdir())
+OWN = """
+import os
+from pathlib import Path
+from tests.carts import cart
+
+def scale():
+    return {scale}
+
+def mine():
+    task = cart(running_cost=lambda state, control: 0.0 * state.qpos[0])
+    return task.replace(final_cost=lambda state: scale() * state.qpos[0])
+"""
+SCALES = {
+    "its own source": ("2.0", "3.0", lambda monkeypatch: None),
+    "a file": ('float(Path("by.txt").read_text())', None, lambda monkeypatch: Path("by.txt").write_text("3.0")),
+    "a variable": ('float(os.environ["CART_BY"])', None, lambda monkeypatch: monkeypatch.setenv("CART_BY", "3.0")),
+    "an import by name": (
+        '__import__("la" + "zy").BY', None, lambda monkeypatch: Path("lazy.py").write_text("BY = 3.0  # changed\n"),
+    ),
+}  # fmt: skip
+
+
+def own_value(monkeypatch: pytest.MonkeyPatch, scale: str) -> np.ndarray:
+    """Evaluate a task of the user's module `mine`, as a new process does."""
+    Path("mine.py").write_text(OWN.format(scale=scale))
+    for name in ("mine", "lazy"):
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    importlib.invalidate_caches()
+    return evaluated(make_task("mine:mine"))
+
+
+@pytest.fixture
+def in_a_folder(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path_factory.mktemp("own"))
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    monkeypatch.setattr(user_inputs, "_RECORDED", defaultdict(dict))
+    monkeypatch.setenv("CART_BY", "2.0")
+    Path("by.txt").write_text("2.0")
+    Path("lazy.py").write_text("BY = 2.0\n")
+
+
+@pytest.mark.usefixtures("in_a_folder")
+@pytest.mark.parametrize("read", SCALES)
+def test_a_trace_of_own_code_is_found_again_until_anything_that_it_reads_differs(
+    read: str, folder: Path, monkeypatch: pytest.MonkeyPatch
+):
+    scale, other, change = SCALES[read]
+    first = own_value(monkeypatch, scale)
+    assert len(list(folder.glob("*.trace"))) == 1
+    with monkeypatch.context() as patch:
+        patch.setattr(programs, "rollout_cost", untraceable)
+        np.testing.assert_array_equal(own_value(monkeypatch, scale), first)
+    change(monkeypatch)
+    np.testing.assert_allclose(own_value(monkeypatch, other or scale), first * 1.5)
+
+
+@pytest.mark.usefixtures("in_a_folder")
+def test_code_that_holds_what_cannot_be_digested_is_traced_in_every_process(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    compiled._say_untraceable.cache_clear()
+    own_value(monkeypatch, "next(NUMBERS)\n\nNUMBERS = iter(lambda: 2.0, None)\nSAME = (each for each in (1, 2))")
+    assert list(folder.glob("*.trace"))  # an iterator's state is data
+    (path,) = folder.glob("*.trace")
+    path.unlink()
+    own_value(monkeypatch, "next(NUMBERS)\n\nNUMBERS = (each for each in 9 * [2.0])")
+    assert not list(folder.glob("*.trace"))
+    said = capsys.readouterr().err
+    assert said.count("builtins.generator holds data that cannot be digested") == 1 and said.count("\n") == 1
 
 
 def test_statistics_of_seeds_and_structures_come_back(folder: Path):
@@ -156,7 +226,6 @@ def test_statistics_are_compiled_for_the_batches_that_come(
     folder: Path, monkeypatch: pytest.MonkeyPatch, names: tuple[str, ...]
 ):
     """Beside the programs of rollouts, from their forms alone: with another form there would be another trace."""
-    monkeypatch.setattr(gradients, "traces_folder", lambda: folder)
     gradient_numbers.seed_numbers.cache_clear()
     needs = {oracle for name in names for oracle in estimators.find_estimator(name).needs}
     chosen = {"contact": ("penalty",), "stiffness": (100.0,), "horizon": 2, "seeds": 3}

@@ -2,6 +2,7 @@
 
 import itertools
 import re
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +11,10 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from jax.flatten_util import ravel_pytree
 
 import mjx_study as study
+from mjx_study.graph.native import SWITCH, native_identity
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.contact import apply_contact
 from mjx_study.simulation.drop_in import differentiable_mjx, solver_residual, step
@@ -20,10 +23,12 @@ from mjx_study.simulation.onset import corrected_rollout
 from mjx_study.simulation.patches import patched
 from tests.scenes import (
     CASES,
+    FALLING,
     assert_close_by_rows,
     central_jacobian,
     compiled,
     floor_scene,
+    in_both_modes,
     option,
     scene_of,
     slider,
@@ -34,7 +39,8 @@ from tests.test_onset_term import BOUNCING, Law
 
 PAGE = Path(__file__).parents[1] / "docs" / "differentiable-mjx.md"
 MODELS = Path(mjx.__file__).parent / "test_data"
-FAST = ("tendon/armature", "tendon/wrap_sidesite")
+NATIVE = pytest.mark.skipif(native_identity() is None, reason="there is no C compiler")
+FAST = ("tendon/armature",)
 CROWDS = {f"humanoid/{count:02}_humanoids" for count in range(2, 11)}  # copies of the first, and slow
 STILL = {"ray", "actuator/general_dyntype"}  # no coordinate; an inertia matrix that is singular
 NAMES = sorted({str(path.relative_to(MODELS))[:-4] for path in MODELS.rglob("*.xml")} - CROWDS - STILL)
@@ -104,34 +110,29 @@ TENDON_DRIVEN = f"""<mujoco>{option()}<worldbody><geom type="plane" size="1 1 .1
 <tendon><spatial name="t" stiffness="20"><site site="a"/><site site="b"/></spatial></tendon>
 <actuator><general tendon="t" dyntype="filter" dynprm=".05" gainprm="3"/></actuator></mujoco>"""
 INPUTS = {"qpos": (0.01, -0.0004), "qvel": (0.2, -0.3), "act": (0.2,), "ctrl": (0.4,)}
-SOME = [pytest.param(pair, marks=[] if pair == ("qvel",) else [pytest.mark.slow])
-        for size in (1, 2) for pair in itertools.combinations(INPUTS, size)]  # fmt: skip
+PAIRS = [pair for size in (1, 2) for pair in itertools.combinations(INPUTS, size)]
+SOME = [pytest.param(pair, onset, marks=[] if (pair, onset) == (("qvel",), "none") else [pytest.mark.slow])
+        for pair in PAIRS for onset in ("none", "linear")]  # fmt: skip
 
 
-@pytest.mark.parametrize("onset", ["none", "linear"])
-@pytest.mark.parametrize("names", SOME, ids=" ".join)
+@pytest.mark.parametrize(("names", "onset"), SOME)
 def test_derivatives_over_any_input(names: tuple[str, ...], onset: str) -> None:
     """In both modes, over some inputs of a scanned step: the columns of the derivative over all of them."""
     model, data = device(TENDON_DRIVEN)
-    point = {name: jnp.array(value) for name, value in INPUTS.items()}
+    inputs = {name: jnp.array(value) for name, value in INPUTS.items()}
+    point, chosen = ravel_pytree({name: inputs[name] for name in names})
 
-    def last(chosen):
-        start = data.replace(time=jnp.array(1.0), **(point | chosen))
+    def last(point):
+        start = data.replace(time=jnp.array(1.0), **(inputs | chosen(point)))
         following = jax.lax.scan(lambda data, _: (step(model, data, onset=onset), None), start, length=2)[0]
         return jnp.concatenate([following.qpos, following.qvel, following.act])
 
-    def both(chosen):
-        return jax.jacfwd(last)(chosen), jax.jacrev(last)(chosen)
-
-    some = {name: point[name] for name in names}
-    forward, reverse = compiled(both, some)(some)
-    for name in names:
-        values = compiled(lambda x, name=name: last({name: x}), point[name])
-        expected = central_jacobian(values, np.asarray(point[name]), 1e-5)
-        scale = np.abs(expected).max()
-        np.testing.assert_allclose(reverse[name], forward[name], rtol=0, atol=1e-10 * scale)
-        if onset == "none":
-            np.testing.assert_allclose(forward[name], expected, rtol=0, atol=1e-6 * scale)
+    program = compiled(in_both_modes(last), point)
+    _, forward, reverse = program(point)
+    expected = central_jacobian(lambda x: program(x)[0], np.asarray(point), 1e-5)
+    assert_close_by_rows(reverse.T, forward.T, 1e-10)
+    if onset == "none":
+        assert_close_by_rows(forward.T, expected.T, 1e-6)
 
 
 @pytest.mark.slow
@@ -141,19 +142,13 @@ def test_derivatives_are_those_of_the_scenes_step(name: str) -> None:
     case = prepare(name)
     scene = case.scene
 
-    def after(model, point):
+    def after(point):
         qpos, qvel, act, ctrl = split(scene, point)
         data = scene.template.replace(qpos=qpos, qvel=qvel, act=act, ctrl=ctrl, qacc_warmstart=case.warmstart)
-        data = step(model, data)
+        data = step(scene.model, data)
         return jnp.concatenate([data.qpos, data.qvel, data.act])
 
-    def both(model, point):
-        value, push = jax.linearize(lambda x: after(model, x), point)
-        pull = jax.linear_transpose(push, point)
-        forward = jax.vmap(push, out_axes=-1)(jnp.eye(point.shape[0]))
-        return forward, jax.vmap(lambda row: pull(row)[0])(jnp.eye(value.shape[0]))
-
-    forward, reverse = compiled(both, scene.model, case.point)(scene.model, case.point)
+    _, forward, reverse = compiled(in_both_modes(after), case.point)(case.point)
     assert_close_by_rows(reverse, forward, 1e-10)
     # from another warm start the solver stops elsewhere, 1e-8 from the solution with cones
     assert_close_by_rows(forward, jacobian(name), 1e-6)
@@ -170,11 +165,12 @@ def test_derivatives_of_sensors_and_forces() -> None:
         return jnp.concatenate([after.sensordata, after._impl.efc_force, after.qfrc_constraint, after.qacc])
 
     point = np.array([0.0, 0.0, -4e-4, 0.3, 0.2, -0.1, 0.05])
-    forward, reverse = compiled(lambda x: (jax.jacfwd(outputs)(x), jax.jacrev(outputs)(x)), point)(point)
+    program = compiled(in_both_modes(outputs), point)
+    _, forward, reverse = program(point)
     assert forward.shape == (11 + 3 + 3 + 3, 7) and np.abs(forward).max(axis=1).min() > 0
     assert_close_by_rows(reverse, forward, 1e-10)
     # the acceleration is 1e-8 off where MJX's solver stops, over differences of 5e-5
-    assert_close_by_rows(forward, central_jacobian(compiled(outputs, point), point, 5e-5), 1e-3)
+    assert_close_by_rows(forward, central_jacobian(lambda x: program(x)[0], point, 5e-5), 1e-3)
 
 
 class Environment:
@@ -291,16 +287,11 @@ def test_what_has_no_derivative_is_refused() -> None:
         study.check_model(host, "sled")
 
 
-# A ball falls on the floor; a step with the onset term against rollouts with it.
-FALLING = floor_scene(
-    '<body pos="0 0 .1"><joint type="slide" axis="0 0 1"/><geom size=".1" mass="1" condim="1"/></body>',
-    option(5e-4),
-    'condim="1"',
-)
-
-
-def test_the_backward_pass_does_not_run_the_solver_again() -> None:
-    """The only loop of open end is the solver's; gradients, too, have it once."""
+@pytest.mark.parametrize("ending", ["while[", pytest.param("native[", marks=NATIVE)])
+def test_the_backward_pass_does_not_run_the_solver_again(monkeypatch: pytest.MonkeyPatch, ending: str) -> None:
+    """The only loop of open end is the solver's; gradients, too, have it once. In native code, they call the solved
+    step and the transpose of its derivative once each."""
+    monkeypatch.setenv(SWITCH, "1" if ending == "native[" else "0")
     model, data = device(FALLING)
 
     def last(speed):
@@ -308,20 +299,23 @@ def test_the_backward_pass_does_not_run_the_solver_again() -> None:
         return jax.lax.scan(lambda data, _: (step(model, data), None), start, length=3)[0].qpos[0]
 
     programs = [str(jax.make_jaxpr(function)(-0.1)) for function in (last, jax.grad(last))]
-    assert [program.count("while[") for program in programs] == [1, 1]
+    assert [program.count("while[") for program in programs] == ([1, 1] if ending == "while[" else [0, 0])
+    assert [program.count("native[") for program in programs] == ([0, 0] if ending == "while[" else [1, 2])
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("law", "speed", "gaps", "steps"),
     [
         # Over a cell: contact begins early or late in a step.
         pytest.param(Law(), -1.5, 0.035 + 7.5e-4 * (np.arange(4) + 0.3) / 4, 80, id="begins"),
-        pytest.param(BOUNCING, -1.0, np.linspace(0.0311, 0.0489, 7), 400, id="begins and ends under force"),
+        pytest.param(
+            BOUNCING, -1.0, np.linspace(0.0311, 0.0489, 7), 400,
+            id="begins and ends under force", marks=pytest.mark.slow,
+        ),
     ],
-)
+)  # fmt: skip
 def test_the_onset_term_of_a_step_is_that_of_a_rollout(law: Law, speed: float, gaps: np.ndarray, steps: int) -> None:
-    """To the order of a timestep, 1 %, where the term is four times the rest; both modes, the same values."""
+    """To the order of a timestep, 1 %, where the term is four times the rest; the same values."""
     scene = scene_of(FALLING)
     model, start, qvel = apply_contact(scene.model, law.contact), scene.template, jnp.array([speed])
 
@@ -329,23 +323,21 @@ def test_the_onset_term_of_a_step_is_that_of_a_rollout(law: Law, speed: float, g
         def advance(data, _):
             return step(model, data, onset=onset), None
 
-        last, _ = jax.lax.scan(advance, start.replace(qpos=gap[None], qvel=qvel), length=steps)
-        return last.qpos[0], last.qpos[0]
+        return jax.lax.scan(advance, start.replace(qpos=gap, qvel=qvel), length=steps)[0].qpos
 
     def by_rollout(gap):
-        state = initial_state(scene, gap[None], qvel)
-        return corrected_rollout(scene, model, state, lambda index, state: jnp.zeros(0), steps)[0].qpos[-1, 0]
+        state = initial_state(scene, gap, qvel)
+        return corrected_rollout(scene, model, state, lambda index, state: jnp.zeros(0), steps)[0].qpos[-1]
 
     def all_of(gap):
-        linear = lambda gap: by_steps(gap, "linear")  # noqa: E731
-        forward, value = jax.jacfwd(linear, has_aux=True)(gap)
-        plain, stock = jax.jacfwd(lambda gap: by_steps(gap, "none"), has_aux=True)(gap)
-        return forward, jax.grad(linear, has_aux=True)(gap)[0], jax.jacfwd(by_rollout)(gap), plain, value, stock
+        value, pull = jax.vjp(partial(by_steps, onset="linear"), gap)
+        stock, plain = jax.jvp(partial(by_steps, onset="none"), (gap,), (jnp.ones(1),))
+        return value, *pull(jnp.ones(1)), stock, plain, jax.jvp(by_rollout, (gap,), (jnp.ones(1),))[1]
 
-    forward, reverse, expected, plain, value, stock = compiled(jax.vmap(all_of), gaps)(gaps)
-    np.testing.assert_array_equal(value, stock)
-    np.testing.assert_allclose(reverse, forward, rtol=1e-9)
-    np.testing.assert_allclose(forward, expected, rtol=0, atol=0.01 * np.abs(expected - plain).max())
+    points = gaps[:, None]
+    value, corrected, stock, plain, expected = compiled(jax.vmap(all_of), points)(points)
+    np.testing.assert_allclose(value, stock, rtol=1e-13)
+    np.testing.assert_allclose(corrected, expected, rtol=0, atol=0.01 * np.abs(expected - plain).max())
     assert np.abs(expected - plain).min() > 0.1
 
 
@@ -396,7 +388,7 @@ def test_the_page_runs(ways: int) -> None:
     """Both ways give the same gradient: friction brakes the ball until it rolls, at 5/7 of its speed."""
     names: dict[str, Any] = {}
     for block in re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL):
-        if ways == 2 or "differentiable_mjx()" not in block:
+        if ways == 2 or not {"differentiable_mjx", "hessian"} & set(re.findall(r"\w+", block)):
             exec(block, names)
     if ways == 2:
         np.testing.assert_allclose(names["same"], names["gradient"], rtol=1e-9, atol=1e-15)

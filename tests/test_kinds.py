@@ -27,7 +27,7 @@ from mjx_study.results.warnings import warnings_of
 from mjx_study.storage import cell_files, folder
 from mjx_study.storage.arrays import required
 from mjx_study.storage.folder import Store, load_study
-from tests.documents import study_document
+from tests.documents import content, same, study_document
 from tests.test_layering import FILES, ROOT
 
 NUMBERS = Path(__file__).parent / "data" / "kinds.json"
@@ -51,15 +51,6 @@ each_kind = pytest.mark.parametrize("name", STUDIES)
 
 def config(name: str, **changes: Any) -> StudyConfig:
     return StudyConfig(**(COMMON | STUDIES[name] | changes))
-
-
-def same(one: xr.Dataset, other: xr.Dataset) -> bool:
-    """Whether all but measured times is equal, bit for bit."""
-    return one.drop_vars(MEASURED, errors="ignore").equals(other.drop_vars(MEASURED, errors="ignore"))
-
-
-def content(path: Path) -> dict[Path, bytes]:
-    return {each: each.read_bytes() for each in path.rglob("*") if each.is_file()}
 
 
 @pytest.fixture(scope="module")
@@ -215,7 +206,13 @@ def test_a_write_that_fails_keeps_the_cells_before_it(
 @each_kind
 def test_a_study_is_drawn_reported_and_tabulated(studies: dict[str, Path], copy: Path, name: str) -> None:
     found = load_study(studies[name])
-    assert set(found.mjx_study.plot()) == FIGURES[name]
+    figures = found.mjx_study.plot()
+    assert set(figures) == FIGURES[name]
+    for figure in figures.values():
+        panels = [(axes, axes.get_subplotspec()) for axes in figure.axes]
+        lowest = [axes for axes, panel in panels if panel is not None and panel.is_last_row()]
+        assert lowest and all(axes.get_xlabel() or axes.get_xticklabels() for axes in lowest)
+        assert any(axes.get_ylabel() for axes in figure.axes)
     assert found.mjx_study.findings() == findings_of(found) and len(found.mjx_study.table()) >= 2
     page = render_report(found)
     assert page.count("data:image/png;base64,") == len(FIGURES[name])

@@ -26,9 +26,8 @@ from mjx_study.experiment.study import StudyPlan
 from mjx_study.options.configuration import StudyConfig
 from mjx_study.results.variables import MEASURED
 from mjx_study.storage.folder import Store, load_study
-from tests.documents import numbers_of
+from tests.documents import numbers_of, same
 from tests.poison import ACCOUNT, RAISE, SLOW
-from tests.test_sweep import same
 
 SUBSTITUTES = {"bias_p_value", "variance_lower", "variance_upper"}
 """Variables that only rows tell to rounding; the first test of numbers has by how much they differ. Those of norms are
@@ -176,8 +175,6 @@ def test_what_needs_whole_batches_is_refused() -> None:
     large: dict[str, Any] = {"samples": (10_000_000,), "block_size": None}
     with pytest.raises(ValueError, match=f"and more seeds; or omit delta: {able}"):
         planned(**large, estimators=("zobg", "delta"))
-    with pytest.raises(ValueError, match="`block_size` is for gradients: omit it"):
-        planned(points=3, reference_samples=None)
 
 
 def test_ten_million_samples_are_planned_in_blocks() -> None:

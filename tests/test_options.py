@@ -14,7 +14,6 @@ import pytest
 from estimators import AlphaOrder
 from estimators.intervals import Interval
 from mjx_study import cli, tasks
-from mjx_study.cli import options
 from mjx_study.cli.sweep import sweep_fields
 from mjx_study.experiment.plan import plan_study
 from mjx_study.options.configuration import OPTIONS, StudyConfig
@@ -27,9 +26,8 @@ _built = functools.cache(tasks.make_task)
 
 @pytest.fixture(autouse=True)
 def configured(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """In an empty folder, with the tests' JAX settings, which a process takes once, and tasks built once."""
+    """In an empty folder, with tasks built once."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(options, "configure", lambda **_: None)
     monkeypatch.setattr(tasks, "make_task", _built)
 
 
@@ -137,6 +135,7 @@ SETS: list[tuple[dict[str, Any], str]] = [
     ({"tasks": ("double_pendulum",), "published": True}, "{published} has no effect on double_pendulum"),
     ({"estimators": ("ivw_h",), "block_size": 4}, "{block_size} splits batches, and ivw_h must have whole"),
     ({"iterations": 3, "network": (4,), "contact": ("reference",)}, "{network} needs MJX: the analytic"),
+    ({"iterations": 3, "network": (2,), "horizon": 2, "theta": (1.0, 2.0)}, "{theta} has 2 numbers; pusher needs 13,"),
     ({"iterations": 3, "optimizer": "adm"}, "optax has no optimiser 'adm' that takes a learning rate"),
     ({"iterations": 3, "sigma_schedule": "print(1)"}, "'print(1)' cannot be read (optax has no schedule 'print')"),
     ({"iterations": 3, "sigma_schedule": "linear_schedule(1)"}, "'linear_schedule(1)' cannot be read "),
@@ -211,6 +210,8 @@ def test_options_that_do_not_go_together(fields: dict[str, Any], message: str) -
         ("gradcheck pusher --mean --estimators zobg --onset linear", "--onset has no effect on these estimators"),
         ("gradcheck pusher --mean --direction means --span 1,2", "--span is for one path, and --direction means choo"),
         ("gradcheck tennis --mean --estimators delta", "'delta' needs noise that is added to theta itself"),
+        ("gradcheck tennis --mean --onset jump --estimators total_propagation", "--onset has no effect"),
+        ("gradcheck model.xml --mean", "no MJCF file at model.xml"),
         ("rollout pusher --view zx", "argument --view: unknown view 'zx'; choose from auto, xz"),
         ("rollout pusher --seed 3", "--seed has an effect only with --noisy, as the initial state is fixed"),
         ("rollout pusher --sigma 0.2", "--sigma has an effect only with --noisy"),

@@ -3,10 +3,11 @@
 Two closed forms are used. `ImpedancePusher` has MuJoCo's impedance and must agree to rounding at any stiffness;
 `Pusher`, the study's reference, is its limit and must be approached linearly as the impedance falls.
 
-Along a direction of the controls the penalty cost is exactly quadratic while no contact event changes (see
-test_reference), so a difference quotient is only rounding away from the derivative, and a difference that straddles an
-event can be told from the closed form's events. At an event of a contact with impedance d the force jumps by d times
-the relative acceleration: differences across it measure the jump divided by the step, which no gradient contains.
+Along a direction of the controls the penalty cost is exactly quadratic while no contact event changes, since the
+dynamics are affine between events. A difference quotient is then only rounding away from the derivative, and one that
+straddles an event is recognised by the closed form's events. At an event of a contact with impedance d the force jumps
+by d times the relative acceleration: differences across it measure the jump divided by the step, which no gradient
+contains.
 """
 
 import functools

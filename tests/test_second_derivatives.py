@@ -16,7 +16,7 @@ from mjx_study.graph.derivative_rule import refusing, with_rule
 from mjx_study.simulation.drop_in import step
 from mjx_study.simulation.dynamics import State, rollout
 from mjx_study.simulation.onset import corrected_rollout
-from tests.scenes import MECHANISM, compiled, floor_scene, option, scene_of, slider
+from tests.scenes import FALLING, MECHANISM, compiled, floor_scene, option, scene_of, slider
 
 STEPS = 5
 Function = Callable[[Any], Any]
@@ -69,8 +69,8 @@ def test_a_rule_holds_at_every_order(repeat: Callable[[Function, Any], Any]) -> 
     of_root, exact = (lambda x, f=f: repeat(lambda x: jnp.sin(x) + f(x) / 2, x) ** 2 for f in (root, in_closed_form))
     truth = jax.jit(jax.grad(jax.grad(exact)))(0.7)
     for name, compose in COMPOSITIONS.items():
-        np.testing.assert_allclose(jax.jit(compose(of_root))(0.7), truth, rtol=1e-12, err_msg=name)
-        np.testing.assert_allclose(jax.jit(jax.vmap(compose(of_root)))(jnp.array([0.2, 0.7]))[1], truth, rtol=1e-12)
+        found = jax.jit(jax.vmap(compose(of_root)))(jnp.array([0.2, 0.7]))[1]
+        np.testing.assert_allclose(found, truth, rtol=1e-12, err_msg=name)
     third = jax.jit(jax.grad(jax.jacfwd(jax.grad(of_root))))(0.7)
     np.testing.assert_allclose(third, jax.jit(jax.grad(jax.grad(jax.grad(exact))))(0.7), rtol=1e-11)
 
@@ -103,6 +103,7 @@ class Contact:
 
 ROLLER = '<body><freejoint/><geom size=".1" mass="1" friction=".3 .01 .01" condim="4"/></body>'
 MODELS = {
+    "falling": Contact(FALLING, (-5e-4,), (-0.1,), ((1, 0.5),)),
     "slider": Contact(
         floor_scene(slider(), option(extra='cone="elliptic"')),
         (0, 0, -5e-4), (0.4, 0.2, -0.1), ((1, 0), (0, 1), (0.1, 0.2)),
@@ -189,7 +190,7 @@ def assert_hessian(function: Function, contact: Contact, names: tuple[str, ...])
 
 
 def test_a_hessian_through_scanned_contact() -> None:
-    assert_hessian(by_steps(MODELS["slider"]), MODELS["slider"], ("forward over reverse",))
+    assert_hessian(by_steps(MODELS["falling"]), MODELS["falling"], ("forward over reverse",))
 
 
 ROUTES: dict[str, Callable[[Contact], Function]] = {
@@ -204,14 +205,14 @@ ROUTES: dict[str, Callable[[Contact], Function]] = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("route", ROUTES)
-@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize("name", [name for name in MODELS if name != "falling"])
 def test_hessians_are_the_engines(name: str, route: str) -> None:
     assert_hessian(ROUTES[route](MODELS[name]), MODELS[name], tuple(COMPOSITIONS))
 
 
 @pytest.mark.parametrize("compose", [COMPOSITIONS["forward over reverse"], COMPOSITIONS["forward over forward"]])
 def test_the_onset_term_has_no_second_derivative(compose: Callable[[Function], Function]) -> None:
-    contact = MODELS["slider"]
+    contact = MODELS["falling"]
     for function in (by_steps(contact, onset="linear"), by_rollout(contact, "graph", corrected=True)):
         with pytest.raises(TypeError, match="derivatives with the onset term are of first order"):
             jax.eval_shape(compose(function), jnp.zeros(2))

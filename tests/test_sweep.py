@@ -2,14 +2,10 @@
 
 import dataclasses
 import json
-import os
-import random
 import re
-import signal
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -19,28 +15,23 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-import xarray as xr
 
 import estimators
 from estimators import AlphaOrder, DiscontinuityGated
 from mjx_study import cli
-from mjx_study.cli import options
 from mjx_study.cli.sweep import sweep_fields
 from mjx_study.execution.run import run_study
-from mjx_study.experiment import sampling
 from mjx_study.experiment.checkpoint import StudyError
 from mjx_study.experiment.gradients import GradientComputation
 from mjx_study.experiment.plan import plan_study
 from mjx_study.experiment.study import estimators_of
 from mjx_study.objective import Simulator, simulate
 from mjx_study.options.configuration import StudyConfig
-from mjx_study.plots import study as study_plots
-from mjx_study.report import render_report
-from mjx_study.results.variables import MEASURED
 from mjx_study.results.warnings import warnings_of
 from mjx_study.simulation.contact import stiffness_from_solref
 from mjx_study.storage.folder import Store, load_study, open_store
 from mjx_study.tasks import make_task
+from tests.documents import same
 
 pytestmark = pytest.mark.usefixtures("shared_programs")
 
@@ -69,23 +60,10 @@ def config(**changes: Any) -> StudyConfig:
     return StudyConfig(**(SMALL | of_gradients | changes))
 
 
-def same(one: xr.Dataset, other: xr.Dataset) -> bool:
-    """All but what was measured with a clock, and when and where."""
-    return one.drop_vars(MEASURED, errors="ignore").equals(other.drop_vars(MEASURED, errors="ignore"))
-
-
 @pytest.fixture(scope="module")
 def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("study") / "undisturbed"
     run_study(plan_study(config()), folder)
-    return folder
-
-
-@pytest.fixture(scope="module")
-def descents(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("study") / "descents"
-    changes: dict[str, Any] = {"iterations": 4, "samples": (4,), "evaluation_samples": 50, "learning_rate": 0.003}
-    run_study(plan_study(config(**changes, contact=("reference",), estimators=("fobg", "aobg"))), folder)
     return folder
 
 
@@ -105,18 +83,12 @@ def test_results_are_labelled(undisturbed: Path) -> None:
     assert data["contact"].values.tolist() == ["penalty", "penalty", "mujoco", "mujoco"]
     assert data["stiffness"].attrs["units"] == "N/m" and data["timestep"].attrs["units"] == "s"
     for name, variable in ((str(name), each) for name, each in data.data_vars.items()):
-        assert variable.attrs["units"] and variable.attrs["long_name"], name
         alpha_only = name in ("alpha", "epsilon", "discrepancy")
-        known = variable.sel(estimator="aobg") if alpha_only else variable
-        there = known.notnull()
-        assert bool(there.any() if name.startswith("debiased_cosine") else there.all()), (
-            name
-        )  # none where noise hides it
+        there = (variable.sel(estimator="aobg") if alpha_only else variable).notnull()
+        hidden = name.startswith("debiased_cosine")  # where there is more noise than signal
+        assert bool(there.any() if hidden else there.all()), name
     config_kept = json.loads(data.attrs["config"])
     assert config_kept["stiffness"] == [10.0, 1000.0] and config_kept["kind"] == "gradients"
-    assert json.loads(data.attrs["environment"])["precision"] == "float64" and data.attrs["missing_cells"] == 0
-    with xr.open_dataset(undisturbed / "results.nc") as stored:
-        assert stored.equals(data)
 
 
 @pytest.fixture(scope="module")
@@ -143,20 +115,6 @@ def test_numbers_are_those_of_the_estimators(undisturbed: Path, by_hand: Simulat
         float(jnp.linalg.norm(high.mean)), rel=1e-8
     )
     assert float(found["residual"].max()) < 1e-6 and float(found["unconverged"].sum()) == 0
-
-
-@pytest.mark.slow
-def test_one_compilation_serves_all_contact_models(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    made: list[Simulator] = []
-    monkeypatch.setattr(
-        sampling, "Simulator", lambda *args, **kwargs: made.append(Simulator(*args, **kwargs)) or made[-1]
-    )
-    plan = plan_study(config(timestep=(0.005, 0.0025), samples=(4,), seeds=3, reference_samples=3))
-    run_study(plan, tmp_path / "out")
-    assert len(made) == 2 == len(plan.groups) and plan.compilations == 4
-    for simulator in made:
-        sizes = {name: each.num_compilations for name, each in simulator._programs.items()}
-        assert sizes["value"] == sizes["gradient"] == 1, sizes
 
 
 def test_a_cell_is_sampled_beside_the_statistics_of_the_last_one(undisturbed: Path, tmp_path, monkeypatch) -> None:
@@ -239,25 +197,6 @@ def test_killed_at_any_moment_a_folder_is_whole(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_killed_sweep_goes_on_to_the_same_data(undisturbed: Path, tmp_path: Path) -> None:
-    """The command itself, killed twenty times at random moments and started again each time."""
-    folder, rng, kills, late = tmp_path / "out", random.Random(1), 0, 2.0
-    while kills < 20:
-        done = sorted(folder.glob("cells/*.npz"))
-        running = process(folder)
-        time.sleep(late * rng.random())
-        running.send_signal(signal.SIGKILL)
-        running.communicate()
-        if running.returncode == 0:
-            break
-        kills += 1
-        late *= 1.3 if sorted(folder.glob("cells/*.npz")) == done else 1.0  # until it gets somewhere here
-    last = process(folder)
-    last.communicate()
-    assert last.returncode == 0 and kills >= 3 and same(load_study(folder), load_study(undisturbed))
-
-
-@pytest.mark.slow
 def test_two_processes_share_a_study_and_a_third_has_nothing_to_do(undisturbed: Path, tmp_path: Path) -> None:
     folder = tmp_path / "out"
     both = [process(folder), process(folder, "--devices", "2")]
@@ -278,12 +217,8 @@ def copy_of(folder: Path, to: Path) -> Path:
     return to
 
 
-def test_a_folder_of_another_study_is_refused(undisturbed: Path, tmp_path: Path) -> None:
+def test_a_folder_without_a_whole_study_json_is_refused(undisturbed: Path, tmp_path: Path) -> None:
     folder = copy_of(undisturbed, tmp_path / "out")
-    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-    with pytest.raises(StudyError, match="holds another study .seed 0 there and 1 here.; choose another folder"):
-        run_study(plan_study(config(seed=1)), folder)
-    assert before == {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
     (folder / "study.json").write_text("{")
     with pytest.raises(StudyError, match="study.json is damaged"):
         run_study(plan_study(config()), folder)
@@ -295,38 +230,6 @@ def test_a_folder_of_another_study_is_refused(undisturbed: Path, tmp_path: Path)
     (tmp_path / "study.json").write_text(json.dumps({"format": 99, "config": {}, "cells": []}))
     with pytest.raises(StudyError, match="is of format 99; this program reads 4"):
         load_study(tmp_path)
-
-
-LIMITED = """
-import os, resource, signal, sys
-signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-resource.setrlimit(resource.RLIMIT_FSIZE, (3000, 3000))
-os.execv(sys.executable, [sys.executable, "-m", "mjx_study", "sweep", *sys.argv[1:]])
-"""
-
-
-@pytest.mark.slow
-def test_a_full_disk_leaves_what_is_complete(undisturbed: Path, tmp_path: Path) -> None:
-    """Files of more than 3 kB cannot be written by this process: a write that fails on its way, as on a full disk."""
-    folder = tmp_path / "out"
-    open_store(plan_study(config()), folder)
-    environment = os.environ | {"JAX_ENABLE_COMPILATION_CACHE": "false"}
-    command = [sys.executable, "-c", LIMITED, *ARGUMENTS, "--output", str(folder), "--json"]
-    running = subprocess.run(command, capture_output=True, text=True, env=environment)
-    error = running.stderr
-    assert running.returncode == 1, error
-    assert json.loads(running.stdout)["computed"] == 0
-    assert "cannot write to" in error and "the same command resumes" in error
-    assert len([line for line in error.splitlines() if "(compiling first)" not in line]) == 1
-    assert not list((folder / "cells").iterdir())
-    assert run_study(plan_study(config()), folder).attrs["computed_cells"] == 8
-    assert same(load_study(folder), load_study(undisturbed))
-
-
-def test_a_folder_that_cannot_be_written_to_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    with pytest.raises(ValueError, match="cannot write to the output folder"):
-        run_study(plan_study(config()), tmp_path / "file")
 
 
 def test_landscapes_are_labelled_and_right(landscapes: Path, by_hand: Simulator) -> None:
@@ -397,29 +300,9 @@ def test_contact_models_in_mujocos_terms() -> None:
     assert models[0].stiffness == pytest.approx(stiffness_from_solref([-1000.0, -5.0], effective_mass=mass)[0])
 
 
-def test_every_axis_gets_its_figures(undisturbed: Path, descents: Path, landscapes: Path) -> None:
-    assert set(study_plots.plot_study(load_study(undisturbed))) == {
-        "variance", "bias", "alpha", "error_against_samples", "map_stiffness_samples",
-    }  # fmt: skip
-    assert set(study_plots.plot_study(load_study(descents))) == {"achieved", "descent"}
-    assert set(study_plots.plot_study(load_study(landscapes))) == {"landscape"}
-    assert "steepest slope" in render_report(load_study(landscapes))
-    page = render_report(load_study(descents))  # both estimators of both models, though only one has an alpha
-    assert page.count("<td>FoBG</td>") == page.count("<td>AoBG</td>") == 2
-    few = load_study(undisturbed).assign(squared_bias=load_study(undisturbed)["squared_bias"] * np.nan)
-    assert "bias" not in study_plots.plot_study(few)
-    for folder in (undisturbed, descents, landscapes):
-        for name, figure in study_plots.plot_study(load_study(folder)).items():
-            places = [(axes, axes.get_subplotspec()) for axes in figure.axes]
-            bottom = [axes for axes, place in places if place is not None and place.is_last_row()]
-            assert bottom and all(axes.get_xlabel() or axes.get_xticklabels() for axes in bottom), name
-            assert any(axes.get_ylabel() for axes in figure.axes), name
-
-
 def test_the_commands_write_figures_and_a_page(
-    undisturbed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    undisturbed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(options, "configure", lambda **_: None)
     folder = copy_of(undisturbed, tmp_path / "out")
     assert cli.main(["sweep", *ARGUMENTS[:-2], "--output", str(folder), "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
@@ -434,10 +317,7 @@ def test_the_commands_write_figures_and_a_page(
     for wrong, says in (
         (["plot", str(tmp_path)], "holds no study"),
         (["report", str(tmp_path)], "holds no study"),
-        (["sweep", "--output", str(tmp_path / "x")], "no task: name one"),
-        (["sweep", "pusher"], "no folder for the study: give --output, or --dry-run"),
         (["sweep", *ARGUMENTS[:-2], "--seed", "4", "--output", str(folder)], "holds another study"),
-        (["sweep", "--config", "nowhere.toml", "--output", "x"], "cannot read nowhere.toml"),
     ):
         capsys.readouterr()
         assert cli.main(wrong) == 2

@@ -59,7 +59,7 @@ def config(**changes: Any) -> StudyConfig:
 
 def test_numbers_do_not_depend_on_how_seeds_are_grouped(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sampling, "Simulator", Stub)
-    monkeypatch.setattr(gradients, "traces_folder", lambda: None)
+    monkeypatch.setattr(gradients.GradientComputation, "_build", lambda *_: None)
     plan = plan_study(config(samples=(8,), seeds=5, estimators=("zobg",)))
     found = []
     for at_once, groups in ((1e9, 5), (1.0, 1), (2.5 * plan.memory_of_seed(plan.cells[0]), 2)):
@@ -94,7 +94,7 @@ from mjx_study.experiment.plan import plan_study
 from tests.documents import numbers_of
 from tests.test_sweep_memory import Stub, config
 
-sampling.Simulator, gradients.traces_folder = Stub, lambda: None
+sampling.Simulator, gradients.GradientComputation._build = Stub, lambda *_: None
 plan = plan_study(config(samples=(10_000,), seeds=int(sys.argv[1]), horizon=200))
 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 numbers_of(plan)

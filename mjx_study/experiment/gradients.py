@@ -22,7 +22,7 @@ import estimators
 from estimators import ORACLES, Evaluation, GradientEstimate
 from estimators.merged_samples import MAX_THINNED, moments_of
 from estimators.statistics import merged_estimates
-from mjx_study.compiled import type_of
+from mjx_study.compiled import Builds, type_of
 from mjx_study.experiment.checkpoint import Arrays, Checkpoint
 from mjx_study.experiment.gradient_numbers import (
     MOST_KEPT,
@@ -42,7 +42,7 @@ from mjx_study.experiment.memory import (
     check_batches,
 )
 from mjx_study.experiment.merged_samples import REFERENCE_UNIT, Blocks, pack
-from mjx_study.experiment.reference_gradient import CANDIDATES, reference_of, soft_gradient, takes_candidates
+from mjx_study.experiment.reference_gradient import CANDIDATES, reference_of, soft_gradient
 from mjx_study.experiment.sampling import Objectives, cell_keys, draw_batches, rollouts_of, sample_keys
 from mjx_study.experiment.study import Computation, Result, StudyCell, StudyKind, StudyPlan, Work, done, estimators_of
 from mjx_study.experiment.tally import Tally
@@ -54,7 +54,6 @@ from mjx_study.results.findings import gradient_findings
 from mjx_study.results.kind import Drawing
 from mjx_study.results.rows import rows_of
 from mjx_study.results.variables import GRADIENTS, ONSETS
-from mjx_study.runtime import traces_folder
 
 PILOT: Final = LARGEST_BLOCK
 """Maximum number of samples of the first batch used to select among the reference's control variates."""
@@ -173,7 +172,7 @@ class GradientComputation(Computation):
         self._plan, self._config, self._objectives = plan, plan.config, Objectives(plan)
         self._warm: set[Any] = {None}
         self._soft: dict[tuple[int, float], Array | None] = {}
-        self._pool, self._compiling = ThreadPoolExecutor(1), done(None)
+        self._builds = Builds()
         self._device, self._statistics = Lock(), ThreadPoolExecutor(1)
 
     @property
@@ -246,18 +245,23 @@ class GradientComputation(Computation):
         config, oracles, keys = self._config, self._plan.oracles, self._keys
         objective, theta = self._objective(cell), self._plan.task_of(cell).theta
         tests, chosen = jax.random.split(keys["test"], config.batches), estimators_of(self._plan, cell)
-        together = seeds_together(self._plan, cell)
+        together, each = seeds_together(self._plan, cell), self._seeds_of_statistics(cell)
         pad = partial(padded, size=self._plan.padded_samples(cell))
         reference: GradientEstimate | None = None
         parts: list[Future[Any]] = []
 
-        def statistics(drawn: Any, seconds: Any, residuals: Any, keys: Any, compiled: Future[None]) -> Any:
-            compiled.result()
-            arguments = jax.tree.map(pad, drawn), np.asarray(cell.samples), reference, keys
-            with self._device:
-                numbers = jax.block_until_ready(seed_numbers(chosen, config.confidence)(*arguments))
+        def statistics(drawn: Any, seconds: Any, residuals: Any, keys: Any) -> Any:
+            batches, samples, found = jax.tree.map(pad, drawn), np.asarray(cell.samples), []
+            for first in range(0, len(keys), each):
+                some = slice(first, first + each)
+                with self._device:
+                    numbers = seed_numbers(chosen, config.confidence)(
+                        jax.tree.map(lambda leaf, some=some: leaf[some], batches), samples, reference, keys[some]
+                    )
+                    found.append(jax.device_get(numbers))
+            numbers = jax.tree.map(lambda *leaves: np.concatenate(leaves), *found)
             tallies = {name: Tally.of(drawn[name], seconds[name], residuals[name]) for name in oracles}
-            return jax.device_get(numbers), tallies
+            return numbers, tallies
 
         def all_numbers() -> Arrays:
             assert reference is not None
@@ -274,7 +278,7 @@ class GradientComputation(Computation):
                     reference = self._reference(cell, objective, pilot)
             if parts:
                 parts[-1].result()  # keep at most two groups of seeds in memory
-            parts.append(self._in_order(partial(statistics, *drawn, tests[some], self._compiling)))
+            parts.append(self._in_order(partial(statistics, *drawn, tests[some])))
         return self._in_order(all_numbers)
 
     def _in_order(self, call: Callable[[], Result]) -> Future[Result]:
@@ -285,37 +289,45 @@ class GradientComputation(Computation):
         """The objective of a cell, with its programs compiled, so that measured times exclude compilation."""
         objective, theta = self._objectives(cell), self._plan.task_of(cell).theta
         if (program := self._plan.program_of(cell)) not in self._warm:
-            self._compile_statistics(cell, objective)
-            for name in dict.fromkeys([*self._plan.oracles, "differentiation"]):  # the control variate needs it
+            if isinstance(objective, MjxObjective):
+                self._build(cell, objective)
+            for name in self._batches:
                 getattr(objective, ORACLES[name].method)(theta, jax.random.split(jax.random.key(0), 1))
             self._warm.add(program)
         return objective
 
-    def _compile_statistics(self, cell: StudyCell, objective: MjxObjective | Reference) -> None:
-        """Compile the statistics in another thread, in parallel with the rollouts."""
-        in_blocks = blocks_of(self._plan, cell) > 1
-        if not isinstance(objective, MjxObjective) or traces_folder() is None or in_blocks:
-            return
+    @property
+    def _batches(self) -> tuple[str, ...]:
+        """The oracles of all batches: the estimators', and that of the reference's control variate."""
+        return tuple(dict.fromkeys([*self._plan.oracles, "differentiation"]))
+
+    def _seeds_of_statistics(self, cell: StudyCell) -> int:
+        """Number of seeds in a call of the statistics: one on CPUs, so that any number of seeds takes one program."""
+        return 1 if jax.default_backend() == "cpu" else seeds_together(self._plan, cell)
+
+    def _build(self, cell: StudyCell, objective: MjxObjective) -> None:
+        """Build the programs of rollouts, and of the statistics of whole batches, side by side."""
         config, task = self._config, self._plan.task_of(cell)
-        blank = BlankObjective(**vars(objective))
-        key, seeds = jax.random.split(jax.random.key(0), 1), seeds_together(self._plan, cell)
-        size = self._plan.padded_samples(cell)
+        blank = BlankObjective(**vars(objective), builds=self._builds)
+        key, seeds = jax.random.split(jax.random.key(0), 1), self._seeds_of_statistics(cell)
         batches = {
-            name: getattr(blank, ORACLES[name].method)(task.theta, jax.random.clone(key)) for name in self._plan.oracles
+            name: getattr(blank, ORACLES[name].method)(task.theta, jax.random.clone(key)) for name in self._batches
         }
-        drawn = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct((seeds, size, *leaf.shape[1:]), leaf.dtype), batches)
-        soft = task.theta if takes_candidates(task) and task.contact_pair is not None else None
-        pilot = blank.evaluate(task.theta, jax.random.split(jax.random.key(0), min(cell.samples, PILOT)))
-        reference = reference_of(task, blank, *self._reference_keys, pilot, soft)
-        keys = jax.random.split(self._keys["test"], config.batches)[:seeds]
-        types = drawn, type_of(np.asarray(size)), jax.tree.map(type_of, reference), type_of(keys)
-        statistics = seed_numbers(estimators_of(self._plan, cell), config.confidence)
-        self._compiling = self._pool.submit(statistics.ahead(*types))
+        if blocks_of(self._plan, cell) == 1:
+            size, drawn = self._plan.padded_samples(cell), {name: batches[name] for name in self._plan.oracles}
+            drawn = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct((seeds, size, *leaf.shape[1:]), leaf.dtype), drawn)
+            pilot = blank.evaluate(task.theta, jax.random.split(jax.random.key(0), min(cell.samples, PILOT)))
+            reference = reference_of(task, blank, *self._reference_keys, pilot, None)
+            keys = jax.random.split(self._keys["test"], config.batches)[:seeds]
+            types = drawn, type_of(np.asarray(size)), jax.tree.map(type_of, reference), type_of(keys)
+            self._builds.start(seed_numbers(estimators_of(self._plan, cell), config.confidence), *types)
+        self._builds.wait()
 
     def _reference(self, cell: StudyCell, objective: MjxObjective | Reference, pilot: Evaluation) -> GradientEstimate:
         softened = cell.group, cell.sigma
-        if softened not in self._soft and not cell.model.analytic:
+        if softened not in self._soft and cell.model.contact is not None:
             self._soft[softened] = soft_gradient(
                 self._objectives.simulator(cell.group), cell.sigma, self._reference_keys[1]
             )
-        return reference_of(self._plan.task_of(cell), objective, *self._reference_keys, pilot, self._soft.get(softened))
+        soft = None if cell.model.contact is None else self._soft[softened]
+        return reference_of(self._plan.task_of(cell), objective, *self._reference_keys, pilot, soft)

@@ -58,6 +58,11 @@ class ScalarFunction:
         return needed_for(entries_of(self.outputs))
 
     @cached_property
+    def size(self) -> int:
+        """Number of operations, those of loops included."""
+        return _size(self.needed)
+
+    @cached_property
     def used(self) -> list[int]:
         """Places of the inputs that the outputs depend on."""
         needed = {node.number for node in self.needed}
@@ -70,7 +75,17 @@ class ScalarFunction:
 
     def of(self, places: Sequence[int]) -> "ScalarFunction":
         """Return the function of some of its inputs, which does not depend on the others."""
-        return dataclasses.replace(self, inputs=[self.inputs[place] for place in places])
+        key = "of", tuple(places)
+        if key not in self.derived:
+            self.derived[key] = dataclasses.replace(self, inputs=[self.inputs[place] for place in places])
+            if "values" in self.derived:
+                self.derived[key].derived["values"] = self.derived["values"].of(places)
+        return self.derived[key]
+
+
+def _size(nodes: list[Node]) -> int:
+    loops = [each.parameters for each in nodes if each.operation == "loop"]
+    return len(nodes) + sum(_size(needed_for([*again, *after])) for _, again, after in loops)
 
 
 def is_input(leaf: Any) -> bool:

@@ -25,14 +25,16 @@ class LinearMap:
     Attributes:
         push: the changes of the results, from (point, changes).
         pull: makes the function of the transpose: the adjoints of what changes, from (point, adjoints of the results).
+        early: whether it is used as soon as JAX traces it. Reverse mode traces a derivative only to transpose it.
     """
 
     push: ScalarFunction
     pull: Callable[[], ScalarFunction]
+    early: bool = False
 
     @cached_property
     def transposed(self) -> "LinearMap":
-        return LinearMap(self.pull(), lambda: self.push)
+        return LinearMap(self.pull(), lambda: self.push, early=True)
 
 
 @no_type_check

@@ -53,29 +53,43 @@ def _works() -> bool:
     return library_ready(build_library(source_of(function, jax.default_backend())))
 
 
-def as_native(values: ScalarFunction, function: ScalarFunction) -> "NativeFunction | None":
-    """Begin to build native code for a function's values; None if it cannot be written.
+def as_native(values: ScalarFunction, function: ScalarFunction, *, early: bool = True) -> "NativeFunction | None":
+    """Native code for a function's values; None if it cannot be written.
 
     Args:
         values: the function captured for its values only.
         function: the function, which derivatives are taken of.
+        early: whether to begin to build it now, or when a program with it is compiled.
     """
-    try:
-        return NativeFunction(source_of(values, jax.default_backend()), function)
-    except NotWrittenError as error:
-        count_left(str(error))
-        return None
+    native = NativeFunction(values, function)
+    return native if not early or native.begun() else None
 
 
 class NativeFunction:
     """A captured function as a library, and as a JAX program for derivatives and where there is no library."""
 
-    def __init__(self, source: str, function: ScalarFunction):
-        self._function = function
+    def __init__(self, values: ScalarFunction, function: ScalarFunction):
+        self._values, self._function = values, function
         self.inputs = function.types
         self.outputs = function.avals
         self.platform = jax.default_backend()
-        self.name = build_library(source)
+
+    @cached_property
+    def name(self) -> str:
+        """Name of the library, which is being built; it may raise NotWrittenError."""
+        return build_library(source_of(self._values, self.platform))
+
+    def begun(self) -> bool:
+        """Begin to build the library; whether it can be written."""
+        try:
+            return bool(self.name)
+        except NotWrittenError as error:
+            count_left(str(error))
+            return False
+
+    def ready(self) -> bool:
+        """Wait for the library to be built and loaded; whether that succeeded."""
+        return self.begun() and library_ready(self.name)
 
     def __call__(self, *inputs: jax.Array) -> list[jax.Array]:
         return _native.bind(*inputs, function=self, batch=())
@@ -133,7 +147,7 @@ def _evaluate(*inputs: Any, function: NativeFunction, batch: tuple[int, ...]) ->
 
 
 def _lower(platform: str, context: Any, *operands: Any, function: NativeFunction, batch: tuple[int, ...]) -> Any:
-    if function.platform != platform or not library_ready(function.name):
+    if function.platform != platform or not function.ready():
         count_left("not built")
         return mlir.lower_fun(_plain(function, batch), multiple_results=True)(context, *operands)
     ins = [_layout(at.ndim, at.ndim - aval.ndim) for at, aval in zip(context.avals_in, function.inputs, strict=True)]

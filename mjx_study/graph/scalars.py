@@ -16,14 +16,14 @@ import numpy as np
 from jax.core import Tracer
 
 from mjx_study.graph.function import ScalarFunction, capture, is_input
-from mjx_study.graph.native import native_identity
+from mjx_study.graph.native import count_left, native_identity
 from mjx_study.graph.nodes import TooLargeError, no_type_check
 from mjx_study.graph.operation import computed
 
 MOST_SCALARS: Final = {"cpu": 12_000, "gpu": 6_000, "tpu": 6_000}
 """Maximum number of scalar operations, by backend; XLA's compile time grows faster than linearly in it."""
-MOST_NATIVE: Final = 200_000
-"""Maximum number of scalar operations in native code."""
+MOST_NATIVE: Final = {"cpu": 100_000, "gpu": 50_000}
+"""Maximum number of scalar operations in native code, by backend; it takes compilers about half a minute."""
 
 _CAPTURED: Final[dict[Any, ScalarFunction | None]] = {}
 """Graphs, keyed by everything they depend on; None if too large."""
@@ -31,8 +31,8 @@ MOST_KEPT: Final = 64
 """Maximum number of graphs in `_CAPTURED`."""
 
 
-def unrolled(function: Callable[..., Any], *arguments: Any) -> Any:
-    """Evaluate `function(*arguments)` entry by entry, or as is if that takes more than `most_scalars` operations.
+def unrolled(function: Callable[..., Any], *arguments: Any, otherwise: Callable[..., Any] | None = None) -> Any:
+    """Evaluate `function(*arguments)` entry by entry, or `otherwise` or as is beyond `most_scalars` operations.
 
     Untraced arrays among the arguments are constants. The result equals the function's up to rounding, except that 0
     times infinity or NaN is 0 where the 0 is a constant. Forward and reverse mode differentiate it like the function
@@ -40,7 +40,7 @@ def unrolled(function: Callable[..., Any], *arguments: Any) -> Any:
     """
     inputs = [leaf for leaf in jax.tree.leaves(arguments) if isinstance(leaf, Tracer)]
     if not inputs or (captured := captured_once(function, *arguments)) is None:
-        return function(*arguments)
+        return (otherwise or function)(*arguments)
     return jax.tree.unflatten(captured.structure, computed(captured, inputs))
 
 
@@ -55,7 +55,7 @@ def captured_once(function: Callable[..., Any], *arguments: Any) -> ScalarFuncti
         try:
             captured = capture(function, *arguments, most=2 * most)
         except TooLargeError:
-            captured = None
+            captured = _left()
         _CAPTURED[key] = captured = captured if captured and is_small(captured) else None
         if captured and any(node.operation == "whole" for node in captured.needed):
             captured.derived["values"] = capture(function, *arguments, most=2 * most, values_only=True)
@@ -63,13 +63,21 @@ def captured_once(function: Callable[..., Any], *arguments: Any) -> ScalarFuncti
 
 
 def is_small(function: ScalarFunction) -> bool:
-    """Whether a graph is worth compiling: it has at most `most_scalars` operations."""
-    return len(function.needed) <= most_scalars()
+    """Whether a graph is worth compiling: it has at most `most_scalars` operations; counted if it is not."""
+    if (len(function.needed) if native_identity() is None else function.size) <= most_scalars():
+        return True
+    _left()
+    return False
+
+
+def _left() -> None:
+    if native_identity() is not None:
+        count_left(f"more than {most_scalars()} operations")
 
 
 def most_scalars() -> int:
     """Maximum number of scalar operations here: `MOST_NATIVE`, or `MOST_SCALARS` without native code."""
-    return MOST_SCALARS[jax.default_backend()] if native_identity() is None else MOST_NATIVE
+    return (MOST_SCALARS if native_identity() is None else MOST_NATIVE)[jax.default_backend()]
 
 
 def _name(function: Callable[..., Any]) -> Any:

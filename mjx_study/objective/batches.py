@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Key
 
 from estimators import Differentiation, Evaluation, Linearisation, StepDifferentiation, StepEvaluation
 from estimators.noise import check_sigma
-from mjx_study.compiled import Compiled
+from mjx_study.compiled import Builds, Compiled
 from mjx_study.objective.chunks import spread
 from mjx_study.objective.cost import simulate
 from mjx_study.objective.programs import SamplePrograms
@@ -97,7 +97,12 @@ class Simulator:
     def form(self, name: str, theta: Any, contact: ContactModel | None, sigma: Any) -> Any:
         """Shapes and types of a chunk's outputs of one of `SamplePrograms`, without running it."""
         arguments = self._chunk(theta, contact, sigma)
-        return jax.eval_shape(self._programs[name].prepare(*arguments, platform=self.devices[0].platform), *arguments)
+        return self._programs[name].outputs(*arguments, platform=self.devices[0].platform)
+
+    def build(self, name: str, theta: Any, contact: ContactModel | None, sigma: Any, builds: Builds) -> None:
+        """Trace one of `SamplePrograms` and begin to compile it, where all devices share one program."""
+        if self.devices[0].platform == "cpu":
+            builds.start(self._programs[name], *self._chunk(theta, contact_for(name, contact), sigma))
 
     def _chunk(self, theta: Any, contact: ContactModel | None, sigma: Any) -> tuple[Any, ...]:
         """Program arguments for a chunk of identical samples, with the shapes of any chunk."""
@@ -232,9 +237,13 @@ class MjxObjective:
 
 @dataclasses.dataclass(frozen=True)
 class BlankObjective(MjxObjective):
-    """An objective whose batches hold zeros: their shapes, from programs that are traced but not compiled."""
+    """An objective whose batches hold zeros: their shapes, from programs that are traced, and compiled in the
+    background."""
+
+    builds: Builds
 
     def _run(self, name: str, theta, keys, rows=None, noise_scale=None):
+        self.simulator.build(name, theta, self.contact, self.sigma, self.builds)
         rows = np.arange(len(keys)) if rows is None else rows
         made = self.simulator.form(name, theta, contact_for(name, self.contact), self.sigma)
         return jax.tree.map(lambda leaf: np.zeros((len(rows), *leaf.shape[1:]), leaf.dtype), made)

@@ -46,6 +46,7 @@ def rollout_cost(
     backward = derivative_model(task, contact)
     if backward is not None and onset != "none":
         raise ValueError("the onset term requires exact derivatives: omit onset, or the contact's backward model")
+    running_cost, final_cost = task.costs(contact)
     first = task.policy.place(theta, noise, start)
     simulated, counts, term = (task.scene, model, first, control_law, task.horizon), None, 0.0
     if onset == "linear":
@@ -55,9 +56,8 @@ def rollout_cost(
     if onset == "jump":
         fixed = jax.lax.stop_gradient((theta, feedforward))
         law = lambda index, state: control_law(index, state, *fixed)  # noqa: E731
-        costs = task.running_cost, task.final_cost
-        term, counts = jump_term(task.scene, without_derivative(model), states, controls, law, *costs)
-    cost = jnp.sum(jax.vmap(task.running_cost)(before_each_step(states), controls)) + task.final_cost(last_of(states))
+        term, counts = jump_term(task.scene, without_derivative(model), states, controls, law, running_cost, final_cost)
+    cost = jnp.sum(jax.vmap(running_cost)(before_each_step(states), controls)) + final_cost(last_of(states))
     return cost + term, (states, controls, jnp.max(residuals), counts)
 
 

@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jax.ad_checkpoint import checkpoint_name
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from mjx_study.graph.derivative_rule import with_rule
 from mjx_study.graph.scalars import traced_part
@@ -113,6 +113,34 @@ def constraint_force(model: mjx.Model, data: mjx.Data, qacc: Qvel) -> Qvel:
     return rows.efc_J.T @ row_force(model, data, rows.efc_J @ qacc - rows.efc_aref)
 
 
+def with_forces(model: mjx.Model, data: mjx.Data, qacc: Qvel) -> mjx.Data:
+    """The data with an acceleration, and with the force of every constraint row at it."""
+    rows: Any = data._impl
+    forces = row_force(model, data, rows.efc_J @ qacc - rows.efc_aref)
+    found: Any = data.tree_replace({"qacc": qacc, "_impl.efc_force": forces})
+    return found
+
+
+def contact_forces(model: mjx.Model, data: mjx.Data) -> tuple[Int[Array, "contacts 2"], Float[Array, "contacts 3"]]:
+    """Geoms of every contact, and its force [N] on the second one in the world frame; data of `with_forces`.
+
+    The rows of an elliptic contact are its normal and tangential forces; of a pyramidal one, forces along n + mu t and
+    n - mu t for each tangent t.
+    """
+    rows: Any = data._impl
+    contact, forces = rows.contact, []
+    for index, (condim, address) in enumerate(zip(contact.dim, contact.efc_address, strict=True)):
+        edges = 2 * (condim - 1) if condim > 1 and model.opt.cone != ELLIPTIC else 0
+        force = rows.efc_force[int(address) : int(address) + (edges or int(condim))]
+        if edges:
+            plus, minus = force[::2], force[1::2]
+            force = jnp.concatenate([jnp.sum(force)[None], contact.friction[index, : condim - 1] * (plus - minus)])
+        forces.append(force[:3] @ contact.frame[index][: len(force[:3])])
+    if not forces:
+        return jnp.zeros((0, 2), int), jnp.zeros((0, 3), data.qpos.dtype)
+    return contact.geom, jnp.stack(forces)
+
+
 def imbalance(model: mjx.Model, data: mjx.Data, qacc: Qvel) -> Qvel:
     """Left side of the solver's equation, G(a) = M a - qfrc_smooth - J^T f(J a - aref) [N or N m]."""
     return mjx.mul_m(model, data, qacc) - data.qfrc_smooth - constraint_force(model, data, qacc)
@@ -132,19 +160,19 @@ def run_solver(model: mjx.Model, data: mjx.Data) -> Qvel:
 
     Small systems use Newton's method, to rounding; larger ones use MJX's solver within the model's budget.
     """
-    if num_constraint_rows(data) == 0:
-        return data.qacc_smooth
     if OWN_SOLVER and model.nv <= MOST_UNROLLED:
-        return _newton(model, data)
-    return mjx.solve(model, data).qacc
+        return newton(model, data)
+    return data.qacc_smooth if num_constraint_rows(data) == 0 else mjx.solve(model, data).qacc
 
 
-def _newton(model: mjx.Model, data: mjx.Data) -> Qvel:
-    """Solve the solver's equation to rounding by Newton's method with a line search.
+def newton(model: mjx.Model, data: mjx.Data) -> Qvel:
+    """Compute the constrained acceleration to rounding by Newton's method with a line search, ignoring budgets.
 
     If no row exerts a force, the result is the unconstrained acceleration. The loop over a batch ends with its slowest
     sample: seldom after more than two steps, or six where boxes stick and slip.
     """
+    if num_constraint_rows(data) == 0:
+        return data.qacc_smooth
     rows: Any = data._impl
     inertia, jacobian = mjx.full_m(model, data), rows.efc_J
     rounding = MOST_ROUNDINGS * jnp.finfo(inertia.dtype).eps

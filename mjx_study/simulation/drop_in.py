@@ -20,6 +20,7 @@ from mjx_study.simulation import constraint, guards
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.dynamics import Qvel, State, fwd_position
 from mjx_study.simulation.integration import difference_position, integrate_position
+from mjx_study.simulation.native_step import solved_natively
 from mjx_study.simulation.onset import differentiated_once, onset_term, tangent_of, without_derivative
 from mjx_study.simulation.patches import Place, patched
 from mjx_study.simulation.touch import Events, crossings, onset_begins
@@ -46,9 +47,11 @@ class Preceding(NamedTuple):
 def step(model: mjx.Model, data: mjx.Data, *, onset: str = "none") -> mjx.Data:
     """`mjx.step`, differentiable through contact in forward and reverse mode, in every array of model and data.
 
-    Values agree with `mjx.step` to rounding, with the model's solver budget. The derivative is that of a converged
-    step, by the implicit function theorem at the solver's result, and only as good as the solver's convergence, which
-    `solver_residual` reports. Reverse mode stores a step's inputs and acceleration, and recomputes the rest.
+    Values agree with `mjx.step` to rounding, with the model's solver budget. If that has 20 iterations or more and no
+    array of the model is traced, the step is native code where there is some, and solved to rounding; other fields than
+    the state are then computed only if they are read. The derivative is that of a converged step, by the implicit
+    function theorem at the solver's result, and only as good as the solver's convergence, which `solver_residual`
+    reports. Reverse mode stores a step's inputs and acceleration, and recomputes the rest.
 
     Args:
         model: the model; its array leaves may be traced, batched under `jax.vmap` and differentiated.
@@ -73,7 +76,7 @@ def step(model: mjx.Model, data: mjx.Data, *, onset: str = "none") -> mjx.Data:
         )
     with patched(_SOLVE):
         if onset == "none":
-            following = jax.checkpoint(mjx.step, policy=constraint.SAVE_SOLUTION)(model, data)
+            following = _uncorrected_step(model, data)
         else:
             preceding = _preceding_contact(model, data)
             following = jax.checkpoint(_corrected_step, policy=constraint.SAVE_SOLUTION)(model, data, preceding)
@@ -105,6 +108,19 @@ def _check_onset(onset: str) -> None:
         raise ValueError(unknown("onset of a step", onset, ONSETS))
 
 
+def _uncorrected_step(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """`mjx.step`, in native code where there is some.
+
+    Then MJX's operations compute only those fields that are read and not of the state, from the known acceleration.
+    """
+    if (found := solved_natively(model, data)) is None:
+        return jax.checkpoint(mjx.step, policy=constraint.SAVE_SOLUTION)(model, data)
+    qpos, qvel, act, qacc = found
+    with patched(_KNOWN):
+        following = jax.checkpoint(mjx.step)(model, data.replace(qacc_warmstart=jax.lax.stop_gradient(qacc)))
+    return following.replace(qpos=qpos, qvel=qvel, act=act, qacc=qacc, qacc_warmstart=qacc)
+
+
 def _uncorrected(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """Replaces MJX's integrators to catch steps that bypass the replacement of `mjx.step`."""
     raise RuntimeError("this step would have no onset term: call mjx.step by that name, or mjx_study.step")
@@ -120,14 +136,18 @@ def solver_residual(model: mjx.Model, data: mjx.Data) -> Float[Array, ""]:
     return constraint.residual(model, data, data.qacc)
 
 
-def _solve(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    qacc = constraint.solve(model, data, lambda *arguments: mjx.solve(*arguments).qacc)
+def _solve(solver: constraint.Solver, model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    qacc = constraint.solve(model, data, solver)
     rows: Any = data._impl
     force = constraint.row_force(model, data, rows.efc_J @ qacc - rows.efc_aref)
     return data.replace(qacc=qacc, qfrc_constraint=rows.efc_J.T @ force, _impl=rows.replace(efc_force=force))
 
 
-_SOLVE: Final[Replacements] = {("solver", "solve"): _solve}
+_SOLVE: Final[Replacements] = {
+    ("solver", "solve"): partial(_solve, lambda model, data: mjx.solve(model, data).qacc),
+}
+_KNOWN: Final[Replacements] = {("solver", "solve"): partial(_solve, lambda _, data: data.qacc_warmstart)}
+"""Takes the warm start for the solution."""
 _REPLACED: Final[dict[str, Replacements]] = {
     "none": {**_SOLVE, ("", "step"): step},
     "linear": {

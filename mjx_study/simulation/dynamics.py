@@ -9,19 +9,20 @@ a given acceleration a, and the solver's equation G(x, a) = 0,
 Reverse mode stores a step's inputs and acceleration, and does not run the solver again. Two programs compute the
 derivative, with the same numbers:
 
-- the *graph*, for models with few degrees of freedom: JAX traces G and S once and without derivatives, and their graph
-  is differentiated (`mjx_study.graph.linear_map`). Where that is not possible, JAX forms the step's matrix column by
-  column, in forward mode.
-- the *tape*, for larger models and for derivatives with respect to model parameters: JAX differentiates MJX's
-  operations, in reverse mode by computing them again.
+- the *graph*, in native code and for models with few degrees of freedom: JAX traces G and S once and without
+  derivatives, and their graph is differentiated (`mjx_study.graph.linear_map`). Where that is not possible for a small
+  model, JAX forms the step's matrix column by column, in forward mode.
+- the *tape*, for steps too large for a graph and for derivatives with respect to model parameters: JAX differentiates
+  MJX's operations, in reverse mode by computing them again.
 
 The scene's `adjoint` and the differentiated inputs determine the program.
 """
 
 import dataclasses
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import jax
 import jax.numpy as jnp
@@ -69,6 +70,14 @@ class State:
     act: Float[Array, "*batch na"]
     warmstart: Float[Array, "*batch nv"]
 
+    if not TYPE_CHECKING:  # so that type checkers still find unknown attributes
+
+        def __getattr__(self, name: str) -> NoReturn:
+            raise AttributeError(
+                f"a State has qpos, qvel and act, but no {name!r}; positions of bodies, contact forces and sensors are "
+                "those of mjx_study.observed(scene, state)"
+            )
+
 
 def initial_state(scene: Scene, qpos: Qpos | None = None, qvel: Qvel | None = None) -> State:
     """Return a state at rest in the MJCF's reference pose, or at `qpos` [m or rad] and `qvel` [m/s or rad/s]."""
@@ -101,6 +110,13 @@ def step(scene: Scene, model: mjx.Model, state: State, control: Control) -> tupl
     return dataclasses.replace(following, warmstart=warmstart), residual
 
 
+def acceleration(scene: Scene, model: mjx.Model, state: State, control: Control) -> Qvel:
+    """Constrained acceleration during a `step` [m/s^2 or rad/s^2], with its implicit derivative."""
+    if scene.host.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:  # without constraints
+        return smooth_stages(scene, model, state, control).qacc_smooth
+    return _differentiable_step(scene, model, state, control)[0].warmstart
+
+
 def exact_step(scene: Scene, model: mjx.Model, state: State, control: Control) -> tuple[State, Scalar, mjx.Data]:
     """`step` with constraints solved to rounding, ignoring budgets, and its `smooth_stages`; values only.
 
@@ -118,11 +134,11 @@ def smooth_stages(scene: Scene, model: mjx.Model, state: State, control: Control
 
 def solved_step(scene: Scene, model: mjx.Model, state: State, control: Control) -> tuple[State, Scalar, guards.Course]:
     """`step` without derivatives, and the course of the guards in it."""
-    return entry_by_entry(partial(_solved_step, scene), model, state, control)
+    return _with_solver(partial(_solved_step, scene), model, state, control)
 
 
-def _solved_step(scene: Scene, model: mjx.Model, state: State, control: Array):
-    after, residual, data = _solved(constraint.run_solver, scene, model, state, control)
+def _solved_step(scene: Scene, solver: constraint.Solver, model: mjx.Model, state: State, control: Array):
+    after, residual, data = _solved(solver, scene, model, state, control)
     return after, residual, guards.course(model, data, state.qvel, after.qvel, after.warmstart)
 
 
@@ -130,7 +146,7 @@ def _solved(solver: constraint.Solver, scene: Scene, model: mjx.Model, state: St
     """State after a step, residual, and `smooth_stages`; no derivatives."""
     data = smooth_stages(scene, model, state, control).replace(qacc_warmstart=state.warmstart)
     qacc = solver(model, data)
-    return State(*_integrated(scene, model, data, qacc), qacc), constraint.residual(model, data, qacc), data
+    return State(*integrated(model, data, qacc), qacc), constraint.residual(model, data, qacc), data
 
 
 def entry_by_entry(function: Callable[..., Any], model: mjx.Model, *arguments: Any) -> Any:
@@ -138,6 +154,15 @@ def entry_by_entry(function: Callable[..., Any], model: mjx.Model, *arguments: A
     if model.nv <= MOST_UNROLLED and not isinstance(model.body_mass, Tracer):
         return unrolled(function, model, *arguments)
     return function(model, *arguments)
+
+
+def _with_solver(function: Callable[..., Any], model: mjx.Model, *arguments: Any) -> Any:
+    """Evaluate `function(solver, model, *arguments)`, of any size if native code pays for it, else `entry_by_entry`."""
+    plain, solved = (partial(function, solver) for solver in (constraint.run_solver, constraint.newton))
+    larger = model.nv > MOST_UNROLLED and constraint.OWN_SOLVER and native_identity() is not None
+    if larger and not isinstance(model.body_mass, Tracer):
+        return unrolled(solved, model, *arguments, otherwise=plain)
+    return entry_by_entry(plain, model, *arguments)
 
 
 ControlLaw = Callable[[Int[Array, ""], State], Control]
@@ -243,7 +268,7 @@ def _differentiable_step(scene: Scene, model: mjx.Model, state: State, control: 
     traced_model, whole = traced_part(model)
 
     def solved(traced: Any, state: State, control: Control) -> tuple[State, Scalar]:
-        return entry_by_entry(partial(_values, scene), whole(traced), state, control)
+        return _with_solver(partial(_values, scene), whole(traced), state, control)
 
     def rule(primals: Any, changes: Any) -> Any:
         following, residual = advance(*primals)
@@ -251,7 +276,7 @@ def _differentiable_step(scene: Scene, model: mjx.Model, state: State, control: 
         moved = changes[1].qpos, changes[1].qvel, changes[1].act, changes[2]
         if jax.tree.leaves(changes[0]):
             through = lambda qacc, traced, *point: _at_solution(scene, whole(traced), qacc, *point)  # noqa: E731
-            change = _by_tape(through, following.warmstart, (traced, *point), (changes[0], *moved))
+            change = by_tape(through, following.warmstart, (traced, *point), (changes[0], *moved))
         else:
             moved = instantiated(tuple(point), moved)
             change = step_change(scene, whole(traced), tuple(point), following.warmstart, moved)
@@ -261,8 +286,10 @@ def _differentiable_step(scene: Scene, model: mjx.Model, state: State, control: 
     return advance(traced_model, state, control)
 
 
-def _values(scene: Scene, model: mjx.Model, state: State, control: Control) -> tuple[State, Scalar]:
-    return _solved(constraint.run_solver, scene, model, state, control)[:2]
+def _values(
+    scene: Scene, solver: constraint.Solver, model: mjx.Model, state: State, control: Control
+) -> tuple[State, Scalar]:
+    return _solved(solver, scene, model, state, control)[:2]
 
 
 Point = tuple[Qpos, Qvel, Act, Control]
@@ -283,40 +310,62 @@ def step_change(scene: Scene, model: mjx.Model, point: Point, qacc: Qvel, change
         qacc: the converged constrained acceleration there.
         change: change of the point.
     """
-    if scene.uses_graph:
-        found = _by_graph(scene, model, point, qacc, change)
-        return found or _by_columns(partial(_at_solution, scene, model), qacc, point, change)
-    return _by_tape(partial(_at_solution, scene, model), qacc, point, change)
+    step = partial(_at_solution, scene, model)
+    if scene.uses_graph and (found := by_graph(partial(_equations, scene), step, model, point, qacc, change)):
+        return found
+    return (_by_columns if scene.forms_matrix else by_tape)(step, qacc, point, change)
 
 
-def _by_graph(scene: Scene, model: mjx.Model, point: Point, qacc: Qvel, change: Point) -> StepChange | None:
-    """`step_change` as a graph, if it is one and worth compiling.
+def by_graph(
+    equations: Callable[..., Any],
+    step: Callable[..., Any],
+    model: mjx.Model,
+    point: Sequence[Array],
+    qacc: Qvel,
+    change: Sequence[Array | None],
+) -> StepChange | None:
+    """Change of a step and of its acceleration as a graph, if it is one and worth compiling.
 
     Native code computes products with the derivative or its transpose. XLA would compute each entry of those anew from
     the start, and is given the matrix.
+
+    Args:
+        equations: maps (model, *point, qacc) to the left side of the solver's equation and the step.
+        step: maps (qacc, *point) to the step and its acceleration, differentiable by JAX.
+        model: the model to step.
+        point: what precedes the step.
+        qacc: the converged constrained acceleration there.
+        change: change of the point, None for arrays that do not change.
     """
     if isinstance(model.body_mass, Tracer):
         return None
     kind = lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype)  # noqa: E731
     like = jax.tree.map(lambda leaf: kind(leaf) if isinstance(leaf, Tracer) else leaf, model)
-    equations = captured_once(partial(_equations, scene), like, *map(kind, (*point, qacc)))
-    if equations is None:
+    captured = captured_once(equations, like, *map(kind, (*point, qacc)))
+    if captured is None:
         return None
     inputs = [*(leaf for leaf in jax.tree.leaves(model) if isinstance(leaf, Tracer)), *point, qacc]
-    over = tuple(range(len(inputs) - 5, len(inputs) - 1))
+    over = tuple(len(inputs) - 1 - len(point) + at for at, each in enumerate(change) if each is not None)
+    changes = [each for each in change if each is not None]
+
+    def plain(inputs: Sequence[Any], changes: Sequence[Any]) -> Any:
+        *point, qacc = inputs[-1 - len(change) :]
+        left = iter(changes)
+        return by_tape(step, qacc, tuple(point), tuple(None if each is None else next(left) for each in change))
+
     try:
         if native_identity() is not None:
-            slope = implicit_derivative(equations, over, solve_positive_definite)
-            return tuple(applied(slope, inputs, change)) if is_small(slope.push) else None
-        matrix = implicit_jacobian(equations, over, solve_positive_definite)
+            slope = implicit_derivative(captured, over, solve_positive_definite)
+            return tuple(applied(slope, inputs, changes, plain)) if is_small(slope.push) else None
+        matrix = implicit_jacobian(captured, over, solve_positive_definite)
     except NotDifferentiableError as error:
         count_left(f"derivative of {error}")
         return None
     if not is_small(matrix):
         return None
     (entries,) = computed(matrix, inputs)
-    flat = product(entries, jnp.concatenate(change))
-    return tuple(jnp.split(flat, np.cumsum([scene.host.nq, scene.host.nv, scene.host.na])))
+    ends = np.cumsum([math.prod(aval.shape) for aval in captured.avals[1:]])
+    return tuple(jnp.split(product(entries, jnp.concatenate(changes)), ends))
 
 
 def _equations(
@@ -324,7 +373,7 @@ def _equations(
 ) -> tuple[Qvel, Qpos, Qvel, Act]:
     """Left side of the solver's equation G, and the step S, at any acceleration."""
     data = force_stage(model, position_stage(scene, model, qpos), qvel, act, control)
-    return constraint.imbalance(model, data, qacc), *_integrated(scene, model, data, qacc)
+    return constraint.imbalance(model, data, qacc), *integrated(model, data, qacc)
 
 
 def _at_solution(
@@ -333,15 +382,16 @@ def _at_solution(
     """Step and acceleration, whose value is known, with the derivatives of the step."""
     data = force_stage(model, position_stage(scene, model, qpos), qvel, act, control)
     qacc = constraint.solve(model, data.replace(qacc_warmstart=known), lambda _, data: data.qacc_warmstart)
-    return *_integrated(scene, model, data, qacc), qacc
+    return *integrated(model, data, qacc), qacc
 
 
-def _integrated(scene: Scene, model: mjx.Model, data: mjx.Data, qacc: Array) -> tuple[Qpos, Qvel, Act]:
+def integrated(model: mjx.Model, data: mjx.Data, qacc: Array) -> tuple[Qpos, Qvel, Act]:
+    """State after a step, given its acceleration and the data of `force_stage`."""
     qvel, act = advance_velocity(model, data, qacc)
-    return integrate_position(scene.host, data.qpos, qvel, model.opt.timestep), qvel, act
+    return integrate_position(model, data.qpos, qvel, model.opt.timestep), qvel, act
 
 
-def _by_tape(function: Callable[..., Any], qacc: Qvel, point: tuple[Any, ...], change: tuple[Any, ...]) -> Any:
+def by_tape(function: Callable[..., Any], qacc: Qvel, point: tuple[Any, ...], change: tuple[Any, ...]) -> Any:
     """Change of `function(qacc, *point)` with the leaves of the point, those without change None.
 
     Reverse mode stores the arguments and recomputes the rest.

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 MOST_UNROLLED: Final = 8
-"""Largest number of degrees of freedom for which linear systems are unrolled."""
+"""Largest number of degrees of freedom for which linear systems are unrolled in XLA's programs."""
 
 
 def product(matrix: Float[Array, "rows columns"], vector: Float[Array, " columns"]) -> Float[Array, " rows"]:
@@ -46,5 +46,11 @@ def solve_factored(upper: Float[Array, "n n"], right_side: Float[Array, "n ..."]
 
 
 def solve_positive_definite(matrix: Float[Array, "n n"], right_side: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
-    """Solve a symmetric positive definite linear system."""
+    """Solve a symmetric positive definite linear system.
+
+    Large ones are eliminated from the end, where inertia matrices have leaves of the body tree: zeros stay zero.
+    """
+    if matrix.shape[0] > MOST_UNROLLED:
+        flipped = jax.scipy.linalg.cho_factor(matrix[::-1, ::-1])
+        return jax.scipy.linalg.cho_solve(flipped, right_side[::-1])[::-1]
     return solve_factored(cholesky(matrix), right_side)

@@ -20,7 +20,7 @@ from jaxtyping import Array, Float
 from mjx_study.graph.derivative_rule import instantiated, with_rule
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.integration import rotate_quaternion, rotation_between
-from mjx_study.simulation.linear_algebra import cholesky, solve_factored
+from mjx_study.simulation.linear_algebra import MOST_UNROLLED, cholesky, solve_factored, solve_positive_definite
 
 _REFSAFE: Final = int(mujoco.mjtDisableBit.mjDSBL_REFSAFE)
 _UNSEEN: Final = 1e-30  # [m]; its square is still a normal number
@@ -173,11 +173,12 @@ def factored_inertia(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 
 
 def solved_inertia(model: mjx.Model, data: mjx.Data, force: Float[Array, " nv"]) -> Float[Array, " nv"]:
-    """MJX's solution of M a = force, likewise."""
+    """MJX's solution of M a = force, likewise; large ones from M, whose factor fills up in MJX's order."""
     rows: Any = data._impl
     if rows.M.ndim != 2:
         return _ORIGINAL["smooth", "solve_m"](model, data, force)
-    return solve_factored(rows.qLD, force)
+    large = model.nv > MOST_UNROLLED
+    return solve_positive_definite(rows.M, force) if large else solve_factored(rows.qLD, force)
 
 
 def body_tree(model: mjx.Model, of_body: Callable[..., Any], *arguments: Any, **named: Any) -> Any:

@@ -14,6 +14,7 @@ import numpy as np
 
 from estimators.choices import suggestion
 from mjx_study.choices import CONES, INTEGRATORS, SOLVERS, unknown
+from mjx_study.graph.native import native_identity
 from mjx_study.limits import MOST_GIB
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.contact_pair import frictionless_pair, geom_label
@@ -55,7 +56,7 @@ class Scene:
               its matrix, in forward mode. Not for RK4.
             - "tape": automatic differentiation of MJX's own operations around the implicit solve; reverse mode computes
               each step again (fault 13 in `docs/gradient-faults.md`).
-            - "auto": graphs up to `MOST_UNROLLED` degrees of freedom, else the tape.
+            - "auto": graphs in native code, and up to `MOST_UNROLLED` degrees of freedom; else the tape.
 
             Derivatives with respect to the model always use the tape.
 
@@ -78,6 +79,11 @@ class Scene:
     @property
     def uses_graph(self) -> bool:
         """Whether steps are differentiated as graphs rather than by the tape."""
+        return self.forms_matrix or (self.adjoint == "auto" and native_identity() is not None and not self._explicit)
+
+    @property
+    def forms_matrix(self) -> bool:
+        """Whether steps that are no graph are differentiated by their matrix rather than by the tape."""
         small = self.host.nv <= MOST_UNROLLED
         return self.adjoint == "graph" or (self.adjoint == "auto" and small and not self._explicit)
 
@@ -102,6 +108,21 @@ class Scene:
     def joint(self, name: str) -> int:
         """Index of a joint by name. Raises SceneError, listing the choices, for an unknown name."""
         return self._index(mujoco.mjtObj.mjOBJ_JOINT, "joint", name, self.host.njnt)
+
+    def body(self, name: str) -> int:
+        """Index of a body by name. Raises SceneError, listing the choices, for an unknown name."""
+        return self._index(mujoco.mjtObj.mjOBJ_BODY, "body", name, self.host.nbody)
+
+    def site(self, name: str) -> int:
+        """Index of a site by name. Raises SceneError, listing the choices, for an unknown name."""
+        return self._index(mujoco.mjtObj.mjOBJ_SITE, "site", name, self.host.nsite)
+
+    def sensor(self, name: str) -> slice:
+        """Place of a sensor's output in sensordata, by name. Raises SceneError, listing the choices, for an unknown
+        name."""
+        index = self._index(mujoco.mjtObj.mjOBJ_SENSOR, "sensor", name, self.host.nsensor)
+        first = int(self.host.sensor_adr[index])
+        return slice(first, first + int(self.host.sensor_dim[index]))
 
     def _index(self, kind: mujoco.mjtObj, noun: str, name: str, count: int) -> int:
         index = mujoco.mj_name2id(self.host, kind, name)

@@ -101,8 +101,9 @@ def find_events(course: Course, timestep: float | Scalar, slots: int) -> tuple[E
     (flat,) = jnp.nonzero(happens.reshape(-1), size=slots, fill_value=happens.size)
     used = flat < happens.size
     step, guard = jnp.divmod(jnp.where(used, flat, happens.shape[1]), happens.shape[1])
-    others = jax.vmap(lambda step, guard: jax.tree.map(lambda leaf: leaf[step], crossing).others(guard))(step, guard)
-    events = Events(step, guard, ends[step, guard], brief[step, guard], *others, used)
+    at_step = jax.tree.map(lambda leaf: leaf[step], crossing)
+    absent, touching = jax.vmap(Crossings.others)(at_step, guard)
+    events = Events(step, guard, ends[step, guard], brief[step, guard], absent, touching, used)
     return events, jnp.sum(happens) - jnp.sum(used)
 
 

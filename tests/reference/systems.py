@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mjx_study.reference import DoublePendulum, LinearQuadratic, Pusher, Rollout, SlidingBox, System, Tennis
+from tests.pusher_fixtures import INPUTS, ImpedancePusher
 
 RNG = np.random.default_rng(0)
 
@@ -99,8 +100,11 @@ def _tennis_case(**options) -> StepCase:
 
 
 LINEAR_QUADRATIC = linear_quadratic()
+PUSHER = _pusher_states(), RNG.standard_normal((50, 1))
 STEPS = {
-    "pusher": StepCase(Pusher(100.0), _pusher_states(), RNG.standard_normal((50, 1))),
+    "pusher": StepCase(Pusher(100.0), *PUSHER),
+    "pusher, unstable": StepCase(Pusher(1e4), *PUSHER),
+    "pusher, impedance": StepCase(ImpedancePusher(1e3), *PUSHER),
     "sliding_box": StepCase(SlidingBox(), _sliding_box_states(), RNG.standard_normal((60, 1))),
     "double_pendulum": StepCase(
         DoublePendulum(timestep=0.05), RNG.standard_normal((50, 4)) * [2.0, 2.0, 4.0, 4.0], np.zeros((50, 0))
@@ -176,5 +180,13 @@ ROLLOUTS = {
         RNG.standard_normal((8, 2)),
         0.3 * RNG.standard_normal((2, 3)),
         _no_events,
+    ),
+    "pusher, impedance": RolloutCase(
+        ImpedancePusher(100.0),
+        np.array([0.0, 0.98, 0.1, -0.2]),
+        INPUTS["swell"],
+        np.zeros((1, 4)),
+        _pusher_events,
+        1e-5,
     ),
 }

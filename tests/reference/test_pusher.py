@@ -1,9 +1,12 @@
-"""The pusher's contact as a law of nature: it conserves momentum."""
+"""The pusher's contact as a law of nature, which conserves momentum; and the published order of variances."""
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_study.reference import Pusher, roll_out
+from estimators import first_order, variance_interval, zeroth_order
+from mjx_study.reference import Pusher, ReferenceObjective, roll_out
+from tests.pusher_fixtures import HORIZON, INPUTS, SIGMA, START, sample_keys
 
 
 @pytest.mark.parametrize("stiffness", [10.0, 1000.0])
@@ -23,3 +26,40 @@ def test_equal_masses_exchange_their_velocities():
         states = roll_out(system, np.array([0.0, 1.1, 2.0, -1.0]), np.zeros((300 * 2**halvings, 1))).states
         errors.append(np.abs(states[-1, 2:] - [-1.0, 2.0]).max())
     assert errors[0] < 0.05 and errors[2] < errors[0]
+
+
+@pytest.mark.parametrize("stiffness", [10.0, 1e4])
+def test_momentum_balance(stiffness):
+    """Contact is internal: total momentum follows p' = damping p + h u whatever the stiffness, even an unstable one."""
+    system, controls = Pusher(stiffness), INPUTS["reversing"]
+    states = roll_out(system, START, controls).states
+    momentum = system.mass * states[:, 2:].sum(axis=1)
+    expected = [0.0]
+    for control in controls[:, 0]:
+        expected.append(system.damping * expected[-1] + system.timestep * control)
+    size = system.mass * np.abs(states[:, 2:]).max()
+    np.testing.assert_allclose(momentum, expected, rtol=0, atol=HORIZON * np.finfo(float).eps * size)
+    assert np.abs(states[:, 2] - states[:, 3]).max() > 0.05 * np.abs(states[:, 2:]).max()  # they do exchange it
+
+
+def test_contact_only_pushes():
+    pulled = roll_out(Pusher(1000.0), START, np.full((50, 1), -1.0)).states
+    np.testing.assert_array_equal(pulled[:, [1, 3]], np.broadcast_to([1.0, 0.0], (51, 2)))
+    assert pulled[-1, 0] < -0.1
+
+
+def reference_variances(stiffness: float):
+    """99 % intervals of the variance of one sample, zeroth and first order."""
+    objective = ReferenceObjective(Pusher(stiffness), tuple(START), HORIZON, SIGMA)
+    theta = jnp.full(HORIZON, 0.1)
+    zeroth = zeroth_order(objective.evaluate(theta, sample_keys(300, 0)), "zero_noise")
+    first = first_order(objective.differentiate(theta, sample_keys(300, 1)))
+    return variance_interval(zeroth, 0.99), variance_interval(first, 0.99)
+
+
+def test_stiffness_turns_the_order_of_variances():
+    """The figure: at K = 10 first-order gradients vary less than zeroth-order ones, at K = 1000 more."""
+    (zeroth_low, _), (_, first_high) = reference_variances(10.0)
+    assert first_high < zeroth_low
+    (_, zeroth_high), (first_low, _) = reference_variances(1000.0)
+    assert zeroth_high < first_low
