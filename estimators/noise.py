@@ -112,7 +112,8 @@ def standard_noise(
     noise_key: Key[Array, ""], shape: tuple[int, int], dtype, density: str = "gaussian"
 ) -> Float[Array, "steps dimensions"]:
     """Draw unit-variance noise for a rollout, (steps, dimensions); policies scale it by sigma."""
-    return NOISES[density].draw(noise_key, shape, dtype)
+    flat = NOISES[density].draw(noise_key, (math.prod(shape),), dtype)  # the same bits, in long vectors
+    return flat.reshape(shape)
 
 
 @partial(jax.jit, static_argnames=("shape", "density"))

@@ -14,8 +14,8 @@ from typing import Any, Final
 import numpy as np
 from jax import lax
 
-from mjx_study.graph.function import ScalarFunction
-from mjx_study.graph.nodes import Node, needed_for, no_type_check
+from mjx_study.graph.function import Passes, ScalarFunction, depending_on
+from mjx_study.graph.nodes import Node, entries_of, needed_for, no_type_check
 from mjx_study.graph.parts import Loop, Statement, in_parts
 
 _OPERATORS: Final = {
@@ -47,10 +47,11 @@ class NotWrittenError(Exception):
     """The graph has an operation or a type that C is not written for."""
 
 
-def source_of(function: ScalarFunction, platform: str = "cpu") -> str:
+def source_of(function: ScalarFunction, platform: str = "cpu", passes: Passes | None = None) -> str:
     """Write a function of arrays as C: a handler of XLA's foreign function interface for batches of samples.
 
-    For "gpu" the same text is the source of a kernel in CUDA and of the handler that starts it.
+    For "gpu" the same text is the source of a kernel in CUDA and of the handler that starts it. With `passes`, the
+    handler computes all passes of a loop whose body the function is.
 
     The handler takes the inputs and gives the outputs with the batch as their fastest dimension; inputs may have none.
 
@@ -58,9 +59,11 @@ def source_of(function: ScalarFunction, platform: str = "cpu") -> str:
         NotWrittenError: an operation or a type is not covered.
     """
     writer = _Writer(function)
-    functions, num_kept = in_parts(writer.statements(), writer.loads, MOST_TOGETHER[platform])
-    forms_in = [(math.prod(each.shape), each.dtype, each.ndim) for each in function.types]
-    forms_out = [(math.prod(each.shape), each.dtype, each.ndim) for each in function.avals]
+    statements = writer.statements() if passes is None else writer.loop(passes)
+    functions, num_kept = in_parts(statements, writer.loads, MOST_TOGETHER[platform])
+    types, avals = (function.types, function.avals) if passes is None else passes.avals(function)
+    forms_in = [(math.prod(each.shape), each.dtype, each.ndim) for each in types]
+    forms_out = [(math.prod(each.shape), each.dtype, each.ndim) for each in avals]
     if platform == "gpu":
         kernel = [_text("prelude.cu"), _text("functions.c"), *functions, _text("kernel.cu")]
         parts = ["#ifdef __CUDACC_RTC__", *kernel, "#else", _text("launcher.c"), "#endif"]
@@ -146,29 +149,72 @@ class _Writer:
 
     def statements(self) -> list[Statement | Loop]:
         """All statements, with every output stored as soon as it is known."""
-        for place, array in enumerate(self._function.inputs):
+        self.loads = self._loaded(range(len(self._function.inputs)))
+        constant = self._stores_of(range(len(self._function.outputs)), self._function.outputs)
+        known = [self._stored(number, number) for number in self.loads]
+        return [*itertools.chain(*known), *self._written(self._function.needed), *constant]
+
+    def loop(self, passes: Passes) -> list[Statement | Loop]:
+        """All statements of a loop with the function as its body; what is the same in all passes comes before it."""
+        function, (first, second) = self._function, (passes.num_consts, passes.num_consts + passes.num_carry)
+        carried = entries_of(function.inputs[first:second])
+        after = entries_of(function.outputs[: passes.num_carry])
+        self.loads = self._loaded(range(first))
+        starts = self._loaded(range(first, second))
+        begin = [Statement(text, frozenset(), self._kinds([at])) for at, text in starts.items()]
+        changing = depending_on(function.needed, [*carried, *entries_of(function.inputs[second:])])
+        fixed = self._written(each for each in function.needed if each.number not in changing)
+        rows = self._loaded(range(second, len(function.inputs)), each_pass=True)
+        outputs = range(passes.num_carry, len(function.outputs))
+        constant = self._stores_of(outputs, function.outputs[passes.num_carry :], each_pass=True)
+        known = [self._stored(number, name) for number, name in self._names.items()]
+        body = [*itertools.chain(*known), *self._written(function.needed), *constant]
+        moved = [(each.number, value) for each, value in zip(carried, after, strict=True) if each is not value]
+        kinds = self._kinds(at for at, _ in moved)
+        lines = [f"{kinds[at]} next{at} = {self._value(value)};" for at, value in moved]
+        self._uses |= kinds.keys()
+        body.append(self._statement([*lines, *(f"x{at} = next{at};" for at in kinds)], kinds))
+        self._stores = {}
+        self._stores_of(range(passes.num_carry), function.inputs[first:second])
+        end = [self._stored(each.number, each.number) for each in carried]
+        return [*begin, *fixed, Loop([], None, body, _head(passes), rows), *itertools.chain(*end)]
+
+    def _kinds(self, numbers: Iterable[int]) -> dict[int, str]:
+        kinds = {node.number: node.dtype for node in entries_of(self._function.inputs)}
+        return {number: _type(kinds[number]) for number in numbers}
+
+    def _loaded(self, places: Iterable[int], each_pass: bool = False) -> dict[int, str]:
+        """Declarations of the entries of inputs by number; those of each pass of a loop in turn or of the only one."""
+        found: dict[int, str] = {}
+        for place in places:
+            array = self._function.inputs[place]
             for at, node in enumerate(array.flat):
-                self._load(node, place, at)
+                kind = _type(node.dtype)
+                self.dtypes.add(node.dtype)
+                where = f"{place}, {at} + {array.size} * step" if each_pass else f"{place}, {at}"
+                load = f"LOAD_BOOL({where})" if kind == "mask" else f"LOAD({kind}, {where})"
+                found[node.number] = f"{kind} x{node.number} = {load};"
+                self._names[node.number] = node.number
+        return found
+
+    def _stores_of(
+        self, places: Iterable[int], arrays: Iterable[np.ndarray], each_pass: bool = False
+    ) -> list[Statement]:
+        """Prepare to store the entries of outputs as soon as they are known; the statements for constant ones."""
         constant = []
-        for place, (array, aval) in enumerate(zip(self._function.outputs, self._function.avals, strict=True)):
+        for place, array in zip(places, arrays, strict=True):
+            aval = self._function.avals[place]
             for at, entry in enumerate(array.flat):
                 kind, value = _type(aval.dtype), "{}" if isinstance(entry, Node) else _constant(entry)
                 self.dtypes.add(aval.dtype)
                 store = "STORE_BOOL(" if kind == "mask" else f"STORE({kind}, "
-                text = f"{store}{place}, {at}, {value});"
+                where = f"{place}, {at} + {array.size} * step" if each_pass else f"{place}, {at}"
+                text = f"{store}{where}, {value});"
                 if isinstance(entry, Node):
                     self._stores.setdefault(entry.number, []).append(text)
                 else:
                     constant.append(Statement(text, frozenset()))
-        known = [self._stored(number, number) for number in self.loads if number in self._stores]
-        return [*itertools.chain(*known), *self._written(self._function.needed), *constant]
-
-    def _load(self, node: Node, place: int, at: int) -> None:
-        kind = _type(node.dtype)
-        self.dtypes.add(node.dtype)
-        load = f"LOAD_BOOL({place}, {at})" if kind == "mask" else f"LOAD({kind}, {place}, {at})"
-        self.loads[node.number] = f"{kind} x{node.number} = {load};"
-        self._names[node.number] = node.number
+        return constant
 
     def _stored(self, number: int, name: int) -> list[Statement]:
         return [Statement(each.format(f"x{name}"), frozenset({name})) for each in self._stores.get(number, ())]
@@ -294,6 +340,12 @@ class _Writer:
         for place, other in enumerate(others, 1):
             first = f"{select}(MASK({index} == {place}), {first}, {other})"
         return first
+
+
+def _head(passes: Passes) -> str:
+    if passes.reverse:
+        return f"for (step = {passes.length - 1}; step >= 0; step--)"
+    return f"for (step = 0; step < {passes.length}; step++)"
 
 
 def _select(dtype: Any) -> str:

@@ -88,6 +88,26 @@ def _size(nodes: list[Node]) -> int:
     return len(nodes) + sum(_size(needed_for([*again, *after])) for _, again, after in loops)
 
 
+@dataclasses.dataclass(frozen=True)
+class Passes:
+    """A loop of known length whose body is a function of constants, carry and rows, and gives carry and rows."""
+
+    num_consts: int
+    num_carry: int
+    length: int
+    reverse: bool
+
+    def avals(self, body: ScalarFunction) -> tuple[list[ShapedArray], list[ShapedArray]]:
+        """Types of the loop's inputs and outputs, with the rows of all passes."""
+        stacked = lambda aval: aval.update(shape=(self.length, *aval.shape))  # noqa: E731
+        before, carried = self.num_consts + self.num_carry, self.num_carry
+        inputs, outputs = body.types, list(body.avals)
+        return (
+            [*inputs[:before], *map(stacked, inputs[before:])],
+            [*outputs[:carried], *map(stacked, outputs[carried:])],
+        )
+
+
 def is_input(leaf: Any) -> bool:
     """Whether a leaf of a captured function's arguments is one of its inputs; others are constants."""
     return isinstance(leaf, Tracer | jax.ShapeDtypeStruct)
@@ -145,7 +165,7 @@ def _equation(graph: ScalarGraph, equation: Any, inputs: list[np.ndarray]) -> Se
     aval: Any = equation.outvars[0].aval
     if not any(math.prod(each.aval.shape) for each in equation.outvars):
         return [filled(each.aval.shape, ()) for each in equation.outvars]
-    if name in _SAME:
+    if name in _SAME or (graph.values_only and name == "stop_gradient"):
         return inputs
     if name in ELEMENTWISE:
         return [graph.elementwise(equation.primitive, inputs, aval, **parameters)]
@@ -155,6 +175,8 @@ def _equation(graph: ScalarGraph, equation: Any, inputs: list[np.ndarray]) -> Se
         return _branch(graph, equation, inputs)
     if name == "scan":
         return _scan(graph, equation, inputs)
+    if name == "native" and parameters["function"].values is not None:
+        return _native(graph, parameters["function"].values, inputs, parameters["batch"])
     if name in RULES and (outputs := RULES[name](graph, inputs, aval, parameters)) is not None:
         return outputs
     if name == "while":
@@ -187,12 +209,7 @@ def _branch(graph: ScalarGraph, equation: Any, inputs: Sequence[np.ndarray]) -> 
 def _scan(graph: ScalarGraph, equation: Any, inputs: Sequence[np.ndarray]) -> list[np.ndarray]:
     """Write out all passes of a loop of known length."""
     parameters = equation.params
-    if "ft_in" in parameters:  # from JAX 0.11 on
-        consts, carry, rows = map(list, parameters["ft_in"].update(inputs).unpack())
-    else:
-        first = parameters["num_consts"]
-        second = first + parameters["num_carry"]
-        consts, carry, rows = inputs[:first], list(inputs[first:second]), inputs[second:]
+    consts, carry, rows = scan_inputs(equation, inputs)
     avals = [each.aval for each in equation.outvars[len(carry) :]]
     stacked = [np.empty(aval.shape, object) for aval in avals]
     passes = range(parameters["length"])
@@ -202,6 +219,59 @@ def _scan(graph: ScalarGraph, equation: Any, inputs: Sequence[np.ndarray]) -> li
         for every, one in zip(stacked, outputs[len(carry) :], strict=True):
             every[at] = one
     return [*carry, *stacked]
+
+
+def scan_inputs(equation: Any, inputs: Sequence[Any]) -> tuple[list[Any], list[Any], list[Any]]:
+    """Constants, initial carry and rows among the inputs of a scan."""
+    parameters = equation.params
+    if "ft_in" in parameters:  # from JAX 0.11 on
+        consts, carry, rows = parameters["ft_in"].update(inputs).unpack()
+        return list(consts), list(carry), list(rows)
+    first = parameters["num_consts"]
+    second = first + parameters["num_carry"]
+    return list(inputs[:first]), list(inputs[first:second]), list(inputs[second:])
+
+
+@no_type_check
+def _native(
+    graph: ScalarGraph, function: ScalarFunction, inputs: Sequence[np.ndarray], batch: tuple[int, ...]
+) -> list[np.ndarray]:
+    """Write out native code that is called, which is a graph already."""
+    outputs = [np.empty((*batch, *aval.shape), object) for aval in function.avals]
+    for at in np.ndindex(*batch):
+        values: dict[int, Any] = {}
+        for array, nodes in zip(inputs, function.inputs, strict=True):
+            entries = array[at] if array.ndim > nodes.ndim else array
+            values |= zip((node.number for node in nodes.flat), entries.flat, strict=True)
+        _copy(graph, function.needed, values)
+        for every, array in zip(outputs, function.outputs, strict=True):
+            found = (values[each.number] if isinstance(each, Node) else each for each in array.flat)
+            every[at] = filled(array.shape, found)[()]
+    return outputs
+
+
+@no_type_check
+def _copy(graph: ScalarGraph, nodes: Iterable[Node], values: dict[int, Any]) -> None:
+    """Add nodes of another graph, arguments first, where they are not in `values` yet."""
+
+    def copies(entries: Iterable[Any], values: dict[int, Any]) -> list[Any]:
+        return [values[each.number] if isinstance(each, Node) else each for each in entries]
+
+    for node in nodes:
+        if node.number in values:
+            continue
+        arguments, parameters = copies(node.arguments, values), node.parameters
+        if node.operation == "loop":
+            old, *ends = parameters
+            carried = [graph.node("carry", (), None, each.dtype) for each in old]
+            inside = values | {each.number: new for each, new in zip(old, carried, strict=True)}
+            _copy(graph, needed_for(itertools.chain(*ends)), inside)
+            copied = _loop_node(graph, arguments[: len(old)], carried, *(copies(end, inside) for end in ends))
+        elif isinstance(node.operation, str):
+            copied = graph.node(node.operation, tuple(arguments), parameters, node.dtype)
+        else:
+            copied = graph.scalar(node.operation, tuple(arguments), node.dtype, **(parameters or {}))
+        values[node.number] = copied
 
 
 def _loop(graph: ScalarGraph, equation: Any, inputs: list[np.ndarray]) -> list[np.ndarray]:
@@ -215,19 +285,31 @@ def _loop(graph: ScalarGraph, equation: Any, inputs: list[np.ndarray]) -> list[n
 
     again, after = inside("cond_jaxpr", inputs[:first]), inside("body_jaxpr", inputs[first:second])
     carried = entries_of(during)
-    needed, changing = needed_for([*again, *after]), {each.number for each in carried}
-    for each in needed:
-        if any(isinstance(argument, Node) and argument.number in changing for argument in each.arguments):
-            changing.add(each.number)
-    fixed = [each for each in needed if each.number not in changing]
-    start = entries_of(inputs[second:])
-    node = graph.node("loop", (*start, *fixed), (carried, again, after), None)
+    node = _loop_node(graph, entries_of(inputs[second:]), carried, again, after)
     flat = [ShapedArray((), each.dtype) for each in carried]
     scalars = iter([each[()] for each in graph.outputs(node, flat)])
     return [filled(aval.shape, itertools.islice(scalars, math.prod(aval.shape))) for aval in avals]
 
 
-def bind_whole(equation: Any, arrays: Sequence[jax.Array]) -> Sequence[jax.Array]:
+@no_type_check
+def _loop_node(graph: ScalarGraph, start: list[Any], carried: list[Node], again: list[Any], after: list[Any]) -> Node:
+    needed = needed_for([*again, *after])
+    changing = depending_on(needed, carried)
+    fixed = [each for each in needed if each.number not in changing]
+    return graph.node("loop", (*start, *fixed), (carried, again, after), None)
+
+
+@no_type_check
+def depending_on(nodes: Iterable[Node], some: Iterable[Node]) -> set[int]:
+    """Numbers of some nodes, and of those among `nodes`, arguments first, that depend on them."""
+    found = {each.number for each in some}
+    for node in nodes:
+        if any(isinstance(each, Node) and each.number in found for each in node.arguments):
+            found.add(node.number)
+    return found
+
+
+def bind_whole(equation: Any, arrays: Sequence[Any]) -> Sequence[jax.Array]:
     """Apply an operation to whole arrays, with its own differentiation rule if it has one."""
     parameters = equation.primitive.get_bind_params(equation.params)
     functions, parameters = parameters if isinstance(parameters, tuple) else ((), parameters)  # depends on JAX version

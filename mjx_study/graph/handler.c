@@ -1,5 +1,6 @@
 // Called by XLA with arrays of a whole batch, which is their fastest dimension; arrays without one are the same for all
-// samples. These, and the last vector, pass through `padded`, whose surplus lanes repeat the last sample.
+// samples, and pass through `padded`. So do batches smaller than a vector, whose surplus lanes repeat the last sample; in
+// others, the last vector ends with the last sample, and computes some of its samples again.
 
 struct array {
   long entries, bytes, rank;
@@ -31,25 +32,20 @@ static void batch(long count, const char *const *from, const int *shared, char *
     if (shared[k]) pad(spare[k], from[k], IN[k], IN[k].bytes, 1);
     in_step[k] = (shared[k] ? LANES : count) * IN[k].bytes;
   }
-  for (long k = 0; k < NUM_OUT; k++) out_step[k] = count * OUT[k].bytes;
+  int few = count < LANES;
+  for (long k = 0; k < NUM_IN; k++)
+    if (few && !shared[k]) {
+      pad(spare[k], from[k], IN[k], in_step[k], count);
+      in_step[k] = LANES * IN[k].bytes;
+    }
+  for (long k = 0; k < NUM_OUT; k++) out_step[k] = (few ? LANES : count) * OUT[k].bytes;
   for (long first = 0; first < count; first += LANES) {
-    long left = count - first;
-    for (long k = 0; k < NUM_IN; k++) {
-      in[k] = shared[k] ? spare[k] : from[k] + first * IN[k].bytes;
-      if (left < LANES && !shared[k]) {
-        pad(spare[k], in[k], IN[k], in_step[k], left);
-        in[k] = spare[k], in_step[k] = LANES * IN[k].bytes;
-      }
-    }
-    for (long k = 0; k < NUM_OUT; k++) {
-      out[k] = left < LANES ? spare[NUM_IN + k] : to[k] + first * OUT[k].bytes;
-      if (left < LANES) out_step[k] = LANES * OUT[k].bytes;
-    }
-    samples(in, in_step, out, out_step, kept);
-    if (left < LANES)
-      for (long k = 0; k < NUM_OUT; k++)
-        unpad(to[k] + first * OUT[k].bytes, out[k], OUT[k], count * OUT[k].bytes, left);
+    if (!few && first > count - LANES) first = count - LANES;
+    for (long k = 0; k < NUM_IN; k++) in[k] = few || shared[k] ? spare[k] : from[k] + first * IN[k].bytes;
+    for (long k = 0; k < NUM_OUT; k++) out[k] = few ? spare[NUM_IN + k] : to[k] + first * OUT[k].bytes;
+    samples(in, in_step, out, out_step, kept, 0);
   }
+  for (long k = 0; few && k < NUM_OUT; k++) unpad(to[k], out[k], OUT[k], count * OUT[k].bytes, count);
 }
 
 XLA_FFI_Error *handler(XLA_FFI_CallFrame *frame) {

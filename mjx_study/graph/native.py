@@ -2,7 +2,9 @@
 
 import os
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from functools import cache, cached_property, partial
 from typing import Any, Final
 
@@ -23,6 +25,8 @@ SWITCH: Final = "MJX_STUDY_NATIVE"
 """Environment variable; 0 does without native code."""
 _LEFT: Final[Counter[str]] = Counter()
 """Numbers of functions left to XLA, by reason."""
+_POSTPONED: Final[ContextVar[bool]] = ContextVar("postponed", default=False)
+"""Whether functions are called without building their libraries."""
 
 
 def native_identity() -> str | None:
@@ -61,23 +65,45 @@ def as_native(values: ScalarFunction, function: ScalarFunction, *, early: bool =
         function: the function, which derivatives are taken of.
         early: whether to begin to build it now, or when a program with it is compiled.
     """
-    native = NativeFunction(values, function)
-    return native if not early or native.begun() else None
+    native = NativeFunction(
+        lambda: source_of(values, native.platform),
+        function.types,
+        function.avals,
+        lambda: written_out(function),
+        values,
+    )
+    return native if not early or _POSTPONED.get() or native.begun() else None
 
 
 class NativeFunction:
-    """A captured function as a library, and as a JAX program for derivatives and where there is no library."""
+    """A function as a library, and as a JAX program for derivatives and where there is no library.
 
-    def __init__(self, values: ScalarFunction, function: ScalarFunction):
-        self._values, self._function = values, function
-        self.inputs = function.types
-        self.outputs = function.avals
+    Args:
+        write: writes the library's source; it may raise NotWrittenError.
+        inputs: types of the function's inputs.
+        outputs: types of its outputs.
+        program: makes the program.
+
+    Attributes:
+        values: graph of the function's values, if it is a graph.
+    """
+
+    def __init__(
+        self,
+        write: Callable[[], str],
+        inputs: Sequence[Any],
+        outputs: Sequence[Any],
+        program: Callable[[], Callable[..., list[jax.Array]]],
+        values: ScalarFunction | None = None,
+    ):
+        self._write, self._program = write, program
+        self.inputs, self.outputs, self.values = inputs, outputs, values
         self.platform = jax.default_backend()
 
     @cached_property
     def name(self) -> str:
         """Name of the library, which is being built; it may raise NotWrittenError."""
-        return build_library(source_of(self._values, self.platform))
+        return build_library(self._write())
 
     def begun(self) -> bool:
         """Begin to build the library; whether it can be written."""
@@ -97,7 +123,17 @@ class NativeFunction:
     @cached_property
     def program(self) -> Callable[..., list[jax.Array]]:
         """The function in JAX operations."""
-        return written_out(self._function)
+        return self._program()
+
+
+@contextmanager
+def building_postponed() -> Generator[None]:
+    """Leave it to whoever needs a library of functions that are called here to build it."""
+    token = _POSTPONED.set(True)
+    try:
+        yield
+    finally:
+        _POSTPONED.reset(token)
 
 
 def _plain(function: NativeFunction, batch: tuple[int, ...]) -> Callable[..., list[jax.Array]]:

@@ -29,22 +29,31 @@ class Statement:
 
 @dataclass(frozen=True)
 class Loop:
-    """A loop that computes `test`, ends if the mask with the number `again` is empty, and computes `body`."""
+    """A loop that computes `test`, ends if the mask with the number `again` is empty, and computes `body`.
+
+    Attributes:
+        head: the loop's head in C.
+        loads: declarations of variables that differ from pass to pass, by number.
+    """
 
     test: Sequence["Statement | Loop"]
-    again: int
+    again: int | None
     body: Sequence["Statement | Loop"]
+    head: str = "for (;;)"
+    loads: Mapping[int, str] = field(default_factory=dict)
 
     def together(self) -> Statement:
         inside = [each.together() if isinstance(each, Loop) else each for each in (*self.test, *self.body)]
         split = len(self.test)
         lines = [each.text for each in inside]
-        lines.insert(split, f"if (!any(x{self.again})) break;")
+        if self.again is not None:
+            lines.insert(split, f"if (!any(x{self.again})) break;")
         own = {at for each in inside for at in each.defines if at not in each.uses}
         assigned = {at: kind for each in inside for at, kind in each.defines.items() if at not in own}
         uses = frozenset(at for each in inside for at in each.uses) - own
-        text = "\n".join(["for (;;) {", *lines, "}"])
-        return Statement(text, uses, assigned, sum(each.size for each in inside))
+        loaded = sorted(uses.intersection(self.loads))
+        text = "\n".join([f"{self.head} {{", *(self.loads[at] for at in loaded), *lines, "}"])
+        return Statement(text, uses.difference(self.loads), assigned, sum(each.size for each in inside))
 
 
 def in_parts(items: Iterable[Statement | Loop], loads: Mapping[int, str], most: int) -> tuple[list[str], int]:
@@ -64,7 +73,7 @@ def in_parts(items: Iterable[Statement | Loop], loads: Mapping[int, str], most: 
 
 class _Parts:
     def __init__(self, loads: Mapping[int, str], most: int):
-        self._loads, self._most = loads, most
+        self._loads, self._most = dict(loads), most
         self._open: list[Statement] = []
         self._parts: list[list[Statement]] = []
         self._driver: list[str | int] = []  # lines, and numbers of masks that end a loop
@@ -83,10 +92,12 @@ class _Parts:
     def _divide(self, loop: Loop) -> None:
         self.close()
         first = len(self._parts)
-        self._driver.append("for (;;) {")
+        self._driver.append(f"{loop.head} {{")
+        self._loads |= loop.loads
         self.place(loop.test)
         self.close()
-        self._driver.append(loop.again)
+        if loop.again is not None:
+            self._driver.append(loop.again)
         self.place(loop.body)
         self.close()
         self._driver.append("}")

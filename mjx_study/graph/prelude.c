@@ -20,8 +20,9 @@
 #define ONE static inline __attribute__((always_inline))  // inlined wherever it is used
 #define APART static __attribute__((noinline))
 #define PART static
-#define ARGUMENTS const char *const *in, const long *in_step, char *const *out, const long *out_step, char *kept
-#define PASSED in, in_step, out, out_step, kept
+#define ARGUMENTS const char *const *in, const long *in_step, char *const *out, const long *out_step, char *kept, \
+                  long step
+#define PASSED in, in_step, out, out_step, kept, step
 
 #define VECTOR_OF(name, scalar)                                      \
   typedef scalar name __attribute__((vector_size(sizeof(scalar) * LANES))); \

@@ -21,8 +21,8 @@ typedef int mask;  // -1 or 0
 #define ALL(type, constant) ((type)(constant))
 #define APART static __device__
 #define PART static __device__
-#define ARGUMENTS const struct batch &batch, const long lane, char *kept
-#define PASSED batch, lane, kept
+#define ARGUMENTS const struct batch &batch, const long lane, char *kept, long step
+#define PASSED batch, lane, kept, step
 
 ONE int any(mask m) { return m; }
 

@@ -126,6 +126,9 @@ RULES: Final[dict[str, Rule]] = {
     "reduce_sum": _reduction(lax.add_p),
     "rev": lambda _, inputs, __, parameters: [np.flip(inputs[0], parameters["dimensions"])],
     "slice": _slice,
+    "split": lambda _, inputs, __, parameters: np.split(
+        inputs[0], np.cumsum(parameters["sizes"])[:-1], parameters["axis"]
+    ),
     "stack": lambda _, inputs, __, parameters: [np.stack(inputs, parameters["axis"])],
     "tile": lambda _, inputs, __, parameters: [np.tile(inputs[0], parameters["reps"])],
     "unstack": lambda _, inputs, __, parameters: list(np.moveaxis(inputs[0], parameters["axis"], 0)),

@@ -13,6 +13,7 @@ from jaxtyping import Array, Float, Key
 from estimators import Differentiation, Evaluation, Linearisation, StepDifferentiation, StepEvaluation
 from estimators.noise import check_sigma
 from mjx_study.compiled import Builds, Compiled
+from mjx_study.graph.scans import with_native_scans
 from mjx_study.objective.chunks import spread
 from mjx_study.objective.cost import simulate
 from mjx_study.objective.programs import SamplePrograms
@@ -51,7 +52,7 @@ class Simulator:
     @cached_property
     def _programs(self) -> dict[str, Compiled]:
         return {
-            name: Compiled(jax.vmap(each, (None, None, None, 0, 0)), name, self.task)
+            name: Compiled(jax.vmap(with_native_scans(each), (None, None, None, 0, 0)), name, self.task)
             for name, each in SamplePrograms(self.task).by_name.items()
         }
 

@@ -8,7 +8,7 @@ from estimators.noise import split_sample_key, standard_noise
 from mjx_study.simulation._mjx import mjx
 from mjx_study.simulation.branches import jump_term
 from mjx_study.simulation.contact import ContactModel, apply_contact
-from mjx_study.simulation.dynamics import State, rollout
+from mjx_study.simulation.dynamics import State, simulated, trajectory
 from mjx_study.simulation.onset import corrected_rollout, without_derivative
 from mjx_study.simulation.touch import OnsetCounts
 from mjx_study.tasks.task import Task
@@ -38,9 +38,9 @@ def rollout_cost(
     """
     feedforward = task.policy.feedforward(theta, noise)
 
-    def control_law(index, state, theta=theta, feedforward=feedforward):
+    def control_law(feedforward, state, theta=theta):
         feedback = task.policy.feedback(theta, state)
-        return feedforward[index] if feedback is None else feedforward[index] + feedback
+        return feedforward if feedback is None else feedforward + feedback
 
     model = apply_contact(task.scene.model, contact)
     backward = derivative_model(task, contact)
@@ -48,16 +48,18 @@ def rollout_cost(
         raise ValueError("the onset term requires exact derivatives: omit onset, or the contact's backward model")
     running_cost, final_cost = task.costs(contact)
     first = task.policy.place(theta, noise, start)
-    simulated, counts, term = (task.scene, model, first, control_law, task.horizon), None, 0.0
+    moved, counts, term = (task.scene, model, first, control_law), None, 0.0
     if onset == "linear":
-        states, controls, residuals, counts = corrected_rollout(*simulated, weight=weight)
+        states, controls, residuals, counts = corrected_rollout(*moved, task.horizon, inputs=feedforward, weight=weight)
+        costs, last = jax.vmap(running_cost)(before_each_step(states), controls), last_of(states)
     else:
-        states, controls, residuals = rollout(*simulated, backward)
+        last, (before, controls, residuals, costs) = simulated(*moved, feedforward, running_cost, backward)
+        states = trajectory(before, last)
     if onset == "jump":
-        fixed = jax.lax.stop_gradient((theta, feedforward))
-        law = lambda index, state: control_law(index, state, *fixed)  # noqa: E731
+        fixed, each = jax.lax.stop_gradient((theta, feedforward))
+        law = lambda index, state: control_law(each[index], state, fixed)  # noqa: E731
         term, counts = jump_term(task.scene, without_derivative(model), states, controls, law, running_cost, final_cost)
-    cost = jnp.sum(jax.vmap(running_cost)(before_each_step(states), controls)) + final_cost(last_of(states))
+    cost = jnp.sum(costs) + final_cost(last)
     return cost + term, (states, controls, jnp.max(residuals), counts)
 
 

@@ -30,7 +30,7 @@ import mujoco
 import numpy as np
 from jax.core import Tracer
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from estimators.pytree import register_pytree
 from mjx_study.graph.derivative_rule import instantiated, with_rule
@@ -165,7 +165,8 @@ def _with_solver(function: Callable[..., Any], model: mjx.Model, *arguments: Any
     return entry_by_entry(plain, model, *arguments)
 
 
-ControlLaw = Callable[[Int[Array, ""], State], Control]
+ControlLaw = Callable[[Any, State], Control]
+"""The control of a step from its index, or another input that differs from step to step, and the state before it."""
 
 
 def surrogate_step(
@@ -215,18 +216,49 @@ def rollout(
     """
     if horizon < 1:
         raise ValueError(f"horizon must be at least 1 step, got {horizon}")
+    law = control_law, jnp.arange(horizon)
+    last, (states, controls, residuals, _) = simulated(scene, model, start, *law, lambda *_: None, backward)
+    return trajectory(states, last), controls, residuals
 
-    def advance(state: State, index: Int[Array, ""]):
-        control = control_law(index, state)
+
+RunningCost = Callable[[State, Control], Any]
+
+
+def simulated(
+    scene: Scene,
+    model: mjx.Model,
+    start: State,
+    control_law: ControlLaw,
+    inputs: Any,
+    running_cost: RunningCost,
+    backward: mjx.Model | None = None,
+) -> tuple[State, tuple[State, Controls, Float[Array, " horizon"], Any]]:
+    """Simulate a step for every input of the control law.
+
+    Args:
+        scene, model, start, backward: as for `rollout`.
+        control_law: maps (input, state) to the control of a step.
+        inputs: pytree of arrays with a leading axis of steps.
+        running_cost: cost of a step, of the state before it and its control.
+
+    Returns:
+        The state after the last step; and of every step, the state before it, its control, residual and cost.
+    """
+
+    def advance(state: State, given: Any):
+        control = control_law(given, state)
         if backward is None:
             following, residual = step(scene, model, state, control)
         else:
             following, residual = surrogate_step(scene, model, backward, state, control)
-        return following, (following, control, residual)
+        return following, (state, control, residual, running_cost(state, control))
 
-    _, (states, controls, residuals) = jax.lax.scan(advance, start, jnp.arange(horizon))
-    trajectory = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), start, states)
-    return trajectory, controls, residuals
+    return jax.lax.scan(advance, start, inputs)
+
+
+def trajectory(states: State, last: State) -> State:
+    """All states of a rollout, from those before each step and the last."""
+    return jax.tree.map(lambda before, end: jnp.concatenate([before, end[None]]), states, last)
 
 
 # The stages of a step. A Jacobian over qvel, act or ctrl starts after the position stage and so is cheap. Each stage is

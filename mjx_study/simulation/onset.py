@@ -34,7 +34,7 @@ from typing import Any, Final, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from mjx_study.choices import ONSETS, unknown
 from mjx_study.graph.derivative_rule import refusing, with_rule
@@ -49,9 +49,10 @@ from mjx_study.simulation.dynamics import (
     advance_velocity,
     entry_by_entry,
     force_stage,
-    rollout,
+    simulated,
     solved_step,
     step_change,
+    trajectory,
 )
 from mjx_study.simulation.guards import Course
 from mjx_study.simulation.integration import difference_position, integrate_position
@@ -81,6 +82,7 @@ def corrected_rollout(
     horizon: int,
     slots: int = SLOTS,
     weight: float | Scalar = 1.0,
+    inputs: Any = None,
 ) -> tuple[State, Controls, Float[Array, " horizon"], OnsetCounts]:
     """`dynamics.rollout` with the same values, but derivatives that include the onset term.
 
@@ -90,32 +92,33 @@ def corrected_rollout(
         model: the model to step; may be traced, but not differentiated (TypeError).
         slots: maximum number of onsets to correct, earliest first.
         weight: factor of the term; 0 gives the derivatives of `dynamics.rollout`.
+        inputs: inputs of the control law, as for `dynamics.simulated`; None for the steps' indices.
     """
+    inputs = jnp.arange(horizon) if inputs is None else inputs
     if not scene.has_constraints:
-        return *rollout(scene, model, start, control_law, horizon), OnsetCounts.none(start.qpos.dtype)
+        last, (states, controls, residuals, _) = simulated(scene, model, start, control_law, inputs, lambda *_: None)
+        return trajectory(states, last), controls, residuals, OnsetCounts.none(start.qpos.dtype)
     model = without_derivative(model)
 
-    def observe(state: State, index: Int[Array, ""]):
-        control = jax.lax.stop_gradient(control_law(index, state))
+    def observe(state: State, given: Any):
+        control = jax.lax.stop_gradient(control_law(given, state))
         following, residual, course = solved_step(scene, model, state, control)
         return following, (state, control, following, residual, course)
 
-    _, (before, controls, after, residuals, course) = jax.lax.scan(
-        observe, jax.lax.stop_gradient(start), jnp.arange(horizon)
-    )
+    _, (before, controls, after, residuals, course) = jax.lax.scan(observe, jax.lax.stop_gradient(start), inputs)
     spread, shift, counts = _corrections(scene, model, before, controls, course, slots)
     spread, shift = weight * spread, weight * shift
 
     def follow(change: State, known):
-        index, fixed, fixed_control, fixed_after, spread, shift = known
+        given, fixed, fixed_control, fixed_after, spread, shift = known
         state = jax.tree.map(lambda value, moved: value + tangent_of(moved), fixed, change)
-        control = control_law(index, state)
+        control = control_law(given, state)
         moved = tangent_of(difference_position(scene.host, fixed.qpos, state.qpos))
         velocity = tangent_along(shift, moved - scene.timestep * change.qvel)
         carried = tangent_of(integrate_position(scene.host, fixed.qpos, velocity, scene.timestep))
         point = fixed.qpos, fixed.qvel, fixed.act, fixed_control
-        inputs = change.qpos + carried, change.qvel + velocity, change.act, tangent_of(control)
-        _, qvel, act, _ = map(tangent_of, step_change(scene, model, point, fixed_after.warmstart, inputs))
+        moving = change.qpos + carried, change.qvel + velocity, change.act, tangent_of(control)
+        _, qvel, act, _ = map(tangent_of, step_change(scene, model, point, fixed_after.warmstart, moving))
         qvel = qvel + tangent_along(spread, moved)
         qpos = integrate_position(
             scene.host, fixed.qpos + change.qpos + carried, fixed_after.qvel + qvel, scene.timestep
@@ -123,11 +126,11 @@ def corrected_rollout(
         following = State(tangent_of(qpos), qvel, act, jnp.zeros_like(qvel))
         return following, (following, tangent_of(control))
 
-    known = (jnp.arange(horizon), before, controls, after, spread, shift)
+    known = (inputs, before, controls, after, spread, shift)
     _, (changes, over_controls) = jax.lax.scan(follow, jax.tree.map(tangent_of, start), known)
     states = jax.tree.map(jnp.add, after, changes)
-    trajectory = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), start, states)
-    return trajectory, controls + over_controls, residuals, counts
+    whole = jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), start, states)
+    return whole, controls + over_controls, residuals, counts
 
 
 def _corrections(

@@ -133,7 +133,13 @@ class LinearFeedback(Feedback):
 
     def score(self, theta: Theta, states: State, noise_gradient: Noise) -> Theta:
         """sum_h noise_gradient_h phi(x_h)^T."""
-        return jnp.sum(noise_gradient[:, :, None] * jax.vmap(self.features)(states)[:, None, :], axis=0).reshape(-1)
+
+        def add(total: Float[Array, "controls features"], step: tuple[State, Control]):
+            state, slope = step
+            return total + slope[:, None] * self.features(state), None
+
+        start = jnp.zeros((self.controls, self.num_features), theta.dtype)
+        return jax.lax.scan(add, start, (states, noise_gradient))[0].reshape(-1)
 
 
 @dataclasses.dataclass(frozen=True)
