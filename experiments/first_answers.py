@@ -62,7 +62,6 @@ HEADER: Final = (
     "wall [s]",
     "processor [s]",
     "tracing",
-    "compiling",
     "C compiler",
     "rest",
     "programs",
