@@ -245,7 +245,8 @@ class GradientComputation(Computation):
             parts.append(jax.device_get(estimate_numbers(estimates, reference, tests[seed], self._config.confidence)))
             tallies.append({name: each for name, each in summary.items() if name in ORACLES})
         numbers = jax.tree.map(lambda *leaves: np.stack(leaves), *parts)
-        return cell_numbers(numbers, reference, chosen, tallies, cell.samples * blocks.seeds)
+        found = cell_numbers(numbers, reference, chosen, tallies, cell.samples * blocks.seeds)
+        return found | {"reference_pairs": np.array(float(self._config.settings.reference_samples))}
 
     def _whole(self, cell: StudyCell) -> Future[Arrays]:
         """A cell's numbers from whole batches."""

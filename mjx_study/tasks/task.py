@@ -194,10 +194,10 @@ class Task:
             contact: the contact model of forces and sensors; None for the MJCF's.
         """
 
-        def running_cost(state: State, control: Float[Array, " nu"]) -> Float[Array, ""]:
+        def running_cost(state: State, control: Array) -> Array:
             return self.running_cost(observed(self.scene, state, contact, control), control)
 
-        def final_cost(state: State) -> Float[Array, ""]:
+        def final_cost(state: State) -> Array:
             return self.final_cost(observed(self.scene, state, contact))
 
         return running_cost, final_cost

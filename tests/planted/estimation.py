@@ -35,8 +35,8 @@ OBJECTIVE: Final = (
     Defect(
         "costs-so-far",
         "mjx_study/objective/programs.py",
-        "jnp.cumsum(running[::-1])[::-1] + self.task.final_cost",
-        "jnp.cumsum(running) + self.task.final_cost",
+        "jnp.cumsum(running[::-1])[::-1] + final_cost",
+        "jnp.cumsum(running) + final_cost",
         "costs up to a step in place of those from it on",
         ("tests/test_batches.py::test_costs_to_go_are_sums_of_remaining_costs",),
     ),
