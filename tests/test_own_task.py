@@ -142,7 +142,7 @@ def test_landscape_plot_and_report(task: str, document) -> None:
     assert document("plot", "line", "--output", "drawn")["written"] == ["drawn/landscape.png", "drawn/landscape.pdf"]
     document("report", "line")
     page = Path("line/report.html").read_text()
-    assert f"<h1>{task}: landscapes through" in page and 'alt="landscape"' in page
+    assert f"<h1>{task}: landscapes through" in page and 'alt="landscape: ' in page
 
 
 def test_optimise_and_rollout(task: str, document) -> None:
@@ -304,7 +304,7 @@ def test_a_task_takes_no_options(write) -> None:
         ),
         (
             "final_cost=lambda state: state.position[0]",
-            "mine:bad: the final_cost raised AttributeError: 'State' object has no attribute 'position' (mine.py, ",
+            "mine:bad: the final_cost raised AttributeError: a state has qpos, qvel, act, ",
         ),
         (
             "policy=InitialStatePolicy(3, 0, 3, lambda start, theta: 1 / 0)",
