@@ -23,6 +23,7 @@ from mjx_study.simulation.contact import (
 from mjx_study.simulation.drop_in import differentiable_mjx, solver_residual, step
 from mjx_study.simulation.dynamics import State, initial_state, rollout, step_jacobian
 from mjx_study.simulation.dynamics import step as scene_step
+from mjx_study.simulation.observation import ObservedState, observed
 from mjx_study.simulation.scene import Scene, SceneError, check_model, load_scene, put_scene
 from mjx_study.storage.folder import load_study
 from mjx_study.tasks import TASKS, make_task
@@ -36,6 +37,7 @@ __all__ = [
     "InitialStatePolicy",
     "LinearFeedback",
     "MjxObjective",
+    "ObservedState",
     "OpenLoop",
     "Policy",
     "Recipe",
@@ -60,6 +62,7 @@ __all__ = [
     "load_scene",
     "load_study",
     "make_task",
+    "observed",
     "plan_study",
     "plot_study",
     "put_scene",

@@ -216,6 +216,7 @@ def _stock_programs(task: Task, contact: ContactModel | None, keys: Any, devices
     def cost(theta, contact, key_data, iterations: int):
         model = scene.model.replace(opt=scene.model.opt.replace(iterations=iterations))
         model = apply_contact(model, contact)
+        running_cost, final_cost = task.costs(contact)
         start_key, noise_key = split_sample_key(jax.random.wrap_key_data(key_data))
         noise = task.sigma * standard_noise(noise_key, policy.noise_shape, dtype, task.noise)
         start = policy.place(theta, noise, task.draw_start(start_key))
@@ -224,11 +225,11 @@ def _stock_programs(task: Task, contact: ContactModel | None, keys: Any, devices
             state = State(data.qpos, data.qvel, data.act, data.qacc_warmstart)
             feedback = policy.feedback(theta, state)
             control = feedforward if feedback is None else feedforward + feedback
-            return mjx.step(model, data.replace(ctrl=control)), task.running_cost(state, control)
+            return mjx.step(model, data.replace(ctrl=control)), running_cost(state, control)
 
         first = scene.template.replace(qpos=start.qpos, qvel=start.qvel, act=start.act)
         last, values = jax.lax.scan(advance, first, policy.feedforward(theta, noise))
-        return jnp.sum(values) + task.final_cost(State(last.qpos, last.qvel, last.act, last.qacc_warmstart))
+        return jnp.sum(values) + final_cost(State(last.qpos, last.qvel, last.act, last.qacc_warmstart))
 
     def program(function):
         return Compiled(jax.vmap(function, in_axes=(None, None, 0)))

@@ -40,14 +40,18 @@ for name, value in SETTINGS.items():
 
 
 @pytest.fixture(scope="module", autouse=True)
-def settings() -> None:
-    """Each module begins with the same settings, whatever commands the modules before it have run in this process."""
+def settings() -> Iterator[None]:
+    """Each module begins with the same settings, and commands keep them: JAX takes its devices once per process."""
     from mjx_study import runtime  # not above: type checking is switched on after this file is imported
+    from mjx_study.cli import options
 
     for name, value in SETTINGS.items():
         jax.config.update(name, value)
     runtime._TRACES.clear()
     runtime._CORES[:] = [2]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(options, "configure", lambda **_: None)
+        yield
 
 
 @pytest.fixture(scope="module", autouse=True)

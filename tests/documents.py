@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import xarray as xr
 
 from mjx_study.execution.cells import Cells, compute_here
 from mjx_study.experiment.checkpoint import Checkpoint
@@ -15,6 +16,7 @@ from mjx_study.experiment.gradients import Gradients
 from mjx_study.experiment.study import Computation, StudyCell, StudyPlan, done
 from mjx_study.progress import silent
 from mjx_study.results.kind import find_kind
+from mjx_study.results.variables import MEASURED
 from mjx_study.storage.arrays import required, sizes_of
 from mjx_study.storage.manifest import document_of, sealed
 
@@ -71,6 +73,16 @@ def stub_cells(patch: pytest.MonkeyPatch, compute: Callable[[StudyPlan, StudyCel
             return done(compute(self.plan, cell))
 
     patch.setattr(Gradients, "computation", lambda self, plan: Stubbed(plan))
+
+
+def content(folder: Path) -> dict[Path, bytes]:
+    """Every file in a folder."""
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def same(one: xr.Dataset, other: xr.Dataset) -> bool:
+    """Whether all but measured times is equal, bit for bit."""
+    return one.drop_vars(MEASURED, errors="ignore").equals(other.drop_vars(MEASURED, errors="ignore"))
 
 
 def altered(path: Path, **changes: Any) -> None:

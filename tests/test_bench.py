@@ -9,20 +9,12 @@ import numpy as np
 import pytest
 
 from mjx_study import bench, cli
-from mjx_study.cli import options
 from mjx_study.objective import Simulator, simulate
 from mjx_study.runtime import local_devices
 from mjx_study.simulation.engine import engine_model
 from mjx_study.tasks import make_task
 from mjx_study.tasks.contact_grid import family_grid
 from mjx_study.tasks.task import StudyDefaults
-
-
-@pytest.fixture(autouse=True)
-def configured(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The tests' own settings stand: JAX takes its devices once per process."""
-    monkeypatch.setattr(options, "configure", lambda **_: None)
-
 
 RATIOS = {"gradient_per_value", "rollouts_over_stock", "rollouts_over_engine", "speedup_over_stock"}
 

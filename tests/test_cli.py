@@ -30,12 +30,6 @@ MJCF = """<mujoco><worldbody>
 </worldbody><actuator><motor joint="{joint}"/></actuator></mujoco>"""
 
 
-@pytest.fixture(autouse=True)
-def configured(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The tests' own settings stand: JAX takes its devices once per process."""
-    monkeypatch.setattr(options, "configure", lambda **_: None)
-
-
 def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
     """Run, expect exit code 2 and one line on standard error, and return that line."""
     assert cli.main(arguments) == 2
@@ -53,8 +47,7 @@ def small_run(shared_programs: None, tmp_path_factory: pytest.TempPathFactory) -
     command = ["compare", "pusher", *SMALL, "--output", str(folder), "--details"]
     command += ["--stiffness", "10,1000", "--contact", "penalty,mujoco_default", "--estimators", "zobg,fobg,aobg,ivw"]
     out, told = io.StringIO(), io.StringIO()
-    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(out), contextlib.redirect_stderr(told):
-        patch.setattr(options, "configure", lambda **_: None)
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(told):
         assert cli.main(command) == 0
     first, *others = stages_of(told.getvalue())
     assert first == "[0/3] pusher, penalty, K = 10 N/m, h = 0.005 s, N = 8 (compiling first)"

@@ -33,8 +33,8 @@ from mjx_study.experiment.checkpoint import StudyError
 from mjx_study.options.configuration import StudyConfig
 from mjx_study.results.warnings import warnings_of
 from mjx_study.storage.folder import Store, load_study
+from tests.documents import same
 from tests.poison import ACCOUNT, CRASH, RAISE, SLOW
-from tests.test_sweep import same
 
 STIFFNESSES = tuple(SLOW + index for index in range(8))
 ARGUMENTS = ["tests.poison:poison", "--contact", "reference", "--stiffness", ",".join(map(str, STIFFNESSES)),
@@ -101,7 +101,7 @@ def test_a_worker_of_other_versions_is_refused(workers: Any, tmp_path: Path, mon
 
 def test_nobody_else_can_connect_to_local_workers(workers: Any) -> None:
     """The scheduler's and the workers' ports answer only to this client's key; there is no dashboard."""
-    workers.wait_for_workers(2)  # those that tests before this one killed are started again
+    workers.wait_for_workers(2, timeout=120)  # those that tests before this one killed are started again
     addresses = [workers.scheduler.address, *workers.nthreads()]
     assert len(addresses) == 3 and all(address.startswith("tls://127.0.0.1:") for address in addresses)
     stranger = distributed.Security.temporary()

@@ -14,7 +14,6 @@ import pytest
 
 from estimators import Differentiation, Evaluation, FirstOrder, ZerothOrder, estimate
 from mjx_study import cli
-from mjx_study.cli import options
 from mjx_study.diagnose.advice import advise
 from mjx_study.diagnose.means import along_means
 from mjx_study.diagnose.measurement import ESTIMATORS, Measured, affordable, chunk_of
@@ -136,10 +135,7 @@ def test_the_command_prints_the_page(tmp_path: Path, capsys: pytest.CaptureFixtu
 
 @pytest.mark.slow
 @pytest.mark.parametrize("model", ["cart", "pendulum", "peg"])
-def test_the_commands_on_the_page_repeat_it(
-    model: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(options, "configure", lambda **_: None)  # JAX takes its devices once per process
+def test_the_commands_on_the_page_repeat_it(model: str, capsys: pytest.CaptureFixture[str]) -> None:
     name, horizon = str(HELD_OUT / f"{model}.xml"), 60
     found = diagnose_task(name, make_task(name, horizon=horizon), samples=60, options=f" --horizon {horizon}")
     commands = commands_of(found)

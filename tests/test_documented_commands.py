@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from mjx_study import cli
-from mjx_study.cli import options
 from mjx_study.cli.gradcheck import UNEXERCISED
 from mjx_study.tasks import TASKS
 
@@ -92,7 +91,6 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     np.save(tmp_path / "learnt.npy", np.zeros(21))
     (tmp_path / "study.toml").write_text('tasks = ["pusher"]\nstiffness = "10:1000:2:log"\n')
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(options, "configure", lambda **_: None)
     return tmp_path
 
 

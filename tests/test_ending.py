@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 
 from mjx_study import cli, disk
-from mjx_study.cli import options, studies
+from mjx_study.cli import studies
 from mjx_study.execution.run import run_study
 from mjx_study.experiment.study import StudyCell, StudyPlan
 from mjx_study.results.variables import GRADIENTS
-from tests.documents import stages_of, stub_cells
+from tests.documents import content, stages_of, stub_cells
 
 SIGNALS = """
 import os, signal, sys, time
@@ -109,7 +109,6 @@ def test_names_of_folders_need_not_be_utf_8(tmp_path: Path) -> None:
 @pytest.fixture
 def full(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
     """Fills the disk: no file can be begun any more."""
-    monkeypatch.setattr(options, "configure", lambda **_: None)
 
     def begin(path: Path) -> Any:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
@@ -184,8 +183,8 @@ def test_a_full_disk_costs_a_study_nothing_that_was_there(
     arguments = ["sweep", "pusher", "--stiffness", "10", "--contact", "penalty", "--samples", "4,8", "--horizon", "2"]
     out = ended(capsys, *arguments, "--output", str(folder))
     assert "computed 1 cells" in out and "1 cells are not computed yet" in out and "results.nc" not in out
-    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    before = content(folder)
     assert len(before) == 3  # study.json, its lock, and a cell
     assert ended(capsys, "plot", str(folder)) == "warning: 1 cells are not computed yet; the same command resumes\n"
     assert "written" not in ended(capsys, "report", str(folder))
-    assert before == {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    assert before == content(folder)

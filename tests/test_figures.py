@@ -1,9 +1,7 @@
 """Figures of made-up studies: what they show, mark and name, and that their texts fit."""
 
-import ast
 import json
 import re
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,10 +13,9 @@ from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
 
 from estimators import ESTIMATORS, Estimator
-from mjx_study import plots
 from mjx_study._matplotlib import matplotlib
 from mjx_study.plots.edges import UNDRAWN
-from mjx_study.plots.panels import UNSTABLE, counted, number
+from mjx_study.plots.panels import UNSTABLE, counted
 from mjx_study.plots.study import MOST_DECADES, plot_study
 from mjx_study.plots.style import STYLES, combines, fit_to_paper, mark_clipped, style_of
 from mjx_study.report import render_report
@@ -315,27 +312,7 @@ def test_bounds_of_a_bias_are_side_by_side(models: list[tuple[str, float]]) -> N
     assert len(bounds) == len({float(x[0]) for x in bounds}) == len(BOTH)  # type: ignore[index]
 
 
-def test_numbers_on_axes_are_of_one_kind() -> None:
-    assert [number(each) for each in (300, 3000.0, 10_000.0, 0.5, 1e7)] == ["300", "3,000", "10,000", "0.5", "1e+07"]
-    models = [("penalty", stiffness) for stiffness in (3000.0, 10_000.0, 30_000.0)]
-    (figure,) = plot_study(study("gradients", models)).values()
-    assert [each.get_text() for each in figure.axes[1].get_xticklabels()] == ["3,000", "10,000", "30,000"]
-
-
 def test_any_name_of_a_task_can_be_written() -> None:
     found = study("gradients", [("penalty", 10.0)]).assign_coords(task=["a$\\b$\0c"])
     (figure,) = plot_study(found).values()
     assert "a$\\b$?c" in figure.get_suptitle()
-
-
-def test_constants_say_what_they_limit() -> None:
-    """A docstring follows every number at the top of a module of figures."""
-    for path in Path(plots.__file__).parent.glob("*.py"):
-        body = ast.parse(path.read_text()).body
-        for here, after in zip(body, [*body[1:], None], strict=True):
-            value = getattr(here, "value", None)
-            if isinstance(here, ast.Assign | ast.AnnAssign) and value is not None:
-                numbers = [each for each in ast.walk(value) if isinstance(each, ast.Constant)]
-                if numbers and all(isinstance(each.value, int | float) for each in numbers):
-                    told = isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant)
-                    assert told, f"{path.name}:{here.lineno}"

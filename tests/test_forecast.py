@@ -7,23 +7,17 @@ import numpy as np
 import pytest
 
 from mjx_study import cli
-from mjx_study.cli import options
 from mjx_study.execution.forecast import forecast_study
 from mjx_study.execution.run import run_study
 from mjx_study.experiment.plan import plan_study
 from mjx_study.options.configuration import StudyConfig
 from mjx_study.table import count, size
+from tests.documents import content
 
 DESCENTS = (
     "optimise pusher --reference --horizon 8 --iterations 3 --seeds 2 --samples 4 --evaluation-samples 5 "
     "--estimators zobg,fobg --output"
 ).split()
-
-
-@pytest.fixture(autouse=True)
-def configured(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The process as it is."""
-    monkeypatch.setattr(options, "configure", lambda **_: None)
 
 
 def test_batches_of_gradients_are_counted() -> None:
@@ -68,7 +62,7 @@ def test_what_is_forecast_is_what_descents_do(tmp_path: Path, capsys: pytest.Cap
     assert told["gradients"] == 2 * 3 * 4 and told["kept"] >= 8 * data["theta"].size
 
     assert cli.main([*DESCENTS, str(folder)]) == 0
-    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    before = content(folder)
     capsys.readouterr()
     assert cli.main([*DESCENTS, str(folder), "--dry-run"]) == 0
     assert "cells: 1, 1 computed, 0 to compute\n" in capsys.readouterr().out
@@ -77,7 +71,7 @@ def test_what_is_forecast_is_what_descents_do(tmp_path: Path, capsys: pytest.Cap
     assert json.loads(capsys.readouterr().out)["computed"] == 0
     assert cli.main([*DESCENTS, str(folder), "--dry-run", "--sigma", "0.3"]) == 2
     assert "holds another study" in capsys.readouterr().err
-    assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
+    assert content(folder) == before
 
 
 def test_figures_are_for_people(capsys: pytest.CaptureFixture[str]) -> None:

@@ -7,7 +7,6 @@ from typing import Any
 import pytest
 
 from mjx_study import caches
-from mjx_study.cli import options
 from mjx_study.experiment import plan as plan_module
 from mjx_study.storage import manifest as document
 from tests.fuzz import FUZZERS, flips, fuzz, strategies, studies
@@ -25,12 +24,6 @@ SAMPLE = {"bit flips in files of studies": 36, "bit flips in files of caches": 6
 def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder that fuzzers share."""
     return tmp_path_factory.mktemp("fuzz").resolve()
-
-
-@pytest.fixture(autouse=True)
-def configured(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Commands run under the settings of the tests."""
-    monkeypatch.setattr(options, "configure", lambda **_: None)
 
 
 @pytest.mark.parametrize("kind", FUZZERS)

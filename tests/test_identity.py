@@ -31,7 +31,7 @@ from mjx_study.storage import folder as store
 from mjx_study.storage.folder import Store, load_study
 from mjx_study.tasks import make_task
 from mjx_study.tasks.task import StudyDefaults, Task
-from tests.documents import altered, planned_arrays, stub_cells
+from tests.documents import altered, content, planned_arrays, stub_cells
 
 MODULE = """
 from functools import partial
@@ -169,9 +169,7 @@ def test_a_study_of_another_precision_is_refused(tmp_path: Path, monkeypatch: py
 
 
 @pytest.mark.usefixtures("stubbed")
-def test_a_study_whose_model_or_task_changed_is_refused(
-    tmp_path: Path, own: Callable[..., Task], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_study_whose_model_or_task_changed_is_refused(tmp_path: Path, own: Callable[..., Task]) -> None:
     path = tmp_path / "own.xml"
     text = (models_folder() / "pusher.xml").read_text()
     path.write_text(text)
@@ -254,10 +252,6 @@ def descended(
     return run_study(
         StudyConfig(tasks=(task,), **DESCENT, iterations=iterations), folder, accept_versions=accept_versions
     )
-
-
-def content(folder: Path) -> dict[Path, bytes]:
-    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 def test_a_longer_run_is_neither_cut_nor_lost(tmp_path: Path) -> None:

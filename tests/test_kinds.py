@@ -27,7 +27,7 @@ from mjx_study.results.warnings import warnings_of
 from mjx_study.storage import cell_files, folder
 from mjx_study.storage.arrays import required
 from mjx_study.storage.folder import Store, load_study
-from tests.documents import study_document
+from tests.documents import content, same, study_document
 from tests.test_layering import FILES, ROOT
 
 NUMBERS = Path(__file__).parent / "data" / "kinds.json"
@@ -51,15 +51,6 @@ each_kind = pytest.mark.parametrize("name", STUDIES)
 
 def config(name: str, **changes: Any) -> StudyConfig:
     return StudyConfig(**(COMMON | STUDIES[name] | changes))
-
-
-def same(one: xr.Dataset, other: xr.Dataset) -> bool:
-    """Whether all but measured times is equal, bit for bit."""
-    return one.drop_vars(MEASURED, errors="ignore").equals(other.drop_vars(MEASURED, errors="ignore"))
-
-
-def content(path: Path) -> dict[Path, bytes]:
-    return {each: each.read_bytes() for each in path.rglob("*") if each.is_file()}
 
 
 @pytest.fixture(scope="module")

@@ -20,7 +20,7 @@ from scipy.integrate import quad
 
 from estimators import NOISES, Differentiation, Evaluation
 from mjx_study import cli
-from mjx_study.cli import options, studies
+from mjx_study.cli import studies
 from mjx_study.cli.console import curves
 from mjx_study.cli.studies import as_document
 from mjx_study.execution.run import run_study
@@ -42,13 +42,6 @@ from mjx_study.tasks.policy import InitialStatePolicy, LinearFeedback
 from mjx_study.tasks.task import Task
 from tests.carts import WALL, cart
 from tests.documents import altered, numbers_of
-
-
-@pytest.fixture(autouse=True)
-def configured(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The tests' own settings stand: JAX takes its devices once per process."""
-    monkeypatch.setattr(options, "configure", lambda **_: None)
-
 
 POSITION = np.linspace(0.1, 1.4, 7)
 SIGMA = 0.1
@@ -181,8 +174,7 @@ def drawn(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     folder = tmp_path_factory.mktemp("landscape") / "out"
     arguments = ["landscape", f"{__name__}:shot", "--points", "5", "--samples", "300", "--span", "0.3,1.2"]
     arguments += ["--contact", "mujoco", "--stiffness", "10000", "--output", str(folder)]
-    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(io.StringIO()) as printed:
-        patch.setattr(options, "configure", lambda **_: None)
+    with contextlib.redirect_stdout(io.StringIO()) as printed:
         assert cli.main(arguments) == 0
     return folder, printed.getvalue()
 

@@ -26,9 +26,8 @@ from mjx_study.experiment.study import StudyPlan
 from mjx_study.options.configuration import StudyConfig
 from mjx_study.results.variables import MEASURED
 from mjx_study.storage.folder import Store, load_study
-from tests.documents import numbers_of
+from tests.documents import numbers_of, same
 from tests.poison import ACCOUNT, RAISE, SLOW
-from tests.test_sweep import same
 
 SUBSTITUTES = {"bias_p_value", "variance_lower", "variance_upper"}
 """Variables that only rows tell to rounding; the first test of numbers has by how much they differ. Those of norms are

@@ -7,7 +7,7 @@ import pytest
 
 from estimators import make_estimator
 from mjx_study import gradcheck
-from mjx_study.cli import main, options
+from mjx_study.cli import main
 from mjx_study.diagnose.means import MeanCheck, check_mean, lines_of
 from mjx_study.tasks import make_task
 from mjx_study.tasks.contact_grid import family_grid
@@ -31,9 +31,8 @@ def test_checks_of_means_are_importable_from_gradcheck() -> None:
         _ = gradcheck.check_median
 
 
-def test_estimators_take_their_options(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_estimators_take_their_options(capsys: pytest.CaptureFixture[str]) -> None:
     """A norm that no sample reaches clips none."""
-    monkeypatch.setattr(options, "configure", lambda **_: None)
     chosen = ["--estimators", "fobg,fobg_clipped", "--max-norm", "1e9", "--samples", "5", "--json"]
     main(["gradcheck", "tests.carts:walled_cart", "--contact", "penalty", "--stiffness", "10", "--mean", *chosen])
     plain, clipped = json.loads(capsys.readouterr().out)["checks"]

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from mjx_study import cli
-from mjx_study.cli import options
 from mjx_study.simulation.dynamics import State
 from mjx_study.tasks import make_task
 from mjx_study.tasks.network import Network, with_network
@@ -59,10 +58,7 @@ def test_what_cannot_be_a_network_is_refused() -> None:
 
 
 @pytest.mark.slow
-def test_a_network_is_optimised_and_replayed(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(options, "configure", lambda **_: None)
+def test_a_network_is_optimised_and_replayed(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     out = tmp_path / "out"
     arguments = ["optimise", "pusher", "--network", "4", "--estimators", "fobg", "--horizon", "60", "--iterations", "8"]
     arguments += ["--contact", "penalty", "--stiffness", "100", "--optimizer", "adam", "--learning-rate", "0.02"]

@@ -17,7 +17,7 @@ from PIL import Image
 import estimators
 from estimators import ESTIMATORS, Differentiation, FirstOrder
 from mjx_study import cli, disk
-from mjx_study.cli import motions, options
+from mjx_study.cli import motions
 from mjx_study.execution.run import run_study
 from mjx_study.experiment import descents, plan, sampling
 from mjx_study.experiment import iteration as descent
@@ -282,7 +282,6 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     folder = tmp_path_factory.mktemp("optimise") / "out"
     arguments = ["optimise", "pusher", "--reference", "--horizon", "8", "--iterations", "4", "--seeds", "2"]
     patch = pytest.MonkeyPatch()
-    patch.setattr(options, "configure", lambda **_: None)
     lines: list[str] = []
     patch.setattr("builtins.print", lambda *parts, **_: lines.append(" ".join(map(str, parts))))
     try:
@@ -307,10 +306,7 @@ def test_the_command_writes_a_study_a_figure_and_policies(written: tuple[Path, s
         assert words in printed
 
 
-def test_a_policy_is_replayed(
-    written: tuple[Path, str], capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(options, "configure", lambda **_: None)
+def test_a_policy_is_replayed(written: tuple[Path, str], capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     policy = written[0] / "policy-fobg.json"
     theta = json.loads(policy.read_text())["theta"]
     arguments = ["rollout", "pusher", "--theta", str(policy), "--frames", "1", "--json"]

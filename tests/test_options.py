@@ -14,7 +14,6 @@ import pytest
 from estimators import AlphaOrder
 from estimators.intervals import Interval
 from mjx_study import cli, tasks
-from mjx_study.cli import options
 from mjx_study.cli.sweep import sweep_fields
 from mjx_study.experiment.plan import plan_study
 from mjx_study.options.configuration import OPTIONS, StudyConfig
@@ -27,9 +26,8 @@ _built = functools.cache(tasks.make_task)
 
 @pytest.fixture(autouse=True)
 def configured(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """In an empty folder, with the tests' JAX settings, which a process takes once, and tasks built once."""
+    """In an empty folder, with tasks built once."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(options, "configure", lambda **_: None)
     monkeypatch.setattr(tasks, "make_task", _built)
 
 

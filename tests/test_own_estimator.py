@@ -13,7 +13,6 @@ import pytest
 
 from estimators import ESTIMATORS, Estimator, FirstOrder, ZerothOrder, find_estimator, make_estimator, register
 from mjx_study import cli, experiment
-from mjx_study.cli import options
 from mjx_study.options.configuration import OPTIONS
 from mjx_study.plots.style import combines, style_of
 from mjx_study.results.rows import rows_of
@@ -63,8 +62,7 @@ pytestmark = pytest.mark.usefixtures("shared_programs")
 
 @pytest.fixture(autouse=True)
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """The page's file, in the current directory; the tests' own settings stand."""
-    monkeypatch.setattr(options, "configure", lambda **_: None)
+    """The page's file, in the current directory."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "my_estimators.py").write_text(CODE + HEIRS)
     path = list(sys.path)
@@ -129,9 +127,7 @@ raise SystemExit(0)
 
 
 @pytest.mark.parametrize("place", [CAUTIOUS, "registered"])
-def test_reading_imports_nothing(
-    place: str, folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_reading_imports_nothing(place: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Not the estimators and tasks that a study names, which are drawn as they would be where they are known."""
     with monkeypatch.context() as patch:
         patch.setitem(ESTIMATORS, "registered", FirstOrder)

@@ -6,7 +6,6 @@ import jax
 import numpy as np
 import pytest
 
-from mjx_study.cli import options
 from mjx_study.experiment.plan import plan_study
 from mjx_study.experiment.resolution import configured_estimators
 from mjx_study.experiment.study import estimators_of
@@ -24,12 +23,6 @@ CONSTANTS = {
     "momentum_transfer": (0.2 * MOMENTUM, MOMENTUM),
     "tennis": (1000.0, 1000.0),
 }
-
-
-@pytest.fixture(autouse=True)
-def configured(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The tests' own settings stand: JAX takes its devices once per process."""
-    monkeypatch.setattr(options, "configure", lambda **_: None)
 
 
 @pytest.mark.parametrize("name", CONSTANTS)

@@ -48,7 +48,7 @@ def test_the_torques_of_landing_are_the_servos() -> None:
     task = make_task("landing")
     assert callable(task.running_cost)
     for state, control, force in played(task, 0)[1][::20]:
-        own = float(task.running_cost(state, jnp.array(control))) * task.horizon
+        own = float(task.costs()[0](state, jnp.array(control))) * task.horizon
         assert own == pytest.approx(np.sum((force / TORQUE) ** 2), rel=1e-9)
 
 

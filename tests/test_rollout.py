@@ -32,8 +32,7 @@ KEYFRAME = '<keyframe><key qpos=".3" qvel="-1" ctrl="2"/></keyframe>'
 
 @pytest.fixture(autouse=True)
 def elsewhere(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
-    """Default folders lie in a temporary one; the tests' own settings of JAX stand."""
-    monkeypatch.setattr(shared, "configure", lambda **_: None)
+    """Default folders lie in a temporary one."""
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
@@ -246,19 +245,3 @@ def test_a_start_that_is_not_finite_is_refused(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(motions, "task_of", lambda options: task.replace(start=lost))
     with pytest.raises(shared.UsageError, match="pusher: .*: the first state is not finite"):
         call(*SHORT, "--output", "out")
-
-
-def test_many_bodies_are_not_all_printed(capsys: pytest.CaptureFixture[str], elsewhere: Path) -> None:
-    bodies = "".join(f'<body pos="{k} 0 1"><freejoint/><geom size=".1"/></body>' for k in range(14))
-    (elsewhere / "many.xml").write_text(f"<mujoco><worldbody>{bodies}</worldbody></mujoco>")
-    assert call("many.xml", "--horizon", "5", "--renderer", "drawing") == 0
-    printed = capsys.readouterr().out
-    assert "body 12" in printed and "body 13" not in printed and "and 2 more bodies" in printed
-
-
-def test_help_teaches(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        call("--help")
-    text = capsys.readouterr().out
-    for taught in ("FILE.xml", "trajectory.npz", "stroboscope", "mjx-study rollout pusher", "opengl", "--slow"):
-        assert taught in text

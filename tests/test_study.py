@@ -2,7 +2,6 @@
 
 import json
 import math
-import re
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +22,6 @@ from estimators import (
     summarise,
 )
 from estimators.registry import label_of
-from mjx_study import cli
 from mjx_study.cli import console
 from mjx_study.cli.studies import as_document
 from mjx_study.execution.run import run_study
@@ -365,17 +363,6 @@ def table(dataset: xr.Dataset, details: bool = True) -> list[str]:
     return console.gradient_lines(dataset, as_json(dataset), details)
 
 
-def test_the_short_table_says_which_estimator_to_take(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("COLUMNS", "104")
-    data = result(row("zobg", 10, 1), row("fobg", 10, 1))
-    short, full = table(data, details=False), table(data)
-    (heading,) = [line for line in short if "estimator" in line]
-    for name in ("variance (95 % interval)", "relative error -> debiased", "alpha", "ms", "variance x s"):
-        assert name in heading and any(name in line for line in full)
-    for name in ("|gradient|", "effective (top)", "cosine -> debiased", "epsilon", "B", "residual", "nan"):
-        assert name not in re.split(r"\s{2,}", heading) and any(name in line for line in full)
-
-
 def test_doubtful_numbers_are_marked_in_the_table() -> None:
     sure = row("zobg", 10, 1, relative_error=0.325, debiased_error=0.298, debiased_error_se=0.0098)
     lines = table(result(sure, row("fobg", 20, 1, effective_samples=1.2, top_share=0.9)))
@@ -428,24 +415,6 @@ def test_the_unstable_band_begins_at_the_limit() -> None:
 
 
 @pytest.mark.parametrize(
-    ("value", "digits", "shown"),
-    [
-        (None, 3, "-"),
-        (0.0, 3, "0"),
-        (math.nan, 3, "nan"),
-        (176.07, 3, "176"),
-        (8.545, 3, "8.54"),
-        (4585.0, 2, "4600"),
-        (6.83e6, 3, "6.8e6"),
-        (3.3e-16, 2, "3.3e-16"),
-        (-1.5, 3, "-1.5"),
-    ],
-)
-def test_numbers_are_short(value: float | None, digits: int, shown: str) -> None:
-    assert console.number(value, digits) == shown
-
-
-@pytest.mark.parametrize(
     ("value", "error", "shown"),
     [
         (832.0912, 0.0123, "832.091 ± 0.012"),
@@ -491,28 +460,12 @@ def test_a_bound_of_a_cosine_is_rounded_down(cosine: float, error: float, shown:
     assert any(f"{shown}  " in line for line in table(result(each)))
 
 
-def test_times_are_no_more_exact_than_the_clock() -> None:
-    lines = table(result(row("fobg", 10, 1.234, seconds_per_sample=3.456e-3)))
-    assert any(re.search(r"  3\.5 +0\.0043($|  )", line) for line in lines)
-
-
 def test_stepwise_estimators_take_a_task_without_controls() -> None:
     """Whose single-step derivatives have an axis of length 0."""
     stepwise = {"estimators": ("fobg_truncated", "fobg", "total_propagation"), "window": 1000}
     found = compare(tasks=("ball_wall",), contact=("reference",), **stepwise).gradient
     np.testing.assert_allclose(found.isel(estimator=0), found.isel(estimator=1), rtol=1e-9)  # longer than the rollout
     assert np.isfinite(found).all()
-
-
-def test_a_table_says_what_was_chosen(capsys: pytest.CaptureFixture[str]) -> None:
-    arguments = ["--contact", "reference", "--samples", "8", "--reference-samples", "8", "--theta", "0.5"]
-    assert cli.main(["compare", "ball_wall", *arguments, "--gamma", "0.5"]) == 0
-    assert "float64, theta 0.5, gamma 0.5\n" in capsys.readouterr().out
-
-
-def test_a_single_parameter_has_no_cosine() -> None:
-    headings = [line for line in table(compare(tasks=("ball_wall",), contact=("reference",))) if "estimator" in line]
-    assert headings and not any("cosine" in heading for heading in headings)
 
 
 @pytest.mark.parametrize(("columns", "tables"), [(200, 1), (80, 3)])

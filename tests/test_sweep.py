@@ -15,12 +15,10 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-import xarray as xr
 
 import estimators
 from estimators import AlphaOrder, DiscontinuityGated
 from mjx_study import cli
-from mjx_study.cli import options
 from mjx_study.cli.sweep import sweep_fields
 from mjx_study.execution.run import run_study
 from mjx_study.experiment.checkpoint import StudyError
@@ -29,11 +27,11 @@ from mjx_study.experiment.plan import plan_study
 from mjx_study.experiment.study import estimators_of
 from mjx_study.objective import Simulator, simulate
 from mjx_study.options.configuration import StudyConfig
-from mjx_study.results.variables import MEASURED
 from mjx_study.results.warnings import warnings_of
 from mjx_study.simulation.contact import stiffness_from_solref
 from mjx_study.storage.folder import Store, load_study, open_store
 from mjx_study.tasks import make_task
+from tests.documents import same
 
 pytestmark = pytest.mark.usefixtures("shared_programs")
 
@@ -60,11 +58,6 @@ LINE: dict[str, Any] = {
 def config(**changes: Any) -> StudyConfig:
     of_gradients: dict[str, Any] = {} if {"iterations", "points"} & changes.keys() else {"reference_samples": 6}
     return StudyConfig(**(SMALL | of_gradients | changes))
-
-
-def same(one: xr.Dataset, other: xr.Dataset) -> bool:
-    """All but what was measured with a clock, and when and where."""
-    return one.drop_vars(MEASURED, errors="ignore").equals(other.drop_vars(MEASURED, errors="ignore"))
 
 
 @pytest.fixture(scope="module")
@@ -308,9 +301,8 @@ def test_contact_models_in_mujocos_terms() -> None:
 
 
 def test_the_commands_write_figures_and_a_page(
-    undisturbed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    undisturbed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(options, "configure", lambda **_: None)
     folder = copy_of(undisturbed, tmp_path / "out")
     assert cli.main(["sweep", *ARGUMENTS[:-2], "--output", str(folder), "--json"]) == 0
     told = json.loads(capsys.readouterr().out)

@@ -38,6 +38,7 @@ from mjx_study.results.findings import descent_findings
 from mjx_study.results.kind import Drawing
 from mjx_study.results.variables import DESCENTS, HISTORY, METRIC, START
 from mjx_study.simulation.contact import ContactModel, soften
+from mjx_study.simulation.observation import observed
 from mjx_study.tasks.contact_grid import ContactPoint
 from mjx_study.tasks.task import Recipe, Task
 
@@ -264,7 +265,7 @@ class Backend:
 
         def one(theta: Float[Array, " params"], contact: ContactModel | None, key: Key[Array, ""]) -> dict[str, Array]:
             states, *_ = simulate(self.task, theta, contact, key, 1.0)
-            return self.task.metrics(states)  # type: ignore[misc]
+            return self.task.metrics(observed(self.task.scene, states, contact))  # type: ignore[misc]
 
         return Compiled(jax.vmap(one, (None, None, 0)), "metrics", self.task)
 

@@ -19,6 +19,8 @@ from mjx_study.graph.native import as_native, count_left, native_identity
 
 MOST_DIFFERENTIATED: Final = 20_000
 """Maximum size of a linear map that is differentiated as a graph if JAX can do it, too."""
+Along = Callable[[Sequence[Any], Sequence[Any]], Sequence[Any] | None]
+"""From inputs and their changes, None where there is none, to the changes of the outputs; None to derive the graph."""
 Plain = Callable[[Sequence[Any], Sequence[Any]], Sequence[Any]]
 """A linear map in JAX operations: (point, changes) -> changes of the results."""
 
@@ -27,9 +29,9 @@ def computed(
     function: ScalarFunction,
     inputs: Sequence[Any],
     transpose: Transpose | None = None,
+    along: Along | None = None,
     *,
     early: bool = True,
-    plain: Callable[..., Sequence[Any]] | None = None,
 ) -> list[Any]:
     """Outputs of a graph.
 
@@ -37,27 +39,22 @@ def computed(
         function: the graph.
         inputs: its inputs.
         transpose: its transposition, if it is linear in some of its inputs.
+        along: its derivative, if it is not to be that of the graph.
         early: whether to begin to build native code now, or when a program with it is compiled.
-        plain: the same in JAX operations, to differentiate a function larger than `MOST_DIFFERENTIATED`.
     """
 
-    def value(primals: Sequence[Any]) -> list[Any]:
-        return computed(function, primals, transpose, early=early, plain=plain)
-
-    def by_jax(program: Callable[..., Any], primals: Sequence[Any], changes: Sequence[Any]) -> Any:
-        return jax.jvp(program, tuple(primals), tuple(instantiated(list(primals), list(changes))))
-
     def rule(primals: Sequence[Any], changes: Sequence[Any]) -> Any:
-        if plain is not None and function.size > MOST_DIFFERENTIATED:
-            return value(primals), list(by_jax(plain, primals, changes)[1])
+        value = computed(function, primals, transpose, along, early=early)
+        if along is not None and (found := along(primals, changes)) is not None:
+            return value, list(found)
         moving = tuple(place for place, change in enumerate(changes) if change is not None)
         try:
             slope = derivative(function, moving)
         except NotDifferentiableError as error:  # JAX differentiates the operations on whole arrays
             count_left(f"derivative of {error}")
-            return by_jax(program, primals, changes)
+            return jax.jvp(program, tuple(primals), tuple(instantiated(list(primals), list(changes))))
         found = iter(applied(slope, primals, [changes[place] for place in moving]))
-        return value(primals), [next(found) if aval.dtype.kind == "f" else None for aval in function.avals]
+        return value, [next(found) if aval.dtype.kind == "f" else None for aval in function.avals]
 
     program = _program(function, early)
     return flat_with_rule(program, inputs, rule, transpose)
@@ -70,24 +67,30 @@ def applied(linear: LinearMap, point: Sequence[Any], changes: Sequence[Any], pla
         linear: the map.
         point: the point.
         changes: the changes there.
-        plain: the same in JAX operations, from which derivatives of large maps are taken.
+        plain: the same in JAX operations, from which derivatives of a large map over the point are taken.
     """
+    size = len(point)
 
     def transpose(fixed: Sequence[Any], adjoints: Sequence[Any]) -> list[Any]:
-        found = applied(linear.transposed, fixed[: len(point)], adjoints, None if plain is None else turned)
-        wanted = [each if known is None else None for each, known in zip(found, fixed[len(point) :], strict=True)]
-        return [None] * len(point) + wanted
+        found = applied(linear.transposed, fixed[:size], adjoints, None if plain is None else turned)
+        wanted = [each if known is None else None for each, known in zip(found, fixed[size:], strict=True)]
+        return [None] * size + wanted
 
-    def turned(point: Sequence[Any], adjoints: Sequence[Any]) -> Sequence[Any]:
-        along = partial(split, *point)
-        return jax.linear_transpose(along, *map(jax.typeof, changes))(tuple(adjoints))
+    def along(primals: Sequence[Any], moved: Sequence[Any]) -> Sequence[Any] | None:
+        whole = tuple(instantiated(list(primals), list(moved)))
+        if all(each is None for each in moved[:size]):
+            return applied(linear, primals[:size], whole[size:], plain)
+        large = plain is not None and linear.push.size > MOST_DIFFERENTIATED
+        return jax.jvp(split, tuple(primals), whole)[1] if large else None
 
     def split(*inputs: Any) -> tuple[Any, ...]:
         assert plain is not None
-        return tuple(plain(inputs[: len(point)], inputs[len(point) :]))
+        return tuple(plain(inputs[:size], inputs[size:]))
 
-    also = None if plain is None else split
-    return computed(linear.push, [*point, *changes], transpose, early=linear.early, plain=also)
+    def turned(point: Sequence[Any], adjoints: Sequence[Any]) -> Sequence[Any]:
+        return jax.linear_transpose(partial(split, *point), *map(jax.typeof, changes))(tuple(adjoints))
+
+    return computed(linear.push, [*point, *changes], transpose, along, early=linear.early)
 
 
 def _program(function: ScalarFunction, early: bool) -> Callable[..., list[jax.Array]]:

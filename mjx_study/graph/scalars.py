@@ -22,8 +22,8 @@ from mjx_study.graph.operation import computed
 
 MOST_SCALARS: Final = {"cpu": 12_000, "gpu": 6_000, "tpu": 6_000}
 """Maximum number of scalar operations, by backend; XLA's compile time grows faster than linearly in it."""
-MOST_NATIVE: Final = 100_000
-"""Maximum number of scalar operations in native code, which takes compilers about half a minute."""
+MOST_NATIVE: Final = {"cpu": 100_000, "gpu": 50_000}
+"""Maximum number of scalar operations in native code, by backend; it takes compilers about half a minute."""
 
 _CAPTURED: Final[dict[Any, ScalarFunction | None]] = {}
 """Graphs, keyed by everything they depend on; None if too large."""
@@ -55,8 +55,7 @@ def captured_once(function: Callable[..., Any], *arguments: Any) -> ScalarFuncti
         try:
             captured = capture(function, *arguments, most=2 * most)
         except TooLargeError:
-            captured = None
-            count_left(f"more than {most} operations")
+            captured = _left()
         _CAPTURED[key] = captured = captured if captured and is_small(captured) else None
         if captured and any(node.operation == "whole" for node in captured.needed):
             captured.derived["values"] = capture(function, *arguments, most=2 * most, values_only=True)
@@ -64,13 +63,21 @@ def captured_once(function: Callable[..., Any], *arguments: Any) -> ScalarFuncti
 
 
 def is_small(function: ScalarFunction) -> bool:
-    """Whether a graph is worth compiling: it has at most `most_scalars` operations."""
-    return (len(function.needed) if native_identity() is None else function.size) <= most_scalars()
+    """Whether a graph is worth compiling: it has at most `most_scalars` operations; counted if it is not."""
+    if (len(function.needed) if native_identity() is None else function.size) <= most_scalars():
+        return True
+    _left()
+    return False
+
+
+def _left() -> None:
+    if native_identity() is not None:
+        count_left(f"more than {most_scalars()} operations")
 
 
 def most_scalars() -> int:
     """Maximum number of scalar operations here: `MOST_NATIVE`, or `MOST_SCALARS` without native code."""
-    return MOST_SCALARS[jax.default_backend()] if native_identity() is None else MOST_NATIVE
+    return (MOST_SCALARS if native_identity() is None else MOST_NATIVE)[jax.default_backend()]
 
 
 def _name(function: Callable[..., Any]) -> Any:

@@ -46,20 +46,20 @@ def rollout_cost(
     backward = derivative_model(task, contact)
     if backward is not None and onset != "none":
         raise ValueError("the onset term requires exact derivatives: omit onset, or the contact's backward model")
+    running_cost, final_cost = task.costs(contact)
     first = task.policy.place(theta, noise, start)
     moved, counts, term = (task.scene, model, first, control_law), None, 0.0
     if onset == "linear":
         states, controls, residuals, counts = corrected_rollout(*moved, task.horizon, inputs=feedforward, weight=weight)
-        costs, last = jax.vmap(task.running_cost)(before_each_step(states), controls), last_of(states)
+        costs, last = jax.vmap(running_cost)(before_each_step(states), controls), last_of(states)
     else:
-        last, (before, controls, residuals, costs) = simulated(*moved, feedforward, task.running_cost, backward)
+        last, (before, controls, residuals, costs) = simulated(*moved, feedforward, running_cost, backward)
         states = trajectory(before, last)
     if onset == "jump":
         fixed, each = jax.lax.stop_gradient((theta, feedforward))
         law = lambda index, state: control_law(each[index], state, fixed)  # noqa: E731
-        of_steps = task.running_cost, task.final_cost
-        term, counts = jump_term(task.scene, without_derivative(model), states, controls, law, *of_steps)
-    cost = jnp.sum(costs) + task.final_cost(last)
+        term, counts = jump_term(task.scene, without_derivative(model), states, controls, law, running_cost, final_cost)
+    cost = jnp.sum(costs) + final_cost(last)
     return cost + term, (states, controls, jnp.max(residuals), counts)
 
 

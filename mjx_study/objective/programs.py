@@ -62,7 +62,7 @@ class SamplePrograms:
 
     def _sample_steps(self, theta, contact, sigma, key_data, noise_scale):
         _, (states, controls, noise, residual, _) = self.cost(theta, contact, sigma, key_data, noise_scale)
-        return self._step_terms(theta, states, controls, noise, sigma), residual
+        return self._step_terms(theta, contact, states, controls, noise, sigma), residual
 
     def _sample_step_gradient(self, theta, contact, sigma, key_data, noise_scale):
         start, noise = self.draw(sigma, key_data, noise_scale)
@@ -76,6 +76,7 @@ class SamplePrograms:
         start, noise = self.draw(sigma, key_data, noise_scale)
         _, (states, controls, residual, _) = rollout_cost(task, theta, contact, start, noise)
         model = derivative_model(task, contact) or apply_contact(task.scene.model, contact)
+        running_cost, final_cost = task.costs(contact)
         before, last = before_each_step(states), last_of(states)
         sizes = np.cumsum([states.qpos.shape[1], states.qvel.shape[1]])
 
@@ -86,23 +87,24 @@ class SamplePrograms:
         def derivatives(state: State, control):
             vector = _coordinates(state)
             following = lambda x, u: _coordinates(step(task.scene, model, state_of(x, state), u)[0])  # noqa: E731
-            over_cost = jax.grad(lambda x, u: task.running_cost(state_of(x, state), u), argnums=(0, 1))
+            over_cost = jax.grad(lambda x, u: running_cost(state_of(x, state), u), argnums=(0, 1))
             feedback = lambda x: task.policy.feedback(theta, state_of(x, state))  # noqa: E731
             over_policy = None if task.policy.additive else jax.jacfwd(feedback)(vector)
             return over_cost(vector, control), jax.jacfwd(following, argnums=(0, 1))(vector, control), over_policy
 
         over_cost, over_step, over_policy = jax.vmap(derivatives)(before, controls)
-        over_final = jax.grad(lambda x: task.final_cost(state_of(x, last)))(_coordinates(last))
+        over_final = jax.grad(lambda x: final_cost(state_of(x, last)))(_coordinates(last))
         over_start = None
         if task.policy.at_start:
             over_start = jax.jacfwd(lambda at: _coordinates(task.policy.place(at, noise, start)))(theta)
-        terms = self._step_terms(theta, states, controls, noise, sigma)
+        terms = self._step_terms(theta, contact, states, controls, noise, sigma)
         return terms, residual, (*over_cost, over_final, *over_step, over_policy, over_start)
 
-    def _step_terms(self, theta, states, controls, noise, sigma):
+    def _step_terms(self, theta, contact, states, controls, noise, sigma):
         """Costs to go from each noisy step, noise scores, and the policy's Jacobian."""
-        running = jax.vmap(self.task.running_cost)(before_each_step(states), controls)
-        to_go = jnp.cumsum(running[::-1])[::-1] + self.task.final_cost(last_of(states))
+        running_cost, final_cost = self.task.costs(contact)
+        running = jax.vmap(running_cost)(before_each_step(states), controls)
+        to_go = jnp.cumsum(running[::-1])[::-1] + final_cost(last_of(states))
         return to_go[: len(noise)], noise_score(noise, sigma, self.task.noise), self._policy_jacobian(theta, states)
 
     def _policy_jacobian(self, theta, states):

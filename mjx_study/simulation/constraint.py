@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jax.ad_checkpoint import checkpoint_name
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from mjx_study.graph.derivative_rule import with_rule
 from mjx_study.graph.scalars import traced_part
@@ -112,6 +112,34 @@ def constraint_force(model: mjx.Model, data: mjx.Data, qacc: Qvel) -> Qvel:
     """Joint-space constraint force J^T f(J a - aref) [N or N m] at the acceleration `qacc`."""
     rows: Any = data._impl
     return rows.efc_J.T @ row_force(model, data, rows.efc_J @ qacc - rows.efc_aref)
+
+
+def with_forces(model: mjx.Model, data: mjx.Data, qacc: Qvel) -> mjx.Data:
+    """The data with an acceleration, and with the force of every constraint row at it."""
+    rows: Any = data._impl
+    forces = row_force(model, data, rows.efc_J @ qacc - rows.efc_aref)
+    found: Any = data.tree_replace({"qacc": qacc, "_impl.efc_force": forces})
+    return found
+
+
+def contact_forces(model: mjx.Model, data: mjx.Data) -> tuple[Int[Array, "contacts 2"], Float[Array, "contacts 3"]]:
+    """Geoms of every contact, and its force [N] on the second one in the world frame; data of `with_forces`.
+
+    The rows of an elliptic contact are its normal and tangential forces; of a pyramidal one, forces along n + mu t and
+    n - mu t for each tangent t.
+    """
+    rows: Any = data._impl
+    contact, forces = rows.contact, []
+    for index, (condim, address) in enumerate(zip(contact.dim, contact.efc_address, strict=True)):
+        edges = 2 * (condim - 1) if condim > 1 and model.opt.cone != _ELLIPTIC else 0
+        force = rows.efc_force[int(address) : int(address) + (edges or int(condim))]
+        if edges:
+            plus, minus = force[::2], force[1::2]
+            force = jnp.concatenate([jnp.sum(force)[None], contact.friction[index, : condim - 1] * (plus - minus)])
+        forces.append(force[:3] @ contact.frame[index][: len(force[:3])])
+    if not forces:
+        return jnp.zeros((0, 2), int), jnp.zeros((0, 3), data.qpos.dtype)
+    return contact.geom, jnp.stack(forces)
 
 
 def imbalance(model: mjx.Model, data: mjx.Data, qacc: Qvel) -> Qvel:

@@ -36,9 +36,11 @@ STEP_SLOTS: Final = 2
 def step(model: mjx.Model, data: mjx.Data, *, onset: str = "none") -> mjx.Data:
     """`mjx.step`, differentiable through contact in forward and reverse mode, in every array of model and data.
 
-    Values agree with `mjx.step` to rounding, with the model's solver budget. The derivative is that of a converged
-    step, by the implicit function theorem at the solver's result, and only as good as the solver's convergence, which
-    `solver_residual` reports. Reverse mode stores a step's inputs and acceleration, and recomputes the rest.
+    Values agree with `mjx.step` to rounding, with the model's solver budget. If that has 20 iterations or more and no
+    array of the model is traced, the step is native code where there is some, and solved to rounding; other fields than
+    the state are then computed only if they are read. The derivative is that of a converged step, by the implicit
+    function theorem at the solver's result, and only as good as the solver's convergence, which `solver_residual`
+    reports. Reverse mode stores a step's inputs and acceleration, and recomputes the rest.
 
     Args:
         model: the model; its array leaves may be traced, batched under `jax.vmap` and differentiated.

@@ -22,7 +22,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import jax
 import jax.numpy as jnp
@@ -70,6 +70,14 @@ class State:
     act: Float[Array, "*batch na"]
     warmstart: Float[Array, "*batch nv"]
 
+    if not TYPE_CHECKING:  # so that type checkers still find unknown attributes
+
+        def __getattr__(self, name: str) -> NoReturn:
+            raise AttributeError(
+                f"a State has qpos, qvel and act, but no {name!r}; positions of bodies, contact forces and sensors are "
+                "those of mjx_study.observed(scene, state)"
+            )
+
 
 def initial_state(scene: Scene, qpos: Qpos | None = None, qvel: Qvel | None = None) -> State:
     """Return a state at rest in the MJCF's reference pose, or at `qpos` [m or rad] and `qvel` [m/s or rad/s]."""
@@ -100,6 +108,13 @@ def step(scene: Scene, model: mjx.Model, state: State, control: Control) -> tupl
     following, residual = _differentiable_step(scene, model, state, control)
     warmstart, residual = jax.lax.stop_gradient((following.warmstart, residual))
     return dataclasses.replace(following, warmstart=warmstart), residual
+
+
+def acceleration(scene: Scene, model: mjx.Model, state: State, control: Control) -> Qvel:
+    """Constrained acceleration during a `step` [m/s^2 or rad/s^2], with its implicit derivative."""
+    if scene.host.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:  # without constraints
+        return smooth_stages(scene, model, state, control).qacc_smooth
+    return _differentiable_step(scene, model, state, control)[0].warmstart
 
 
 def exact_step(scene: Scene, model: mjx.Model, state: State, control: Control) -> tuple[State, Scalar, mjx.Data]:

@@ -109,6 +109,21 @@ class Scene:
         """Index of a joint by name. Raises SceneError, listing the choices, for an unknown name."""
         return self._index(mujoco.mjtObj.mjOBJ_JOINT, "joint", name, self.host.njnt)
 
+    def body(self, name: str) -> int:
+        """Index of a body by name. Raises SceneError, listing the choices, for an unknown name."""
+        return self._index(mujoco.mjtObj.mjOBJ_BODY, "body", name, self.host.nbody)
+
+    def site(self, name: str) -> int:
+        """Index of a site by name. Raises SceneError, listing the choices, for an unknown name."""
+        return self._index(mujoco.mjtObj.mjOBJ_SITE, "site", name, self.host.nsite)
+
+    def sensor(self, name: str) -> slice:
+        """Place of a sensor's output in sensordata, by name. Raises SceneError, listing the choices, for an unknown
+        name."""
+        index = self._index(mujoco.mjtObj.mjOBJ_SENSOR, "sensor", name, self.host.nsensor)
+        first = int(self.host.sensor_adr[index])
+        return slice(first, first + int(self.host.sensor_dim[index]))
+
     def _index(self, kind: mujoco.mjtObj, noun: str, name: str, count: int) -> int:
         index = mujoco.mj_name2id(self.host, kind, name)
         if index < 0:

@@ -29,10 +29,11 @@ def check_soundness(task: Task) -> None:
     if not all(np.all(np.isfinite(leaf[0])) for leaf in (states.qpos, states.qvel, states.act)):
         raise ValueError(f"{task.name}: the initial state is not finite")
     steps = len(controls)
+    running_cost, final_cost = task.costs()
     running, final = jax.jit(
         lambda states, controls: (
-            jax.vmap(task.running_cost)(jax.tree.map(lambda leaf: leaf[:-1], states), controls),
-            task.final_cost(jax.tree.map(lambda leaf: leaf[-1], states)),
+            jax.vmap(running_cost)(jax.tree.map(lambda leaf: leaf[:-1], states), controls),
+            final_cost(jax.tree.map(lambda leaf: leaf[-1], states)),
         )
     )(states, controls)
     wrong = np.flatnonzero(~np.isfinite(np.asarray(running)))

@@ -13,8 +13,9 @@ from estimators.noise import check_density, check_sigma
 from estimators.user_code import describe_error
 from mjx_study.choices import TASK_DESCRIPTIONS
 from mjx_study.reference import Reference
-from mjx_study.simulation.contact import effective_mass
+from mjx_study.simulation.contact import ContactModel, effective_mass
 from mjx_study.simulation.dynamics import State
+from mjx_study.simulation.observation import ObservedState, observed
 from mjx_study.simulation.onset import check_onset
 from mjx_study.simulation.scene import Scene
 from mjx_study.tasks.policy import Policy
@@ -115,8 +116,9 @@ class Task:
             avoid recompilation for the theta of a descent.
         sigma: standard deviation of the noise, in the unit of the quantity it is added to.
         start: initial state, or a function of a key that draws one.
-        running_cost: c(state, control) of each step, evaluated before the step; optional if there is a final cost.
-        final_cost: c(state) after the last step; optional if there is a running cost.
+        running_cost: c(state, control) of each step, evaluated before the step; optional if there is a final cost. The
+            state is an `ObservedState`, which knows bodies, contact forces and sensors.
+        final_cost: c(state) after the last step, likewise; optional if there is a running cost.
         contact_pair: names of the two geoms whose contact is swept; None without contact.
         reference: function of the stiffness [N/m] that returns the analytic counterpart of the penalty family, or None;
             `analytic` adds the task's noise.
@@ -124,7 +126,7 @@ class Task:
         onset: treatment of the onset of contact in first-order gradients: "none" for exact derivatives of the steps, or
             "linear" or "jump" to add what those miss (see `mjx_study.simulation.onset` and `.branches`).
         metrics: function that computes named metrics of a rollout, reported along with the cost, from its states
-            including the initial one; None for none.
+            including the initial one, (horizon + 1, ...), likewise; None for none.
         defaults: defaults for studies of the task.
     """
 
@@ -136,13 +138,13 @@ class Task:
     theta: Float[Array, " params"]
     sigma: float
     start: State | Callable[[Key[Array, ""]], State]
-    running_cost: Callable[[State, Float[Array, " nu"]], Float[Array, ""]] = no_cost
-    final_cost: Callable[[State], Float[Array, ""]] = no_cost
+    running_cost: Callable[[ObservedState, Float[Array, " nu"]], Float[Array, ""]] = no_cost
+    final_cost: Callable[[ObservedState], Float[Array, ""]] = no_cost
     contact_pair: tuple[str, str] | None
     reference: Callable[[float], Reference] | None = None
     noise: str = "gaussian"
     onset: str = "none"
-    metrics: Callable[[State], dict[str, Float[Array, ""]]] | None = None
+    metrics: Callable[[ObservedState], dict[str, Float[Array, ""]]] | None = None
     defaults: StudyDefaults = StudyDefaults()
 
     def __post_init__(self) -> None:
@@ -183,6 +185,23 @@ class Task:
         """Initial state, drawn with the key if it is random."""
         return self.start if isinstance(self.start, State) else self.start(key)
 
+    def costs(
+        self, contact: ContactModel | None = None
+    ) -> tuple[Callable[[State, Float[Array, " nu"]], Float[Array, ""]], Callable[[State], Float[Array, ""]]]:
+        """The running_cost and final_cost of plain states, which they are given as `ObservedState`s.
+
+        Args:
+            contact: the contact model of forces and sensors; None for the MJCF's.
+        """
+
+        def running_cost(state: State, control: Float[Array, " nu"]) -> Float[Array, ""]:
+            return self.running_cost(observed(self.scene, state, contact, control), control)
+
+        def final_cost(state: State) -> Float[Array, ""]:
+            return self.final_cost(observed(self.scene, state, contact))
+
+        return running_cost, final_cost
+
     def replace(self, **changes) -> "Task":
         """The task with other attributes."""
         return dataclasses.replace(self, **changes)
@@ -206,11 +225,12 @@ def check_shapes(task: Task, name: str = "") -> None:
         found, needed = getattr(placed, leaf).shape, getattr(task.scene.template, leaf).shape
         if found != needed:
             raise ValueError(f"{name}: {leaf} of the start has shape {found}; the scene needs {needed}")
+    running_cost, final_cost = task.costs()
     parts = {
         "policy's feedforward": (policy.feedforward, (task.theta, noise), (steps, controls)),
         "policy's feedback": (policy.feedback, (task.theta, start), (controls,)),
-        "running_cost": (task.running_cost, (start, control), ()),
-        "final_cost": (task.final_cost, (start,), ()),
+        "running_cost": (running_cost, (start, control), ()),
+        "final_cost": (final_cost, (start,), ()),
     }
     for part, (function, arguments, needed) in parts.items():
         found = _traced(name, part, function, *arguments)

@@ -8,7 +8,6 @@ import mujoco
 import pytest
 
 from mjx_study import cli
-from mjx_study.cli import options
 from mjx_study.gradcheck import Finding, GradcheckReport, gradcheck, plan_gradcheck, plan_scene_gradcheck
 from mjx_study.simulation import dynamics
 from mjx_study.simulation.scene import load_scene, put_scene
@@ -34,13 +33,6 @@ def only(report: GradcheckReport, verdict: str) -> Finding:
     return finding
 
 
-@pytest.fixture
-def configured(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Keep the tests' settings: JAX takes its devices once per process."""
-    monkeypatch.setattr(options, "configure", lambda **_: None)
-
-
-@pytest.mark.usefixtures("configured")
 def test_the_pusher_is_right(capsys: pytest.CaptureFixture[str]) -> None:
     arguments = ["gradcheck", "pusher", "--horizon", "12", "--stiffness", "100", "--states", "2"]
     assert cli.main([*arguments, "--contact", "penalty,mujoco_default", "--json"]) == 0
@@ -247,7 +239,6 @@ def test_plans_are_refused() -> None:
         plan_scene_gradcheck(fixed, seed=0)
 
 
-@pytest.mark.usefixtures("configured")
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

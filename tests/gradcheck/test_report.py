@@ -6,7 +6,6 @@ import mujoco
 import pytest
 
 from mjx_study import cli, gradcheck
-from mjx_study.cli import options
 from mjx_study.gradcheck import Finding, GradcheckReport, StepCheck
 from mjx_study.gradcheck.check import unoffered
 from mjx_study.gradcheck.cost import judge_closed_forms
@@ -49,7 +48,6 @@ def test_unexercised_parts_are_a_warning_and_another_exit_code(
 ) -> None:
     unexercised = dataclasses.replace(STEP, coverage=STICKING)
     failing = dataclasses.replace(unexercised, verdict="value")
-    monkeypatch.setattr(options, "configure", lambda **_: None)
     for steps, code in (((STEP,), 0), ((STEP, unexercised), 3), ((STEP, failing), 1)):
         monkeypatch.setattr(gradcheck, "gradcheck", lambda plan, progress, steps=steps: report(*steps))
         assert cli.main(["gradcheck", "pusher", "--horizon", "2", "--stiffness", "100"]) == code
@@ -82,7 +80,6 @@ def test_each_stage_is_a_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Ca
         progress(1, 2, "penalty: start")
         return report(STEP)
 
-    monkeypatch.setattr(options, "configure", lambda **_: None)
     monkeypatch.setattr(gradcheck, "gradcheck", stages)
     assert cli.main(["gradcheck", "pusher", "--horizon", "2", "--stiffness", "100"]) == 0
     assert stages_of(capsys.readouterr().err) == ["[0/2] compiling", "[1/2] penalty: start"]
